@@ -1,0 +1,146 @@
+"""The flight container: what one vehicle's log holds, as arrays in the frames and units of the log format.
+
+A case is a set of flights of the same vehicle(s) with one vehicle file. World frame: x east, y north, z up.
+Body frame: x forward, y left, z up. SI units. Quaternions are scalar-first and rotate body to world.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from openjax.vehicle.vehicle_file import VehicleFile
+
+Array = np.ndarray
+
+# Channels of a Flight in the order of the log format; each is None where it wasn't logged.
+CHANNELS = (
+    "position", "quaternion", "velocity", "body_rates", "specific_force",
+    "command_thrust", "command_body_rates", "motor_command", "battery_voltage",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Issue:
+    """One finding about a flight's data.
+
+    `flight` is the log's file name (with the vehicle's id where several flew), `issue` says in words what was
+    found, `refused` whether the flight can't be used because of it, and `kind` is a short name of the check.
+    """
+
+    flight: str
+    issue: str
+    refused: bool = False
+    kind: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Flight:
+    """One vehicle's flight, T rows sorted by time, float64. A channel that wasn't logged is None; a value that
+    wasn't sampled at a row (slower channels) is NaN. Motors are in the nominal order: front right, rear right,
+    rear left, front left.
+    """
+
+    name: str                              # log file name; "FILE:ID" where several vehicles share the file
+    log: str                               # log file name: flights with the same `log` flew together
+    vehicle: str                           # vehicle id, "0" by default
+    time: Array                            # (T,) s
+    position: Array | None = None          # (T, 3) m, world, of the tracked frame
+    quaternion: Array | None = None        # (T, 4) wxyz, body to world, unit, without sign flips
+    velocity: Array | None = None          # (T, 3) m/s, world
+    body_rates: Array | None = None        # (T, 3) rad/s, gyroscope
+    specific_force: Array | None = None    # (T, 3) m/s^2, body, accelerometer (+9.81 on z at rest)
+    command_thrust: Array | None = None    # (T,) commanded collective thrust, 0..1 of 4x the maximal rotor thrust
+    command_body_rates: Array | None = None  # (T, 3) rad/s, commanded body rates
+    motor_command: Array | None = None     # (T, 4) 0..1, meaning by the vehicle file's `motor_command`
+    battery_voltage: Array | None = None   # (T,) V, under load
+    velocity_derived: bool = False         # True: differentiated from position by the reader, not logged
+    fingerprint: str = ""                  # hash of the whole log's values, the same for copies under other names
+    notes: tuple[str, ...] = field(default=())
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def duration(self) -> float:
+        """s, from the first row to the last."""
+        return float(self.time[-1] - self.time[0]) if len(self.time) > 1 else 0.0
+
+    @property
+    def row_period(self) -> float:
+        """s, median step between rows."""
+        return float(np.median(np.diff(self.time))) if len(self.time) > 1 else float("nan")
+
+    @property
+    def has_pose(self) -> bool:
+        return self.position is not None and self.quaternion is not None
+
+    @property
+    def has_imu(self) -> bool:
+        return self.body_rates is not None and self.specific_force is not None
+
+    @property
+    def has_motors(self) -> bool:
+        return self.motor_command is not None
+
+    @property
+    def has_commands(self) -> bool:
+        return self.command_thrust is not None and self.command_body_rates is not None
+
+    def sampled(self, channel: str) -> tuple[Array, Array]:
+        """Times (S,) and values (S, ...) of the rows at which `channel` was sampled in full."""
+        values = getattr(self, channel)
+        if values is None:
+            raise ValueError(f"{self.name}: no channel {channel}")
+        rows = np.isfinite(values.reshape(len(values), -1)).all(1)
+        return self.time[rows], values[rows]
+
+    def interpolated(self, channel: str, time: Array | None = None) -> Array:
+        """`channel` at `time` (S,) (default: every row), linearly between its samples, held at the ends.
+
+        Quaternions are interpolated componentwise and normalised, which is exact to second order in the step.
+        """
+        time = self.time if time is None else time
+        at, values = self.sampled(channel)
+        flat = values.reshape(len(values), -1)
+        out = np.stack([np.interp(time, at, column) for column in flat.T], 1)
+        if channel == "quaternion":
+            out /= np.linalg.norm(out, axis=1, keepdims=True)
+        return out.reshape((len(time),) + values.shape[1:])
+
+    def stretches(self, max_step: float | None = None, min_duration: float = 0.0) -> list[slice]:
+        """Slices of rows without a gap in time longer than `max_step` s (default 5 row periods)."""
+        max_step = 5.0 * self.row_period if max_step is None else max_step
+        breaks = np.flatnonzero(np.diff(self.time) > max_step) + 1
+        edges = [0, *breaks.tolist(), len(self.time)]
+        slices = [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        return [s for s in slices if self.time[s.stop - 1] - self.time[s.start] >= min_duration]
+
+    def rows(self, rows: slice | Array) -> Flight:
+        """The flight with a subset of its rows."""
+        cut = {c: getattr(self, c)[rows] for c in CHANNELS if getattr(self, c) is not None}
+        return dataclasses.replace(self, time=self.time[rows], **cut)
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """Flights of the same vehicle(s), their vehicle file, and what the checks found (refused flights included)."""
+
+    name: str
+    flights: tuple[Flight, ...]
+    vehicle_file: VehicleFile
+    quality: tuple[Issue, ...] = ()
+    path: Path | None = None
+
+    def others(self, flight: Flight) -> tuple[Flight, ...]:
+        """The other vehicles that flew together with `flight` (neighbours, for downwash)."""
+        return tuple(f for f in self.flights if f.log == flight.log and f.vehicle != flight.vehicle)
+
+    def vehicle_of(self, flight: Flight):
+        """The nominal `Vehicle` of this flight: the vehicle file's, with `[vehicles.<id>]` applied."""
+        return self.vehicle_file.vehicle_of(flight.vehicle)
