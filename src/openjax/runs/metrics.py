@@ -1,0 +1,95 @@
+"""Metrics as JSON lines and TensorBoard events; what was logged survives a SIGKILL."""
+
+import json
+import math
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+METRICS_FILE = "metrics.jsonl"
+
+
+class MetricsWriter:
+    """Appends records to `DIR/metrics.jsonl` and `DIR/tensorboard`.
+
+    Each record is one write to an unbuffered file, so nothing logged is lost with the process, and nothing is
+    kept in memory.
+
+    Args:
+      directory: the run's directory.
+      resumed_update: records of later updates are removed first (they come again); None starts afresh.
+      resumed_steps: environment steps done at `resumed_update`, where TensorBoard's curves go on.
+      tensorboard: False leaves the event files out.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        resumed_update: int | None = None,
+        resumed_steps: int = 0,
+        tensorboard: bool = True,
+    ):
+        directory = Path(directory)
+        directory.mkdir(parents=True, exist_ok=True)
+        path = directory / METRICS_FILE
+        if resumed_update is None:
+            path.unlink(missing_ok=True)
+        else:
+            truncate_metrics(path, resumed_update)
+        self._file = open(path, "ab", buffering=0)
+        self._events = None
+        if tensorboard:
+            from tensorboardX import SummaryWriter
+
+            purge_step = None if resumed_update is None else resumed_steps + 1
+            self._events = SummaryWriter(str(directory / "tensorboard"), purge_step=purge_step, flush_secs=10)
+
+    def write(self, event: str, update: int, steps: int, seconds: float, values: dict[str, float]) -> None:
+        """Log one record.
+
+        Args:
+          event: what it's about: `train` or `evaluation`; the prefix of the TensorBoard tags.
+          update: training updates done.
+          steps: environment steps done.
+          seconds: training time so far, without the time between a kill and its resume.
+          values: numbers by name; what isn't finite is written as null.
+        """
+        numbers = {name: float(value) for name, value in values.items()}
+        record = {"event": event, "update": int(update), "steps": int(steps), "seconds": round(seconds, 3)}
+        record |= {name: value if math.isfinite(value) else None for name, value in numbers.items()}
+        self._file.write((json.dumps(record) + "\n").encode())
+        if self._events is not None:
+            for name, value in numbers.items():
+                self._events.add_scalar(f"{event}/{name}", value, int(steps))
+            self._events.flush()
+
+    def close(self) -> None:
+        """Close both files."""
+        self._file.close()
+        if self._events is not None:
+            self._events.close()
+
+
+def read_metrics(path: Path, event: str | None = None) -> Iterator[dict]:
+    """Records of a metrics file, optionally of one event only; a half-written last line is passed over."""
+    with open(path, "rb") as lines:
+        for line in lines:
+            try:
+                record = json.loads(line)
+            except ValueError:
+                continue
+            if event is None or record["event"] == event:
+                yield record
+
+
+def truncate_metrics(path: Path, update: int) -> None:
+    """Drop records of updates after `update` and a half-written last line."""
+    path = Path(path)
+    if not path.exists():
+        return
+    temporary = path.with_name(path.name + ".writing")
+    with open(temporary, "w", encoding="utf-8") as kept:
+        for record in read_metrics(path):
+            if record["update"] <= update:
+                kept.write(json.dumps(record) + "\n")
+    os.replace(temporary, path)

@@ -1,0 +1,140 @@
+"""What a run shows on the terminal from its first second on: a live panel, or plain lines into a file."""
+
+import time
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.panel import Panel
+from rich.progress_bar import ProgressBar
+from rich.spinner import Spinner
+from rich.table import Table
+from rich.text import Text
+
+_SHOWN = {
+    "capture_rate": "capture rate",
+    "collision_rate": "collision rate",
+    "episode_return": "return",
+    "prediction_error": "prediction error [m]",
+    "archive_size": "archive size",
+}
+_LINE_INTERVAL = 5.0  # s between plain lines
+
+
+class Progress:
+    """Live display of a run. Use as a context manager.
+
+    Args:
+      title: what is being run.
+      total_steps: environment steps of the whole run.
+      console: where to draw; by default standard output.
+    """
+
+    def __init__(self, title: str, total_steps: int, console: Console | None = None):
+        self._console = console or Console(highlight=False)
+        self._title = title
+        self._total = max(total_steps, 1)
+        self._phase, self._phase_start = "starting", time.monotonic()
+        self._steps = 0
+        self._rate = 0.0
+        self._last = None  # (time, steps) of the last update, for the speed
+        self._values: dict[str, float] = {}
+        self._held_back: dict[str, float] = {}
+        self._last_line = 0.0
+        self._live = None
+        self._spinner = Spinner("dots", text="")
+
+    def __enter__(self):
+        if self._console.is_terminal:
+            self._live = Live(
+                get_renderable=self._render, console=self._console, refresh_per_second=4, transient=False
+            )
+            self._live.start()
+        return self
+
+    def __exit__(self, *_):
+        if self._live is not None:
+            self._live.stop()
+            self._live = None
+
+    def phase(self, text: str) -> None:
+        """Say what is going on now, for example what is being compiled."""
+        self._phase, self._phase_start = text, time.monotonic()
+        self._last = None
+        if self._live is None:
+            self._print(f"{text} ...")
+
+    def message(self, text: str) -> None:
+        """A line that stays."""
+        self._print(text)
+
+    def update(self, steps: int, values: dict[str, float]) -> None:
+        """One training update is done.
+
+        Args:
+          steps: environment steps so far.
+          values: its metrics; those known to the display are shown.
+        """
+        now = time.monotonic()
+        if self._last is not None and now > self._last[0]:
+            rate = (steps - self._last[1]) / (now - self._last[0])
+            self._rate = rate if self._rate == 0.0 else 0.9 * self._rate + 0.1 * rate
+        self._last = (now, steps)
+        self._steps, self._values = steps, values
+        if self._live is None and now - self._last_line > _LINE_INTERVAL:
+            self._last_line = now
+            self._print(f"{self._speed()} | " + ", ".join(f"{k} {v}" for k, v in self._shown(values)))
+
+    def held_back(self, values: dict[str, float], is_best: bool) -> None:
+        """Result of an evaluation on the held-back tasks."""
+        self._held_back = values
+        if self._live is None:
+            shown = ", ".join(f"{k} {v}" for k, v in self._shown(values))
+            self._print(f"held-back tasks: {shown}{' (best so far)' if is_best else ''}")
+
+    def _shown(self, values):
+        return [(label, _number(values[name])) for name, label in _SHOWN.items() if name in values]
+
+    def _speed(self):
+        left = (self._total - self._steps) / self._rate if self._rate > 0 else float("nan")
+        return (
+            f"{100 * min(self._steps / self._total, 1):.0f} %, {_count(self._steps)} steps, "
+            f"{_count(self._rate)} steps/s, {_duration(left)} left"
+        )
+
+    def _print(self, text):
+        self._console.print(Text(text), soft_wrap=True)
+        self._console.file.flush()
+
+    def _render(self):
+        seconds = time.monotonic() - self._phase_start
+        self._spinner.update(text=Text(f"{self._phase}  {seconds:.0f} s"))
+        rows = [self._spinner, ProgressBar(total=self._total, completed=self._steps), Text(self._speed())]
+        if self._values or self._held_back:
+            table = Table.grid(padding=(0, 3))
+            table.add_row("", Text("training", style="bold"), Text("held-back tasks", style="bold"))
+            held_back = dict(self._shown(self._held_back))
+            training = dict(self._shown(self._values))
+            for label in _SHOWN.values():
+                if label in training or label in held_back:
+                    table.add_row(label, training.get(label, ""), held_back.get(label, ""))
+            rows.append(table)
+        return Panel(Group(*rows), title=self._title, title_align="left")
+
+
+def _number(value):
+    return "–" if value is None or value != value else f"{value:.4g}"
+
+
+def _count(value):
+    for unit, size in (("G", 1e9), ("M", 1e6), ("k", 1e3)):
+        if value >= size:
+            return f"{value / size:.3g} {unit}"
+    return f"{value:.0f}"
+
+
+def _duration(seconds):
+    if seconds != seconds:
+        return "–"
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"

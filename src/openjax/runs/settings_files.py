@@ -1,0 +1,109 @@
+"""Settings as JSON: nested frozen dataclasses to plain values and back, strictly."""
+
+import dataclasses
+import json
+import os
+import types
+import typing
+from pathlib import Path
+from typing import Any
+
+from openjax.errors import UserError
+
+SETTINGS_FILE = "settings.json"
+
+
+def to_plain(value: Any) -> Any:
+    """Dataclasses, tuples and paths as JSON values (dict, list, str, numbers, None)."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: to_plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, dict):
+        return {str(key): to_plain(entry) for key, entry in value.items()}
+    if isinstance(value, tuple | list):
+        return [to_plain(entry) for entry in value]
+    if isinstance(value, Path):
+        return str(value)
+    if hasattr(value, "item") and getattr(value, "ndim", 0) == 0:
+        return value.item()
+    return value
+
+
+def from_plain(kind: Any, value: Any, where: str = "settings") -> Any:
+    """The inverse of `to_plain` for the annotated type `kind`.
+
+    Raises:
+      UserError: an unknown key, or a value that doesn't fit its annotation; `where` names the place.
+    """
+    if dataclasses.is_dataclass(kind):
+        return _dataclass_from_plain(kind, value, where)
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is typing.Annotated:
+        return from_plain(arguments[0], value, where)
+    if origin in (typing.Union, types.UnionType):
+        return _union_from_plain(arguments, value, where)
+    if origin is typing.Literal:
+        if value not in arguments:
+            raise UserError(f"{where} is {value!r}; expected one of {', '.join(map(repr, arguments))}")
+        return value
+    if origin is tuple:
+        if not isinstance(value, list | tuple):
+            raise UserError(f"{where} is {value!r}; expected a list")
+        if len(arguments) == 2 and arguments[1] is Ellipsis:
+            return tuple(from_plain(arguments[0], entry, f"{where}[{i}]") for i, entry in enumerate(value))
+        if len(arguments) != len(value):
+            raise UserError(f"{where} has {len(value)} entries; expected {len(arguments)}")
+        return tuple(
+            from_plain(argument, entry, f"{where}[{i}]")
+            for i, (argument, entry) in enumerate(zip(arguments, value, strict=True))
+        )
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if kind is Path and isinstance(value, str):
+        return Path(value)
+    if isinstance(kind, type) and kind in (int, float, str, bool):
+        if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
+            raise UserError(f"{where} is {value!r}; expected {kind.__name__}")
+    if kind is type(None) and value is not None:
+        raise UserError(f"{where} is {value!r}; expected nothing")
+    return value
+
+
+def _dataclass_from_plain(kind, value, where):
+    if not isinstance(value, dict):
+        raise UserError(f"{where} is {value!r}; expected a table of settings")
+    known = {field.name for field in dataclasses.fields(kind) if field.init}
+    for key in value:
+        if key not in known:
+            raise UserError(f"{where} has the unknown setting {key!r}; known are {', '.join(sorted(known))}")
+    hints = typing.get_type_hints(kind, include_extras=True)
+    return kind(**{key: from_plain(hints[key], entry, f"{where}.{key}") for key, entry in value.items()})
+
+
+def _union_from_plain(arguments, value, where):
+    reasons = []
+    # The exact match first: True is not 1, and 1 must not become 1.0 when int stands in the union.
+    for argument in sorted(arguments, key=lambda kind: kind is not type(value)):
+        try:
+            return from_plain(argument, value, where)
+        except UserError as error:
+            reasons.append(str(error))
+    raise UserError(reasons[0])
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write JSON so that a reader sees the old file or the new one, never a half."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(path.name + ".writing")
+    temporary.write_text(json.dumps(to_plain(value), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    os.replace(temporary, path)
+
+
+def read_json(path: Path) -> Any:
+    """Raises UserError when the file is missing or no JSON."""
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UserError(f"{path} can't be read: {error.strerror}") from error
+    except ValueError as error:
+        raise UserError(f"{path} is no JSON file: {error}") from error
