@@ -46,21 +46,23 @@ class Flight:
     rear left, front left.
     """
 
-    name: str                              # log file name; "FILE:ID" where several vehicles share the file
-    log: str                               # log file name: flights with the same `log` flew together
-    vehicle: str                           # vehicle id, "0" by default
-    time: Array                            # (T,) s
-    position: Array | None = None          # (T, 3) m, world, of the tracked frame
-    quaternion: Array | None = None        # (T, 4) wxyz, body to world, unit, without sign flips
-    velocity: Array | None = None          # (T, 3) m/s, world
-    body_rates: Array | None = None        # (T, 3) rad/s, gyroscope
-    specific_force: Array | None = None    # (T, 3) m/s^2, body, accelerometer (+9.81 on z at rest)
-    command_thrust: Array | None = None    # (T,) commanded collective thrust, 0..1 of 4x the maximal rotor thrust
+    name: str  # log file name; "FILE:ID" where several vehicles share the file
+    log: str  # log file name: flights with the same `log` flew together
+    vehicle: str  # vehicle id, "0" by default
+    time: Array  # (T,) s
+    position: Array | None = None  # (T, 3) m, world, of the tracked frame
+    quaternion: Array | None = None  # (T, 4) wxyz, body to world, unit, without sign flips
+    velocity: Array | None = None  # (T, 3) m/s, world
+    body_rates: Array | None = None  # (T, 3) rad/s, gyroscope
+    specific_force: Array | None = None  # (T, 3) m/s^2, body, accelerometer (+9.81 on z at rest)
+    command_thrust: Array | None = (
+        None  # (T,) commanded collective thrust, 0..1 of 4x the maximal rotor thrust
+    )
     command_body_rates: Array | None = None  # (T, 3) rad/s, commanded body rates
-    motor_command: Array | None = None     # (T, 4) 0..1, meaning by the vehicle file's `motor_command`
-    battery_voltage: Array | None = None   # (T,) V, under load
-    velocity_derived: bool = False         # True: differentiated from position by the reader, not logged
-    fingerprint: str = ""                  # hash of the whole log's values, the same for copies under other names
+    motor_command: Array | None = None  # (T, 4) 0..1, meaning by the vehicle file's `motor_command`
+    battery_voltage: Array | None = None  # (T,) V, under load
+    velocity_derived: bool = False  # True: differentiated from position by the reader, not logged
+    fingerprint: str = ""  # hash of the whole log's values, the same for copies under other names
     notes: tuple[str, ...] = field(default=())
 
     def __len__(self) -> int:

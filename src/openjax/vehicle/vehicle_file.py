@@ -79,7 +79,11 @@ class VehicleFile:
     def vehicle_of(self, vehicle_id: str) -> Vehicle:
         """The vehicle that flew as `vehicle_id`, with `[vehicles.<id>]` applied."""
         mass = self.vehicles.get(vehicle_id, _NO_OVERRIDES).get("mass")
-        return self.vehicle if mass is None else self.vehicle.replace(mass=jnp.asarray(mass, self.vehicle.mass.dtype))
+        return (
+            self.vehicle
+            if mass is None
+            else self.vehicle.replace(mass=jnp.asarray(mass, self.vehicle.mass.dtype))
+        )
 
     def mass_weighed_of(self, vehicle_id: str) -> bool:
         """Whether the mass of `vehicle_id` was weighed, so that a thrust error can't be explained by it."""
@@ -99,7 +103,9 @@ def load_vehicle_file(path: str | Path | None = None, dtype=jnp.float32) -> Vehi
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: can't read the vehicle file ({error.__class__.__name__}); a case needs one") from error
+        raise UserError(
+            f"{path}: can't read the vehicle file ({error.__class__.__name__}); a case needs one"
+        ) from error
     try:
         tables = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -112,7 +118,11 @@ def save_vehicle_file(path: str | Path, vehicle_file: VehicleFile) -> None:
 
     The source file's text, comments included, is kept where there is one; `[calibrated]` is written anew.
     """
-    document = tomlkit.parse(vehicle_file.path.read_text(encoding="utf-8")) if vehicle_file.path else _document(vehicle_file)
+    document = (
+        tomlkit.parse(vehicle_file.path.read_text(encoding="utf-8"))
+        if vehicle_file.path
+        else _document(vehicle_file)
+    )
     document.pop("calibrated", None)
     if vehicle_file.calibrated:
         tables = tomlkit.table(is_super_table=True)
@@ -142,10 +152,14 @@ def _from_tables(tables: dict, path: Path, dtype) -> VehicleFile:
         raise UserError(f'{path}: motor.command is {command!r}; it must be "thrust" or "pwm"')
     order = _names(motor.get("order", NOMINAL_ORDER), path, "order")
     if sorted(order) != sorted(NOMINAL_ORDER):
-        raise UserError(f"{path}: motor.order is {list(order)}; it must name each of {', '.join(NOMINAL_ORDER)} once")
+        raise UserError(
+            f"{path}: motor.order is {list(order)}; it must name each of {', '.join(NOMINAL_ORDER)} once"
+        )
     spin = _names(motor.get("spin", _spin_of(order)), path, "spin")
     if sorted(spin) != ["ccw", "ccw", "cw", "cw"]:
-        raise UserError(f'{path}: motor.spin is {list(spin)}; it must hold two "cw" and two "ccw", in the order m1..m4')
+        raise UserError(
+            f'{path}: motor.spin is {list(spin)}; it must hold two "cw" and two "ccw", in the order m1..m4'
+        )
 
     nominal = load_vehicle(dtype=dtype)
     changes: dict[str, Any] = {}
@@ -191,7 +205,9 @@ def _calibrated(table: dict, path: Path) -> dict[str, CalibratedValue]:
             raise UserError(f"{path}: {where} must be a table with value and interval90")
         _only(entry, _CALIBRATED_KEYS, path, where)
         if entry.get("unit", CALIBRATED_UNITS[name]) != CALIBRATED_UNITS[name]:
-            raise UserError(f"{path}: {where} is in {entry['unit']!r}; it must be in {CALIBRATED_UNITS[name]!r}")
+            raise UserError(
+                f"{path}: {where} is in {entry['unit']!r}; it must be in {CALIBRATED_UNITS[name]!r}"
+            )
         n = 3 if name == "inertia" else 1
         try:
             value = np.asarray(entry["value"], float).reshape(-1)
@@ -199,9 +215,13 @@ def _calibrated(table: dict, path: Path) -> dict[str, CalibratedValue]:
         except (KeyError, TypeError, ValueError):
             value, interval = np.zeros(0), np.zeros((0, 2))
         if value.shape != (n,) or interval.shape != (n, 2):
-            raise UserError(f"{path}: {where} needs value ({n} number{'s' * (n > 1)}) and interval90 ([low, high] for each)")
+            raise UserError(
+                f"{path}: {where} needs value ({n} number{'s' * (n > 1)}) and interval90 ([low, high] for each)"
+            )
         if not (np.isfinite(value).all() and (value > 0).all() and (interval[:, 0] <= interval[:, 1]).all()):
-            raise UserError(f"{path}: {where}: values must be positive and finite, and low must not exceed high")
+            raise UserError(
+                f"{path}: {where}: values must be positive and finite, and low must not exceed high"
+            )
         pairs = tuple((float(low), float(high)) for low, high in interval)
         result[name] = CalibratedValue(tuple(value.tolist()), pairs, str(entry.get("notes", "")))
     return result
@@ -281,9 +301,16 @@ def _names(value: Any, path: Path, key: str) -> tuple[str, ...]:
 def _only(table: dict, known: set[str], path: Path, where: str) -> None:
     unknown = sorted(set(table) - known)
     if unknown:
-        raise UserError(f"{path}: unknown key {unknown[0]!r} in {where}; known are {', '.join(sorted(known))}")
+        raise UserError(
+            f"{path}: unknown key {unknown[0]!r} in {where}; known are {', '.join(sorted(known))}"
+        )
 
 
 def _positive(value: Any, path: Path, where: str) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value <= 0:
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, int | float)
+        or not math.isfinite(value)
+        or value <= 0
+    ):
         raise UserError(f"{path}: {where} is {value!r}; it must be a positive number")

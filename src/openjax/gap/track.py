@@ -1,0 +1,132 @@
+"""A flight on a uniform clock: the arrays that the replay runs on.
+
+Replays step from row to row, so a flight is put on an even time grid once: rows between 100 Hz and 50 Hz are kept,
+faster logs are averaged down to 100 Hz, and a longer gap splits a flight into two tracks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from openjax.gap.flight import Case, Flight
+
+Array = np.ndarray
+GRID_PERIOD = 0.01  # s, the step of the simulator
+MIN_DURATION = 2.0  # s, shorter stretches say next to nothing and are left out
+MAX_GAP = 0.05  # s, a longer step between rows splits the flight
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """One stretch of one vehicle's flight, T rows of period `dt`. Units and frames are those of `Flight`; motors are
+    fractions of the maximal rotor thrust. What wasn't logged is None."""
+
+    name: str
+    flight: str  # name of the flight it comes from: the unit that is held out
+    dt: float
+    time: Array  # (T,)
+    position: Array | None  # (T, 3)
+    quaternion: Array | None  # (T, 4)
+    velocity: Array | None  # (T, 3)
+    body_rates: Array  # (T, 3)
+    specific_force: Array | None  # (T, 3)
+    command: Array | None  # (T, 4) thrust 0..1, body rates rad/s
+    motor: Array | None  # (T, 4) 0..1 thrust fraction
+    voltage: Array | None  # (T,)
+    neighbours: Array  # (K, T, 3) m, positions of the vehicles that flew along
+    start_height: float = 0.0
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+def tracks_of(case: Case) -> list[Track]:
+    """All usable stretches of a case's flights, in the case's order."""
+    return [track for flight in case.flights for track in flight_tracks(flight, case)]
+
+
+def flight_tracks(flight: Flight, case: Case) -> list[Track]:
+    """The stretches of one flight without gaps, on a uniform grid."""
+    found = []
+    for number, stretch in enumerate(
+        flight.stretches(max_step=max(MAX_GAP, 3 * flight.row_period), min_duration=MIN_DURATION)
+    ):
+        part = flight.rows(stretch)
+        found.append(_on_grid(part, flight, case, f"{flight.name}#{number}" if number else flight.name))
+    return found
+
+
+def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
+    period = max(part.row_period, GRID_PERIOD)
+    if abs(period - GRID_PERIOD) < 0.15 * GRID_PERIOD:
+        period = GRID_PERIOD
+    count = int((part.time[-1] - part.time[0]) / period + 1e-6) + 1
+    grid = part.time[0] + period * np.arange(count)
+    per_row = int(round(period / part.row_period))
+
+    def take(channel: str, ahead: bool = False) -> Array | None:
+        if getattr(part, channel) is None:
+            return None
+        if per_row <= 1 or channel in ("position", "quaternion"):
+            return part.interpolated(channel, grid)
+        # Faster logs: the mean of the samples around a grid point (for commands: of those that follow it).
+        fine = grid[:, None] + period * (
+            np.arange(per_row) / per_row - (0.0 if ahead else 0.5 - 0.5 / per_row)
+        )
+        values = part.interpolated(channel, fine.reshape(-1))
+        return values.reshape((count, per_row) + values.shape[1:]).mean(1)
+
+    quaternion = take("quaternion")
+    motor = take("motor_command", ahead=True)
+    voltage = take("battery_voltage")
+    if motor is not None and case.vehicle_file.motor_command == "pwm":
+        motor = pwm_thrust(motor, voltage, case.vehicle_of(flight))
+    command = None
+    if part.has_commands:
+        command = np.concatenate([take("command_thrust", True)[:, None], take("command_body_rates", True)], 1)
+    neighbours = [
+        other.interpolated("position", grid) for other in case.others(flight) if other.position is not None
+    ]
+    return Track(
+        name=name, flight=flight.log, dt=period, time=grid,
+        position=take("position"), quaternion=quaternion, velocity=take("velocity"),
+        body_rates=take("body_rates"), specific_force=take("specific_force"),
+        command=command, motor=motor, voltage=None if voltage is None else smooth(voltage, 0.3, period),
+        neighbours=np.array(neighbours) if neighbours else np.zeros((0, count, 3)),
+    )  # fmt: skip
+
+
+def pwm_thrust(duty: Array, voltage: Array | None, vehicle) -> Array:
+    """Thrust fraction (T, 4) that a duty cycle gives: motor voltage U = duty x battery, and the public map of the
+    Crazyflie firmware's battery compensation, U = -0.0006239 g^2 + 0.088 g for g grams of thrust of all four rotors.
+    """
+    volts = duty * (3.7 if voltage is None else voltage[:, None])
+    grams = (0.088 - np.sqrt(np.maximum(0.088**2 - 4 * 0.0006239 * volts, 0.0))) / (2 * 0.0006239)
+    newtons = grams * 1e-3 * 9.81 / 4
+    return newtons / float(vehicle.thrust_constant * vehicle.max_rotor_speed**2)
+
+
+def smooth(values: Array, width: float, dt: float) -> Array:
+    """`values` (T, ...) smoothed by a Hann window of `width` s, ends held."""
+    n = max(int(round(width / dt)), 1)
+    if n < 2:
+        return values
+    window = np.hanning(n + 2)[1:-1]
+    window /= window.sum()
+    flat = values.reshape(len(values), -1)
+    left, right = n // 2, n - 1 - n // 2
+    padded = np.concatenate([np.repeat(flat[:1], left, 0), flat, np.repeat(flat[-1:], right, 0)])
+    out = np.stack([np.convolve(column, window, "valid") for column in padded.T], 1)
+    return out.reshape(values.shape)
+
+
+def rotation(quaternion: Array) -> Array:
+    """Rotation matrices (T, 3, 3), body to world, of quaternions (T, 4) wxyz."""
+    w, x, y, z = np.moveaxis(quaternion, -1, 0)
+    return np.stack([
+        np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+        np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+        np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+    ], -2)  # fmt: skip
