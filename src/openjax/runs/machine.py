@@ -28,11 +28,11 @@ def describe_machine() -> dict:
 
 
 def commit() -> dict:
-    """`commit` (hash or None) of the source tree that runs; `commit_clean` is False with local changes to it."""
+    """`commit` (hash or None) of the running source tree; `commit_clean` is False with local changes."""
     this_file = Path(__file__).resolve()
     source = this_file.parents[1]
     revision = _git(source, "rev-parse", "HEAD")
-    # Installed from a wheel, the files may lie inside another repository, whose commit says nothing about them.
+    # Installed from a wheel, the files may lie inside another repository, whose commit says nothing.
     if revision is None or _git(source, "ls-files", "--error-unmatch", str(this_file)) is None:
         return {"commit": None, "commit_clean": None}
     changes = _git(source, "status", "--porcelain", "--", str(source))

@@ -1,8 +1,8 @@
 """Trained policies as one small file: arrays and settings in a .npz, no pickle.
 
-A file holds the leaves of a parameter tree under their paths, the settings that rebuild everything around them, and
-a note of where they come from. Floating-point arrays are float16 by default (half the size; about 3 decimal digits),
-other kinds stay as they are.
+A file holds the leaves of a parameter tree under their paths, the settings that rebuild everything around
+them, and a note of where they come from. Floating-point arrays are stored as float16 by default (half the
+size, about three decimal digits), other kinds stay as they are.
 """
 
 import json

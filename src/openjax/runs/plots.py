@@ -1,0 +1,103 @@
+"""Pictures of a run: trajectories from above, and training curves. Drawn without a display."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+
+from openjax.runs.metrics import read_metrics
+from openjax.runs.trajectory import Trajectory
+
+PURSUER_COLORS = ("tab:blue", "tab:green", "tab:purple", "tab:cyan", "tab:olive", "tab:brown", "navy", "teal")
+EVADER_COLOR = "tab:red"
+
+_CURVES = (
+    ("capture_rate", "capture rate"),
+    ("episode_return", "return"),
+    ("collision_rate", "collision rate"),
+    ("capture_step", "capture step"),
+    ("prediction_error", "prediction error [m]"),
+    ("archive_size", "tasks in the archive"),
+)
+
+
+def plot_trajectories(path: Path, trajectories: Sequence[Trajectory]) -> None:
+    """One panel per episode from above: paths, starts (hollow), pillars and the first capture (star)."""
+    columns = min(3, len(trajectories))
+    rows = -(-len(trajectories) // columns)
+    figure = Figure(figsize=(4 * columns, 4.3 * rows), layout="constrained")
+    for axes, trajectory in zip(
+        np.atleast_1d(figure.subplots(rows, columns)).ravel(), trajectories, strict=False
+    ):
+        draw_from_above(axes, trajectory)
+    for axes in figure.axes[len(trajectories) :]:
+        axes.set_axis_off()
+    figure.axes[0].legend(loc="lower left", fontsize="x-small")
+    _save(figure, path)
+
+
+def draw_arena(axes: Axes, trajectory: Trajectory) -> None:
+    """Arena and pillars from above."""
+    axes.add_patch(Circle((0, 0), trajectory.arena_radius, fill=False, color="black"))
+    for pillar in trajectory.pillar_position:
+        axes.add_patch(Circle(pillar, trajectory.pillar_radius, color="0.6"))
+    limit = 1.08 * trajectory.arena_radius
+    axes.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal", xlabel="x [m]", ylabel="y [m]")
+
+
+def draw_from_above(axes: Axes, trajectory: Trajectory) -> None:
+    """One episode up to a second after its first capture, or whole without one."""
+    draw_arena(axes, trajectory)
+    capture = trajectory.capture_index
+    after = round(1.0 / trajectory.time_step)
+    end = len(trajectory.evader_position) if capture is None else capture + after
+    for i in range(trajectory.pursuer_position.shape[1]):
+        position = trajectory.pursuer_position[:end, i]
+        color = PURSUER_COLORS[i % len(PURSUER_COLORS)]
+        axes.plot(*position[:, :2].T, color=color, linewidth=1.2, label=f"pursuer {i + 1}")
+        axes.plot(*position[0, :2], "o", color=color, fillstyle="none")
+        axes.plot(*position[-1, :2], "o", color=color, markersize=4)
+    evader = trajectory.evader_position[:end]
+    axes.plot(*evader[:, :2].T, color=EVADER_COLOR, linewidth=1.2, label="evader")
+    axes.plot(*evader[0, :2], "o", color=EVADER_COLOR, fillstyle="none")
+    if capture is None:
+        axes.plot(*evader[-1, :2], "o", color=EVADER_COLOR, markersize=4)
+        outcome = "not captured"
+    else:
+        captured_at = trajectory.evader_position[capture, :2]
+        axes.add_patch(Circle(captured_at, trajectory.capture_radius, fill=False, color="0.5", linestyle=":"))
+        axes.plot(
+            *captured_at, "*", color="gold", markeredgecolor="black", markersize=14, label="first capture"
+        )
+        outcome = f"captured after {(capture + 1) * trajectory.time_step:.2f} s"
+    axes.set_title(f"{trajectory.title}: {outcome}", fontsize="medium")
+
+
+def plot_training(path: Path, metrics_path: Path) -> None:
+    """Training curves and the held-back evaluations of a metrics file, over environment steps."""
+    training = list(read_metrics(metrics_path, "train"))
+    evaluation = list(read_metrics(metrics_path, "evaluation"))
+    figure = Figure(figsize=(11, 6), layout="constrained")
+    for axes, (name, label) in zip(figure.subplots(2, 3).ravel(), _CURVES, strict=True):
+        for records, style, legend in (
+            (training, {"color": "tab:blue", "linewidth": 1}, "training"),
+            (evaluation, {"color": "tab:orange", "marker": "o", "markersize": 3}, "held-back tasks"),
+        ):
+            points = [(r["steps"], r[name]) for r in records if r.get(name) is not None]
+            if points:
+                axes.plot(*np.asarray(points, dtype=float).T, label=legend, **style)
+        axes.set(xlabel="environment steps", ylabel=label)
+        if axes.lines:
+            axes.legend(fontsize="x-small")
+    _save(figure, path)
+
+
+def _save(figure, path):
+    FigureCanvasAgg(figure)
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=120)

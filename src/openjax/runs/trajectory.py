@@ -1,0 +1,41 @@
+"""One flown episode as host arrays, for pictures and animations."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True)
+class Trajectory:
+    """An episode of T steps with N pursuers. Lengths in metres, world frame."""
+
+    title: str
+    pursuer_position: np.ndarray  # (T, N, 3)
+    pursuer_quaternion: np.ndarray  # (T, N, 4) wxyz, body to world
+    evader_position: np.ndarray  # (T, 3)
+    captured: np.ndarray  # (T, N) bool, pursuers that capture in this step
+    pillar_position: np.ndarray  # (P, 2), those in use
+    arena_radius: float
+    arena_height: float
+    pillar_radius: float
+    capture_radius: float
+    time_step: float  # s
+
+    @property
+    def capture_index(self) -> int | None:
+        """Index of the first step with a capture."""
+        steps = np.flatnonzero(self.captured.any(axis=-1))
+        return int(steps[0]) if steps.size else None
+
+    def save(self, path: Path) -> None:
+        """Write as .npz."""
+        np.savez_compressed(path, **{name: np.asarray(value) for name, value in vars(self).items()})
+
+    @classmethod
+    def load(cls, path: Path) -> "Trajectory":
+        """Read what `save` wrote."""
+        with np.load(path, allow_pickle=False) as stored:
+            values = {name: stored[name] for name in stored.files}
+        plain = {name: value.item() if value.ndim == 0 else value for name, value in values.items()}
+        return cls(**plain)

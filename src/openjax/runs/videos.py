@@ -1,0 +1,127 @@
+"""Animations of an episode, also where there's no display.
+
+MuJoCo's renderer runs in a process of its own: an OpenGL driver that isn't there, or that crashes, can't take
+the run with it. Where no backend works, matplotlib draws the episode from above and from the side.
+"""
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+
+from openjax.runs.plots import EVADER_COLOR, PURSUER_COLORS, draw_arena
+from openjax.runs.trajectory import Trajectory
+
+FRAMES_PER_SECOND = 12.5
+_BACKENDS = ("egl", "osmesa", "glfw")
+_RENDER_LIMIT = 120  # s for one backend
+
+
+def animate(path: Path, trajectory: Trajectory, renderer: str = "auto") -> str:
+    """Write an animated GIF up to a second after the first capture.
+
+    Args:
+      path: the .gif file.
+      trajectory: the episode.
+      renderer: `mujoco`, `matplotlib` or `auto` (MuJoCo where an OpenGL backend works).
+
+    Returns:
+      The renderer that drew it: `mujoco` with the backend's name, or `matplotlib`.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if renderer != "matplotlib":
+        backend = _animate_with_mujoco(path, trajectory)
+        if backend is not None:
+            return f"mujoco ({backend})"
+        if renderer == "mujoco":
+            raise RuntimeError("no OpenGL backend works here (tried MUJOCO_GL = egl, osmesa, glfw)")
+    _animate_with_matplotlib(path, trajectory)
+    return "matplotlib"
+
+
+def frame_indices(trajectory: Trajectory) -> np.ndarray:
+    """Steps that are drawn."""
+    steps = len(trajectory.evader_position)
+    if trajectory.capture_index is not None:
+        steps = min(steps, trajectory.capture_index + round(1.0 / trajectory.time_step))
+    return np.arange(0, steps, max(1, round(1.0 / (FRAMES_PER_SECOND * trajectory.time_step))))
+
+
+def write_gif(path: Path, frames: list[np.ndarray]) -> None:
+    """Write (H, W, 3) uint8 frames with one palette, which covers small coloured things too."""
+    sample = np.concatenate(frames[:: max(1, len(frames) // 6)])
+    palette = Image.fromarray(sample).quantize(255, method=Image.Quantize.MAXCOVERAGE)
+    images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    images[0].save(
+        path, save_all=True, append_images=images[1:], duration=round(1000 / FRAMES_PER_SECOND), loop=0
+    )
+
+
+def _animate_with_mujoco(path, trajectory):
+    chosen = os.environ.get("MUJOCO_GL")
+    # glfw needs a display; asking for a window without one only prints warnings.
+    usable = [name for name in _BACKENDS if name != "glfw" or os.environ.get("DISPLAY") or os.name == "nt"]
+    with tempfile.TemporaryDirectory() as directory:
+        flight, drawn = Path(directory) / "flight.npz", Path(directory) / "flight.gif"
+        trajectory.save(flight)
+        for backend in (chosen,) if chosen else usable:
+            command = [sys.executable, "-m", "openjax.runs.mujoco_rendering", str(flight), str(drawn)]
+            environment = {**os.environ, "MUJOCO_GL": backend}
+            if backend in ("egl", "osmesa"):
+                environment["PYOPENGL_PLATFORM"] = backend
+            try:
+                done = subprocess.run(command, env=environment, capture_output=True, timeout=_RENDER_LIMIT)
+            except (OSError, subprocess.TimeoutExpired):
+                continue
+            if done.returncode == 0 and drawn.exists():
+                path.write_bytes(drawn.read_bytes())
+                return backend
+    return None
+
+
+def _animate_with_matplotlib(path, trajectory):
+    figure = Figure(figsize=(8, 4.2), dpi=80, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    above, side = figure.subplots(1, 2)
+    draw_arena(above, trajectory)
+    limit = 1.08 * trajectory.arena_radius
+    side.set(
+        xlim=(-limit, limit),
+        ylim=(0, 1.05 * trajectory.arena_height),
+        xlabel="x [m]",
+        ylabel="z [m]",
+        aspect="equal",
+    )
+    for x in trajectory.pillar_position[:, 0]:
+        side.axvspan(x - trajectory.pillar_radius, x + trajectory.pillar_radius, color="0.85")
+    count = trajectory.pursuer_position.shape[1]
+    colors = [PURSUER_COLORS[i % len(PURSUER_COLORS)] for i in range(count)] + [EVADER_COLOR]
+    artists = [
+        (
+            above.plot([], [], color=c, linewidth=1)[0],
+            above.plot([], [], "o", color=c)[0],
+            side.plot([], [], "o", color=c)[0],
+        )
+        for c in colors
+    ]
+    bodies = np.concatenate([trajectory.pursuer_position, trajectory.evader_position[:, None]], axis=1)
+    frames = []
+    for i in frame_indices(trajectory):
+        for body, (trail, dot, height) in enumerate(artists):
+            trail.set_data(*bodies[max(0, i - 60) : i + 1, body, :2].T)
+            dot.set_data(bodies[i, body, :1], bodies[i, body, 1:2])
+            height.set_data(bodies[i, body, :1], bodies[i, body, 2:3])
+        captured = trajectory.captured[: i + 1].any()
+        above.set_title(
+            f"{trajectory.title}  {i * trajectory.time_step:.1f} s{'  captured' if captured else ''}"
+        )
+        canvas.draw()
+        frames.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+    write_gif(path, frames)
