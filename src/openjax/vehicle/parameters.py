@@ -1,0 +1,123 @@
+"""The vehicle's parameters, read from its MJCF: the one source of these numbers."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from openjax.errors import UserError
+
+ROTORS = ("rotor_1", "rotor_2", "rotor_3", "rotor_4")
+BODY = "crazyflie"
+
+
+@flax.struct.dataclass
+class Vehicle:
+    """One vehicle: a pytree of arrays. A copy with replaced leaves is another vehicle. Body frame: x forward, y left,
+    z up, origin at the centre of mass."""
+
+    mass: jax.Array  # () kg
+    inertia: jax.Array  # (3,) kg m^2, principal, along the body axes
+    rotor_position: (
+        jax.Array
+    )  # (4, 3) m, body frame, m1 front right, m2 rear right, m3 rear left, m4 front left
+    rotor_spin: (
+        jax.Array
+    )  # (4,) +1: reaction torque on the body along +z (clockwise rotor), -1: counter-clockwise
+    thrust_constant: jax.Array  # () N s^2, thrust = thrust_constant * speed^2
+    torque_constant: jax.Array  # () N m s^2, torque = spin * torque_constant * speed^2
+    max_rotor_speed: jax.Array  # () rad/s
+    motor_time_constant: jax.Array  # () s, while the rotor speeds up
+    motor_slowdown_ratio: jax.Array  # () time constant of slowing down / of speeding up, 1 nominally
+    gravity: jax.Array  # () m/s^2
+    rate_kp: jax.Array  # (3,) motor counts per deg/s; roll, pitch, yaw
+    rate_ki: jax.Array  # (3,) motor counts per deg
+    rate_kd: jax.Array  # (3,) motor counts per deg/s^2
+    rate_integral_limit: jax.Array  # (3,) deg
+
+
+def assets_directory() -> Path:
+    """Where the MJCF files lie: inside the installed package, or at the top of the source tree."""
+    here = Path(__file__).resolve()
+    for candidate in (here.parents[1] / "assets", here.parents[3] / "assets"):
+        if (candidate / "crazyflie.xml").is_file():
+            return candidate
+    raise UserError(
+        f"assets/crazyflie.xml is neither beside the package {here.parents[1]} nor at the top of its source tree"
+    )
+
+
+@lru_cache(maxsize=8)
+def read_mjcf(path: str) -> dict[str, np.ndarray]:
+    """Field of `Vehicle` -> float64 value, from the compiled model at `path`."""
+    try:
+        model = mujoco.MjModel.from_xml_path(path)
+    except (ValueError, OSError) as error:
+        raise UserError(f"{path}: not a readable MJCF model ({str(error).splitlines()[0]})") from None
+
+    def find(kind: str, name: str) -> int:
+        index = mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
+        if index < 0:
+            raise UserError(f"{path}: has no {kind} named {name!r}, which a vehicle needs")
+        return index
+
+    def number(name: str, size: int) -> np.ndarray:
+        index = find("numeric", name)
+        start, count = model.numeric_adr[index], model.numeric_size[index]
+        if count != size:
+            raise UserError(f"{path}: numeric {name!r} holds {count} values, {size} would be right")
+        values = np.array(model.numeric_data[start : start + count])
+        return values[0] if size == 1 else values
+
+    body = find("body", BODY)
+    if not (np.allclose(model.body_iquat[body], [1, 0, 0, 0]) and np.allclose(model.body_ipos[body], 0)):
+        raise UserError(
+            f"{path}: the inertial frame of {BODY!r} must lie in the body frame (pos 0, diaginertia only)"
+        )
+    gear = np.array([model.actuator_gear[find("actuator", name)] for name in ROTORS])
+    thrust_constant = number("thrust_constant", 1)
+    return {
+        "mass": model.body_mass[body],
+        "inertia": model.body_inertia[body].copy(),
+        "rotor_position": np.array([model.site_pos[find("site", name)] for name in ROTORS]),
+        "rotor_spin": np.sign(gear[:, 5]),
+        "thrust_constant": thrust_constant,
+        "torque_constant": np.abs(gear[:, 5]).mean() * thrust_constant,
+        "max_rotor_speed": number("max_rotor_speed", 1),
+        "motor_time_constant": number("motor_time_constant", 1),
+        "motor_slowdown_ratio": np.float64(1.0),
+        "gravity": -model.opt.gravity[2],
+        "rate_kp": number("rate_kp", 3),
+        "rate_ki": number("rate_ki", 3),
+        "rate_kd": number("rate_kd", 3),
+        "rate_integral_limit": number("rate_integral_limit", 3),
+    }
+
+
+def load_vehicle(path: str | Path | None = None, dtype=jnp.float32) -> Vehicle:
+    """The vehicle described by an MJCF file (default: the nominal Crazyflie 2.1 of `assets/crazyflie.xml`).
+
+    Raises UserError if the file is missing, isn't MJCF or lacks a part of a vehicle.
+    """
+    path = assets_directory() / "crazyflie.xml" if path is None else Path(path)
+    if not path.is_file():
+        raise UserError(f"{path}: no such MJCF file")
+    return Vehicle(
+        **{name: jnp.asarray(value, dtype) for name, value in read_mjcf(str(path.resolve())).items()}
+    )
+
+
+def hover_rotor_speed(vehicle: Vehicle) -> jax.Array:
+    """Rotor speed at which four level rotors carry the vehicle, () rad/s."""
+    return jnp.sqrt(vehicle.mass * vehicle.gravity / (4 * vehicle.thrust_constant))
+
+
+def max_rotor_thrust(vehicle: Vehicle) -> jax.Array:
+    """Largest thrust of one rotor, () N."""
+    return vehicle.thrust_constant * vehicle.max_rotor_speed**2

@@ -1,0 +1,51 @@
+"""The true state of one drone: all that a simulation carries from step to step."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from openjax.vehicle.parameters import Vehicle, hover_rotor_speed
+
+
+@flax.struct.dataclass
+class DroneState:
+    """One drone; more drones or environments are leading axes. The world frame has z up and z = 0 at the floor."""
+
+    position: jax.Array  # (3,) m, world, of the centre of mass
+    quaternion: jax.Array  # (4,) scalar first, rotates body to world, of unit length
+    velocity: jax.Array  # (3,) m/s, world
+    body_rates: jax.Array  # (3,) rad/s, body frame
+    rotor_speed: jax.Array  # (4,) rad/s
+    rate_integral: jax.Array  # (3,) deg, the rate controller's integrated error
+    previous_body_rates: jax.Array  # (3,) rad/s, the rate controller's last measurement
+    effect_memory: Any  # pytree of arrays, () when no effect needs memory
+
+
+def hover_state(
+    vehicle: Vehicle, position, quaternion=None, velocity=None, effect_memory: Any = ()
+) -> DroneState:
+    """A drone with its rotors at hover speed, at rest unless `velocity` says otherwise, controller reset.
+
+    position (..., 3) m, quaternion (..., 4) (default: level), velocity (..., 3) m/s (default: zero); leading axes are
+    broadcast. `effect_memory` comes from `openjax.vehicle.effects.initial_memory` where effects need it.
+    """
+    dtype = vehicle.mass.dtype
+    position = jnp.asarray(position, dtype)
+    quaternion = jnp.array([1, 0, 0, 0], dtype) if quaternion is None else jnp.asarray(quaternion, dtype)
+    velocity = jnp.zeros(3, dtype) if velocity is None else jnp.asarray(velocity, dtype)
+    lead = jnp.broadcast_shapes(position.shape[:-1], quaternion.shape[:-1], velocity.shape[:-1])
+    zeros = jnp.zeros((*lead, 3), dtype)
+    return DroneState(
+        position=jnp.broadcast_to(position, (*lead, 3)),
+        quaternion=jnp.broadcast_to(quaternion, (*lead, 4)),
+        velocity=jnp.broadcast_to(velocity, (*lead, 3)),
+        body_rates=zeros,
+        rotor_speed=jnp.broadcast_to(hover_rotor_speed(vehicle), (*lead, 4)),
+        rate_integral=zeros,
+        previous_body_rates=zeros,
+        effect_memory=effect_memory,
+    )
