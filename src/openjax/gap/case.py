@@ -1,0 +1,59 @@
+"""Loading a case: every log of a folder is read, checked and either kept or refused with the reason."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import jax.numpy as jnp
+
+from openjax.errors import UserError
+from openjax.gap.checks import check_flight, duplicates
+from openjax.gap.flight import Case, Flight, Issue
+from openjax.gap.importers import find_logs, read_log
+from openjax.gap.reading import LogError, flights_of
+from openjax.vehicle.vehicle_file import VehicleFile, load_vehicle_file
+
+
+def load_case(path: str | Path, dtype=jnp.float32) -> Case:
+    """Read a case folder: its `vehicle.toml` and its logs (CSV, micro-SD logs, ROS 2 bags).
+
+    Logs that can't be used are left out and named in `quality` (`refused`). Raises UserError for a folder that isn't
+    a case, an unusable vehicle file, or if no log is left.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        raise UserError(f"{path}: no such folder; a case is a folder of flight logs with a vehicle.toml")
+    logs = find_logs(path)
+    if not logs:
+        raise UserError(f"{path}: holds no flight log (.csv, .csv.gz, micro-SD log or ROS 2 bag)")
+    vehicle_file = load_vehicle_file(path / "vehicle.toml", dtype)
+    flights, issues = [], []
+    for log in logs:
+        read, found = _read(log, vehicle_file)
+        flights += read
+        issues += found
+    copies = duplicates(flights)
+    for name, original in copies.items():
+        issues.append(
+            Issue(name, f"the same values as {original}: a copy, left out", refused=True, kind="duplicate")
+        )
+    flights = [f for f in flights if f.log not in copies]
+    kept = []
+    for flight in flights:
+        checked, found = check_flight(flight, vehicle_file.vehicle_of(flight.vehicle), vehicle_file.log)
+        issues += found
+        kept += [] if checked is None else [checked]
+    if not kept:
+        reasons = [i for i in issues if i.refused]
+        first = f"{reasons[0].flight}: {reasons[0].issue}" if reasons else "no vehicle in any log"
+        more = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
+        raise UserError(f"{path}: no flight can be used: {first}{more}")
+    return Case(path.resolve().name, tuple(kept), vehicle_file, tuple(issues), path)
+
+
+def _read(log: Path, vehicle_file: VehicleFile) -> tuple[list[Flight], list[Issue]]:
+    try:
+        flights, remarks = flights_of(read_log(log), vehicle_file.motor_permutation)
+    except LogError as error:
+        return [], [Issue(log.name, str(error), refused=True, kind="reading")]
+    return flights, [Issue(log.name, remark, kind="columns") for remark in remarks]

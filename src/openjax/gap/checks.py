@@ -1,0 +1,295 @@
+"""Checks of flight logs: what can be mended is mended and named, what can't be used is refused with the reason."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from openjax.gap.consistency import check_consistency
+from openjax.gap.flight import CHANNELS, Flight, Issue
+from openjax.gap.reading import CHANNEL_COLUMNS
+
+SHORTEST = 2.0  # s airborne: windows of 0.5 s, and a few of them
+SLOWEST = 0.05  # s between rows
+FROZEN = 0.5  # s without a change of a sensor that has noise
+GROUND_CLEARANCE = 0.02  # m above the floor
+SENSORS = ("position", "quaternion", "velocity", "body_rates", "specific_force")
+
+
+class _Refused(Exception):
+    def __init__(self, kind: str, reason: str):
+        super().__init__(reason)
+        self.kind = kind
+
+
+def check_flight(flight: Flight, vehicle, log: dict | None = None) -> tuple[Flight | None, list[Issue]]:
+    """Check one flight as read. Returns it sorted, cleaned and cut to its airborne part, or None if it can't be used,
+    and the findings. `vehicle` is the nominal vehicle, `log` the vehicle file's `[log]` table (floor_z)."""
+    issues: list[Issue] = []
+
+    def note(kind: str, text: str) -> None:
+        issues.append(Issue(flight.name, text, kind=kind))
+
+    try:
+        _has_what_is_needed(flight)
+        checked = _in_time(flight, note)
+        checked = _clean(checked, note)
+        checked = _in_range(checked, note)
+        checked = _derive_velocity(checked, note)
+        checked = _airborne(checked, (log or {}).get("floor_z"), note)
+        _has_what_is_needed(checked)
+    except _Refused as refused:
+        return None, [*issues, Issue(flight.name, str(refused), refused=True, kind=refused.kind)]
+    found = check_consistency(checked, vehicle)
+    return (None if found else checked), issues + found
+
+
+def duplicates(flights: list[Flight]) -> dict[str, str]:
+    """Log name -> name of an earlier log with the same values."""
+    first: dict[str, str] = {}
+    copies = {}
+    for flight in flights:
+        original = first.setdefault(flight.fingerprint, flight.log)
+        if original != flight.log:
+            copies[flight.log] = original
+    return copies
+
+
+def _has_what_is_needed(flight: Flight) -> None:
+    if not (flight.has_pose or flight.has_imu):
+        raise _Refused("columns", "needs position and orientation (x, y, z, qw, qx, qy, qz) or accelerometer and "
+                                  "gyroscope (ax, ay, az, wx, wy, wz)")  # fmt: skip
+    if not (flight.has_motors or flight.has_commands):
+        raise _Refused("columns", "holds no commands: needs m1..m4, or cmd_thrust and cmd_wx, cmd_wy, cmd_wz")
+
+
+def _in_time(flight: Flight, note) -> Flight:
+    """Sorted by time, in seconds, without repeated rows."""
+    time = flight.time
+    finite = np.isfinite(time)
+    if not finite.all():
+        note("time", f"{(~finite).sum()} rows without a time are left out")
+        flight = flight.rows(finite)
+        time = flight.time
+    if len(time) < 20:
+        raise _Refused("short", f"only {len(time)} rows")
+    steps = np.diff(time)
+    backwards = int((steps < 0).sum())
+    if backwards:
+        if (steps < -1.0).any() or backwards > 0.05 * len(time):
+            at = time[int(np.argmin(steps))]
+            raise _Refused(
+                "time", f"time runs backwards (after t = {at:g}): unsorted, or several recordings in one file"
+            )
+        note("time", f"{backwards} rows out of order in time were sorted")
+        flight = flight.rows(np.argsort(time, kind="stable"))
+    repeated = np.diff(flight.time) == 0
+    if repeated.mean() > 0.2:
+        raise _Refused(
+            "time", f"{repeated.mean():.0%} of the rows repeat the time of the row before (frozen clock)"
+        )
+    if repeated.any():
+        note("time", f"{repeated.sum()} rows repeat the time of the row before and are left out")
+        flight = flight.rows(np.r_[True, ~repeated])
+    step = flight.row_period
+    if step > SLOWEST:
+        for unit, factor in (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)):
+            if 5e-4 <= step / factor <= SLOWEST:
+                raise _Refused("units", f"t is in {unit} (rows {step:g} apart); the log format wants seconds")
+        raise _Refused("time", f"rows are {step:g} s apart; at least 20 rows per second are needed")
+    if step < 2e-4:
+        raise _Refused("units", f"rows are {step:g} s apart: t is not in seconds, or the clock is corrupt")
+    steps = np.diff(flight.time)
+    gaps = np.flatnonzero(steps > max(5 * step, 0.05))
+    if len(gaps):
+        longest = gaps[np.argmax(steps[gaps])]
+        note("gaps", f"{len(gaps)} gap{'s' * (len(gaps) > 1)} in time, the longest {steps[longest]:.2f} s "
+                     f"after t = {flight.time[longest]:.2f}")  # fmt: skip
+    return flight
+
+
+def _clean(flight: Flight, note) -> Flight:
+    """Constant columns refuse or drop their channel; frozen stretches become not sampled; holes are named."""
+    changes = {}
+    for channel in CHANNELS:
+        values = getattr(flight, channel)
+        if values is None:
+            continue
+        columns, table = CHANNEL_COLUMNS[channel], values.reshape(len(values), -1)
+        rows = np.flatnonzero(np.isfinite(table).all(1))
+        if len(rows) < 2:
+            raise _Refused("corrupt", f"{', '.join(columns)}: hardly any row holds a number")
+        if channel in SENSORS or channel == "motor_command":
+            changed = np.diff(table[rows], axis=0) != 0
+            together = channel in ("position", "quaternion", "velocity")
+            dead = [] if together and changed.any() else np.flatnonzero(~changed.any(0))
+            if len(dead):
+                names = ", ".join(columns[i] for i in dead)
+                raise _Refused("corrupt", f"{names}: the same value {table[rows[0], dead[0]]:g} in every row")
+            frozen = _frozen(table, rows, flight.time, together)
+            if frozen.any():
+                share, start = frozen.mean(), flight.time[np.argmax(frozen)]
+                words = f"{', '.join(columns)} stand still for {share * flight.duration:.1f} s from t = {start:.2f}"
+                if share > 0.5:
+                    raise _Refused("corrupt", f"{words}: frozen for {share:.0%} of the flight")
+                note("corrupt", f"{words}; taken as not sampled there")
+                changes[channel] = np.where(frozen.reshape((-1,) + (1,) * (values.ndim - 1)), np.nan, values)
+                rows = rows[~frozen[rows]]
+        if channel != "battery_voltage" and len(rows) > 1:
+            at = flight.time[rows]
+            steps = np.diff(at)
+            hole = int(np.argmax(steps))
+            if steps[hole] > max(0.2, 10 * np.median(steps)):
+                note(
+                    "gaps",
+                    f"{', '.join(columns)}: not sampled for {steps[hole]:.2f} s after t = {at[hole]:.2f}",
+                )
+    return dataclasses.replace(flight, **changes) if changes else flight
+
+
+def _frozen(table: np.ndarray, rows: np.ndarray, time: np.ndarray, together: bool) -> np.ndarray:
+    """(T,) True in runs of at least FROZEN seconds in which a column (all columns if `together`) doesn't change though
+    it does elsewhere. Runs at the column's extremes are saturation, not a frozen sensor."""
+    values = table[rows]
+    still = np.diff(values, axis=0) == 0
+    extreme = (values == values.min(0)) | (values == values.max(0))
+    per_column = [still.all(1)] if together else [s & ~e for s, e in zip(still.T, extreme[1:].T, strict=True)]
+    frozen = np.zeros(len(time), bool)
+    for run in per_column:
+        edges = np.flatnonzero(np.diff(np.r_[0, run, 0]))
+        for start, stop in zip(edges[::2], edges[1::2], strict=True):
+            if time[rows[stop]] - time[rows[start]] >= FROZEN:
+                frozen[rows[start] + 1 : rows[stop] + 1] = True
+    return frozen
+
+
+def _in_range(flight: Flight, note) -> Flight:
+    """Values that no flight of such a vehicle has: units and corrupt columns that show by their size alone."""
+    changes = {}
+    motor = flight.motor_command
+    if motor is not None:
+        _share_of_one(motor, "m1, m2, m3, m4")
+    if flight.command_thrust is not None:
+        _share_of_one(flight.command_thrust, "cmd_thrust")
+    if flight.quaternion is not None:
+        norm = np.linalg.norm(flight.quaternion, axis=1)
+        off = np.nanmax(np.abs(norm - 1.0))
+        if np.nanmedian(np.abs(norm - 1.0)) > 0.05:
+            raise _Refused(
+                "quaternion",
+                f"quaternions aren't unit (norm {np.nanmedian(norm):.3g}): wrong columns or corrupt",
+            )
+        unit = flight.quaternion / norm[:, None]
+        bad = np.abs(norm - 1.0) > 0.05
+        if bad.any():
+            note("quaternion", f"{bad.sum()} quaternions far from unit length are taken as not sampled")
+            unit[bad] = np.nan
+        elif off > 2e-3:
+            note("quaternion", f"quaternions were off unit length by up to {off:.1g} and are normalised")
+        changes["quaternion"] = _without_flips(unit)
+    if flight.position is not None and np.nanmax(np.abs(flight.position)) > 100.0:
+        span = np.nanmax(np.ptp(flight.position[np.isfinite(flight.position).all(1)], axis=0))
+        if span > 20.0:
+            raise _Refused("units", f"x, y, z span {span:.0f}: in mm? The log format wants m")
+    if flight.body_rates is not None and np.nanmax(np.abs(flight.body_rates)) > 60.0:
+        raise _Refused("units", f"wx, wy, wz reach {np.nanmax(np.abs(flight.body_rates)):.0f}: in deg/s? "
+                                "The log format wants rad/s")  # fmt: skip
+    voltage = flight.battery_voltage
+    if voltage is not None:
+        middle = float(np.nanmedian(voltage))
+        if middle > 100:
+            raise _Refused("units", f"vbat is {middle:.0f}: in mV? The log format wants V")
+        if not 2.0 < middle < 30.0:
+            note("corrupt", f"vbat is {middle:.2g} V, which no battery in flight has; left out")
+            changes["battery_voltage"] = None
+    return dataclasses.replace(flight, **changes) if changes else flight
+
+
+def _share_of_one(values: np.ndarray, columns: str) -> None:
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    if high > 256.0:
+        hint = "16-bit counts; divide by 65535" if high > 2100 else "a pulse width in microseconds"
+        raise _Refused("units", f"{columns} reach {high:.0f}: {hint}; the log format wants 0..1")
+    if high > 1.02:
+        hint = (
+            "per cent"
+            if high > 2 and high <= 101
+            else "8-bit counts"
+            if high > 101
+            else "a wrong scale or corrupt"
+        )
+        raise _Refused("units", f"{columns} reach {high:.3g}: {hint}; the log format wants 0..1")
+    if low < -0.02:
+        raise _Refused("corrupt", f"{columns} go down to {low:.3g}; commands lie in 0..1")
+
+
+def _without_flips(quaternion: np.ndarray) -> np.ndarray:
+    """The same attitudes without jumps between q and -q."""
+    rows = np.flatnonzero(np.isfinite(quaternion).all(1))
+    flips = (quaternion[rows[1:]] * quaternion[rows[:-1]]).sum(1) < 0
+    sign = np.ones(len(quaternion))
+    sign[rows[1:]] = np.where(np.cumsum(flips) % 2, -1.0, 1.0)
+    return quaternion * sign[:, None]
+
+
+def _derive_velocity(flight: Flight, note) -> Flight:
+    """Velocity from position where it wasn't logged: local quadratic fits over about 50 ms (Savitzky-Golay)."""
+    if flight.velocity is not None or flight.position is None:
+        return flight
+    time, position = flight.sampled("position")
+    half = max(2, round(0.025 / max(float(np.median(np.diff(time))), 1e-4)))
+    velocity = np.full((len(flight), 3), np.nan)
+    rows = np.flatnonzero(np.isfinite(flight.position).all(1))
+    if len(rows) < 2 * half + 1:
+        raise _Refused("short", f"only {len(rows)} rows hold a position")
+    # Windowed least squares on [1, dt, dt^2] handles uneven steps; sums run over a sliding window of rows.
+    index = np.clip(np.arange(len(rows)), half, len(rows) - half - 1)[:, None] + np.arange(-half, half + 1)
+    dt = time[index] - time[:, None]
+    basis = np.stack([np.ones_like(dt), dt, dt**2], -1)
+    normal = np.einsum("rki,rkj->rij", basis, basis)
+    moment = np.einsum("rki,rkc->ric", basis, position[index])
+    scale = np.array([1.0, 1e-2, 1e-4])  # keeps the normal equations well conditioned
+    solved = np.linalg.solve(normal / np.outer(scale, scale) * 1.0, moment / scale[:, None])
+    velocity[rows] = solved[:, 1] / scale[1]
+    jump = np.abs(dt).max(1) > 0.25
+    velocity[rows[jump]] = np.nan
+    note("columns", "no velocity was logged: it is derived from position")
+    return dataclasses.replace(flight, velocity=velocity, velocity_derived=True)
+
+
+def _airborne(flight: Flight, floor_z: float | None, note) -> Flight:
+    """Cut to the longest airborne stretch. Off the ground: motors give at least 40 % of their usual command, and the
+    vehicle isn't at rest on the floor; shorter dips (half a second) are manoeuvres."""
+    drive = flight.motor_command if flight.motor_command is not None else flight.command_thrust
+    drive = drive if drive.ndim == 1 else drive.mean(1)
+    rows = np.isfinite(drive)
+    drive = np.interp(flight.time, flight.time[rows], drive[rows])
+    usual = np.median(drive[drive >= np.median(drive)])
+    if usual < 0.02:
+        raise _Refused("short", "never took off: the commands stay near zero")
+    on_ground = drive < 0.4 * usual
+    if flight.position is not None and flight.velocity is not None:
+        floor = 0.0 if floor_z is None else float(floor_z)
+        height = flight.interpolated("position")[:, 2] - floor
+        speed = np.linalg.norm(flight.interpolated("velocity"), axis=1)
+        on_ground |= (np.abs(height) < GROUND_CLEARANCE) & (speed < 0.05)
+    edges = np.flatnonzero(np.diff(np.r_[0, on_ground, 0]))
+    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+        inside = start > 0 and stop < len(on_ground)
+        if inside and flight.time[stop - 1] - flight.time[start] < 0.5:
+            on_ground[start:stop] = False
+    edges = np.flatnonzero(np.diff(np.r_[0, ~on_ground, 0]))
+    runs = list(zip(edges[::2], edges[1::2], strict=True))
+    if not runs:
+        raise _Refused("short", "never took off")
+    start, stop = max(runs, key=lambda r: flight.time[r[1] - 1] - flight.time[r[0]])
+    airborne = flight.time[stop - 1] - flight.time[start]
+    if airborne < SHORTEST:
+        raise _Refused("short", f"airborne for {airborne:.1f} s only; at least {SHORTEST:g} s are needed")
+    if stop - start < len(flight):
+        cut = flight.duration - airborne
+        note("ground", f"{cut:.1f} s on the ground are cut away (kept: t = {flight.time[start]:.2f} "
+                       f"to {flight.time[stop - 1]:.2f})")  # fmt: skip
+        flight = flight.rows(slice(start, stop))
+    return flight

@@ -1,0 +1,330 @@
+"""Do a flight's sensors agree with each other? Finds swapped or reversed axes, wrong quaternion conventions,
+wrong units, wrong motor order or spin, from what rigid-body kinematics and the signs of the rotor torques demand.
+
+Each test compares two signals in a low band, over every relabelling of the axes, and speaks only where the logged
+labelling clearly fails and another clearly fits: a flight that doesn't excite an axis isn't blamed for it.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import butter, sosfiltfilt
+
+from openjax.gap.flight import Flight, Issue
+
+RATE = 100.0  # Hz, common clock of the comparisons
+KINEMATIC_BAND = (0.3, 4.0)  # Hz: above drift and offsets, below most of the sensors' noise and delays
+TORQUE_BAND = (0.5, 8.0)
+LAGS = np.arange(-6, 7, 2)  # samples of the common clock; clock offsets between streams are a nuisance
+LONGEST = 30.0  # s, enough to tell
+GRAVITY = 9.81
+_FITS, _FAILS, _BETTER = 0.65, 0.3, 0.8  # correlation of an axis; summed over the axes
+
+_AXES = "xyz"
+_RELABELLINGS = [
+    (order, signs)
+    for order in itertools.permutations(range(3))
+    for signs in itertools.product((1.0, -1.0), repeat=3)
+]  # identity first
+_QUATERNIONS = {
+    "": lambda q: q,
+    "in the order x, y, z, w": lambda q: q[:, [3, 0, 1, 2]],
+    "from world to body": lambda q: q * [1.0, -1.0, -1.0, -1.0],
+    "in the order x, y, z, w and from world to body": lambda q: q[:, [3, 0, 1, 2]] * [1.0, -1.0, -1.0, -1.0],
+}
+
+
+@dataclass(frozen=True)
+class Match:
+    """How well `measured` fits `reference` axis by axis: as labelled, and in the best relabelling."""
+
+    as_labelled: np.ndarray  # (3,) correlations
+    best: np.ndarray  # (3,) correlations
+    order: tuple[int, ...]  # best: measured axis i is reference axis order[i] ...
+    signs: tuple[float, ...]  # ... times signs[i]
+    gain: float  # rms of measured over rms of reference, over the axes that fit
+
+    @property
+    def changed(self) -> np.ndarray:
+        return np.array(
+            [o != i or s < 0 for i, (o, s) in enumerate(zip(self.order, self.signs, strict=True))]
+        )
+
+    @property
+    def wrong(self) -> bool:
+        """The labelling fails on an axis that another labelling explains."""
+        clear = self.changed & (self.best > _FITS) & (self.as_labelled < _FAILS)
+        return bool(clear.any() and self.best.sum() - self.as_labelled.sum() > _BETTER)
+
+    @property
+    def fits(self) -> bool:
+        return not self.wrong and bool((self.as_labelled > _FITS).sum() >= 2)
+
+    def words(self, names: tuple[str, ...], reference: tuple[str, ...] = ("x", "y", "z")) -> str:
+        """Which column holds what: "wx holds the y axis, wy minus the x axis"."""
+        parts = []
+        for i in np.flatnonzero(self.changed & (self.best > _FITS)):
+            sign = "minus " if self.signs[i] < 0 else ""
+            parts.append(f"{names[i]} holds {sign}{reference[self.order[i]]}")
+        return ", ".join(parts)
+
+
+def check_consistency(flight: Flight, vehicle) -> list[Issue]:
+    """Findings on axes, conventions, units and motor order of a flight that has passed the other checks (sorted,
+    finite, airborne). `vehicle` gives the rotors' places and spins. Every finding refuses the flight."""
+    grid = _grid(flight)
+    if grid is None:
+        return []
+    found: list[tuple[str, str]] = []
+    gyro = _on(flight, "body_rates", grid)
+    quaternion = _on(flight, "quaternion", grid)
+    position = _on(flight, "position", grid)
+    force = _on(flight, "specific_force", grid)
+
+    found += _gravity(force)
+    if quaternion is not None and not found:
+        found += _pose(quaternion, position, gyro, force)
+    if position is not None and flight.velocity is not None and not flight.velocity_derived:
+        found += _velocity(position, _on(flight, "velocity", grid), quaternion)
+    rates = gyro if gyro is not None else (None if quaternion is None else rates_of(quaternion))
+    if rates is not None and not found:
+        if flight.command_body_rates is not None:
+            found += _commands(_on(flight, "command_body_rates", grid), rates)
+        if flight.motor_command is not None and not found:
+            found += _motors(_on(flight, "motor_command", grid), rates, vehicle)
+    return [Issue(flight.name, text, refused=True, kind=kind) for kind, text in found]
+
+
+def rates_of(quaternion: np.ndarray) -> np.ndarray:
+    """Body rates (T, 3) rad/s of attitudes (T, 4) on the common clock, by central differences."""
+    before, after = np.roll(quaternion, 1, 0), np.roll(quaternion, -1, 0)
+    w = (before * after).sum(1)
+    vector = (
+        before[:, :1] * after[:, 1:] - after[:, :1] * before[:, 1:] - np.cross(before[:, 1:], after[:, 1:])
+    )
+    rates = 2.0 * np.arctan2(np.linalg.norm(vector, axis=1), np.abs(w))[:, None] * np.sign(w)[:, None]
+    rates = rates * vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-12) * RATE / 2
+    rates[[0, -1]] = rates[[1, -2]]
+    return rates
+
+
+def match_axes(measured: np.ndarray, reference: np.ndarray, band=KINEMATIC_BAND, lags=LAGS) -> Match:
+    """Compare (T, 3) with (T, 3) on the common clock in `band` Hz, over all 48 relabellings and a few time shifts."""
+    y, x = _band(measured, band), _band(reference, band)
+    correlations = np.stack([_correlation(y, np.roll(x, lag, 0)) for lag in lags])  # (L, 3, 3)
+    scores = [
+        sum(signs[i] * correlations[:, i, order[i]] for i in range(3)).max() for order, signs in _RELABELLINGS
+    ]
+    order, signs = _RELABELLINGS[int(np.argmax(scores))]
+    lag = int(np.argmax(sum(signs[i] * correlations[:, i, order[i]] for i in range(3))))
+    best = np.array([signs[i] * correlations[lag, i, order[i]] for i in range(3)])
+    as_labelled = correlations[int(np.argmax(np.trace(correlations, axis1=1, axis2=2)))].diagonal()
+    fitting = best > _FITS
+    rms_y, rms_x = y.std(0), x.std(0)[list(order)]
+    gain = (
+        float(np.median(rms_y[fitting] / np.maximum(rms_x[fitting], 1e-12)))
+        if fitting.any()
+        else float("nan")
+    )
+    return Match(as_labelled, best, order, signs, gain)
+
+
+def _gravity(force: np.ndarray | None) -> list[tuple[str, str]]:
+    """A flying quadrotor's specific force points along body z, about 9.81 m/s^2 up, whatever its attitude."""
+    if force is None:
+        return []
+    mean = np.median(force, 0)
+    size, axis = float(np.linalg.norm(mean)), int(np.argmax(np.abs(mean)))
+    if 0.6 < size < 2.0:
+        return [("units", f"ax, ay, az are in g (mean {size:.2f}); the log format wants m/s^2")]
+    if 600 < size < 2000:
+        return [
+            ("units", f"ax, ay, az are in thousandths of g (mean {size:.0f}); the log format wants m/s^2")
+        ]
+    if size < 0.6:
+        return [("units", "az is near zero in flight: gravity was taken out; the log format wants specific force, "
+                          "+9.81 m/s^2 on z at hover")]  # fmt: skip
+    if not 4.0 < size < 30.0:
+        return [
+            ("units", f"the mean specific force is {size:.3g}, not near 9.81 m/s^2: wrong unit or corrupt")
+        ]
+    if axis != 2 and abs(mean[axis]) > 2 * abs(mean[2]):
+        sign = "minus " if mean[axis] < 0 else ""
+        return [("axes", f"accelerometer axes: a{_AXES[axis]} holds {sign}z (median {mean[axis]:.1f} m/s^2)")]
+    if mean[2] < 0:
+        return [
+            ("axes", f"accelerometer sign: az is {mean[2]:.1f} m/s^2 in flight; it must read +9.81 at hover")
+        ]
+    return []
+
+
+def _pose(quaternion, position, gyro, force) -> list[tuple[str, str]]:
+    """Attitude against gyroscope and against the curvature of the path: first which convention fits both."""
+    matches = {}
+    for name, convert in _QUATERNIONS.items():
+        attitude = convert(quaternion)
+        pair = []
+        if gyro is not None:
+            pair.append(match_axes(gyro, rates_of(attitude)))
+        if position is not None:
+            pair.append(match_axes(_acceleration(position), _path_acceleration(attitude, force)))
+        matches[name] = pair
+    logged = matches[""]
+    if any(m.wrong for m in logged):
+        for name, pair in matches.items():
+            if name and all(m.fits for m in pair):
+                return [
+                    (
+                        "quaternion",
+                        f"the quaternion is {name}; the log format wants w, x, y, z from body to world",
+                    )
+                ]
+        found = []
+        if gyro is not None and logged[0].wrong:
+            found.append(("axes", f"gyroscope axes: {logged[0].words(('wx', 'wy', 'wz'))} of the pose"))
+        elif position is not None and logged[-1].wrong:
+            found.append(
+                ("axes", f"position axes: {logged[-1].words(('x', 'y', 'z'))} of the attitude's world")
+            )
+        return found
+    found = []
+    if gyro is not None:
+        found += _scale(logged[0].gain, "wx, wy, wz", "deg/s", "rad/s", 180 / np.pi, "the quaternion's rate")
+    if position is not None:
+        for unit, factor in (("mm", 1000.0), ("cm", 100.0)):
+            found = found or _scale(
+                logged[-1].gain, "x, y, z", unit, "m", factor, "what the accelerations say"
+            )
+    return found
+
+
+def _velocity(position, velocity, quaternion) -> list[tuple[str, str]]:
+    derived = np.gradient(position, 1 / RATE, axis=0)
+    match = match_axes(velocity, derived)
+    if match.wrong and quaternion is not None and match_axes(velocity, _to_body(quaternion, derived)).fits:
+        return [("axes", "vx, vy, vz are in the body frame; the log format wants the world frame")]
+    if match.wrong:
+        return [("axes", f"velocity axes: {match.words(('vx', 'vy', 'vz'))} of the position's derivative")]
+    found = _scale(match.gain, "vx, vy, vz", "mm/s", "m/s", 1000.0, "the position's derivative")
+    return found or _scale(1 / match.gain, "x, y, z", "mm", "m", 1000.0, "the velocity's integral")
+
+
+def _commands(command, rates) -> list[tuple[str, str]]:
+    """Commanded body rates against the measured ones: the rate loop follows in this band."""
+    match = match_axes(command, rates)
+    names = ("cmd_wx", "cmd_wy", "cmd_wz")
+    if match.wrong:
+        return [("axes", f"command axes: {match.words(names)} of the gyroscope")]
+    found = _scale(match.gain, ", ".join(names), "deg/s", "rad/s", 180 / np.pi, "the gyroscope")
+    return found or _scale(1 / match.gain, "wx, wy, wz", "deg/s", "rad/s", 180 / np.pi, "the commanded rates")
+
+
+def _motors(motor, rates, vehicle) -> list[tuple[str, str]]:
+    """Angular acceleration against what the motors' torques demand, over all 24 orders and both spins."""
+    place = np.asarray(vehicle.rotor_position, float)
+    arms = np.stack([place[:, 1], -place[:, 0]])  # roll, pitch torque per thrust
+    spin = np.asarray(vehicle.rotor_spin, float)
+    measured = _band(np.gradient(rates, 1 / RATE, axis=0), TORQUE_BAND)
+    lagged = _band(_first_order(motor, float(vehicle.motor_time_constant)), TORQUE_BAND)
+    if (lagged.std(0) < 1e-6).all():
+        return []
+    # (3, 4) correlations of each axis with each motor aren't enough: motors are correlated. Score whole torques.
+    best, best_score, logged = None, -np.inf, None
+    shifted = [np.roll(lagged, lag, 0) for lag in LAGS]
+    for order in itertools.permutations(range(4)):
+        for flip in (1.0, -1.0):
+            mixing = np.stack([arms[0][list(order)], arms[1][list(order)], flip * spin[list(order)]])
+            each = np.stack([_paired(measured, m @ mixing.T) for m in shifted])
+            correlations = each[int(np.argmax(each.sum(1)))]
+            if logged is None:
+                logged = correlations
+            if correlations.sum() > best_score + 1e-9:
+                best, best_score = (order, flip, correlations), correlations.sum()
+    order, flip, correlations = best
+    unexplained = (logged < _FAILS) & (correlations > _FITS)
+    if not unexplained.any() or best_score - logged.sum() < _BETTER:
+        return []
+    if order == (0, 1, 2, 3):
+        return [("motors", "the rotors' spin is opposite: yaw accelerates against the torque of m1..m4; "
+                           "reverse motor.spin in vehicle.toml")]  # fmt: skip
+    names = ("front_right", "rear_right", "rear_left", "front_left")
+    words = ", ".join(f"m{i + 1} {names[o]}" for i, o in enumerate(order))
+    return [("motors", f"motor order: the angular acceleration fits only if (in the nominal order) {words}"
+                       f"{' with the spins reversed' if flip < 0 else ''}; correct motor.order in vehicle.toml")]  # fmt: skip
+
+
+def _scale(
+    gain: float, columns: str, unit: str, wanted: str, factor: float, against: str
+) -> list[tuple[str, str]]:
+    if not factor / 2.5 < gain < factor * 2.5:
+        return []
+    return [("units", f"{columns} are in {unit} ({gain:.0f} x {against}); the log format wants {wanted}")]
+
+
+def _path_acceleration(quaternion, force) -> np.ndarray:
+    """Acceleration (T, 3) m/s^2, world, of a vehicle whose specific force lies along body z."""
+    size = np.full(len(quaternion), GRAVITY) if force is None else force[:, 2]
+    w, x, y, z = quaternion.T
+    up = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], 1)
+    return up * size[:, None] - [0.0, 0.0, GRAVITY]
+
+
+def _to_body(quaternion, vector) -> np.ndarray:
+    w, u = quaternion[:, :1], -quaternion[:, 1:]
+    t = 2.0 * np.cross(u, vector)
+    return vector + w * t + np.cross(u, t)
+
+
+def _acceleration(position) -> np.ndarray:
+    return np.gradient(np.gradient(position, 1 / RATE, axis=0), 1 / RATE, axis=0)
+
+
+def _first_order(values, time_constant) -> np.ndarray:
+    out, blend = np.array(values), -np.expm1(-1 / (RATE * time_constant))
+    for k in range(1, len(out)):
+        out[k] = out[k - 1] + blend * (values[k - 1] - out[k - 1])
+    return out
+
+
+def _grid(flight: Flight) -> np.ndarray | None:
+    """The common clock over the longest stretch without gaps; None if that is too short to tell anything."""
+    stretch = max(flight.stretches(max(0.1, 5 * flight.row_period)), key=lambda s: s.stop - s.start)
+    start, stop = flight.time[stretch.start], flight.time[stretch.stop - 1]
+    if stop - start < 1.5:
+        return None
+    return np.arange(start, min(stop, start + LONGEST), 1 / RATE)
+
+
+def _on(flight: Flight, channel: str, grid: np.ndarray) -> np.ndarray | None:
+    """A channel on the common clock; fast channels are averaged over the clock's period first."""
+    values = getattr(flight, channel)
+    if values is None:
+        return None
+    at, values = flight.sampled(channel)
+    if len(at) < 10:
+        return None
+    step = float(np.median(np.diff(at)))
+    if step < 0.7 / RATE and channel != "quaternion":
+        width = round(1 / (RATE * step))
+        kernel = np.ones(width) / width
+        values = np.stack([np.convolve(c, kernel, mode="same") for c in values.T], 1)
+    out = np.stack([np.interp(grid, at, column) for column in values.T], 1)
+    return out / np.linalg.norm(out, axis=1, keepdims=True) if channel == "quaternion" else out
+
+
+def _band(values: np.ndarray, band: tuple[float, float]) -> np.ndarray:
+    sos = butter(2, band, "bandpass", fs=RATE, output="sos")
+    edge = min(20, len(values) // 8)  # rows at the ends where filter and differences aren't trustworthy
+    return sosfiltfilt(sos, values - values.mean(0), axis=0)[edge:-edge]
+
+
+def _correlation(y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    return (y.T @ x) / np.maximum(np.outer(np.linalg.norm(y, axis=0), np.linalg.norm(x, axis=0)), 1e-12)
+
+
+def _paired(y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    size = np.linalg.norm(y, axis=0) * np.linalg.norm(x, axis=0)
+    return (y * x).sum(0) / np.maximum(size, 1e-12)
