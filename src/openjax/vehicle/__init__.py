@@ -1,4 +1,4 @@
-"""A drone: parameters from its MJCF, rotors, rate controller, dynamics with solid surroundings, optional effects."""
+"""A drone: parameters from its MJCF, rotors, rate controller, dynamics with solids, optional effects."""
 
 from openjax.vehicle.drones import make_drones_step
 from openjax.vehicle.parameters import Vehicle, hover_rotor_speed, load_vehicle, max_rotor_thrust

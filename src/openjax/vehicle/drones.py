@@ -21,24 +21,23 @@ PHYSICS = ("mjx", "rigid")
 def make_drones_step(
     physics: str = "mjx", dt: float = 0.01, substeps: int = 1, effects=(), contacts: bool = True
 ) -> Callable[..., DroneState]:
-    """Make the step of N drones of one world; a pure function to be mapped over worlds and compiled by the caller.
+    """Make the step of N drones of one world: pure, to be mapped over worlds and compiled by the caller.
 
-    physics "mjx": MuJoCo MJX, in which floor, pillars and other drones are solid unless `contacts` is off; "rigid": the
-    same free-flight equations written out, nothing is solid. dt is the step in seconds; `substeps` divide it, and the
-    rate controller runs in each. `effects` names what is modelled beyond the nominal vehicle.
+    physics "mjx": MuJoCo MJX, in which floor, pillars and other drones are solid unless `contacts` is off;
+    "rigid": the same free-flight equations written out, nothing is solid. dt is the step in seconds;
+    `substeps` divide it, and the rate controller runs in each. `effects` names what is modelled beyond the
+    nominal vehicle.
 
-    The step: `drones_step(vehicle, drones, command, pillar_position, pillar_active, effect_parameters) -> drones` with
-    drones of leading axis N, command (N, 4) as for `rate_controller`, pillar_position (P, 2) m, pillar_active (P,) bool
-    and effect_parameters {effect: {parameter: array}} ({} for none). The arithmetic is done in the precision of the
-    drones' state. Within a substep: controller on the present state, motors, rotor speeds, wrench from the updated
-    rotor speeds, body.
+    The step: `drones_step(vehicle, drones, command, pillar_position, pillar_active, effect_parameters) ->
+    drones` with drones of leading axis N, command (N, 4) as for `rate_controller`, pillar_position (P, 2) m,
+    pillar_active (P,) bool and effect_parameters {effect: {parameter: array}} ({} for none). The arithmetic
+    is done in the precision of the drones' state. Within a substep: controller on the present state, motors,
+    rotor speeds, wrench from the updated rotor speeds, body.
     """
     if physics not in PHYSICS:
         raise UserError(f"physics {physics!r} is unknown; one of {', '.join(PHYSICS)} would be right")
     if substeps < 1 or dt <= 0:
-        raise UserError(
-            f"dt {dt} and substeps {substeps}: a positive step and at least one substep would be right"
-        )
+        raise UserError(f"dt {dt} with {substeps} substeps: dt > 0 and substeps >= 1 would be right")
     sub_dt = dt / substeps
 
     def motors(vehicle, drone, command):

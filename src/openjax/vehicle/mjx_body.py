@@ -1,12 +1,13 @@
 """One drone among solid things, stepped by MuJoCo MJX with the Euler integrator.
 
-Each drone has its own small world: itself as the only moving body, and floor, pillars and other drones as shapes that
-are put in place anew in every step. Mapping this world over drones costs far less than one model that holds them all
-(its matrices grow with the square of the number of drones), and only true state is carried between steps.
+Each drone has its own small world: itself as the only moving body, and floor, pillars and other drones as
+shapes that are put in place anew in every step. Mapping this world over drones costs far less than one model
+that holds them all (its matrices grow with the square of the number of drones), and only true state is
+carried between steps.
 
-A shape is placed where it will stand, seen from the drone, at the end of the step if nothing intervened. So a contact
-stops a drone at the surface in the step in which it would have passed it, at any speed up to metres per step, where
-a test of present positions would let it sink in by a step's way first.
+A shape is placed where it will stand, seen from the drone, at the end of the step if nothing intervened. So a
+contact stops a drone at the surface in the step in which it would have passed it, at any speed that it can
+reach, where a test of present positions would let it sink in by a step's way first.
 """
 
 from __future__ import annotations
@@ -33,24 +34,26 @@ PILLAR_RADIUS = 0.1  # m
 PILLAR_HEIGHT = 1.2  # m, of the cylindrical part, which stands on the floor
 _PARKED = -100.0  # m, height of what is not there
 
-# Contacts in MuJoCo's direct form: acceleration along the normal >= -stiffness * gap - damping * speed, `gap` being the
-# one at the end of the step. In units of 1/dt^2 and 1/dt. Fixed things: together they cancel the approach in one step
-# and close 0.4 of the gap, below the half at which a resting drone would chatter. Other drones: each of the pair takes
-# half of the approach, which is an inelastic impact of equal masses that keeps their momentum.
+# Contacts in MuJoCo's direct form: acceleration along the normal >= -stiffness * gap - damping * speed, `gap`
+# being the one at the end of the step. In units of 1/dt^2 and 1/dt. Fixed things: together they cancel the
+# approach in one step and close 0.4 of the gap, below the half at which a resting drone would chatter. Other
+# drones: each of the pair takes half of the approach, which is an inelastic impact of equal masses that keeps
+# their momentum.
 _FIXED = (0.4, 0.6)
 _DRONE = (0.5, 0.0)
 _IMPEDANCE = "0.99 0.99 0.001"
 
 
 class World(NamedTuple):
-    """A one-drone MJX model with arrays on the host, its blank data, and where the shapes sit among its geoms."""
+    """A one-drone MJX model and its blank data, their arrays on the host."""
 
     model: mjx.Model
     data: mjx.Data
 
 
 def world_xml(n_pillars: int, n_others: int, dt: float, contacts: bool = True) -> str:
-    """MJCF of one drone (the geoms in order: floor, pillars, other drones, drone); a step lasts dt seconds."""
+    """MJCF of one drone (the geoms in order: floor, pillars, other drones, drone); a step lasts dt
+    seconds."""
     nominal = read_mjcf(str(assets_directory() / "crazyflie.xml"))
     shapes = ['<geom name="floor" type="plane" size="0 0 1"/>']
     pairs = [("floor", _FIXED)]
@@ -69,9 +72,10 @@ def world_xml(n_pillars: int, n_others: int, dt: float, contacts: bool = True) -
     )
     inertia = " ".join(str(value) for value in nominal["inertia"].tolist())
     return f"""<mujoco>
-      <option timestep="{dt}" integrator="Euler" solver="CG" iterations="1" ls_iterations="4" jacobian="sparse">
-        <flag warmstart="disable" filterparent="disable" actuation="disable" sensor="disable" equality="disable"
-              limit="disable" frictionloss="disable" eulerdamp="disable" refsafe="disable"
+      <option timestep="{dt}" integrator="Euler" solver="CG" iterations="1" ls_iterations="4"
+              jacobian="sparse">
+        <flag warmstart="disable" filterparent="disable" actuation="disable" sensor="disable"
+              equality="disable" limit="disable" frictionloss="disable" eulerdamp="disable" refsafe="disable"
               contact="{"enable" if contacts else "disable"}"/>
       </option>
       <default><geom contype="0" conaffinity="0" mass="0"/></default>
@@ -102,7 +106,8 @@ def _as_dtype(tree, dtype):
 
 
 def end_of_step_shapes(drones, pillar_position, pillar_active, dt) -> jax.Array:
-    """Where each drone's shapes stand at the end of the step, seen from the drone: (N, 1 + P + N - 1 + 1, 3) m.
+    """Where each drone's shapes stand at the end of the step, seen from the drone: (N, 1 + P + N - 1 + 1, 3)
+    m.
 
     Geoms in the order of `world_xml`; the drone's own geom sits at its body's origin.
     """

@@ -19,8 +19,8 @@ BODY = "crazyflie"
 
 @flax.struct.dataclass
 class Vehicle:
-    """One vehicle: a pytree of arrays. A copy with replaced leaves is another vehicle. Body frame: x forward, y left,
-    z up, origin at the centre of mass."""
+    """One vehicle: a pytree of arrays. A copy with replaced leaves is another vehicle. Body frame: x forward,
+    y left, z up, origin at the centre of mass."""
 
     mass: jax.Array  # () kg
     inertia: jax.Array  # (3,) kg m^2, principal, along the body axes
@@ -48,9 +48,7 @@ def assets_directory() -> Path:
     for candidate in (here.parents[1] / "assets", here.parents[3] / "assets"):
         if (candidate / "crazyflie.xml").is_file():
             return candidate
-    raise UserError(
-        f"assets/crazyflie.xml is neither beside the package {here.parents[1]} nor at the top of its source tree"
-    )
+    raise UserError(f"crazyflie.xml is neither in {here.parents[1]}/assets nor in {here.parents[3]}/assets")
 
 
 @lru_cache(maxsize=8)

@@ -50,8 +50,8 @@ def quaternion_integrate(quaternion, body_rates, dt) -> jax.Array:
 
 
 def euler_step(position, quaternion, velocity, body_rates, acceleration, angular_acceleration, dt):
-    """Advance velocities by the accelerations (3,) m/s^2 world and (3,) rad/s^2 body, then positions by the new
-    velocities: MuJoCo's Euler integrator. Returns position, quaternion, velocity, body rates."""
+    """Advance velocities by the accelerations (3,) m/s^2 world and (3,) rad/s^2 body, then positions by the
+    new velocities: MuJoCo's Euler integrator. Returns position, quaternion, velocity, body rates."""
     velocity = velocity + dt * acceleration
     body_rates = body_rates + dt * angular_acceleration
     return position + dt * velocity, quaternion_integrate(quaternion, body_rates, dt), velocity, body_rates

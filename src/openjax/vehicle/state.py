@@ -13,7 +13,7 @@ from openjax.vehicle.parameters import Vehicle, hover_rotor_speed
 
 @flax.struct.dataclass
 class DroneState:
-    """One drone; more drones or environments are leading axes. The world frame has z up and z = 0 at the floor."""
+    """One drone; more drones or environments are leading axes. World frame: z up, z = 0 is the floor."""
 
     position: jax.Array  # (3,) m, world, of the centre of mass
     quaternion: jax.Array  # (4,) scalar first, rotates body to world, of unit length
@@ -30,8 +30,9 @@ def hover_state(
 ) -> DroneState:
     """A drone with its rotors at hover speed, at rest unless `velocity` says otherwise, controller reset.
 
-    position (..., 3) m, quaternion (..., 4) (default: level), velocity (..., 3) m/s (default: zero); leading axes are
-    broadcast. `effect_memory` comes from `openjax.vehicle.effects.initial_memory` where effects need it.
+    position (..., 3) m, quaternion (..., 4) (default: level), velocity (..., 3) m/s (default: zero); leading
+    axes are broadcast. `effect_memory` comes from `openjax.vehicle.effects.initial_memory` where effects need
+    it.
     """
     dtype = vehicle.mass.dtype
     position = jnp.asarray(position, dtype)
