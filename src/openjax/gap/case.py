@@ -17,8 +17,8 @@ from openjax.vehicle.vehicle_file import VehicleFile, load_vehicle_file
 def load_case(path: str | Path, dtype=jnp.float32) -> Case:
     """Read a case folder: its `vehicle.toml` and its logs (CSV, micro-SD logs, ROS 2 bags).
 
-    Logs that can't be used are left out and named in `quality` (`refused`). Raises UserError for a folder that isn't
-    a case, an unusable vehicle file, or if no log is left.
+    Logs that can't be used are left out and named in `quality` (`refused`). Raises UserError for a folder
+    that isn't a case, an unusable vehicle file, or if no log is left.
     """
     path = Path(path)
     if not path.is_dir():

@@ -1,4 +1,5 @@
-"""Checks of flight logs: what can be mended is mended and named, what can't be used is refused with the reason."""
+"""Checks of flight logs: what can be mended is mended and named, what can't be used is refused with a
+reason."""
 
 from __future__ import annotations
 
@@ -24,8 +25,9 @@ class _Refused(Exception):
 
 
 def check_flight(flight: Flight, vehicle, log: dict | None = None) -> tuple[Flight | None, list[Issue]]:
-    """Check one flight as read. Returns it sorted, cleaned and cut to its airborne part, or None if it can't be used,
-    and the findings. `vehicle` is the nominal vehicle, `log` the vehicle file's `[log]` table (floor_z)."""
+    """Check one flight as read. Returns it sorted, cleaned and cut to its airborne part, or None if it can't
+    be used, and the findings. `vehicle` is the nominal vehicle, `log` the vehicle file's `[log]` table
+    (floor_z)."""
     issues: list[Issue] = []
 
     def note(kind: str, text: str) -> None:
@@ -58,8 +60,8 @@ def duplicates(flights: list[Flight]) -> dict[str, str]:
 
 def _has_what_is_needed(flight: Flight) -> None:
     if not (flight.has_pose or flight.has_imu):
-        raise _Refused("columns", "needs position and orientation (x, y, z, qw, qx, qy, qz) or accelerometer and "
-                                  "gyroscope (ax, ay, az, wx, wy, wz)")  # fmt: skip
+        pose, imu = "x, y, z, qw, qx, qy, qz", "ax, ay, az, wx, wy, wz"
+        raise _Refused("columns", f"needs position and orientation ({pose}) or accelerometer and gyroscope ({imu})")
     if not (flight.has_motors or flight.has_commands):
         raise _Refused("columns", "holds no commands: needs m1..m4, or cmd_thrust and cmd_wx, cmd_wy, cmd_wz")
 
@@ -130,7 +132,8 @@ def _clean(flight: Flight, note) -> Flight:
             frozen = _frozen(table, rows, flight.time, together)
             if frozen.any():
                 share, start = frozen.mean(), flight.time[np.argmax(frozen)]
-                words = f"{', '.join(columns)} stand still for {share * flight.duration:.1f} s from t = {start:.2f}"
+                length = share * flight.duration
+                words = f"{', '.join(columns)} stand still for {length:.1f} s from t = {start:.2f}"
                 if share > 0.5:
                     raise _Refused("corrupt", f"{words}: frozen for {share:.0%} of the flight")
                 note("corrupt", f"{words}; taken as not sampled there")
@@ -149,8 +152,8 @@ def _clean(flight: Flight, note) -> Flight:
 
 
 def _frozen(table: np.ndarray, rows: np.ndarray, time: np.ndarray, together: bool) -> np.ndarray:
-    """(T,) True in runs of at least FROZEN seconds in which a column (all columns if `together`) doesn't change though
-    it does elsewhere. Runs at the column's extremes are saturation, not a frozen sensor."""
+    """(T,) True in runs of at least FROZEN seconds in which a column (all columns if `together`) doesn't
+    change though it does elsewhere. Runs at the column's extremes are saturation, not a frozen sensor."""
     values = table[rows]
     still = np.diff(values, axis=0) == 0
     extreme = (values == values.min(0)) | (values == values.max(0))
@@ -165,7 +168,8 @@ def _frozen(table: np.ndarray, rows: np.ndarray, time: np.ndarray, together: boo
 
 
 def _in_range(flight: Flight, note) -> Flight:
-    """Values that no flight of such a vehicle has: units and corrupt columns that show by their size alone."""
+    """Values that no flight of such a vehicle has: units and corrupt columns that show by their size
+    alone."""
     changes = {}
     motor = flight.motor_command
     if motor is not None:
@@ -234,7 +238,8 @@ def _without_flips(quaternion: np.ndarray) -> np.ndarray:
 
 
 def _derive_velocity(flight: Flight, note) -> Flight:
-    """Velocity from position where it wasn't logged: local quadratic fits over about 50 ms (Savitzky-Golay)."""
+    """Velocity from position where it wasn't logged: local quadratic fits over about 50 ms
+    (Savitzky-Golay)."""
     if flight.velocity is not None or flight.position is None:
         return flight
     time, position = flight.sampled("position")
@@ -259,8 +264,8 @@ def _derive_velocity(flight: Flight, note) -> Flight:
 
 
 def _airborne(flight: Flight, floor_z: float | None, note) -> Flight:
-    """Cut to the longest airborne stretch. Off the ground: motors give at least 40 % of their usual command, and the
-    vehicle isn't at rest on the floor; shorter dips (half a second) are manoeuvres."""
+    """Cut to the longest airborne stretch. Off the ground: motors give at least 40 % of their usual command,
+    and the vehicle isn't at rest on the floor; shorter dips (half a second) are manoeuvres."""
     drive = flight.motor_command if flight.motor_command is not None else flight.command_thrust
     drive = drive if drive.ndim == 1 else drive.mean(1)
     rows = np.isfinite(drive)

@@ -1,8 +1,10 @@
 """Do a flight's sensors agree with each other? Finds swapped or reversed axes, wrong quaternion conventions,
-wrong units, wrong motor order or spin, from what rigid-body kinematics and the signs of the rotor torques demand.
+wrong units, wrong motor order or spin, from what rigid-body kinematics and the signs of the rotor torques
+demand.
 
-Each test compares two signals in a low band, over every relabelling of the axes, and speaks only where the logged
-labelling clearly fails and another clearly fits: a flight that doesn't excite an axis isn't blamed for it.
+Each test compares two signals in a low band, over every relabelling of the axes, and speaks only where the
+logged labelling clearly fails and another clearly fits: a flight that doesn't excite an axis isn't blamed
+for it.
 """
 
 from __future__ import annotations
@@ -73,8 +75,9 @@ class Match:
 
 
 def check_consistency(flight: Flight, vehicle) -> list[Issue]:
-    """Findings on axes, conventions, units and motor order of a flight that has passed the other checks (sorted,
-    finite, airborne). `vehicle` gives the rotors' places and spins. Every finding refuses the flight."""
+    """Findings on axes, conventions, units and motor order of a flight that has passed the other checks
+    (sorted, finite, airborne). `vehicle` gives the rotors' places and spins. Every finding refuses the
+    flight."""
     grid = _grid(flight)
     if grid is None:
         return []
@@ -112,7 +115,8 @@ def rates_of(quaternion: np.ndarray) -> np.ndarray:
 
 
 def match_axes(measured: np.ndarray, reference: np.ndarray, band=KINEMATIC_BAND, lags=LAGS) -> Match:
-    """Compare (T, 3) with (T, 3) on the common clock in `band` Hz, over all 48 relabellings and a few time shifts."""
+    """Compare (T, 3) with (T, 3) on the common clock in `band` Hz, over all 48 relabellings and a few
+    time shifts."""
     y, x = _band(measured, band), _band(reference, band)
     correlations = np.stack([_correlation(y, np.roll(x, lag, 0)) for lag in lags])  # (L, 3, 3)
     scores = [
@@ -145,8 +149,8 @@ def _gravity(force: np.ndarray | None) -> list[tuple[str, str]]:
             ("units", f"ax, ay, az are in thousandths of g (mean {size:.0f}); the log format wants m/s^2")
         ]
     if size < 0.6:
-        return [("units", "az is near zero in flight: gravity was taken out; the log format wants specific force, "
-                          "+9.81 m/s^2 on z at hover")]  # fmt: skip
+        text = "az is near zero in flight: gravity was taken out"
+        return [("units", f"{text}; the log format wants specific force, +9.81 m/s^2 on z at hover")]
     if not 4.0 < size < 30.0:
         return [
             ("units", f"the mean specific force is {size:.3g}, not near 9.81 m/s^2: wrong unit or corrupt")
@@ -231,7 +235,8 @@ def _motors(motor, rates, vehicle) -> list[tuple[str, str]]:
     lagged = _band(_first_order(motor, float(vehicle.motor_time_constant)), TORQUE_BAND)
     if (lagged.std(0) < 1e-6).all():
         return []
-    # (3, 4) correlations of each axis with each motor aren't enough: motors are correlated. Score whole torques.
+    # (3, 4) correlations of each axis with each motor aren't enough: motors are correlated. Score whole
+    # torques.
     best, best_score, logged = None, -np.inf, None
     shifted = [np.roll(lagged, lag, 0) for lag in LAGS]
     for order in itertools.permutations(range(4)):
@@ -248,12 +253,13 @@ def _motors(motor, rates, vehicle) -> list[tuple[str, str]]:
     if not unexplained.any() or best_score - logged.sum() < _BETTER:
         return []
     if order == (0, 1, 2, 3):
-        return [("motors", "the rotors' spin is opposite: yaw accelerates against the torque of m1..m4; "
-                           "reverse motor.spin in vehicle.toml")]  # fmt: skip
+        text = "the rotors' spin is opposite: yaw accelerates against the torque of m1..m4"
+        return [("motors", f"{text}; reverse motor.spin in vehicle.toml")]
     names = ("front_right", "rear_right", "rear_left", "front_left")
     words = ", ".join(f"m{i + 1} {names[o]}" for i, o in enumerate(order))
-    return [("motors", f"motor order: the angular acceleration fits only if (in the nominal order) {words}"
-                       f"{' with the spins reversed' if flip < 0 else ''}; correct motor.order in vehicle.toml")]  # fmt: skip
+    words += " with the spins reversed" if flip < 0 else ""
+    text = f"motor order: the angular acceleration fits only if (in the nominal order) {words}"
+    return [("motors", f"{text}; correct motor.order in vehicle.toml")]
 
 
 def _scale(

@@ -7,6 +7,7 @@ Body frame: x forward, y left, z up. SI units. Quaternions are scalar-first and 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -41,9 +42,9 @@ class Issue:
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """One vehicle's flight, T rows sorted by time, float64. A channel that wasn't logged is None; a value that
-    wasn't sampled at a row (slower channels) is NaN. Motors are in the nominal order: front right, rear right,
-    rear left, front left.
+    """One vehicle's flight, T rows sorted by time, float64. A channel that wasn't logged is None; a value
+    that wasn't sampled at a row (slower channels) is NaN. Motors are in the nominal order: front right, rear
+    right, rear left, front left.
     """
 
     name: str  # log file name; "FILE:ID" where several vehicles share the file
@@ -113,14 +114,14 @@ class Flight:
         out = np.stack([np.interp(time, at, column) for column in flat.T], 1)
         if channel == "quaternion":
             out /= np.linalg.norm(out, axis=1, keepdims=True)
-        return out.reshape((len(time),) + values.shape[1:])
+        return out.reshape((len(time), *values.shape[1:]))
 
     def stretches(self, max_step: float | None = None, min_duration: float = 0.0) -> list[slice]:
         """Slices of rows without a gap in time longer than `max_step` s (default 5 row periods)."""
         max_step = 5.0 * self.row_period if max_step is None else max_step
         breaks = np.flatnonzero(np.diff(self.time) > max_step) + 1
         edges = [0, *breaks.tolist(), len(self.time)]
-        slices = [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        slices = [slice(a, b) for a, b in itertools.pairwise(edges)]
         return [s for s in slices if self.time[s.stop - 1] - self.time[s.start] >= min_duration]
 
     def rows(self, rows: slice | Array) -> Flight:
@@ -131,7 +132,8 @@ class Flight:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """Flights of the same vehicle(s), their vehicle file, and what the checks found (refused flights included)."""
+    """Flights of the same vehicle(s), their vehicle file, and what the checks found, refused flights
+    included."""
 
     name: str
     flights: tuple[Flight, ...]

@@ -42,8 +42,8 @@ class LogError(UserError):
 
 @dataclass(frozen=True, eq=False)
 class LogTable:
-    """One log file as columns of the log format: `columns[name]` (R,) float64, NaN where a cell was empty; `vehicle`
-    (R,) ids. `remarks` are things found while reading that don't stop it."""
+    """One log file as columns of the log format: `columns[name]` (R,) float64, NaN where a cell was empty;
+    `vehicle` (R,) ids. `remarks` are things found while reading that don't stop it."""
 
     name: str
     columns: dict[str, np.ndarray]
@@ -83,7 +83,8 @@ def read_csv(path: str | Path, delimiter: str = ",", known: tuple[str, ...] | No
         [f"unknown column{'s' * (len(unknown) > 1)} left out: {', '.join(unknown[:8])}"] if unknown else []
     )
 
-    # An empty cell becomes NaN; a written "nan" becomes infinite, so that the two can be told apart afterwards.
+    # An empty cell becomes NaN; a written "nan" becomes infinite, so that the two can be told apart
+    # afterwards.
     spelt = _NOT_A_NUMBER.search(body) is not None
     numbers = _NOT_A_NUMBER.sub("inf", body) if spelt else body
     numbers = _EMPTY_CELL.sub("nan", numbers)
@@ -113,8 +114,8 @@ def read_csv(path: str | Path, delimiter: str = ",", known: tuple[str, ...] | No
 def flights_of(
     table: LogTable, motor_permutation: tuple[int, ...] = (0, 1, 2, 3)
 ) -> tuple[list[Flight], list[str]]:
-    """The table's flights, one per vehicle, as logged (not yet sorted, checked or cut), motors in the nominal order;
-    and remarks on columns that couldn't be used. Raises LogError without time."""
+    """The table's flights, one per vehicle, as logged (not yet sorted, checked or cut), motors in the
+    nominal order; and remarks on columns that couldn't be used. Raises LogError without time."""
     if "t" not in table.columns:
         raise LogError("no column t")
     channels, remarks = {}, list(table.remarks)
@@ -200,7 +201,8 @@ def _why_not(body: str, names: list[str], kept: list[int], error: ValueError) ->
 
 
 def _fingerprint(channels: dict[str, np.ndarray]) -> str:
-    """Hash of the values without time or file layout, so that a renamed, shifted or repacked copy is the same."""
+    """Hash of the values without time or file layout, so that a renamed, shifted or repacked copy is the
+    same."""
     digest = hashlib.sha256()
     for name in ("motor_command", "command_thrust", "body_rates", "specific_force", "position", "quaternion"):
         if name in channels:

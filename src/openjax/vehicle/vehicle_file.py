@@ -1,7 +1,7 @@
 """`vehicle.toml`: which vehicle flew, how its motors are commanded, and what a calibration found.
 
-`[vehicle]`, `[vehicles.<id>]`, `[motor]` and `[calibrated]` are strict, so that a misspelt key can't be ignored
-silently; `[log]` is free. What the file leaves out is the nominal vehicle.
+`[vehicle]`, `[vehicles.<id>]`, `[motor]` and `[calibrated]` are strict, so that a misspelt key can't be
+ignored silently; `[log]` is free. What the file leaves out is the nominal vehicle.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ NOMINAL_SPIN = ("ccw", "cw", "ccw", "cw")
 MOTOR_COMMANDS = ("thrust", "pwm")
 NOMINAL_NAME = "crazyflie-2.1"
 
-# Quantities a calibration may hold: unit, number of values (a list for inertia), and what the vehicle calls it.
+# Quantities a calibration may hold: unit, number of values (a list for inertia), and what the vehicle calls
+# it.
 CALIBRATED_UNITS = MappingProxyType({
     "mass": "kg",
     "thrust_constant": "N s^2",
@@ -53,8 +54,9 @@ class CalibratedValue:
 
 @dataclass(frozen=True, eq=False)
 class VehicleFile:
-    """What a vehicle file says. `vehicle` holds the nominal vehicle with everything of the file applied, motors in
-    the nominal order; `motor_order` and `motor_spin` are the file's, for the logged columns m1..m4."""
+    """What a vehicle file says. `vehicle` holds the nominal vehicle with everything of the file applied,
+    motors in the nominal order; `motor_order` and `motor_spin` are the file's, for the logged columns
+    m1..m4."""
 
     vehicle: Vehicle
     name: str = NOMINAL_NAME
@@ -93,7 +95,8 @@ class VehicleFile:
 def load_vehicle_file(path: str | Path | None = None, dtype=jnp.float32) -> VehicleFile:
     """Read a `vehicle.toml` (or a folder that holds one); None gives the nominal vehicle.
 
-    Raises UserError for a missing or unreadable file, an unknown key in a strict table, or an impossible value.
+    Raises UserError for a missing or unreadable file, an unknown key in a strict table, or an impossible
+    value.
     """
     if path is None:
         return VehicleFile(vehicle=load_vehicle(dtype=dtype))
@@ -216,7 +219,7 @@ def _calibrated(table: dict, path: Path) -> dict[str, CalibratedValue]:
             value, interval = np.zeros(0), np.zeros((0, 2))
         if value.shape != (n,) or interval.shape != (n, 2):
             raise UserError(
-                f"{path}: {where} needs value ({n} number{'s' * (n > 1)}) and interval90 ([low, high] for each)"
+                f"{path}: {where} needs value ({n} number{'s' * (n > 1)}) and interval90 ([low, high] each)"
             )
         if not (np.isfinite(value).all() and (value > 0).all() and (interval[:, 0] <= interval[:, 1]).all()):
             raise UserError(
