@@ -1,0 +1,21 @@
+"""Learning: rollout, advantages, MAPPO, predictor update, task archive and generator, the compiled training step."""
+
+from openjax.learning.evaluation import Evaluation, Trajectory, make_evaluate, summarise
+from openjax.learning.settings import PRESETS, GeneratorSettings, MappoSettings, TrainSettings, preset
+from openjax.learning.training import TrainCarry, build, init_carry, make_training_step
+
+__all__ = [
+    "PRESETS",
+    "Evaluation",
+    "GeneratorSettings",
+    "MappoSettings",
+    "TrainCarry",
+    "TrainSettings",
+    "Trajectory",
+    "build",
+    "init_carry",
+    "make_evaluate",
+    "make_training_step",
+    "preset",
+    "summarise",
+]

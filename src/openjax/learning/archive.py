@@ -1,0 +1,84 @@
+"""The active archive: unsolved tasks as a pytree of arrays (the paper's Q_active)."""
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from openjax.pursuit import PursuitSettings, Task
+
+NEVER = jnp.iinfo(jnp.int32).min
+
+
+@struct.dataclass
+class TaskArchive:
+    """Tasks with leading axis C (capacity). Used slots come first, newest first."""
+
+    tasks: Task
+    success: jax.Array  # (C,) float32, success rate at which each task entered
+    size: jax.Array  # () int32, used slots
+
+
+def empty_archive(settings: PursuitSettings, capacity: int) -> TaskArchive:
+    """An archive without tasks."""
+    tasks = Task(
+        pursuer_position=jnp.zeros((capacity, settings.num_pursuers, 3), jnp.float32),
+        evader_position=jnp.zeros((capacity, 3), jnp.float32),
+        pillar_position=jnp.zeros((capacity, settings.max_pillars, 2), jnp.float32),
+        pillar_active=jnp.zeros((capacity, settings.max_pillars), bool),
+    )
+    return TaskArchive(
+        tasks=tasks, success=jnp.zeros((capacity,), jnp.float32), size=jnp.zeros((), jnp.int32)
+    )
+
+
+def descriptor(tasks: Task) -> jax.Array:
+    """(M, D) what tells tasks apart: all start positions and the pillars in use (m)."""
+    pillars = jnp.where(tasks.pillar_active[..., None], tasks.pillar_position, 0.0)
+    m = pillars.shape[0]
+    return jnp.concatenate(
+        [tasks.pursuer_position.reshape(m, -1), tasks.evader_position.reshape(m, -1), pillars.reshape(m, -1)], axis=-1
+    )
+
+
+def insert(archive: TaskArchive, tasks: Task, success: jax.Array, accepted: jax.Array) -> TaskArchive:
+    """Add the accepted ones of M tasks; where there are more than slots, keep the spread.
+
+    Every task's novelty is its distance to the nearest *newer* one, and the most novel stay: of a cluster the newest
+    member survives and the older ones go first. One matrix product, no host, no sequential choice; farthest-point
+    sampling, which the paper's code runs on the host, has the same aim.
+
+    Args:
+        archive: C slots.
+        tasks: leading axis M, newest last.
+        success: (M,) success rates.
+        accepted: (M,) bool, which of them enter.
+    """
+    capacity = archive.success.shape[0]
+    m = success.shape[0]
+    pool = jax.tree.map(lambda new, old: jnp.concatenate([new[::-1], old]), tasks, archive.tasks)
+    pool_success = jnp.concatenate([success[::-1], archive.success])
+    used = jnp.concatenate([accepted[::-1], jnp.arange(capacity) < archive.size])
+
+    features = descriptor(pool)
+    squared = jnp.sum(features**2, axis=-1)
+    product = jnp.matmul(features, features.T, precision=jax.lax.Precision.HIGHEST)
+    distance = squared[:, None] + squared[None] - 2.0 * product
+    index = jnp.arange(m + capacity)
+    newer = (index[None] < index[:, None]) & used[None]
+    novelty = jnp.min(jnp.where(newer, jnp.maximum(distance, 0.0), jnp.inf), axis=1)
+    novelty = jnp.where(used, novelty, -1.0)
+
+    kept = jax.lax.top_k(novelty, capacity)[1]
+    # back to newest first, unused last: rank by (unused, age)
+    kept = jnp.sort(jnp.where(used[kept], kept, kept + m + capacity)) % (m + capacity)
+    return TaskArchive(
+        tasks=jax.tree.map(lambda leaf: leaf[kept], pool),
+        success=pool_success[kept],
+        size=jnp.minimum(jnp.sum(used), capacity).astype(jnp.int32),
+    )
+
+
+def draw(archive: TaskArchive, key: jax.Array) -> Task:
+    """One used task, uniformly; slot 0 (all zeros) of an empty archive: check `size` first."""
+    slot = jax.random.randint(key, (), 0, jnp.maximum(archive.size, 1))
+    return jax.tree.map(lambda leaf: leaf[slot], archive.tasks)

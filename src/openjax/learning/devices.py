@@ -1,0 +1,33 @@
+"""Environments spread over devices: what a training step needs to know of the others.
+
+A training step sees its own device's environments only. With `axis=None` there is one device and these functions do
+nothing. Everything else (parameters, archive, keys) is the same on every device.
+"""
+
+import jax
+import jax.numpy as jnp
+
+
+def mean_over_devices(tree, axis: str | None):
+    """Mean of every leaf over all devices."""
+    return tree if axis is None else jax.lax.pmean(tree, axis)
+
+
+def gather_over_devices(tree, axis: str | None):
+    """Every leaf with the devices' leading axes joined, in the order of the devices."""
+    return tree if axis is None else jax.tree.map(lambda x: jax.lax.all_gather(x, axis, tiled=True), tree)
+
+
+def own_keys(key: jax.Array, number: int, axis: str | None) -> jax.Array:
+    """This device's `number` of keys out of one split for all devices: the same ones however many devices there are."""
+    if axis is None:
+        return jax.random.split(key, number)
+    keys = jax.random.split(key, number * jax.lax.axis_size(axis))
+    return jax.lax.dynamic_slice_in_dim(keys, jax.lax.axis_index(axis) * number, number)
+
+
+def joint_moments(x: jax.Array, axis: str | None) -> tuple[jax.Array, jax.Array]:
+    """Mean and standard deviation over all elements on all devices."""
+    mean = mean_over_devices(jnp.mean(x), axis)
+    variance = mean_over_devices(jnp.mean((x - mean) ** 2), axis)
+    return mean, jnp.sqrt(variance)

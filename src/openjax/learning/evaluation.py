@@ -1,0 +1,108 @@
+"""Evaluation: whole episodes of the mean policy on given tasks."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from openjax.policy import Policy, PolicyParameters
+from openjax.pursuit import EpisodeStatistics, Pursuit, Task
+
+
+@struct.dataclass
+class Evaluation:
+    """B episodes."""
+
+    statistics: EpisodeStatistics  # (B,) each
+    prediction_error: jax.Array  # (B,) m, mean distance between predicted and true next position; NaN without predictor
+    last_seen_error: jax.Array  # (B,) m, the same for keeping the last seen position
+
+
+@struct.dataclass
+class Trajectory:
+    """B episodes of T steps, for pictures."""
+
+    pursuers: jax.Array  # (B, T, N, 3) m
+    quaternion: jax.Array  # (B, T, N, 4) wxyz
+    evader: jax.Array  # (B, T, 3) m
+    seen: jax.Array  # (B, T) bool
+    captured: jax.Array  # (B, T, N) bool
+    predicted: jax.Array | None  # (B, T, K, 3) m, predicted for the steps after
+
+
+def make_evaluate(
+    environment: Pursuit, policy: Policy, trajectory: bool = False
+) -> Callable[[PolicyParameters, Task, jax.Array], Evaluation | tuple[Evaluation, Trajectory]]:
+    """`evaluate(parameters, tasks, key)`: one episode per task (leading axis B), to be compiled by the caller.
+
+    With `trajectory` it returns positions of every step as well.
+    """
+    step = jax.vmap(environment.step, in_axes=(None, 0, 0))
+
+    def evaluate(parameters: PolicyParameters, tasks: Task, key: jax.Array):
+        number = tasks.evader_position.shape[0]
+        reset_key, step_key = jax.random.split(key)
+        observation, state = jax.vmap(environment.reset_to)(jax.random.split(reset_key, number), tasks)
+
+        def one(carry, step_key):
+            observation, state, errors = carry
+            predicted = policy.predict(parameters, observation)
+            mean, _ = policy.distribution(parameters.actor, observation, predicted)
+            last_seen = observation.last_seen
+            observation, state, _, _, _, info = step(step_key, state, jnp.tanh(mean))
+            guesses = [last_seen if predicted is None else predicted[:, 0], last_seen]
+            errors = errors + jnp.stack(
+                [jnp.linalg.norm(guess - state.evader_position, axis=-1) for guess in guesses]
+            )
+            record = None
+            if trajectory:
+                record = Trajectory(
+                    pursuers=state.drones.position,
+                    quaternion=state.drones.quaternion,
+                    evader=state.evader_position,
+                    seen=info.seen,
+                    captured=info.captured,
+                    predicted=predicted,
+                )
+            return (observation, state, errors), record
+
+        length = environment.settings.episode_length
+        start = (observation, state, jnp.zeros((2, number), jnp.float32))
+        (_, state, errors), record = jax.lax.scan(one, start, jax.random.split(step_key, length))
+        errors = errors / length
+        evaluation = Evaluation(
+            statistics=state.statistics,
+            prediction_error=errors[0] if policy.predictor.enabled else jnp.full_like(errors[0], jnp.nan),
+            last_seen_error=errors[1],
+        )
+        if trajectory:
+            return evaluation, jax.tree.map(lambda x: jnp.moveaxis(x, 0, 1), record)
+        return evaluation
+
+    return evaluate
+
+
+def summarise(evaluation: Evaluation) -> dict[str, float]:
+    """The metrics of SPEC section 6 as means over the episodes."""
+    statistics = evaluation.statistics
+    steps = jnp.maximum(statistics.steps, 1)
+
+    def mean(x):
+        return float(jnp.mean(jnp.asarray(x, jnp.float32)))
+
+    return {
+        "capture_rate": mean(statistics.captured),
+        "capture_step": mean(statistics.capture_step),
+        "collision_rate": mean(statistics.collision_rate),
+        "collision_parts": {
+            "pillar": mean(statistics.pillar_steps / steps),
+            "drone": mean(statistics.drone_steps / steps),
+            "bounds": mean(statistics.bounds_steps / steps),
+        },
+        "crash_rate": mean(statistics.crashed),
+        "over_speed_rate": mean(statistics.over_speed_rate),
+        "prediction_error": mean(evaluation.prediction_error),
+        "last_seen_error": mean(evaluation.last_seen_error),
+        "episode_return": mean(statistics.episode_return),
+    }

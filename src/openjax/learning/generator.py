@@ -1,0 +1,42 @@
+"""The adaptive environment generator (the paper's section IV-C, algorithm 1)."""
+
+import jax
+import jax.numpy as jnp
+
+from openjax.learning.archive import TaskArchive, draw, insert
+from openjax.learning.settings import GeneratorSettings
+from openjax.pursuit import EpisodeStatistics, PursuitSettings, Task, expand_task, uniform_task
+
+
+def generate_task(
+    settings: GeneratorSettings, environment: PursuitSettings, archive: TaskArchive, key: jax.Array
+) -> Task:
+    """Draw one task: with probability p an archived one, expanded, else a uniform one."""
+    uniform_key, choice_key, draw_key, expand_key = jax.random.split(key, 4)
+    uniform = uniform_task(environment, uniform_key)
+    if not settings.enabled:
+        return uniform
+    expanded = expand_task(environment, expand_key, draw(archive, draw_key))
+    local = (jax.random.uniform(choice_key) < settings.expansion) & (archive.size > 0)
+    return jax.tree.map(lambda a, b: jnp.where(local, a, b), expanded, uniform)
+
+
+def successes(settings: GeneratorSettings, statistics: EpisodeStatistics) -> jax.Array:
+    """Whether episodes count as solved: captured, and (by setting) with few collisions. Any leading axes."""
+    return statistics.captured & (statistics.collision_rate <= settings.collision_tolerance)
+
+
+def select(
+    settings: GeneratorSettings, archive: TaskArchive, tasks: Task, success: jax.Array, complete: jax.Array
+) -> TaskArchive:
+    """Keep the tasks that are neither solved nor hopeless.
+
+    Args:
+        settings: bounds of the success rate.
+        archive: the archive so far.
+        tasks: leading axis M.
+        success: (M,) success rate of each.
+        complete: (M,) bool, its episodes ran their full length (the first ones start late).
+    """
+    unsolved = (success >= settings.success_low) & (success <= settings.success_high)
+    return insert(archive, tasks, success, unsolved & complete)

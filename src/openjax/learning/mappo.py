@@ -1,0 +1,199 @@
+"""Multi-agent PPO (Yu et al., 2022): shared actor, clipped ratio, normalised values."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from openjax.learning.advantages import generalised_advantages
+from openjax.learning.devices import joint_moments, mean_over_devices
+from openjax.learning.rollout import Rollout
+from openjax.learning.settings import MappoSettings
+from openjax.policy import Policy, gaussian_entropy, gaussian_log_prob
+from openjax.pursuit import Observation
+
+
+@struct.dataclass
+class ValueScale:
+    """Running mean and mean square of the returns, for value normalisation."""
+
+    mean: jax.Array  # ()
+    square: jax.Array  # ()
+    weight: jax.Array  # () sum of weights so far, to remove the bias of the start
+
+    @property
+    def moments(self) -> tuple[jax.Array, jax.Array]:
+        """Mean and standard deviation; 0 and 1 before the first update."""
+        weight = jnp.maximum(self.weight, 1e-6)
+        mean = self.mean / weight
+        variance = self.square / weight - mean**2
+        std = jnp.where(self.weight > 0, jnp.sqrt(jnp.maximum(variance, 1e-4)), 1.0)
+        return mean, std
+
+
+def initial_value_scale() -> ValueScale:
+    """No returns seen."""
+    zero = jnp.zeros((), jnp.float32)
+    return ValueScale(mean=zero, square=zero, weight=zero)
+
+
+@struct.dataclass
+class Batch:
+    """Samples of the policy update; leading axes alike."""
+
+    observation: Observation
+    predicted: jax.Array | None  # (..., K, 3)
+    action: jax.Array  # (..., N, 4)
+    log_prob: jax.Array  # (..., N)
+    advantage: jax.Array  # (..., N)
+    target: jax.Array  # (..., N) normalised returns
+
+
+def make_optimiser(
+    settings: MappoSettings, total_updates: int
+) -> tuple[optax.GradientTransformation, optax.GradientTransformation]:
+    """Optimisers of actor and critic; the step size falls linearly to zero over the run."""
+    steps = total_updates * settings.epochs * settings.minibatches
+    schedule = optax.linear_schedule(settings.learning_rate, 0.0, steps)
+
+    def one():
+        return optax.chain(
+            optax.clip_by_global_norm(settings.gradient_norm), optax.adam(schedule, eps=1e-5)
+        )
+
+    return one(), one()
+
+
+def policy_loss(
+    settings: MappoSettings, policy: Policy, actor: Any, batch: Batch
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Clipped surrogate minus the entropy bonus; and what to watch."""
+    mean, log_std = policy.distribution(actor, batch.observation, batch.predicted)
+    log_ratio = gaussian_log_prob(batch.action, mean, log_std) - batch.log_prob
+    ratio = jnp.exp(log_ratio)
+    clipped = jnp.clip(ratio, 1.0 - settings.clip, 1.0 + settings.clip)
+    surrogate = jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
+    entropy = gaussian_entropy(log_std)
+    watch = {
+        "kl": jnp.mean(ratio - 1.0 - log_ratio),
+        "clipped": jnp.mean(jnp.abs(ratio - 1.0) > settings.clip),
+        "entropy": entropy,
+    }
+    return -surrogate - settings.entropy * entropy, watch
+
+
+def value_loss(settings: MappoSettings, policy: Policy, critic: Any, batch: Batch) -> jax.Array:
+    """Huber loss of normalised values."""
+    value = policy.value(critic, batch.observation, batch.predicted)
+    return jnp.mean(optax.huber_loss(value, batch.target, delta=settings.huber))
+
+
+def update_policy(
+    settings: MappoSettings,
+    policy: Policy,
+    optimisers: tuple[optax.GradientTransformation, optax.GradientTransformation],
+    parameters: tuple[Any, Any],
+    optimiser_states: tuple[Any, Any],
+    scale: ValueScale,
+    rollout: Rollout,
+    last: Observation,
+    last_predicted: jax.Array | None,
+    key: jax.Array,
+    axis: str | None,
+):
+    """All epochs of the policy update on one rollout.
+
+    Args:
+        settings: MAPPO's.
+        policy: the networks.
+        optimisers: of actor and critic.
+        parameters: of actor and critic.
+        optimiser_states: of actor and critic.
+        scale: value normalisation before this rollout.
+        rollout: T steps of E worlds.
+        last: (E, ...) observation after the rollout, before any reset.
+        last_predicted: (E, K, 3) its prediction.
+        key: shuffles, the same on all devices.
+        axis: name of the devices' axis.
+
+    Returns:
+        (actor, critic), optimiser states, value scale, dict of () metrics.
+    """
+    actor, critic = parameters
+    mean, std = scale.moments
+    value = mean + std * policy.value(critic, rollout.observation, rollout.predicted)
+    last_value = mean + std * policy.value(critic, last, last_predicted)
+    next_value = jnp.concatenate([value[1:], last_value[None]])
+    per_pursuer = value.shape
+    advantage = generalised_advantages(
+        settings.reward_scale * rollout.reward,
+        value,
+        next_value,
+        jnp.broadcast_to(rollout.terminated[..., None], per_pursuer),
+        jnp.broadcast_to(rollout.truncated[..., None], per_pursuer),
+        settings.discount,
+        settings.trace,
+    )
+    returns = advantage + value
+    explained = 1.0 - joint_moments(advantage, axis)[1] ** 2 / (joint_moments(returns, axis)[1] ** 2 + 1e-8)
+
+    keep = settings.value_memory
+    first, second = mean_over_devices((jnp.mean(returns), jnp.mean(returns**2)), axis)
+    scale = ValueScale(
+        mean=keep * scale.mean + (1 - keep) * first,
+        square=keep * scale.square + (1 - keep) * second,
+        weight=keep * scale.weight + (1 - keep),
+    )
+    mean, std = scale.moments
+    advantage_mean, advantage_std = joint_moments(advantage, axis)
+    batch = Batch(
+        observation=rollout.observation,
+        predicted=rollout.predicted,
+        action=rollout.action,
+        log_prob=rollout.log_prob,
+        advantage=(advantage - advantage_mean) / (advantage_std + 1e-8),
+        target=(returns - mean) / std,
+    )
+    batch = _partition(batch, settings.minibatches)
+
+    def gradient_step(carry, index):
+        (actor, critic), (actor_state, critic_state) = carry
+        part = jax.tree.map(lambda x: x[index], batch)
+        (actor_loss, watch), actor_gradient = jax.value_and_grad(
+            lambda p: policy_loss(settings, policy, p, part), has_aux=True
+        )(actor)
+        critic_loss, critic_gradient = jax.value_and_grad(lambda p: value_loss(settings, policy, p, part))(critic)
+        watch |= {"policy_loss": actor_loss, "value_loss": critic_loss}
+        actor_gradient, critic_gradient, watch = mean_over_devices(
+            (actor_gradient, critic_gradient, watch), axis
+        )
+        watch |= {"actor_gradient": optax.global_norm(actor_gradient)}
+        actor_update, actor_state = optimisers[0].update(actor_gradient, actor_state, actor)
+        critic_update, critic_state = optimisers[1].update(critic_gradient, critic_state, critic)
+        actor = optax.apply_updates(actor, actor_update)
+        critic = optax.apply_updates(critic, critic_update)
+        return ((actor, critic), (actor_state, critic_state)), watch
+
+    order = jax.vmap(lambda k: jax.random.permutation(k, settings.minibatches))(
+        jax.random.split(key, settings.epochs)
+    ).ravel()
+    (parameters, optimiser_states), watch = jax.lax.scan(gradient_step, (parameters, optimiser_states), order)
+    metrics = jax.tree.map(jnp.mean, watch) | {"explained_variance": explained, "value_scale": std}
+    return parameters, optimiser_states, scale, metrics
+
+
+def _partition(batch: Batch, minibatches: int) -> Batch:
+    """(T, E, ...) to (M, E / M, T, ...): whole trajectories, one contiguous block per minibatch.
+
+    Environment e goes to minibatch e mod M, so that each device of several holds its share of every minibatch.
+    """
+
+    def split(x):
+        x = jnp.moveaxis(x, 0, 1)
+        return jnp.moveaxis(x.reshape(x.shape[0] // minibatches, minibatches, *x.shape[1:]), 1, 0)
+
+    # the history's frames are the predictor's; the policy sees the prediction
+    batch = batch.replace(observation=batch.observation.replace(frames=None))
+    return jax.tree.map(split, batch)

@@ -1,0 +1,165 @@
+"""Settings of a training run and its presets."""
+
+import dataclasses
+from dataclasses import dataclass, field
+
+from openjax.errors import UserError
+from openjax.policy import NetworkSettings, PredictorSettings
+from openjax.pursuit import PursuitSettings, RewardSettings
+
+
+@dataclass(frozen=True)
+class MappoSettings:
+    """Multi-agent PPO with a shared actor."""
+
+    learning_rate: float = 5e-4
+    """Adam step size at the start; falls linearly to zero over `total_steps`."""
+    epochs: int = 4
+    minibatches: int = 16
+    clip: float = 0.1
+    """Clip range of the probability ratio."""
+    entropy: float = 1e-3
+    """Weight of the entropy."""
+    discount: float = 0.995
+    trace: float = 0.95
+    """Lambda of the generalised advantage estimate."""
+    gradient_norm: float = 10.0
+    """Global norm to which gradients are cut, actor and critic each."""
+    huber: float = 10.0
+    """Where the value loss turns linear, in standard deviations of the returns."""
+    value_memory: float = 0.95
+    """Share of the old mean and variance of the returns that value normalisation keeps per iteration."""
+    reward_scale: float = 0.1
+
+
+@dataclass(frozen=True)
+class GeneratorSettings:
+    """The adaptive environment generator."""
+
+    enabled: bool = True
+    """Draw tasks from the archive of unsolved ones; False: uniform tasks only."""
+    capacity: int = 5000
+    """Tasks in the archive."""
+    expansion: float = 0.7
+    """Probability p of local expansion of an archived task, else a uniform one."""
+    success_low: float = 0.5
+    success_high: float = 0.9
+    """A task enters the archive if its success rate lies between these."""
+    episodes_per_task: int = 4
+    """Environments that share one task, so that its success rate can be told."""
+    collision_tolerance: float = 1.0
+    """An episode counts as success if it captures and its collision rate stays below this (1: capture alone)."""
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """Everything that determines a run. A run's result depends on nothing else but the machine's arithmetic."""
+
+    environment: PursuitSettings = field(default_factory=PursuitSettings)
+    network: NetworkSettings = field(default_factory=NetworkSettings)
+    predictor: PredictorSettings = field(default_factory=PredictorSettings)
+    mappo: MappoSettings = field(default_factory=MappoSettings)
+    generator: GeneratorSettings = field(default_factory=GeneratorSettings)
+    num_envs: int = 2048
+    """Worlds that are simulated at once."""
+    rollout_length: int = 80
+    """Control steps per iteration; divides the episode's length, so that episodes end between rollouts."""
+    total_steps: int = 400_000_000
+    """Environment steps of the run (one step moves one world, all its pursuers)."""
+    evaluation_interval: int = 50
+    """Iterations between evaluations on held-back uniform tasks."""
+    evaluation_episodes: int = 256
+    """Held-back uniform tasks."""
+    seed: int = 0
+
+    def __post_init__(self):
+        def need(condition, text):
+            if not condition:
+                raise UserError(text)
+
+        length, rollout = self.environment.episode_length, self.rollout_length
+        need(
+            rollout >= 1 and length % rollout == 0,
+            f"rollout_length {rollout} must divide environment.episode_length {length}",
+        )
+        unit = self.start_groups * self.episodes_per_task
+        need(
+            self.num_envs >= unit and self.num_envs % unit == 0,
+            f"num_envs {self.num_envs} must be a multiple of {unit} (start groups times episodes per task)",
+        )
+        need(
+            self.num_envs % self.mappo.minibatches == 0,
+            f"num_envs {self.num_envs} must be a multiple of mappo.minibatches {self.mappo.minibatches}",
+        )
+        if self.predictor.enabled:
+            room = rollout - self.predictor.horizons[-1] + 1
+            need(
+                room >= self.predictor.windows,
+                f"predictor: {self.predictor.windows} windows and horizon {self.predictor.horizons[-1]} "
+                f"do not fit into rollout_length {rollout}",
+            )
+        need(self.total_steps >= 1, f"total_steps is {self.total_steps}; it must be positive")
+
+    @property
+    def start_groups(self) -> int:
+        """Groups of environments by start time; one of them ends its episodes after each rollout."""
+        return self.environment.episode_length // self.rollout_length
+
+    @property
+    def episodes_per_task(self) -> int:
+        """Environments that share one task; 1 without the generator."""
+        return self.generator.episodes_per_task if self.generator.enabled else 1
+
+    @property
+    def steps_per_update(self) -> int:
+        """Environment steps of one training step."""
+        return self.num_envs * self.rollout_length
+
+    @property
+    def total_updates(self) -> int:
+        """Training steps of the run."""
+        return max(1, -(-self.total_steps // self.steps_per_update))
+
+
+def quick() -> TrainSettings:
+    """A few minutes on two CPU cores: shows learning, not the paper's result."""
+    return TrainSettings(
+        environment=PursuitSettings(observe_position=True),
+        network=NetworkSettings(features=64, heads=4),
+        predictor=PredictorSettings(units=32),
+        mappo=MappoSettings(learning_rate=1e-3, minibatches=4, epochs=4, clip=0.2),
+        generator=GeneratorSettings(capacity=500),
+        num_envs=160,
+        rollout_length=80,
+        total_steps=2_500_000,
+        evaluation_interval=20,
+        evaluation_episodes=64,
+    )
+
+
+def paper() -> TrainSettings:
+    """The paper's task at the paper's scale on one large accelerator."""
+    return TrainSettings(
+        environment=PursuitSettings(observe_position=True, reward=RewardSettings(collision=10.0)),
+        network=NetworkSettings(compute_type="bfloat16"),
+        mappo=MappoSettings(minibatches=16),
+        num_envs=4160,
+        rollout_length=80,
+        total_steps=600_000_000,
+        evaluation_interval=100,
+        evaluation_episodes=512,
+    )
+
+
+PRESETS = {"quick": quick, "paper": paper}
+
+
+def preset(name: str, **changes) -> TrainSettings:
+    """A preset's settings, with top-level fields changed.
+
+    Raises:
+        UserError: no such preset.
+    """
+    if name not in PRESETS:
+        raise UserError(f"preset {name}: unknown; possible are {', '.join(PRESETS)}")
+    return dataclasses.replace(PRESETS[name](), **changes)

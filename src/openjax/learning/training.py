@@ -1,0 +1,224 @@
+"""The compiled training step: rollout, predictor update, policy update, selection of tasks; one function of one carry."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from openjax.learning.archive import TaskArchive, empty_archive
+from openjax.learning.devices import gather_over_devices, mean_over_devices, own_keys
+from openjax.learning.generator import generate_task, select, successes
+from openjax.learning.mappo import ValueScale, initial_value_scale, make_optimiser, update_policy
+from openjax.learning.predictor_update import update_predictor
+from openjax.learning.rollout import collect
+from openjax.learning.settings import TrainSettings
+from openjax.policy import Policy, PolicyParameters
+from openjax.pursuit import Observation, Pursuit, PursuitState
+
+
+@struct.dataclass
+class TrainCarry:
+    """Everything that a run is. Saved whole, it goes on as if nothing had happened."""
+
+    policy: PolicyParameters
+    actor_optimiser: Any
+    critic_optimiser: Any
+    predictor_optimiser: Any
+    value_scale: ValueScale
+    observation: Observation  # (E, ...)
+    state: PursuitState  # (E, ...)
+    archive: TaskArchive
+    key: jax.Array
+    update: jax.Array  # () int32, training steps done
+
+
+@struct.dataclass
+class Building:
+    """What a training step is made of: environment, networks and optimisers of a run's settings."""
+
+    environment: Pursuit = struct.field(pytree_node=False)
+    policy: Policy = struct.field(pytree_node=False)
+    optimisers: tuple = struct.field(pytree_node=False)
+    predictor_optimiser: optax.GradientTransformation = struct.field(pytree_node=False)
+
+
+def build(settings: TrainSettings, environment: Pursuit | None = None) -> Building:
+    """Environment, networks and optimisers of a run. `environment` overrides the nominal one (effects, vehicle)."""
+    environment = environment or Pursuit(settings.environment)
+    return Building(
+        environment=environment,
+        policy=Policy.for_environment(environment, settings.network, settings.predictor),
+        optimisers=make_optimiser(settings.mappo, settings.total_updates),
+        predictor_optimiser=optax.chain(
+            optax.clip_by_global_norm(1.0), optax.adam(settings.predictor.learning_rate)
+        ),
+    )
+
+
+def init_carry(settings: TrainSettings, key: jax.Array, environment: Pursuit | None = None) -> TrainCarry:
+    """The start of a run: fresh networks, uniform tasks, an empty archive, staggered start times."""
+    parts = build(settings, environment)
+    return jax.jit(lambda key: _initial_carry(settings, parts, key))(key)
+
+
+def _initial_carry(settings, parts, key):
+    environment = parts.environment
+    archive = empty_archive(settings.environment, settings.generator.capacity)
+    key, policy_key, task_key, reset_key = jax.random.split(key, 4)
+    tasks = _tasks(settings, archive, jax.random.split(task_key, settings.num_envs // settings.episodes_per_task))
+    # environment e belongs to start group e mod G; within a group, neighbours share a task
+    groups = settings.start_groups
+    tasks = jax.tree.map(lambda x: jnp.moveaxis(x.reshape(groups, -1, *x.shape[1:]), 0, 1), tasks)
+    tasks = jax.tree.map(lambda x: x.reshape(settings.num_envs, *x.shape[2:]), tasks)
+    observation, state = jax.vmap(environment.reset_to)(jax.random.split(reset_key, settings.num_envs), tasks)
+    age = jnp.arange(settings.num_envs, dtype=jnp.int32) % groups
+    state = state.replace(step=age * settings.rollout_length)
+    observation = jax.vmap(environment.observe)(state)
+    policy = parts.policy.init(policy_key, jax.tree.map(lambda x: x[0], observation))
+    return TrainCarry(
+        policy=policy,
+        actor_optimiser=parts.optimisers[0].init(policy.actor),
+        critic_optimiser=parts.optimisers[1].init(policy.critic),
+        predictor_optimiser=parts.predictor_optimiser.init(policy.predictor),
+        value_scale=initial_value_scale(),
+        observation=observation,
+        state=state,
+        archive=archive,
+        key=key,
+        update=jnp.zeros((), jnp.int32),
+    )
+
+
+def make_training_step(
+    settings: TrainSettings, environment: Pursuit | None = None, axis: str | None = None
+) -> Callable[[TrainCarry], tuple[TrainCarry, dict[str, jax.Array]]]:
+    """The training step `carry -> (carry, metrics)`; compile it with `jax.jit(step, donate_argnums=0)`.
+
+    `axis` names the axis of devices when it runs under `shard_map` (see `openjax.learning.parallel`).
+    Metrics are () float32, counted over the rollout or over the episodes that ended with it.
+    """
+    parts = build(settings, environment)
+    environment, policy = parts.environment, parts.policy
+
+    def training_step(carry: TrainCarry) -> tuple[TrainCarry, dict[str, jax.Array]]:
+        key, noise_key, window_key, shuffle_key, task_key, reset_key = jax.random.split(carry.key, 6)
+        num_envs = carry.state.step.shape[0]  # of this device
+
+        # rollout
+        shape = (settings.rollout_length, settings.environment.num_pursuers, 4)
+        noise = jax.vmap(lambda k: jax.random.normal(k, shape))(own_keys(noise_key, num_envs, axis))
+        rollout, observation, state = collect(
+            environment, policy, carry.policy, carry.observation, carry.state, jnp.moveaxis(noise, 1, 0)
+        )
+        last_predicted = policy.predict(carry.policy, observation)
+
+        # predictor update
+        predictor, predictor_optimiser = carry.policy.predictor, carry.predictor_optimiser
+        metrics = {}
+        if settings.predictor.enabled:
+            predictor, predictor_optimiser, loss = update_predictor(
+                policy,
+                parts.predictor_optimiser,
+                settings.environment.history_spacing,
+                predictor,
+                predictor_optimiser,
+                carry.state.frames,
+                rollout,
+                own_keys(window_key, num_envs, axis),
+                axis,
+            )
+            error = jnp.linalg.norm(rollout.predicted[:, :, 0] - rollout.evader, axis=-1)
+            metrics |= {"predictor_loss": loss, "prediction_error": mean_over_devices(jnp.mean(error), axis)}
+
+        # policy update
+        (actor, critic), optimiser_states, scale, watched = update_policy(
+            settings.mappo,
+            policy,
+            parts.optimisers,
+            (carry.policy.actor, carry.policy.critic),
+            (carry.actor_optimiser, carry.critic_optimiser),
+            carry.value_scale,
+            rollout,
+            observation,
+            last_predicted,
+            shuffle_key,
+            axis,
+        )
+        metrics |= watched
+
+        # selection of tasks: the one start group whose episodes have just ended gets new ones
+        group = (settings.start_groups - 1 - carry.update) % settings.start_groups
+        ended = _group(state, group, settings.start_groups)
+        archive, counted = _selection(settings, carry.archive, ended, axis)
+        metrics |= counted
+        number = ended.step.shape[0]
+        tasks = _tasks(settings, archive, own_keys(task_key, number // settings.episodes_per_task, axis))
+        fresh = jax.vmap(environment.reset_to)(own_keys(reset_key, number, axis), tasks)
+        observation, state = jax.tree.map(
+            lambda x, new: _set_group(x, new, group, settings.start_groups), (observation, state), fresh
+        )
+
+        carry = TrainCarry(
+            policy=PolicyParameters(actor=actor, critic=critic, predictor=predictor),
+            actor_optimiser=optimiser_states[0],
+            critic_optimiser=optimiser_states[1],
+            predictor_optimiser=predictor_optimiser,
+            value_scale=scale,
+            observation=observation,
+            state=state,
+            archive=archive,
+            key=key,
+            update=carry.update + 1,
+        )
+        metrics["reward"] = mean_over_devices(jnp.mean(rollout.reward), axis)
+        return carry, {name: value.astype(jnp.float32) for name, value in metrics.items()}
+
+    return training_step
+
+
+def _tasks(settings, archive, keys):
+    """One task per key, repeated for the environments that share it."""
+    tasks = jax.vmap(lambda k: generate_task(settings.generator, settings.environment, archive, k))(keys)
+    return jax.tree.map(lambda x: jnp.repeat(x, settings.episodes_per_task, axis=0), tasks)
+
+
+def _selection(settings, archive, ended, axis):
+    """Put unsolved tasks of ended episodes into the archive; and what these episodes were like."""
+    statistics = ended.statistics
+    complete = statistics.steps >= settings.environment.episode_length
+    share = settings.episodes_per_task
+    solved = successes(settings.generator, statistics).astype(jnp.float32).reshape(-1, share)
+    if settings.generator.enabled:
+        tasks = jax.tree.map(lambda x: x[::share], ended.task)
+        candidates = gather_over_devices((tasks, jnp.mean(solved, axis=1), complete[::share]), axis)
+        archive = select(settings.generator, archive, *candidates)
+    counted = {
+        "capture_rate": statistics.captured,
+        "capture_step": statistics.capture_step,
+        "collision_rate": statistics.collision_rate,
+        "crash_rate": statistics.crashed,
+        "over_speed_rate": statistics.over_speed_rate,
+        "episode_return": statistics.episode_return,
+        "success_rate": solved,
+    }
+    counted = {name: jnp.mean(value.astype(jnp.float32)) for name, value in counted.items()}
+    counted = mean_over_devices(counted, axis)
+    return archive, counted | {"archive_size": archive.size}
+
+
+def _group(tree, group, groups):
+    """Environments e with e mod groups == group, of every leaf's leading axis."""
+    return jax.tree.map(
+        lambda x: jax.lax.dynamic_index_in_dim(
+            x.reshape(x.shape[0] // groups, groups, *x.shape[1:]), group, axis=1, keepdims=False
+        ),
+        tree,
+    )
+
+
+def _set_group(x, new, group, groups):
+    split = x.reshape(x.shape[0] // groups, groups, *x.shape[1:])
+    return jax.lax.dynamic_update_index_in_dim(split, new, group, axis=1).reshape(x.shape)

@@ -1,0 +1,70 @@
+"""Actor and critic (the paper's section IV-B)."""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from openjax.policy.encoder import Encoder
+from openjax.policy.settings import NetworkSettings
+from openjax.pursuit import Observation
+
+
+class Actor(nn.Module):
+    """Mean and log standard deviation of the Gaussian over actions before the tanh."""
+
+    settings: NetworkSettings
+    initial_action: tuple[float, ...]
+    """Mean before the tanh at initialisation: hovering."""
+
+    @nn.compact
+    def __call__(self, observation: Observation, predicted: jax.Array | None) -> tuple[jax.Array, jax.Array]:
+        """Observation of (..., N) pursuers, predicted (..., K, 3) positions or None -> mean (..., N, 4), log_std (4,)."""
+        settings = self.settings
+        hidden = Encoder(settings.features, settings.heads, jnp.dtype(settings.compute_type), name="encoder")(
+            own_features(observation, predicted), observation.others, observation.pillars, observation.pillar_seen
+        )
+        start = jnp.array(self.initial_action, jnp.float32)
+        mean = nn.Dense(
+            len(self.initial_action),
+            dtype=jnp.float32,
+            kernel_init=nn.initializers.orthogonal(0.01),
+            bias_init=lambda key, shape, dtype: start.astype(dtype),
+            name="mean",
+        )(hidden)
+        log_std = self.param(
+            "log_std", nn.initializers.constant(settings.initial_log_std), (len(self.initial_action),)
+        )
+        return mean, log_std
+
+
+class Critic(nn.Module):
+    """Normalised value of each pursuer's state."""
+
+    settings: NetworkSettings
+
+    @nn.compact
+    def __call__(self, observation: Observation, predicted: jax.Array | None) -> jax.Array:
+        """Observation of (..., N) pursuers, predicted (..., K, 3) positions or None -> (..., N)."""
+        settings = self.settings
+        own = own_features(observation, predicted)
+        if settings.critic_input == "state":
+            own = jnp.concatenate([own, observation.privileged], axis=-1)
+        dtype = jnp.dtype(settings.compute_type)
+        hidden = Encoder(settings.features, settings.heads, dtype, name="encoder")(
+            own, observation.others, observation.pillars, observation.pillar_seen
+        )
+        hidden = nn.Dense(
+            settings.features, dtype=dtype, kernel_init=nn.initializers.orthogonal(2**0.5), name="hidden"
+        )(hidden)
+        value = nn.Dense(1, dtype=jnp.float32, kernel_init=nn.initializers.orthogonal(1.0), name="value")(
+            nn.gelu(hidden)
+        )
+        return value[..., 0]
+
+
+def own_features(observation: Observation, predicted: jax.Array | None) -> jax.Array:
+    """A pursuer's own part: its state and, relative to it, the predicted (..., K, 3) evader positions."""
+    if predicted is None:
+        return observation.self_state
+    relative = observation.position[..., :, None, :] - predicted[..., None, :, :]
+    return jnp.concatenate([observation.self_state, relative.reshape(*relative.shape[:-2], -1)], axis=-1)

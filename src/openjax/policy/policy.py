@@ -1,0 +1,105 @@
+"""Actor, critic and predictor as one policy: initial parameters, distribution, value, prediction."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from openjax.policy.actor_critic import Actor, Critic
+from openjax.policy.predictor import EvaderPredictor
+from openjax.policy.settings import NetworkSettings, PredictorSettings
+from openjax.pursuit import Observation, Pursuit, hover_action
+
+
+@struct.dataclass
+class PolicyParameters:
+    """Parameters of the three networks; `predictor` is empty where it is switched off."""
+
+    actor: Any
+    critic: Any
+    predictor: Any
+
+
+@dataclass(frozen=True)
+class Policy:
+    """The networks for one game, as pure functions of their parameters."""
+
+    network: NetworkSettings = field(default_factory=NetworkSettings)
+    predictor: PredictorSettings = field(default_factory=PredictorSettings)
+    arena_radius: float = 0.9
+    arena_height: float = 1.2
+    initial_action: tuple[float, ...] = (0.2549, 0.0, 0.0, 0.0)
+
+    @classmethod
+    def for_environment(
+        cls, environment: Pursuit, network: NetworkSettings, predictor: PredictorSettings
+    ) -> "Policy":
+        """The policy for an environment: its arena's size, and a start that hovers its vehicle."""
+        hover = np.arctanh(np.clip(np.asarray(hover_action(environment.vehicle), np.float64), -0.99, 0.99))
+        return cls(
+            network=network,
+            predictor=predictor,
+            arena_radius=environment.settings.arena_radius,
+            arena_height=environment.settings.arena_height,
+            initial_action=tuple(float(x) for x in hover),
+        )
+
+    @property
+    def _actor(self) -> Actor:
+        return Actor(self.network, self.initial_action)
+
+    @property
+    def _critic(self) -> Critic:
+        return Critic(self.network)
+
+    @property
+    def _predictor(self) -> EvaderPredictor:
+        return EvaderPredictor(self.predictor, self.arena_radius, self.arena_height)
+
+    def init(self, key: jax.Array, observation: Observation) -> PolicyParameters:
+        """Initial parameters for observations shaped like `observation`."""
+        actor_key, critic_key, predictor_key = jax.random.split(key, 3)
+        predictor = {}
+        if self.predictor.enabled:
+            predictor = self._predictor.init(predictor_key, observation.frames, observation.last_seen)
+        parameters = PolicyParameters(actor={}, critic={}, predictor=predictor)
+        predicted = self.predict(parameters, observation)
+        return parameters.replace(
+            actor=self._actor.init(actor_key, observation, predicted),
+            critic=self._critic.init(critic_key, observation, predicted),
+        )
+
+    def predict(self, parameters: PolicyParameters, observation: Observation) -> jax.Array | None:
+        """Predicted evader positions (..., K, 3) in the world (m); None without a predictor."""
+        if not self.predictor.enabled:
+            return None
+        return self._predictor.apply(parameters.predictor, observation.frames, observation.last_seen)
+
+    def distribution(
+        self, actor: Any, observation: Observation, predicted: jax.Array | None
+    ) -> tuple[jax.Array, jax.Array]:
+        """Mean (..., N, 4) and log standard deviation (4,) of the Gaussian before the tanh."""
+        return self._actor.apply(actor, observation, predicted)
+
+    def value(self, critic: Any, observation: Observation, predicted: jax.Array | None) -> jax.Array:
+        """Normalised values (..., N)."""
+        return self._critic.apply(critic, observation, predicted)
+
+    def act(self, parameters: PolicyParameters, observation: Observation) -> jax.Array:
+        """The mean policy's action (..., N, 4) in -1..1."""
+        predicted = self.predict(parameters, observation)
+        return jnp.tanh(self.distribution(parameters.actor, observation, predicted)[0])
+
+
+def gaussian_log_prob(sample: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
+    """Log density (...) of (..., 4) samples under independent Gaussians."""
+    scaled = (sample - mean) * jnp.exp(-log_std)
+    return jnp.sum(-0.5 * scaled**2 - log_std - 0.5 * jnp.log(2 * jnp.pi), axis=-1)
+
+
+def gaussian_entropy(log_std: jax.Array) -> jax.Array:
+    """Entropy () of independent Gaussians."""
+    return jnp.sum(log_std + 0.5 * jnp.log(2 * jnp.pi * jnp.e))

@@ -1,0 +1,35 @@
+"""The evader prediction network: an LSTM over the last frames (the paper's section IV-B1)."""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from openjax.policy.settings import PredictorSettings
+
+
+class EvaderPredictor(nn.Module):
+    """Future evader positions from a window of frames; see `openjax.pursuit.observation.frame`."""
+
+    settings: PredictorSettings
+    arena_radius: float
+    arena_height: float
+
+    @nn.compact
+    def __call__(self, frames: jax.Array, last_seen: jax.Array) -> jax.Array:
+        """frames (..., n, F) oldest first, last_seen (..., 3) -> (..., K, 3) positions (m, world)."""
+        units, horizons = self.settings.units, self.settings.horizons
+        # all frames' projections in one product; only the recurrent part is sequential
+        inputs = nn.Dense(4 * units, name="input")(frames)
+        recurrent = self.param("recurrent", nn.initializers.orthogonal(), (units, 4 * units))
+        hidden = cell = jnp.zeros((*frames.shape[:-2], units), jnp.float32)
+        for i in range(frames.shape[-2]):
+            gates = inputs[..., i, :] + hidden @ recurrent
+            in_gate, forget_gate, candidate, out_gate = jnp.split(gates, 4, axis=-1)
+            cell = jax.nn.sigmoid(forget_gate + 1.0) * cell + jax.nn.sigmoid(in_gate) * jnp.tanh(candidate)
+            hidden = jax.nn.sigmoid(out_gate) * jnp.tanh(cell)
+        output = nn.Dense(3 * len(horizons), kernel_init=nn.initializers.orthogonal(0.1), name="output")(hidden)
+        output = output.reshape(*output.shape[:-1], len(horizons), 3)
+        scale = jnp.array([self.arena_radius, self.arena_radius, self.arena_height / 2], jnp.float32)
+        if self.settings.relative:
+            return last_seen[..., None, :] + 0.1 * scale * output
+        return jnp.array([0.0, 0.0, self.arena_height / 2], jnp.float32) + scale * output

@@ -1,0 +1,52 @@
+"""Settings of the networks."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from openjax.errors import UserError
+
+
+@dataclass(frozen=True)
+class NetworkSettings:
+    """Actor and critic: an attention encoder each (the paper's figure 3)."""
+
+    features: int = 128
+    """Width of the entity embeddings and of all layers."""
+    heads: int = 4
+    """Attention heads."""
+    compute_type: Literal["float32", "bfloat16"] = "float32"
+    """Arithmetic of the networks; parameters stay in float32."""
+    initial_log_std: float = -0.5
+    """Start of the Gaussian policy's state-independent log standard deviation."""
+    critic_input: Literal["state", "observation"] = "state"
+    """"state": the critic also sees the true evader, its velocity and the own position; "observation": what the actor sees."""
+
+    def __post_init__(self):
+        if self.features % self.heads:
+            raise UserError(f"network: features {self.features} must be a multiple of heads {self.heads}")
+
+
+@dataclass(frozen=True)
+class PredictorSettings:
+    """Evader predictor: an LSTM over the last frames."""
+
+    enabled: bool = True
+    """Predict the evader and let the policy observe the prediction."""
+    units: int = 64
+    """Width of the LSTM."""
+    horizons: tuple[int, ...] = (1, 2, 3, 4, 5)
+    """Control steps ahead at which positions are predicted; the first is 1, the paper's are 1 to 5."""
+    relative: bool = True
+    """Predict the displacement from where the evader was last seen; False: positions in the arena, as in the paper."""
+    learning_rate: float = 1e-3
+    """Adam step size; 1e-4 in the paper."""
+    windows: int = 8
+    """Windows of each environment's rollout that one iteration trains on."""
+    steps: int = 4
+    """Gradient steps per iteration, over disjoint windows."""
+
+    def __post_init__(self):
+        if not self.horizons or self.horizons[0] != 1 or any(h < 1 for h in self.horizons):
+            raise UserError(f"predictor: horizons {self.horizons} must start with 1 and be positive")
+        if self.windows % self.steps:
+            raise UserError(f"predictor: windows {self.windows} must be a multiple of steps {self.steps}")

@@ -1,0 +1,29 @@
+"""The game: tasks, evader, sensing, observation, reward, test layouts, and the environment made of them."""
+
+from openjax.pursuit.environment import Pursuit, PursuitState, StepInfo, action_to_command, hover_action, make
+from openjax.pursuit.observation import Observation
+from openjax.pursuit.scenarios import SCENARIOS, Scenario, find_scenario, scenario_settings, scenario_task
+from openjax.pursuit.settings import PursuitSettings, RewardSettings
+from openjax.pursuit.statistics import EpisodeStatistics
+from openjax.pursuit.task import Task, expand_task, uniform_task
+
+__all__ = [
+    "SCENARIOS",
+    "EpisodeStatistics",
+    "Observation",
+    "Pursuit",
+    "PursuitSettings",
+    "PursuitState",
+    "RewardSettings",
+    "Scenario",
+    "StepInfo",
+    "Task",
+    "action_to_command",
+    "expand_task",
+    "find_scenario",
+    "hover_action",
+    "make",
+    "scenario_settings",
+    "scenario_task",
+    "uniform_task",
+]

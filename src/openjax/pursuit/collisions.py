@@ -1,0 +1,72 @@
+"""Breaches of safety distances and arena bounds, and crashes."""
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from openjax.pursuit.settings import SOLID_RADIUS, PursuitSettings
+
+TOUCH = 1e-3
+"""A gap between solids below this (m) counts as touching: contacts are soft by a fraction of it."""
+
+
+@struct.dataclass
+class Breaches:
+    """Number of breaches of each pursuer in one step (SPEC section 5)."""
+
+    pillar: jax.Array  # (N,) float, pillars whose surface is too close
+    drone: jax.Array  # (N,) float, other drones too close
+    bounds: jax.Array  # (N,) float, above the ceiling, outside the wall
+
+    @property
+    def total(self) -> jax.Array:
+        """(N,) all breaches of each pursuer."""
+        return self.pillar + self.drone + self.bounds
+
+
+def pillar_distance(settings: PursuitSettings, position: jax.Array, pillar_position: jax.Array) -> jax.Array:
+    """(N, P) distance (m) between (N, 3) centres and the surfaces of (P, 2) pillars."""
+    offset = position[:, None, :2] - pillar_position[None]
+    return jnp.sqrt(jnp.sum(offset**2, axis=-1) + 1e-12) - settings.pillar_radius
+
+
+def drone_distance(position: jax.Array) -> jax.Array:
+    """(N, N) distance (m) between (N, 3) centres; infinite on the diagonal."""
+    n = position.shape[0]
+    offset = position[:, None] - position[None]
+    distance = jnp.sqrt(jnp.sum(offset**2, axis=-1) + 1e-12)
+    return jnp.where(jnp.eye(n, dtype=bool), jnp.inf, distance)
+
+
+def breaches(
+    settings: PursuitSettings, position: jax.Array, pillar_position: jax.Array, pillar_active: jax.Array
+) -> Breaches:
+    """Count the breaches of each of N pursuers at (N, 3) positions."""
+    to_pillar = pillar_distance(settings, position, pillar_position)
+    near_pillar = pillar_active[None] & (to_pillar < settings.pillar_clearance)
+    near_drone = drone_distance(position) < settings.drone_clearance
+    above = position[:, 2] > settings.arena_height
+    outside = jnp.sum(position[:, :2] ** 2, axis=-1) > settings.arena_radius**2
+    return Breaches(
+        pillar=jnp.sum(near_pillar, axis=-1).astype(jnp.float32),
+        drone=jnp.sum(near_drone, axis=-1).astype(jnp.float32),
+        bounds=above.astype(jnp.float32) + outside.astype(jnp.float32),
+    )
+
+
+def crashed(
+    settings: PursuitSettings,
+    position: jax.Array,
+    body_z_up: jax.Array,
+    pillar_position: jax.Array,
+    pillar_active: jax.Array,
+) -> jax.Array:
+    """(N,) whether each pursuer touches the floor or anything solid, or is tilted beyond 90 degrees.
+
+    `body_z_up` (N,) is the world z component of the body's z axis.
+    """
+    reach = SOLID_RADIUS + TOUCH
+    on_floor = position[:, 2] < reach
+    on_pillar = jnp.any(pillar_active & (pillar_distance(settings, position, pillar_position) < reach), axis=-1)
+    on_drone = jnp.any(drone_distance(position) < 2 * SOLID_RADIUS + TOUCH, axis=-1)
+    return on_floor | on_pillar | on_drone | (body_z_up < 0.0)

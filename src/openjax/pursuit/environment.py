@@ -1,0 +1,206 @@
+"""The environment: reset and step as pure functions of arrays."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from openjax.pursuit.collisions import Breaches, breaches, crashed
+from openjax.pursuit.evader import evader_velocity
+from openjax.pursuit.observation import Observation, frame, observe, rotation_axes
+from openjax.pursuit.reward import captures, over_speed, reward
+from openjax.pursuit.sensing import line_of_sight
+from openjax.pursuit.settings import PursuitSettings
+from openjax.pursuit.statistics import EpisodeStatistics, count, empty_statistics
+from openjax.pursuit.task import Task, start_attitude, uniform_task
+from openjax.vehicle import DroneState, Vehicle, hover_state, load_vehicle, make_drones_step
+
+THRUST_LIMIT = 0.9
+"""The commanded thrust is cut here, as a fraction of the maximum (SPEC section 2)."""
+
+
+@struct.dataclass
+class PursuitState:
+    """State of one world with N pursuers."""
+
+    task: Task
+    drones: DroneState  # leading axis N
+    evader_position: jax.Array  # (3,) m, world
+    evader_velocity: jax.Array  # (3,) m/s, world
+    last_seen: jax.Array  # (3,) where the evader was last seen; the arena's middle before that
+    seen: jax.Array  # () bool, some pursuer sees the evader
+    frames: jax.Array  # (n * spacing, F) history, oldest first
+    previous_action: jax.Array  # (N, 4) squashed command of the last step
+    step: jax.Array  # () int32, control steps since the start
+    statistics: EpisodeStatistics
+
+
+@struct.dataclass
+class StepInfo:
+    """What happened in one step, beside the reward."""
+
+    captured: jax.Array  # (N,) bool
+    seen: jax.Array  # () bool, some pursuer sees the evader
+    breaches: Breaches
+    over_speed: jax.Array  # (N,) bool
+    crashed: jax.Array  # (N,) bool
+
+
+def hover_action(vehicle: Vehicle) -> jax.Array:
+    """(4,) action [thrust, roll, pitch, yaw rate] in -1..1 that hovers."""
+    hover = vehicle.mass * vehicle.gravity / (4 * vehicle.thrust_constant * vehicle.max_rotor_speed**2)
+    return jnp.concatenate([(2.0 * hover - 1.0)[None], jnp.zeros(3, jnp.float32)]).astype(jnp.float32)
+
+
+def action_to_command(action: jax.Array) -> jax.Array:
+    """(..., 4) action in -1..1 to command: collective thrust 0..0.9 of the maximum, body rates up to pi rad/s."""
+    action = jnp.clip(action, -1.0, 1.0)
+    thrust = jnp.minimum(0.5 * (action[..., :1] + 1.0), THRUST_LIMIT)
+    return jnp.concatenate([thrust, jnp.pi * action[..., 1:]], axis=-1)
+
+
+class Pursuit:
+    """Pursuit-evasion by N quadrotors, as pure functions: map them with `jax.vmap`, compile them with `jax.jit`.
+
+    Args:
+        settings: the game; see `PursuitSettings`.
+        vehicle: the pursuers' vehicle; None is the nominal Crazyflie.
+        effects: names of physical effects to fly with (`openjax.vehicle.effects`).
+        effect_parameters: their parameters, {effect: {parameter: value}}.
+    """
+
+    def __init__(
+        self,
+        settings: PursuitSettings | None = None,
+        vehicle: Vehicle | None = None,
+        effects: tuple[str, ...] = (),
+        effect_parameters: dict | None = None,
+    ):
+        self.settings = settings or PursuitSettings()
+        self.vehicle = vehicle if vehicle is not None else load_vehicle()
+        self.effects = tuple(effects)
+        self.effect_parameters = effect_parameters or {}
+        self._drones_step = make_drones_step(
+            physics=self.settings.physics,
+            dt=self.settings.time_step,
+            substeps=self.settings.substeps,
+            effects=self.effects,
+        )
+
+    def reset(self, key: jax.Array) -> tuple[Observation, PursuitState]:
+        """Start an episode of a uniformly drawn task."""
+        task_key, reset_key = jax.random.split(key)
+        return self.reset_to(reset_key, uniform_task(self.settings, task_key))
+
+    def reset_to(self, key: jax.Array, task: Task) -> tuple[Observation, PursuitState]:
+        """Start an episode of `task`; `key` draws the start attitudes."""
+        settings = self.settings
+        quaternion = start_attitude(settings, key)
+        drones = jax.vmap(lambda p, q: hover_state(self.vehicle, p, q))(task.pursuer_position, quaternion)
+        in_sight = line_of_sight(
+            settings, task.pursuer_position, task.evader_position, task.pillar_position, task.pillar_active
+        )
+        seen = jnp.any(in_sight)
+        still = jnp.zeros(3, jnp.float32)
+        step = jnp.zeros((), jnp.int32)
+        middle = jnp.array([0.0, 0.0, settings.arena_height / 2], jnp.float32)
+        first = frame(settings, step, task.pursuer_position, task.evader_position, still, seen)
+        frames = jnp.broadcast_to(first, (settings.history_length * settings.history_spacing, settings.frame_size))
+        state = PursuitState(
+            task=task,
+            drones=drones,
+            evader_position=task.evader_position,
+            evader_velocity=still,
+            last_seen=jnp.where(seen, task.evader_position, middle),
+            seen=seen,
+            frames=frames,
+            previous_action=jnp.broadcast_to(hover_action(self.vehicle), (settings.num_pursuers, 4)),
+            step=step,
+            statistics=empty_statistics(settings.episode_length),
+        )
+        return self.observe(state), state
+
+    def observe(self, state: PursuitState) -> Observation:
+        """The observation of a state."""
+        return observe(
+            self.settings,
+            state.step,
+            state.drones.position,
+            state.drones.quaternion,
+            state.drones.velocity,
+            state.evader_position,
+            state.evader_velocity,
+            state.seen,
+            state.last_seen,
+            state.frames[self.settings.history_spacing - 1 :: self.settings.history_spacing],
+            state.task.pillar_position,
+            state.task.pillar_active,
+        )
+
+    def step(
+        self, key: jax.Array, state: PursuitState, action: jax.Array
+    ) -> tuple[Observation, PursuitState, jax.Array, jax.Array, jax.Array, StepInfo]:
+        """One control step.
+
+        Args:
+            key: drives random effects (unused by the nominal game).
+            state: of this step's start.
+            action: (N, 4) in -1..1: collective thrust, roll, pitch and yaw rate; see `action_to_command`.
+
+        Returns:
+            observation, state, reward (N,), terminated (), truncated (), info.
+        """
+        del key
+        settings, task = self.settings, state.task
+        action = jnp.clip(action.astype(jnp.float32), -1.0, 1.0)
+        pillars = (task.pillar_position, task.pillar_active)
+
+        position = state.drones.position
+        in_sight = line_of_sight(settings, position, state.evader_position, *pillars)
+        velocity = evader_velocity(settings, state.evader_position, position, in_sight, *pillars)
+        evader = state.evader_position + settings.time_step * velocity
+
+        drones = self._drones_step(
+            self.vehicle, state.drones, action_to_command(action), *pillars, self.effect_parameters
+        )
+        if settings.speed_limit == "clamp":
+            speed = jnp.sqrt(jnp.sum(drones.velocity**2, axis=-1, keepdims=True) + 1e-12)
+            drones = drones.replace(velocity=drones.velocity * jnp.minimum(1.0, settings.max_speed / speed))
+
+        step = state.step + 1
+        position = drones.position
+        in_sight = line_of_sight(settings, position, evader, *pillars)
+        seen = jnp.any(in_sight)
+        captured = captures(settings, position, evader, in_sight)
+        breach = breaches(settings, position, *pillars)
+        too_fast = over_speed(settings, drones.velocity)
+        body_z_up = rotation_axes(drones.quaternion)[1][:, 2]
+        crash = crashed(settings, position, body_z_up, *pillars)
+        distance = jnp.sqrt(jnp.sum((position - evader) ** 2, axis=-1) + 1e-12)
+        rewards = reward(settings, captured, distance, breach, too_fast, action, state.previous_action)
+
+        newest = frame(settings, step, position, evader, velocity, seen)
+        state = PursuitState(
+            task=task,
+            drones=drones,
+            evader_position=evader,
+            evader_velocity=velocity,
+            last_seen=jnp.where(seen, evader, state.last_seen),
+            seen=seen,
+            frames=jnp.concatenate([state.frames[1:], newest[None]]),
+            previous_action=action,
+            step=step,
+            statistics=count(state.statistics, step, captured, breach, too_fast, crash, rewards),
+        )
+        over = step >= settings.episode_length
+        never = jnp.zeros((), bool)
+        # an observed horizon is part of the task, so its end is terminal; an unobserved one only cuts the episode
+        terminated, truncated = (over, never) if settings.observe_time else (never, over)
+        info = StepInfo(captured=captured, seen=seen, breaches=breach, over_speed=too_fast, crashed=crash)
+        return self.observe(state), state, rewards, terminated, truncated, info
+
+
+def make(settings: PursuitSettings | None = None, **changes) -> Pursuit:
+    """An environment. `changes` are fields of `PursuitSettings`: `make(num_pursuers=4, speed_limit="none")`."""
+    return Pursuit(dataclasses.replace(settings or PursuitSettings(), **changes))

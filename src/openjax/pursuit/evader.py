@@ -1,0 +1,52 @@
+"""The evader: a potential field that flees pursuers in sight, pillars and the arena's bounds."""
+
+import jax
+import jax.numpy as jnp
+
+from openjax.pursuit.settings import PursuitSettings
+
+EPSILON = 1e-5
+INWARD = 1e5
+"""Push back where the evader is outside the arena or inside a pillar."""
+
+
+def evader_velocity(
+    settings: PursuitSettings,
+    evader: jax.Array,
+    pursuers: jax.Array,
+    in_sight: jax.Array,
+    pillar_position: jax.Array,
+    pillar_active: jax.Array,
+) -> jax.Array:
+    """(3,) velocity (m/s, world) of the evader at (3,), memoryless, of constant speed (SPEC section 3).
+
+    `pursuers` (N, 3) repel as 1/distance where `in_sight` (N,); bounds and pillars as 1/distance to their surface.
+    """
+    away = evader - pursuers
+    force = jnp.sum(jnp.where(in_sight[:, None], away / (_norm_squared(away) + EPSILON), 0.0), axis=0)
+
+    radius = jnp.sqrt(_norm_squared(evader[:2])[0] + 1e-12)
+    outward = evader[:2] / radius
+    to_wall = settings.arena_radius - radius
+    wall = -outward * jnp.where(to_wall > 0.0, 1.0 / (jnp.maximum(to_wall, 0.0) + EPSILON), INWARD)
+
+    to_ceiling = settings.arena_height - evader[2]
+    ceiling = jnp.where(to_ceiling > 0.0, 1.0 / (jnp.maximum(to_ceiling, 0.0) + EPSILON), INWARD)
+    floor = jnp.where(evader[2] > 0.0, 1.0 / (jnp.maximum(evader[2], 0.0) + EPSILON), INWARD)
+
+    from_pillar = evader[None, :2] - pillar_position
+    distance = jnp.sqrt(_norm_squared(from_pillar) + 1e-12)
+    to_surface = distance - settings.pillar_radius
+    strength = jnp.where(to_surface > 0.0, 1.0 / (jnp.maximum(to_surface, 0.0) + EPSILON), INWARD)
+    pillars = jnp.sum(jnp.where(pillar_active[:, None], from_pillar / distance * strength, 0.0), axis=0)
+
+    force = force + jnp.concatenate([wall + pillars, (floor - ceiling)[None]])
+    if settings.evader_norm == "axis":
+        size = jnp.max(jnp.abs(force))
+    else:
+        size = jnp.sqrt(jnp.sum(force**2) + 1e-12)
+    return settings.evader_speed * force / (size + EPSILON)
+
+
+def _norm_squared(vector: jax.Array) -> jax.Array:
+    return jnp.sum(vector**2, axis=-1, keepdims=True)

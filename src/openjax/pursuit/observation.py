@@ -1,0 +1,123 @@
+"""What each pursuer observes, and what the critic may see beside it (SPEC section 4)."""
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from openjax.pursuit.collisions import pillar_distance
+from openjax.pursuit.settings import HIDDEN, PursuitSettings
+
+
+@struct.dataclass
+class Observation:
+    """Observation of N pursuers. Relative positions point from the entity to the pursuer (p_i - p_entity), in metres."""
+
+    self_state: jax.Array  # (N, S) evader, quaternion wxyz, velocity, body x axis, body z axis, t/T x 4 [, position]
+    others: jax.Array  # (N, N - 1, 3) the other pursuers
+    pillars: jax.Array  # (N, k, 5) nearest pillars: position relative to their centre (3), height, radius
+    pillar_seen: jax.Array  # (N, k) bool, slots in use
+    privileged: jax.Array  # (N, 10) true relative evader position, its velocity, own position, seen: for the critic
+    position: jax.Array  # (N, 3) own positions, to express predicted positions relative to them
+    last_seen: jax.Array  # (3,) where the evader was last seen
+    frames: jax.Array  # (n, F) history for the predictor, oldest first
+
+
+def rotation_axes(quaternion: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Body x and z axes in the world, (..., 3) each, of (..., 4) unit quaternions wxyz."""
+    w, x, y, z = jnp.moveaxis(quaternion, -1, 0)
+    body_x = jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=-1)
+    body_z = jnp.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=-1)
+    return body_x, body_z
+
+
+def frame(
+    settings: PursuitSettings,
+    step: jax.Array,
+    pursuers: jax.Array,
+    evader: jax.Array,
+    velocity: jax.Array,
+    seen: jax.Array,
+) -> jax.Array:
+    """(F,) one frame of the predictor's history: t/T, evader position and velocity (-5 where unseen), pursuers."""
+    time = step.astype(jnp.float32)[None] / settings.episode_length
+    evader = jnp.where(seen, jnp.concatenate([evader, velocity]), HIDDEN)
+    return jnp.concatenate([time, evader, pursuers.ravel()])
+
+
+def observe(
+    settings: PursuitSettings,
+    step: jax.Array,
+    position: jax.Array,
+    quaternion: jax.Array,
+    velocity: jax.Array,
+    evader: jax.Array,
+    evader_velocity: jax.Array,
+    seen: jax.Array,
+    last_seen: jax.Array,
+    frames: jax.Array,
+    pillar_position: jax.Array,
+    pillar_active: jax.Array,
+) -> Observation:
+    """Build the observation of all N pursuers; the evader seen by one (`seen`, ()) is seen by all."""
+    n = settings.num_pursuers
+    to_evader = position - evader
+    body_x, body_z = rotation_axes(quaternion)
+    parts = [jnp.where(seen, to_evader, HIDDEN), quaternion, velocity, body_x, body_z]
+    if settings.observe_time:
+        parts.append(jnp.broadcast_to(step.astype(jnp.float32) / settings.episode_length, (n, 4)))
+    if settings.observe_position:
+        parts.append(position)
+
+    index = jnp.array([[j for j in range(n) if j != i] for i in range(n)], jnp.int32).reshape(n, n - 1)
+    others = position[:, None] - position[index]
+
+    pillars, pillar_seen = _nearest_pillars(settings, position, pillar_position, pillar_active)
+    privileged = jnp.concatenate(
+        [
+            to_evader,
+            jnp.broadcast_to(evader_velocity, (n, 3)),
+            position,
+            jnp.broadcast_to(seen.astype(jnp.float32), (n, 1)),
+        ],
+        axis=-1,
+    )
+    return Observation(
+        self_state=jnp.concatenate(parts, axis=-1),
+        others=others,
+        pillars=pillars,
+        pillar_seen=pillar_seen,
+        privileged=privileged,
+        position=position,
+        last_seen=last_seen,
+        frames=frames,
+    )
+
+
+def _nearest_pillars(settings, position, pillar_position, pillar_active):
+    """The k nearest active pillars of each pursuer: (N, k, 5) features, -5 in unused slots, and (N, k) in use."""
+    n, k = settings.num_pursuers, settings.observed_pillars
+    slots = pillar_position.shape[0]
+    if slots < k:
+        pillar_position = jnp.concatenate([pillar_position, jnp.zeros((k - slots, 2), jnp.float32)])
+        pillar_active = jnp.concatenate([pillar_active, jnp.zeros(k - slots, bool)])
+    distance = pillar_distance(settings, position, pillar_position)
+    distance = jnp.where(pillar_active[None], distance, jnp.inf)
+    # rank by counting nearer ones: for a handful of pillars much cheaper on an accelerator than a sort
+    earlier = jnp.arange(distance.shape[1])[:, None] < jnp.arange(distance.shape[1])[None]
+    nearer = (distance[:, :, None] < distance[:, None, :]) | (
+        (distance[:, :, None] == distance[:, None, :]) & earlier[None]
+    )
+    rank = jnp.sum(nearer, axis=1)
+    slot = (rank[:, None, :] == jnp.arange(k)[None, :, None]).astype(jnp.float32)
+    axis = jnp.sum(slot[..., None] * pillar_position[None, None], axis=2)
+    seen = jnp.sum(slot * pillar_active[None, None], axis=2) > 0.5
+    features = jnp.concatenate(
+        [
+            position[:, None, :2] - axis,
+            jnp.broadcast_to(position[:, None, 2:] - settings.arena_height / 2, (n, k, 1)),
+            jnp.full((n, k, 1), settings.arena_height, jnp.float32),
+            jnp.full((n, k, 1), settings.pillar_radius, jnp.float32),
+        ],
+        axis=-1,
+    )
+    return jnp.where(seen[..., None], features, HIDDEN), seen

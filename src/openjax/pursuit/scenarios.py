@@ -1,0 +1,165 @@
+"""The six test layouts, and a user's own as a TOML file."""
+
+import dataclasses
+import tomllib
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from openjax.errors import UserError
+from openjax.pursuit.settings import SOLID_RADIUS, PursuitSettings
+from openjax.pursuit.task import Task
+
+FLIGHT_HEIGHT = 0.5
+"""All vehicles of the six layouts start at this height (m)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Scenario:
+    """A named layout; positions in metres, world frame."""
+
+    name: str
+    pillars: tuple[tuple[float, float], ...]
+    pursuers: tuple[tuple[float, float, float], ...]
+    evader: tuple[float, float, float]
+
+
+def _layout(name, pillars, pursuers, evader):
+    def lift(xy):
+        return (*xy, FLIGHT_HEIGHT)
+
+    return Scenario(name, tuple(pillars), tuple(lift(xy) for xy in pursuers), lift(evader))
+
+
+_RIGHT = ((0.6, 0.0), (0.8, 0.0), (0.8, -0.2))
+
+# The first five are the released code's; in "hidden" nobody sees the evader at the start (SPEC section 6).
+SCENARIOS: dict[str, Scenario] = {
+    layout.name: layout
+    for layout in (
+        _layout(
+            "wall",
+            ((0.0, 0.15), (0.0, -0.15), (0.0, 0.45), (0.0, -0.45)),
+            ((0.6, 0.4), (0.6, 0.0), (0.6, -0.4)),
+            (-0.8, 0.0),
+        ),
+        _layout(
+            "narrow_gap",
+            ((0.3, 0.3), (0.3, -0.3), (-0.3, 0.3), (-0.3, -0.3), (0.0, 0.3)),
+            ((0.0, 0.7), (0.2, 0.7), (-0.2, 0.7)),
+            (-0.5, 0.2),
+        ),
+        _layout(
+            "random",
+            ((0.6, 0.4), (-0.6, 0.4), (-0.2, 0.4), (0.0, 0.2), (-0.2, -0.4), (0.0, -0.2)),
+            ((0.6, 0.0), (0.8, 0.0), (0.8, -0.2)),
+            (-0.8, 0.0),
+        ),
+        _layout(
+            "passage",
+            ((0.0, 0.3), (0.2, 0.3), (-0.2, 0.3), (0.0, -0.2), (0.2, -0.2), (-0.2, -0.2)),
+            ((0.6, 0.0), (0.8, 0.2), (0.8, -0.2)),
+            (0.0, 0.6),
+        ),
+        _layout("empty", (), _RIGHT, (-0.8, 0.0)),
+        _layout("hidden", ((0.0, 0.0), (0.0, 0.2), (0.0, -0.2), (-0.4, 0.4), (-0.4, -0.4)), _RIGHT, (-0.8, 0.0)),
+    )
+}
+
+
+def scenario_settings(settings: PursuitSettings, scenario: Scenario) -> PursuitSettings:
+    """The settings with as many pursuers and pillar slots as the scenario has (at least one slot)."""
+    slots = max(1, len(scenario.pillars))
+    return dataclasses.replace(
+        settings, num_pursuers=len(scenario.pursuers), max_pillars=slots, min_pillars=min(settings.min_pillars, slots)
+    )
+
+
+def scenario_task(settings: PursuitSettings, scenario: Scenario) -> Task:
+    """The scenario as a task with `settings.max_pillars` slots."""
+    slots, used = settings.max_pillars, len(scenario.pillars)
+    if used > slots:
+        raise UserError(f"scenario {scenario.name}: {used} pillars do not fit into {slots} slots (max_pillars)")
+    if len(scenario.pursuers) != settings.num_pursuers:
+        raise UserError(
+            f"scenario {scenario.name}: has {len(scenario.pursuers)} pursuers, the environment {settings.num_pursuers}"
+        )
+    pillars = np.zeros((slots, 2), np.float32)
+    pillars[:used] = np.asarray(scenario.pillars, np.float32).reshape(used, 2)
+    return Task(
+        pursuer_position=jnp.asarray(scenario.pursuers, jnp.float32),
+        evader_position=jnp.asarray(scenario.evader, jnp.float32),
+        pillar_position=jnp.asarray(pillars),
+        pillar_active=jnp.arange(slots) < used,
+    )
+
+
+def find_scenario(name_or_path: str, settings: PursuitSettings) -> Scenario:
+    """A scenario by its name, or read from a TOML file.
+
+    The file holds `pillars` (list of [x, y]), `pursuers` (list of [x, y, z]) and `evader` ([x, y, z]), in metres, and
+    optionally a `name`.
+
+    Raises:
+        UserError: no such name or file, a wrong entry, a pillar outside the arena or over a start, a start outside.
+    """
+    if name_or_path in SCENARIOS:
+        return SCENARIOS[name_or_path]
+    path = Path(name_or_path)
+    if path.suffix != ".toml":
+        raise UserError(f"scenario {name_or_path}: not one of {', '.join(SCENARIOS)} and not a .toml file")
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"scenario {path}: can't be read ({error})") from error
+    except tomllib.TOMLDecodeError as error:
+        raise UserError(f"scenario {path}: is not valid TOML ({error})") from error
+    unknown = sorted(set(data) - {"name", "pillars", "pursuers", "evader"})
+    if unknown:
+        raise UserError(f"scenario {path}: unknown key {unknown[0]}; possible are name, pillars, pursuers, evader")
+    scenario = Scenario(
+        name=str(data.get("name", path.stem)),
+        pillars=_points(path, data, "pillars", 2, ()),
+        pursuers=_points(path, data, "pursuers", 3, None),
+        evader=_points(path, {"evader": [data.get("evader")]}, "evader", 3, None)[0],
+    )
+    _check(path, scenario, settings)
+    return scenario
+
+
+def _points(path, data, key, size, default):
+    values = data.get(key, default)
+    if values is None:
+        raise UserError(f"scenario {path}: {key} is missing; it lists points of {size} numbers in metres")
+    points = []
+    for value in values:
+        good = isinstance(value, list) and len(value) == size
+        good = good and all(isinstance(x, int | float) and not isinstance(x, bool) and np.isfinite(x) for x in value)
+        if not good:
+            raise UserError(f"scenario {path}: {key} holds {value}; a point is {size} numbers in metres")
+        points.append(tuple(float(x) for x in value))
+    return tuple(points)
+
+
+def _check(path, scenario, settings):
+    if not 1 <= len(scenario.pursuers) <= 8:
+        raise UserError(f"scenario {path}: has {len(scenario.pursuers)} pursuers; 1 to 8 are possible")
+    radius, height = settings.arena_radius, settings.arena_height
+    for x, y in scenario.pillars:
+        if np.hypot(x, y) > radius:
+            raise UserError(f"scenario {path}: pillar ({x}, {y}) stands outside the arena of radius {radius} m")
+    starts = {f"pursuer {i + 1}": p for i, p in enumerate(scenario.pursuers)} | {"the evader": scenario.evader}
+    for who, (x, y, z) in starts.items():
+        if np.hypot(x, y) > radius or not 0.0 < z < height:
+            raise UserError(
+                f"scenario {path}: {who} starts at ({x}, {y}, {z}), outside the arena of {radius} m by {height} m"
+            )
+        for px, py in scenario.pillars:
+            reach = settings.pillar_radius + SOLID_RADIUS
+            if np.hypot(x - px, y - py) < reach:
+                raise UserError(f"scenario {path}: pillar ({px}, {py}) stands over the start of {who} (within {reach} m)")
+    for i, a in enumerate(scenario.pursuers):
+        for b in scenario.pursuers[:i]:
+            if np.linalg.norm(np.subtract(a, b)) < 2 * SOLID_RADIUS:
+                raise UserError(f"scenario {path}: two pursuers start inside each other at {a} and {b}")

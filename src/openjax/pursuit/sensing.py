@@ -1,0 +1,28 @@
+"""Who sees the evader: line of sight past the pillars, shared by the team."""
+
+import jax
+import jax.numpy as jnp
+
+from openjax.pursuit.settings import PursuitSettings
+
+
+def line_of_sight(
+    settings: PursuitSettings,
+    position: jax.Array,
+    target: jax.Array,
+    pillar_position: jax.Array,
+    pillar_active: jax.Array,
+) -> jax.Array:
+    """(N,) whether the segment from each (N, 3) position to the (3,) target is clear of pillars, seen from above.
+
+    A pillar blocks it if its axis is closer to the segment than its radius and the foot point lies on the segment.
+    """
+    start = position[:, None, :2]
+    segment = target[None, None, :2] - start
+    to_axis = pillar_position[None] - start
+    length_squared = jnp.sum(segment**2, axis=-1)
+    along = jnp.sum(to_axis * segment, axis=-1) / jnp.maximum(length_squared, 1e-12)
+    across = to_axis - along[..., None] * segment
+    near = jnp.sum(across**2, axis=-1) < settings.pillar_radius**2
+    blocked = pillar_active[None] & near & (along >= 0.0) & (along <= 1.0)
+    return ~jnp.any(blocked, axis=-1)

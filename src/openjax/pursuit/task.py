@@ -1,0 +1,142 @@
+"""Tasks: where pursuers, evader and pillars start (the paper's task parameter w)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from openjax.pursuit.collisions import breaches
+from openjax.pursuit.settings import PursuitSettings
+
+START_X = (0.1, 0.536)
+"""Uniform tasks: pursuers start at x in this range, the evader at the mirrored one (m)."""
+START_Y = 0.536
+START_Z = 0.1
+"""Uniform tasks: |z - H/2| at the start at most (m)."""
+PILLAR_GRID = 0.2
+PILLAR_REACH = 0.8
+"""Pillars of uniform tasks stand on cells of this grid whose centre is closer to the axis than this (m)."""
+EXPANSION = 0.1
+"""Local expansion moves each vehicle by up to this along each axis (m): the paper's delta."""
+CANDIDATES = 8
+"""Draws of a start among which the first good one is taken."""
+
+
+@struct.dataclass
+class Task:
+    """One task of N pursuers and P pillar slots."""
+
+    pursuer_position: jax.Array  # (N, 3) m, world
+    evader_position: jax.Array  # (3,) m, world
+    pillar_position: jax.Array  # (P, 2) m, axis of each pillar
+    pillar_active: jax.Array  # (P,) bool, slots in use
+
+
+def starts_clear(settings: PursuitSettings, task: Task) -> jax.Array:
+    """Whether no pursuer starts in a breach and the evader starts outside all pillars. () bool."""
+    breach = breaches(settings, task.pursuer_position, task.pillar_position, task.pillar_active)
+    distance = jnp.linalg.norm(task.evader_position[:2] - task.pillar_position, axis=-1)
+    evader_blocked = jnp.any(task.pillar_active & (distance < settings.pillar_radius + settings.pillar_clearance))
+    return ~(jnp.any(breach.total > 0) | evader_blocked)
+
+
+def pillar_cells() -> np.ndarray:
+    """(cells, 2) centres of the grid cells on which a uniform task may put a pillar (m)."""
+    steps = np.arange(-4, 5) * PILLAR_GRID
+    x, y = np.meshgrid(steps, steps, indexing="ij")
+    cells = np.stack([x.ravel(), y.ravel()], axis=-1)
+    return cells[np.linalg.norm(cells, axis=-1) < PILLAR_REACH - 1e-6]
+
+
+def uniform_task(settings: PursuitSettings, key: jax.Array) -> Task:
+    """Draw a task uniformly: the paper's global exploration.
+
+    Pursuers on one side, the evader on the other, pillars on distinct free cells of a grid (SPEC section 6). Among a
+    few draws of the pursuers' starts the first without a breach is taken; cells too close to a start stay free.
+    """
+    n = settings.num_pursuers
+    position_key, evader_key, number_key, cell_key = jax.random.split(key, 4)
+    middle = settings.arena_height / 2
+    low = jnp.array([START_X[0], -START_Y, middle - START_Z], jnp.float32)
+    high = jnp.array([START_X[1], START_Y, middle + START_Z], jnp.float32)
+    candidates = jax.random.uniform(position_key, (CANDIDATES, n, 3), jnp.float32, low, high)
+    apart = jax.vmap(lambda p: _closest_pair(p) >= settings.drone_clearance)(candidates)
+    pursuers = candidates[jnp.argmax(apart)]
+    mirrored = jnp.array([-1.0, 1.0, 1.0], jnp.float32)
+    evader = jax.random.uniform(evader_key, (3,), jnp.float32, low, high) * mirrored
+
+    cells = jnp.asarray(pillar_cells(), jnp.float32)
+    vehicles = jnp.concatenate([pursuers, evader[None]])[:, :2]
+    distance = jnp.linalg.norm(cells[:, None] - vehicles[None], axis=-1)
+    own_cell = jnp.all(jnp.abs(cells[:, None] - vehicles[None]) <= PILLAR_GRID / 2, axis=-1)
+    clear = settings.pillar_radius + settings.pillar_clearance
+    free = ~jnp.any(own_cell | (distance < clear), axis=-1)
+    rank = jnp.where(free, jax.random.uniform(cell_key, (cells.shape[0],)), -1.0)
+    chosen = jax.lax.top_k(rank, settings.max_pillars)[1]
+    number = jax.random.randint(number_key, (), settings.min_pillars, settings.max_pillars + 1)
+    active = (jnp.arange(settings.max_pillars) < number) & free[chosen]
+    return Task(
+        pursuer_position=pursuers,
+        evader_position=evader,
+        pillar_position=jnp.where(active[:, None], cells[chosen], 0.0),
+        pillar_active=active,
+    )
+
+
+def expand_task(settings: PursuitSettings, key: jax.Array, task: Task) -> Task:
+    """Move every vehicle of a task a little and keep its pillars: the paper's local expansion.
+
+    Starts stay within 0.1 m of the arena's wall and of half its height. Among a few draws the first that starts
+    clear is taken, else the task itself.
+    """
+
+    def draw(key):
+        pursuer_key, evader_key = jax.random.split(key)
+
+        def move(key, position):
+            moved = position + jax.random.uniform(key, position.shape, jnp.float32, -EXPANSION, EXPANSION)
+            radius = jnp.linalg.norm(moved[..., :2], axis=-1, keepdims=True)
+            reach = settings.arena_radius - 0.1
+            xy = moved[..., :2] * jnp.minimum(1.0, reach / jnp.maximum(radius, 1e-6))
+            middle = settings.arena_height / 2
+            z = jnp.clip(moved[..., 2:], middle - START_Z, middle + START_Z)
+            return jnp.concatenate([xy, z], axis=-1)
+
+        return task.replace(
+            pursuer_position=move(pursuer_key, task.pursuer_position),
+            evader_position=move(evader_key, task.evader_position),
+        )
+
+    candidates = jax.vmap(draw)(jax.random.split(key, CANDIDATES))
+    clear = jax.vmap(lambda candidate: starts_clear(settings, candidate))(candidates)
+    first = jnp.argmax(clear)
+    return jax.tree.map(lambda drawn, seed: jnp.where(jnp.any(clear), drawn[first], seed), candidates, task)
+
+
+def start_attitude(settings: PursuitSettings, key: jax.Array) -> jax.Array:
+    """(N, 4) start quaternions wxyz: roll and pitch within 36 degrees, yaw in 0 to 36 degrees; or all level."""
+    n = settings.num_pursuers
+    if settings.start_attitude == "level":
+        return jnp.broadcast_to(jnp.array([1.0, 0.0, 0.0, 0.0], jnp.float32), (n, 4))
+    limit = 0.2 * np.pi
+    half = 0.5 * jax.random.uniform(
+        key, (n, 3), jnp.float32, jnp.array([-limit, -limit, 0.0], jnp.float32), jnp.float32(limit)
+    )
+    cr, cp, cy = jnp.cos(half).T
+    sr, sp, sy = jnp.sin(half).T
+    return jnp.stack(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ],
+        axis=-1,
+    )
+
+
+def _closest_pair(position: jax.Array) -> jax.Array:
+    """Smallest distance (m) between two of (N, 3) positions; infinite for one."""
+    n = position.shape[0]
+    distance = jnp.linalg.norm(position[:, None] - position[None] + 1e-12, axis=-1)
+    return jnp.min(jnp.where(jnp.eye(n, dtype=bool), jnp.inf, distance))
