@@ -63,7 +63,8 @@ def abstract_carry(init, shardings: Any = None) -> Any:
 
 
 def save_state(path: Path, carry: Any, notes: dict | None = None) -> None:
-    """Write one carry to the directory `path`; it appears whole or not at all."""
+    """Write one carry to the directory `path`, in place of what is there; it appears whole or not at all."""
+    shutil.rmtree(path, ignore_errors=True)
     _start_save(Path(path), carry, notes or {}).result()
 
 
@@ -106,8 +107,7 @@ def load_arrays(path: Path, prefix: str = "") -> dict[str, np.ndarray]:
 
 def is_checkpoint(path: Path) -> bool:
     """True for a committed checkpoint; half-written ones carry another name until they are whole."""
-    path = Path(path)
-    return path.is_dir() and bool(orbax.is_orbax_checkpoint(path.absolute()))
+    return _metadata(Path(path)) is not None
 
 
 class Checkpoints:
@@ -122,11 +122,9 @@ class Checkpoints:
         """Committed checkpoints, oldest first."""
         found = []
         for path in sorted(self.directory.glob("[0-9]" * _DIGITS)):
-            try:
-                notes = dict(orbax.metadata(path).custom_metadata or {}) if is_checkpoint(path) else None
-            except Exception:  # a damaged directory is no checkpoint, whatever orbax makes of it
-                notes = None
-            if notes is not None:
+            metadata = _metadata(path)
+            if metadata is not None:
+                notes = dict(metadata.custom_metadata or {})
                 found.append(CheckpointRecord(path, int(path.name), notes.pop("score", None), notes))
         return found
 
@@ -187,6 +185,16 @@ class Checkpoints:
         for path in self.directory.iterdir():
             if path.is_dir() and "tmp" in path.name:
                 shutil.rmtree(path, ignore_errors=True)
+
+
+def _metadata(path):
+    """Orbax's metadata of a committed checkpoint, else None."""
+    if not path.is_dir():
+        return None
+    try:
+        return orbax.metadata(path.absolute())
+    except Exception:  # whatever orbax and tensorstore make of a foreign or damaged directory: it's none
+        return None
 
 
 def _default_sharding():

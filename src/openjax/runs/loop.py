@@ -1,0 +1,206 @@
+"""The host's side of training: the compiled step, log, evaluate, checkpoint, stop when asked or at a NaN.
+
+Works on any carry; it knows nothing of what is trained.
+"""
+
+import dataclasses
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from openjax.runs.checkpoints import Checkpoints, named_leaves, save_state
+from openjax.runs.metrics import MetricsWriter
+from openjax.runs.progress import Progress
+from openjax.runs.settings_files import write_json
+
+NOT_FINITE = "not_finite"
+
+
+class NotFiniteError(Exception):
+    """A NaN appeared; the message is one line that says where and what is left to look at."""
+
+
+class _Broken(Exception):
+    """Update, names of the leaves that hold a NaN, metrics of that update."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """What a run is to do."""
+
+    total_updates: int
+    steps_per_update: int
+    """Environment steps of one update."""
+    evaluation_interval: int
+    """Updates between evaluations on the held-back tasks; each writes a checkpoint."""
+    checkpoint_seconds: float = 60.0
+    """Longest time without a checkpoint."""
+    time_limit: float = float("inf")
+    """Seconds of training time (compilation included) after which to stop."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """How a run ended."""
+
+    carry: Any
+    update: int
+    seconds: float
+    stopped_by: str | None
+    """None: all updates are done; else the signal or limit that ended it."""
+
+
+class StopRequest:
+    """SIGINT and SIGTERM ask to stop after the present update; a second SIGINT interrupts at once."""
+
+    def __init__(self):
+        self.name: str | None = None
+        self._previous = {}
+
+    def __enter__(self):
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._previous[number] = signal.signal(number, self._ask)
+        return self
+
+    def __exit__(self, *_):
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _ask(self, number, frame):
+        self.name = signal.Signals(number).name
+        signal.signal(signal.SIGINT, self._previous[signal.SIGINT])
+
+
+def guarded(step: Callable[[Any], tuple[Any, dict]]) -> Callable:
+    """`step` compiled, with its carry donated, and a check of the result for NaN in the same program.
+
+    Args:
+      step: pure function carry -> (carry, metrics by name).
+
+    Returns:
+      carry -> (carry, metrics, (L,) bool: which of the leaves of `float_leaves(carry)` hold a NaN).
+      Infinities are left alone: they're legitimate as bounds.
+    """
+
+    def checked(carry):
+        carry, metrics = step(carry)
+        broken = [jnp.any(jnp.isnan(leaf)) for leaf in float_leaves(carry).values()]
+        return carry, metrics, jnp.stack(broken) if broken else jnp.zeros((0,), bool)
+
+    return jax.jit(checked, donate_argnums=0)
+
+
+def float_leaves(carry: Any) -> dict[str, jax.Array]:
+    """The floating-point leaves of a carry by path."""
+    return {
+        name: leaf for name, leaf in named_leaves(carry).items() if jnp.issubdtype(leaf.dtype, jnp.floating)
+    }
+
+
+def run_updates(
+    step: Callable,
+    carry: Any,
+    plan: Plan,
+    *,
+    checkpoints: Checkpoints,
+    metrics: MetricsWriter,
+    progress: Progress,
+    directory: Path,
+    stop: StopRequest,
+    evaluate: Callable[[Any], tuple[float, dict[str, float]]] | None = None,
+    first_update: int = 0,
+    seconds: float = 0.0,
+) -> Outcome:
+    """Train until the plan is done, a time limit, a signal or a NaN.
+
+    Args:
+      step: from `guarded`.
+      carry: its leaves are donated.
+      plan: how long, how often.
+      checkpoints, metrics, progress: where to save, log and show.
+      directory: the run's directory; the state with a NaN is left in `not_finite` there.
+      stop: asks for an early end.
+      evaluate: carry -> (score, metrics) on the held-back tasks; must not touch the carry.
+      first_update: updates done before (a resumed run).
+      seconds: training time spent before.
+
+    Raises:
+      NotFiniteError: a leaf of the carry holds a NaN.
+    """
+    started = saved_at = time.monotonic()
+    update, pending, best = first_update, None, checkpoints.best()
+    best_score = best.score if best else -float("inf")
+    # On an accelerator the next update is started before the last one's metrics are read, so that it never
+    # waits for the host; on a CPU nothing is gained, and a NaN stops the run one update sooner.
+    lag = 0 if jax.devices()[0].platform == "cpu" else 1
+    names = list(float_leaves(carry))
+
+    def elapsed():
+        return seconds + time.monotonic() - started
+
+    def finish(entry):
+        at, values, broken = entry
+        broken = np.asarray(broken)
+        values = {name: float(value) for name, value in jax.device_get(values).items()}
+        metrics.write("train", at, at * plan.steps_per_update, elapsed(), values)
+        if broken.any():
+            raise _Broken(at, [name for name, bad in zip(names, broken, strict=True) if bad], values)
+        progress.update(at * plan.steps_per_update, values)
+
+    def stop_reason():
+        if stop.name is not None:
+            return stop.name
+        return "the time limit" if elapsed() >= plan.time_limit else None
+
+    reason = stop_reason()
+    try:
+        while update < plan.total_updates and reason is None:
+            carry, values, broken = step(carry)
+            update += 1
+            if pending is not None:
+                finish(pending)
+            pending = (update, values, broken)
+            due = update % plan.evaluation_interval == 0 or update == plan.total_updates
+            reason = stop_reason()
+            late = time.monotonic() - saved_at > plan.checkpoint_seconds
+            if lag == 0 or due or late or reason:
+                finish(pending)
+                pending = None
+            score = None
+            if due and evaluate is not None:
+                score, held_back = evaluate(carry)
+                metrics.write("evaluation", update, update * plan.steps_per_update, elapsed(), held_back)
+                progress.held_back(held_back, is_best=score >= best_score)
+                best_score = max(score, best_score)
+            if due or late:
+                checkpoints.save(update, carry, score, {"seconds": elapsed()})
+                saved_at = time.monotonic()
+    except _Broken as broken:
+        raise _leave_broken_state(directory, carry, checkpoints, *broken.args) from None
+    checkpoints.save(update, carry, None, {"seconds": elapsed()})  # does nothing where it's saved already
+    checkpoints.wait()
+    return Outcome(carry, update, elapsed(), reason if update < plan.total_updates else None)
+
+
+def _leave_broken_state(directory, carry, checkpoints, update, leaves, values):
+    checkpoints.wait()
+    place = Path(directory) / NOT_FINITE
+    save_state(place / f"{update:09d}", carry, {"update": update})
+    write_json(
+        place / "report.json",
+        {
+            "update": update,
+            "leaves": leaves,
+            "metrics": {name: value if np.isfinite(value) else str(value) for name, value in values.items()},
+        },
+    )
+    latest = checkpoints.latest()
+    good = f"the last good checkpoint is {latest.path}" if latest else "there is no checkpoint yet"
+    shown = ", ".join(leaves[:3]) + (f" and {len(leaves) - 3} more" if len(leaves) > 3 else "")
+    return NotFiniteError(f"NaN in update {update} in {shown}; the state is in {place}, {good}")

@@ -1,0 +1,118 @@
+"""Settings, metrics, policies and pictures on disk."""
+
+import dataclasses
+import pickle
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+from openjax.errors import UserError
+from openjax.runs.metrics import MetricsWriter, read_metrics
+from openjax.runs.plots import plot_training, plot_trajectories
+from openjax.runs.policy_files import fill, load_policy_file, save_policy_file
+from openjax.runs.settings_files import from_plain, to_plain
+from openjax.runs.trajectory import Trajectory
+from openjax.runs.videos import animate
+
+
+@dataclasses.dataclass(frozen=True)
+class Inner:
+    kind: Literal["a", "b"] = "a"
+    sizes: tuple[int, ...] = (1, 2)
+    limit: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Outer:
+    inner: Inner = dataclasses.field(default_factory=Inner)
+    rate: float = 0.5
+    count: int = 3
+
+
+def test_settings_round_trip_and_are_strict():
+    settings = Outer(Inner("b", (4,), 2.0), 1.0, 7)
+    assert from_plain(Outer, to_plain(settings)) == settings
+    for wrong, message in (
+        ({"inner": {"kinds": "a"}}, r"settings\.inner has the unknown setting 'kinds'"),
+        ({"inner": {"kind": "c"}}, r"settings\.inner\.kind is 'c'; expected one of 'a', 'b'"),
+        ({"count": 2.5}, r"settings\.count is 2\.5; expected int"),
+    ):
+        with pytest.raises(UserError, match=message):
+            from_plain(Outer, wrong)
+
+
+def test_metrics_survive_a_kill_and_are_cut_to_the_resumed_update(tmp_path):
+    writer = MetricsWriter(tmp_path, tensorboard=False)
+    for update in range(1, 6):
+        writer.write("train", update, update * 10, 0.1, {"loss": float("nan") if update == 2 else update})
+    # No close: the file must already hold everything. Then a write that a kill cut short.
+    with open(tmp_path / "metrics.jsonl", "ab") as file:
+        file.write(b'{"event": "train", "upd')
+    assert [r["loss"] for r in read_metrics(tmp_path / "metrics.jsonl")] == [1, None, 3, 4, 5]
+    MetricsWriter(tmp_path, resumed_update=3, tensorboard=False).write("train", 4, 40, 0.1, {"loss": 40})
+    assert [r["loss"] for r in read_metrics(tmp_path / "metrics.jsonl")] == [1, None, 3, 40]
+
+
+def test_policy_file_round_trip(tmp_path):
+    parameters = {"actor": {"kernel": jnp.linspace(0, 1, 6).reshape(2, 3)}, "count": jnp.int32(3)}
+    path = tmp_path / "policy.npz"
+    save_policy_file(path, parameters, Outer(), {"steps": 5})
+    leaves, settings, notes = load_policy_file(path)
+    restored = fill(parameters, leaves, str(path))
+    np.testing.assert_allclose(restored["actor"]["kernel"], parameters["actor"]["kernel"], atol=5e-4)
+    assert restored["actor"]["kernel"].dtype == jnp.float32 and int(restored["count"]) == 3
+    assert from_plain(Outer, settings) == Outer() and notes == {"steps": 5}
+    with pytest.raises(UserError, match=r"actor/kernel is \[2, 3\] there, its settings make it \[2, 4\]"):
+        fill({"actor": {"kernel": jnp.zeros((2, 4))}}, leaves, str(path))
+
+
+def test_pickle_is_refused_as_a_policy(tmp_path):
+    path = tmp_path / "policy.npz"
+    path.write_bytes(pickle.dumps({"actor": 1}))
+    with pytest.raises(UserError, match="is no policy file"):
+        load_policy_file(path)
+    np.savez(path, **{"openjax.json": np.array([{"a": 1}], dtype=object)})
+    with pytest.raises(UserError, match="is no policy file"):
+        load_policy_file(path)
+
+
+@pytest.fixture(scope="module")
+def trajectory():
+    steps = 40
+    t = np.linspace(0, 1, steps)
+    pursuers = np.stack(
+        [np.stack([0.5 * np.cos(t + i), 0.5 * np.sin(t + i), 0.5 + 0 * t], -1) for i in range(3)], 1
+    )
+    captured = np.zeros((steps, 3), bool)
+    captured[30:, 1] = True
+    level = np.tile([1.0, 0.0, 0.0, 0.0], (steps, 3, 1))
+    pillars = np.array([[0.2, 0.1]])
+    return Trajectory(
+        "wall", pursuers, level, pursuers[:, 0] * 0.5, captured, pillars, 0.9, 1.2, 0.1, 0.3, 0.01
+    )
+
+
+@pytest.mark.parametrize("renderer", ["auto", "matplotlib"])
+def test_animation_is_drawn_without_a_display(tmp_path, trajectory, renderer, monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    animate(tmp_path / "chase.gif", trajectory, renderer)
+    with Image.open(tmp_path / "chase.gif") as image:
+        assert image.n_frames == 5
+
+
+def test_pictures_are_drawn(tmp_path, trajectory):
+    writer = MetricsWriter(tmp_path)
+    for update in range(3):
+        writer.write(
+            "train", update, update, 0.0, {"capture_rate": 0.1 * update, "capture_step": float("nan")}
+        )
+    writer.close()
+    plot_training(tmp_path / "training.png", tmp_path / "metrics.jsonl")
+    plot_trajectories(tmp_path / "trajectories.png", [trajectory, trajectory])
+    for name in ("training.png", "trajectories.png"):
+        with Image.open(tmp_path / name) as image:
+            assert len(np.unique(np.asarray(image.convert("RGB")).reshape(-1, 3), axis=0)) > 10
+    assert list((tmp_path / "tensorboard").iterdir())

@@ -1,0 +1,141 @@
+"""The host loop on a toy carry: exact resume, one compilation, stops on a NaN, a signal, a time limit."""
+
+import json
+import os
+import signal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+from rich.console import Console
+
+from openjax.runs.checkpoints import Checkpoints, abstract_carry, is_checkpoint, named_leaves, place
+from openjax.runs.loop import NotFiniteError, Plan, StopRequest, guarded, run_updates
+from openjax.runs.metrics import MetricsWriter, read_metrics
+from openjax.runs.progress import Progress
+
+
+@struct.dataclass
+class Carry:
+    parameters: jax.Array
+    momentum: jax.Array
+    key: jax.Array
+    update: jax.Array
+    nothing: jax.Array
+
+
+def init():
+    return Carry(
+        parameters=jnp.ones((4, 3)),
+        momentum=jnp.zeros((4, 3)),
+        key=jax.random.key(7),
+        update=jnp.int32(0),
+        nothing=jnp.zeros((0, 3)),
+    )
+
+
+def step(carry):
+    key, draw = jax.random.split(carry.key)
+    momentum = 0.9 * carry.momentum + jax.random.normal(draw, carry.parameters.shape)
+    parameters = carry.parameters - 0.1 * momentum
+    new = carry.replace(parameters=parameters, momentum=momentum, key=key, update=carry.update + 1)
+    return new, {"loss": jnp.mean(parameters**2)}
+
+
+def broken_step(carry):
+    new, metrics = step(carry)
+    bad = jnp.where(new.update >= 5, jnp.nan, 1.0)
+    return new.replace(parameters=new.parameters * bad), metrics
+
+
+@pytest.fixture(scope="module")
+def compiled():
+    return guarded(step)
+
+
+def run(directory, compiled_step, updates, resume=False, evaluate=None, **plan):
+    checkpoints = Checkpoints(directory / "checkpoints")
+    first = 0
+    if resume:
+        carry, record = checkpoints.restore_latest(abstract_carry(init))
+        first = record.update
+    else:
+        carry = place(init())
+    metrics = MetricsWriter(directory, resumed_update=first if resume else None, tensorboard=False)
+    plan = Plan(total_updates=updates, steps_per_update=10, **{"evaluation_interval": 4, **plan})
+    with (
+        Progress("toy", 10 * updates, Console(quiet=True)) as progress,
+        StopRequest() as stop,
+    ):
+        try:
+            return run_updates(
+                compiled_step,
+                carry,
+                plan,
+                checkpoints=checkpoints,
+                metrics=metrics,
+                progress=progress,
+                directory=directory,
+                stop=stop,
+                evaluate=evaluate(stop) if evaluate else None,
+                first_update=first,
+            )
+        finally:
+            metrics.close()
+
+
+def assert_same(a, b):
+    for (name, x), (_, y) in zip(named_leaves(a).items(), named_leaves(b).items(), strict=True):
+        if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+            x, y = jax.random.key_data(x), jax.random.key_data(y)
+        assert x.dtype == y.dtype
+        np.testing.assert_array_equal(np.asarray(x), np.asarray(y), err_msg=name)
+
+
+def test_resumed_run_equals_uninterrupted_run_and_compiles_once(tmp_path, compiled):
+    whole = run(tmp_path / "whole", compiled, 12)
+    run(tmp_path / "parts", compiled, 5)
+    parts = run(tmp_path / "parts", compiled, 12, resume=True)
+    assert_same(whole.carry, parts.carry)
+    assert compiled._cache_size() == 1
+    losses = [[r["loss"] for r in read_metrics(tmp_path / d / "metrics.jsonl")] for d in ("whole", "parts")]
+    assert losses[0] == losses[1]
+
+
+def test_best_and_last_checkpoints_are_kept(tmp_path, compiled):
+    scores = iter([0.2, 0.9, 0.3, 0.4, 0.5])
+    run(tmp_path, compiled, 20, evaluate=lambda stop: lambda carry: (next(scores), {"capture_rate": 0.0}))
+    checkpoints = Checkpoints(tmp_path / "checkpoints")
+    assert [record.update for record in checkpoints.records()] == [8, 16, 20]
+    assert checkpoints.best().update == 8
+
+
+def test_nan_stops_and_leaves_both_states(tmp_path):
+    with pytest.raises(NotFiniteError, match=r"update 5 in parameters; .*000000004"):
+        run(tmp_path, guarded(broken_step), 20)
+    assert Checkpoints(tmp_path / "checkpoints").latest().update == 4
+    assert is_checkpoint(tmp_path / "not_finite" / "000000005")
+    assert json.loads((tmp_path / "not_finite" / "report.json").read_text())["leaves"] == ["parameters"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_signal_saves_and_stops(tmp_path, compiled, number):
+    def evaluate(stop):
+        def kill_and_score(carry):
+            os.kill(os.getpid(), number)
+            return 0.0, {}
+
+        return kill_and_score
+
+    outcome = run(tmp_path, compiled, 1000, evaluate=evaluate, evaluation_interval=3)
+    assert outcome.stopped_by == signal.Signals(number).name
+    assert outcome.update < 10
+    assert Checkpoints(tmp_path / "checkpoints").latest().update == outcome.update
+
+
+def test_time_limit_stops(tmp_path, compiled):
+    outcome = run(tmp_path, compiled, 10**6, time_limit=0.3)
+    assert outcome.stopped_by == "the time limit"
+    assert 0 < outcome.update < 10**6
