@@ -61,7 +61,8 @@ def duplicates(flights: list[Flight]) -> dict[str, str]:
 def _has_what_is_needed(flight: Flight) -> None:
     if not (flight.has_pose or flight.has_imu):
         pose, imu = "x, y, z, qw, qx, qy, qz", "ax, ay, az, wx, wy, wz"
-        raise _Refused("columns", f"needs position and orientation ({pose}) or accelerometer and gyroscope ({imu})")
+        sensors = f"position and orientation ({pose}) or accelerometer and gyroscope ({imu})"
+        raise _Refused("columns", f"needs {sensors}")
     if not (flight.has_motors or flight.has_commands):
         raise _Refused("columns", "holds no commands: needs m1..m4, or cmd_thrust and cmd_wx, cmd_wy, cmd_wz")
 

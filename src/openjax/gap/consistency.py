@@ -23,7 +23,7 @@ TORQUE_BAND = (0.5, 8.0)
 LAGS = np.arange(-6, 7, 2)  # samples of the common clock; clock offsets between streams are a nuisance
 LONGEST = 30.0  # s, enough to tell
 GRAVITY = 9.81
-_FITS, _FAILS, _BETTER = 0.65, 0.3, 0.8  # correlation of an axis; summed over the axes
+_FITS, _BETTER = 0.65, 0.6  # correlation of an axis that fits; least gain in their sum of another labelling
 
 _AXES = "xyz"
 _RELABELLINGS = [
@@ -58,7 +58,7 @@ class Match:
     @property
     def wrong(self) -> bool:
         """The labelling fails on an axis that another labelling explains."""
-        clear = self.changed & (self.best > _FITS) & (self.as_labelled < _FAILS)
+        clear = self.changed & _clearly_better(self.best, self.as_labelled)
         return bool(clear.any() and self.best.sum() - self.as_labelled.sum() > _BETTER)
 
     @property
@@ -249,8 +249,7 @@ def _motors(motor, rates, vehicle) -> list[tuple[str, str]]:
             if correlations.sum() > best_score + 1e-9:
                 best, best_score = (order, flip, correlations), correlations.sum()
     order, flip, correlations = best
-    unexplained = (logged < _FAILS) & (correlations > _FITS)
-    if not unexplained.any() or best_score - logged.sum() < _BETTER:
+    if not _clearly_better(correlations, logged).any() or best_score - logged.sum() < _BETTER:
         return []
     if order == (0, 1, 2, 3):
         text = "the rotors' spin is opposite: yaw accelerates against the torque of m1..m4"
@@ -329,6 +328,15 @@ def _band(values: np.ndarray, band: tuple[float, float]) -> np.ndarray:
 
 def _correlation(y: np.ndarray, x: np.ndarray) -> np.ndarray:
     return (y.T @ x) / np.maximum(np.outer(np.linalg.norm(y, axis=0), np.linalg.norm(x, axis=0)), 1e-12)
+
+
+def _clearly_better(best: np.ndarray, as_labelled: np.ndarray) -> np.ndarray:
+    """Per axis: another labelling fits and the logged one fails, the less the better the other fits."""
+    return (
+        ((best > _FITS) & (as_labelled < 0.3))
+        | ((best > 0.9) & (as_labelled < 0.6))
+        | (best > as_labelled + 0.8)
+    )
 
 
 def _paired(y: np.ndarray, x: np.ndarray) -> np.ndarray:
