@@ -1,4 +1,6 @@
-"""From a plan of cases to flown batches: which missions, which parameters, and the severity of what was drawn."""
+"""From a plan of cases to flown batches: which missions, which parameters, and the severity of what was
+drawn.
+"""
 
 import json
 from pathlib import Path
@@ -22,11 +24,13 @@ def case_rng(seed, case, *more):
 
 
 def draw_missions(rng, needed, two):
-    """Three flights: list of (mission,) or (mission_of_0, mission_of_1). `needed`: list of tuples of exposing missions."""
+    """Three flights: list of (mission,) or (mission_of_0, mission_of_1). `needed`: list of tuples of exposing
+    missions.
+    """
     flights = [None, None, None]
     order = rng.permutation(3)
     slot = 0
-    for options in needed * 2:                 # each cause is exposed in two of the flights where there is room
+    for options in needed * 2:  # each cause is exposed in two of the flights where there is room
         if slot < 3 and options:
             flights[order[slot]] = options[int(rng.integers(len(options)))]
             slot += 1
@@ -39,10 +43,14 @@ def draw_missions(rng, needed, two):
 
 
 class Flights:
-    """The bodies of a list of cases: reference, noise and partner of each, and which columns belong to which case."""
+    """The bodies of a list of cases: reference, noise and partner of each, and which columns belong to which
+    case.
+    """
 
     def __init__(self, seed, specs):
-        """specs: list of {"number", "flights": [(mission, ...)]}; noise and references depend on seed and number alone."""
+        """specs: list of {"number", "flights": [(mission, ...)]}; noise and references depend on seed and
+        number alone.
+        """
         self.specs, references, noises, partner = specs, [], [], []
         self.columns, self.of_flight, self.ticks = [], [], []
         for spec in specs:
@@ -55,7 +63,10 @@ class Flights:
                 if mission[0] in missions.PAIR:
                     refs = missions.pair(mission[0], rng, TICKS)
                 elif len(mission) == 2:
-                    refs = [missions.apart(missions.single(m, rng, TICKS), side) for m, side in zip(mission, (-1, 1), strict=True)]
+                    refs = [
+                        missions.apart(missions.single(m, rng, TICKS), side)
+                        for m, side in zip(mission, (-1, 1), strict=True)
+                    ]
                 else:
                     refs = [missions.single(mission[0], rng, TICKS)]
                 here = list(range(len(references), len(references) + len(refs)))
@@ -84,10 +95,15 @@ class Flights:
             said = []
             for i, cause in enumerate(own):
                 if cause["effect"] in causes.EFFECTS:
-                    said.append(causes.apply(cause, p, columns, arrival, case_rng(self.seed, spec["number"], 2, i)))
+                    said.append(
+                        causes.apply(cause, p, columns, arrival, case_rng(self.seed, spec["number"], 2, i))
+                    )
                 else:
                     typical, unit, _ = unknowns.KINDS[cause["effect"]]
-                    entry = strangers.setdefault(cause["effect"], {"strength": np.zeros(self.count), "shape": np.zeros((8, self.count))})
+                    entry = strangers.setdefault(
+                        cause["effect"],
+                        {"strength": np.zeros(self.count), "shape": np.zeros((8, self.count))},
+                    )
                     entry["strength"][columns] = typical * cause["size"]
                     entry["shape"][:, columns] = np.asarray(cause["shape"])[:, None]
                     said.append({"strength": typical * cause["size"], "unit": unit})
@@ -100,8 +116,13 @@ class Flights:
         """The log of every body as (K, n, B) arrays for `replay.errors`."""
         rows = [sensors.log_rows(flown, self.noise, i, TICKS) for i in range(self.count)]
         rows = np.stack(rows, axis=-1)
-        return {"position": rows[:, 0:3], "quaternion": rows[:, 3:7], "velocity": rows[:, 7:10], "rates": rows[:, 10:13],
-                "pose": rows[:, 3:7]}
+        return {
+            "position": rows[:, 0:3],
+            "quaternion": rows[:, 3:7],
+            "velocity": rows[:, 7:10],
+            "rates": rows[:, 10:13],
+            "pose": rows[:, 3:7],
+        }
 
     def rms(self, errors, flown):
         """Root mean square per channel and case (12, cases), windows after a crash left out."""
@@ -113,6 +134,38 @@ class Flights:
             squares = np.where(ok, errors[:, :, columns] ** 2, 0.0).sum(axis=(1, 2))
             out[:, i] = np.sqrt(squares / max(ok.sum(), 1))
         return out
+
+
+def exposure(flown, flights, index):
+    """What the flights of a case passed through: seconds near the floor, the ceiling, under the other
+    vehicle; speed, thrust.
+    """
+    low = high = wake = 0.0
+    speeds, demands = [], []
+    for bodies, ticks in zip(flights.of_flight[index], flights.ticks[index], strict=True):
+        for j in bodies:
+            z = flown["position"][:ticks, 2, j]
+            low += 0.01 * float((z < 0.15).sum())
+            high += 0.01 * float((z > body.CEILING - 0.15).sum())
+            speeds.append(np.sqrt((flown["velocity"][:ticks, :, j].astype(float) ** 2).sum(axis=1)))
+            demands.append(flown["motor"][:ticks, :, j].max(axis=1))
+            other = flights.partner[j]
+            if other != j:
+                apart = flown["position"][:ticks, :, other] - flown["position"][:ticks, :, j]
+                wake += 0.01 * float(
+                    (
+                        (apart[:, 2] > 0.03)
+                        & (apart[:, 2] < 0.7)
+                        & (np.hypot(apart[:, 0], apart[:, 1]) < 0.12)
+                    ).sum()
+                )
+    return {
+        "below_15cm_s": round(low, 2),
+        "within_15cm_of_ceiling_s": round(high, 2),
+        "in_wake_s": round(wake, 2),
+        "speed_rms": round(float(np.sqrt(np.mean(np.concatenate(speeds) ** 2))), 3),
+        "motor_99": round(float(np.percentile(np.concatenate(demands), 99)), 3),
+    }
 
 
 def floor():
@@ -146,4 +199,4 @@ def calibrate(flights, causes_of, targets, rounds=2):
             step = 0.6 if crashed else np.clip(targets[i] / max(reached[i], 0.05), 0.15, 6.0)
             smallest, largest = limits(own[0]["effect"])
             own[0]["size"] = float(np.clip(own[0]["size"] * step, smallest, largest))
-    return nominal, without
+    return without

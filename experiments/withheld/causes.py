@@ -1,8 +1,10 @@
-"""The vocabulary inside the withheld plant: forms of each effect, how a size is turned into parameters, and what has to be flown to see it.
+"""The vocabulary inside the withheld plant: forms of each effect, how a size is turned into parameters, and
+what has to be flown to see it.
 
-A cause is {"effect", "form", "size", "shape"}: `size` is the one number that severity calibration moves, `shape` are eight uniform draws that
-fix everything else (signs, axes, ratios), once per case. Form 0 is close to what any library would write; the others are not.
-`LIMITS` are the smallest and largest size that are drawn, about GAP.md's usual ranges.
+A cause is {"effect", "form", "size", "shape"}: `size` is the one number that severity calibration moves,
+`shape` are eight uniform draws that fix everything else (signs, axes, ratios), once per case. Form 0 is close
+to what any library would write; the others are not. `LIMITS` are the smallest and largest size that are
+drawn, about GAP.md's usual ranges.
 """
 
 import numpy as np
@@ -11,32 +13,67 @@ from experiments.withheld import body as b
 
 # effect: (smallest, start, largest) size, missions that expose it, number of forms
 LIMITS = {
-    "mass": (0.02, 0.06, 0.30), "thrust_scale": (0.02, 0.05, 0.22), "battery_sag": (0.10, 0.3, 1.4),
-    "thrust_saturation": (0.03, 0.12, 0.27), "rotor_drag": (0.003, 0.010, 0.035), "blade_flapping": (0.05, 0.3, 3.0),
-    "wind": (0.3, 0.8, 3.0), "ground_effect": (0.04, 0.12, 0.35), "ceiling_effect": (0.04, 0.12, 0.35), "downwash": (2.0, 8.0, 20.0),
-    "motor_lag": (0.2, 0.8, 3.5), "command_latency": (4.0, 12.0, 60.0), "packet_loss": (0.02, 0.12, 0.5),
-    "thrust_curve": (0.05, 0.25, 1.0), "motor_imbalance": (0.003, 0.02, 0.15), "com_offset": (0.1, 0.6, 8.0),
-    "inertia": (0.06, 0.2, 0.6), "yaw_torque": (0.06, 0.25, 0.85), "rate_gains": (0.08, 0.3, 1.0), "state_latency": (4.0, 15.0, 60.0),
+    "mass": (0.02, 0.06, 0.30),
+    "thrust_scale": (0.02, 0.05, 0.22),
+    "battery_sag": (0.10, 0.3, 1.4),
+    "thrust_saturation": (0.03, 0.12, 0.27),
+    "rotor_drag": (0.003, 0.010, 0.035),
+    "blade_flapping": (0.05, 0.3, 3.0),
+    "wind": (0.2, 0.8, 3.0),
+    "ground_effect": (0.015, 0.1, 0.35),
+    "ceiling_effect": (0.015, 0.1, 0.35),
+    "downwash": (2.0, 8.0, 20.0),
+    "motor_lag": (0.2, 0.8, 3.5),
+    "command_latency": (4.0, 12.0, 60.0),
+    "packet_loss": (0.01, 0.12, 0.5),
+    "thrust_curve": (0.05, 0.25, 1.0),
+    "motor_imbalance": (0.003, 0.02, 0.15),
+    "com_offset": (0.05, 0.6, 8.0),
+    "inertia": (0.06, 0.2, 0.6),
+    "yaw_torque": (0.06, 0.25, 0.85),
+    "rate_gains": (0.08, 0.3, 1.0),
+    "state_latency": (4.0, 15.0, 60.0),
 }
 EFFECTS = tuple(LIMITS)
 FORMS = {
-    "mass": ("plain", "payload"), "thrust_scale": ("plain", "thrust_only"), "battery_sag": ("linear", "power", "quadratic", "load"),
-    "thrust_saturation": ("hard", "voltage", "soft"), "rotor_drag": ("linear", "quadratic", "rotor_speed", "raised_hub"),
-    "blade_flapping": ("linear", "advance_ratio"), "wind": ("steady", "quadratic", "shear", "gusty"),
+    "mass": ("plain", "payload"),
+    "thrust_scale": ("plain", "thrust_only"),
+    "battery_sag": ("linear", "power", "quadratic", "load"),
+    "thrust_saturation": ("hard", "voltage", "soft"),
+    "rotor_drag": ("linear", "quadratic", "rotor_speed", "raised_hub"),
+    "blade_flapping": ("linear", "advance_ratio"),
+    "wind": ("steady", "quadratic", "shear", "gusty"),
     "ground_effect": ("inverse_square", "cheeseman_bennett", "exponential"),
     "ceiling_effect": ("inverse_square", "cheeseman_bennett", "exponential"),
-    "downwash": ("gaussian", "jet"), "motor_lag": ("slower", "up_down", "second_order"),
-    "command_latency": ("constant", "jitter", "spikes"), "packet_loss": ("independent", "bursts"),
-    "thrust_curve": ("quadratic", "power", "dip"), "motor_imbalance": ("all", "one_weak"), "com_offset": ("torque", "full"),
-    "inertia": ("diagonal", "products"), "yaw_torque": ("scale",), "rate_gains": ("gains", "filtered_d"),
+    "downwash": ("gaussian", "jet"),
+    "motor_lag": ("slower", "up_down", "second_order"),
+    "command_latency": ("constant", "jitter", "spikes"),
+    "packet_loss": ("independent", "bursts"),
+    "thrust_curve": ("quadratic", "power", "dip"),
+    "motor_imbalance": ("all", "one_weak"),
+    "com_offset": ("torque", "full"),
+    "inertia": ("diagonal", "products"),
+    "yaw_torque": ("scale",),
+    "rate_gains": ("gains", "filtered_d"),
     "state_latency": ("constant", "jitter"),
 }
 EXPOSING = {
-    "battery_sag": ("climb", "agile", "step"), "thrust_saturation": ("climb",), "rotor_drag": ("fast", "agile", "spiral"),
-    "blade_flapping": ("fast", "agile", "spiral"), "wind": ("yaw", "fast", "hover"), "ground_effect": ("low",), "ceiling_effect": ("high",),
-    "downwash": ("pass", "pass_moving"), "motor_lag": ("agile", "step"), "command_latency": ("agile", "step", "yaw"),
-    "packet_loss": ("agile", "step", "yaw"), "thrust_curve": ("climb",), "inertia": ("agile", "step", "yaw"), "yaw_torque": ("yaw",),
-    "rate_gains": ("agile", "step", "yaw"), "state_latency": ("agile", "fast", "step"),
+    "battery_sag": ("climb", "agile", "step"),
+    "thrust_saturation": ("climb",),
+    "rotor_drag": ("fast", "agile", "spiral"),
+    "blade_flapping": ("fast", "agile", "spiral"),
+    "wind": ("yaw", "fast", "hover"),
+    "ground_effect": ("low",),
+    "ceiling_effect": ("high",),
+    "downwash": ("pass", "pass_moving"),
+    "motor_lag": ("agile", "step"),
+    "command_latency": ("agile", "step", "yaw"),
+    "packet_loss": ("agile", "step", "yaw"),
+    "thrust_curve": ("climb",),
+    "inertia": ("agile", "step", "yaw"),
+    "yaw_torque": ("yaw",),
+    "rate_gains": ("agile", "step", "yaw"),
+    "state_latency": ("agile", "fast", "step"),
 }
 
 
@@ -48,7 +85,8 @@ def draw(rng, effect, form=None):
 
 
 def apply(cause, p, columns, arrival=None, rng=None):
-    """Write the cause into the parameters of the bodies `columns`; the link's effects change `arrival` (K, B) instead.
+    """Write the cause into the parameters of the bodies `columns`; the link's effects change `arrival` (K, B)
+    instead.
 
     Returns the magnitudes in the units of GAP.md.
     """
@@ -88,7 +126,7 @@ def apply(cause, p, columns, arrival=None, rng=None):
         elif form == "quadratic":
             p["drag_xy"][c], p["drag_z"][c], p["drag_quadratic"][c] = 0.5 * a, 0.5 * a, 0.5 * a
         elif form == "rotor_speed":
-            p["drag_rotor"][c] = a / (4 * 0.79)          # at hover speed the four hubs add up to a
+            p["drag_rotor"][c] = a / (4 * 0.79)  # at hover speed the four hubs add up to a
             values["d_z"] = 0.5 * a
         else:
             p["drag_xy"][c], p["drag_z"][c], p["drag_height"][c] = a, a * ratio, 0.002 + 0.003 * s[2]
@@ -151,7 +189,7 @@ def apply(cause, p, columns, arrival=None, rng=None):
         for j in np.atleast_1d(c):
             if form == "independent":
                 lost = rng.uniform(0, 1, ticks) < a
-            else:          # Gilbert-Elliott: bad spells of some 5 packets, in which nearly all are lost
+            else:  # Gilbert-Elliott: bad spells of some 5 packets, in which nearly all are lost
                 stay = 0.8
                 enter = (1 - stay) * a / max(0.95 - a, 0.05)
                 bad, lost, draws = False, np.zeros(ticks, bool), rng.uniform(0, 1, (ticks, 2))
@@ -170,7 +208,11 @@ def _apply_body(name, form, a, s, sign, p, c):
             # a u^2 + ... through the hover point, slope there changed too: the curvature is the cause
             root = 0.35 + 0.2 * s[1]
             curve = sign * a
-            p["curve_c"][c], p["curve_b"][c], p["curve_a"][c] = curve, 1 - curve * (0.625 + root), curve * 0.625 * root
+            p["curve_c"][c], p["curve_b"][c], p["curve_a"][c] = (
+                curve,
+                1 - curve * (0.625 + root),
+                curve * 0.625 * root,
+            )
             return {"curvature": curve, "root": root}
         if form == "power":
             p["curve_power"][c] = 1 + sign * min(a, 0.9)

@@ -1,8 +1,10 @@
 """Generate withheld cases: logs to one folder, answers to another.
 
-    python -m experiments.withheld.generate --seed 11 --scale 1.0 --logs OUT/logs --answers OUT/answers.json [--jobs 8]
+    python -m experiments.withheld.generate --seed 11 --scale 1.0 --logs OUT/logs --answers OUT/answers.json
+    [--jobs 8]
 
-Prints the SHA-256 of the answers. `--floor` measures the noise floor again and writes floor.json beside this file.
+Prints the SHA-256 of the answers. `--floor` measures the noise floor again and writes floor.json beside this
+file.
 """
 
 import argparse
@@ -55,26 +57,48 @@ def write_case(folder, spec, flights, flown, index):
             for vehicle, values in enumerate(rows):
                 text.write(f"{0.01 * k:.2f},{vehicle}," + (line % tuple(values[k])).replace("nan", "") + "\n")
         # mtime 0: the same seed gives the same bytes
-        with open(folder / f"flight_{letter}.csv.gz", "wb") as raw, gzip.GzipFile("", "wb", 6, raw, mtime=0) as packed:
+        with (
+            open(folder / f"flight_{letter}.csv.gz", "wb") as raw,
+            gzip.GzipFile("", "wb", 6, raw, mtime=0) as packed,
+        ):
             packed.write(text.getvalue().encode())
         lengths.append(ticks)
     return lengths
+
+
+def _pair_strengths(seed, specs):
+    """Severity of each cause of a pair when it acts alone, written into the cause."""
+    both = [(s, c) for s in specs if len(s["causes"]) > 1 for c in s["causes"]]
+    if not both:
+        return
+    lone = cases.Flights(seed, [dict(s) for s, _ in both])
+    rms = []
+    for own in ([[] for _ in both], [[c] for _, c in both]):
+        flown, _ = lone.fly(own)
+        rms.append(lone.rms(replay.errors(flown, cases.TICKS), flown))
+    reached = cases.severity(rms[1], rms[0], cases.floor()).max(axis=0)
+    for (_, cause), value in zip(both, reached, strict=True):
+        cause["severity_alone"] = round(float(value), 3)
 
 
 def fly_chunk(job):
     """Fly, calibrate and write one list of cases; returns their answers."""
     seed, specs, folder = job
     alone = [(i, j) for i, s in enumerate(specs) for j in range(len(s["causes"]))]
-    nominal = without = None
-    if alone:           # the causes of a pair are calibrated one by one on the same flights
+    if alone:  # the causes of a pair are calibrated one by one on the same flights
         lone = cases.Flights(seed, [dict(specs[i]) for i, _ in alone])
-        cases.calibrate(lone, [[specs[i]["causes"][j]] for i, j in alone], [specs[i]["targets"][j] for i, j in alone])
+        cases.calibrate(
+            lone, [[specs[i]["causes"][j]] for i, j in alone], [specs[i]["targets"][j] for i, j in alone]
+        )
+    _pair_strengths(seed, specs)
     flights = cases.Flights(seed, specs)
     nominal, _ = flights.fly([[] for _ in specs])
     without = flights.rms(replay.errors(nominal, cases.TICKS), nominal)
     for _ in range(4):
         flown, magnitudes = flights.fly([s["causes"] for s in specs])
-        early = [i for i, c in enumerate(flights.columns) if flown["crashed"][c].min() < 700 and specs[i]["causes"]]
+        early = [
+            i for i, c in enumerate(flights.columns) if flown["crashed"][c].min() < 700 and specs[i]["causes"]
+        ]
         if not early:
             break
         for i in early:
@@ -83,22 +107,36 @@ def fly_chunk(job):
     level = cases.floor()
     ratio = cases.severity(flights.rms(replay.errors(flown, cases.TICKS), flown), without, level)
     before = flights.rms(replay.errors(flown, cases.TICKS, flights.logged(flown)), flown) / level[:, None]
-    after = flights.rms(replay.errors(nominal, cases.TICKS, flights.logged(nominal)), nominal) / level[:, None]
+    after = (
+        flights.rms(replay.errors(nominal, cases.TICKS, flights.logged(nominal)), nominal) / level[:, None]
+    )
     answers = []
     for i, spec in enumerate(specs):
         lengths = write_case(folder / spec["name"], spec, flights, flown, i)
         gap, rest = (float(np.sqrt(np.mean(x[:, i] ** 2))) for x in (before, after))
         top = float(ratio[:, i].max())
-        answers.append({
-            "case": spec["name"], "kind": spec["kind"], "effects": spec["effects"], "without": spec["without"],
-            "mass_weighed": spec["mass_weighed"],
-            "causes": [c | {"magnitudes": m} for c, m in zip(spec["causes"], magnitudes[i], strict=True)],
-            "severity_target": spec["band"], "severity_ratio": round(top, 3), "severity": cases.label(top) if spec["causes"] else None,
-            "ratio_per_channel": {c: round(float(r), 3) for c, r in zip(replay.CHANNELS, ratio[:, i], strict=True)},
-            "gap": {"before": gap, "floor": rest, "closed_by_truth": max(0.0, 1 - rest / gap)},
-            "flights": [list(m) for m in spec["flights"]], "ticks": lengths,
-            "crashed": bool((flown["crashed"][flights.columns[i]] < cases.TICKS).any()),
-        })
+        answers.append(
+            {
+                "case": spec["name"],
+                "kind": spec["kind"],
+                "effects": spec["effects"],
+                "without": spec["without"],
+                "mass_weighed": spec["mass_weighed"],
+                "causes": [c | {"magnitudes": m} for c, m in zip(spec["causes"], magnitudes[i], strict=True)],
+                "severity_target": spec["band"],
+                "severity_ratio": round(top, 3),
+                "severity": cases.label(top) if spec["causes"] else None,
+                "ratio_per_channel": {
+                    c: round(float(r), 3) for c, r in zip(replay.CHANNELS, ratio[:, i], strict=True)
+                },
+                "gap": {"before": gap, "floor": rest, "closed_by_truth": max(0.0, 1 - rest / gap)},
+                "exposure": cases.exposure(flown, flights, i),
+                "hidden": spec.get("hidden"),
+                "flights": [list(m) for m in spec["flights"]],
+                "ticks": lengths,
+                "crashed": bool((flown["crashed"][flights.columns[i]] < cases.TICKS).any()),
+            }
+        )
     return answers
 
 
@@ -109,8 +147,12 @@ def measure_floor(seed=0, count=24):
     flown, _ = flights.fly([[] for _ in specs])
     errors = replay.errors(flown, cases.TICKS, flights.logged(flown))
     level = np.sqrt(np.mean(errors**2, axis=(1, 2)))
-    text = {"seed": seed, "cases": count, "what": replay.__doc__.strip().splitlines()[0],
-            "floor": {c: float(f"{v:.4g}") for c, v in zip(replay.CHANNELS, level, strict=True)}}
+    text = {
+        "seed": seed,
+        "cases": count,
+        "what": replay.__doc__.strip().splitlines()[0],
+        "floor": {c: float(f"{v:.4g}") for c, v in zip(replay.CHANNELS, level, strict=True)},
+    }
     cases.FLOOR_FILE.write_text(json.dumps(text, indent=2) + "\n")
     return text
 
@@ -119,7 +161,7 @@ def generate(seed, scale, logs, jobs=1, counts=None, chunk=None):
     """All cases of the plan; writes the logs and returns the answers, sorted by case."""
     specs = plan.make_plan(seed, counts or plan.counts(scale))
     size = chunk or max(4, min(48, math.ceil(len(specs) / jobs)))
-    work = [(seed, specs[i:i + size], Path(logs)) for i in range(0, len(specs), size)]
+    work = [(seed, specs[i : i + size], Path(logs)) for i in range(0, len(specs), size)]
     answers, start = [], time.perf_counter()
     if jobs == 1:
         for job in work:
@@ -137,8 +179,16 @@ def write_answers(path, answers, seed, scale):
     """Write the answers as JSON; returns the SHA-256 of the file."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    text = json.dumps({"seed": seed, "scale": scale, "bands": cases.BANDS, "floor": json.loads(cases.FLOOR_FILE.read_text())["floor"],
-                       "cases": {a["case"]: a for a in answers}}, indent=1)
+    text = json.dumps(
+        {
+            "seed": seed,
+            "scale": scale,
+            "bands": cases.BANDS,
+            "floor": json.loads(cases.FLOOR_FILE.read_text())["floor"],
+            "cases": {a["case"]: a for a in answers},
+        },
+        indent=1,
+    )
     path.write_text(text)
     digest = hashlib.sha256(text.encode()).hexdigest()
     path.with_suffix(".sha256").write_text(digest + "\n")
@@ -146,10 +196,15 @@ def write_answers(path, answers, seed, scale):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--scale", type=float, default=1.0, help="1.0: the full plan")
-    parser.add_argument("--kinds", help="own plan instead: none=4,rotor_drag=3,pair=2,unknown=2,not_testable=1,each=1 (of every effect)")
+    parser.add_argument(
+        "--kinds",
+        help="own plan instead: none=4,rotor_drag=3,pair=2,unknown=2,not_testable=1,each=1 (of every effect)",
+    )
     parser.add_argument("--logs", type=Path, default=Path("withheld/logs"))
     parser.add_argument("--answers", type=Path, default=Path("withheld_answers/answers.json"))
     parser.add_argument("--jobs", type=int, default=1)

@@ -1,7 +1,8 @@
 """Reference trajectories of the withheld plant: what the off-board controller is asked to fly.
 
-A mission is sampled at 100 Hz. Positions are drawn as way-points or closed curves and smoothed with a Gaussian, whose derivatives give
-the velocity and acceleration that the controller feeds forward. All missions stay inside the arena (radius 0.9 m, height 1.2 m).
+A mission is sampled at 100 Hz. Positions are drawn as way-points or closed curves and smoothed with a
+Gaussian, whose derivatives give the velocity and acceleration that the controller feeds forward. All missions
+stay inside the arena (radius 0.9 m, height 1.2 m).
 """
 
 import numpy as np
@@ -46,14 +47,24 @@ def _doublets(rng, length, rate, axes, size):
         axis = rng.choice(axes)
         amplitude = rng.uniform(0.4, 1.0) * rng.choice([-1, 1]) * (0.1 if axis == 0 else size)
         width = rng.integers(4, 9)
-        pulses[start:start + width, axis] += amplitude
-        pulses[start + width:start + 2 * width, axis] -= amplitude
+        pulses[start : start + width, axis] += amplitude
+        pulses[start + width : start + 2 * width, axis] -= amplitude
         start += int(RATE * rng.uniform(0.5, 1.5) / rate)
     return pulses
 
 
+def _dither(rng, length):
+    """Pseudo-random body-rate commands (K, 4) on top of tracking: a broad excitation, as identification
+    flights have.
+    """
+    held = _held(rng, rng.choice([-1.0, 0.0, 1.0], (length, 3)), length, (0.04, 0.16))
+    return np.concatenate([np.zeros((length, 1)), rng.uniform(0.2, 0.7) * held], axis=1)
+
+
 def single(kind, rng, length):
-    """One vehicle's reference: position (K, 3) m, velocity, acceleration, yaw (K,) rad, yaw rate, pulses (K, 4)."""
+    """One vehicle's reference: position (K, 3) m, velocity, acceleration, yaw (K,) rad, yaw rate, pulses (K,
+    4).
+    """
     t = np.arange(length) / RATE
     position = np.zeros((length, 3))
     centre = np.r_[rng.uniform(-0.15, 0.15, 2), rng.uniform(0.45, 0.75)]
@@ -98,6 +109,8 @@ def single(kind, rng, length):
     else:
         raise ValueError(f"unknown mission {kind!r}")
     yaw = yaw + yaw_rate_of * t
+    if kind != "hover" and rng.random() < 0.3:
+        pulses = pulses + _dither(rng, length)
     return _smooth(position, yaw, pulses, sigma)
 
 
@@ -111,8 +124,14 @@ def _smooth(position, yaw, pulses, sigma):
     def smooth(signal, order):
         return gaussian_filter1d(signal, width, axis=0, order=order, mode="nearest") * RATE**order
 
-    return {"position": smooth(position, 0), "velocity": smooth(position, 1), "acceleration": smooth(position, 2),
-            "yaw": smooth(yaw, 0), "yaw_rate": smooth(yaw, 1), "pulses": pulses}
+    return {
+        "position": smooth(position, 0),
+        "velocity": smooth(position, 1),
+        "acceleration": smooth(position, 2),
+        "yaw": smooth(yaw, 0),
+        "yaw_rate": smooth(yaw, 1),
+        "pulses": pulses,
+    }
 
 
 def apart(reference, side):
@@ -125,7 +144,9 @@ def apart(reference, side):
 
 
 def pair(kind, rng, length):
-    """Two vehicles' references; the second passes above the first, so that the first is in its wake now and then."""
+    """Two vehicles' references; the second passes above the first, so that the first is in its wake now and
+    then.
+    """
     t = np.arange(length) / RATE
     lower = np.tile(np.r_[rng.uniform(-0.1, 0.1, 2), rng.uniform(0.3, 0.45)], (length, 1))
     if kind == "pass_moving":

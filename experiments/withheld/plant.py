@@ -1,7 +1,9 @@
-"""The withheld plant: quadrotors flown at 1 kHz by a firmware-like rate loop (500 Hz) and an off-board controller (100 Hz).
+"""The withheld plant: quadrotors flown at 1 kHz by a firmware-like rate loop (500 Hz) and an off-board
+controller (100 Hz).
 
-`fly` integrates a whole batch of bodies at once (NumPy, body index last) and returns what was true at every 10 ms plus what the sensors and
-the radio said. Nothing of `openjax` is used. Euler angles appear nowhere; integration is semi-implicit with a trapezoidal position.
+`fly` integrates a whole batch of bodies at once (NumPy, body index last) and returns what was true at every
+10 ms plus what the sensors and the radio said. Nothing of `openjax` is used. Euler angles appear nowhere;
+integration is semi-implicit with a trapezoidal position.
 """
 
 from dataclasses import dataclass, field
@@ -13,18 +15,19 @@ from experiments.withheld import plant_effects as effects
 from experiments.withheld import unknowns
 
 DT = 0.001
-RING = 128                 # ms of history kept for delayed poses
+RING = 128  # ms of history kept for delayed poses
 
 
 @dataclass
 class Batch:
     """Everything that decides a batch of B bodies over K control ticks of 10 ms."""
-    parameters: dict                    # arrays of `body.nominal_parameters`
-    reference: dict                     # position, velocity, acceleration (K, 3, B), yaw, yaw_rate (K, B), pulses (K, 4, B)
-    partner: np.ndarray                 # (B,) index of the vehicle that may fly above; itself if alone
-    arrival: np.ndarray                 # (K, B) ms at which the command of tick k reaches the vehicle; >= 10**8: lost
-    noise: dict                         # see `sensors.draw_noise`
-    strangers: dict = field(default_factory=dict)       # unknown causes: name -> (B,) strength and details
+
+    parameters: dict  # arrays of `body.nominal_parameters`
+    reference: dict  # position, velocity, acceleration (K, 3, B), yaw, yaw_rate (K, B), pulses (K, 4, B)
+    partner: np.ndarray  # (B,) index of the vehicle that may fly above; itself if alone
+    arrival: np.ndarray  # (K, B) ms at which the command of tick k reaches the vehicle; >= 10**8: lost
+    noise: dict  # see `sensors.draw_noise`
+    strangers: dict = field(default_factory=dict)  # unknown causes: name -> (B,) strength and details
 
 
 def _received(arrival, steps):
@@ -68,11 +71,13 @@ def _control(reference, k, position, q, velocity, integral, p_mass):
 
 
 def fly(batch):
-    """Fly the batch; dict of arrays over ticks: true state, received commands, motors, and what the sensors saw.
+    """Fly the batch; dict of arrays over ticks: true state, received commands, motors, and what the sensors
+    saw.
 
-    Shapes: position, velocity, rates, specific (K, 3, B); quaternion (K, 4, B); command, motor (K, 4, B) (motor: mean over the
-    10 ms that begin at the tick); rotor (K, 4, B) rad/s; integral (K, 3, B) deg; voltage (K, B); measured_* as logged, before IMU
-    noise; crashed (B,) tick of the first breach (floor, tilt above 85 degrees or 2.5 m away), K if none.
+    Shapes: position, velocity, rates, specific (K, 3, B); quaternion (K, 4, B); command, motor (K, 4, B)
+    (motor: mean over the 10 ms that begin at the tick); rotor (K, 4, B) rad/s; integral (K, 3, B) deg;
+    voltage (K, B); measured_* as logged, before IMU noise; crashed (B,) tick of the first breach (floor, tilt
+    above 85 degrees or 2.5 m away), K if none.
     """
     p, reference, noise, partner = batch.parameters, batch.reference, batch.noise, batch.partner
     ticks, _, count = reference["position"].shape
@@ -86,7 +91,7 @@ def fly(batch):
     q = np.stack([np.cos(half), np.zeros(count), np.zeros(count), np.sin(half)])
     hover = b.MASS * b.GRAVITY / (4 * b.MAX_THRUST)
     rotor = np.full((4, count), b.MAX_SPEED * np.sqrt(hover))
-    drive = rotor.copy()                        # state of a second lag, if any
+    drive = rotor.copy()  # state of a second lag, if any
     m = np.full((4, count), hover)
     output_integral, previous, filtered = np.zeros((3, count)), rates.copy(), np.zeros((3, count))
     goal_integral = np.zeros((3, count))
@@ -104,12 +109,29 @@ def fly(batch):
     second = np.where(p["tau_second"] > 0, 1 - np.exp(-DT / np.maximum(p["tau_second"], 1e-4)), 1.0)
     d_keep = np.where(p["d_filter"] > 0, np.exp(-0.002 / np.maximum(p["d_filter"], 1e-6)), 0.0)
     spin = b.SPIN[:, None]
-    ring = {"p": np.repeat(position[None], RING, 0), "q": np.repeat(q[None], RING, 0), "v": np.repeat(velocity[None], RING, 0)}
+    ring = {
+        "p": np.repeat(position[None], RING, 0),
+        "q": np.repeat(q[None], RING, 0),
+        "v": np.repeat(velocity[None], RING, 0),
+    }
     columns = np.arange(count)
-    names3 = ("position", "velocity", "rates", "specific", "integral", "measured_position", "measured_velocity", "measured_rates",
-              "measured_specific", "disturbance")
+    names3 = (
+        "position",
+        "velocity",
+        "rates",
+        "specific",
+        "integral",
+        "measured_position",
+        "measured_velocity",
+        "measured_rates",
+        "measured_specific",
+        "disturbance",
+    )
     out = {n: np.zeros((ticks, 3, count), np.float32) for n in names3}
-    out |= {n: np.zeros((ticks, 4, count), np.float32) for n in ("quaternion", "rotor", "motor", "measured_quaternion", "applied")}
+    out |= {
+        n: np.zeros((ticks, 4, count), np.float32)
+        for n in ("quaternion", "rotor", "motor", "measured_quaternion", "applied")
+    }
     out["voltage"] = np.zeros((ticks, count), np.float32)
     crashed = np.full(count, ticks)
     specific, accel = np.zeros((3, count)), np.zeros((3, count))
@@ -126,23 +148,47 @@ def fly(batch):
         k, sub = divmod(n, 10)
         if sub == 0:
             ring["p"][n % RING], ring["q"][n % RING], ring["v"][n % RING] = position, q, velocity
-            delay = np.clip(noise["mocap_delay"] + noise["mocap_jitter"][k] + p["pose_delay"] + p["pose_jitter"] * noise["pose_jitter"][k],
-                            0.0, RING - 3.0)
+            delay = np.clip(
+                noise["mocap_delay"]
+                + noise["mocap_jitter"][k]
+                + p["pose_delay"]
+                + p["pose_jitter"] * noise["pose_jitter"][k],
+                0.0,
+                RING - 3.0,
+            )
             seen_p = delayed("p", n, delay) + noise["position"][k]
             seen_v = delayed("v", n, delay) + noise["velocity"][k]
             seen_q = b.multiply(delayed("q", n, delay), noise["attitude"][k])
             seen_q /= np.sqrt((seen_q * seen_q).sum(axis=0))
             command[k] = _control(reference, k, seen_p, seen_q, seen_v, goal_integral, b.MASS)
-            for name, value in (("position", position), ("velocity", velocity), ("rates", rates), ("specific", specific),
-                                ("integral", output_integral), ("measured_position", seen_p), ("measured_velocity", seen_v),
-                                ("quaternion", q), ("rotor", rotor), ("measured_quaternion", seen_q), ("voltage", voltage)):
+            for name, value in (
+                ("position", position),
+                ("velocity", velocity),
+                ("rates", rates),
+                ("specific", specific),
+                ("integral", output_integral),
+                ("measured_position", seen_p),
+                ("measured_velocity", seen_v),
+                ("quaternion", q),
+                ("rotor", rotor),
+                ("measured_quaternion", seen_q),
+                ("voltage", voltage),
+            ):
                 out[name][k] = value
-            bad = (position[2] < 0.015) | (1 - 2 * (q[1] ** 2 + q[2] ** 2) < 0.087) | ((position**2).sum(axis=0) > 2.5**2)
+            bad = (
+                (position[2] < 0.015)
+                | (1 - 2 * (q[1] ** 2 + q[2] ** 2) < 0.087)
+                | ((position**2).sum(axis=0) > 2.5**2)
+            )
             bad |= ~np.isfinite(position[0])
             crashed = np.where(bad & (crashed == ticks), k, crashed)
             dead = crashed < ticks
-            if dead.any():            # parked, so that one wreck does not spoil the arithmetic of the batch
-                position[:, dead], velocity[:, dead], rates[:, dead] = reference["position"][k][:, dead], 0.0, 0.0
+            if dead.any():  # parked, so that one wreck does not spoil the arithmetic of the batch
+                position[:, dead], velocity[:, dead], rates[:, dead] = (
+                    reference["position"][k][:, dead],
+                    0.0,
+                    0.0,
+                )
                 q[:, dead] = np.array([1.0, 0, 0, 0])[:, None]
             gust_force, gust_torque = noise["gust_force"][k], noise["gust_torque"][k]
         else:
@@ -152,7 +198,9 @@ def fly(batch):
             now = np.where(index >= 0, command[np.maximum(index, 0), :, columns].T, start)
             gyro = rates + noise["gyro_bias"] + noise["gyro_loop"][5 * k + sub // 2]
             error = np.rad2deg(now[1:] - gyro)
-            output_integral = np.clip(output_integral + 0.002 * error, -b.INTEGRAL_LIMIT[:, None], b.INTEGRAL_LIMIT[:, None])
+            output_integral = np.clip(
+                output_integral + 0.002 * error, -b.INTEGRAL_LIMIT[:, None], b.INTEGRAL_LIMIT[:, None]
+            )
             slope = -np.rad2deg(gyro - previous) / 0.002
             filtered = d_keep * filtered + (1 - d_keep) * slope
             previous = gyro
@@ -173,16 +221,25 @@ def fly(batch):
         rotor = rotor + np.where(drive > rotor, up_lag, down_lag) * (drive - rotor)
         squared = b.THRUST_CONSTANT * rotor * rotor * p["rotor_gain"]
         thrust = squared * effects.surface_gain(p, active, position, q)
-        moment = np.stack([(arm_y * thrust).sum(0), -(arm_x * thrust).sum(0),
-                           p["torque_ratio"] * p["torque_gain"] * (spin * squared).sum(0)])
+        moment = np.stack(
+            [
+                (arm_y * thrust).sum(0),
+                -(arm_x * thrust).sum(0),
+                p["torque_ratio"] * p["torque_gain"] * (spin * squared).sum(0),
+            ]
+        )
         force = np.stack([np.zeros(count), np.zeros(count), thrust.sum(0)])
-        air_force, air_torque = effects.air_forces(p, active, q, velocity, rates, rotor, thrust, position, noise["slow"][k])
+        air_force, air_torque = effects.air_forces(
+            p, active, q, velocity, rates, rotor, thrust, position, noise["slow"][k]
+        )
         force, moment = force + air_force, moment + air_torque + gust_torque
         outside = gust_force
         if active("wake"):
             pull, gradient = effects.wake_force(p, position, partner)
             outside = outside + np.stack([np.zeros(count), np.zeros(count), pull])
-            moment = moment + b.rotate_back(q, np.stack([gradient[1], -gradient[0], np.zeros(count)])) * (b.ARM**2)
+            moment = moment + b.rotate_back(q, np.stack([gradient[1], -gradient[0], np.zeros(count)])) * (
+                b.ARM**2
+            )
         extra_force, extra_torque = strangers.wrench(n * DT, position, q, velocity, rates, rotor, old, thrust)
         force = force + b.rotate_back(q, outside) + extra_force
         moment = moment + extra_torque

@@ -1,12 +1,21 @@
 """How the effects act inside the withheld plant: command side, rotors, forces and torques on the body.
 
-Every function takes the parameter dict of `body.nominal_parameters` and arrays with the body index last. A block is skipped when no body
-of the batch uses it.
+Every function takes the parameter dict of `body.nominal_parameters` and arrays with the body index last. A
+block is skipped when no body of the batch uses it.
 """
 
 import numpy as np
 
-from experiments.withheld.body import CEILING, GRAVITY, MASS, MAX_SPEED, PROPELLER, ROTOR_X, ROTOR_Y, rotate_back
+from experiments.withheld.body import (
+    CEILING,
+    GRAVITY,
+    MASS,
+    MAX_SPEED,
+    PROPELLER,
+    ROTOR_X,
+    ROTOR_Y,
+    rotate_back,
+)
 
 
 class Active:
@@ -20,7 +29,7 @@ class Active:
 
 
 def motor_demand(p, active, m, voltage, load):
-    """Motor commands (4, B) to effective thrust fraction: thrust map, battery and saturation, in this order."""
+    """Motor commands (4, B) to effective thrust fraction: thrust map, battery, saturation, in this order."""
     u = m
     if active("curve_a", "curve_b", "curve_c"):
         u = p["curve_a"] + p["curve_b"] * u + p["curve_c"] * u * u
@@ -47,7 +56,7 @@ def motor_demand(p, active, m, voltage, load):
 def surface_gain(p, active, position, q):
     """Thrust factor of each rotor (4, B) near the floor and the ceiling."""
     gain = 1.0
-    tilt_x = 2 * (q[1] * q[3] - q[0] * q[2])       # world z of the body x axis
+    tilt_x = 2 * (q[1] * q[3] - q[0] * q[2])  # world z of the body x axis
     tilt_y = 2 * (q[2] * q[3] + q[0] * q[1])
     height = position[2] + ROTOR_X[:, None] * tilt_x + ROTOR_Y[:, None] * tilt_y
     for side, distance in (("ground", height), ("ceiling", CEILING - height)):
@@ -55,7 +64,8 @@ def surface_gain(p, active, position, q):
         if not active(side + "_image", side + "_exp", side + "_inverse"):
             continue
         d = np.maximum(distance, 0.0) + p[side + "_offset"]
-        # Cheeseman-Bennett 1 / (1 - (R / 4 z)^2) with an effective radius; an exponential; the simple (R / z)^2
+        # Cheeseman-Bennett 1 / (1 - (R / 4 z)^2) with an effective radius; an exponential; the simple (R /
+        # z)^2
         ratio = np.minimum((image * PROPELLER / (4.0 * d)) ** 2, 0.5)
         gain = gain + (1.0 / (1.0 - ratio) - 1.0) + exponential * np.exp(-d / p[side + "_scale"])
         gain = gain + inverse * (PROPELLER / d) ** 2
@@ -63,7 +73,9 @@ def surface_gain(p, active, position, q):
 
 
 def wake_force(p, position, partner):
-    """Vertical force (B,) N, negative, on each body from the rotor wake of its partner above, and its gradient (2, B) N/m."""
+    """Vertical force (B,) N, negative, on each body from the rotor wake of its partner above, and its
+    gradient (2, B) N/m.
+    """
     other = position[:, partner]
     dx, dy, dz = position[0] - other[0], position[1] - other[1], other[2] - position[2]
     below = np.where((dz > 0.02) & (partner != np.arange(position.shape[1])), 1.0, 0.0)
@@ -73,15 +85,23 @@ def wake_force(p, position, partner):
     gauss = np.exp(-0.5 * r2 / width**2) * np.exp(-dz / p["wake_height"])
     # free jet: speed falls with 1 / distance, a top-hat with soft edge
     edge = np.sqrt(r2 + 1e-9)
-    jet = 1.0 / (1.0 + np.exp(np.clip((edge - 1.2 * width) / (0.25 * width), -40, 40))) * (0.15 / (0.15 + dz)) ** 2
+    jet = (
+        1.0
+        / (1.0 + np.exp(np.clip((edge - 1.2 * width) / (0.25 * width), -40, 40)))
+        * (0.15 / (0.15 + dz)) ** 2
+    )
     shape = np.where(p["wake_jet"] > 0, jet, gauss)
-    slope = np.where(p["wake_jet"] > 0, -jet * (1 - np.clip(jet, 0, 1)) / (0.25 * width * edge), -gauss / width**2)
+    slope = np.where(
+        p["wake_jet"] > 0, -jet * (1 - np.clip(jet, 0, 1)) / (0.25 * width * edge), -gauss / width**2
+    )
     force = -p["wake"] * below * shape
     return force, -p["wake"] * below * slope * np.stack([dx, dy])
 
 
 def air_forces(p, active, q, velocity, rates, speed, thrust, position, gust):
-    """Force (3, B) N and torque (3, B) N m in the body frame from drag, flapping and wind. `thrust` and `speed` are (4, B)."""
+    """Force (3, B) N and torque (3, B) N m in the body frame from drag, flapping and wind. `thrust` and
+    `speed` are (4, B).
+    """
     vb = rotate_back(q, velocity)
     force, torque = np.zeros_like(vb), np.zeros_like(vb)
     if active("drag_xy", "drag_z"):
@@ -96,8 +116,13 @@ def air_forces(p, active, q, velocity, rates, speed, thrust, position, gust):
         fy = -c * (vb[1] + rates[2] * ROTOR_X[:, None])
         fz = -0.5 * c * (vb[2] + rates[0] * ROTOR_Y[:, None] - rates[1] * ROTOR_X[:, None])
         force += np.stack([fx.sum(0), fy.sum(0), fz.sum(0)])
-        torque += np.stack([(ROTOR_Y[:, None] * fz).sum(0), -(ROTOR_X[:, None] * fz).sum(0),
-                            (ROTOR_X[:, None] * fy - ROTOR_Y[:, None] * fx).sum(0)])
+        torque += np.stack(
+            [
+                (ROTOR_Y[:, None] * fz).sum(0),
+                -(ROTOR_X[:, None] * fz).sum(0),
+                (ROTOR_X[:, None] * fy - ROTOR_Y[:, None] * fx).sum(0),
+            ]
+        )
     if active("drag_height"):
         torque += np.stack([-p["drag_height"] * force[1], p["drag_height"] * force[0], np.zeros(vb.shape[1])])
     if active("flap_torque", "flap_tilt", "flap_advance"):

@@ -1,11 +1,13 @@
-"""Causes outside the vocabulary: things that really act on a quadrotor and that no effect of the list describes.
+"""Causes outside the vocabulary: things that really act on a quadrotor and that no effect of the list
+describes.
 
-Each has a strength per body (0: absent) and a shape drawn once per case. `Strangers` holds the state that some of them need.
+Each has a strength per body (0: absent) and a shape drawn once per case. `Strangers` holds the state that
+some of them need.
 """
 
 import numpy as np
 
-from experiments.withheld.body import GRAVITY, MASS, SPIN, rotate, rotate_back
+from experiments.withheld.body import GRAVITY, MASS, SPIN, rotate_back
 
 # name -> (strength of a typical case, unit, what it is)
 KINDS = {
@@ -15,7 +17,11 @@ KINDS = {
     "yaw_disturbance": (0.35, "mN m", "a periodic yaw torque fixed to the heading, as of a magnetic field"),
     "late_motor_fault": (0.12, "1", "one rotor loses part of its thrust in the middle of the flight"),
     "wall_suction": (18.0, "mN", "a pull towards the arena's wall close to it"),
-    "rotor_precession": (1.0e-6, "kg m^2", "gyroscopic torque of heavy rotors and the reaction to spinning them up"),
+    "rotor_precession": (
+        1.0e-6,
+        "kg m^2",
+        "gyroscopic torque of heavy rotors and the reaction to spinning them up",
+    ),
     "thrust_oscillation": (0.06, "1", "a thrust that oscillates at some hertz"),
     "elastic_tether": (60.0, "mN/m", "an elastic cord to a fixed point"),
     "translational_lift": (0.09, "1 per (m/s)^2", "thrust that grows with horizontal speed"),
@@ -28,7 +34,9 @@ KINDS = {
 
 
 class Strangers:
-    """Strengths and states of the unknown causes of one batch: {name: {"strength": (B,), "shape": (4, B) uniform draws}}."""
+    """Strengths and states of the unknown causes of one batch: {name: {"strength": (B,), "shape": (4, B)
+    uniform draws}}.
+    """
 
     def __init__(self, causes, count):
         self.causes = {name: c for name, c in causes.items() if np.any(c["strength"] != 0)}
@@ -69,7 +77,9 @@ class Strangers:
         for name in self.causes:
             s, shape = self._get(name)
             if name == "slung_load":
-                force = force + rotate_back(q, self._slung(s * 1e-3, 0.1 + 0.1 * shape[0], position, velocity))
+                force = force + rotate_back(
+                    q, self._slung(s * 1e-3, 0.1 + 0.1 * shape[0], position, velocity)
+                )
             elif name == "loose_propeller":
                 wave = s * 1e-3 * np.sin(2 * np.pi * (6.0 + 14.0 * shape[0]) * time + 6 * shape[1])
                 angle = 2 * np.pi * shape[2]
@@ -80,13 +90,17 @@ class Strangers:
                 force = force + s * 1e-3 * on * np.stack([np.cos(angle), np.sin(angle), zero])
             elif name == "yaw_disturbance":
                 heading = np.arctan2(2 * (q[0] * q[3] + q[1] * q[2]), 1 - 2 * (q[2] ** 2 + q[3] ** 2))
-                torque = torque + np.stack([zero, zero, s * 1e-3 * np.sin(2 * np.pi * (0.5 + 1.5 * shape[0]) * time + heading)])
+                torque = torque + np.stack(
+                    [zero, zero, s * 1e-3 * np.sin(2 * np.pi * (0.5 + 1.5 * shape[0]) * time + heading)]
+                )
             elif name == "wall_suction":
                 radius = np.sqrt(position[0] ** 2 + position[1] ** 2) + 1e-6
                 pull = s * 1e-3 * np.exp(-np.maximum(0.75 - radius, 0.0) / 0.18)
-                force = force + rotate_back(q, np.stack([pull * position[0] / radius, pull * position[1] / radius, zero]))
+                force = force + rotate_back(
+                    q, np.stack([pull * position[0] / radius, pull * position[1] / radius, zero])
+                )
             elif name == "rotor_precession":
-                spin = s * (SPIN[:, None] * -rotor).sum(axis=0)       # angular momentum of the rotors along body z
+                spin = s * (SPIN[:, None] * -rotor).sum(axis=0)  # angular momentum of the rotors along body z
                 spun_up = s * (SPIN[:, None] * (rotor - old_rotor)).sum(axis=0) / 0.001
                 torque = torque + np.stack([-rates[1] * spin, rates[0] * spin, spun_up])
                 # a case of equal rotors has no net momentum: one pair is heavier
@@ -96,15 +110,21 @@ class Strangers:
                 anchor = np.stack([0.5 * shape[0] - 0.25, 0.5 * shape[1] - 0.25, zero])
                 away = position - anchor
                 length = np.sqrt((away * away).sum(axis=0)) + 1e-6
-                force = force - rotate_back(q, s * 1e-3 * np.maximum(length - 0.3 - 0.3 * shape[2], 0.0) * away / length)
+                force = force - rotate_back(
+                    q, s * 1e-3 * np.maximum(length - 0.3 - 0.3 * shape[2], 0.0) * away / length
+                )
             elif name == "translational_lift":
                 gain = s * np.minimum(velocity[0] ** 2 + velocity[1] ** 2, 2.5)
                 force = force + np.stack([zero, zero, gain * thrust.sum(axis=0)])
             elif name == "descent_loss":
-                force = force - np.stack([zero, zero, s * np.clip(-velocity[2] - 0.1, 0.0, 1.5) * thrust.sum(axis=0)])
+                force = force - np.stack(
+                    [zero, zero, s * np.clip(-velocity[2] - 0.1, 0.0, 1.5) * thrust.sum(axis=0)]
+                )
             elif name == "shifting_payload":
                 tilt = rotate_back(q, np.stack([zero, zero, -np.ones(self.count)]))[:2]
-                self.slide = np.clip(self.slide + 0.001 * (6.0 * tilt + 0.3 * np.sin(2.0 * time + 6 * shape[:2])), -1, 1)
+                self.slide = np.clip(
+                    self.slide + 0.001 * (6.0 * tilt + 0.3 * np.sin(2.0 * time + 6 * shape[:2])), -1, 1
+                )
                 c = 1e-3 * s * self.slide
                 total = thrust.sum(axis=0)
                 torque = torque + np.stack([-c[1] * total, c[0] * total, zero])
@@ -128,7 +148,9 @@ class Strangers:
         distance = np.sqrt((apart * apart).sum(axis=0)) + 1e-9
         along = apart / distance
         closing = ((velocity - speed) * along).sum(axis=0)
-        tension = np.maximum(20.0 * (distance - length) + 0.15 * closing, 0.0) * (distance > length) * (mass > 0)
+        tension = (
+            np.maximum(20.0 * (distance - length) + 0.15 * closing, 0.0) * (distance > length) * (mass > 0)
+        )
         tension = np.minimum(tension, 10 * safe * GRAVITY + 0.2 * MASS * GRAVITY)
         acceleration = tension * along / safe
         acceleration[2] -= GRAVITY
