@@ -1,6 +1,6 @@
 """A drone: parameters from its MJCF, rotors, rate controller, dynamics with solids, optional effects."""
 
-from openjax.vehicle.drones import make_drones_step
+from openjax.vehicle.drones import DronesStep, make_drones_step
 from openjax.vehicle.parameters import Vehicle, hover_rotor_speed, load_vehicle, max_rotor_thrust
 from openjax.vehicle.rate_controller import rate_controller
 from openjax.vehicle.rigid_body import (
@@ -10,11 +10,19 @@ from openjax.vehicle.rigid_body import (
     rotate,
     rotate_inverse,
 )
-from openjax.vehicle.rotors import commanded_rotor_speed, rotor_speed_step, rotor_thrust, rotor_wrench
+from openjax.vehicle.rotors import (
+    commanded_rotor_speed,
+    rotor_reaction,
+    rotor_speed_step,
+    rotor_thrust,
+    rotor_wrench,
+)
 from openjax.vehicle.state import DroneState, hover_state
+from openjax.vehicle.wrench import rotor_wrench, total_wrench
 
 __all__ = [
     "DroneState",
+    "DronesStep",
     "Vehicle",
     "commanded_rotor_speed",
     "hover_rotor_speed",
@@ -28,7 +36,9 @@ __all__ = [
     "rigid_step",
     "rotate",
     "rotate_inverse",
+    "rotor_reaction",
     "rotor_speed_step",
     "rotor_thrust",
     "rotor_wrench",
+    "total_wrench",
 ]

@@ -2,79 +2,176 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import jax
 import jax.numpy as jnp
 
 from openjax.errors import UserError
-from openjax.vehicle.mjx_body import end_of_step_shapes, make_world, mjx_step
+from openjax.vehicle.effects import composition
+from openjax.vehicle.effects.effect import Context, Effect, make_context
+from openjax.vehicle.mjx_body import end_of_step_shapes, make_world, mjx_step, others
 from openjax.vehicle.parameters import Vehicle
 from openjax.vehicle.rate_controller import rate_controller
 from openjax.vehicle.rigid_body import rigid_step, rotate
-from openjax.vehicle.rotors import rotor_speed_step, rotor_thrust, rotor_wrench
+from openjax.vehicle.rotors import rotor_reaction, rotor_speed_step, rotor_thrust
 from openjax.vehicle.state import DroneState
+from openjax.vehicle.wrench import total_wrench
 
 PHYSICS = ("mjx", "rigid")
 
 
-def make_drones_step(
-    physics: str = "mjx", dt: float = 0.01, substeps: int = 1, effects=(), contacts: bool = True
-) -> Callable[..., DroneState]:
-    """Make the step of N drones of one world: pure, to be mapped over worlds and compiled by the caller.
-
-    physics "mjx": MuJoCo MJX, in which floor, pillars and other drones are solid unless `contacts` is off;
-    "rigid": the same free-flight equations written out, nothing is solid. dt is the step in seconds;
-    `substeps` divide it, and the rate controller runs in each. `effects` names what is modelled beyond the
-    nominal vehicle.
-
-    The step: `drones_step(vehicle, drones, command, pillar_position, pillar_active, effect_parameters) ->
-    drones` with drones of leading axis N, command (N, 4) as for `rate_controller`, pillar_position (P, 2) m,
-    pillar_active (P,) bool and effect_parameters {effect: {parameter: array}} ({} for none). The arithmetic
-    is done in the precision of the drones' state. Within a substep: controller on the present state, motors,
-    rotor speeds, wrench from the updated rotor speeds, body.
+@dataclass(frozen=True)
+class DronesStep:
+    """The step of N drones of one world; made by `make_drones_step`. Its methods are pure: map them over
+    worlds.
     """
-    if physics not in PHYSICS:
-        raise UserError(f"physics {physics!r} is unknown; one of {', '.join(PHYSICS)} would be right")
-    if substeps < 1 or dt <= 0:
-        raise UserError(f"dt {dt} with {substeps} substeps: dt > 0 and substeps >= 1 would be right")
-    sub_dt = dt / substeps
 
-    def motors(vehicle, drone, command):
-        """Everything of one drone up to the wrench on its body."""
-        motor_command, integral = rate_controller(vehicle, drone, command, sub_dt)
-        rotor_speed = rotor_speed_step(vehicle, drone.rotor_speed, motor_command, sub_dt)
-        force, torque = rotor_wrench(vehicle, rotor_thrust(vehicle, rotor_speed), rotor_speed)
-        moved = drone.replace(
-            rotor_speed=rotor_speed, rate_integral=integral, previous_body_rates=drone.body_rates
-        )
-        return moved, rotate(drone.quaternion, force), torque
+    physics: str
+    dt: float
+    substeps: int
+    contacts: bool
+    effects: tuple[Effect, ...] = field(repr=False)
 
-    def substep(vehicle, drones, command, pillar_position, pillar_active):
-        moved, force, torque = jax.vmap(motors, in_axes=(None, 0, 0))(vehicle, drones, command)
-        body = (drones.position, drones.quaternion, drones.velocity, drones.body_rates, force, torque)
-        if physics == "rigid":
-            body = jax.vmap(lambda *parts: rigid_step(vehicle, *parts, sub_dt))(*body)
+    def __call__(
+        self,
+        vehicle: Vehicle,
+        drones: DroneState,
+        command,
+        pillar_position,
+        pillar_active,
+        effect_parameters=None,
+    ) -> DroneState:
+        """`drones` (leading axis N) after one step of `dt` seconds.
+
+        command (N, 4) as for `rate_controller`, pillar_position (P, 2) m, pillar_active (P,) bool,
+        effect_parameters {effect: {parameter: array}} for the effects of this step; what is left out has no
+        effect. The arithmetic is done in the precision of the drones' state.
+        """
+        dtype = drones.position.dtype
+        vehicle = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), vehicle)
+        command = jnp.asarray(command, dtype)
+        parameters = composition.complete_parameters(self.effects, effect_parameters, dtype)
+        vehicle = composition.change_body(self.effects, parameters, vehicle)
+        if self.effects:
+            command, drones = self._receive(vehicle, parameters, drones, command)
+
+        def substep(drones, _):
+            return self._substep(vehicle, parameters, drones, command, pillar_position, pillar_active), None
+
+        if self.substeps == 1:
+            drones, _ = substep(drones, None)
         else:
-            n = drones.position.shape[0]
-            solid = (pillar_position.shape[0], n - 1) if contacts else (0, 0)
-            world = make_world(*solid, sub_dt, contacts)
-            shapes = end_of_step_shapes(drones, pillar_position, pillar_active, sub_dt) if contacts else None
-            step = lambda shape, *parts: mjx_step(world, vehicle, shape, *parts, sub_dt)  # noqa: E731
-            body = jax.vmap(step, in_axes=(0 if contacts else None,) + (0,) * 6)(shapes, *body)
+            drones, _ = jax.lax.scan(substep, drones, None, length=self.substeps)
+        if self.effects:
+            memory = jax.vmap(
+                lambda drone: composition.record(self.effects, drone.effect_memory, drone, self.dt)
+            )(drones)
+            drones = drones.replace(effect_memory=memory)
+        return drones
+
+    def reset(self, vehicle: Vehicle, drones: DroneState, key=None) -> DroneState:
+        """`drones` (leading axis N) with the effects' memory as at the start of an episode.
+
+        `key` is needed by random effects only (UserError without it).
+        """
+        number = jnp.arange(drones.position.shape[0])
+
+        def memory(drone, n):
+            own = None if key is None else jax.random.fold_in(key, n)
+            return composition.initial_memory(self.effects, vehicle, drone, self.dt, own)
+
+        return drones.replace(effect_memory=jax.vmap(memory)(drones, number))
+
+    def seen(self, drones: DroneState, effect_parameters=None) -> DroneState:
+        """What the off-board controller sees of `drones` (leading axis N): they themselves without sensor
+        effects.
+        """
+        if not self.effects:
+            return drones
+        parameters = composition.complete_parameters(self.effects, effect_parameters, drones.position.dtype)
+        return jax.vmap(lambda drone: composition.seen_state(self.effects, parameters, drone))(drones)
+
+    def _contexts(self, vehicle, drones, dt) -> Context:
+        neighbours = drones.position[others(drones.position.shape[0])]
+
+        def context(drone, neighbour):
+            air_time = drone.effect_memory[composition.AIR_TIME]
+            return make_context(vehicle, drone, others_position=neighbour, air_time=air_time, dt=dt)
+
+        return jax.vmap(context)(drones, neighbours)
+
+    def _receive(self, vehicle, parameters, drones, command):
+        """The commands that reach the rate controllers, and the drones with the memory of it."""
+        contexts = self._contexts(vehicle, drones, self.dt)
+        change = lambda *drone: composition.change_command(self.effects, parameters, *drone)  # noqa: E731
+        command, memory = jax.vmap(change)(drones.effect_memory, command, contexts)
+        return command, drones.replace(effect_memory=memory)
+
+    def _substep(self, vehicle, parameters, drones, command, pillar_position, pillar_active):
+        dt = self.dt / self.substeps
+        contexts = self._contexts(vehicle, drones, dt) if self.effects else None
+        motors = lambda *drone: self._motors(vehicle, parameters, *drone, dt)  # noqa: E731
+        moved, force, torque = jax.vmap(motors)(drones, command, contexts)
+        body = (drones.position, drones.quaternion, drones.velocity, drones.body_rates, force, torque)
+        if self.physics == "rigid":
+            body = jax.vmap(lambda *parts: rigid_step(vehicle, *parts, dt))(*body)
+        elif self.contacts:
+            world = make_world(pillar_position.shape[0], drones.position.shape[0] - 1, dt, True)
+            shapes = end_of_step_shapes(drones, pillar_position, pillar_active, dt)
+            body = jax.vmap(lambda *parts: mjx_step(world, vehicle, *parts, dt))(shapes, *body)
+        else:
+            world = make_world(0, 0, dt, False)
+            body = jax.vmap(lambda *parts: mjx_step(world, vehicle, None, *parts, dt))(*body)
         position, quaternion, velocity, body_rates = body
         return moved.replace(
             position=position, quaternion=quaternion, velocity=velocity, body_rates=body_rates
         )
 
-    def drones_step(
-        vehicle: Vehicle, drones: DroneState, command, pillar_position, pillar_active, effect_parameters=None
-    ) -> DroneState:
-        dtype = drones.position.dtype
-        vehicle = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), vehicle)
-        command = jnp.asarray(command, dtype)
-        for _ in range(substeps):
-            drones = substep(vehicle, drones, command, pillar_position, pillar_active)
-        return drones
+    def _motors(self, vehicle, parameters, drone, command, context, dt):
+        """One drone up to the wrench on its body: its new controller and rotors, force world, torque body."""
+        motor_command, integral = rate_controller(vehicle, drone, command, dt)
+        if self.effects:
+            motor_command = composition.change_motor_command(self.effects, parameters, motor_command, context)
+        speed = rotor_speed_step(vehicle, drone.rotor_speed, motor_command, dt)
+        thrust, reaction = rotor_thrust(vehicle, speed), rotor_reaction(vehicle, speed)
+        if self.effects:
+            context = context.replace(rotor_speed=speed, thrust=thrust)
+            thrust, reaction = composition.change_thrust(self.effects, parameters, thrust, reaction, context)
+            context = context.replace(thrust=thrust)
+        force, torque = total_wrench(vehicle, thrust, reaction)
+        if self.effects:
+            more_force, more_torque = composition.added_wrench(self.effects, parameters, context)
+            force, torque = force + more_force, torque + more_torque
+        drone = drone.replace(rotor_speed=speed, rate_integral=integral, previous_body_rates=drone.body_rates)
+        return drone, rotate(drone.quaternion, force), torque
 
-    return drones_step
+
+def make_drones_step(
+    physics: str = "mjx",
+    dt: float = 0.01,
+    substeps: int = 1,
+    effects=(),
+    contacts: bool = True,
+    max_pillars: int | None = None,
+    num_drones: int | None = None,
+) -> DronesStep:
+    """Make the step of N drones of one world.
+
+    physics "mjx": MuJoCo MJX, in which floor, pillars and other drones are solid unless `contacts` is off;
+    "rigid": the same free-flight equations written out, nothing is solid. dt is the step in seconds;
+    `substeps` divide it, and the rate controller runs in each. `effects` (names or `Effect`s) are modelled
+    beyond the nominal vehicle. Within a substep: controller on the present state, motors, rotor speeds,
+    wrench from the updated rotor speeds, body.
+
+    Sizes are those of the arrays that the step gets; with `max_pillars` and `num_drones` the MJX model for
+    them is built here instead of at the first step. Raises UserError for unknown physics or effects and
+    impossible steps.
+    """
+    if physics not in PHYSICS:
+        raise UserError(f"physics {physics!r} is unknown; one of {', '.join(PHYSICS)} would be right")
+    if substeps < 1 or dt <= 0:
+        raise UserError(f"dt {dt} with {substeps} substeps: dt > 0 and substeps >= 1 would be right")
+    if physics == "mjx" and contacts and max_pillars is not None and num_drones is not None:
+        make_world(max_pillars, num_drones - 1, dt / substeps, True)
+    return DronesStep(physics, dt, substeps, contacts, composition.resolve(effects))

@@ -105,6 +105,11 @@ def _as_dtype(tree, dtype):
     return jax.tree.map(convert, tree)
 
 
+def others(n: int) -> np.ndarray:
+    """(n, n - 1) indices of the other drones, for each of n."""
+    return np.array([[j for j in range(n) if j != i] for i in range(n)], int).reshape(n, n - 1)
+
+
 def end_of_step_shapes(drones, pillar_position, pillar_active, dt) -> jax.Array:
     """Where each drone's shapes stand at the end of the step, seen from the drone: (N, 1 + P + N - 1 + 1, 3)
     m.
@@ -113,14 +118,13 @@ def end_of_step_shapes(drones, pillar_position, pillar_active, dt) -> jax.Array:
     """
     n = drones.position.shape[0]
     dtype = drones.position.dtype
-    others = np.array([[j for j in range(n) if j != i] for i in range(n)], int).reshape(n, n - 1)
     ahead = drones.velocity * dt
     active = pillar_active.astype(bool)[:, None]
     height = jnp.where(active, PILLAR_HEIGHT / 2, _PARKED).astype(dtype)
     pillars = jnp.concatenate([pillar_position.astype(dtype), height], axis=1)
     floor = jnp.zeros((n, 1, 3), dtype)
     pillars = jnp.broadcast_to(pillars, (n, *pillars.shape))
-    neighbours = (drones.position + ahead)[others]
+    neighbours = (drones.position + ahead)[others(n)]
     shapes = jnp.concatenate([floor, pillars, neighbours], axis=1) - ahead[:, None]
     return jnp.concatenate([shapes, jnp.zeros((n, 1, 3), dtype)], axis=1)
 

@@ -34,14 +34,6 @@ def rotor_thrust(vehicle: Vehicle, rotor_speed) -> jax.Array:
     return vehicle.thrust_constant * jnp.square(rotor_speed)
 
 
-def rotor_wrench(vehicle: Vehicle, thrust, rotor_speed) -> tuple[jax.Array, jax.Array]:
-    """Force (3,) N and torque about the centre of mass (3,) N m of the rotors, body frame.
-
-    thrust (4,) N acts along body z at the hubs; the reaction torque follows the speed (4,) rad/s.
-    """
-    x, y = vehicle.rotor_position[:, 0], vehicle.rotor_position[:, 1]
-    reaction = vehicle.rotor_spin * vehicle.torque_constant * jnp.square(rotor_speed)
-    zero = jnp.zeros_like(thrust[0])
-    force = jnp.stack([zero, zero, jnp.sum(thrust)])
-    torque = jnp.stack([jnp.sum(y * thrust), -jnp.sum(x * thrust), jnp.sum(reaction)])
-    return force, torque
+def rotor_reaction(vehicle: Vehicle, rotor_speed) -> jax.Array:
+    """Reaction torque of each rotor on the body along body z, signed, (4,) N m."""
+    return vehicle.rotor_spin * vehicle.torque_constant * jnp.square(rotor_speed)

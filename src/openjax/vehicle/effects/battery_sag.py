@@ -1,0 +1,38 @@
+"""Thrust falls with the battery's voltage: a motor command is a share of what the battery gives now."""
+
+import jax.numpy as jnp
+
+from openjax.vehicle.effects.effect import Effect, Parameter
+
+
+def voltage(parameters, context):
+    """Battery voltage () V: the context's where it is known, else a linear discharge from `full`."""
+    simulated = parameters["full"] - parameters["discharge"] * context.air_time
+    known = ~jnp.isnan(context.battery_voltage)
+    return jnp.maximum(jnp.where(known, context.battery_voltage, simulated), 1.0)
+
+
+def motor(parameters, motor_command, context):
+    """m (V / V0)^exponent, of which thrust is a linear function."""
+    ratio = voltage(parameters, context) / parameters["reference"]
+    return motor_command * ratio ** parameters["exponent"]
+
+
+_CELL = "one-cell LiPo: 4.2 V full, about 3.2 V empty under load, seven minutes of hover"
+
+EFFECT = Effect(
+    name="battery_sag",
+    description="the motor command loses (V / reference)^exponent",
+    parameters={
+        "exponent": Parameter(
+            unit="1",
+            none=0.0,
+            prior=(0.0, 2.0),
+            source="0 with voltage compensation, 2 where speed follows voltage; to 40 % less thrust empty",
+        ),
+        "reference": Parameter("V", 3.9, (3.7, 4.2), _CELL, "voltage at which the nominal thrust holds"),
+        "full": Parameter("V", 4.0, (3.8, 4.15), _CELL, "voltage at take-off, where none is logged"),
+        "discharge": Parameter("V/s", 0.0017, (0.001, 0.003), _CELL, "loss per second, where none is logged"),
+    },
+    motor=motor,
+)

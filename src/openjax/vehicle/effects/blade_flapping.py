@@ -1,0 +1,35 @@
+"""Flapping blades tilt the thrust against the motion and pitch the body back."""
+
+import jax.numpy as jnp
+
+from openjax.vehicle.effects.airspeed import body_velocity, hub_velocity, hub_wrench
+from openjax.vehicle.effects.effect import Effect, Parameter
+
+
+def wrench(parameters, context):
+    """-tilt T_i v_xy at each hub, and the torque stiffness (v x e3)."""
+    in_plane = hub_velocity(context) * jnp.array([1, 1, 0], context.velocity.dtype)
+    force, torque = hub_wrench(context, -parameters["tilt"] * context.thrust[:, None] * in_plane)
+    vx, vy, _ = body_velocity(context)
+    return force, torque + parameters["stiffness"] * jnp.stack([vy, -vx, jnp.zeros_like(vx)])
+
+
+EFFECT = Effect(
+    name="blade_flapping",
+    description="thrust tilts back with airspeed, and the hubs pass on a torque",
+    parameters={
+        "tilt": Parameter(
+            unit="rad s/m",
+            none=0.0,
+            prior=(0.0, 0.05),
+            source="tilt of the tip-path plane per airspeed (Mahony, Kumar, Corke 2012)",
+        ),
+        "stiffness": Parameter(
+            unit="N m s/m",
+            none=0.0,
+            prior=(2e-5, 5e-4),
+            source="hub moment (Hoffmann et al. 2007), rotor drag 1 cm above the centre of mass",
+        ),
+    },
+    wrench=wrench,
+)

@@ -1,0 +1,25 @@
+"""The centre of mass isn't amid the rotors: thrust turns the body."""
+
+import jax.numpy as jnp
+
+from openjax.vehicle.effects.effect import Effect, Parameter
+
+
+def body(parameters, vehicle):
+    """Positions and velocities of the state are those of the centre of mass, wherever it is."""
+    offset = jnp.stack([parameters["x"], parameters["y"], parameters["z"]])
+    return vehicle.replace(rotor_position=vehicle.rotor_position - offset)
+
+
+_SOURCE = "battery and decks shift it by 0.05-8 mm"
+
+EFFECT = Effect(
+    name="com_offset",
+    description="centre of mass away from the middle of the rotors, body frame",
+    parameters={
+        "x": Parameter("m", 0.0, (-0.008, 0.008), _SOURCE, "forward"),
+        "y": Parameter("m", 0.0, (-0.008, 0.008), _SOURCE, "left"),
+        "z": Parameter("m", 0.0, (-0.01, 0.01), _SOURCE, "up; felt only through forces in the rotor plane"),
+    },
+    body=body,
+)

@@ -1,0 +1,30 @@
+"""Commands arrive late."""
+
+import jax.numpy as jnp
+
+from openjax.vehicle.effects.delay import fill, look_back, push
+from openjax.vehicle.effects.effect import Effect, Parameter
+from openjax.vehicle.parameters import max_rotor_thrust
+
+
+def initial_memory(vehicle, state, dt, key):
+    """As if hover had been commanded before."""
+    del key
+    hover = vehicle.mass * vehicle.gravity / (4 * max_rotor_thrust(vehicle))
+    return fill(jnp.zeros(4, state.position.dtype).at[0].set(hover), dt)
+
+
+def command(parameters, memory, command, context):
+    memory = push(memory, command)
+    return look_back(memory, parameters["delay"], context.dt), memory
+
+
+EFFECT = Effect(
+    name="command_latency",
+    description="the rate controller gets commands of a fixed time ago",
+    parameters={
+        "delay": Parameter("s", 0.0, (0.004, 0.06), "radio links of the Crazyflie and of ROS bridges")
+    },
+    command=command,
+    initial_memory=initial_memory,
+)

@@ -1,0 +1,123 @@
+"""Several effects at once. They act in the order of their names, whatever order they are given in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import reduce
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from openjax.errors import UserError
+from openjax.vehicle.effects.effect import Context, Effect
+from openjax.vehicle.effects.registry import EFFECTS
+from openjax.vehicle.parameters import Vehicle
+from openjax.vehicle.state import DroneState
+
+AIR_TIME = "air_time"  # beside the effects' own memories
+
+
+def resolve(effects) -> tuple[Effect, ...]:
+    """Effects from names or `Effect`s, in the order in which they act. Raises UserError for unknown names."""
+    found = {}
+    for effect in effects:
+        if not isinstance(effect, Effect):
+            if effect not in EFFECTS:
+                raise UserError(f"effect {effect!r} is unknown; known: {', '.join(EFFECTS)}")
+            effect = EFFECTS[effect]
+        found[effect.name] = effect
+    return tuple(found[name] for name in sorted(found))
+
+
+def complete_parameters(effects, given: Mapping[str, Mapping[str, Any]] | None, dtype) -> dict[str, dict]:
+    """Parameters of every effect as arrays; what `given` leaves out has no effect. Raises UserError for
+    strangers."""
+    given = given or {}
+    names = {effect.name for effect in effects}
+    if strangers := sorted(set(given) - names):
+        raise UserError(f"parameters for {strangers[0]!r}, which is not among the effects {sorted(names)}")
+    complete = {}
+    for effect in effects:
+        values = given.get(effect.name, {})
+        if strangers := sorted(set(values) - set(effect.parameters)):
+            known = ", ".join(effect.parameters)
+            raise UserError(f"effect {effect.name!r} has no parameter {strangers[0]!r}; it has {known}")
+        complete[effect.name] = {
+            name: jnp.asarray(values.get(name, none), dtype) for name, none in effect.none().items()
+        }
+    return complete
+
+
+def initial_memory(effects, vehicle: Vehicle, state: DroneState, dt: float, key=None):
+    """Memory of the effects for one drone at the start of an episode; () without effects.
+
+    Raises UserError if an effect draws random numbers and `key` is None.
+    """
+    if not effects:
+        return ()
+    memory = {AIR_TIME: jnp.zeros((), state.position.dtype)}
+    for number, effect in enumerate(effects):
+        if effect.random and key is None:
+            raise UserError(f"effect {effect.name!r} is random: its memory needs a key")
+        if effect.initial_memory is not None:
+            own = None if key is None else jax.random.fold_in(key, number)
+            memory[effect.name] = effect.initial_memory(vehicle, state, dt, own)
+    return memory
+
+
+def change_body(effects, parameters, vehicle: Vehicle) -> Vehicle:
+    """The vehicle that really flies."""
+    hooks = [(effect.body, parameters[effect.name]) for effect in effects if effect.body is not None]
+    return reduce(lambda vehicle, hook: hook[0](hook[1], vehicle), hooks, vehicle)
+
+
+def change_command(effects, parameters, memory, command, context: Context):
+    """The command (4,) that reaches the rate controller, and the memory after it."""
+    for effect in effects:
+        if effect.command is not None:
+            command, own = effect.command(parameters[effect.name], memory[effect.name], command, context)
+            memory = {**memory, effect.name: own}
+    return command, memory
+
+
+def change_motor_command(effects, parameters, motor_command, context: Context):
+    """The motor command (4,) that the motors follow; negative thrust is beyond a rotor."""
+    hooks = [(effect.motor, parameters[effect.name]) for effect in effects if effect.motor is not None]
+    changed = reduce(lambda command, hook: hook[0](hook[1], command, context), hooks, motor_command)
+    return jnp.maximum(changed, 0.0) if hooks else changed
+
+
+def change_thrust(effects, parameters, thrust, reaction, context: Context):
+    """Thrust (4,) N and reaction torque (4,) N m of the rotors."""
+    for effect in effects:
+        if effect.thrust is not None:
+            thrust, reaction = effect.thrust(parameters[effect.name], thrust, reaction, context)
+    return thrust, reaction
+
+
+def added_wrench(effects, parameters, context: Context):
+    """Force (3,) N and torque (3,) N m of the effects on the body, body frame."""
+    force = torque = jnp.zeros_like(context.velocity)
+    for effect in effects:
+        if effect.wrench is not None:
+            more_force, more_torque = effect.wrench(parameters[effect.name], context)
+            force, torque = force + more_force, torque + more_torque
+    return force, torque
+
+
+def record(effects, memory, state: DroneState, dt):
+    """Memory at the end of a step of dt seconds that led to `state`."""
+    memory = {**memory, AIR_TIME: memory[AIR_TIME] + jnp.asarray(dt, memory[AIR_TIME].dtype)}
+    for effect in effects:
+        if effect.record is not None:
+            memory[effect.name] = effect.record(memory[effect.name], state)
+    return memory
+
+
+def seen_state(effects, parameters, state: DroneState) -> DroneState:
+    """What the off-board controller sees of one drone in `state`."""
+    for effect in effects:
+        if effect.sensor is not None:
+            state = effect.sensor(parameters[effect.name], state.effect_memory[effect.name], state)
+    return state

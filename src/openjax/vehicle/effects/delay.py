@@ -1,0 +1,39 @@
+"""A delay by any fraction of a step, in a buffer of fixed length, differentiable in the delay."""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+
+LONGEST_DELAY = 0.1  # s
+
+
+def buffer_length(dt: float) -> int:
+    """Samples needed to look back by LONGEST_DELAY at steps of dt seconds."""
+    return math.ceil(LONGEST_DELAY / dt) + 2
+
+
+def fill(value, dt: float) -> jax.Array:
+    """A buffer (length, *shape), newest first, as if `value` had always been there."""
+    return jnp.broadcast_to(value, (buffer_length(dt), *value.shape))
+
+
+def push(buffer, value) -> jax.Array:
+    """The buffer one step later."""
+    return jnp.concatenate([value[None], buffer[:-1]])
+
+
+def look_back(buffer, delay, dt) -> jax.Array:
+    """The value `delay` seconds before the newest, interpolated linearly.
+
+    For values that are held over a step this is their mean over the step that starts now, which is what a
+    plant driven by the delayed signal integrates. The delay is cut to 0..LONGEST_DELAY.
+    """
+    steps = jnp.clip(delay, 0.0, LONGEST_DELAY) / dt
+    whole = jax.lax.stop_gradient(jnp.floor(steps))
+    part = steps - whole
+    index = jnp.arange(buffer.shape[0], dtype=buffer.dtype)
+    weight = jnp.where(index == whole, 1.0 - part, 0.0) + jnp.where(index == whole + 1.0, part, 0.0)
+    return jnp.tensordot(weight, buffer, axes=1)

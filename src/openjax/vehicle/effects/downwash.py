@@ -1,0 +1,38 @@
+"""The wake of vehicles above pushes down, at each hub: at the wake's edge it tilts the vehicle."""
+
+import jax
+import jax.numpy as jnp
+
+from openjax.vehicle.effects.airspeed import hub_wrench
+from openjax.vehicle.effects.effect import Effect, Parameter
+from openjax.vehicle.rigid_body import rotate, rotate_inverse
+
+
+def wrench(parameters, context):
+    """-A exp(-dz / h) exp(-r^2 / 2 s^2), s = width + spread dz, along world z; a quarter of it at each
+    hub."""
+    hubs = jax.vmap(lambda r: rotate(context.quaternion, r))(context.rotor_position) + context.position
+    separation = context.others_position[None] - hubs[:, None]  # (4, M, 3)
+    above = separation[..., 2] > 0.0
+    dz = jnp.where(above, separation[..., 2], 0.0)
+    square = separation[..., 0] ** 2 + separation[..., 1] ** 2
+    width = parameters["width"] + parameters["spread"] * dz
+    strength = jnp.exp(-dz / parameters["length"] - square / (2.0 * width**2))
+    push = -0.25 * parameters["force"] * jnp.sum(jnp.where(above, strength, 0.0), axis=1)  # (4,)
+    up = rotate_inverse(context.quaternion, jnp.array([0, 0, 1], context.position.dtype))
+    return hub_wrench(context, push[:, None] * up)
+
+
+_SOURCE = "3-20 g under another Crazyflie, 3-8 cm wide (Shi et al. 2020, Neural-Swarm; Preiss et al. 2017)"
+
+EFFECT = Effect(
+    name="downwash",
+    description="force along -z under another vehicle, decaying with the distance below it and to the side",
+    parameters={
+        "force": Parameter("N", 0.0, (0.03, 0.2), _SOURCE, "right under the other vehicle"),
+        "length": Parameter("m", 0.5, (0.2, 1.0), _SOURCE, "decay below"),
+        "width": Parameter("m", 0.05, (0.03, 0.08), _SOURCE, "standard deviation to the side, at the rotors"),
+        "spread": Parameter("1", 0.1, (0.0, 0.3), "turbulent jets widen by about 0.1 m per m"),
+    },
+    wrench=wrench,
+)

@@ -1,0 +1,138 @@
+"""What an effect is: named parameters, and pure functions that hook into the step of one drone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from openjax.vehicle.parameters import Vehicle
+from openjax.vehicle.state import DroneState
+
+ARENA_CEILING = 1.2  # m
+
+
+@flax.struct.dataclass
+class Context:
+    """What surrounds one drone at a moment; the input of most hooks. NaN stands for "not known"."""
+
+    position: jax.Array  # (3,) m, world
+    quaternion: jax.Array  # (4,) body to world
+    velocity: jax.Array  # (3,) m/s, world
+    body_rates: jax.Array  # (3,) rad/s
+    rotor_position: jax.Array  # (4, 3) m, body frame, hubs seen from the centre of mass
+    rotor_speed: jax.Array  # (4,) rad/s
+    thrust: jax.Array  # (4,) N
+    others_position: jax.Array  # (M, 3) m, world, the other vehicles; M may be 0
+    battery_voltage: jax.Array  # () V under load
+    packet_lost: jax.Array  # () 1: this command was lost, 0: it arrived
+    air_time: jax.Array  # () s since the start
+    floor_height: jax.Array  # () m
+    ceiling_height: jax.Array  # () m
+    dt: jax.Array  # () s, time until the next call
+
+
+def make_context(
+    vehicle: Vehicle,
+    state: DroneState,
+    thrust=None,
+    others_position=None,
+    battery_voltage=jnp.nan,
+    packet_lost=jnp.nan,
+    air_time=0.0,
+    floor_height=0.0,
+    ceiling_height=ARENA_CEILING,
+    dt=0.01,
+) -> Context:
+    """The context of one drone in `state`; `thrust` (4,) N defaults to that of its rotor speeds.
+
+    For logged flights: map it over the samples, `jax.vmap(lambda state, v: make_context(vehicle, state,
+    battery_voltage=v))(states, voltages)`, and map an effect's hooks over the result.
+    """
+    dtype = state.position.dtype
+    if thrust is None:
+        thrust = vehicle.thrust_constant * jnp.square(state.rotor_speed)
+    if others_position is None:
+        others_position = jnp.zeros((0, 3), dtype)
+    return Context(
+        position=state.position,
+        quaternion=state.quaternion,
+        velocity=state.velocity,
+        body_rates=state.body_rates,
+        rotor_position=vehicle.rotor_position,
+        rotor_speed=state.rotor_speed,
+        thrust=thrust,
+        others_position=others_position,
+        battery_voltage=jnp.asarray(battery_voltage, dtype),
+        packet_lost=jnp.asarray(packet_lost, dtype),
+        air_time=jnp.asarray(air_time, dtype),
+        floor_height=jnp.asarray(floor_height, dtype),
+        ceiling_height=jnp.asarray(ceiling_height, dtype),
+        dt=jnp.asarray(dt, dtype),
+    )
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A scalar parameter of an effect.
+
+    none: with every parameter of an effect at this value the effect is absent, and a step with it equals one
+    without. prior: the usual range (a weak prior, not a bound), in the parameter's unit.
+    """
+
+    unit: str
+    none: float
+    prior: tuple[float, float]
+    source: str
+    meaning: str = ""
+
+
+# Hooks of one drone; `parameters` is {name: () array}, `memory` a pytree of arrays.
+BodyHook = Callable[[Mapping[str, Any], Vehicle], Vehicle]
+CommandHook = Callable[[Mapping[str, Any], Any, jax.Array, Context], tuple[jax.Array, Any]]
+MotorHook = Callable[[Mapping[str, Any], jax.Array, Context], jax.Array]
+ThrustHook = Callable[[Mapping[str, Any], jax.Array, jax.Array, Context], tuple[jax.Array, jax.Array]]
+WrenchHook = Callable[[Mapping[str, Any], Context], tuple[jax.Array, jax.Array]]
+SensorHook = Callable[[Mapping[str, Any], Any, DroneState], DroneState]
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One physical effect that the nominal vehicle leaves out. Any subset of the hooks may be given:
+
+    body(parameters, vehicle) -> vehicle: another vehicle; once per step.
+    command(parameters, memory, command (4,), context) -> command, memory: what reaches the rate controller of
+        what the off-board controller sent; once per step.
+    motor(parameters, motor_command (4,), context) -> motor_command: before the motors' lag.
+    thrust(parameters, thrust (4,) N, reaction (4,) N m, context) -> thrust, reaction: of each rotor.
+    wrench(parameters, context) -> force (3,) N, torque (3,) N m: added, body frame, about the centre of mass.
+    sensor(parameters, memory, state) -> state: what the off-board controller sees of the present state.
+    record(memory, state) -> memory: remembers the state at the end of a step, for `sensor`.
+    initial_memory(vehicle, state, dt, key) -> memory: needed where `command`, `sensor` or `record` use one.
+    random: whether `initial_memory` needs its key.
+    """
+
+    name: str
+    description: str
+    parameters: Mapping[str, Parameter]
+    body: BodyHook | None = None
+    command: CommandHook | None = None
+    motor: MotorHook | None = None
+    thrust: ThrustHook | None = None
+    wrench: WrenchHook | None = None
+    sensor: SensorHook | None = None
+    record: Callable[[Any, DroneState], Any] | None = None
+    initial_memory: Callable[[Vehicle, DroneState, float, Any], Any] | None = None
+    random: bool = False
+
+    def none(self) -> dict[str, float]:
+        """Parameters at which the effect is absent."""
+        return {name: parameter.none for name, parameter in self.parameters.items()}
+
+    def typical(self) -> dict[str, float]:
+        """Parameters in the middle of their priors."""
+        return {name: 0.5 * sum(parameter.prior) for name, parameter in self.parameters.items()}

@@ -1,0 +1,35 @@
+"""Rotors near the floor push more."""
+
+import jax.numpy as jnp
+
+from openjax.vehicle.effects.airspeed import PROPELLER_RADIUS, hub_height
+from openjax.vehicle.effects.effect import Effect, Parameter
+
+
+def gain(strength, distance):
+    """1 + strength (R / distance)^2 for hubs at `distance` m from a plane; cut at half a propeller radius."""
+    near = jnp.maximum(distance, 0.5 * PROPELLER_RADIUS)
+    return 1.0 + strength * (PROPELLER_RADIUS / near) ** 2
+
+
+def thrust(parameters, thrust, reaction, context):
+    """Each hub has its own height, so that a tilted vehicle is righted or turned over."""
+    height = hub_height(context) - context.floor_height
+    return thrust * gain(parameters["strength"], height + parameters["offset"]), reaction
+
+
+_SOURCE = (
+    "5-25 % at 5 cm (Cheeseman-Bennett form with free strength; Sanchez-Cuevas et al. 2017 for multirotors)"
+)
+
+EFFECT = Effect(
+    name="ground_effect",
+    description="thrust grows by strength (R / (z + offset))^2 near the floor, per rotor",
+    parameters={
+        "strength": Parameter("1", 0.0, (0.2, 1.2), _SOURCE),
+        "offset": Parameter(
+            "m", 0.0, (0.0, 0.03), "height of the rotors above the tracked point, mocap offset"
+        ),
+    },
+    thrust=thrust,
+)

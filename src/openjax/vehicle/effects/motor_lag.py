@@ -1,0 +1,30 @@
+"""Motors follow their commands more slowly than assumed; spin-up isn't spin-down."""
+
+import jax.numpy as jnp
+
+from openjax.vehicle.effects.effect import Effect, Parameter
+
+_SHORTEST = 1e-3  # s
+
+
+def body(parameters, vehicle):
+    up = jnp.maximum(vehicle.motor_time_constant + parameters["extra_up"], _SHORTEST)
+    down = vehicle.motor_time_constant * vehicle.motor_slowdown_ratio + parameters["extra_down"]
+    return vehicle.replace(motor_time_constant=up, motor_slowdown_ratio=jnp.maximum(down, _SHORTEST) / up)
+
+
+_SOURCE = "coreless motors of this size: time constants of 0.02-0.12 s, against a nominal 0.025 s"
+
+EFFECT = Effect(
+    name="motor_lag",
+    description="first-order lag of the rotor speed, separately for speeding up and slowing down",
+    parameters={
+        "extra_up": Parameter(
+            "s", 0.0, (-0.005, 0.095), _SOURCE, "added to the time constant of speeding up"
+        ),
+        "extra_down": Parameter(
+            "s", 0.0, (-0.005, 0.095), _SOURCE, "added to the time constant of slowing down"
+        ),
+    },
+    body=body,
+)

@@ -1,0 +1,40 @@
+"""Some commands never arrive: the last one is held.
+
+Which are lost is drawn from a key in the memory. In a replay that knows, `Context.packet_lost` decides
+instead (1 lost, 0 arrived). A share between gives the mean over draws of one step, which is differentiable in
+that share.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from openjax.vehicle.effects.effect import Effect, Parameter
+from openjax.vehicle.parameters import max_rotor_thrust
+
+
+def initial_memory(vehicle, state, dt, key):
+    del dt
+    hover = vehicle.mass * vehicle.gravity / (4 * max_rotor_thrust(vehicle))
+    held = jnp.zeros(4, state.position.dtype).at[0].set(hover)
+    return {"held": held, "key": jax.random.key_data(key)}
+
+
+def command(parameters, memory, command, context):
+    draw, carry = jax.random.split(jax.random.wrap_key_data(memory["key"]))
+    drawn = jax.random.uniform(draw, (), command.dtype) < parameters["probability"]
+    known = ~jnp.isnan(context.packet_lost)
+    lost = jnp.where(known, context.packet_lost, drawn.astype(command.dtype))
+    command = (1.0 - lost) * command + lost * memory["held"]
+    return command, {"held": command, "key": jax.random.key_data(carry)}
+
+
+EFFECT = Effect(
+    name="packet_loss",
+    description="each command is lost with a fixed probability, and the last one is held",
+    parameters={
+        "probability": Parameter("1", 0.0, (0.01, 0.5), "2.4 GHz radio in crowded rooms and swarms: 1-50 %")
+    },
+    command=command,
+    initial_memory=initial_memory,
+    random=True,
+)

@@ -1,0 +1,27 @@
+"""Linear drag of the spinning rotors. It acts at the hubs, so it damps body rates as well."""
+
+import jax.numpy as jnp
+
+from openjax.vehicle.effects.airspeed import hub_velocity, hub_wrench
+from openjax.vehicle.effects.effect import Effect, Parameter
+
+
+def wrench(parameters, context):
+    """-d v at each hub, a quarter of the vehicle's drag each."""
+    drag = jnp.stack([parameters["d_xy"], parameters["d_xy"], parameters["d_z"]])
+    return hub_wrench(context, -0.25 * drag * hub_velocity(context))
+
+
+_SOURCE = (
+    "induced drag of small quadrotors (Foerster 2015 for the Crazyflie; Faessler, Franchi, Scaramuzza 2018)"
+)
+
+EFFECT = Effect(
+    name="rotor_drag",
+    description="force against the hubs' velocity in the body frame",
+    parameters={
+        "d_xy": Parameter("N s/m", 0.0, (0.005, 0.03), _SOURCE, "in the rotor plane, all four rotors"),
+        "d_z": Parameter("N s/m", 0.0, (0.0, 0.03), _SOURCE, "along the rotor axes, all four rotors"),
+    },
+    wrench=wrench,
+)

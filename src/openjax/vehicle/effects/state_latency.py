@@ -1,0 +1,43 @@
+"""The pose that the off-board controller sees is old; gyroscope and motors on board are not."""
+
+import jax.numpy as jnp
+
+from openjax.vehicle.effects.delay import fill, look_back, push
+from openjax.vehicle.effects.effect import Effect, Parameter
+
+
+def _pose(state):
+    return jnp.concatenate([state.position, state.quaternion, state.velocity])
+
+
+def initial_memory(vehicle, state, dt, key):
+    """As if the drone had been here before. The step is remembered, since `sensor` has no other way to know
+    it."""
+    del vehicle, key
+    return {"pose": fill(_pose(state), dt), "dt": jnp.asarray(dt, state.position.dtype)}
+
+
+def record(memory, state):
+    """Quaternions q and -q are the same attitude: the one nearer to the last is kept, so they can be
+    averaged."""
+    pose = _pose(state)
+    same = jnp.sum(state.quaternion * memory["pose"][0, 3:7]) >= 0.0
+    sign = jnp.where(same, 1.0, -1.0).astype(pose.dtype)
+    pose = pose.at[3:7].multiply(sign)
+    return {**memory, "pose": push(memory["pose"], pose)}
+
+
+def sensor(parameters, memory, state):
+    pose = look_back(memory["pose"], parameters["delay"], memory["dt"])
+    quaternion = pose[3:7] / jnp.linalg.norm(pose[3:7])
+    return state.replace(position=pose[:3], quaternion=quaternion, velocity=pose[7:])
+
+
+EFFECT = Effect(
+    name="state_latency",
+    description="position, attitude and velocity are seen a fixed time late",
+    parameters={"delay": Parameter("s", 0.0, (0.004, 0.06), "motion capture, filtering and network")},
+    sensor=sensor,
+    record=record,
+    initial_memory=initial_memory,
+)

@@ -1,0 +1,38 @@
+"""Rotors top out early: a one-sided limit that may fall with the battery."""
+
+import jax.numpy as jnp
+
+from openjax.vehicle.effects.effect import Effect, Parameter
+
+_REFERENCE_VOLTAGE = 3.9  # V
+
+
+def motor(parameters, motor_command, context):
+    """min(m, limit), before the motors' lag: a saturated motor leaves its limit as soon as the command
+    does."""
+    missing = jnp.where(jnp.isnan(context.battery_voltage), 0.0, context.battery_voltage - _REFERENCE_VOLTAGE)
+    limit = parameters["limit"] * (1.0 + parameters["voltage_slope"] * missing)
+    return jnp.minimum(motor_command, limit)
+
+
+EFFECT = Effect(
+    name="thrust_saturation",
+    description="no rotor gives more than a share of the nominal largest thrust",
+    parameters={
+        "limit": Parameter(
+            unit="1",
+            none=1.0,
+            prior=(0.6, 0.95),
+            source="brushed motors on a worn battery top out 10-30 % early",
+            meaning="largest thrust as a share of the nominal one, at 3.9 V",
+        ),
+        "voltage_slope": Parameter(
+            unit="1/V",
+            none=0.0,
+            prior=(0.0, 0.5),
+            source="thrust at full duty follows the square of the voltage: 2 / 3.9 V",
+            meaning="relative change of the limit per volt above 3.9 V, where the voltage is known",
+        ),
+    },
+    motor=motor,
+)

@@ -1,0 +1,25 @@
+"""Every rotor pushes by the same factor more or less, its reaction torque with it."""
+
+from openjax.vehicle.effects.effect import Effect, Parameter
+
+
+def body(parameters, vehicle):
+    factor = 1.0 + parameters["scale"]
+    return vehicle.replace(
+        thrust_constant=vehicle.thrust_constant * factor, torque_constant=vehicle.torque_constant * factor
+    )
+
+
+EFFECT = Effect(
+    name="thrust_scale",
+    description="thrust and rotor torque differ by a common factor 1 + scale",
+    parameters={
+        "scale": Parameter(
+            unit="1",
+            none=0.0,
+            prior=(-0.2, 0.2),
+            source="spread of published Crazyflie thrust maps and of propellers: 2-20 %",
+        )
+    },
+    body=body,
+)

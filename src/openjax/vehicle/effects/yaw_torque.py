@@ -1,0 +1,22 @@
+"""The rotors' reaction torque differs from what is assumed, their thrust doesn't."""
+
+from openjax.vehicle.effects.effect import Effect, Parameter
+
+
+def body(parameters, vehicle):
+    return vehicle.replace(torque_constant=vehicle.torque_constant * parameters["ratio"])
+
+
+EFFECT = Effect(
+    name="yaw_torque",
+    description="torque constant as a multiple of the assumed one",
+    parameters={
+        "ratio": Parameter(
+            unit="1",
+            none=1.0,
+            prior=(0.15, 2.0),
+            source="torque per thrust of 0.005-0.007 m measured on Crazyflies, against a nominal 0.031 m",
+        )
+    },
+    body=body,
+)
