@@ -10,13 +10,7 @@ from openjax.vehicle.rigid_body import (
     rotate,
     rotate_inverse,
 )
-from openjax.vehicle.rotors import (
-    commanded_rotor_speed,
-    rotor_reaction,
-    rotor_speed_step,
-    rotor_thrust,
-    rotor_wrench,
-)
+from openjax.vehicle.rotors import commanded_rotor_speed, rotor_reaction, rotor_speed_step, rotor_thrust
 from openjax.vehicle.state import DroneState, hover_state
 from openjax.vehicle.wrench import rotor_wrench, total_wrench
 
