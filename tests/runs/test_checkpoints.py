@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from openjax.errors import UserError
-from openjax.runs.checkpoints import Checkpoints, abstract_carry, load_arrays, load_state, place
+from openjax.runs.checkpoints import Checkpoints, abstract_like, load_arrays, load_state, place
 
 
 def init():
@@ -38,7 +38,7 @@ def test_half_written_checkpoint_is_passed_over_and_removed(run):
     unfinished = run.directory / "000000003.orbax-checkpoint-tmp"
     shutil.copytree(good, unfinished)
     (unfinished / "commit_success.txt").unlink(missing_ok=True)
-    carry, record = run.restore_latest(abstract_carry(init))
+    carry, record = run.restore_latest(abstract_like(place(init())))
     assert record.update == 2 and int(carry["n"]) == 2
     assert not unfinished.exists()
 
@@ -47,7 +47,7 @@ def test_damaged_checkpoint_falls_back_to_the_one_before(run):
     for file in (run.latest().path / "state" / "d").iterdir():
         file.write_bytes(file.read_bytes()[:3])
     warnings = []
-    carry, record = run.restore_latest(abstract_carry(init), warnings.append)
+    carry, record = run.restore_latest(abstract_like(place(init())), warnings.append)
     assert record.update == 1 and int(carry["n"]) == 1
     assert len(warnings) == 1 and "000000002" in warnings[0]
 
@@ -57,15 +57,15 @@ def test_other_shape_is_named(run):
         return {**init(), "actor": {"kernel": jnp.ones((3, 5))}}
 
     with pytest.raises(UserError, match=r"actor/kernel is float32\[3, 4\] there, .* float32\[3, 5\]"):
-        run.restore_latest(abstract_carry(other))
+        run.restore_latest(abstract_like(place(other())))
 
 
 def test_foreign_directory_is_no_checkpoint(tmp_path):
     (tmp_path / "readme.txt").write_text("nothing here")
     with pytest.raises(UserError, match="is no checkpoint"):
-        load_state(tmp_path, abstract_carry(init))
+        load_state(tmp_path, abstract_like(place(init())))
     with pytest.raises(UserError, match="holds no checkpoint"):
-        Checkpoints(tmp_path).restore_latest(abstract_carry(init))
+        Checkpoints(tmp_path).restore_latest(abstract_like(place(init())))
 
 
 def test_part_of_a_tree_can_be_read_without_knowing_it(run):

@@ -11,7 +11,7 @@ import pytest
 from flax import struct
 from rich.console import Console
 
-from openjax.runs.checkpoints import Checkpoints, abstract_carry, is_checkpoint, named_leaves, place
+from openjax.runs.checkpoints import Checkpoints, abstract_like, is_checkpoint, named_leaves, place
 from openjax.runs.loop import NotFiniteError, Plan, StopRequest, guarded, run_updates
 from openjax.runs.metrics import MetricsWriter, read_metrics
 from openjax.runs.progress import Progress
@@ -59,7 +59,7 @@ def run(directory, compiled_step, updates, resume=False, evaluate=None, **plan):
     checkpoints = Checkpoints(directory / "checkpoints")
     first = 0
     if resume:
-        carry, record = checkpoints.restore_latest(abstract_carry(init))
+        carry, record = checkpoints.restore_latest(abstract_like(place(init())))
         first = record.update
     else:
         carry = place(init())

@@ -49,16 +49,10 @@ def place(carry: Any, shardings: Any = None) -> Any:
     return jax.device_put(carry, _default_sharding() if shardings is None else shardings)
 
 
-def abstract_carry(init, shardings: Any = None) -> Any:
-    """Shapes, dtypes and shardings of `init()` without running it."""
-    shapes = jax.eval_shape(init)
-    if shardings is None or isinstance(shardings, jax.sharding.Sharding):
-        one = _default_sharding() if shardings is None else shardings
-        return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=one), shapes)
+def abstract_like(carry: Any) -> Any:
+    """Shapes, dtypes and shardings of a carry that `place` put on its devices."""
     return jax.tree.map(
-        lambda leaf, sharding: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding),
-        shapes,
-        shardings,
+        lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=leaf.sharding), carry
     )
 
 
@@ -69,7 +63,7 @@ def save_state(path: Path, carry: Any, notes: dict | None = None) -> None:
 
 
 def load_state(path: Path, abstract: Any) -> Any:
-    """Read a carry whose shapes, dtypes and shardings are those of `abstract` (from `abstract_carry`).
+    """Read a carry whose shapes, dtypes and shardings are those of `abstract` (from `abstract_like`).
 
     Raises:
       UserError: not a checkpoint, or one of another shape.

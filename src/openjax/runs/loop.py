@@ -151,6 +151,7 @@ def run_updates(
         metrics.write("train", at, at * plan.steps_per_update, elapsed(), values)
         if broken.any():
             raise _Broken(at, [name for name, bad in zip(names, broken, strict=True) if bad], values)
+        progress.phase("training", announce=at == first_update + 1)
         progress.update(at * plan.steps_per_update, values)
 
     def stop_reason():
@@ -161,6 +162,8 @@ def run_updates(
     reason = stop_reason()
     try:
         while update < plan.total_updates and reason is None:
+            if update == first_update:
+                progress.phase("compiling the training step")
             carry, values, broken = step(carry)
             update += 1
             if pending is not None:
@@ -174,6 +177,7 @@ def run_updates(
                 pending = None
             score = None
             if due and evaluate is not None:
+                progress.phase("evaluating on held-back tasks", announce=False)
                 score, held_back = evaluate(carry)
                 metrics.write("evaluation", update, update * plan.steps_per_update, elapsed(), held_back)
                 progress.held_back(held_back, is_best=score >= best_score)

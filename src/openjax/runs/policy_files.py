@@ -69,14 +69,15 @@ def load_policy_file(path: Path) -> tuple[dict[str, np.ndarray], dict, dict]:
     return leaves, header["settings"], header["notes"]
 
 
-def fill(abstract: Any, leaves: dict[str, np.ndarray], where: str) -> Any:
-    """The tree of `abstract` (shapes and dtypes) with its leaves taken by path.
+def fill(abstract: Any, leaves: dict[str, np.ndarray], where: str, prefix: str = "") -> Any:
+    """The tree of `abstract` (shapes and dtypes) with its leaves taken by path, which starts with `prefix`.
 
     Raises:
       UserError: a leaf is missing or has another shape; `where` names the source.
     """
     filled = []
-    for name, leaf in named_leaves(abstract).items():
+    for path, leaf in named_leaves(abstract).items():
+        name = prefix + path
         if name not in leaves:
             raise UserError(f"{where} lacks the parameters {name}; it was made by another network or version")
         if leaves[name].shape != leaf.shape:

@@ -56,11 +56,16 @@ class Progress:
             self._live.stop()
             self._live = None
 
-    def phase(self, text: str) -> None:
-        """Say what is going on now, for example what is being compiled."""
+    def phase(self, text: str, announce: bool = True) -> None:
+        """Say what is going on now, for example what is being compiled.
+
+        Where there's no terminal, it's a line of its own if `announce`.
+        """
+        if text == self._phase:
+            return
         self._phase, self._phase_start = text, time.monotonic()
-        self._last = None
-        if self._live is None:
+        self._last = None  # the speed is that of training alone
+        if self._live is None and announce:
             self._print(f"{text} ...")
 
     def message(self, text: str) -> None:

@@ -1,0 +1,208 @@
+"""Evaluation of policies on layouts and on held-back tasks, as tables, records and trajectories."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.table import Table
+
+from openjax.learning import Evaluation, make_evaluate, summarise
+from openjax.policy import Policy, PolicyParameters
+from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, Scenario, Task, scenario_task, uniform_task
+from openjax.runs.trajectory import Trajectory
+
+FIELDS = (
+    "scenario",
+    "episodes",
+    "capture_rate",
+    "capture_step",
+    "collision_rate",
+    "collision_parts",
+    "crash_rate",
+    "over_speed_rate",
+    "prediction_error",
+)
+"""What a record of an evaluation holds, in this order."""
+
+HELD_BACK_KEY = 20_000_003
+"""The held-back tasks are drawn from this key in all runs, so that runs can be compared."""
+
+
+class Evaluator:
+    """Episodes of the mean policy, `batch` at a time: one compilation for whatever tasks come.
+
+    Args:
+      environment: its settings say how many pursuers and pillar slots the tasks have.
+      policy: the networks.
+      batch: episodes per call of the compiled function.
+    """
+
+    def __init__(self, environment: Pursuit, policy: Policy, batch: int):
+        self.settings = environment.settings
+        self.batch = batch
+        self._evaluate = jax.jit(make_evaluate(environment, policy, trajectory=True))
+
+    def __call__(
+        self, parameters: PolicyParameters, tasks: Task, key: jax.Array
+    ) -> tuple[Evaluation, list[Any]]:
+        """One episode per task (leading axis B).
+
+        Returns:
+          Evaluation with leading axis B on the host, and the device trajectories of each batch.
+        """
+        number = tasks.evader_position.shape[0]
+        evaluations, records = [], []
+        for i, start in enumerate(range(0, number, self.batch)):
+            index = np.minimum(np.arange(start, start + self.batch), number - 1)
+            part = jax.tree.map(lambda leaf, index=index: leaf[index], tasks)
+            evaluation, record = self._evaluate(parameters, part, jax.random.fold_in(key, i))
+            used = min(self.batch, number - start)
+            evaluations.append(jax.tree.map(lambda leaf, used=used: np.asarray(leaf)[:used], evaluation))
+            records.append(record)
+        return jax.tree.map(lambda *parts: np.concatenate(parts), *evaluations), records
+
+    def trajectory(self, records: list[Any], episode: int, task: Task, title: str) -> Trajectory:
+        """Episode number `episode` of a call, for drawing; `task` is that episode's."""
+        record = jax.tree.map(
+            lambda leaf: np.asarray(leaf[episode % self.batch]), records[episode // self.batch]
+        )
+        settings = self.settings
+        return Trajectory(
+            title=title,
+            pursuer_position=record.pursuers,
+            pursuer_quaternion=record.quaternion,
+            evader_position=record.evader,
+            captured=record.captured,
+            pillar_position=np.asarray(task.pillar_position)[np.asarray(task.pillar_active)],
+            arena_radius=settings.arena_radius,
+            arena_height=settings.arena_height,
+            pillar_radius=settings.pillar_radius,
+            capture_radius=settings.capture_radius,
+            time_step=settings.time_step,
+        )
+
+
+def layout_slots(settings: PursuitSettings) -> int:
+    """Pillar slots that hold every layout and uniform task, so that one compiled evaluation serves all."""
+    return max(settings.max_pillars, *(len(scenario.pillars) for scenario in SCENARIOS.values()))
+
+
+def held_back_tasks(settings: PursuitSettings, number: int, slots: int) -> Task:
+    """The first `number` held-back uniform tasks, with `slots` pillar slots."""
+    keys = jax.random.split(jax.random.key(HELD_BACK_KEY), number)
+    tasks = jax.jit(jax.vmap(lambda key: uniform_task(settings, key)))(keys)
+    extra = slots - settings.max_pillars
+    return tasks.replace(
+        pillar_position=jnp.pad(tasks.pillar_position, ((0, 0), (0, extra), (0, 0))),
+        pillar_active=jnp.pad(tasks.pillar_active, ((0, 0), (0, extra))),
+    )
+
+
+def repeat_task(task: Task, number: int) -> Task:
+    """`number` copies along a new leading axis."""
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (number, *leaf.shape)), task)
+
+
+def evaluate_scenarios(
+    evaluator: Evaluator,
+    parameters: PolicyParameters,
+    scenarios: Sequence[Scenario],
+    episodes: int,
+    seed: int,
+    extra: tuple[str, ...] = (),
+) -> tuple[list[dict], list[Trajectory]]:
+    """A record (`FIELDS` and `extra`) and the first episode's trajectory for each scenario.
+
+    Scenarios whose episodes fill whole batches are flown one by one, so that a scenario's result is the same
+    alone and among others; otherwise all are packed into as few batches as they need.
+    """
+    single = [scenario_task(evaluator.settings, scenario) for scenario in scenarios]
+    repeated = [repeat_task(task, episodes) for task in single]
+    key = jax.random.key(seed)
+    if episodes % evaluator.batch == 0:
+        results = [(*evaluator(parameters, tasks, key), 0) for tasks in repeated]
+    else:
+        tasks = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *repeated)
+        evaluation, records = evaluator(parameters, tasks, key)
+        results = []
+        for start in range(0, len(scenarios) * episodes, episodes):
+            part = jax.tree.map(lambda leaf, start=start: leaf[start : start + episodes], evaluation)
+            results.append((part, records, start))
+    rows, flights = [], []
+    for scenario, task, (evaluation, records, first) in zip(scenarios, single, results, strict=True):
+        rows.append(record_of(scenario.name, episodes, summarise(evaluation), extra))
+        flights.append(evaluator.trajectory(records, first, task, scenario.name))
+    return rows, flights
+
+
+def record_of(scenario: str, episodes: int, summary: dict, extra: tuple[str, ...] = ()) -> dict:
+    """A summary as a record with exactly `FIELDS` (and `extra` ones); what isn't a number is None."""
+    values = {"scenario": scenario, "episodes": episodes, **summary}
+
+    def clean(value):
+        if isinstance(value, dict):
+            return {name: clean(entry) for name, entry in value.items()}
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    return {name: clean(values[name]) for name in (*FIELDS, *extra)}
+
+
+def selection_score(summary: dict) -> float:
+    """By which the best checkpoint is chosen, on the held-back tasks.
+
+    Captures count, breaches and crashes cost; the return settles it while nothing is captured yet.
+    """
+    return (
+        summary["capture_rate"]
+        - 5.0 * summary["collision_rate"]
+        - 0.5 * summary["crash_rate"]
+        - 0.1 * summary["over_speed_rate"]
+        + 1e-4 * summary["episode_return"]
+    )
+
+
+def results_table(title: str, rows: Sequence[dict]) -> Table:
+    """Records as a table."""
+    table = Table(title=title, title_justify="left")
+    table.add_column("scenario")
+    for name in ("episodes", "capture rate", "capture step", "collision rate"):
+        table.add_column(name, justify="right")
+    table.add_column("pillar / drone / bounds", justify="right")
+    for name in ("crash rate", "over-speed rate", "prediction error [m]"):
+        table.add_column(name, justify="right")
+    for row in rows:
+        parts = row["collision_parts"]
+        table.add_row(
+            row["scenario"],
+            str(row["episodes"]),
+            f"{row['capture_rate']:.3f}",
+            f"{row['capture_step']:.0f}",
+            f"{row['collision_rate']:.4f}",
+            f"{parts['pillar']:.4f} / {parts['drone']:.4f} / {parts['bounds']:.4f}",
+            f"{row['crash_rate']:.3f}",
+            f"{row['over_speed_rate']:.4f}",
+            "–" if row["prediction_error"] is None else f"{row['prediction_error']:.4f}",
+        )
+    return table
+
+
+def before_after_table(before: Sequence[dict], after: Sequence[dict]) -> Table:
+    """Returns, captures and collisions per layout, before and after training."""
+    table = Table(title="Before and after training", title_justify="left")
+    table.add_column("layout")
+    columns = (
+        ("episode_return", "return", ".0f"),
+        ("capture_rate", "capture rate", ".2f"),
+        ("capture_step", "capture step", ".0f"),
+        ("collision_rate", "collision rate", ".3f"),
+        ("crash_rate", "crash rate", ".2f"),
+    )
+    for _, label, _ in columns:
+        table.add_column(label, justify="right")
+    for old, new in zip(before, after, strict=True):
+        cells = [f"{old[name]:{style}} → {new[name]:{style}}" for name, _, style in columns]
+        table.add_row(old["scenario"], *cells)
+    return table

@@ -1,0 +1,91 @@
+"""Policies from wherever they lie: a policy file, a run, a checkpoint, or one shipped with the package."""
+
+import dataclasses
+from pathlib import Path
+
+import jax
+
+from openjax.errors import UserError
+from openjax.learning import TrainSettings
+from openjax.policy import Policy, PolicyParameters
+from openjax.pursuit import Observation, Pursuit
+from openjax.runs.checkpoints import Checkpoints, is_checkpoint, load_arrays
+from openjax.runs.policy_files import WEIGHTS, fill, load_policy_file, shipped_policies
+from openjax.runs.run_directory import RunDirectory, is_run
+from openjax.runs.settings_files import from_plain
+
+
+@dataclasses.dataclass(frozen=True)
+class LoadedPolicy:
+    """A trained policy; call it with an observation."""
+
+    policy: Policy
+    parameters: PolicyParameters
+    settings: TrainSettings
+    """What it was trained with."""
+    source: str
+
+    def __call__(self, observation: Observation) -> jax.Array:
+        """The mean policy's action (..., N, 4) in -1..1: collective thrust, roll, pitch and yaw rate."""
+        return self.policy.act(self.parameters, observation)
+
+
+def load_policy(name_or_path: str | Path) -> LoadedPolicy:
+    """Load a policy.
+
+    Args:
+      name_or_path: a name from `shipped_policies()`, a policy file (.npz), a run's directory (its best
+        policy) or a checkpoint's directory inside a run.
+
+    Raises:
+      UserError: nothing of that kind is there, or it's of another shape than its settings say.
+    """
+    path, source = Path(name_or_path), str(name_or_path)
+    if str(name_or_path) in shipped_policies():
+        return _from_file(WEIGHTS / f"{name_or_path}.npz", source)
+    if is_run(path):
+        return _from_run(RunDirectory(path), source)
+    if path.is_file():
+        return _from_file(path, source)
+    if is_checkpoint(path) and is_run(path.parent.parent):
+        run = RunDirectory(path.parent.parent)
+        return _build(run.read_settings(TrainSettings), load_arrays(path, "policy/"), source, "policy/")
+    if path.exists():
+        raise UserError(
+            f"{path} is no policy; expected a .npz file, a run of openjax.train or one of its checkpoints"
+        )
+    names = ", ".join(shipped_policies()) or "none"
+    raise UserError(
+        f"policy {name_or_path}: no such file or directory, nor shipped with the package ({names})"
+    )
+
+
+def abstract_parameters(environment: Pursuit, policy: Policy) -> PolicyParameters:
+    """Shapes and dtypes of the policy's parameters."""
+    return jax.eval_shape(lambda key: policy.init(key, environment.reset(key)[0]), jax.random.key(0))
+
+
+def _from_file(path, source):
+    leaves, settings, _ = load_policy_file(path)
+    return _build(from_plain(TrainSettings, settings, f"the settings of {path}"), leaves, source)
+
+
+def _from_run(run, source):
+    if run.policy.exists():
+        return _from_file(run.policy, source)
+    checkpoints = Checkpoints(run.checkpoints)
+    record = checkpoints.best() or checkpoints.latest()
+    if record is None:
+        raise UserError(f"{run.path} holds no policy and no checkpoint yet")
+    return _build(run.read_settings(TrainSettings), load_arrays(record.path, "policy/"), source, "policy/")
+
+
+def _build(settings, leaves, source, prefix=""):
+    if jax.default_backend() == "cpu":  # CPUs emulate bfloat16, slowly
+        settings = dataclasses.replace(
+            settings, network=dataclasses.replace(settings.network, compute_type="float32")
+        )
+    environment = Pursuit(settings.environment)
+    policy = Policy.for_environment(environment, settings.network, settings.predictor)
+    parameters = fill(abstract_parameters(environment, policy), leaves, source, prefix)
+    return LoadedPolicy(policy, parameters, settings, source)

@@ -1,0 +1,126 @@
+"""The directory of one run: what lies where, and that no run is overwritten by accident.
+
+settings.json      everything that determines the run; a policy or checkpoint needs nothing else
+vehicle.toml, effects.toml   copies of what it flew with, if not the nominal vehicle
+metrics.jsonl, tensorboard/  the logs
+checkpoints/       whole training states: the last ones and the best by the held-back tasks
+policy_start.npz, policy.npz  the policy before training and the best one
+layouts.json       before and after, per layout
+training.png, trajectories.png, chase.gif
+not_finite/        only after a NaN: the state that holds it
+"""
+
+import dataclasses
+import shutil
+from pathlib import Path
+from typing import Any
+
+from openjax.errors import UserError
+from openjax.runs.settings_files import SETTINGS_FILE, from_plain, read_json, write_json
+
+_FORMAT = "openjax run 1"
+_FILES = (
+    SETTINGS_FILE,
+    "vehicle.toml",
+    "effects.toml",
+    "metrics.jsonl",
+    "policy_start.npz",
+    "policy.npz",
+    "layouts.json",
+    "training.png",
+    "trajectories.png",
+    "chase.gif",
+)
+_FOLDERS = ("checkpoints", "tensorboard", "not_finite")
+
+
+@dataclasses.dataclass(frozen=True)
+class RunDirectory:
+    """Paths of one run."""
+
+    path: Path
+
+    @property
+    def checkpoints(self) -> Path:
+        return self.path / "checkpoints"
+
+    @property
+    def settings_file(self) -> Path:
+        return self.path / SETTINGS_FILE
+
+    @property
+    def start_policy(self) -> Path:
+        return self.path / "policy_start.npz"
+
+    @property
+    def policy(self) -> Path:
+        return self.path / "policy.npz"
+
+    def optional(self, name: str) -> Path | None:
+        """A file of the run if it's there: `vehicle.toml` or `effects.toml`."""
+        path = self.path / name
+        return path if path.exists() else None
+
+    def write_settings(self, settings: Any, facts: dict) -> None:
+        """Record the settings (nested dataclass) and facts like machine and command line."""
+        write_json(self.settings_file, {"format": _FORMAT, "settings": settings, **facts})
+
+    def read_settings(self, kind: type) -> Any:
+        """The settings as the dataclass `kind`.
+
+        Raises:
+          UserError: not written by openjax, or with settings that this version doesn't know.
+        """
+        stored = read_json(self.settings_file)
+        if not isinstance(stored, dict) or stored.get("format") != _FORMAT:
+            raise UserError(f"{self.settings_file} isn't of the format {_FORMAT!r}")
+        return from_plain(kind, stored["settings"], str(self.settings_file))
+
+
+def is_run(path: Path) -> bool:
+    """Whether the directory holds a run."""
+    return (Path(path) / SETTINGS_FILE).is_file()
+
+
+def open_run(path: Path) -> RunDirectory:
+    """A run that exists.
+
+    Raises:
+      UserError: there is none.
+    """
+    if not is_run(path):
+        raise UserError(
+            f"{path} is no run; expected a directory written by openjax.train (with {SETTINGS_FILE})"
+        )
+    return RunDirectory(Path(path))
+
+
+def check_free(path: Path, overwrite: bool) -> None:
+    """Whether a new run may be written to `path`; changes nothing.
+
+    Raises:
+      UserError: it holds a run and `overwrite` is False, or it holds other things.
+    """
+    path = Path(path)
+    if path.exists() and not path.is_dir():
+        raise UserError(f"{path} is a file; --out takes a directory")
+    if is_run(path):
+        if not overwrite:
+            raise UserError(
+                f"{path} already holds a run; --resume {path} goes on with it, --overwrite replaces it"
+            )
+    elif path.is_dir() and any(path.iterdir()):
+        raise UserError(f"{path} holds files that are no run; choose another --out")
+
+
+def create_run(path: Path, overwrite: bool) -> RunDirectory:
+    """An empty run directory; with `overwrite` a run that is there is removed, and only its own files."""
+    check_free(path, overwrite)
+    path = Path(path)
+    path.mkdir(parents=True, exist_ok=True)
+    # The settings file goes first: what is left of a half-removed run is no run that could be resumed.
+    for name in _FILES:
+        (path / name).unlink(missing_ok=True)
+    for name in _FOLDERS:
+        shutil.rmtree(path / name, ignore_errors=True)
+    return RunDirectory(path)

@@ -1,0 +1,211 @@
+"""One training run from its settings to its report: compile, train, evaluate, draw."""
+
+import dataclasses
+import time
+
+import jax
+import numpy as np
+from rich.console import Console
+
+from openjax.learning import TrainSettings, build, init_carry, make_training_step, summarise
+from openjax.policy import PolicyParameters
+from openjax.pursuit import SCENARIOS, Pursuit
+from openjax.runs.checkpoints import Checkpoints, abstract_like, load_arrays, named_leaves, place
+from openjax.runs.evaluation import (
+    Evaluator,
+    before_after_table,
+    evaluate_scenarios,
+    held_back_tasks,
+    layout_slots,
+    record_of,
+    selection_score,
+)
+from openjax.runs.loop import NotFiniteError, Plan, StopRequest, guarded, run_updates
+from openjax.runs.metrics import METRICS_FILE, MetricsWriter
+from openjax.runs.plots import plot_training, plot_trajectories
+from openjax.runs.policies import abstract_parameters, load_policy
+from openjax.runs.policy_files import fill, load_policy_file, save_policy_file
+from openjax.runs.progress import Progress
+from openjax.runs.run_directory import RunDirectory
+from openjax.runs.settings_files import write_json
+from openjax.runs.videos import animate
+
+_BESIDE_RECORD = ("episode_return",)
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainingJob:
+    """What to train and how to go about it."""
+
+    settings: TrainSettings
+    environment: Pursuit
+    start_from: str | None
+    """Policy whose networks the run starts with."""
+    devices: int
+    time_limit: float
+    """Seconds of training after which to stop."""
+    layout_episodes: int
+    facts: dict
+    """Kept beside the settings: command line, machine."""
+    started: float
+    """`time.monotonic()` when the command started."""
+
+    def check(self) -> None:
+        """Raises UserError for a policy to start from that doesn't fit, before any directory is touched."""
+        if self.start_from is not None:
+            _start_parameters(self)
+
+
+def run_job(job: TrainingJob, directory: RunDirectory, resume: bool, console: Console) -> int:
+    """Train, then write the report. Returns the exit status: 0, or 1 after a NaN."""
+    settings = job.settings
+    title = f"openjax.train → {directory.path}"
+    with StopRequest() as stop, Progress(title, settings.total_steps, console) as progress:
+        checkpoints = Checkpoints(directory.checkpoints)
+        progress.phase("compiling the start: networks, first tasks")
+        carry, update, seconds = _first_carry(job, directory, checkpoints, resume, progress)
+        directory.write_settings(settings, job.facts)
+        evaluator, tasks = _make_evaluator(job)
+
+        def evaluate(carry):
+            parameters = jax.device_put(carry.policy, jax.devices()[0])
+            summary = summarise(evaluator(parameters, tasks, jax.random.key(0))[0])
+            flat = {name: value for name, value in summary.items() if not isinstance(value, dict)}
+            flat |= {f"collision_{part}": value for part, value in summary["collision_parts"].items()}
+            score = selection_score(summary)
+            return score, {**flat, "score": score}
+
+        metrics = MetricsWriter(
+            directory.path, update if resume else None, resumed_steps=update * settings.steps_per_update
+        )
+        try:
+            outcome = run_updates(
+                guarded(make_training_step(settings, job.environment)),
+                carry,
+                Plan(
+                    total_updates=settings.total_updates,
+                    steps_per_update=settings.steps_per_update,
+                    evaluation_interval=settings.evaluation_interval,
+                    time_limit=job.time_limit,
+                ),
+                checkpoints=checkpoints,
+                metrics=metrics,
+                progress=progress,
+                directory=directory.path,
+                stop=stop,
+                evaluate=evaluate,
+                first_update=update,
+                seconds=seconds + time.monotonic() - job.started,
+            )
+        except NotFiniteError as error:
+            progress.message(f"stopped: {error}")
+            return 1
+        finally:
+            metrics.close()
+        _save_best(job, directory, checkpoints, outcome)
+        if stop.name is not None:
+            progress.message(
+                f"{stop.name}: saved at update {outcome.update}; "
+                f"go on with python -m openjax.train --resume {directory.path}"
+            )
+            return 0
+        table = _report(job, directory, evaluator, tasks, outcome, progress)
+    console.print(table)
+    console.print(f"run, policy and pictures are in {directory.path}", soft_wrap=True)
+    return 0
+
+
+def _first_carry(job, directory, checkpoints, resume, progress):
+    """The carry to start from, the updates done and the seconds spent."""
+    settings = job.settings
+    carry = init_carry(settings, jax.random.key(settings.seed), job.environment)
+    if resume:
+        abstract = abstract_like(place(carry))
+        del carry
+        carry, record = checkpoints.restore_latest(abstract, progress.message)
+        progress.message(f"resumed at update {record.update} of {settings.total_updates}")
+        return carry, record.update, float(record.notes.get("seconds", 0.0))
+    if job.start_from is not None:
+        carry = carry.replace(policy=_start_parameters(job))
+    carry = place(carry)
+    save_policy_file(directory.start_policy, carry.policy, settings, {"update": 0}, storage="float32")
+    return carry, 0, 0.0
+
+
+def _start_parameters(job) -> PolicyParameters:
+    loaded = load_policy(job.start_from)
+    abstract = abstract_parameters(job.environment, build(job.settings, job.environment).policy)
+    return fill(abstract, named_leaves(loaded.parameters), f"--start_from {job.start_from}")
+
+
+def _make_evaluator(job):
+    """One compiled evaluation for the held-back tasks and the layouts alike, and the held-back tasks."""
+    settings, environment = job.settings, job.environment
+    slots = layout_slots(settings.environment)
+    wide = Pursuit(
+        dataclasses.replace(settings.environment, max_pillars=slots),
+        environment.vehicle,
+        environment.effects,
+        environment.effect_parameters,
+    )
+    policy = build(settings, environment).policy
+    tasks = held_back_tasks(settings.environment, settings.evaluation_episodes, slots)
+    return Evaluator(wide, policy, settings.evaluation_episodes), tasks
+
+
+def _save_best(job, directory, checkpoints, outcome):
+    """Write the policy of the best checkpoint, or of the latest where none was evaluated."""
+    record = checkpoints.best() or checkpoints.latest()
+    abstract = jax.eval_shape(lambda: outcome.carry.policy)
+    parameters = fill(abstract, load_arrays(record.path, "policy/"), str(record.path), "policy/")
+    notes = {
+        "update": record.update,
+        "steps": record.update * job.settings.steps_per_update,
+        "held_back_score": record.score,
+        "seconds": record.notes.get("seconds"),
+        **job.facts,
+    }
+    save_policy_file(directory.policy, parameters, job.settings, notes, storage="float32")
+
+
+def _report(job, directory, evaluator, tasks, outcome, progress):
+    """Evaluate the first and the best policy on the layouts and draw the best one's flights."""
+    settings = job.settings
+    fitting = [s for s in SCENARIOS.values() if len(s.pursuers) == settings.environment.num_pursuers]
+    abstract = jax.eval_shape(lambda: outcome.carry.policy)
+    rows, flights = {}, []
+    for moment, path in (("before", directory.start_policy), ("after", directory.policy)):
+        progress.phase(f"evaluating the policy {moment} training on the layouts")
+        parameters = fill(abstract, load_policy_file(path)[0], str(path))
+        held_back, records = evaluator(parameters, tasks, jax.random.key(0))
+        rows[moment] = [
+            record_of("held_back", settings.evaluation_episodes, summarise(held_back), _BESIDE_RECORD)
+        ]
+        flights = [_flight(evaluator, records, tasks, i) for i in range(min(3, settings.evaluation_episodes))]
+        if fitting:
+            layouts, flights = evaluate_scenarios(
+                evaluator, parameters, fitting, job.layout_episodes, seed=0, extra=_BESIDE_RECORD
+            )
+            rows[moment] += layouts
+    progress.phase("drawing")
+    write_json(
+        directory.path / "layouts.json",
+        {
+            **rows,
+            "updates": outcome.update,
+            "steps": outcome.update * settings.steps_per_update,
+            "seconds": round(outcome.seconds, 1),
+            **job.facts,
+        },
+    )
+    plot_training(directory.path / "training.png", directory.path / METRICS_FILE)
+    plot_trajectories(directory.path / "trajectories.png", flights)
+    captured = [flight for flight in flights if flight.capture_index is not None]
+    drawn_by = animate(directory.path / "chase.gif", (captured or flights)[0])
+    progress.phase(f"done (animation by {drawn_by})")
+    return before_after_table(rows["before"], rows["after"])
+
+
+def _flight(evaluator, records, tasks, episode):
+    task = jax.tree.map(lambda leaf: np.asarray(leaf[episode]), tasks)
+    return evaluator.trajectory(records, episode, task, f"held-back task {episode + 1}")

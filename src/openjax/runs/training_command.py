@@ -1,0 +1,153 @@
+"""Options of `openjax.train`, their checks, and the start of a run: everything before the first array."""
+
+import dataclasses
+import shutil
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import tyro
+from rich.console import Console
+
+from openjax.errors import UserError
+from openjax.learning import TrainSettings, preset
+from openjax.runs.command_line import parse, peek
+from openjax.runs.environments import make_environment
+from openjax.runs.machine import describe_machine
+from openjax.runs.run_directory import RunDirectory, check_free, create_run, open_run
+from openjax.runs.training import TrainingJob, run_job
+
+PROGRAM = "python -m openjax.train"
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainCommand:
+    """Train pursuers to capture a faster evader.
+
+    Every setting of the run can be given, for example --environment.capture_radius 0.2 or --mappo.epochs 2;
+    the defaults shown are those of the preset.
+    """
+
+    preset: str | None = None
+    """quick: minutes on two CPU cores; paper: the paper's task on an accelerator; by default what fits."""
+    out: Path | None = None
+    """Directory of the run; by default runs/DATE-PRESET."""
+    steps: int | None = None
+    """Environment steps of the whole run, short for --total_steps."""
+    minutes: float | None = None
+    """Stop after this time, compilation included."""
+    resume: Path | None = None
+    """Go on with the run in this directory, exactly where it stopped."""
+    start_from: str | None = None
+    """Start with the networks of this policy (a run, a policy file or a name) instead of fresh ones."""
+    overwrite: bool = False
+    """Replace the run that --out already holds."""
+    effects: Path | None = None
+    """Physical effects to fly with (effects.toml, as the diagnosis writes it)."""
+    vehicle: Path | None = None
+    """Vehicle to fly (vehicle.toml, as the calibration writes it); by default the nominal Crazyflie."""
+    devices: str = "1"
+    """Number of devices to train on, or all."""
+    layout_episodes: int | None = None
+    """Episodes per layout in the final table; by default 100 on an accelerator, 32 on a CPU."""
+    settings: Annotated[tyro.conf.FlagConversionOff[TrainSettings], tyro.conf.arg(name="")] = (
+        dataclasses.field(default_factory=TrainSettings)
+    )
+
+
+def read_command(arguments: Sequence[str]) -> TrainCommand:
+    """The command line as `TrainCommand`, its settings complete.
+
+    Raises:
+      UserError: anything wrong with it, before a file is touched.
+    """
+    resume, name = peek(arguments, "resume"), peek(arguments, "preset")
+    if resume is not None:
+        if name is not None:
+            raise UserError("--preset and --resume exclude each other: a resumed run keeps its settings")
+        default = open_run(Path(resume)).read_settings(TrainSettings)
+    else:
+        default = preset(name or default_preset())
+    command = parse(TrainCommand, TrainCommand(settings=default), arguments, PROGRAM)
+    if command.steps is not None:
+        settings = dataclasses.replace(command.settings, total_steps=command.steps)
+        command = dataclasses.replace(command, settings=settings)
+    _check(command)
+    return command
+
+
+def default_preset() -> str:
+    """`quick` without an accelerator, else `paper`."""
+    return "quick" if jax.default_backend() == "cpu" else "paper"
+
+
+def start(command: TrainCommand, arguments: Sequence[str], started: float) -> int:
+    """Make the run's directory, or open it, and train. Returns the exit status."""
+    # Everything that can be wrong with the files is found before the directory is touched.
+    resumed = None if command.resume is None else open_run(command.resume)
+    vehicle = command.vehicle or (resumed.optional("vehicle.toml") if resumed else None)
+    effects = command.effects or (resumed.optional("effects.toml") if resumed else None)
+    environment = make_environment(command.settings.environment, vehicle, effects)
+    devices = _devices(command.devices)
+    name = command.preset or default_preset()
+    if resumed is None:
+        out = command.out or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{name}"
+        check_free(out, command.overwrite)
+    job = TrainingJob(
+        settings=command.settings,
+        environment=environment,
+        start_from=command.start_from,
+        devices=devices,
+        time_limit=float("inf") if command.minutes is None else 60.0 * command.minutes,
+        layout_episodes=command.layout_episodes or (32 if jax.default_backend() == "cpu" else 100),
+        facts={"command": " ".join([PROGRAM, *arguments]), "machine": describe_machine()},
+        started=started,
+    )
+    job.check()
+    if resumed is not None:
+        return run_job(job, resumed, resume=True, console=Console(highlight=False))
+    directory = create_run(out, command.overwrite)
+    _copy_files(directory, vehicle, effects)
+    return run_job(job, directory, resume=False, console=Console(highlight=False))
+
+
+def _check(command):
+    def need(condition, text):
+        if not condition:
+            raise UserError(text)
+
+    need(
+        command.minutes is None or command.minutes > 0, f"--minutes is {command.minutes}; it must be positive"
+    )
+    need(
+        command.layout_episodes is None or command.layout_episodes > 0,
+        f"--layout_episodes is {command.layout_episodes}; it must be positive",
+    )
+    if command.resume is None:
+        return
+    need(
+        command.out is None or command.out.resolve() == command.resume.resolve(),
+        f"--resume {command.resume} writes there; leave --out away",
+    )
+    need(not command.overwrite, "--resume and --overwrite exclude each other")
+    for option in ("start_from", "effects", "vehicle"):
+        need(getattr(command, option) is None, f"--{option} can't change when a run is resumed")
+
+
+def _devices(text):
+    available = len(jax.devices())
+    if text == "all":
+        return available
+    if not text.isdecimal() or not 1 <= int(text) <= available:
+        raise UserError(
+            f"--devices is {text!r}; expected all or a number up to the {available} that are here"
+        )
+    return int(text)
+
+
+def _copy_files(directory: RunDirectory, vehicle, effects):
+    for name, path in (("vehicle.toml", vehicle), ("effects.toml", effects)):
+        if path is not None:
+            shutil.copyfile(path, directory.path / name)
