@@ -1,0 +1,156 @@
+"""The path from commands to motors: the radio and the rate controller, read without any dynamics.
+
+The mean of the motor commands is the commanded thrust, so its delay and its lost packets show row by row; what the
+motors differ by is the rate controller's output.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from openjax.gap.linear_path import LinearPath, fit_linear_path
+from openjax.gap.observer import GYRO_GAIN, TICKS, observe
+from openjax.gap.replay import bucket, padded
+from openjax.gap.track import Track, smooth
+from openjax.vehicle.rate_controller import mixer
+
+GAIN_STEP = 0.05
+LONGEST_DELAY = 0.1         # s
+DELAY_STEP = 0.0005         # s
+TOLERANCE = 3e-4            # of thrust: rounding of the logs and of the firmware's integers
+INFORMATIVE = 1.5e-3        # smallest change of commanded thrust that shows whether a packet arrived
+
+
+@dataclass(frozen=True, eq=False)
+class Radio:
+    """What the link did. `gain` maps a set of its effects to its log-likelihood gain over a perfect link; `arrived`
+    [(fraction, (T, 2) rows)]: the command in force at the end and at the start of each row, and the share of the row
+    that the older one rules; `misfit` is the mean error of the collective thrust per set."""
+
+    delay: float
+    loss: float
+    gain: dict
+    arrived: dict
+    misfit: dict
+    informative: int
+
+
+def read_radio(tracks: list[Track]) -> Radio:
+    """Delay and lost packets from the commanded thrust against the mean of the motor commands."""
+    delays = np.arange(0.0, LONGEST_DELAY, DELAY_STEP)
+    misfit = sum(_delay_misfit(t, delays) for t in tracks)
+    delay = float(delays[int(np.argmin(misfit))])
+    perfect, straight = _decode(tracks, 0.0, False), _decode(tracks, 0.0, True)
+    late, both = _decode(tracks, delay, False), _decode(tracks, delay, True)
+    names = {(): perfect, ("command_latency",): late, ("packet_loss",): straight, ("command_latency", "packet_loss"): both}
+    level = {name: _scale(found) for name, found in names.items()}
+    used = both if delay > 0 else straight
+    return Radio(
+        delay, used["lost"] / max(used["informative"], 1),
+        {name: level[name] - level[()] for name in names},
+        {name: found["arrived"] for name, found in names.items()},
+        {name: float(np.mean(np.abs(found["error"]))) if len(found["error"]) else 0.0 for name, found in names.items()},
+        used["informative"],
+    )  # fmt: skip
+
+
+def _scale(found) -> float:
+    """Log-likelihood of the errors under a Laplace distribution of unknown scale; a third of the rows is counted as
+    independent."""
+    error = np.abs(found["error"])
+    return float(-len(error) / 3.0 * np.log(error.mean() + TOLERANCE)) if len(error) else 0.0
+
+
+def _clean_rows(track: Track) -> np.ndarray:
+    clean = ((track.motor < 0.997) & (track.motor > 0.003)).all(1)
+    clean[: int(LONGEST_DELAY / track.dt) + 2] = False
+    return clean
+
+
+def _delay_misfit(track: Track, delays: np.ndarray) -> np.ndarray:
+    thrust, given, clean = track.command[:, 0], track.motor.mean(1), _clean_rows(track)
+    cap = 0.3 * np.std(np.diff(thrust)) + 1e-9      # a lost packet must not pull at the delay
+    misfit = np.zeros(len(delays))
+    for number, delay in enumerate(delays):
+        whole = int(delay / track.dt + 1e-9)
+        part = delay / track.dt - whole
+        newer, older = _late(thrust, whole), _late(thrust, whole + 1)
+        error = np.abs(given - (1 - part) * newer - part * older)[clean]
+        misfit[number] = np.minimum(error, cap).sum()
+    return misfit
+
+
+def _late(values: np.ndarray, rows: int) -> np.ndarray:
+    return np.concatenate([np.repeat(values[:1], rows, 0), values[: len(values) - rows]])
+
+
+def _decode(tracks, delay: float, may_lose: bool) -> dict:
+    """Row by row: did the command due in this row arrive, or is the one before still held?"""
+    errors, arrived, lost, informative = [], [], 0, 0
+    for track in tracks:
+        thrust, given, clean = track.command[:, 0].tolist(), track.motor.mean(1).tolist(), _clean_rows(track)
+        whole = int(delay / track.dt + 1e-9)
+        part = delay / track.dt - whole
+        held, rows, error = 0, np.zeros((len(track), 2), int), np.zeros(len(track))
+        flags = clean.tolist()
+        for row in range(len(track)):
+            due = max(row - whole, 0)
+            expected = (1 - part) * thrust[due] + part * thrust[held]
+            missed = False
+            if flags[row] and abs(thrust[due] - thrust[held]) * (1 - part) > INFORMATIVE:
+                informative += 1
+                missed = may_lose and abs(given[row] - thrust[held]) < abs(given[row] - expected)
+                lost += missed
+            error[row] = given[row] - (thrust[held] if missed else expected)
+            rows[row] = (held if missed else due), held
+            if not missed:
+                held = due
+        errors.append(error[clean])
+        arrived.append((part, rows))
+    return {"error": np.concatenate(errors), "arrived": arrived, "lost": lost, "informative": informative}
+
+
+def in_force(track: Track, arrived) -> np.ndarray:
+    """Command (T, TICKS, 4) that rules at each tick of the rate loop."""
+    part, rows = arrived
+    out = np.repeat(track.command[rows[:, 0]][:, None], TICKS, 1)
+    older = int(round(part * TICKS))
+    out[:, :older] = track.command[rows[:, 1]][:, None]
+    return out
+
+
+def read_rate_loop(tracks, vehicles, arrived, flight_of) -> tuple[LinearPath, list[np.ndarray]]:
+    """The rate controller's gains from what the motors differ by, and the motor commands (T, TICKS, 4) of the ticks.
+
+    The observer runs twice: what pushed the body beyond the nominal physics in the first run is given to the second.
+    """
+    gains = np.concatenate([np.ones((1, 3)), 1.0 + GAIN_STEP * np.eye(3)]).astype(np.float32)
+    y, columns, nuisances, masks, ticks = [], [], [], [], []
+    for track, vehicle, link in zip(tracks, vehicles, arrived, strict=True):
+        size = bucket(len(track))
+        inputs = [padded(in_force(track, link), size), padded(track.motor, size), padded(track.body_rates, size)]
+        push = np.zeros((size, 3), np.float32)
+        for _ in range(2):
+            wanted, sent, rates = observe(gains, vehicle, *inputs, push, np.float32(track.dt))
+            miss = track.body_rates[1:] - np.asarray(rates[0], float)[: len(track) - 1]
+            pushed = miss.copy()        # undo the observer's own correction of what it missed before
+            pushed[1:] -= (1.0 - GYRO_GAIN) * miss[:-1]
+            pushed = smooth(np.concatenate([pushed, pushed[-1:]]), 0.06, track.dt) / track.dt
+            push = push + padded(pushed, size)
+        wanted = np.asarray(wanted, float)[:, : len(track)]
+        ticks.append(np.asarray(sent[0])[: len(track)])
+        outputs = np.linalg.pinv(np.asarray(mixer(vehicle), float)).T       # motors to roll, pitch, yaw
+        demand, logged = wanted @ outputs, track.motor @ outputs
+        y.append(logged - demand[0])
+        columns.append((demand[1:] - demand[0]) / GAIN_STEP)
+        time = (track.time - track.time[0])[:, None]
+        integral = np.asarray(vehicle.rate_ki, float) * 57.3 / 65536.0
+        trims = [f for axis in np.eye(3) for f in (0.3 * axis * np.ones_like(logged), 0.03 * axis * integral * time)]
+        nuisances.append(np.stack(trims))
+        clean = ((track.motor < 0.997) & (track.motor > 0.003)).all(1)
+        masks.append(1.0 - (np.convolve(~clean, np.ones(12))[: len(clean)] > 0))
+    groups = (((0, 1), False), ((2,), False))
+    path = fit_linear_path(y, columns, nuisances, flight_of, (0.4, 0.4, 0.4), groups, masks)
+    return path, ticks

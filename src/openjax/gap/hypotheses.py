@@ -1,0 +1,216 @@
+"""Sets of physics effects as hypotheses: Gauss-Newton fits through the simulator, and how well each explains a case.
+
+Every set is fitted with the same nuisances and weighed by its marginal likelihood (Laplace's approximation), so that
+parameters cost what they are worth. Singles and the best sets are fitted in full; the other pairs are weighed by
+adding the linearised singles.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import norm
+
+from openjax.gap.library import ABSENT, FITS, PLACE, Library, places, prior, start_of
+from openjax.gap.replay import GROUPS, SKIP, Replay
+from openjax.gap.whitening import fit_noise
+
+ITERATIONS = 6
+SMALL_STEP = 0.05       # nats: an improvement below this ends the search
+REFITTED = 5            # pairs fitted in full
+
+
+@dataclass(eq=False)
+class SetFit:
+    """A fitted set of effects. `grams` (F, 1 + p, 1 + p) of residual and derivatives at the optimum, by flight;
+    `score` the log marginal likelihood; `index` (p,) places in `theta` (P,), companions last."""
+
+    effects: tuple[str, ...]
+    theta: np.ndarray
+    index: np.ndarray
+    grams: np.ndarray
+    columns: list
+    covariance: np.ndarray
+    score: float
+    objective: float
+
+    def parameters(self) -> dict[str, dict[str, tuple[float, float]]]:
+        """{effect: {parameter: (value, standard deviation)}} of the set's own effects."""
+        deviation = dict(zip(self.index.tolist(), np.sqrt(np.diag(self.covariance)), strict=True))
+        return {
+            e: {p.name: (float(self.theta[PLACE[e, p.name]]), float(deviation[PLACE[e, p.name]]))
+                for p in FITS[e].parameters}
+            for e in self.effects
+        }  # fmt: skip
+
+
+def fit_set(replay: Replay, effects, start: np.ndarray | None = None, iterations: int = ITERATIONS) -> SetFit:
+    """Gauss-Newton from `start` (P,), by default the effects' first starts."""
+    effects = tuple(effects)
+    index, mean, precision = prior(effects)
+    if start is None:
+        start = ABSENT.copy()
+        for effect in effects:
+            start[places((effect,))] = start_of(effect)
+    theta, best = start.copy(), None
+    reach = 3.0 / np.sqrt(np.diag(precision)) if len(index) else np.zeros(0)
+    for iteration in range(iterations + 1):
+        columns = replay.linearised(theta, index)
+        grams = replay.grams(columns)
+        gram, off = grams.sum(0), theta[index] - mean
+        objective = 0.5 * gram[0, 0] + 0.5 * off @ precision @ off
+        if best is not None and not objective < best[0] - SMALL_STEP:
+            if objective < best[0]:
+                best = (objective, theta.copy(), grams, columns)
+                break
+            if not np.isfinite(objective) or objective > best[0] + 1.0:
+                if iteration < iterations:        # overshot: half way back
+                    theta = 0.5 * (theta + best[1])
+                    continue
+            break
+        best = (objective, theta.copy(), grams, columns)
+        if not len(index):
+            break
+        step = np.linalg.solve(gram[1:, 1:] + precision, gram[1:, 0] - precision @ off)
+        theta = theta.copy()
+        theta[index] += np.clip(step, -reach, reach)
+    objective, theta, grams, columns = best
+    hessian = grams.sum(0)[1:, 1:] + precision
+    covariance = np.linalg.inv(hessian) if len(index) else np.zeros((0, 0))
+    volume = np.linalg.slogdet(hessian)[1] - np.linalg.slogdet(precision)[1] if len(index) else 0.0
+    score = -objective - 0.5 * volume + _sign_term(effects, index, theta, covariance)
+    return SetFit(effects, theta, index, grams, columns, covariance, float(score), float(objective))
+
+
+def _sign_term(effects, index, theta, covariance) -> float:
+    """Log of how much likelier the right signs are after the fit than before."""
+    total = 0.0
+    for place, deviation in zip(index, np.sqrt(np.diag(covariance)), strict=True):
+        for effect in effects:
+            for parameter in FITS[effect].parameters:
+                if parameter.positive and PLACE[effect, parameter.name] == place:
+                    total += norm.logcdf((theta[place] - ABSENT[place]) / deviation) + np.log(2.0)
+    return float(total)
+
+
+def model_noise(replay: Replay, library: Library) -> list[np.ndarray]:
+    """Fit the noise models to what is left when all effects of the library may act at once; residuals (T, 9)."""
+    theta = ABSENT.copy()
+    ahead = []
+    for effect in library.physics:
+        for number in range(1 + len(FITS[effect].others)):
+            point = ABSENT.copy()
+            point[places((effect,))] = start_of(effect, number)
+            ahead.append(point)
+    index, _, precision = prior(library.physics)
+    columns = replay.linearised(theta, index)
+    moved = replay.predict(np.array(ahead)) if ahead else [np.zeros((0, *n.shape)) for n in replay.nominal]
+    columns = [
+        np.concatenate([c, m - n[None]]) for c, m, n in zip(columns, moved, replay.nominal, strict=True)
+    ]
+    size = len(index)
+    penalty = np.eye(size + len(ahead))
+    penalty[:size, :size] = precision
+    residuals = []
+    for _ in range(2):
+        gram = replay.grams(columns).sum(0)
+        weights = np.linalg.solve(gram[1:, 1:] + penalty, gram[1:, 0])
+        residuals = []
+        for number, column in enumerate(columns):
+            left = column[0] - np.tensordot(weights, column[1:], 1)
+            residuals.append(without_nuisances(replay, left, number))
+        skip = int(SKIP / replay.tracks[0].dt)
+        replay.set_noise([fit_noise(axes, residuals, integrated, skip=skip) if replay.usable[axes[0]] else old
+                          for (axes, integrated), old in zip(GROUPS, replay.noises, strict=True)])  # fmt: skip
+    return residuals
+
+
+def without_nuisances(replay: Replay, residual: np.ndarray, track: int) -> np.ndarray:
+    """A residual (T, 9) less the nuisances' most likely part."""
+    n = replay.whitened_nuisances[track].reshape(len(replay.nuisances[track]), -1)
+    taken = np.linalg.solve(np.eye(len(n)) + n @ n.T, n @ replay.whiten(residual, track).ravel())
+    return residual - np.tensordot(taken, replay.nuisances[track], 1)
+
+
+def weigh_sets(replay: Replay, library: Library, largest: int = 3) -> dict[tuple[str, ...], SetFit | float]:
+    """Score of every set up to pairs and of the best triples: fits in full, or scores where only linearised."""
+    effects = library.physics
+    found: dict[tuple[str, ...], SetFit | float] = {(): fit_set(replay, ())}
+    for effect in effects:
+        fits = []
+        for number in range(1 + len(FITS[effect].others)):
+            start = ABSENT.copy()
+            start[places((effect,))] = start_of(effect, number)
+            fits.append(fit_set(replay, (effect,), start))
+        found[effect,] = max(fits, key=lambda f: f.score)
+    if largest < 2 or len(effects) < 2:
+        return found
+    sums = LinearSums(replay, [found[e,] for e in effects], found[()])
+    pairs = {pair: sums.score(pair) for pair in itertools.combinations(effects, 2)}
+    _refit(replay, found, pairs, sums, REFITTED)
+    if largest < 3:
+        return found
+    best = max((k for k in found if len(k) == 2), key=lambda k: score_of(found[k]))
+    triples = {tuple(sorted((*best, e), key=effects.index)): 0.0 for e in effects if e not in best}
+    triples = {triple: sums.score(triple) for triple in triples}
+    _refit(replay, found, triples, sums, 2)
+    return found
+
+
+def _refit(replay, found, scores, sums, count) -> None:
+    ranked = sorted(scores, key=lambda k: -scores[k])
+    for chosen in ranked[:count]:
+        found[chosen] = fit_set(replay, chosen, sums.point(chosen), 4)
+    level = max(found[k].score for k in ranked[:count])
+    # A linearised score is an estimate: never let it beat a set that was fitted in full.
+    found.update({k: min(scores[k], level) for k in ranked[count:]})
+
+
+def score_of(entry: SetFit | float) -> float:
+    return entry.score if isinstance(entry, SetFit) else entry
+
+
+class LinearSums:
+    """Joint scores of effects from their single fits: residuals and derivatives are taken to add up."""
+
+    def __init__(self, replay: Replay, singles: list[SetFit], nothing: SetFit):
+        columns = [[c[:1]] for c in nothing.columns]
+        self.row, self.own, self.theta = {}, {}, {}
+        at = 1
+        for fit in singles:
+            effect, own = fit.effects[0], len(places(fit.effects))
+            self.row[effect], self.own[effect], self.theta[effect] = at, list(range(at + 1, at + 1 + own)), fit.theta
+            for number, column in enumerate(fit.columns):
+                columns[number].append(column[: 1 + own])
+            at += 1 + own
+        self.gram = replay.grams([np.concatenate(c) for c in columns]).sum(0)
+
+    def point(self, effects) -> np.ndarray:
+        """Where the single fits of `effects` are, taken together."""
+        theta = ABSENT.copy()
+        for effect in effects:
+            index = places((effect,))
+            theta[index] = self.theta[effect][index]
+        return theta
+
+    def score(self, effects) -> float:
+        """Log marginal likelihood of a set, without companions."""
+        pick = [j for e in effects for j in self.own[e]]
+        transform = np.zeros((1 + len(pick), len(self.gram)))
+        transform[0, 0] = 1.0 - len(effects)
+        for effect in effects:
+            transform[0, self.row[effect]] += 1.0
+        transform[np.arange(1, 1 + len(pick)), pick] = 1.0
+        gram = transform @ self.gram @ transform.T
+        size = len(pick)
+        index, mean, precision = prior(effects)
+        covariance = np.linalg.inv(precision)[:size, :size]
+        precision, off = np.linalg.inv(covariance), self.point(effects)[index[:size]] - mean[:size]
+        hessian = gram[1:, 1:] + precision
+        push = gram[1:, 0] - precision @ off
+        volume = np.linalg.slogdet(hessian)[1] - np.linalg.slogdet(precision)[1]
+        return float(
+            -0.5 * gram[0, 0] - 0.5 * off @ precision @ off + 0.5 * push @ np.linalg.solve(hessian, push) - 0.5 * volume
+        )

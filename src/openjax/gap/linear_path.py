@@ -1,0 +1,65 @@
+"""Paths of a log that need no physics: firmware and estimator, each linear in what is asked of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from openjax.gap.replay import marginal_gram
+from openjax.gap.whitening import Noise, fit_noise, whiten
+
+PASSES = 3              # of fitting the noise model and the coefficients in turn
+
+
+@dataclass(eq=False)
+class LinearPath:
+    """y (T, A) = columns x theta + nuisances + noise, for each track; theta has a zero-mean prior of `spread` (P,)."""
+
+    grams: np.ndarray           # (F, 1 + P, 1 + P) whitened inner products per flight, nuisances marginalised
+    spread: np.ndarray          # (P,)
+    residual: list[np.ndarray]  # (T, A) after the fit
+    noises: tuple[Noise, ...]
+    rows: int                   # residuals that counted
+
+    def score(self) -> tuple[float, np.ndarray, np.ndarray]:
+        """Log Bayes factor of the path's effect against its absence, coefficients (P,), covariance (P, P)."""
+        return linear_score(self.grams.sum(0), self.spread)
+
+
+def linear_score(gram: np.ndarray, spread: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Log Bayes factor, coefficients and covariance from a gram matrix (1 + P, 1 + P), residual first."""
+    precision = np.diag(1.0 / spread**2)
+    hessian = gram[1:, 1:] + precision
+    theta = np.linalg.solve(hessian, gram[1:, 0])
+    volume = np.linalg.slogdet(hessian)[1] + 2 * np.log(spread).sum()
+    return float(0.5 * gram[1:, 0] @ theta - 0.5 * volume), theta, np.linalg.inv(hessian)
+
+
+def fit_linear_path(y, columns, nuisances, flight_of, spread, groups, masks=None, skip: int = 20) -> LinearPath:
+    """Fit tracks' y [(T, A)], columns [(P, T, A)], nuisances [(N, T, A)] (unit prior variance).
+
+    groups: ((axes, integrated), ...) that share a noise model; masks [(T,)] are 0 in rows that must not count.
+    """
+    spread = np.asarray(spread, float)
+    size = 1 + len(spread)
+    flights = int(np.max(flight_of)) + 1
+    data = [np.concatenate([a[None], b, c]) for a, b, c in zip(y, columns, nuisances, strict=True)]
+    residual = [a - a.mean(0) for a in y]
+    for _ in range(PASSES):
+        noises = tuple(fit_noise(axes, residual, integrated, masks, skip) for axes, integrated in groups)
+        grams, whitened, rows = np.zeros((flights, size, size)), [], 0
+        for number, d in enumerate(data):
+            w = whiten(noises, d)[:, skip:]
+            if masks is not None:
+                w = w * masks[number][skip:, None]
+            rows += int(w.shape[1] if masks is None else masks[number][skip:].sum()) * w.shape[2]
+            whitened.append(w.reshape(len(w), -1))
+            grams[flight_of[number]] += marginal_gram(whitened[-1][:size], whitened[-1][size:])
+        _, theta, _ = linear_score(grams.sum(0), spread)
+        residual = []
+        for d, w in zip(data, whitened, strict=True):
+            left, n = w[0] - theta @ w[1:size], w[size:]
+            taken = np.linalg.solve(np.eye(len(n)) + n @ n.T, n @ left)
+            residual.append(d[0] - np.tensordot(theta, d[1:size], 1) - np.tensordot(taken, d[size:], 1))
+    return LinearPath(grams, spread, residual, noises, rows)

@@ -1,0 +1,70 @@
+"""The nominal vehicle flown along a log: what the firmware did inside each row.
+
+A row of a log holds the mean of the motor commands over 10 ms, in which the 500 Hz rate loop ran five times. The
+observer runs that loop: the nominal rate controller on body rates that the logged motors drive and the gyroscope
+corrects after every row. It gives the motor command of every tick (its mean is the logged one), which the physics
+needs, and the mean that the controller would have sent, which shows whether the controller is the assumed one.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+
+from openjax.vehicle import DroneState
+from openjax.vehicle.effects import EFFECTS
+from openjax.vehicle.rate_controller import rate_controller
+from openjax.vehicle.rotors import rotor_reaction, rotor_speed_step, rotor_thrust
+from openjax.vehicle.wrench import total_wrench
+
+TICKS = 5               # of the rate loop per row
+GYRO_GAIN = 0.3         # share of a gyro innovation that corrects the observer, near the optimum for usual noise
+GAIN_NAMES = ("p", "i", "d")
+
+
+def _observe(gains, vehicle, command, motor, gyro, disturbance, dt):
+    """One track. gains (3,) multiples of p, i, d; command (T, TICKS, 4), motor (T, 4), gyro (T, 3) rad/s,
+    disturbance (T, 3) rad/s^2 of angular acceleration beyond the nominal; dt () s per row.
+
+    Returns the controller's mean motor command (T, 4), the motor commands of the ticks (T, TICKS, 4) with the logged
+    mean, and the rates at the end of each row as predicted (T, 3).
+    """
+    controller = EFFECTS["rate_gains"].body(dict(zip(GAIN_NAMES, gains, strict=True)), vehicle)
+    h = dt / TICKS
+    at_rest = jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0])
+
+    def tick(carry, command):
+        rates, previous, integral, speed, offset, push = carry
+        state = DroneState(*at_rest, jnp.zeros(3), rates, speed, integral, previous, ())
+        wanted, integral = rate_controller(controller, state, command, h)
+        given = jnp.clip(wanted + offset, 0.0, 1.0)
+        speed = rotor_speed_step(vehicle, speed, given, h)
+        _, torque = total_wrench(vehicle, rotor_thrust(vehicle, speed), rotor_reaction(vehicle, speed))
+        gyroscopic = jnp.cross(rates, vehicle.inertia * rates)
+        after = rates + h * ((torque - gyroscopic) / vehicle.inertia + push)
+        return (after, rates, integral, speed, offset, push), (wanted, given)
+
+    def row(carry, inputs):
+        command, logged, gyro_next, push = inputs
+        _, (wanted, _) = jax.lax.scan(tick, (*carry, jnp.zeros(4), push), command, unroll=True)
+        # The second pass follows the motors as logged: the controller's pattern in the row, the log's mean.
+        start = (*carry, logged - wanted.mean(0), push)
+        (rates, previous, integral, speed, _, _), (wanted, given) = jax.lax.scan(tick, start, command, unroll=True)
+        step = GYRO_GAIN * (gyro_next - rates)
+        sent = given + (logged - given.mean(0))
+        return (rates + step, previous + step, integral, speed), (wanted.mean(0), sent, rates)
+
+    speed = vehicle.max_rotor_speed * jnp.sqrt(jnp.clip(motor[0], 1e-4, 1.0))
+    gyro_next = jnp.concatenate([gyro[1:], gyro[-1:]])
+    start = (gyro[0], gyro[0], jnp.zeros(3), speed)
+    return jax.lax.scan(row, start, (command, motor, gyro_next, disturbance))[1]
+
+
+@partial(jax.jit)
+def observe(gains, vehicle, command, motor, gyro, disturbance, dt):
+    """`_observe` for gains (B, 3); everything else is shared."""
+    return jax.vmap(_observe, in_axes=(0, None, None, None, None, None, None))(
+        gains, vehicle, command, motor, gyro, disturbance, dt
+    )

@@ -1,0 +1,203 @@
+"""Replay of the motion: what a vehicle with given effects would have measured along each track, channel by channel.
+
+Channels: body rates (3), velocity (3, world) - both integrated from the first row - and specific force (3, body).
+Residuals are compared through noise models (`whitening`), with the nuisances marginalised per flight.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+
+from openjax.gap.library import ABSENT, MOTOR_SHIFT, PHYSICS_EFFECTS, PLACE, STEP, THETA, THRUST_OFFSET
+from openjax.gap.physics import Path, compiled_physics
+from openjax.gap.track import Track, rotation, smooth
+from openjax.gap.whitening import Noise, whiten
+
+RATES, VELOCITY, FORCE = slice(0, 3), slice(3, 6), slice(6, 9)
+# Groups of channels that share a noise model: axes, whether integrated.
+GROUPS = (((0, 1), True), ((2,), True), ((3, 4), True), ((5,), True), ((6, 7), False), ((8,), False))
+FIRST_NOISE = (0.03, 0.03, 0.006, 0.006, 0.25, 0.25)
+SKIP = 0.2              # s left out at the start of a track: rotor speeds are not known there
+BUCKETS = (256, 512, 1024, 2048, 4096, 8192, 16384, 32768)
+BATCH = 8
+# Nuisances and their standard deviations; see GAP: free in every hypothesis.
+TILT = np.radians(0.5)          # between tracked frame and thrust axis
+ACCELEROMETER_BIAS = 0.4        # m/s^2
+POSE_SHIFT = 0.0015             # s between motion capture and the vehicle's clock
+
+
+def bucket(length: int) -> int:
+    """The padded length of a track: a few fixed sizes, so that nothing is compiled twice."""
+    return next((b for b in BUCKETS if b >= length), length)
+
+
+def padded(values: np.ndarray, length: int) -> np.ndarray:
+    """float32, the last row repeated up to `length`."""
+    values = np.asarray(values, np.float32)
+    return np.concatenate([values, np.repeat(values[-1:], length - len(values), 0)])
+
+
+@dataclass(eq=False)
+class Replay:
+    """All tracks of a case under one nominal vehicle each. `usable` (9,) says which channels were logged."""
+
+    tracks: list[Track]
+    vehicles: list
+    paths: list[Path]
+    measured: list[np.ndarray]      # (T, 9)
+    nominal: list[np.ndarray]       # (T, 9)
+    nuisances: list[np.ndarray]     # (N, T, 9), in units of their standard deviations
+    flights: tuple[str, ...]
+    flight_of: np.ndarray           # (tracks,) index of a track's flight
+    usable: np.ndarray
+    noises: tuple[Noise, ...] = ()
+    whitened_nuisances: list | None = None
+
+    def predict(self, theta: np.ndarray, track: int | None = None) -> list[np.ndarray]:
+        """Channels (B, T, 9) of each track (or of one) for parameter vectors theta (B, P)."""
+        count = len(theta)
+        fill = -count % BATCH
+        theta = np.concatenate([theta, np.repeat(theta[:1], fill, 0)]).astype(np.float32)
+        physics = compiled_physics(PHYSICS_EFFECTS, THETA)
+        out = []
+        for number in range(len(self.tracks)) if track is None else (track,):
+            parts = [
+                np.asarray(physics(theta[i:i + BATCH], self.vehicles[number], self.paths[number]))
+                for i in range(0, len(theta), BATCH)
+            ]
+            out.append(_integrated(np.concatenate(parts)[:count, :len(self.tracks[number])], self.tracks[number].dt))
+        return out
+
+    def set_noise(self, noises) -> None:
+        """Use these noise models; unlogged channels get none and count nothing."""
+        self.noises = tuple(noises)
+        self.whitened_nuisances = [self.whiten(n, k) for k, n in enumerate(self.nuisances)]
+
+    def whiten(self, x: np.ndarray, track: int) -> np.ndarray:
+        """x (..., T, 9) of a track -> (..., T', 9) in units of the noise, without the first moments."""
+        out = whiten(self.noises, x) * self.usable
+        return out[..., int(SKIP / self.tracks[track].dt):, :]
+
+    def grams(self, columns: list[np.ndarray]) -> np.ndarray:
+        """Inner products (F, C, C) per flight of columns [(C, T, 9) per track], nuisances marginalised."""
+        total = 0.0
+        size = len(columns[0])
+        total = np.zeros((len(self.flights), size, size))
+        for number, column in enumerate(columns):
+            w = self.whiten(column, number).reshape(size, -1)
+            total[self.flight_of[number]] += marginal_gram(w, self.whitened_nuisances[number])
+        return total
+
+    def linearised(self, theta: np.ndarray, index: np.ndarray) -> list[np.ndarray]:
+        """Residual and derivatives (1 + p, T, 9) of each track at theta (P,) with respect to theta[index]."""
+        index = np.asarray(index, int)
+        batch = np.repeat(theta[None], len(index) + 1, 0)
+        batch[np.arange(len(index)) + 1, index] += STEP[index]
+        steps = STEP[index][:, None, None]
+        return [
+            np.concatenate([(y - p[0])[None], (p[1:] - p[:1]) / steps])
+            for y, p in zip(self.measured, self.predict(batch), strict=True)
+        ]
+
+
+def marginal_gram(w: np.ndarray, nuisances: np.ndarray) -> np.ndarray:
+    """w w' (C, C) of whitened columns (C, M) after marginalising nuisances (N, ...) of unit prior variance."""
+    n = nuisances.reshape(len(nuisances), -1)
+    cross = w @ n.T
+    return w @ w.T - cross @ np.linalg.solve(np.eye(len(n)) + n @ n.T, cross.T)
+
+
+def _integrated(rows: np.ndarray, dt: float) -> np.ndarray:
+    """Channels (B, T, 9) from accelerations and specific force (B, T, 9) of the rows' intervals."""
+    rows = rows.astype(float)
+    integral = np.zeros_like(rows[:, :, :6])
+    np.cumsum(rows[:, :-1, :6] * dt, axis=1, out=integral[:, 1:])
+    specific = rows[:, :, 6:].copy()
+    specific[:, 1:] = 0.5 * (rows[:, 1:, 6:] + rows[:, :-1, 6:])
+    return np.concatenate([integral, specific], 2)
+
+
+def make_replay(tracks, vehicles, motor_ticks) -> Replay:
+    """Replay of tracks with their nominal vehicles and motor commands (T, TICKS, 4) of the rate loop's ticks."""
+    paths = [_path(t, m) for t, m in zip(tracks, motor_ticks, strict=True)]
+    measured = [_measured(t) for t in tracks]
+    usable = np.ones(9)
+    if any(t.velocity is None for t in tracks):
+        usable[VELOCITY] = 0.0
+    if any(t.specific_force is None for t in tracks):
+        usable[FORCE] = 0.0
+    flights = tuple(dict.fromkeys(t.flight for t in tracks))
+    replay = Replay(
+        list(tracks), [jax.tree.map(np.float32, v) for v in vehicles], paths, measured, [], [], flights,
+        np.array([flights.index(t.flight) for t in tracks]), usable,
+    )  # fmt: skip
+    offset = PLACE[THRUST_OFFSET[:2]]
+    batch = np.repeat(ABSENT[None], 3, 0)
+    batch[1, offset] += STEP[offset]
+    batch[2, -1] += STEP[-1]
+    for number, track in enumerate(tracks):
+        base, scaled, shifted = replay.predict(batch, number)[0]
+        replay.nominal.append(base)
+        columns = [(scaled - base) / STEP[offset] * THRUST_OFFSET[2], (shifted - base) / STEP[-1] * MOTOR_SHIFT]
+        replay.nuisances.append(np.stack(columns + _sensor_nuisances(track, paths[number], base)))
+    replay.set_noise([Noise(a, 0.15 if i else None, np.zeros(0), s)
+                      for (a, i), s in zip(GROUPS, FIRST_NOISE, strict=True)])  # fmt: skip
+    return replay
+
+
+def _path(track: Track, ticks: np.ndarray) -> Path:
+    rows, size = len(track), bucket(len(track))
+
+    def middle(values):
+        return padded(0.5 * (values + np.concatenate([values[1:], values[-1:]])), size)
+
+    unknown = np.zeros((rows, 3))
+    quaternion = track.quaternion if track.quaternion is not None else np.tile([1.0, 0, 0, 0], (rows, 1))
+    quaternion = middle(quaternion)
+    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+    # Without a pose the vehicle is taken to be in mid-air, far from everything.
+    position = track.position if track.position is not None else unknown + [0.0, 0.0, 0.6]
+    velocity = track.velocity if track.velocity is not None else unknown
+    others = [middle(p) for p in track.neighbours] or [np.tile(np.float32([50.0, 50.0, -50.0]), (size, 1))]
+    voltage = np.full(size, np.nan, np.float32) if track.voltage is None else middle(track.voltage)
+    return Path(
+        middle(position), quaternion, middle(velocity), middle(smooth(track.body_rates, 0.05, track.dt)),
+        padded(ticks, size), voltage, np.stack(others, 1), np.float32(track.dt),
+    )  # fmt: skip
+
+
+def _measured(track: Track) -> np.ndarray:
+    out = np.zeros((len(track), 9))
+    out[:, RATES] = track.body_rates - track.body_rates[0]
+    if track.velocity is not None:
+        out[:, VELOCITY] = track.velocity - track.velocity[0]
+    if track.specific_force is not None:
+        out[:, FORCE] = track.specific_force
+    return out
+
+
+def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> list[np.ndarray]:
+    """Tilt of the tracked frame (2), accelerometer bias (3), clock of the motion capture: columns (T, 9)."""
+    rows = len(track)
+    turn = rotation(path.quaternion[:rows].astype(float))
+    specific = np.gradient(nominal[:, VELOCITY], track.dt, axis=0) + [0.0, 0.0, 9.81]
+    body = np.einsum("tji,tj->ti", turn, specific)
+
+    def moved(acceleration):        # what a change of the body-frame acceleration does to the velocity
+        column = np.zeros((rows, 9))
+        column[:, VELOCITY] = np.cumsum(np.einsum("tij,tj->ti", turn, acceleration), 0) * track.dt
+        return column
+
+    columns = [moved(np.cross(axis, body)) * TILT for axis in np.eye(3)[:2]]
+    for axis in range(3):
+        column = np.zeros((rows, 9))
+        column[:, 6 + axis] = ACCELEROMETER_BIAS
+        columns.append(column)
+    if track.velocity is not None:
+        column = -moved(np.cross(path.body_rates[:rows].astype(float), body))
+        column[:, VELOCITY] += smooth(np.gradient(track.velocity, track.dt, axis=0), 0.05, track.dt)
+        columns.append(column * POSE_SHIFT)
+    return columns
