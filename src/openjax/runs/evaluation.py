@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from rich import box
 from rich.table import Table
 
 from openjax.learning import Evaluation, make_evaluate, summarise
@@ -166,12 +167,12 @@ def selection_score(summary: dict) -> float:
 
 def results_table(title: str, rows: Sequence[dict]) -> Table:
     """Records as a table."""
-    table = Table(title=title, title_justify="left")
+    table = Table(title=title, title_justify="left", box=box.SIMPLE, pad_edge=False)
     table.add_column("scenario")
-    for name in ("episodes", "capture rate", "capture step", "collision rate"):
+    for name in ("episodes", "capture\nrate", "capture\nstep", "collision\nrate"):
         table.add_column(name, justify="right")
-    table.add_column("pillar / drone / bounds", justify="right")
-    for name in ("crash rate", "over-speed rate", "prediction error [m]"):
+    table.add_column("pillar/drone/bounds", justify="right")
+    for name in ("crash\nrate", "over-\nspeed", "prediction\nerror [m]"):
         table.add_column(name, justify="right")
     for row in rows:
         parts = row["collision_parts"]
@@ -181,7 +182,7 @@ def results_table(title: str, rows: Sequence[dict]) -> Table:
             f"{row['capture_rate']:.3f}",
             f"{row['capture_step']:.0f}",
             f"{row['collision_rate']:.4f}",
-            f"{parts['pillar']:.4f} / {parts['drone']:.4f} / {parts['bounds']:.4f}",
+            "/".join(f"{parts[name]:.3f}" for name in ("pillar", "drone", "bounds")),
             f"{row['crash_rate']:.3f}",
             f"{row['over_speed_rate']:.4f}",
             "–" if row["prediction_error"] is None else f"{row['prediction_error']:.4f}",
@@ -191,7 +192,7 @@ def results_table(title: str, rows: Sequence[dict]) -> Table:
 
 def before_after_table(before: Sequence[dict], after: Sequence[dict]) -> Table:
     """Returns, captures and collisions per layout, before and after training."""
-    table = Table(title="Before and after training", title_justify="left")
+    table = Table(title="Before and after training", title_justify="left", box=box.SIMPLE, pad_edge=False)
     table.add_column("layout")
     columns = (
         ("episode_return", "return", ".0f"),
