@@ -42,7 +42,7 @@ def _received(arrival, steps):
     return np.maximum.accumulate(table, axis=0)
 
 
-def _control(reference, k, position, q, velocity, integral, p_mass):
+def off_board_control(reference, k, position, q, velocity, integral, p_mass):
     """Off-board controller: [thrust 0..1, body rates rad/s] (4, B) from the measured pose and velocity."""
     error = reference["position"][k] - position
     integral += 0.01 * np.clip(error, -0.2, 0.2)
@@ -160,7 +160,7 @@ def fly(batch):
             seen_v = delayed("v", n, delay) + noise["velocity"][k]
             seen_q = b.multiply(delayed("q", n, delay), noise["attitude"][k])
             seen_q /= np.sqrt((seen_q * seen_q).sum(axis=0))
-            command[k] = _control(reference, k, seen_p, seen_q, seen_v, goal_integral, b.MASS)
+            command[k] = off_board_control(reference, k, seen_p, seen_q, seen_v, goal_integral, b.MASS)
             for name, value in (
                 ("position", position),
                 ("velocity", velocity),
