@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from openjax.errors import UserError
 from openjax.gap.checks import check_flight, duplicates
 from openjax.gap.flight import Case, Flight, Issue
-from openjax.gap.importers import find_logs, read_log
+from openjax.gap.importers import MAPPING_FILE, ColumnMapping, find_logs, load_mapping, read_log
 from openjax.gap.reading import LogError, flights_of
 from openjax.vehicle.vehicle_file import VehicleFile, load_vehicle_file
 
@@ -27,9 +27,10 @@ def load_case(path: str | Path, dtype=jnp.float32) -> Case:
     if not logs:
         raise UserError(f"{path}: holds no flight log (.csv, .csv.gz, micro-SD log or ROS 2 bag)")
     vehicle_file = load_vehicle_file(path / "vehicle.toml", dtype)
+    mapping = load_mapping(path / MAPPING_FILE) if (path / MAPPING_FILE).exists() else None
     flights, issues = [], []
     for log in logs:
-        read, found = _read(log, vehicle_file)
+        read, found = _read(log, vehicle_file, mapping)
         flights += read
         issues += found
     copies = duplicates(flights)
@@ -51,9 +52,11 @@ def load_case(path: str | Path, dtype=jnp.float32) -> Case:
     return Case(path.resolve().name, tuple(kept), vehicle_file, tuple(issues), path)
 
 
-def _read(log: Path, vehicle_file: VehicleFile) -> tuple[list[Flight], list[Issue]]:
+def _read(
+    log: Path, vehicle_file: VehicleFile, mapping: ColumnMapping | None
+) -> tuple[list[Flight], list[Issue]]:
     try:
-        flights, remarks = flights_of(read_log(log), vehicle_file.motor_permutation)
+        flights, remarks = flights_of(read_log(log, mapping), vehicle_file.motor_permutation)
     except LogError as error:
         return [], [Issue(log.name, str(error), refused=True, kind="reading")]
     return flights, [Issue(log.name, remark, kind="columns") for remark in remarks]

@@ -144,7 +144,8 @@ def _clean(flight: Flight, note) -> Flight:
             at = flight.time[rows]
             steps = np.diff(at)
             hole = int(np.argmax(steps))
-            if steps[hole] > max(0.2, 10 * np.median(steps)):
+            missing = rows[hole + 1] - rows[hole] > 1  # else it is a gap in time, named already
+            if missing and steps[hole] > max(0.2, 10 * np.median(steps)):
                 note(
                     "gaps",
                     f"{', '.join(columns)}: not sampled for {steps[hole]:.2f} s after t = {at[hole]:.2f}",

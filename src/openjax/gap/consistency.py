@@ -249,7 +249,10 @@ def _motors(motor, rates, vehicle) -> list[tuple[str, str]]:
             if correlations.sum() > best_score + 1e-9:
                 best, best_score = (order, flip, correlations), correlations.sum()
     order, flip, correlations = best
-    if not _clearly_better(correlations, logged).any() or best_score - logged.sum() < _BETTER:
+    # The right order explains every axis; an offset mass or weak motor can spoil one or two, and isn't an
+    # order.
+    explains = correlations.min() > 0.4 and correlations.mean() > _FITS
+    if not explains or not _clearly_better(correlations, logged).any() or best_score - logged.sum() < _BETTER:
         return []
     if order == (0, 1, 2, 3):
         text = "the rotors' spin is opposite: yaw accelerates against the torque of m1..m4"
@@ -332,11 +335,8 @@ def _correlation(y: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 def _clearly_better(best: np.ndarray, as_labelled: np.ndarray) -> np.ndarray:
     """Per axis: another labelling fits and the logged one fails, the less the better the other fits."""
-    return (
-        ((best > _FITS) & (as_labelled < 0.3))
-        | ((best > 0.9) & (as_labelled < 0.6))
-        | (best > as_labelled + 0.8)
-    )
+    fails = (as_labelled < 0.3) | (best > as_labelled + 0.8) | ((best > 0.9) & (as_labelled < 0.6))
+    return (best > _FITS) & fails
 
 
 def _paired(y: np.ndarray, x: np.ndarray) -> np.ndarray:

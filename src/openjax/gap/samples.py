@@ -1,12 +1,14 @@
 """Sample flights: openjax's own vehicle flown through manoeuvres, logged as a laboratory would log them.
 
-Physics at 1 kHz, rate loop at 500 Hz on a noisy gyroscope, off-board commands every 10 ms from a position controller
-that knows the nominal vehicle only. Rows every 10 ms: sensors at t, commands issued at t, motors averaged over the
-10 ms that begin at t. Sensor noise and biases are those of a Crazyflie's IMU and a motion-capture system, rounded.
+Physics at 1 kHz, rate loop at 500 Hz on a noisy gyroscope, off-board commands every 10 ms from a position
+controller that knows the nominal vehicle only. Rows every 10 ms: sensors at t, commands issued at t, motors
+averaged over the 10 ms that begin at t. Noise and biases are of the size of a Crazyflie's IMU and a
+motion-capture system.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -24,14 +26,41 @@ from openjax.vehicle import (
     rigid_step,
     rotate,
     rotate_inverse,
+    rotor_reaction,
     rotor_speed_step,
     rotor_thrust,
-    rotor_wrench,
+    total_wrench,
 )
+from openjax.vehicle.effects import composition, make_context
 
 PERIOD = 0.01  # s, rows and off-board commands
 RATE_LOOPS = 5  # per row: 500 Hz
 SUBSTEPS = 2  # per rate loop: 1 kHz
+
+# What to fly with where a user names an effect only: within its usual range, strong enough to see, still
+# flyable.
+SAMPLE_STRENGTHS: Mapping[str, Mapping[str, float]] = {
+    "battery_sag": {"exponent": 1.0},
+    "blade_flapping": {"tilt": 0.02, "stiffness": 2e-4},
+    "ceiling_effect": {"strength": 0.6, "offset": 0.01},
+    "com_offset": {"x": 0.003, "y": -0.002},
+    "command_latency": {"delay": 0.03},
+    "downwash": {"force": 0.05, "length": 0.5, "width": 0.06, "spread": 0.1},
+    "ground_effect": {"strength": 0.8, "offset": 0.01},
+    "inertia": {"xx": 1.4, "yy": 1.4, "zz": 1.4},
+    "mass": {"extra": 0.003},
+    "motor_imbalance": {"m1": 0.06, "m2": -0.04, "m3": 0.02, "m4": -0.05},
+    "motor_lag": {"extra_up": 0.02, "extra_down": 0.03},
+    "packet_loss": {"probability": 0.2},
+    "rate_gains": {"p": 0.65, "i": 0.65, "d": 0.65},
+    "rotor_drag": {"d_xy": 0.015, "d_z": 0.005},
+    "state_latency": {"delay": 0.03},
+    "thrust_curve": {"curvature": 0.25},
+    "thrust_saturation": {"limit": 0.82},
+    "thrust_scale": {"scale": -0.08},
+    "wind": {"x": 1.2, "y": -0.8, "drag": 0.015},
+    "yaw_torque": {"ratio": 0.4},
+}
 
 
 @dataclass(frozen=True)
@@ -50,162 +79,230 @@ class SensorModel:
 
 @dataclass(frozen=True)
 class Reference:
-    """What to fly: (T, ...) at the row period. `extra_command` is added to the controller's command."""
+    """What N vehicles are to fly, T rows at the row period."""
 
-    position: np.ndarray  # (T, 3) m
-    yaw: np.ndarray  # (T,) rad
-    extra_command: np.ndarray  # (T, 4) thrust in 0..1, body rates in rad/s
+    position: np.ndarray  # (T, N, 3) m
+    yaw: np.ndarray  # (T, N) rad
+    extra_command: np.ndarray  # (T, N, 4) thrust in 0..1, body rates in rad/s, added to the controller's
+    open_circuit_voltage: float = 3.9  # V at the start
 
 
-def references(seed: int = 0, duration: float = 10.0) -> dict[str, Reference]:
-    """Three flights that expose a vehicle: waypoints down to 6 cm above the floor, a fast Lissajous figure with turning
-    yaw, and doublets on every axis around hover."""
+def references(seed: int = 0, duration: float = 10.0, neighbour: bool = False) -> dict[str, Reference]:
+    """Three flights that expose a vehicle: waypoints down to 6 cm above the floor and near 1.1 m, a fast
+    Lissajous figure with turning yaw, and doublets on every axis around hover, from a full to a low battery.
+    With `neighbour` a second vehicle sweeps back and forth 35 to 55 cm above."""
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, duration, PERIOD)
     zero = np.zeros((len(t), 4))
 
-    corners = rng.uniform([-0.6, -0.6, 0.3], [0.6, 0.6, 1.0], (8, 3))
-    corners[[2, 5], 2] = rng.uniform(0.06, 0.12, 2)
-    waypoints = Reference(_minimum_jerk(corners, t, 1.4), 0.6 * np.sin(0.9 * t), zero)
+    leg = 1.6  # s
+    corners = rng.uniform([-0.6, -0.6, 0.3], [0.6, 0.6, 1.0], (int(duration / leg) + 2, 3))
+    corners[3::3, 2] = rng.uniform(0.06, 0.1, len(corners[3::3]))
+    corners[2::3, 2] = rng.uniform(1.05, 1.12, len(corners[2::3]))
+    waypoints = _minimum_jerk(corners, t, leg)
 
     phase = rng.uniform(0, 2 * np.pi, 3)
-    speed = np.array([0.4, 0.33, 0.25]) * 2 * np.pi * rng.uniform(0.9, 1.1, 3)
-    amplitude = np.array([0.55, 0.55, 0.2])
-    start = np.clip(t / 2.0, 0, 1)[:, None] ** 2
-    figure = start * amplitude * np.sin(speed * t[:, None] + phase) + [0.0, 0.0, 0.65]
-    lissajous = Reference(figure, 0.8 * np.sin(0.7 * t), zero)
+    frequency = np.array([0.42, 0.35, 0.25]) * 2 * np.pi * rng.uniform(0.9, 1.1, 3)
+    start = np.clip(t / 3.0, 0, 1)[:, None]
+    figure = start**2 * (3 - 2 * start) * [0.55, 0.55, 0.22] * np.sin(frequency * t[:, None] + phase)
+    figure += [0.0, 0.0, 0.6]
 
-    doublets = zero.copy()
-    size = np.array([0.12, 4.0, 4.0, 3.0])
+    doublets, size = zero.copy(), np.array([0.12, 4.0, 4.0, 3.0])
     for k, begin in enumerate(np.arange(0.8, duration - 0.6, 0.45)):
         axis, sign = k % 4, 1 if (k // 4) % 2 == 0 else -1
         at = (t >= begin) & (t < begin + 0.16)
         doublets[at, axis] += sign * size[axis] * np.where(t[at] < begin + 0.08, 1.0, -1.0)
     hover = np.tile([0.0, 0.0, 0.7], (len(t), 1))
-    return {"flight_a": waypoints, "flight_b": lissajous, "flight_c": Reference(hover, 0.0 * t, doublets)}
+
+    flights = {
+        "flight_a": (waypoints, 0.6 * np.sin(0.9 * t), zero, 4.1),
+        "flight_b": (figure, 0.8 * np.sin(0.7 * t), zero, 3.9),
+        "flight_c": (hover, 0.0 * t, doublets, 3.7),
+    }
+    if not neighbour:
+        return {n: Reference(p[:, None], y[:, None], c[:, None], v) for n, (p, y, c, v) in flights.items()}
+    offset = np.stack([0.25 * np.sin(1.3 * t), 0.1 * np.sin(0.8 * t), 0.45 + 0.1 * np.sin(0.5 * t)], 1)
+    return {
+        n: Reference(np.stack([p, p + offset], 1), np.stack([y, 0 * y], 1), np.stack([c, zero], 1), v)
+        for n, (p, y, c, v) in flights.items()
+    }
 
 
-def fly(plant: Vehicle, assumed: Vehicle, reference: Reference, seed: int = 0, sensors: SensorModel | None = None):
-    """Fly `plant` along `reference` with a controller that assumes `assumed`; the columns of the log, {name: (T,)}."""
+def fly(
+    plant: Vehicle,
+    assumed: Vehicle,
+    reference: Reference,
+    seed: int = 0,
+    effects: Mapping[str, Mapping[str, float]] | None = None,
+    sensors: SensorModel | None = None,
+) -> list[dict[str, np.ndarray]]:
+    """Fly `plant` with `effects` ({name: {parameter: value}}) along `reference`, under a controller that
+    assumes the vehicle `assumed`. Returns the columns of the log for each vehicle, {name: (T,)}."""
     sensors = SensorModel() if sensors is None else sensors
-    key = jax.random.key(seed)
+    names = tuple(sorted(effects or {}))
+    parameters = composition.complete_parameters(composition.resolve(names), effects, jnp.float32)
     velocity = np.gradient(reference.position, PERIOD, axis=0)
-    wanted = (
-        jnp.asarray(reference.position, jnp.float32),
-        jnp.asarray(velocity, jnp.float32),
-        jnp.asarray(np.gradient(velocity, PERIOD, axis=0), jnp.float32),
-        jnp.asarray(reference.yaw, jnp.float32),
-        jnp.asarray(reference.extra_command, jnp.float32),
+    acceleration = np.gradient(velocity, PERIOD, axis=0)
+    wanted = (reference.position, velocity, acceleration, reference.yaw, reference.extra_command)
+    wanted = tuple(jnp.asarray(w, jnp.float32) for w in wanted)
+    start = jnp.float32(reference.open_circuit_voltage)
+    rows = jax.device_get(
+        _fly(plant, assumed, wanted, start, parameters, jax.random.key(seed), names, sensors)
     )
-    rows = jax.device_get(_fly(plant, assumed, wanted, key, sensors))
-    return _log(rows, np.random.default_rng([seed, 1]), sensors)
+    rng = np.random.default_rng([seed, 1])
+    return [_columns([r[:, n] for r in rows], rng, sensors) for n in range(reference.position.shape[1])]
 
 
-@partial(jax.jit, static_argnames="sensors")
-def _fly(plant: Vehicle, assumed: Vehicle, wanted, key, sensors: SensorModel):
-    key, bias_key = jax.random.split(key)
-    gyro_bias = sensors.gyro_bias * jax.random.normal(bias_key, (3,))
-    state = hover_state(plant, wanted[0][0], velocity=wanted[1][0])
-    carry = (state, jnp.zeros(3), jnp.zeros(3), key)
+def log_of(columns: list[dict[str, np.ndarray]], name: str) -> LogTable:
+    """The vehicles' columns as one log in the long format, sorted by time; vehicles are "0", "1", ..."""
+    time = np.concatenate([c["t"] for c in columns])
+    order = np.argsort(time, kind="stable")
+    joined = {n: np.concatenate([c[n] for c in columns])[order] for n in columns[0]}
+    vehicle = np.concatenate([np.full(len(c["t"]), str(i)) for i, c in enumerate(columns)])[order]
+    return LogTable(name, joined, vehicle)
 
-    def row(carry, wanted_row):
-        state, integral, force, key = carry
+
+@partial(jax.jit, static_argnames=("names", "sensors"))
+def _fly(plant: Vehicle, assumed: Vehicle, wanted, voltage, parameters, key, names, sensors: SensorModel):
+    effects, count = composition.resolve(names), wanted[0].shape[1]
+    flown = composition.change_body(effects, parameters, plant)
+    key, bias_key, memory_key = jax.random.split(key, 3)
+    gyro_bias = sensors.gyro_bias * jax.random.normal(bias_key, (count, 3))
+    drones = hover_state(plant, wanted[0][0], velocity=wanted[1][0])
+    memory = jax.vmap(lambda d, k: composition.initial_memory(effects, plant, d, PERIOD, k))(
+        drones, jax.random.split(memory_key, count)
+    )
+    drones = drones.replace(effect_memory=memory)
+    others = np.array([[j for j in range(count) if j != i] for i in range(count)], int).reshape(
+        count, count - 1
+    )
+
+    def contexts(drones, load, air_time, dt):
+        """Of every drone. The cell gives less with charge (0.02 V/s is a short, hard flight) and with
+        load."""
+        under_load = voltage - 0.004 * air_time - 0.5 * load
+        build = lambda d, near, v: make_context(  # noqa: E731
+            flown, d, others_position=near, battery_voltage=v, air_time=air_time, dt=dt
+        )
+        return jax.vmap(build)(drones, drones.position[others], under_load), under_load
+
+    def row(carry, inputs):
+        drones, integral, force, load, key = carry
+        wanted_row, air_time = inputs
         key, noise_key = jax.random.split(key)
-        command, integral = _position_controller(assumed, state, integral, wanted_row)
+        seen = drones
+        if effects:
+            seen = jax.vmap(lambda d: composition.seen_state(effects, parameters, d))(drones)
+        sent, integral = jax.vmap(_position_controller, (None, 0, 0, 0))(assumed, seen, integral, wanted_row)
+        command = sent
+        context, under_load = contexts(drones, load, air_time, PERIOD)
+        if effects:
+            change = lambda m, c, ctx: composition.change_command(effects, parameters, m, c, ctx)  # noqa:
+            E731 command, memory = jax.vmap(change)(drones.effect_memory, command, context)
+            drones = drones.replace(effect_memory=memory)
 
         def rate_loop(inner, noise):
-            state, _ = inner
-            gyro = state.body_rates + gyro_bias + sensors.gyro_noise * noise
-            motor, rate_integral = rate_controller(
-                plant, state.replace(body_rates=gyro), command, PERIOD / RATE_LOOPS
+            drones, _ = inner
+            gyro = drones.body_rates + gyro_bias + sensors.gyro_noise * noise
+            control = lambda d, g, c: rate_controller(  # noqa: E731
+                flown, d.replace(body_rates=g), c, PERIOD / RATE_LOOPS
             )
-            state = state.replace(rate_integral=rate_integral, previous_body_rates=gyro)
+            motor, rate_integral = jax.vmap(control)(drones, gyro, command)
+            drones = drones.replace(rate_integral=rate_integral, previous_body_rates=gyro)
             for _ in range(SUBSTEPS):
-                state, force = _physics(plant, state, motor, PERIOD / RATE_LOOPS / SUBSTEPS)
-            return (state, force), motor
+                context, _ = contexts(drones, load, air_time, PERIOD / RATE_LOOPS / SUBSTEPS)
+                drones, force = jax.vmap(partial(_physics, flown, effects, parameters))(
+                    drones, motor, context
+                )
+            return (drones, force), motor
 
-        noise = jax.random.normal(noise_key, (RATE_LOOPS, 3))
-        (after, force_after), motors = jax.lax.scan(rate_loop, (state, force), noise)
-        gyro = state.body_rates + gyro_bias
-        log = (state.position, state.quaternion, state.velocity, gyro, force / plant.mass, command, motors.mean(0))
-        return (after, integral, force_after, key), log
+        noise = jax.random.normal(noise_key, (RATE_LOOPS, count, 3))
+        (after, force_after), motors = jax.lax.scan(rate_loop, (drones, force), noise)
+        motors = motors.mean(0)
+        if effects:
+            record = lambda d: composition.record(effects, d.effect_memory, d, PERIOD)  # noqa: E731
+            after = after.replace(effect_memory=jax.vmap(record)(after))
+        # What motion capture and estimator deliver is what the controller sees; the IMU knows the moment
+        # itself.
+        pose = (seen.position, seen.quaternion, seen.velocity)
+        log = (*pose, drones.body_rates + gyro_bias, force / flown.mass, sent, motors, under_load)
+        return (after, integral, force_after, motors.mean(-1), key), log
 
-    # The first row's specific force is that of hover.
-    carry = (state, carry[1], jnp.array([0.0, 0.0, 1.0]) * plant.mass * plant.gravity, carry[3])
-    return jax.lax.scan(row, carry, wanted)[1]
+    hover = jnp.zeros((count, 3)).at[:, 2].set(flown.mass * flown.gravity)
+    load = jnp.full(count, 0.6)
+    air_time = jnp.arange(wanted[0].shape[0], dtype=jnp.float32) * PERIOD
+    return jax.lax.scan(row, (drones, jnp.zeros((count, 3)), hover, load, key), (wanted, air_time))[1]
 
 
-def _physics(vehicle: Vehicle, state: DroneState, motor_command, dt) -> tuple[DroneState, jax.Array]:
-    """One physics step; the state, and the force without gravity in the body frame (3,) N."""
-    rotor_speed = rotor_speed_step(vehicle, state.rotor_speed, motor_command, dt)
-    force, torque = rotor_wrench(vehicle, rotor_thrust(vehicle, rotor_speed), rotor_speed)
+def _physics(vehicle, effects, parameters, drone: DroneState, motor_command, context):
+    """One physics step of one drone; its state, and the force without gravity in the body frame (3,) N."""
+    motor_command = composition.change_motor_command(effects, parameters, motor_command, context)
+    speed = rotor_speed_step(vehicle, drone.rotor_speed, motor_command, context.dt)
+    thrust, reaction = rotor_thrust(vehicle, speed), rotor_reaction(vehicle, speed)
+    context = context.replace(rotor_speed=speed, thrust=thrust)
+    thrust, reaction = composition.change_thrust(effects, parameters, thrust, reaction, context)
+    force, torque = total_wrench(vehicle, thrust, reaction)
+    more_force, more_torque = composition.added_wrench(effects, parameters, context.replace(thrust=thrust))
+    force, torque = force + more_force, torque + more_torque
+    body = (drone.position, drone.quaternion, drone.velocity, drone.body_rates)
     position, quaternion, velocity, body_rates = rigid_step(
-        vehicle,
-        state.position,
-        state.quaternion,
-        state.velocity,
-        state.body_rates,
-        rotate(state.quaternion, force),
-        torque,
-        dt,
+        vehicle, *body, rotate(drone.quaternion, force), torque, context.dt
     )
-    state = state.replace(
+    drone = drone.replace(
         position=position,
         quaternion=quaternion,
         velocity=velocity,
         body_rates=body_rates,
-        rotor_speed=rotor_speed,
+        rotor_speed=speed,
     )
-    return state, force
+    return drone, force
 
 
 def _position_controller(assumed: Vehicle, state: DroneState, integral, wanted):
-    """Command (4,) of a position controller: PID to a wanted acceleration, thrust along body z, attitude error to
-    body rates. Gains are for a vehicle of this size."""
+    """Command (4,) of a position controller and its integral (3,) m s: PID to a wanted acceleration, thrust
+    along body z, attitude error to body rates. Gains are for a vehicle of this size."""
     position, velocity, acceleration, yaw, extra = wanted
     error = position - state.position
     integral = jnp.clip(integral + error * PERIOD, -0.5, 0.5)
-    pull = acceleration + 9.0 * error + 5.0 * (velocity - state.velocity) + 3.0 * integral
+    pull = acceleration + 9.0 * error + 5.0 * (velocity - state.velocity) + 5.0 * integral
     pull = jnp.clip(pull, -6.0, 6.0) + jnp.array([0.0, 0.0, 1.0]) * assumed.gravity
     up = rotate(state.quaternion, jnp.array([0.0, 0.0, 1.0]))
     thrust = assumed.mass * jnp.dot(pull, up) / (4 * max_rotor_thrust(assumed))
     tilt = rotate_inverse(state.quaternion, jnp.cross(up, pull / jnp.linalg.norm(pull)))
     forward = rotate(state.quaternion, jnp.array([1.0, 0.0, 0.0]))
-    turn = jnp.arctan2(jnp.sin(yaw) * forward[0] - jnp.cos(yaw) * forward[1],
-                       jnp.cos(yaw) * forward[0] + jnp.sin(yaw) * forward[1])  # fmt: skip
-    rates = jnp.stack([9.0 * tilt[0], 9.0 * tilt[1], 3.0 * turn])
+    across = jnp.sin(yaw) * forward[0] - jnp.cos(yaw) * forward[1]
+    along = jnp.cos(yaw) * forward[0] + jnp.sin(yaw) * forward[1]
+    rates = jnp.stack([9.0 * tilt[0], 9.0 * tilt[1], 3.0 * jnp.arctan2(across, along)])
     command = jnp.concatenate([thrust[None], rates]) + extra
-    low = jnp.array([0.05, -jnp.pi * 2, -jnp.pi * 2, -jnp.pi * 2])
-    return jnp.clip(command, low, jnp.array([0.95, jnp.pi * 2, jnp.pi * 2, jnp.pi * 2])), integral
+    limit = jnp.array([0.95, 2 * jnp.pi, 2 * jnp.pi, 2 * jnp.pi])
+    return jnp.clip(command, limit * jnp.array([0.05, -1, -1, -1]), limit), integral
 
 
-def _log(rows, rng: np.random.Generator, sensors: SensorModel) -> dict[str, np.ndarray]:
-    """The log's columns: true rows through the sensors."""
-    position, quaternion, velocity, gyro, specific_force, command, motors = (np.asarray(r, float) for r in rows)
+def _columns(rows, rng: np.random.Generator, sensors: SensorModel) -> dict[str, np.ndarray]:
+    """The log's columns of one vehicle: true rows through the sensors."""
+    position, quaternion, velocity, gyro, specific_force, command, motors, voltage = (
+        np.asarray(r, float) for r in rows
+    )
     count = len(position)
-    tilt = sensors.attitude_noise * rng.standard_normal((count, 3))
-    measured = {
-        "xyz": position + sensors.position_noise * rng.standard_normal((count, 3)),
-        "q": _turned(quaternion, tilt),
-        "v": velocity + sensors.velocity_noise * rng.standard_normal((count, 3)),
-        "w": gyro + sensors.gyro_noise * rng.standard_normal((count, 3)),
-        "a": specific_force
-        + sensors.accelerometer_bias * rng.standard_normal(3)
-        + sensors.accelerometer_noise * rng.standard_normal((count, 3)),
+
+    def noisy(values, size):
+        return values + size * rng.standard_normal(values.shape)
+
+    specific_force = specific_force + sensors.accelerometer_bias * rng.standard_normal(3)
+    groups = {
+        ("x", "y", "z"): noisy(position, sensors.position_noise),
+        ("qw", "qx", "qy", "qz"): _turned(quaternion, noisy(np.zeros((count, 3)), sensors.attitude_noise)),
+        ("vx", "vy", "vz"): noisy(velocity, sensors.velocity_noise),
+        ("wx", "wy", "wz"): noisy(gyro, sensors.gyro_noise),
+        ("ax", "ay", "az"): noisy(specific_force, sensors.accelerometer_noise),
+        ("cmd_thrust", "cmd_wx", "cmd_wy", "cmd_wz"): command,
+        ("m1", "m2", "m3", "m4"): motors,
     }
-    # A 250 mAh cell from nearly full: falls with charge and load; sampled at 10 Hz.
-    load = motors.mean(1)
-    voltage = 4.0 - 0.004 * np.arange(count) * PERIOD - 0.35 * load + sensors.voltage_noise * rng.standard_normal(count)
-    voltage[np.arange(count) % 10 != 0] = np.nan
     columns = {"t": np.arange(count) * PERIOD}
-    columns |= dict(zip(("x", "y", "z"), measured["xyz"].T, strict=True))
-    columns |= dict(zip(("qw", "qx", "qy", "qz"), measured["q"].T, strict=True))
-    columns |= dict(zip(("vx", "vy", "vz"), measured["v"].T, strict=True))
-    columns |= dict(zip(("wx", "wy", "wz"), measured["w"].T, strict=True))
-    columns |= dict(zip(("ax", "ay", "az"), measured["a"].T, strict=True))
-    columns |= dict(zip(("cmd_thrust", "cmd_wx", "cmd_wy", "cmd_wz"), command.T, strict=True))
-    columns |= dict(zip(("m1", "m2", "m3", "m4"), motors.T, strict=True))
-    return columns | {"vbat": voltage}
+    for names, values in groups.items():
+        columns |= dict(zip(names, values.T, strict=True))
+    every_tenth = np.arange(count) % 10 == 0
+    return columns | {"vbat": np.where(every_tenth, noisy(voltage, sensors.voltage_noise), np.nan)}
 
 
 def _turned(quaternion: np.ndarray, rotation: np.ndarray) -> np.ndarray:
@@ -216,12 +313,8 @@ def _turned(quaternion: np.ndarray, rotation: np.ndarray) -> np.ndarray:
 
 
 def _minimum_jerk(points: np.ndarray, t: np.ndarray, leg: float) -> np.ndarray:
-    """Positions (T, 3) along legs of `leg` seconds between points, at rest at each (10 s^3 - 15 s^4 + 6 s^5)."""
+    """Positions (T, 3) along legs of `leg` seconds between points, at rest at each (10 s^3 - 15 s^4 + 6
+    s^5)."""
     k = np.minimum((t / leg).astype(int), len(points) - 2)
     s = np.clip(t / leg - k, 0.0, 1.0)[:, None]
     return points[k] + (points[k + 1] - points[k]) * s**3 * (10 - 15 * s + 6 * s**2)
-
-
-def table_of(columns: dict[str, np.ndarray], name: str, vehicle: str = "0") -> LogTable:
-    """One vehicle's columns as a log table."""
-    return LogTable(name, columns, np.full(len(columns["t"]), vehicle))

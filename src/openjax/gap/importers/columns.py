@@ -1,0 +1,194 @@
+"""Column mapping: which column, log variable or message field holds what, in which unit.
+
+A `columns.toml` in a case folder applies to all its logs:
+
+    delimiter = ";"                                        # CSV only; "," if left out
+    [columns]
+    t      = { from = "timestamp", unit = "ms" }
+    x      = "pos_x"                                       # already in the log format's unit
+    wx     = { from = "gyro.x", unit = "deg/s" }           # a micro-SD log variable
+    ax     = { from = "/cf1/imu:linear_acceleration.x" }   # a field of a ROS 2 topic
+    cmd_wy = { from = "pitch_rate", unit = "deg/s", scale = -1 }
+
+Besides the columns of the log format, `roll`, `pitch`, `yaw` (z-y-x, body to world) may stand for the
+quaternion.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from openjax.errors import UserError
+from openjax.gap.reading import CHANNEL_COLUMNS, LOG_COLUMNS, LogError, LogTable
+
+MAPPING_FILE = "columns.toml"
+EULER = ("roll", "pitch", "yaw")
+
+# Factor to the log format's unit.
+UNITS = {
+    "1": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9,
+    "m": 1.0, "cm": 1e-2, "mm": 1e-3, "m/s": 1.0, "mm/s": 1e-3,
+    "rad": 1.0, "deg": math.pi / 180, "rad/s": 1.0, "deg/s": math.pi / 180, "mrad/s": 1e-3,
+    "m/s^2": 1.0, "g": 9.80665, "mg": 9.80665e-3, "V": 1.0, "mV": 1e-3,
+    "percent": 1e-2, "8bit": 1 / 255, "16bit": 1 / 65535,
+}  # fmt: skip
+
+_MOTION = {c for n in ("position", "quaternion", "body_rates", "specific_force") for c in CHANNEL_COLUMNS[n]}
+_CONTINUOUS = _MOTION | set(CHANNEL_COLUMNS["velocity"]) | set(EULER)
+_STALE = 5.0  # periods after which a stream's last value counts as not sampled
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a column comes from: raw name, and value = scale * raw + offset in the log format's unit."""
+
+    name: str
+    scale: float = 1.0
+    offset: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Stream:
+    """Raw signals sampled together: time (N,) s and values {raw name: (N,)}."""
+
+    time: np.ndarray
+    values: dict[str, np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class ColumnMapping:
+    """Sources of the log format's columns."""
+
+    columns: dict[str, Source] = field(default_factory=dict)
+    delimiter: str = ","
+
+    def table(self, name: str, raw: LogTable) -> LogTable:
+        """A raw CSV table with its columns renamed and converted; time starts at zero."""
+        if "t" not in self.columns:
+            raise LogError(f"{MAPPING_FILE} doesn't say where t comes from")
+        columns, remarks = {}, list(raw.remarks)
+        for column, source in self.columns.items():
+            if column == "vehicle":
+                continue
+            if source.name in raw.columns:
+                columns[column] = source.scale * raw.columns[source.name] + source.offset
+            else:
+                remarks.append(f"no column {source.name!r} for {column}")
+        if "t" not in columns:
+            raise LogError(f"no column {self.columns['t'].name!r}, which {MAPPING_FILE} names for t")
+        columns["t"] = columns["t"] - np.nanmin(columns["t"])
+        return LogTable(name, with_quaternion(columns), raw.vehicle, tuple(remarks))
+
+
+def load_mapping(path: str | Path) -> ColumnMapping:
+    """Read a `columns.toml`. Raises UserError for an unknown key, column or unit."""
+    path = Path(path)
+    try:
+        tables = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise UserError(f"{path}: not a readable TOML file: {error}") from error
+    unknown = sorted(set(tables) - {"delimiter", "columns"})
+    if unknown or not isinstance(tables.get("columns"), dict):
+        problem = f"unknown key {unknown[0]!r}" if unknown else "no table [columns]"
+        raise UserError(f"{path}: {problem}; it may hold delimiter and must hold [columns]")
+    delimiter = tables.get("delimiter", ",")
+    if not isinstance(delimiter, str) or len(delimiter) != 1:
+        raise UserError(f"{path}: delimiter must be one character")
+    columns = {c: _source(c, entry, path) for c, entry in tables["columns"].items()}
+    return ColumnMapping(columns, delimiter)
+
+
+def merge_streams(streams: list[Stream], columns: dict[str, Source]) -> dict[str, np.ndarray]:
+    """Columns of the log format on one clock: that of the fastest stream with motion in it (`t` as in the
+    stream).
+
+    Other motion streams are interpolated linearly, commands are held, the battery keeps its own samples.
+    What is older than five periods of its stream counts as not sampled. Raises LogError if no motion is
+    there.
+    """
+    used = []
+    for stream in streams:
+        own = {c: s for c, s in columns.items() if s.name in stream.values}
+        finite = np.isfinite(stream.time)
+        if own and finite.sum() > 1:
+            order = np.argsort(stream.time[finite], kind="stable")
+            converted = {
+                c: (s.scale * stream.values[s.name] + s.offset)[finite][order] for c, s in own.items()
+            }
+            used.append((stream.time[finite][order], converted))
+    with_motion = [u for u in used if _MOTION & set(u[1])]
+    if not with_motion:
+        raise LogError(
+            "holds neither position and orientation nor accelerometer and gyroscope under known names"
+        )
+    clock = min(with_motion, key=lambda u: float(np.median(np.diff(u[0]))))[0]
+    clock = clock[np.r_[True, np.diff(clock) > 0]]
+    merged = {"t": clock}
+    for time, converted in used:
+        period = max(float(np.median(np.diff(time))), 1e-4)
+        for column, values in converted.items():
+            merged.setdefault(column, _onto(clock, time, values, column, period))
+    return with_quaternion(merged)
+
+
+def with_quaternion(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Roll, pitch, yaw replaced by the quaternion, unless that is there."""
+    angles = [columns.get(name) for name in EULER]
+    rest = {c: v for c, v in columns.items() if c not in EULER}
+    if any(a is None for a in angles) or all(c in rest for c in CHANNEL_COLUMNS["quaternion"]):
+        return rest
+    (cr, cp, cy), (sr, sp, sy) = ([f(a / 2) for a in angles] for f in (np.cos, np.sin))
+    rest["qw"] = cr * cp * cy + sr * sp * sy
+    rest["qx"] = sr * cp * cy - cr * sp * sy
+    rest["qy"] = cr * sp * cy + sr * cp * sy
+    rest["qz"] = cr * cp * sy - sr * sp * cy
+    return rest
+
+
+def _onto(clock, time, values, column: str, period: float) -> np.ndarray:
+    if len(time) == len(clock) and np.array_equal(time, clock):
+        return values
+    finite = np.isfinite(values)
+    time, values = time[finite], values[finite]
+    if not len(time):
+        return np.full(len(clock), np.nan)
+    before = np.searchsorted(time, clock, side="right") - 1
+    if column == "vbat":
+        out = np.full(len(clock), np.nan)
+        nearest = np.clip(np.searchsorted(clock, time), 0, len(clock) - 1)
+        out[nearest] = values
+        return out
+    if column in _CONTINUOUS:
+        out = np.interp(clock, time, values, left=np.nan, right=np.nan)
+        after = np.clip(before + 1, 0, len(time) - 1)
+        wide = time[after] - time[np.clip(before, 0, None)] > max(_STALE * period, 0.05)
+        return np.where(wide, np.nan, out)
+    out = np.where(before >= 0, values[np.clip(before, 0, None)], np.nan)
+    return np.where(clock - time[np.clip(before, 0, None)] > max(_STALE * period, 0.1), np.nan, out)
+
+
+def _source(column: str, entry, path: Path) -> Source:
+    known = (*LOG_COLUMNS, *EULER)
+    if column not in known:
+        raise UserError(f"{path}: unknown column {column!r} in [columns]; known are {', '.join(known)}")
+    if isinstance(entry, str):
+        return Source(entry)
+    if not isinstance(entry, dict) or not isinstance(entry.get("from"), str):
+        raise UserError(f'{path}: {column} must be "NAME" or {{ from = "NAME", unit = "...", scale = ... }}')
+    unknown = sorted(set(entry) - {"from", "unit", "scale", "offset"})
+    if unknown:
+        raise UserError(
+            f"{path}: unknown key {unknown[0]!r} for {column}; known are from, unit, scale, offset"
+        )
+    unit = entry.get("unit", "1")
+    if unit not in UNITS:
+        raise UserError(f"{path}: unknown unit {unit!r} for {column}; known are {', '.join(UNITS)}")
+    numbers = (entry.get("scale", 1.0), entry.get("offset", 0.0))
+    if not all(isinstance(n, int | float) and math.isfinite(n) for n in numbers):
+        raise UserError(f"{path}: scale and offset of {column} must be numbers")
+    return Source(entry["from"], UNITS[unit] * numbers[0], float(numbers[1]))

@@ -1,0 +1,156 @@
+"""Bitcraze micro-SD deck logs (the binary files that a Crazyflie writes while flying).
+
+Layout, little endian (crazyflie-firmware, tools/usdlog): byte 0xBC; uint16 version (1 or 2); uint16 number
+of event types; for each: uint16 id, name and NUL, uint16 number of variables, each "group.name(T)" and NUL
+with T a struct letter. Then records: uint16 event id, time stamp (version 1: uint32 ms, version 2: uint64
+us), the variables packed. The last four bytes are the CRC-32 of all before.
+"""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from zlib import crc32
+
+import numpy as np
+
+from openjax.gap.importers.columns import UNITS, ColumnMapping, Source, Stream, merge_streams
+from openjax.gap.reading import LogError, LogTable
+
+MAGIC = 0xBC
+_VERSIONS = {1: ("<HI", 1e-3), 2: ("<HQ", 1e-6)}
+_TYPES = set("bBhHiIqQefd")
+
+
+def _firmware_sources() -> dict[str, list[Source]]:
+    """Log variables of the firmware that hold each column, best first. `controller.pitchRate` and
+    `stateEstimate.pitch` are in the firmware's legacy sense, opposite to a rotation about y."""
+    deg, g = UNITS["deg"], UNITS["g"]
+    sources = {
+        "vbat": [Source("pm.vbat"), Source("pm.vbatMV", 1e-3)],
+        "cmd_thrust": [Source("controller.cmd_thrust", UNITS["16bit"])],
+        "cmd_wx": [Source("controller.rollRate", deg)],
+        "cmd_wy": [Source("controller.pitchRate", -deg)],
+        "cmd_wz": [Source("controller.yawRate", deg)],
+        "roll": [Source("stateEstimate.roll", deg)],
+        "pitch": [Source("stateEstimate.pitch", -deg)],
+        "yaw": [Source("stateEstimate.yaw", deg)],
+    }
+    for axis in "xyz":
+        sources[axis] = [Source(f"stateEstimate.{axis}"), Source(f"stateEstimateZ.{axis}", 1e-3)]
+        sources[f"v{axis}"] = [Source(f"stateEstimate.v{axis}"), Source(f"stateEstimateZ.v{axis}", 1e-3)]
+        sources[f"w{axis}"] = [Source(f"gyro.{axis}", deg)]
+        sources[f"a{axis}"] = [Source(f"acc.{axis}", g)]
+    for part in "wxyz":
+        sources[f"q{part}"] = [Source(f"stateEstimate.q{part}")]
+    for motor in "1234":
+        sources[f"m{motor}"] = [
+            Source(f"motor.m{motor}", UNITS["16bit"]),
+            Source(f"pwm.m{motor}_pwm", UNITS["16bit"]),
+        ]
+    return sources
+
+
+FIRMWARE_SOURCES = _firmware_sources()
+
+
+def is_micro_sd(path: Path) -> bool:
+    """Whether a file starts like a micro-SD log."""
+    if not path.is_file() or path.suffix in (".csv", ".gz", ".toml", ".md", ".txt"):
+        return False
+    with path.open("rb") as file:
+        head = file.read(5)
+    return len(head) == 5 and head[0] == MAGIC and int.from_bytes(head[1:3], "little") in _VERSIONS
+
+
+def read_micro_sd(path: str | Path, mapping: ColumnMapping | None = None) -> LogTable:
+    """Read a micro-SD log. Without a mapping the firmware's usual log variables are looked for.
+
+    Raises LogError if it isn't such a log, or holds nothing that can be used.
+    """
+    path = Path(path)
+    streams, remarks = decode(path.read_bytes())
+    names = {name for stream in streams for name in stream.values}
+    if mapping is not None:
+        columns = {c: s for c, s in mapping.columns.items() if c not in ("t", "vehicle")}
+        missing = [s.name for s in columns.values() if s.name not in names]
+        remarks += [f"no log variable {name!r}" for name in missing]
+    else:
+        columns = {
+            c: next((s for s in options if s.name in names), None) for c, options in FIRMWARE_SOURCES.items()
+        }
+        columns = {c: s for c, s in columns.items() if s is not None}
+    merged = merge_streams(streams, columns)
+    merged["t"] = merged["t"] - merged["t"][0]
+    return LogTable(path.name, merged, np.full(len(merged["t"]), "0"), tuple(remarks))
+
+
+def decode(data: bytes) -> tuple[list[Stream], list[str]]:
+    """The events of a micro-SD log as streams, one per event type, and remarks. Raises LogError if it is
+    none."""
+    if len(data) < 9 or data[0] != MAGIC:
+        raise LogError("not a micro-SD log (it doesn't start with 0xBC)")
+    version, event_types = struct.unpack_from("<HH", data, 1)
+    if version not in _VERSIONS:
+        raise LogError(f"micro-SD log of version {version}; versions 1 and 2 are known")
+    remarks = []
+    end = len(data) - 4
+    if crc32(data[:end]) != int.from_bytes(data[end:], "little"):
+        # Power was cut before the file was closed: what was written is there, its checksum isn't.
+        remarks.append("the checksum doesn't match: the log is cut off or corrupt, read as far as it goes")
+        end = len(data)
+    try:
+        events, start = _header(data, event_types)
+    except (struct.error, IndexError, ValueError) as error:
+        raise LogError("micro-SD log with a corrupt header") from error
+    head, tick = _VERSIONS[version]
+    head_size = struct.calcsize(head)
+    records: dict[int, list[bytes]] = {event: [] for event in events}
+    stamps: dict[int, list[int]] = {event: [] for event in events}
+    at = start
+    while at + head_size <= end:
+        event, stamp = struct.unpack_from(head, data, at)
+        if event not in events:
+            if end != len(data):
+                raise LogError(f"micro-SD log with an unknown event {event} at byte {at}: corrupt")
+            break
+        size = events[event].itemsize
+        at += head_size
+        if at + size > end:
+            break
+        records[event].append(data[at : at + size])
+        stamps[event].append(stamp)
+        at += size
+    streams = []
+    for event, dtype in events.items():
+        if records[event] and dtype.names:
+            rows = np.frombuffer(b"".join(records[event]), dtype)
+            time = np.array(stamps[event], np.float64) * tick
+            streams.append(Stream(time, {name: rows[name].astype(float) for name in dtype.names}))
+    if not streams:
+        raise LogError("micro-SD log without a record")
+    return streams, remarks
+
+
+def _header(data: bytes, event_types: int) -> tuple[dict[int, np.dtype], int]:
+    """Event id -> packed record type, and where the records start."""
+
+    def text(at: int) -> tuple[str, int]:
+        stop = data.index(0, at)
+        return data[at:stop].decode("utf-8"), stop + 1
+
+    events, at = {}, 5
+    for _ in range(event_types):
+        (event,) = struct.unpack_from("<H", data, at)
+        _, at = text(at + 2)
+        (count,) = struct.unpack_from("<H", data, at)
+        at += 2
+        fields = []
+        for _ in range(count):
+            variable, at = text(at)
+            name, letter = variable[:-3], variable[-2]
+            if letter not in _TYPES:
+                raise ValueError(variable)
+            fields.append((name, "<" + np.dtype(letter).str[1:]))
+        events[event] = np.dtype(fields)
+    return events, at

@@ -1,0 +1,106 @@
+"""`python -m openjax.sample_flights OUT`: make a case of three sample flights, to try calibration and
+diagnosis on."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from openjax.errors import UserError
+
+VEHICLE_TOML = """\
+[vehicle]
+name = "crazyflie-2.1"
+mass = {mass:.4f}            # kg, what the simulator should assume
+mass_weighed = true
+
+[motor]
+command = "thrust"       # m = 1 asks for the maximal rotor thrust
+order = ["front_right", "rear_right", "rear_left", "front_left"]
+spin = ["ccw", "cw", "ccw", "cw"]
+
+[log]
+source = "simulated: openjax.sample_flights, seed {seed}, effect: {effect}"
+motion_capture_rate = 100   # Hz
+floor_z = 0.0            # m
+"""
+DECIMALS = {"t": 2, "vbat": 3} | {
+    c: 5 for c in ("x", "y", "z", "qw", "qx", "qy", "qz", "m1", "m2", "m3", "m4")
+}
+_REST = 4
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Fly openjax's own vehicle through three manoeuvres and write the logs as a case."""
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """Folder to write the case to; must not exist or be empty."""
+    effect: str = "none"
+    """What the vehicle suffers from that the simulator doesn't know: an effect's name, or "none"."""
+    duration: float = 10.0
+    """Seconds per flight."""
+    seed: int = 0
+    """Random numbers: trajectories, noise, biases."""
+
+
+def make_case(arguments: Arguments) -> list[Path]:
+    """Write the case; returns its files. Raises UserError for an unknown effect or a folder that isn't
+    empty."""
+    from openjax.gap.reading import LOG_COLUMNS, write_csv
+    from openjax.gap.samples import SAMPLE_STRENGTHS, fly, log_of, references
+    from openjax.vehicle import load_vehicle
+
+    if arguments.effect not in ("none", *SAMPLE_STRENGTHS):
+        known = ", ".join(("none", *SAMPLE_STRENGTHS))
+        raise UserError(f"--effect {arguments.effect}: no such effect; known are {known}")
+    if not 3.0 <= arguments.duration <= 120.0:
+        raise UserError(f"--duration {arguments.duration:g}: must be between 3 and 120 seconds")
+    out = arguments.out
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise UserError(f"{out}: exists and isn't an empty folder; name another one")
+    effects = {} if arguments.effect == "none" else {arguments.effect: SAMPLE_STRENGTHS[arguments.effect]}
+    vehicle = load_vehicle()
+    decimals = {c: DECIMALS.get(c, _REST) for c in LOG_COLUMNS}
+    flights = references(arguments.seed, arguments.duration, neighbour=arguments.effect == "downwash")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    # Written beside and moved at the end: an interrupted run leaves no half case.
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as scratch:
+        folder = Path(scratch) / "case"
+        folder.mkdir()
+        for number, (name, reference) in enumerate(flights.items()):
+            columns = fly(vehicle, vehicle, reference, 1000 * arguments.seed + number, effects)
+            write_csv(folder / f"{name}.csv.gz", log_of(columns, name), decimals)
+        text = VEHICLE_TOML.format(mass=float(vehicle.mass), seed=arguments.seed, effect=arguments.effect)
+        (folder / "vehicle.toml").write_text(text, encoding="utf-8")
+        if out.exists():
+            out.rmdir()
+        shutil.move(folder, out)
+    return sorted(out.iterdir())
+
+
+def main(args: list[str] | None = None) -> int:
+    arguments = tyro.cli(Arguments, prog="python -m openjax.sample_flights", args=args)
+    try:
+        files = make_case(arguments)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    console = Console()
+    console.print(
+        f"[bold]{arguments.out}[/]: three flights of {arguments.duration:g} s, effect: {arguments.effect}"
+    )
+    for file in files:
+        console.print(f"  {file.name}  {file.stat().st_size / 1024:.0f} KiB", highlight=False)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,103 @@
+"""Reading logs: what is in the file arrives in the right channel, row and vehicle, and only that."""
+
+import gzip
+import time
+
+import numpy as np
+import pytest
+
+from openjax.gap.reading import LogError, LogTable, flights_of, read_csv, write_csv
+
+HEADER = "t,wx,wy,wz,ax,ay,az,m1,m2,m3,m4,vbat\n"
+
+
+def write(path, text):
+    path.write_text(text)
+    return path
+
+
+def test_round_trip_of_every_channel(tmp_path, sample_columns):
+    columns = sample_columns["flight_b"]
+    for name in ("log.csv", "log.csv.gz"):
+        write_csv(tmp_path / name, LogTable(name, columns, np.full(len(columns["t"]), "0")), {"t": 9})
+        table = read_csv(tmp_path / name)
+        assert set(table.columns) == set(columns) and not table.remarks
+        for column, values in columns.items():
+            np.testing.assert_allclose(table.columns[column], values, atol=1e-6)  # NaN where not sampled
+    (a,), (b,) = (flights_of(read_csv(tmp_path / n))[0] for n in ("log.csv", "log.csv.gz"))
+    assert a.fingerprint == b.fingerprint
+    assert a.quaternion.shape == (len(a), 4) and a.motor_command.shape == (len(a), 4)
+
+
+def test_empty_cells_are_not_sampled_and_written_nan_is_remarked(tmp_path):
+    rows = [
+        "0.0,1,2,3,4,5,6,.1,.2,.3,.4,3.7",
+        "0.01,,,,4,5,6,.1,.2,.3,.4,",
+        "0.02,1,nan,3,4,5,6,.1,.2,.3,.4,",
+    ]
+    table = read_csv(write(tmp_path / "log.csv", HEADER + "\r\n".join(rows)))
+    assert np.isnan(table.columns["wx"]).tolist() == [False, True, False]
+    assert np.isnan(table.columns["vbat"]).tolist() == [False, True, True]
+    assert table.remarks == ("column wy: 1 of 3 rows are NaN or infinite",)
+
+
+def test_vehicles_in_long_format_are_told_apart(tmp_path):
+    text =
+    "t,vehicle,x,y,z,m1,m2,m3,m4\n0,cf2,2,0,1,.1,.2,.3,.4\n0,cf1,1,0,1,.1,.2,.3,.4\n.01,cf2,2.5,0,1,.1,.2,.3,.4\n" first, second = flights_of(read_csv(write(tmp_path / "log.csv", text)))[0]
+    assert (first.vehicle, second.vehicle) == ("cf2", "cf1")
+    assert first.position[:, 0].tolist() == [2.0, 2.5] and second.position[:, 0].tolist() == [1.0]
+    assert first.log == second.log == "log.csv" and first.name != second.name
+
+
+def test_motors_arrive_in_the_nominal_order(tmp_path):
+    text = HEADER + "0,1,2,3,4,5,6,.1,.2,.3,.4,\n"
+    table = read_csv(write(tmp_path / "log.csv", text))
+    # m1 rear left, m2 front left, m3 front right, m4 rear right: nominal m1 (front right) is the logged m3.
+    (flight,), _ = flights_of(table, motor_permutation=(2, 3, 0, 1))
+    assert flight.motor_command[0].tolist() == [0.3, 0.4, 0.1, 0.2]
+
+
+def test_a_channel_with_a_missing_column_is_left_out_and_named(tmp_path):
+    table = read_csv(write(tmp_path / "log.csv", "t,x,y,wx,wy,wz,colour\n0,1,2,3,4,5,6\n"))
+    (flight,), remarks = flights_of(table)
+    assert flight.position is None and flight.body_rates is not None
+    assert remarks == ["unknown column left out: colour", "x, y without z: position is left out"]
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", "no column names"),
+        ("t,wx\n", "no rows"),
+        ("0,1\n0.01,2\n", "no column names"),
+        ("t;wx\n0;1\n", "separated by ';'"),
+        ("t,wx,wx\n0,1,2\n", "'wx' occurs more than once"),
+        ("t,wx\n0,1\n0.01,fast\n", "line 3, column wx: 'fast' is no number"),
+        ("t,wx\n0,1\n0.01\n", "line 3 has 1 cells"),
+        ("wx,wy\n0,1\n", "no column t"),
+    ],
+)
+def test_what_is_no_log_says_why(tmp_path, text, reason):
+    with pytest.raises(LogError, match=reason):
+        flights_of(read_csv(write(tmp_path / "log.csv", text)))
+
+
+@pytest.mark.parametrize(
+    "data", [b"\x1f\x8bnot gzip", gzip.compress(b"t,wx\n0,1\n" * 500)[:40], b"\xff\xfe\x00t"]
+)
+def test_corrupt_files_say_so(tmp_path, data):
+    path = tmp_path / "log.csv.gz"
+    path.write_bytes(data if data[:1] == b"\x1f" else gzip.compress(data))
+    with pytest.raises(LogError):
+        read_csv(path)
+
+
+def test_ten_seconds_at_a_kilohertz_are_read_in_a_moment(tmp_path):
+    rng = np.random.default_rng(0)
+    columns = {"t": np.arange(10_000) * 1e-3} | {
+        c: rng.standard_normal(10_000) for c in HEADER.strip().split(",")[1:]
+    }
+    write_csv(tmp_path / "log.csv", LogTable("log.csv", columns, np.full(10_000, "0")))
+    start = time.perf_counter()
+    read_csv(tmp_path / "log.csv")
+    assert time.perf_counter() - start < 1.0  # about 0.05 s on an idle core
