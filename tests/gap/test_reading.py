@@ -42,8 +42,9 @@ def test_empty_cells_are_not_sampled_and_written_nan_is_remarked(tmp_path):
 
 
 def test_vehicles_in_long_format_are_told_apart(tmp_path):
-    text =
-    "t,vehicle,x,y,z,m1,m2,m3,m4\n0,cf2,2,0,1,.1,.2,.3,.4\n0,cf1,1,0,1,.1,.2,.3,.4\n.01,cf2,2.5,0,1,.1,.2,.3,.4\n" first, second = flights_of(read_csv(write(tmp_path / "log.csv", text)))[0]
+    rows = ["t,vehicle,x,y,z,m1", "0,cf2,2,0,1,.1", "0,cf1,1,0,1,.1", ".01,cf2,2.5,0,1,.1"]
+    text = "\n".join(rows)
+    first, second = flights_of(read_csv(write(tmp_path / "log.csv", text)))[0]
     assert (first.vehicle, second.vehicle) == ("cf2", "cf1")
     assert first.position[:, 0].tolist() == [2.0, 2.5] and second.position[:, 0].tolist() == [1.0]
     assert first.log == second.log == "log.csv" and first.name != second.name

@@ -197,8 +197,8 @@ def _fly(plant: Vehicle, assumed: Vehicle, wanted, voltage, parameters, key, nam
         command = sent
         context, under_load = contexts(drones, load, air_time, PERIOD)
         if effects:
-            change = lambda m, c, ctx: composition.change_command(effects, parameters, m, c, ctx)  # noqa:
-            E731 command, memory = jax.vmap(change)(drones.effect_memory, command, context)
+            change = partial(composition.change_command, effects, parameters)
+            command, memory = jax.vmap(change)(drones.effect_memory, command, context)
             drones = drones.replace(effect_memory=memory)
 
         def rate_loop(inner, noise):

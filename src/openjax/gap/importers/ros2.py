@@ -1,7 +1,8 @@
 """ROS 2 bags (SQLite or MCAP), through the `rosbags` library; no ROS installation is needed.
 
 Without a column mapping, topics are recognised by their message types, and a topic's namespace ("/cf1" of
-"/cf1/imu") is the vehicle. Times are the messages' header stamps where they have one, else the bag's receive times.
+"/cf1/imu") is the vehicle. Times are the messages' header stamps where they have one, else the bag's receive
+times.
 """
 
 from __future__ import annotations
