@@ -1,0 +1,236 @@
+"""Importers: what a laboratory's files hold arrives with the right sign, unit, clock and vehicle."""
+
+import struct
+from zlib import crc32
+
+import numpy as np
+import pytest
+
+from openjax.errors import UserError
+from openjax.gap.case import load_case
+from openjax.gap.importers import find_logs, load_mapping, read_log
+from openjax.gap.reading import LogError, write_csv
+from openjax.gap.samples import log_of
+
+DEGREES = 180 / np.pi
+
+
+def micro_sd(events, version=2, cut=0):
+    """A micro-SD log as the firmware writes it. events: [(name, period in us, {variable: (letter, values)})]."""
+    data = struct.pack("<BHH", 0xBC, version, len(events))
+    for number, (name, _, variables) in enumerate(events):
+        data += struct.pack("<H", number) + name.encode() + b"\0" + struct.pack("<H", len(variables))
+        for variable, (letter, _) in variables.items():
+            data += f"{variable}({letter})".encode() + b"\0"
+    stamped = []
+    for number, (_, period, variables) in enumerate(events):
+        layout = "<" + "".join(letter for letter, _ in variables.values())
+        for row, values in enumerate(zip(*(v for _, v in variables.values()), strict=True)):
+            stamp = 5_000_000 + row * period if version == 2 else 5_000 + row * period // 1000
+            head = struct.pack("<HQ" if version == 2 else "<HI", number, stamp)
+            stamped.append((stamp, head + struct.pack(layout, *values)))
+    data += b"".join(record for _, record in sorted(stamped, key=lambda s: s[0]))
+    return (data + struct.pack("<I", crc32(data)))[: -cut or None]
+
+
+def firmware_variables(c):
+    """A sample flight as the firmware logs it: degrees, g, counts, and its legacy sense of pitch."""
+    floats = {f"stateEstimate.{a}": c[a] for a in "xyz"}
+    floats |= {f"stateEstimate.q{a}": c[f"q{a}"] for a in "wxyz"}
+    floats |= {f"gyro.{a}": c[f"w{a}"] * DEGREES for a in "xyz"} | {
+        f"acc.{a}": c[f"a{a}"] / 9.80665 for a in "xyz"
+    }
+    floats |= {"controller.cmd_thrust": c["cmd_thrust"] * 65535, "controller.rollRate": c["cmd_wx"] * DEGREES}
+    floats |= {"controller.pitchRate": -c["cmd_wy"] * DEGREES, "controller.yawRate": c["cmd_wz"] * DEGREES}
+    variables = {name: ("f", values) for name, values in floats.items()}
+    return variables | {f"motor.m{i}": ("H", np.round(c[f"m{i}"] * 65535).astype(int)) for i in (1, 2, 3, 4)}
+
+
+@pytest.fixture
+def columns(sample_columns):
+    return sample_columns["flight_c"]
+
+
+def assert_same(table, columns, tolerance=3e-5, skip=("vbat", "vx", "vy", "vz")):
+    for name, values in columns.items():
+        if name not in skip:
+            np.testing.assert_allclose(table.columns[name], values, atol=tolerance, err_msg=name)
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_micro_sd_log_of_one_clock(tmp_path, columns, version):
+    path = tmp_path / "log00"
+    path.write_bytes(micro_sd([("fixedFrequency", 10_000, firmware_variables(columns))], version))
+    assert find_logs(tmp_path) == [path]
+    table = read_log(path)
+    assert_same(table, columns)
+    assert table.remarks == ()
+
+
+def test_micro_sd_streams_are_put_on_the_imu_clock(tmp_path, columns):
+    variables = firmware_variables(columns)
+    slow = {n: (letter, v[::2]) for n, (letter, v) in variables.items() if n.startswith("stateEstimate")}
+    fast = {n: v for n, v in variables.items() if n not in slow}
+    battery = {"pm.vbat": ("f", np.linspace(4.0, 3.8, 8))}
+    events = [("pose", 20_000, slow), ("imu", 10_000, fast), ("power", 1_000_000, battery)]
+    path = tmp_path / "log01"
+    path.write_bytes(micro_sd(events))
+    table = read_log(path)
+    assert_same(table, {n: columns[n] for n in ("t", "wx", "az", "m1", "cmd_wy")})
+    assert np.isfinite(table.columns["vbat"]).sum() == 8
+    # Every second pose was logged; the rows between are interpolated.
+    np.testing.assert_allclose(table.columns["x"][:-1], columns["x"][:-1], atol=1e-3)
+
+
+def test_a_micro_sd_log_cut_off_is_read_as_far_as_it_goes(tmp_path, columns):
+    path = tmp_path / "log02"
+    path.write_bytes(micro_sd([("fixedFrequency", 10_000, firmware_variables(columns))], cut=1000))
+    table = read_log(path)
+    assert "checksum" in table.remarks[0]
+    rows = len(table.columns["t"])
+    assert 700 < rows < 800
+    assert_same(table, {n: v[:rows] for n, v in columns.items()})
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (b"\xbc\x02\x00\xff\x00" + b"x" * 20, "corrupt header"),
+        (micro_sd([("e", 10_000, {"a.b": ("f", [])})]), "without a record"),
+        (micro_sd([("e", 10_000, {"a.b": ("f", [1.0, 2.0, 3.0])})]), "neither position"),
+    ],
+)
+def test_unusable_micro_sd_logs_say_why(tmp_path, data, reason):
+    (tmp_path / "log03").write_bytes(data)
+    with pytest.raises(LogError, match=reason):
+        read_log(tmp_path / "log03")
+
+
+def test_a_mapped_csv_in_other_names_units_and_angles(tmp_path, columns):
+    qw, qx, qy, qz = (columns[f"q{a}"] for a in "wxyz")
+    other = {
+        "stamp": columns["t"] * 1e3 + 1.7e12,
+        "px": columns["x"] * 1e3,
+        "py": columns["y"] * 1e3,
+        "pz": columns["z"] * 1e3,
+        "roll": np.arctan2(2 * (qw * qx + qy * qz), 1 - 2 * (qx**2 + qy**2)) * DEGREES,
+        "pitch": np.arcsin(2 * (qw * qy - qz * qx)) * DEGREES,
+        "yaw": np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy**2 + qz**2)) * DEGREES,
+    } | {f"u{i}": columns[f"m{i}"] * 255 for i in (1, 2, 3, 4)}
+    lines = [";".join([*other, "comment"])]
+    lines += [";".join([*(f"{v:.7f}" for v in row), "text"]) for row in zip(*other.values(), strict=True)]
+    (tmp_path / "other.csv").write_text("\n".join(lines))
+    (tmp_path / "columns.toml").write_text(
+        'delimiter = ";"\n[columns]\nt = { from = "stamp", unit = "ms" }\n'
+        + "".join(f'{a} = {{ from = "p{a}", unit = "mm" }}\n' for a in "xyz")
+        + "".join(f'{a} = {{ from = "{a}", unit = "deg" }}\n' for a in ("roll", "pitch", "yaw"))
+        + "".join(f'm{i} = {{ from = "u{i}", unit = "8bit" }}\n' for i in (1, 2, 3, 4))
+    )
+    (tmp_path / "vehicle.toml").write_text('[motor]\ncommand = "pwm"\n')
+    table = read_log(tmp_path / "other.csv", load_mapping(tmp_path / "columns.toml"))
+    names = ("x", "y", "z", "qw", "qx", "qy", "qz", "m1", "m4")
+    assert_same(table, {n: columns[n] for n in names})
+    np.testing.assert_allclose(table.columns["t"], columns["t"], atol=1e-3)
+    case = load_case(tmp_path)  # the mapping is found and used
+    assert [f.name for f in case.flights] == ["other.csv"]
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("x = 1", "unknown key 'x'"),
+        ("[columns]\nxx = 'a'", "unknown column 'xx'"),
+        ("[columns]\nx = { from = 'a', unit = 'feet' }", "unknown unit 'feet'"),
+        ("[columns]\nx = { form = 'a' }", "x must be"),
+        ("[columns", "not a readable TOML"),
+    ],
+)
+def test_a_mapping_with_a_slip_says_where(tmp_path, text, reason):
+    (tmp_path / "columns.toml").write_text(text)
+    with pytest.raises(UserError, match=reason):
+        load_mapping(tmp_path / "columns.toml")
+
+
+def write_bag(path, columns, storage):
+    """A ROS 2 bag of two vehicles with standard messages: pose at 50 Hz, IMU and motors at 100 Hz."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    kinds = {
+        name.rpartition("/")[2]: store.types[name]
+        for name in (
+            "sensor_msgs/msg/Imu",
+            "geometry_msgs/msg/PoseStamped",
+            "geometry_msgs/msg/Pose",
+            "geometry_msgs/msg/Point",
+            "geometry_msgs/msg/Quaternion",
+            "geometry_msgs/msg/Vector3",
+            "std_msgs/msg/Header",
+            "std_msgs/msg/Float32MultiArray",
+            "std_msgs/msg/MultiArrayLayout",
+            "builtin_interfaces/msg/Time",
+        )
+    }
+    with Writer(path, version=9, storage_plugin=getattr(StoragePlugin, storage)) as writer:
+        for number, vehicle in enumerate(("cf1", "cf2")):
+            topics = {
+                name: writer.add_connection(f"/{vehicle}/{name}", kind, typestore=store)
+                for name, kind in (
+                    ("imu", "sensor_msgs/msg/Imu"),
+                    ("pose", "geometry_msgs/msg/PoseStamped"),
+                    ("motors", "std_msgs/msg/Float32MultiArray"),
+                )
+            }
+            for k in range(len(columns["t"])):
+                at = 1_700_000_000_000_000_000 + round(columns["t"][k] * 1e9)
+                header = kinds["Header"](kinds["Time"](at // 10**9, at % 10**9), vehicle)
+                rates = kinds["Vector3"](*(columns[f"w{a}"][k] for a in "xyz"))
+                force = kinds["Vector3"](*(columns[f"a{a}"][k] for a in "xyz"))
+                none = kinds["Quaternion"](0.0, 0.0, 0.0, 1.0)
+                zero = np.zeros(9)
+                messages = {"imu": kinds["Imu"](header, none, zero, rates, zero, force, zero)}
+                motors = np.array([columns[f"m{i}"][k] for i in (1, 2, 3, 4)], np.float32)
+                messages["motors"] = kinds["Float32MultiArray"](kinds["MultiArrayLayout"]([], 0), motors)
+                if k % 2 == 0:
+                    point = kinds["Point"](columns["x"][k] + number, columns["y"][k], columns["z"][k])
+                    attitude = kinds["Quaternion"](*(columns[f"q{a}"][k] for a in "xyzw"))
+                    messages["pose"] = kinds["PoseStamped"](header, kinds["Pose"](point, attitude))
+                for name, message in messages.items():
+                    # Received 3 ms after it was stamped; the motors have no stamp of their own.
+                    delay = 0 if name == "motors" else 3_000_000
+                    connection = topics[name]
+                    writer.write(connection, at + delay, store.serialize_cdr(message, connection.msgtype))
+
+
+@pytest.mark.parametrize("storage", ["SQLITE3", "MCAP"])
+def test_ros2_bag_of_two_vehicles(tmp_path, columns, storage):
+    pytest.importorskip("rosbags")
+    columns = {n: v[:300] for n, v in columns.items()}
+    write_bag(tmp_path / "bag", columns, storage)
+    assert find_logs(tmp_path) == [tmp_path / "bag"]
+    table = read_log(tmp_path / "bag")
+    assert set(table.vehicle.tolist()) == {"cf1", "cf2"}
+    for number, vehicle in enumerate(("cf1", "cf2")):
+        rows = table.vehicle == vehicle
+        own = type(table)("bag", {n: v[rows] for n, v in table.columns.items()}, table.vehicle[rows])
+        assert_same(own, {n: columns[n] for n in ("t", "wx", "wz", "ay", "m1", "m4")}, 1e-5)
+        np.testing.assert_allclose(own.columns["x"][:-1:2], columns["x"][::2] + number, atol=1e-6)
+    mapping = tmp_path / "columns.toml"
+    mapping.write_text('[columns]\nwx = "/cf2/imu:angular_velocity.x"\nm1 = "/cf2/motors:data[0]"\n')
+    mapped = read_log(tmp_path / "bag", load_mapping(mapping))
+    assert_same(mapped, {n: columns[n] for n in ("wx", "m1")}, 1e-5)
+    mapping.write_text('[columns]\nwx = "/cf2/imu:angular_velocity.q"\n')
+    with pytest.raises(LogError, match=r"no number 'angular_velocity\.q'"):
+        read_log(tmp_path / "bag", load_mapping(mapping))
+
+
+def test_a_damaged_bag_is_refused_and_the_csv_beside_it_is_used(tmp_path, columns):
+    pytest.importorskip("rosbags")
+    (tmp_path / "bag").mkdir()
+    (tmp_path / "bag" / "metadata.yaml").write_text("nonsense: [")
+    (tmp_path / "vehicle.toml").write_text("")
+    write_csv(tmp_path / "flight.csv", log_of([columns], "flight"))
+    case = load_case(tmp_path)
+    assert [f.name for f in case.flights] == ["flight.csv"]
+    assert [(i.flight, i.refused) for i in case.quality] == [("bag", True)]

@@ -1,0 +1,130 @@
+"""vehicle.toml: strict where a slip would go unnoticed, free where facts are kept, the same after a round trip."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from openjax.errors import UserError
+from openjax.vehicle import load_vehicle
+from openjax.vehicle.vehicle_file import CalibratedValue, VehicleFile, load_vehicle_file, save_vehicle_file
+
+FULL = """
+[vehicle]
+name = "cf-07"
+mass = 0.0335            # kg, with markers
+mass_weighed = true
+
+[vehicles.2]
+mass = 0.0318
+
+[motor]
+command = "pwm"
+order = ["rear_left", "front_left", "front_right", "rear_right"]
+spin = ["ccw", "cw", "ccw", "cw"]
+torque_per_thrust = 0.006
+
+[log]
+source = "ours"
+floor_z = 0.05
+anything = [1, 2]
+
+[[log.flight]]
+file = "a.csv"
+
+[calibrated.thrust_constant]
+value = 2.2e-8
+interval90 = [2.1e-8, 2.3e-8]
+unit = "N s^2"
+
+[calibrated.inertia]
+value = [1.5e-5, 1.5e-5, 2.5e-5]
+interval90 = [[1.4e-5, 1.6e-5], [1.4e-5, 1.6e-5], [2.3e-5, 2.7e-5]]
+"""
+
+
+def write(tmp_path, text):
+    path = tmp_path / "vehicle.toml"
+    path.write_text(text)
+    return path
+
+
+def test_what_the_file_says_is_applied(tmp_path):
+    file = load_vehicle_file(write(tmp_path, FULL))
+    assert (file.name, file.mass_weighed, file.motor_command) == ("cf-07", True, "pwm")
+    assert file.motor_permutation == (2, 3, 0, 1)  # the nominal m1, front right, is logged as m3
+    vehicle = file.vehicle
+    assert float(vehicle.mass) == pytest.approx(0.0335)
+    assert float(vehicle.thrust_constant) == pytest.approx(2.2e-8)
+    assert float(vehicle.torque_constant) == pytest.approx(0.006 * 2.2e-8)
+    np.testing.assert_allclose(vehicle.inertia, [1.5e-5, 1.5e-5, 2.5e-5], rtol=1e-6)
+    assert float(file.vehicle_of("2").mass) == pytest.approx(0.0318)
+    assert float(file.vehicle_of("1").mass) == pytest.approx(0.0335)
+    assert file.log["floor_z"] == 0.05 and file.log["anything"] == [1, 2]
+
+
+def test_an_empty_file_is_the_nominal_vehicle(tmp_path):
+    nominal, file = load_vehicle(), load_vehicle_file(write(tmp_path, ""))
+    for name in ("mass", "inertia", "thrust_constant", "torque_constant", "rotor_spin"):
+        np.testing.assert_array_equal(getattr(file.vehicle, name), getattr(nominal, name))
+    assert file.motor_permutation == (0, 1, 2, 3)
+
+
+def test_spin_follows_the_place_and_can_be_reversed(tmp_path):
+    nominal = load_vehicle()
+    moved = load_vehicle_file(
+        write(tmp_path, '[motor]\norder = ["rear_right", "front_right", "front_left", "rear_left"]\n')
+    )
+    np.testing.assert_array_equal(moved.vehicle.rotor_spin, nominal.rotor_spin)
+    assert moved.motor_spin == ("cw", "ccw", "cw", "ccw")
+    reversed_ = load_vehicle_file(write(tmp_path, '[motor]\nspin = ["cw", "ccw", "cw", "ccw"]\n'))
+    np.testing.assert_array_equal(reversed_.vehicle.rotor_spin, -nominal.rotor_spin)
+
+
+def test_saving_keeps_text_and_comments_and_replaces_the_calibration(tmp_path):
+    file = load_vehicle_file(write(tmp_path, FULL))
+    value = CalibratedValue((0.031,), ((0.028, 0.034),), "from up and down steps")
+    changed = dataclasses.replace(file, calibrated={"motor_time_constant": value})
+    save_vehicle_file(tmp_path / "new.toml", changed)
+    text = (tmp_path / "new.toml").read_text()
+    assert "# kg, with markers" in text and "thrust_constant" not in text
+    again = load_vehicle_file(tmp_path / "new.toml")
+    assert float(again.vehicle.motor_time_constant) == pytest.approx(0.031)
+    assert again.calibrated["motor_time_constant"] == value
+    assert again.log["anything"] == [1, 2]
+    assert list(tmp_path.glob("*.partial")) == []
+
+
+def test_a_file_made_from_nothing_reads_back(tmp_path):
+    file = VehicleFile(vehicle=load_vehicle(), name="new", motor_command="pwm", mass_weighed=True)
+    save_vehicle_file(tmp_path / "vehicle.toml", file)
+    again = load_vehicle_file(tmp_path)
+    assert (again.name, again.motor_command, again.mass_weighed) == ("new", "pwm", True)
+    np.testing.assert_allclose(again.vehicle.mass, file.vehicle.mass, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("[vehicle]\nmas = 0.03", "unknown key 'mas' in \\[vehicle\\]"),
+        ("[vehicles.1]\ninertia = 1", "unknown key 'inertia'"),
+        ("[motors]\ncommand = 'pwm'", "unknown key 'motors'"),
+        ("[motor]\ncommand = 'rpm'", "motor.command is 'rpm'"),
+        ("[motor]\norder = ['front_right', 'front_right', 'rear_left', 'front_left']", "motor.order"),
+        ("[motor]\nspin = ['cw', 'cw', 'cw', 'ccw']", "motor.spin"),
+        ("[vehicle]\nmass = 32.1", "in grams"),
+        ("[vehicle]\nmass = -1", "positive number"),
+        ("[vehicle]\nmass = nan", "positive number"),
+        ("[vehicle]\nmass_weighed = 'yes'", "true or false"),
+        ("[calibrated.drag]\nvalue = 1", "unknown key 'drag'"),
+        ("[calibrated.mass]\nvalue = 0.03", "interval90"),
+        ("[calibrated.mass]\nvalue = 30\ninterval90 = [29, 31]\nunit = 'g'", "must be in 'kg'"),
+        ("[calibrated.inertia]\nvalue = 1e-5\ninterval90 = [1e-5, 2e-5]", "3 numbers"),
+        ("[vehicle", "not valid TOML"),
+    ],
+)
+def test_a_slip_is_one_clear_line(tmp_path, text, reason):
+    path = write(tmp_path, text)
+    with pytest.raises(UserError, match=reason) as caught:
+        load_vehicle_file(path)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
