@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 import tyro
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from openjax.errors import UserError
@@ -22,7 +21,7 @@ from openjax.learning import TrainSettings, build, init_carry, make_training_ste
 from openjax.learning.rollout import collect
 from openjax.pursuit import Pursuit, hover_action, uniform_task
 from openjax.pursuit.environment import action_to_command
-from openjax.runs.command_line import parse, peek, run_command
+from openjax.runs.command_line import output_console, parse, peek, run_command
 from openjax.runs.machine import describe_machine
 from openjax.runs.settings_files import write_json
 from openjax.runs.timing import Timing, time_compiled
@@ -83,7 +82,7 @@ def main(arguments: Sequence[str]) -> int:
         facts["compilation_cache"] = jax.config.jax_compilation_cache_dir is not None
         # After each measurement, so that an interrupted sweep leaves what it has.
         write_json(command.json, {**facts, "settings": command.settings, "rows": rows})
-    console = Console(highlight=False)
+    console = output_console()
     console.print(results_table(rows))
     console.print(f"written to {command.json}")
     return 0

@@ -10,11 +10,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import tyro
-from rich.console import Console
 
 from openjax.errors import UserError
 from openjax.pursuit import SCENARIOS, PursuitSettings, find_scenario
-from openjax.runs.command_line import parse, peek, run_command
+from openjax.runs.command_line import output_console, parse, peek, run_command
 
 PROGRAM = "python -m openjax.evaluate"
 
@@ -100,9 +99,7 @@ def _show(command, rows):
     from openjax.runs.evaluation import results_table
     from openjax.runs.settings_files import write_json
 
-    console = Console(highlight=False)
-    if not console.is_terminal:  # into a file the table gets the width it needs
-        console = Console(highlight=False, width=160)
+    console = output_console()
     console.print(results_table(f"{command.policy}, mean policy, seed {command.seed}", rows))
     if command.json is not None:
         write_json(command.json, rows if command.scenario == "all" else rows[0])

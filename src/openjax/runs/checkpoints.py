@@ -95,8 +95,11 @@ def load_arrays(path: Path, prefix: str = "") -> dict[str, np.ndarray]:
         else orbax.PLACEHOLDER
         for name, leaf in orbax.metadata(path).metadata.items()
     }
-    loaded = orbax.load(path, wanted)
-    return {name: np.asarray(loaded[name]) for name in wanted if name.startswith(prefix)}
+    loaded = {name: leaf for name, leaf in orbax.load(path, wanted).items() if name.startswith(prefix)}
+    is_key = {name: jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) for name, leaf in loaded.items()}
+    return {
+        name: np.asarray(jax.random.key_data(leaf) if is_key[name] else leaf) for name, leaf in loaded.items()
+    }
 
 
 def is_checkpoint(path: Path) -> bool:
@@ -111,15 +114,20 @@ class Checkpoints:
         self.directory = Path(directory).absolute()
         self.keep_last = keep_last
         self._pending = None
+        self._known: dict[str, CheckpointRecord] = {}  # a committed checkpoint doesn't change
 
     def records(self) -> list[CheckpointRecord]:
         """Committed checkpoints, oldest first."""
         found = []
         for path in sorted(self.directory.glob("[0-9]" * _DIGITS)):
-            metadata = _metadata(path)
+            metadata = None if path.name in self._known else _metadata(path)
             if metadata is not None:
                 notes = dict(metadata.custom_metadata or {})
-                found.append(CheckpointRecord(path, int(path.name), notes.pop("score", None), notes))
+                self._known[path.name] = CheckpointRecord(
+                    path, int(path.name), notes.pop("score", None), notes
+                )
+            if path.name in self._known:
+                found.append(self._known[path.name])
         return found
 
     def best(self) -> CheckpointRecord | None:

@@ -11,6 +11,8 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
+from rich.console import Console
+
 from openjax.errors import UserError
 
 Command = TypeVar("Command")
@@ -57,6 +59,12 @@ def peek(arguments: Sequence[str], name: str) -> str | None:
         elif argument.startswith(f"--{name}="):
             value = argument.split("=", 1)[1]
     return value
+
+
+def output_console() -> Console:
+    """Standard output as it is on a terminal; into a file, tables get the width that they need."""
+    console = Console(highlight=False)
+    return console if console.is_terminal else Console(highlight=False, width=120)
 
 
 def run_command(main: Callable[[Sequence[str]], int | None]) -> None:

@@ -167,12 +167,12 @@ def selection_score(summary: dict) -> float:
 
 def results_table(title: str, rows: Sequence[dict]) -> Table:
     """Records as a table."""
-    table = Table(title=title, title_justify="left", box=box.SIMPLE, pad_edge=False)
+    table = Table(title=title, title_justify="left", box=box.SIMPLE, pad_edge=False, padding=0)
     table.add_column("scenario")
-    for name in ("episodes", "capture\nrate", "capture\nstep", "collision\nrate"):
+    for name in ("epi-\nsodes", "capture\nrate", "capture\nstep", "colli-\nsions"):
         table.add_column(name, justify="right")
-    table.add_column("pillar/drone/bounds", justify="right")
-    for name in ("crash\nrate", "over-\nspeed", "prediction\nerror [m]"):
+    table.add_column("pillar/drone/\nbounds", justify="right")
+    for name in ("crash\nrate", "over-\nspeed", "predicted\noff by [m]"):
         table.add_column(name, justify="right")
     for row in rows:
         parts = row["collision_parts"]
@@ -182,7 +182,7 @@ def results_table(title: str, rows: Sequence[dict]) -> Table:
             f"{row['capture_rate']:.3f}",
             f"{row['capture_step']:.0f}",
             f"{row['collision_rate']:.4f}",
-            "/".join(f"{parts[name]:.3f}" for name in ("pillar", "drone", "bounds")),
+            "/".join(f"{parts[name]:.3f}".removeprefix("0") for name in ("pillar", "drone", "bounds")),
             f"{row['crash_rate']:.3f}",
             f"{row['over_speed_rate']:.4f}",
             "–" if row["prediction_error"] is None else f"{row['prediction_error']:.4f}",
@@ -192,7 +192,9 @@ def results_table(title: str, rows: Sequence[dict]) -> Table:
 
 def before_after_table(before: Sequence[dict], after: Sequence[dict]) -> Table:
     """Returns, captures and collisions per layout, before and after training."""
-    table = Table(title="Before and after training", title_justify="left", box=box.SIMPLE, pad_edge=False)
+    table = Table(
+        title="Before and after training", title_justify="left", box=box.SIMPLE, pad_edge=False, padding=0
+    )
     table.add_column("layout")
     columns = (
         ("episode_return", "return", ".0f"),

@@ -9,11 +9,10 @@ from typing import Annotated
 
 import jax
 import tyro
-from rich.console import Console
 
 from openjax.errors import UserError
 from openjax.learning import TrainSettings, preset
-from openjax.runs.command_line import parse, peek
+from openjax.runs.command_line import output_console, parse, peek
 from openjax.runs.environments import make_environment
 from openjax.runs.machine import describe_machine
 from openjax.runs.run_directory import RunDirectory, check_free, create_run, open_run
@@ -107,10 +106,10 @@ def start(command: TrainCommand, arguments: Sequence[str], started: float) -> in
     )
     job.check()
     if resumed is not None:
-        return run_job(job, resumed, resume=True, console=Console(highlight=False))
+        return run_job(job, resumed, resume=True, console=output_console())
     directory = create_run(out, command.overwrite)
     _copy_files(directory, vehicle, effects)
-    return run_job(job, directory, resume=False, console=Console(highlight=False))
+    return run_job(job, directory, resume=False, console=output_console())
 
 
 def _check(command):

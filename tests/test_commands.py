@@ -1,0 +1,283 @@
+"""The commands as a user runs them, tiny: training, kill and resume, evaluation, benchmark, bad input."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from openjax import benchmark, evaluate, train
+from openjax.runs import training
+from openjax.runs.checkpoints import Checkpoints, abstract_like, is_checkpoint, load_arrays, place
+from openjax.runs.command_line import run_command
+from openjax.runs.evaluation import FIELDS
+from openjax.runs.loop import guarded
+from openjax.runs.metrics import read_metrics
+
+UPDATES = 24
+TINY = (
+    "--num_envs 16 --rollout_length 10 --environment.episode_length 20 --environment.physics rigid "
+    "--network.features 8 --network.heads 2 --predictor.units 4 --predictor.windows 4 --predictor.steps 2 "
+    "--mappo.minibatches 2 --mappo.epochs 1 --generator.capacity 8 "
+    "--evaluation_interval 3 --evaluation_episodes 4"
+).split()
+STEPS = ["--steps", str(UPDATES * 160), "--layout_episodes", "4"]
+
+
+@pytest.fixture(scope="session")
+def shared_cache(tmp_path_factory):
+    """One compilation cache for all processes of this module: the training step is compiled once."""
+    directory = str(tmp_path_factory.mktemp("compiled"))
+    options = {
+        "jax_compilation_cache_dir": directory,
+        "jax_persistent_cache_min_compile_time_secs": 0.3,
+        "jax_persistent_cache_min_entry_size_bytes": 0,
+    }
+    before = {name: getattr(jax.config, name) for name in options}
+    for name, value in options.items():
+        jax.config.update(name, value)
+    yield {name.upper(): str(value) for name, value in options.items()}
+    for name, value in before.items():
+        jax.config.update(name, value)
+
+
+def start(arguments, cache, **options):
+    command = [sys.executable, "-m", *arguments]
+    environment = {**os.environ, **cache, "JAX_PLATFORMS": "cpu"}
+    return subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **options
+    )
+
+
+def finish(process, status=0):
+    output, _ = process.communicate(timeout=300)
+    assert process.returncode == status, output
+    return output
+
+
+@pytest.fixture(scope="session")
+def whole_run(tmp_path_factory, shared_cache):
+    """A run from start to end, and what it printed."""
+    out = tmp_path_factory.mktemp("runs") / "whole"
+    return out, finish(start(["openjax.train", *TINY, *STEPS, "--out", str(out)], shared_cache))
+
+
+def in_process(main, arguments, monkeypatch, capsys):
+    """Exit status and standard error of a command, run here."""
+    monkeypatch.setattr(sys, "argv", ["command", *map(str, arguments)])
+    with pytest.raises(SystemExit) as stop:
+        run_command(main)
+    return stop.value.code, capsys.readouterr().err
+
+
+def test_train_shows_progress_and_leaves_what_the_readme_says(whole_run):
+    out, printed = whole_run
+    for line in (
+        "loading JAX",
+        "compiling the training step",
+        "steps/s",
+        "held-back tasks",
+        "Before and after",
+    ):
+        assert line in printed
+    for name in (
+        "settings.json",
+        "policy.npz",
+        "layouts.json",
+        "training.png",
+        "trajectories.png",
+        "chase.gif",
+    ):
+        assert (out / name).stat().st_size > 100, name
+    assert [r["update"] for r in read_metrics(out / "metrics.jsonl", "train")] == list(range(1, UPDATES + 1))
+    layouts = json.loads((out / "layouts.json").read_text())
+    assert [row["scenario"] for row in layouts["after"]][1:3] == ["wall", "narrow_gap"]
+    assert layouts["machine"]["versions"]["jax"] == jax.__version__
+
+
+def test_killed_in_the_middle_of_a_checkpoint_and_resumed_equals_whole(whole_run, tmp_path, shared_cache):
+    out = tmp_path / "killed"
+    process = start(["openjax.train", *TINY, *STEPS, "--out", str(out)], shared_cache)
+    checkpoints = Checkpoints(out / "checkpoints")
+    deadline = time.monotonic() + 200
+    while time.monotonic() < deadline and process.poll() is None:
+        names = os.listdir(checkpoints.directory) if checkpoints.directory.is_dir() else []
+        committed = [name for name in names if name.isdecimal()]
+        if len(committed) >= 2 and any("tmp" in name for name in names):
+            break
+        time.sleep(0.0005)
+    process.kill()
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL
+    reached = checkpoints.latest().update
+    assert 0 < reached < UPDATES
+
+    printed = finish(start(["openjax.train", "--resume", str(out), *STEPS[2:]], shared_cache))
+    assert f"resumed at update {reached} of {UPDATES}" in printed
+    whole = Checkpoints(whole_run[0] / "checkpoints").latest()
+    again = checkpoints.latest()
+    assert whole.update == again.update == UPDATES
+    expected, arrays = load_arrays(whole.path), load_arrays(again.path)
+    assert len(expected) > 100 and expected.keys() == arrays.keys()
+    for name, array in expected.items():
+        np.testing.assert_array_equal(array, arrays[name], err_msg=name)
+    losses = [
+        [(r["update"], r["value_loss"]) for r in read_metrics(path / "metrics.jsonl", "train")]
+        for path in (whole_run[0], out)
+    ]
+    assert losses[0] == losses[1]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signal_saves_and_exits_cleanly(whole_run, tmp_path, shared_cache, number):
+    out = tmp_path / "stopped"
+    arguments = ["openjax.train", *TINY, "--steps", "100000000", "--out", str(out)]
+    process = start(arguments, shared_cache)
+    deadline = time.monotonic() + 200
+    while time.monotonic() < deadline and process.poll() is None:
+        if (out / "metrics.jsonl").exists() and (out / "metrics.jsonl").stat().st_size > 0:
+            break
+        time.sleep(0.05)
+    process.send_signal(number)
+    printed = finish(process)
+    assert signal.Signals(number).name in printed and "--resume" in printed
+    logged = [r["update"] for r in read_metrics(out / "metrics.jsonl", "train")]
+    assert Checkpoints(out / "checkpoints").latest().update == logged[-1]
+    assert (out / "policy.npz").exists()
+
+
+def test_training_step_compiles_once_also_after_a_resume(whole_run, shared_cache):
+    checkpoints = Checkpoints(whole_run[0] / "checkpoints")
+    settings = training.RunDirectory(whole_run[0]).read_settings(training.TrainSettings)
+    step = guarded(training.make_training_step(settings))
+    carry = place(training.init_carry(settings, jax.random.key(0)))
+    abstract = abstract_like(carry)
+    for _ in range(10):
+        carry, _, _ = step(carry)
+    carry, _ = checkpoints.restore_latest(abstract)
+    step(carry)
+    assert step._cache_size() == 1
+
+
+def test_nan_stops_the_run_and_leaves_the_state(tmp_path, monkeypatch, capsys, shared_cache):
+    def make_broken_step(settings, environment):
+        def step(carry):
+            update = carry.update + 1
+            broken = jax.tree.map(lambda leaf: leaf + (0.0 / (update != 4)), carry.policy.actor)
+            return carry.replace(policy=carry.policy.replace(actor=broken), update=update), {
+                "reward": 0.0 * update
+            }
+
+        return step
+
+    monkeypatch.setattr(training, "make_training_step", make_broken_step)
+    out = tmp_path / "broken"
+    status, _ = in_process(train.main, [*TINY, *STEPS, "--out", out], monkeypatch, capsys)
+    assert status == 1
+    report = json.loads((out / "not_finite" / "report.json").read_text())
+    assert report["update"] == 4 and all(name.startswith("policy/actor/") for name in report["leaves"])
+    assert is_checkpoint(out / "not_finite" / "000000004")
+    assert Checkpoints(out / "checkpoints").latest().update == 3
+
+
+LAYOUT = """
+pillars = [[0.0, 0.3], [0.2, -0.2]]
+pursuers = [[0.6, 0.0, 0.5], [0.6, 0.3, 0.5], [0.6, -0.3, 0.5]]
+evader = [-0.6, 0.0, 0.5]
+"""
+
+
+def test_evaluate_prints_and_writes_the_records(whole_run, tmp_path, monkeypatch, capsys, shared_cache):
+    records = tmp_path / "records.json"
+    arguments = ["--policy", whole_run[0], "--episodes", "4", "--json", records]
+    assert in_process(evaluate.main, [*arguments, "--scenario", "all"], monkeypatch, capsys)[0] == 0
+    rows = json.loads(records.read_text())
+    assert [tuple(row) for row in rows] == [FIELDS] * 6
+    layout = tmp_path / "own.toml"
+    layout.write_text(LAYOUT)
+    for scenario in ("hidden", layout):
+        assert in_process(evaluate.main, [*arguments, "--scenario", scenario], monkeypatch, capsys)[0] == 0
+        row = json.loads(records.read_text())
+        assert tuple(row) == FIELDS and row["episodes"] == 4
+        if scenario == "hidden":
+            assert row == rows[-1]  # alone and among others alike
+    assert row["scenario"] == "own"
+
+
+def test_benchmark_writes_table_and_file(tmp_path, monkeypatch, capsys, shared_cache):
+    file = tmp_path / "speed.json"
+    arguments = [*TINY, "--parts", "rigid", "training", "--envs", "8", "--training_envs", "16"]
+    arguments += ["--steps", "5", "--seconds", "0.1", "--json", file]
+    assert in_process(benchmark.main, arguments, monkeypatch, capsys)[0] == 0
+    result = json.loads(file.read_text())
+    assert [row["part"] for row in result["rows"]] == ["rigid", "training"]
+    assert all(row["env_steps_per_second"] > 0 and row["compile_seconds"] > 0 for row in result["rows"])
+    assert {"device", "versions", "commit"} <= result["machine"].keys()
+
+
+def wrong_layout(change):
+    return LAYOUT.replace("[0.0, 0.3]", change)
+
+
+@pytest.mark.parametrize(
+    ("main", "arguments", "message"),
+    [
+        (
+            train,
+            "--environment.capture_radios 1",
+            "unknown setting --environment.capture_radios; did you mean",
+        ),
+        (train, "--environment.num_pursuers 9", "num_pursuers is 9; 1 to 8 are possible"),
+        (train, "--mappo.epochs two", "invalid literal"),
+        (train, "--preset huge", "preset huge: unknown; possible are quick, paper"),
+        (train, "--out {run}", "already holds a run; --resume"),
+        (train, "--out {folder}", "holds files that are no run"),
+        (train, "--resume {folder}", "is no run"),
+        (train, "--resume {run} --network.features 16", "is of another shape"),
+        (train, "--resume {run} --overwrite", "exclude each other"),
+        (train, "--effects {folder}/nothing.toml", "nothing.toml"),
+        (train, "--vehicle {folder}/nothing.toml", "nothing.toml"),
+        (train, "--start_from {folder}", "is no policy"),
+        (train, "--devices 1000", "expected all or a number up to"),
+        (evaluate, "--policy {folder}", "is no policy"),
+        (evaluate, "--policy {run} --scenario nowhere", "not one of wall"),
+        (evaluate, "--policy {run} --scenario {folder}/outside.toml", "outside the arena"),
+        (evaluate, "--policy {run} --scenario {folder}/over.toml", "over the start"),
+        (evaluate, "--policy {run} --json {folder}/no/where.json", "doesn't exist"),
+        (evaluate, "--policy {run} --episode 3", "unknown setting --episode; did you mean --episodes?"),
+        (benchmark, "--envs 0", "must be positive"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(
+    main, arguments, message, whole_run, tmp_path, monkeypatch, capsys, shared_cache
+):
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    (folder / "outside.toml").write_text(wrong_layout("[2.0, 0.3]"))
+    (folder / "over.toml").write_text(wrong_layout("[0.6, 0.0]"))
+    run = whole_run[0]
+    before = {path: path.stat().st_mtime_ns for path in [*run.rglob("*"), *folder.rglob("*")]}
+    monkeypatch.chdir(tmp_path)
+    arguments = [argument.format(run=run, folder=folder) for argument in arguments.split()]
+    status, error = in_process(main.main, arguments, monkeypatch, capsys)
+    assert status == 2
+    assert len(error.strip().splitlines()) == 1 and message in error
+    assert {path: path.stat().st_mtime_ns for path in [*run.rglob("*"), *folder.rglob("*")]} == before
+    assert os.listdir(tmp_path) == ["folder"]
+
+
+def test_overwrite_replaces_the_run_and_keeps_foreign_files(tmp_path):
+    from openjax.runs.run_directory import create_run
+
+    run = create_run(tmp_path / "run", overwrite=False)
+    run.write_settings({}, {})
+    (run.checkpoints / "000000001").mkdir(parents=True)
+    (run.path / "notes.txt").write_text("mine")
+    create_run(run.path, overwrite=True)
+    assert [path.name for path in Path(run.path).iterdir()] == ["notes.txt"]
