@@ -5,15 +5,17 @@ import jax.numpy as jnp
 
 from openjax.learning.archive import TaskArchive, draw, insert
 from openjax.learning.settings import GeneratorSettings
-from openjax.pursuit import EpisodeStatistics, PursuitSettings, Task, expand_task, uniform_task
+from openjax.pursuit import EpisodeStatistics, PursuitSettings, Task, expand_task, turn_task, uniform_task
 
 
 def generate_task(
     settings: GeneratorSettings, environment: PursuitSettings, archive: TaskArchive, key: jax.Array
 ) -> Task:
     """Draw one task: with probability p an archived one, expanded, else a uniform one."""
-    uniform_key, choice_key, draw_key, expand_key = jax.random.split(key, 4)
+    uniform_key, turn_key, choice_key, draw_key, expand_key = jax.random.split(key, 5)
     uniform = uniform_task(environment, uniform_key)
+    if settings.turn:
+        uniform = turn_task(turn_key, uniform)
     if not settings.enabled:
         return uniform
     expanded = expand_task(environment, expand_key, draw(archive, draw_key))

@@ -34,6 +34,7 @@ def collect(
     observation: Observation,
     state: PursuitState,
     noise: jax.Array,
+    penalty_share: jax.Array | float = 1.0,
 ) -> tuple[Rollout, Observation, PursuitState]:
     """Act with exploration for T steps in E worlds.
 
@@ -44,6 +45,7 @@ def collect(
         observation: (E, ...) of `state`.
         state: (E, ...).
         noise: (T, E, N, 4) standard normal, drawn ahead in one go.
+        penalty_share: () share of the reward's penalties that counts.
 
     Returns:
         the rollout, and observation and state after it.
@@ -57,13 +59,13 @@ def collect(
         mean, log_std = policy.distribution(parameters.actor, observation, predicted)
         action = mean + jnp.exp(log_std) * noise
         log_prob = gaussian_log_prob(action, mean, log_std)
-        following, state, reward, terminated, truncated, _ = step(unused_key, state, jnp.tanh(action))
+        following, state, reward, terminated, truncated, info = step(unused_key, state, jnp.tanh(action))
         record = Rollout(
             observation=newest_frame(observation),
             predicted=predicted,
             action=action,
             log_prob=log_prob,
-            reward=reward,
+            reward=reward - (1.0 - penalty_share) * info.penalty,
             terminated=terminated,
             truncated=truncated,
             evader=state.evader_position,

@@ -30,6 +30,10 @@ class MappoSettings:
     value_memory: float = 0.95
     """Share of the old mean and variance of the returns that value normalisation keeps per iteration."""
     reward_scale: float = 0.1
+    penalty_start: float = 1.0
+    """Share of the penalties (collision, speed, crash) at the start of the run ..."""
+    penalty_ramp: float = 0.5
+    """... which rises linearly to one over this share of the run."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,8 @@ class GeneratorSettings:
     """Draw tasks from the archive of unsolved ones; False: uniform tasks only."""
     capacity: int = 5000
     """Tasks in the archive."""
+    turn: bool = True
+    """Turn uniform tasks about the arena's axis, so that they come from all sides (the paper's come from one)."""
     expansion: float = 0.7
     """Probability p of local expansion of an archived task, else a uniform one."""
     success_low: float = 0.5

@@ -111,7 +111,13 @@ def make_training_step(
         shape = (settings.rollout_length, settings.environment.num_pursuers, 4)
         noise = jax.vmap(lambda k: jax.random.normal(k, shape))(own_keys(noise_key, num_envs, axis))
         rollout, observation, state = collect(
-            environment, policy, carry.policy, carry.observation, carry.state, jnp.moveaxis(noise, 1, 0)
+            environment,
+            policy,
+            carry.policy,
+            carry.observation,
+            carry.state,
+            jnp.moveaxis(noise, 1, 0),
+            _penalty_share(settings, carry.update),
         )
         last_predicted = policy.predict(carry.policy, observation)
 
@@ -177,6 +183,13 @@ def make_training_step(
         return carry, {name: value.astype(jnp.float32) for name, value in metrics.items()}
 
     return training_step
+
+
+def _penalty_share(settings, update):
+    """Share of the penalties that counts in this update: a ramp from its start to one."""
+    start = settings.mappo.penalty_start
+    progress = update.astype(jnp.float32) / (settings.total_updates * max(settings.mappo.penalty_ramp, 1e-6))
+    return start + (1.0 - start) * jnp.minimum(progress, 1.0)
 
 
 def _tasks(settings, archive, keys):

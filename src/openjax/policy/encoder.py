@@ -4,13 +4,18 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from openjax.policy.attention import EntityKind, Layout, attend
 
-class EntityAttention(nn.Module):
-    """Multi-head attention with one query, that of the pursuer itself, over all entities.
+MASKED = -1e4
+"""Added to the score of an entity that isn't there."""
 
-    Only the own token's output is used, so the key and value projections are folded to the query's side: instead of
-    projecting every entity, the query is taken to the entities' space and the weighted mean of entities is projected.
-    Algebraically the same as projecting keys and values of each entity (a key bias cancels in the softmax).
+
+class SelfAttention(nn.Module):
+    """Multi-head attention of the pursuer itself over itself and all other entities.
+
+    Only the own token's output is used, so one query suffices, and the key projection is folded into the query's, the
+    value projection into the output's: score and mean are taken in the space of the embeddings. Algebraically the same
+    as projecting keys and values of every entity (a bias of the keys cancels in the softmax).
     """
 
     features: int
@@ -18,25 +23,48 @@ class EntityAttention(nn.Module):
     dtype: jnp.dtype
 
     @nn.compact
-    def __call__(self, query: jax.Array, entities: jax.Array, mask: jax.Array) -> jax.Array:
-        """query (..., F), entities (..., M, F), mask (..., M) bool -> (..., F)."""
-        width = self.features // self.heads
-        init = nn.initializers.orthogonal()
-        projected = nn.Dense(self.features, dtype=self.dtype, kernel_init=init, name="query")(query)
-        projected = projected.reshape(*projected.shape[:-1], self.heads, width)
-        key_kernel = self.param("key_kernel", init, (self.features, self.features))
-        value_kernel = self.param("value_kernel", init, (self.features, self.features))
-        key_kernel = key_kernel.reshape(self.features, self.heads, width).astype(self.dtype)
-        value_kernel = value_kernel.reshape(self.features, self.heads, width).astype(self.dtype)
+    def __call__(self, own: jax.Array, others: jax.Array, pillars: jax.Array, pillar_seen: jax.Array) -> jax.Array:
+        """own (B, F) embedded; others (B, A, 3), pillars (B, k, 5) as observed; pillar_seen (B, k) bool -> (B, F)."""
+        f, h = self.features, self.heads
+        width = f // h
+        orthogonal = nn.initializers.orthogonal()
 
-        folded = jnp.einsum("...hd,fhd->...hf", projected, key_kernel)
-        score = jnp.einsum("...hf,...mf->...hm", folded, entities, preferred_element_type=jnp.float32)
-        score = jnp.where(mask[..., None, :], score * width**-0.5, -1e9)
-        weight = jax.nn.softmax(score, axis=-1).astype(self.dtype)
-        mean = jnp.einsum("...hm,...mf->...hf", weight, entities)
-        attended = jnp.einsum("...hf,fhd->...hd", mean, value_kernel)
-        attended = attended.reshape(*attended.shape[:-2], self.features)
-        return nn.Dense(self.features, dtype=self.dtype, kernel_init=init, name="output")(attended)
+        def kernel(name, shape, init=orthogonal):
+            return self.param(name, init, shape, jnp.float32)
+
+        query = jnp.einsum(
+            "ahd,fhd->ahf",
+            kernel("query", (f, f)).reshape(f, h, width),
+            kernel("key", (f, f)).reshape(f, h, width),
+        )
+        output = jnp.einsum(
+            "fhd,hdo->hfo",
+            kernel("value", (f, f)).reshape(f, h, width),
+            kernel("output", (f, f)).reshape(h, width, f),
+        )
+        kinds, weights, inputs, bias = [], [], [], []
+        embed = nn.initializers.orthogonal(2**0.5)
+        seen = jnp.where(pillar_seen, 0.0, MASKED)
+        for name, x, b in (("others", others, jnp.zeros(others.shape[:-1])), ("pillars", pillars, seen)):
+            count, size = x.shape[-2:]
+            if count == 0:
+                continue
+            kinds.append(EntityKind(count, size))
+            weights += [
+                kernel(f"{name}_kernel", (size, f), embed),
+                kernel(f"{name}_bias", (1, f), nn.initializers.zeros_init()),
+            ]
+            inputs.append(x.reshape(x.shape[0], count * size))
+            bias.append(b)
+        mean = attend(
+            own.astype(self.dtype) @ query.reshape(f, h * f).astype(self.dtype),
+            own,
+            jnp.concatenate(inputs + bias, axis=1).astype(jnp.float32).T,
+            jnp.concatenate(weights),
+            Layout(f, h, tuple(kinds), width**-0.5),
+        )
+        out_bias = self.param("output_bias", nn.initializers.zeros_init(), (f,))
+        return mean @ output.reshape(h * f, f).astype(self.dtype) + out_bias.astype(self.dtype)
 
 
 class Encoder(nn.Module):
@@ -51,20 +79,20 @@ class Encoder(nn.Module):
         self, self_state: jax.Array, others: jax.Array, pillars: jax.Array, pillar_seen: jax.Array
     ) -> jax.Array:
         """self_state (..., S), others (..., A, 3), pillars (..., k, 5), pillar_seen (..., k) bool -> (..., F)."""
-        own = self._layer("self_1", self_state)
-        own = self._layer("self_2", own)
-        tokens = [own[..., None, :], self._layer("pillars", pillars)]
-        mask = [jnp.ones((*pillar_seen.shape[:-1], 1), bool), pillar_seen]
-        if others.shape[-2] > 0:
-            tokens.append(self._layer("others", others))
-            mask.append(jnp.ones(others.shape[:-1], bool))
-        entities = jnp.concatenate(tokens, axis=-2)
-        attention = EntityAttention(self.features, self.heads, self.dtype, name="attention")
-        hidden = own + attention(own, entities, jnp.concatenate(mask, axis=-1))
-        hidden = nn.LayerNorm(dtype=self.dtype, name="norm")(hidden)
-        return self._layer("hidden", hidden)
+        leading = self_state.shape[:-1]
+        rows = len(leading)
 
-    def _layer(self, name, x):
+        def flat(x):
+            return x.reshape(-1, *x.shape[rows:])
+
+        own = self._dense("self_1", flat(self_state))
+        own = nn.gelu(nn.LayerNorm(dtype=self.dtype, name="self_norm")(own))
+        own = nn.gelu(self._dense("self_2", own))
+        attention = SelfAttention(self.features, self.heads, self.dtype, name="attention")
+        hidden = own + attention(own, flat(others), flat(pillars), flat(pillar_seen))
+        hidden = nn.LayerNorm(dtype=self.dtype, name="norm")(hidden)
+        return nn.gelu(self._dense("hidden", hidden)).reshape(*leading, self.features)
+
+    def _dense(self, name, x):
         init = nn.initializers.orthogonal(2**0.5)
-        x = nn.Dense(self.features, dtype=self.dtype, kernel_init=init, name=name)(x)
-        return nn.gelu(nn.LayerNorm(dtype=self.dtype, name=f"{name}_norm")(x))
+        return nn.Dense(self.features, dtype=self.dtype, kernel_init=init, name=name)(x)

@@ -5,7 +5,7 @@ from openjax.pursuit.observation import Observation
 from openjax.pursuit.scenarios import SCENARIOS, Scenario, find_scenario, scenario_settings, scenario_task
 from openjax.pursuit.settings import PursuitSettings, RewardSettings
 from openjax.pursuit.statistics import EpisodeStatistics
-from openjax.pursuit.task import Task, expand_task, uniform_task
+from openjax.pursuit.task import Task, expand_task, turn_task, uniform_task
 
 __all__ = [
     "SCENARIOS",
@@ -25,5 +25,6 @@ __all__ = [
     "make",
     "scenario_settings",
     "scenario_task",
+    "turn_task",
     "uniform_task",
 ]

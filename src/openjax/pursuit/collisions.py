@@ -39,14 +39,18 @@ def drone_distance(position: jax.Array) -> jax.Array:
 
 
 def breaches(
-    settings: PursuitSettings, position: jax.Array, pillar_position: jax.Array, pillar_active: jax.Array
+    settings: PursuitSettings,
+    position: jax.Array,
+    pillar_position: jax.Array,
+    pillar_active: jax.Array,
+    margin: float = 0.0,
 ) -> Breaches:
-    """Count the breaches of each of N pursuers at (N, 3) positions."""
+    """Count the breaches of each of N pursuers at (N, 3) positions; `margin` (m) widens every limit."""
     to_pillar = pillar_distance(settings, position, pillar_position)
-    near_pillar = pillar_active[None] & (to_pillar < settings.pillar_clearance)
-    near_drone = drone_distance(position) < settings.drone_clearance
-    above = position[:, 2] > settings.arena_height
-    outside = jnp.sum(position[:, :2] ** 2, axis=-1) > settings.arena_radius**2
+    near_pillar = pillar_active[None] & (to_pillar < settings.pillar_clearance + margin)
+    near_drone = drone_distance(position) < settings.drone_clearance + margin
+    above = position[:, 2] > settings.arena_height - margin
+    outside = jnp.sum(position[:, :2] ** 2, axis=-1) > (settings.arena_radius - margin) ** 2
     return Breaches(
         pillar=jnp.sum(near_pillar, axis=-1).astype(jnp.float32),
         drone=jnp.sum(near_drone, axis=-1).astype(jnp.float32),
@@ -60,13 +64,14 @@ def crashed(
     body_z_up: jax.Array,
     pillar_position: jax.Array,
     pillar_active: jax.Array,
+    margin: float = 0.0,
 ) -> jax.Array:
     """(N,) whether each pursuer touches the floor or anything solid, or is tilted beyond 90 degrees.
 
-    `body_z_up` (N,) is the world z component of the body's z axis.
+    `body_z_up` (N,) is the world z component of the body's z axis. `margin` widens every limit (m; and the cosine).
     """
-    reach = SOLID_RADIUS + TOUCH
+    reach = SOLID_RADIUS + TOUCH + margin
     on_floor = position[:, 2] < reach
     on_pillar = jnp.any(pillar_active & (pillar_distance(settings, position, pillar_position) < reach), axis=-1)
-    on_drone = jnp.any(drone_distance(position) < 2 * SOLID_RADIUS + TOUCH, axis=-1)
-    return on_floor | on_pillar | on_drone | (body_z_up < 0.0)
+    on_drone = jnp.any(drone_distance(position) < SOLID_RADIUS + reach, axis=-1)
+    return on_floor | on_pillar | on_drone | (body_z_up < margin)

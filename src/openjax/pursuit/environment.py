@@ -45,6 +45,7 @@ class StepInfo:
     breaches: Breaches
     over_speed: jax.Array  # (N,) bool
     crashed: jax.Array  # (N,) bool
+    penalty: jax.Array  # (N,) the reward's penalties, at most 0
 
 
 def hover_action(vehicle: Vehicle) -> jax.Array:
@@ -178,7 +179,12 @@ class Pursuit:
         body_z_up = rotation_axes(drones.quaternion)[1][:, 2]
         crash = crashed(settings, position, body_z_up, *pillars)
         distance = jnp.sqrt(jnp.sum((position - evader) ** 2, axis=-1) + 1e-12)
-        rewards = reward(settings, captured, distance, breach, too_fast, action, state.previous_action)
+        margin = settings.reward.margin
+        counted = breach if margin == 0.0 else breaches(settings, position, *pillars, margin)
+        counted_crash = crash if margin == 0.0 else crashed(settings, position, body_z_up, *pillars, margin)
+        rewards, penalty = reward(
+            settings, captured, distance, counted, too_fast, counted_crash, action, state.previous_action
+        )
 
         newest = frame(settings, step, position, evader, velocity, seen)
         state = PursuitState(
@@ -197,7 +203,9 @@ class Pursuit:
         never = jnp.zeros((), bool)
         # an observed horizon is part of the task, so its end is terminal; an unobserved one only cuts the episode
         terminated, truncated = (over, never) if settings.observe_time else (never, over)
-        info = StepInfo(captured=captured, seen=seen, breaches=breach, over_speed=too_fast, crashed=crash)
+        info = StepInfo(
+            captured=captured, seen=seen, breaches=breach, over_speed=too_fast, crashed=crash, penalty=penalty
+        )
         return self.observe(state), state, rewards, terminated, truncated, info
 
 

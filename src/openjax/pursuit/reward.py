@@ -28,16 +28,17 @@ def reward(
     distance: jax.Array,
     breach: Breaches,
     too_fast: jax.Array,
+    crash: jax.Array,
     action: jax.Array,
     previous_action: jax.Array,
-) -> jax.Array:
-    """(N,) reward of each pursuer.
+) -> tuple[jax.Array, jax.Array]:
+    """(N,) reward of each pursuer, and (N,) the penalties that it holds (at most 0).
 
-    `captured` (N,) bool rewards all; `distance` (N,) to the evader (m), `breach`, `too_fast` (N,) bool and the change of
-    the squashed command `action` (N, 4) count for each pursuer (or, by `team_share`, for the team's mean).
+    `captured` (N,) bool rewards all; `distance` (N,) to the evader (m), `breach`, `too_fast` and `crash` (N,) bool and
+    the change of the squashed command `action` (N, 4) count for each pursuer.
     """
     weights = settings.reward
-    own = -weights.distance * distance - weights.collision * breach.total - weights.over_speed * too_fast
-    own = (1.0 - weights.team_share) * own + weights.team_share * jnp.mean(own)
+    penalty = -weights.collision * breach.total - weights.over_speed * too_fast - weights.crash * crash
     change = jnp.sqrt(jnp.sum((action - previous_action) ** 2, axis=-1) + 1e-12)
-    return weights.capture * jnp.any(captured) + own + weights.smoothness * jnp.exp(-change)
+    task = weights.capture * jnp.any(captured) - weights.distance * distance
+    return task + weights.smoothness * jnp.exp(-change) + penalty, penalty

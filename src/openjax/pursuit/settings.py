@@ -26,8 +26,10 @@ class RewardSettings:
     """Subtracted in each step above 1.01 times the maximal speed."""
     smoothness: float = 0.0
     """Weight of exp(-|a_t - a_{t-1}|); 2.0 in the paper's second stage."""
-    team_share: float = 0.0
-    """Share of collision, speed and distance terms that is averaged over the team (0: each its own)."""
+    crash: float = 0.0
+    """Subtracted in each step in which a pursuer touches something solid or tips over (not in the paper)."""
+    margin: float = 0.0
+    """The reward counts breaches, floor and tilt (as a cosine) this much early; the metrics don't (m; not in the paper)."""
 
 
 @dataclass(frozen=True)

@@ -113,6 +113,24 @@ def expand_task(settings: PursuitSettings, key: jax.Array, task: Task) -> Task:
     return jax.tree.map(lambda drawn, seed: jnp.where(jnp.any(clear), drawn[first], seed), candidates, task)
 
 
+def turn_task(key: jax.Array, task: Task) -> Task:
+    """Turn a whole task about the arena's axis by a random angle: the game looks the same from every side."""
+    angle = jax.random.uniform(key, (), jnp.float32, -np.pi, np.pi)
+    cosine, sine = jnp.cos(angle), jnp.sin(angle)
+
+    def turn(position):
+        x, y = position[..., 0], position[..., 1]
+        xy = jnp.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
+        return jnp.concatenate([xy, position[..., 2:]], axis=-1)
+
+    return Task(
+        pursuer_position=turn(task.pursuer_position),
+        evader_position=turn(task.evader_position),
+        pillar_position=turn(task.pillar_position),
+        pillar_active=task.pillar_active,
+    )
+
+
 def start_attitude(settings: PursuitSettings, key: jax.Array) -> jax.Array:
     """(N, 4) start quaternions wxyz: roll and pitch within 36 degrees, yaw in 0 to 36 degrees; or all level."""
     n = settings.num_pursuers
