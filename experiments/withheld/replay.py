@@ -83,7 +83,7 @@ def replay(position, q, velocity, rates, rotor, integral, commands, parameters=N
     return out_v, out_w, out_m, q
 
 
-def _turn_between(q0, q1):
+def turn_between(q0, q1):
     """Body-frame rotation vector (3, W) from q0 to q1."""
     d = b.multiply(np.stack([q0[0], -q0[1], -q0[2], -q0[3]]), q1)
     return 2 * d[1:] * np.sign(d[0])
@@ -118,5 +118,5 @@ def errors(flown, ticks, logged=None):
     gyro = sum(
         (_windows(src["rates"], starts, k) + _windows(src["rates"], starts, k + 1)) * 0.005 for k in range(10)
     )
-    dp = _turn_between(pose0, pose1) - gyro
+    dp = turn_between(pose0, pose1) - gyro
     return np.concatenate([dv, dw, dm, dp]).reshape(len(CHANNELS), len(starts), count)
