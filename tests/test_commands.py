@@ -134,19 +134,17 @@ def test_killed_in_the_middle_of_a_checkpoint_and_resumed_equals_whole(whole_run
     assert losses[0] == losses[1]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signal_saves_and_exits_cleanly(whole_run, tmp_path, shared_cache, number):
+def test_signal_saves_and_exits_cleanly(whole_run, tmp_path, shared_cache):
     out = tmp_path / "stopped"
-    arguments = ["openjax.train", *TINY, "--steps", "100000000", "--out", str(out)]
-    process = start(arguments, shared_cache)
+    process = start(["openjax.train", *TINY, *STEPS, "--out", str(out)], shared_cache)
     deadline = time.monotonic() + 200
     while time.monotonic() < deadline and process.poll() is None:
         if (out / "metrics.jsonl").exists() and (out / "metrics.jsonl").stat().st_size > 0:
             break
-        time.sleep(0.05)
-    process.send_signal(number)
+        time.sleep(0.01)
+    process.terminate()
     printed = finish(process)
-    assert signal.Signals(number).name in printed and "--resume" in printed
+    assert "SIGTERM: saved at update" in printed and "--resume" in printed
     logged = [r["update"] for r in read_metrics(out / "metrics.jsonl", "train")]
     assert Checkpoints(out / "checkpoints").latest().update == logged[-1]
     assert (out / "policy.npz").exists()

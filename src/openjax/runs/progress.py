@@ -121,7 +121,7 @@ class Progress:
             training = dict(self._shown(self._values))
             for label in _SHOWN.values():
                 if label in training or label in held_back:
-                    table.add_row(label, training.get(label, ""), held_back.get(label, ""))
+                    table.add_row(Text(label), training.get(label, ""), held_back.get(label, ""))
             rows.append(table)
         return Panel(Group(*rows), title=self._title, title_align="left")
 
