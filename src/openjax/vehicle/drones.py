@@ -10,11 +10,12 @@ import jax.numpy as jnp
 from openjax.errors import UserError
 from openjax.vehicle.effects import composition
 from openjax.vehicle.effects.effect import Context, Effect, make_context
-from openjax.vehicle.mjx_body import end_of_step_shapes, make_world, mjx_step, others
+from openjax.vehicle.mjx_body import make_world, mjx_step
 from openjax.vehicle.parameters import Vehicle
 from openjax.vehicle.rate_controller import rate_controller
 from openjax.vehicle.rigid_body import rigid_step, rotate
 from openjax.vehicle.rotors import rotor_reaction, rotor_speed_step, rotor_thrust
+from openjax.vehicle.solids import others, place_solids
 from openjax.vehicle.state import DroneState
 from openjax.vehicle.wrench import total_wrench
 
@@ -118,7 +119,7 @@ class DronesStep:
             body = jax.vmap(lambda *parts: rigid_step(vehicle, *parts, dt))(*body)
         elif self.contacts:
             world = make_world(pillar_position.shape[0], drones.position.shape[0] - 1, dt, True)
-            shapes = end_of_step_shapes(drones, pillar_position, pillar_active, dt)
+            shapes = place_solids(drones.position, drones.velocity, pillar_position, pillar_active, dt)
             body = jax.vmap(lambda *parts: mjx_step(world, vehicle, *parts, dt))(shapes, *body)
         else:
             world = make_world(0, 0, dt, False)

@@ -1,13 +1,9 @@
-"""One drone among solid things, stepped by MuJoCo MJX with the Euler integrator.
+"""The body of one drone among solid things, its accelerations found by MuJoCo MJX.
 
 Each drone has its own small world: itself as the only moving body, and floor, pillars and other drones as
 shapes that are put in place anew in every step. Mapping this world over drones costs far less than one model
 that holds them all (its matrices grow with the square of the number of drones), and only true state is
 carried between steps.
-
-A shape is placed where it will stand, seen from the drone, at the end of the step if nothing intervened. So a
-contact stops a drone at the surface in the step in which it would have passed it, at any speed that it can
-reach, where a test of present positions would let it sink in by a step's way first.
 """
 
 from __future__ import annotations
@@ -24,24 +20,11 @@ import numpy as np
 
 from openjax.vehicle.parameters import Vehicle, assets_directory, read_mjcf
 from openjax.vehicle.rigid_body import euler_step
+from openjax.vehicle.solids import DRONE_RADIUS, solids_xml
 
 # MJX prints two lines when its optional backend is not installed; it is not used here.
 with contextlib.redirect_stdout(io.StringIO()):
     from mujoco import mjx
-
-DRONE_RADIUS = 0.05  # m, the solid sphere of a drone
-PILLAR_RADIUS = 0.1  # m
-PILLAR_HEIGHT = 1.2  # m, of the cylindrical part, which stands on the floor
-_PARKED = -100.0  # m, height of what is not there
-
-# Contacts in MuJoCo's direct form: acceleration along the normal >= -stiffness * gap - damping * speed, `gap`
-# being the one at the end of the step. In units of 1/dt^2 and 1/dt. Fixed things: together they cancel the
-# approach in one step and close 0.4 of the gap, below the half at which a resting drone would chatter. Other
-# drones: each of the pair takes half of the approach, which is an inelastic impact of equal masses that keeps
-# their momentum.
-_FIXED = (0.4, 0.6)
-_DRONE = (0.5, 0.0)
-_IMPEDANCE = "0.99 0.99 0.001"
 
 
 class World(NamedTuple):
@@ -52,27 +35,16 @@ class World(NamedTuple):
 
 
 def world_xml(n_pillars: int, n_others: int, dt: float, contacts: bool = True) -> str:
-    """MJCF of one drone (the geoms in order: floor, pillars, other drones, drone); a step lasts dt
-    seconds."""
+    """MJCF of one drone; a step lasts dt seconds. The drone's geom comes after those of `solids_xml`.
+
+    One Newton iteration finds the contact forces for the things that are hit; more would change little, and
+    reverse mode can't pass a loop of unknown length.
+    """
     nominal = read_mjcf(str(assets_directory() / "crazyflie.xml"))
-    shapes = ['<geom name="floor" type="plane" size="0 0 1"/>']
-    pairs = [("floor", _FIXED)]
-    for k in range(n_pillars):
-        shapes.append(f'<geom name="pillar_{k}" type="capsule" size="{PILLAR_RADIUS} {PILLAR_HEIGHT / 2}"/>')
-        pairs.append((f"pillar_{k}", _FIXED))
-    for k in range(n_others):
-        shapes.append(f'<geom name="other_{k}" type="sphere" size="{DRONE_RADIUS}"/>')
-        pairs.append((f"other_{k}", _DRONE))
-    if not contacts:
-        shapes, pairs = [], []
-    contact = "".join(
-        f'<pair geom1="drone" geom2="{name}" condim="1" solimp="{_IMPEDANCE}" '
-        f'solref="{-stiffness / dt**2} {-damping / dt}"/>'
-        for name, (stiffness, damping) in pairs
-    )
+    shapes, pairs = solids_xml(n_pillars, n_others, dt) if contacts else ("", "")
     inertia = " ".join(str(value) for value in nominal["inertia"].tolist())
     return f"""<mujoco>
-      <option timestep="{dt}" integrator="Euler" solver="CG" iterations="1" ls_iterations="4"
+      <option timestep="{dt}" integrator="Euler" solver="Newton" iterations="1" ls_iterations="1"
               jacobian="sparse">
         <flag warmstart="disable" filterparent="disable" actuation="disable" sensor="disable"
               equality="disable" limit="disable" frictionloss="disable" eulerdamp="disable" refsafe="disable"
@@ -82,9 +54,9 @@ def world_xml(n_pillars: int, n_others: int, dt: float, contacts: bool = True) -
       <worldbody>
         <body><freejoint/><inertial pos="0 0 0" mass="{nominal["mass"]}" diaginertia="{inertia}"/>
           <geom name="drone" type="sphere" size="{DRONE_RADIUS}"/></body>
-        {"".join(shapes)}
+        {shapes}
       </worldbody>
-      <contact>{contact}</contact>
+      <contact>{pairs}</contact>
     </mujoco>"""
 
 
@@ -105,30 +77,6 @@ def _as_dtype(tree, dtype):
     return jax.tree.map(convert, tree)
 
 
-def others(n: int) -> np.ndarray:
-    """(n, n - 1) indices of the other drones, for each of n."""
-    return np.array([[j for j in range(n) if j != i] for i in range(n)], int).reshape(n, n - 1)
-
-
-def end_of_step_shapes(drones, pillar_position, pillar_active, dt) -> jax.Array:
-    """Where each drone's shapes stand at the end of the step, seen from the drone: (N, 1 + P + N - 1 + 1, 3)
-    m.
-
-    Geoms in the order of `world_xml`; the drone's own geom sits at its body's origin.
-    """
-    n = drones.position.shape[0]
-    dtype = drones.position.dtype
-    ahead = drones.velocity * dt
-    active = pillar_active.astype(bool)[:, None]
-    height = jnp.where(active, PILLAR_HEIGHT / 2, _PARKED).astype(dtype)
-    pillars = jnp.concatenate([pillar_position.astype(dtype), height], axis=1)
-    floor = jnp.zeros((n, 1, 3), dtype)
-    pillars = jnp.broadcast_to(pillars, (n, *pillars.shape))
-    neighbours = (drones.position + ahead)[others(n)]
-    shapes = jnp.concatenate([floor, pillars, neighbours], axis=1) - ahead[:, None]
-    return jnp.concatenate([shapes, jnp.zeros((n, 1, 3), dtype)], axis=1)
-
-
 def mjx_step(
     world: World,
     vehicle: Vehicle,
@@ -141,8 +89,10 @@ def mjx_step(
     torque_body,
     dt,
 ):
-    """`rigid_step` by MJX among `shapes` (n_geoms, 3) (None: contact-free); dt must be the world's.
+    """`rigid_step` by MJX among `shapes` of `place_solids`, (n, 3) m (None: contact-free); dt must be the
+    world's.
 
+    MJX gives the accelerations; velocities and positions are advanced as its Euler integrator does it.
     Reverse-mode gradients are promised without contacts only.
     """
     dtype = position.dtype
@@ -154,7 +104,7 @@ def mjx_step(
         opt=model.opt.replace(gravity=gravity),
     )
     if shapes is not None:
-        model = model.replace(geom_pos=shapes)
+        model = model.replace(geom_pos=jnp.concatenate([shapes, jnp.zeros((1, 3), dtype)]))
     data = data.replace(
         qpos=jnp.concatenate([position, quaternion]),
         qvel=jnp.concatenate([velocity, body_rates]),
