@@ -1,0 +1,60 @@
+"""Sample flights: a complete, flyable, repeatable case; and the command keeps its hands off what is there."""
+
+import numpy as np
+import pytest
+
+from openjax.gap.case import load_case
+from openjax.gap.samples import SAMPLE_STRENGTHS, fly, references
+from openjax.sample_flights import main
+from openjax.vehicle import load_vehicle
+from openjax.vehicle.effects import EFFECTS
+
+
+def test_every_effect_has_a_strength_within_its_usual_range():
+    assert set(SAMPLE_STRENGTHS) == set(EFFECTS)
+    for name, values in SAMPLE_STRENGTHS.items():
+        for parameter, value in values.items():
+            low, high = EFFECTS[name].parameters[parameter].prior
+            assert low <= value <= high, (name, parameter)
+
+
+def test_the_nominal_controller_follows_the_reference(sample_columns):
+    for name, reference in references(seed=1, duration=8.0).items():
+        columns = sample_columns[name]
+        error = np.stack([columns[a] for a in "xyz"], 1) - reference.position[:, 0]
+        assert np.sqrt(np.mean(error**2)) < 0.08, name
+        assert columns["z"].min() > 0.03
+
+
+def test_an_effect_shows_where_it_should():
+    """Rotor drag: the lateral specific force is minus d/m times the body velocity."""
+    vehicle, reference = load_vehicle(), references(seed=1, duration=8.0)["flight_b"]
+    columns = fly(vehicle, vehicle, reference, 1, {"rotor_drag": {"d_xy": 0.02}})[0]
+    w, z = columns["qw"], columns["qz"]  # nearly level: turn by yaw only
+    cos, sin = 1 - 2 * z**2, 2 * w * z
+    forward = cos * columns["vx"] + sin * columns["vy"]
+    slope = np.polyfit(forward, columns["ax"], 1)[0]
+    assert slope == pytest.approx(-0.02 / 0.0321, rel=0.1)
+
+
+def test_the_command_makes_a_case_that_passes_every_check(tmp_path):
+    for number in (1, 2):
+        assert main([str(tmp_path / f"case{number}"), "--duration", "8"]) == 0
+    case = load_case(tmp_path / "case1")
+    assert [f.name for f in case.flights] == ["flight_a.csv.gz", "flight_b.csv.gz", "flight_c.csv.gz"]
+    assert case.quality == () and case.vehicle_file.mass_weighed
+    first, second = (sorted((tmp_path / f"case{n}").iterdir()) for n in (1, 2))
+    assert [p.read_bytes() for p in first] == [p.read_bytes() for p in second]  # same seed, same bytes
+
+
+@pytest.mark.parametrize("arguments", [["--effect", "gremlins"], ["--duration", "1"]])
+def test_bad_arguments_are_one_line(tmp_path, capsys, arguments):
+    assert main([str(tmp_path / "case"), *arguments]) == 2
+    assert capsys.readouterr().err.count("\n") == 1 and not (tmp_path / "case").exists()
+
+
+def test_a_folder_in_use_is_left_alone(tmp_path, capsys):
+    (tmp_path / "mine.txt").write_text("precious")
+    assert main([str(tmp_path)]) == 2
+    assert "empty folder" in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
