@@ -85,9 +85,8 @@ def _print(result, console: Console) -> None:
     console.print(table)
     for channel, (before, after) in result.explained.items():
         given = f"{before:.1%}" if before > 0 else "none"
-        console.print(
-            f"{channel}: the fitted vehicle explains {max(after, 0.0):.1%} of the changes, the given one {given}"
-        )
+        fitted = f"{max(after, 0.0):.1%}"
+        console.print(f"{channel}: the fitted vehicle explains {fitted} of the changes, the given one {given}")
     console.print("[bold]What these flights can't tell[/]")
     for text in result.cannot_tell:
         console.print(f"• {text}", highlight=False)

@@ -80,9 +80,8 @@ def test_an_altered_vehicle_is_recovered(altered_case):
     result = calibrate(altered_case)
     assert_recovered(result, ALTERED, 0.06)
     assert result.explained["body rates"][1] > 0.99 > result.explained["body rates"][0]
-    assert result.cannot_tell == (
-        "yaw torque constant against yaw inertia: only their ratio shows in yaw; the inertia is assumed nominal there",
-    )
+    (only,) = result.cannot_tell
+    assert only.startswith("yaw torque constant against yaw inertia")
 
 
 def test_the_nominal_vehicle_stays_nominal():
@@ -155,7 +154,7 @@ def test_flights_without_motor_commands_cannot_calibrate():
     def no_motors(columns):
         return {n: v for n, v in columns.items() if n not in ("m1", "m2", "m3", "m4")}
 
-    with pytest.raises(UserError, match="m1..m4"):
+    with pytest.raises(UserError, match="motor commands"):
         calibrate(fly_case(NOMINAL, change=no_motors))
 
 

@@ -16,7 +16,7 @@ DEGREES = 180 / np.pi
 
 
 def micro_sd(events, version=2, cut=0):
-    """A micro-SD log as the firmware writes it. events: [(name, period in us, {variable: (letter, values)})]."""
+    """A micro-SD log as the firmware writes it; events: [(name, period us, {variable: (letter, values)})]."""
     data = struct.pack("<BHH", 0xBC, version, len(events))
     for number, (name, _, variables) in enumerate(events):
         data += struct.pack("<H", number) + name.encode() + b"\0" + struct.pack("<H", len(variables))
