@@ -6,6 +6,7 @@ motors differ by is the rate controller's output.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,10 @@ from openjax.gap.track import Track, smooth
 from openjax.vehicle.rate_controller import mixer
 
 GAIN_STEP = 0.05
+# For p, i, d: the share that the replay's step can imitate, and what gyro noise does per row (measured on nominal
+# flights of the tuning plant).
+GAIN_TOLERANCE = ((0.02, 0.3), (0.4, 0.004), (0.12, 0.1))
+GYRO_TILT = 0.01            # rad, between the logged gyro and the one that the controller uses
 LONGEST_DELAY = 0.1         # s
 DELAY_STEP = 0.0005         # s
 TOLERANCE = 3e-4            # of thrust: rounding of the logs and of the firmware's integers
@@ -112,6 +117,20 @@ def _decode(tracks, delay: float, may_lose: bool) -> dict:
     return {"error": np.concatenate(errors), "arrived": arrived, "lost": lost, "informative": informative}
 
 
+def with_motors(track: Track, vehicle) -> Track:
+    """The track with motor commands: where they weren't logged, those that the nominal rate controller would send."""
+    if track.motor is not None:
+        return track
+    rows = np.arange(len(track))
+    link = (0.0, np.stack([rows, np.maximum(rows - 1, 0)], 1))
+    track = dataclasses.replace(track, motor=np.repeat(track.command[:, :1], 4, 1))
+    gains = np.ones((1, 3), np.float32)
+    for _ in range(2):
+        wanted, _ = _observe_twice(track, vehicle, link, gains)
+        track = dataclasses.replace(track, motor=wanted[0], motors_logged=False)
+    return track
+
+
 def in_force(track: Track, arrived) -> np.ndarray:
     """Command (T, TICKS, 4) that rules at each tick of the rate loop."""
     part, rows = arrived
@@ -121,36 +140,44 @@ def in_force(track: Track, arrived) -> np.ndarray:
     return out
 
 
-def read_rate_loop(tracks, vehicles, arrived, flight_of) -> tuple[LinearPath, list[np.ndarray]]:
-    """The rate controller's gains from what the motors differ by, and the motor commands (T, TICKS, 4) of the ticks.
+def _observe_twice(track: Track, vehicle, link, gains):
+    """The observer's output: mean motor commands wanted (B, T, 4), and those sent in the ticks (T, TICKS, 4) with the first gains.
 
-    The observer runs twice: what pushed the body beyond the nominal physics in the first run is given to the second.
+    What pushed the body beyond the nominal physics in a first run is given to a second, so that the rates inside a
+    row are right whatever the physics.
     """
+    rows, size = len(track), bucket(len(track))
+    inputs = [padded(v, size) for v in (in_force(track, link), track.motor, track.body_rates)]
+    push = np.zeros((size, 3), np.float32)
+    for _ in range(2):
+        wanted, sent, rates = observe(gains, vehicle, *inputs, push, np.float32(track.dt))
+        miss = track.body_rates[1:] - np.asarray(rates[0], float)[: rows - 1]
+        step = miss.copy()          # undo the observer's own correction of what it missed before
+        step[1:] -= (1.0 - GYRO_GAIN) * miss[:-1]
+        push = push + padded(smooth(np.concatenate([step, step[-1:]]), 0.06, track.dt) / track.dt, size)
+    return np.asarray(wanted, float)[:, :rows], np.asarray(sent[0])[:rows]
+
+
+def read_rate_loop(tracks, vehicles, arrived, flight_of) -> tuple[LinearPath, list[np.ndarray]]:
+    """The rate controller's gains from what the motors differ by, and the motor commands (T, TICKS, 4) of the ticks."""
     gains = np.concatenate([np.ones((1, 3)), 1.0 + GAIN_STEP * np.eye(3)]).astype(np.float32)
     y, columns, nuisances, masks, ticks = [], [], [], [], []
     for track, vehicle, link in zip(tracks, vehicles, arrived, strict=True):
-        size = bucket(len(track))
-        inputs = [padded(in_force(track, link), size), padded(track.motor, size), padded(track.body_rates, size)]
-        push = np.zeros((size, 3), np.float32)
-        for _ in range(2):
-            wanted, sent, rates = observe(gains, vehicle, *inputs, push, np.float32(track.dt))
-            miss = track.body_rates[1:] - np.asarray(rates[0], float)[: len(track) - 1]
-            pushed = miss.copy()        # undo the observer's own correction of what it missed before
-            pushed[1:] -= (1.0 - GYRO_GAIN) * miss[:-1]
-            pushed = smooth(np.concatenate([pushed, pushed[-1:]]), 0.06, track.dt) / track.dt
-            push = push + padded(pushed, size)
-        wanted = np.asarray(wanted, float)[:, : len(track)]
-        ticks.append(np.asarray(sent[0])[: len(track)])
+        wanted, sent = _observe_twice(track, vehicle, link, gains)
+        ticks.append(sent)
         outputs = np.linalg.pinv(np.asarray(mixer(vehicle), float)).T       # motors to roll, pitch, yaw
         demand, logged = wanted @ outputs, track.motor @ outputs
         y.append(logged - demand[0])
         columns.append((demand[1:] - demand[0]) / GAIN_STEP)
         time = (track.time - track.time[0])[:, None]
         integral = np.asarray(vehicle.rate_ki, float) * 57.3 / 65536.0
-        trims = [f for axis in np.eye(3) for f in (0.3 * axis * np.ones_like(logged), 0.03 * axis * integral * time)]
+        seen = np.stack([np.cross(axis, track.body_rates) for axis in np.eye(3)]) * GYRO_TILT
+        proportional = np.asarray(vehicle.rate_kp, float) * 57.3 / 65536.0
+        trims = list(proportional * seen + integral * np.cumsum(seen, 1) * track.dt)
+        trims += [f for axis in np.eye(3) for f in (0.3 * axis * np.ones_like(logged), 0.03 * axis * integral * time)]
         nuisances.append(np.stack(trims))
         clean = ((track.motor < 0.997) & (track.motor > 0.003)).all(1)
         masks.append(1.0 - (np.convolve(~clean, np.ones(12))[: len(clean)] > 0))
     groups = (((0, 1), False), ((2,), False))
-    path = fit_linear_path(y, columns, nuisances, flight_of, (0.4, 0.4, 0.4), groups, masks)
+    path = fit_linear_path(y, columns, nuisances, flight_of, (0.4, 0.4, 0.4), groups, masks, GAIN_TOLERANCE)
     return path, ticks

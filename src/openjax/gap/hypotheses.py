@@ -19,7 +19,9 @@ from openjax.gap.whitening import fit_noise
 
 ITERATIONS = 6
 SMALL_STEP = 0.05       # nats: an improvement below this ends the search
-REFITTED = 5            # pairs fitted in full
+REFITTED = 4            # pairs fitted in full
+WORTH_A_THIRD = 10.0    # nats: three effects are tried only where two beat one by this
+UNEXPOSED = 0.5         # nats that a typical effect would leave: below, the effect isn't fitted at all
 
 
 @dataclass(eq=False)
@@ -73,7 +75,10 @@ def fit_set(replay: Replay, effects, start: np.ndarray | None = None, iterations
         best = (objective, theta.copy(), grams, columns)
         if not len(index):
             break
-        step = np.linalg.solve(gram[1:, 1:] + precision, gram[1:, 0] - precision @ off)
+        push = gram[1:, 0] - precision @ off
+        step = np.linalg.solve(gram[1:, 1:] + precision, push)
+        if 0.5 * push @ step < SMALL_STEP:
+            break
         theta = theta.copy()
         theta[index] += np.clip(step, -reach, reach)
     objective, theta, grams, columns = best
@@ -95,12 +100,14 @@ def _sign_term(effects, index, theta, covariance) -> float:
     return float(total)
 
 
-def model_noise(replay: Replay, library: Library) -> list[np.ndarray]:
-    """Fit the noise models to what is left when all effects of the library may act at once; residuals (T, 9)."""
+def model_noise(replay: Replay, library: Library) -> tuple[list[np.ndarray], dict[str, float]]:
+    """Fit the noise models to what is left when all effects of the library may act at once: residuals [(T, 9)], and
+    what each effect would show if it acted as at its start (nats, nuisances marginalised): its exposure."""
     theta = ABSENT.copy()
-    ahead = []
+    ahead, firsts = [], []
     for effect in library.physics:
         for number in range(1 + len(FITS[effect].others)):
+            firsts.append(effect)
             point = ABSENT.copy()
             point[places((effect,))] = start_of(effect, number)
             ahead.append(point)
@@ -124,7 +131,11 @@ def model_noise(replay: Replay, library: Library) -> list[np.ndarray]:
         skip = int(SKIP / replay.tracks[0].dt)
         replay.set_noise([fit_noise(axes, residuals, integrated, skip=skip) if replay.usable[axes[0]] else old
                           for (axes, integrated), old in zip(GROUPS, replay.noises, strict=True)])  # fmt: skip
-    return residuals
+    shown = np.diag(replay.grams(columns).sum(0))[1 + size:]
+    exposure = {e: 0.0 for e in library.physics}
+    for effect, square in zip(firsts, shown, strict=True):
+        exposure[effect] = max(exposure[effect], 0.5 * float(square))
+    return residuals, exposure
 
 
 def without_nuisances(replay: Replay, residual: np.ndarray, track: int) -> np.ndarray:
@@ -134,25 +145,29 @@ def without_nuisances(replay: Replay, residual: np.ndarray, track: int) -> np.nd
     return residual - np.tensordot(taken, replay.nuisances[track], 1)
 
 
-def weigh_sets(replay: Replay, library: Library, largest: int = 3) -> dict[tuple[str, ...], SetFit | float]:
+def weigh_sets(replay: Replay, library: Library, exposure=None, largest: int = 3) -> dict[tuple[str, ...], SetFit | float]:
     """Score of every set up to pairs and of the best triples: fits in full, or scores where only linearised."""
     effects = library.physics
     found: dict[tuple[str, ...], SetFit | float] = {(): fit_set(replay, ())}
     for effect in effects:
+        if exposure is not None and exposure.get(effect, 1.0) < UNEXPOSED:
+            continue
         fits = []
         for number in range(1 + len(FITS[effect].others)):
             start = ABSENT.copy()
             start[places((effect,))] = start_of(effect, number)
             fits.append(fit_set(replay, (effect,), start))
         found[effect,] = max(fits, key=lambda f: f.score)
+    effects = tuple(e for e in effects if (e,) in found)
     if largest < 2 or len(effects) < 2:
         return found
     sums = LinearSums(replay, [found[e,] for e in effects], found[()])
     pairs = {pair: sums.score(pair) for pair in itertools.combinations(effects, 2)}
     _refit(replay, found, pairs, sums, REFITTED)
-    if largest < 3:
-        return found
     best = max((k for k in found if len(k) == 2), key=lambda k: score_of(found[k]))
+    alone = max(score_of(found[k]) for k in found if len(k) == 1)
+    if largest < 3 or score_of(found[best]) < alone + WORTH_A_THIRD:
+        return found
     triples = {tuple(sorted((*best, e), key=effects.index)): 0.0 for e in effects if e not in best}
     triples = {triple: sums.score(triple) for triple in triples}
     _refit(replay, found, triples, sums, 2)

@@ -18,7 +18,8 @@ class LinearPath:
 
     grams: np.ndarray           # (F, 1 + P, 1 + P) whitened inner products per flight, nuisances marginalised
     spread: np.ndarray          # (P,)
-    residual: list[np.ndarray]  # (T, A) after the fit
+    before: list[np.ndarray]    # (T, A) residuals without the effect, nuisances taken off
+    residual: list[np.ndarray]  # (T, A) residuals after the fit
     noises: tuple[Noise, ...]
     rows: int                   # residuals that counted
 
@@ -36,10 +37,12 @@ def linear_score(gram: np.ndarray, spread: np.ndarray) -> tuple[float, np.ndarra
     return float(0.5 * gram[1:, 0] @ theta - 0.5 * volume), theta, np.linalg.inv(hessian)
 
 
-def fit_linear_path(y, columns, nuisances, flight_of, spread, groups, masks=None, skip: int = 20) -> LinearPath:
+def fit_linear_path(y, columns, nuisances, flight_of, spread, groups, masks=None, tolerance=None, skip: int = 20):
     """Fit tracks' y [(T, A)], columns [(P, T, A)], nuisances [(N, T, A)] (unit prior variance).
 
-    groups: ((axes, integrated), ...) that share a noise model; masks [(T,)] are 0 in rows that must not count.
+    groups: ((axes, integrated), ...) that share a noise model; masks [(T,)] are 0 in rows that must not count. tolerance ((least share, noise per row), ...) for each coefficient: how far it may be off without a
+    cause, per flight. The second number is what noise in the column does (errors in variables): it pulls a coefficient
+    down by that number divided by the column's mean square, so calm flights say little.
     """
     spread = np.asarray(spread, float)
     size = 1 + len(spread)
@@ -54,12 +57,23 @@ def fit_linear_path(y, columns, nuisances, flight_of, spread, groups, masks=None
             if masks is not None:
                 w = w * masks[number][skip:, None]
             rows += int(w.shape[1] if masks is None else masks[number][skip:].sum()) * w.shape[2]
-            whitened.append(w.reshape(len(w), -1))
+            w = w.reshape(len(w), -1)
+            if tolerance is not None:
+                per_row = [r * w.shape[1] / max(c @ c, 1e-9) for (_, r), c in zip(tolerance, w[1:size], strict=True)]
+                shares = [max(least, share) for (least, _), share in zip(tolerance, per_row, strict=True)]
+                w = np.concatenate([w, w[1:size] * np.array(shares)[:, None]])
+            whitened.append(w)
             grams[flight_of[number]] += marginal_gram(whitened[-1][:size], whitened[-1][size:])
         _, theta, _ = linear_score(grams.sum(0), spread)
-        residual = []
-        for d, w in zip(data, whitened, strict=True):
-            left, n = w[0] - theta @ w[1:size], w[size:]
-            taken = np.linalg.solve(np.eye(len(n)) + n @ n.T, n @ left)
-            residual.append(d[0] - np.tensordot(theta, d[1:size], 1) - np.tensordot(taken, d[size:], 1))
-    return LinearPath(grams, spread, residual, noises, rows)
+        residual = [_left(d, w, theta) for d, w in zip(data, whitened, strict=True)]
+    before = [_left(d, w, 0.0 * theta) for d, w in zip(data, whitened, strict=True)]
+    return LinearPath(grams, spread, before, residual, noises, rows)
+
+
+def _left(d: np.ndarray, w: np.ndarray, theta: np.ndarray) -> np.ndarray:
+    """Residual (T, A) of one track's data d with coefficients theta, less the nuisances' most likely part."""
+    size = 1 + len(theta)
+    left, n = w[0] - theta @ w[1:size], w[size:]
+    taken = np.linalg.solve(np.eye(len(n)) + n @ n.T, n @ left)[: len(d) - size]
+    return d[0] - np.tensordot(theta, d[1:size], 1) - np.tensordot(taken, d[size:], 1)
+

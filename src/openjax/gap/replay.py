@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import jax
 import numpy as np
 
-from openjax.gap.library import ABSENT, MOTOR_SHIFT, PHYSICS_EFFECTS, PLACE, STEP, THETA, THRUST_OFFSET
+from openjax.gap.library import ABSENT, MOTOR_SHIFT, NUISANCES, PHYSICS_EFFECTS, PLACE, STEP, THETA
 from openjax.gap.physics import Path, compiled_physics
 from openjax.gap.track import Track, rotation, smooth
 from openjax.gap.whitening import Noise, whiten
@@ -122,7 +122,7 @@ def _integrated(rows: np.ndarray, dt: float) -> np.ndarray:
 
 def make_replay(tracks, vehicles, motor_ticks) -> Replay:
     """Replay of tracks with their nominal vehicles and motor commands (T, TICKS, 4) of the rate loop's ticks."""
-    paths = [_path(t, m) for t, m in zip(tracks, motor_ticks, strict=True)]
+    paths = [jax.device_put(_path(t, m)) for t, m in zip(tracks, motor_ticks, strict=True)]
     measured = [_measured(t) for t in tracks]
     usable = np.ones(9)
     if any(t.velocity is None for t in tracks):
@@ -131,17 +131,17 @@ def make_replay(tracks, vehicles, motor_ticks) -> Replay:
         usable[FORCE] = 0.0
     flights = tuple(dict.fromkeys(t.flight for t in tracks))
     replay = Replay(
-        list(tracks), [jax.tree.map(np.float32, v) for v in vehicles], paths, measured, [], [], flights,
+        list(tracks), [jax.device_put(jax.tree.map(np.float32, v)) for v in vehicles], paths, measured, [], [], flights,
         np.array([flights.index(t.flight) for t in tracks]), usable,
     )  # fmt: skip
-    offset = PLACE[THRUST_OFFSET[:2]]
-    batch = np.repeat(ABSENT[None], 3, 0)
-    batch[1, offset] += STEP[offset]
-    batch[2, -1] += STEP[-1]
+    index = [PLACE[key[:2]] for key in NUISANCES] + [len(ABSENT) - 1]
+    spread = np.array([key[2] for key in NUISANCES] + [MOTOR_SHIFT])
+    batch = np.repeat(ABSENT[None], 1 + len(index), 0)
+    batch[np.arange(len(index)) + 1, index] += STEP[index]
     for number, track in enumerate(tracks):
-        base, scaled, shifted = replay.predict(batch, number)[0]
+        base, *moved = replay.predict(batch, number)[0]
         replay.nominal.append(base)
-        columns = [(scaled - base) / STEP[offset] * THRUST_OFFSET[2], (shifted - base) / STEP[-1] * MOTOR_SHIFT]
+        columns = [(m - base) * s for m, s in zip(moved, spread / STEP[index], strict=True)]
         replay.nuisances.append(np.stack(columns + _sensor_nuisances(track, paths[number], base)))
     replay.set_noise([Noise(a, 0.15 if i else None, np.zeros(0), s)
                       for (a, i), s in zip(GROUPS, FIRST_NOISE, strict=True)])  # fmt: skip
@@ -182,7 +182,7 @@ def _measured(track: Track) -> np.ndarray:
 def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> list[np.ndarray]:
     """Tilt of the tracked frame (2), accelerometer bias (3), clock of the motion capture: columns (T, 9)."""
     rows = len(track)
-    turn = rotation(path.quaternion[:rows].astype(float))
+    turn = rotation(np.asarray(path.quaternion, float)[:rows])
     specific = np.gradient(nominal[:, VELOCITY], track.dt, axis=0) + [0.0, 0.0, 9.81]
     body = np.einsum("tji,tj->ti", turn, specific)
 
@@ -197,7 +197,7 @@ def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> list[np.
         column[:, 6 + axis] = ACCELEROMETER_BIAS
         columns.append(column)
     if track.velocity is not None:
-        column = -moved(np.cross(path.body_rates[:rows].astype(float), body))
+        column = -moved(np.cross(np.asarray(path.body_rates, float)[:rows], body))
         column[:, VELOCITY] += smooth(np.gradient(track.velocity, track.dt, axis=0), 0.05, track.dt)
         columns.append(column * POSE_SHIFT)
     return columns

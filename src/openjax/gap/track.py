@@ -36,7 +36,7 @@ class Track:
     motor: Array | None  # (T, 4) 0..1 thrust fraction
     voltage: Array | None  # (T,)
     neighbours: Array  # (K, T, 3) m, positions of the vehicles that flew along
-    start_height: float = 0.0
+    motors_logged: bool = True      # False: made by the nominal rate controller from the commands
 
     def __len__(self) -> int:
         return len(self.time)

@@ -1,0 +1,123 @@
+"""Diagnose the sim-to-real gap of flights: `python -m openjax.diagnose CASE_DIR [CASE_DIR ...]`."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from openjax.errors import UserError
+
+
+@dataclass(frozen=True)
+class Options:
+    """Diagnose the sim-to-real gap: where the simulator differs from flights, which effect causes it, how far it shrinks.
+
+    Writes OUT/<case>/report.html, report.json and effects.toml (which `python -m openjax.train --effects` flies with).
+    """
+
+    cases: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Folders of flight logs, each with a vehicle.toml."""
+    out: Path = Path("diagnosis")
+    """Where the reports go, one folder per case."""
+    predictions: Path | None = None
+    """Also write all cases' answers into this one JSON file."""
+    without: tuple[str, ...] = ()
+    """Effects that the library must do without."""
+    settings: Path | None = None
+    """A JSON file with other decision settings."""
+    html: bool = True
+    """Write report.html (pictures take about a second per case)."""
+    overwrite: bool = False
+    """Replace reports that are already in OUT."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command; returns the exit status: 0, or 2 if nothing could be diagnosed or the input is wrong."""
+    options = tyro.cli(Options, args=arguments, prog="python -m openjax.diagnose")
+    try:
+        return run(options)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+
+
+def run(options: Options) -> int:
+    """Diagnose every case; a case that can't be used is named and the rest goes on. Raises UserError for bad options."""
+    from rich.console import Console
+
+    console = Console()
+    if not options.cases:
+        raise UserError("no case given: name at least one folder of flight logs with a vehicle.toml")
+    names = [c.resolve().name for c in options.cases]
+    twice = next((n for n in names if names.count(n) > 1), None)
+    if twice is not None:
+        raise UserError(f"two cases are called {twice!r}: their reports would overwrite each other")
+    for name in names:
+        if (options.out / name).exists() and not options.overwrite:
+            raise UserError(f"{options.out / name} already exists: choose another --out or give --overwrite")
+
+    from openjax.gap import decision
+    from openjax.gap.case import load_case
+    from openjax.gap.diagnosis import diagnose_case
+    from openjax.gap.library import library
+
+    settings = decision.load_settings(options.settings)
+    library(options.without)
+    predictions, failed = {}, 0
+    for folder, name in zip(options.cases, names, strict=True):
+        try:
+            with console.status(f"{name}: reading") as status:
+                case = load_case(folder)
+                tell = lambda text, name=name: status.update(f"{name}: {text}")  # noqa: E731
+                report = diagnose_case(case, settings, options.without, tell)
+                tell("writing the report")
+                _write(report, options.out / name, options.html)
+        except UserError as error:
+            failed += 1
+            print(f"error: {error}", file=sys.stderr)
+            continue
+        predictions[name] = report.prediction()
+        _show(console, report, options.out / name)
+    if options.predictions is not None and predictions:
+        partial = options.predictions.with_name(options.predictions.name + ".partial")
+        options.predictions.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_text(json.dumps(predictions, indent=1) + "\n", encoding="utf-8")
+        partial.replace(options.predictions)
+    return 2 if failed == len(names) else 0
+
+
+def _write(report, folder: Path, pictures: bool) -> None:
+    """All files of a report, or none: written beside the place and moved there at the end."""
+    from openjax.gap.report import write_report
+
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    try:
+        write_report(report, partial, pictures)
+        partial.chmod(0o755)
+        if folder.exists():
+            shutil.rmtree(folder)
+        partial.replace(folder)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+
+
+def _show(console, report, folder: Path) -> None:
+    from rich.panel import Panel
+    from rich.text import Text
+
+    title = f"{report.case}: {', '.join(report.effects) or report.verdict}"
+    body = "\n".join([*report.in_words(), f"({report.seconds:.1f} s; {folder}/report.html)"])
+    console.print(Panel(Text(body), title=title, title_align="left"))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,125 @@
+"""Everything that a case's flights say about causes, before any decision: scores of sets, path by path."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+import jax.numpy as jnp
+import numpy as np
+
+from openjax.errors import UserError
+from openjax.gap import estimator, firmware
+from openjax.gap.firmware import Radio
+from openjax.gap.flight import Case
+from openjax.gap.hypotheses import SetFit, fit_set, model_noise, score_of, weigh_sets
+from openjax.gap.library import ABSENT, PLACE, Library
+from openjax.gap.linear_path import LinearPath
+from openjax.gap.observer import TICKS
+from openjax.gap.replay import Replay, make_replay
+from openjax.gap.track import Track, tracks_of
+from openjax.vehicle.effects import EFFECTS
+
+CLEAR_DELAY = 0.002     # s of pose delay above which the pose is moved before the physics is read
+CLEAR_SCORE = 3.0       # nats, likewise
+RADIO_COST = 15.0       # nats that a radio effect must gain before the rate loop is read with it
+
+
+@dataclass(eq=False)
+class Evidence:
+    """Scores are log marginal likelihoods above that of no effect (nats). `sets` holds physics sets: a full fit or a
+    linearised score; `exposure` what a typical effect would show. None: that path wasn't logged."""
+
+    case: Case
+    library: Library
+    tracks: list[Track]
+    vehicles: list
+    replay: Replay
+    sets: dict[tuple[str, ...], SetFit | float]
+    exposure: dict[str, float]
+    floor: list[np.ndarray]         # (T, 9) residuals when all effects may act at once: sensors and gusts
+    radio: Radio | None
+    rate_loop: LinearPath | None
+    pose: LinearPath | None
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def nothing(self) -> SetFit:
+        return self.sets[()]
+
+    def gain(self, effects) -> float:
+        """Score of a physics set above no effect."""
+        return score_of(self.sets[tuple(effects)]) - self.nothing.score
+
+    def fit(self, effects) -> SetFit:
+        """The full fit of a physics set, made now if it was only weighed so far."""
+        effects = tuple(effects)
+        if not isinstance(self.sets.get(effects), SetFit):
+            start = ABSENT.copy()
+            for effect in effects:
+                own = [PLACE[effect, p] for e, p in PLACE if e == effect]
+                start[own] = self.sets[effect,].theta[own]
+            self.sets[effects] = fit_set(self.replay, effects, start)
+        return self.sets[effects]
+
+
+def gather(case: Case, library: Library, progress=None) -> Evidence:
+    """Read a case by all its paths. Raises UserError where no stretch of flight is long enough."""
+    tell = progress or (lambda text: None)
+    seconds, clock = {}, time.perf_counter()
+
+    def lap(name):
+        nonlocal clock
+        now = time.perf_counter()
+        seconds[name], clock = now - clock, now
+
+    tell("reading the paths of the log")
+    tracks = [t for t in tracks_of(case) if t.motor is not None or t.command is not None]
+    if not tracks:
+        raise UserError(f"{case.name}: no flight has 2 s without a gap, with body rates and commands or motors")
+    flights = {f.name: f for f in case.flights}
+    vehicles = [case.vehicle_of(flights[t.name.split("#")[0]]) for t in tracks]
+    names = list(dict.fromkeys(t.flight for t in tracks))
+    flight_of = np.array([names.index(t.flight) for t in tracks])
+
+    pose = None
+    if all(t.quaternion is not None for t in tracks):
+        pose = estimator.read_estimator(tracks, flight_of)
+        score, delay, _ = pose.score()
+        if "state_latency" in library.effects and score > CLEAR_SCORE and abs(delay[0]) > CLEAR_DELAY:
+            tracks = [estimator.undelayed(t, float(delay[0])) for t in tracks]
+    radio, arrived = None, None
+    tracks = [firmware.with_motors(t, v) for t, v in zip(tracks, vehicles, strict=True)]
+    if all(t.command is not None for t in tracks):
+        radio = firmware.read_radio(tracks)
+        allowed = {k: v for k, v in radio.gain.items() if all(e in library.effects for e in k)}
+        arrived = radio.arrived[max(allowed, key=lambda k: allowed[k] - RADIO_COST * len(k))]
+    lap("paths")
+    rate_loop, ticks = None, [np.repeat(t.motor[:, None], TICKS, 1) for t in tracks]
+    if arrived is not None:
+        rate_loop, ticks = firmware.read_rate_loop(tracks, vehicles, arrived, flight_of)
+    lap("rate loop")
+    tell("replaying the flights")
+    replay = make_replay(tracks, vehicles, ticks)
+    floor, exposure = model_noise(replay, library)
+    lap("noise")
+    tell("weighing causes")
+    sets = weigh_sets(replay, library, exposure)
+    lap("sets")
+    if rate_loop is not None:
+        best = max((f for f in sets.values() if isinstance(f, SetFit)), key=lambda f: f.score)
+        if any(EFFECTS[e].body is not None for e in best.effects):
+            # The observer's own physics matters where it is far off: once more with what was found.
+            flown = [_with_effects(v, best) for v in vehicles]
+            rate_loop, _ = firmware.read_rate_loop(tracks, flown, arrived, flight_of)
+    lap("rate loop again")
+    return Evidence(case, library, tracks, vehicles, replay, sets, exposure, floor, radio, rate_loop, pose, seconds)
+
+
+def _with_effects(vehicle, fit: SetFit):
+    for effect in fit.effects:
+        if EFFECTS[effect].body is not None:
+            values = EFFECTS[effect].none()
+            values |= {p: float(fit.theta[PLACE[e, p]]) for e, p in PLACE if e == effect}
+            vehicle = EFFECTS[effect].body({k: jnp.asarray(v, jnp.float32) for k, v in values.items()}, vehicle)
+    return vehicle

@@ -1,0 +1,153 @@
+"""The report of one case: what was found, as plain data, as text and as files."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from openjax.gap.how_far import Gap
+from openjax.gap.where import Place, in_words
+from openjax.vehicle.effects import EFFECTS, save_effects
+
+VERDICTS = ("effect", "none", "unknown", "not_testable")
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A fitted parameter with its 90 % interval, in `unit`; `usual` is the prior range."""
+
+    value: float
+    unit: str
+    interval90: tuple[float, float]
+    usual: tuple[float, float]
+
+    @property
+    def unusual(self) -> bool:
+        return not self.usual[0] <= self.value <= self.usual[1]
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """What the flights of one case say. `parameters` {effect: {parameter: Estimate}}; `nuisances` {name: text} says what
+    they took; `plots` holds arrays for the pictures and isn't part of the JSON."""
+
+    case: str
+    verdict: str
+    effects: tuple[str, ...]
+    probabilities: dict[str, float]
+    equivalent: dict[str, list[str]]
+    parameters: dict[str, dict[str, Estimate]]
+    where: list[Place]
+    gap: Gap
+    not_testable: list[str]
+    next_flight: str
+    quality: list[dict[str, str]]
+    runner_up: str = ""
+    rest: str = ""
+    nuisances: dict[str, str] = field(default_factory=dict)
+    seconds: float = 0.0
+    plots: dict = field(default_factory=dict, repr=False)
+
+    def prediction(self) -> dict:
+        """The case's entry in a predictions file."""
+        return {
+            "effects": list(self.effects),
+            "probabilities": {k: round(v, 5) for k, v in self.probabilities.items() if v >= 5e-6},
+            "where": in_words(self.where),
+            "reduction": round(min(max(self.gap.reduction, 0.0), 1.0), 4),
+            "not_testable": list(self.not_testable),
+        }
+
+    def to_dict(self) -> dict:
+        """`report.json`."""
+        return {
+            "verdict": self.verdict,
+            "effects": list(self.effects),
+            "probabilities": {k: round(v, 6) for k, v in self.probabilities.items()},
+            "equivalent": self.equivalent,
+            "parameters": {
+                e: {
+                    p: {"value": v.value, "unit": v.unit, "interval90": list(v.interval90), "unusual": v.unusual}
+                    for p, v in values.items()
+                }
+                for e, values in self.parameters.items()
+            },
+            "where": [
+                {"channel": p.channel, "regime": p.regime, "share": round(p.share, 4), "before": round(p.before, 3),
+                 "after": round(p.after, 3)}
+                for p in self.where
+            ],
+            "gap": {
+                "metric": self.gap.metric, "before": round(self.gap.before, 4), "after": round(self.gap.after, 4),
+                "floor": round(self.gap.floor, 4), "reduction": round(self.gap.reduction, 4),
+                "interval90": [round(v, 4) for v in self.gap.interval90],
+            },
+            "not_testable": list(self.not_testable),
+            "next_flight": self.next_flight,
+            "quality": self.quality,
+            "runner_up": self.runner_up,
+            "rest": self.rest,
+            "nuisances": self.nuisances,
+        }  # fmt: skip
+
+    def in_words(self) -> list[str]:
+        """The verdict in a few plain sentences."""
+        chance = self.probabilities
+        lines = []
+        if self.verdict == "effect":
+            names = " and ".join(self.effects)
+            lines.append(f"Cause: {names} (probability {sum(chance.get(e, 0.0) for e in self.effects):.2f}).")
+        elif self.verdict == "unknown":
+            named = [e for e in self.effects if e != "unknown"]
+            more = f"; part of it looks like {named[0]}" if named else ""
+            lines.append(
+                f"Something acts that no known effect explains (probability {chance['unknown']:.2f}){more}."
+            )
+        elif self.verdict == "not_testable":
+            lines.append("No effect is seen, but these flights could not show most of those that are usual.")
+        else:
+            lines.append(f"The simulator agrees with these flights to within the noise (probability {chance['none']:.2f}).")
+        if self.rest:
+            lines.append(self.rest)
+        lines.append(f"Where: {in_words(self.where)}.")
+        for effect, values in self.parameters.items():
+            shown = ", ".join(
+                f"{p} = {v.value:.4g} [{v.interval90[0]:.4g}, {v.interval90[1]:.4g}] {v.unit}"
+                + (" (unusual)" if v.unusual else "")
+                for p, v in values.items()
+            )
+            lines.append(f"{effect}: {shown}.")
+        for name, others in self.equivalent.items():
+            lines.append(f"These flights can't tell {name} from {', '.join(others)}.")
+        if self.parameters:
+            low, high = self.gap.interval90
+            lines.append(
+                f"Gap on held-out flights: {self.gap.before:.2f} before, {self.gap.after:.2f} after, floor "
+                f"{self.gap.floor:.2f}: {100 * self.gap.reduction:.0f} % smaller [{100 * low:.0f}, {100 * high:.0f}]."
+            )
+            if self.gap.reduction < 0:
+                lines.append("Careful: with these effects the held-out predictions got worse.")
+        if self.runner_up:
+            lines.append(f"Runner-up: {self.runner_up}.")
+        if self.not_testable:
+            lines.append(f"Not testable with these flights: {', '.join(self.not_testable)}.")
+        if self.next_flight:
+            lines.append(f"Fly next: {self.next_flight}")
+        return lines
+
+
+def write_report(report: Report, folder: Path, pictures: bool = True) -> None:
+    """Write `report.json`, `effects.toml` and (with `pictures`) `report.html` into an existing
+    folder."""
+    (folder / "report.json").write_text(json.dumps(report.to_dict(), indent=1) + "\n", encoding="utf-8")
+    values = {e: {p: v.value for p, v in estimates.items()} for e, estimates in report.parameters.items()}
+    for effect, estimates in values.items():
+        # What wasn't fitted keeps the value at which it does nothing.
+        values[effect] = EFFECTS[effect].none() | estimates
+    intervals = {e: {p: v.interval90 for p, v in estimates.items()} for e, estimates in report.parameters.items()}
+    save_effects(folder / "effects.toml", values, intervals, notes=" ".join(report.in_words()[:2]))
+    if pictures:
+        from openjax.gap.html import html_of
+
+        (folder / "report.html").write_text(html_of(report), encoding="utf-8")
