@@ -1,7 +1,7 @@
 """Attention of one query per sample over a few entities that are embedded on the fly.
 
-Entities other than the pursuer itself are described by three to five numbers each, so their embeddings, a linear layer
-and a ReLU, cost less to compute again than to read back. On a GPU a hand-written kernel (Pallas, Triton) therefore
+Entities other than the pursuer itself are described by a few numbers each, so their embeddings, a linear layer and an
+activation, cost less to compute again than to read back. On a GPU a hand-written kernel (Pallas, Triton) therefore
 embeds them in registers, forward and backward, and nothing as large as samples x entities x features reaches memory:
 XLA's own fusions moved several times as many bytes (experiments/performance.md). Elsewhere the same formula is left
 to XLA.
@@ -17,6 +17,8 @@ from jax.experimental.pallas import triton as pallas_triton
 
 ROWS = 8
 """Samples that one program of the kernel works on; with more, the backward kernel's registers spill (3 times slower)."""
+
+WARPS = 4
 
 
 class EntityKind(NamedTuple):
@@ -54,7 +56,7 @@ class Layout(NamedTuple):
 def attend(query: jax.Array, own: jax.Array, inputs: jax.Array, weights: jax.Array, layout: Layout) -> jax.Array:
     """Weighted mean of entities for each head.
 
-    Entity 0 is `own`; entity m is relu(W' x_m + b) with the weights of its kind. With score
+    Entity 0 is `own`; entity m is activation(W' x_m + b) with the weights of its kind. With score
     s_hm = scale * query_h . e_m + bias_m, the result of head h is sum_m softmax(s_h)_m e_m.
 
     Args:
@@ -64,10 +66,22 @@ def attend(query: jax.Array, own: jax.Array, inputs: jax.Array, weights: jax.Arr
         weights: (sum of size + 1 over kinds, features) float32: per kind its matrix, then its bias.
         layout: sizes.
 
+    All but the biases in `inputs` are differentiable.
+
     Returns:
         (B, heads * features) in the type of `query`.
     """
     return _attend(query, own, inputs, weights, layout)
+
+
+def activation(x: jax.Array) -> jax.Array:
+    """x sigmoid(1.702 x), the cheap approximation of GELU (Hendrycks and Gimpel, 2016)."""
+    return x / (1.0 + jnp.exp(-1.702 * x))
+
+
+def _activation_slope(x):
+    share = 1.0 / (1.0 + jnp.exp(-1.702 * x))
+    return share + 1.702 * x * share * (1.0 - share)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(4,))
@@ -80,11 +94,7 @@ def _attend_forward(query, own, inputs, weights, layout):
 
 
 def _attend_backward(layout, saved, gradient):
-    query_grad, own_grad, weight_grad = _on_platform(_reference_backward, _backward_kernel_call, layout)(
-        *saved, gradient
-    )
-    # observations are data, not functions of parameters, so the inputs' gradient is never asked for
-    return query_grad, own_grad, jnp.zeros_like(saved[2]), weight_grad
+    return _on_platform(_reference_backward, _backward_kernel_call, layout)(*saved, gradient)
 
 
 _attend.defvjp(_attend_forward, _attend_backward)
@@ -105,7 +115,7 @@ def _reference(layout, query, own, inputs, weights):
     entities = [own.astype(jnp.float32)]
     for row, size, weight in layout.entities:
         linear = inputs[row : row + size].T @ weights[weight : weight + size] + weights[weight + size]
-        entities.append(jax.nn.relu(linear))
+        entities.append(activation(linear))
     entities = jnp.stack(entities, axis=1)
     heads = query.reshape(batch, layout.heads, layout.features).astype(jnp.float32)
     score = layout.scale * jnp.einsum("bhf,bmf->bhm", heads, entities)
@@ -116,19 +126,19 @@ def _reference(layout, query, own, inputs, weights):
 
 
 def _reference_backward(layout, query, own, inputs, weights, gradient):
-    _, pullback = jax.vjp(lambda q, o, w: _reference(layout, q, o, inputs, w), query, own, weights)
+    _, pullback = jax.vjp(functools.partial(_reference, layout), query, own, inputs, weights)
     return pullback(gradient)
 
 
 def _entity(layout, own, x, w_ref, m):
-    """Entity m of a block of samples: (rows, F) float32, and its value before the ReLU (None for the pursuer)."""
+    """Entity m of a block of samples: (rows, F) float32, and its value before the activation (None for the pursuer)."""
     if m == 0:
         return own, None
     row, size, weight = layout.entities[m - 1]
     linear = w_ref[weight + size, :][None, :]
     for i in range(size):
         linear = linear + x(row + i)[:, None] * w_ref[weight + i, :][None, :]
-    return jnp.maximum(linear, 0.0), linear
+    return activation(linear), linear
 
 
 def _softmax(scores):
@@ -194,7 +204,7 @@ def _backward_kernel(layout, q_ref, own_ref, x_ref, w_ref, g_ref, dq_ref, down_r
         if m == 0:
             down_ref[...] = dentity.astype(down_ref.dtype)
         else:
-            dlinear_ref[m - 1, :, :] = jnp.where(linear > 0.0, dentity, 0.0).astype(dlinear_ref.dtype)
+            dlinear_ref[m - 1, :, :] = (dentity * _activation_slope(linear)).astype(dlinear_ref.dtype)
     for h in range(heads):
         dq_ref[:, h * f : (h + 1) * f] = (dquery[h] * layout.scale).astype(dq_ref.dtype)
 
@@ -227,7 +237,7 @@ def _forward_kernel_call(layout, query, own, inputs, weights, interpret=False):
         in_specs=[wide, narrow, numbers, whole],
         out_specs=wide,
         interpret=interpret,
-        compiler_params=pallas_triton.CompilerParams(num_warps=4, num_stages=1),
+        compiler_params=pallas_triton.CompilerParams(num_warps=WARPS, num_stages=1),
         name="attend",
     )(query, own, inputs, weights)
     return mean[:batch]
@@ -249,16 +259,23 @@ def _backward_kernel_call(layout, query, own, inputs, weights, gradient, interpr
         in_specs=[wide, narrow, numbers, whole, wide],
         out_specs=(wide, narrow, pl.BlockSpec((number, ROWS, layout.features), lambda i: (0, i, 0))),
         interpret=interpret,
-        compiler_params=pallas_triton.CompilerParams(num_warps=4, num_stages=1),
+        compiler_params=pallas_triton.CompilerParams(num_warps=WARPS, num_stages=1),
         name="attend_backward",
     )(query, own, inputs, weights, gradient)
-    rows, start = [], 0
+    # what is left are products over the batch, with the inputs and with the weights of each kind
+    weight_grads, input_grads, start, first = [], [], 0, 0
     for kind in layout.kinds:
         size, part = kind.size, dlinear[start : start + kind.count]
-        row = layout.entities[start][0] if kind.count else 0
+        row = layout.entities[start][0]
         x = inputs[row : row + kind.count * size].reshape(kind.count, size, -1)
         # the bias is one more input that is always one
         x = jnp.concatenate([x, jnp.ones_like(x[:, :1])], axis=1).astype(part.dtype)
-        rows.append(jnp.einsum("mib,mbf->if", x, part, preferred_element_type=jnp.float32))
-        start += kind.count
-    return dquery[:batch], down[:batch], jnp.concatenate(rows)
+        weight_grads.append(jnp.einsum("mib,mbf->if", x, part, preferred_element_type=jnp.float32))
+        kernel = weights[first : first + size].astype(part.dtype)
+        input_grads.append(
+            jnp.einsum("mbf,if->mib", part, kernel, preferred_element_type=jnp.float32).reshape(-1, part.shape[1])
+        )
+        start, first = start + kind.count, first + size + 1
+    # the scores' biases mask, they are not learnt
+    input_grads.append(jnp.zeros((number, inputs.shape[1]), inputs.dtype))
+    return dquery[:batch], down[:batch], jnp.concatenate(input_grads)[:, :batch], jnp.concatenate(weight_grads)

@@ -49,12 +49,19 @@ class SelfAttention(nn.Module):
             count, size = x.shape[-2:]
             if count == 0:
                 continue
-            kinds.append(EntityKind(count, size))
+            linear = jnp.concatenate(
+                [
+                    kernel(f"{name}_kernel", (size, f), embed),
+                    kernel(f"{name}_bias", (1, f), nn.initializers.zeros_init()),
+                ]
+            )
+            x, linear = normalised_linear(x, linear)
+            kinds.append(EntityKind(count, size + 1))
             weights += [
-                kernel(f"{name}_kernel", (size, f), embed),
-                kernel(f"{name}_bias", (1, f), nn.initializers.zeros_init()),
+                linear * kernel(f"{name}_scale", (f,), nn.initializers.ones_init()),
+                kernel(f"{name}_shift", (1, f), nn.initializers.zeros_init()),
             ]
-            inputs.append(x.reshape(x.shape[0], count * size))
+            inputs.append(x.reshape(x.shape[0], count * (size + 1)))
             bias.append(b)
         mean = attend(
             own.astype(self.dtype) @ query.reshape(f, h * f).astype(self.dtype),
@@ -65,6 +72,26 @@ class SelfAttention(nn.Module):
         )
         out_bias = self.param("output_bias", nn.initializers.zeros_init(), (f,))
         return mean @ output.reshape(h * f, f).astype(self.dtype) + out_bias.astype(self.dtype)
+
+
+def normalised_linear(x: jax.Array, linear: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Layer normalisation of a linear layer, without its output.
+
+    Mean and variance over the features of W' x are a linear and a quadratic form of the few numbers x, so scaled
+    inputs and centred weights give the normalised output.
+
+    Args:
+        x: (..., size).
+        linear: (size + 1, F), the bias last.
+
+    Returns:
+        inputs (..., size + 1) and weights (size + 1, F), whose product is LayerNorm(linear' [x, 1]).
+    """
+    x = jnp.concatenate([x, jnp.ones_like(x[..., :1])], axis=-1)
+    centred = linear - jnp.mean(linear, axis=1, keepdims=True)
+    covariance = jnp.matmul(centred, centred.T, precision=jax.lax.Precision.HIGHEST) / linear.shape[1]
+    variance = jnp.sum(jnp.matmul(x, covariance, precision=jax.lax.Precision.HIGHEST) * x, axis=-1, keepdims=True)
+    return x * jax.lax.rsqrt(variance + 1e-6), centred
 
 
 class Encoder(nn.Module):
@@ -85,14 +112,14 @@ class Encoder(nn.Module):
         def flat(x):
             return x.reshape(-1, *x.shape[rows:])
 
-        own = self._dense("self_1", flat(self_state))
-        own = nn.gelu(nn.LayerNorm(dtype=self.dtype, name="self_norm")(own))
-        own = nn.gelu(self._dense("self_2", own))
+        own = self._layer("self_1", flat(self_state))
+        own = self._layer("self_2", own)
         attention = SelfAttention(self.features, self.heads, self.dtype, name="attention")
         hidden = own + attention(own, flat(others), flat(pillars), flat(pillar_seen))
         hidden = nn.LayerNorm(dtype=self.dtype, name="norm")(hidden)
-        return nn.gelu(self._dense("hidden", hidden)).reshape(*leading, self.features)
+        return self._layer("hidden", hidden).reshape(*leading, self.features)
 
-    def _dense(self, name, x):
+    def _layer(self, name, x):
         init = nn.initializers.orthogonal(2**0.5)
-        return nn.Dense(self.features, dtype=self.dtype, kernel_init=init, name=name)(x)
+        x = nn.Dense(self.features, dtype=self.dtype, kernel_init=init, name=name)(x)
+        return nn.gelu(nn.LayerNorm(dtype=self.dtype, name=f"{name}_norm")(x))
