@@ -11,7 +11,7 @@ from experiments.withheld import body, causes, missions, plant, replay, sensors,
 
 TICKS = 1200
 FLOOR_FILE = Path(__file__).with_name("floor.json")
-BANDS = {"low": (0.8, 1.6), "medium": (2.0, 4.0), "high": (5.0, 25.0)}
+BANDS = {"low": (0.8, 1.6), "medium": (2.0, 4.0), "high": (5.0, 40.0)}
 
 
 def label(severity):
@@ -184,19 +184,38 @@ def limits(effect):
     return smallest, largest
 
 
-def calibrate(flights, causes_of, targets, rounds=2):
-    """Move each case's single cause to its target severity; returns the rms per channel without causes."""
+def calibrate(flights, causes_of, targets, rounds=3):
+    """Move each case's single cause to its target severity, by secants in logarithms; the size that came
+    nearest is kept. Sizes stay within `causes.LIMITS`, whatever the target.
+    """
     level = floor()
     nominal, _ = flights.fly([[] for _ in causes_of])
     without = flights.rms(replay.errors(nominal, TICKS), nominal)
-    for _ in range(rounds):
+    tried = [[] for _ in causes_of]  # (log size, log reached) per case
+    for number in range(rounds):
         flown, _ = flights.fly(causes_of)
         reached = severity(flights.rms(replay.errors(flown, TICKS), flown), without, level).max(axis=0)
         for i, own in enumerate(causes_of):
             if not own or targets[i] is None:
                 continue
             crashed = (flown["crashed"][flights.columns[i]] < TICKS).any()
-            step = 0.6 if crashed else np.clip(targets[i] / max(reached[i], 0.05), 0.15, 6.0)
-            smallest, largest = limits(own[0]["effect"])
-            own[0]["size"] = float(np.clip(own[0]["size"] * step, smallest, largest))
-    return without
+            tried[i].append((np.log(own[0]["size"]), np.log(max(reached[i], 0.02)), crashed))
+            if number < rounds - 1:
+                moved = np.exp(_next(tried[i], np.log(targets[i])))
+                own[0]["size"] = float(np.clip(moved, *limits(own[0]["effect"])))
+    for i, own in enumerate(causes_of):
+        if tried[i]:
+            # a crash ends the search on that side
+            best = min(tried[i], key=lambda t: abs(t[1] - np.log(targets[i])) + 10 * t[2])
+            own[0]["size"] = float(np.exp(best[0]))
+
+
+def _next(tried, target):
+    """Next log size from the (log size, log reached, crashed) tried so far."""
+    size, reached, crashed = tried[-1]
+    if crashed:
+        return size - 0.6
+    slope = 1.0
+    if len(tried) > 1 and abs(size - tried[-2][0]) > 0.05:
+        slope = np.clip((reached - tried[-2][1]) / (size - tried[-2][0]), 0.5, 4.0)
+    return size + np.clip((target - reached) / slope, -2.0, 1.8)

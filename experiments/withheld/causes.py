@@ -139,7 +139,8 @@ def apply(cause, p, columns, arrival=None, rng=None):
     if name == "wind":
         angle = 2 * np.pi * s[1]
         p["wind"][:, c] = (a * np.array([np.cos(angle), np.sin(angle), 0.3 * (s[2] - 0.5)]))[:, None]
-        drag = 0.008 + 0.010 * s[3]
+        # low severities need less drag than the speed's lower limit alone leaves
+        drag = (0.008 + 0.010 * s[3]) * min(1.0, max(0.3, a / 0.6))
         p["wind_quadratic" if form == "quadratic" else "wind_drag"][c] = drag
         p["wind_shear"][c] = 0.8 if form == "shear" else 0.0
         p["wind_gust"][c] = 0.3 if form == "gusty" else 0.0

@@ -48,10 +48,10 @@ def diagnose_case(job):
 
 
 def _diagnose(folder, without):
-    from openjax.gap import diagnose, load_case
+    from openjax.gap import load_case
+    from openjax.gap.diagnosis import diagnose_case as diagnose
 
-    case = load_case(folder)
-    report = diagnose(case.flights, case.vehicle_file, without=tuple(without))
+    report = diagnose(load_case(folder), without=tuple(without))
     return report.prediction(), report.to_dict()
 
 
@@ -94,6 +94,8 @@ def main():
     parser.add_argument("--limit", type=int, help="only the first so many cases")
     options = parser.parse_args()
     predictions, reports = diagnose_all(options.logs, options.jobs, options.limit)
+    if all("error" in p for p in predictions.values()):
+        raise SystemExit("no case could be diagnosed")
     for path, content in ((options.predictions, predictions), (options.reports, reports)):
         if path:
             path.parent.mkdir(parents=True, exist_ok=True)

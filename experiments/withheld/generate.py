@@ -94,12 +94,12 @@ def fly_chunk(job):
     flights = cases.Flights(seed, specs)
     nominal, _ = flights.fly([[] for _ in specs])
     without = flights.rms(replay.errors(nominal, cases.TICKS), nominal)
-    for _ in range(4):
+    for attempt in range(5):
         flown, magnitudes = flights.fly([s["causes"] for s in specs])
         early = [
             i for i, c in enumerate(flights.columns) if flown["crashed"][c].min() < 700 and specs[i]["causes"]
         ]
-        if not early:
+        if not early or attempt == 4:
             break
         for i in early:
             for cause in specs[i]["causes"]:

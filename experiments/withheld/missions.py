@@ -86,7 +86,7 @@ def single(kind, rng, length):
         position[:, 2] = _held(rng, heights[:, None], length, (0.7, 1.3))[:, 0]
         sigma, pulses = rng.uniform(0.09, 0.14), _doublets(rng, length, 0.7, [0], 1.0)
     elif kind in ("low", "high"):
-        bounds = (0.045, 0.22) if kind == "low" else (0.98, 1.165)
+        bounds = (0.045, 0.22) if kind == "low" else (0.98, 1.15)
         position[:, :2] = _curve(rng, t, rng.uniform(0.3, 0.7), rng.uniform(0.25, 0.45))
         position[:, 2] = _held(rng, rng.uniform(*bounds, (40, 1)), length, (0.5, 1.4))[:, 0]
         start = np.clip(t / 2.0, 0, 1)
