@@ -86,7 +86,7 @@ def _print(result, console: Console) -> None:
     for channel, (before, after) in result.explained.items():
         given = f"{before:.1%}" if before > 0 else "none"
         fitted = f"{max(after, 0.0):.1%}"
-        console.print(f"{channel}: the fitted vehicle explains {fitted} of the changes, the given one {given}")
+        console.print(f"{channel}: the fitted vehicle explains {fitted} of what changed, the given {given}")
     console.print("[bold]What these flights can't tell[/]")
     for text in result.cannot_tell:
         console.print(f"• {text}", highlight=False)

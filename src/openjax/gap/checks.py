@@ -275,17 +275,12 @@ def _airborne(flight: Flight, floor_z: float | None, note) -> Flight:
     usual = np.median(drive[drive >= np.median(drive)])
     if usual < 0.02:
         raise _Refused("short", "never took off: the commands stay near zero")
-    on_ground = drive < 0.4 * usual
+    on_ground = _long_runs(drive < 0.4 * usual, flight.time)
     if flight.position is not None and flight.velocity is not None:
         floor = 0.0 if floor_z is None else float(floor_z)
         height = flight.interpolated("position")[:, 2] - floor
         speed = np.linalg.norm(flight.interpolated("velocity"), axis=1)
         on_ground |= (np.abs(height) < GROUND_CLEARANCE) & (speed < 0.05)
-    edges = np.flatnonzero(np.diff(np.r_[0, on_ground, 0]))
-    for start, stop in zip(edges[::2], edges[1::2], strict=True):
-        inside = start > 0 and stop < len(on_ground)
-        if inside and flight.time[stop - 1] - flight.time[start] < 0.5:
-            on_ground[start:stop] = False
     edges = np.flatnonzero(np.diff(np.r_[0, ~on_ground, 0]))
     runs = list(zip(edges[::2], edges[1::2], strict=True))
     if not runs:
@@ -300,3 +295,13 @@ def _airborne(flight: Flight, floor_z: float | None, note) -> Flight:
                        f"to {flight.time[stop - 1]:.2f})")  # fmt: skip
         flight = flight.rows(slice(start, stop))
     return flight
+
+
+def _long_runs(flags: np.ndarray, time: np.ndarray, shortest: float = 0.5) -> np.ndarray:
+    """`flags` (T,) without runs of less than `shortest` s: a dip of thrust in the air is a manoeuvre."""
+    kept = flags.copy()
+    edges = np.flatnonzero(np.diff(np.r_[0, flags, 0]))
+    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+        if time[stop - 1] - time[start] < shortest:
+            kept[start:stop] = False
+    return kept

@@ -21,6 +21,8 @@ RATE = 100.0  # Hz, common clock of the comparisons
 KINEMATIC_BAND = (0.3, 4.0)  # Hz: above drift and offsets, below most of the sensors' noise and delays
 TORQUE_BAND = (0.5, 8.0)
 LAGS = np.arange(-6, 7, 2)  # samples of the common clock; clock offsets between streams are a nuisance
+LEAST_RATE = 0.03  # rad/s rms in the band, below which an axis can't be judged against the pose
+LEAST_COMMANDED = 0.2  # rad/s, the same against commands: in a quiet loop they oppose what the air does
 LONGEST = 30.0  # s, enough to tell
 GRAVITY = 9.81
 _FITS, _BETTER = 0.65, 0.6  # correlation of an axis that fits; least gain in their sum of another labelling
@@ -48,6 +50,7 @@ class Match:
     order: tuple[int, ...]  # best: measured axis i is reference axis order[i] ...
     signs: tuple[float, ...]  # ... times signs[i]
     gain: float  # rms of measured over rms of reference, over the axes that fit
+    excited: np.ndarray  # (3,) whether the axis moves enough to be judged
 
     @property
     def changed(self) -> np.ndarray:
@@ -58,7 +61,7 @@ class Match:
     @property
     def wrong(self) -> bool:
         """The labelling fails on an axis that another labelling explains."""
-        clear = self.changed & _clearly_better(self.best, self.as_labelled)
+        clear = self.changed & self.excited & _clearly_better(self.best, self.as_labelled)
         return bool(clear.any() and self.best.sum() - self.as_labelled.sum() > _BETTER)
 
     @property
@@ -68,7 +71,7 @@ class Match:
     def words(self, names: tuple[str, ...], reference: tuple[str, ...] = ("x", "y", "z")) -> str:
         """Which column holds what: "wx holds the y axis, wy minus the x axis"."""
         parts = []
-        for i in np.flatnonzero(self.changed & (self.best > _FITS)):
+        for i in np.flatnonzero(self.changed & self.excited & (self.best > _FITS)):
             sign = "minus " if self.signs[i] < 0 else ""
             parts.append(f"{names[i]} holds {sign}{reference[self.order[i]]}")
         return ", ".join(parts)
@@ -114,11 +117,11 @@ def rates_of(quaternion: np.ndarray) -> np.ndarray:
     return rates
 
 
-def match_axes(measured: np.ndarray, reference: np.ndarray, band=KINEMATIC_BAND, lags=LAGS) -> Match:
+def match_axes(measured: np.ndarray, reference: np.ndarray, least: float = 0.0) -> Match:
     """Compare (T, 3) with (T, 3) on the common clock in `band` Hz, over all 48 relabellings and a few
     time shifts."""
-    y, x = _band(measured, band), _band(reference, band)
-    correlations = np.stack([_correlation(y, np.roll(x, lag, 0)) for lag in lags])  # (L, 3, 3)
+    y, x = _band(measured, KINEMATIC_BAND), _band(reference, KINEMATIC_BAND)
+    correlations = np.stack([_correlation(y, np.roll(x, lag, 0)) for lag in LAGS])  # (L, 3, 3)
     scores = [
         sum(signs[i] * correlations[:, i, order[i]] for i in range(3)).max() for order, signs in _RELABELLINGS
     ]
@@ -133,7 +136,10 @@ def match_axes(measured: np.ndarray, reference: np.ndarray, band=KINEMATIC_BAND,
         if fitting.any()
         else float("nan")
     )
-    return Match(as_labelled, best, order, signs, gain)
+    # An axis that hardly moves shows the others' leakage and the loop's own noise: too little to accuse it
+    # by.
+    alike = (rms_y > 0.3 * gain * rms_x) & (rms_y < 3.0 * gain * rms_x)
+    return Match(as_labelled, best, order, signs, gain, alike & (rms_x > least) & (rms_y > least))
 
 
 def _gravity(force: np.ndarray | None) -> list[tuple[str, str]]:
@@ -172,7 +178,7 @@ def _pose(quaternion, position, gyro, force) -> list[tuple[str, str]]:
         attitude = convert(quaternion)
         pair = []
         if gyro is not None:
-            pair.append(match_axes(gyro, rates_of(attitude)))
+            pair.append(match_axes(gyro, rates_of(attitude), LEAST_RATE))
         if position is not None:
             pair.append(match_axes(_acceleration(position), _path_acceleration(attitude, force)))
         matches[name] = pair
@@ -218,7 +224,7 @@ def _velocity(position, velocity, quaternion) -> list[tuple[str, str]]:
 
 def _commands(command, rates) -> list[tuple[str, str]]:
     """Commanded body rates against the measured ones: the rate loop follows in this band."""
-    match = match_axes(command, rates)
+    match = match_axes(command, rates, LEAST_COMMANDED)
     names = ("cmd_wx", "cmd_wy", "cmd_wz")
     if match.wrong:
         return [("axes", f"command axes: {match.words(names)} of the gyroscope")]
