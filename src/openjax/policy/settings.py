@@ -34,8 +34,8 @@ class PredictorSettings:
     """Predict the evader and let the policy observe the prediction."""
     units: int = 64
     """Width of the LSTM."""
-    horizons: tuple[int, ...] = (1, 2, 3, 4, 5)
-    """Control steps ahead at which positions are predicted; the first is 1, the paper's are 1 to 5."""
+    horizons: tuple[int, ...] = (1, 5, 10, 20, 40)
+    """Control steps ahead at which positions are predicted; the first is 1. The paper's are 1 to 5."""
     relative: bool = True
     """Predict the displacement from where the evader was last seen; False: positions in the arena, as in the paper."""
     learning_rate: float = 1e-3
