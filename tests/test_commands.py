@@ -13,21 +13,28 @@ import numpy as np
 import pytest
 
 from openjax import benchmark, evaluate, train
+from openjax.learning import TrainSettings, init_carry, make_training_step
 from openjax.runs import training
 from openjax.runs.checkpoints import Checkpoints, abstract_like, is_checkpoint, load_arrays, place
 from openjax.runs.command_line import run_command
 from openjax.runs.evaluation import FIELDS
 from openjax.runs.loop import guarded
 from openjax.runs.metrics import read_metrics
+from openjax.runs.run_directory import RunDirectory
 
 UPDATES = 24
 TINY = (
     "--num_envs 16 --rollout_length 10 --environment.episode_length 20 --environment.physics rigid "
-    "--network.features 8 --network.heads 2 --predictor.units 4 --predictor.windows 4 --predictor.steps 2 "
+    "--network.features 8 --network.heads 2 "
+    "--predictor.units 4 --predictor.windows 4 --predictor.steps 2 --predictor.horizons 1 2 "
     "--mappo.minibatches 2 --mappo.epochs 1 --generator.capacity 8 "
     "--evaluation_interval 3 --evaluation_episodes 4"
 ).split()
 STEPS = ["--steps", str(UPDATES * 160), "--layout_episodes", "4"]
+
+
+# Compilation is what these tests wait for; what they compare is compiled alike.
+QUICK_COMPILATION = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 
 
 @pytest.fixture(scope="session")
@@ -49,7 +56,7 @@ def shared_cache(tmp_path_factory):
 
 def start(arguments, cache, **options):
     command = [sys.executable, "-m", *arguments]
-    environment = {**os.environ, **cache, "JAX_PLATFORMS": "cpu"}
+    environment = {**os.environ, **cache, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": QUICK_COMPILATION}
     return subprocess.Popen(
         command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **options
     )
@@ -152,9 +159,9 @@ def test_signal_saves_and_exits_cleanly(whole_run, tmp_path, shared_cache):
 
 def test_training_step_compiles_once_also_after_a_resume(whole_run, shared_cache):
     checkpoints = Checkpoints(whole_run[0] / "checkpoints")
-    settings = training.RunDirectory(whole_run[0]).read_settings(training.TrainSettings)
-    step = guarded(training.make_training_step(settings))
-    carry = place(training.init_carry(settings, jax.random.key(0)))
+    settings = RunDirectory(whole_run[0]).read_settings(TrainSettings)
+    step = guarded(make_training_step(settings))
+    carry = place(init_carry(settings, jax.random.key(0)))
     abstract = abstract_like(carry)
     for _ in range(10):
         carry, _, _ = step(carry)
@@ -164,7 +171,7 @@ def test_training_step_compiles_once_also_after_a_resume(whole_run, shared_cache
 
 
 def test_nan_stops_the_run_and_leaves_the_state(tmp_path, monkeypatch, capsys, shared_cache):
-    def make_broken_step(settings, environment):
+    def make_broken_step(settings, environment, devices):
         def step(carry):
             update = carry.update + 1
             broken = jax.tree.map(lambda leaf: leaf + (0.0 / (update != 4)), carry.policy.actor)
@@ -174,7 +181,7 @@ def test_nan_stops_the_run_and_leaves_the_state(tmp_path, monkeypatch, capsys, s
 
         return step
 
-    monkeypatch.setattr(training, "make_training_step", make_broken_step)
+    monkeypatch.setattr(training, "make_device_step", make_broken_step)
     out = tmp_path / "broken"
     status, _ = in_process(train.main, [*TINY, *STEPS, "--out", out], monkeypatch, capsys)
     assert status == 1

@@ -77,11 +77,12 @@ class StopRequest:
         signal.signal(signal.SIGINT, self._previous[signal.SIGINT])
 
 
-def guarded(step: Callable[[Any], tuple[Any, dict]]) -> Callable:
+def guarded(step: Callable[[Any], tuple[Any, dict]], shardings: Any = None) -> Callable:
     """`step` compiled, with its carry donated, and a check of the result for NaN in the same program.
 
     Args:
       step: pure function carry -> (carry, metrics by name).
+      shardings: where the carry's leaves lie, before and after; see `place`.
 
     Returns:
       carry -> (carry, metrics, (L,) bool: which of the leaves of `float_leaves(carry)` hold a NaN).
@@ -93,7 +94,8 @@ def guarded(step: Callable[[Any], tuple[Any, dict]]) -> Callable:
         broken = [jnp.any(jnp.isnan(leaf)) for leaf in float_leaves(carry).values()]
         return carry, metrics, jnp.stack(broken) if broken else jnp.zeros((0,), bool)
 
-    return jax.jit(checked, donate_argnums=0)
+    # Without saying so, the compiler may move a leaf, and the next call would compile again.
+    return jax.jit(checked, donate_argnums=0, out_shardings=(shardings, None, None))
 
 
 def float_leaves(carry: Any) -> dict[str, jax.Array]:

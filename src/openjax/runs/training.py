@@ -7,10 +7,11 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from openjax.learning import TrainSettings, build, init_carry, make_training_step, summarise
+from openjax.learning import TrainSettings, build, init_carry, summarise
 from openjax.policy import PolicyParameters
 from openjax.pursuit import SCENARIOS, Pursuit
 from openjax.runs.checkpoints import Checkpoints, abstract_like, load_arrays, named_leaves, place
+from openjax.runs.devices import carry_shardings, check_devices, make_device_step
 from openjax.runs.evaluation import (
     Evaluator,
     before_after_table,
@@ -51,7 +52,8 @@ class TrainingJob:
     """`time.monotonic()` when the command started."""
 
     def check(self) -> None:
-        """Raises UserError for a policy to start from that doesn't fit, before any directory is touched."""
+        """Raises UserError for what doesn't fit together, before any directory is touched."""
+        check_devices(self.settings, self.devices)
         if self.start_from is not None:
             _start_parameters(self)
 
@@ -66,6 +68,7 @@ def run_job(job: TrainingJob, directory: RunDirectory, resume: bool, console: Co
         carry, update, seconds = _first_carry(job, directory, checkpoints, resume, progress)
         directory.write_settings(settings, job.facts)
         evaluator, tasks = _make_evaluator(job)
+        shardings = carry_shardings(job.devices)
 
         def evaluate(carry):
             parameters = jax.device_put(carry.policy, jax.devices()[0])
@@ -80,7 +83,7 @@ def run_job(job: TrainingJob, directory: RunDirectory, resume: bool, console: Co
         )
         try:
             outcome = run_updates(
-                guarded(make_training_step(settings, job.environment)),
+                guarded(make_device_step(settings, job.environment, job.devices), shardings),
                 carry,
                 Plan(
                     total_updates=settings.total_updates,
@@ -120,14 +123,14 @@ def _first_carry(job, directory, checkpoints, resume, progress):
     settings = job.settings
     carry = init_carry(settings, jax.random.key(settings.seed), job.environment)
     if resume:
-        abstract = abstract_like(place(carry))
+        abstract = abstract_like(place(carry, carry_shardings(job.devices)))
         del carry
         carry, record = checkpoints.restore_latest(abstract, progress.message)
         progress.message(f"resumed at update {record.update} of {settings.total_updates}")
         return carry, record.update, float(record.notes.get("seconds", 0.0))
     if job.start_from is not None:
         carry = carry.replace(policy=_start_parameters(job))
-    carry = place(carry)
+    carry = place(carry, carry_shardings(job.devices))
     save_policy_file(directory.start_policy, carry.policy, settings, {"update": 0}, storage="float32")
     return carry, 0, 0.0
 

@@ -1,0 +1,67 @@
+"""A training run on several devices of a host: the worlds are shared out, all else is the same on each.
+
+The step sees its own device's worlds and averages over all where it must (`openjax.learning.devices`), so
+that one device and many give the same result on the same worlds, up to the order of sums.
+"""
+
+import jax
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from openjax.errors import UserError
+from openjax.learning import TrainCarry, TrainSettings, make_training_step
+from openjax.pursuit import Pursuit
+
+AXIS = "devices"
+_SHARED_OUT = ("observation", "state")
+"""Fields of the carry whose leading axis is the worlds."""
+
+
+def check_devices(settings: TrainSettings, number: int) -> None:
+    """Whether the worlds can be shared out.
+
+    Raises:
+      UserError: they can't, with the next number of worlds that could.
+    """
+    minibatches = settings.mappo.minibatches
+    unit = number * int(np.lcm(settings.start_groups * settings.episodes_per_task, minibatches))
+    if number > 1 and settings.num_envs % unit:
+        possible = -(-settings.num_envs // unit) * unit
+        raise UserError(
+            f"num_envs {settings.num_envs} can't be shared out to {number} devices; {possible} could"
+        )
+
+
+def carry_shardings(number: int) -> TrainCarry | jax.sharding.Sharding:
+    """Where the leaves of a carry lie, as a prefix of its tree."""
+    if number == 1:
+        return jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    mesh = _mesh(number)
+    return _carry_of(
+        NamedSharding(mesh, PartitionSpec(AXIS)),
+        NamedSharding(mesh, PartitionSpec()),
+    )
+
+
+def make_device_step(settings: TrainSettings, environment: Pursuit, number: int):
+    """The training step `carry -> (carry, metrics)` on `number` devices, not yet compiled."""
+    if number == 1:
+        return make_training_step(settings, environment)
+    specs = _carry_of(PartitionSpec(AXIS), PartitionSpec())
+    return jax.shard_map(
+        make_training_step(settings, environment, axis=AXIS),
+        mesh=_mesh(number),
+        in_specs=(specs,),
+        out_specs=(specs, PartitionSpec()),
+        # The step averages gradients itself; with the check on, they'd be summed before that.
+        check_vma=False,
+    )
+
+
+def _mesh(number):
+    return Mesh(np.asarray(jax.devices()[:number]), (AXIS,))
+
+
+def _carry_of(shared_out, same):
+    fields = TrainCarry.__dataclass_fields__
+    return TrainCarry(**{name: shared_out if name in _SHARED_OUT else same for name in fields})
