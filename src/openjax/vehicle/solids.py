@@ -36,7 +36,7 @@ _TOUCHING = -1e-6  # m, gap at which a contact acts but doesn't push
 
 
 def solids_xml(n_pillars: int, n_others: int, dt: float) -> tuple[str, str]:
-    """MJCF of the shapes (floor, pillars, other drones) and of their contact pairs with a geom named "drone"."""
+    """MJCF of the shapes (floor, pillars, other drones) and of their contact pairs with the geom "drone"."""
     shapes = ['<geom name="floor" type="plane" size="0 0 1"/>']
     pairs = [("floor", _FIXED)]
     for k in range(n_pillars):

@@ -1,0 +1,57 @@
+"""effects.toml: what is written is read back, and anything strange is refused with what would be right."""
+
+import pytest
+
+from openjax.errors import UserError
+from openjax.vehicle.effects import EFFECTS, load_effects, save_effects
+
+
+def test_everything_comes_back(tmp_path):
+    path = tmp_path / "effects.toml"
+    written = {name: effect.typical() for name, effect in EFFECTS.items()}
+    save_effects(path, written, intervals={"rotor_drag": {"d_xy": (0.01, 0.02)}}, notes="three flights")
+    names, read = load_effects(path)
+    assert names == tuple(sorted(EFFECTS)) and read == written
+    text = path.read_text()
+    assert 'unit = "N s/m"' in text and "interval90 = [0.01, 0.02]" in text
+    assert [file.name for file in tmp_path.iterdir()] == ["effects.toml"]
+
+
+def test_bare_numbers_and_missing_parameters(tmp_path):
+    path = tmp_path / "effects.toml"
+    path.write_text('notes = "by hand"\n[wind]\nx = 1\ndrag = 0.01\n[yaw_torque]\n')
+    assert load_effects(path) == (
+        ("wind", "yaw_torque"),
+        {"wind": {"x": 1.0, "drag": 0.01}, "yaw_torque": {}},
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("[drag]\nd = 1\n", "effect 'drag' is unknown"),
+        ("rotor_drag = 1\n", "must be a table"),
+        ("[rotor_drag]\nd = 1\n", "no parameter 'd'"),
+        ('[rotor_drag]\nd_xy = { value = 1, unit = "g" }\n', "'N s/m' would be right"),
+        ("[rotor_drag]\nd_xy = { value = 1, interval = [0, 1] }\n", "unknown key 'interval'"),
+        ('[rotor_drag]\nd_xy = "0.01"\n', "must be a finite number"),
+        ("[rotor_drag]\nd_xy = nan\n", "must be a finite number"),
+        ("[rotor_drag]\nd_xy = {}\n", "must be a finite number"),
+        ("[rotor_drag\n", "not readable as TOML"),
+    ],
+)
+def test_strange_files_are_refused(tmp_path, text, reason):
+    path = tmp_path / "effects.toml"
+    path.write_text(text)
+    with pytest.raises(UserError, match=reason) as error:
+        load_effects(path)
+    assert "\n" not in str(error.value) and str(path) in str(error.value)
+
+
+def test_nothing_is_written_for_strangers(tmp_path):
+    path = tmp_path / "effects.toml"
+    for strange in ({"drag": {}}, {"wind": {"speed": 1.0}}):
+        with pytest.raises(UserError):
+            save_effects(path, strange)
+    with pytest.raises(UserError, match="no such effects file"):
+        load_effects(path)
