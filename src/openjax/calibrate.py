@@ -4,8 +4,8 @@ and with what the flights can't tell, and write a `vehicle.toml` that trainer an
 from __future__ import annotations
 
 import dataclasses
-import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -15,6 +15,9 @@ from rich.console import Console
 from rich.table import Table
 
 from openjax.errors import UserError
+from openjax.runs.command_line import output_console, parse, run_command
+
+PROGRAM = "python -m openjax.calibrate"
 
 
 @dataclass(frozen=True)
@@ -92,15 +95,10 @@ def _print(result, console: Console) -> None:
         console.print(f"• {text}", highlight=False)
 
 
-def main(args: list[str] | None = None) -> int:
-    arguments = tyro.cli(Arguments, prog="python -m openjax.calibrate", args=args)
-    try:
-        run(arguments, Console())
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+def main(arguments: Sequence[str]) -> None:
+    parsed = parse(Arguments, Arguments(case=tyro.MISSING), arguments, PROGRAM)
+    run(parsed, output_console())
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(main)

@@ -4,16 +4,18 @@ diagnosis on."""
 from __future__ import annotations
 
 import shutil
-import sys
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 
 from openjax.errors import UserError
+from openjax.runs.command_line import output_console, parse, run_command
+
+PROGRAM = "python -m openjax.sample_flights"
 
 VEHICLE_TOML = """\
 [vehicle]
@@ -86,21 +88,14 @@ def make_case(arguments: Arguments) -> list[Path]:
     return sorted(out.iterdir())
 
 
-def main(args: list[str] | None = None) -> int:
-    arguments = tyro.cli(Arguments, prog="python -m openjax.sample_flights", args=args)
-    try:
-        files = make_case(arguments)
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    console = Console()
-    console.print(
-        f"[bold]{arguments.out}[/]: three flights of {arguments.duration:g} s, effect: {arguments.effect}"
-    )
+def main(arguments: Sequence[str]) -> None:
+    parsed = parse(Arguments, Arguments(out=tyro.MISSING), arguments, PROGRAM)
+    files = make_case(parsed)
+    console = output_console()
+    console.print(f"[bold]{parsed.out}[/]: three flights of {parsed.duration:g} s, effect: {parsed.effect}")
     for file in files:
-        console.print(f"  {file.name}  {file.stat().st_size / 1024:.0f} KiB", highlight=False)
-    return 0
+        console.print(f"  {file.name}  {file.stat().st_size / 1024:.1f} KiB")
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(main)

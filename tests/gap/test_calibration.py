@@ -2,6 +2,8 @@
 flights can't tell is said and kept nominal."""
 
 import dataclasses
+import subprocess
+import sys
 
 import jax.numpy as jnp
 import numpy as np
@@ -160,20 +162,28 @@ def test_flights_without_motor_commands_cannot_calibrate():
 
 def test_the_command_writes_a_file_that_loads(case_folder, tmp_path, capsys):
     out = tmp_path / "mine.toml"
-    assert main([str(case_folder), "--out", str(out)]) == 0
+    main([str(case_folder), "--out", str(out)])
     printed = capsys.readouterr().out
     assert "What these flights can't tell" in printed and "thrust constant" in printed
     file = load_vehicle_file(out)
     assert set(file.calibrated) == {"thrust_constant", "torque_constant", "motor_time_constant", "inertia"}
     np.testing.assert_allclose(file.vehicle.thrust_constant, NOMINAL.thrust_constant, rtol=0.02)
-    assert main([str(case_folder), "--out", str(out)]) == 2  # never overwritten by itself
+    with pytest.raises(UserError, match="--overwrite"):
+        main([str(case_folder), "--out", str(out)])
     (case_folder / "vehicle.toml").write_text(out.read_text())
     again = load_case(case_folder)  # the diagnosis starts from the calibrated vehicle
     np.testing.assert_array_equal(again.vehicle_file.vehicle.inertia, file.vehicle.inertia)
 
 
+def test_as_a_command_a_bad_case_exits_with_status_2(tmp_path):
+    command = [sys.executable, "-m", "openjax.calibrate", str(tmp_path / "nowhere")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2 and done.stdout == ""
+    assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
+
+
 @pytest.mark.parametrize("problem", ["no folder", "unknown key", "no logs"])
-def test_bad_input_is_one_line_and_leaves_nothing(case_folder, tmp_path, capsys, problem):
+def test_bad_input_is_one_line_and_leaves_nothing(case_folder, tmp_path, problem):
     out, case = tmp_path / "out.toml", case_folder
     if problem == "no folder":
         case = tmp_path / "nowhere"
@@ -182,7 +192,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(case_folder, tmp_path, capsys,
     else:
         for log in case.glob("*.gz"):
             log.write_text("t,wx\n")
-    assert main([str(case), "--out", str(out)]) == 2
-    captured = capsys.readouterr()
-    assert captured.err.startswith("error: ") and captured.err.count("\n") == 1
+    with pytest.raises(UserError) as caught:
+        main([str(case), "--out", str(out)])
+    assert "\n" not in str(caught.value)
     assert not out.exists() and not list(tmp_path.glob("*.partial"))
