@@ -42,6 +42,22 @@ def draw_missions(rng, needed, two):
     return [(f, f) if f in missions.PAIR else (f, str(rng.choice(missions.SINGLE))) for f in flights]
 
 
+def _with_nuisance(cause, spec):
+    """Magnitudes together with the nuisance of the case that acts in the same way and that no flight can
+    split off.
+    """
+    offset = 1 + spec["thrust_offset"]
+    sign = 1 if cause["shape"][0] < 0.5 else -1
+    if cause["effect"] == "mass":
+        return {"seen_extra_kg": body.MASS * ((1 + sign * cause["size"]) / offset - 1)}
+    if cause["effect"] == "thrust_scale":
+        return {"seen_scale": (1 + sign * cause["size"]) * offset - 1}
+    if cause["effect"] == "state_latency":
+        # mean of the jitter's absolute value: 0.8 of its standard deviation
+        return {"seen_delay_ms": cause["size"] + spec["mocap_delay"] + 0.8 * sensors.MOCAP_JITTER}
+    return {}
+
+
 class Flights:
     """The bodies of a list of cases: reference, noise and partner of each, and which columns belong to which
     case.
@@ -56,7 +72,7 @@ class Flights:
         for spec in specs:
             rng = case_rng(seed, spec["number"], 1)
             shared = sensors.draw_case(rng)
-            spec["thrust_offset"] = shared["thrust_offset"]
+            spec["thrust_offset"], spec["mocap_delay"] = shared["thrust_offset"], shared["mocap_delay"]
             start, flights, lengths = len(references), [], []
             for mission in spec["flights"]:
                 length = int(rng.integers(900, TICKS + 1))

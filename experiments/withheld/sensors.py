@@ -9,6 +9,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 GUST_FORCE = 0.9e-3  # N rms per axis
+MOCAP_JITTER = 0.4  # ms, standard deviation of the extra delay before its absolute value is taken
 GUST_TORQUE = 1.2e-5  # N m rms per axis (roll, pitch); yaw half
 
 
@@ -64,7 +65,7 @@ def draw_flight(rng, case, ticks, open_voltage):
         "accel_bias": case["accel_bias"] + 0.02 * rng.standard_normal(3),
         "tilt": case["tilt"],
         "mocap_delay": case["mocap_delay"],
-        "mocap_jitter": np.abs(0.4 * rng.standard_normal(ticks)),
+        "mocap_jitter": np.abs(MOCAP_JITTER * rng.standard_normal(ticks)),
         "pose_jitter": rng.uniform(-1, 1, ticks),
         "open_voltage": open_voltage,
         "resistance": case["resistance"],
