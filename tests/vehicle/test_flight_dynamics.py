@@ -142,20 +142,29 @@ def test_motor_lag_is_exact(vehicle):
     np.testing.assert_allclose(twice, once, rtol=1e-5)
 
 
-@pytest.mark.parametrize(("physics", "contacts"), [("rigid", False), ("mjx", False)])
-def test_gradients_are_finite_and_right(vehicle, physics, contacts):
-    """Also at full stop of a rotor, where the square root of the command has no slope."""
-    step = make_drones_step(physics, contacts=contacts)
-    start = hover_state(vehicle, jnp.array([[0.0, 0, 1]]))
+def test_gradients_are_right_and_finite(vehicle):
+    """By MJX among solids as by the written-out equations; finite on the floor, where a contact acts, and at
+    full stop
+    of a rotor, where the square root of the command has no slope."""
+    pillars = jnp.array([[0.5, 0.0]]), jnp.ones(1, bool)
 
-    def height(thrust, mass):
-        command = jnp.zeros((1, 4)).at[:, 0].set(thrust).at[:, 1].set(3.0)
-        return step(vehicle.replace(mass=mass), start, command, *NO_PILLARS).position[0, 2]
+    def slopes(physics):
+        step = make_drones_step(physics)
 
-    gradient = jax.jit(jax.grad(height, argnums=(0, 1)))
-    slope = gradient(jnp.float32(0.7), vehicle.mass)
-    assert np.all(np.isfinite(slope)) and slope[0] > 0 and slope[1] < 0
-    assert np.all(np.isfinite(gradient(jnp.float32(0.0), vehicle.mass)))
+        def end(thrust, mass, height):
+            start = hover_state(vehicle, jnp.array([[0.0, 0, 0], [0.2, 0, 0]]).at[:, 2].set(height))
+            command = jnp.zeros((2, 4)).at[:, 0].set(thrust).at[:, 1].set(3.0)
+            drones = step(vehicle.replace(mass=mass), start, command, *pillars)
+            return jnp.sum(drones.position[:, 2]) + jnp.sum(drones.body_rates[:, 0])
+
+        return jax.jit(jax.grad(end, argnums=(0, 1, 2)))
+
+    rigid, mjx = slopes("rigid"), slopes("mjx")
+    np.testing.assert_allclose(mjx(0.7, vehicle.mass, 1.0), rigid(0.7, vehicle.mass, 1.0), rtol=1e-3)
+    assert np.all(np.abs(rigid(0.7, vehicle.mass, 1.0)) > 1e-3)
+    for thrust, height in ((0.0, 1.0), (0.5, 0.05), (0.0, 0.049)):
+        assert np.isfinite(mjx(thrust, vehicle.mass, height)).all()
+        assert np.isfinite(rigid(thrust, vehicle.mass, height)).all()
 
 
 def test_precision_is_that_of_the_state(vehicle):
