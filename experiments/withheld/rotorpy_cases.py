@@ -213,15 +213,14 @@ def fly(changed, wind, reference, noise, ticks=TICKS):
     for k in range(ticks):
         q = np.roll(state["q"], 1)[:, None]
         p, v, w = state["x"][:, None], state["v"][:, None], state["w"][:, None]
-        seen_p, seen_v = p - delay * v + noise["position"][k], v + noise["velocity"][k]
+        state["wind"] = air.update(0.01 * k, state["x"])
+        accel = model.statedot(state, {"cmd_motor_speeds": state["rotor_speeds"]}, dt)["vdot"][:, None]
+        seen_p = p - delay * v + noise["position"][k]
+        seen_v = v - delay * accel + noise["velocity"][k]
         seen_q = b.turn(q, -w, delay)
         seen_q = b.multiply(seen_q, noise["attitude"][k])
         seen_q = seen_q / np.sqrt((seen_q * seen_q).sum(axis=0))
         command = plant.off_board_control(reference, k, seen_p, seen_q, seen_v, goal, b.MASS)
-        state["wind"] = air.update(0.01 * k, state["x"])
-        accel = model.statedot(state, {"cmd_motor_speeds": state["rotor_speeds"]}, dt)["vdot"] + np.array(
-            [0, 0, b.GRAVITY]
-        )
         for name, value in (
             ("position", p),
             ("velocity", v),
@@ -233,7 +232,7 @@ def fly(changed, wind, reference, noise, ticks=TICKS):
             ("rotor", state["rotor_speeds"][:, None]),
             ("measured_quaternion", seen_q),
             ("command", command),
-            ("specific", b.rotate_back(q, accel[:, None])),
+            ("specific", b.rotate_back(q, accel + np.array([[0.0], [0.0], [b.GRAVITY]]))),
         ):
             out[name][k] = value
         out["voltage"][k] = voltage
