@@ -288,8 +288,8 @@ def make_case(job):
     spec = {"mass_weighed": False, "name": f"case_{number:04d}"}
     lengths = generate.write_case(Path(folder) / spec["name"], spec, flights, joined, 0)
     level = cases.floor()
-    # the sensors' part of the pose channel is there without any cause
-    base = np.where([c.startswith("pose") for c in replay.CHANNELS], level, 0.0)
+    # the sensors' part (pose noise, the rate loop's gyro bias and noise) is there without any cause
+    base = np.where([c.startswith("velocity") for c in replay.CHANNELS], 0.0, level)
     rms = np.sqrt((replay.errors(joined, min(lengths)) ** 2).mean(axis=(1, 2)))
     ratio = np.sqrt(np.maximum(rms**2 - base**2, 0.0)) / level
     said = said if isinstance(said, list) else [said]

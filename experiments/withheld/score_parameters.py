@@ -1,9 +1,9 @@
 """Recovered parameters against the true magnitudes.
 
 Only forms whose parameters mean the same in the library are compared; others (a quadratic drag against a
-linear one) have no true value. What a nuisance of the case adds in the same way (thrust offset to
-a scale, clock offset to a delay) counts as part of the truth, since no flight can split it off. A relative error
-is |estimate - truth| / |truth - none|, with vectors (imbalance, offset, lag up and down) taken as one.
+linear one) have no true value. What a nuisance of the case adds in the same way (thrust offset to a scale,
+clock offset to a delay) counts as part of the truth, since no flight can split it off. A relative error is
+|estimate - truth| / |truth - none|, with vectors (imbalance, offset, lag up and down) taken as one.
 """
 
 import numpy as np
