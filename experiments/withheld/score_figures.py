@@ -71,7 +71,7 @@ def _severity(severities, path):
         axes.errorbar([i], [value["value"]], yerr=[[low], [high]], fmt="o", capsize=4, color="tab:blue")
     axes.set_xticks(range(len(shown)), [f"{k}\nn = {v['n']}" for k, v in shown.items()])
     axes.set_ylim(0, 1.02)
-    axes.set_xlabel("severity: rms of the effect over the noise floor (low < 2, medium < 4.5)")
+    axes.set_xlabel("severity: effect over noise floor (low < 2, medium < 4.5)")
     axes.set_ylabel("cause named first")
     figure.savefig(path, dpi=110)
     plt.close(figure)
