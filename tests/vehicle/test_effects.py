@@ -357,6 +357,8 @@ def test_random_effects_need_a_key_and_differ_between_drones(vehicle):
 @pytest.mark.parametrize("wrong", [{"wind": {"speed": 1.0}}, {"mass": {"extra": 0.0}}])
 def test_parameters_of_nothing_are_refused(vehicle, wrong):
     step = make_drones_step("rigid", effects=("wind",))
+    with pytest.raises(UserError, match="reset"):
+        step(vehicle, hover_state(vehicle, jnp.zeros((1, 3))), jnp.zeros((1, 4)), *NO_PILLARS)
     start = step.reset(vehicle, hover_state(vehicle, jnp.zeros((1, 3))))
     with pytest.raises(UserError):
         step(vehicle, start, jnp.zeros((1, 4)), *NO_PILLARS, wrong)

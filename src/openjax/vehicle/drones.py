@@ -24,9 +24,7 @@ PHYSICS = ("mjx", "rigid")
 
 @dataclass(frozen=True)
 class DronesStep:
-    """The step of N drones of one world; made by `make_drones_step`. Its methods are pure: map them over
-    worlds.
-    """
+    """The step of N drones of one world, made by `make_drones_step`. Its methods are pure, to be mapped."""
 
     physics: str
     dt: float
@@ -55,6 +53,10 @@ class DronesStep:
         parameters = composition.complete_parameters(self.effects, effect_parameters, dtype)
         vehicle = composition.change_body(self.effects, parameters, vehicle)
         if self.effects:
+            if not isinstance(drones.effect_memory, dict):
+                raise UserError(
+                    "drones without memory of the effects: pass them through the step's reset() first"
+                )
             command, drones = self._receive(vehicle, parameters, drones, command)
 
         def substep(drones, _):

@@ -1,13 +1,12 @@
-"""Physical effects that the nominal vehicle leaves out: twenty of them, one file each, to fly with and to
-fit.
+"""Physical effects that the nominal vehicle leaves out: twenty, one file each, to fly with and to fit.
 
-In a step: `make_drones_step(effects=("rotor_drag", "wind"))`, with `{"rotor_drag": {"d_xy": 0.01}}` as its
+In a step: `make_drones_step(effects=("rotor_drag",))`, with `{"rotor_drag": {"d_xy": 0.01}}` as its
 parameters. On logged states, without simulating: the hooks of `EFFECTS[name]` are pure functions of one
-sample, to be mapped and differentiated, e.g. the force that rotor drag would have exerted along a flight:
+sample, to be mapped and differentiated. The force of rotor drag along a flight (states: leading axis T):
 
-    context = jax.vmap(lambda state: make_context(vehicle, state))(states)      # states: DroneState, leading
-    axis T force, torque = jax.vmap(lambda c: EFFECTS["rotor_drag"].wrench({"d_xy": d, "d_z": 0.0},
-    c))(context)
+    drag = EFFECTS["rotor_drag"]
+    context = jax.vmap(lambda state: make_context(vehicle, state))(states)
+    force, torque = jax.vmap(lambda c: drag.wrench({"d_xy": d, "d_z": 0.0}, c))(context)
 """
 
 from openjax.vehicle.effects.composition import complete_parameters, initial_memory, resolve, seen_state

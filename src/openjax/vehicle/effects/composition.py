@@ -31,8 +31,10 @@ def resolve(effects) -> tuple[Effect, ...]:
 
 
 def complete_parameters(effects, given: Mapping[str, Mapping[str, Any]] | None, dtype) -> dict[str, dict]:
-    """Parameters of every effect as arrays; what `given` leaves out has no effect. Raises UserError for
-    strangers."""
+    """Parameters of every effect as arrays; what `given` leaves out has no effect.
+
+    Raises UserError for effects or parameters that aren't known.
+    """
     given = given or {}
     names = {effect.name for effect in effects}
     if strangers := sorted(set(given) - names):

@@ -80,8 +80,8 @@ def make_context(
 class Parameter:
     """A scalar parameter of an effect.
 
-    none: with every parameter of an effect at this value the effect is absent, and a step with it equals one
-    without. prior: the usual range (a weak prior, not a bound), in the parameter's unit.
+    none: with every parameter of an effect at this value the effect is absent.
+    prior: the usual range (weak, not a bound), in the parameter's unit.
     """
 
     unit: str
