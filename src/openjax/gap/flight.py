@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -64,7 +64,6 @@ class Flight:
     battery_voltage: Array | None = None  # (T,) V, under load
     velocity_derived: bool = False  # True: differentiated from position by the reader, not logged
     fingerprint: str = ""  # hash of the whole log's values, the same for copies under other names
-    notes: tuple[str, ...] = field(default=())
 
     def __len__(self) -> int:
         return len(self.time)

@@ -1,0 +1,43 @@
+"""The flight container: slower channels, gaps and neighbours are handled once, for everyone behind it."""
+
+import numpy as np
+
+from openjax.gap.flight import Case, Flight
+
+
+def flight(time, **channels):
+    return Flight("log.csv:0", "log.csv", "0", np.asarray(time, float), **channels)
+
+
+def test_slower_channels_are_interpolated_between_their_own_samples():
+    voltage = np.array([4.0, np.nan, np.nan, np.nan, 3.6])
+    f = flight([0, 1, 2, 3, 4], battery_voltage=voltage)
+    np.testing.assert_allclose(f.interpolated("battery_voltage"), [4.0, 3.9, 3.8, 3.7, 3.6])
+    at, values = f.sampled("battery_voltage")
+    assert at.tolist() == [0, 4] and values.tolist() == [4.0, 3.6]
+
+
+def test_interpolated_attitudes_are_unit_and_rows_sampled_in_part_do_not_count():
+    angle = np.array([0.0, 0.2, np.nan])
+    quaternion = np.stack([np.cos(angle / 2), 0 * angle, 0 * angle, np.sin(angle / 2)], 1)
+    quaternion[2, 0] = 1.0
+    f = flight([0, 1, 2], quaternion=quaternion)
+    middle = f.interpolated("quaternion", np.array([0.5]))[0]
+    np.testing.assert_allclose(middle, [np.cos(0.05), 0, 0, np.sin(0.05)], atol=1e-6)
+    assert len(f.sampled("quaternion")[0]) == 2
+
+
+def test_stretches_break_at_gaps_and_rows_cut_every_channel():
+    time = np.r_[np.arange(0, 1, 0.01), np.arange(1.5, 3, 0.01)]
+    f = flight(time, motor_command=np.zeros((250, 4)))
+    assert f.stretches() == [slice(0, 100), slice(100, 250)]
+    assert f.stretches(min_duration=1.2) == [slice(100, 250)]
+    part = f.rows(f.stretches()[1])
+    assert len(part) == 150 and part.motor_command.shape == (150, 4) and part.position is None
+
+
+def test_others_are_those_of_the_same_log():
+    first, second = flight([0, 1]), Flight("log.csv:1", "log.csv", "1", np.array([0.0, 1.0]))
+    elsewhere = Flight("b.csv:1", "b.csv", "1", np.array([0.0, 1.0]))
+    case = Case("case", (first, second, elsewhere), vehicle_file=None)
+    assert case.others(first) == (second,) and case.others(elsewhere) == ()
