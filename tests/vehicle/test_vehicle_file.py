@@ -1,4 +1,4 @@
-"""vehicle.toml: strict where a slip would go unnoticed, free where facts are kept, unchanged by a round trip."""
+"""vehicle.toml: strict where a slip would go unnoticed, free for facts, unchanged by a round trip."""
 
 import dataclasses
 
