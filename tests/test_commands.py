@@ -13,14 +13,11 @@ import numpy as np
 import pytest
 
 from openjax import benchmark, evaluate, train
-from openjax.learning import TrainSettings, init_carry, make_training_step
 from openjax.runs import training
-from openjax.runs.checkpoints import Checkpoints, abstract_like, is_checkpoint, load_arrays, place
+from openjax.runs.checkpoints import Checkpoints, is_checkpoint, load_arrays
 from openjax.runs.command_line import run_command
 from openjax.runs.evaluation import FIELDS
-from openjax.runs.loop import guarded
 from openjax.runs.metrics import read_metrics
-from openjax.runs.run_directory import RunDirectory
 
 UPDATES = 24
 TINY = (
@@ -157,17 +154,30 @@ def test_signal_saves_and_exits_cleanly(whole_run, tmp_path, shared_cache):
     assert (out / "policy.npz").exists()
 
 
-def test_training_step_compiles_once_also_after_a_resume(whole_run, shared_cache):
-    checkpoints = Checkpoints(whole_run[0] / "checkpoints")
-    settings = RunDirectory(whole_run[0]).read_settings(TrainSettings)
-    step = guarded(make_training_step(settings))
-    carry = place(init_carry(settings, jax.random.key(0)))
-    abstract = abstract_like(carry)
-    for _ in range(10):
-        carry, _, _ = step(carry)
-    carry, _ = checkpoints.restore_latest(abstract)
-    step(carry)
-    assert step._cache_size() == 1
+COMPILES_ONCE = """
+import sys, jax
+from openjax.learning import TrainSettings, init_carry, make_training_step
+from openjax.runs.checkpoints import Checkpoints, abstract_like, place
+from openjax.runs.loop import guarded
+from openjax.runs.run_directory import open_run
+
+run = open_run(sys.argv[1])
+settings = run.read_settings(TrainSettings)
+step = guarded(make_training_step(settings))
+carry = place(init_carry(settings, jax.random.key(0)))
+abstract = abstract_like(carry)
+for _ in range(10):
+    carry, _, _ = step(carry)
+carry, _ = Checkpoints(run.checkpoints).restore_latest(abstract)
+step(carry)
+print("compiled", step._cache_size())
+"""
+
+
+def test_training_step_compiles_once_also_after_a_resume(whole_run, tmp_path, shared_cache):
+    (tmp_path / "compiles_once.py").write_text(COMPILES_ONCE)
+    process = start(["compiles_once", str(whole_run[0])], shared_cache, cwd=tmp_path)
+    assert "compiled 1\n" in finish(process)
 
 
 def test_nan_stops_the_run_and_leaves_the_state(tmp_path, monkeypatch, capsys, shared_cache):
@@ -215,11 +225,12 @@ def test_evaluate_prints_and_writes_the_records(whole_run, tmp_path, monkeypatch
     assert row["scenario"] == "own"
 
 
-def test_benchmark_writes_table_and_file(tmp_path, monkeypatch, capsys, shared_cache):
+def test_benchmark_writes_table_and_file(tmp_path, shared_cache):
     file = tmp_path / "speed.json"
     arguments = [*TINY, "--parts", "rigid", "training", "--envs", "8", "--training_envs", "16"]
-    arguments += ["--steps", "5", "--seconds", "0.1", "--json", file]
-    assert in_process(benchmark.main, arguments, monkeypatch, capsys)[0] == 0
+    arguments += ["--steps", "5", "--seconds", "0.1", "--json", str(file)]
+    printed = finish(start(["openjax.benchmark", *arguments], shared_cache))
+    assert "env steps/s" in printed and "compile" in printed
     result = json.loads(file.read_text())
     assert [row["part"] for row in result["rows"]] == ["rigid", "training"]
     assert all(row["env_steps_per_second"] > 0 and row["compile_seconds"] > 0 for row in result["rows"])
