@@ -12,7 +12,7 @@ from scipy.stats import t as student
 from openjax.gap import decision as rules
 from openjax.gap.evidence import Evidence, gather
 from openjax.gap.flight import Case, Flight, Issue
-from openjax.gap.how_far import shrink
+from openjax.gap.how_far import held_out_residuals, shrink
 from openjax.gap.hypotheses import SetFit
 from openjax.gap.library import FITS, PLACE, Library, library, path_of
 from openjax.gap.linear_path import linear_score
@@ -83,19 +83,16 @@ def conclude(evidence: Evidence, settings: rules.Settings) -> Report:
     best_physics = max((f for f in evidence.sets.values() if isinstance(f, SetFit)), key=lambda f: f.score)
     rest = look(evidence.replay, best_physics)
     found = rules.decide(evidence, rest, settings)
-    fit = rules.best_fit(evidence, found.best)
-    gap = shrink(evidence, fit, found.best)
     unknown = found.unknown > settings.unknown_threshold
+    effects = ("unknown", *_partly(evidence, found.best)) if unknown else found.best
+    named = [e for e in effects if e != "unknown"]
+    fit = rules.best_fit(evidence, named)
+    held_out = held_out_residuals(evidence, fit)
+    gap = shrink(evidence, held_out, named)
     missing = not_testable(evidence, settings)
-    effects = found.best
-    if unknown:
-        effects = ("unknown", *_partly(evidence, found.best))
-        fit = rules.best_fit(evidence, effects[1:])
-        gap = shrink(evidence, fit, effects[1:])
     verdict = "unknown" if unknown else "effect" if effects else "none"
     if verdict == "none" and len(missing) >= len(evidence.library.effects) // 2:
         verdict = "not_testable"
-    named = [e for e in effects if e != "unknown"]
     equivalent = equivalents(evidence, found, named)
     ranked = sorted(found.probabilities, key=lambda e: -found.probabilities[e])
     second = next((e for e in ranked if e not in effects and not (e == "none" and not effects)), "")
@@ -109,7 +106,7 @@ def conclude(evidence: Evidence, settings: rules.Settings) -> Report:
         quality=[{"flight": i.flight, "issue": i.issue} for i in evidence.case.quality],
         runner_up=f"{second} ({chance:.2f})" if second else "", rest=_rest_in_words(rest) if unknown else "",
         nuisances=_nuisances(evidence, fit),
-        plots={"evidence": evidence, "fit": fit, "rest": rest, "decision": found},
+        plots={"evidence": evidence, "fit": fit, "held_out": held_out, "rest": rest, "decision": found},
     )  # fmt: skip
 
 

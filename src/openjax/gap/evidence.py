@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, field
 
-import jax.numpy as jnp
 import numpy as np
 
 from openjax.errors import UserError
@@ -18,10 +17,10 @@ from openjax.gap.linear_path import LinearPath
 from openjax.gap.observer import TICKS
 from openjax.gap.replay import Replay, make_replay
 from openjax.gap.track import Track, tracks_of
-from openjax.vehicle.effects import EFFECTS
 
 CLEAR_DELAY = 0.002     # s of pose delay above which the pose is moved before the physics is read
 CLEAR_SCORE = 3.0       # nats, likewise
+WORTH_A_SECOND_LOOK = 30.0      # nats of the best set above none
 RADIO_COST = 15.0       # nats that a radio effect must gain before the rate loop is read with it
 
 
@@ -90,36 +89,36 @@ def gather(case: Case, library: Library, progress=None) -> Evidence:
             tracks = [estimator.undelayed(t, float(delay[0])) for t in tracks]
     radio, arrived = None, None
     tracks = [firmware.with_motors(t, v) for t, v in zip(tracks, vehicles, strict=True)]
-    if all(t.command is not None for t in tracks):
+    if all(t.command is not None and t.motors_logged for t in tracks):
         radio = firmware.read_radio(tracks)
         allowed = {k: v for k, v in radio.gain.items() if all(e in library.effects for e in k)}
         arrived = radio.arrived[max(allowed, key=lambda k: allowed[k] - RADIO_COST * len(k))]
     lap("paths")
-    rate_loop, ticks = None, [np.repeat(t.motor[:, None], TICKS, 1) for t in tracks]
-    if arrived is not None:
-        rate_loop, ticks = firmware.read_rate_loop(tracks, vehicles, arrived, flight_of)
-    lap("rate loop")
     tell("replaying the flights")
-    replay = make_replay(tracks, vehicles, ticks)
-    floor, exposure = model_noise(replay, library)
-    lap("noise")
-    tell("weighing causes")
-    sets = weigh_sets(replay, library, exposure)
-    lap("sets")
-    if rate_loop is not None:
-        best = max((f for f in sets.values() if isinstance(f, SetFit)), key=lambda f: f.score)
-        if any(EFFECTS[e].body is not None for e in best.effects):
-            # The observer's own physics matters where it is far off: once more with what was found.
-            flown = [_with_effects(v, best) for v in vehicles]
-            rate_loop, _ = firmware.read_rate_loop(tracks, flown, arrived, flight_of)
-    lap("rate loop again")
+    found = _physics(tracks, vehicles, arrived, flight_of, library, None)
+    lap("first look")
+    best = max((f for f in found[1].values() if isinstance(f, SetFit)), key=lambda f: f.score)
+    if found[4] is not None and best.effects and best.score - found[1][()].score > WORTH_A_SECOND_LOOK:
+        # The rate controller was read with the nominal physics: once more with what was found.
+        tell("looking again with what was found")
+        pushes = [
+            np.gradient((known - plain)[0, :, :3], track.dt, axis=0)
+            for track, known, plain in zip(
+                tracks, found[0].predict(best.theta[None]), found[0].predict(ABSENT[None]), strict=True
+            )
+        ]
+        found = _physics(tracks, vehicles, arrived, flight_of, library, pushes)
+        lap("second look")
+    replay, sets, exposure, floor, rate_loop = found
     return Evidence(case, library, tracks, vehicles, replay, sets, exposure, floor, radio, rate_loop, pose, seconds)
 
 
-def _with_effects(vehicle, fit: SetFit):
-    for effect in fit.effects:
-        if EFFECTS[effect].body is not None:
-            values = EFFECTS[effect].none()
-            values |= {p: float(fit.theta[PLACE[e, p]]) for e, p in PLACE if e == effect}
-            vehicle = EFFECTS[effect].body({k: jnp.asarray(v, jnp.float32) for k, v in values.items()}, vehicle)
-    return vehicle
+def _physics(tracks, vehicles, arrived, flight_of, library, pushes):
+    """Replay, scores of the sets, exposure, floor residuals and the rate loop's path."""
+    rate_loop, ticks, surprise = None, [np.repeat(t.motor[:, None], TICKS, 1) for t in tracks], None
+    if arrived is not None:
+        loop = firmware.read_rate_loop(tracks, vehicles, arrived, flight_of, pushes)
+        rate_loop, ticks, surprise = loop.path, loop.ticks, loop.surprise
+    replay = make_replay(tracks, vehicles, ticks, surprise)
+    floor, exposure = model_noise(replay, library)
+    return replay, weigh_sets(replay, library, exposure), exposure, floor, rate_loop

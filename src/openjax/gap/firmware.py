@@ -21,6 +21,7 @@ GAIN_STEP = 0.05
 # For p, i, d: the share that the replay's step can imitate, and what gyro noise does per row (measured on nominal
 # flights of the tuning plant).
 GAIN_TOLERANCE = ((0.02, 0.3), (0.4, 0.004), (0.12, 0.1))
+CLEAR_SCORE = 5.0           # nats above which other gains are taken into account
 GYRO_TILT = 0.01            # rad, between the logged gyro and the one that the controller uses
 LONGEST_DELAY = 0.1         # s
 DELAY_STEP = 0.0005         # s
@@ -126,7 +127,7 @@ def with_motors(track: Track, vehicle) -> Track:
     track = dataclasses.replace(track, motor=np.repeat(track.command[:, :1], 4, 1))
     gains = np.ones((1, 3), np.float32)
     for _ in range(2):
-        wanted, _ = _observe_twice(track, vehicle, link, gains)
+        wanted, _, _ = _observe_twice(track, vehicle, link, gains)
         track = dataclasses.replace(track, motor=wanted[0], motors_logged=False)
     return track
 
@@ -140,30 +141,46 @@ def in_force(track: Track, arrived) -> np.ndarray:
     return out
 
 
-def _observe_twice(track: Track, vehicle, link, gains):
-    """The observer's output: mean motor commands wanted (B, T, 4), and those sent in the ticks (T, TICKS, 4) with the first gains.
+def _observe_twice(track: Track, vehicle, link, gains, push=None):
+    """The observer's output: mean motor commands wanted (B, T, 4), the same knowing the past only, and the commands sent in
+    the ticks (T, TICKS, 4) with the first gains.
 
     What pushed the body beyond the nominal physics in a first run is given to a second, so that the rates inside a
     row are right whatever the physics.
     """
     rows, size = len(track), bucket(len(track))
     inputs = [padded(v, size) for v in (in_force(track, link), track.motor, track.body_rates)]
-    push = np.zeros((size, 3), np.float32)
+    push, causal = padded(np.zeros((rows, 3)) if push is None else push, size), None
     for _ in range(2):
         wanted, sent, rates = observe(gains, vehicle, *inputs, push, np.float32(track.dt))
+        causal = np.asarray(wanted, float)[:, :rows] if causal is None else causal
         miss = track.body_rates[1:] - np.asarray(rates[0], float)[: rows - 1]
         step = miss.copy()          # undo the observer's own correction of what it missed before
         step[1:] -= (1.0 - GYRO_GAIN) * miss[:-1]
         push = push + padded(smooth(np.concatenate([step, step[-1:]]), 0.06, track.dt) / track.dt, size)
-    return np.asarray(wanted, float)[:, :rows], np.asarray(sent[0])[:rows]
+    return np.asarray(wanted, float)[:, :rows], causal, np.asarray(sent[0])[:rows]
 
 
-def read_rate_loop(tracks, vehicles, arrived, flight_of) -> tuple[LinearPath, list[np.ndarray]]:
-    """The rate controller's gains from what the motors differ by, and the motor commands (T, TICKS, 4) of the ticks."""
+@dataclass(frozen=True, eq=False)
+class RateLoop:
+    """The rate controller read from what the motors differ by: `path` for its gains; the motor commands (T, TICKS, 4)
+    of each track's ticks; and what the controller did beyond the observer's foresight, (T, 3) roll, pitch, yaw, 0 where
+    motors were at a limit: the controller sees the body's true rates, so this is a sensor of theirs."""
+
+    path: LinearPath
+    ticks: list[np.ndarray]
+    surprise: list[np.ndarray]
+
+
+def read_rate_loop(tracks, vehicles, arrived, flight_of, pushes=None) -> RateLoop:
+    """Read the rate controllers of all tracks; `arrived` as in `Radio`. pushes [(T, 3)]: angular accelerations (rad/s^2)
+    beyond the nominal that are already known."""
     gains = np.concatenate([np.ones((1, 3)), 1.0 + GAIN_STEP * np.eye(3)]).astype(np.float32)
-    y, columns, nuisances, masks, ticks = [], [], [], [], []
-    for track, vehicle, link in zip(tracks, vehicles, arrived, strict=True):
-        wanted, sent = _observe_twice(track, vehicle, link, gains)
+    y, columns, nuisances, masks, ticks, foreseen = [], [], [], [], [], []
+    for number, (track, vehicle, link) in enumerate(zip(tracks, vehicles, arrived, strict=True)):
+        push = None if pushes is None else pushes[number]
+        wanted, causal, sent = _observe_twice(track, vehicle, link, gains, push)
+        foreseen.append(causal)
         ticks.append(sent)
         outputs = np.linalg.pinv(np.asarray(mixer(vehicle), float)).T       # motors to roll, pitch, yaw
         demand, logged = wanted @ outputs, track.motor @ outputs
@@ -180,4 +197,12 @@ def read_rate_loop(tracks, vehicles, arrived, flight_of) -> tuple[LinearPath, li
         masks.append(1.0 - (np.convolve(~clean, np.ones(12))[: len(clean)] > 0))
     groups = (((0, 1), False), ((2,), False))
     path = fit_linear_path(y, columns, nuisances, flight_of, (0.4, 0.4, 0.4), groups, masks, GAIN_TOLERANCE)
-    return path, ticks
+    score, theta, _ = path.score()
+    if score < CLEAR_SCORE:
+        theta = 0.0 * theta
+    surprise = []
+    for track, vehicle, wanted, mask in zip(tracks, vehicles, foreseen, masks, strict=True):
+        known = wanted[0] + np.tensordot(theta, wanted[1:] - wanted[0], 1) / GAIN_STEP
+        beyond = (track.motor - known) @ np.linalg.pinv(np.asarray(mixer(vehicle), float)).T
+        surprise.append((beyond - np.average(beyond, axis=0, weights=mask + 1e-9)) * mask[:, None])
+    return RateLoop(path, ticks, surprise)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from openjax.gap.evidence import Evidence
-from openjax.gap.hypotheses import SetFit, without_nuisances
+from openjax.gap.hypotheses import SetFit, fit_set, without_nuisances
 from openjax.gap.replay import SKIP
 from openjax.gap.track import smooth
 
@@ -23,6 +23,7 @@ METRIC = (
 HORIZONS = {"velocity": 0.25, "rates": 0.05, "pose": 0.1}      # s
 BLOCK = 1.0             # s, unit of the bootstrap
 DRAWS = 400
+REFIT_STEPS = 2         # of Gauss-Newton for each flight left out, from the fit to all
 
 
 @dataclass(frozen=True)
@@ -39,10 +40,11 @@ class Gap:
     held_out: bool
 
 
-def shrink(evidence: Evidence, fit: SetFit, named) -> Gap:
-    """The gap before and after the named effects: `fit` for the physics, the other paths by name."""
-    blocks = _blocks(evidence, fit, tuple(named))
-    before, after, floor = (_gap(blocks, kind) for kind in range(3))
+def shrink(evidence: Evidence, after: list[np.ndarray], named) -> Gap:
+    """The gap before and after the named effects: `after` are the physics' held-out residuals with them, the other
+    paths go by name."""
+    blocks = _blocks(evidence, after, tuple(named))
+    before, left, floor = (_gap(blocks, kind) for kind in range(3))
     generator = np.random.default_rng(0)
     size = min(len(b[0]) for b in blocks.values())
     drawn = []
@@ -52,8 +54,8 @@ def shrink(evidence: Evidence, fit: SetFit, named) -> Gap:
         drawn.append(1.0 - _gap(blocks, 1, pick) / start)
     low, high = np.quantile(drawn, [0.05, 0.95])
     held_out = len(evidence.replay.flights) > 1
-    reduction = 1.0 - after / before
-    return Gap(METRIC, before, after, floor, reduction, (float(min(low, reduction)), float(max(high, reduction))), held_out)
+    reduction = 1.0 - left / before
+    return Gap(METRIC, before, left, floor, reduction, (float(min(low, reduction)), float(max(high, reduction))), held_out)
 
 
 def _gap(blocks, kind: int, pick=None) -> float:
@@ -65,26 +67,20 @@ def _gap(blocks, kind: int, pick=None) -> float:
 
 
 def held_out_residuals(evidence: Evidence, fit: SetFit) -> list[np.ndarray]:
-    """Residual (T, 9) of each track under the parameters fitted to the other flights (one Newton step away)."""
-    replay, count = evidence.replay, len(evidence.replay.flights)
-    out = []
-    precision = np.linalg.inv(fit.covariance) - fit.grams.sum(0)[1:, 1:] if len(fit.index) else None
-    for number, column in enumerate(fit.columns):
-        residual = column[0]
-        if len(fit.index) and count > 1:
-            gram = fit.grams.sum(0) - fit.grams[replay.flight_of[number]]
-            # At the optimum the prior's pull balances the gradient of all flights; the held-out one's part is missing.
-            push = -fit.grams[replay.flight_of[number]][1:, 0]
-            step = np.linalg.solve(gram[1:, 1:] + precision, push)
-            residual = residual - np.tensordot(step, column[1:], 1)
-        out.append(without_nuisances(replay, residual, number))
-    return out
+    """Residual (T, 9) of each track under the parameters fitted to the other flights, nuisances taken off."""
+    replay = evidence.replay
+    residuals = [column[0] for column in fit.columns]
+    if len(fit.index) and len(replay.flights) > 1:
+        for held in range(len(replay.flights)):
+            theta = fit_set(replay.without_flight(held), fit.effects, fit.theta, REFIT_STEPS).theta
+            for number in np.flatnonzero(replay.flight_of == held):
+                residuals[number] = replay.measured[number] - replay.predict(theta[None], number)[0][0]
+    return [without_nuisances(replay, r, k) for k, r in enumerate(residuals)]
 
 
-def _blocks(evidence: Evidence, fit: SetFit, named) -> dict[str, list[np.ndarray]]:
+def _blocks(evidence: Evidence, after, named) -> dict[str, list[np.ndarray]]:
     """channel -> mean squared errors of each block: [before, after, floor]."""
     nothing = held_out_residuals(evidence, evidence.nothing)
-    after = held_out_residuals(evidence, fit)
     blocks: dict[str, list[list[float]]] = {}
 
     def add(channel, kind, track, values):

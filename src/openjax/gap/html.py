@@ -126,10 +126,10 @@ def _ranking(report: Report):
 
 
 def _overlay(report: Report):
-    evidence, fit = report.plots["evidence"], report.plots["fit"]
+    evidence = report.plots["evidence"]
     track = evidence.tracks[-1]
     before = held_out_residuals(evidence, evidence.nothing)[-1]
-    after = held_out_residuals(evidence, fit)[-1]
+    after = report.plots["held_out"][-1]
     floor = evidence.floor[-1]
     step = max(int(round(HORIZONS["velocity"] / track.dt)), 1)
     axis = 3 + int(np.argmax([np.std(before[step:, 3 + a] - before[:-step, 3 + a]) for a in range(3)]))
@@ -156,15 +156,15 @@ def _overlay(report: Report):
 
 def _coordinate(report: Report):
     """Force along the effect's channel against the variable that drives it, binned, before and after."""
-    evidence, fit = report.plots["evidence"], report.plots["fit"]
+    evidence = report.plots["evidence"]
     effect = next((e for e in report.effects if e != "unknown"), None)
     picked = {"rotor_drag": "v", "wind": "v", "blade_flapping": "v", "ground_effect": "z", "ceiling_effect": "z",
               "downwash": "dz", "battery_sag": "V"}.get(effect, "F")  # fmt: skip
     if effect is None or not evidence.replay.usable[3]:
         return None
     points = {0: [], 1: []}
-    for kind, chosen in enumerate((evidence.nothing, fit)):
-        for number, residual in enumerate(held_out_residuals(evidence, chosen)):
+    for kind, residuals in enumerate((held_out_residuals(evidence, evidence.nothing), report.plots["held_out"])):
+        for number, residual in enumerate(residuals):
             track = evidence.tracks[number]
             rest = smooth(disturbances(track, residual), 0.12, track.dt)[:, 3:6]
             if picked == "v":

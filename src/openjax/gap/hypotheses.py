@@ -15,12 +15,13 @@ from scipy.stats import norm
 
 from openjax.gap.library import ABSENT, FITS, PLACE, Library, places, prior, start_of
 from openjax.gap.replay import GROUPS, SKIP, Replay
-from openjax.gap.whitening import fit_noise
+from openjax.gap.whitening import Noise, fit_noise
 
 ITERATIONS = 6
 SMALL_STEP = 0.05       # nats: an improvement below this ends the search
 REFITTED = 4            # pairs fitted in full
 WORTH_A_THIRD = 10.0    # nats: three effects are tried only where two beat one by this
+WORTH_ALL = 60.0        # nats: all effects together must explain this much of a channel to count in its noise model
 UNEXPOSED = 0.5         # nats that a typical effect would leave: below, the effect isn't fitted at all
 
 
@@ -86,6 +87,7 @@ def fit_set(replay: Replay, effects, start: np.ndarray | None = None, iterations
     covariance = np.linalg.inv(hessian) if len(index) else np.zeros((0, 0))
     volume = np.linalg.slogdet(hessian)[1] - np.linalg.slogdet(precision)[1] if len(index) else 0.0
     score = -objective - 0.5 * volume + _sign_term(effects, index, theta, covariance)
+    score -= _free_ride(grams.sum(0), theta[index] - mean, precision, len(places(effects)))
     return SetFit(effects, theta, index, grams, columns, covariance, float(score), float(objective))
 
 
@@ -98,6 +100,18 @@ def _sign_term(effects, index, theta, covariance) -> float:
                 if parameter.positive and PLACE[effect, parameter.name] == place:
                     total += norm.logcdf((theta[place] - ABSENT[place]) / deviation) + np.log(2.0)
     return float(total)
+
+
+def _free_ride(gram, off, precision, own: int) -> float:
+    """What the companions alone would gain over no effect (nats): a set must not live off them."""
+    if len(off) == own:
+        return 0.0
+    # Seen from no effect: the residual there is the present one plus what the whole set explains.
+    push = gram[1 + own:, 0] + gram[1 + own:, 1:] @ off
+    prior_part = precision[own:, own:]
+    hessian = gram[1 + own:, 1 + own:] + prior_part
+    volume = np.linalg.slogdet(hessian)[1] - np.linalg.slogdet(prior_part)[1]
+    return max(0.0, float(0.5 * push @ np.linalg.solve(hessian, push) - 0.5 * volume))
 
 
 def model_noise(replay: Replay, library: Library) -> tuple[list[np.ndarray], dict[str, float]]:
@@ -120,22 +134,55 @@ def model_noise(replay: Replay, library: Library) -> tuple[list[np.ndarray], dic
     size = len(index)
     penalty = np.eye(size + len(ahead))
     penalty[:size, :size] = precision
-    residuals = []
-    for _ in range(2):
+    nothing, _ = _settle(replay, columns, lambda: None)
+    alone = replay.noises
+
+    def weights():
         gram = replay.grams(columns).sum(0)
-        weights = np.linalg.solve(gram[1:, 1:] + penalty, gram[1:, 0])
-        residuals = []
-        for number, column in enumerate(columns):
-            left = column[0] - np.tensordot(weights, column[1:], 1)
-            residuals.append(without_nuisances(replay, left, number))
-        skip = int(SKIP / replay.tracks[0].dt)
-        replay.set_noise([fit_noise(axes, residuals, integrated, skip=skip) if replay.usable[axes[0]] else old
-                          for (axes, integrated), old in zip(GROUPS, replay.noises, strict=True)])  # fmt: skip
+        return np.linalg.solve(gram[1:, 1:] + penalty, gram[1:, 0])
+
+    residuals, together = _settle(replay, columns, weights)
+    # Where all effects together explain no more than so many parameters must, the noise is that of no effect: in calm
+    # flights feedback makes disturbances look like weak motors, and a noise model made under that would confirm it.
+    chosen = []
+    for group, (none, full) in enumerate(zip(alone, together, strict=True)):
+        axes = list(GROUPS[group][0])
+        gained = len(axes) * sum(len(t) for t in replay.tracks) * np.log(none.deviation / full.deviation)
+        chosen.append(full if gained > WORTH_ALL else none)
+        if gained <= WORTH_ALL:
+            for left, calm in zip(residuals, nothing, strict=True):
+                left[:, axes] = calm[:, axes]
+    replay.set_noise(chosen)
+    taken = weights() if any(c is f for c, f in zip(chosen, together, strict=True)) else None
+    replay.settle_surprise([
+        c[0] if taken is None else c[0] - np.tensordot(taken, c[1:], 1) for c in columns
+    ])  # fmt: skip
     shown = np.diag(replay.grams(columns).sum(0))[1 + size:]
     exposure = {e: 0.0 for e in library.physics}
     for effect, square in zip(firsts, shown, strict=True):
         exposure[effect] = max(exposure[effect], 0.5 * float(square))
     return residuals, exposure
+
+
+def _settle(replay: Replay, columns, weights) -> tuple[list[np.ndarray], tuple]:
+    """Residuals [(T, 9)] and noise models that fit each other, with `weights()` of the columns (None: none)."""
+    for _ in range(2):
+        taken = weights()
+        residuals = []
+        for number, column in enumerate(columns):
+            left = column[0] if taken is None else column[0] - np.tensordot(taken, column[1:], 1)
+            residuals.append(without_nuisances(replay, left, number))
+        replay.set_noise(noise_of(replay, residuals))
+    return residuals, replay.noises
+
+
+def noise_of(replay: Replay, residuals: list[np.ndarray]) -> list[Noise]:
+    """Noise models of residuals; channels that weren't logged keep the present ones."""
+    skip = int(SKIP / replay.tracks[0].dt)
+    return [
+        fit_noise(axes, residuals, integrated, skip=skip) if replay.usable[axes[0]] else old
+        for (axes, integrated), old in zip(GROUPS, replay.noises, strict=True)
+    ]
 
 
 def without_nuisances(replay: Replay, residual: np.ndarray, track: int) -> np.ndarray:

@@ -53,7 +53,7 @@ FITS = {
     for fit in (
         Fit("mass", (_p("extra", 0.0, 0.005, 0.001, 2e-5),),
             companions=(("inertia", "xx", 0.02), ("inertia", "yy", 0.02), ("inertia", "zz", 0.02))),
-        Fit("thrust_scale", (_p("scale", 0.0, 0.1, 0.02, 1e-3),), companions=(("yaw_torque", "ratio", 0.1),)),
+        Fit("thrust_scale", (_p("scale", 0.0, 0.1, 0.02, 1e-3),), companions=(("yaw_torque", "ratio", 0.03),)),
         Fit("battery_sag", (_p("exponent", 0.0, 1.0, 0.5, 1e-2, True), _p("reference", 3.85, 0.15, 3.85, 1e-2))),
         Fit("thrust_saturation", (_p("limit", 0.8, 0.12, 0.8, 2e-3), _p("voltage_slope", 0.1, 0.15, 0.1, 1e-2)),
             others=((0.9, 0.1), (0.7, 0.1))),
@@ -65,7 +65,7 @@ FITS = {
         Fit("wind", (_p("x", 0.0, 1.5, 0.3, 1e-2), _p("y", 0.0, 1.5, 0.3, 1e-2), _p("z", 0.0, 0.5, 0.0, 1e-2),
                      _p("drag", 0.013, 0.006, 0.013, 1e-4, True))),
         Fit("ground_effect", (_p("strength", 0.0, 0.8, 0.4, 1e-2, True), _p("offset", 0.012, 0.01, 0.012, 5e-4))),
-        Fit("ceiling_effect", (_p("strength", 0.0, 0.8, 0.4, 1e-2, True), _p("offset", 0.012, 0.01, 0.012, 5e-4))),
+        Fit("ceiling_effect", (_p("strength", 0.0, 0.8, 0.4, 1e-2, True), _p("offset", 0.012, 0.025, 0.012, 5e-4))),
         Fit("downwash", (_p("force", 0.0, 0.1, 0.08, 1e-3, True), _p("length", 0.5, 0.25, 0.5, 5e-3),
                          _p("width", 0.045, 0.012, 0.045, 5e-4), _p("spread", 0.1, 0.06, 0.1, 2e-3)),
             others=((0.05, 0.8, 0.06, 0.15),)),

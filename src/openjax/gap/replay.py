@@ -6,6 +6,7 @@ Residuals are compared through noise models (`whitening`), with the nuisances ma
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import jax
@@ -14,7 +15,7 @@ import numpy as np
 from openjax.gap.library import ABSENT, MOTOR_SHIFT, NUISANCES, PHYSICS_EFFECTS, PLACE, STEP, THETA
 from openjax.gap.physics import Path, compiled_physics
 from openjax.gap.track import Track, rotation, smooth
-from openjax.gap.whitening import Noise, whiten
+from openjax.gap.whitening import Noise, first_noise, whiten
 
 RATES, VELOCITY, FORCE = slice(0, 3), slice(3, 6), slice(6, 9)
 # Groups of channels that share a noise model: axes, whether integrated.
@@ -27,6 +28,17 @@ BATCH = 8
 TILT = np.radians(0.5)          # between tracked frame and thrust axis
 ACCELEROMETER_BIAS = 0.4        # m/s^2
 POSE_SHIFT = 0.0015             # s between motion capture and the vehicle's clock
+
+
+# How the body rates follow the controller's surprise (rad/s per share of thrust): its sum, then 1 to 5 rows later, with
+# spreads. Measured on nominal flights of the tuning plant, where it hardly varies; the spreads leave room for others.
+SURPRISE = {
+    (0, 1): ((-1.87, 0.1, -0.3, -0.1, 0.05, 0.0), (0.3, 0.25, 0.25, 0.25, 0.25, 0.25)),
+    (2,): ((-3.0, -1.4, -0.6, -0.2, 0.0, 0.0), (0.7, 0.7, 0.6, 0.6, 0.6, 0.6)),
+}
+
+
+SETTLED = 0.3           # of those spreads, once a case's own values are known
 
 
 def bucket(length: int) -> int:
@@ -55,6 +67,7 @@ class Replay:
     usable: np.ndarray
     noises: tuple[Noise, ...] = ()
     whitened_nuisances: list | None = None
+    surprise_columns: int = 0       # the last so many nuisances are the controller as a sensor
 
     def predict(self, theta: np.ndarray, track: int | None = None) -> list[np.ndarray]:
         """Channels (B, T, 9) of each track (or of one) for parameter vectors theta (B, P)."""
@@ -70,6 +83,39 @@ class Replay:
             ]
             out.append(_integrated(np.concatenate(parts)[:count, :len(self.tracks[number])], self.tracks[number].dt))
         return out
+
+    def settle_surprise(self, residuals) -> None:
+        """Take what the rates owe to the controller's surprise from the residuals [(T, 9)] of a good explanation, and
+        hold it nearly fixed from now on."""
+        if not self.surprise_columns:
+            return
+        last = slice(-self.surprise_columns, None)
+        taken = np.mean([t[last] for t in self.nuisance_estimates(residuals)], 0)
+        for number in range(len(self.tracks)):
+            self.measured[number] = self.measured[number] - np.tensordot(taken, self.nuisances[number][last], 1)
+            self.nuisances[number][last] *= SETTLED
+        self.set_noise(self.noises)
+
+    def nuisance_estimates(self, residuals) -> list[np.ndarray]:
+        """Most likely nuisances (N,) of each track, in their standard deviations, given residuals (T, 9)."""
+        out = []
+        for number, residual in enumerate(residuals):
+            n = self.whitened_nuisances[number].reshape(len(self.nuisances[number]), -1)
+            w = self.whiten(residual, number).ravel()
+            out.append(np.linalg.solve(np.eye(len(n)) + n @ n.T, n @ w))
+        return out
+
+    def without_flight(self, flight: int) -> Replay:
+        """The same replay without the tracks of one flight."""
+        keep = [k for k, f in enumerate(self.flight_of) if f != flight]
+        names = tuple(n for k, n in enumerate(self.flights) if k != flight)
+        pick = lambda values: [values[k] for k in keep]  # noqa: E731
+        return dataclasses.replace(
+            self, tracks=pick(self.tracks), vehicles=pick(self.vehicles), paths=pick(self.paths),
+            measured=pick(self.measured), nominal=pick(self.nominal), nuisances=pick(self.nuisances), flights=names,
+            flight_of=np.array([f - (f > flight) for f in self.flight_of[keep]]),
+            whitened_nuisances=pick(self.whitened_nuisances),
+        )  # fmt: skip
 
     def set_noise(self, noises) -> None:
         """Use these noise models; unlogged channels get none and count nothing."""
@@ -120,8 +166,11 @@ def _integrated(rows: np.ndarray, dt: float) -> np.ndarray:
     return np.concatenate([integral, specific], 2)
 
 
-def make_replay(tracks, vehicles, motor_ticks) -> Replay:
-    """Replay of tracks with their nominal vehicles and motor commands (T, TICKS, 4) of the rate loop's ticks."""
+def make_replay(tracks, vehicles, motor_ticks, surprise=None) -> Replay:
+    """Replay of tracks with their nominal vehicles and motor commands (T, TICKS, 4) of the rate loop's ticks.
+
+    surprise [(T, 3)]: what the rate controller did beyond foresight (`RateLoop`), a second sensor of the body rates.
+    """
     paths = [jax.device_put(_path(t, m)) for t, m in zip(tracks, motor_ticks, strict=True)]
     measured = [_measured(t) for t in tracks]
     usable = np.ones(9)
@@ -142,9 +191,14 @@ def make_replay(tracks, vehicles, motor_ticks) -> Replay:
         base, *moved = replay.predict(batch, number)[0]
         replay.nominal.append(base)
         columns = [(m - base) * s for m, s in zip(moved, spread / STEP[index], strict=True)]
-        replay.nuisances.append(np.stack(columns + _sensor_nuisances(track, paths[number], base)))
-    replay.set_noise([Noise(a, 0.15 if i else None, np.zeros(0), s)
-                      for (a, i), s in zip(GROUPS, FIRST_NOISE, strict=True)])  # fmt: skip
+        columns += _sensor_nuisances(track, paths[number], base)
+        if surprise is not None:
+            usual, more = _controller_as_sensor(surprise[number])
+            measured[number] -= usual
+            columns += more
+            replay.surprise_columns = len(more)
+        replay.nuisances.append(np.stack(columns))
+    replay.set_noise([first_noise(a, i, d) for (a, i), d in zip(GROUPS, FIRST_NOISE, strict=True)])
     return replay
 
 
@@ -201,3 +255,25 @@ def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> list[np.
         column[:, VELOCITY] += smooth(np.gradient(track.velocity, track.dt, axis=0), 0.05, track.dt)
         columns.append(column * POSE_SHIFT)
     return columns
+
+
+def _controller_as_sensor(surprise: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+    """What the rate controller's surprise (T, 3) says about the rates that follow: the usual (T, 9), and nuisances for
+    what may differ from it.
+
+    The controller acts on the true rates with a better gyroscope than the log's, so the motors know of a gust before
+    the log does. Without this a model that makes the motors weak predicts better than the true one, since feedback
+    against gusts looks like motors without effect (closed-loop identification).
+    """
+    def later(values, rows):
+        return np.concatenate([np.zeros((rows, 3)), values[: len(values) - rows]])
+
+    usual, columns = np.zeros((len(surprise), 9)), []
+    shapes = [later(np.cumsum(surprise, 0), 1), *(later(surprise, k) for k in range(1, 6))]
+    for axes, (means, spreads) in SURPRISE.items():
+        for shape, mean, spread in zip(shapes, means, spreads, strict=True):
+            column = np.zeros((len(surprise), 9))
+            column[:, axes] = shape[:, axes]
+            usual += mean * column
+            columns.append(spread * column)
+    return usual, columns

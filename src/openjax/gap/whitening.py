@@ -1,42 +1,41 @@
 """Noise models: what turns the residual of a channel into (nearly) independent numbers of unit variance.
 
-Integrated channels (rates, velocity, attitude) wander: their residual is a random walk from disturbances plus white
-sensor noise. A stationary Kalman filter of that pair, s -> s - prediction, is one first-order high-pass; what is left
-of colour is taken out by an autoregression. Both act on residuals and on their derivatives alike, and causally, so
-that a residual is only ever explained by what came before it.
+A residual is sensor noise and gusts. Sensor noise is white; a gust is a force or torque with a memory of some time,
+which integrated channels (rates, velocity, attitude) add up, beside small white steps from what the replay leaves
+out. The innovations of the Kalman filter of this model are white; what colour is left is taken out by a short
+autoregression. Everything acts on residuals and on their derivatives alike, and causally: in closed loop the motors
+answer disturbances, so only a residual given its own past says something about causes.
 """
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
-from scipy.linalg import solve_toeplitz
+from scipy.linalg import solve_discrete_are, solve_toeplitz
 from scipy.signal import lfilter
 
-GAINS = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7)
-ORDER = 12
+ORDER = 6
+# The grid of models: memory of the gust (per row), its rms per row and that of the white steps over sensor noise.
+MEMORIES = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.995)
+GUSTS = (0.003, 0.01, 0.02, 0.04, 0.08, 0.15, 0.3, 0.6, 1.5)
+STEPS = (0.0, 0.05, 0.15, 0.4, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Noise of one group of axes: Kalman gain (None: not integrated), autoregression (p,), innovation's deviation."""
+    """Noise of one group of axes: whitening filter (numerator, denominator) and the innovation's deviation."""
 
     axes: tuple[int, ...]
-    gain: float | None
-    regression: np.ndarray
+    numerator: np.ndarray
+    denominator: np.ndarray
     deviation: float
-
-    def high_pass(self, x: np.ndarray) -> np.ndarray:
-        """Innovations of x (..., T, axes) before the autoregression."""
-        return x if self.gain is None else lfilter([1.0, -1.0], [1.0, self.gain - 1.0], x, axis=-2)
 
     def whiten(self, x: np.ndarray) -> np.ndarray:
         """x (..., T, axes) in units of the innovation's standard deviation."""
-        numerator, denominator = np.r_[1.0, -self.regression], [1.0, 0.0]
-        if self.gain is not None:
-            numerator, denominator = np.convolve([1.0, -1.0], numerator), [1.0, self.gain - 1.0]
-        return lfilter(numerator / self.deviation, denominator, x, axis=-2)
+        return lfilter(self.numerator / self.deviation, self.denominator, x, axis=-2)
 
 
 def whiten(noises, x: np.ndarray) -> np.ndarray:
@@ -48,21 +47,72 @@ def whiten(noises, x: np.ndarray) -> np.ndarray:
     return out
 
 
+def first_noise(axes, integrated: bool, deviation: float) -> Noise:
+    """A noise model to begin with: sensor noise and some white steps."""
+    return Noise(tuple(axes), *_kalman(0.9, 0.04, 0.15 if integrated else 0.0, integrated), deviation)
+
+
 def fit_noise(axes, residuals, integrated: bool, masks=None, skip: int = 20) -> Noise:
-    """Noise model of residuals [(T, C), ...], pooled over tracks and `axes`; rows where a mask is 0 don't count."""
-    best = None
-    for gain in GAINS if integrated else (None,):
-        filtered = Noise(tuple(axes), gain, np.zeros(0), 1.0)
-        series = []
-        for number, residual in enumerate(residuals):
-            z = filtered.high_pass(residual[:, list(axes)])
-            if masks is not None:
-                z = z * masks[number][:, None]
-            series += list(z[skip:].T)
-        regression, deviation = _autoregression(series)
-        if best is None or deviation < best.deviation:
-            best = Noise(tuple(axes), gain, regression, deviation)
-    return best
+    """Noise model of residuals [(T, C), ...], pooled over tracks and `axes`; rows where a mask is 0 don't count.
+
+    The model of the grid is chosen by Whittle's likelihood, the autoregression by Yule-Walker on its innovations.
+    """
+    axes = tuple(axes)
+    chosen = _choose([r[skip:, list(axes)] for r in residuals], integrated)
+    numerator, denominator = _kalman(*chosen, integrated)
+    series = []
+    for number, residual in enumerate(residuals):
+        z = lfilter(numerator, denominator, residual[:, list(axes)], axis=0)
+        if masks is not None:
+            z = z * masks[number][:, None]
+        series += list(z[skip:].T)
+    regression, deviation = _autoregression(series)
+    return Noise(axes, np.convolve(numerator, np.r_[1.0, -regression]), denominator, deviation)
+
+
+def _choose(parts, integrated: bool) -> tuple[float, float, float]:
+    """The grid's (memory, gust, step) with the largest Whittle likelihood, its scale profiled out."""
+    log_part, ratio_part, count = 0.0, 0.0, 0
+    for part in parts:
+        z = np.diff(part, axis=0) if integrated else part
+        taper = np.hanning(len(z))[:, None]
+        periodogram = (np.abs(np.fft.rfft((z - z.mean(0)) * taper, axis=0)) ** 2).sum(1)[2:] / (taper**2).sum()
+        spectra, logs = _spectra(len(z), integrated)
+        ratio_part = ratio_part + (periodogram / spectra).sum(1)
+        log_part = log_part + z.shape[1] * logs
+        count += len(periodogram) * z.shape[1]
+    likelihood = -log_part - count * np.log(ratio_part / count)
+    return _grid(integrated)[int(np.argmax(likelihood))]
+
+
+@lru_cache(maxsize=2)
+def _grid(integrated: bool) -> list[tuple[float, float, float]]:
+    return list(itertools.product(MEMORIES, GUSTS, STEPS if integrated else (0.0,)))
+
+
+@lru_cache(maxsize=32)
+def _spectra(rows: int, integrated: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Model spectra (G, f) of (differenced) residuals of unit sensor noise, and the sums of their logarithms (G,)."""
+    shift = np.exp(-2j * np.pi * np.fft.rfftfreq(rows)[2:])
+    grid = np.array(_grid(integrated))
+    memory, gust, step = (grid[:, k, None] for k in range(3))
+    spectra = gust**2 * (1 - memory**2) / np.abs(1 - memory * shift) ** 2 + step**2
+    spectra = spectra + (np.abs(1 - shift) ** 2 if integrated else 1.0)
+    return spectra, np.log(spectra).sum(1)
+
+
+@lru_cache(maxsize=1024)
+def _kalman(memory: float, gust: float, step: float, integrated: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Innovation filter (numerator, denominator) of the stationary Kalman filter with unit sensor noise."""
+    drive = gust**2 * (1 - memory**2)
+    if integrated:
+        a, q = np.array([[1.0, 1.0], [0.0, memory]]), np.diag([step**2 + 1e-9, drive])
+        c = np.array([[1.0, 0.0]])
+    else:
+        a, q, c = np.array([[memory]]), np.array([[drive + 1e-9]]), np.array([[1.0]])
+    variance = solve_discrete_are(a.T, c.T, q, np.eye(1))
+    gain = a @ variance @ c.T / (c @ variance @ c.T + 1.0)
+    return np.poly(a), np.poly(a - gain @ c)
 
 
 def _autoregression(series) -> tuple[np.ndarray, float]:
