@@ -95,10 +95,12 @@ class Pursuit:
         return self.reset_to(reset_key, uniform_task(self.settings, task_key))
 
     def reset_to(self, key: jax.Array, task: Task) -> tuple[Observation, PursuitState]:
-        """Start an episode of `task`; `key` draws the start attitudes."""
+        """Start an episode of `task`; `key` draws the start attitudes and drives random effects."""
         settings = self.settings
-        quaternion = start_attitude(settings, key)
+        attitude_key, effect_key = jax.random.split(key)
+        quaternion = start_attitude(settings, attitude_key)
         drones = jax.vmap(lambda p, q: hover_state(self.vehicle, p, q))(task.pursuer_position, quaternion)
+        drones = self._drones_step.reset(self.vehicle, drones, effect_key)
         in_sight = line_of_sight(
             settings, task.pursuer_position, task.evader_position, task.pillar_position, task.pillar_active
         )
@@ -106,7 +108,7 @@ class Pursuit:
         still = jnp.zeros(3, jnp.float32)
         step = jnp.zeros((), jnp.int32)
         middle = jnp.array([0.0, 0.0, settings.arena_height / 2], jnp.float32)
-        first = frame(settings, step, task.pursuer_position, task.evader_position, still, seen)
+        first = frame(settings, step, self._sensed(drones).position, task.evader_position, still, seen)
         frames = jnp.broadcast_to(first, (settings.history_length * settings.history_spacing, settings.frame_size))
         state = PursuitState(
             task=task,
@@ -123,13 +125,14 @@ class Pursuit:
         return self.observe(state), state
 
     def observe(self, state: PursuitState) -> Observation:
-        """The observation of a state."""
+        """The observation of a state; effects on the sensors act on what a pursuer knows of all pursuers."""
+        seen = self._drones_step.seen(state.drones, self.effect_parameters)
         return observe(
             self.settings,
             state.step,
-            state.drones.position,
-            state.drones.quaternion,
-            state.drones.velocity,
+            seen.position,
+            seen.quaternion,
+            seen.velocity,
             state.evader_position,
             state.evader_velocity,
             state.seen,
@@ -145,7 +148,7 @@ class Pursuit:
         """One control step.
 
         Args:
-            key: drives random effects (unused by the nominal game).
+            key: for an interface like other environments'; the game itself draws nothing after its reset.
             state: of this step's start.
             action: (N, 4) in -1..1: collective thrust, roll, pitch and yaw rate; see `action_to_command`.
 
@@ -186,7 +189,7 @@ class Pursuit:
             settings, captured, distance, counted, too_fast, counted_crash, action, state.previous_action
         )
 
-        newest = frame(settings, step, position, evader, velocity, seen)
+        newest = frame(settings, step, self._sensed(drones).position, evader, velocity, seen)
         state = PursuitState(
             task=task,
             drones=drones,
