@@ -1,0 +1,66 @@
+"""Summary of training runs: `python experiments/summarise_runs.py OUT.json NAME=RUN ... [--note TEXT] [--commit HASH]`.
+
+Keeps what a run's directory says of itself: settings, evaluations on the held-back tasks, the layouts before and after.
+Writes OUT.json and a table beside it.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+from openjax.runs.settings_files import write_json
+
+
+def summary(run: Path) -> dict:
+    """Settings, evaluations and layouts of one run."""
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()]
+    return {
+        "settings": json.loads((run / "settings.json").read_text(encoding="utf-8")),
+        "evaluations": [line for line in lines if line["event"] == "evaluation"],
+        "layouts": json.loads((run / "layouts.json").read_text(encoding="utf-8")),
+    }
+
+
+def first_reaching(evaluations: list[dict], rate: float) -> str:
+    """Environment steps and seconds until the held-back capture rate first reaches `rate`."""
+    for entry in evaluations:
+        if entry["capture_rate"] >= rate:
+            return f"{entry['steps'] / 1e6:.0f} M, {entry['seconds']:.0f} s"
+    return "not reached"
+
+
+def main() -> None:
+    """Write both files."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("runs", nargs="+")
+    parser.add_argument("--note", default="")
+    parser.add_argument("--commit", default="")
+    arguments = parser.parse_args()
+    runs = {name: summary(Path(path)) for name, _, path in (run.partition("=") for run in arguments.runs)}
+    write_json(arguments.out, {"note": arguments.note, "commit": arguments.commit, "runs": runs})
+    lines = ["# Training runs", "", f"{arguments.note} Commit {arguments.commit}.", ""]
+    lines += ["| run | env steps | seconds, compilation included | held-back capture ≥ .95 | ≥ .99 | held-back capture, "
+              "collisions at the end |", "|---|---|---|---|---|---|"]
+    for name, run in runs.items():
+        last = run["evaluations"][-1]
+        lines.append(
+            f"| {name} | {last['steps'] / 1e6:.0f} M | {last['seconds']:.0f} | {first_reaching(run['evaluations'], 0.95)} | "
+            f"{first_reaching(run['evaluations'], 0.99)} | {last['capture_rate']:.3f}, {last['collision_rate']:.4f} |"
+        )
+    lines += ["", "Layouts after training, evaluated on the same machine (capture rate / capture step / collision rate / "
+              "crash rate):", ""]
+    names = [row["scenario"] for row in next(iter(runs.values()))["layouts"]["after"]]
+    lines += ["| run | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
+    for name, run in runs.items():
+        cells = [
+            f"{row['capture_rate']:.2f} / {row['capture_step']:.0f} / {row['collision_rate']:.4f} / {row['crash_rate']:.2f}"
+            for row in run["layouts"]["after"]
+        ]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    arguments.out.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    print("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()
