@@ -108,7 +108,7 @@ class Pursuit:
         still = jnp.zeros(3, jnp.float32)
         step = jnp.zeros((), jnp.int32)
         middle = jnp.array([0.0, 0.0, settings.arena_height / 2], jnp.float32)
-        first = frame(settings, step, self._sensed(drones).position, task.evader_position, still, seen)
+        first = frame(settings, step, task.pursuer_position, task.evader_position, still, seen)
         frames = jnp.broadcast_to(first, (settings.history_length * settings.history_spacing, settings.frame_size))
         state = PursuitState(
             task=task,
@@ -189,7 +189,7 @@ class Pursuit:
             settings, captured, distance, counted, too_fast, counted_crash, action, state.previous_action
         )
 
-        newest = frame(settings, step, self._sensed(drones).position, evader, velocity, seen)
+        newest = frame(settings, step, position, evader, velocity, seen)
         state = PursuitState(
             task=task,
             drones=drones,
