@@ -132,6 +132,8 @@ def _points(path, data, key, size, default):
     values = data.get(key, default)
     if values is None:
         raise UserError(f"scenario {path}: {key} is missing; it lists points of {size} numbers in metres")
+    if not isinstance(values, list | tuple):
+        raise UserError(f"scenario {path}: {key} is {values}; it lists points of {size} numbers in metres")
     points = []
     for value in values:
         good = isinstance(value, list) and len(value) == size
