@@ -214,6 +214,16 @@ def test_evaluate_prints_and_writes_the_records(whole_run, tmp_path, monkeypatch
     assert in_process(evaluate.main, [*arguments, "--scenario", "all"], monkeypatch, capsys)[0] == 0
     rows = json.loads(records.read_text())
     assert [tuple(row) for row in rows] == [FIELDS] * 6
+    twice = [
+        "--policy",
+        whole_run[0],
+        whole_run[0] / "policy_start.npz",
+        "--scenario",
+        "wall",
+        "--episodes",
+        "4",
+    ]
+    assert in_process(evaluate.main, twice, monkeypatch, capsys)[0] == 0
     layout = tmp_path / "own.toml"
     layout.write_text(LAYOUT)
     for scenario in ("hidden", layout):

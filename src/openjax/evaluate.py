@@ -13,7 +13,7 @@ import tyro
 
 from openjax.errors import UserError
 from openjax.pursuit import SCENARIOS, PursuitSettings, find_scenario
-from openjax.runs.command_line import output_console, parse, peek, run_command
+from openjax.runs.command_line import output_console, parse, run_command
 
 PROGRAM = "python -m openjax.evaluate"
 
@@ -26,8 +26,10 @@ class EvaluateCommand:
     --environment.speed_limit none or --environment.start_attitude level.
     """
 
-    policy: str = "open"
-    """A run's directory, a policy file (.npz), a checkpoint, or the name of a policy in the package."""
+    policy: tuple[str, ...] = ("open",)
+    """A run's directory, a policy file (.npz), a checkpoint, or the name of a policy in the package.
+
+    Of several, for example one per training seed, mean and standard deviation are shown too."""
     scenario: str = "all"
     """wall, narrow_gap, random, passage, empty, hidden, a TOML file with an own layout, or all six."""
     episodes: int = 100
@@ -47,31 +49,35 @@ class EvaluateCommand:
 
 def main(arguments: Sequence[str]) -> int:
     """The command; returns its exit status."""
+    command = parse(EvaluateCommand, EvaluateCommand(), arguments, PROGRAM)
+    _check(command)
     from openjax.runs.policies import load_policy
 
-    default = EvaluateCommand()
-    loaded = None
-    if not {"-h", "--help"} & set(arguments):
-        loaded = load_policy(peek(arguments, "policy") or default.policy)
-        default = dataclasses.replace(default, environment=loaded.settings.environment)
-    command = parse(EvaluateCommand, default, arguments, PROGRAM)
-    rows = evaluate(command, loaded)
-    return _show(command, rows)
+    evaluators: dict = {}
+    results = []
+    for loaded in [load_policy(name) for name in command.policy]:
+        # Once more, with the game of this policy as the default.
+        default = dataclasses.replace(EvaluateCommand(), environment=loaded.settings.environment)
+        own = parse(EvaluateCommand, default, arguments, PROGRAM)
+        results.append((loaded.source, evaluate(own, loaded, evaluators)))
+    _show(command, results)
+    return 0
 
 
-def evaluate(command: EvaluateCommand, loaded) -> list[dict]:
+def evaluate(command: EvaluateCommand, loaded, evaluators: dict) -> list[dict]:
     """One record per scenario; see `openjax.runs.evaluation.FIELDS`.
 
+    Args:
+      command: what to fly, with the game's settings.
+      loaded: the policy.
+      evaluators: those already compiled, to be used again for policies of the same kind.
+
     Raises:
-      UserError: an unusable layout, or one with another number of pursuers than a policy can fly.
+      UserError: an unusable layout, or a game that the policy can't play.
     """
     from openjax.runs.environments import make_environment
     from openjax.runs.evaluation import Evaluator, evaluate_scenarios, layout_slots
 
-    if command.episodes < 1:
-        raise UserError(f"--episodes is {command.episodes}; it must be positive")
-    if command.json is not None and not command.json.parent.is_dir():
-        raise UserError(f"--json {command.json}: the directory {command.json.parent} doesn't exist")
     settings = command.environment
     if command.scenario == "all":
         scenarios = list(SCENARIOS.values())
@@ -80,9 +86,24 @@ def evaluate(command: EvaluateCommand, loaded) -> list[dict]:
     slots = max(layout_slots(settings), *(len(scenario.pillars) for scenario in scenarios))
     settings = dataclasses.replace(settings, max_pillars=slots, num_pursuers=len(scenarios[0].pursuers))
     _check_sizes(settings, loaded.settings.environment)
-    environment = make_environment(settings, command.vehicle, command.effects)
-    evaluator = Evaluator(environment, loaded.policy, command.episodes)
-    return evaluate_scenarios(evaluator, loaded.parameters, scenarios, command.episodes, command.seed)[0]
+    kind = (settings, loaded.policy)
+    if kind not in evaluators:
+        environment = make_environment(settings, command.vehicle, command.effects)
+        evaluators[kind] = Evaluator(environment, loaded.policy, command.episodes)
+    return evaluate_scenarios(evaluators[kind], loaded.parameters, scenarios, command.episodes, command.seed)[
+        0
+    ]
+
+
+def _check(command):
+    if not command.policy:
+        raise UserError("--policy needs at least one policy")
+    if command.episodes < 1:
+        raise UserError(f"--episodes is {command.episodes}; it must be positive")
+    if command.json is not None and not command.json.absolute().parent.is_dir():
+        raise UserError(
+            f"--json {command.json}: the directory {command.json.absolute().parent} doesn't exist"
+        )
 
 
 def _check_sizes(settings, trained):
@@ -95,15 +116,20 @@ def _check_sizes(settings, trained):
             )
 
 
-def _show(command, rows):
-    from openjax.runs.evaluation import results_table
+def _show(command, results):
+    """Print the tables and write the file: a record, a list of them, or such a list by policy."""
+    from openjax.runs.evaluation import results_table, spread_table
     from openjax.runs.settings_files import write_json
 
     console = output_console()
-    console.print(results_table(f"{command.policy}, mean policy, seed {command.seed}", rows))
+    for source, rows in results:
+        console.print(results_table(f"{source}, mean policy, seed {command.seed}", rows))
+    if len(results) > 1:
+        console.print(spread_table([rows for _, rows in results]))
     if command.json is not None:
-        write_json(command.json, rows if command.scenario == "all" else rows[0])
-    return 0
+        plain = [rows if command.scenario == "all" else rows[0] for _, rows in results]
+        sources = [source for source, _ in results]
+        write_json(command.json, plain[0] if len(plain) == 1 else dict(zip(sources, plain, strict=True)))
 
 
 if __name__ == "__main__":

@@ -94,10 +94,11 @@ def assert_same(a, b):
         np.testing.assert_array_equal(np.asarray(x), np.asarray(y), err_msg=name)
 
 
-def test_resumed_run_equals_uninterrupted_run_and_compiles_once(tmp_path, compiled):
+@pytest.mark.parametrize("overlap", [False, True])
+def test_resumed_run_equals_uninterrupted_run_and_compiles_once(tmp_path, compiled, overlap):
     whole = run(tmp_path / "whole", compiled, 12)
-    run(tmp_path / "parts", compiled, 5)
-    parts = run(tmp_path / "parts", compiled, 12, resume=True)
+    run(tmp_path / "parts", compiled, 5, overlap=overlap)
+    parts = run(tmp_path / "parts", compiled, 12, resume=True, overlap=overlap)
     assert_same(whole.carry, parts.carry)
     assert compiled._cache_size() == 1
     losses = [[r["loss"] for r in read_metrics(tmp_path / d / "metrics.jsonl")] for d in ("whole", "parts")]
@@ -112,12 +113,14 @@ def test_best_and_last_checkpoints_are_kept(tmp_path, compiled):
     assert checkpoints.best().update == 8
 
 
-def test_nan_stops_and_leaves_both_states(tmp_path):
+@pytest.mark.parametrize("overlap", [False, True])
+def test_nan_stops_and_leaves_both_states(tmp_path, overlap):
     with pytest.raises(NotFiniteError, match=r"update 5 in parameters; .*000000004"):
-        run(tmp_path, guarded(broken_step), 20)
+        run(tmp_path, guarded(broken_step), 20, overlap=overlap)
     assert Checkpoints(tmp_path / "checkpoints").latest().update == 4
-    assert is_checkpoint(tmp_path / "not_finite" / "000000005")
-    assert json.loads((tmp_path / "not_finite" / "report.json").read_text())["leaves"] == ["parameters"]
+    report = json.loads((tmp_path / "not_finite" / "report.json").read_text())
+    assert report["update"] == 5 and report["leaves"] == ["parameters"]
+    assert is_checkpoint(tmp_path / "not_finite" / f"{report['state_after_update']:09d}")
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

@@ -190,6 +190,26 @@ def results_table(title: str, rows: Sequence[dict]) -> Table:
     return table
 
 
+def spread_table(results: Sequence[Sequence[dict]]) -> Table:
+    """Mean and standard deviation over several policies' records of the same scenarios."""
+    title = f"Mean ± standard deviation of {len(results)} policies"
+    table = Table(title=title, title_justify="left", box=box.SIMPLE, pad_edge=False, padding=0)
+    table.add_column("scenario")
+    columns = (
+        ("capture_rate", "capture rate", ".3f"),
+        ("capture_step", "capture step", ".0f"),
+        ("collision_rate", "collision rate", ".4f"),
+        ("crash_rate", "crash rate", ".3f"),
+    )
+    for _, label, _ in columns:
+        table.add_column(label, justify="right")
+    for rows in zip(*results, strict=True):
+        values = [(np.array([row[name] for row in rows]), style) for name, _, style in columns]
+        cells = [f"{value.mean():{style}} ± {value.std(ddof=1):{style}}" for value, style in values]
+        table.add_row(rows[0]["scenario"], *cells)
+    return table
+
+
 def before_after_table(before: Sequence[dict], after: Sequence[dict]) -> Table:
     """Returns, captures and collisions per layout, before and after training."""
     table = Table(

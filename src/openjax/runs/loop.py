@@ -43,6 +43,11 @@ class Plan:
     """Longest time without a checkpoint."""
     time_limit: float = float("inf")
     """Seconds of training time (compilation included) after which to stop."""
+    overlap: bool | None = None
+    """Start an update before the last one's metrics are read: an accelerator then never waits for the host.
+
+    None: on accelerators. On a CPU nothing is gained, and a NaN stops the run one update sooner.
+    """
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,9 +143,7 @@ def run_updates(
     started = saved_at = time.monotonic()
     update, pending, best = first_update, None, checkpoints.best()
     best_score = best.score if best else -float("inf")
-    # On an accelerator the next update is started before the last one's metrics are read, so that it never
-    # waits for the host; on a CPU nothing is gained, and a NaN stops the run one update sooner.
-    lag = 0 if jax.devices()[0].platform == "cpu" else 1
+    overlap = jax.devices()[0].platform != "cpu" if plan.overlap is None else plan.overlap
     names = list(float_leaves(carry))
 
     def elapsed():
@@ -174,7 +177,7 @@ def run_updates(
             due = update % plan.evaluation_interval == 0 or update == plan.total_updates
             reason = stop_reason()
             late = time.monotonic() - saved_at > plan.checkpoint_seconds
-            if lag == 0 or due or late or reason:
+            if not overlap or due or late or reason:
                 finish(pending)
                 pending = None
             score = None
@@ -188,20 +191,22 @@ def run_updates(
                 checkpoints.save(update, carry, score, {"seconds": elapsed()})
                 saved_at = time.monotonic()
     except _Broken as broken:
-        raise _leave_broken_state(directory, carry, checkpoints, *broken.args) from None
+        raise _leave_broken_state(directory, carry, update, checkpoints, *broken.args) from None
     checkpoints.save(update, carry, None, {"seconds": elapsed()})  # does nothing where it's saved already
     checkpoints.wait()
     return Outcome(carry, update, elapsed(), reason if update < plan.total_updates else None)
 
 
-def _leave_broken_state(directory, carry, checkpoints, update, leaves, values):
+def _leave_broken_state(directory, carry, reached, checkpoints, update, leaves, values):
+    """Save the carry, which `reached` one update more than the broken one where updates overlap."""
     checkpoints.wait()
     place = Path(directory) / NOT_FINITE
-    save_state(place / f"{update:09d}", carry, {"update": update})
+    save_state(place / f"{reached:09d}", carry, {"update": reached})
     write_json(
         place / "report.json",
         {
             "update": update,
+            "state_after_update": reached,
             "leaves": leaves,
             "metrics": {name: value if np.isfinite(value) else str(value) for name, value in values.items()},
         },

@@ -88,7 +88,8 @@ def _build(settings, leaves, source, prefix=""):
     environment = Pursuit(settings.environment)
     policy = Policy.for_environment(environment, settings.network, settings.predictor)
     abstract = abstract_parameters(environment, policy)
-    if not any(name.startswith(f"{prefix}critic") for name in leaves):  # shipped without: flying needs no critic
+    if not any(name.startswith(f"{prefix}critic") for name in leaves):
+        # Shipped without: flying needs no critic.
         abstract = abstract.replace(critic={})
     parameters = fill(abstract, leaves, source, prefix)
     return LoadedPolicy(policy, parameters, settings, source)

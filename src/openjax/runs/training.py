@@ -89,7 +89,7 @@ def run_job(job: TrainingJob, directory: RunDirectory, resume: bool, console: Co
                     total_updates=settings.total_updates,
                     steps_per_update=settings.steps_per_update,
                     evaluation_interval=settings.evaluation_interval,
-                    time_limit=job.time_limit,
+                    time_limit=seconds + job.time_limit,
                 ),
                 checkpoints=checkpoints,
                 metrics=metrics,

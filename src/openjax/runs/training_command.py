@@ -36,7 +36,7 @@ class TrainCommand:
     steps: int | None = None
     """Environment steps of the whole run, short for --total_steps."""
     minutes: float | None = None
-    """Stop after this time, compilation included."""
+    """Stop after this time, compilation included; a resumed run has it anew."""
     resume: Path | None = None
     """Go on with the run in this directory, exactly where it stopped."""
     start_from: str | None = None
