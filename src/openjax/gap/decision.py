@@ -84,13 +84,15 @@ def path_scores(evidence: Evidence) -> dict:
         "radio": None if evidence.radio is None else (dict(evidence.radio.gain), evidence.radio.loss),
         "rate": None if evidence.rate_loop is None else evidence.rate_loop.score()[0],
         "pose": None if evidence.pose is None else evidence.pose.score()[0],
+        "exposure": dict(evidence.exposure),
     }
 
 
 def combine(paths: dict, effects: set[str], s: Settings) -> dict[tuple[str, ...], float]:
     """Log posterior of every set from `path_scores`."""
     physics = {}
-    gains = paths["sets"]
+    # What these flights could not show at its usual size is not named, however well it may fit.
+    gains = {k: g for k, g in paths["sets"].items() if all(paths["exposure"].get(e, 0.0) >= s.testable for e in k)}
     for key, gain in gains.items():
         # A further effect must add its share of what the others explain: no form is exact.
         rest = max((gains[k] for k in itertools.combinations(key, len(key) - 1) if k in gains), default=0.0) if len(key) > 1 else 0.0

@@ -99,7 +99,7 @@ def conclude(evidence: Evidence, settings: rules.Settings) -> Report:
     chance = found.probabilities.get(second, 0.0)
     splitter = named[0] if named else (second if second in NEXT_FLIGHT else (missing[0] if missing else ""))
     return Report(
-        case=evidence.case.name, verdict=verdict, effects=tuple(effects), probabilities=found.probabilities,
+        case=evidence.case.name, verdict=verdict, effects=tuple(effects), probabilities=dict.fromkeys(EFFECTS, 0.0) | found.probabilities,
         equivalent=equivalent, parameters=estimates(evidence, fit, named),
         where=locate(evidence, fit, named), gap=gap, not_testable=missing,
         next_flight=NEXT_FLIGHT.get(second if second in NEXT_FLIGHT and chance > 0.02 else splitter, ""),
@@ -217,7 +217,7 @@ def _nuisances(evidence: Evidence, fit: SetFit) -> dict[str, str]:
     """What the nuisances took, as text, from the first track of each flight."""
     names = ("thrust offset", "inertia xx", "inertia yy", "inertia zz", "motor lag up", "motor lag down", "motor clock",
              "frame tilt x", "frame tilt y", "accelerometer bias x", "accelerometer bias y", "accelerometer bias z",
-             "pose clock")  # fmt: skip
+             "IMU tilt x", "IMU tilt y", "IMU tilt z", "roll and pitch damping", "yaw damping", "pose clock")  # fmt: skip
     taken = []
     for number, column in enumerate(fit.columns):
         n = evidence.replay.whitened_nuisances[number].reshape(len(evidence.replay.nuisances[number]), -1)

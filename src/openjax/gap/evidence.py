@@ -72,6 +72,8 @@ def gather(case: Case, library: Library, progress=None) -> Evidence:
         now = time.perf_counter()
         seconds[name], clock = now - clock, now
 
+    if case.vehicle_file.mass_weighed:
+        library = Library(tuple(e for e in library.effects if e != "mass"))
     tell("reading the paths of the log")
     tracks = [t for t in tracks_of(case) if t.motor is not None or t.command is not None]
     if not tracks:

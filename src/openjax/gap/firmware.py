@@ -21,6 +21,7 @@ GAIN_STEP = 0.05
 # For p, i, d: the share that the replay's step can imitate, and what gyro noise does per row (measured on nominal
 # flights of the tuning plant).
 GAIN_TOLERANCE = ((0.02, 0.3), (0.4, 0.004), (0.12, 0.1))
+LARGEST_SURPRISE = 2.5      # usual deviations
 CLEAR_SCORE = 5.0           # nats above which other gains are taken into account
 GYRO_TILT = 0.01            # rad, between the logged gyro and the one that the controller uses
 LONGEST_DELAY = 0.1         # s
@@ -204,5 +205,8 @@ def read_rate_loop(tracks, vehicles, arrived, flight_of, pushes=None) -> RateLoo
     for track, vehicle, wanted, mask in zip(tracks, vehicles, foreseen, masks, strict=True):
         known = wanted[0] + np.tensordot(theta, wanted[1:] - wanted[0], 1) / GAIN_STEP
         beyond = (track.motor - known) @ np.linalg.pinv(np.asarray(mixer(vehicle), float)).T
-        surprise.append((beyond - np.average(beyond, axis=0, weights=mask + 1e-9)) * mask[:, None])
+        beyond = (beyond - np.median(beyond[mask > 0], axis=0) if mask.any() else beyond) * mask[:, None]
+        # Only what gusts do: larger surprises are causes at work, and must be explained, not taken as known.
+        usual = 1.4826 * np.median(np.abs(beyond[mask > 0]), axis=0) if mask.any() else np.zeros(3)
+        surprise.append(np.clip(beyond, -LARGEST_SURPRISE * usual, LARGEST_SURPRISE * usual))
     return RateLoop(path, ticks, surprise)

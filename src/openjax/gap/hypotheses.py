@@ -199,12 +199,7 @@ def weigh_sets(replay: Replay, library: Library, exposure=None, largest: int = 3
     for effect in effects:
         if exposure is not None and exposure.get(effect, 1.0) < UNEXPOSED:
             continue
-        fits = []
-        for number in range(1 + len(FITS[effect].others)):
-            start = ABSENT.copy()
-            start[places((effect,))] = start_of(effect, number)
-            fits.append(fit_set(replay, (effect,), start))
-        found[effect,] = max(fits, key=lambda f: f.score)
+        found[effect,] = fit_set(replay, (effect,), _best_start(replay, effect))
     effects = tuple(e for e in effects if (e,) in found)
     if largest < 2 or len(effects) < 2:
         return found
@@ -219,6 +214,19 @@ def weigh_sets(replay: Replay, library: Library, exposure=None, largest: int = 3
     triples = {triple: sums.score(triple) for triple in triples}
     _refit(replay, found, triples, sums, 2)
     return found
+
+
+def _best_start(replay: Replay, effect: str) -> np.ndarray:
+    """Of an effect's starts the one that explains most by itself."""
+    starts = []
+    for number in range(1 + len(FITS[effect].others)):
+        start = ABSENT.copy()
+        start[places((effect,))] = start_of(effect, number)
+        starts.append(start)
+    if len(starts) == 1:
+        return starts[0]
+    residuals = [y[None] - p for y, p in zip(replay.measured, replay.predict(np.array(starts)), strict=True)]
+    return starts[int(np.argmin(np.diag(replay.grams(residuals).sum(0))))]
 
 
 def _refit(replay, found, scores, sums, count) -> None:

@@ -16,6 +16,7 @@ from openjax.gap.library import ABSENT, MOTOR_SHIFT, NUISANCES, PHYSICS_EFFECTS,
 from openjax.gap.physics import Path, compiled_physics
 from openjax.gap.track import Track, rotation, smooth
 from openjax.gap.whitening import Noise, first_noise, whiten
+from openjax.vehicle.effects.effect import ARENA_CEILING
 
 RATES, VELOCITY, FORCE = slice(0, 3), slice(3, 6), slice(6, 9)
 # Groups of channels that share a noise model: axes, whether integrated.
@@ -26,6 +27,8 @@ BUCKETS = (256, 512, 1024, 2048, 4096, 8192, 16384, 32768)
 BATCH = 8
 # Nuisances and their standard deviations; see GAP: free in every hypothesis.
 TILT = np.radians(0.5)          # between tracked frame and thrust axis
+IMU_TILT = 0.01                 # rad, between the IMU's axes and the body's
+DAMPING = 0.15                  # 1/s, of the body rates by what the rotors do
 ACCELEROMETER_BIAS = 0.4        # m/s^2
 POSE_SHIFT = 0.0015             # s between motion capture and the vehicle's clock
 
@@ -214,6 +217,8 @@ def _path(track: Track, ticks: np.ndarray) -> Path:
     quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
     # Without a pose the vehicle is taken to be in mid-air, far from everything.
     position = track.position if track.position is not None else unknown + [0.0, 0.0, 0.6]
+    # Neither floor nor ceiling can be entered: a log that says so has an offset in height.
+    position = np.concatenate([position[:, :2], np.clip(position[:, 2:], 0.01, ARENA_CEILING - 0.02)], 1)
     velocity = track.velocity if track.velocity is not None else unknown
     others = [middle(p) for p in track.neighbours] or [np.tile(np.float32([50.0, 50.0, -50.0]), (size, 1))]
     voltage = np.full(size, np.nan, np.float32) if track.voltage is None else middle(track.voltage)
@@ -234,7 +239,8 @@ def _measured(track: Track) -> np.ndarray:
 
 
 def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> list[np.ndarray]:
-    """Tilt of the tracked frame (2), accelerometer bias (3), clock of the motion capture: columns (T, 9)."""
+    """Tilt of the tracked frame (2), accelerometer bias (3), tilt of the IMU (3), damping (2), clock of the motion
+    capture: columns (T, 9)."""
     rows = len(track)
     turn = rotation(np.asarray(path.quaternion, float)[:rows])
     specific = np.gradient(nominal[:, VELOCITY], track.dt, axis=0) + [0.0, 0.0, 9.81]
@@ -250,6 +256,17 @@ def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> list[np.
         column = np.zeros((rows, 9))
         column[:, 6 + axis] = ACCELEROMETER_BIAS
         columns.append(column)
+    rates = smooth(track.body_rates, 0.03, track.dt)
+    force = nominal[:, FORCE]
+    for axis in np.eye(3):          # the IMU's axes
+        column = np.zeros((rows, 9))
+        column[:, RATES] = -np.cross(axis, rates - rates[0])
+        column[:, FORCE] = -np.cross(axis, force)
+        columns.append(column * IMU_TILT)
+    for axes in ((0, 1), (2,)):     # damping of the body rates
+        column = np.zeros((rows, 9))
+        column[:, axes] = -np.cumsum(rates, 0)[:, axes] * track.dt
+        columns.append(column * DAMPING)
     if track.velocity is not None:
         column = -moved(np.cross(np.asarray(path.body_rates, float)[:rows], body))
         column[:, VELOCITY] += smooth(np.gradient(track.velocity, track.dt, axis=0), 0.05, track.dt)
