@@ -1,0 +1,231 @@
+"""The environment as pure functions: compiled or not, mapped or not, any size; its end, its gradients, its solids."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from openjax.pursuit import Pursuit, PursuitSettings, Task, action_to_command, hover_action, make
+from openjax.vehicle.effects import EFFECTS
+
+KEY = jax.random.key(0)
+TINY = PursuitSettings(physics="rigid", episode_length=3)
+
+
+def assert_trees_close(a, b, atol):
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=atol, rtol=1e-5), a, b)
+
+
+@pytest.fixture(scope="module")
+def tiny():
+    return Pursuit(TINY)
+
+
+@pytest.fixture(scope="module")
+def two_steps(tiny):
+    """(keys (B,), actions (B, 2, N, 4)) -> all that two steps from a reset return."""
+
+    def one(key, actions):
+        _, state = tiny.reset(key)
+        out = []
+        for action in actions:
+            observation, state, *rest = tiny.step(key, state, action)
+            out.append((observation, state, *rest))
+        return out
+
+    return one, jax.jit(jax.vmap(one))
+
+
+def test_compiled_and_mapped_is_the_same_as_eager_one_by_one(two_steps):
+    eager, mapped = two_steps
+    keys = jax.random.split(KEY, 3)
+    actions = jax.random.uniform(KEY, (3, 2, 3, 4), minval=-1.0)
+    together = mapped(keys, actions)
+    assert_trees_close(jax.tree.map(lambda x: x[1], together), eager(keys[1], actions[1]), 1e-4)
+    again = mapped(keys, actions)
+    jax.tree.map(np.testing.assert_array_equal, together, again)  # pure
+
+
+@pytest.mark.parametrize("observe_time", [True, False])
+def test_the_end_is_terminal_where_the_time_is_observed(observe_time):
+    environment = make(TINY, observe_time=observe_time)
+
+    @jax.jit
+    def play(key):
+        def one(state, _):
+            _, state, _, terminated, truncated, _ = environment.step(key, state, jnp.zeros((3, 4)))
+            return state, (terminated, truncated)
+
+        return jax.lax.scan(one, environment.reset(key)[1], length=4)[1]
+
+    terminated, truncated = play(KEY)
+    ends, never = [False, False, True, True], [False] * 4
+    assert [terminated.tolist(), truncated.tolist()] == ([ends, never] if observe_time else [never, ends])
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        dict(num_pursuers=1, observe_position=True),
+        dict(num_pursuers=8, max_pillars=2, min_pillars=0, speed_limit="none"),
+        dict(min_pillars=0, max_pillars=0, observed_pillars=1, history_length=3, history_spacing=2),
+        dict(arena_radius=2.0, arena_height=3.0, pillar_radius=0.05, capture_radius=0.1, substeps=2, time_step=0.02),
+    ],
+    ids=["one", "eight", "no pillars", "another arena"],
+)
+def test_other_sizes(changes):
+    environment = make(TINY, **changes)
+    settings = environment.settings
+
+    @jax.jit
+    def play(key):
+        observation, state = environment.reset(key)
+        action = jnp.broadcast_to(hover_action(environment.vehicle), (settings.num_pursuers, 4))
+        return observation, *environment.step(key, state, action)
+
+    first, second, state, reward, *_ = play(KEY)
+    n = settings.num_pursuers
+    assert first.self_state.shape == (n, settings.self_size) and first.others.shape == (n, n - 1, 3)
+    assert first.privileged.shape == (n, settings.privileged_size)
+    assert first.pillars.shape == (n, settings.observed_pillars, 5)
+    assert first.frames.shape == (settings.history_length, settings.frame_size)
+    assert jax.tree.map(lambda x: (x.shape, x.dtype), first) == jax.tree.map(lambda x: (x.shape, x.dtype), second)
+    assert reward.shape == (n,) and np.isfinite(reward).all()
+    moved = np.linalg.norm(state.evader_position - state.task.evader_position)
+    np.testing.assert_allclose(moved, settings.evader_speed * settings.time_step, rtol=1e-2)
+
+
+def test_commands():
+    command = action_to_command(jnp.array([[-1.0, 1, -1, 0.5], [0.0, 0, 0, 0], [1.0, 3, 0, 0]]))
+    expected = [[0, np.pi, -np.pi, np.pi / 2], [0.5, 0, 0, 0], [0.9, np.pi, 0, 0]]
+    np.testing.assert_allclose(command, expected, atol=1e-6)
+
+
+def test_order_within_a_step_and_history():
+    """The evader flees where the pursuers were, frames are taken every `history_spacing` steps, oldest first."""
+    environment = make(TINY, episode_length=100, history_length=3, history_spacing=2)
+
+    @jax.jit
+    def play(key):
+        observation, state = environment.reset(key)
+
+        def one(state, action):
+            observation, new, *_ = environment.step(key, state, action)
+            return new, (observation, new.evader_position, new.evader_velocity, new.drones.position, new.seen)
+
+        actions = jax.random.uniform(key, (9, 3, 4), minval=-1.0)
+        return observation, state, jax.lax.scan(one, state, actions)[1]
+
+    first, start, (observation, evader, velocity, position, seen) = jax.tree.map(np.asarray, play(KEY))
+    np.testing.assert_allclose(evader[0], start.evader_position + 0.01 * velocity[0], atol=1e-6)
+    np.testing.assert_array_equal(first.frames[0], first.frames[2])
+    for k in (2, 8):  # observation after step k + 1: frames of steps k - 3, k - 1, k + 1
+        for slot, step in enumerate((k - 3, k - 1, k + 1)):
+            frame = observation.frames[k, slot]
+            if step <= 0:
+                np.testing.assert_array_equal(frame, first.frames[0])
+                continue
+            at = step - 1
+            shown = np.r_[evader[at], velocity[at]] if seen[at] else np.full(6, -5.0)
+            np.testing.assert_allclose(frame, np.r_[step / 100, shown, position[at].ravel()], atol=1e-6)
+
+
+def test_clamp_cuts_the_norm_of_the_velocity():
+    fast = jnp.array([[3.0, 4, 0], [0.3, 0.4, 0], [0, 0, 1.005]])
+
+    @jax.jit
+    def step(key):
+        speeds = []
+        for limit in ("clamp", "none"):
+            environment = make(TINY, speed_limit=limit, start_attitude="level")
+            _, state = environment.reset(key)
+            state = state.replace(drones=state.drones.replace(velocity=fast))
+            action = jnp.broadcast_to(hover_action(environment.vehicle), (3, 4))
+            speeds.append(environment.step(key, state, action)[1].drones.velocity)
+        return speeds
+
+    clamped, free = step(KEY)
+    np.testing.assert_allclose(free, fast, atol=1e-3)
+    np.testing.assert_allclose(clamped, [[0.6, 0.8, 0], [0.3, 0.4, 0], [0, 0, 1]], atol=1e-3)
+
+
+def test_gradients_of_free_flight_are_finite_and_right(tiny):
+    """Of the distance to the evader after some steps, by the actions; checked along one direction."""
+
+    def loss(actions, state):
+        def one(state, action):
+            _, state, reward, *_ = tiny.step(KEY, state, action)
+            return state, reward
+
+        state, reward = jax.lax.scan(one, state, actions)
+        return jnp.sum(jnp.linalg.norm(state.drones.position - state.evader_position, axis=-1)) - 0.01 * jnp.sum(reward)
+
+    actions = 0.5 * jax.random.uniform(KEY, (8, 3, 4), minval=-1.0)
+    with jax.enable_x64(False):
+        _, state = tiny.reset(jax.random.key(3))
+        value_and_gradient = jax.jit(jax.value_and_grad(loss))
+        _, gradient = value_and_gradient(actions, state)
+        assert np.isfinite(gradient).all() and np.abs(gradient).max() > 1e-5
+        direction = gradient / jnp.linalg.norm(gradient)
+        step = 1e-2
+        up, _ = value_and_gradient(actions + step * direction, state)
+        down, _ = value_and_gradient(actions - step * direction, state)
+    np.testing.assert_allclose((up - down) / (2 * step), jnp.sum(gradient * direction), rtol=0.05)
+
+
+def test_pillar_and_floor_are_solid():
+    """One drone flies into a pillar, one falls to the floor, one flies into another drone: all stay outside."""
+    settings = PursuitSettings(
+        num_pursuers=4, max_pillars=1, min_pillars=0, start_attitude="level", episode_length=60, evader_speed=0.01
+    )
+    environment = Pursuit(settings)
+    task = Task(
+        pursuer_position=jnp.array([[0.3, 0.0, 0.6], [0.0, -0.6, 0.3], [-0.5, 0.4, 0.6], [-0.5, 0.65, 0.6]]),
+        evader_position=jnp.array([-0.7, -0.2, 0.6]),
+        pillar_position=jnp.zeros((1, 2)),
+        pillar_active=jnp.ones(1, bool),
+    )
+    speed = jnp.array([[-1.0, 0, 0], [0, 0, 0], [0, 0.8, 0], [0, -0.8, 0]])
+
+    @jax.jit
+    def play():
+        _, state = environment.reset_to(KEY, task)
+        state = state.replace(drones=state.drones.replace(velocity=speed))
+        hover = hover_action(environment.vehicle)
+        actions = jnp.stack([hover, jnp.array([-1.0, 0, 0, 0]), hover, hover])
+
+        def one(state, _):
+            _, state, _, _, _, info = environment.step(KEY, state, actions)
+            return state, (state.drones.position, info.crashed)
+
+        state, (position, crash) = jax.lax.scan(one, state, length=60)
+        return position, crash, state.statistics
+
+    position, crash, statistics = jax.tree.map(np.asarray, play())
+    to_axis = np.linalg.norm(position[:, 0, :2], axis=-1)
+    between = np.linalg.norm(position[:, 2] - position[:, 3], axis=-1)
+    reached = [to_axis.min(), position[:, 1, 2].min(), between.min()]
+    np.testing.assert_allclose(reached, [0.15, 0.05, 0.1], atol=0.01)
+    assert crash.any(axis=0).all() and statistics.crashed
+    assert statistics.pillar_steps > 0 and statistics.drone_steps > 0
+
+
+def test_physical_effects_act_in_the_game():
+    """Drag slows, a late sensor shows the past, random packet loss differs from episode to episode."""
+    names = ("rotor_drag", "state_latency", "packet_loss")
+    parameters = {name: EFFECTS[name].typical() for name in names}
+    environment = Pursuit(TINY, effects=names, effect_parameters=parameters)
+
+    @jax.jit
+    def step(key):
+        first, state = environment.reset(key)
+        state = state.replace(drones=state.drones.replace(velocity=jnp.ones((3, 3)) * 0.4))
+        action = jnp.broadcast_to(hover_action(environment.vehicle), (3, 4))
+        observation, state, *_ = environment.step(key, state, action)
+        return first, observation, state
+
+    first, observation, state = step(KEY)
+    assert (np.linalg.norm(state.drones.velocity, axis=-1) < 0.4 * 3**0.5).any()
+    moved = np.abs(np.asarray(observation.position - state.drones.position)).max()
+    np.testing.assert_array_less(1e-4, moved)
+    np.testing.assert_allclose(first.position, state.task.pursuer_position, atol=1e-6)

@@ -1,0 +1,144 @@
+"""Drawn tasks: where they start, what expansion and turning keep, and attitudes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from openjax.pursuit import PursuitSettings, Task, expand_task, turn_task, uniform_task
+from openjax.pursuit.task import start_attitude, starts_clear
+
+SETTINGS = PursuitSettings()
+DRAWS = 2000
+
+
+def keys(seed, number=DRAWS):
+    return jax.random.split(jax.random.key(seed), number)
+
+
+@pytest.fixture(scope="module")
+def uniform():
+    return jax.jit(jax.vmap(lambda key: uniform_task(SETTINGS, key)))(keys(0))
+
+
+@pytest.fixture(scope="module")
+def expand():
+    return jax.jit(jax.vmap(lambda key, task: expand_task(SETTINGS, key, task)))
+
+
+def distances(tasks):
+    """Between pursuers, from pursuers and from the evader to the surface of the nearest pillar; (B, ...) each."""
+    pursuers, evader, pillars = (
+        np.asarray(x, np.float64) for x in (tasks.pursuer_position, tasks.evader_position, tasks.pillar_position)
+    )
+    n = pursuers.shape[1]
+    between = np.linalg.norm(pursuers[:, :, None] - pursuers[:, None], axis=-1)[:, ~np.eye(n, dtype=bool)]
+
+    def to_pillars(points):
+        distance = np.linalg.norm(points[:, :, None, :2] - pillars[:, None], axis=-1) - 0.1
+        return np.where(np.asarray(tasks.pillar_active)[:, None], distance, np.inf)
+
+    return between, to_pillars(pursuers), to_pillars(evader[:, None])
+
+
+def assert_clear(tasks, slack=1e-6):
+    between, pursuers, evader = distances(tasks)
+    assert between.min() >= 0.14 - slack
+    assert pursuers.min() >= 0.07 - slack
+    assert evader.min() > 0.0
+    assert np.linalg.norm(tasks.pursuer_position[..., :2], axis=-1).max() <= 0.9 + slack
+
+
+def test_uniform_tasks_start_in_their_box_and_clear(uniform):
+    assert_clear(uniform)
+    pursuers, evader = np.asarray(uniform.pursuer_position), np.asarray(uniform.evader_position)
+    mirrored = evader * [-1, 1, 1]
+    for positions in (pursuers.reshape(-1, 3), mirrored):
+        low, high = positions.min(axis=0), positions.max(axis=0)
+        assert (low >= [0.1, -0.536, 0.5]).all() and (high <= np.float32([0.536, 0.536, 0.7])).all()
+        np.testing.assert_allclose(low, [0.1, -0.536, 0.5], atol=0.02)  # and fill it
+        np.testing.assert_allclose(high, [0.536, 0.536, 0.7], atol=0.02)
+
+
+def test_pillars_of_uniform_tasks(uniform):
+    pillars, active = np.asarray(uniform.pillar_position), np.asarray(uniform.pillar_active)
+    number = active.sum(axis=1)
+    assert set(number) == {4, 5} and 0.4 < np.mean(number == 5) < 0.6
+    cells = np.round(pillars / 0.2).astype(int)
+    np.testing.assert_allclose(pillars, 0.2 * cells, atol=1e-6)
+    assert (np.linalg.norm(pillars[active], axis=-1) < 0.8).all()
+    for cell, used in zip(cells[:500], active[:500], strict=True):
+        assert len({tuple(c) for c in cell[used]}) == used.sum()
+    starts = np.concatenate([uniform.pursuer_position, uniform.evader_position[:, None]], axis=1)[..., :2]
+    same_cell = (np.round(starts / 0.2)[:, :, None] == cells[:, None]).all(axis=-1) & active[:, None]
+    assert not same_cell.any()
+
+
+@pytest.mark.parametrize("pursuers", [1, 4])
+def test_other_numbers_of_pursuers_start_clear(pursuers):
+    settings = PursuitSettings(num_pursuers=pursuers)
+    tasks = jax.jit(jax.vmap(lambda key: uniform_task(settings, key)))(keys(1, 500))
+    assert tasks.pursuer_position.shape == (500, pursuers, 3)
+    clear = jax.vmap(lambda task: starts_clear(settings, task))(tasks)
+    assert clear.mean() > 0.99
+
+
+def test_expansion_moves_vehicles_a_little_and_never_into_a_breach(uniform, expand):
+    tasks = uniform
+    for generation in range(4):  # out of the box of the uniform draw
+        parents, tasks = tasks, expand(keys(10 + generation), tasks)
+        for name in ("pillar_position", "pillar_active"):
+            np.testing.assert_array_equal(getattr(tasks, name), getattr(uniform, name))
+        for name in ("pursuer_position", "evader_position"):
+            moved = np.asarray(getattr(tasks, name)) - np.asarray(getattr(parents, name))
+            # the push back from the rim may turn a move along the axes into an oblique one
+            assert np.linalg.norm(moved[..., :2], axis=-1).max() <= 0.1 * 2**0.5 + 1e-6
+            assert np.abs(moved[..., 2]).max() <= 0.1 + 1e-6
+        assert_clear(tasks)
+    positions = np.concatenate([tasks.pursuer_position, tasks.evader_position[:, None]], axis=1)
+    assert np.linalg.norm(positions[..., :2], axis=-1).max() <= 0.8 + 1e-6
+    assert positions[..., 2].min() >= 0.5 - 1e-6 and positions[..., 2].max() <= 0.7 + 1e-6
+    assert positions[:, :3, 0].min() < 0.0
+    assert np.mean(np.any(np.asarray(tasks.evader_position) != np.asarray(parents.evader_position), axis=-1)) > 0.95
+
+
+def test_expansion_of_a_task_without_room_is_the_task_itself(uniform):
+    # each pursuer is ringed by six pillars that only just leave it room
+    turn = 2 * np.pi / 3 * np.arange(3)
+    pursuers = 0.5 * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    ring = np.pi / 3 * np.arange(6)
+    pillars = pursuers[:, None] + 0.1705 * np.stack([np.cos(ring), np.sin(ring)], axis=-1)
+    task = Task(
+        pursuer_position=jnp.asarray(np.c_[pursuers, np.full(3, 0.6)], jnp.float32),
+        evader_position=jnp.array([0.0, 0.0, 0.6]),
+        pillar_position=jnp.asarray(pillars.reshape(18, 2), jnp.float32),
+        pillar_active=jnp.ones(18, bool),
+    )
+    assert starts_clear(SETTINGS, task)
+    drawn = jax.jit(jax.vmap(lambda key: expand_task(SETTINGS, key, task)))(keys(20, 100))
+    for name in ("pursuer_position", "evader_position"):
+        np.testing.assert_array_equal(getattr(drawn, name), np.tile(getattr(task, name), (100, 1, 1)).reshape(getattr(drawn, name).shape))
+
+
+def test_turning_keeps_all_distances(uniform):
+    turned = jax.jit(jax.vmap(turn_task))(keys(30), uniform)
+    for before, after in zip(distances(uniform), distances(turned), strict=True):
+        finite = np.isfinite(before)
+        np.testing.assert_array_equal(np.isfinite(after), finite)
+        np.testing.assert_allclose(after[finite], before[finite], atol=1e-5)
+    np.testing.assert_array_equal(turned.pursuer_position[..., 2], uniform.pursuer_position[..., 2])
+    angle = np.arctan2(turned.evader_position[:, 1], turned.evader_position[:, 0])
+    assert np.histogram(angle, 8, (-np.pi, np.pi))[0].min() > DRAWS / 16  # from all sides
+
+
+def test_start_attitudes():
+    from scipy.spatial.transform import Rotation
+
+    quaternion = np.asarray(jax.vmap(lambda key: start_attitude(SETTINGS, key))(keys(40))).reshape(-1, 4)
+    np.testing.assert_allclose(np.linalg.norm(quaternion, axis=-1), 1.0, atol=1e-5)
+    yaw, pitch, roll = Rotation.from_quat(quaternion[:, [1, 2, 3, 0]]).as_euler("ZYX", degrees=True).T
+    for angle, low in ((roll, -36), (pitch, -36), (yaw, 0)):
+        np.testing.assert_allclose([angle.min(), angle.max()], [low, 36], atol=0.5)
+        assert angle.min() >= low - 1e-3 and angle.max() <= 36 + 1e-3
+    level = start_attitude(PursuitSettings(start_attitude="level"), jax.random.key(0))
+    np.testing.assert_array_equal(level, [[1, 0, 0, 0]] * 3)
