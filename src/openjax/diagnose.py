@@ -17,10 +17,11 @@ from openjax.errors import UserError
 
 @dataclass(frozen=True)
 class Options:
-    """Diagnose the sim-to-real gap: where the simulator differs from flights, which effect causes it, how far it shrinks.
+    """Diagnose the sim-to-real gap: where the simulator differs from flights, which effect causes it, how far
+    it shrinks.
 
-    Writes OUT/<case>/report.html, report.json and effects.toml (which `python -m openjax.train --effects` flies with).
-    """
+    Writes OUT/<case>/report.html, report.json and effects.toml (which `python -m openjax.train --effects`
+    flies with)."""
 
     cases: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Folders of flight logs, each with a vehicle.toml."""
@@ -39,7 +40,7 @@ class Options:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command; returns the exit status: 0, or 2 if nothing could be diagnosed or the input is wrong."""
+    """Run the command; the exit status is 0, or 2 if nothing could be diagnosed or the input is wrong."""
     options = tyro.cli(Options, args=arguments, prog="python -m openjax.diagnose")
     try:
         return run(options)
@@ -49,7 +50,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def run(options: Options) -> int:
-    """Diagnose every case; a case that can't be used is named and the rest goes on. Raises UserError for bad options."""
+    """Diagnose every case; a case that can't be used is named and the rest goes on. Raises UserError for
+    bad options."""
     from rich.console import Console
 
     console = Console()

@@ -1,8 +1,8 @@
 """From scores to a verdict: probabilities of every cause, of none and of something unknown.
 
-The scores of the four paths add up. They are tempered, since residuals are never quite as independent and forms never
-quite as right as a likelihood takes them to be; how much is settled once on a tuning set and kept in `decision.json`.
-"""
+The scores of the four paths add up. They are tempered, since residuals are never quite as independent and
+forms never quite as right as a likelihood takes them to be; how much is settled once on a tuning set and
+kept in `decision.json`."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ SETTINGS_FILE = Path(__file__).with_name("decision.json")
 
 @dataclass(frozen=True)
 class Settings:
-    """All numbers of the decision. Temperatures divide nats; costs are nats; shares are of the stronger effect's gain
-    that a further effect must add, per path."""
+    """All numbers of the decision. Temperatures divide nats; costs are nats; shares are of the stronger
+    effect's gain that a further effect must add, per path."""
 
     temperature: float = 3.0
     radio_temperature: float = 10.0
@@ -63,8 +63,8 @@ def load_settings(path: str | Path | None = None) -> Settings:
 
 @dataclass(frozen=True, eq=False)
 class Decision:
-    """`posterior` {set of effects: probability} given that the cause is in the library, `probabilities` of being the
-    strongest cause (with none and unknown), `best` the most probable set, strongest first."""
+    """`posterior` {set of effects: probability} given that the cause is in the library, `probabilities` of
+    being the strongest cause (with none and unknown), `best` the most probable set, strongest first."""
 
     posterior: dict[tuple[str, ...], float]
     probabilities: dict[str, float]
@@ -92,11 +92,19 @@ def combine(paths: dict, effects: set[str], s: Settings) -> dict[tuple[str, ...]
     """Log posterior of every set from `path_scores`."""
     physics = {}
     # What these flights could not show at its usual size is not named, however well it may fit.
-    gains = {k: g for k, g in paths["sets"].items() if all(paths["exposure"].get(e, 0.0) >= s.testable for e in k)}
+    gains = {
+        k: g for k, g in paths["sets"].items() if all(paths["exposure"].get(e, 0.0) >= s.testable for e in k)
+    }
     for key, gain in gains.items():
         # A further effect must add its share of what the others explain: no form is exact.
-        rest = max((gains[k] for k in itertools.combinations(key, len(key) - 1) if k in gains), default=0.0) if len(key) > 1 else 0.0
-        physics[key] = gain / s.temperature - s.effect_cost * len(key) - s.second_share * max(rest, 0.0) * (len(key) > 1)
+        rest = (
+            max((gains[k] for k in itertools.combinations(key, len(key) - 1) if k in gains), default=0.0)
+            if len(key) > 1
+            else 0.0
+        )
+        physics[key] = (
+            gain / s.temperature - s.effect_cost * len(key) - s.second_share * max(rest, 0.0) * (len(key) > 1)
+        )
     strongest = max(max(gains.values()), 0.0)
     others = {(): 0.0}
     if paths["radio"] is not None:
@@ -105,8 +113,9 @@ def combine(paths: dict, effects: set[str], s: Settings) -> dict[tuple[str, ...]
             if key and all(e in effects for e in key) and not ("packet_loss" in key and loss < s.least_loss):
                 others[key] = value / s.radio_temperature - s.radio_cost * len(key)
     for name, effect, temperature, cost in (
-        ("rate", "rate_gains", s.rate_temperature, s.rate_cost), ("pose", "state_latency", s.pose_temperature, s.pose_cost),
-    ):  # fmt: skip
+        ("rate", "rate_gains", s.rate_temperature, s.rate_cost),
+        ("pose", "state_latency", s.pose_temperature, s.pose_cost),
+    ):
         if paths[name] is not None and effect in effects:
             value = (paths[name] - s.cross_share * strongest) / temperature - cost
             others |= {(*k, effect): v + value for k, v in others.items()}
@@ -122,7 +131,7 @@ def combine(paths: dict, effects: set[str], s: Settings) -> dict[tuple[str, ...]
 
 
 def strengths(evidence: Evidence) -> dict[str, float]:
-    """How much each effect explains on its own, on one scale (nats, with the radio's huge likelihoods cut)."""
+    """How much each effect explains on its own, on one scale (nats)."""
     paths = path_scores(evidence)
     return strengths_of(paths)
 
@@ -138,7 +147,9 @@ def strengths_of(paths: dict) -> dict[str, float]:
 def decide(evidence: Evidence, rest: Rest | None, settings: Settings) -> Decision:
     """Probabilities of all causes."""
     paths = path_scores(evidence)
-    return decide_from(paths, set(evidence.library.effects), None if rest is None else rest.vector(), settings)
+    return decide_from(
+        paths, set(evidence.library.effects), None if rest is None else rest.vector(), settings
+    )
 
 
 def decide_from(paths: dict, effects: set[str], rest, settings: Settings) -> Decision:
@@ -161,16 +172,23 @@ def decide_from(paths: dict, effects: set[str], rest, settings: Settings) -> Dec
 
 
 def unknown_features(rest, paths: dict, s: Settings) -> np.ndarray:
-    """The numbers that the unknown gate weighs: standardised looks at the rest, and what the best set explains."""
+    """The numbers that the unknown gate weighs: standardised looks at the rest, and what the best set
+    explains."""
     mean, scale = np.asarray(s.rest_mean), np.asarray(s.rest_scale)
     z = np.clip((np.asarray(rest) - mean) / scale, -3.0, 30.0)
     bands, explained, uneven, incoherent = z[:18], np.asarray(rest)[18:24], z[24:30], np.asarray(rest)[30]
     gain = max(paths["sets"].values())
-    return np.array([
-        np.log1p(max(bands.max(), 0.0)), np.log1p(np.clip(np.sort(bands)[-4:], 0, None).mean()),
-        float(explained[:4].max()), float(explained.max()),
-        np.log1p(max(uneven[:4].max(), 0.0)), incoherent, np.log1p(max(gain, 0.0)) / 10.0,
-    ])  # fmt: skip
+    return np.array(
+        [
+            np.log1p(max(bands.max(), 0.0)),
+            np.log1p(np.clip(np.sort(bands)[-4:], 0, None).mean()),
+            float(explained[:4].max()),
+            float(explained.max()),
+            np.log1p(max(uneven[:4].max(), 0.0)),
+            incoherent,
+            np.log1p(max(gain, 0.0)) / 10.0,
+        ]
+    )
 
 
 def unknown_probability(rest, paths: dict, s: Settings) -> float:

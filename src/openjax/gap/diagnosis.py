@@ -22,7 +22,7 @@ from openjax.gap.where import locate
 from openjax.vehicle.effects import EFFECTS
 from openjax.vehicle.vehicle_file import VehicleFile, load_vehicle_file
 
-EQUAL = 0.05            # share of the best set's probability at which a substitute counts as equivalent
+EQUAL = 0.05  # share of the best set's probability at which a substitute counts as equivalent
 # Pairs that motion alone can't split, whatever their scores, unless something was measured beforehand.
 ALWAYS_EQUAL = (("mass", "thrust_scale"),)
 NEXT_FLIGHT = {
@@ -60,9 +60,9 @@ def diagnose(
 ) -> Report:
     """Diagnose flights of one vehicle (or of several of one build that flew together).
 
-    flights as `load_case` gives them, `vehicle` their vehicle file (default: the nominal vehicle), `without` effects
-    that the library must do without. Raises UserError where the flights are too short or hold no commands.
-    """
+    flights as `load_case` gives them, `vehicle` their vehicle file (default: the nominal vehicle),
+    `without` effects that the library must do without. Raises UserError where the flights are too short or
+    hold no commands."""
     vehicle = load_vehicle_file() if vehicle is None else vehicle
     return diagnose_case(Case(name, tuple(flights), vehicle, tuple(quality)), settings, without, progress)
 
@@ -99,19 +99,27 @@ def conclude(evidence: Evidence, settings: rules.Settings) -> Report:
     chance = found.probabilities.get(second, 0.0)
     splitter = named[0] if named else (second if second in NEXT_FLIGHT else (missing[0] if missing else ""))
     return Report(
-        case=evidence.case.name, verdict=verdict, effects=tuple(effects), probabilities=dict.fromkeys(EFFECTS, 0.0) | found.probabilities,
-        equivalent=equivalent, parameters=estimates(evidence, fit, named),
-        where=locate(evidence, fit, named), gap=gap, not_testable=missing,
+        case=evidence.case.name,
+        verdict=verdict,
+        effects=tuple(effects),
+        probabilities=dict.fromkeys(EFFECTS, 0.0) | found.probabilities,
+        equivalent=equivalent,
+        parameters=estimates(evidence, fit, named),
+        where=locate(evidence, fit, named),
+        gap=gap,
+        not_testable=missing,
         next_flight=NEXT_FLIGHT.get(second if second in NEXT_FLIGHT and chance > 0.02 else splitter, ""),
         quality=[{"flight": i.flight, "issue": i.issue} for i in evidence.case.quality],
-        runner_up=f"{second} ({chance:.2f})" if second else "", rest=_rest_in_words(rest) if unknown else "",
+        runner_up=f"{second} ({chance:.2f})" if second else "",
+        rest=_rest_in_words(rest) if unknown else "",
         nuisances=_nuisances(evidence, fit),
         plots={"evidence": evidence, "fit": fit, "held_out": held_out, "rest": rest, "decision": found},
-    )  # fmt: skip
+    )
 
 
 def _partly(evidence: Evidence, best) -> list[str]:
-    """Of the named effects those that clearly explain a part although something unknown acts: the first, if any."""
+    """Of the named effects those that clearly explain a part although something unknown acts: the first,
+    if any."""
     for effect in best:
         if path_of(effect) != "physics":
             return [effect]
@@ -137,9 +145,10 @@ def equivalents(evidence: Evidence, found: rules.Decision, named) -> dict[str, l
     for effect in named:
         rest = frozenset(found.best) - {effect}
         others = [
-            next(iter(set(key) - rest)) for key, p in found.posterior.items()
+            next(iter(set(key) - rest))
+            for key, p in found.posterior.items()
             if len(key) == len(found.best) and rest < frozenset(key) and effect not in key and p > EQUAL * top
-        ]  # fmt: skip
+        ]
         for pair in ALWAYS_EQUAL:
             weighed = evidence.case.vehicle_file.mass_weighed
             if effect in pair and not weighed:
@@ -150,7 +159,8 @@ def equivalents(evidence: Evidence, found: rules.Decision, named) -> dict[str, l
 
 
 def estimates(evidence: Evidence, fit: SetFit, named) -> dict[str, dict[str, Estimate]]:
-    """Parameters of the named effects with 90 % intervals: the larger of the model's and the flights' own spread."""
+    """Parameters of the named effects with 90 % intervals: the larger of the model's and the flights' own
+    spread."""
     out = {}
     deviation = robust_deviation(fit)
     for effect in named:
@@ -164,13 +174,16 @@ def estimates(evidence: Evidence, fit: SetFit, named) -> dict[str, dict[str, Est
             else:
                 value, spread = _path_estimate(evidence, effect, number)
             reach = 1.645 * spread
-            values[fitted.name] = Estimate(value, parameter.unit, (value - reach, value + reach), parameter.prior)
+            values[fitted.name] = Estimate(
+                value, parameter.unit, (value - reach, value + reach), parameter.prior
+            )
         out[effect] = values
     return out
 
 
 def robust_deviation(fit: SetFit) -> np.ndarray:
-    """Standard deviations (p,) of a fit's parameters: flight-wise sandwich where flights disagree more than they should."""
+    """Standard deviations (p,) of a fit's parameters: flight-wise sandwich where flights disagree more
+    than they should."""
     model = np.sqrt(np.diag(fit.covariance))
     count = len(fit.grams)
     if count < 2 or not len(fit.index):
@@ -190,7 +203,9 @@ def _path_estimate(evidence: Evidence, effect: str, number: int) -> tuple[float,
     if effect == "rate_gains":
         _, theta, covariance = evidence.rate_loop.score()
         spread = np.sqrt(covariance[number, number])
-        per_flight = np.array([linear_score(g, evidence.rate_loop.spread)[1][number] for g in evidence.rate_loop.grams])
+        per_flight = np.array(
+            [linear_score(g, evidence.rate_loop.spread)[1][number] for g in evidence.rate_loop.grams]
+        )
         if len(per_flight) > 1:
             spread = max(spread, per_flight.std(ddof=1) / np.sqrt(len(per_flight)))
         return 1.0 + float(theta[number]), float(spread)
@@ -206,7 +221,8 @@ def _rest_in_words(rest: Rest) -> str:
     if rest.explained[best] > 0.1:
         drivers = ", ".join(rest.drivers.get(CHANNELS[best], []))
         return (
-            f"A flexible model predicts {100 * rest.explained[best]:.0f} % of the rest in {CHANNELS[best].replace('_', ' ')} "
+            f"A flexible model predicts {100 * rest.explained[best]:.0f} % of the rest in "
+            f"{CHANNELS[best].replace('_', ' ')} "
             f"on held-out flights, mostly from: {drivers}."
         )
     worst = int(np.argmax(rest.bands.max(1)))
@@ -215,9 +231,26 @@ def _rest_in_words(rest: Rest) -> str:
 
 def _nuisances(evidence: Evidence, fit: SetFit) -> dict[str, str]:
     """What the nuisances took, as text, from the first track of each flight."""
-    names = ("thrust offset", "inertia xx", "inertia yy", "inertia zz", "motor lag up", "motor lag down", "motor clock",
-             "frame tilt x", "frame tilt y", "accelerometer bias x", "accelerometer bias y", "accelerometer bias z",
-             "IMU tilt x", "IMU tilt y", "IMU tilt z", "roll and pitch damping", "yaw damping", "pose clock")  # fmt: skip
+    names = (
+        "thrust offset",
+        "inertia xx",
+        "inertia yy",
+        "inertia zz",
+        "motor lag up",
+        "motor lag down",
+        "motor clock",
+        "frame tilt x",
+        "frame tilt y",
+        "accelerometer bias x",
+        "accelerometer bias y",
+        "accelerometer bias z",
+        "IMU tilt x",
+        "IMU tilt y",
+        "IMU tilt z",
+        "roll and pitch damping",
+        "yaw damping",
+        "pose clock",
+    )
     taken = []
     for number, column in enumerate(fit.columns):
         n = evidence.replay.whitened_nuisances[number].reshape(len(evidence.replay.nuisances[number]), -1)

@@ -1,4 +1,5 @@
-"""The estimator's path: the attitude against the integrated gyroscope. No dynamics are needed to see a late pose."""
+"""The estimator's path: the attitude against the integrated gyroscope. No dynamics are needed to see a
+late pose."""
 
 from __future__ import annotations
 
@@ -10,13 +11,14 @@ from openjax.gap.linear_path import LinearPath, fit_linear_path
 from openjax.gap.replay import POSE_SHIFT
 from openjax.gap.track import Track, smooth
 
-DELAY_SPREAD = 0.02     # s
-GYRO_BIAS = 0.1         # rad/s
-GYRO_TILT = 0.01        # rad
+DELAY_SPREAD = 0.02  # s
+GYRO_BIAS = 0.1  # rad/s
+GYRO_TILT = 0.01  # rad
 
 
 def read_estimator(tracks: list[Track], flight_of) -> LinearPath:
-    """How late the attitude is against the gyroscope (s, one coefficient); a clock offset of a few ms is a nuisance."""
+    """How late the attitude is against the gyroscope (s, one coefficient); a clock offset of a few ms is a
+    nuisance."""
     y, columns, nuisances = [], [], []
     for track in tracks:
         turned, gyro = turn_increments(track.quaternion), track.body_rates
@@ -28,7 +30,9 @@ def read_estimator(tracks: list[Track], flight_of) -> LinearPath:
         columns.append(late[None])
         time = (track.time - track.time[0])[:, None]
         drift = [GYRO_BIAS * axis * time for axis in np.eye(3)]
-        tilted = [GYRO_TILT * np.concatenate([start, np.cumsum(np.cross(axis, between), 0)]) for axis in np.eye(3)]
+        tilted = [
+            GYRO_TILT * np.concatenate([start, np.cumsum(np.cross(axis, between), 0)]) for axis in np.eye(3)
+        ]
         nuisances.append(np.stack([*drift, *tilted, POSE_SHIFT * late]))
     return fit_linear_path(y, columns, nuisances, flight_of, (DELAY_SPREAD,), (((0, 1, 2), True),))
 
@@ -43,10 +47,13 @@ def turn_increments(quaternion: np.ndarray) -> np.ndarray:
 
 def undelayed(track: Track, delay: float) -> Track:
     """The track with its pose `delay` s younger than logged."""
+
     def moved(values):
         return np.stack([np.interp(track.time + delay, track.time, column) for column in values.T], 1)
 
     quaternion = moved(track.quaternion)
     quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
     velocity = None if track.velocity is None else moved(track.velocity)
-    return dataclasses.replace(track, position=moved(track.position), quaternion=quaternion, velocity=velocity)
+    return dataclasses.replace(
+        track, position=moved(track.position), quaternion=quaternion, velocity=velocity
+    )

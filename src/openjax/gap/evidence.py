@@ -18,16 +18,17 @@ from openjax.gap.observer import TICKS
 from openjax.gap.replay import Replay, make_replay
 from openjax.gap.track import Track, tracks_of
 
-CLEAR_DELAY = 0.002     # s of pose delay above which the pose is moved before the physics is read
-CLEAR_SCORE = 3.0       # nats, likewise
-WORTH_A_SECOND_LOOK = 30.0      # nats of the best set above none
-RADIO_COST = 15.0       # nats that a radio effect must gain before the rate loop is read with it
+CLEAR_DELAY = 0.002  # s of pose delay above which the pose is moved before the physics is read
+CLEAR_SCORE = 3.0  # nats, likewise
+WORTH_A_SECOND_LOOK = 30.0  # nats of the best set above none
+RADIO_COST = 15.0  # nats that a radio effect must gain before the rate loop is read with it
 
 
 @dataclass(eq=False)
 class Evidence:
-    """Scores are log marginal likelihoods above that of no effect (nats). `sets` holds physics sets: a full fit or a
-    linearised score; `exposure` what a typical effect would show. None: that path wasn't logged."""
+    """Scores are log marginal likelihoods above that of no effect (nats). `sets` holds physics sets: a
+    full fit or a linearised score; `exposure` what a typical effect would show. None: that path wasn't
+    logged."""
 
     case: Case
     library: Library
@@ -36,7 +37,7 @@ class Evidence:
     replay: Replay
     sets: dict[tuple[str, ...], SetFit | float]
     exposure: dict[str, float]
-    floor: list[np.ndarray]         # (T, 9) residuals when all effects may act at once: sensors and gusts
+    floor: list[np.ndarray]  # (T, 9) residuals when all effects may act at once: sensors and gusts
     radio: Radio | None
     rate_loop: LinearPath | None
     pose: LinearPath | None
@@ -77,7 +78,9 @@ def gather(case: Case, library: Library, progress=None) -> Evidence:
     tell("reading the paths of the log")
     tracks = [t for t in tracks_of(case) if t.motor is not None or t.command is not None]
     if not tracks:
-        raise UserError(f"{case.name}: no flight has 2 s without a gap, with body rates and commands or motors")
+        raise UserError(
+            f"{case.name}: no flight has 2 s without a gap, with body rates and commands or motors"
+        )
     flights = {f.name: f for f in case.flights}
     vehicles = [case.vehicle_of(flights[t.name.split("#")[0]]) for t in tracks]
     names = list(dict.fromkeys(t.flight for t in tracks))
@@ -112,7 +115,9 @@ def gather(case: Case, library: Library, progress=None) -> Evidence:
         found = _physics(tracks, vehicles, arrived, flight_of, library, pushes)
         lap("second look")
     replay, sets, exposure, floor, rate_loop = found
-    return Evidence(case, library, tracks, vehicles, replay, sets, exposure, floor, radio, rate_loop, pose, seconds)
+    return Evidence(
+        case, library, tracks, vehicles, replay, sets, exposure, floor, radio, rate_loop, pose, seconds
+    )
 
 
 def _physics(tracks, vehicles, arrived, flight_of, library, pushes):

@@ -1,8 +1,7 @@
 """The path from commands to motors: the radio and the rate controller, read without any dynamics.
 
-The mean of the motor commands is the commanded thrust, so its delay and its lost packets show row by row; what the
-motors differ by is the rate controller's output.
-"""
+The mean of the motor commands is the commanded thrust, so its delay and its lost packets show row by row;
+what the motors differ by is the rate controller's output."""
 
 from __future__ import annotations
 
@@ -18,23 +17,25 @@ from openjax.gap.track import Track, smooth
 from openjax.vehicle.rate_controller import mixer
 
 GAIN_STEP = 0.05
-# For p, i, d: the share that the replay's step can imitate, and what gyro noise does per row (measured on nominal
+# For p, i, d: the share that the replay's step can imitate, and what gyro noise does per row (measured on
+# nominal
 # flights of the tuning plant).
 GAIN_TOLERANCE = ((0.02, 0.3), (0.4, 0.004), (0.12, 0.1))
-LARGEST_SURPRISE = 2.5      # usual deviations
-CLEAR_SCORE = 5.0           # nats above which other gains are taken into account
-GYRO_TILT = 0.01            # rad, between the logged gyro and the one that the controller uses
-LONGEST_DELAY = 0.1         # s
-DELAY_STEP = 0.0005         # s
-TOLERANCE = 3e-4            # of thrust: rounding of the logs and of the firmware's integers
-INFORMATIVE = 1.5e-3        # smallest change of commanded thrust that shows whether a packet arrived
+LARGEST_SURPRISE = 2.5  # usual deviations
+CLEAR_SCORE = 5.0  # nats above which other gains are taken into account
+GYRO_TILT = 0.01  # rad, between the logged gyro and the one that the controller uses
+LONGEST_DELAY = 0.1  # s
+DELAY_STEP = 0.0005  # s
+TOLERANCE = 3e-4  # of thrust: rounding of the logs and of the firmware's integers
+INFORMATIVE = 1.5e-3  # smallest change of commanded thrust that shows whether a packet arrived
 
 
 @dataclass(frozen=True, eq=False)
 class Radio:
-    """What the link did. `gain` maps a set of its effects to its log-likelihood gain over a perfect link; `arrived`
-    [(fraction, (T, 2) rows)]: the command in force at the end and at the start of each row, and the share of the row
-    that the older one rules; `misfit` is the mean error of the collective thrust per set."""
+    """What the link did. `gain` maps a set of its effects to its log-likelihood gain over a perfect link;
+    `arrived` [(fraction, (T, 2) rows)]: the command in force at the end and at the start of each row,
+    and the share of the row that the older one rules; `misfit` is the mean error of the collective
+    thrust per set."""
 
     delay: float
     loss: float
@@ -51,21 +52,30 @@ def read_radio(tracks: list[Track]) -> Radio:
     delay = float(delays[int(np.argmin(misfit))])
     perfect, straight = _decode(tracks, 0.0, False), _decode(tracks, 0.0, True)
     late, both = _decode(tracks, delay, False), _decode(tracks, delay, True)
-    names = {(): perfect, ("command_latency",): late, ("packet_loss",): straight, ("command_latency", "packet_loss"): both}
+    names = {
+        (): perfect,
+        ("command_latency",): late,
+        ("packet_loss",): straight,
+        ("command_latency", "packet_loss"): both,
+    }
     level = {name: _scale(found) for name, found in names.items()}
     used = both if delay > 0 else straight
     return Radio(
-        delay, used["lost"] / max(used["informative"], 1),
+        delay,
+        used["lost"] / max(used["informative"], 1),
         {name: level[name] - level[()] for name in names},
         {name: found["arrived"] for name, found in names.items()},
-        {name: float(np.mean(np.abs(found["error"]))) if len(found["error"]) else 0.0 for name, found in names.items()},
+        {
+            name: float(np.mean(np.abs(found["error"]))) if len(found["error"]) else 0.0
+            for name, found in names.items()
+        },
         used["informative"],
-    )  # fmt: skip
+    )
 
 
 def _scale(found) -> float:
-    """Log-likelihood of the errors under a Laplace distribution of unknown scale; a third of the rows is counted as
-    independent."""
+    """Log-likelihood of the errors under a Laplace distribution of unknown scale; a third of the rows is
+    counted as independent."""
     error = np.abs(found["error"])
     return float(-len(error) / 3.0 * np.log(error.mean() + TOLERANCE)) if len(error) else 0.0
 
@@ -78,7 +88,7 @@ def _clean_rows(track: Track) -> np.ndarray:
 
 def _delay_misfit(track: Track, delays: np.ndarray) -> np.ndarray:
     thrust, given, clean = track.command[:, 0], track.motor.mean(1), _clean_rows(track)
-    cap = 0.3 * np.std(np.diff(thrust)) + 1e-9      # a lost packet must not pull at the delay
+    cap = 0.3 * np.std(np.diff(thrust)) + 1e-9  # a lost packet must not pull at the delay
     misfit = np.zeros(len(delays))
     for number, delay in enumerate(delays):
         whole = int(delay / track.dt + 1e-9)
@@ -120,7 +130,8 @@ def _decode(tracks, delay: float, may_lose: bool) -> dict:
 
 
 def with_motors(track: Track, vehicle) -> Track:
-    """The track with motor commands: where they weren't logged, those that the nominal rate controller would send."""
+    """The track with motor commands: where they weren't logged, those that the nominal rate controller
+    would send."""
     if track.motor is not None:
         return track
     rows = np.arange(len(track))
@@ -137,18 +148,17 @@ def in_force(track: Track, arrived) -> np.ndarray:
     """Command (T, TICKS, 4) that rules at each tick of the rate loop."""
     part, rows = arrived
     out = np.repeat(track.command[rows[:, 0]][:, None], TICKS, 1)
-    older = int(round(part * TICKS))
+    older = round(part * TICKS)
     out[:, :older] = track.command[rows[:, 1]][:, None]
     return out
 
 
 def _observe_twice(track: Track, vehicle, link, gains, push=None):
-    """The observer's output: mean motor commands wanted (B, T, 4), the same knowing the past only, and the commands sent in
-    the ticks (T, TICKS, 4) with the first gains.
+    """The observer's output: mean motor commands wanted (B, T, 4), the same knowing the past only, and the
+    commands sent in the ticks (T, TICKS, 4) with the first gains.
 
-    What pushed the body beyond the nominal physics in a first run is given to a second, so that the rates inside a
-    row are right whatever the physics.
-    """
+    What pushed the body beyond the nominal physics in a first run is given to a second, so that the rates
+    inside a row are right whatever the physics."""
     rows, size = len(track), bucket(len(track))
     inputs = [padded(v, size) for v in (in_force(track, link), track.motor, track.body_rates)]
     push, causal = padded(np.zeros((rows, 3)) if push is None else push, size), None
@@ -156,7 +166,7 @@ def _observe_twice(track: Track, vehicle, link, gains, push=None):
         wanted, sent, rates = observe(gains, vehicle, *inputs, push, np.float32(track.dt))
         causal = np.asarray(wanted, float)[:, :rows] if causal is None else causal
         miss = track.body_rates[1:] - np.asarray(rates[0], float)[: rows - 1]
-        step = miss.copy()          # undo the observer's own correction of what it missed before
+        step = miss.copy()  # undo the observer's own correction of what it missed before
         step[1:] -= (1.0 - GYRO_GAIN) * miss[:-1]
         push = push + padded(smooth(np.concatenate([step, step[-1:]]), 0.06, track.dt) / track.dt, size)
     return np.asarray(wanted, float)[:, :rows], causal, np.asarray(sent[0])[:rows]
@@ -164,9 +174,10 @@ def _observe_twice(track: Track, vehicle, link, gains, push=None):
 
 @dataclass(frozen=True, eq=False)
 class RateLoop:
-    """The rate controller read from what the motors differ by: `path` for its gains; the motor commands (T, TICKS, 4)
-    of each track's ticks; and what the controller did beyond the observer's foresight, (T, 3) roll, pitch, yaw, 0 where
-    motors were at a limit: the controller sees the body's true rates, so this is a sensor of theirs."""
+    """The rate controller read from what the motors differ by: `path` for its gains; the motor commands
+    (T, TICKS, 4) of each track's ticks; and what the controller did beyond the observer's foresight,
+    (T, 3) roll, pitch, yaw, 0 where motors were at a limit: the controller sees the body's true rates,
+    so this is a sensor of theirs."""
 
     path: LinearPath
     ticks: list[np.ndarray]
@@ -174,8 +185,8 @@ class RateLoop:
 
 
 def read_rate_loop(tracks, vehicles, arrived, flight_of, pushes=None) -> RateLoop:
-    """Read the rate controllers of all tracks; `arrived` as in `Radio`. pushes [(T, 3)]: angular accelerations (rad/s^2)
-    beyond the nominal that are already known."""
+    """Read the rate controllers of all tracks; `arrived` as in `Radio`. pushes [(T, 3)]: angular
+    accelerations (rad/s^2) beyond the nominal that are already known."""
     gains = np.concatenate([np.ones((1, 3)), 1.0 + GAIN_STEP * np.eye(3)]).astype(np.float32)
     y, columns, nuisances, masks, ticks, foreseen = [], [], [], [], [], []
     for number, (track, vehicle, link) in enumerate(zip(tracks, vehicles, arrived, strict=True)):
@@ -183,7 +194,7 @@ def read_rate_loop(tracks, vehicles, arrived, flight_of, pushes=None) -> RateLoo
         wanted, causal, sent = _observe_twice(track, vehicle, link, gains, push)
         foreseen.append(causal)
         ticks.append(sent)
-        outputs = np.linalg.pinv(np.asarray(mixer(vehicle), float)).T       # motors to roll, pitch, yaw
+        outputs = np.linalg.pinv(np.asarray(mixer(vehicle), float)).T  # motors to roll, pitch, yaw
         demand, logged = wanted @ outputs, track.motor @ outputs
         y.append(logged - demand[0])
         columns.append((demand[1:] - demand[0]) / GAIN_STEP)
@@ -192,7 +203,11 @@ def read_rate_loop(tracks, vehicles, arrived, flight_of, pushes=None) -> RateLoo
         seen = np.stack([np.cross(axis, track.body_rates) for axis in np.eye(3)]) * GYRO_TILT
         proportional = np.asarray(vehicle.rate_kp, float) * 57.3 / 65536.0
         trims = list(proportional * seen + integral * np.cumsum(seen, 1) * track.dt)
-        trims += [f for axis in np.eye(3) for f in (0.3 * axis * np.ones_like(logged), 0.03 * axis * integral * time)]
+        trims += [
+            f
+            for axis in np.eye(3)
+            for f in (0.3 * axis * np.ones_like(logged), 0.03 * axis * integral * time)
+        ]
         nuisances.append(np.stack(trims))
         clean = ((track.motor < 0.997) & (track.motor > 0.003)).all(1)
         masks.append(1.0 - (np.convolve(~clean, np.ones(12))[: len(clean)] > 0))

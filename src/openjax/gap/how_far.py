@@ -1,9 +1,9 @@
-"""How far the gap shrinks: prediction errors on flights that the effects were not fitted to, before and after.
+"""How far the gap shrinks: prediction errors on flights that the effects were not fitted to, before and
+after.
 
-The gap is the rms over channels of each channel's error divided by its noise floor. Errors are those of short
-predictions from logged states: velocity over 0.25 s, body rates over 0.05 s, the pose against the gyroscope over
-0.1 s, the motor commands from the body-rate commands over a row.
-"""
+The gap is the rms over channels of each channel's error divided by its noise floor. Errors are those of
+short predictions from logged states: velocity over 0.25 s, body rates over 0.05 s, the pose against the
+gyroscope over 0.1 s, the motor commands from the body-rate commands over a row."""
 
 from __future__ import annotations
 
@@ -17,19 +17,21 @@ from openjax.gap.replay import SKIP
 from openjax.gap.track import smooth
 
 METRIC = (
-    "rms over channels of prediction error / noise floor on held-out flights (velocity over 0.25 s, body rates over "
+    "rms over channels of prediction error / noise floor on held-out flights (velocity over 0.25 s, "
+    "body rates over "
     "0.05 s, pose against gyroscope over 0.1 s, motor commands from body-rate commands)"
 )
-HORIZONS = {"velocity": 0.25, "rates": 0.05, "pose": 0.1}      # s
-BLOCK = 1.0             # s, unit of the bootstrap
+HORIZONS = {"velocity": 0.25, "rates": 0.05, "pose": 0.1}  # s
+BLOCK = 1.0  # s, unit of the bootstrap
 DRAWS = 400
-REFIT_STEPS = 2         # of Gauss-Newton for each flight left out, from the fit to all
+REFIT_STEPS = 2  # of Gauss-Newton for each flight left out, from the fit to all
 
 
 @dataclass(frozen=True)
 class Gap:
-    """`before`, `after` and `floor` are in units of the noise floor (so `floor` is 1 where it is known). `reduction` is
-    1 - after / before; a negative one means that the named effects made held-out predictions worse."""
+    """`before`, `after` and `floor` are in units of the noise floor (so `floor` is 1 where it is known).
+    `reduction` is 1 - after / before; a negative one means that the named effects made held-out
+    predictions worse."""
 
     metric: str
     before: float
@@ -41,8 +43,8 @@ class Gap:
 
 
 def shrink(evidence: Evidence, after: list[np.ndarray], named) -> Gap:
-    """The gap before and after the named effects: `after` are the physics' held-out residuals with them, the other
-    paths go by name."""
+    """The gap before and after the named effects: `after` are the physics' held-out residuals with them,
+    the other paths go by name."""
     blocks = _blocks(evidence, after, tuple(named))
     before, left, floor = (_gap(blocks, kind) for kind in range(3))
     generator = np.random.default_rng(0)
@@ -55,7 +57,15 @@ def shrink(evidence: Evidence, after: list[np.ndarray], named) -> Gap:
     low, high = np.quantile(drawn, [0.05, 0.95])
     held_out = len(evidence.replay.flights) > 1
     reduction = 1.0 - left / before
-    return Gap(METRIC, before, left, floor, reduction, (float(min(low, reduction)), float(max(high, reduction))), held_out)
+    return Gap(
+        METRIC,
+        before,
+        left,
+        floor,
+        reduction,
+        (float(min(low, reduction)), float(max(high, reduction))),
+        held_out,
+    )
 
 
 def _gap(blocks, kind: int, pick=None) -> float:
@@ -85,7 +95,7 @@ def _blocks(evidence: Evidence, after, named) -> dict[str, list[np.ndarray]]:
 
     def add(channel, kind, track, values):
         size = max(int(BLOCK / track.dt), 1)
-        values = values[int(SKIP / track.dt):]
+        values = values[int(SKIP / track.dt) :]
         count = max(len(values) // size, 1)
         means = [float(np.mean(v)) for v in np.array_split(values, count)]
         blocks.setdefault(channel, [[], [], []])[kind].extend(means)
@@ -96,14 +106,18 @@ def _blocks(evidence: Evidence, after, named) -> dict[str, list[np.ndarray]]:
             for group, axes in groups.items():
                 if not evidence.replay.usable[axes[0]]:
                     continue
-                step = max(int(round(HORIZONS[group] / track.dt)), 1)
+                step = max(round(HORIZONS[group] / track.dt), 1)
                 error = residual[step:] - residual[:-step]
                 for axis in axes:
                     add(f"{group} {'xyz'[axis % 3]}", kind, track, error[:, axis] ** 2)
         if evidence.pose is not None:
-            step = max(int(round(HORIZONS["pose"] / track.dt)), 1)
-            known = evidence.pose.residual[number] if "state_latency" in named else evidence.pose.before[number]
-            for kind, residual in enumerate((evidence.pose.before[number], known, evidence.pose.residual[number])):
+            step = max(round(HORIZONS["pose"] / track.dt), 1)
+            known = (
+                evidence.pose.residual[number] if "state_latency" in named else evidence.pose.before[number]
+            )
+            for kind, residual in enumerate(
+                (evidence.pose.before[number], known, evidence.pose.residual[number])
+            ):
                 error = residual[step:] - residual[:-step]
                 for axis in range(3):
                     add(f"pose {'xyz'[axis]}", kind, track, error[:, axis] ** 2)
@@ -117,7 +131,7 @@ def _blocks(evidence: Evidence, after, named) -> dict[str, list[np.ndarray]]:
         if evidence.radio is not None:
             radio = evidence.radio
             used = tuple(e for e in ("command_latency", "packet_loss") if e in named)
-            floor = 2e-3        # of thrust: below, the link is perfect for every purpose
+            floor = 2e-3  # of thrust: below, the link is perfect for every purpose
             for kind, key in enumerate(((), used, ("command_latency", "packet_loss"))):
                 value = radio.misfit[key] ** 2 + floor**2
                 add("motors all", kind, track, np.full(len(track), value))

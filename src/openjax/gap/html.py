@@ -21,32 +21,42 @@ from openjax.gap.where import CHANNELS, REGIMES
 
 STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:62rem;margin:2rem auto;padding:0 1rem;color:#222}
 h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2rem}table{border-collapse:collapse;margin:.6rem 0}
-td,th{border-bottom:1px solid #ddd;padding:.2rem .7rem;text-align:left}img{max-width:100%}.verdict{background:#f3f6fa;
+td,th{border-bottom:1px solid #ddd;padding:.2rem .7rem;text-align:left}img{max-width:100%}
+.verdict{background:#f3f6fa;
 padding: .8rem 1.2rem;border-left:4px solid #2b6cb0}.small{color:#666;font-size:.9em}"""
 
 
 def html_of(report: Report) -> str:
     """The whole page as text."""
     lines = report.in_words()
-    body = [f"<h1>{html.escape(report.case)}: {html.escape(', '.join(report.effects) or report.verdict)}</h1>"]
+    body = [
+        f"<h1>{html.escape(report.case)}: {html.escape(', '.join(report.effects) or report.verdict)}</h1>"
+    ]
     body.append('<div class="verdict">' + "".join(f"<p>{html.escape(line)}</p>" for line in lines) + "</div>")
     body.append("<h2>Causes</h2>" + _probabilities(report))
     if report.parameters:
         body.append("<h2>Parameters</h2>" + _parameters(report))
     if report.plots:
-        pictures = (("Where the gap lies", _where), ("What each cause explains, and what is left", _ranking),
-                    ("A held-out flight", _overlay), ("The rest against the effect's own coordinate", _coordinate))  # fmt: skip
+        pictures = (
+            ("Where the gap lies", _where),
+            ("What each cause explains, and what is left", _ranking),
+            ("A held-out flight", _overlay),
+            ("The rest against the effect's own coordinate", _coordinate),
+        )
         for title, draw in pictures:
             figure = draw(report)
             if figure is not None:
                 body.append(f"<h2>{title}</h2>{_image(figure)}")
     if report.nuisances:
-        body.append("<h2>What the nuisances took</h2>" + _table([[k, v] for k, v in report.nuisances.items()]))
+        body.append(
+            "<h2>What the nuisances took</h2>" + _table([[k, v] for k, v in report.nuisances.items()])
+        )
     if report.quality:
         body.append("<h2>Data</h2>" + _table([[q["flight"], q["issue"]] for q in report.quality]))
     body.append(f'<p class="small">Gap: {html.escape(report.gap.metric)}.</p>')
     title = html.escape(f"Diagnosis of {report.case}")
-    page = f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>{STYLE}</style></head>'
+    page = f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
+    page += f"<style>{STYLE}</style></head>"
     return page + "<body>" + "\n".join(body) + "</body></html>\n"
 
 
@@ -58,7 +68,9 @@ def _table(rows, head=None) -> str:
 
 def _probabilities(report: Report) -> str:
     ranked = sorted(report.probabilities.items(), key=lambda item: -item[1])
-    return _table([[e, f"{p:.3f}"] for e, p in ranked[:8] if p > 5e-4], ("cause", "probability of being the strongest"))
+    return _table(
+        [[e, f"{p:.3f}"] for e, p in ranked[:8] if p > 5e-4], ("cause", "probability of being the strongest")
+    )
 
 
 def _parameters(report: Report) -> str:
@@ -91,7 +103,9 @@ def _where(report: Report):
             for column in range(len(REGIMES)):
                 if np.isfinite(table[row, column]):
                     axis.text(column, row, f"{table[row, column]:.1f}", ha="center", va="center", fontsize=7)
-        axis.set_xticks(range(len(REGIMES)), [r.replace("_", " ") for r in REGIMES], rotation=45, ha="right", fontsize=8)
+        axis.set_xticks(
+            range(len(REGIMES)), [r.replace("_", " ") for r in REGIMES], rotation=45, ha="right", fontsize=8
+        )
         axis.set_yticks(range(len(CHANNELS)), [c.replace("_", " ") for c in CHANNELS], fontsize=8)
         axis.set_title(f"{kind}, in units of the noise floor", fontsize=10)
     figure.colorbar(shown, ax=axes, label="log2")
@@ -110,16 +124,28 @@ def _ranking(report: Report):
         names.append(key[0])
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 2.8))
     left.barh(names[::-1], gains[::-1], xerr=errors[::-1], color="#2b6cb0", ecolor="#888")
-    head = max(0.5 * nothing.grams[:, 0, 0].sum() - 0.5 * sum(
-        float((evidence.replay.whiten(r, k) ** 2).sum()) for k, r in enumerate(evidence.floor)), 0.0)  # fmt: skip
+    head = max(
+        0.5 * nothing.grams[:, 0, 0].sum()
+        - 0.5 * sum(float((evidence.replay.whiten(r, k) ** 2).sum()) for k, r in enumerate(evidence.floor)),
+        0.0,
+    )
     left.axvline(head, color="#c53030", ls="--", lw=1, label="all effects together")
     left.set_xscale("symlog", linthresh=10)
     left.set_xlabel("log-likelihood gained (nats), spread over flights")
     left.legend(fontsize=8)
     left.tick_params(labelsize=8)
     gap = report.gap
-    right.bar(["before", "after " + "+".join(e for e in report.effects if e != "unknown") if report.parameters else "after",
-               "floor"], [gap.before, gap.after, gap.floor], color=["#c53030", "#2b6cb0", "#999"])  # fmt: skip
+    right.bar(
+        [
+            "before",
+            "after " + "+".join(e for e in report.effects if e != "unknown")
+            if report.parameters
+            else "after",
+            "floor",
+        ],
+        [gap.before, gap.after, gap.floor],
+        color=["#c53030", "#2b6cb0", "#999"],
+    )
     right.set_ylabel("gap, units of the floor")
     right.tick_params(labelsize=8)
     return figure
@@ -131,24 +157,35 @@ def _overlay(report: Report):
     before = held_out_residuals(evidence, evidence.nothing)[-1]
     after = report.plots["held_out"][-1]
     floor = evidence.floor[-1]
-    step = max(int(round(HORIZONS["velocity"] / track.dt)), 1)
+    step = max(round(HORIZONS["velocity"] / track.dt), 1)
     axis = 3 + int(np.argmax([np.std(before[step:, 3 + a] - before[:-step, 3 + a]) for a in range(3)]))
     if not evidence.replay.usable[3]:
         axis = 2
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 2.8), width_ratios=(2, 1))
     time = track.time[step:]
-    for residual, colour, label in ((before, "#c53030", "nominal"), (after, "#2b6cb0", "with the named effects")):
+    for residual, colour, label in (
+        (before, "#c53030", "nominal"),
+        (after, "#2b6cb0", "with the named effects"),
+    ):
         left.plot(time, residual[step:, axis] - residual[:-step, axis], color=colour, lw=0.9, label=label)
     band = 1.645 * np.std(floor[step:, axis] - floor[:-step, axis])
     left.axhspan(-band, band, color="#999", alpha=0.3, lw=0, label="90 % of the noise")
     left.set_xlabel("s")
     unit = "m/s" if axis >= 3 else "rad/s"
-    left.set_ylabel(f"{'velocity' if axis >= 3 else 'rate'} {'xyz'[axis % 3]}, error after {HORIZONS['velocity']} s, {unit}")
+    left.set_ylabel(
+        f"{'velocity' if axis >= 3 else 'rate'} {'xyz'[axis % 3]}, error after "
+        f"{HORIZONS['velocity']} s, {unit}"
+    )
     left.legend(fontsize=8)
-    rows = [max(int(round(h / track.dt)), 1) for h in (0.02, 0.05, 0.1, 0.25, 0.5, 1.0)]
+    rows = [max(round(h / track.dt), 1) for h in (0.02, 0.05, 0.1, 0.25, 0.5, 1.0)]
     for residual, colour in ((before, "#c53030"), (after, "#2b6cb0"), (floor, "#999")):
-        right.loglog([r * track.dt for r in rows], [np.std(residual[r:, axis] - residual[:-r, axis]) for r in rows],
-                     "o-", color=colour, ms=3)  # fmt: skip
+        right.loglog(
+            [r * track.dt for r in rows],
+            [np.std(residual[r:, axis] - residual[:-r, axis]) for r in rows],
+            "o-",
+            color=colour,
+            ms=3,
+        )
     right.set_xlabel("horizon, s")
     right.set_ylabel(f"rms error, {unit}")
     return figure
@@ -158,12 +195,21 @@ def _coordinate(report: Report):
     """Force along the effect's channel against the variable that drives it, binned, before and after."""
     evidence = report.plots["evidence"]
     effect = next((e for e in report.effects if e != "unknown"), None)
-    picked = {"rotor_drag": "v", "wind": "v", "blade_flapping": "v", "ground_effect": "z", "ceiling_effect": "z",
-              "downwash": "dz", "battery_sag": "V"}.get(effect, "F")  # fmt: skip
+    picked = {
+        "rotor_drag": "v",
+        "wind": "v",
+        "blade_flapping": "v",
+        "ground_effect": "z",
+        "ceiling_effect": "z",
+        "downwash": "dz",
+        "battery_sag": "V",
+    }.get(effect, "F")
     if effect is None or not evidence.replay.usable[3]:
         return None
     points = {0: [], 1: []}
-    for kind, residuals in enumerate((held_out_residuals(evidence, evidence.nothing), report.plots["held_out"])):
+    for kind, residuals in enumerate(
+        (held_out_residuals(evidence, evidence.nothing), report.plots["held_out"])
+    ):
         for number, residual in enumerate(residuals):
             track = evidence.tracks[number]
             rest = smooth(disturbances(track, residual), 0.12, track.dt)[:, 3:6]
@@ -172,8 +218,11 @@ def _coordinate(report: Report):
                 y = rest[:, 0]
             else:
                 y = rest[:, 2]
-                x = {"z": track.position[:, 2], "F": smooth(track.motor.mean(1), 0.05, track.dt),
-                     "V": track.voltage if track.voltage is not None else track.time}.get(picked)  # fmt: skip
+                x = {
+                    "z": track.position[:, 2],
+                    "F": smooth(track.motor.mean(1), 0.05, track.dt),
+                    "V": track.voltage if track.voltage is not None else track.time,
+                }.get(picked)
                 if picked == "dz":
                     if not len(track.neighbours):
                         continue
@@ -182,8 +231,13 @@ def _coordinate(report: Report):
     if not points[0]:
         return None
     figure, axis = plt.subplots(figsize=(6, 3))
-    names = {"v": "body velocity x, m/s", "z": "height, m", "dz": "other vehicle above by, m", "V": "voltage, V",
-             "F": "mean motor command"}  # fmt: skip
+    names = {
+        "v": "body velocity x, m/s",
+        "z": "height, m",
+        "dz": "other vehicle above by, m",
+        "V": "voltage, V",
+        "F": "mean motor command",
+    }
     for kind, colour, label in ((0, "#c53030", "nominal"), (1, "#2b6cb0", "with the named effects")):
         data = np.concatenate(points[kind])
         edges = np.quantile(data[:, 0], np.linspace(0, 1, 16))

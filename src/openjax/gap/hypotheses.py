@@ -1,9 +1,9 @@
-"""Sets of physics effects as hypotheses: Gauss-Newton fits through the simulator, and how well each explains a case.
+"""Sets of physics effects as hypotheses: Gauss-Newton fits through the simulator, and how well each explains
+a case.
 
-Every set is fitted with the same nuisances and weighed by its marginal likelihood (Laplace's approximation), so that
-parameters cost what they are worth. Singles and the best sets are fitted in full; the other pairs are weighed by
-adding the linearised singles.
-"""
+Every set is fitted with the same nuisances and weighed by its marginal likelihood (Laplace's
+approximation), so that parameters cost what they are worth. Singles and the best sets are fitted in full;
+the other pairs are weighed by adding the linearised singles."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from openjax.gap.replay import GROUPS, SKIP, Replay
 from openjax.gap.whitening import Noise, fit_noise
 
 ITERATIONS = 6
-SMALL_STEP = 0.05       # nats: an improvement below this ends the search
-REFITTED = 4            # pairs fitted in full
-WORTH_A_THIRD = 10.0    # nats: three effects are tried only where two beat one by this
-WORTH_ALL = 60.0        # nats: all effects together must explain this much of a channel to count in its noise model
-UNEXPOSED = 0.5         # nats that a typical effect would leave: below, the effect isn't fitted at all
+SMALL_STEP = 0.05  # nats: an improvement below this ends the search
+REFITTED = 4  # pairs fitted in full
+WORTH_A_THIRD = 10.0  # nats: three effects are tried only where two beat one by this
+WORTH_ALL = 60.0  # nats: all effects together must explain this much of a channel to count in its noise model
+UNEXPOSED = 0.5  # nats that a typical effect would leave: below, the effect isn't fitted at all
 
 
 @dataclass(eq=False)
 class SetFit:
-    """A fitted set of effects. `grams` (F, 1 + p, 1 + p) of residual and derivatives at the optimum, by flight;
-    `score` the log marginal likelihood; `index` (p,) places in `theta` (P,), companions last."""
+    """A fitted set of effects. `grams` (F, 1 + p, 1 + p) of residual and derivatives at the optimum, by
+    flight; `score` the log marginal likelihood; `index` (p,) places in `theta` (P,), companions last."""
 
     effects: tuple[str, ...]
     theta: np.ndarray
@@ -43,10 +43,12 @@ class SetFit:
         """{effect: {parameter: (value, standard deviation)}} of the set's own effects."""
         deviation = dict(zip(self.index.tolist(), np.sqrt(np.diag(self.covariance)), strict=True))
         return {
-            e: {p.name: (float(self.theta[PLACE[e, p.name]]), float(deviation[PLACE[e, p.name]]))
-                for p in FITS[e].parameters}
+            e: {
+                p.name: (float(self.theta[PLACE[e, p.name]]), float(deviation[PLACE[e, p.name]]))
+                for p in FITS[e].parameters
+            }
             for e in self.effects
-        }  # fmt: skip
+        }
 
 
 def fit_set(replay: Replay, effects, start: np.ndarray | None = None, iterations: int = ITERATIONS) -> SetFit:
@@ -69,7 +71,7 @@ def fit_set(replay: Replay, effects, start: np.ndarray | None = None, iterations
                 best = (objective, theta.copy(), grams, columns)
                 break
             if not np.isfinite(objective) or objective > best[0] + 1.0:
-                if iteration < iterations:        # overshot: half way back
+                if iteration < iterations:  # overshot: half way back
                     theta = 0.5 * (theta + best[1])
                     continue
             break
@@ -107,16 +109,17 @@ def _free_ride(gram, off, precision, own: int) -> float:
     if len(off) == own:
         return 0.0
     # Seen from no effect: the residual there is the present one plus what the whole set explains.
-    push = gram[1 + own:, 0] + gram[1 + own:, 1:] @ off
+    push = gram[1 + own :, 0] + gram[1 + own :, 1:] @ off
     prior_part = precision[own:, own:]
-    hessian = gram[1 + own:, 1 + own:] + prior_part
+    hessian = gram[1 + own :, 1 + own :] + prior_part
     volume = np.linalg.slogdet(hessian)[1] - np.linalg.slogdet(prior_part)[1]
     return max(0.0, float(0.5 * push @ np.linalg.solve(hessian, push) - 0.5 * volume))
 
 
 def model_noise(replay: Replay, library: Library) -> tuple[list[np.ndarray], dict[str, float]]:
-    """Fit the noise models to what is left when all effects of the library may act at once: residuals [(T, 9)], and
-    what each effect would show if it acted as at its start (nats, nuisances marginalised): its exposure."""
+    """Fit the noise models to what is left when all effects of the library may act at once: residuals [(T,
+    9)], and what each effect would show if it acted as at its start (nats, nuisances marginalised): its
+    exposure."""
     theta = ABSENT.copy()
     ahead, firsts = [], []
     for effect in library.physics:
@@ -142,8 +145,10 @@ def model_noise(replay: Replay, library: Library) -> tuple[list[np.ndarray], dic
         return np.linalg.solve(gram[1:, 1:] + penalty, gram[1:, 0])
 
     residuals, together = _settle(replay, columns, weights)
-    # Where all effects together explain no more than so many parameters must, the noise is that of no effect: in calm
-    # flights feedback makes disturbances look like weak motors, and a noise model made under that would confirm it.
+    # Where all effects together explain no more than so many parameters must, the noise is that of no effect:
+    # in calm
+    # flights feedback makes disturbances look like weak motors, and a noise model made under that would
+    # confirm it.
     chosen = []
     for group, (none, full) in enumerate(zip(alone, together, strict=True)):
         axes = list(GROUPS[group][0])
@@ -153,11 +158,10 @@ def model_noise(replay: Replay, library: Library) -> tuple[list[np.ndarray], dic
             for left, calm in zip(residuals, nothing, strict=True):
                 left[:, axes] = calm[:, axes]
     replay.set_noise(chosen)
+    replay.loosen_calm_flights()
     taken = weights() if any(c is f for c, f in zip(chosen, together, strict=True)) else None
-    replay.settle_surprise([
-        c[0] if taken is None else c[0] - np.tensordot(taken, c[1:], 1) for c in columns
-    ])  # fmt: skip
-    shown = np.diag(replay.grams(columns).sum(0))[1 + size:]
+    replay.settle_surprise([c[0] if taken is None else c[0] - np.tensordot(taken, c[1:], 1) for c in columns])
+    shown = np.diag(replay.grams(columns).sum(0))[1 + size :]
     exposure = {e: 0.0 for e in library.physics}
     for effect, square in zip(firsts, shown, strict=True):
         exposure[effect] = max(exposure[effect], 0.5 * float(square))
@@ -165,7 +169,7 @@ def model_noise(replay: Replay, library: Library) -> tuple[list[np.ndarray], dic
 
 
 def _settle(replay: Replay, columns, weights) -> tuple[list[np.ndarray], tuple]:
-    """Residuals [(T, 9)] and noise models that fit each other, with `weights()` of the columns (None: none)."""
+    """Residuals [(T, 9)] and noise models that suit each other, with `weights()` of the columns."""
     for _ in range(2):
         taken = weights()
         residuals = []
@@ -192,8 +196,10 @@ def without_nuisances(replay: Replay, residual: np.ndarray, track: int) -> np.nd
     return residual - np.tensordot(taken, replay.nuisances[track], 1)
 
 
-def weigh_sets(replay: Replay, library: Library, exposure=None, largest: int = 3) -> dict[tuple[str, ...], SetFit | float]:
-    """Score of every set up to pairs and of the best triples: fits in full, or scores where only linearised."""
+def weigh_sets(
+    replay: Replay, library: Library, exposure=None, largest: int = 3
+) -> dict[tuple[str, ...], SetFit | float]:
+    """Score of every set up to pairs and of the best triples: a full fit, or a linearised score."""
     effects = library.physics
     found: dict[tuple[str, ...], SetFit | float] = {(): fit_set(replay, ())}
     for effect in effects:
@@ -251,7 +257,11 @@ class LinearSums:
         at = 1
         for fit in singles:
             effect, own = fit.effects[0], len(places(fit.effects))
-            self.row[effect], self.own[effect], self.theta[effect] = at, list(range(at + 1, at + 1 + own)), fit.theta
+            self.row[effect], self.own[effect], self.theta[effect] = (
+                at,
+                list(range(at + 1, at + 1 + own)),
+                fit.theta,
+            )
             for number, column in enumerate(fit.columns):
                 columns[number].append(column[: 1 + own])
             at += 1 + own
@@ -282,5 +292,8 @@ class LinearSums:
         push = gram[1:, 0] - precision @ off
         volume = np.linalg.slogdet(hessian)[1] - np.linalg.slogdet(precision)[1]
         return float(
-            -0.5 * gram[0, 0] - 0.5 * off @ precision @ off + 0.5 * push @ np.linalg.solve(hessian, push) - 0.5 * volume
+            -0.5 * gram[0, 0]
+            - 0.5 * off @ precision @ off
+            + 0.5 * push @ np.linalg.solve(hessian, push)
+            - 0.5 * volume
         )

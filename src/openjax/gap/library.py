@@ -1,9 +1,9 @@
-"""How each effect of `openjax.vehicle.effects` is fitted: which parameters, where to start, what is plausible.
+"""How each effect of `openjax.vehicle.effects` is fitted: which parameters, where to start, what is
+plausible.
 
-Priors are weak: their spread is of the order of the effect's usual range. A *companion* is a parameter of another
-effect that may move a little whenever this one does, because real effects seldom have exactly the library's form
-(a payload adds inertia, drag acts above the centre of mass).
-"""
+Priors are weak: their spread is of the order of the effect's usual range. A *companion* is a parameter of
+another effect that may move a little whenever this one does, because real effects seldom have exactly the
+library's form (a payload adds inertia, drag acts above the centre of mass)."""
 
 from __future__ import annotations
 
@@ -16,13 +16,18 @@ from openjax.errors import UserError
 from openjax.vehicle.effects import EFFECTS
 
 PATHS = ("physics", "radio", "rate_loop", "estimator")
-_PATH = {"command_latency": "radio", "packet_loss": "radio", "rate_gains": "rate_loop", "state_latency": "estimator"}
+_PATH = {
+    "command_latency": "radio",
+    "packet_loss": "radio",
+    "rate_gains": "rate_loop",
+    "state_latency": "estimator",
+}
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """One fitted parameter: prior mean and standard deviation, start of the search, step of the difference quotient,
-    all in the parameter's unit. `positive`: a value below the effect-free one is implausible."""
+    """One fitted parameter: prior mean and standard deviation, start of the search, step of the difference
+    quotient, all in the parameter's unit. `positive`: a value below the effect-free one is implausible."""
 
     name: str
     mean: float
@@ -34,8 +39,8 @@ class Fitted:
 
 @dataclass(frozen=True)
 class Fit:
-    """How one effect is fitted. `common` is the spread that all its parameters share, `others` are more starts,
-    `companions` are ((effect, parameter, spread), ...)."""
+    """How one effect is fitted. `common` is the spread that all its parameters share, `others` are more
+    starts, `companions` are ((effect, parameter, spread), ...)."""
 
     effect: str
     parameters: tuple[Fitted, ...]
@@ -51,29 +56,73 @@ def _p(name, mean, spread, start, step, positive=False):
 FITS = {
     fit.effect: fit
     for fit in (
-        Fit("mass", (_p("extra", 0.0, 0.005, 0.001, 2e-5),),
-            companions=(("inertia", "xx", 0.02), ("inertia", "yy", 0.02), ("inertia", "zz", 0.02))),
-        Fit("thrust_scale", (_p("scale", 0.0, 0.1, 0.02, 1e-3),), companions=(("yaw_torque", "ratio", 0.03),)),
-        Fit("battery_sag", (_p("exponent", 0.0, 1.0, 0.5, 1e-2, True), _p("reference", 3.85, 0.15, 3.85, 1e-2))),
-        Fit("thrust_saturation", (_p("limit", 0.8, 0.12, 0.8, 2e-3), _p("voltage_slope", 0.05, 0.15, 0.0, 1e-2)),
-            others=tuple((limit, 0.0) for limit in (0.95, 0.92, 0.89, 0.865, 0.84, 0.76, 0.7))),
-        Fit("thrust_curve", (_p("offset", 0.0, 0.08, 0.02, 1e-3), _p("slope", 1.0, 0.2, 0.95, 1e-3),
-                             _p("curvature", 0.0, 0.25, 0.02, 1e-3))),
-        Fit("rotor_drag", (_p("d_xy", 0.0, 0.015, 0.01, 1e-4, True), _p("d_z", 0.0, 0.012, 0.005, 1e-4)),
-            companions=(("blade_flapping", "stiffness", 4e-5),)),
-        Fit("blade_flapping", (_p("tilt", 0.0, 0.02, 0.005, 1e-4), _p("stiffness", 0.0, 2e-4, 3e-5, 1e-6))),
-        Fit("wind", (_p("x", 0.0, 1.5, 0.3, 1e-2), _p("y", 0.0, 1.5, 0.3, 1e-2), _p("z", 0.0, 0.5, 0.0, 1e-2),
-                     _p("drag", 0.013, 0.006, 0.013, 1e-4, True))),
-        Fit("ground_effect", (_p("strength", 0.0, 0.8, 0.4, 1e-2, True), _p("offset", 0.012, 0.01, 0.012, 5e-4))),
-        Fit("ceiling_effect", (_p("strength", 0.0, 0.8, 0.4, 1e-2, True), _p("offset", 0.012, 0.025, 0.012, 5e-4))),
-        Fit("downwash", (_p("force", 0.0, 0.1, 0.08, 1e-3, True), _p("length", 0.5, 0.25, 0.5, 5e-3),
-                         _p("width", 0.045, 0.012, 0.045, 5e-4), _p("spread", 0.1, 0.06, 0.1, 2e-3)),
-            others=((0.05, 0.8, 0.06, 0.15), (0.08, 0.3, 0.03, 0.08))),
-        Fit("motor_lag", (_p("extra_up", 0.0, 0.03, 0.01, 5e-4), _p("extra_down", 0.0, 0.03, 0.01, 5e-4)),
-            common=0.03),
-        Fit("motor_imbalance", tuple(
-            _p(f"m{i}", 0.0, 0.05, s, 1e-3) for i, s in ((1, 0.02), (2, -0.01), (3, 0.0), (4, -0.01))
-        )),
+        Fit(
+            "mass",
+            (_p("extra", 0.0, 0.005, 0.001, 2e-5),),
+            companions=(("inertia", "xx", 0.02), ("inertia", "yy", 0.02), ("inertia", "zz", 0.02)),
+        ),
+        Fit(
+            "thrust_scale", (_p("scale", 0.0, 0.1, 0.02, 1e-3),), companions=(("yaw_torque", "ratio", 0.03),)
+        ),
+        Fit(
+            "battery_sag",
+            (_p("exponent", 0.0, 1.0, 0.5, 1e-2, True), _p("reference", 3.85, 0.15, 3.85, 1e-2)),
+        ),
+        Fit(
+            "thrust_saturation",
+            (_p("limit", 0.8, 0.12, 0.8, 2e-3), _p("voltage_slope", 0.05, 0.15, 0.0, 1e-2)),
+            others=tuple((limit, 0.0) for limit in (0.95, 0.92, 0.89, 0.865, 0.84, 0.76, 0.7)),
+        ),
+        Fit(
+            "thrust_curve",
+            (
+                _p("offset", 0.0, 0.08, 0.02, 1e-3),
+                _p("slope", 1.0, 0.2, 0.95, 1e-3),
+                _p("curvature", 0.0, 0.25, 0.02, 1e-3),
+            ),
+        ),
+        Fit(
+            "rotor_drag",
+            (_p("d_xy", 0.0, 0.015, 0.01, 1e-4, True), _p("d_z", 0.0, 0.012, 0.005, 1e-4, True)),
+            companions=(("blade_flapping", "stiffness", 4e-5),),
+        ),
+        Fit("blade_flapping", (_p("tilt", 0.0, 0.02, 0.005, 1e-4, True), _p("stiffness", 0.0, 2e-4, 3e-5, 1e-6))),
+        Fit(
+            "wind",
+            (
+                _p("x", 0.0, 1.5, 0.3, 1e-2),
+                _p("y", 0.0, 1.5, 0.3, 1e-2),
+                _p("z", 0.0, 0.5, 0.0, 1e-2),
+                _p("drag", 0.013, 0.006, 0.013, 1e-4, True),
+            ),
+        ),
+        Fit(
+            "ground_effect",
+            (_p("strength", 0.0, 0.8, 0.4, 1e-2, True), _p("offset", 0.012, 0.01, 0.012, 5e-4)),
+        ),
+        Fit(
+            "ceiling_effect",
+            (_p("strength", 0.0, 0.8, 0.4, 1e-2, True), _p("offset", 0.012, 0.025, 0.012, 5e-4)),
+        ),
+        Fit(
+            "downwash",
+            (
+                _p("force", 0.0, 0.1, 0.08, 1e-3, True),
+                _p("length", 0.5, 0.25, 0.5, 5e-3),
+                _p("width", 0.045, 0.012, 0.045, 5e-4),
+                _p("spread", 0.1, 0.06, 0.1, 2e-3),
+            ),
+            others=((0.05, 0.8, 0.06, 0.15), (0.08, 0.3, 0.03, 0.08)),
+        ),
+        Fit(
+            "motor_lag",
+            (_p("extra_up", 0.0, 0.03, 0.01, 5e-4), _p("extra_down", 0.0, 0.03, 0.01, 5e-4)),
+            common=0.03,
+        ),
+        Fit(
+            "motor_imbalance",
+            tuple(_p(f"m{i}", 0.0, 0.05, s, 1e-3) for i, s in ((1, 0.02), (2, -0.01), (3, 0.0), (4, -0.01))),
+        ),
         Fit("com_offset", (_p("x", 0.0, 2e-3, 3e-4, 2e-5), _p("y", 0.0, 2e-3, 3e-4, 2e-5))),
         Fit("inertia", tuple(_p(axis, 1.0, 0.12, 1.1, 5e-3) for axis in ("xx", "yy", "zz")), common=0.3),
         Fit("yaw_torque", (_p("ratio", 1.0, 0.5, 0.9, 5e-3),)),
@@ -82,14 +131,19 @@ FITS = {
         Fit("rate_gains", tuple(_p(gain, 1.0, 0.4, 1.0, 5e-2) for gain in ("p", "i", "d"))),
         Fit("state_latency", (_p("delay", 0.0, 0.02, 0.0, 5e-4, True),)),
     )
-}  # fmt: skip
-# Small errors of the vehicle's numbers that no effect is blamed for: GAP's "thrust offset up to 1 %", and what the
+}
+# Small errors of the vehicle's numbers that no effect is blamed for: GAP's "thrust offset up to 1 %", and
+# what the
 # replay's own step and the half-known motor commands inside a row leave.
 NUISANCES = (
-    ("thrust_scale", "scale", 0.006), ("inertia", "xx", 0.01), ("inertia", "yy", 0.01), ("inertia", "zz", 0.01),
-    ("motor_lag", "extra_up", 3e-4), ("motor_lag", "extra_down", 3e-4),
-)  # fmt: skip
-MOTOR_SHIFT = 0.001     # s, standard deviation of the motors' clock offset
+    ("thrust_scale", "scale", 0.006),
+    ("inertia", "xx", 0.01),
+    ("inertia", "yy", 0.01),
+    ("inertia", "zz", 0.01),
+    ("motor_lag", "extra_up", 3e-4),
+    ("motor_lag", "extra_down", 3e-4),
+)
+MOTOR_SHIFT = 0.001  # s, standard deviation of the motors' clock offset
 
 
 @dataclass(frozen=True)
@@ -108,7 +162,8 @@ class Library:
         return tuple(e for e in self.effects if path_of(e) == path)
 
 
-# Every physics parameter has a fixed place in theta, whatever is left out of a library: one compiled function.
+# Every physics parameter has a fixed place in theta, whatever is left out of a library: one compiled
+# function.
 PHYSICS_EFFECTS = tuple(e for e in FITS if e not in _PATH)
 THETA = tuple((e, p.name) for e in PHYSICS_EFFECTS for p in FITS[e].parameters)
 PLACE = {key: number for number, key in enumerate(THETA)}
@@ -141,7 +196,8 @@ def start_of(effect: str, number: int = 0) -> np.ndarray:
 
 
 def prior(effects) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Indices (p,), mean (p,) and precision (p, p) of the parameters of a set of physics effects, companions last."""
+    """Indices (p,), mean (p,) and precision (p, p) of the parameters of a set of physics effects,
+    companions last."""
     index, mean, blocks = [], [], []
     for effect in effects:
         fit = FITS[effect]
@@ -157,7 +213,7 @@ def prior(effects) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     size = len(index)
     covariance, at = np.zeros((size, size)), 0
     for block in blocks:
-        covariance[at:at + len(block), at:at + len(block)] = block
+        covariance[at : at + len(block), at : at + len(block)] = block
         at += len(block)
     precision = np.linalg.inv(covariance) if size else covariance
     return np.array(index, int), np.array(mean), precision

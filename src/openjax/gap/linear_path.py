@@ -9,19 +9,20 @@ import numpy as np
 from openjax.gap.replay import marginal_gram
 from openjax.gap.whitening import Noise, fit_noise, whiten
 
-PASSES = 3              # of fitting the noise model and the coefficients in turn
+PASSES = 3  # of fitting the noise model and the coefficients in turn
 
 
 @dataclass(eq=False)
 class LinearPath:
-    """y (T, A) = columns x theta + nuisances + noise, for each track; theta has a zero-mean prior of `spread` (P,)."""
+    """y (T, A) = columns x theta + nuisances + noise, for each track; theta has a zero-mean prior of
+    `spread` (P,)."""
 
-    grams: np.ndarray           # (F, 1 + P, 1 + P) whitened inner products per flight, nuisances marginalised
-    spread: np.ndarray          # (P,)
-    before: list[np.ndarray]    # (T, A) residuals without the effect, nuisances taken off
+    grams: np.ndarray  # (F, 1 + P, 1 + P) whitened inner products per flight, nuisances marginalised
+    spread: np.ndarray  # (P,)
+    before: list[np.ndarray]  # (T, A) residuals without the effect, nuisances taken off
     residual: list[np.ndarray]  # (T, A) residuals after the fit
     noises: tuple[Noise, ...]
-    rows: int                   # residuals that counted
+    rows: int  # residuals that counted
 
     def score(self) -> tuple[float, np.ndarray, np.ndarray]:
         """Log Bayes factor of the path's effect against its absence, coefficients (P,), covariance (P, P)."""
@@ -37,13 +38,16 @@ def linear_score(gram: np.ndarray, spread: np.ndarray) -> tuple[float, np.ndarra
     return float(0.5 * gram[1:, 0] @ theta - 0.5 * volume), theta, np.linalg.inv(hessian)
 
 
-def fit_linear_path(y, columns, nuisances, flight_of, spread, groups, masks=None, tolerance=None, skip: int = 20):
+def fit_linear_path(
+    y, columns, nuisances, flight_of, spread, groups, masks=None, tolerance=None, skip: int = 20
+):
     """Fit tracks' y [(T, A)], columns [(P, T, A)], nuisances [(N, T, A)] (unit prior variance).
 
-    groups: ((axes, integrated), ...) that share a noise model; masks [(T,)] are 0 in rows that must not count. tolerance ((least share, noise per row), ...) for each coefficient: how far it may be off without a
-    cause, per flight. The second number is what noise in the column does (errors in variables): it pulls a coefficient
-    down by that number divided by the column's mean square, so calm flights say little.
-    """
+    groups: ((axes, integrated), ...) that share a noise model; masks [(T,)] are 0 in rows that must not
+    count. tolerance ((least share, noise per row), ...) for each coefficient: how far it may be off
+    without a cause, per flight. The second number is what noise in the column does (errors in variables):
+    it pulls a coefficient down by that number divided by the column's mean square, so calm flights say
+    little."""
     spread = np.asarray(spread, float)
     size = 1 + len(spread)
     flights = int(np.max(flight_of)) + 1
@@ -59,7 +63,9 @@ def fit_linear_path(y, columns, nuisances, flight_of, spread, groups, masks=None
             rows += int(w.shape[1] if masks is None else masks[number][skip:].sum()) * w.shape[2]
             w = w.reshape(len(w), -1)
             if tolerance is not None:
-                per_row = [r * w.shape[1] / max(c @ c, 1e-9) for (_, r), c in zip(tolerance, w[1:size], strict=True)]
+                per_row = [
+                    r * w.shape[1] / max(c @ c, 1e-9) for (_, r), c in zip(tolerance, w[1:size], strict=True)
+                ]
                 shares = [max(least, share) for (least, _), share in zip(tolerance, per_row, strict=True)]
                 w = np.concatenate([w, w[1:size] * np.array(shares)[:, None]])
             whitened.append(w)
@@ -76,4 +82,3 @@ def _left(d: np.ndarray, w: np.ndarray, theta: np.ndarray) -> np.ndarray:
     left, n = w[0] - theta @ w[1:size], w[size:]
     taken = np.linalg.solve(np.eye(len(n)) + n @ n.T, n @ left)[: len(d) - size]
     return d[0] - np.tensordot(theta, d[1:size], 1) - np.tensordot(taken, d[size:], 1)
-

@@ -1,10 +1,10 @@
 """The nominal vehicle flown along a log: what the firmware did inside each row.
 
-A row of a log holds the mean of the motor commands over 10 ms, in which the 500 Hz rate loop ran five times. The
-observer runs that loop: the nominal rate controller on body rates that the logged motors drive and the gyroscope
-corrects after every row. It gives the motor command of every tick (its mean is the logged one), which the physics
-needs, and the mean that the controller would have sent, which shows whether the controller is the assumed one.
-"""
+A row of a log holds the mean of the motor commands over 10 ms, in which the 500 Hz rate loop ran five
+times. The observer runs that loop: the nominal rate controller on body rates that the logged motors drive
+and the gyroscope corrects after every row. It gives the motor command of every tick (its mean is the
+logged one), which the physics needs, and the mean that the controller would have sent, which shows whether
+the controller is the assumed one."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from openjax.vehicle.rate_controller import rate_controller
 from openjax.vehicle.rotors import rotor_reaction, rotor_speed_step, rotor_thrust
 from openjax.vehicle.wrench import total_wrench
 
-TICKS = 5               # of the rate loop per row
-GYRO_GAIN = 0.3         # share of a gyro innovation that corrects the observer, near the optimum for usual noise
+TICKS = 5  # of the rate loop per row
+GYRO_GAIN = 0.3  # share of a gyro innovation that corrects the observer, near the optimum for usual noise
 GAIN_NAMES = ("p", "i", "d")
 
 
@@ -28,9 +28,8 @@ def _observe(gains, vehicle, command, motor, gyro, disturbance, dt):
     """One track. gains (3,) multiples of p, i, d; command (T, TICKS, 4), motor (T, 4), gyro (T, 3) rad/s,
     disturbance (T, 3) rad/s^2 of angular acceleration beyond the nominal; dt () s per row.
 
-    Returns the controller's mean motor command (T, 4), the motor commands of the ticks (T, TICKS, 4) with the logged
-    mean, and the rates at the end of each row as predicted (T, 3).
-    """
+    Returns the controller's mean motor command (T, 4), the motor commands of the ticks (T, TICKS, 4) with
+    the logged mean, and the rates at the end of each row as predicted (T, 3)."""
     controller = EFFECTS["rate_gains"].body(dict(zip(GAIN_NAMES, gains, strict=True)), vehicle)
     h = dt / TICKS
     at_rest = jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0])
@@ -51,7 +50,9 @@ def _observe(gains, vehicle, command, motor, gyro, disturbance, dt):
         _, (wanted, _) = jax.lax.scan(tick, (*carry, jnp.zeros(4), push), command, unroll=True)
         # The second pass follows the motors as logged: the controller's pattern in the row, the log's mean.
         start = (*carry, logged - wanted.mean(0), push)
-        (rates, previous, integral, speed, _, _), (wanted, given) = jax.lax.scan(tick, start, command, unroll=True)
+        (rates, previous, integral, speed, _, _), (wanted, given) = jax.lax.scan(
+            tick, start, command, unroll=True
+        )
         step = GYRO_GAIN * (gyro_next - rates)
         sent = given + (logged - given.mean(0))
         return (rates + step, previous + step, integral, speed), (wanted.mean(0), sent, rates)

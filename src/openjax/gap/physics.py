@@ -1,8 +1,9 @@
-"""Forces and torques along a flight: the simulator's own functions on logged states, driven by the logged motors.
+"""Forces and torques along a flight: the simulator's own functions on logged states, driven by the logged
+motors.
 
-Nothing is rolled out: at every row the vehicle is where the log says, only the rotor speeds are simulated, from the
-motor commands through the motors' lag. So an error stays where it arises, and one call is a few milliseconds.
-"""
+Nothing is rolled out: at every row the vehicle is where the log says, only the rotor speeds are simulated,
+from the motor commands through the motors' lag. So an error stays where it arises, and one call is a few
+milliseconds."""
 
 from __future__ import annotations
 
@@ -19,30 +20,29 @@ from openjax.vehicle.rigid_body import rotate
 from openjax.vehicle.rotors import rotor_reaction, rotor_speed_step, rotor_thrust
 from openjax.vehicle.wrench import total_wrench
 
-CHANNELS = 9    # angular acceleration (body), acceleration (world), specific force (body)
+CHANNELS = 9  # angular acceleration (body), acceleration (world), specific force (body)
 
 
 @flax.struct.dataclass
 class Path:
-    """A track as the physics sees it: T rows, each the state in the middle of its interval. float32, padded."""
+    """A track as the physics sees it: T rows, each the state amid its interval. float32, padded."""
 
-    position: jax.Array         # (T, 3) m
-    quaternion: jax.Array       # (T, 4)
-    velocity: jax.Array         # (T, 3) m/s
-    body_rates: jax.Array       # (T, 3) rad/s
-    motor: jax.Array            # (T, TICKS, 4) 0..1 in the row's ticks
-    voltage: jax.Array          # (T,) V, NaN where unknown
-    others: jax.Array           # (T, M, 3) m
-    dt: jax.Array               # () s
+    position: jax.Array  # (T, 3) m
+    quaternion: jax.Array  # (T, 4)
+    velocity: jax.Array  # (T, 3) m/s
+    body_rates: jax.Array  # (T, 3) rad/s
+    motor: jax.Array  # (T, TICKS, 4) 0..1 in the row's ticks
+    voltage: jax.Array  # (T,) V, NaN where unknown
+    others: jax.Array  # (T, M, 3) m
+    dt: jax.Array  # () s
 
 
 @lru_cache(maxsize=16)
 def compiled_physics(names: tuple[str, ...], parameters: tuple[tuple[str, str], ...]):
     """The batched physics with the effects `names`: theta (B, P), vehicle, path -> (B, T, 9).
 
-    `parameters` says which (effect, parameter) each entry of theta is; parameters not named stay without effect.
-    A last entry of theta beyond them shifts the motors in time (s, later is positive).
-    """
+    `parameters` says which (effect, parameter) each entry of theta is; parameters not named stay without
+    effect. A last entry of theta beyond them shifts the motors in time (s, later is positive)."""
     effects = resolve(names)
 
     def one(theta, vehicle, path: Path):

@@ -1,8 +1,9 @@
-"""Replay of the motion: what a vehicle with given effects would have measured along each track, channel by channel.
+"""Replay of the motion: what a vehicle with given effects would have measured along each track, channel by
+channel.
 
-Channels: body rates (3), velocity (3, world) - both integrated from the first row - and specific force (3, body).
-Residuals are compared through noise models (`whitening`), with the nuisances marginalised per flight.
-"""
+Channels: body rates (3), velocity (3, world) - both integrated from the first row - and specific force (3,
+body). Residuals are compared through noise models (`whitening`), with the nuisances marginalised per
+flight."""
 
 from __future__ import annotations
 
@@ -22,26 +23,31 @@ RATES, VELOCITY, FORCE = slice(0, 3), slice(3, 6), slice(6, 9)
 # Groups of channels that share a noise model: axes, whether integrated.
 GROUPS = (((0, 1), True), ((2,), True), ((3, 4), True), ((5,), True), ((6, 7), False), ((8,), False))
 FIRST_NOISE = (0.03, 0.03, 0.006, 0.006, 0.25, 0.25)
-SKIP = 0.2              # s left out at the start of a track: rotor speeds are not known there
+SKIP = 0.2  # s left out at the start of a track: rotor speeds are not known there
 BUCKETS = (256, 512, 1024, 2048, 4096, 8192, 16384, 32768)
 BATCH = 8
 # Nuisances and their standard deviations; see GAP: free in every hypothesis.
-TILT = np.radians(0.5)          # between tracked frame and thrust axis
-IMU_TILT = 0.01                 # rad, between the IMU's axes and the body's
-DAMPING = 0.15                  # 1/s, of the body rates by what the rotors do
-ACCELEROMETER_BIAS = 0.4        # m/s^2
-POSE_SHIFT = 0.0015             # s between motion capture and the vehicle's clock
+TILT = np.radians(0.5)  # between tracked frame and thrust axis
+IMU_TILT = 0.01  # rad, between the IMU's axes and the body's
+DAMPING = 0.15  # 1/s, of the body rates by what the rotors do
+ACCELEROMETER_BIAS = 0.4  # m/s^2
+POSE_SHIFT = 0.0015  # s between motion capture and the vehicle's clock
 
 
-# How the body rates follow the controller's surprise (rad/s per share of thrust): its sum, then 1 to 5 rows later, with
-# spreads. Measured on nominal flights of the tuning plant, where it hardly varies; the spreads leave room for others.
+# How the body rates follow the controller's surprise (rad/s per share of thrust): its sum, then 1 to 5 rows
+# later, with
+# spreads. Measured on nominal flights of the tuning plant, where it hardly varies; the spreads leave room for
+# others.
 SURPRISE = {
     (0, 1): ((-1.87, 0.1, -0.3, -0.1, 0.05, 0.0), (0.3, 0.25, 0.25, 0.25, 0.25, 0.25)),
     (2,): ((-3.0, -1.4, -0.6, -0.2, 0.0, 0.0), (0.7, 0.7, 0.6, 0.6, 0.6, 0.6)),
 }
 
 
-SETTLED = 0.3           # of those spreads, once a case's own values are known
+# Share of the torque that may be missing, times the mean square of its derivative per row in units of the
+# noise: measured on hovering nominal flights of the tuning plant.
+CALM_TORQUE = 0.15
+SETTLED = 0.3  # of those spreads, once a case's own values are known
 
 
 def bucket(length: int) -> int:
@@ -62,15 +68,15 @@ class Replay:
     tracks: list[Track]
     vehicles: list
     paths: list[Path]
-    measured: list[np.ndarray]      # (T, 9)
-    nominal: list[np.ndarray]       # (T, 9)
-    nuisances: list[np.ndarray]     # (N, T, 9), in units of their standard deviations
+    measured: list[np.ndarray]  # (T, 9)
+    nominal: list[np.ndarray]  # (T, 9)
+    nuisances: list[np.ndarray]  # (N, T, 9), in units of their standard deviations
     flights: tuple[str, ...]
-    flight_of: np.ndarray           # (tracks,) index of a track's flight
+    flight_of: np.ndarray  # (tracks,) index of a track's flight
     usable: np.ndarray
     noises: tuple[Noise, ...] = ()
     whitened_nuisances: list | None = None
-    surprise_columns: int = 0       # the last so many nuisances are the controller as a sensor
+    surprise_columns: int = 0  # the last so many nuisances are the controller as a sensor
 
     def predict(self, theta: np.ndarray, track: int | None = None) -> list[np.ndarray]:
         """Channels (B, T, 9) of each track (or of one) for parameter vectors theta (B, P)."""
@@ -81,22 +87,36 @@ class Replay:
         out = []
         for number in range(len(self.tracks)) if track is None else (track,):
             parts = [
-                np.asarray(physics(theta[i:i + BATCH], self.vehicles[number], self.paths[number]))
+                np.asarray(physics(theta[i : i + BATCH], self.vehicles[number], self.paths[number]))
                 for i in range(0, len(theta), BATCH)
             ]
-            out.append(_integrated(np.concatenate(parts)[:count, :len(self.tracks[number])], self.tracks[number].dt))
+            out.append(
+                _integrated(np.concatenate(parts)[:count, : len(self.tracks[number])], self.tracks[number].dt)
+            )
         return out
 
     def settle_surprise(self, residuals) -> None:
-        """Take what the rates owe to the controller's surprise from the residuals [(T, 9)] of a good explanation, and
-        hold it nearly fixed from now on."""
+        """Take what the rates owe to the controller's surprise from the residuals [(T, 9)] of a good
+        explanation, and hold it nearly fixed from now on."""
         if not self.surprise_columns:
             return
         last = slice(-self.surprise_columns, None)
         taken = np.mean([t[last] for t in self.nuisance_estimates(residuals)], 0)
         for number in range(len(self.tracks)):
-            self.measured[number] = self.measured[number] - np.tensordot(taken, self.nuisances[number][last], 1)
+            self.measured[number] = self.measured[number] - np.tensordot(
+                taken, self.nuisances[number][last], 1
+            )
             self.nuisances[number][last] *= SETTLED
+        self.set_noise(self.noises)
+
+    def loosen_calm_flights(self) -> None:
+        """Free the torque per motor command where little is flown: what is left is feedback against gusts."""
+        for number, columns in enumerate(self.nuisances):
+            for place, (effect, _, spread) in enumerate(NUISANCES):
+                if effect == "inertia":
+                    w = self.whitened_nuisances[number][place]
+                    power = float((w * w).sum()) / spread**2 / w.shape[0]
+                    columns[place] *= (spread + CALM_TORQUE / max(power, 1e-3)) / spread
         self.set_noise(self.noises)
 
     def nuisance_estimates(self, residuals) -> list[np.ndarray]:
@@ -114,11 +134,17 @@ class Replay:
         names = tuple(n for k, n in enumerate(self.flights) if k != flight)
         pick = lambda values: [values[k] for k in keep]  # noqa: E731
         return dataclasses.replace(
-            self, tracks=pick(self.tracks), vehicles=pick(self.vehicles), paths=pick(self.paths),
-            measured=pick(self.measured), nominal=pick(self.nominal), nuisances=pick(self.nuisances), flights=names,
+            self,
+            tracks=pick(self.tracks),
+            vehicles=pick(self.vehicles),
+            paths=pick(self.paths),
+            measured=pick(self.measured),
+            nominal=pick(self.nominal),
+            nuisances=pick(self.nuisances),
+            flights=names,
             flight_of=np.array([f - (f > flight) for f in self.flight_of[keep]]),
             whitened_nuisances=pick(self.whitened_nuisances),
-        )  # fmt: skip
+        )
 
     def set_noise(self, noises) -> None:
         """Use these noise models; unlogged channels get none and count nothing."""
@@ -128,7 +154,7 @@ class Replay:
     def whiten(self, x: np.ndarray, track: int) -> np.ndarray:
         """x (..., T, 9) of a track -> (..., T', 9) in units of the noise, without the first moments."""
         out = whiten(self.noises, x) * self.usable
-        return out[..., int(SKIP / self.tracks[track].dt):, :]
+        return out[..., int(SKIP / self.tracks[track].dt) :, :]
 
     def grams(self, columns: list[np.ndarray]) -> np.ndarray:
         """Inner products (F, C, C) per flight of columns [(C, T, 9) per track], nuisances marginalised."""
@@ -153,7 +179,7 @@ class Replay:
 
 
 def marginal_gram(w: np.ndarray, nuisances: np.ndarray) -> np.ndarray:
-    """w w' (C, C) of whitened columns (C, M) after marginalising nuisances (N, ...) of unit prior variance."""
+    """w w' (C, C) of whitened columns (C, M), nuisances (N, ...) of unit prior variance marginalised."""
     n = nuisances.reshape(len(nuisances), -1)
     cross = w @ n.T
     return w @ w.T - cross @ np.linalg.solve(np.eye(len(n)) + n @ n.T, cross.T)
@@ -172,8 +198,8 @@ def _integrated(rows: np.ndarray, dt: float) -> np.ndarray:
 def make_replay(tracks, vehicles, motor_ticks, surprise=None) -> Replay:
     """Replay of tracks with their nominal vehicles and motor commands (T, TICKS, 4) of the rate loop's ticks.
 
-    surprise [(T, 3)]: what the rate controller did beyond foresight (`RateLoop`), a second sensor of the body rates.
-    """
+    surprise [(T, 3)]: what the rate controller did beyond foresight (`RateLoop`), a second sensor of the
+    body rates."""
     paths = [jax.device_put(_path(t, m)) for t, m in zip(tracks, motor_ticks, strict=True)]
     measured = [_measured(t) for t in tracks]
     usable = np.ones(9)
@@ -183,9 +209,16 @@ def make_replay(tracks, vehicles, motor_ticks, surprise=None) -> Replay:
         usable[FORCE] = 0.0
     flights = tuple(dict.fromkeys(t.flight for t in tracks))
     replay = Replay(
-        list(tracks), [jax.device_put(jax.tree.map(np.float32, v)) for v in vehicles], paths, measured, [], [], flights,
-        np.array([flights.index(t.flight) for t in tracks]), usable,
-    )  # fmt: skip
+        list(tracks),
+        [jax.device_put(jax.tree.map(np.float32, v)) for v in vehicles],
+        paths,
+        measured,
+        [],
+        [],
+        flights,
+        np.array([flights.index(t.flight) for t in tracks]),
+        usable,
+    )
     index = [PLACE[key[:2]] for key in NUISANCES] + [len(ABSENT) - 1]
     spread = np.array([key[2] for key in NUISANCES] + [MOTOR_SHIFT])
     batch = np.repeat(ABSENT[None], 1 + len(index), 0)
@@ -216,16 +249,22 @@ def _path(track: Track, ticks: np.ndarray) -> Path:
     quaternion = middle(quaternion)
     quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
     # Without a pose the vehicle is taken to be in mid-air, far from everything.
-    position = track.position if track.position is not None else unknown + [0.0, 0.0, 0.6]
+    position = track.position if track.position is not None else unknown + np.array([0.0, 0.0, 0.6])
     # Neither floor nor ceiling can be entered: a log that says so has an offset in height.
     position = np.concatenate([position[:, :2], np.clip(position[:, 2:], 0.01, ARENA_CEILING - 0.02)], 1)
     velocity = track.velocity if track.velocity is not None else unknown
     others = [middle(p) for p in track.neighbours] or [np.tile(np.float32([50.0, 50.0, -50.0]), (size, 1))]
     voltage = np.full(size, np.nan, np.float32) if track.voltage is None else middle(track.voltage)
     return Path(
-        middle(position), quaternion, middle(velocity), middle(smooth(track.body_rates, 0.05, track.dt)),
-        padded(ticks, size), voltage, np.stack(others, 1), np.float32(track.dt),
-    )  # fmt: skip
+        middle(position),
+        quaternion,
+        middle(velocity),
+        middle(smooth(track.body_rates, 0.05, track.dt)),
+        padded(ticks, size),
+        voltage,
+        np.stack(others, 1),
+        np.float32(track.dt),
+    )
 
 
 def _measured(track: Track) -> np.ndarray:
@@ -239,14 +278,14 @@ def _measured(track: Track) -> np.ndarray:
 
 
 def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> list[np.ndarray]:
-    """Tilt of the tracked frame (2), accelerometer bias (3), tilt of the IMU (3), damping (2), clock of the motion
-    capture: columns (T, 9)."""
+    """Tilt of the tracked frame (2), accelerometer bias (3), tilt of the IMU (3), damping (2), clock of
+    the motion capture: columns (T, 9)."""
     rows = len(track)
     turn = rotation(np.asarray(path.quaternion, float)[:rows])
-    specific = np.gradient(nominal[:, VELOCITY], track.dt, axis=0) + [0.0, 0.0, 9.81]
+    specific = np.gradient(nominal[:, VELOCITY], track.dt, axis=0) + np.array([0.0, 0.0, 9.81])
     body = np.einsum("tji,tj->ti", turn, specific)
 
-    def moved(acceleration):        # what a change of the body-frame acceleration does to the velocity
+    def moved(acceleration):  # what a change of the body-frame acceleration does to the velocity
         column = np.zeros((rows, 9))
         column[:, VELOCITY] = np.cumsum(np.einsum("tij,tj->ti", turn, acceleration), 0) * track.dt
         return column
@@ -258,12 +297,12 @@ def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> list[np.
         columns.append(column)
     rates = smooth(track.body_rates, 0.03, track.dt)
     force = nominal[:, FORCE]
-    for axis in np.eye(3):          # the IMU's axes
+    for axis in np.eye(3):  # the IMU's axes
         column = np.zeros((rows, 9))
         column[:, RATES] = -np.cross(axis, rates - rates[0])
         column[:, FORCE] = -np.cross(axis, force)
         columns.append(column * IMU_TILT)
-    for axes in ((0, 1), (2,)):     # damping of the body rates
+    for axes in ((0, 1), (2,)):  # damping of the body rates
         column = np.zeros((rows, 9))
         column[:, axes] = -np.cumsum(rates, 0)[:, axes] * track.dt
         columns.append(column * DAMPING)
@@ -275,13 +314,13 @@ def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> list[np.
 
 
 def _controller_as_sensor(surprise: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """What the rate controller's surprise (T, 3) says about the rates that follow: the usual (T, 9), and nuisances for
-    what may differ from it.
+    """What the rate controller's surprise (T, 3) says about the rates that follow: the usual (T, 9), and
+    nuisances for what may differ from it.
 
-    The controller acts on the true rates with a better gyroscope than the log's, so the motors know of a gust before
-    the log does. Without this a model that makes the motors weak predicts better than the true one, since feedback
-    against gusts looks like motors without effect (closed-loop identification).
-    """
+    The controller acts on the true rates with a better gyroscope than the log's, so the motors know of a
+    gust before the log does. Without this a model that makes the motors weak predicts better than the true
+    one, since feedback against gusts looks like motors without effect (closed-loop identification)."""
+
     def later(values, rows):
         return np.concatenate([np.zeros((rows, 3)), values[: len(values) - rows]])
 

@@ -29,8 +29,8 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """What the flights of one case say. `parameters` {effect: {parameter: Estimate}}; `nuisances` {name: text} says what
-    they took; `plots` holds arrays for the pictures and isn't part of the JSON."""
+    """What the flights of one case say. `parameters` {effect: {parameter: Estimate}}; `nuisances` {name:
+    text} says what they took; `plots` holds arrays for the pictures and isn't part of the JSON."""
 
     case: str
     verdict: str
@@ -68,19 +68,32 @@ class Report:
             "equivalent": self.equivalent,
             "parameters": {
                 e: {
-                    p: {"value": v.value, "unit": v.unit, "interval90": list(v.interval90), "unusual": v.unusual}
+                    p: {
+                        "value": v.value,
+                        "unit": v.unit,
+                        "interval90": list(v.interval90),
+                        "unusual": v.unusual,
+                    }
                     for p, v in values.items()
                 }
                 for e, values in self.parameters.items()
             },
             "where": [
-                {"channel": p.channel, "regime": p.regime, "share": round(p.share, 4), "before": round(p.before, 3),
-                 "after": round(p.after, 3)}
+                {
+                    "channel": p.channel,
+                    "regime": p.regime,
+                    "share": round(p.share, 4),
+                    "before": round(p.before, 3),
+                    "after": round(p.after, 3),
+                }
                 for p in self.where
             ],
             "gap": {
-                "metric": self.gap.metric, "before": round(self.gap.before, 4), "after": round(self.gap.after, 4),
-                "floor": round(self.gap.floor, 4), "reduction": round(self.gap.reduction, 4),
+                "metric": self.gap.metric,
+                "before": round(self.gap.before, 4),
+                "after": round(self.gap.after, 4),
+                "floor": round(self.gap.floor, 4),
+                "reduction": round(self.gap.reduction, 4),
                 "interval90": [round(v, 4) for v in self.gap.interval90],
             },
             "not_testable": list(self.not_testable),
@@ -89,7 +102,7 @@ class Report:
             "runner_up": self.runner_up,
             "rest": self.rest,
             "nuisances": self.nuisances,
-        }  # fmt: skip
+        }
 
     def in_words(self) -> list[str]:
         """The verdict in a few plain sentences."""
@@ -107,7 +120,10 @@ class Report:
         elif self.verdict == "not_testable":
             lines.append("No effect is seen, but these flights could not show most of those that are usual.")
         else:
-            lines.append(f"The simulator agrees with these flights to within the noise (probability {chance['none']:.2f}).")
+            lines.append(
+                "The simulator agrees with these flights to within the noise "
+                f"(probability {chance['none']:.2f})."
+            )
         if self.rest:
             lines.append(self.rest)
         lines.append(f"Where: {in_words(self.where)}.")
@@ -124,7 +140,8 @@ class Report:
             low, high = self.gap.interval90
             lines.append(
                 f"Gap on held-out flights: {self.gap.before:.2f} before, {self.gap.after:.2f} after, floor "
-                f"{self.gap.floor:.2f}: {100 * self.gap.reduction:.0f} % smaller [{100 * low:.0f}, {100 * high:.0f}]."
+                f"{self.gap.floor:.2f}: {100 * self.gap.reduction:.0f} % smaller "
+                f"[{100 * low:.0f}, {100 * high:.0f}]."
             )
             if self.gap.reduction < 0:
                 lines.append("Careful: with these effects the held-out predictions got worse.")
@@ -145,7 +162,9 @@ def write_report(report: Report, folder: Path, pictures: bool = True) -> None:
     for effect, estimates in values.items():
         # What wasn't fitted keeps the value at which it does nothing.
         values[effect] = EFFECTS[effect].none() | estimates
-    intervals = {e: {p: v.interval90 for p, v in estimates.items()} for e, estimates in report.parameters.items()}
+    intervals = {
+        e: {p: v.interval90 for p, v in estimates.items()} for e, estimates in report.parameters.items()
+    }
     save_effects(folder / "effects.toml", values, intervals, notes=" ".join(report.in_words()[:2]))
     if pictures:
         from openjax.gap.html import html_of

@@ -1,8 +1,7 @@
 """A flight on a uniform clock: the arrays that the replay runs on.
 
-Replays step from row to row, so a flight is put on an even time grid once: rows between 100 Hz and 50 Hz are kept,
-faster logs are averaged down to 100 Hz, and a longer gap splits a flight into two tracks.
-"""
+Replays step from row to row, so a flight is put on an even time grid once: rows between 100 Hz and 50 Hz
+are kept, faster logs are averaged down to 100 Hz, and a longer gap splits a flight into two tracks."""
 
 from __future__ import annotations
 
@@ -20,8 +19,8 @@ MAX_GAP = 0.05  # s, a longer step between rows splits the flight
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """One stretch of one vehicle's flight, T rows of period `dt`. Units and frames are those of `Flight`; motors are
-    fractions of the maximal rotor thrust. What wasn't logged is None."""
+    """One stretch of one vehicle's flight, T rows of period `dt`. Units and frames are those of `Flight`;
+    motors are fractions of the maximal rotor thrust. What wasn't logged is None."""
 
     name: str
     flight: str  # name of the flight it comes from: the unit that is held out
@@ -36,7 +35,7 @@ class Track:
     motor: Array | None  # (T, 4) 0..1 thrust fraction
     voltage: Array | None  # (T,)
     neighbours: Array  # (K, T, 3) m, positions of the vehicles that flew along
-    motors_logged: bool = True      # False: made by the nominal rate controller from the commands
+    motors_logged: bool = True  # False: made by the nominal rate controller from the commands
 
     def __len__(self) -> int:
         return len(self.time)
@@ -64,7 +63,7 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
         period = GRID_PERIOD
     count = int((part.time[-1] - part.time[0]) / period + 1e-6) + 1
     grid = part.time[0] + period * np.arange(count)
-    per_row = int(round(period / part.row_period))
+    per_row = round(period / part.row_period)
 
     def take(channel: str, ahead: bool = False) -> Array | None:
         if getattr(part, channel) is None:
@@ -76,7 +75,7 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
             np.arange(per_row) / per_row - (0.0 if ahead else 0.5 - 0.5 / per_row)
         )
         values = part.interpolated(channel, fine.reshape(-1))
-        return values.reshape((count, per_row) + values.shape[1:]).mean(1)
+        return values.reshape((count, per_row, *values.shape[1:])).mean(1)
 
     quaternion = take("quaternion")
     motor = take("motor_command", ahead=True)
@@ -90,18 +89,26 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
         other.interpolated("position", grid) for other in case.others(flight) if other.position is not None
     ]
     return Track(
-        name=name, flight=flight.log, dt=period, time=grid,
-        position=take("position"), quaternion=quaternion, velocity=take("velocity"),
-        body_rates=take("body_rates"), specific_force=take("specific_force"),
-        command=command, motor=motor, voltage=None if voltage is None else smooth(voltage, 0.3, period),
+        name=name,
+        flight=flight.log,
+        dt=period,
+        time=grid,
+        position=take("position"),
+        quaternion=quaternion,
+        velocity=take("velocity"),
+        body_rates=take("body_rates"),
+        specific_force=take("specific_force"),
+        command=command,
+        motor=motor,
+        voltage=None if voltage is None else smooth(voltage, 0.3, period),
         neighbours=np.array(neighbours) if neighbours else np.zeros((0, count, 3)),
-    )  # fmt: skip
+    )
 
 
 def pwm_thrust(duty: Array, voltage: Array | None, vehicle) -> Array:
-    """Thrust fraction (T, 4) that a duty cycle gives: motor voltage U = duty x battery, and the public map of the
-    Crazyflie firmware's battery compensation, U = -0.0006239 g^2 + 0.088 g for g grams of thrust of all four rotors.
-    """
+    """Thrust fraction (T, 4) that a duty cycle gives: motor voltage U = duty x battery, and the public map
+    of the Crazyflie firmware's battery compensation, U = -0.0006239 g^2 + 0.088 g for g grams of thrust
+    of all four rotors."""
     volts = duty * (3.7 if voltage is None else voltage[:, None])
     grams = (0.088 - np.sqrt(np.maximum(0.088**2 - 4 * 0.0006239 * volts, 0.0))) / (2 * 0.0006239)
     newtons = grams * 1e-3 * 9.81 / 4
@@ -110,7 +117,7 @@ def pwm_thrust(duty: Array, voltage: Array | None, vehicle) -> Array:
 
 def smooth(values: Array, width: float, dt: float) -> Array:
     """`values` (T, ...) smoothed by a Hann window of `width` s, ends held."""
-    n = max(int(round(width / dt)), 1)
+    n = max(round(width / dt), 1)
     if n < 2:
         return values
     window = np.hanning(n + 2)[1:-1]
@@ -125,8 +132,11 @@ def smooth(values: Array, width: float, dt: float) -> Array:
 def rotation(quaternion: Array) -> Array:
     """Rotation matrices (T, 3, 3), body to world, of quaternions (T, 4) wxyz."""
     w, x, y, z = np.moveaxis(quaternion, -1, 0)
-    return np.stack([
-        np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-        np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-        np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-    ], -2)  # fmt: skip
+    return np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+        ],
+        -2,
+    )

@@ -13,15 +13,25 @@ from openjax.gap.rest import disturbances, residuals_of
 from openjax.gap.track import Track, smooth
 
 CHANNELS = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z", "estimator", "firmware")
-REGIMES = ("hover", "fast", "climb", "low", "high", "under_neighbour", "low_battery", "high_thrust", "transient")
-LEAST_TIME = 0.5        # s in a regime, or it isn't judged
-CALM = 0.12             # s over which the rest is smoothed: sensor noise out, causes in
+REGIMES = (
+    "hover",
+    "fast",
+    "climb",
+    "low",
+    "high",
+    "under_neighbour",
+    "low_battery",
+    "high_thrust",
+    "transient",
+)
+LEAST_TIME = 0.5  # s in a regime, or it isn't judged
+CALM = 0.12  # s over which the rest is smoothed: sensor noise out, causes in
 
 
 @dataclass(frozen=True)
 class Place:
-    """One cell of the table. `before` and `after` are rms in units of the noise floor; `share` is the part of the
-    whole excess over the floor that lies here; `seconds` the time spent in the regime."""
+    """One cell of the table. `before` and `after` are rms in units of the noise floor; `share` is the part
+    of the whole excess over the floor that lies here; `seconds` the time spent in the regime."""
 
     channel: str
     regime: str
@@ -63,7 +73,7 @@ def locate(evidence: Evidence, fit: SetFit, named=()) -> list[Place]:
     before, after, floor = (_powers(evidence, r) for r in (evidence.nothing, fit, None))
     paths = _other_paths(evidence, named)
     cells, total = [], 0.0
-    masks = [{r: m[int(SKIP / t.dt):] for r, m in regimes_of(t).items()} for t in evidence.tracks]
+    masks = [{r: m[int(SKIP / t.dt) :] for r, m in regimes_of(t).items()} for t in evidence.tracks]
     for number, channel in enumerate(CHANNELS):
         if number < 6:
             columns = [[p[k][:, number] for k in range(len(p))] for p in (before, after, floor)]
@@ -85,7 +95,10 @@ def locate(evidence: Evidence, fit: SetFit, named=()) -> list[Place]:
             excess = max(b - 1.0, 0.0) * seconds
             total += excess
             cells.append((channel, regime, excess, np.sqrt(b), np.sqrt(a), seconds))
-    places = [Place(c, r, float(e / total) if total > 0 else 0.0, float(b), float(a), float(s)) for c, r, e, b, a, s in cells]
+    places = [
+        Place(c, r, float(e / total) if total > 0 else 0.0, float(b), float(a), float(s))
+        for c, r, e, b, a, s in cells
+    ]
     return sorted(places, key=lambda p: -p.share)
 
 
@@ -96,7 +109,7 @@ def _powers(evidence: Evidence, fit: SetFit | None) -> list[np.ndarray]:
     for track, residual in zip(evidence.tracks, residuals, strict=True):
         rest = disturbances(track, residual)
         force = rest[:, 3:6] if evidence.replay.usable[3] else rest[:, 6:9]
-        calm = smooth(np.concatenate([force, rest[:, :3]], 1), CALM, track.dt)[int(SKIP / track.dt):]
+        calm = smooth(np.concatenate([force, rest[:, :3]], 1), CALM, track.dt)[int(SKIP / track.dt) :]
         out.append(calm**2)
     return out
 
@@ -105,13 +118,18 @@ def _other_paths(evidence: Evidence, named) -> dict[str, list]:
     """Squared residuals before, after and at the floor, per track, of estimator and firmware."""
     skips = [int(SKIP / t.dt) for t in evidence.tracks]
     found = {}
-    for channel, path, effect in (("estimator", evidence.pose, "state_latency"), ("firmware", evidence.rate_loop, "rate_gains")):
+    for channel, path, effect in (
+        ("estimator", evidence.pose, "state_latency"),
+        ("firmware", evidence.rate_loop, "rate_gains"),
+    ):
         if path is None:
             continue
 
         def power(residuals, path=path):
             scale = np.concatenate(path.residual).std(0) + 1e-12
-            return [(((r - r.mean(0)) / scale)[s:] ** 2).mean(1) for r, s in zip(residuals, skips, strict=True)]
+            return [
+                (((r - r.mean(0)) / scale)[s:] ** 2).mean(1) for r, s in zip(residuals, skips, strict=True)
+            ]
 
         after = path.residual if effect in named else path.before
         found[channel] = [power(path.before), power(after), power(path.residual)]
@@ -135,5 +153,7 @@ def in_words(places: list[Place]) -> str:
             continue
         kind, _, axis = place.channel.partition("_")
         name = f"{words[kind]} {axis}" if kind in words else place.channel
-        parts.append(f"{name} in {place.regime.replace('_', ' ')} flight ({place.before:.1f} times the noise floor)")
+        parts.append(
+            f"{name} in {place.regime.replace('_', ' ')} flight ({place.before:.1f} times the noise floor)"
+        )
     return "; ".join(parts) or "no channel stands out of the noise"

@@ -1,11 +1,11 @@
 """Noise models: what turns the residual of a channel into (nearly) independent numbers of unit variance.
 
-A residual is sensor noise and gusts. Sensor noise is white; a gust is a force or torque with a memory of some time,
-which integrated channels (rates, velocity, attitude) add up, beside small white steps from what the replay leaves
-out. The innovations of the Kalman filter of this model are white; what colour is left is taken out by a short
-autoregression. Everything acts on residuals and on their derivatives alike, and causally: in closed loop the motors
-answer disturbances, so only a residual given its own past says something about causes.
-"""
+A residual is sensor noise and gusts. Sensor noise is white; a gust is a force or torque with a memory of
+some time, which integrated channels (rates, velocity, attitude) add up, beside small white steps from what
+the replay leaves out. The innovations of the Kalman filter of this model are white; what colour is left is
+taken out by a short autoregression. Everything acts on residuals and on their derivatives alike, and
+causally: in closed loop the motors answer disturbances, so only a residual given its own past says
+something about causes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from scipy.linalg import solve_discrete_are, solve_toeplitz
 from scipy.signal import lfilter
 
 ORDER = 6
-# The grid of models: memory of the gust (per row), its rms per row and that of the white steps over sensor noise.
+# The grid of models: memory of the gust (per row), its rms per row and that of the white steps over sensor
+# noise.
 MEMORIES = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.995)
 GUSTS = (0.003, 0.01, 0.02, 0.04, 0.08, 0.15, 0.3, 0.6, 1.5)
 STEPS = (0.0, 0.05, 0.15, 0.4, 1.0)
@@ -26,7 +27,7 @@ STEPS = (0.0, 0.05, 0.15, 0.4, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Noise of one group of axes: whitening filter (numerator, denominator) and the innovation's deviation."""
+    """Noise of one group of axes: whitening filter (numerator, denominator), innovation's deviation."""
 
     axes: tuple[int, ...]
     numerator: np.ndarray
@@ -53,10 +54,11 @@ def first_noise(axes, integrated: bool, deviation: float) -> Noise:
 
 
 def fit_noise(axes, residuals, integrated: bool, masks=None, skip: int = 20) -> Noise:
-    """Noise model of residuals [(T, C), ...], pooled over tracks and `axes`; rows where a mask is 0 don't count.
+    """Noise model of residuals [(T, C), ...], pooled over tracks and `axes`; rows where a mask is 0 don't
+    count.
 
-    The model of the grid is chosen by Whittle's likelihood, the autoregression by Yule-Walker on its innovations.
-    """
+    The model of the grid is chosen by Whittle's likelihood, the autoregression by Yule-Walker on its
+    innovations."""
     axes = tuple(axes)
     chosen = _choose([r[skip:, list(axes)] for r in residuals], integrated)
     numerator, denominator = _kalman(*chosen, integrated)
@@ -76,7 +78,9 @@ def _choose(parts, integrated: bool) -> tuple[float, float, float]:
     for part in parts:
         z = np.diff(part, axis=0) if integrated else part
         taper = np.hanning(len(z))[:, None]
-        periodogram = (np.abs(np.fft.rfft((z - z.mean(0)) * taper, axis=0)) ** 2).sum(1)[2:] / (taper**2).sum()
+        periodogram = (np.abs(np.fft.rfft((z - z.mean(0)) * taper, axis=0)) ** 2).sum(1)[2:] / (
+            taper**2
+        ).sum()
         spectra, logs = _spectra(len(z), integrated)
         ratio_part = ratio_part + (periodogram / spectra).sum(1)
         log_part = log_part + z.shape[1] * logs
@@ -92,7 +96,8 @@ def _grid(integrated: bool) -> list[tuple[float, float, float]]:
 
 @lru_cache(maxsize=32)
 def _spectra(rows: int, integrated: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Model spectra (G, f) of (differenced) residuals of unit sensor noise, and the sums of their logarithms (G,)."""
+    """Model spectra (G, f) of (differenced) residuals of unit sensor noise, and the sums of their
+    logarithms (G,)."""
     shift = np.exp(-2j * np.pi * np.fft.rfftfreq(rows)[2:])
     grid = np.array(_grid(integrated))
     memory, gust, step = (grid[:, k, None] for k in range(3))

@@ -1,0 +1,1 @@
+"""Tuning of the diagnosis' decision on the withheld plant's tuning seeds."""

@@ -1,0 +1,139 @@
+"""The diagnosis on flights whose cause is known: the right name, honest parameters, and honest refusals."""
+
+import json
+
+import pytest
+
+from openjax.diagnose import main
+from openjax.gap.case import load_case
+from openjax.gap.diagnosis import diagnose_case
+from openjax.gap.reading import write_csv
+from openjax.gap.report import VERDICTS
+from openjax.gap.samples import fly, log_of, references
+from openjax.gap.where import CHANNELS, REGIMES
+from openjax.vehicle import load_vehicle
+from openjax.vehicle.effects import EFFECTS, load_effects
+
+VEHICLE = '[vehicle]\nmass = 0.0321\nmass_weighed = {weighed}\n\n[motor]\ncommand = "thrust"\n'
+NOTHING = {
+    "mass": {"extra": 0.0},
+    "rotor_drag": {"d_xy": 0.0, "d_z": 0.0},
+}  # one compiled flight for all cases
+DRAG = {"d_xy": 0.015, "d_z": 0.006}
+
+
+def _case(folder, effects, weighed=False, flights=("flight_a", "flight_b", "flight_c"), seed=3):
+    """Fly and log a case; `flights` may repeat a reference."""
+    vehicle, found = load_vehicle(), references(seed=seed, duration=8.0)
+    folder.mkdir(parents=True)
+    (folder / "vehicle.toml").write_text(VEHICLE.format(weighed=str(weighed).lower()))
+    for number, name in enumerate(flights):
+        columns = fly(vehicle, vehicle, found[name], 10 * seed + number, NOTHING | effects)
+        write_csv(folder / f"flight_{number}.csv.gz", log_of(columns, f"flight_{number}"))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    root = tmp_path_factory.mktemp("cases")
+    return {
+        "none": _case(root / "none", {}),
+        "drag": _case(root / "drag", {"rotor_drag": DRAG}),
+        "mass": _case(root / "mass", {"mass": {"extra": 0.003}}),
+        "weighed": _case(root / "weighed", {"mass": {"extra": 0.003}}, weighed=True),
+        "doublets": _case(root / "doublets", {}, flights=("flight_c", "flight_c")),
+    }
+
+
+@pytest.fixture(scope="module")
+def reports(folders):
+    return {name: diagnose_case(load_case(folder)) for name, folder in folders.items()}
+
+
+def test_a_known_cause_is_named_with_its_size(reports):
+    report = reports["drag"]
+    assert report.verdict == "effect" and report.effects == ("rotor_drag",)
+    assert report.probabilities["rotor_drag"] > 0.8
+    estimate = report.parameters["rotor_drag"]["d_xy"]
+    assert estimate.value == pytest.approx(DRAG["d_xy"], rel=0.1)
+    # 90 % intervals may miss; three half-widths may not.
+    half = 0.5 * (estimate.interval90[1] - estimate.interval90[0])
+    assert abs(estimate.value - DRAG["d_xy"]) < 3 * half < 0.01
+    assert report.gap.reduction > 0.3 and report.gap.interval90[0] > 0
+    assert report.where[0].channel.startswith("force") and report.where[0].after < report.where[0].before
+
+
+def test_nothing_is_named_where_nothing_is_wrong(reports):
+    report = reports["none"]
+    assert report.effects == () and report.verdict == "none"
+    assert report.probabilities["none"] > 0.5
+    assert abs(report.gap.reduction) < 0.05
+
+
+def test_a_cause_outside_the_library_is_unknown_not_its_neighbour(folders):
+    report = diagnose_case(load_case(folders["drag"]), without=("rotor_drag", "wind", "blade_flapping"))
+    assert report.verdict == "unknown" and report.effects[0] == "unknown"
+
+
+def test_mass_and_thrust_are_one_class_until_the_mass_is_weighed(reports):
+    assert reports["mass"].effects in (("mass",), ("thrust_scale",))
+    named = reports["mass"].effects[0]
+    assert {"mass": "thrust_scale", "thrust_scale": "mass"}[named] in reports["mass"].equivalent[named]
+    assert reports["weighed"].effects == ("thrust_scale",)
+
+
+def test_what_was_not_flown_is_not_testable(reports):
+    assert {"ground_effect", "ceiling_effect", "downwash"} <= set(reports["doublets"].not_testable)
+    assert "downwash" in reports["drag"].not_testable and "motor_lag" not in reports["drag"].not_testable
+
+
+def test_the_report_has_the_agreed_form(reports):
+    for report in reports.values():
+        data = json.loads(json.dumps(report.to_dict()))
+        assert data["verdict"] in VERDICTS
+        assert set(data["probabilities"]) == {*EFFECTS, "none", "unknown"}
+        assert sum(data["probabilities"].values()) == pytest.approx(1.0, abs=1e-4)
+        assert set(data["effects"]) <= {*EFFECTS, "unknown"}
+        for effect, values in data["parameters"].items():
+            for name, estimate in values.items():
+                assert estimate["unit"] == EFFECTS[effect].parameters[name].unit
+                assert estimate["interval90"][0] <= estimate["value"] <= estimate["interval90"][1]
+        assert all(p["channel"] in CHANNELS and p["regime"] in REGIMES for p in data["where"])
+        assert {"metric", "before", "after", "floor", "reduction", "interval90"} <= set(data["gap"])
+        assert set(data["not_testable"]) <= set(EFFECTS)
+        prediction = report.prediction()
+        assert set(prediction) == {"effects", "probabilities", "where", "reduction", "not_testable"}
+        assert sum(prediction["probabilities"].values()) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_the_command_writes_everything_or_nothing(folders, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert main([str(folders["drag"]), "--out", str(out), "--predictions", str(tmp_path / "p.json")]) == 0
+    names, parameters = load_effects(out / "drag" / "effects.toml")
+    assert names == ("rotor_drag",) and parameters["rotor_drag"]["d_xy"] == pytest.approx(
+        DRAG["d_xy"], rel=0.1
+    )
+    assert "<img" in (out / "drag" / "report.html").read_text()
+    assert json.loads((tmp_path / "p.json").read_text())["drag"]["effects"] == ["rotor_drag"]
+    assert sorted(p.name for p in out.iterdir()) == ["drag"]
+    capsys.readouterr()
+    assert main([str(folders["drag"]), "--out", str(out)]) == 2
+    assert "already exists" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", ["missing", "empty", "no_commands", "unknown_effect"])
+def test_bad_input_is_one_line_and_leaves_nothing(folders, tmp_path, capsys, kind):
+    folder, more = tmp_path / "case", []
+    if kind != "missing":
+        folder.mkdir()
+        (folder / "vehicle.toml").write_text(VEHICLE.format(weighed="false"))
+    if kind == "no_commands":
+        (folder / "a.csv").write_text(
+            "t,wx,wy,wz\n" + "".join(f"{k / 100},0.1,{k % 7},0\n" for k in range(500))
+        )
+    if kind == "unknown_effect":
+        folder, more = folders["none"], ["--without", "gremlins"]
+    assert main([str(folder), "--out", str(tmp_path / "out"), *more]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and error.count("\n") == 1
+    assert not (tmp_path / "out").exists() or not list((tmp_path / "out").iterdir())
