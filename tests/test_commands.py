@@ -12,12 +12,14 @@ import jax
 import numpy as np
 import pytest
 
+import openjax
 from openjax import benchmark, evaluate, train
 from openjax.runs import training
 from openjax.runs.checkpoints import Checkpoints, is_checkpoint, load_arrays
 from openjax.runs.command_line import run_command
 from openjax.runs.evaluation import FIELDS
 from openjax.runs.metrics import read_metrics
+from openjax.runs.policy_files import shipped_policies
 
 UPDATES = 24
 TINY = (
@@ -66,10 +68,21 @@ def finish(process, status=0):
 
 
 @pytest.fixture(scope="session")
-def whole_run(tmp_path_factory, shared_cache):
+def train_arguments(tmp_path_factory):
+    """The tiny run, in a simulator with effects and another vehicle, on all devices."""
+    directory = tmp_path_factory.mktemp("simulator")
+    effects, vehicle = directory / "effects.toml", directory / "vehicle.toml"
+    effects.write_text("[rotor_drag]\nd_xy = 0.01\n[command_latency]\ndelay = { value = 0.02, unit = 's' }\n")
+    vehicle.write_text("[vehicle]\nmass = 0.034\n")
+    files = ["--effects", str(effects), "--vehicle", str(vehicle)]
+    return ["openjax.train", *TINY, *STEPS, *files, "--devices", "all"]
+
+
+@pytest.fixture(scope="session")
+def whole_run(tmp_path_factory, shared_cache, train_arguments):
     """A run from start to end, and what it printed."""
     out = tmp_path_factory.mktemp("runs") / "whole"
-    return out, finish(start(["openjax.train", *TINY, *STEPS, "--out", str(out)], shared_cache))
+    return out, finish(start([*train_arguments, "--out", str(out)], shared_cache))
 
 
 def in_process(main, arguments, monkeypatch, capsys):
@@ -105,9 +118,11 @@ def test_train_shows_progress_and_leaves_what_the_readme_says(whole_run):
     assert layouts["machine"]["versions"]["jax"] == jax.__version__
 
 
-def test_killed_in_the_middle_of_a_checkpoint_and_resumed_equals_whole(whole_run, tmp_path, shared_cache):
+def test_killed_in_the_middle_of_a_checkpoint_and_resumed_equals_whole(
+    whole_run, tmp_path, shared_cache, train_arguments
+):
     out = tmp_path / "killed"
-    process = start(["openjax.train", *TINY, *STEPS, "--out", str(out)], shared_cache)
+    process = start([*train_arguments, "--out", str(out)], shared_cache)
     checkpoints = Checkpoints(out / "checkpoints")
     deadline = time.monotonic() + 200
     while time.monotonic() < deadline and process.poll() is None:
@@ -138,9 +153,9 @@ def test_killed_in_the_middle_of_a_checkpoint_and_resumed_equals_whole(whole_run
     assert losses[0] == losses[1]
 
 
-def test_signal_saves_and_exits_cleanly(whole_run, tmp_path, shared_cache):
+def test_signal_saves_and_exits_cleanly(whole_run, tmp_path, shared_cache, train_arguments):
     out = tmp_path / "stopped"
-    process = start(["openjax.train", *TINY, *STEPS, "--out", str(out)], shared_cache)
+    process = start([*train_arguments, "--out", str(out)], shared_cache)
     deadline = time.monotonic() + 200
     while time.monotonic() < deadline and process.poll() is None:
         if (out / "metrics.jsonl").exists() and (out / "metrics.jsonl").stat().st_size > 0:
@@ -158,13 +173,17 @@ COMPILES_ONCE = """
 import sys, jax
 from openjax.learning import TrainSettings, init_carry, make_training_step
 from openjax.runs.checkpoints import Checkpoints, abstract_like, place
+from openjax.runs.environments import make_environment
 from openjax.runs.loop import guarded
 from openjax.runs.run_directory import open_run
 
 run = open_run(sys.argv[1])
 settings = run.read_settings(TrainSettings)
-step = guarded(make_training_step(settings))
-carry = place(init_carry(settings, jax.random.key(0)))
+environment = make_environment(
+    settings.environment, run.optional("vehicle.toml"), run.optional("effects.toml")
+)
+step = guarded(make_training_step(settings, environment))
+carry = place(init_carry(settings, jax.random.key(0), environment))
 abstract = abstract_like(carry)
 for _ in range(10):
     carry, _, _ = step(carry)
@@ -233,6 +252,15 @@ def test_evaluate_prints_and_writes_the_records(whole_run, tmp_path, monkeypatch
         if scenario == "hidden":
             assert row == rows[-1]  # alone and among others alike
     assert row["scenario"] == "own"
+
+
+def test_shipped_policies_act():
+    environment = openjax.make()
+    observation, _ = jax.jit(environment.reset)(jax.random.key(0))
+    for name in shipped_policies():
+        action = openjax.load_policy(name)(observation)
+        assert action.shape == (3, 4) and bool((abs(action) <= 1).all()), name
+    assert "open" in shipped_policies()
 
 
 def test_benchmark_writes_table_and_file(tmp_path, shared_cache):
