@@ -160,7 +160,7 @@ def decide_from(paths: dict, effects: set[str], rest, settings: Settings) -> Dec
     total = sum(weights.values())
     posterior = {k: w / total for k, w in weights.items()}
     strong = strengths_of(paths)
-    unknown = unknown_probability(rest, paths, settings)
+    unknown = unknown_probability(rest, paths, effects, settings)
     probabilities = {e: 0.0 for e in effects}
     for key, p in posterior.items():
         if key:
@@ -171,31 +171,34 @@ def decide_from(paths: dict, effects: set[str], rest, settings: Settings) -> Dec
     return Decision(posterior, probabilities, tuple(sorted(best, key=lambda e: -strong.get(e, 0.0))), unknown)
 
 
-def unknown_features(rest, paths: dict, s: Settings) -> np.ndarray:
-    """The numbers that the unknown gate weighs: standardised looks at the rest, and what the best set
-    explains."""
-    mean, scale = np.asarray(s.rest_mean), np.asarray(s.rest_scale)
-    z = np.clip((np.asarray(rest) - mean) / scale, -3.0, 30.0)
-    bands, explained, uneven, incoherent = z[:18], np.asarray(rest)[18:24], z[24:30], np.asarray(rest)[30]
-    gain = max(paths["sets"].values())
+def unknown_features(rest, paths: dict, effects: set[str], s: Settings) -> np.ndarray:
+    """The numbers that the unknown gate weighs: the rest's bands against nominal flights, how much of it a
+    flexible model predicts, how unevenly it comes, how the flights agree, and how much was explained at
+    all."""
+    values = np.asarray(rest)
+    z = (values[:30] - np.asarray(s.rest_mean)[:30]) / np.asarray(s.rest_scale)[:30]
+    bands = np.log1p(np.clip(z[:18], 0.0, None))
+    motion, accelerometer = np.sort(bands[:12]), np.sort(bands[12:])
+    gain = max((g for k, g in paths["sets"].items() if set(k) <= effects), default=0.0)
     return np.array(
         [
-            np.log1p(max(bands.max(), 0.0)),
-            np.log1p(np.clip(np.sort(bands)[-4:], 0, None).mean()),
-            float(explained[:4].max()),
-            float(explained.max()),
-            np.log1p(max(uneven[:4].max(), 0.0)),
-            incoherent,
+            motion[-1],
+            motion[-3],
+            accelerometer[-1],
+            bands[[2, 5]].max(),
+            float(values[18:22].max()),
+            np.log1p(max(z[24:28].max(), 0.0)),
+            float(values[30]),
             np.log1p(max(gain, 0.0)) / 10.0,
         ]
     )
 
 
-def unknown_probability(rest, paths: dict, s: Settings) -> float:
+def unknown_probability(rest, paths: dict, effects: set[str], s: Settings) -> float:
     """Probability that something acts which the library doesn't hold."""
     if rest is None or not s.unknown_weights:
         return 0.0
-    x = unknown_features(rest, paths, s)
+    x = unknown_features(rest, paths, effects, s)
     return float(1.0 / (1.0 + np.exp(-(s.unknown_bias + np.asarray(s.unknown_weights) @ x))))
 
 

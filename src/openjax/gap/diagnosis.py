@@ -231,13 +231,9 @@ def _rest_in_words(rest: Rest) -> str:
 
 def _nuisances(evidence: Evidence, fit: SetFit) -> dict[str, str]:
     """What the nuisances took, as text, from the first track of each flight."""
+    numbers = [" ".join(key[:2]) for key in evidence.replay.numbers]
     names = (
-        "thrust offset",
-        "inertia xx",
-        "inertia yy",
-        "inertia zz",
-        "motor lag up",
-        "motor lag down",
+        *numbers,
         "motor clock",
         "frame tilt x",
         "frame tilt y",

@@ -12,7 +12,7 @@ from openjax.gap import estimator, firmware
 from openjax.gap.firmware import Radio
 from openjax.gap.flight import Case
 from openjax.gap.hypotheses import SetFit, fit_set, model_noise, score_of, weigh_sets
-from openjax.gap.library import ABSENT, PLACE, Library
+from openjax.gap.library import ABSENT, NUISANCES, PLACE, PWM_NUISANCES, Library
 from openjax.gap.linear_path import LinearPath
 from openjax.gap.observer import TICKS
 from openjax.gap.replay import Replay, make_replay
@@ -20,6 +20,16 @@ from openjax.gap.track import Track, tracks_of
 
 CLEAR_DELAY = 0.002  # s of pose delay above which the pose is moved before the physics is read
 CLEAR_SCORE = 3.0  # nats, likewise
+# Channels without which an effect can't be told, though it leaves a trace in others.
+NEEDS = {
+    "rotor_drag": "velocity",
+    "blade_flapping": "velocity",
+    "wind": "velocity",
+    "ground_effect": "position",
+    "ceiling_effect": "position",
+    "downwash": "position",
+    "battery_sag": "voltage",
+}
 WORTH_A_SECOND_LOOK = 30.0  # nats of the best set above none
 RADIO_COST = 15.0  # nats that a radio effect must gain before the rate loop is read with it
 
@@ -100,7 +110,8 @@ def gather(case: Case, library: Library, progress=None) -> Evidence:
         arrived = radio.arrived[max(allowed, key=lambda k: allowed[k] - RADIO_COST * len(k))]
     lap("paths")
     tell("replaying the flights")
-    found = _physics(tracks, vehicles, arrived, flight_of, library, None)
+    numbers = PWM_NUISANCES if case.vehicle_file.motor_command == "pwm" else NUISANCES
+    found = _physics(tracks, vehicles, arrived, flight_of, library, numbers, None)
     lap("first look")
     best = max((f for f in found[1].values() if isinstance(f, SetFit)), key=lambda f: f.score)
     if found[4] is not None and best.effects and best.score - found[1][()].score > WORTH_A_SECOND_LOOK:
@@ -112,7 +123,7 @@ def gather(case: Case, library: Library, progress=None) -> Evidence:
                 tracks, found[0].predict(best.theta[None]), found[0].predict(ABSENT[None]), strict=True
             )
         ]
-        found = _physics(tracks, vehicles, arrived, flight_of, library, pushes)
+        found = _physics(tracks, vehicles, arrived, flight_of, library, numbers, pushes)
         lap("second look")
     replay, sets, exposure, floor, rate_loop = found
     return Evidence(
@@ -120,12 +131,15 @@ def gather(case: Case, library: Library, progress=None) -> Evidence:
     )
 
 
-def _physics(tracks, vehicles, arrived, flight_of, library, pushes):
+def _physics(tracks, vehicles, arrived, flight_of, library, numbers, pushes):
     """Replay, scores of the sets, exposure, floor residuals and the rate loop's path."""
     rate_loop, ticks, surprise = None, [np.repeat(t.motor[:, None], TICKS, 1) for t in tracks], None
     if arrived is not None:
         loop = firmware.read_rate_loop(tracks, vehicles, arrived, flight_of, pushes)
         rate_loop, ticks, surprise = loop.path, loop.ticks, loop.surprise
-    replay = make_replay(tracks, vehicles, ticks, surprise)
+    replay = make_replay(tracks, vehicles, ticks, surprise, numbers)
     floor, exposure = model_noise(replay, library)
+    for effect, channel in NEEDS.items():
+        if any(getattr(t, channel) is None for t in tracks):
+            exposure[effect] = 0.0
     return replay, weigh_sets(replay, library, exposure), exposure, floor, rate_loop

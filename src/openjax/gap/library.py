@@ -86,7 +86,10 @@ FITS = {
             (_p("d_xy", 0.0, 0.015, 0.01, 1e-4, True), _p("d_z", 0.0, 0.012, 0.005, 1e-4, True)),
             companions=(("blade_flapping", "stiffness", 4e-5),),
         ),
-        Fit("blade_flapping", (_p("tilt", 0.0, 0.02, 0.005, 1e-4, True), _p("stiffness", 0.0, 2e-4, 3e-5, 1e-6))),
+        Fit(
+            "blade_flapping",
+            (_p("tilt", 0.0, 0.02, 0.005, 1e-4, True), _p("stiffness", 0.0, 2e-4, 3e-5, 1e-6)),
+        ),
         Fit(
             "wind",
             (
@@ -142,6 +145,20 @@ NUISANCES = (
     ("inertia", "zz", 0.01),
     ("motor_lag", "extra_up", 3e-4),
     ("motor_lag", "extra_down", 3e-4),
+)
+# With duty cycles for motor commands the map to thrust is a guess: scale, shape, lag and torques are free,
+# and what
+# they can imitate isn't testable.
+PWM_NUISANCES = (
+    ("thrust_scale", "scale", 0.3),
+    ("inertia", "xx", 0.2),
+    ("inertia", "yy", 0.2),
+    ("inertia", "zz", 0.2),
+    ("motor_lag", "extra_up", 0.01),
+    ("motor_lag", "extra_down", 0.01),
+    ("thrust_curve", "offset", 0.15),
+    ("thrust_curve", "curvature", 0.3),
+    ("yaw_torque", "ratio", 0.5),
 )
 MOTOR_SHIFT = 0.001  # s, standard deviation of the motors' clock offset
 

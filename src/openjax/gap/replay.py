@@ -76,6 +76,7 @@ class Replay:
     usable: np.ndarray
     noises: tuple[Noise, ...] = ()
     whitened_nuisances: list | None = None
+    numbers: tuple = NUISANCES  # the vehicle's numbers among the nuisances, which come first
     surprise_columns: int = 0  # the last so many nuisances are the controller as a sensor
 
     def predict(self, theta: np.ndarray, track: int | None = None) -> list[np.ndarray]:
@@ -112,7 +113,7 @@ class Replay:
     def loosen_calm_flights(self) -> None:
         """Free the torque per motor command where little is flown: what is left is feedback against gusts."""
         for number, columns in enumerate(self.nuisances):
-            for place, (effect, _, spread) in enumerate(NUISANCES):
+            for place, (effect, _, spread) in enumerate(self.numbers):
                 if effect == "inertia":
                     w = self.whitened_nuisances[number][place]
                     power = float((w * w).sum()) / spread**2 / w.shape[0]
@@ -195,7 +196,7 @@ def _integrated(rows: np.ndarray, dt: float) -> np.ndarray:
     return np.concatenate([integral, specific], 2)
 
 
-def make_replay(tracks, vehicles, motor_ticks, surprise=None) -> Replay:
+def make_replay(tracks, vehicles, motor_ticks, surprise=None, numbers=NUISANCES) -> Replay:
     """Replay of tracks with their nominal vehicles and motor commands (T, TICKS, 4) of the rate loop's ticks.
 
     surprise [(T, 3)]: what the rate controller did beyond foresight (`RateLoop`), a second sensor of the
@@ -218,9 +219,10 @@ def make_replay(tracks, vehicles, motor_ticks, surprise=None) -> Replay:
         flights,
         np.array([flights.index(t.flight) for t in tracks]),
         usable,
+        numbers=numbers,
     )
-    index = [PLACE[key[:2]] for key in NUISANCES] + [len(ABSENT) - 1]
-    spread = np.array([key[2] for key in NUISANCES] + [MOTOR_SHIFT])
+    index = [PLACE[key[:2]] for key in numbers] + [len(ABSENT) - 1]
+    spread = np.array([key[2] for key in numbers] + [MOTOR_SHIFT])
     batch = np.repeat(ABSENT[None], 1 + len(index), 0)
     batch[np.arange(len(index)) + 1, index] += STEP[index]
     for number, track in enumerate(tracks):
