@@ -25,7 +25,12 @@ CONDITIONS = {
     "no clamp, drawn starts": {"speed_limit": "none", "start_attitude": "drawn"},
 }
 # The paper's table and the goals of this project: capture rate, capture step, collision rate.
-PAPER = {"wall": (0.987, 480, 0.000), "narrow_gap": (1.0, 526, 0.017), "random": (1.0, 330, 0.011), "passage": (1.0, 330, 0.006)}
+PAPER = {
+    "wall": (0.987, 480, 0.000),
+    "narrow_gap": (1.0, 526, 0.017),
+    "random": (1.0, 330, 0.011),
+    "passage": (1.0, 330, 0.006),
+}
 GOAL_STEP = {"wall": 300, "narrow_gap": 260, "random": 260, "passage": 230}
 GOAL_COLLISION = {"wall": 0.0005, "narrow_gap": 0.017, "random": 0.011, "passage": 0.006}
 PAPER_PREDICTION = {"wall": 0.054, "narrow_gap": 0.084, "random": 0.109, "passage": 0.081}
@@ -79,20 +84,39 @@ def main() -> None:
         "checkpoints. How the policies were trained: h200_runs.md.",
     ]
     for condition, by_policy in records.items():
-        lines += ["", f"## {condition}", "", "| layout | capture rate, lowest seed | capture rate | capture step | "
-                  "collision rate | crash rate | over speed | goals: step, collisions | paper: rate, step, collisions |",
-                  "|---|---|---|---|---|---|---|---|---|"]
+        lines += [
+            "",
+            f"## {condition}",
+            "",
+            "| layout | capture rate, lowest seed | capture rate | capture step | "
+            "collision rate | crash rate | over speed | goals: step, collisions | paper: rate, step, collisions |",
+            "|---|---|---|---|---|---|---|---|---|",
+        ]
         for i, layout in enumerate(SCENARIOS):
             rows = [by_policy[name][i] for name in SEEDS]
             goal = f"≤ {GOAL_STEP[layout]}, ≤ {GOAL_COLLISION[layout]}" if layout in GOAL_STEP else "–"
             paper = "{:.3f}, {}, {:.3f}".format(*PAPER[layout]) if layout in PAPER else "–"
             lines.append(
                 f"| {layout} | {min(row['capture_rate'] for row in rows):.2f} | "
-                + " | ".join(across_seeds(rows, f) for f in ("capture_rate", "capture_step", "collision_rate", "crash_rate", "over_speed_rate"))
+                + " | ".join(
+                    across_seeds(rows, f)
+                    for f in (
+                        "capture_rate",
+                        "capture_step",
+                        "collision_rate",
+                        "crash_rate",
+                        "over_speed_rate",
+                    )
+                )
                 + f" | {goal} | {paper} |"
             )
-    lines += ["", "## Prediction of the next position (m), clamp, drawn starts", "",
-              "| layout | predictor | keeping the last seen position | paper |", "|---|---|---|---|"]
+    lines += [
+        "",
+        "## Prediction of the next position (m), clamp, drawn starts",
+        "",
+        "| layout | predictor | keeping the last seen position | paper |",
+        "|---|---|---|---|",
+    ]
     for i, layout in enumerate(SCENARIOS):
         rows = [records["clamp, drawn starts"][name][i] for name in SEEDS]
         lines.append(

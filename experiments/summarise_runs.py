@@ -40,16 +40,23 @@ def main() -> None:
     runs = {name: summary(Path(path)) for name, _, path in (run.partition("=") for run in arguments.runs)}
     write_json(arguments.out, {"note": arguments.note, "commit": arguments.commit, "runs": runs})
     lines = ["# Training runs", "", f"{arguments.note} Commit {arguments.commit}.", ""]
-    lines += ["| run | env steps | seconds, compilation included | held-back capture ≥ .95 | ≥ .99 | held-back capture, "
-              "collisions at the end |", "|---|---|---|---|---|---|"]
+    lines += [
+        "| run | env steps | seconds, compilation included | held-back capture ≥ .95 | ≥ .99 | held-back capture, "
+        "collisions at the end |",
+        "|---|---|---|---|---|---|",
+    ]
     for name, run in runs.items():
         last = run["evaluations"][-1]
         lines.append(
             f"| {name} | {last['steps'] / 1e6:.0f} M | {last['seconds']:.0f} | {first_reaching(run['evaluations'], 0.95)} | "
             f"{first_reaching(run['evaluations'], 0.99)} | {last['capture_rate']:.3f}, {last['collision_rate']:.4f} |"
         )
-    lines += ["", "Layouts after training, evaluated on the same machine (capture rate / capture step / collision rate / "
-              "crash rate):", ""]
+    lines += [
+        "",
+        "Layouts after training, evaluated on the same machine (capture rate / capture step / collision rate / "
+        "crash rate):",
+        "",
+    ]
     names = [row["scenario"] for row in next(iter(runs.values()))["layouts"]["after"]]
     lines += ["| run | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
     for name, run in runs.items():

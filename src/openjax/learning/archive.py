@@ -36,7 +36,8 @@ def descriptor(tasks: Task) -> jax.Array:
     pillars = jnp.where(tasks.pillar_active[..., None], tasks.pillar_position, 0.0)
     m = pillars.shape[0]
     return jnp.concatenate(
-        [tasks.pursuer_position.reshape(m, -1), tasks.evader_position.reshape(m, -1), pillars.reshape(m, -1)], axis=-1
+        [tasks.pursuer_position.reshape(m, -1), tasks.evader_position.reshape(m, -1), pillars.reshape(m, -1)],
+        axis=-1,
     )
 
 

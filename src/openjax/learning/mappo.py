@@ -59,9 +59,7 @@ def make_optimiser(
     schedule = optax.linear_schedule(settings.learning_rate, 0.0, steps)
 
     def one():
-        return optax.chain(
-            optax.clip_by_global_norm(settings.gradient_norm), optax.adam(schedule, eps=1e-5)
-        )
+        return optax.chain(optax.clip_by_global_norm(settings.gradient_norm), optax.adam(schedule, eps=1e-5))
 
     return one(), one()
 
@@ -164,7 +162,9 @@ def update_policy(
         (actor_loss, watch), actor_gradient = jax.value_and_grad(
             lambda p: policy_loss(settings, policy, p, part), has_aux=True
         )(actor)
-        critic_loss, critic_gradient = jax.value_and_grad(lambda p: value_loss(settings, policy, p, part))(critic)
+        critic_loss, critic_gradient = jax.value_and_grad(lambda p: value_loss(settings, policy, p, part))(
+            critic
+        )
         watch |= {"policy_loss": actor_loss, "value_loss": critic_loss}
         actor_gradient, critic_gradient, watch = mean_over_devices(
             (actor_gradient, critic_gradient, watch), axis

@@ -68,7 +68,9 @@ def _initial_carry(settings, parts, key):
     environment = parts.environment
     archive = empty_archive(settings.environment, settings.generator.capacity)
     key, policy_key, task_key, reset_key = jax.random.split(key, 4)
-    tasks = _tasks(settings, archive, jax.random.split(task_key, settings.num_envs // settings.episodes_per_task))
+    tasks = _tasks(
+        settings, archive, jax.random.split(task_key, settings.num_envs // settings.episodes_per_task)
+    )
     # environment e belongs to start group e mod G; within a group, neighbours share a task
     groups = settings.start_groups
     tasks = jax.tree.map(lambda x: jnp.moveaxis(x.reshape(groups, -1, *x.shape[1:]), 0, 1), tasks)

@@ -21,7 +21,10 @@ class Actor(nn.Module):
         """Observation of (..., N) pursuers, predicted (..., K, 3) positions or None -> mean (..., N, 4), log_std (4,)."""
         settings = self.settings
         hidden = Encoder(settings.features, settings.heads, jnp.dtype(settings.compute_type), name="encoder")(
-            own_features(observation, predicted), observation.others, observation.pillars, observation.pillar_seen
+            own_features(observation, predicted),
+            observation.others,
+            observation.pillars,
+            observation.pillar_seen,
         )
         start = jnp.array(self.initial_action, jnp.float32)
         mean = nn.Dense(

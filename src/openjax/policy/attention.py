@@ -53,7 +53,9 @@ class Layout(NamedTuple):
         return sum(kind.count * kind.size for kind in self.kinds)
 
 
-def attend(query: jax.Array, own: jax.Array, inputs: jax.Array, weights: jax.Array, layout: Layout) -> jax.Array:
+def attend(
+    query: jax.Array, own: jax.Array, inputs: jax.Array, weights: jax.Array, layout: Layout
+) -> jax.Array:
     """Weighted mean of entities for each head.
 
     Entity 0 is `own`; entity m is activation(W' x_m + b) with the weights of its kind. With score
@@ -273,9 +275,16 @@ def _backward_kernel_call(layout, query, own, inputs, weights, gradient, interpr
         weight_grads.append(jnp.einsum("mib,mbf->if", x, part, preferred_element_type=jnp.float32))
         kernel = weights[first : first + size].astype(part.dtype)
         input_grads.append(
-            jnp.einsum("mbf,if->mib", part, kernel, preferred_element_type=jnp.float32).reshape(-1, part.shape[1])
+            jnp.einsum("mbf,if->mib", part, kernel, preferred_element_type=jnp.float32).reshape(
+                -1, part.shape[1]
+            )
         )
         start, first = start + kind.count, first + size + 1
     # the scores' biases mask, they are not learnt
     input_grads.append(jnp.zeros((number, inputs.shape[1]), inputs.dtype))
-    return dquery[:batch], down[:batch], jnp.concatenate(input_grads)[:, :batch], jnp.concatenate(weight_grads)
+    return (
+        dquery[:batch],
+        down[:batch],
+        jnp.concatenate(input_grads)[:, :batch],
+        jnp.concatenate(weight_grads),
+    )

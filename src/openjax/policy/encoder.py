@@ -23,7 +23,9 @@ class SelfAttention(nn.Module):
     dtype: jnp.dtype
 
     @nn.compact
-    def __call__(self, own: jax.Array, others: jax.Array, pillars: jax.Array, pillar_seen: jax.Array) -> jax.Array:
+    def __call__(
+        self, own: jax.Array, others: jax.Array, pillars: jax.Array, pillar_seen: jax.Array
+    ) -> jax.Array:
         """own (B, F) embedded; others (B, A, 3), pillars (B, k, 5) as observed; pillar_seen (B, k) bool -> (B, F)."""
         f, h = self.features, self.heads
         width = f // h
@@ -90,7 +92,9 @@ def normalised_linear(x: jax.Array, linear: jax.Array) -> tuple[jax.Array, jax.A
     x = jnp.concatenate([x, jnp.ones_like(x[..., :1])], axis=-1)
     centred = linear - jnp.mean(linear, axis=1, keepdims=True)
     covariance = jnp.matmul(centred, centred.T, precision=jax.lax.Precision.HIGHEST) / linear.shape[1]
-    variance = jnp.sum(jnp.matmul(x, covariance, precision=jax.lax.Precision.HIGHEST) * x, axis=-1, keepdims=True)
+    variance = jnp.sum(
+        jnp.matmul(x, covariance, precision=jax.lax.Precision.HIGHEST) * x, axis=-1, keepdims=True
+    )
     return x * jax.lax.rsqrt(variance + 1e-6), centred
 
 

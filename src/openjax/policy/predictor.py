@@ -27,7 +27,9 @@ class EvaderPredictor(nn.Module):
             in_gate, forget_gate, candidate, out_gate = jnp.split(gates, 4, axis=-1)
             cell = jax.nn.sigmoid(forget_gate + 1.0) * cell + jax.nn.sigmoid(in_gate) * jnp.tanh(candidate)
             hidden = jax.nn.sigmoid(out_gate) * jnp.tanh(cell)
-        output = nn.Dense(3 * len(horizons), kernel_init=nn.initializers.orthogonal(0.1), name="output")(hidden)
+        output = nn.Dense(3 * len(horizons), kernel_init=nn.initializers.orthogonal(0.1), name="output")(
+            hidden
+        )
         output = output.reshape(*output.shape[:-1], len(horizons), 3)
         scale = jnp.array([self.arena_radius, self.arena_radius, self.arena_height / 2], jnp.float32)
         if self.settings.relative:

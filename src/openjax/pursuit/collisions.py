@@ -72,6 +72,8 @@ def crashed(
     """
     reach = SOLID_RADIUS + TOUCH + margin
     on_floor = position[:, 2] < reach
-    on_pillar = jnp.any(pillar_active & (pillar_distance(settings, position, pillar_position) < reach), axis=-1)
+    on_pillar = jnp.any(
+        pillar_active & (pillar_distance(settings, position, pillar_position) < reach), axis=-1
+    )
     on_drone = jnp.any(drone_distance(position) < SOLID_RADIUS + reach, axis=-1)
     return on_floor | on_pillar | on_drone | (body_z_up < margin)

@@ -109,7 +109,9 @@ class Pursuit:
         step = jnp.zeros((), jnp.int32)
         middle = jnp.array([0.0, 0.0, settings.arena_height / 2], jnp.float32)
         first = frame(settings, step, task.pursuer_position, task.evader_position, still, seen)
-        frames = jnp.broadcast_to(first, (settings.history_length * settings.history_spacing, settings.frame_size))
+        frames = jnp.broadcast_to(
+            first, (settings.history_length * settings.history_spacing, settings.frame_size)
+        )
         state = PursuitState(
             task=task,
             drones=drones,

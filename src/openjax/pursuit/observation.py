@@ -12,11 +12,15 @@ from openjax.pursuit.settings import HIDDEN, PursuitSettings
 class Observation:
     """Observation of N pursuers. Relative positions point from the entity to the pursuer (p_i - p_entity), in metres."""
 
-    self_state: jax.Array  # (N, S) evader, quaternion wxyz, velocity, body x axis, body z axis, t/T x 4 [, position]
+    self_state: (
+        jax.Array
+    )  # (N, S) evader, quaternion wxyz, velocity, body x axis, body z axis, t/T x 4 [, position]
     others: jax.Array  # (N, N - 1, 3) the other pursuers
     pillars: jax.Array  # (N, k, 5) nearest pillars: position relative to their centre (3), height, radius
     pillar_seen: jax.Array  # (N, k) bool, slots in use
-    privileged: jax.Array  # (N, 10) true relative evader position, its velocity, own position, seen: for the critic
+    privileged: (
+        jax.Array
+    )  # (N, 10) true relative evader position, its velocity, own position, seen: for the critic
     position: jax.Array  # (N, 3) own positions, to express predicted positions relative to them
     last_seen: jax.Array  # (3,) where the evader was last seen
     frames: jax.Array  # (n, F) history for the predictor, oldest first

@@ -63,7 +63,9 @@ SCENARIOS: dict[str, Scenario] = {
             (0.0, 0.6),
         ),
         _layout("empty", (), _RIGHT, (-0.8, 0.0)),
-        _layout("hidden", ((0.0, 0.0), (0.0, 0.2), (0.0, -0.2), (-0.4, 0.4), (-0.4, -0.4)), _RIGHT, (-0.8, 0.0)),
+        _layout(
+            "hidden", ((0.0, 0.0), (0.0, 0.2), (0.0, -0.2), (-0.4, 0.4), (-0.4, -0.4)), _RIGHT, (-0.8, 0.0)
+        ),
     )
 }
 
@@ -72,7 +74,10 @@ def scenario_settings(settings: PursuitSettings, scenario: Scenario) -> PursuitS
     """The settings with as many pursuers and pillar slots as the scenario has (at least one slot)."""
     slots = max(1, len(scenario.pillars))
     return dataclasses.replace(
-        settings, num_pursuers=len(scenario.pursuers), max_pillars=slots, min_pillars=min(settings.min_pillars, slots)
+        settings,
+        num_pursuers=len(scenario.pursuers),
+        max_pillars=slots,
+        min_pillars=min(settings.min_pillars, slots),
     )
 
 
@@ -80,7 +85,9 @@ def scenario_task(settings: PursuitSettings, scenario: Scenario) -> Task:
     """The scenario as a task with `settings.max_pillars` slots."""
     slots, used = settings.max_pillars, len(scenario.pillars)
     if used > slots:
-        raise UserError(f"scenario {scenario.name}: {used} pillars do not fit into {slots} slots (max_pillars)")
+        raise UserError(
+            f"scenario {scenario.name}: {used} pillars do not fit into {slots} slots (max_pillars)"
+        )
     if len(scenario.pursuers) != settings.num_pursuers:
         raise UserError(
             f"scenario {scenario.name}: has {len(scenario.pursuers)} pursuers, the environment {settings.num_pursuers}"
@@ -117,7 +124,9 @@ def find_scenario(name_or_path: str, settings: PursuitSettings) -> Scenario:
         raise UserError(f"scenario {path}: is not valid TOML ({error})") from error
     unknown = sorted(set(data) - {"name", "pillars", "pursuers", "evader"})
     if unknown:
-        raise UserError(f"scenario {path}: unknown key {unknown[0]}; possible are name, pillars, pursuers, evader")
+        raise UserError(
+            f"scenario {path}: unknown key {unknown[0]}; possible are name, pillars, pursuers, evader"
+        )
     scenario = Scenario(
         name=str(data.get("name", path.stem)),
         pillars=_points(path, data, "pillars", 2, ()),
@@ -137,7 +146,9 @@ def _points(path, data, key, size, default):
     points = []
     for value in values:
         good = isinstance(value, list) and len(value) == size
-        good = good and all(isinstance(x, int | float) and not isinstance(x, bool) and np.isfinite(x) for x in value)
+        good = good and all(
+            isinstance(x, int | float) and not isinstance(x, bool) and np.isfinite(x) for x in value
+        )
         if not good:
             raise UserError(f"scenario {path}: {key} holds {value}; a point is {size} numbers in metres")
         points.append(tuple(float(x) for x in value))
@@ -150,8 +161,12 @@ def _check(path, scenario, settings):
     radius, height = settings.arena_radius, settings.arena_height
     for x, y in scenario.pillars:
         if np.hypot(x, y) > radius:
-            raise UserError(f"scenario {path}: pillar ({x}, {y}) stands outside the arena of radius {radius} m")
-    starts = {f"pursuer {i + 1}": p for i, p in enumerate(scenario.pursuers)} | {"the evader": scenario.evader}
+            raise UserError(
+                f"scenario {path}: pillar ({x}, {y}) stands outside the arena of radius {radius} m"
+            )
+    starts = {f"pursuer {i + 1}": p for i, p in enumerate(scenario.pursuers)} | {
+        "the evader": scenario.evader
+    }
     for who, (x, y, z) in starts.items():
         if np.hypot(x, y) > radius or not 0.0 < z < height:
             raise UserError(
@@ -160,7 +175,9 @@ def _check(path, scenario, settings):
         for px, py in scenario.pillars:
             reach = settings.pillar_radius + SOLID_RADIUS
             if np.hypot(x - px, y - py) < reach:
-                raise UserError(f"scenario {path}: pillar ({px}, {py}) stands over the start of {who} (within {reach} m)")
+                raise UserError(
+                    f"scenario {path}: pillar ({px}, {py}) stands over the start of {who} (within {reach} m)"
+                )
     for i, a in enumerate(scenario.pursuers):
         for b in scenario.pursuers[:i]:
             if np.linalg.norm(np.subtract(a, b)) < 2 * SOLID_RADIUS:

@@ -92,7 +92,9 @@ class PursuitSettings:
         )
         need(self.episode_length >= 1, f"episode_length is {self.episode_length}; it must be at least 1")
         need(self.substeps >= 1, f"substeps is {self.substeps}; it must be at least 1")
-        need(self.observed_pillars >= 1, f"observed_pillars is {self.observed_pillars}; it must be at least 1")
+        need(
+            self.observed_pillars >= 1, f"observed_pillars is {self.observed_pillars}; it must be at least 1"
+        )
         need(self.history_length >= 1, f"history_length is {self.history_length}; it must be at least 1")
         need(self.history_spacing >= 1, f"history_spacing is {self.history_spacing}; it must be at least 1")
         for name in (

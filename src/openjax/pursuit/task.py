@@ -36,7 +36,9 @@ def starts_clear(settings: PursuitSettings, task: Task) -> jax.Array:
     """Whether no pursuer starts in a breach and the evader starts outside all pillars. () bool."""
     breach = breaches(settings, task.pursuer_position, task.pillar_position, task.pillar_active)
     distance = jnp.linalg.norm(task.evader_position[:2] - task.pillar_position, axis=-1)
-    evader_blocked = jnp.any(task.pillar_active & (distance < settings.pillar_radius + settings.pillar_clearance))
+    evader_blocked = jnp.any(
+        task.pillar_active & (distance < settings.pillar_radius + settings.pillar_clearance)
+    )
     return ~(jnp.any(breach.total > 0) | evader_blocked)
 
 
