@@ -1,12 +1,12 @@
 """openjax: multi-quadrotor pursuit-evasion in JAX, trained in one compiled step, with a diagnosis of the sim-to-real gap.
 
-    import jax, openjax
-    environment = openjax.make(num_pursuers=3)
-    observation, state = environment.reset(jax.random.key(0))
-    policy = openjax.load_policy("open")
-    observation, state, reward, terminated, truncated, info = environment.step(
-        jax.random.key(1), state, policy(observation)
-    )
+import jax, openjax
+environment = openjax.make(num_pursuers=3)
+observation, state = environment.reset(jax.random.key(0))
+policy = openjax.load_policy("open")
+observation, state, reward, terminated, truncated, info = environment.step(
+    jax.random.key(1), state, policy(observation)
+)
 """
 
 import importlib

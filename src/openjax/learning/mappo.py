@@ -119,7 +119,7 @@ def update_policy(
     Returns:
         (actor, critic), optimiser states, value scale, dict of () metrics.
     """
-    actor, critic = parameters
+    critic = parameters[1]
     mean, std = scale.moments
     value = mean + std * policy.value(critic, rollout.observation, rollout.predicted)
     last_value = mean + std * policy.value(critic, last, last_predicted)
