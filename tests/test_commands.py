@@ -254,13 +254,17 @@ def test_evaluate_prints_and_writes_the_records(whole_run, tmp_path, monkeypatch
     assert row["scenario"] == "own"
 
 
-def test_shipped_policies_act():
-    environment = openjax.make()
-    observation, _ = jax.jit(environment.reset)(jax.random.key(0))
-    for name in shipped_policies():
-        action = openjax.load_policy(name)(observation)
-        assert action.shape == (3, 4) and bool((abs(action) <= 1).all()), name
+def test_shipped_policies_act_in_their_game_and_refuse_another():
     assert "open" in shipped_policies()
+    for name in shipped_policies():
+        policy = openjax.load_policy(name)
+        environment = openjax.make(policy.settings.environment, speed_limit="none")
+        observation, _ = jax.jit(environment.reset)(jax.random.key(0))
+        action = policy(observation)
+        assert action.shape == (3, 4) and bool((abs(action) <= 1).all()), name
+    other = openjax.make(policy.settings.environment, history_length=3)
+    with pytest.raises(openjax.UserError, match="make its game with"):
+        policy(jax.eval_shape(other.reset, jax.random.key(0))[0])
 
 
 def test_benchmark_writes_table_and_file(tmp_path, shared_cache):

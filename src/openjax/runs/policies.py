@@ -17,7 +17,7 @@ from openjax.runs.settings_files import from_plain
 
 @dataclasses.dataclass(frozen=True)
 class LoadedPolicy:
-    """A trained policy; call it with an observation."""
+    """A trained policy, called with observations of its game: `openjax.make(policy.settings.environment)`."""
 
     policy: Policy
     parameters: PolicyParameters
@@ -26,7 +26,19 @@ class LoadedPolicy:
     source: str
 
     def __call__(self, observation: Observation) -> jax.Array:
-        """The mean policy's action (..., N, 4) in -1..1: collective thrust, roll, pitch and yaw rate."""
+        """The mean policy's action (..., N, 4) in -1..1: collective thrust, roll, pitch and yaw rate.
+
+        Raises:
+          UserError: the observation is that of another game.
+        """
+        game = self.settings.environment
+        given = (observation.self_state.shape[-1], *observation.frames.shape[-2:])
+        expected = (game.self_size, game.history_length, game.frame_size)
+        if given != expected:
+            raise UserError(
+                f"policy {self.source} observes {expected} numbers (own state, history), here are {given}; "
+                "make its game with openjax.make(policy.settings.environment)"
+            )
         return self.policy.act(self.parameters, observation)
 
 
