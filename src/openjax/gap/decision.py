@@ -21,6 +21,17 @@ from openjax.gap.rest import Rest
 SETTINGS_FILE = Path(__file__).with_name("decision.json")
 
 
+# Effects that stand in for one another: two of a family at once are rarely more than one of them in another form.
+FAMILIES = (
+    {"mass", "thrust_scale", "battery_sag"},
+    {"rotor_drag", "wind", "blade_flapping"},
+    {"motor_imbalance", "com_offset"},
+    {"inertia", "yaw_torque"},
+    {"thrust_curve", "thrust_saturation", "battery_sag"},
+    {"ground_effect", "ceiling_effect"},
+)
+
+
 @dataclass(frozen=True)
 class Settings:
     """All numbers of the decision. Temperatures divide nats; costs are nats; shares are of the stronger
@@ -37,6 +48,7 @@ class Settings:
     least_loss: float = 0.006
     second_share: float = 0.01
     cross_share: float = 0.005
+    family_cost: float = 12.0
     prior_none: float = 0.3
     prior_sizes: tuple[float, ...] = (0.5, 0.17, 0.03)
     testable: float = 6.0
@@ -102,8 +114,12 @@ def combine(paths: dict, effects: set[str], s: Settings) -> dict[tuple[str, ...]
             if len(key) > 1
             else 0.0
         )
+        related = sum(len(family & set(key)) > 1 for family in FAMILIES)
         physics[key] = (
-            gain / s.temperature - s.effect_cost * len(key) - s.second_share * max(rest, 0.0) * (len(key) > 1)
+            gain / s.temperature
+            - s.effect_cost * len(key)
+            - s.second_share * max(rest, 0.0) * (len(key) > 1)
+            - s.family_cost * related
         )
     strongest = max(max(gains.values()), 0.0)
     others = {(): 0.0}
@@ -190,8 +206,20 @@ def unknown_features(rest, paths: dict, effects: set[str], s: Settings) -> np.nd
             np.log1p(max(z[24:28].max(), 0.0)),
             float(values[30]),
             np.log1p(max(gain, 0.0)) / 10.0,
+            np.log1p(_unexplained(paths, effects)),
         ]
     )
+
+
+def _unexplained(paths: dict, effects: set[str]) -> float:
+    """Nats by which radio and pose ask for an effect that the library lacks."""
+    total = 0.0
+    if paths["radio"] is not None:
+        gain, _ = paths["radio"]
+        total += max(gain.values()) - max(v for k, v in gain.items() if set(k) <= effects)
+    if paths["pose"] is not None and "state_latency" not in effects:
+        total += max(paths["pose"], 0.0)
+    return total
 
 
 def unknown_probability(rest, paths: dict, effects: set[str], s: Settings) -> float:

@@ -29,6 +29,7 @@ BATCH = 8
 # Nuisances and their standard deviations; see GAP: free in every hypothesis.
 TILT = np.radians(0.5)  # between tracked frame and thrust axis
 IMU_TILT = 0.01  # rad, between the IMU's axes and the body's
+GYROSCOPIC = 0.1  # relative to the moments of inertia
 DAMPING = 0.15  # 1/s, of the body rates by what the rotors do
 ACCELEROMETER_BIAS = 0.4  # m/s^2
 POSE_SHIFT = 0.0015  # s between motion capture and the vehicle's clock
@@ -280,8 +281,8 @@ def _measured(track: Track) -> np.ndarray:
 
 
 def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> list[np.ndarray]:
-    """Tilt of the tracked frame (2), accelerometer bias (3), tilt of the IMU (3), damping (2), clock of
-    the motion capture: columns (T, 9)."""
+    """Tilt of the tracked frame (2), accelerometer bias (3), tilt of the IMU (3), gyroscopic torques (3),
+    damping (2), clock of the motion capture: columns (T, 9)."""
     rows = len(track)
     turn = rotation(np.asarray(path.quaternion, float)[:rows])
     specific = np.gradient(nominal[:, VELOCITY], track.dt, axis=0) + np.array([0.0, 0.0, 9.81])
@@ -304,6 +305,10 @@ def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> list[np.
         column[:, RATES] = -np.cross(axis, rates - rates[0])
         column[:, FORCE] = -np.cross(axis, force)
         columns.append(column * IMU_TILT)
+    for axis in range(3):  # gyroscopic torques, with the rates as the gyroscope has them
+        column = np.zeros((rows, 9))
+        column[:, axis] = np.cumsum(rates[:, axis - 2] * rates[:, axis - 1]) * track.dt
+        columns.append(column * GYROSCOPIC)
     for axes in ((0, 1), (2,)):  # damping of the body rates
         column = np.zeros((rows, 9))
         column[:, axes] = -np.cumsum(rates, 0)[:, axes] * track.dt
