@@ -10,7 +10,7 @@ train: $(READY)
 	$(BIN)/python -m openjax.train --out runs/train --overwrite $(ARGS)
 
 test: $(READY)
-	$(BIN)/python -m pytest -n 2 $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
 
 lint: $(READY)
 	$(BIN)/ruff check src tests experiments
@@ -20,7 +20,7 @@ benchmark: $(READY)
 	$(BIN)/python -m openjax.benchmark $(ARGS)
 
 evaluate: $(READY)
-	$(BIN)/python -m openjax.evaluate --scenario all $(ARGS)
+	$(BIN)/python -m openjax.evaluate --policy open open_seed_0 open_seed_1 --scenario all $(ARGS)
 
 withheld: $(READY)
 	$(BIN)/python experiments/withheld/run.py $(ARGS)

@@ -99,7 +99,7 @@ def make_training_step(
 ) -> Callable[[TrainCarry], tuple[TrainCarry, dict[str, jax.Array]]]:
     """The training step `carry -> (carry, metrics)`; compile it with `jax.jit(step, donate_argnums=0)`.
 
-    `axis` names the axis of devices when it runs under `shard_map` (see `openjax.learning.parallel`).
+    `axis` names the axis of devices when it runs under `shard_map` (see `openjax.runs.devices`).
     Metrics are () float32, counted over the rollout or over the episodes that ended with it.
     """
     parts = build(settings, environment)
