@@ -66,7 +66,7 @@ def update_predictor(
     )
 
     def loss(parameters, frames, last_seen, positions):
-        predicted = policy._predictor.apply(parameters, frames, last_seen)
+        predicted = policy.predict_from(parameters, frames, last_seen)
         return jnp.mean((predicted - positions) ** 2)
 
     def one(carry, batch):

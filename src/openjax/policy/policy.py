@@ -76,7 +76,11 @@ class Policy:
         """Predicted evader positions (..., K, 3) in the world (m); None without a predictor."""
         if not self.predictor.enabled:
             return None
-        return self._predictor.apply(parameters.predictor, observation.frames, observation.last_seen)
+        return self.predict_from(parameters.predictor, observation.frames, observation.last_seen)
+
+    def predict_from(self, predictor: Any, frames: jax.Array, last_seen: jax.Array) -> jax.Array:
+        """Positions (..., K, 3) predicted from windows of frames (..., n, F) and last seen positions (..., 3)."""
+        return self._predictor.apply(predictor, frames, last_seen)
 
     def distribution(
         self, actor: Any, observation: Observation, predicted: jax.Array | None
