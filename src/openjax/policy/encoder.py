@@ -1,5 +1,7 @@
 """The attention-based observation encoder (the paper's section IV-B, figure 3)."""
 
+import math
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -114,7 +116,8 @@ class Encoder(nn.Module):
         rows = len(leading)
 
         def flat(x):
-            return x.reshape(-1, *x.shape[rows:])
+            # not -1: with a single pursuer there are no others, and nothing to tell the size from
+            return x.reshape(math.prod(leading), *x.shape[rows:])
 
         own = self._layer("self_1", flat(self_state))
         own = self._layer("self_2", own)
