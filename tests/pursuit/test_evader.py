@@ -37,7 +37,10 @@ def along(force):
         (dict(evader=(0.5, 0.0, 0.6)), (-1 / 0.4, 0, 0)),
         (dict(evader=(0.3, 0.4, 0.4)), (-0.6 / 0.4, -0.8 / 0.4, 1 / 0.4 - 1 / 0.8)),
         (dict(evader=MIDDLE, pursuers=[(0.3, 0, 0.2)], in_sight=[True]), (-0.3 / 0.25, 0, 0.4 / 0.25)),
-        (dict(evader=(0.3, 0, 0.5), pursuers=[(0.3, -0.5, 0.5)], in_sight=[False]), (-1 / 0.6, 0, 2 - 1 / 0.7)),
+        (
+            dict(evader=(0.3, 0, 0.5), pursuers=[(0.3, -0.5, 0.5)], in_sight=[False]),
+            (-1 / 0.6, 0, 2 - 1 / 0.7),
+        ),
         (
             dict(evader=(0.3, 0, 0.6), pursuers=[(0.3, -0.5, 0.6), (0, 0, 0.6)], in_sight=[True, False]),
             (-1 / 0.6, 2, 0),
@@ -97,7 +100,9 @@ def flee(settings):
 
 def test_turning_the_scene_turns_the_velocity(scenes):
     angle = 0.7
-    turn = jnp.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]], jnp.float32)
+    turn = jnp.array(
+        [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]], jnp.float32
+    )
 
     def turned(x):
         return jnp.matmul(x, turn[: x.shape[-1], : x.shape[-1]].T, precision="highest")

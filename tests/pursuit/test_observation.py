@@ -108,7 +108,12 @@ def test_body_axes():
 def test_frame_of_the_history(seen):
     settings = PursuitSettings(episode_length=400)
     numbers = frame(
-        settings, jnp.int32(100), jnp.asarray(POSITION), jnp.asarray(EVADER), jnp.array([1.0, 2.0, 3.0]), jnp.asarray(seen)
+        settings,
+        jnp.int32(100),
+        jnp.asarray(POSITION),
+        jnp.asarray(EVADER),
+        jnp.array([1.0, 2.0, 3.0]),
+        jnp.asarray(seen),
     )
     evader = [*EVADER, 1, 2, 3] if seen else [-5] * 6
     np.testing.assert_allclose(numbers, [0.25, *evader, *POSITION.ravel()], atol=1e-6)

@@ -100,7 +100,9 @@ def test_drones_too_close_and_touching(play):
     statistics, reward, info = play(task(near, (0, 0, 0.6)))
     assert statistics.drone_steps == 4 and not statistics.crashed
     np.testing.assert_array_equal(info.breaches.drone, [[1, 1, 0]] * 4)
-    np.testing.assert_allclose(reward[0], 2 - 0.1 * np.array([0.5, np.hypot(0.5, 0.12), 0.5]) - [10, 10, 0], atol=1e-4)
+    np.testing.assert_allclose(
+        reward[0], 2 - 0.1 * np.array([0.5, np.hypot(0.5, 0.12), 0.5]) - [10, 10, 0], atol=1e-4
+    )
     touching = [(0.5, 0, 0.6), (0.5, 0.095, 0.6), (-0.5, 0, 0.6)]
     statistics, _, info = play(task(touching, (0, 0, 0.6)))
     assert statistics.crashed

@@ -50,7 +50,9 @@ def test_layouts_are_those_of_the_table_and_start_clear(name):
     def rounded(points):
         return {tuple(float(x) for x in np.round(point, 6)) for point in np.asarray(points, np.float64)}
 
-    assert rounded(np.asarray(task.pillar_position)[np.asarray(task.pillar_active)]) == rounded([*map(list, pillars)])
+    assert rounded(np.asarray(task.pillar_position)[np.asarray(task.pillar_active)]) == rounded(
+        [*map(list, pillars)]
+    )
     assert int(task.pillar_active.sum()) == len(pillars)
     assert rounded(task.pursuer_position) == rounded([[*p, 0.5] for p in pursuers])
     np.testing.assert_allclose(task.evader_position, [*evader, 0.5], atol=1e-6)

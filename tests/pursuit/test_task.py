@@ -29,7 +29,8 @@ def expand():
 def distances(tasks):
     """Between pursuers, from pursuers and from the evader to the surface of the nearest pillar; (B, ...) each."""
     pursuers, evader, pillars = (
-        np.asarray(x, np.float64) for x in (tasks.pursuer_position, tasks.evader_position, tasks.pillar_position)
+        np.asarray(x, np.float64)
+        for x in (tasks.pursuer_position, tasks.evader_position, tasks.pillar_position)
     )
     n = pursuers.shape[1]
     between = np.linalg.norm(pursuers[:, :, None] - pursuers[:, None], axis=-1)[:, ~np.eye(n, dtype=bool)]
@@ -99,7 +100,10 @@ def test_expansion_moves_vehicles_a_little_and_never_into_a_breach(uniform, expa
     assert np.linalg.norm(positions[..., :2], axis=-1).max() <= 0.8 + 1e-6
     assert positions[..., 2].min() >= 0.5 - 1e-6 and positions[..., 2].max() <= 0.7 + 1e-6
     assert positions[:, :3, 0].min() < 0.0
-    assert np.mean(np.any(np.asarray(tasks.evader_position) != np.asarray(parents.evader_position), axis=-1)) > 0.95
+    assert (
+        np.mean(np.any(np.asarray(tasks.evader_position) != np.asarray(parents.evader_position), axis=-1))
+        > 0.95
+    )
 
 
 def test_expansion_of_a_task_without_room_is_the_task_itself(uniform):
@@ -117,7 +121,10 @@ def test_expansion_of_a_task_without_room_is_the_task_itself(uniform):
     assert starts_clear(SETTINGS, task)
     drawn = jax.jit(jax.vmap(lambda key: expand_task(SETTINGS, key, task)))(keys(20, 100))
     for name in ("pursuer_position", "evader_position"):
-        np.testing.assert_array_equal(getattr(drawn, name), np.tile(getattr(task, name), (100, 1, 1)).reshape(getattr(drawn, name).shape))
+        np.testing.assert_array_equal(
+            getattr(drawn, name),
+            np.tile(getattr(task, name), (100, 1, 1)).reshape(getattr(drawn, name).shape),
+        )
 
 
 def test_turning_keeps_all_distances(uniform):

@@ -1,0 +1,85 @@
+"""The adaptive environment generator: which tasks it draws and which it keeps."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from openjax.learning.archive import empty_archive
+from openjax.learning.generator import generate_task, select, successes
+from openjax.learning.settings import GeneratorSettings
+from openjax.pursuit import PursuitSettings, Task, uniform_task
+from openjax.pursuit.statistics import empty_statistics
+
+GAME = PursuitSettings()
+NOMINAL = GeneratorSettings(capacity=8, turn=False)
+KEYS = jax.random.split(jax.random.key(0), 1000)
+
+
+def generated(settings, archive):
+    return jax.jit(jax.vmap(lambda archive, key: generate_task(settings, GAME, archive, key), (None, 0)))(
+        archive, KEYS
+    )
+
+
+def archived():
+    """An archive of one task that no uniform draw can give: pillars off the grid, all on the other side."""
+    archive = empty_archive(GAME, 8)
+    task = Task(
+        pursuer_position=jnp.array([[-0.5, 0, 0.6], [-0.5, 0.3, 0.6], [-0.5, -0.3, 0.6]]),
+        evader_position=jnp.array([0.5, 0.0, 0.6]),
+        pillar_position=jnp.array([[0.05, 0.05]] + [[0.0, 0.0]] * 4),
+        pillar_active=jnp.array([True] + [False] * 4),
+    )
+    tasks = jax.tree.map(lambda slots, one: slots.at[0].set(one), archive.tasks, task)
+    return archive.replace(tasks=tasks, size=jnp.int32(1)), task
+
+
+@pytest.mark.parametrize("switch", ["empty archive", "disabled"])
+def test_uniform_tasks_without_archived_ones(switch):
+    if switch == "empty archive":
+        tasks = generated(NOMINAL, empty_archive(GAME, 8))
+    else:
+        tasks = generated(dataclasses.replace(NOMINAL, enabled=False), archived()[0])
+    assert tasks.pursuer_position[..., 0].min() >= 0.1 and tasks.evader_position[:, 0].max() <= -0.1
+    assert set(np.asarray(tasks.pillar_active.sum(axis=1))) == {4, 5}
+
+
+def test_archived_tasks_are_expanded_with_probability_p():
+    archive, parent = archived()
+    tasks = generated(NOMINAL, archive)
+    local = np.asarray(tasks.pillar_active.sum(axis=1)) == 1
+    np.testing.assert_allclose(local.mean(), NOMINAL.expansion, atol=0.05)
+    moved = np.asarray(tasks.pursuer_position)[local] - np.asarray(parent.pursuer_position)
+    assert np.abs(moved).max() <= 0.1 + 1e-6 and np.abs(moved).max(axis=(1, 2)).min() > 0
+    np.testing.assert_array_equal(np.asarray(tasks.pillar_position)[local][:, 0], np.float32(0.05))
+    assert (np.asarray(tasks.pursuer_position)[~local][..., 0] >= 0.1).all()
+
+
+def test_turned_uniform_tasks_come_from_all_sides():
+    tasks = generated(GeneratorSettings(capacity=8), empty_archive(GAME, 8))
+    angle = np.arctan2(tasks.evader_position[:, 1], tasks.evader_position[:, 0])
+    assert np.histogram(angle, 4, (-np.pi, np.pi))[0].min() > 150
+
+
+def test_unsolved_tasks_of_whole_episodes_enter():
+    success = jnp.array([0.0, 0.25, 0.5, 0.75, 0.9, 1.0, 0.75])
+    complete = jnp.array([True] * 6 + [False])
+    tasks = jax.vmap(lambda key: uniform_task(GAME, key))(KEYS[:7])
+    archive = jax.jit(lambda *a: select(NOMINAL, *a))(empty_archive(GAME, 8), tasks, success, complete)
+    assert int(archive.size) == 3
+    np.testing.assert_allclose(archive.success[:3], [0.9, 0.75, 0.5], atol=1e-6)
+    np.testing.assert_array_equal(archive.tasks.pursuer_position[:3], tasks.pursuer_position[4:1:-1])
+
+
+def test_collisions_may_spoil_a_success():
+    statistics = jax.vmap(lambda _: empty_statistics(10))(jnp.arange(3)).replace(
+        captured=jnp.array([True, True, False]),
+        steps=jnp.full(3, 10),
+        collision_steps=jnp.array([0.0, 2.0, 0.0]),
+    )
+    assert successes(NOMINAL, statistics).tolist() == [True, True, False]
+    strict = dataclasses.replace(NOMINAL, collision_tolerance=0.1)
+    assert successes(strict, statistics).tolist() == [True, False, False]

@@ -1,0 +1,145 @@
+"""Probe environments whose values and best actions are known, each of which isolates one part of MAPPO."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from openjax.learning.mappo import initial_value_scale, make_optimiser, update_policy
+from openjax.learning.rollout import Rollout
+from openjax.learning.settings import MappoSettings
+from openjax.policy import NetworkSettings, Policy, PredictorSettings, gaussian_log_prob
+from openjax.pursuit import Observation
+
+STEPS, WORLDS, UPDATES = 2, 64, 120
+DISCOUNT = 0.5
+SETTINGS = MappoSettings(
+    learning_rate=5e-3, epochs=4, minibatches=2, clip=0.2, entropy=0.0, discount=DISCOUNT, reward_scale=1.0
+)
+POLICY = Policy(
+    NetworkSettings(features=16, heads=2, critic_input="observation"),
+    PredictorSettings(enabled=False),
+    initial_action=(0.0, 0.0, 0.0, 0.0),
+)
+
+
+def observation_of(flag, late):
+    """What one pursuer sees: a random sign, and whether this is the second step."""
+    leading = flag.shape
+    return Observation(
+        self_state=jnp.stack([flag, late], axis=-1)[..., None, :],
+        others=jnp.zeros((*leading, 1, 0, 3)),
+        pillars=jnp.full((*leading, 1, 1, 5), -5.0),
+        pillar_seen=jnp.zeros((*leading, 1, 1), bool),
+        privileged=jnp.zeros((*leading, 1, 10)),
+        position=jnp.zeros((*leading, 1, 3)),
+        last_seen=jnp.zeros((*leading, 3)),
+        frames=jnp.zeros((*leading, 1, 10)),
+    )
+
+
+def flags(key, length):
+    return jnp.where(jax.random.bernoulli(key, 0.5, (length, WORLDS)), 1.0, -1.0)
+
+
+@pytest.fixture(scope="module")
+def learn():
+    """Train on a probe; returns values and mean actions for flag -1, +1 (rows) in the first, second step (columns).
+
+    The reward is constant + by_flag * flag + by_step * (second step) - by_action * (first action - 0.5 flag)^2.
+    """
+    optimisers = make_optimiser(SETTINGS, UPDATES)
+    late = jnp.broadcast_to(jnp.arange(STEPS, dtype=jnp.float32)[:, None], (STEPS, WORLDS))
+
+    def one_update(probe, carry, key):
+        actor, critic, states, scale = carry
+        flag_key, noise_key, shuffle_key = jax.random.split(key, 3)
+        flag = flags(flag_key, STEPS + 1)
+        observation = observation_of(flag[:-1], late)
+        mean, log_std = POLICY.distribution(actor, observation, None)
+        action = mean + jnp.exp(log_std) * jax.random.normal(noise_key, mean.shape)
+        miss = (jnp.tanh(action[..., 0, 0]) - 0.5 * flag[:-1]) ** 2
+        reward = (
+            probe["constant"]
+            + probe["by_flag"] * flag[:-1]
+            + probe["by_step"] * late
+            - probe["by_action"] * miss
+        )
+        rollout = Rollout(
+            observation=observation,
+            predicted=None,
+            action=action,
+            log_prob=gaussian_log_prob(action, mean, log_std),
+            reward=reward[..., None],
+            terminated=jnp.broadcast_to(probe["terminated"][:, None], (STEPS, WORLDS)),
+            truncated=jnp.broadcast_to(probe["truncated"][:, None], (STEPS, WORLDS)),
+            evader=jnp.zeros((STEPS, WORLDS, 3)),
+        )
+        last = observation_of(flag[-1], jnp.ones(WORLDS))
+        (actor, critic), states, scale, _ = update_policy(
+            SETTINGS,
+            POLICY,
+            optimisers,
+            (actor, critic),
+            states,
+            scale,
+            rollout,
+            last,
+            None,
+            shuffle_key,
+            None,
+        )
+        return (actor, critic, states, scale), None
+
+    @jax.jit
+    def train(probe):
+        corners = observation_of(jnp.array([[-1.0, -1.0], [1.0, 1.0]]), jnp.array([[0.0, 1.0], [0.0, 1.0]]))
+        parameters = POLICY.init(jax.random.key(0), corners)
+        states = (optimisers[0].init(parameters.actor), optimisers[1].init(parameters.critic))
+        carry = (parameters.actor, parameters.critic, states, initial_value_scale())
+        (actor, critic, _, scale), _ = jax.lax.scan(
+            lambda carry, key: one_update(probe, carry, key),
+            carry,
+            jax.random.split(jax.random.key(1), UPDATES),
+        )
+        mean, std = scale.moments
+        value = mean + std * POLICY.value(critic, corners, None)[..., 0]
+        return value, jnp.tanh(POLICY.distribution(actor, corners, None)[0])[..., 0, :]
+
+    def call(
+        constant=0.0,
+        by_flag=0.0,
+        by_step=0.0,
+        by_action=0.0,
+        terminated=(True, True),
+        truncated=(False, False),
+    ):
+        numbers = dict(constant=constant, by_flag=by_flag, by_step=by_step, by_action=by_action)
+        probe = {name: jnp.float32(value) for name, value in numbers.items()}
+        probe |= {"terminated": jnp.array(terminated), "truncated": jnp.array(truncated)}
+        return jax.tree.map(np.asarray, train(probe))
+
+    return call
+
+
+def test_constant_reward_is_the_value(learn):
+    np.testing.assert_allclose(learn(constant=1.0)[0], 1.0, atol=0.05)
+
+
+def test_value_depends_on_the_observation(learn):
+    np.testing.assert_allclose(learn(by_flag=1.0)[0], [[-1, -1], [1, 1]], atol=0.15)
+
+
+def test_a_later_reward_is_discounted(learn):
+    value, _ = learn(by_step=1.0, terminated=(False, True))
+    np.testing.assert_allclose(value, [[DISCOUNT, 1], [DISCOUNT, 1]], atol=0.1)
+
+
+def test_a_cut_episode_goes_on_in_the_value(learn):
+    value, _ = learn(constant=1.0, terminated=(False, False), truncated=(False, True))
+    np.testing.assert_allclose(value, 1 / (1 - DISCOUNT), atol=0.1)
+
+
+def test_the_policy_finds_the_action_that_the_observation_asks_for(learn):
+    _, action = learn(by_action=1.0)
+    np.testing.assert_allclose(action[..., 0], [[-0.5, -0.5], [0.5, 0.5]], atol=0.15)

@@ -1,0 +1,111 @@
+"""The folded attention against the textbook's, and the kernel (in interpret mode) against the plain formula."""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from openjax.policy.attention import (
+    EntityKind,
+    Layout,
+    _backward_kernel_call,
+    _forward_kernel_call,
+    _reference,
+    _reference_backward,
+)
+from openjax.policy.encoder import SelfAttention, normalised_linear
+
+FEATURES, HEADS = 16, 4
+
+
+def shaken(tree, seed, size=0.3):
+    """Parameters moved at random, so that zeros and ones at the start hide nothing."""
+    leaves, structure = jax.tree.flatten(tree)
+    keys = jax.random.split(jax.random.key(seed), len(leaves))
+    return structure.unflatten(
+        [x + size * jax.random.normal(k, x.shape) for x, k in zip(leaves, keys, strict=True)]
+    )
+
+
+def gelu(x):
+    return x / (1 + np.exp(-1.702 * x))
+
+
+def textbook(p, own, others, pillars, seen):
+    """softmax(q K' / sqrt(d)) V of one query over all tokens, head by head, in float64."""
+    p = jax.tree.map(lambda x: np.asarray(x, np.float64), p)
+
+    def embedded(x, name):
+        linear = x @ p[f"{name}_kernel"] + p[f"{name}_bias"][0]
+        centred = linear - linear.mean(-1, keepdims=True)
+        normal = centred / np.sqrt((centred**2).mean(-1, keepdims=True) + 1e-6)
+        return gelu(normal * p[f"{name}_scale"] + p[f"{name}_shift"][0])
+
+    tokens = np.concatenate([own[:, None], embedded(others, "others"), embedded(pillars, "pillars")], axis=1)
+    there = np.concatenate([np.ones((len(own), 1 + others.shape[1]), bool), seen], axis=1)
+    query, keys, values = own @ p["query"], tokens @ p["key"], tokens @ p["value"]
+    width, mixed = FEATURES // HEADS, []
+    for head in range(HEADS):
+        part = slice(head * width, (head + 1) * width)
+        score = np.einsum("bd,bmd->bm", query[:, part], keys[..., part]) / np.sqrt(width)
+        score = np.where(there, score, -np.inf)
+        weight = np.exp(score - score.max(1, keepdims=True))
+        weight /= weight.sum(1, keepdims=True)
+        mixed.append(np.einsum("bm,bmd->bd", weight, values[..., part]))
+    return np.concatenate(mixed, axis=1) @ p["output"] + p["output_bias"]
+
+
+def test_folded_attention_is_multi_head_attention_with_one_query():
+    draw = np.random.default_rng(0)
+    own = draw.normal(size=(7, FEATURES))
+    others, pillars = draw.normal(size=(7, 2, 3)), draw.normal(size=(7, 3, 5))
+    seen = draw.uniform(size=(7, 3)) < 0.5
+    seen[0], seen[1] = False, True
+    pillars[~seen] = -5.0
+    module = SelfAttention(FEATURES, HEADS, jnp.float32)
+    arguments = [jnp.asarray(x, jnp.float32) for x in (own, others, pillars)] + [jnp.asarray(seen)]
+    parameters = shaken(jax.jit(module.init)(jax.random.key(0), *arguments), 1)
+    with jax.default_matmul_precision("highest"):
+        folded = jax.jit(module.apply)(parameters, *arguments)
+    expected = textbook(parameters["params"], own, others, pillars, seen)
+    np.testing.assert_allclose(folded, expected, atol=2e-4 * np.abs(expected).max())
+
+
+def test_normalised_linear_is_layer_norm_of_the_linear_layer():
+    keys = jax.random.split(jax.random.key(2), 2)
+    x, linear = jax.random.normal(keys[0], (50, 5)), jax.random.normal(keys[1], (6, FEATURES)) + 0.5
+    x = x.at[0].set(-5.0).at[1].set(0.0)
+    inputs, weights = jax.jit(normalised_linear)(x, linear)
+    norm = nn.LayerNorm(epsilon=1e-6, use_bias=False, use_scale=False)
+    expected = norm.apply({}, x @ linear[:5] + linear[5])
+    np.testing.assert_allclose(inputs @ weights, expected, atol=1e-4)
+
+
+LAYOUT = Layout(FEATURES, HEADS, (EntityKind(2, 4), EntityKind(3, 6)), 0.5)
+
+
+def arguments_of(batch):
+    keys = jax.random.split(jax.random.key(batch), 5)
+    weights = 0.5 * jax.random.normal(keys[3], (4 + 1 + 6 + 1, FEATURES))
+    numbers = jax.random.normal(keys[2], (LAYOUT.input_rows, batch))
+    masked = jnp.where(jax.random.uniform(keys[4], (5, batch)) < 0.3, -1e4, 0.0)
+    query = jax.random.normal(keys[0], (batch, HEADS * FEATURES))
+    return query, jax.random.normal(keys[1], (batch, FEATURES)), jnp.concatenate([numbers, masked]), weights
+
+
+@pytest.mark.parametrize("batch", [16, 19])
+def test_kernel_is_the_plain_formula_forward_and_backward(batch):
+    arguments = arguments_of(batch)
+    gradient = jax.random.normal(jax.random.key(9), arguments[0].shape)
+    expected = jax.jit(lambda *a: _reference(LAYOUT, *a))(*arguments)
+    kernel = jax.jit(lambda *a: _forward_kernel_call(LAYOUT, *a, interpret=True))(*arguments)
+    assert kernel.shape == expected.shape
+    np.testing.assert_allclose(kernel, expected, atol=1e-4)
+
+    expected = jax.jit(lambda *a: _reference_backward(LAYOUT, *a))(*arguments, gradient)
+    kernel = jax.jit(lambda *a: _backward_kernel_call(LAYOUT, *a, interpret=True))(*arguments, gradient)
+    rows = LAYOUT.input_rows  # the biases that follow only mask: nothing flows into them
+    expected, kernel = [(q, own, x[:rows], w) for q, own, x, w in (expected, kernel)]
+    for name, a, b in zip(("query", "own", "inputs", "weights"), kernel, expected, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-4 * float(jnp.abs(b).max() + 1), err_msg=name)

@@ -1,0 +1,174 @@
+"""Actor, critic and predictor as a user of the policy sees them."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from openjax.errors import UserError
+from openjax.policy import NetworkSettings, Policy, PredictorSettings, gaussian_entropy, gaussian_log_prob
+from openjax.pursuit import Observation
+
+N, BATCH = 3, 4
+POLICY = Policy(NetworkSettings(features=16, heads=2), PredictorSettings(units=8, horizons=(1, 2)))
+
+
+def observation_of(seed, n=N, pillars=3, batch=BATCH):
+    draw = np.random.default_rng(seed)
+
+    def normal(*shape):
+        return jnp.asarray(draw.normal(size=(batch, *shape)), jnp.float32)
+
+    seen = jnp.asarray(draw.uniform(size=(batch, n, pillars)) < 0.6)
+    seen = seen.at[0].set(False).at[1].set(True)
+    return Observation(
+        self_state=normal(n, 20),
+        others=normal(n, n - 1, 3),
+        pillars=jnp.where(seen[..., None], normal(n, pillars, 5), -5.0),
+        pillar_seen=seen,
+        privileged=normal(n, 10),
+        position=normal(n, 3),
+        last_seen=0.3 * normal(3),
+        frames=0.3 * normal(10, 7 + 3 * n),
+    )
+
+
+def functions(policy):
+    def both(parameters, observation):
+        predicted = policy.predict(parameters, observation)
+        mean, _ = policy.distribution(parameters.actor, observation, predicted)
+        return mean, policy.value(parameters.critic, observation, predicted)
+
+    return jax.jit(policy.init), jax.jit(both)
+
+
+@pytest.fixture(scope="module")
+def networks():
+    """(parameters away from their start, function to mean and value)."""
+    init, both = functions(POLICY)
+    parameters = init(jax.random.key(0), observation_of(0))
+    leaves, structure = jax.tree.flatten(parameters)
+    keys = jax.random.split(jax.random.key(1), len(leaves))
+    leaves = [x + 0.1 * jax.random.normal(k, x.shape) for x, k in zip(leaves, keys, strict=True)]
+    return structure.unflatten(leaves), both
+
+
+def test_order_of_others_and_pillars_does_not_matter(networks):
+    parameters, both = networks
+    observation = observation_of(1)
+    order = jnp.array([2, 0, 1])
+    changed = observation.replace(
+        others=observation.others[:, :, ::-1],
+        pillars=observation.pillars[:, :, order],
+        pillar_seen=observation.pillar_seen[:, :, order],
+    )
+    for a, b in zip(both(parameters, observation), both(parameters, changed), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-5)
+
+
+def test_unused_slots_have_no_influence_and_used_ones_have(networks):
+    parameters, both = networks
+    observation = observation_of(2)
+    for used in (False, True):
+        change = (observation.pillar_seen == used)[..., None]
+        changed = observation.replace(pillars=jnp.where(change, 7.0, observation.pillars))
+        for a, b in zip(both(parameters, observation), both(parameters, changed), strict=True):
+            same = np.all(np.asarray(a == b).reshape(BATCH, N, -1), axis=-1)
+            expected = (
+                ~np.asarray(observation.pillar_seen).any(axis=-1) if used else np.ones((BATCH, N), bool)
+            )
+            np.testing.assert_array_equal(same, expected)
+
+
+def test_pursuers_share_one_actor_and_worlds_do_not_mix(networks):
+    parameters, both = networks
+    observation = observation_of(3)
+    mean, value = both(parameters, observation)
+    one = jax.tree.map(lambda x: x[1:2], observation)
+    shuffled = jnp.array([2, 0, 1])
+    fields = ("self_state", "others", "pillars", "pillar_seen", "privileged", "position")
+    turned = observation.replace(**{name: getattr(observation, name)[:, shuffled] for name in fields})
+    for a, b in zip((mean, value), both(parameters, turned), strict=True):
+        np.testing.assert_allclose(a[:, shuffled], b, atol=1e-5)
+    for a, b in zip((mean, value), jax.tree.map(lambda x: x, both(parameters, one)), strict=True):
+        np.testing.assert_allclose(a[1:2], b, atol=1e-5)
+
+
+@pytest.mark.parametrize("critic_input", ["state", "observation"])
+def test_who_sees_what_is_privileged(critic_input):
+    policy = dataclasses.replace(
+        POLICY, network=NetworkSettings(features=16, heads=2, critic_input=critic_input)
+    )
+    init, both = functions(policy)
+    observation = observation_of(4)
+    parameters = init(jax.random.key(0), observation)
+    mean, value = both(parameters, observation)
+    more_mean, more_value = both(parameters, observation.replace(privileged=observation.privileged + 1))
+    np.testing.assert_array_equal(mean, more_mean)
+    assert bool(jnp.any(value != more_value)) == (critic_input == "state")
+
+
+@pytest.mark.parametrize(("n", "pillars"), [(1, 1), (8, 4)])
+def test_starts_near_hover_for_any_number_of_pursuers_without_predictor(n, pillars):
+    policy = Policy(
+        NetworkSettings(features=16, heads=4, compute_type="bfloat16"),
+        PredictorSettings(enabled=False),
+        initial_action=(0.3, 0.0, 0.0, 0.0),
+    )
+    observation = observation_of(5, n, pillars)
+    parameters = jax.jit(policy.init)(jax.random.key(0), observation)
+    assert parameters.predictor == {} and policy.predict(parameters, observation) is None
+    action = jax.jit(policy.act)(parameters, observation)
+    np.testing.assert_allclose(action, np.broadcast_to([np.tanh(0.3), 0, 0, 0], (BATCH, n, 4)), atol=0.1)
+    assert all(x.dtype == jnp.float32 for x in jax.tree.leaves(parameters))
+
+
+def test_density_and_entropy():
+    draw = np.random.default_rng(0)
+    sample, mean = draw.normal(size=(2, 5, 4))
+    log_std = np.array([-1.0, 0.0, 0.5, -0.2])
+    density = gaussian_log_prob(jnp.asarray(sample), jnp.asarray(mean), jnp.asarray(log_std))
+    np.testing.assert_allclose(density, norm.logpdf(sample, mean, np.exp(log_std)).sum(-1), rtol=1e-4)
+    np.testing.assert_allclose(
+        gaussian_entropy(jnp.asarray(log_std)), norm.entropy(0, np.exp(log_std)).sum(), rtol=1e-5
+    )
+
+
+@pytest.mark.parametrize("relative", [True, False])
+def test_predictor_is_an_lstm_whose_range_is_the_arena(relative):
+    policy = dataclasses.replace(POLICY, predictor=dataclasses.replace(POLICY.predictor, relative=relative))
+    observation = observation_of(6)
+    parameters = jax.jit(policy.init)(jax.random.key(0), observation)
+    predicted = jax.jit(policy.predict)(parameters, observation)
+    assert predicted.shape == (BATCH, 2, 3)
+    p = jax.tree.map(lambda x: np.asarray(x, np.float64), parameters.predictor["params"])
+
+    def sigmoid(x):
+        return 1 / (1 + np.exp(-x))
+
+    hidden = cell = np.zeros((BATCH, 8))
+    for frame in np.moveaxis(np.asarray(observation.frames, np.float64), 1, 0):
+        gates = frame @ p["input"]["kernel"] + p["input"]["bias"] + hidden @ p["recurrent"]
+        enter, forget, candidate, leave = np.split(gates, 4, axis=1)
+        cell = sigmoid(forget + 1) * cell + sigmoid(enter) * np.tanh(candidate)
+        hidden = sigmoid(leave) * np.tanh(cell)
+    output = (hidden @ p["output"]["kernel"] + p["output"]["bias"]).reshape(BATCH, 2, 3)
+    scale = np.array([0.9, 0.9, 0.6])
+    start = np.asarray(observation.last_seen)[:, None] if relative else np.array([0, 0, 0.6])
+    np.testing.assert_allclose(predicted, start + (0.1 if relative else 1.0) * scale * output, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: NetworkSettings(features=10, heads=4), "features 10 must be a multiple of heads 4"),
+        (lambda: PredictorSettings(horizons=(2, 3)), "must start with 1"),
+        (lambda: PredictorSettings(windows=5, steps=2), "windows 5 must be a multiple of steps 2"),
+    ],
+)
+def test_impossible_settings(make, message):
+    with pytest.raises(UserError, match=message):
+        make()
