@@ -54,7 +54,10 @@ def _observe(gains, vehicle, command, motor, gyro, disturbance, dt):
             tick, start, command, unroll=True
         )
         step = GYRO_GAIN * (gyro_next - rates)
-        sent = given + (logged - given.mean(0))
+        # The log's mean, within a motor's limits: what a limit cuts off one tick, the others must have had.
+        sent = given
+        for _ in range(3):
+            sent = jnp.clip(sent + (logged - sent.mean(0)), 0.0, 1.0)
         return (rates + step, previous + step, integral, speed), (wanted.mean(0), sent, rates)
 
     speed = vehicle.max_rotor_speed * jnp.sqrt(jnp.clip(motor[0], 1e-4, 1.0))
