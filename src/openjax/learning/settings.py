@@ -66,7 +66,7 @@ class TrainSettings:
     predictor: PredictorSettings = field(default_factory=PredictorSettings)
     mappo: MappoSettings = field(default_factory=MappoSettings)
     generator: GeneratorSettings = field(default_factory=GeneratorSettings)
-    num_envs: int = 2048
+    num_envs: int = 2560
     """Worlds that are simulated at once."""
     rollout_length: int = 80
     """Control steps per iteration; divides the episode's length, so that episodes end between rollouts."""
