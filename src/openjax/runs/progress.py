@@ -100,7 +100,7 @@ class Progress:
         return [(label, _number(values[name])) for name, label in _SHOWN.items() if name in values]
 
     def _speed(self):
-        left = (self._total - self._steps) / self._rate if self._rate > 0 else float("nan")
+        left = max(self._total - self._steps, 0) / self._rate if self._rate > 0 else float("nan")
         return (
             f"{100 * min(self._steps / self._total, 1):.0f} %, {_count(self._steps)} steps, "
             f"{_count(self._rate)} steps/s, {_duration(left)} left"
