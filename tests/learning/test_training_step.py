@@ -1,0 +1,258 @@
+"""The compiled training step as a whole: compiles once, keeps its carry's types, resets in turn, obeys its switches."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from openjax.errors import UserError
+from openjax.learning import (
+    GeneratorSettings,
+    MappoSettings,
+    TrainSettings,
+    build,
+    init_carry,
+    make_evaluate,
+    make_training_step,
+    preset,
+    summarise,
+)
+from openjax.learning.training import _initial_carry, _penalty_share
+from openjax.policy import NetworkSettings, PredictorSettings
+from openjax.pursuit import SCENARIOS, PursuitSettings, hover_action, scenario_task
+
+GROUPS, LENGTH, ROLLOUT, UPDATES = 3, 12, 4, 7
+SETTINGS = TrainSettings(
+    environment=PursuitSettings(episode_length=LENGTH, physics="rigid", capture_radius=1.0, history_length=3),
+    network=NetworkSettings(features=8, heads=2),
+    predictor=PredictorSettings(units=4, windows=2, steps=1, horizons=(1, 2)),
+    mappo=MappoSettings(minibatches=2, epochs=1, penalty_start=0.2, penalty_ramp=0.5),
+    generator=GeneratorSettings(capacity=8, success_low=0.0, success_high=1.0, episodes_per_task=2),
+    num_envs=12,
+    rollout_length=ROLLOUT,
+    total_steps=12 * ROLLOUT * 10,
+)
+
+
+@pytest.fixture(scope="module")
+def run():
+    """(start, carries after each of UPDATES steps, their metrics, the compiled step); carries as NumPy."""
+    carry = init_carry(SETTINGS, jax.random.key(0))
+    step = jax.jit(make_training_step(SETTINGS), donate_argnums=0)
+    start, carries, metrics, donated = _numpy(carry), [], [], carry
+    for _ in range(UPDATES):
+        carry, watched = step(carry)
+        carries.append(_numpy(carry))
+        metrics.append(jax.tree.map(float, watched))
+    return start, carries, metrics, step, carry, donated
+
+
+def _numpy(tree):
+    def copied(x):
+        return np.array(jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x)
+
+    return jax.tree.map(copied, tree)
+
+
+def test_compiles_once_and_keeps_the_types_of_its_carry(run):
+    start, carries, _, step, carry, donated = run
+    assert step._cache_size() == 1
+    for leaf in jax.tree.leaves(carry):
+        assert isinstance(leaf, jax.Array) and not getattr(leaf, "weak_type", False)
+    shapes = [jax.tree.map(lambda x: (x.shape, x.dtype), tree) for tree in (start, carries[-1])]
+    assert shapes[0] == shapes[1]
+    # the buffers of the carry that was handed in are used again
+    assert donated.state.drones.position.is_deleted() and donated.archive.tasks.pillar_position.is_deleted()
+
+
+def test_metrics_are_finite_numbers(run):
+    _, _, metrics, *_ = run
+    expected = {
+        "capture_rate",
+        "collision_rate",
+        "prediction_error",
+        "predictor_loss",
+        "entropy",
+        "kl",
+        "reward",
+    }
+    assert expected | {"archive_size", "success_rate", "episode_return"} <= set(metrics[0])
+    assert all(np.isfinite(list(watched.values())).all() for watched in metrics)
+
+
+def test_each_group_ends_in_its_turn_and_after_its_whole_episode(run):
+    start, carries, *_ = run
+    group = np.arange(SETTINGS.num_envs) % GROUPS
+    np.testing.assert_array_equal(start.state.step, group * ROLLOUT)
+    before = start.state
+    ages = before.step.copy()
+    for update, carry in enumerate(carries):
+        ended = group == (GROUPS - 1 - update) % GROUPS
+        np.testing.assert_array_equal(before.step[ended], LENGTH - ROLLOUT)
+        np.testing.assert_array_equal(carry.state.step, np.where(ended, 0, before.step + ROLLOUT))
+        np.testing.assert_array_equal(carry.state.statistics.steps[ended], 0)
+        went_on = carry.state.task.evader_position[~ended] == before.task.evader_position[~ended]
+        assert went_on.all()
+        assert np.any(carry.state.task.evader_position[ended] != before.task.evader_position[ended])
+        ages = np.where(ended, 0, ages + ROLLOUT)
+        before = carry.state
+    np.testing.assert_array_equal(carries[-1].state.step, ages)
+    # from the first reset on, what is counted is the whole episode so far
+    np.testing.assert_array_equal(carries[-1].state.statistics.steps, ages)
+
+
+def test_environments_that_share_a_task_start_alike_but_for_their_attitude(run):
+    start, carries, *_ = run
+    for state in (start.state, carries[-1].state):
+        evader = state.task.evader_position.reshape(-1, GROUPS, 3)  # (place in the group, group)
+        np.testing.assert_array_equal(evader[0::2], evader[1::2])
+        assert np.any(evader[0] != evader[2])
+    assert np.any(start.state.drones.quaternion[0] != start.state.drones.quaternion[GROUPS])
+
+
+def test_only_whole_episodes_enter_the_archive(run):
+    _, carries, metrics, *_ = run
+    # the groups that started late end incomplete episodes in the first two steps; then two tasks per step enter
+    sizes = [int(carry.archive.size) for carry in carries]
+    assert sizes == [0, 0, 2, 4, 6, 8, 8]
+    assert [watched["archive_size"] for watched in metrics] == sizes
+    ended = carries[1].state.task  # of group 0, whose episodes end in the third step
+    entered = carries[2].archive.tasks.evader_position[:2]
+    np.testing.assert_array_equal(entered[::-1], ended.evader_position[0::GROUPS][::2])
+
+
+def test_what_an_update_changes(run):
+    start, carries, *_ = run
+    for before, after in ((start, carries[0]), (carries[0], carries[1])):
+        for name in ("actor", "critic", "predictor"):
+            moved = jax.tree.map(
+                lambda a, b: np.any(a != b), getattr(before.policy, name), getattr(after.policy, name)
+            )
+            assert any(jax.tree.leaves(moved)), name
+        assert np.any(before.key != after.key) and after.update == before.update + 1
+    assert carries[-1].value_scale.weight > carries[0].value_scale.weight
+
+
+def test_same_seed_same_run(run):
+    _, carries, _, step, *_ = run
+    carry, _ = step(init_carry(SETTINGS, jax.random.key(0)))
+    jax.tree.map(np.testing.assert_array_equal, _numpy(carry), carries[0])
+
+
+def test_ablations():
+    """Without predictor and generator nothing of theirs is left; each alone traces as well."""
+    no_predictor = dataclasses.replace(SETTINGS.predictor, enabled=False)
+    no_generator = dataclasses.replace(SETTINGS.generator, enabled=False)
+    plain = dataclasses.replace(SETTINGS, predictor=no_predictor, generator=no_generator)
+    assert plain.episodes_per_task == 1
+    carry = init_carry(plain, jax.random.key(0))
+    evader = np.asarray(carry.state.task.evader_position)
+    assert len(np.unique(evader, axis=0)) == plain.num_envs and carry.policy.predictor == {}
+    step = jax.jit(make_training_step(plain))
+    for _ in range(GROUPS + 1):
+        carry, metrics = step(carry)
+    assert int(carry.archive.size) == 0 and not {"predictor_loss", "prediction_error"} & set(metrics)
+    assert np.isfinite([float(x) for x in metrics.values()]).all()
+
+    for changes in (dict(predictor=no_predictor), dict(generator=no_generator)):
+        settings = dataclasses.replace(SETTINGS, **changes)
+        shapes = jax.eval_shape(
+            functools.partial(_initial_carry, settings, build(settings)), jax.random.key(0)
+        )
+        after, metrics = jax.eval_shape(make_training_step(settings), shapes)
+        assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == jax.tree.map(
+            lambda x: (x.shape, x.dtype), shapes
+        )
+        assert ("predictor_loss" in metrics) == settings.predictor.enabled
+
+
+def test_penalties_ramp_up():
+    share = [float(_penalty_share(SETTINGS, jnp.int32(update))) for update in (0, 2, 5, 9)]
+    np.testing.assert_allclose(share, [0.2, 0.52, 1.0, 1.0], atol=1e-6)
+    assert float(_penalty_share(TrainSettings(), jnp.int32(0))) == 1.0
+
+
+def test_evaluation_of_a_policy_that_hovers():
+    """Drones that hover at their starts in `empty`: nothing is captured or breached, and the evader is always seen."""
+    layout = dataclasses.replace(
+        SCENARIOS["empty"], pursuers=((0.0, 0.5, 0.5), (0.0, 0.5, 0.62), (0.5, 0.0, 0.5))
+    )
+    game = PursuitSettings(
+        num_pursuers=3,
+        min_pillars=0,
+        max_pillars=1,
+        physics="rigid",
+        start_attitude="level",
+        episode_length=10,
+    )
+    settings = TrainSettings(
+        environment=game, network=SETTINGS.network, predictor=SETTINGS.predictor, rollout_length=10
+    )
+    parts = build(settings)
+    task = jax.tree.map(lambda x: jnp.stack([x, x]), scenario_task(game, layout))
+    near = task.replace(evader_position=task.evader_position.at[1].set(jnp.array([0.5, -0.27, 0.5])))
+
+    @jax.jit
+    def play(key, tasks):
+        observation, _ = parts.environment.reset(key)
+        parameters = parts.policy.init(key, observation)
+        parameters = jax.tree_util.tree_map_with_path(
+            lambda path, x: jnp.zeros_like(x) if _is_output(path) else x, parameters
+        )
+        return make_evaluate(parts.environment, parts.policy, trajectory=True)(parameters, tasks, key)
+
+    evaluation, trajectory = play(jax.random.key(0), near)
+    assert trajectory.pursuers.shape == (2, 10, 3, 3) and trajectory.predicted.shape == (2, 10, 2, 3)
+    np.testing.assert_allclose(
+        trajectory.pursuers, np.broadcast_to(near.pursuer_position[:, None], (2, 10, 3, 3)), atol=2e-3
+    )
+    np.testing.assert_allclose(hover_action(parts.environment.vehicle)[1:], 0.0)
+    # the predictor's output is zero: it says what keeping the last seen position says
+    np.testing.assert_allclose(evaluation.last_seen_error, 0.013, rtol=1e-2)
+    np.testing.assert_allclose(evaluation.prediction_error, evaluation.last_seen_error, rtol=1e-5)
+    assert trajectory.captured[1, 0, 2] and not trajectory.captured[0].any()
+    metrics = summarise(evaluation)
+    # two drones are too close all the time; in one of two episodes the evader starts within reach
+    assert (metrics["capture_rate"], metrics["capture_step"]) == (0.5, 5.5)
+    assert metrics["collision_rate"] == 1.0 and metrics["collision_parts"] == {
+        "pillar": 0.0,
+        "drone": 1.0,
+        "bounds": 0.0,
+    }
+    assert metrics["crash_rate"] == 0.0 and metrics["over_speed_rate"] == 0.0
+    expected = evaluation.statistics.episode_return.mean()
+    np.testing.assert_allclose(metrics["episode_return"], expected, rtol=1e-5)
+
+
+def _is_output(path):
+    """Leaves of the last layers' kernels, of actor and predictor."""
+    text = jax.tree_util.keystr(path)
+    return ("'mean'" in text or "'output'" in text) and "'kernel'" in text
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (dict(rollout_length=5), "rollout_length 5 must divide environment.episode_length 12"),
+        (dict(num_envs=10), "num_envs 10 must be a multiple of 6"),
+        (dict(mappo=MappoSettings(minibatches=5)), "num_envs 12 must be a multiple of mappo.minibatches 5"),
+        (
+            dict(predictor=PredictorSettings(windows=4, steps=1, horizons=(1, 3))),
+            "do not fit into rollout_length 4",
+        ),
+        (dict(total_steps=0), "total_steps is 0"),
+    ],
+)
+def test_impossible_settings(changes, message):
+    with pytest.raises(UserError, match=message):
+        dataclasses.replace(SETTINGS, **changes)
+
+
+def test_presets():
+    for name in ("quick", "paper"):
+        assert preset(name, seed=3).seed == 3
+    with pytest.raises(UserError, match="possible are quick, paper"):
+        preset("papers")
