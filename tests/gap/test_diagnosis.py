@@ -40,7 +40,7 @@ def folders(tmp_path_factory):
         "none": _case(root / "none", {}),
         "drag": _case(root / "drag", {"rotor_drag": DRAG}),
         "mass": _case(root / "mass", {"mass": {"extra": 0.003}}),
-        "weighed": _case(root / "weighed", {"mass": {"extra": 0.003}}, weighed=True),
+        "weighed": _case(root / "weighed", {"thrust_scale": {"scale": -0.08}}, weighed=True),
         "doublets": _case(root / "doublets", {}, flights=("flight_c", "flight_c")),
     }
 
@@ -79,7 +79,11 @@ def test_mass_and_thrust_are_one_class_until_the_mass_is_weighed(reports):
     assert reports["mass"].effects in (("mass",), ("thrust_scale",))
     named = reports["mass"].effects[0]
     assert {"mass": "thrust_scale", "thrust_scale": "mass"}[named] in reports["mass"].equivalent[named]
-    assert reports["weighed"].effects == ("thrust_scale",)
+    weighed = reports["weighed"]
+    assert weighed.effects == ("thrust_scale",)
+    assert "mass" not in weighed.equivalent.get("thrust_scale", [])
+    assert weighed.parameters["thrust_scale"]["scale"].value == pytest.approx(-0.08, abs=0.015)
+    assert weighed.probabilities["mass"] == 0.0
 
 
 def test_what_was_not_flown_is_not_testable(reports):

@@ -21,7 +21,8 @@ from openjax.gap.rest import Rest
 SETTINGS_FILE = Path(__file__).with_name("decision.json")
 
 
-# Effects that stand in for one another: two of a family at once are rarely more than one of them in another form.
+# Effects that stand in for one another: two of a family at once are rarely more than one of them in another
+# form.
 FAMILIES = (
     {"mass", "thrust_scale", "battery_sag"},
     {"rotor_drag", "wind", "blade_flapping"},
@@ -30,6 +31,9 @@ FAMILIES = (
     {"thrust_curve", "thrust_saturation", "battery_sag"},
     {"ground_effect", "ceiling_effect"},
 )
+
+
+SAME = {"thrust_scale": "mass"}
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,8 @@ class Settings:
     pose_cost: float = 2.0
     least_loss: float = 0.006
     second_share: float = 0.01
+    second_root: float = 0.0
+    second_cost: float = 0.0
     cross_share: float = 0.005
     family_cost: float = 12.0
     prior_none: float = 0.3
@@ -118,7 +124,8 @@ def combine(paths: dict, effects: set[str], s: Settings) -> dict[tuple[str, ...]
         physics[key] = (
             gain / s.temperature
             - s.effect_cost * len(key)
-            - s.second_share * max(rest, 0.0) * (len(key) > 1)
+            - (s.second_share * max(rest, 0.0) + s.second_root * np.sqrt(max(rest, 0.0))) * (len(key) > 1)
+            - s.second_cost * max(len(key) - 1, 0)
             - s.family_cost * related
         )
     strongest = max(max(gains.values()), 0.0)
@@ -183,7 +190,13 @@ def decide_from(paths: dict, effects: set[str], rest, settings: Settings) -> Dec
             probabilities[max(key, key=lambda e: strong.get(e, 0.0))] += p * (1.0 - unknown)
     probabilities["none"] = posterior.get((), 0.0) * (1.0 - unknown)
     probabilities["unknown"] = unknown
-    best = max(posterior, key=posterior.get)
+    # Members of a class that motion can't split count together, so that they don't lose to none one by one.
+    classes: dict[frozenset, float] = {}
+    for key, p in posterior.items():
+        name = frozenset(SAME.get(e, e) for e in key)
+        classes[name] = classes.get(name, 0.0) + p
+    winner = max(classes, key=classes.get)
+    best = max((k for k in posterior if frozenset(SAME.get(e, e) for e in k) == winner), key=posterior.get)
     return Decision(posterior, probabilities, tuple(sorted(best, key=lambda e: -strong.get(e, 0.0))), unknown)
 
 

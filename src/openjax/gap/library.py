@@ -70,7 +70,7 @@ FITS = {
         ),
         Fit(
             "thrust_saturation",
-            (_p("limit", 0.8, 0.12, 0.8, 2e-3), _p("voltage_slope", 0.05, 0.15, 0.0, 1e-2)),
+            (_p("limit", 0.8, 0.12, 0.8, 2e-3), _p("voltage_slope", 0.0, 0.1, 0.0, 1e-2)),
             others=tuple((limit, 0.0) for limit in (0.95, 0.92, 0.89, 0.865, 0.84, 0.76, 0.7)),
         ),
         Fit(
