@@ -19,7 +19,7 @@ PILLAR_REACH = 0.8
 EXPANSION = 0.1
 """Local expansion moves each vehicle by up to this along each axis (m): the paper's delta."""
 CANDIDATES = 8
-"""Draws of a start among which the first good one is taken."""
+"""Draws of a start among which the first good one is taken; more for more than three pursuers."""
 
 
 @struct.dataclass
@@ -61,7 +61,9 @@ def uniform_task(settings: PursuitSettings, key: jax.Array) -> Task:
     middle = settings.arena_height / 2
     low = jnp.array([START_X[0], -START_Y, middle - START_Z], jnp.float32)
     high = jnp.array([START_X[1], START_Y, middle + START_Z], jnp.float32)
-    candidates = jax.random.uniform(position_key, (CANDIDATES, n, 3), jnp.float32, low, high)
+    # each further pursuer about halves the chance that all are apart
+    draws = CANDIDATES * 2 ** max(0, n - 3)
+    candidates = jax.random.uniform(position_key, (draws, n, 3), jnp.float32, low, high)
     apart = jax.vmap(lambda p: _closest_pair(p) >= settings.drone_clearance)(candidates)
     pursuers = candidates[jnp.argmax(apart)]
     mirrored = jnp.array([-1.0, 1.0, 1.0], jnp.float32)
