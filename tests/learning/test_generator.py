@@ -1,6 +1,7 @@
 """The adaptive environment generator: which tasks it draws and which it keeps."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ import pytest
 from openjax.learning.archive import empty_archive
 from openjax.learning.generator import generate_task, select, successes
 from openjax.learning.settings import GeneratorSettings
-from openjax.pursuit import PursuitSettings, Task, uniform_task
+from openjax.pursuit import PursuitSettings, Task
 from openjax.pursuit.statistics import empty_statistics
 
 GAME = PursuitSettings()
@@ -18,10 +19,13 @@ NOMINAL = GeneratorSettings(capacity=8, turn=False)
 KEYS = jax.random.split(jax.random.key(0), 1000)
 
 
+@functools.cache
+def generate(settings):
+    return jax.jit(jax.vmap(lambda archive, key: generate_task(settings, GAME, archive, key), (None, 0)))
+
+
 def generated(settings, archive):
-    return jax.jit(jax.vmap(lambda archive, key: generate_task(settings, GAME, archive, key), (None, 0)))(
-        archive, KEYS
-    )
+    return generate(settings)(archive, KEYS)
 
 
 def archived():
@@ -67,11 +71,12 @@ def test_turned_uniform_tasks_come_from_all_sides():
 def test_unsolved_tasks_of_whole_episodes_enter():
     success = jnp.array([0.0, 0.25, 0.5, 0.75, 0.9, 1.0, 0.75])
     complete = jnp.array([True] * 6 + [False])
-    tasks = jax.vmap(lambda key: uniform_task(GAME, key))(KEYS[:7])
+    tasks = jax.tree.map(lambda x: jnp.stack([x] * 7), archived()[1])
+    tasks = tasks.replace(evader_position=0.1 * jnp.arange(21.0).reshape(7, 3))
     archive = jax.jit(lambda *a: select(NOMINAL, *a))(empty_archive(GAME, 8), tasks, success, complete)
     assert int(archive.size) == 3
     np.testing.assert_allclose(archive.success[:3], [0.9, 0.75, 0.5], atol=1e-6)
-    np.testing.assert_array_equal(archive.tasks.pursuer_position[:3], tasks.pursuer_position[4:1:-1])
+    np.testing.assert_array_equal(archive.tasks.evader_position[:3], tasks.evader_position[4:1:-1])
 
 
 def test_collisions_may_spoil_a_success():

@@ -4,9 +4,9 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from openjax.policy.attention import (
+    ROWS,
     EntityKind,
     Layout,
     _backward_kernel_call,
@@ -94,18 +94,21 @@ def arguments_of(batch):
     return query, jax.random.normal(keys[1], (batch, FEATURES)), jnp.concatenate([numbers, masked]), weights
 
 
-@pytest.mark.parametrize("batch", [16, 19])
-def test_kernel_is_the_plain_formula_forward_and_backward(batch):
+def test_kernel_is_the_plain_formula_forward_and_backward():
+    batch = 2 * ROWS + 3  # not a multiple of the block
     arguments = arguments_of(batch)
     gradient = jax.random.normal(jax.random.key(9), arguments[0].shape)
+    kernel = jax.jit(lambda *a: _forward_kernel_call(LAYOUT, *a, interpret=True))
     expected = jax.jit(lambda *a: _reference(LAYOUT, *a))(*arguments)
-    kernel = jax.jit(lambda *a: _forward_kernel_call(LAYOUT, *a, interpret=True))(*arguments)
-    assert kernel.shape == expected.shape
-    np.testing.assert_allclose(kernel, expected, atol=1e-4)
+    got = kernel(*arguments)
+    assert got.shape == expected.shape
+    np.testing.assert_allclose(got, expected, atol=1e-4)
+    whole = [x[:ROWS] if x.shape[0] == batch else x[:, :ROWS] for x in arguments[:3]]
+    np.testing.assert_allclose(kernel(*whole, arguments[3]), expected[:ROWS], atol=1e-4)
 
     expected = jax.jit(lambda *a: _reference_backward(LAYOUT, *a))(*arguments, gradient)
-    kernel = jax.jit(lambda *a: _backward_kernel_call(LAYOUT, *a, interpret=True))(*arguments, gradient)
+    got = jax.jit(lambda *a: _backward_kernel_call(LAYOUT, *a, interpret=True))(*arguments, gradient)
     rows = LAYOUT.input_rows  # the biases that follow only mask: nothing flows into them
-    expected, kernel = [(q, own, x[:rows], w) for q, own, x, w in (expected, kernel)]
-    for name, a, b in zip(("query", "own", "inputs", "weights"), kernel, expected, strict=True):
+    expected, got = [(q, own, x[:rows], w) for q, own, x, w in (expected, got)]
+    for name, a, b in zip(("query", "own", "inputs", "weights"), got, expected, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-4 * float(jnp.abs(b).max() + 1), err_msg=name)

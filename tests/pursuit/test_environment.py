@@ -53,9 +53,8 @@ def test_the_end_is_terminal_where_the_time_is_observed(observe_time):
 @pytest.mark.parametrize(
     "changes",
     [
-        dict(num_pursuers=1, observe_position=True),
+        dict(num_pursuers=1, observe_position=True, min_pillars=0, max_pillars=0, history_spacing=2),
         dict(num_pursuers=8, max_pillars=2, min_pillars=0, speed_limit="none"),
-        dict(min_pillars=0, max_pillars=0, observed_pillars=1, history_length=3, history_spacing=2),
         dict(
             arena_radius=2.0,
             arena_height=3.0,
@@ -65,7 +64,7 @@ def test_the_end_is_terminal_where_the_time_is_observed(observe_time):
             time_step=0.02,
         ),
     ],
-    ids=["one", "eight", "no pillars", "another arena"],
+    ids=["one without pillars", "eight", "another arena"],
 )
 def test_other_sizes(changes):
     environment = make(TINY, **changes)

@@ -75,13 +75,12 @@ def test_pillars_of_uniform_tasks(uniform):
     assert not same_cell.any()
 
 
-@pytest.mark.parametrize("pursuers", [1, 4])
-def test_other_numbers_of_pursuers_start_clear(pursuers):
-    settings = PursuitSettings(num_pursuers=pursuers)
+def test_eight_pursuers_start_clear():
+    settings = PursuitSettings(num_pursuers=8)
     tasks = jax.jit(jax.vmap(lambda key: uniform_task(settings, key)))(keys(1, 500))
-    assert tasks.pursuer_position.shape == (500, pursuers, 3)
+    assert tasks.pursuer_position.shape == (500, 8, 3)
     clear = jax.vmap(lambda task: starts_clear(settings, task))(tasks)
-    assert clear.mean() > 0.99
+    assert clear.all()
 
 
 def test_expansion_moves_vehicles_a_little_and_never_into_a_breach(uniform, expand):
