@@ -5,7 +5,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from openjax.pursuit import Pursuit, PursuitSettings, Task, action_to_command, hover_action, make
+from openjax.pursuit import (
+    SCENARIOS,
+    Pursuit,
+    PursuitSettings,
+    Task,
+    action_to_command,
+    hover_action,
+    make,
+    scenario_task,
+)
+from openjax.pursuit.evader import evader_velocity
+from openjax.pursuit.sensing import line_of_sight
 from openjax.vehicle.effects import EFFECTS
 
 KEY = jax.random.key(0)
@@ -102,7 +113,9 @@ def test_order_within_a_step_and_history():
 
     @jax.jit
     def play(key):
-        observation, state = environment.reset(key)
+        observation, state = environment.reset_to(
+            key, scenario_task(environment.settings, SCENARIOS["hidden"])
+        )
 
         def one(state, action):
             observation, new, *_ = environment.step(key, state, action)
@@ -113,6 +126,21 @@ def test_order_within_a_step_and_history():
 
     first, start, (observation, evader, velocity, position, seen) = jax.tree.map(np.asarray, play(KEY))
     np.testing.assert_allclose(evader[0], start.evader_position + 0.01 * velocity[0], atol=1e-6)
+    pillars = start.task.pillar_position, start.task.pillar_active
+
+    @jax.jit
+    @jax.vmap
+    def fled(evader, position):
+        in_sight = line_of_sight(environment.settings, position, evader, *pillars)
+        return in_sight, evader_velocity(environment.settings, evader, position, in_sight, *pillars)
+
+    in_sight, expected = fled(
+        np.concatenate([start.evader_position[None], evader[:-1]]),
+        np.concatenate([start.drones.position[None], position[:-1]]),
+    )
+    np.testing.assert_allclose(velocity, expected, atol=1e-3)
+    assert not in_sight[0].any() and not start.seen
+    np.testing.assert_allclose(start.last_seen, [0, 0, 0.6])
     np.testing.assert_array_equal(first.frames[0], first.frames[2])
     for k in (2, 8):  # observation after step k + 1: frames of steps k - 3, k - 1, k + 1
         for slot, step in enumerate((k - 3, k - 1, k + 1)):
