@@ -136,7 +136,7 @@ def quick() -> TrainSettings:
         mappo=MappoSettings(learning_rate=1e-3, minibatches=4, clip=0.2),
         generator=GeneratorSettings(capacity=500),
         num_envs=80,
-        total_steps=1_000_000,
+        total_steps=1_500_000,
         evaluation_interval=50,
         evaluation_episodes=64,
     )
