@@ -205,8 +205,10 @@ def unknown_features(rest, paths: dict, effects: set[str], s: Settings) -> np.nd
     flexible model predicts, how unevenly it comes, how the flights agree, and how much was explained at
     all."""
     values = np.asarray(rest)
-    z = (values[:30] - np.asarray(s.rest_mean)[:30]) / np.asarray(s.rest_scale)[:30]
-    bands = np.log1p(np.clip(z[:18], 0.0, None))
+    z = (values - np.asarray(s.rest_mean)) / np.asarray(s.rest_scale)
+    # Strong against the sensors' noise and strong in itself: neither other sensors nor noisier ones look
+    # strange.
+    bands = np.log1p(np.clip(np.minimum(z[:18], z[31:49]), 0.0, None))
     motion, accelerometer = np.sort(bands[:12]), np.sort(bands[12:])
     gain = max((g for k, g in paths["sets"].items() if set(k) <= effects), default=0.0)
     return np.array(
@@ -220,6 +222,7 @@ def unknown_features(rest, paths: dict, effects: set[str], s: Settings) -> np.nd
             float(values[30]),
             np.log1p(max(gain, 0.0)) / 10.0,
             np.log1p(_unexplained(paths, effects)),
+            np.log1p(max(paths["pose"] or 0.0, 0.0)) / 10.0 if "state_latency" in effects else 0.0,
         ]
     )
 

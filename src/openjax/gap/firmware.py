@@ -23,6 +23,7 @@ GAIN_STEP = 0.05
 GAIN_TOLERANCE = ((0.02, 0.3), (0.4, 0.004), (0.12, 0.1))
 LARGEST_SURPRISE = 2.5  # usual deviations
 CLEAR_SCORE = 5.0  # nats above which other gains are taken into account
+USUAL_GYRO_NOISE = 0.0165  # rad/s, of those flights by `gyro_noise`
 GYRO_TILT = 0.01  # rad, between the logged gyro and the one that the controller uses
 LONGEST_DELAY = 0.1  # s
 DELAY_STEP = 0.0005  # s
@@ -172,6 +173,12 @@ def _observe_twice(track: Track, vehicle, link, gains, push=None):
     return np.asarray(wanted, float)[:, :rows], causal, np.asarray(sent[0])[:rows]
 
 
+def gyro_noise(rates: np.ndarray) -> float:
+    """White noise of a gyroscope log (T, 3), rad/s: from third differences, which motion hardly reaches at
+    100 Hz."""
+    return float(1.4826 * np.median(np.abs(np.diff(rates, 3, axis=0))) / np.sqrt(20.0))
+
+
 @dataclass(frozen=True, eq=False)
 class RateLoop:
     """The rate controller read from what the motors differ by: `path` for its gains; the motor commands
@@ -211,8 +218,11 @@ def read_rate_loop(tracks, vehicles, arrived, flight_of, pushes=None) -> RateLoo
         nuisances.append(np.stack(trims))
         clean = ((track.motor < 0.997) & (track.motor > 0.003)).all(1)
         masks.append(1.0 - (np.convolve(~clean, np.ones(12))[: len(clean)] > 0))
+    noise = np.mean([gyro_noise(t.body_rates) for t in tracks])
+    worse = float(np.clip((noise / USUAL_GYRO_NOISE) ** 2, 0.5, 10.0))
+    tolerance = tuple((least, per_row * worse) for least, per_row in GAIN_TOLERANCE)
     groups = (((0, 1), False), ((2,), False))
-    path = fit_linear_path(y, columns, nuisances, flight_of, (0.4, 0.4, 0.4), groups, masks, GAIN_TOLERANCE)
+    path = fit_linear_path(y, columns, nuisances, flight_of, (0.4, 0.4, 0.4), groups, masks, tolerance)
     score, theta, _ = path.score()
     if score < CLEAR_SCORE:
         theta = 0.0 * theta

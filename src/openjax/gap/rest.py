@@ -25,19 +25,23 @@ BLOCK = 0.5  # s
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """`bands` (6, 3): log power by channel and band over sensor noise; `explained` (6,): share of the
-    rest's power that the flexible model predicts on held-out flights; `uneven` (6,): log ratio of the
-    largest to the median power of half-second blocks; `incoherent`: disagreement of the flights about
-    the parameters, per parameter; `drivers` {channel: names of the regressors that carry most}."""
+    """`bands` (6, 3): log power by channel and band over sensor noise, `levels` the same as densities;
+    `explained` (6,): share of the rest's power that the flexible model predicts on held-out flights;
+    `uneven` (6,): log ratio of the largest to the median power of half-second blocks; `incoherent`:
+    disagreement of the flights about the parameters, per parameter; `drivers` {channel: names of the
+    regressors that carry most}."""
 
     bands: np.ndarray
+    levels: np.ndarray
     explained: np.ndarray
     uneven: np.ndarray
     incoherent: float
     drivers: dict[str, list[str]]
 
     def vector(self) -> np.ndarray:
-        return np.concatenate([self.bands.ravel(), self.explained, self.uneven, [self.incoherent]])
+        return np.concatenate(
+            [self.bands.ravel(), self.explained, self.uneven, [self.incoherent], self.levels.ravel()]
+        )
 
 
 def residuals_of(replay: Replay, fit: SetFit) -> list[np.ndarray]:
@@ -63,20 +67,21 @@ def look(replay: Replay, fit: SetFit) -> Rest:
     """All three looks at what `fit` leaves."""
     residuals = residuals_of(replay, fit)
     rests = [disturbances(t, r) for t, r in zip(replay.tracks, residuals, strict=True)]
-    bands = np.mean([_bands(t, r) for t, r in zip(replay.tracks, rests, strict=True)], 0)
+    bands, levels = np.mean([_bands(t, r) for t, r in zip(replay.tracks, rests, strict=True)], 0)
     calm = [smooth(r, 0.15, t.dt) for t, r in zip(replay.tracks, rests, strict=True)]
     explained, drivers = _explained(replay, calm)
     uneven = np.max([_uneven(t, r) for t, r in zip(replay.tracks, calm, strict=True)], 0)
-    return Rest(bands, explained, uneven, _incoherent(fit), drivers)
+    return Rest(bands, levels, explained, uneven, _incoherent(fit), drivers)
 
 
-def _bands(track: Track, rest: np.ndarray) -> np.ndarray:
+def _bands(track: Track, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """log10 power density (6, 3) in the bands over that of the sensors, each as the sensor sees it."""
     rows = rest[int(SKIP / track.dt) :]
     window = np.hanning(len(rows))[:, None]
     power = np.abs(np.fft.rfft((rows - rows.mean(0)) * window, axis=0)) ** 2
     frequency = np.fft.rfftfreq(len(rows), track.dt)
-    out = np.zeros((len(AXES), len(BANDS)))
+    out, levels = np.zeros((len(AXES), len(BANDS))), np.zeros((len(AXES), len(BANDS)))
+    density = track.dt / (window**2).sum()
     for number, axes in enumerate(AXES):
         spectrum = power[:, list(axes)].mean(1)
         top = (frequency > SENSOR_BAND[0]) & (frequency < SENSOR_BAND[1])
@@ -86,7 +91,8 @@ def _bands(track: Track, rest: np.ndarray) -> np.ndarray:
         for band, (low, high) in enumerate(BANDS):
             inside = (frequency > low) & (frequency <= high)
             out[number, band] = np.log10((spectrum[inside].mean() + 1e-20) / level)
-    return out
+            levels[number, band] = np.log10(spectrum[inside].mean() * density + 1e-20)
+    return out, levels
 
 
 def regressors(track: Track) -> tuple[list[str], np.ndarray]:
