@@ -134,9 +134,10 @@ def quick() -> TrainSettings:
         network=NetworkSettings(features=64),
         predictor=PredictorSettings(units=32),
         mappo=MappoSettings(learning_rate=1e-3, minibatches=4, clip=0.2),
-        generator=GeneratorSettings(capacity=500),
+        # few tasks reach the archive in so short a run; drawn from too often, they'd be all that is learnt
+        generator=GeneratorSettings(capacity=500, expansion=0.3),
         num_envs=80,
-        total_steps=1_500_000,
+        total_steps=1_000_000,
         evaluation_interval=50,
         evaluation_episodes=64,
     )
