@@ -1,0 +1,61 @@
+"""The README's commands: each exists, and the way from sample flights to a corrected simulator works as written."""
+
+import importlib.util
+import json
+import re
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+
+import openjax
+from openjax import calibrate, diagnose, sample_flights
+from openjax.runs.environments import make_environment
+from openjax.vehicle.vehicle_file import load_vehicle_file
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def test_every_command_and_target_of_the_readme_exists():
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    for target in set(re.findall(r"\bmake ([a-z]+)\b", README)) - {"it"}:
+        assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
+    modules = set(re.findall(r"python -m (openjax\.\w+)", README))
+    assert len(modules) >= 5
+    for module in modules:
+        assert importlib.util.find_spec(module), module
+    for path in re.findall(r"\]\((experiments/[^)]+)\)", README):
+        assert (ROOT / path).exists(), path
+
+
+def test_from_sample_flights_to_a_corrected_simulator(tmp_path):
+    """sample_flights -> calibrate -> diagnose -> an environment that flies with what was found."""
+    case, out = tmp_path / "drag", tmp_path / "diagnosis"
+    sample_flights.main([str(case), "--effect", "rotor_drag", "--seed", "3"])
+    calibrate.main([str(case), "--out", str(tmp_path / "vehicle_calibrated.toml")])
+    vehicle = load_vehicle_file(tmp_path / "vehicle_calibrated.toml").vehicle
+    nominal = load_vehicle_file(case).vehicle
+    assert (
+        abs(float(vehicle.thrust_constant / nominal.thrust_constant) - 1) < 0.05
+    )  # nothing was wrong with it
+
+    assert diagnose.main([str(case), "--out", str(out), "--no-html"]) == 0
+    report = json.loads((out / "drag" / "report.json").read_text(encoding="utf-8"))
+    assert report["verdict"] == "effect"
+    assert "rotor_drag" in report["effects"]
+    assert report["gap"]["reduction"] > 0.5
+
+    settings = openjax.PursuitSettings(physics="rigid", speed_limit="none")
+    corrected = make_environment(settings, None, out / "drag" / "effects.toml")
+    action = jnp.zeros((3, 4)).at[:, 0].set(0.25).at[:, 2].set(0.2)
+
+    def speed_after_a_second(environment):
+        step = jax.jit(environment.step)
+        _, state = environment.reset(jax.random.key(0))
+        for _ in range(100):
+            _, state, *_ = step(jax.random.key(0), state, action)
+        return float(jnp.mean(jnp.linalg.norm(state.drones.velocity, axis=-1)))
+
+    # the same commands fly slower against the drag that was found
+    assert speed_after_a_second(corrected) < 0.97 * speed_after_a_second(openjax.Pursuit(settings))
