@@ -133,7 +133,7 @@ def quick() -> TrainSettings:
         environment=PursuitSettings(observe_position=True),
         network=NetworkSettings(features=64),
         predictor=PredictorSettings(units=32),
-        mappo=MappoSettings(learning_rate=1e-3, minibatches=4, clip=0.2),
+        mappo=MappoSettings(learning_rate=1e-3, minibatches=8, clip=0.2, discount=0.99),
         # few tasks reach the archive in so short a run; drawn from too often, they'd be all that is learnt
         generator=GeneratorSettings(capacity=500, expansion=0.3),
         num_envs=80,
