@@ -6,6 +6,7 @@ Writes OUT.json and a table beside it.
 
 import argparse
 import json
+import statistics
 from pathlib import Path
 
 from openjax.runs.settings_files import write_json
@@ -27,6 +28,22 @@ def first_reaching(evaluations: list[dict], rate: float) -> str:
         if entry["capture_rate"] >= rate:
             return f"{entry['steps'] / 1e6:.0f} M, {entry['seconds']:.0f} s"
     return "not reached"
+
+
+def learning_against_spread(runs: dict[str, dict]) -> list[str]:
+    """Improvement on the held-back tasks in standard deviations over the runs' ends."""
+    lines = ["", "Learning against spread, held-back tasks:", ""]
+    lines += ["| figure | before, mean | after, each run | improvement over standard deviation |", "|---|---|---|---|"]
+    for field in ("episode_return", "collision_rate"):
+        before, after = (
+            [row[field] for run in runs.values() for row in run["layouts"][when] if row["scenario"] == "held_back"]
+            for when in ("before", "after")
+        )
+        change = abs(statistics.mean(after) - statistics.mean(before))
+        shown = ", ".join(f"{value:.3f}" for value in after)
+        ratio = change / statistics.stdev(after)
+        lines.append(f"| {field} | {statistics.mean(before):.3f} | {shown} | {ratio:.1f} |")
+    return lines
 
 
 def main() -> None:
@@ -65,6 +82,8 @@ def main() -> None:
             for row in run["layouts"]["after"]
         ]
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    if len(runs) > 1:
+        lines += learning_against_spread(runs)
     arguments.out.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")
     print("\n".join(lines))
 
