@@ -33,10 +33,18 @@ def first_reaching(evaluations: list[dict], rate: float) -> str:
 def learning_against_spread(runs: dict[str, dict]) -> list[str]:
     """Improvement on the held-back tasks in standard deviations over the runs' ends."""
     lines = ["", "Learning against spread, held-back tasks:", ""]
-    lines += ["| figure | before, mean | after, each run | improvement over standard deviation |", "|---|---|---|---|"]
+    lines += [
+        "| figure | before, mean | after, each run | improvement over standard deviation |",
+        "|---|---|---|---|",
+    ]
     for field in ("episode_return", "collision_rate"):
         before, after = (
-            [row[field] for run in runs.values() for row in run["layouts"][when] if row["scenario"] == "held_back"]
+            [
+                row[field]
+                for run in runs.values()
+                for row in run["layouts"][when]
+                if row["scenario"] == "held_back"
+            ]
             for when in ("before", "after")
         )
         change = abs(statistics.mean(after) - statistics.mean(before))

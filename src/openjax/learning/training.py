@@ -1,6 +1,7 @@
 """The compiled training step: rollout, predictor update, policy update, selection of tasks; one function of one carry."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -35,14 +36,14 @@ class TrainCarry:
     update: jax.Array  # () int32, training steps done
 
 
-@struct.dataclass
+@dataclass(frozen=True)
 class Building:
     """What a training step is made of: environment, networks and optimisers of a run's settings."""
 
-    environment: Pursuit = struct.field(pytree_node=False)
-    policy: Policy = struct.field(pytree_node=False)
-    optimisers: tuple = struct.field(pytree_node=False)
-    predictor_optimiser: optax.GradientTransformation = struct.field(pytree_node=False)
+    environment: Pursuit
+    policy: Policy
+    optimisers: tuple[optax.GradientTransformation, optax.GradientTransformation]
+    predictor_optimiser: optax.GradientTransformation
 
 
 def build(settings: TrainSettings, environment: Pursuit | None = None) -> Building:

@@ -211,7 +211,7 @@ def _backward_kernel(layout, q_ref, own_ref, x_ref, w_ref, g_ref, dq_ref, down_r
         dq_ref[:, h * f : (h + 1) * f] = (dquery[h] * layout.scale).astype(dq_ref.dtype)
 
 
-def _padded(layout, query, own, inputs, *more):
+def _padded(query, own, inputs, *more):
     """Samples padded to whole blocks."""
     extra = -own.shape[0] % ROWS
     if not extra:
@@ -230,7 +230,7 @@ def _block_specs(layout, inputs, weights):
 
 def _forward_kernel_call(layout, query, own, inputs, weights, interpret=False):
     batch = own.shape[0]
-    query, own, inputs = _padded(layout, query, own, inputs)
+    query, own, inputs = _padded(query, own, inputs)
     wide, narrow, numbers, whole = _block_specs(layout, inputs, weights)
     mean = pl.pallas_call(
         functools.partial(_forward_kernel, layout),
@@ -247,7 +247,7 @@ def _forward_kernel_call(layout, query, own, inputs, weights, interpret=False):
 
 def _backward_kernel_call(layout, query, own, inputs, weights, gradient, interpret=False):
     batch = own.shape[0]
-    query, own, inputs, gradient = _padded(layout, query, own, inputs, gradient)
+    query, own, inputs, gradient = _padded(query, own, inputs, gradient)
     wide, narrow, numbers, whole = _block_specs(layout, inputs, weights)
     number = len(layout.entities)
     dquery, down, dlinear = pl.pallas_call(
