@@ -53,7 +53,7 @@ def textbook(p, own, others, pillars, seen):
         weight = np.exp(score - score.max(1, keepdims=True))
         weight /= weight.sum(1, keepdims=True)
         mixed.append(np.einsum("bm,bmd->bd", weight, values[..., part]))
-    return np.concatenate(mixed, axis=1) @ p["output"] + p["output_bias"]
+    return np.concatenate(mixed, axis=1) @ p["output"]
 
 
 def test_folded_attention_is_multi_head_attention_with_one_query():

@@ -1,10 +1,12 @@
 """Actor and critic (the paper's section IV-B)."""
 
+import math
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from openjax.policy.encoder import Encoder
+from openjax.policy.encoder import Encoder, HiddenLayer
 from openjax.policy.settings import NetworkSettings
 from openjax.pursuit import Observation
 
@@ -49,20 +51,32 @@ class Critic(nn.Module):
     def __call__(self, observation: Observation, predicted: jax.Array | None) -> jax.Array:
         """Observation of (..., N) pursuers, predicted (..., K, 3) positions or None -> (..., N)."""
         settings = self.settings
-        own = own_features(observation, predicted)
-        if settings.critic_input == "state":
-            own = jnp.concatenate([own, observation.privileged], axis=-1)
         dtype = jnp.dtype(settings.compute_type)
-        hidden = Encoder(settings.features, settings.heads, dtype, name="encoder")(
-            own, observation.others, observation.pillars, observation.pillar_seen
+        encoder = Encoder(settings.features, settings.heads, dtype, name="encoder")
+        if settings.critic_input == "world":
+            number = observation.position.shape[-2]
+            hidden = encoder(*world_features(observation))
+        else:
+            number = 1
+            own = own_features(observation, predicted)
+            if settings.critic_input == "state":
+                own = jnp.concatenate([own, observation.privileged], axis=-1)
+            hidden = encoder(own, observation.others, observation.pillars, observation.pillar_seen)
+        leading = hidden.shape[:-1]
+        hidden = HiddenLayer(settings.features, dtype, name="hidden")(
+            hidden.reshape(math.prod(leading), settings.features)
         )
-        hidden = nn.Dense(
-            settings.features, dtype=dtype, kernel_init=nn.initializers.orthogonal(2**0.5), name="hidden"
-        )(hidden)
-        value = nn.Dense(1, dtype=jnp.float32, kernel_init=nn.initializers.orthogonal(1.0), name="value")(
-            nn.gelu(hidden)
-        )
-        return value[..., 0]
+        value = nn.Dense(
+            number, dtype=jnp.float32, kernel_init=nn.initializers.orthogonal(1.0), name="value"
+        )(hidden).reshape(*leading, number)
+        return value if settings.critic_input == "world" else value[..., 0]
+
+
+def world_features(observation: Observation) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """The whole world as the encoder's input: the team (..., N * S) for the own part, no others, all pillars (..., P, 2)."""
+    team = jnp.concatenate([observation.self_state, observation.privileged], axis=-1)
+    team = team.reshape(*team.shape[:-2], team.shape[-2] * team.shape[-1])
+    return team, jnp.zeros((*team.shape[:-1], 0, 3)), observation.pillar_position, observation.pillar_active
 
 
 def own_features(observation: Observation, predicted: jax.Array | None) -> jax.Array:

@@ -15,6 +15,9 @@ import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as pallas_triton
 
+from openjax.policy.activation import activation, activation_slope
+from openjax.policy.platform import on_platform
+
 ROWS = 8
 """Samples that one program of the kernel works on; with more, the backward kernel's registers spill (3 times slower)."""
 
@@ -76,19 +79,9 @@ def attend(
     return _attend(query, own, inputs, weights, layout)
 
 
-def activation(x: jax.Array) -> jax.Array:
-    """x sigmoid(1.702 x), the cheap approximation of GELU (Hendrycks and Gimpel, 2016)."""
-    return x / (1.0 + jnp.exp(-1.702 * x))
-
-
-def _activation_slope(x):
-    share = 1.0 / (1.0 + jnp.exp(-1.702 * x))
-    return share + 1.702 * x * share * (1.0 - share)
-
-
 @functools.partial(jax.custom_vjp, nondiff_argnums=(4,))
 def _attend(query, own, inputs, weights, layout):
-    return _on_platform(_reference, _forward_kernel_call, layout)(query, own, inputs, weights)
+    return on_platform(_reference, _forward_kernel_call, layout)(query, own, inputs, weights)
 
 
 def _attend_forward(query, own, inputs, weights, layout):
@@ -96,19 +89,10 @@ def _attend_forward(query, own, inputs, weights, layout):
 
 
 def _attend_backward(layout, saved, gradient):
-    return _on_platform(_reference_backward, _backward_kernel_call, layout)(*saved, gradient)
+    return on_platform(_reference_backward, _backward_kernel_call, layout)(*saved, gradient)
 
 
 _attend.defvjp(_attend_forward, _attend_backward)
-
-
-def _on_platform(reference, kernel, layout):
-    def run(*arguments):
-        return jax.lax.platform_dependent(
-            *arguments, default=functools.partial(reference, layout), cuda=functools.partial(kernel, layout)
-        )
-
-    return run
 
 
 def _reference(layout, query, own, inputs, weights):
@@ -206,7 +190,7 @@ def _backward_kernel(layout, q_ref, own_ref, x_ref, w_ref, g_ref, dq_ref, down_r
         if m == 0:
             down_ref[...] = dentity.astype(down_ref.dtype)
         else:
-            dlinear_ref[m - 1, :, :] = (dentity * _activation_slope(linear)).astype(dlinear_ref.dtype)
+            dlinear_ref[m - 1, :, :] = (dentity * activation_slope(linear)).astype(dlinear_ref.dtype)
     for h in range(heads):
         dq_ref[:, h * f : (h + 1) * f] = (dquery[h] * layout.scale).astype(dq_ref.dtype)
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from openjax.policy.attention import EntityKind, Layout, attend
+from openjax.policy.normalisation import normalise
 
 MASKED = -1e4
 """Added to the score of an entity that isn't there."""
@@ -74,8 +75,7 @@ class SelfAttention(nn.Module):
             jnp.concatenate(weights),
             Layout(f, h, tuple(kinds), width**-0.5),
         )
-        out_bias = self.param("output_bias", nn.initializers.zeros_init(), (f,))
-        return mean @ output.reshape(h * f, f).astype(self.dtype) + out_bias.astype(self.dtype)
+        return mean @ output.reshape(h * f, f).astype(self.dtype)
 
 
 def normalised_linear(x: jax.Array, linear: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -119,14 +119,34 @@ class Encoder(nn.Module):
             # not -1: with a single pursuer there are no others, and nothing to tell the size from
             return x.reshape(math.prod(leading), *x.shape[rows:])
 
-        own = self._layer("self_1", flat(self_state))
-        own = self._layer("self_2", own)
+        own = HiddenLayer(self.features, self.dtype, name="self_1")(flat(self_state))
+        own = HiddenLayer(self.features, self.dtype, name="self_2")(own)
         attention = SelfAttention(self.features, self.heads, self.dtype, name="attention")
         hidden = own + attention(own, flat(others), flat(pillars), flat(pillar_seen))
-        hidden = nn.LayerNorm(dtype=self.dtype, name="norm")(hidden)
-        return self._layer("hidden", hidden).reshape(*leading, self.features)
+        hidden = normalise(hidden, affine_parameters(self, "norm", self.features), activate=False)
+        hidden = HiddenLayer(self.features, self.dtype, name="hidden")(hidden)
+        return hidden.reshape(*leading, self.features)
 
-    def _layer(self, name, x):
+
+class HiddenLayer(nn.Module):
+    """Linear layer, layer normalisation and activation."""
+
+    features: int
+    dtype: jnp.dtype
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """(B, inputs) -> (B, features)."""
         init = nn.initializers.orthogonal(2**0.5)
-        x = nn.Dense(self.features, dtype=self.dtype, kernel_init=init, name=name)(x)
-        return nn.gelu(nn.LayerNorm(dtype=self.dtype, name=f"{name}_norm")(x))
+        kernel = self.param("kernel", init, (x.shape[-1], self.features), jnp.float32)
+        x = x.astype(self.dtype) @ kernel.astype(self.dtype)
+        return normalise(x, affine_parameters(self, "affine", self.features))
+
+
+def affine_parameters(module: nn.Module, name: str, features: int) -> jax.Array:
+    """(3, features) bias, scale and shift of a layer, for `normalise`; they start as 0, 1, 0."""
+
+    def start(key, shape, dtype):
+        return jnp.zeros(shape, dtype).at[1].set(1.0)
+
+    return module.param(name, start, (3, features), jnp.float32)

@@ -18,8 +18,9 @@ class NetworkSettings:
     """Arithmetic of the networks; parameters stay in float32."""
     initial_log_std: float = -0.5
     """Start of the Gaussian policy's state-independent log standard deviation."""
-    critic_input: Literal["state", "observation"] = "state"
-    """"state": the critic also sees the true evader, its velocity and the own position; "observation": what the actor sees."""
+    critic_input: Literal["world", "state", "observation"] = "state"
+    """"world": the critic sees the true state of the whole world and values all pursuers in one pass; "state": each
+    pursuer's observation, the true evader, its velocity and the own position; "observation": what the actor sees."""
 
     def __post_init__(self):
         if self.features % self.heads:

@@ -29,11 +29,16 @@ class PursuitState:
     evader_position: jax.Array  # (3,) m, world
     evader_velocity: jax.Array  # (3,) m/s, world
     last_seen: jax.Array  # (3,) where the evader was last seen; the arena's middle before that
-    seen: jax.Array  # () bool, some pursuer sees the evader
+    in_sight: jax.Array  # (N,) bool, which pursuers see the evader
     frames: jax.Array  # (n * spacing, F) history, oldest first
     previous_action: jax.Array  # (N, 4) squashed command of the last step
     step: jax.Array  # () int32, control steps since the start
     statistics: EpisodeStatistics
+
+    @property
+    def seen(self) -> jax.Array:
+        """() bool, some pursuer sees the evader."""
+        return jnp.any(self.in_sight, axis=-1)
 
 
 @struct.dataclass
@@ -118,7 +123,7 @@ class Pursuit:
             evader_position=task.evader_position,
             evader_velocity=still,
             last_seen=jnp.where(seen, task.evader_position, middle),
-            seen=seen,
+            in_sight=in_sight,
             frames=frames,
             previous_action=jnp.broadcast_to(hover_action(self.vehicle), (settings.num_pursuers, 4)),
             step=step,
@@ -162,9 +167,9 @@ class Pursuit:
         action = jnp.clip(action.astype(jnp.float32), -1.0, 1.0)
         pillars = (task.pillar_position, task.pillar_active)
 
-        position = state.drones.position
-        in_sight = line_of_sight(settings, position, state.evader_position, *pillars)
-        velocity = evader_velocity(settings, state.evader_position, position, in_sight, *pillars)
+        velocity = evader_velocity(
+            settings, state.evader_position, state.drones.position, state.in_sight, *pillars
+        )
         evader = state.evader_position + settings.time_step * velocity
 
         drones = self._drones_step(
@@ -198,7 +203,7 @@ class Pursuit:
             evader_position=evader,
             evader_velocity=velocity,
             last_seen=jnp.where(seen, evader, state.last_seen),
-            seen=seen,
+            in_sight=in_sight,
             frames=jnp.concatenate([state.frames[1:], newest[None]]),
             previous_action=action,
             step=step,
