@@ -6,12 +6,14 @@ starts, and without the clamp. Writes experiments/results/headline.json and .md.
 
 import argparse
 import dataclasses
+import functools
 import time
 from pathlib import Path
 
 import numpy as np
 
-from openjax.pursuit import SCENARIOS, Pursuit
+from openjax.policy import Policy
+from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings
 from openjax.runs.evaluation import Evaluator, evaluate_scenarios, layout_slots
 from openjax.runs.machine import describe_machine
 from openjax.runs.policies import load_policy
@@ -37,13 +39,22 @@ PAPER_PREDICTION = {"wall": 0.054, "narrow_gap": 0.084, "random": 0.109, "passag
 EXTRA = ("last_seen_error",)
 
 
-def fly(policy_name: str, changes: dict, episodes: int) -> list[dict]:
-    """Records of one policy on all layouts."""
-    loaded = load_policy(policy_name)
+@functools.cache
+def evaluator_of(settings: PursuitSettings, policy: Policy, episodes: int) -> Evaluator:
+    """One compiled evaluation for all policies of a kind."""
+    return Evaluator(Pursuit(settings), policy, episodes)
+
+
+def fly(
+    policy: str | Path, changes: dict, episodes: int, layouts: tuple[str, ...] = tuple(SCENARIOS)
+) -> list[dict]:
+    """Records of one policy on the layouts, in the game that it was trained in with `changes`."""
+    loaded = load_policy(policy)
     settings = loaded.settings.environment
     settings = dataclasses.replace(settings, max_pillars=layout_slots(settings), **changes)
-    evaluator = Evaluator(Pursuit(settings), loaded.policy, episodes)
-    return evaluate_scenarios(evaluator, loaded.parameters, list(SCENARIOS.values()), episodes, 0, EXTRA)[0]
+    evaluator = evaluator_of(settings, loaded.policy, episodes)
+    scenarios = [SCENARIOS[name] for name in layouts]
+    return evaluate_scenarios(evaluator, loaded.parameters, scenarios, episodes, 0, EXTRA)[0]
 
 
 def across_seeds(rows: list[dict], field: str) -> str:
