@@ -8,17 +8,19 @@ import sys
 import time
 from collections.abc import Sequence
 
-from openjax.runs.command_line import run_command
+from openjax.runs.command_line import peek, run_command
 
 
 def main(arguments: Sequence[str]) -> int:
     """The command; returns its exit status."""
     started = time.monotonic()
-    if not {"-h", "--help"} & set(arguments):
+    if not {"-h", "--help"} & set(arguments) and peek(arguments, "process_id") in (None, "0"):
         print("openjax.train: loading JAX and MuJoCo ...", flush=True)  # takes seconds; nobody should wonder
-    from openjax.runs.training_command import read_command, start
+    from openjax.runs.joining import joined
+    from openjax.runs.training_command import membership, read_command, start
 
-    return start(read_command(arguments), arguments, started)
+    with joined(membership(arguments)) as processes:
+        return start(read_command(arguments), arguments, started, processes)
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ import numpy as np
 from orbax.checkpoint.experimental import v1 as orbax
 
 from openjax.errors import UserError
+from openjax.runs.processes import Processes
 
 _DIGITS = 9
 
@@ -46,7 +47,27 @@ def place(carry: Any, shardings: Any = None) -> Any:
       carry: pytree of arrays.
       shardings: None (the first device) or a sharding or a pytree prefix of them.
     """
-    return jax.device_put(carry, _default_sharding() if shardings is None else shardings)
+    shardings = _default_sharding() if shardings is None else shardings
+    if all(sharding.is_fully_addressable for sharding in jax.tree.leaves(shardings)):
+        return jax.device_put(carry, shardings)
+    # Devices of other processes: each process has the whole carry and hands in its own devices' share.
+    is_key = jax.tree.map(lambda leaf: jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key), carry)
+    arrays = jax.tree.map(
+        lambda leaf, key: np.asarray(jax.random.key_data(leaf) if key else leaf), carry, is_key
+    )
+    implementations = jax.tree.map(
+        lambda leaf, key: jax.random.key_impl(leaf) if key else None, carry, is_key
+    )
+
+    def whole(arrays):
+        return jax.tree.map(
+            lambda leaf, key, kind: jax.random.wrap_key_data(leaf, impl=kind) if key else leaf,
+            arrays,
+            is_key,
+            implementations,
+        )
+
+    return jax.jit(whole, out_shardings=shardings)(arrays)
 
 
 def abstract_like(carry: Any) -> Any:
@@ -58,7 +79,8 @@ def abstract_like(carry: Any) -> Any:
 
 def save_state(path: Path, carry: Any, notes: dict | None = None) -> None:
     """Write one carry to the directory `path`, in place of what is there; it appears whole or not at all."""
-    shutil.rmtree(path, ignore_errors=True)
+    if jax.process_index() == 0:
+        shutil.rmtree(path, ignore_errors=True)
     _start_save(Path(path), carry, notes or {}).result()
 
 
@@ -84,7 +106,10 @@ def load_state(path: Path, abstract: Any) -> Any:
 
 
 def load_arrays(path: Path, prefix: str = "") -> dict[str, np.ndarray]:
-    """Leaves by path as host arrays, without knowing the tree; only those whose path starts with `prefix`."""
+    """Leaves by path as host arrays, without knowing the tree; only those whose path starts with `prefix`.
+
+    Read by this process alone.
+    """
     path = Path(path).absolute()
     if not is_checkpoint(path):
         raise UserError(f"{path} is no checkpoint; expected a directory written by openjax.train")
@@ -95,7 +120,10 @@ def load_arrays(path: Path, prefix: str = "") -> dict[str, np.ndarray]:
         else orbax.PLACEHOLDER
         for name, leaf in orbax.metadata(path).metadata.items()
     }
-    loaded = {name: leaf for name, leaf in orbax.load(path, wanted).items() if name.startswith(prefix)}
+    this = jax.process_index()
+    alone = orbax.options.MultiprocessingOptions(primary_host=this, active_processes={this})
+    with orbax.Context(multiprocessing_options=alone):
+        loaded = {name: leaf for name, leaf in orbax.load(path, wanted).items() if name.startswith(prefix)}
     is_key = {name: jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) for name, leaf in loaded.items()}
     return {
         name: np.asarray(jax.random.key_data(leaf) if is_key[name] else leaf) for name, leaf in loaded.items()
@@ -108,11 +136,15 @@ def is_checkpoint(path: Path) -> bool:
 
 
 class Checkpoints:
-    """The checkpoints of one run: the last few and the best by held-back evaluation are kept."""
+    """The checkpoints of one run: the last few and the best by held-back evaluation are kept.
 
-    def __init__(self, directory: Path, keep_last: int = 2):
+    Of several processes all write and read their part, in the same order; they share the directory.
+    """
+
+    def __init__(self, directory: Path, keep_last: int = 2, processes: Processes | None = None):
         self.directory = Path(directory).absolute()
         self.keep_last = keep_last
+        self._processes = processes or Processes()
         self._pending = None
         self._known: dict[str, CheckpointRecord] = {}  # a committed checkpoint doesn't change
 
@@ -147,9 +179,10 @@ class Checkpoints:
         """
         self.wait()
         path = self.directory / f"{update:0{_DIGITS}d}"
-        if is_checkpoint(path):
+        if self._processes.of_first(is_checkpoint(path)):
             return
-        shutil.rmtree(path, ignore_errors=True)
+        if self._processes.is_first:
+            shutil.rmtree(path, ignore_errors=True)
         self._pending = _start_save(path, carry, {**(notes or {}), "score": score})
 
     def wait(self) -> None:
@@ -158,6 +191,8 @@ class Checkpoints:
             return
         pending, self._pending = self._pending, None
         pending.result()
+        if not self._processes.is_first:
+            return
         records, best = self.records(), self.best()
         for record in records[: -self.keep_last]:
             if best is None or record.path != best.path:
@@ -170,19 +205,24 @@ class Checkpoints:
           UserError: there is none, or it holds a carry of another shape.
         """
         self.remove_unfinished()
-        records = self.records()
-        for record in reversed(records):
+        records = {record.path.name: record for record in self.records()}
+        for name in reversed(self._processes.of_first(list(records))):
+            path, failure, carry = self.directory / name, None, None
             try:
-                return load_state(record.path, abstract), record
+                carry = load_state(path, abstract)
             except UserError:
                 raise
             except Exception as error:  # orbax and tensorstore raise many kinds on damaged files
-                warn(f"{record.path} can't be read ({type(error).__name__}), using the one before it")
+                failure = type(error).__name__
+            failures = [failure for failure in self._processes.everyone(failure) if failure]
+            if not failures:
+                return carry, records[name]
+            warn(f"{path} can't be read ({failures[0]}), using the one before it")
         raise UserError(f"{self.directory} holds no checkpoint that can be read")
 
     def remove_unfinished(self) -> None:
         """Delete what a killed write left behind."""
-        if jax.process_index() != 0 or not self.directory.is_dir():
+        if not self._processes.is_first or not self.directory.is_dir():
             return
         for path in self.directory.iterdir():
             if path.is_dir() and "tmp" in path.name:
@@ -200,7 +240,7 @@ def _metadata(path):
 
 
 def _default_sharding():
-    return jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    return jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
 
 
 def _start_save(path, carry, notes):

@@ -1,8 +1,10 @@
-"""A training run on several devices of a host: the worlds are shared out, all else is the same on each.
+"""A training run on several devices, of one host or of many: the worlds are shared out, all else is the same on each.
 
 The step sees its own device's worlds and averages over all where it must (`openjax.learning.devices`), so
 that one device and many give the same result on the same worlds, up to the order of sums.
 """
+
+from typing import Any
 
 import jax
 import numpy as np
@@ -21,14 +23,16 @@ def check_devices(settings: TrainSettings, number: int) -> None:
     """Whether the worlds can be shared out.
 
     Raises:
-      UserError: they can't, with the next number of worlds that could.
+      UserError: they can't, with the next number of worlds that could, and the numbers of devices that can.
     """
-    minibatches = settings.mappo.minibatches
-    unit = number * int(np.lcm(settings.start_groups * settings.episodes_per_task, minibatches))
+    group = int(np.lcm(settings.start_groups * settings.episodes_per_task, settings.mappo.minibatches))
+    unit = number * group
     if number > 1 and settings.num_envs % unit:
         possible = -(-settings.num_envs // unit) * unit
+        fewer = [n for n in range(1, number) if n == 1 or settings.num_envs % (n * group) == 0]
         raise UserError(
-            f"num_envs {settings.num_envs} can't be shared out to {number} devices; {possible} could"
+            f"num_envs {settings.num_envs} can't be shared out to {number} devices; {possible} could, "
+            f"or --devices {' or '.join(map(str, fewer))}"
         )
 
 
@@ -36,11 +40,20 @@ def carry_shardings(number: int) -> TrainCarry | jax.sharding.Sharding:
     """Where the leaves of a carry lie, as a prefix of its tree."""
     if number == 1:
         return jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    mesh = _mesh(number)
-    return _carry_of(
-        NamedSharding(mesh, PartitionSpec(AXIS)),
-        NamedSharding(mesh, PartitionSpec()),
-    )
+    return _carry_of(NamedSharding(_mesh(number), PartitionSpec(AXIS)), everywhere(number))
+
+
+def everywhere(number: int) -> jax.sharding.Sharding:
+    """The sharding of an array that every device has whole."""
+    if number == 1:
+        return jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    return NamedSharding(_mesh(number), PartitionSpec())
+
+
+def own_copy(tree: Any) -> Any:
+    """Arrays that every device has whole, on this process' first device."""
+    device = jax.local_devices()[0]
+    return jax.tree.map(lambda leaf: jax.device_put(leaf.addressable_data(0), device), tree)
 
 
 def make_device_step(settings: TrainSettings, environment: Pursuit, number: int):

@@ -82,12 +82,17 @@ class StopRequest:
         signal.signal(signal.SIGINT, self._previous[signal.SIGINT])
 
 
-def guarded(step: Callable[[Any], tuple[Any, dict]], shardings: Any = None) -> Callable:
+def guarded(
+    step: Callable[[Any], tuple[Any, dict]],
+    shardings: Any = None,
+    everywhere: jax.sharding.Sharding | None = None,
+) -> Callable:
     """`step` compiled, with its carry donated, and a check of the result for NaN in the same program.
 
     Args:
       step: pure function carry -> (carry, metrics by name).
       shardings: where the carry's leaves lie, before and after; see `place`.
+      everywhere: where the other results go; with several processes, to all devices, so that all can read them.
 
     Returns:
       carry -> (carry, metrics, (L,) bool: which of the leaves of `float_leaves(carry)` hold a NaN).
@@ -100,7 +105,7 @@ def guarded(step: Callable[[Any], tuple[Any, dict]], shardings: Any = None) -> C
         return carry, metrics, jnp.stack(broken) if broken else jnp.zeros((0,), bool)
 
     # Without saying so, the compiler may move a leaf, and the next call would compile again.
-    return jax.jit(checked, donate_argnums=0, out_shardings=(shardings, None, None))
+    return jax.jit(checked, donate_argnums=0, out_shardings=(shardings, everywhere, everywhere))
 
 
 def float_leaves(carry: Any) -> dict[str, jax.Array]:
@@ -123,8 +128,11 @@ def run_updates(
     evaluate: Callable[[Any], tuple[float, dict[str, float]]] | None = None,
     first_update: int = 0,
     seconds: float = 0.0,
+    everyone: Callable[[Any], list] = lambda value: [value],
 ) -> Outcome:
     """Train until the plan is done, a time limit, a signal or a NaN.
+
+    Several processes run this together: each must come to the same decisions after the same update.
 
     Args:
       step: from `guarded`.
@@ -136,6 +144,7 @@ def run_updates(
       evaluate: carry -> (score, metrics) on the held-back tasks; must not touch the carry.
       first_update: updates done before (a resumed run).
       seconds: training time spent before.
+      everyone: gathers a value of each process, as `Processes.everyone` does.
 
     Raises:
       NotFiniteError: a leaf of the carry holds a NaN.
@@ -159,12 +168,15 @@ def run_updates(
         progress.phase("training", announce=at == first_update + 1)
         progress.update(at * plan.steps_per_update, values)
 
-    def stop_reason():
-        if stop.name is not None:
-            return stop.name
-        return "the time limit" if elapsed() >= plan.time_limit else None
+    def decide():
+        """Why to stop, and whether a checkpoint is late: a signal to any process counts, and the first one's clock."""
+        late = time.monotonic() - saved_at > plan.checkpoint_seconds
+        asked = everyone([stop.name, elapsed() >= plan.time_limit, late])
+        signals = [name for name, _, _ in asked if name is not None]
+        _, over, late = asked[0]
+        return signals[0] if signals else "the time limit" if over else None, late
 
-    reason = stop_reason()
+    reason, _ = decide()
     try:
         while update < plan.total_updates and reason is None:
             if update == first_update:
@@ -175,8 +187,7 @@ def run_updates(
                 finish(pending)
             pending = (update, values, broken)
             due = update % plan.evaluation_interval == 0 or update == plan.total_updates
-            reason = stop_reason()
-            late = time.monotonic() - saved_at > plan.checkpoint_seconds
+            reason, late = decide()
             if not overlap or due or late or reason:
                 finish(pending)
                 pending = None
@@ -202,15 +213,10 @@ def _leave_broken_state(directory, carry, reached, checkpoints, update, leaves, 
     checkpoints.wait()
     place = Path(directory) / NOT_FINITE
     save_state(place / f"{reached:09d}", carry, {"update": reached})
-    write_json(
-        place / "report.json",
-        {
-            "update": update,
-            "state_after_update": reached,
-            "leaves": leaves,
-            "metrics": {name: value if np.isfinite(value) else str(value) for name, value in values.items()},
-        },
-    )
+    metrics = {name: value if np.isfinite(value) else str(value) for name, value in values.items()}
+    report = {"update": update, "state_after_update": reached, "leaves": leaves, "metrics": metrics}
+    if jax.process_index() == 0:
+        write_json(place / "report.json", report)
     latest = checkpoints.latest()
     good = f"the last good checkpoint is {latest.path}" if latest else "there is no checkpoint yet"
     shown = ", ".join(leaves[:3]) + (f" and {len(leaves) - 3} more" if len(leaves) > 3 else "")

@@ -19,6 +19,7 @@ def describe_machine() -> dict:
         "device": devices[0].device_kind if devices[0].platform != "cpu" else _processor(),
         "platform": devices[0].platform,
         "device_count": len(devices),
+        "processes": jax.process_count(),
         "cpu_cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "python": platform.python_version(),
         "versions": {name: version for name in _PACKAGES if (version := _version(name))},

@@ -11,7 +11,7 @@ from openjax.learning import TrainSettings, build, init_carry, summarise
 from openjax.policy import PolicyParameters
 from openjax.pursuit import SCENARIOS, Pursuit
 from openjax.runs.checkpoints import Checkpoints, abstract_like, load_arrays, named_leaves, place
-from openjax.runs.devices import carry_shardings, check_devices, make_device_step
+from openjax.runs.devices import carry_shardings, check_devices, everywhere, make_device_step, own_copy
 from openjax.runs.evaluation import (
     Evaluator,
     before_after_table,
@@ -22,10 +22,11 @@ from openjax.runs.evaluation import (
     selection_score,
 )
 from openjax.runs.loop import NotFiniteError, Plan, StopRequest, guarded, run_updates
-from openjax.runs.metrics import METRICS_FILE, MetricsWriter
+from openjax.runs.metrics import METRICS_FILE, MetricsWriter, NoMetrics
 from openjax.runs.plots import plot_training, plot_trajectories
 from openjax.runs.policies import abstract_parameters, load_policy
 from openjax.runs.policy_files import fill, load_policy_file, save_policy_file
+from openjax.runs.processes import Processes
 from openjax.runs.progress import Progress
 from openjax.runs.run_directory import RunDirectory
 from openjax.runs.settings_files import write_json
@@ -43,6 +44,8 @@ class TrainingJob:
     start_from: str | None
     """Policy whose networks the run starts with."""
     devices: int
+    """Of all processes together."""
+    processes: Processes
     time_limit: float
     """Seconds of training after which to stop."""
     layout_episodes: int
@@ -60,30 +63,36 @@ class TrainingJob:
 
 def run_job(job: TrainingJob, directory: RunDirectory, resume: bool, console: Console) -> int:
     """Train, then write the report. Returns the exit status: 0, or 1 after a NaN."""
-    settings = job.settings
+    settings, processes = job.settings, job.processes
+    if not processes.is_first:
+        console = Console(quiet=True)
     title = f"openjax.train → {directory.path}"
     with StopRequest() as stop, Progress(title, settings.total_steps, console) as progress:
-        checkpoints = Checkpoints(directory.checkpoints)
+        checkpoints = Checkpoints(directory.checkpoints, processes=processes)
+        processes.advice = lambda: _advice(checkpoints, directory)
         progress.phase("compiling the start: networks, first tasks")
         carry, update, seconds = _first_carry(job, directory, checkpoints, resume, progress)
-        directory.write_settings(settings, job.facts)
+        if processes.is_first:
+            directory.write_settings(settings, job.facts)
         evaluator, tasks = _make_evaluator(job)
-        shardings = carry_shardings(job.devices)
 
         def evaluate(carry):
-            parameters = jax.device_put(carry.policy, jax.devices()[0])
-            summary = summarise(evaluator(parameters, tasks, jax.random.key(0))[0])
+            if not processes.is_first:
+                return processes.of_first()
+            summary = summarise(evaluator(own_copy(carry.policy), tasks, jax.random.key(0))[0])
             flat = {name: value for name, value in summary.items() if not isinstance(value, dict)}
             flat |= {f"collision_{part}": value for part, value in summary["collision_parts"].items()}
             score = selection_score(summary)
-            return score, {**flat, "score": score}
+            return processes.of_first((score, {**flat, "score": score}))
 
-        metrics = MetricsWriter(
-            directory.path, update if resume else None, resumed_steps=update * settings.steps_per_update
-        )
+        metrics = NoMetrics()
+        if processes.is_first:
+            steps = update * settings.steps_per_update
+            metrics = MetricsWriter(directory.path, update if resume else None, resumed_steps=steps)
+        step = make_device_step(settings, job.environment, job.devices)
         try:
             outcome = run_updates(
-                guarded(make_device_step(settings, job.environment, job.devices), shardings),
+                guarded(step, carry_shardings(job.devices), everywhere(job.devices)),
                 carry,
                 Plan(
                     total_updates=settings.total_updates,
@@ -99,16 +108,20 @@ def run_job(job: TrainingJob, directory: RunDirectory, resume: bool, console: Co
                 evaluate=evaluate,
                 first_update=update,
                 seconds=seconds + time.monotonic() - job.started,
+                everyone=processes.everyone,
             )
         except NotFiniteError as error:
             progress.message(f"stopped: {error}")
             return 1
         finally:
             metrics.close()
+        signals = [name for name in processes.everyone(stop.name) if name is not None]
+        if not processes.is_first:
+            return 0
         _save_best(job, directory, checkpoints, outcome)
-        if stop.name is not None:
+        if signals:
             progress.message(
-                f"{stop.name}: saved at update {outcome.update}; "
+                f"{signals[0]}: saved at update {outcome.update}; "
                 f"go on with python -m openjax.train --resume {directory.path}"
             )
             return 0
@@ -131,8 +144,16 @@ def _first_carry(job, directory, checkpoints, resume, progress):
     if job.start_from is not None:
         carry = carry.replace(policy=_start_parameters(job))
     carry = place(carry, carry_shardings(job.devices))
-    save_policy_file(directory.start_policy, carry.policy, settings, {"update": 0}, storage="float32")
+    if job.processes.is_first:
+        save_policy_file(directory.start_policy, carry.policy, settings, {"update": 0}, storage="float32")
     return carry, 0, 0.0
+
+
+def _advice(checkpoints, directory):
+    """What to do when another process is lost."""
+    if checkpoints.latest() is None:
+        return "there is no checkpoint yet, start again"
+    return f"go on with python -m openjax.train --resume {directory.path} --devices all"
 
 
 def _start_parameters(job) -> PolicyParameters:

@@ -14,8 +14,11 @@ from openjax.errors import UserError
 from openjax.learning import TrainSettings, preset
 from openjax.runs.command_line import output_console, parse, peek
 from openjax.runs.environments import make_environment
+from openjax.runs.joining import Membership, find_membership
 from openjax.runs.machine import describe_machine
+from openjax.runs.processes import Processes
 from openjax.runs.run_directory import RunDirectory, check_free, create_run, open_run
+from openjax.runs.settings_files import to_plain
 from openjax.runs.training import TrainingJob, run_job
 
 PROGRAM = "python -m openjax.train"
@@ -48,7 +51,13 @@ class TrainCommand:
     vehicle: Path | None = None
     """Vehicle to fly (vehicle.toml, as the calibration writes it); by default the nominal Crazyflie."""
     devices: str = "1"
-    """Number of devices to train on, or all."""
+    """Number of devices to train on, or all (of all processes)."""
+    coordinator_address: str | None = None
+    """With several processes: host:port of process 0; the port after it is used too. Slurm and Open MPI tell it."""
+    num_processes: int | None = None
+    """How many processes train together, for example one per host. Slurm and Open MPI tell it."""
+    process_id: int | None = None
+    """Which of them this one is, from 0. Slurm and Open MPI tell it."""
     layout_episodes: int | None = None
     """Episodes per layout in the final table; by default 100 on an accelerator, 32 on a CPU."""
     settings: Annotated[tyro.conf.FlagConversionOff[TrainSettings], tyro.conf.arg(name="")] = (
@@ -77,13 +86,36 @@ def read_command(arguments: Sequence[str]) -> TrainCommand:
     return command
 
 
+def membership(arguments: Sequence[str]) -> Membership | None:
+    """The place among several processes that the command line or the job's manager gives to this one.
+
+    It's needed before the command line can be read in full, as a preset depends on the devices.
+    """
+    if {"-h", "--help"} & set(arguments):
+        return None
+
+    def number(name):
+        text = peek(arguments, name)
+        if text is not None and not text.isdecimal():
+            raise UserError(f"--{name} is {text!r}; expected a number")
+        return None if text is None else int(text)
+
+    return find_membership(
+        peek(arguments, "coordinator_address"),
+        number("num_processes"),
+        number("process_id"),
+        all_devices=peek(arguments, "devices") == "all",
+    )
+
+
 def default_preset() -> str:
     """`quick` without an accelerator, else `paper`."""
     return "quick" if jax.default_backend() == "cpu" else "paper"
 
 
-def start(command: TrainCommand, arguments: Sequence[str], started: float) -> int:
+def start(command: TrainCommand, arguments: Sequence[str], started: float, processes: Processes) -> int:
     """Make the run's directory, or open it, and train. Returns the exit status."""
+    _check_same(command, processes)
     # Everything that can be wrong with the files is found before the directory is touched.
     resumed = None if command.resume is None else open_run(command.resume)
     vehicle = command.vehicle or (resumed.optional("vehicle.toml") if resumed else None)
@@ -93,23 +125,44 @@ def start(command: TrainCommand, arguments: Sequence[str], started: float) -> in
     name = command.preset or default_preset()
     if resumed is None:
         out = command.out or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{name}"
+        out = Path(processes.of_first(str(out)))
         check_free(out, command.overwrite)
     job = TrainingJob(
         settings=command.settings,
         environment=environment,
         start_from=command.start_from,
         devices=devices,
+        processes=processes,
         time_limit=float("inf") if command.minutes is None else 60.0 * command.minutes,
         layout_episodes=command.layout_episodes or (32 if jax.default_backend() == "cpu" else 100),
         facts={"command": " ".join([PROGRAM, *arguments]), "machine": describe_machine()},
         started=started,
     )
     job.check()
+    processes.everyone()  # a mistake shows before any process changes a file
     if resumed is not None:
         return run_job(job, resumed, resume=True, console=output_console())
-    directory = create_run(out, command.overwrite)
-    _copy_files(directory, vehicle, effects)
+    directory = RunDirectory(out)
+    if processes.is_first:
+        directory = create_run(out, command.overwrite)
+        _copy_files(directory, vehicle, effects)
+    processes.everyone()
+    if not out.is_dir():
+        raise UserError(
+            f"{out} isn't there on the host of process {processes.index}; all hosts must share it"
+        )
     return run_job(job, directory, resume=False, console=output_console())
+
+
+def _check_same(command, processes):
+    """Raises UserError where processes were started with different settings: their results would drift apart."""
+    own = {"settings": to_plain(command.settings), "JAX": jax.__version__}
+    for other, theirs in enumerate(processes.everyone(own)):
+        different = [name for name in own if own[name] != theirs[name]]
+        if different:
+            raise UserError(
+                f"processes {other} and {processes.index} differ in their {' and '.join(different)}"
+            )
 
 
 def _check(command):

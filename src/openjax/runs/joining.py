@@ -1,0 +1,192 @@
+"""Joining a job of several processes: which place this one has, and the connections between them."""
+
+import contextlib
+import dataclasses
+import json
+import socket
+import time
+from collections.abc import Iterator
+
+from openjax.errors import UserError
+from openjax.runs.processes import Processes, encoded
+
+JOIN = 300.0
+"""Seconds to wait for all processes at the start."""
+
+_MANAGERS = ("slurm", "ompi")
+_BY_HAND = "deactivate"
+
+
+@dataclasses.dataclass(frozen=True)
+class Membership:
+    """This process' place in a job of several."""
+
+    coordinator_address: str
+    """host:port of process 0; the port after it is used too."""
+    num_processes: int
+    process_id: int
+    detection: str
+    """What JAX is to ask for this process' devices: `slurm`, `ompi`, or `deactivate` (all of the host)."""
+
+
+def find_membership(
+    coordinator_address: str | None, num_processes: int | None, process_id: int | None, all_devices: bool
+) -> Membership | None:
+    """This process' place, from the command line or else from Slurm or Open MPI; None: it is alone.
+
+    Raises:
+      UserError: the three make no sense, or one is missing and nothing else tells it.
+    """
+    given = (coordinator_address, num_processes, process_id)
+    by_hand = any(value is not None for value in given)
+    if not by_hand and not all_devices:
+        return None
+    detection = _BY_HAND
+    if None in given:
+        detection, given = _detected(given)
+    if None in given:
+        if not by_hand:
+            return None
+        raise UserError(
+            "--coordinator_address, --num_processes and --process_id go together, "
+            "unless Slurm or Open MPI tells what is missing"
+        )
+    address, number, index = given
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 65535:
+        raise UserError(f"--coordinator_address is {address!r}; expected host:port of process 0")
+    if number < 1 or not 0 <= index < number:
+        raise UserError(
+            f"--process_id {index} and --num_processes {number}: expected an id from 0 to the number less one"
+        )
+    if not all_devices:
+        raise UserError(f"{number} processes train on all of their devices; add --devices all")
+    return Membership(address, number, index, detection) if number > 1 else None
+
+
+def _detected(given):
+    """What is missing of address, number and id, as `jax.distributed.initialize` itself would find it."""
+    from jax._src.clusters import ClusterEnv
+
+    for name in _MANAGERS:
+        kind = next((kind for kind in ClusterEnv._cluster_types if kind.name == name), None)
+        if kind is not None and kind.is_env_present():
+            found = ClusterEnv.auto_detect_unset_distributed_params(*given, None, name, int(JOIN))
+            return name, found[:3]
+    return _BY_HAND, given
+
+
+@contextlib.contextmanager
+def joined(membership: Membership | None) -> Iterator[Processes]:
+    """Join the job, before JAX touches a device; leave it together with the others, or tell them what went wrong.
+
+    Raises:
+      UserError: not all processes came in time, or a port is taken.
+    """
+    if membership is None:
+        yield Processes()
+        return
+    # Before JAX's own connections: the files of a dying process close in order, and this news should come first.
+    processes = Processes(membership.num_processes, membership.process_id, _connect(membership))
+    try:
+        import jax
+
+        jax.distributed.initialize(
+            coordinator_address=membership.coordinator_address,
+            num_processes=membership.num_processes,
+            process_id=membership.process_id,
+            cluster_detection_method=membership.detection,
+        )
+        yield processes
+        processes.everyone()  # JAX's own barrier would not wait as long as process 0 draws
+        jax.distributed.shutdown()
+        processes.leave()
+    except UserError as error:
+        processes.fail(2, _one_line(error))
+        raise
+    except Exception as error:
+        processes.await_verdict()
+        processes.fail(1, f"{type(error).__name__}: {_one_line(error)}")
+        raise
+    except BaseException as error:
+        processes.fail(130 if isinstance(error, KeyboardInterrupt) else 1, type(error).__name__)
+        raise
+
+
+def _one_line(error):
+    return " ".join(str(error).split())[:500]
+
+
+def _connect(membership):
+    """Connections by process: to all others on process 0, to process 0 elsewhere."""
+    host, _, port = membership.coordinator_address.rpartition(":")
+    host, port, deadline = host.strip("[]"), int(port) + 1, time.monotonic() + JOIN
+    if membership.process_id == 0:
+        return _accept(port, membership.num_processes, deadline)
+    greeting = encoded({"process": membership.process_id, "of": membership.num_processes})
+    while True:
+        try:
+            connection = socket.create_connection((host, port), timeout=10.0)
+            connection.sendall(greeting)
+            connection.settimeout(max(deadline - time.monotonic(), 1.0))
+            if _read_line(connection):  # all have come
+                return {0: connection}
+            reason = "it closed the connection: it, or all of the others, may be of another job"
+        except OSError as error:
+            reason = str(error.strerror or error)
+        if time.monotonic() > deadline:
+            raise UserError(
+                f"process 0 can't be reached at {host}:{port} within {JOIN:.0f} s ({reason}); "
+                "it needs the coordinator's port and the one after it"
+            )
+        time.sleep(0.2)
+
+
+def _accept(port, number, deadline):
+    both = socket.has_dualstack_ipv6()
+    family = socket.AF_INET6 if both else socket.AF_INET
+    try:
+        server = socket.create_server(("", port), family=family, dualstack_ipv6=both)
+    except OSError as error:
+        raise UserError(
+            f"port {port}, the one after the coordinator's, can't be used: {error.strerror}"
+        ) from error
+    found: dict[int, socket.socket] = {}
+    with server:
+        while len(found) < number - 1:
+            server.settimeout(max(deadline - time.monotonic(), 0.01))
+            try:
+                connection, _ = server.accept()
+            except TimeoutError:
+                missing = ", ".join(str(i) for i in range(1, number) if i not in found)
+                raise UserError(f"process {missing} of {number} didn't come within {JOIN:.0f} s") from None
+            other = _greeted(connection, number)
+            if other is None or other in found:
+                connection.close()  # a stranger, or a second process of that number
+            else:
+                found[other] = connection
+    for connection in found.values():
+        connection.sendall(encoded({"welcome": number}))
+    return found
+
+
+def _greeted(connection, number):
+    """The number of the process that greets; None for a stranger."""
+    connection.settimeout(10.0)
+    try:
+        greeting = json.loads(_read_line(connection))
+        other = greeting["process"]
+        return other if greeting["of"] == number and 1 <= other < number else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _read_line(connection):
+    """A short line, byte by byte, as what follows belongs to the link; empty where there is none."""
+    line = b""
+    while not line.endswith(b"\n"):
+        byte = connection.recv(1)
+        if not byte or len(line) > 100:
+            return b""
+        line += byte
+    return line

@@ -1,0 +1,199 @@
+"""The processes of a job that trains on several hosts: what all of them know, and the loss of one.
+
+Arrays travel by JAX's own collectives. Beside these every process holds one TCP connection to process 0. Over it the
+processes agree on what only one of them knows (a signal, a clock, a score), and by it they notice a process that is
+gone: JAX alone would wait for it for minutes, and then end with a stack trace.
+"""
+
+import contextlib
+import json
+import os
+import queue
+import socket
+import sys
+import threading
+from collections.abc import Callable
+from typing import Any
+
+BEAT = 2.0
+"""Seconds between two signs of life."""
+SILENCE = 30.0
+"""Seconds without one after which a process counts as lost."""
+GRACE = 5.0
+"""Seconds that a process has to end by itself when another one failed."""
+
+_FAREWELL = "farewell"
+
+
+class Processes:
+    """This process among all of its job. One alone has no connections and loses nobody.
+
+    Attributes:
+      number, index: how many there are, and which one this is.
+      advice: says what to do now, when another process is lost.
+    """
+
+    def __init__(self, number: int = 1, index: int = 0, connections: dict[int, socket.socket] | None = None):
+        """`connections` by process: to all others on process 0, to process 0 elsewhere."""
+        self.number, self.index = number, index
+        self.advice: Callable[[], str] = lambda: "start it again"
+        self._links = {
+            other: _Link(connection, other, self._receive, self._gone)
+            for other, connection in (connections or {}).items()
+        }
+        self._asked = {other: queue.Queue() for other in self._links}
+        self._answers: queue.Queue = queue.Queue()
+        self._closing = threading.Event()
+        self._ending = threading.Lock()
+        for link in self._links.values():
+            link.start()
+
+    @property
+    def is_first(self) -> bool:
+        """Whether this is the process that writes and shows."""
+        return self.index == 0
+
+    def everyone(self, value: Any = None) -> list:
+        """The values (JSON) of all processes in their order; waits until all have come here."""
+        if not self._links:
+            return [value]
+        if not self.is_first:
+            self._links[0].send({"value": value})
+            return self._answers.get()
+        values = [value] + [self._asked[other].get() for other in sorted(self._asked)]
+        self._note_farewell(values)
+        self._send_all({"values": values})
+        return values
+
+    def of_first(self, value: Any = None) -> Any:
+        """Process 0's value (JSON)."""
+        return self.everyone(value if self.is_first else None)[0]
+
+    def leave(self) -> None:
+        """End in good order, together with all others."""
+        self.everyone(_FAREWELL)
+        for link in self._links.values():
+            link.close(GRACE)
+
+    def fail(self, status: int, text: str) -> None:
+        """Tell the others that this process ends with an exit status, and why; they end too."""
+        self._closing.set()
+        self._send_all({"status": status, "failed": f"process {self.index} ended: {text}"})
+        for link in self._links.values():
+            link.close(2 * GRACE)
+
+    def await_verdict(self) -> None:
+        """After an error that a lost process may have caused: time for that news, which ends this process."""
+        threading.Event().wait(GRACE if self._links else 0.0)
+
+    def _receive(self, other: int, message: dict) -> None:
+        if "value" in message:
+            self._asked[other].put(message["value"])
+        elif "values" in message:
+            self._note_farewell(message["values"])
+            self._answers.put(message["values"])
+        elif "lost" in message:
+            self._end(1, message["lost"], {})
+        elif "failed" in message and not self._closing.is_set():
+            self._closing.set()
+            if self.is_first:
+                self._send_all(message, but=other)
+            # What all did wrong, this process reports by itself in the meantime.
+            arguments = (message["status"], message["failed"], {})
+            late = threading.Timer(GRACE, self._end, arguments)
+            late.daemon = True
+            late.start()
+
+    def _note_farewell(self, values: list) -> None:
+        if all(value == _FAREWELL for value in values):
+            self._closing.set()
+
+    def _gone(self, other: int, host: str, why: str) -> None:
+        if not self._closing.is_set():
+            text = f"process {other} of {self.number} (on {host}) was lost: {why}"
+            self._end(1, f"{text}; {self._advice()}", {"lost": f"{text}; {self._advice()}"}, but=other)
+
+    def _end(self, status: int, text: str, message: dict, but: int | None = None) -> None:
+        """Say it once and end at once: the main thread may wait for the lost process for ever."""
+        if not self._ending.acquire(blocking=False):
+            return
+        if self.is_first and message:
+            self._send_all(message, but)
+        show_cursor = "\x1b[?25h\n" if sys.stdout.isatty() else ""  # a live display hides it
+        os.write(2, f"{show_cursor}error: {text}\n".encode())
+        # Process 0 holds JAX's coordinator; without it the others' JAX would end them before they speak.
+        for other, link in self._links.items():
+            if self.is_first and other != but:
+                link.wait_closed(GRACE)
+        os._exit(status)
+
+    def _advice(self):
+        try:
+            return self.advice()
+        except Exception:  # it looks at files, which may be what is gone
+            return "start it again"
+
+    def _send_all(self, message, but=None):
+        for other, link in self._links.items():
+            if other != but:
+                link.send(message)
+
+
+class _Link:
+    """A connection to another process: lines of JSON, and signs of life in both directions."""
+
+    def __init__(
+        self,
+        connection: socket.socket,
+        other: int,
+        receive: Callable[[int, dict], None],
+        gone: Callable[[int, str, str], None],
+    ):
+        self._socket, self._other, self._receive, self._gone = connection, other, receive, gone
+        self._host = connection.getpeername()[0].removeprefix("::ffff:")
+        self._sending = threading.Lock()
+        self._closed = threading.Event()
+        connection.settimeout(SILENCE)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def start(self) -> None:
+        for target in (self._read, self._beat):
+            threading.Thread(target=target, name=f"process {self._other}", daemon=True).start()
+
+    def send(self, message: dict) -> None:
+        with contextlib.suppress(OSError), self._sending:  # what is wrong, the reader sees
+            self._socket.sendall(encoded(message))
+
+    def close(self, seconds: float) -> None:
+        """No more from here; wait until the other side closes too."""
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_WR)
+        self.wait_closed(seconds)
+
+    def wait_closed(self, seconds: float) -> None:
+        self._closed.wait(seconds)
+
+    def _read(self):
+        why = "its connection closed"
+        try:
+            for line in self._socket.makefile("rb"):
+                message = json.loads(line)
+                if message:
+                    self._receive(self._other, message)
+        except TimeoutError:
+            why = f"no sign of life for {SILENCE:.0f} s"
+        except OSError as error:
+            why = f"its connection broke ({error.strerror or error})"
+        except ValueError:
+            why = "it sent half a message"
+        self._closed.set()
+        self._gone(self._other, self._host, why)
+
+    def _beat(self):
+        while not self._closed.wait(BEAT):
+            self.send({})
+
+
+def encoded(message: dict) -> bytes:
+    """A message as it goes over a connection."""
+    return (json.dumps(message) + "\n").encode()
