@@ -12,7 +12,7 @@ from rich.table import Table
 
 from openjax.learning import Evaluation, make_evaluate, summarise
 from openjax.policy import Policy, PolicyParameters
-from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, Scenario, Task, scenario_task, uniform_task
+from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, Scenario, Task, scenario_task
 from openjax.runs.trajectory import Trajectory
 
 FIELDS = (
@@ -27,9 +27,6 @@ FIELDS = (
     "prediction_error",
 )
 """What a record of an evaluation holds, in this order."""
-
-HELD_BACK_KEY = 20_000_003
-"""The held-back tasks are drawn from this key in all runs, so that runs can be compared."""
 
 
 class Evaluator:
@@ -91,17 +88,6 @@ def layout_slots(settings: PursuitSettings) -> int:
     return max(settings.max_pillars, *(len(scenario.pillars) for scenario in SCENARIOS.values()))
 
 
-def held_back_tasks(settings: PursuitSettings, number: int, slots: int) -> Task:
-    """The first `number` held-back uniform tasks, with `slots` pillar slots."""
-    keys = jax.random.split(jax.random.key(HELD_BACK_KEY), number)
-    tasks = jax.jit(jax.vmap(lambda key: uniform_task(settings, key)))(keys)
-    extra = slots - settings.max_pillars
-    return tasks.replace(
-        pillar_position=jnp.pad(tasks.pillar_position, ((0, 0), (0, extra), (0, 0))),
-        pillar_active=jnp.pad(tasks.pillar_active, ((0, 0), (0, extra))),
-    )
-
-
 def repeat_task(task: Task, number: int) -> Task:
     """`number` copies along a new leading axis."""
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (number, *leaf.shape)), task)
@@ -149,20 +135,6 @@ def record_of(scenario: str, episodes: int, summary: dict, extra: tuple[str, ...
         return None if isinstance(value, float) and not math.isfinite(value) else value
 
     return {name: clean(values[name]) for name in (*FIELDS, *extra)}
-
-
-def selection_score(summary: dict) -> float:
-    """By which the best checkpoint is chosen, on the held-back tasks.
-
-    Captures count, breaches and crashes cost; the return settles it while nothing is captured yet.
-    """
-    return (
-        summary["capture_rate"]
-        - 5.0 * summary["collision_rate"]
-        - 0.5 * summary["crash_rate"]
-        - 0.1 * summary["over_speed_rate"]
-        + 1e-4 * summary["episode_return"]
-    )
 
 
 def results_table(title: str, rows: Sequence[dict]) -> Table:

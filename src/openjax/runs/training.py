@@ -13,14 +13,12 @@ from openjax.pursuit import SCENARIOS, Pursuit
 from openjax.runs.checkpoints import Checkpoints, abstract_like, load_arrays, named_leaves, place
 from openjax.runs.devices import carry_shardings, check_devices, everywhere, make_device_step, own_copy
 from openjax.runs.evaluation import (
-    Evaluator,
     before_after_table,
     evaluate_scenarios,
-    held_back_tasks,
     layout_slots,
     record_of,
-    selection_score,
 )
+from openjax.runs.held_back import HeldBack, flat_metrics, selection_score
 from openjax.runs.loop import NotFiniteError, Plan, StopRequest, guarded, run_updates
 from openjax.runs.metrics import METRICS_FILE, MetricsWriter, NoMetrics
 from openjax.runs.plots import plot_training, plot_trajectories
@@ -32,7 +30,7 @@ from openjax.runs.run_directory import RunDirectory
 from openjax.runs.settings_files import write_json
 from openjax.runs.videos import animate
 
-_BESIDE_RECORD = ("episode_return",)
+_BESIDE_RECORD = ("episode_return", "last_seen_error")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,16 +72,14 @@ def run_job(job: TrainingJob, directory: RunDirectory, resume: bool, console: Co
         carry, update, seconds = _first_carry(job, directory, checkpoints, resume, progress)
         if processes.is_first:
             directory.write_settings(settings, job.facts)
-        evaluator, tasks = _make_evaluator(job)
+        held_back = _held_back(job)
 
         def evaluate(carry):
             if not processes.is_first:
                 return processes.of_first()
-            summary = summarise(evaluator(own_copy(carry.policy), tasks, jax.random.key(0))[0])
-            flat = {name: value for name, value in summary.items() if not isinstance(value, dict)}
-            flat |= {f"collision_{part}": value for part, value in summary["collision_parts"].items()}
-            score = selection_score(summary)
-            return processes.of_first((score, {**flat, "score": score}))
+            uniform, far = (summarise(part) for part in held_back(own_copy(carry.policy))[:2])
+            score = selection_score(uniform)
+            return processes.of_first((score, {**flat_metrics(uniform, far), "score": score}))
 
         metrics = NoMetrics()
         if processes.is_first:
@@ -125,7 +121,7 @@ def run_job(job: TrainingJob, directory: RunDirectory, resume: bool, console: Co
                 f"go on with python -m openjax.train --resume {directory.path}"
             )
             return 0
-        table = _report(job, directory, evaluator, tasks, outcome, progress)
+        table = _report(job, directory, held_back, outcome, progress)
     console.print(table)
     console.print(f"run, policy and pictures are in {directory.path}", soft_wrap=True)
     return 0
@@ -162,19 +158,17 @@ def _start_parameters(job) -> PolicyParameters:
     return fill(abstract, named_leaves(loaded.parameters), f"--start_from {job.start_from}")
 
 
-def _make_evaluator(job):
-    """One compiled evaluation for the held-back tasks and the layouts alike, and the held-back tasks."""
+def _held_back(job):
+    """The held-back tasks and the compiled evaluation, which has room for the layouts' pillars."""
     settings, environment = job.settings, job.environment
-    slots = layout_slots(settings.environment)
     wide = Pursuit(
-        dataclasses.replace(settings.environment, max_pillars=slots),
+        dataclasses.replace(settings.environment, max_pillars=layout_slots(settings.environment)),
         environment.vehicle,
         environment.effects,
         environment.effect_parameters,
     )
     policy = build(settings, environment).policy
-    tasks = held_back_tasks(settings.environment, settings.evaluation_episodes, slots)
-    return Evaluator(wide, policy, settings.evaluation_episodes), tasks
+    return HeldBack(wide, settings.environment, policy, settings.evaluation_episodes)
 
 
 def _save_best(job, directory, checkpoints, outcome):
@@ -192,7 +186,7 @@ def _save_best(job, directory, checkpoints, outcome):
     save_policy_file(directory.policy, parameters, job.settings, notes, storage="float32")
 
 
-def _report(job, directory, evaluator, tasks, outcome, progress):
+def _report(job, directory, held_back, outcome, progress):
     """Evaluate the first and the best policy on the layouts and draw the best one's flights."""
     settings = job.settings
     fitting = [s for s in SCENARIOS.values() if len(s.pursuers) == settings.environment.num_pursuers]
@@ -201,14 +195,15 @@ def _report(job, directory, evaluator, tasks, outcome, progress):
     for moment, path in (("before", directory.start_policy), ("after", directory.policy)):
         progress.phase(f"evaluating the policy {moment} training on the layouts")
         parameters = fill(abstract, load_policy_file(path)[0], str(path))
-        held_back, records = evaluator(parameters, tasks, jax.random.key(0))
+        *evaluations, records = held_back(parameters)
         rows[moment] = [
-            record_of("held_back", settings.evaluation_episodes, summarise(held_back), _BESIDE_RECORD)
+            record_of(name, held_back.number, summarise(evaluation), _BESIDE_RECORD)
+            for name, evaluation in zip(("held_back", "held_back_far"), evaluations, strict=True)
         ]
-        flights = [_flight(evaluator, records, tasks, i) for i in range(min(3, settings.evaluation_episodes))]
+        flights = [_flight(held_back, records, i) for i in range(min(3, held_back.number))]
         if fitting:
             layouts, flights = evaluate_scenarios(
-                evaluator, parameters, fitting, job.layout_episodes, seed=0, extra=_BESIDE_RECORD
+                held_back.evaluator, parameters, fitting, job.layout_episodes, seed=0, extra=_BESIDE_RECORD
             )
             rows[moment] += layouts
     progress.phase("drawing")
@@ -230,6 +225,6 @@ def _report(job, directory, evaluator, tasks, outcome, progress):
     return before_after_table(rows["before"], rows["after"])
 
 
-def _flight(evaluator, records, tasks, episode):
-    task = jax.tree.map(lambda leaf: np.asarray(leaf[episode]), tasks)
-    return evaluator.trajectory(records, episode, task, f"held-back task {episode + 1}")
+def _flight(held_back, records, episode):
+    task = jax.tree.map(lambda leaf: np.asarray(leaf[episode]), held_back.tasks)
+    return held_back.evaluator.trajectory(records, episode, task, f"held-back task {episode + 1}")

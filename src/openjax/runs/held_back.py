@@ -1,0 +1,98 @@
+"""Held-back tasks: the same in every run, to watch it and to choose its best checkpoint. Never the layouts."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from openjax.learning import Evaluation
+from openjax.policy import Policy, PolicyParameters
+from openjax.pursuit import Pursuit, PursuitSettings, Task, expand_task, turn_task, uniform_task
+from openjax.runs.evaluation import Evaluator
+
+HELD_BACK_KEY = 20_000_003
+"""The held-back tasks are drawn from this key in all runs, so that runs can be compared."""
+
+FAR_EXPANSIONS = 20
+"""Local expansions that lead to a far task: 0.26 m along each axis in the mean square, where nothing stops them."""
+
+
+def uniform_tasks(settings: PursuitSettings, number: int, slots: int) -> Task:
+    """The first `number` held-back uniform tasks, with `slots` pillar slots."""
+    keys = jax.random.split(jax.random.key(HELD_BACK_KEY), number)
+    tasks = jax.jit(jax.vmap(lambda key: uniform_task(settings, key)))(keys)
+    return _with_slots(tasks, slots)
+
+
+def far_tasks(settings: PursuitSettings, number: int, slots: int) -> Task:
+    """The first `number` held-back far tasks, with `slots` pillar slots.
+
+    Other uniform tasks, turned about the arena's axis and expanded as those in a generator's archive are: starts up
+    to 0.1 m from the arena's wall, and pursuers that start apart from each other or around the evader.
+    """
+
+    def draw(key):
+        uniform_key, turn_key, expand_key = jax.random.split(key, 3)
+        task = turn_task(turn_key, uniform_task(settings, uniform_key))
+        keys = jax.random.split(expand_key, FAR_EXPANSIONS)
+        return jax.lax.scan(lambda task, key: (expand_task(settings, key, task), None), task, keys)[0]
+
+    keys = jax.random.split(jax.random.fold_in(jax.random.key(HELD_BACK_KEY), 1), number)
+    return _with_slots(jax.jit(jax.vmap(draw))(keys), slots)
+
+
+class HeldBack:
+    """`number` uniform and as many far tasks, flown in one call of one compiled evaluation.
+
+    Args:
+      environment: its settings say how many pillar slots the tasks have.
+      drawn: settings of the training, from which the tasks are drawn.
+      policy: the networks.
+      number: tasks of each kind.
+    """
+
+    def __init__(self, environment: Pursuit, drawn: PursuitSettings, policy: Policy, number: int):
+        slots = environment.settings.max_pillars
+        self.number = number
+        self.evaluator = Evaluator(environment, policy, 2 * number)
+        parts = uniform_tasks(drawn, number, slots), far_tasks(drawn, number, slots)
+        self.tasks: Task = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+
+    def __call__(self, parameters: PolicyParameters) -> tuple[Evaluation, Evaluation, list[Any]]:
+        """Evaluations on the uniform and on the far tasks, and the device trajectories of both."""
+        evaluation, records = self.evaluator(parameters, self.tasks, jax.random.key(0))
+        uniform = jax.tree.map(lambda leaf: leaf[: self.number], evaluation)
+        far = jax.tree.map(lambda leaf: leaf[self.number :], evaluation)
+        return uniform, far, records
+
+
+def selection_score(summary: dict) -> float:
+    """By which the best checkpoint is chosen, on the uniform held-back tasks.
+
+    Captures count, breaches and crashes cost; the return settles it while nothing is captured yet.
+    """
+    return (
+        summary["capture_rate"]
+        - 5.0 * summary["collision_rate"]
+        - 0.5 * summary["crash_rate"]
+        - 0.1 * summary["over_speed_rate"]
+        + 1e-4 * summary["episode_return"]
+    )
+
+
+def flat_metrics(uniform: dict, far: dict) -> dict[str, float]:
+    """Both summaries by name, the far one's with `far_` before it; parts of collisions as their own numbers."""
+
+    def flat(summary):
+        values = {name: value for name, value in summary.items() if not isinstance(value, dict)}
+        return values | {f"collision_{part}": value for part, value in summary["collision_parts"].items()}
+
+    return flat(uniform) | {f"far_{name}": value for name, value in flat(far).items()}
+
+
+def _with_slots(tasks, slots):
+    extra = slots - tasks.pillar_active.shape[-1]
+    return tasks.replace(
+        pillar_position=jnp.pad(tasks.pillar_position, ((0, 0), (0, extra), (0, 0))),
+        pillar_active=jnp.pad(tasks.pillar_active, ((0, 0), (0, extra))),
+    )
