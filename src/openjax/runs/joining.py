@@ -4,10 +4,13 @@ import contextlib
 import dataclasses
 import json
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 
 from openjax.errors import UserError
+from openjax.runs import coordinator_relay
 from openjax.runs.processes import Processes, encoded
 
 JOIN = 300.0
@@ -86,31 +89,58 @@ def joined(membership: Membership | None) -> Iterator[Processes]:
     if membership is None:
         yield Processes()
         return
-    # Before JAX's own connections: the files of a dying process close in order, and this news should come first.
-    processes = Processes(membership.num_processes, membership.process_id, _connect(membership))
-    try:
-        import jax
+    with _coordinator_relay(membership) as bind_address:
+        processes = Processes(membership.num_processes, membership.process_id, _connect(membership))
+        try:
+            import jax
 
-        jax.distributed.initialize(
-            coordinator_address=membership.coordinator_address,
-            num_processes=membership.num_processes,
-            process_id=membership.process_id,
-            cluster_detection_method=membership.detection,
-        )
-        yield processes
-        processes.everyone()  # JAX's own barrier would not wait as long as process 0 draws
-        jax.distributed.shutdown()
-        processes.leave()
-    except UserError as error:
-        processes.fail(2, _one_line(error))
-        raise
-    except Exception as error:
-        processes.await_verdict()
-        processes.fail(1, f"{type(error).__name__}: {_one_line(error)}")
-        raise
-    except BaseException as error:
-        processes.fail(130 if isinstance(error, KeyboardInterrupt) else 1, type(error).__name__)
-        raise
+            jax.distributed.initialize(
+                coordinator_address=membership.coordinator_address,
+                num_processes=membership.num_processes,
+                process_id=membership.process_id,
+                cluster_detection_method=membership.detection,
+                coordinator_bind_address=bind_address,
+            )
+            yield processes
+            processes.everyone()  # JAX's own barrier would not wait as long as process 0 draws
+            jax.distributed.shutdown()
+            processes.leave()
+        except UserError as error:
+            processes.fail(2, _one_line(error))
+            raise
+        except Exception as error:
+            processes.await_verdict()
+            processes.fail(1, f"{type(error).__name__}: {_one_line(error)}")
+            raise
+        except BaseException as error:
+            processes.fail(130 if isinstance(error, KeyboardInterrupt) else 1, type(error).__name__)
+            raise
+
+
+@contextlib.contextmanager
+def _coordinator_relay(membership):
+    """On process 0, start the relay at the coordinator's port; gives the address for the coordinator itself."""
+    if membership.process_id != 0:
+        yield None
+        return
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        inner = free.getsockname()[1]
+    port = membership.coordinator_address.rpartition(":")[2]
+    # A session of its own: Ctrl-C is for the others.
+    process = subprocess.Popen(
+        [sys.executable, "-I", coordinator_relay.__file__, port, str(inner)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        if not process.stdout.readline():
+            raise UserError(f"the coordinator's port {port} can't be used: {process.stderr.read().strip()}")
+        yield f"127.0.0.1:{inner}"
+    finally:
+        process.stdin.close()  # it ends when the others have closed their connections
 
 
 def _one_line(error):
