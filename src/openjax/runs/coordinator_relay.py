@@ -44,11 +44,12 @@ async def relay(port: int, coordinator_port: int) -> None:
 
 
 async def _pump(reader, writer):
-    """Copy until the source ends; the sink is left open."""
+    """Copy until the source ends; the sink is left open, and when it's broken the source is still read."""
     with contextlib.suppress(OSError):
         while data := await reader.read(1 << 16):
-            writer.write(data)
-            await writer.drain()
+            with contextlib.suppress(OSError):
+                writer.write(data)
+                await writer.drain()
 
 
 if __name__ == "__main__":

@@ -1,8 +1,10 @@
 """Joining a job of several processes: which place this one has, and the connections between them."""
 
+import atexit
 import contextlib
 import dataclasses
 import json
+import os
 import socket
 import subprocess
 import sys
@@ -105,15 +107,17 @@ def joined(membership: Membership | None) -> Iterator[Processes]:
             processes.everyone()  # JAX's own barrier would not wait as long as process 0 draws
             jax.distributed.shutdown()
             processes.leave()
-        except UserError as error:
-            processes.fail(2, _one_line(error))
-            raise
-        except Exception as error:
-            processes.await_verdict()
-            processes.fail(1, f"{type(error).__name__}: {_one_line(error)}")
-            raise
         except BaseException as error:
-            processes.fail(130 if isinstance(error, KeyboardInterrupt) else 1, type(error).__name__)
+            if isinstance(error, UserError):
+                status, reason = 2, _one_line(error)
+            elif isinstance(error, KeyboardInterrupt):
+                status, reason = 130, "interrupted"
+            else:
+                processes.await_verdict()
+                status, reason = 1, f"{type(error).__name__}: {_one_line(error)}"
+            processes.fail(status, reason)
+            # JAX would wait for the others at exit; once this error is told, nothing is left to do.
+            atexit.register(os._exit, status)
             raise
 
 
