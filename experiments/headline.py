@@ -58,12 +58,13 @@ def fly(
 
 
 def across_seeds(rows: list[dict], field: str) -> str:
-    """Mean and standard deviation over the seeds."""
+    """Mean and sample standard deviation over the seeds."""
     values = [row[field] for row in rows if row[field] is not None]
     if not values:
         return "–"
     digits = 0 if field == "capture_step" else 4 if "collision" in field or "error" in field else 3
-    return f"{np.mean(values):.{digits}f} ({np.std(values):.{digits}f})"
+    deviation = f" ({np.std(values, ddof=1):.{digits}f})" if len(values) > 1 else ""
+    return f"{np.mean(values):.{digits}f}{deviation}"
 
 
 def main() -> None:
