@@ -187,7 +187,7 @@ def draw(results: dict, path: Path) -> None:
             *results["guesses"],
         ]
     )
-    figure = Figure(figsize=(12, 4.5), layout="constrained")
+    figure = Figure(figsize=(12, 5.2), layout="constrained")
     FigureCanvasAgg(figure)
     for axis, where, title in zip(
         figure.subplots(1, 2),
@@ -203,7 +203,10 @@ def draw(results: dict, path: Path) -> None:
                 milliseconds, values[name][:, 0, :, where].mean(axis=0), marker="o", label=name, **style
             )
         axis.set(xscale="log", yscale="log", xlabel="time ahead (ms)", ylabel="distance (cm)", title=title)
+        axis.set_ylim(bottom=0.01)
         axis.grid(alpha=0.3, which="both")
-    figure.axes[0].legend(fontsize="x-small")
+    figure.legend(
+        *figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize="small"
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
