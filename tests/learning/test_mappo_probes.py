@@ -60,7 +60,7 @@ def learn():
         observation = observation_of(flag[:-1], late)
         mean, log_std = POLICY.distribution(actor, observation, None)
         action = mean + jnp.exp(log_std) * jax.random.normal(noise_key, mean.shape)
-        miss = (jnp.tanh(action[..., 0, 0]) - 0.5 * flag[:-1]) ** 2
+        miss = (POLICY.action(action[..., 0, 0]) - 0.5 * flag[:-1]) ** 2
         reward = (
             probe["constant"]
             + probe["by_flag"] * flag[:-1]
@@ -106,7 +106,7 @@ def learn():
         )
         mean, std = scale.moments
         value = mean + std * POLICY.value(critic, corners, None)[..., 0]
-        return value, jnp.tanh(POLICY.distribution(actor, corners, None)[0])[..., 0, :]
+        return value, POLICY.action(POLICY.distribution(actor, corners, None)[0])[..., 0, :]
 
     def call(
         constant=0.0,

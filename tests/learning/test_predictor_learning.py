@@ -40,7 +40,7 @@ def recorded():
         def one(carry, action):
             observation, state = carry
             following, state, reward, _, _, info = jax.vmap(environment.step, (None, 0, 0))(
-                key, state, jnp.tanh(action)
+                key, state, policy.action(action)
             )
             return (following, state), (observation, state.evader_position, reward, info.penalty)
 

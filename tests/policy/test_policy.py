@@ -148,6 +148,23 @@ def test_one_pursuer_without_predictor_starts_near_hover():
     assert all(x.dtype == jnp.float32 for x in jax.tree.leaves(parameters))
 
 
+@pytest.mark.parametrize("squash", ["mean", "sample"])
+def test_mean_and_samples_are_actions_within_bounds(squash):
+    policy = Policy(
+        NetworkSettings(features=16, heads=2, squash=squash),
+        PredictorSettings(enabled=False),
+        initial_action=(3.0,) * 4,
+    )
+    observation = observation_of(5)
+    parameters = jax.jit(policy.init)(jax.random.key(0), observation)
+    mean, log_std = policy.distribution(parameters.actor, observation, None)
+    np.testing.assert_allclose(mean, np.tanh(3.0) if squash == "mean" else 3.0, atol=0.1)
+    sample = mean + jnp.exp(log_std) * jax.random.normal(jax.random.key(1), mean.shape)
+    expected = np.clip(sample, -1, 1) if squash == "mean" else np.tanh(sample)
+    np.testing.assert_array_equal(policy.action(sample), expected)
+    np.testing.assert_allclose(policy.act(parameters, observation), policy.action(mean), atol=1e-6)
+
+
 def test_density_and_entropy():
     draw = np.random.default_rng(0)
     sample, mean = draw.normal(size=(2, 5, 4))

@@ -18,7 +18,7 @@ def generate_task(
         uniform = turn_task(turn_key, uniform)
     if not settings.enabled:
         return uniform
-    expanded = expand_task(environment, expand_key, draw(archive, draw_key))
+    expanded = expand_task(environment, expand_key, draw(archive, draw_key), settings.wall_distance)
     local = (jax.random.uniform(choice_key) < settings.expansion) & (archive.size > 0)
     return jax.tree.map(lambda a, b: jnp.where(local, a, b), expanded, uniform)
 

@@ -59,7 +59,9 @@ def make_optimiser(
     schedule = optax.linear_schedule(settings.learning_rate, 0.0, steps)
 
     def one():
-        return optax.chain(optax.clip_by_global_norm(settings.gradient_norm), optax.adam(schedule, eps=1e-5))
+        adam = optax.chain(optax.clip_by_global_norm(settings.gradient_norm), optax.adam(schedule, eps=1e-5))
+        # one vector instead of dozens of small arrays: on a GPU their updates cost by number, not by size
+        return optax.flatten(adam)
 
     return one(), one()
 

@@ -14,7 +14,7 @@ class Rollout:
 
     observation: Observation  # (T, E, ...), before the step; `frames` (T, E, 1, F)
     predicted: jax.Array | None  # (T, E, K, 3) m, predicted evader positions; None without predictor
-    action: jax.Array  # (T, E, N, 4) before the tanh
+    action: jax.Array  # (T, E, N, 4) samples of the policy's Gaussian
     log_prob: jax.Array  # (T, E, N)
     reward: jax.Array  # (T, E, N)
     terminated: jax.Array  # (T, E) bool
@@ -59,7 +59,7 @@ def collect(
         mean, log_std = policy.distribution(parameters.actor, observation, predicted)
         action = mean + jnp.exp(log_std) * noise
         log_prob = gaussian_log_prob(action, mean, log_std)
-        following, state, reward, terminated, truncated, info = step(unused_key, state, jnp.tanh(action))
+        following, state, reward, terminated, truncated, info = step(unused_key, state, policy.action(action))
         record = Rollout(
             observation=newest_frame(observation),
             predicted=predicted,

@@ -51,6 +51,8 @@ class GeneratorSettings:
     success_low: float = 0.5
     success_high: float = 0.9
     """A task enters the archive if its success rate lies between these."""
+    wall_distance: float = 0.1
+    """Expanded starts keep this far from the arena's wall (m); 0.1 in the released code."""
     episodes_per_task: int = 4
     """Environments that share one task, so that its success rate can be told."""
     collision_tolerance: float = 1.0

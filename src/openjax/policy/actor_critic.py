@@ -12,7 +12,7 @@ from openjax.pursuit import Observation
 
 
 class Actor(nn.Module):
-    """Mean and log standard deviation of the Gaussian over actions before the tanh."""
+    """Mean and log standard deviation of the Gaussian over actions."""
 
     settings: NetworkSettings
     initial_action: tuple[float, ...]
@@ -39,7 +39,7 @@ class Actor(nn.Module):
         log_std = self.param(
             "log_std", nn.initializers.constant(settings.initial_log_std), (len(self.initial_action),)
         )
-        return mean, log_std
+        return (jnp.tanh(mean) if settings.squash == "mean" else mean), log_std
 
 
 class Critic(nn.Module):

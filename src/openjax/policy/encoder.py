@@ -119,7 +119,7 @@ class Encoder(nn.Module):
             # not -1: with a single pursuer there are no others, and nothing to tell the size from
             return x.reshape(math.prod(leading), *x.shape[rows:])
 
-        own = HiddenLayer(self.features, self.dtype, name="self_1")(flat(self_state))
+        own = HiddenLayer(self.features, self.dtype, name="self_1")(flat(padded(self_state)))
         own = HiddenLayer(self.features, self.dtype, name="self_2")(own)
         attention = SelfAttention(self.features, self.heads, self.dtype, name="attention")
         hidden = own + attention(own, flat(others), flat(pillars), flat(pillar_seen))
@@ -141,6 +141,12 @@ class HiddenLayer(nn.Module):
         kernel = self.param("kernel", init, (x.shape[-1], self.features), jnp.float32)
         x = x.astype(self.dtype) @ kernel.astype(self.dtype)
         return normalise(x, affine_parameters(self, "affine", self.features))
+
+
+def padded(x: jax.Array) -> jax.Array:
+    """(..., S) with zeros up to a multiple of 8: else XLA copies all samples to pad them for the matrix unit."""
+    extra = -x.shape[-1] % 8
+    return jnp.concatenate([x, jnp.zeros((*x.shape[:-1], extra), x.dtype)], axis=-1) if extra else x
 
 
 def affine_parameters(module: nn.Module, name: str, features: int) -> jax.Array:

@@ -15,7 +15,7 @@ from jax.experimental.pallas import triton as pallas_triton
 from openjax.policy.activation import activation, activation_slope
 from openjax.policy.platform import on_platform
 
-ROWS = 32
+ROWS = 64
 """Samples that one program of the kernel works on."""
 
 WARPS = 4
@@ -81,7 +81,7 @@ def _forward_kernel(activate, x_ref, affine_ref, out_ref):
     out_ref[...] = (activation(out) if activate else out).astype(out_ref.dtype)
 
 
-def _backward_kernel(activate, x_ref, affine_ref, g_ref, dx_ref, dbias_ref, dscale_ref, dshift_ref):
+def _backward_kernel(activate, x_ref, affine_ref, g_ref, dx_ref, daffine_ref):
     standard, inverse = _standardised(x_ref[...], affine_ref[0, :][None, :])
     scale = affine_ref[1, :][None, :]
     dout = g_ref[...].astype(jnp.float32)
@@ -93,9 +93,9 @@ def _backward_kernel(activate, x_ref, affine_ref, g_ref, dx_ref, dbias_ref, dsca
     along = jnp.sum(dstandard * standard, axis=-1, keepdims=True) / features
     dx = inverse * (dstandard - mean - standard * along)
     dx_ref[...] = dx.astype(dx_ref.dtype)
-    dbias_ref[0, :] = jnp.sum(dx, axis=0)
-    dscale_ref[0, :] = jnp.sum(dout * standard, axis=0)
-    dshift_ref[0, :] = jnp.sum(dout, axis=0)
+    daffine_ref[0, 0, :] = jnp.sum(dx, axis=0)
+    daffine_ref[0, 1, :] = jnp.sum(dout * standard, axis=0)
+    daffine_ref[0, 2, :] = jnp.sum(dout, axis=0)
 
 
 def _padded(*arrays):
@@ -124,16 +124,17 @@ def _backward_kernel_call(activate, x, affine, gradient, interpret=False):
     padded, padded_gradient = _padded(x, gradient)
     programs, features = padded.shape[0] // ROWS, x.shape[1]
     block = pl.BlockSpec((ROWS, features), lambda i: (i, 0))
-    row = pl.BlockSpec((1, features), lambda i: (i, 0))
-    sums = jax.ShapeDtypeStruct((programs, features), jnp.float32)
-    dx, *parts = pl.pallas_call(
+    dx, parts = pl.pallas_call(
         functools.partial(_backward_kernel, activate),
-        out_shape=(jax.ShapeDtypeStruct(padded.shape, padded.dtype), sums, sums, sums),
+        out_shape=(
+            jax.ShapeDtypeStruct(padded.shape, padded.dtype),
+            jax.ShapeDtypeStruct((programs, 3, features), jnp.float32),
+        ),
         grid=(programs,),
         in_specs=[block, pl.BlockSpec(affine.shape, lambda i: (0, 0)), block],
-        out_specs=(block, row, row, row),
+        out_specs=(block, pl.BlockSpec((1, 3, features), lambda i: (i, 0, 0))),
         interpret=interpret,
         compiler_params=pallas_triton.CompilerParams(num_warps=WARPS, num_stages=1),
         name="normalise_backward",
     )(padded, affine, padded_gradient)
-    return dx[: x.shape[0]], jnp.stack([jnp.sum(part, axis=0) for part in parts])
+    return dx[: x.shape[0]], jnp.sum(parts, axis=0)

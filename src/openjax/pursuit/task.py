@@ -18,6 +18,8 @@ PILLAR_REACH = 0.8
 """Pillars of uniform tasks stand on cells of this grid whose centre is closer to the axis than this (m)."""
 EXPANSION = 0.1
 """Local expansion moves each vehicle by up to this along each axis (m): the paper's delta."""
+WALL_DISTANCE = 0.1
+"""Local expansion keeps starts this far from the arena's wall (m): the released code's."""
 CANDIDATES = 8
 """Draws of a start among which the first good one is taken; more for more than three pursuers."""
 
@@ -87,11 +89,13 @@ def uniform_task(settings: PursuitSettings, key: jax.Array) -> Task:
     )
 
 
-def expand_task(settings: PursuitSettings, key: jax.Array, task: Task) -> Task:
+def expand_task(
+    settings: PursuitSettings, key: jax.Array, task: Task, wall_distance: float = WALL_DISTANCE
+) -> Task:
     """Move every vehicle of a task a little and keep its pillars: the paper's local expansion.
 
-    Starts stay within 0.1 m of the arena's wall and of half its height. Among a few draws the first that starts
-    clear is taken, else the task itself.
+    Starts stay `wall_distance` (m) from the arena's wall and within 0.1 m of half its height. Among a few draws the
+    first that starts clear is taken, else the task itself.
     """
 
     def draw(key):
@@ -100,7 +104,7 @@ def expand_task(settings: PursuitSettings, key: jax.Array, task: Task) -> Task:
         def move(key, position):
             moved = position + jax.random.uniform(key, position.shape, jnp.float32, -EXPANSION, EXPANSION)
             radius = jnp.linalg.norm(moved[..., :2], axis=-1, keepdims=True)
-            reach = settings.arena_radius - 0.1
+            reach = settings.arena_radius - wall_distance
             xy = moved[..., :2] * jnp.minimum(1.0, reach / jnp.maximum(radius, 1e-6))
             middle = settings.arena_height / 2
             z = jnp.clip(moved[..., 2:], middle - START_Z, middle + START_Z)
