@@ -94,7 +94,12 @@ def goals(by_layout: dict[str, list[dict]]) -> list[tuple[str, str, str, bool]]:
         crash = max(row["crash_rate"] for row in records)
         if layout in GOAL_STEP or layout == "hidden":
             rows.append(
-                (f"{layout}: capture rate, each seed", f"≥ {GOAL_RATE}", f"{lowest:.2f}", lowest > GOAL_RATE - 1e-6)
+                (
+                    f"{layout}: capture rate, each seed",
+                    f"≥ {GOAL_RATE}",
+                    f"{lowest:.2f}",
+                    lowest > GOAL_RATE - 1e-6,
+                )
             )
         if layout in GOAL_STEP:
             goal = GOAL_STEP[layout]

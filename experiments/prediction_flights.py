@@ -119,7 +119,7 @@ def fly(
         mean, log_std = policy.distribution(parameters.actor, observation, predicted)
         noise = exploration[:, None, None] * jax.random.normal(key, mean.shape)
         record = (state.drones.position, state.evader_position, state.evader_velocity, state.seen)
-        observation, state, *_ = step(key, state, jnp.tanh(mean + jnp.exp(log_std) * noise))
+        observation, state, *_ = step(key, state, policy.action(mean + jnp.exp(log_std) * noise))
         last_velocity = jnp.where(state.seen[:, None], state.evader_velocity, last_velocity)
         age = jnp.where(state.seen, 0.0, age + settings.time_step)
         return (observation, state, last_velocity, age), record

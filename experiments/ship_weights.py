@@ -1,8 +1,8 @@
 """Put trained policies into the package, without their critics: `python experiments/ship_weights.py NAME=RUN ...`."""
 
-import sys
 from pathlib import Path
 
+from openjax.runs.command_line import run_command
 from openjax.runs.policies import load_policy
 from openjax.runs.policy_files import WEIGHTS, load_policy_file, save_policy_file
 
@@ -19,4 +19,4 @@ def main(arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    run_command(main)

@@ -15,17 +15,21 @@ from openjax.runs.settings_files import write_json
 def summary(run: Path) -> dict:
     """Settings, evaluations and layouts of one run."""
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()]
+    trained = [line for line in lines if line["event"] == "train"]
+    first, last = trained[0], trained[-1]
     return {
         "settings": json.loads((run / "settings.json").read_text(encoding="utf-8")),
+        "first_update_seconds": first["seconds"],
+        "steps_per_second": (last["steps"] - first["steps"]) / max(last["seconds"] - first["seconds"], 1e-9),
         "evaluations": [line for line in lines if line["event"] == "evaluation"],
         "layouts": json.loads((run / "layouts.json").read_text(encoding="utf-8")),
     }
 
 
-def first_reaching(evaluations: list[dict], rate: float) -> str:
-    """Environment steps and seconds until the held-back capture rate first reaches `rate`."""
+def first_reaching(evaluations: list[dict], rate: float, field: str = "capture_rate") -> str:
+    """Environment steps and seconds until a held-back capture rate first reaches `rate`."""
     for entry in evaluations:
-        if entry["capture_rate"] >= rate:
+        if entry.get(field, 0.0) >= rate:
             return f"{entry['steps'] / 1e6:.0f} M, {entry['seconds']:.0f} s"
     return "not reached"
 
@@ -49,7 +53,8 @@ def learning_against_spread(runs: dict[str, dict]) -> list[str]:
         )
         change = abs(statistics.mean(after) - statistics.mean(before))
         shown = ", ".join(f"{value:.3f}" for value in after)
-        ratio = change / statistics.stdev(after)
+        spread = statistics.stdev(after)
+        ratio = change / spread if spread else float("inf")
         lines.append(f"| {field} | {statistics.mean(before):.3f} | {shown} | {ratio:.1f} |")
     return lines
 
@@ -65,17 +70,21 @@ def main() -> None:
     runs = {name: summary(Path(path)) for name, _, path in (run.partition("=") for run in arguments.runs)}
     write_json(arguments.out, {"note": arguments.note, "commit": arguments.commit, "runs": runs})
     lines = ["# Training runs", "", f"{arguments.note} Commit {arguments.commit}.", ""]
-    lines += [
-        "| run | env steps | seconds, compilation included | held-back capture ≥ .95 | ≥ .99 | held-back capture, "
-        "collisions at the end |",
-        "|---|---|---|---|---|---|",
-    ]
+    far = all("far_capture_rate" in entry for run in runs.values() for entry in run["evaluations"])
+    heads = ["run", "env steps", "seconds, compilation included", "of them before the first update's end"]
+    heads += ["env steps/s, evaluations included", "held-back capture ≥ .95", "≥ .99"]
+    heads += ["far tasks ≥ .95", "≥ .99"] if far else []
+    heads += ["held-back capture, collisions at the end"] + (["far tasks"] if far else [])
+    lines += ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
     for name, run in runs.items():
-        last = run["evaluations"][-1]
-        lines.append(
-            f"| {name} | {last['steps'] / 1e6:.0f} M | {last['seconds']:.0f} | {first_reaching(run['evaluations'], 0.95)} | "
-            f"{first_reaching(run['evaluations'], 0.99)} | {last['capture_rate']:.3f}, {last['collision_rate']:.4f} |"
-        )
+        entries = run["evaluations"]
+        last = entries[-1]
+        cells = [name, f"{last['steps'] / 1e6:.0f} M", f"{last['seconds']:.0f}"]
+        cells += [f"{run['first_update_seconds']:.0f}", f"{run['steps_per_second'] / 1e6:.2f} M"]
+        kinds = ("", "far_") if far else ("",)
+        cells += [first_reaching(entries, r, f"{kind}capture_rate") for kind in kinds for r in (0.95, 0.99)]
+        cells += [f"{last[f'{k}capture_rate']:.3f}, {last[f'{k}collision_rate']:.4f}" for k in kinds]
+        lines.append("| " + " | ".join(cells) + " |")
     lines += [
         "",
         "Layouts after training, evaluated on the same machine (capture rate / capture step / collision rate / "
