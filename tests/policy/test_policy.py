@@ -161,7 +161,7 @@ def test_mean_and_samples_are_actions_within_bounds(squash):
     np.testing.assert_allclose(mean, np.tanh(3.0) if squash == "mean" else 3.0, atol=0.1)
     sample = mean + jnp.exp(log_std) * jax.random.normal(jax.random.key(1), mean.shape)
     expected = np.clip(sample, -1, 1) if squash == "mean" else np.tanh(sample)
-    np.testing.assert_array_equal(policy.action(sample), expected)
+    np.testing.assert_allclose(policy.action(sample), expected, atol=1e-6)
     np.testing.assert_allclose(policy.act(parameters, observation), policy.action(mean), atol=1e-6)
 
 

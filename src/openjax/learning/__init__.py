@@ -2,7 +2,7 @@
 
 from openjax.learning.evaluation import Evaluation, Trajectory, make_evaluate, summarise
 from openjax.learning.settings import PRESETS, GeneratorSettings, MappoSettings, TrainSettings, preset
-from openjax.learning.training import TrainCarry, build, init_carry, make_training_step
+from openjax.learning.training import TrainCarry, abstract_carry, build, init_carry, make_training_step
 
 __all__ = [
     "PRESETS",
@@ -12,6 +12,7 @@ __all__ = [
     "TrainCarry",
     "TrainSettings",
     "Trajectory",
+    "abstract_carry",
     "build",
     "init_carry",
     "make_evaluate",

@@ -65,6 +65,12 @@ def init_carry(settings: TrainSettings, key: jax.Array, environment: Pursuit | N
     return jax.jit(lambda key: _initial_carry(settings, parts, key))(key)
 
 
+def abstract_carry(settings: TrainSettings, environment: Pursuit | None = None) -> TrainCarry:
+    """Shapes and dtypes of a run's carry, without computing one."""
+    parts = build(settings, environment)
+    return jax.eval_shape(lambda key: _initial_carry(settings, parts, key), jax.random.key(0))
+
+
 def _initial_carry(settings, parts, key):
     environment = parts.environment
     archive = empty_archive(settings.environment, settings.generator.capacity)

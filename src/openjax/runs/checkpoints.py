@@ -70,10 +70,18 @@ def place(carry: Any, shardings: Any = None) -> Any:
     return jax.jit(whole, out_shardings=shardings)(arrays)
 
 
-def abstract_like(carry: Any) -> Any:
-    """Shapes, dtypes and shardings of a carry that `place` put on its devices."""
+def abstract_like(carry: Any, shardings: Any = None) -> Any:
+    """Shapes, dtypes and shardings of a carry that `place` put, or would put, on its devices.
+
+    Args:
+      carry: pytree of arrays, or of their shapes and dtypes.
+      shardings: as for `place`.
+    """
+    shardings = _default_sharding() if shardings is None else shardings
     return jax.tree.map(
-        lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=leaf.sharding), carry
+        lambda leaf, sharding: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding),
+        carry,
+        jax.tree.broadcast(shardings, carry),
     )
 
 

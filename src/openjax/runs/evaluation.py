@@ -1,7 +1,7 @@
 """Evaluation of policies on layouts and on held-back tasks, as tables, records and trajectories."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -13,6 +13,7 @@ from rich.table import Table
 from openjax.learning import Evaluation, make_evaluate, summarise
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, Scenario, Task, scenario_task
+from openjax.runs.ahead import compile_ahead
 from openjax.runs.trajectory import Trajectory
 
 FIELDS = (
@@ -61,6 +62,19 @@ class Evaluator:
             evaluations.append(jax.tree.map(lambda leaf, used=used: np.asarray(leaf)[:used], evaluation))
             records.append(record)
         return jax.tree.map(lambda *parts: np.concatenate(parts), *evaluations), records
+
+    def compile_ahead(self, parameters: PolicyParameters, tasks: Task) -> Callable[[], None]:
+        """Start to compile for parameters and tasks of these shapes; see `openjax.runs.ahead`."""
+
+        def one_batch(leaf):
+            return jax.ShapeDtypeStruct((self.batch, *leaf.shape[1:]), leaf.dtype)
+
+        return compile_ahead(
+            self._evaluate,
+            parameters,
+            jax.tree.map(one_batch, tasks),
+            jax.random.fold_in(jax.random.key(0), 0),
+        )
 
     def trajectory(self, records: list[Any], episode: int, task: Task, title: str) -> Trajectory:
         """Episode number `episode` of a call, for drawing; `task` is that episode's."""

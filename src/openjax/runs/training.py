@@ -7,9 +7,10 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from openjax.learning import TrainSettings, build, init_carry, summarise
+from openjax.learning import TrainSettings, abstract_carry, build, init_carry, summarise
 from openjax.policy import PolicyParameters
 from openjax.pursuit import SCENARIOS, Pursuit
+from openjax.runs.ahead import compile_ahead
 from openjax.runs.checkpoints import Checkpoints, abstract_like, load_arrays, named_leaves, place
 from openjax.runs.devices import carry_shardings, check_devices, everywhere, make_device_step, own_copy
 from openjax.runs.evaluation import (
@@ -69,14 +70,21 @@ def run_job(job: TrainingJob, directory: RunDirectory, resume: bool, console: Co
         checkpoints = Checkpoints(directory.checkpoints, processes=processes)
         processes.advice = lambda: _advice(checkpoints, directory)
         progress.phase("compiling the start: networks, first tasks")
-        carry, update, seconds = _first_carry(job, directory, checkpoints, resume, progress)
+        shardings = carry_shardings(job.devices)
+        abstract = abstract_like(abstract_carry(settings, job.environment), shardings)
+        step = guarded(
+            make_device_step(settings, job.environment, job.devices), shardings, everywhere(job.devices)
+        )
+        held_back = _held_back(job)
+        step_ready, evaluation_ready = _compile_ahead(job, step, held_back, abstract)
+        carry, update, seconds = _first_carry(job, abstract, directory, checkpoints, resume, progress)
         if processes.is_first:
             directory.write_settings(settings, job.facts)
-        held_back = _held_back(job)
 
         def evaluate(carry):
             if not processes.is_first:
                 return processes.of_first()
+            evaluation_ready()
             uniform, far = (summarise(part) for part in held_back(own_copy(carry.policy))[:2])
             score = selection_score(uniform)
             return processes.of_first((score, {**flat_metrics(uniform, far), "score": score}))
@@ -85,10 +93,11 @@ def run_job(job: TrainingJob, directory: RunDirectory, resume: bool, console: Co
         if processes.is_first:
             steps = update * settings.steps_per_update
             metrics = MetricsWriter(directory.path, update if resume else None, resumed_steps=steps)
-        step = make_device_step(settings, job.environment, job.devices)
         try:
+            progress.phase("compiling the training step")
+            step_ready()
             outcome = run_updates(
-                guarded(step, carry_shardings(job.devices), everywhere(job.devices)),
+                step,
                 carry,
                 Plan(
                     total_updates=settings.total_updates,
@@ -127,16 +136,25 @@ def run_job(job: TrainingJob, directory: RunDirectory, resume: bool, console: Co
     return 0
 
 
-def _first_carry(job, directory, checkpoints, resume, progress):
-    """The carry to start from, the updates done and the seconds spent."""
+def _compile_ahead(job, step, held_back, abstract):
+    """Start to compile the step and the evaluation; functions that wait for them.
+
+    Not with several processes, which must compile in the same order.
+    """
+    if job.processes.number > 1:
+        return (lambda: None), (lambda: None)
+    policy = abstract_like(abstract.policy, jax.sharding.SingleDeviceSharding(jax.local_devices()[0]))
+    return compile_ahead(step, abstract), held_back.evaluator.compile_ahead(policy, held_back.tasks)
+
+
+def _first_carry(job, abstract, directory, checkpoints, resume, progress):
+    """The carry to start from, the updates done and the seconds spent; `abstract` is its kind."""
     settings = job.settings
-    carry = init_carry(settings, jax.random.key(settings.seed), job.environment)
     if resume:
-        abstract = abstract_like(place(carry, carry_shardings(job.devices)))
-        del carry
         carry, record = checkpoints.restore_latest(abstract, progress.message)
         progress.message(f"resumed at update {record.update} of {settings.total_updates}")
         return carry, record.update, float(record.notes.get("seconds", 0.0))
+    carry = init_carry(settings, jax.random.key(settings.seed), job.environment)
     if job.start_from is not None:
         carry = carry.replace(policy=_start_parameters(job))
     carry = place(carry, carry_shardings(job.devices))
