@@ -25,6 +25,7 @@ from predictors import (
     Budget,
     compared_times,
     errors,
+    lost_steps,
     predict,
     simple_guesses,
     train,
@@ -71,11 +72,11 @@ def study(options: argparse.Namespace) -> dict:
     groups = np.concatenate([np.zeros(options.held_back, int), 1 + np.arange(per_source) // options.episodes])
     times = compared_times(settings.episode_length, options.stride)
     budget = Budget(options.updates, options.batch, options.seeds)
-    jax.block_until_ready(flown)
+    lost = lost_steps(flown)
     seconds = {"flights": time.monotonic() - started}
 
     def compare(variant):
-        parameters, loss = train(variant, settings, budget, flown)
+        parameters, loss = train(variant, settings, budget, flown, lost)
         predicted = predict(variant, settings, parameters, test, options.stride)
         return {
             **dataclasses.asdict(variant),

@@ -24,6 +24,16 @@ QUESTIONS = (
     ("pillars as input", "pillars", "1–40 ahead, relative (default)"),
     ("pillars, beside the last seen position", "last seen and pillars", "last seen position as input"),
     ("frames 40 ms apart, beside both", "last seen and pillars, spacing 4", "last seen and pillars"),
+    (
+        "half of the windows lost, beside both",
+        "last seen and pillars, half of the windows lost",
+        "last seen and pillars",
+    ),
+    (
+        "pillars, where half of the windows are lost",
+        "last seen and pillars, half of the windows lost",
+        "last seen, half of the windows lost",
+    ),
     ("128 units, beside both", "last seen and pillars, 128 units", "last seen and pillars"),
 )
 """What was changed, the variant with it, the one without."""

@@ -37,6 +37,8 @@ class Variant:
     """Frames hold all pillars, relative to where the evader was last seen, nearest first."""
     units: int = 64
     learning_rate: float = 1e-3
+    balanced: bool = False
+    """Half of the windows end where the evader is lost from sight, which else are a few in a thousand."""
 
 
 VARIANTS = (
@@ -54,6 +56,8 @@ VARIANTS = (
     Variant("last seen and pillars, absolute", memory=True, pillars=True, relative=False),
     Variant("last seen and pillars, spacing 4", memory=True, pillars=True, spacing=4),
     Variant("last seen and pillars, 128 units", memory=True, pillars=True, units=128),
+    Variant("last seen, half of the windows lost", memory=True, balanced=True),
+    Variant("last seen and pillars, half of the windows lost", memory=True, pillars=True, balanced=True),
 )
 
 
@@ -100,11 +104,20 @@ def window(variant: Variant, frames: jax.Array, world: jax.Array, time: jax.Arra
     return frames[world[..., None], jnp.maximum(time[..., None] - back, 0)]
 
 
+def lost_steps(flights: Flights) -> jax.Array:
+    """(2, M) world and time of all steps from which a window may end where the evader is lost; (2, 1) zeros if none."""
+    length = flights.seen.shape[1] - HORIZONS[-1] + 1
+    found = np.stack(np.nonzero(visibility(flights, np.arange(length))[..., 1]))
+    return jnp.asarray(found if found.size else np.zeros((2, 1)), jnp.int32)
+
+
 @functools.partial(jax.jit, static_argnums=(0, 1, 2))
-def train(variant: Variant, settings: PursuitSettings, budget: Budget, flights: Flights):
+def train(
+    variant: Variant, settings: PursuitSettings, budget: Budget, flights: Flights, lost: jax.Array
+) -> tuple[dict, jax.Array]:
     """Parameters and last loss (m^2 per coordinate) of `budget.seeds` predictors, leading axis seeds.
 
-    All variants of a seed see the same windows in the same order.
+    All variants of a seed see the same windows in the same order, but for those that prefer steps from `lost_steps`.
     """
     frames = frames_of(variant, settings, flights)
     position = last_known(settings, flights)[0]
@@ -122,9 +135,13 @@ def train(variant: Variant, settings: PursuitSettings, budget: Budget, flights: 
 
     def update(carry, key):
         parameters, state = carry
-        world_key, time_key = jax.random.split(key)
+        world_key, time_key, lost_key = jax.random.split(key, 3)
         world = jax.random.randint(world_key, (budget.batch,), 0, worlds)
         time = jax.random.randint(time_key, (budget.batch,), 0, length - HORIZONS[-1] + 1)
+        if variant.balanced:
+            half = budget.batch // 2
+            chosen = lost[:, jax.random.randint(lost_key, (half,), 0, lost.shape[1])]
+            world, time = world.at[:half].set(chosen[0]), time.at[:half].set(chosen[1])
         value, gradient = jax.value_and_grad(loss)(parameters, world, time)
         change, state = optimiser.update(gradient, state, parameters)
         return (optax.apply_updates(parameters, change), state), value

@@ -86,9 +86,11 @@ def test_training_learns(flights):
     budget = predictors.Budget(updates=100, batch=32, seeds=2)
     first = predictors.Budget(updates=1, batch=32, seeds=2)
     variant = predictors.Variant(
-        "all", relative=False, memory=True, pillars=True, frames=2, units=8, learning_rate=1e-2
+        "all", relative=False, memory=True, balanced=True, pillars=True, frames=2, units=8, learning_rate=1e-2
     )
-    loss = [np.asarray(predictors.train(variant, SETTINGS, b, flights)[1]) for b in (first, budget)]
+    lost = predictors.lost_steps(flights)
+    assert lost.shape[1] == (~flights.seen & (flights.last_index >= 0))[:, : TIMES[-1] + 1].sum() > 0
+    loss = [np.asarray(predictors.train(variant, SETTINGS, b, flights, lost)[1]) for b in (first, budget)]
     assert (loss[1] < 0.5 * loss[0]).all()
 
 
