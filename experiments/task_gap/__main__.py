@@ -66,10 +66,11 @@ def main() -> None:
     parser.add_argument("--replicates", type=int, default=2, help="cases of each effect")
     parser.add_argument("--nones", type=int, default=2)
     parser.add_argument("--effects", nargs="*", default=list(SIZES))
-    parser.add_argument("--conditions", nargs="*", default=list(CONDITIONS)[:2], help=", ".join(CONDITIONS))
+    parser.add_argument("--conditions", nargs="*", default=list(CONDITIONS), help=", ".join(CONDITIONS))
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--seconds", type=float, default=1e6, help="start nothing new after this long")
     parser.add_argument("--work", type=Path, default=Path("runs/task_gap"))
+    parser.add_argument("--commit", help="written into the results where the tree has no repository")
     parser.add_argument("--results", type=Path, default=RESULTS, help="without ending")
     options = parser.parse_args()
     deadline = time.time() + options.seconds

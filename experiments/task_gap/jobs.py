@@ -11,6 +11,12 @@ CONDITIONS = {
     "clamp, drawn starts": {"speed_limit": "clamp", "start_attitude": "drawn"},
     "clamp, level starts": {"speed_limit": "clamp", "start_attitude": "level"},
     "no clamp, drawn starts": {"speed_limit": "none", "start_attitude": "drawn"},
+    # the paper's radius is reached in every episode: with half of it the capture rate says something too
+    "clamp, drawn starts, capture radius 0.15 m": {
+        "speed_limit": "clamp",
+        "start_attitude": "drawn",
+        "capture_radius": 0.15,
+    },
 }
 
 
@@ -33,8 +39,14 @@ class Job:
         if self.world == "flights":
             return self.work / "flights" / f"{self.case.name}.json"
         name = f"{self.case.name}_{self.world}" if self.case else self.world
-        place = self.work / self.policy / self.condition.replace(", ", "_").replace(" ", "_")
-        return place / f"{name}_{self.start}_{self.number}.json"
+        return (
+            world_folder(self.work, self.policy, self.condition) / f"{name}_{self.start}_{self.number}.json"
+        )
+
+
+def world_folder(work: Path, policy: str, condition: str) -> Path:
+    """Where the episodes of a policy under a condition are kept."""
+    return work / Path(policy).stem / condition.replace(", ", "_").replace(" ", "_")
 
 
 def do(job: Job) -> tuple[str, float]:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments.task_gap.jobs import world_folder
 from openjax.runs.machine import describe_machine
 from openjax.runs.settings_files import write_json
 
@@ -19,7 +20,7 @@ DRAWS = 2000
 
 def load_world(work: Path, policy: str, condition: str, name: str) -> dict[str, np.ndarray] | None:
     """Figures of all episodes of a world by their number, or None if there are none."""
-    place = work / policy / condition.replace(", ", "_").replace(" ", "_")
+    place = world_folder(work, policy, condition)
     chunks = {}
     for path in place.glob(f"{name}_*_*.json"):
         stem = path.stem.removeprefix(f"{name}_").split("_")
@@ -142,6 +143,8 @@ def write_results(cases, options) -> None:
         if k not in ("work", "results")
     }
     machine = describe_machine()
+    if options.commit:  # the tree travelled without its repository
+        machine["commit"] = options.commit
     write_json(Path(f"{options.results}.json"), {"settings": told, "machine": machine, **measured})
     Path(f"{options.results}.md").write_text(markdown(cases, options, measured, machine), encoding="utf-8")
 
