@@ -47,18 +47,20 @@ PAPER = {
 PAPER_PREDICTION = {"wall": 0.054, "narrow_gap": 0.084, "random": 0.109, "passage": 0.081}
 
 
-def outcomes() -> list[tuple[str, int, Callable]]:
-    """What the parts are judged by: name, digits, function of a run."""
+def outcomes(fields: list[str]) -> list[tuple[str, int, Callable]]:
+    """What the parts are judged by: name, digits, function of a run; `fields` are capture rates on held-back sets."""
 
     def over_layouts(field, names):
         return lambda run: float(np.mean([r[field] for r in run["layouts"] if r["scenario"] in names]))
 
+    def millions(field):
+        return lambda run: (lambda s: s and s / 1e6)(steps_to(run["held_back"], REACH, field))
+
     four = ("wall", "narrow_gap", "random", "passage")
     return [
-        (
-            f"steps to {REACH} on held-back uniform tasks (M)",
-            1,
-            lambda run: (lambda s: s and s / 1e6)(steps_to(run["held_back"], REACH)),
+        *(
+            (f"steps to {REACH} on held-back {kind_of(field)} tasks (M)", 1, millions(field))
+            for field in fields
         ),
         ("capture rate, the paper's four layouts", 4, over_layouts("capture_rate", four)),
         ("capture step, the paper's four layouts", 1, over_layouts("capture_step", four)),
@@ -68,6 +70,11 @@ def outcomes() -> list[tuple[str, int, Callable]]:
         ("capture step, hidden", 1, over_layouts("capture_step", ("hidden",))),
         ("collision rate, hidden", 5, over_layouts("collision_rate", ("hidden",))),
     ]
+
+
+def kind_of(field: str) -> str:
+    """Which held-back tasks a capture rate is of."""
+    return "uniform" if field == "capture_rate" else field.removesuffix("capture_rate").strip("_/ ")
 
 
 def spread(values: list, digits: int) -> str:
@@ -152,12 +159,12 @@ def report(runs: dict[str, list[dict]], facts: dict) -> list[str]:
         "",
         *prediction_lines(runs),
     ]
-    for field in (name for name in everyone[0]["held_back"][0] if name.endswith("capture_rate")):
-        which = "uniform" if field == "capture_rate" else field.removesuffix("capture_rate").strip("_/ ")
+    fields = [name for name in everyone[0]["held_back"][0] if name.endswith("capture_rate")]
+    for field in fields:
         interval = np.median(np.diff([r["steps"] for r in everyone[0]["held_back"]])) / 1e6
         lines += [
             "",
-            f"## Environment steps to a capture rate of {REACH} on held-back {which} tasks",
+            f"## Environment steps to a capture rate of {REACH} on held-back {kind_of(field)} tasks",
             "",
             f"First evaluation that reaches it; there is one every {interval:.1f} M steps.",
             "",
@@ -175,7 +182,7 @@ def report(runs: dict[str, list[dict]], facts: dict) -> list[str]:
             ),
         ]
     rows, significant = [], []
-    for label, digits, value in outcomes():
+    for label, digits, value in outcomes(fields):
         effects = main_effects(runs, value)
         if effects is None:
             rows.append([label, "–", "–", "–"])
@@ -206,14 +213,19 @@ def draw(runs: dict[str, list[dict]], path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(13, 7), layout="constrained")
+    figure = Figure(figsize=(17, 7), layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.subplots(2, 2)
+    axes = figure.subplots(2, 3)
     colors = dict(zip(VARIANTS, ("tab:red", "tab:blue", "tab:green", "0.3", "tab:olive"), strict=True))
+    far = all("far_capture_rate" in r for group in runs.values() for run in group for r in run["held_back"])
     for axis, field, label in (
-        (axes[0, 0], "capture_rate", "capture rate, held-back tasks"),
-        (axes[0, 1], "capture_step", "capture step, held-back tasks"),
+        (axes[0, 0], "capture_rate", "capture rate, held-back uniform tasks"),
+        (axes[0, 1], "far_capture_rate", "capture rate, held-back far tasks"),
+        (axes[0, 2], "capture_step", "capture step, held-back uniform tasks"),
     ):
+        if field.startswith("far") and not far:
+            axis.set_axis_off()
+            continue
         for name, group in runs.items():
             steps, values = band(group, field)
             axis.plot(steps / 1e6, values.mean(axis=0), color=colors[name], label=name)
@@ -231,8 +243,9 @@ def draw(runs: dict[str, list[dict]], path: Path) -> None:
     axes[0, 0].legend(fontsize="small", title="mean and range over seeds", title_fontsize="small")
     width = 0.8 / len(runs)
     for axis, field, label in (
-        (axes[1, 0], "capture_step", "capture step"),
-        (axes[1, 1], "collision_rate", "collision rate"),
+        (axes[1, 0], "capture_rate", "capture rate"),
+        (axes[1, 1], "capture_step", "capture step"),
+        (axes[1, 2], "collision_rate", "collision rate"),
     ):
         for j, (name, group) in enumerate(runs.items()):
             values = np.array([[row[field] for row in run["layouts"]] for run in group], float)
