@@ -46,11 +46,11 @@ def episode_jobs(cases, options, deadline) -> list[Job]:
         for start in range(0, options.episodes, options.chunk):
             number = min(options.chunk, options.episodes - start)
             rest = (work, options.policy, condition, start, number, deadline)
-            out.append(Job("nominal", None, *rest))
+            out += [Job("nominal", None, *rest, substeps) for substeps in options.substeps]
             for case in cases:
                 out.append(Job("plant", case, *rest))
-                if read_flights(work, case)["found"]["parameters"]:
-                    out.append(Job("corrected", case, *rest))  # without effects it is the nominal simulator
+                if read_flights(work, case)["found"]["parameters"]:  # else it is the nominal simulator
+                    out += [Job("corrected", case, *rest, substeps) for substeps in options.substeps]
     return out
 
 
@@ -67,6 +67,13 @@ def main() -> None:
     parser.add_argument("--nones", type=int, default=2)
     parser.add_argument("--effects", nargs="*", default=list(SIZES))
     parser.add_argument("--conditions", nargs="*", default=list(CONDITIONS), help=", ".join(CONDITIONS))
+    parser.add_argument(
+        "--substeps",
+        type=int,
+        nargs="*",
+        default=[1, 5],
+        help="of the simulators' 10 ms; 5: rate loop at 500 Hz",
+    )
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--seconds", type=float, default=1e6, help="start nothing new after this long")
     parser.add_argument("--work", type=Path, default=Path("runs/task_gap"))

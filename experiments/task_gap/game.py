@@ -4,6 +4,7 @@ The game (evader, line of sight, observation, metrics) is `openjax.pursuit`'s ow
 drones' step is replaced by poses from outside.
 """
 
+import dataclasses
 from functools import partial
 
 import jax
@@ -14,9 +15,12 @@ from experiments.task_gap.air import Air, Solids
 from experiments.withheld import body, causes, sensors
 from experiments.withheld.cases import case_rng
 from openjax.pursuit import Pursuit, PursuitSettings, action_to_command, uniform_task
+from openjax.pursuit.reward import captures
+from openjax.pursuit.sensing import line_of_sight
 from openjax.vehicle import DroneState
 
 FIGURES = ("captured", "capture_step", "collision_rate", "crashed")
+CLOSE = 0.5  # of the capture radius: the whole one is reached in nearly every episode, so it says little
 TASK_KEY = 7_000_001  # tasks and start attitudes are the same in all worlds
 
 
@@ -64,10 +68,25 @@ def draw_tasks(settings: PursuitSettings, start: int, number: int):
     return jax.vmap(partial(uniform_task, settings))(pairs[:, 0]), pairs[:, 1]
 
 
-def figures_of(statistics) -> dict[str, list[float]]:
+def catches_closely(settings: PursuitSettings, state) -> jax.Array:
+    """Whether some pursuer of each world catches the evader within half of the capture radius now. (B,) bool.
+
+    The policy doesn't know the capture radius, so this is the game with the smaller one.
+    """
+    smaller = dataclasses.replace(settings, capture_radius=CLOSE * settings.capture_radius)
+
+    def caught(position, evader, task):
+        sight = line_of_sight(settings, position, evader, task.pillar_position, task.pillar_active)
+        return jnp.any(captures(smaller, position, evader, sight))
+
+    return jax.vmap(caught)(state.drones.position, state.evader_position, state.task)
+
+
+def figures_of(statistics, closely) -> dict[str, list[float]]:
     """The task's figures of each episode, and the parts of the collisions."""
     steps = np.maximum(np.asarray(statistics.steps), 1)
     out = {name: np.asarray(getattr(statistics, name), float) for name in FIGURES}
+    out["captured_closely"] = np.asarray(closely, float)
     for part in ("pillar", "drone", "bounds"):
         out[f"collision_{part}"] = np.asarray(getattr(statistics, f"{part}_steps"), float) / steps
     return {name: [round(float(x), 6) for x in values] for name, values in out.items()}
@@ -81,15 +100,15 @@ def fly_simulator(loaded, settings, start, number, effects=(), parameters=None) 
 
     def episodes(weights, tasks, keys):
         def one(carry, _):
-            observation, state = carry
+            observation, state, closely = carry
             observation, state, *_ = step(keys[0], state, loaded.policy.act(weights, observation))
-            return (observation, state), None
+            return (observation, state, closely | catches_closely(settings, state)), None
 
-        carry = jax.vmap(environment.reset_to)(keys, tasks)
-        (_, state), _ = jax.lax.scan(one, carry, None, length=settings.episode_length)
-        return state.statistics
+        carry = (*jax.vmap(environment.reset_to)(keys, tasks), jnp.zeros(number, bool))
+        (_, state, closely), _ = jax.lax.scan(one, carry, None, length=settings.episode_length)
+        return state.statistics, closely
 
-    return figures_of(jax.jit(episodes)(loaded.parameters, tasks, keys))
+    return figures_of(*jax.jit(episodes)(loaded.parameters, tasks, keys))
 
 
 def fly_plant(loaded, settings, start, number, case) -> dict[str, list[float]]:
@@ -107,9 +126,10 @@ def fly_plant(loaded, settings, start, number, case) -> dict[str, list[float]]:
         return action, action_to_command(action)
 
     @jax.jit
-    def advance(state, action, flown):
+    def advance(state, closely, action, flown):
         state = state.replace(drones=remember(state.drones, flown, flown))
-        return jax.vmap(game.step, in_axes=(None, 0, 0))(keys[0], state, action)[1]
+        state = jax.vmap(game.step, in_axes=(None, 0, 0))(keys[0], state, action)[1]
+        return state, closely | catches_closely(settings, state)
 
     def per_world(position, quaternion, velocity):
         parts = {"position": position, "quaternion": quaternion, "velocity": velocity}
@@ -117,12 +137,14 @@ def fly_plant(loaded, settings, start, number, case) -> dict[str, list[float]]:
             name: value.T.reshape(-1, team, len(value)).astype(np.float32) for name, value in parts.items()
         }
 
+    closely = jnp.zeros(number, bool)
     limit = settings.max_speed if settings.speed_limit == "clamp" else None
     for _ in range(settings.episode_length):
         action, command = look(loaded.parameters, state, per_world(*air.measure()))
         air.fly(np.asarray(command, float).reshape(-1, 4).T, limit)
-        state = advance(state, action, per_world(air.position, air.q, air.velocity))
-    return figures_of(state.statistics)
+        flown = per_world(air.position, air.q, air.velocity)
+        state, closely = advance(state, closely, action, flown)
+    return figures_of(state.statistics, closely)
 
 
 def make_air(settings, state, tasks, start, case) -> Air:

@@ -11,12 +11,6 @@ CONDITIONS = {
     "clamp, drawn starts": {"speed_limit": "clamp", "start_attitude": "drawn"},
     "clamp, level starts": {"speed_limit": "clamp", "start_attitude": "level"},
     "no clamp, drawn starts": {"speed_limit": "none", "start_attitude": "drawn"},
-    # the paper's radius is reached in every episode: with half of it the capture rate says something too
-    "clamp, drawn starts, capture radius 0.15 m": {
-        "speed_limit": "clamp",
-        "start_attitude": "drawn",
-        "capture_radius": 0.15,
-    },
 }
 
 
@@ -32,13 +26,14 @@ class Job:
     start: int
     number: int
     deadline: float
+    substeps: int = 1  # of the simulators; the plant has its own
 
     @property
     def path(self) -> Path:
         """Where the result is kept."""
         if self.world == "flights":
             return self.work / "flights" / f"{self.case.name}.json"
-        name = f"{self.case.name}_{self.world}" if self.case else self.world
+        name = world_name(self.world, self.case, self.substeps)
         return (
             world_folder(self.work, self.policy, self.condition) / f"{name}_{self.start}_{self.number}.json"
         )
@@ -47,6 +42,12 @@ class Job:
 def world_folder(work: Path, policy: str, condition: str) -> Path:
     """Where the episodes of a policy under a condition are kept."""
     return work / Path(policy).stem / condition.replace(", ", "_").replace(" ", "_")
+
+
+def world_name(world: str, case: Case | None, substeps: int) -> str:
+    """By which the files of a world are called."""
+    name = f"{case.name}_{world}" if case else world
+    return name if world == "plant" else f"{name}_{substeps}"
 
 
 def do(job: Job) -> tuple[str, float]:
@@ -74,6 +75,8 @@ def _fly(job):
 
     loaded = load_policy(job.policy)
     settings = dataclasses.replace(loaded.settings.environment, **CONDITIONS[job.condition])
+    if job.world != "plant":
+        settings = dataclasses.replace(settings, substeps=job.substeps)
     part = (loaded, settings, job.start, job.number)
     if job.world == "nominal":
         return fly_simulator(*part)
