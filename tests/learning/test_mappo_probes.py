@@ -33,8 +33,6 @@ def observation_of(flag, late):
         pillar_seen=jnp.zeros((*leading, 1, 1), bool),
         privileged=jnp.zeros((*leading, 1, 10)),
         position=jnp.zeros((*leading, 1, 3)),
-        pillar_position=jnp.zeros((*leading, 1, 2)),
-        pillar_active=jnp.zeros((*leading, 1), bool),
         last_seen=jnp.zeros((*leading, 3)),
         frames=jnp.zeros((*leading, 1, 10)),
     )

@@ -124,7 +124,7 @@ def test_learns_a_circling_evader():
         frames, position = jnp.swapaxes(frames, 0, 1), jnp.swapaxes(position, 0, 1)
         nothing = jnp.zeros((steps, worlds, 1))
         observation = Observation(
-            *[nothing] * 8, last_seen=position[span:-1], frames=frames[span:-1, :, None]
+            *[nothing] * 6, last_seen=position[span:-1], frames=frames[span:-1, :, None]
         )
         rollout = Rollout(
             observation, None, *[nothing] * 3, terminated=None, truncated=None, evader=position[span + 1 :]

@@ -32,8 +32,6 @@ def observation_of(seed, n=N, pillars=3, batch=BATCH):
         pillar_seen=seen,
         privileged=normal(n, 10),
         position=normal(n, 3),
-        pillar_position=normal(pillars, 2),
-        pillar_active=seen.any(axis=1),
         last_seen=0.3 * normal(3),
         frames=0.3 * normal(10, 7 + 3 * n),
     )
@@ -117,21 +115,6 @@ def test_a_critic_of_observations_does_not_see_it():
     value = jax.jit(lambda observation: policy.value(parameters.critic, observation, None))
     more = observation.replace(privileged=observation.privileged + 1)
     np.testing.assert_array_equal(value(observation), value(more))
-
-
-def test_a_critic_of_the_world_values_every_pursuer_and_sees_active_pillars_only():
-    network = NetworkSettings(features=16, heads=2, critic_input="world")
-    policy = Policy(network, PredictorSettings(enabled=False))
-    observation = observation_of(4)
-    parameters = jax.jit(policy.init)(jax.random.key(0), observation)
-    value = jax.jit(lambda observation: policy.value(parameters.critic, observation, None))
-    values = value(observation)
-    assert values.shape == (BATCH, N)
-    assert len(np.unique(values)) == values.size
-    elsewhere = jnp.where(observation.pillar_active[..., None], observation.pillar_position, 3.0)
-    np.testing.assert_array_equal(values, value(observation.replace(pillar_position=elsewhere)))
-    moved = observation.replace(pillar_position=observation.pillar_position + 1.0)
-    assert (values != value(moved)).any(axis=-1)[np.asarray(observation.pillar_active.any(axis=-1))].all()
 
 
 def test_one_pursuer_without_predictor_starts_near_hover():

@@ -67,18 +67,18 @@ def make_optimiser(
 
 
 def policy_loss(
-    settings: MappoSettings, policy: Policy, actor: Any, batch: Batch
+    settings: MappoSettings, policy: Policy, actor: Any, batch: Batch, clip: jax.Array
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Clipped surrogate minus the entropy bonus; and what to watch."""
+    """Surrogate, its ratio clipped to 1 +- `clip` (), minus the entropy bonus; and what to watch."""
     mean, log_std = policy.distribution(actor, batch.observation, batch.predicted)
     log_ratio = gaussian_log_prob(batch.action, mean, log_std) - batch.log_prob
     ratio = jnp.exp(log_ratio)
-    clipped = jnp.clip(ratio, 1.0 - settings.clip, 1.0 + settings.clip)
+    clipped = jnp.clip(ratio, 1.0 - clip, 1.0 + clip)
     surrogate = jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
     entropy = gaussian_entropy(log_std)
     watch = {
         "kl": jnp.mean(ratio - 1.0 - log_ratio),
-        "clipped": jnp.mean(jnp.abs(ratio - 1.0) > settings.clip),
+        "clipped": jnp.mean(jnp.abs(ratio - 1.0) > clip),
         "entropy": entropy,
     }
     return -surrogate - settings.entropy * entropy, watch
@@ -102,6 +102,7 @@ def update_policy(
     last_predicted: jax.Array | None,
     key: jax.Array,
     axis: str | None,
+    progress: jax.Array | float = 0.0,
 ):
     """All epochs of the policy update on one rollout.
 
@@ -117,6 +118,7 @@ def update_policy(
         last_predicted: (E, K, 3) its prediction.
         key: shuffles, the same on all devices.
         axis: name of the devices' axis.
+        progress: () share of the run that is done, for the clip range.
 
     Returns:
         (actor, critic), optimiser states, value scale, dict of () metrics.
@@ -157,12 +159,13 @@ def update_policy(
         target=(returns - mean) / std,
     )
     batch = _partition(batch, settings.minibatches)
+    clip = settings.clip + (settings.clip_end - settings.clip) * progress
 
     def gradient_step(carry, index):
         (actor, critic), (actor_state, critic_state) = carry
         part = jax.tree.map(lambda x: x[index], batch)
         (actor_loss, watch), actor_gradient = jax.value_and_grad(
-            lambda p: policy_loss(settings, policy, p, part), has_aux=True
+            lambda p: policy_loss(settings, policy, p, part, clip), has_aux=True
         )(actor)
         critic_loss, critic_gradient = jax.value_and_grad(lambda p: value_loss(settings, policy, p, part))(
             critic

@@ -17,7 +17,9 @@ class MappoSettings:
     epochs: int = 4
     minibatches: int = 16
     clip: float = 0.1
-    """Clip range of the probability ratio."""
+    """Clip range of the probability ratio at the start ..."""
+    clip_end: float = 0.1
+    """... which changes linearly to this over `total_steps`."""
     entropy: float = 1e-3
     """Weight of the entropy."""
     discount: float = 0.995
@@ -77,7 +79,7 @@ class TrainSettings:
     evaluation_interval: int = 50
     """Iterations between evaluations on held-back uniform tasks."""
     evaluation_episodes: int = 256
-    """Held-back uniform tasks."""
+    """Held-back uniform tasks, and as many far ones."""
     seed: int = 0
 
     def __post_init__(self):
@@ -135,7 +137,7 @@ def quick() -> TrainSettings:
         environment=PursuitSettings(observe_position=True),
         network=NetworkSettings(features=64),
         predictor=PredictorSettings(units=32),
-        mappo=MappoSettings(learning_rate=1e-3, minibatches=8, clip=0.2, discount=0.99),
+        mappo=MappoSettings(learning_rate=1e-3, minibatches=8, clip=0.2, clip_end=0.2, discount=0.99),
         # few tasks reach the archive in so short a run; drawn from too often, they'd be all that is learnt
         generator=GeneratorSettings(capacity=500, expansion=0.3),
         num_envs=80,
@@ -149,12 +151,16 @@ def paper() -> TrainSettings:
     """The paper's task on one large accelerator, in five minutes."""
     return TrainSettings(
         environment=PursuitSettings(
-            observe_position=True, reward=RewardSettings(collision=20.0, crash=10.0, margin=0.02)
+            observe_position=True,
+            reward=RewardSettings(collision=40.0, crash=20.0, margin=0.03, lookahead=0.15),
         ),
-        network=NetworkSettings(compute_type="bfloat16"),
-        mappo=MappoSettings(learning_rate=1e-3, penalty_start=0.05, penalty_ramp=0.6),
+        network=NetworkSettings(heads=2, compute_type="bfloat16"),
+        mappo=MappoSettings(
+            learning_rate=1e-3, clip=0.2, clip_end=0.05, penalty_start=0.03, penalty_ramp=0.5
+        ),
+        generator=GeneratorSettings(wall_distance=0.05),
         num_envs=5120,
-        total_steps=260_000_000,
+        total_steps=300_000_000,
         evaluation_interval=40,
         evaluation_episodes=512,
     )

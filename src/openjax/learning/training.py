@@ -161,6 +161,7 @@ def make_training_step(
             last_predicted,
             shuffle_key,
             axis,
+            carry.update.astype(jnp.float32) / settings.total_updates,
         )
         metrics |= watched
 

@@ -52,31 +52,20 @@ class Critic(nn.Module):
         """Observation of (..., N) pursuers, predicted (..., K, 3) positions or None -> (..., N)."""
         settings = self.settings
         dtype = jnp.dtype(settings.compute_type)
-        encoder = Encoder(settings.features, settings.heads, dtype, name="encoder")
-        if settings.critic_input == "world":
-            number = observation.position.shape[-2]
-            hidden = encoder(*world_features(observation))
-        else:
-            number = 1
-            own = own_features(observation, predicted)
-            if settings.critic_input == "state":
-                own = jnp.concatenate([own, observation.privileged], axis=-1)
-            hidden = encoder(own, observation.others, observation.pillars, observation.pillar_seen)
+        own = own_features(observation, predicted)
+        if settings.critic_input == "state":
+            own = jnp.concatenate([own, observation.privileged], axis=-1)
+        hidden = Encoder(settings.features, settings.heads, dtype, name="encoder")(
+            own, observation.others, observation.pillars, observation.pillar_seen
+        )
         leading = hidden.shape[:-1]
         hidden = HiddenLayer(settings.features, dtype, name="hidden")(
             hidden.reshape(math.prod(leading), settings.features)
         )
-        value = nn.Dense(
-            number, dtype=jnp.float32, kernel_init=nn.initializers.orthogonal(1.0), name="value"
-        )(hidden).reshape(*leading, number)
-        return value if settings.critic_input == "world" else value[..., 0]
-
-
-def world_features(observation: Observation) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """The whole world as the encoder's input: the team (..., N * S) for the own part, no others, all pillars (..., P, 2)."""
-    team = jnp.concatenate([observation.self_state, observation.privileged], axis=-1)
-    team = team.reshape(*team.shape[:-2], team.shape[-2] * team.shape[-1])
-    return team, jnp.zeros((*team.shape[:-1], 0, 3)), observation.pillar_position, observation.pillar_active
+        value = nn.Dense(1, dtype=jnp.float32, kernel_init=nn.initializers.orthogonal(1.0), name="value")(
+            hidden
+        )
+        return value.reshape(leading)
 
 
 def own_features(observation: Observation, predicted: jax.Array | None) -> jax.Array:

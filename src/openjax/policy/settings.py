@@ -21,9 +21,8 @@ class NetworkSettings:
     squash: Literal["mean", "sample"] = "mean"
     """What the tanh bounds. "mean": exploration is added after it and cut at the bounds, so that the mean policy does
     what the exploring one does on average; "sample": exploration passes through the tanh, which shifts that average."""
-    critic_input: Literal["world", "state", "observation"] = "state"
-    """"world": the critic sees the true state of the whole world and values all pursuers in one pass; "state": each
-    pursuer's observation, the true evader, its velocity and the own position; "observation": what the actor sees."""
+    critic_input: Literal["state", "observation"] = "state"
+    """"state": the critic also sees the true evader, its velocity and the own position; "observation": what the actor sees."""
 
     def __post_init__(self):
         if self.features % self.heads:

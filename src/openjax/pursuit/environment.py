@@ -189,9 +189,7 @@ class Pursuit:
         body_z_up = rotation_axes(drones.quaternion)[1][:, 2]
         crash = crashed(settings, position, body_z_up, *pillars)
         distance = jnp.sqrt(jnp.sum((position - evader) ** 2, axis=-1) + 1e-12)
-        margin = settings.reward.margin
-        counted = breach if margin == 0.0 else breaches(settings, position, *pillars, margin)
-        counted_crash = crash if margin == 0.0 else crashed(settings, position, body_z_up, *pillars, margin)
+        counted, counted_crash = self._counted(breach, crash, drones, body_z_up, pillars)
         rewards, penalty = reward(
             settings, captured, distance, counted, too_fast, counted_crash, action, state.previous_action
         )
@@ -217,6 +215,18 @@ class Pursuit:
             captured=captured, seen=seen, breaches=breach, over_speed=too_fast, crashed=crash, penalty=penalty
         )
         return self.observe(state), state, rewards, terminated, truncated, info
+
+    def _counted(self, breach, crash, drones, body_z_up, pillars):
+        """The breaches (N,) and crashes (N,) that the reward counts: those of the metrics, early by margin and lookahead."""
+        settings, weights = self.settings, self.settings.reward
+        if weights.margin != 0.0:
+            breach = breaches(settings, drones.position, *pillars, weights.margin)
+            crash = crashed(settings, drones.position, body_z_up, *pillars, weights.margin)
+        if weights.lookahead != 0.0:
+            ahead = drones.position + weights.lookahead * drones.velocity
+            breach = jax.tree.map(jnp.maximum, breach, breaches(settings, ahead, *pillars))
+            crash = crash | crashed(settings, ahead, body_z_up, *pillars)
+        return breach, crash
 
 
 def make(settings: PursuitSettings | None = None, **changes) -> Pursuit:

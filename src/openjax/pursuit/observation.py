@@ -22,8 +22,6 @@ class Observation:
         jax.Array
     )  # (N, 10) true relative evader position, its velocity, own position, seen: for the critic
     position: jax.Array  # (N, 3) own positions, to express predicted positions relative to them
-    pillar_position: jax.Array  # (P, 2) m, axes of all pillars: for the critic
-    pillar_active: jax.Array  # (P,) bool, slots in use
     last_seen: jax.Array  # (3,) where the evader was last seen
     frames: jax.Array  # (n, F) history for the predictor, oldest first
 
@@ -94,8 +92,6 @@ def observe(
         pillar_seen=pillar_seen,
         privileged=privileged,
         position=position,
-        pillar_position=jnp.where(pillar_active[:, None], pillar_position, 0.0),
-        pillar_active=pillar_active,
         last_seen=last_seen,
         frames=frames,
     )

@@ -30,6 +30,8 @@ class RewardSettings:
     """Subtracted in each step in which a pursuer touches something solid or tips over (not in the paper)."""
     margin: float = 0.0
     """The reward counts breaches, floor and tilt (as a cosine) this much early; the metrics don't (m; not in the paper)."""
+    lookahead: float = 0.0
+    """The reward also counts the breaches that come within this time at the present velocities (s; not in the paper)."""
 
 
 @dataclass(frozen=True)
