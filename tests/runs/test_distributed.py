@@ -111,14 +111,15 @@ print("same")
 # Both wait for each other for ever.
 WAITING = """
 import sys
-from openjax.runs.joining import Membership, _connect
+from openjax.runs.joining import Membership, _connected
 from openjax.runs.processes import Processes
 
 membership = Membership(sys.argv[1], 2, int(sys.argv[2]), "deactivate")
-processes = Processes(2, membership.process_id, _connect(membership))
-assert processes.everyone(membership.process_id) == [0, 1] and processes.of_first(5 + membership.process_id) == 5
-print("here", flush=True)
-processes.everyone() if membership.process_id else processes._answers.get()
+with _connected(membership) as (connections, _):
+    processes = Processes(2, membership.process_id, connections)
+    assert processes.everyone(membership.process_id) == [0, 1] and processes.of_first(5 + membership.process_id) == 5
+    print("here", flush=True)
+    processes.everyone() if membership.process_id else processes._answers.get()
 """
 
 
@@ -131,15 +132,9 @@ def environment_with(devices):
 
 
 def free_address():
-    """A port on loopback that is free, and the one after it too."""
-    while True:
-        with socket.create_server(("127.0.0.1", 0)) as first:
-            port = first.getsockname()[1]
-            try:
-                socket.create_server(("", port + 1)).close()
-            except OSError:
-                continue
-            return f"127.0.0.1:{port}"
+    """A port on loopback that is free."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return f"127.0.0.1:{server.getsockname()[1]}"
 
 
 def wait_for(happened, processes, seconds=240.0):
@@ -182,7 +177,7 @@ def killed(tmp_path_factory):
 def test_lost_process_ends_the_others_with_one_line(killed):
     run, status, seconds, error, _ = killed
     assert status == 1 and seconds < 15
-    pattern = rf"error: process 1 of 2 \(on [\d.]+\) was lost: .*; go on with .* --resume {re.escape(str(run))} --devices all\n"
+    pattern = rf"error: process 1 of 2 \(on \S+\) was lost: .*; go on with .* --resume {re.escape(str(run))} --devices all\n"
     assert re.fullmatch(pattern, error), error
 
 
@@ -222,9 +217,7 @@ def test_the_loss_of_process_0_is_told_by_the_others():
     _, error = other.communicate(timeout=20)
     first.communicate()
     assert other.returncode == 1
-    assert re.fullmatch(r"error: process 0 of 2 \(on 127.0.0.1\) was lost: .*; start it again\n", error), (
-        error
-    )
+    assert re.fullmatch(r"error: process 0 of 2 \(on \S+\) was lost: .*; start it again\n", error), error
 
 
 def test_relay_holds_connections_when_the_coordinator_dies():
@@ -232,17 +225,17 @@ def test_relay_holds_connections_when_the_coordinator_dies():
         inner = coordinator.getsockname()[1]
         port = int(free_address().split(":")[1])
         relay = subprocess.Popen(
-            [sys.executable, "-I", coordinator_relay.__file__, str(port), str(inner)],
+            [sys.executable, "-I", coordinator_relay.__file__, str(port), str(inner), "1"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
         )
         assert relay.stdout.readline()
         client = socket.create_connection(("127.0.0.1", port), timeout=10)
-        served, _ = coordinator.accept()
         client.sendall(b"ask")
-        assert served.recv(3) == b"ask"
+        served, _ = coordinator.accept()
+        assert served.recv(3, socket.MSG_WAITALL) == b"ask"
         served.sendall(b"tell")
-        assert client.recv(4) == b"tell"
+        assert client.recv(4, socket.MSG_WAITALL) == b"tell"
         served.close()
     relay.stdin.close()  # as at the death of process 0
     client.settimeout(0.5)
@@ -252,6 +245,25 @@ def test_relay_holds_connections_when_the_coordinator_dies():
     with pytest.raises(TimeoutError):
         client.recv(1)
     client.close()
+    assert relay.wait(10) == 0
+
+
+def test_relay_passes_the_end_of_the_processes_own_connections_on():
+    with socket.create_server(("127.0.0.1", 0)) as own:
+        inner, port = own.getsockname()[1], int(free_address().split(":")[1])
+        relay = subprocess.Popen(
+            [sys.executable, "-I", coordinator_relay.__file__, str(port), "1", str(inner)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+        )
+        assert relay.stdout.readline()
+        client = socket.create_connection(("127.0.0.1", port), timeout=10)
+        client.sendall(b"{}\n")
+        served, _ = own.accept()
+        served.close()
+        assert client.recv(1) == b""
+        client.close()
+    relay.stdin.close()
     assert relay.wait(10) == 0
 
 

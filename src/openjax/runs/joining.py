@@ -27,7 +27,7 @@ class Membership:
     """This process' place in a job of several."""
 
     coordinator_address: str
-    """host:port of process 0; the port after it is used too."""
+    """host:port of process 0."""
     num_processes: int
     process_id: int
     detection: str
@@ -58,7 +58,7 @@ def find_membership(
         )
     address, number, index = given
     host, _, port = address.rpartition(":")
-    if not host or not port.isdecimal() or not 0 < int(port) < 65535:
+    if not host or not port.isdecimal() or not 0 < int(port) < 65536:
         raise UserError(f"--coordinator_address is {address!r}; expected host:port of process 0")
     if number < 1 or not 0 <= index < number:
         raise UserError(
@@ -91,8 +91,8 @@ def joined(membership: Membership | None) -> Iterator[Processes]:
     if membership is None:
         yield Processes()
         return
-    with _coordinator_relay(membership) as bind_address:
-        processes = Processes(membership.num_processes, membership.process_id, _connect(membership))
+    with _connected(membership) as (connections, bind_address):
+        processes = Processes(membership.num_processes, membership.process_id, connections)
         try:
             import jax
 
@@ -121,98 +121,98 @@ def joined(membership: Membership | None) -> Iterator[Processes]:
             raise
 
 
-@contextlib.contextmanager
-def _coordinator_relay(membership):
-    """On process 0, start the relay at the coordinator's port; gives the address for the coordinator itself."""
-    if membership.process_id != 0:
-        yield None
-        return
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        inner = free.getsockname()[1]
-    port = membership.coordinator_address.rpartition(":")[2]
-    # A session of its own: Ctrl-C is for the others.
-    process = subprocess.Popen(
-        [sys.executable, "-I", coordinator_relay.__file__, port, str(inner)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    try:
-        if not process.stdout.readline():
-            raise UserError(f"the coordinator's port {port} can't be used: {process.stderr.read().strip()}")
-        yield f"127.0.0.1:{inner}"
-    finally:
-        process.stdin.close()  # it ends when the others have closed their connections
-
-
 def _one_line(error):
     return " ".join(str(error).split())[:500]
 
 
-def _connect(membership):
-    """Connections by process: to all others on process 0, to process 0 elsewhere."""
+@contextlib.contextmanager
+def _connected(membership):
+    """Connections and hosts by process (to all others on process 0, to process 0 elsewhere), and where JAX's
+    coordinator is to listen.
+    """
     host, _, port = membership.coordinator_address.rpartition(":")
-    host, port, deadline = host.strip("[]"), int(port) + 1, time.monotonic() + JOIN
-    if membership.process_id == 0:
-        return _accept(port, membership.num_processes, deadline)
-    greeting = encoded({"process": membership.process_id, "of": membership.num_processes})
+    if membership.process_id != 0:
+        yield {0: _call(host.strip("[]"), int(port), membership)}, None
+        return
+    own = socket.create_server(("127.0.0.1", 0))
+    with own, _relay(int(port), own.getsockname()[1]) as coordinator_port:
+        yield _accept(own, membership.num_processes), f"127.0.0.1:{coordinator_port}"
+
+
+@contextlib.contextmanager
+def _relay(port, own_port):
+    """Start the relay; gives the port that it keeps for JAX's coordinator."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        coordinator_port = free.getsockname()[1]
+    process = subprocess.Popen(
+        [sys.executable, "-I", coordinator_relay.__file__, str(port), str(coordinator_port), str(own_port)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,  # Ctrl-C is not for it
+    )
+    try:
+        if not process.stdout.readline():
+            raise UserError(f"the coordinator's port {port} can't be used: {process.stderr.read().strip()}")
+        yield coordinator_port
+    finally:
+        process.stdin.close()  # it ends when the others have closed their connections
+
+
+def _call(host, port, membership):
+    """Connection to process 0, and its host; waits until all processes have come."""
+    deadline = time.monotonic() + JOIN
+    greeting = {
+        "process": membership.process_id,
+        "of": membership.num_processes,
+        "host": socket.gethostname(),
+    }
     while True:
+        reason = "it went away, or counts another number of processes"
         try:
             connection = socket.create_connection((host, port), timeout=10.0)
-            connection.sendall(greeting)
+            connection.sendall(encoded(greeting))
             connection.settimeout(max(deadline - time.monotonic(), 1.0))
-            if _read_line(connection):  # all have come
-                return {0: connection}
-            reason = "it closed the connection: it, or all of the others, may be of another job"
+            if welcome := _read_line(connection):
+                return connection, json.loads(welcome)["host"]
         except OSError as error:
             reason = str(error.strerror or error)
         if time.monotonic() > deadline:
-            raise UserError(
-                f"process 0 can't be reached at {host}:{port} within {JOIN:.0f} s ({reason}); "
-                "it needs the coordinator's port and the one after it"
-            )
+            raise UserError(f"process 0 can't be reached at {host}:{port} within {JOIN:.0f} s: {reason}")
         time.sleep(0.2)
 
 
-def _accept(port, number, deadline):
-    both = socket.has_dualstack_ipv6()
-    family = socket.AF_INET6 if both else socket.AF_INET
-    try:
-        server = socket.create_server(("", port), family=family, dualstack_ipv6=both)
-    except OSError as error:
-        raise UserError(
-            f"port {port}, the one after the coordinator's, can't be used: {error.strerror}"
-        ) from error
-    found: dict[int, socket.socket] = {}
-    with server:
-        while len(found) < number - 1:
-            server.settimeout(max(deadline - time.monotonic(), 0.01))
-            try:
-                connection, _ = server.accept()
-            except TimeoutError:
-                missing = ", ".join(str(i) for i in range(1, number) if i not in found)
-                raise UserError(f"process {missing} of {number} didn't come within {JOIN:.0f} s") from None
-            other = _greeted(connection, number)
-            if other is None or other in found:
-                connection.close()  # a stranger, or a second process of that number
-            else:
-                found[other] = connection
-    for connection in found.values():
-        connection.sendall(encoded({"welcome": number}))
+def _accept(server, number):
+    """Connections to all others and their hosts, by process."""
+    found: dict[int, tuple[socket.socket, str]] = {}
+    deadline = time.monotonic() + JOIN
+    while len(found) < number - 1:
+        server.settimeout(max(deadline - time.monotonic(), 0.01))
+        try:
+            connection, _ = server.accept()
+        except TimeoutError:
+            missing = ", ".join(str(i) for i in range(1, number) if i not in found)
+            raise UserError(f"process {missing} of {number} didn't come within {JOIN:.0f} s") from None
+        other, host = _greeted(connection, number)
+        if other is None or other in found:
+            connection.close()  # a stranger, or a second process of that number
+        else:
+            found[other] = (connection, host)
+    for connection, _ in found.values():
+        connection.sendall(encoded({"host": socket.gethostname()}))
     return found
 
 
 def _greeted(connection, number):
-    """The number of the process that greets; None for a stranger."""
+    """The number and host of the process that greets; None for a stranger."""
     connection.settimeout(10.0)
     try:
         greeting = json.loads(_read_line(connection))
-        other = greeting["process"]
-        return other if greeting["of"] == number and 1 <= other < number else None
+        other, of, host = greeting["process"], greeting["of"], str(greeting["host"])
+        return (other, host) if of == number and 1 <= other < number else (None, host)
     except (OSError, ValueError, KeyError, TypeError):
-        return None
+        return None, None
 
 
 def _read_line(connection):
@@ -220,7 +220,7 @@ def _read_line(connection):
     line = b""
     while not line.endswith(b"\n"):
         byte = connection.recv(1)
-        if not byte or len(line) > 100:
+        if not byte or len(line) > 1000:
             return b""
         line += byte
     return line

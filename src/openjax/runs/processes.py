@@ -33,13 +33,13 @@ class Processes:
       advice: says what to do now, when another process is lost.
     """
 
-    def __init__(self, number: int = 1, index: int = 0, connections: dict[int, socket.socket] | None = None):
-        """`connections` by process: to all others on process 0, to process 0 elsewhere."""
+    def __init__(self, number: int = 1, index: int = 0, connections: dict | None = None):
+        """`connections`: (socket, host) by process: to all others on process 0, to process 0 elsewhere."""
         self.number, self.index = number, index
         self.advice: Callable[[], str] = lambda: "start it again"
         self._links = {
-            other: _Link(connection, other, self._receive, self._gone)
-            for other, connection in (connections or {}).items()
+            other: _Link(connection, other, host, self._receive, self._gone)
+            for other, (connection, host) in (connections or {}).items()
         }
         self._asked = {other: queue.Queue() for other in self._links}
         self._answers: queue.Queue = queue.Queue()
@@ -146,11 +146,12 @@ class _Link:
         self,
         connection: socket.socket,
         other: int,
+        host: str,
         receive: Callable[[int, dict], None],
         gone: Callable[[int, str, str], None],
     ):
-        self._socket, self._other, self._receive, self._gone = connection, other, receive, gone
-        self._host = connection.getpeername()[0].removeprefix("::ffff:")
+        self._socket, self._other, self._host = connection, other, host
+        self._receive, self._gone = receive, gone
         self._sending = threading.Lock()
         self._closed = threading.Event()
         connection.settimeout(SILENCE)

@@ -53,7 +53,7 @@ class TrainCommand:
     devices: str = "1"
     """Number of devices to train on, or all (of all processes)."""
     coordinator_address: str | None = None
-    """With several processes: host:port of process 0; the port after it is used too. Slurm and Open MPI tell it."""
+    """With several processes: host:port of process 0. Slurm and Open MPI tell it."""
     num_processes: int | None = None
     """How many processes train together, for example one per host. Slurm and Open MPI tell it."""
     process_id: int | None = None
