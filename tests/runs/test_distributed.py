@@ -17,6 +17,7 @@ from openjax.errors import UserError
 from openjax.runs import coordinator_relay
 from openjax.runs.joining import Membership, find_membership
 from openjax.runs.metrics import read_metrics
+from openjax.runs.training_command import membership
 
 UPDATES = 3
 OPTIONS = """
@@ -298,6 +299,15 @@ def test_membership_comes_from_the_command_line_or_the_manager(monkeypatch, vari
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
     assert find_membership(*arguments) == expected
+
+
+def test_membership_is_read_with_dashes_and_underscores():
+    for text in (
+        "--devices=all --num-processes 2 --process-id=1",
+        "--devices all --num_processes=2 --process_id 1",
+    ):
+        found = membership([*text.split(), "--coordinator_address", "host:1234"])
+        assert found == Membership("host:1234", 2, 1, "deactivate")
 
 
 @pytest.mark.parametrize(

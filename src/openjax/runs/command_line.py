@@ -54,10 +54,13 @@ def peek(arguments: Sequence[str], name: str) -> str | None:
     """The value of `--name` before the real parsing, which needs it to choose its defaults."""
     value = None
     for i, argument in enumerate(arguments):
-        if argument == f"--{name}" and i + 1 < len(arguments):
+        option, equals, given = argument.partition("=")
+        if option.replace("-", "_") != f"__{name}":  # dashes and underscores alike, as in the real parsing
+            continue
+        if equals:
+            value = given
+        elif i + 1 < len(arguments):
             value = arguments[i + 1]
-        elif argument.startswith(f"--{name}="):
-            value = argument.split("=", 1)[1]
     return value
 
 
