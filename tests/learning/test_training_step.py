@@ -256,3 +256,25 @@ def test_presets():
         assert preset(name, seed=3).seed == 3
     with pytest.raises(UserError, match="possible are quick, paper"):
         preset("papers")
+
+
+def test_the_worlds_of_every_second_task_start_anew_within_the_episode():
+    settings = dataclasses.replace(SETTINGS, restart_every=2, restart_steps=2 * ROLLOUT)
+    carry = init_carry(settings, jax.random.key(0))
+    step = jax.jit(make_training_step(settings))
+    world = np.arange(settings.num_envs)
+    group, brief = world % GROUPS, world // GROUPS // settings.episodes_per_task % 2 == 0
+    expected, entered = group * ROLLOUT, 0
+    for update in range(UPDATES):
+        before = carry.state
+        carry, _ = step(carry)
+        ended = group == (GROUPS - 1 - update) % GROUPS
+        age = (group + update + 1) % GROUPS * ROLLOUT  # since the group's start
+        anew = brief & (age == 2 * ROLLOUT)
+        expected = np.where(ended | anew, 0, expected + ROLLOUT)
+        np.testing.assert_array_equal(carry.state.step, expected)
+        moved = np.any(carry.state.task.evader_position != before.task.evader_position, axis=1)
+        np.testing.assert_array_equal(moved, ended | anew)
+        # of the group that ended only the other task was flown to its end, unless it began late
+        entered += int(update >= 2)
+        assert int(carry.archive.size) == min(entered, settings.generator.capacity)

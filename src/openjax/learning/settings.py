@@ -76,6 +76,11 @@ class TrainSettings:
     """Control steps per iteration; divides the episode's length, so that episodes end between rollouts."""
     total_steps: int = 400_000_000
     """Environment steps of the run (one step moves one world, all its pursuers)."""
+    restart_every: int = 0
+    """The worlds of every n-th task are started anew after `restart_steps` already, so that more is learnt of starts,
+    the hardest part of an episode; 0: none are."""
+    restart_steps: int = 160
+    """Multiple of `rollout_length`; the value of what would have come is estimated, as after every rollout."""
     evaluation_interval: int = 50
     """Iterations between evaluations on held-back uniform tasks."""
     evaluation_episodes: int = 256
@@ -92,10 +97,16 @@ class TrainSettings:
             rollout >= 1 and length % rollout == 0,
             f"rollout_length {rollout} must divide environment.episode_length {length}",
         )
-        unit = self.start_groups * self.episodes_per_task
+        unit = self.world_unit
         need(
             self.num_envs >= unit and self.num_envs % unit == 0,
-            f"num_envs {self.num_envs} must be a multiple of {unit} (start groups times episodes per task)",
+            f"num_envs {self.num_envs} must be a multiple of {unit} (start groups times episodes per task"
+            + (", times restart_every)" if self.restart_every else ")"),
+        )
+        need(self.restart_every != 1, "restart_every is 1; 0 (never) or at least 2 are possible")
+        need(
+            self.restart_steps >= rollout and self.restart_steps % rollout == 0,
+            f"restart_steps {self.restart_steps} must be a multiple of rollout_length {rollout}",
         )
         need(
             self.num_envs % self.mappo.minibatches == 0,
@@ -119,6 +130,11 @@ class TrainSettings:
     def episodes_per_task(self) -> int:
         """Environments that share one task; 1 without the generator."""
         return self.generator.episodes_per_task if self.generator.enabled else 1
+
+    @property
+    def world_unit(self) -> int:
+        """Number of worlds that holds the same share of every start group, task and restart."""
+        return self.start_groups * self.episodes_per_task * max(1, self.restart_every)
 
     @property
     def steps_per_update(self) -> int:
@@ -161,6 +177,7 @@ def paper() -> TrainSettings:
         generator=GeneratorSettings(wall_distance=0.05),
         num_envs=5120,
         total_steps=300_000_000,
+        restart_every=4,
         evaluation_interval=40,
         evaluation_episodes=512,
     )

@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from flax import struct
 
@@ -170,12 +171,18 @@ def make_training_step(
         ended = _group(state, group, settings.start_groups)
         archive, counted = _selection(settings, carry.archive, ended, axis)
         metrics |= counted
-        number = ended.step.shape[0]
-        tasks = _tasks(settings, archive, own_keys(task_key, number // settings.episodes_per_task, axis))
-        fresh = jax.vmap(environment.reset_to)(own_keys(reset_key, number, axis), tasks)
-        observation, state = jax.tree.map(
-            lambda x, new: _set_group(x, new, group, settings.start_groups), (observation, state), fresh
-        )
+        fresh = _fresh(settings, environment, archive, task_key, reset_key, ended.step.shape[0], axis)
+        worlds = _set_group((observation, state), fresh, group, settings.start_groups)
+        # and so do the worlds that are started anew within the episodes of other groups
+        for age in _restart_ages(settings):
+            other = (group + age) % settings.start_groups
+            members = _group(worlds, other, settings.start_groups)
+            number = ended.step.shape[0] // settings.restart_every
+            keys = (jax.random.fold_in(task_key, age), jax.random.fold_in(reset_key, age))
+            fresh = _fresh(settings, environment, archive, *keys, number, axis)
+            members = _set_restarted(settings, members, fresh)
+            worlds = _set_group(worlds, members, other, settings.start_groups)
+        observation, state = worlds
 
         carry = TrainCarry(
             policy=PolicyParameters(actor=actor, critic=critic, predictor=predictor),
@@ -208,6 +215,37 @@ def _tasks(settings, archive, keys):
     return jax.tree.map(lambda x: jnp.repeat(x, settings.episodes_per_task, axis=0), tasks)
 
 
+def _fresh(settings, environment, archive, task_key, reset_key, number, axis):
+    """Observations and states of `number` worlds of this device at the start of newly drawn tasks."""
+    tasks = _tasks(settings, archive, own_keys(task_key, number // settings.episodes_per_task, axis))
+    return jax.vmap(environment.reset_to)(own_keys(reset_key, number, axis), tasks)
+
+
+def _restart_ages(settings):
+    """Ages, in rollouts, at which worlds are started anew before their group's episodes end."""
+    if not settings.restart_every:
+        return range(0)
+    every = settings.restart_steps // settings.rollout_length
+    return range(every, settings.start_groups, every)
+
+
+def _set_restarted(settings, members, new):
+    """A group's members, those of every n-th task replaced by `new`."""
+    share, period = settings.episodes_per_task, settings.restart_every
+
+    def put(x, fresh):
+        tasks = x.reshape(-1, period, share, *x.shape[1:])
+        return tasks.at[:, 0].set(fresh.reshape(-1, share, *x.shape[1:])).reshape(x.shape)
+
+    return jax.tree.map(put, members, new)
+
+
+def _lasting(settings, number):
+    """(number,) bool of a group's members: those that are not started anew within an episode."""
+    task = np.arange(number) // settings.episodes_per_task
+    return task % settings.restart_every != 0 if settings.restart_every else np.ones(number, bool)
+
+
 def _selection(settings, archive, ended, axis):
     """Put unsolved tasks of ended episodes into the archive; and what these episodes were like."""
     statistics = ended.statistics
@@ -225,9 +263,10 @@ def _selection(settings, archive, ended, axis):
         "crash_rate": statistics.crashed,
         "over_speed_rate": statistics.over_speed_rate,
         "episode_return": statistics.episode_return,
-        "success_rate": solved,
+        "success_rate": solved.ravel(),
     }
-    counted = {name: jnp.mean(value.astype(jnp.float32)) for name, value in counted.items()}
+    lasting = _lasting(settings, statistics.steps.shape[0])
+    counted = {name: jnp.mean(value.astype(jnp.float32)[lasting]) for name, value in counted.items()}
     counted = mean_over_devices(counted, axis)
     return archive, counted | {"archive_size": archive.size}
 
@@ -242,6 +281,11 @@ def _group(tree, group, groups):
     )
 
 
-def _set_group(x, new, group, groups):
-    split = x.reshape(x.shape[0] // groups, groups, *x.shape[1:])
-    return jax.lax.dynamic_update_index_in_dim(split, new, group, axis=1).reshape(x.shape)
+def _set_group(tree, new, group, groups):
+    """`tree` with that group's environments replaced by `new`."""
+
+    def put(x, new):
+        split = x.reshape(x.shape[0] // groups, groups, *x.shape[1:])
+        return jax.lax.dynamic_update_index_in_dim(split, new, group, axis=1).reshape(x.shape)
+
+    return jax.tree.map(put, tree, new)

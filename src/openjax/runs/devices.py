@@ -25,7 +25,7 @@ def check_devices(settings: TrainSettings, number: int) -> None:
     Raises:
       UserError: they can't, with the next number of worlds that could, and the numbers of devices that can.
     """
-    group = int(np.lcm(settings.start_groups * settings.episodes_per_task, settings.mappo.minibatches))
+    group = int(np.lcm(settings.world_unit, settings.mappo.minibatches))
     unit = number * group
     if number > 1 and settings.num_envs % unit:
         possible = -(-settings.num_envs // unit) * unit
