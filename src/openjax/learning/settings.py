@@ -172,7 +172,7 @@ def paper() -> TrainSettings:
         ),
         network=NetworkSettings(heads=2, compute_type="bfloat16"),
         mappo=MappoSettings(
-            learning_rate=1e-3, clip=0.2, clip_end=0.05, penalty_start=0.03, penalty_ramp=0.5
+            learning_rate=1e-3, clip=0.2, clip_end=0.05, penalty_start=0.03, penalty_ramp=0.7
         ),
         generator=GeneratorSettings(wall_distance=0.05),
         num_envs=5120,

@@ -173,15 +173,21 @@ def make_training_step(
         metrics |= counted
         fresh = _fresh(settings, environment, archive, task_key, reset_key, ended.step.shape[0], axis)
         worlds = _set_group((observation, state), fresh, group, settings.start_groups)
-        # and so do the worlds that are started anew within the episodes of other groups
-        for age in _restart_ages(settings):
-            other = (group + age) % settings.start_groups
-            members = _group(worlds, other, settings.start_groups)
+        if settings.restart_every:
+            # and so do the worlds that are started anew within the episodes of other groups
             number = ended.step.shape[0] // settings.restart_every
-            keys = (jax.random.fold_in(task_key, age), jax.random.fold_in(reset_key, age))
-            fresh = _fresh(settings, environment, archive, *keys, number, axis)
-            members = _set_restarted(settings, members, fresh)
-            worlds = _set_group(worlds, members, other, settings.start_groups)
+            every = settings.restart_steps // settings.rollout_length
+
+            def start_anew(i, worlds):
+                age = i * every  # in rollouts
+                other = (group + age) % settings.start_groups
+                keys = (jax.random.fold_in(task_key, age), jax.random.fold_in(reset_key, age))
+                fresh = _fresh(settings, environment, archive, *keys, number, axis)
+                members = _set_restarted(settings, _group(worlds, other, settings.start_groups), fresh)
+                return _set_group(worlds, members, other, settings.start_groups)
+
+            # a loop, not unrolled, since it would be compiled as often
+            worlds = jax.lax.fori_loop(1, -(-settings.start_groups // every), start_anew, worlds)
         observation, state = worlds
 
         carry = TrainCarry(
@@ -219,14 +225,6 @@ def _fresh(settings, environment, archive, task_key, reset_key, number, axis):
     """Observations and states of `number` worlds of this device at the start of newly drawn tasks."""
     tasks = _tasks(settings, archive, own_keys(task_key, number // settings.episodes_per_task, axis))
     return jax.vmap(environment.reset_to)(own_keys(reset_key, number, axis), tasks)
-
-
-def _restart_ages(settings):
-    """Ages, in rollouts, at which worlds are started anew before their group's episodes end."""
-    if not settings.restart_every:
-        return range(0)
-    every = settings.restart_steps // settings.rollout_length
-    return range(every, settings.start_groups, every)
 
 
 def _set_restarted(settings, members, new):
