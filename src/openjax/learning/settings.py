@@ -176,7 +176,7 @@ def paper() -> TrainSettings:
         ),
         generator=GeneratorSettings(wall_distance=0.05),
         num_envs=5120,
-        total_steps=300_000_000,
+        total_steps=270_000_000,
         restart_every=4,
         evaluation_interval=40,
         evaluation_episodes=512,
