@@ -184,7 +184,13 @@ def test_lost_process_ends_the_others_with_one_line(killed):
 
 def test_only_the_first_process_writes_and_shows(killed):
     run, _, _, _, other = killed
-    assert all("[Gloo]" in line for line in other.splitlines()), other
+    shown = (
+        "compiling",
+        "training",
+        "held-back",
+        "steps/s",
+    )  # what the first one tells, beside libraries' notes
+    assert not [word for word in shown if word in other], other
     updates = [record["update"] for record in read_metrics(run / "metrics.jsonl", "train")]
     assert updates[:UPDATES] == [1, 2, 3] and len(set(updates)) == len(updates)
 
