@@ -258,8 +258,9 @@ def test_presets():
         preset("papers")
 
 
-def test_the_worlds_of_every_second_task_start_anew_within_the_episode():
-    settings = dataclasses.replace(SETTINGS, restart_every=2, restart_steps=2 * ROLLOUT)
+@pytest.mark.parametrize("rollouts", [1, 2])
+def test_the_worlds_of_every_second_task_start_anew_within_the_episode(rollouts):
+    settings = dataclasses.replace(SETTINGS, restart_every=2, restart_steps=rollouts * ROLLOUT)
     carry = init_carry(settings, jax.random.key(0))
     step = jax.jit(make_training_step(settings))
     world = np.arange(settings.num_envs)
@@ -269,8 +270,8 @@ def test_the_worlds_of_every_second_task_start_anew_within_the_episode():
         before = carry.state
         carry, _ = step(carry)
         ended = group == (GROUPS - 1 - update) % GROUPS
-        age = (group + update + 1) % GROUPS * ROLLOUT  # since the group's start
-        anew = brief & (age == 2 * ROLLOUT)
+        age = (group + update + 1) % GROUPS  # in rollouts, since the group's start
+        anew = brief & (age > 0) & (age % rollouts == 0)
         expected = np.where(ended | anew, 0, expected + ROLLOUT)
         np.testing.assert_array_equal(carry.state.step, expected)
         moved = np.any(carry.state.task.evader_position != before.task.evader_position, axis=1)

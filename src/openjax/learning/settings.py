@@ -137,6 +137,12 @@ class TrainSettings:
         return self.start_groups * self.episodes_per_task * max(1, self.restart_every)
 
     @property
+    def restart_ages(self) -> tuple[int, int, int]:
+        """First, end and step of the ages (in rollouts) at which worlds start anew before their group's episodes end."""
+        every = self.restart_steps // self.rollout_length
+        return every, self.start_groups, every
+
+    @property
     def steps_per_update(self) -> int:
         """Environment steps of one training step."""
         return self.num_envs * self.rollout_length
@@ -178,6 +184,7 @@ def paper() -> TrainSettings:
         num_envs=5120,
         total_steps=270_000_000,
         restart_every=4,
+        restart_steps=80,
         evaluation_interval=40,
         evaluation_episodes=512,
     )

@@ -175,19 +175,11 @@ def make_training_step(
         worlds = _set_group((observation, state), fresh, group, settings.start_groups)
         if settings.restart_every:
             # and so do the worlds that are started anew within the episodes of other groups
-            number = ended.step.shape[0] // settings.restart_every
-            every = settings.restart_steps // settings.rollout_length
-
-            def start_anew(i, worlds):
-                age = i * every  # in rollouts
-                other = (group + age) % settings.start_groups
-                keys = (jax.random.fold_in(task_key, age), jax.random.fold_in(reset_key, age))
-                fresh = _fresh(settings, environment, archive, *keys, number, axis)
-                members = _set_restarted(settings, _group(worlds, other, settings.start_groups), fresh)
-                return _set_group(worlds, members, other, settings.start_groups)
-
-            # a loop, not unrolled, since it would be compiled as often
-            worlds = jax.lax.fori_loop(1, -(-settings.start_groups // every), start_anew, worlds)
+            ages = np.arange(*settings.restart_ages)  # in rollouts
+            number = num_envs // settings.start_groups // settings.restart_every * len(ages)
+            keys = (jax.random.fold_in(task_key, 1), jax.random.fold_in(reset_key, 1))
+            fresh = _fresh(settings, environment, archive, *keys, number, axis)
+            worlds = _set_restarted(settings, worlds, fresh, (group + ages) % settings.start_groups)
         observation, state = worlds
 
         carry = TrainCarry(
@@ -227,15 +219,16 @@ def _fresh(settings, environment, archive, task_key, reset_key, number, axis):
     return jax.vmap(environment.reset_to)(own_keys(reset_key, number, axis), tasks)
 
 
-def _set_restarted(settings, members, new):
-    """A group's members, those of every n-th task replaced by `new`."""
-    share, period = settings.episodes_per_task, settings.restart_every
+def _set_restarted(settings, tree, new, groups):
+    """`tree` with the worlds of every n-th task of some groups (A,) replaced by `new`."""
+    share, period, every_group = settings.episodes_per_task, settings.restart_every, settings.start_groups
 
-    def put(x, fresh):
-        tasks = x.reshape(-1, period, share, *x.shape[1:])
-        return tasks.at[:, 0].set(fresh.reshape(-1, share, *x.shape[1:])).reshape(x.shape)
+    def put(x, new):
+        split = x.reshape(-1, period, share, every_group, *x.shape[1:])
+        new = jnp.swapaxes(new.reshape(split.shape[0], len(groups), share, *x.shape[1:]), 1, 2)
+        return split.at[:, 0].set(split[:, 0].at[:, :, groups].set(new)).reshape(x.shape)
 
-    return jax.tree.map(put, members, new)
+    return jax.tree.map(put, tree, new)
 
 
 def _lasting(settings, number):
