@@ -21,11 +21,11 @@ from openjax.runs.training_command import membership
 
 UPDATES = 3
 OPTIONS = """
-    --preset quick --environment.episode_length 10 --environment.physics rigid --environment.capture_radius 1.0
+    --preset quick --environment.episode_length 20 --environment.physics rigid --environment.capture_radius 1.0
     --network.features 8 --network.heads 2 --predictor.units 4 --predictor.windows 2 --predictor.steps 1
     --predictor.horizons 1 2 --mappo.minibatches 2 --mappo.epochs 1 --generator.capacity 8
     --generator.success_low 0.0 --generator.success_high 1.0 --generator.episodes_per_task 2
-    --num_envs 16 --rollout_length 10 --total_steps 100000000 --evaluation_episodes 2
+    --num_envs 32 --rollout_length 10 --restart_every 2 --restart_steps 10 --total_steps 100000000 --evaluation_episodes 2
 """.split()
 
 # The same run on one device and on four of one process, next to that of two processes with two devices each.
@@ -206,7 +206,7 @@ def test_worlds_that_cannot_be_shared_out_are_an_error_of_one_line(tmp_path):
     process = train("--devices", "all", "--out", tmp_path / "run", env=environment_with(3), **pipes)
     _, error = process.communicate()
     assert process.returncode == 2
-    assert error == "error: num_envs 16 can't be shared out to 3 devices; 18 could, or --devices 1 or 2\n"
+    assert error == "error: num_envs 32 can't be shared out to 3 devices; 48 could, or --devices 1 or 2\n"
     assert not (tmp_path / "run").exists()
 
 
