@@ -162,19 +162,25 @@ def main():
     parser.add_argument("--answers", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True, help="path of the results without ending")
     parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--seconds", type=float, help="score what is done by then")
     options = parser.parse_args()
     for key, value in diagnose_all.SINGLE_THREAD.items():
         diagnose_all.os.environ.setdefault(key, value)
-    folders = sorted(p for p in options.logs.iterdir() if (p / "vehicle.toml").exists())
+    folders = diagnose_all.shuffled(
+        sorted(p for p in options.logs.iterdir() if (p / "vehicle.toml").exists())
+    )
     predictions, network = {}, {}
     with multiprocessing.get_context("spawn").Pool(options.jobs) as pool:
-        for name, prediction, gap in pool.imap_unordered(run_case, folders):
+        done = diagnose_all.results_in_time(
+            pool.imap_unordered(run_case, folders), len(folders), options.seconds
+        )
+        for name, prediction, gap in done:
             predictions[name], network[name] = prediction, gap
             print(
                 f"{len(predictions)}/{len(folders)} {name} {prediction['effects']}",
                 flush=True,
             )
-    answers = json.loads(options.answers.read_text())["cases"]
+    answers = {n: a for n, a in json.loads(options.answers.read_text())["cases"].items() if n in predictions}
     result = score.score(answers, predictions, {})
     command = " ".join(["python -m experiments.withheld.baselines", *sys.argv[1:]])
     strong = [

@@ -16,6 +16,8 @@ import time
 import traceback
 from pathlib import Path
 
+import numpy as np
+
 # one thread per process: the cases are the parallel part. Set before JAX is imported by a worker.
 SINGLE_THREAD = {
     "JAX_PLATFORMS": "cpu",
@@ -55,12 +57,29 @@ def _diagnose(folder, without):
     return report.prediction(), report.to_dict()
 
 
-def diagnose_all(logs, jobs=1, limit=None):
-    """All cases below `logs`: ({case: prediction}, {case: report})."""
+def shuffled(items):
+    """The items in a fixed random order, so that what a time limit leaves is a fair sample."""
+    return [items[i] for i in np.random.default_rng(0).permutation(len(items))]
+
+
+def results_in_time(results, count, seconds=None):
+    """Up to `count` results of an `imap_unordered`, as long as `seconds` last."""
+    start = time.perf_counter()
+    for _ in range(count):
+        left = None if seconds is None else max(seconds - (time.perf_counter() - start), 0.01)
+        try:
+            yield results.next(timeout=left)
+        except multiprocessing.TimeoutError:
+            print(f"time is up after {seconds:.0f} s", flush=True)
+            return
+
+
+def diagnose_all(logs, jobs=1, limit=None, seconds=None):
+    """All cases below `logs`, or those that `seconds` allow: ({case: prediction}, {case: report})."""
     told = logs / "without.json"
     without = json.loads(told.read_text()) if told.exists() else {}
     folders = sorted(p for p in logs.iterdir() if (p / "vehicle.toml").exists())[:limit]
-    work = [(p, without.get(p.name, [])) for p in folders]
+    work = shuffled([(p, without.get(p.name, [])) for p in folders])
     predictions, reports, start = {}, {}, time.perf_counter()
 
     def keep(result):
@@ -78,7 +97,7 @@ def diagnose_all(logs, jobs=1, limit=None):
             keep(diagnose_case(job))
     else:
         with multiprocessing.get_context("spawn").Pool(min(jobs, len(work))) as pool:
-            for result in pool.imap_unordered(diagnose_case, work):
+            for result in results_in_time(pool.imap_unordered(diagnose_case, work), len(work), seconds):
                 keep(result)
     return dict(sorted(predictions.items())), dict(sorted(reports.items()))
 
@@ -92,8 +111,9 @@ def main():
     parser.add_argument("--reports", type=Path)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--limit", type=int, help="only the first so many cases")
+    parser.add_argument("--seconds", type=float, help="with several jobs: write what is done by then")
     options = parser.parse_args()
-    predictions, reports = diagnose_all(options.logs, options.jobs, options.limit)
+    predictions, reports = diagnose_all(options.logs, options.jobs, options.limit, options.seconds)
     if all("error" in p for p in predictions.values()):
         raise SystemExit("no case could be diagnosed")
     for path, content in ((options.predictions, predictions), (options.reports, reports)):

@@ -10,8 +10,10 @@ import numpy as np
 from scipy.stats import t as student
 
 from openjax.gap import decision as rules
+from openjax.gap import gate
 from openjax.gap.evidence import Evidence, gather
 from openjax.gap.flight import Case, Flight, Issue
+from openjax.gap.headroom import look_around
 from openjax.gap.how_far import held_out_residuals, shrink
 from openjax.gap.hypotheses import SetFit
 from openjax.gap.library import FITS, PLACE, Library, library, path_of
@@ -80,9 +82,11 @@ def diagnose_case(case: Case, settings=None, without: Iterable[str] = (), progre
 
 def conclude(evidence: Evidence, settings: rules.Settings) -> Report:
     """The report that the evidence supports."""
-    best_physics = max((f for f in evidence.sets.values() if isinstance(f, SetFit)), key=lambda f: f.score)
-    rest = look(evidence.replay, best_physics)
-    found = rules.decide(evidence, rest, settings)
+    first = rules.decide(evidence, None, settings)
+    left = rules.best_fit(evidence, first.best)
+    rest = look(evidence.replay, left)
+    signs = signs_of(evidence, left, rest, first.best, settings) if settings.unknown else None
+    found = rules.decide(evidence, signs, settings)
     unknown = found.unknown > settings.unknown_threshold
     effects = ("unknown", *_partly(evidence, found.best)) if unknown else found.best
     named = [e for e in effects if e != "unknown"]
@@ -104,7 +108,7 @@ def conclude(evidence: Evidence, settings: rules.Settings) -> Report:
         effects=tuple(effects),
         probabilities=dict.fromkeys(EFFECTS, 0.0) | found.probabilities,
         equivalent=equivalent,
-        parameters=estimates(evidence, fit, named),
+        parameters=estimates(evidence, fit, named, settings),
         where=locate(evidence, fit, named),
         gap=gap,
         not_testable=missing,
@@ -115,6 +119,25 @@ def conclude(evidence: Evidence, settings: rules.Settings) -> Report:
         nuisances=_nuisances(evidence, fit),
         plots={"evidence": evidence, "fit": fit, "held_out": held_out, "rest": rest, "decision": found},
     )
+
+
+def signs_of(
+    evidence: Evidence, fit: SetFit, rest: Rest, chosen, settings: rules.Settings
+) -> dict[str, float]:
+    """What the unknown gate weighs, about the fit of the chosen set."""
+    left = left_by(evidence, fit, rest)
+    nothing = left if not fit.effects else left_by(evidence, evidence.nothing)
+    paths = rules.path_scores(evidence)
+    return gate.features(left, nothing, paths, evidence.library.effects, chosen, settings.null)
+
+
+def left_by(evidence: Evidence, fit: SetFit, rest: Rest | None = None) -> gate.Left:
+    """What a fitted set leaves."""
+    rest = look(evidence.replay, fit) if rest is None else rest
+    room = gate.summary(look_around(evidence.replay, fit))
+    taken = evidence.replay.nuisance_estimates([c[0] for c in fit.columns])
+    size = min(map(len, taken))
+    return gate.Left(rest.vector(), room, np.mean([t[:size] for t in taken], 0))
 
 
 def _partly(evidence: Evidence, best) -> list[str]:
@@ -158,9 +181,9 @@ def equivalents(evidence: Evidence, found: rules.Decision, named) -> dict[str, l
     return out
 
 
-def estimates(evidence: Evidence, fit: SetFit, named) -> dict[str, dict[str, Estimate]]:
+def estimates(evidence: Evidence, fit: SetFit, named, settings) -> dict[str, dict[str, Estimate]]:
     """Parameters of the named effects with 90 % intervals: the larger of the model's and the flights' own
-    spread."""
+    spread, and what an inexact form and the nuisances leave besides, a share of the effect's size."""
     out = {}
     deviation = robust_deviation(fit)
     for effect in named:
@@ -173,7 +196,8 @@ def estimates(evidence: Evidence, fit: SetFit, named) -> dict[str, dict[str, Est
                 value, spread = float(fit.theta[place]), float(deviation[list(fit.index).index(place)])
             else:
                 value, spread = _path_estimate(evidence, effect, number)
-            reach = 1.645 * spread
+            share = settings.form_error.get(effect, settings.usual_form_error)
+            reach = 1.645 * float(np.hypot(spread, share * abs(value - parameter.none)))
             values[fitted.name] = Estimate(
                 value, parameter.unit, (value - reach, value + reach), parameter.prior
             )

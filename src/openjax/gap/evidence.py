@@ -11,8 +11,8 @@ from openjax.errors import UserError
 from openjax.gap import estimator, firmware
 from openjax.gap.firmware import Radio
 from openjax.gap.flight import Case
-from openjax.gap.hypotheses import SetFit, fit_set, model_noise, score_of, weigh_sets
-from openjax.gap.library import ABSENT, NUISANCES, PLACE, PWM_NUISANCES, Library
+from openjax.gap.hypotheses import SetFit, fit_set, joint_start, model_noise, score_of, weigh_sets
+from openjax.gap.library import ABSENT, NUISANCES, PWM_NUISANCES, Library
 from openjax.gap.linear_path import LinearPath
 from openjax.gap.observer import TICKS
 from openjax.gap.replay import Replay, make_replay
@@ -30,6 +30,9 @@ NEEDS = {
     "downwash": "position",
     "battery_sag": "voltage",
 }
+CLEAR_GAINS = 20.0  # nats of the rate loop's path from which its gains are used to read it again
+LOOKS = 2  # at most
+WORTH_KNOWING = 15.0  # nats that an effect must add to be taken as known in the next look
 WORTH_A_SECOND_LOOK = 30.0  # nats of the best set above none
 RADIO_COST = 15.0  # nats that a radio effect must gain before the rate loop is read with it
 
@@ -65,10 +68,7 @@ class Evidence:
         """The full fit of a physics set, made now if it was only weighed so far."""
         effects = tuple(effects)
         if not isinstance(self.sets.get(effects), SetFit):
-            start = ABSENT.copy()
-            for effect in effects:
-                own = [PLACE[effect, p] for e, p in PLACE if e == effect]
-                start[own] = self.sets[effect,].theta[own]
+            start = joint_start(self.replay, self.sets, effects) if len(effects) > 1 else None
             self.sets[effects] = fit_set(self.replay, effects, start)
         return self.sets[effects]
 
@@ -81,7 +81,7 @@ def gather(case: Case, library: Library, progress=None) -> Evidence:
     def lap(name):
         nonlocal clock
         now = time.perf_counter()
-        seconds[name], clock = now - clock, now
+        seconds[name], clock = seconds.get(name, 0.0) + now - clock, now
 
     if case.vehicle_file.mass_weighed:
         library = Library(tuple(e for e in library.effects if e != "mass"))
@@ -111,31 +111,47 @@ def gather(case: Case, library: Library, progress=None) -> Evidence:
     lap("paths")
     tell("replaying the flights")
     numbers = PWM_NUISANCES if case.vehicle_file.motor_command == "pwm" else NUISANCES
-    found = _physics(tracks, vehicles, arrived, flight_of, library, numbers, None)
+    found = _physics(tracks, vehicles, arrived, flight_of, library, numbers)
     lap("first look")
-    best = max((f for f in found[1].values() if isinstance(f, SetFit)), key=lambda f: f.score)
-    if found[4] is not None and best.effects and best.score - found[1][()].score > WORTH_A_SECOND_LOOK:
-        # The rate controller was read with the nominal physics: once more with what was found.
+    known = ()
+    for _ in range(LOOKS - 1):
+        fits = [f for f in found[1].values() if isinstance(f, SetFit)]
+        best = max(fits, key=lambda f: f.score - WORTH_KNOWING * len(f.effects))
+        gains = _clear_gains(found[4], library)
+        surprising = best.effects and best.score - found[1][()].score > WORTH_A_SECOND_LOOK
+        if found[4] is None or set(best.effects) == set(known) or not (surprising or gains is not None):
+            break
+        # The rate controller was read with the nominal physics and gains: once more with what was found.
         tell("looking again with what was found")
-        pushes = [
-            np.gradient((known - plain)[0, :, :3], track.dt, axis=0)
-            for track, known, plain in zip(
-                tracks, found[0].predict(best.theta[None]), found[0].predict(ABSENT[None]), strict=True
-            )
-        ]
-        found = _physics(tracks, vehicles, arrived, flight_of, library, numbers, pushes)
-        lap("second look")
+        known, pushes = best.effects, None
+        if surprising:
+            moved, plain = found[0].predict(best.theta[None]), found[0].predict(ABSENT[None])
+            pushes = [
+                np.gradient((m - p)[0, :, :3], track.dt, axis=0)
+                for track, m, p in zip(tracks, moved, plain, strict=True)
+            ]
+        found = _physics(tracks, vehicles, arrived, flight_of, library, numbers, pushes, gains)
+        lap("next look")
     replay, sets, exposure, floor, rate_loop = found
     return Evidence(
         case, library, tracks, vehicles, replay, sets, exposure, floor, radio, rate_loop, pose, seconds
     )
 
 
-def _physics(tracks, vehicles, arrived, flight_of, library, numbers, pushes):
+def _clear_gains(rate_loop: LinearPath | None, library: Library):
+    """Changes of the rate loop's gains where they are clear, else None."""
+    if rate_loop is None or "rate_gains" not in library.effects:
+        return None
+    score, theta, _ = rate_loop.score()
+    return np.clip(theta, -0.7, 1.5) if score > CLEAR_GAINS and firmware.lost_share(theta) == 0.0 else None
+
+
+def _physics(tracks, vehicles, arrived, flight_of, library, numbers, pushes=None, gains=None):
     """Replay, scores of the sets, exposure, floor residuals and the rate loop's path."""
     rate_loop, ticks, surprise = None, [np.repeat(t.motor[:, None], TICKS, 1) for t in tracks], None
     if arrived is not None:
-        loop = firmware.read_rate_loop(tracks, vehicles, arrived, flight_of, pushes)
+        base = np.zeros(3) if gains is None else gains
+        loop = firmware.read_rate_loop(tracks, vehicles, arrived, flight_of, pushes, base)
         rate_loop, ticks, surprise = loop.path, loop.ticks, loop.surprise
     replay = make_replay(tracks, vehicles, ticks, surprise, numbers)
     floor, exposure = model_noise(replay, library)

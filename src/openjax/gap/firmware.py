@@ -21,6 +21,10 @@ GAIN_STEP = 0.05
 # nominal
 # flights of the tuning plant).
 GAIN_TOLERANCE = ((0.02, 0.3), (0.4, 0.004), (0.12, 0.1))
+# Where a loop seems to have lost so much of its D gain (all of it, or none), and more of it than of its P gain by this
+# factor, it saw other rates than the log: noise or a late or lost command weakens the fastest column most.
+LOST_D = (-0.4, -0.3)
+LOST_RATIO = (1.2, 1.0)
 LARGEST_SURPRISE = 2.5  # usual deviations
 CLEAR_SCORE = 5.0  # nats above which other gains are taken into account
 USUAL_GYRO_NOISE = 0.0165  # rad/s, of those flights by `gyro_noise`
@@ -179,6 +183,15 @@ def gyro_noise(rates: np.ndarray) -> float:
     return float(1.4826 * np.median(np.abs(np.diff(rates, 3, axis=0))) / np.sqrt(20.0))
 
 
+def lost_share(theta) -> float:
+    """How far (0 to 1) changes of the gains p, i, d look like a loop that saw other rates than the log."""
+    p, _, d = theta
+    if p >= 0.0 or d >= 0.0:
+        return 0.0
+    parts = [(v - none) / (whole - none) for v, (whole, none) in ((d, LOST_D), (d / p, LOST_RATIO))]
+    return float(np.prod(np.clip(parts, 0.0, 1.0)))
+
+
 @dataclass(frozen=True, eq=False)
 class RateLoop:
     """The rate controller read from what the motors differ by: `path` for its gains; the motor commands
@@ -191,10 +204,12 @@ class RateLoop:
     surprise: list[np.ndarray]
 
 
-def read_rate_loop(tracks, vehicles, arrived, flight_of, pushes=None) -> RateLoop:
+def read_rate_loop(tracks, vehicles, arrived, flight_of, pushes=None, base=(0.0, 0.0, 0.0)) -> RateLoop:
     """Read the rate controllers of all tracks; `arrived` as in `Radio`. pushes [(T, 3)]: angular
-    accelerations (rad/s^2) beyond the nominal that are already known."""
-    gains = np.concatenate([np.ones((1, 3)), 1.0 + GAIN_STEP * np.eye(3)]).astype(np.float32)
+    accelerations (rad/s^2) beyond the nominal that are already known; `base`: changes of the gains p, i, d
+    around which the loop is linearised."""
+    base = np.asarray(base, float)
+    gains = (1.0 + base + np.concatenate([np.zeros((1, 3)), GAIN_STEP * np.eye(3)])).astype(np.float32)
     y, columns, nuisances, masks, ticks, foreseen = [], [], [], [], [], []
     for number, (track, vehicle, link) in enumerate(zip(tracks, vehicles, arrived, strict=True)):
         push = None if pushes is None else pushes[number]
@@ -203,8 +218,8 @@ def read_rate_loop(tracks, vehicles, arrived, flight_of, pushes=None) -> RateLoo
         ticks.append(sent)
         outputs = np.linalg.pinv(np.asarray(mixer(vehicle), float)).T  # motors to roll, pitch, yaw
         demand, logged = wanted @ outputs, track.motor @ outputs
-        y.append(logged - demand[0])
         columns.append((demand[1:] - demand[0]) / GAIN_STEP)
+        y.append(logged - demand[0] + np.tensordot(base, columns[-1], 1))
         time = (track.time - track.time[0])[:, None]
         integral = np.asarray(vehicle.rate_ki, float) * 57.3 / 65536.0
         seen = np.stack([np.cross(axis, track.body_rates) for axis in np.eye(3)]) * GYRO_TILT
@@ -225,10 +240,10 @@ def read_rate_loop(tracks, vehicles, arrived, flight_of, pushes=None) -> RateLoo
     path = fit_linear_path(y, columns, nuisances, flight_of, (0.4, 0.4, 0.4), groups, masks, tolerance)
     score, theta, _ = path.score()
     if score < CLEAR_SCORE:
-        theta = 0.0 * theta
+        theta = base
     surprise = []
     for track, vehicle, wanted, mask in zip(tracks, vehicles, foreseen, masks, strict=True):
-        known = wanted[0] + np.tensordot(theta, wanted[1:] - wanted[0], 1) / GAIN_STEP
+        known = wanted[0] + np.tensordot(theta - base, wanted[1:] - wanted[0], 1) / GAIN_STEP
         beyond = (track.motor - known) @ np.linalg.pinv(np.asarray(mixer(vehicle), float)).T
         beyond = (beyond - np.median(beyond[mask > 0], axis=0) if mask.any() else beyond) * mask[:, None]
         # Only what gusts do: larger surprises are causes at work, and must be explained, not taken as known.

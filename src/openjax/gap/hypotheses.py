@@ -19,9 +19,12 @@ from openjax.gap.whitening import Noise, fit_noise
 
 ITERATIONS = 6
 SMALL_STEP = 0.05  # nats: an improvement below this ends the search
-REFITTED = 4  # pairs fitted in full
+BESIDE = 4  # pairs with the best single effect fitted in full
+REFITTED = 3  # of the best pairs
+TRIPLES = 2
 WORTH_A_THIRD = 10.0  # nats: three effects are tried only where two beat one by this
 WORTH_ALL = 60.0  # nats: all effects together must explain this much of a channel to count in its noise model
+SIZES = (0.05, 4.0)  # of a start that is scaled
 UNEXPOSED = 0.5  # nats that a typical effect would leave: below, the effect isn't fitted at all
 
 
@@ -196,34 +199,107 @@ def without_nuisances(replay: Replay, residual: np.ndarray, track: int) -> np.nd
     return residual - np.tensordot(taken, replay.nuisances[track], 1)
 
 
-def weigh_sets(
-    replay: Replay, library: Library, exposure=None, largest: int = 3
-) -> dict[tuple[str, ...], SetFit | float]:
+def weigh_sets(replay: Replay, library: Library, exposure=None) -> dict[tuple[str, ...], SetFit | float]:
     """Score of every set up to pairs and of the best triples: a full fit, or a linearised score."""
-    effects = library.physics
-    found: dict[tuple[str, ...], SetFit | float] = {(): fit_set(replay, ())}
-    for effect in effects:
-        if exposure is not None and exposure.get(effect, 1.0) < UNEXPOSED:
-            continue
-        found[effect,] = fit_set(replay, (effect,), _best_start(replay, effect))
-    effects = tuple(e for e in effects if (e,) in found)
-    if largest < 2 or len(effects) < 2:
+    found = weigh_singles(replay, library, exposure)
+    effects = tuple(e for e in library.physics if (e,) in found)
+    if len(effects) < 2:
         return found
     sums = LinearSums(replay, [found[e,] for e in effects], found[()])
     pairs = {pair: sums.score(pair) for pair in itertools.combinations(effects, 2)}
-    _refit(replay, found, pairs, sums, REFITTED)
-    best = max((k for k in found if len(k) == 2), key=lambda k: score_of(found[k]))
+    first = max((k for k in found if k), key=lambda k: found[k].score)
+    beside = {
+        tuple(sorted((*first, e), key=effects.index)): score
+        for e, score in _beside(replay, found, first, effects).items()
+    }
+    _refit(replay, found, pairs | beside, BESIDE, among=beside)
+    _refit(replay, found, pairs | beside, REFITTED)
+    best = max(
+        (k for k, f in found.items() if len(k) == 2 and isinstance(f, SetFit)), key=lambda k: found[k].score
+    )
     alone = max(score_of(found[k]) for k in found if len(k) == 1)
-    if largest < 3 or score_of(found[best]) < alone + WORTH_A_THIRD:
+    if score_of(found[best]) < alone + WORTH_A_THIRD:
         return found
-    triples = {tuple(sorted((*best, e), key=effects.index)): 0.0 for e in effects if e not in best}
-    triples = {triple: sums.score(triple) for triple in triples}
-    _refit(replay, found, triples, sums, 2)
+    third = _beside(replay, found, best, effects)
+    triples = {tuple(sorted((*best, e), key=effects.index)): score for e, score in third.items()}
+    _refit(replay, found, triples, TRIPLES)
     return found
 
 
+def weigh_singles(replay: Replay, library: Library, exposure=None) -> dict[tuple[str, ...], SetFit]:
+    """Full fits of no effect and of every effect alone that the flights could show."""
+    found = {(): fit_set(replay, ())}
+    for effect in library.physics:
+        if exposure is None or exposure.get(effect, 1.0) >= UNEXPOSED:
+            found[effect,] = fit_set(replay, (effect,), _best_start(replay, effect))
+    return found
+
+
+def _beside(replay: Replay, found, key, effects) -> dict[str, float]:
+    """Linearised score of each further effect beside a fitted set: its derivatives there, and its step to where it
+    was fitted alone (some effects have no derivative where they are absent)."""
+    base = found[key]
+    others = [e for e in effects if e not in key]
+    own = base.index
+    more = np.concatenate([places((e,)) for e in others]) if others else np.zeros(0, int)
+    more = np.array([i for i in more if i not in own], int)
+    columns = replay.linearised(base.theta, np.concatenate([own, more]))
+    points = []
+    for effect in others:
+        point = base.theta.copy()
+        point[places((effect,))] = found[effect,].theta[places((effect,))]
+        points.append(point)
+    moved = replay.predict(np.array(points)) if points else []
+    columns = [
+        np.concatenate([c, m - (y - c[0])[None]])
+        for c, m, y in zip(columns, moved, replay.measured, strict=True)
+    ]
+    gram = replay.grams(columns).sum(0)
+    place = {int(i): 1 + k for k, i in enumerate(np.concatenate([own, more]))}
+    out = {}
+    for number, effect in enumerate(others):
+        index, mean, precision = prior((*key, effect))
+        pick = [0, *(place[int(i)] for i in index if int(i) in place), 1 + len(place) + number]
+        inside = [k for k, i in enumerate(index) if int(i) in place]
+        prior_part = np.zeros((len(inside) + 1, len(inside) + 1))
+        prior_part[:-1, :-1] = precision[np.ix_(inside, inside)]
+        prior_part[-1, -1] = 1.0
+        off = np.append((base.theta[index] - mean)[inside], 0.0)
+        own_gram = gram[np.ix_(pick, pick)]
+        hessian = own_gram[1:, 1:] + prior_part
+        push = own_gram[1:, 0] - prior_part @ off
+        volume = np.linalg.slogdet(hessian)[1] - np.linalg.slogdet(prior_part)[1]
+        out[effect] = float(
+            -0.5 * own_gram[0, 0]
+            - 0.5 * off @ prior_part @ off
+            + 0.5 * push @ np.linalg.solve(hessian, push)
+            - 0.5 * volume
+        )
+    return out
+
+
+def joint_start(replay: Replay, found, effects) -> np.ndarray:
+    """Of the fitted parts of a set, alone or with the rest where it was fitted alone, the best start (P,)."""
+    effects = tuple(effects)
+    index, mean, precision = prior(effects)
+    points = []
+    for size in range(1, len(effects)):
+        for part in itertools.combinations(effects, size):
+            if not isinstance(found.get(part), SetFit):
+                continue
+            plain, full = found[part].theta.copy(), found[part].theta.copy()
+            for effect in effects:
+                if effect not in part and isinstance(found.get((effect,)), SetFit):
+                    full[places((effect,))] = found[effect,].theta[places((effect,))]
+            points += [plain, full]
+    residuals = [y[None] - p for y, p in zip(replay.measured, replay.predict(np.array(points)), strict=True)]
+    square = np.diag(replay.grams(residuals).sum(0))
+    off = np.array(points)[:, index] - mean
+    return points[int(np.argmin(square + np.einsum("ki,ij,kj->k", off, precision, off)))]
+
+
 def _best_start(replay: Replay, effect: str) -> np.ndarray:
-    """Of an effect's starts the one that explains most by itself."""
+    """Of an effect's starts the one that explains most by itself, at the size that explains most."""
     starts = []
     for number in range(1 + len(FITS[effect].others)):
         start = ABSENT.copy()
@@ -231,17 +307,31 @@ def _best_start(replay: Replay, effect: str) -> np.ndarray:
         starts.append(start)
     if len(starts) == 1:
         return starts[0]
-    residuals = [y[None] - p for y, p in zip(replay.measured, replay.predict(np.array(starts)), strict=True)]
-    return starts[int(np.argmin(np.diag(replay.grams(residuals).sum(0))))]
+    moved = replay.predict(np.array(starts))
+    if not FITS[effect].linear:
+        residuals = [y[None] - p for y, p in zip(replay.measured, moved, strict=True)]
+        return starts[int(np.argmin(np.diag(replay.grams(residuals).sum(0))))]
+    columns = [
+        np.concatenate([(y - n)[None], m - n[None]])
+        for y, n, m in zip(replay.measured, replay.nominal, moved, strict=True)
+    ]
+    gram = replay.grams(columns).sum(0)
+    size = np.clip(gram[0, 1:] / (np.diag(gram)[1:] + 1e-9), *SIZES)
+    best = int(np.argmax(size * gram[0, 1:] - 0.5 * size**2 * np.diag(gram)[1:]))
+    first = places((effect,))[0]
+    starts[best][first] *= size[best]
+    return starts[best]
 
 
-def _refit(replay, found, scores, sums, count) -> None:
-    ranked = sorted(scores, key=lambda k: -scores[k])
-    for chosen in ranked[:count]:
-        found[chosen] = fit_set(replay, chosen, sums.point(chosen), 4)
-    level = max(found[k].score for k in ranked[:count])
+def _refit(replay, found, scores, count, among=None) -> None:
+    """Fit the `count` best sets in full, of those in `among`; the others keep their linearised scores."""
+    ranked = sorted((k for k in (scores if among is None else among)), key=lambda k: -scores[k])[:count]
+    for chosen in ranked:
+        if not isinstance(found.get(chosen), SetFit):
+            found[chosen] = fit_set(replay, chosen, joint_start(replay, found, chosen), 4)
+    level = max(f.score for k, f in found.items() if isinstance(f, SetFit) and k in scores)
     # A linearised score is an estimate: never let it beat a set that was fitted in full.
-    found.update({k: min(scores[k], level) for k in ranked[count:]})
+    found.update({k: min(v, level) for k, v in scores.items() if not isinstance(found.get(k), SetFit)})
 
 
 def score_of(entry: SetFit | float) -> float:

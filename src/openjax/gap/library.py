@@ -39,12 +39,15 @@ class Fitted:
 
 @dataclass(frozen=True)
 class Fit:
-    """How one effect is fitted. `common` is the spread that all its parameters share, `others` are more
-    starts, `companions` are ((effect, parameter, spread), ...)."""
+    """How one effect is fitted. `common` is the spread that all its parameters share; `balanced`: their mean
+    belongs to another effect and is held near zero; `linear`: the first scales the whole effect; `others`
+    are more starts; `companions` are ((effect, parameter, spread), ...)."""
 
     effect: str
     parameters: tuple[Fitted, ...]
     common: float = 0.0
+    balanced: bool = False
+    linear: bool = False
     others: tuple[tuple[float, ...], ...] = ()
     companions: tuple[tuple[str, str, float], ...] = ()
 
@@ -102,10 +105,14 @@ FITS = {
         Fit(
             "ground_effect",
             (_p("strength", 0.0, 0.8, 0.4, 1e-2, True), _p("offset", 0.012, 0.01, 0.012, 5e-4)),
+            linear=True,
+            others=((0.4, 0.0), (0.4, 0.025), (0.4, 0.05)),
         ),
         Fit(
             "ceiling_effect",
             (_p("strength", 0.0, 0.8, 0.4, 1e-2, True), _p("offset", 0.012, 0.025, 0.012, 5e-4)),
+            linear=True,
+            others=((0.4, 0.0), (0.4, 0.025), (0.4, 0.05)),
         ),
         Fit(
             "downwash",
@@ -115,6 +122,7 @@ FITS = {
                 _p("width", 0.045, 0.012, 0.045, 5e-4),
                 _p("spread", 0.1, 0.06, 0.1, 2e-3),
             ),
+            linear=True,
             others=((0.05, 0.8, 0.06, 0.15), (0.08, 0.3, 0.03, 0.08)),
         ),
         Fit(
@@ -125,6 +133,7 @@ FITS = {
         Fit(
             "motor_imbalance",
             tuple(_p(f"m{i}", 0.0, 0.05, s, 1e-3) for i, s in ((1, 0.02), (2, -0.01), (3, 0.0), (4, -0.01))),
+            balanced=True,
         ),
         Fit("com_offset", (_p("x", 0.0, 2e-3, 3e-4, 2e-5), _p("y", 0.0, 2e-3, 3e-4, 2e-5))),
         Fit("inertia", tuple(_p(axis, 1.0, 0.12, 1.1, 5e-3) for axis in ("xx", "yy", "zz")), common=0.3),
@@ -139,7 +148,7 @@ FITS = {
 # what the
 # replay's own step and the half-known motor commands inside a row leave.
 NUISANCES = (
-    ("thrust_scale", "scale", 0.006),
+    ("thrust_scale", "scale", 0.004),
     ("inertia", "xx", 0.01),
     ("inertia", "yy", 0.01),
     ("inertia", "zz", 0.01),
@@ -160,6 +169,7 @@ PWM_NUISANCES = (
     ("thrust_curve", "curvature", 0.3),
     ("yaw_torque", "ratio", 0.5),
 )
+BALANCE = 0.99  # share of the common variance that `balanced` parameters go without
 MOTOR_SHIFT = 0.001  # s, standard deviation of the motors' clock offset
 
 
@@ -220,7 +230,8 @@ def prior(effects) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         fit = FITS[effect]
         index += [PLACE[effect, p.name] for p in fit.parameters]
         mean += [p.mean for p in fit.parameters]
-        blocks.append(np.diag([p.spread**2 for p in fit.parameters]) + fit.common**2)
+        block = np.diag([p.spread**2 for p in fit.parameters]) + fit.common**2
+        blocks.append(block - BALANCE * block.mean() if fit.balanced else block)
     for effect in effects:
         for other, parameter, spread in FITS[effect].companions:
             if PLACE[other, parameter] not in index:

@@ -33,6 +33,8 @@ GYROSCOPIC = 0.1  # relative to the moments of inertia
 DAMPING = 0.15  # 1/s, of the body rates by what the rotors do
 ACCELEROMETER_BIAS = 0.4  # m/s^2
 POSE_SHIFT = 0.0015  # s between motion capture and the vehicle's clock
+WAKE_TORQUE = 15.0  # rad/s^2 at the edge of another vehicle's wake, which no simple form of it has right
+WAKE_WIDTHS = (0.05, 0.1)  # m
 
 
 # How the body rates follow the controller's surprise (rad/s per share of thrust): its sum, then 1 to 5 rows
@@ -254,7 +256,7 @@ def _path(track: Track, ticks: np.ndarray) -> Path:
     # Without a pose the vehicle is taken to be in mid-air, far from everything.
     position = track.position if track.position is not None else unknown + np.array([0.0, 0.0, 0.6])
     # Neither floor nor ceiling can be entered: a log that says so has an offset in height.
-    position = np.concatenate([position[:, :2], np.clip(position[:, 2:], 0.01, ARENA_CEILING - 0.02)], 1)
+    position = np.concatenate([position[:, :2], np.clip(position[:, 2:], 0.0, ARENA_CEILING)], 1)
     velocity = track.velocity if track.velocity is not None else unknown
     others = [middle(p) for p in track.neighbours] or [np.tile(np.float32([50.0, 50.0, -50.0]), (size, 1))]
     voltage = np.full(size, np.nan, np.float32) if track.voltage is None else middle(track.voltage)
@@ -317,7 +319,30 @@ def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> list[np.
         column = -moved(np.cross(np.asarray(path.body_rates, float)[:rows], body))
         column[:, VELOCITY] += smooth(np.gradient(track.velocity, track.dt, axis=0), 0.05, track.dt)
         columns.append(column * POSE_SHIFT)
-    return columns
+    return columns + [_torque_column(t, track.dt) * WAKE_TORQUE for t in _wake_torques(track, turn)]
+
+
+def _torque_column(acceleration: np.ndarray, dt: float) -> np.ndarray:
+    """Channels (T, 9) of an angular acceleration (T, 3)."""
+    column = np.zeros((len(acceleration), 9))
+    column[1:, RATES] = np.cumsum(acceleration[:-1], 0) * dt
+    return column
+
+
+def _wake_torques(track: Track, turn: np.ndarray) -> list[np.ndarray]:
+    """Directions (T, 3), body frame, in which the wakes of vehicles above turn this one, by wake width."""
+    if track.position is None or not len(track.neighbours):
+        return []
+    gap = track.neighbours - track.position
+    height = np.maximum(gap[..., 2:], 0.0)
+    square = (gap[..., :2] ** 2).sum(-1, keepdims=True)
+    out = []
+    for width in WAKE_WIDTHS:
+        strength = (gap[..., 2:] > 0.02) * np.exp(-height / 0.5 - square / (2.0 * width**2)) / width
+        # The side nearer to the wake is pushed down: (gap) x (-e_z).
+        world = np.stack([-gap[..., 1], gap[..., 0], np.zeros_like(gap[..., 0])], -1) * strength
+        out.append(np.einsum("tji,tj->ti", turn, world.sum(0)))
+    return out
 
 
 def _controller_as_sensor(surprise: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:

@@ -6,10 +6,13 @@ import json
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
 from openjax.gap.how_far import Gap
 from openjax.gap.where import Place, in_words
 from openjax.vehicle.effects import EFFECTS, save_effects
 
+REFERENCE_VOLTAGE = 3.9  # V, to which the limit of `thrust_saturation` refers
 VERDICTS = ("effect", "none", "unknown", "not_testable")
 
 
@@ -154,17 +157,31 @@ class Report:
         return lines
 
 
+def to_fly(report: Report) -> tuple[dict, dict]:
+    """Values and 90 % intervals by effect and parameter for a simulator that knows no voltage: the battery and what
+    depends on it are as in the flights, at their median."""
+    values = {e: {p: v.value for p, v in found.items()} for e, found in report.parameters.items()}
+    intervals = {e: {p: v.interval90 for p, v in found.items()} for e, found in report.parameters.items()}
+    # What wasn't fitted keeps the value at which it does nothing.
+    values = {e: EFFECTS[e].none() | found for e, found in values.items()}
+    evidence = report.plots.get("evidence")
+    voltage = [t.voltage for t in evidence.tracks if t.voltage is not None] if evidence is not None else []
+    if voltage and "battery_sag" in values:
+        values["battery_sag"] |= {"full": float(np.median(np.concatenate(voltage))), "discharge": 0.0}
+    if voltage and "thrust_saturation" in values:
+        own, reach = values["thrust_saturation"], intervals["thrust_saturation"]
+        factor = 1.0 + own["voltage_slope"] * (float(np.median(np.concatenate(voltage))) - REFERENCE_VOLTAGE)
+        own |= {"limit": own["limit"] * factor, "voltage_slope": 0.0}
+        reach["limit"] = tuple(factor * v for v in reach["limit"])
+        reach.pop("voltage_slope", None)
+    return values, intervals
+
+
 def write_report(report: Report, folder: Path, pictures: bool = True) -> None:
     """Write `report.json`, `effects.toml` and (with `pictures`) `report.html` into an existing
     folder."""
     (folder / "report.json").write_text(json.dumps(report.to_dict(), indent=1) + "\n", encoding="utf-8")
-    values = {e: {p: v.value for p, v in estimates.items()} for e, estimates in report.parameters.items()}
-    for effect, estimates in values.items():
-        # What wasn't fitted keeps the value at which it does nothing.
-        values[effect] = EFFECTS[effect].none() | estimates
-    intervals = {
-        e: {p: v.interval90 for p, v in estimates.items()} for e, estimates in report.parameters.items()
-    }
+    values, intervals = to_fly(report)
     save_effects(folder / "effects.toml", values, intervals, notes=" ".join(report.in_words()[:2]))
     if pictures:
         from openjax.gap.html import html_of
