@@ -20,7 +20,7 @@ benchmark: $(READY)
 	$(BIN)/python -m openjax.benchmark $(ARGS)
 
 evaluate: $(READY)
-	$(BIN)/python -m openjax.evaluate --policy open open_seed_0 open_seed_1 --scenario all $(ARGS)
+	$(BIN)/python -m openjax.evaluate --policy open open_seed_1 open_seed_2 --scenario all $(ARGS)
 
 withheld: $(READY)
 	$(BIN)/python experiments/withheld/run.py $(ARGS)
