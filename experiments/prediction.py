@@ -91,12 +91,15 @@ def study(options: argparse.Namespace) -> dict:
     guesses = simple_guesses(settings, test, times)
     guesses["the evader's own rule"] = flying.evader_rule(settings, test, times, HORIZONS)
     guesses = {name: plain(errors(guess, HORIZONS, test, times, groups)) for name, guess in guesses.items()}
-    share = visibility(test, times).mean(axis=1)
+    kinds = visibility(test, times)
+    share = kinds.mean(axis=1)
+    fewer = "" if options.variants >= len(VARIANTS) else f" --variants {options.variants}"
     outcome = np.asarray(outcome[number:]).reshape(sources, len(SCENARIOS), options.episodes, 3).mean(axis=2)
     return {
         "command": f"python experiments/prediction.py --policy {options.policy} --worlds {options.worlds} "
         f"--held-back {options.held_back} --episodes {options.episodes} --updates {options.updates} "
-        f"--batch {options.batch} --seeds {options.seeds} --stride {options.stride}",
+        f"--batch {options.batch} --seeds {options.seeds} --stride {options.stride}{fewer}",
+        "note": options.note,
         "commit": options.commit,
         "machine": describe_machine(),
         "seconds": {**seconds, "whole": time.monotonic() - started},
@@ -105,6 +108,7 @@ def study(options: argparse.Namespace) -> dict:
         "groups": ["training tasks", *SCENARIOS],
         "visibility": VISIBILITY,
         "share": [plain(share[groups == g].mean(axis=0)) for g in range(len(SCENARIOS) + 1)],
+        "lost_steps": [int(kinds[groups == g, :, 1].sum()) for g in range(len(SCENARIOS) + 1)],
         "variants": variants,
         "guesses": guesses,
         "told": {name: outcome[i].tolist() for i, name in enumerate(flying.SOURCES[:sources])},
@@ -135,6 +139,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--variants", type=int, default=len(VARIANTS), help="only the first so many")
     parser.add_argument("--episode-length", type=int, default=0, help="shorter episodes, to try the command")
     parser.add_argument("--commit", default="", help="where the machine has no repository")
+    parser.add_argument("--note", default="")
     parser.add_argument("--report", action="store_true", help="from the stored results")
     parser.add_argument("--out", type=Path, default=RESULTS / "prediction")
     options = parser.parse_args(arguments)

@@ -6,22 +6,24 @@ import numpy as np
 from ablations import PAPER_PREDICTION, table
 
 SEEN, LOST, NOT_YET, ALL = 0, 1, 2, 3
+PAPER = "paper: 1–5 ahead, absolute, step size 1e-4"
+DEFAULT = "1–40 ahead, relative (default)"
 QUESTIONS = (
     (
         "relative to where it was last seen, not in the arena",
-        "1–40 ahead, relative (default)",
+        DEFAULT,
         "1–40 ahead, absolute",
     ),
-    ("longer horizons", "1–40 ahead, relative (default)", "1–5 ahead, relative"),
-    ("frames 40 ms apart", "spacing 4", "1–40 ahead, relative (default)"),
-    ("frames 80 ms apart", "spacing 8", "1–40 ahead, relative (default)"),
+    ("longer horizons", DEFAULT, "1–5 ahead, relative"),
+    ("frames 40 ms apart", "spacing 4", DEFAULT),
+    ("frames 80 ms apart", "spacing 8", DEFAULT),
     ("twice as many frames, 80 ms apart", "20 frames, spacing 8", "spacing 8"),
     (
         "last seen position, velocity, time since as input",
         "last seen position as input",
-        "1–40 ahead, relative (default)",
+        DEFAULT,
     ),
-    ("pillars as input", "pillars", "1–40 ahead, relative (default)"),
+    ("pillars as input", "pillars", DEFAULT),
     ("pillars, beside the last seen position", "last seen and pillars", "last seen position as input"),
     ("frames 40 ms apart, beside both", "last seen and pillars, spacing 4", "last seen and pillars"),
     (
@@ -78,7 +80,7 @@ def report(results: dict) -> list[str]:
         "# Predicting the evader: what helps where it is hidden",
         "",
         f"`{results['command']}` on {machine['device']}, JAX {machine['versions']['jax']}, commit {commit}: "
-        f"{results['seconds']['whole']:.0f} s.",
+        f"{results['seconds']['whole']:.0f} s. {results['note']}".rstrip(),
         "",
         f"A fixed policy flew {worlds} training tasks (uniform ones, turned, up to 20 times expanded) with the exploration of "
         f"training. All variants learnt from these flights: {budget['updates']} updates of {budget['batch']} windows, "
@@ -87,8 +89,8 @@ def report(results: dict) -> list[str]:
         "at a time that is so far ahead, by what is known when the prediction is made: somebody sees the evader; nobody sees "
         "it any more (lost); nobody has seen it yet.",
         "",
-        f"## Training tasks (lost in {100 * results['share'][0][LOST]:.1f} % of the steps, not yet seen in "
-        f"{100 * results['share'][0][NOT_YET]:.1f} %)",
+        f"## Training tasks (lost in {100 * results['share'][0][LOST]:.1f} % of the steps, {results['lost_steps'][0]} of those "
+        f"compared; not yet seen in {100 * results['share'][0][NOT_YET]:.1f} %)",
         "",
         f"Mean over seeds (standard deviation over seeds at most {spread:.2f}).",
         "",
@@ -118,8 +120,7 @@ def report(results: dict) -> list[str]:
         "Error of the next position over all steps, as the paper reports it.",
         "",
     ]
-    names = [results["variants"][0]["name"], *(v["name"] for v in results["variants"][4:5]), best]
-    names = [*dict.fromkeys([*names, *results["guesses"]])]
+    names = [name for name in dict.fromkeys([PAPER, DEFAULT, best, *results["guesses"]]) if name in values]
     lines += table(
         ["layout", "paper", *names],
         [
@@ -188,8 +189,8 @@ def draw(results: dict, path: Path) -> None:
     milliseconds = 1000 * results["time_step"] * np.array(results["horizons"])
     shown = dict.fromkeys(
         [
-            results["variants"][0]["name"],
-            "1–40 ahead, relative (default)",
+            PAPER,
+            DEFAULT,
             "spacing 8",
             "pillars",
             "last seen position as input",
