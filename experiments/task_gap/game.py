@@ -94,11 +94,12 @@ def figures_of(statistics, closely) -> dict[str, list[float]]:
 
 def fly_simulator(loaded, settings, start, number, effects=(), parameters=None) -> dict[str, list[float]]:
     """Episodes in the simulator, nominal or with effects."""
-    environment = Pursuit(settings, effects=effects, effect_parameters=parameters)
     tasks, keys = draw_tasks(settings, start, number)
-    step = jax.vmap(environment.step, in_axes=(None, 0, 0))
 
-    def episodes(weights, tasks, keys):
+    def episodes(weights, tasks, keys, parameters):  # parameters as arguments: one program for an effect
+        environment = Pursuit(settings, effects=effects, effect_parameters=parameters)
+        step = jax.vmap(environment.step, in_axes=(None, 0, 0))
+
         def one(carry, _):
             observation, state, closely = carry
             observation, state, *_ = step(keys[0], state, loaded.policy.act(weights, observation))
@@ -108,7 +109,7 @@ def fly_simulator(loaded, settings, start, number, effects=(), parameters=None) 
         (_, state, closely), _ = jax.lax.scan(one, carry, None, length=settings.episode_length)
         return state.statistics, closely
 
-    return figures_of(*jax.jit(episodes)(loaded.parameters, tasks, keys))
+    return figures_of(*jax.jit(episodes)(loaded.parameters, tasks, keys, parameters or {}))
 
 
 def fly_plant(loaded, settings, start, number, case) -> dict[str, list[float]]:

@@ -215,11 +215,9 @@ def _summary_table(summary):
 
 def _case_table(cases, told, rows):
     lines = [
-        "| cause (form, size) | diagnosed | episodes | "
-        + " | ".join(
-            f"{title}: nominal, flights, corrected (gap before → after)" for title, _ in FIGURES.values()
-        )
-        + " |",
+        "Each cell: nominal, flights, corrected (gap to the flights before → after).",
+        "",
+        "| cause (form, size) | diagnosed | episodes | " + " | ".join(t for t, _ in FIGURES.values()) + " |",
         "|---|---|---|" + "---|" * len(FIGURES),
     ]
     for case in cases:
