@@ -36,7 +36,14 @@ def report(results: dict) -> list[str]:
     commit = results["commit"] or machine.get("commit") or "unknown"
     own_speed, own_radius = own_values(results)
     at_speed, at_radius = results["speeds"].index(own_speed), results["radii"].index(own_radius)
-    seeds = ", ".join(f"{name} {len(figures['capture_rate'])}" for name, figures in variants.items())
+    steps = {
+        variant_of(policy["settings"]): policy["settings"]["total_steps"] / 1e6
+        for policy in results["policies"]
+    }
+    seeds = ", ".join(
+        f"{name} {len(figures['capture_rate'])} (trained for {steps[name]:.0f} M steps)"
+        for name, figures in variants.items()
+    )
     limit = "speed clamp" if results["speed_limit"] == "clamp" else "no speed clamp"
     lines = [
         "# Capture radius and evader speed",
