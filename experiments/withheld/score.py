@@ -198,17 +198,18 @@ def meets(key, figure):
     return value >= target if larger else value <= target
 
 
-def provenance(command):
-    """Command, commit, machine and date that stand beside the figures."""
+def provenance(command, commit=None, machine=None):
+    """Command, commit, machine and date that stand beside the figures; `commit` and `machine` of the diagnosis where it
+    ran elsewhere."""
     import os
 
-    commit = subprocess.run(
+    here = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
-    ).stdout.strip()
+    )
     return {
         "command": command,
-        "commit": commit or "unknown",
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        "commit": commit or here.stdout.strip() or "unknown",
+        "machine": machine or f"{platform.machine()}, {os.cpu_count()} cores",
         "python": platform.python_version(),
         "date": date.today().isoformat(),
     }
@@ -278,6 +279,8 @@ def main():
     parser.add_argument(
         "--command", default=" ".join(["python -m experiments.withheld.score", *sys.argv[1:]])
     )
+    parser.add_argument("--commit", help="of the diagnosis, if it isn't this one")
+    parser.add_argument("--machine", help="of the diagnosis, if it isn't this one")
     options = parser.parse_args()
     text = options.answers.read_text()
     answers = json.loads(text)
@@ -286,7 +289,7 @@ def main():
     result = score(answers["cases"], predictions, reports)
     result |= {
         "title": options.title,
-        "provenance": provenance(options.command),
+        "provenance": provenance(options.command, options.commit, options.machine),
         "seed": answers.get("seed"),
         "scale": answers.get("scale"),
         "bands": answers.get("bands"),
