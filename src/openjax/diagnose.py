@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import sys
 import tempfile
@@ -54,6 +55,8 @@ def run(options: Options) -> int:
     bad options."""
     from rich.console import Console
 
+    # Small matrices: more threads than one only wait for each other. Read when NumPy is loaded, below.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     console = Console()
     if not options.cases:
         raise UserError("no case given: name at least one folder of flight logs with a vehicle.toml")
