@@ -1,6 +1,7 @@
 """Settle the numbers of the diagnosis' decision on tuning cases, and write `src/openjax/gap/decision.json`.
 
-    python -m experiments.diagnosis.tune RECORDS.npz [RECORDS.npz ...] [--last SEED ...] [--folds 4] [--write]
+    python -m experiments.diagnosis.tune RECORDS.npz [...] [--earlier RECORDS.npz ...] [--last SEED ...] [--folds 4]
+        [--write]
 
 The records come from `experiments.diagnosis.records`; only the plant's tuning seeds (below 100) may be used. What
 nominal flights show, how far effects explain what isn't theirs, temperatures and costs (log-probability of the true
@@ -20,7 +21,6 @@ from experiments.diagnosis import figures
 from experiments.diagnosis.records import unpack
 from experiments.withheld import plan
 from openjax.gap import decision, gate
-from openjax.gap.headroom import GROUPS
 from openjax.gap.library import path_of
 from openjax.gap.linear_path import linear_score
 
@@ -362,8 +362,6 @@ def main():
     if options.write:
         decision.SETTINGS_FILE.write_text(json.dumps(dataclasses.asdict(settings), indent=1) + "\n")
 
-
-__all__ = ["GROUPS"]
 
 if __name__ == "__main__":
     main()

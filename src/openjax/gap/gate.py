@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from openjax.gap.headroom import SPREADS, TORQUE, Headroom
+from openjax.gap.headroom import TORQUE, Headroom
 
 COLUMN_SPREAD = 0.3  # prior rms of a dictionary column alone: m/s^2, and times TORQUE rad/s^2
 USUAL_GAIN = 5.0  # nats added to what a column gains on nominal flights before ratios are taken
@@ -129,6 +129,3 @@ def _in_vain(paths: dict, effects) -> dict[str, float]:
         "rate in vain": 0.0 if "rate_gains" in effects else float(np.log1p(rate)),
         "rate lost": float(np.log1p(lost)),
     }
-
-
-__all__ = ["SPREADS", "Null", "column_gains", "features", "summary"]
