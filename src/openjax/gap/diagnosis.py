@@ -116,8 +116,22 @@ def conclude(evidence: Evidence, settings: rules.Settings) -> Report:
         quality=[{"flight": i.flight, "issue": i.issue} for i in evidence.case.quality],
         runner_up=f"{second} ({chance:.2f})" if second else "",
         rest=_rest_in_words(rest) if unknown else "",
+        nearest=_nearest(evidence, left, first.best, settings) if unknown else "",
         nuisances=_nuisances(evidence, fit),
         plots={"evidence": evidence, "fit": fit, "held_out": held_out, "rest": rest, "decision": found},
+    )
+
+
+def _nearest(evidence: Evidence, fit: SetFit, best, settings: rules.Settings) -> str:
+    """What the known effects alone would say, in words: not an answer, but where to look."""
+    if not fit.effects:
+        return ""
+    found = estimates(evidence, fit, fit.effects, settings)
+    shown = [f"{e} ({', '.join(v.in_words(p) for p, v in own.items())})" for e, own in found.items()]
+    gap = shrink(evidence, held_out_residuals(evidence, fit), best)
+    return (
+        f"Of the known effects these come nearest: {'; '.join(shown)}; with them the gap on held-out flights would go from "
+        f"{gap.before:.2f} to {gap.after:.2f}."
     )
 
 

@@ -25,6 +25,11 @@ class Estimate:
     interval90: tuple[float, float]
     usual: tuple[float, float]
 
+    def in_words(self, name: str) -> str:
+        """The value of the parameter `name` with its interval and unit."""
+        low, high = self.interval90
+        return f"{name} = {self.value:.4g} [{low:.4g}, {high:.4g}] {self.unit}"
+
     @property
     def unusual(self) -> bool:
         return not self.usual[0] <= self.value <= self.usual[1]
@@ -48,6 +53,7 @@ class Report:
     quality: list[dict[str, str]]
     runner_up: str = ""
     rest: str = ""
+    nearest: str = ""
     nuisances: dict[str, str] = field(default_factory=dict)
     seconds: float = 0.0
     plots: dict = field(default_factory=dict, repr=False)
@@ -104,6 +110,7 @@ class Report:
             "quality": self.quality,
             "runner_up": self.runner_up,
             "rest": self.rest,
+            "nearest": self.nearest,
             "nuisances": self.nuisances,
         }
 
@@ -127,15 +134,10 @@ class Report:
                 "The simulator agrees with these flights to within the noise "
                 f"(probability {chance['none']:.2f})."
             )
-        if self.rest:
-            lines.append(self.rest)
+        lines += [text for text in (self.rest, self.nearest) if text]
         lines.append(f"Where: {in_words(self.where)}.")
         for effect, values in self.parameters.items():
-            shown = ", ".join(
-                f"{p} = {v.value:.4g} [{v.interval90[0]:.4g}, {v.interval90[1]:.4g}] {v.unit}"
-                + (" (unusual)" if v.unusual else "")
-                for p, v in values.items()
-            )
+            shown = ", ".join(v.in_words(p) + (" (unusual)" if v.unusual else "") for p, v in values.items())
             lines.append(f"{effect}: {shown}.")
         for name, others in self.equivalent.items():
             lines.append(f"These flights can't tell {name} from {', '.join(others)}.")
