@@ -150,6 +150,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--episodes", type=int, default=100, help="per layout and speed")
     parser.add_argument("--speed-limit", choices=("clamp", "none"), default="clamp")
     parser.add_argument("--commit", default="", help="where the machine has no repository")
+    parser.add_argument("--note", default="")
     parser.add_argument("--report", action="store_true", help="from the stored results")
     parser.add_argument("--out", type=Path, default=RESULTS / "sweeps")
     options = parser.parse_args(arguments)
@@ -165,6 +166,7 @@ def main(arguments: list[str]) -> int:
             {
                 "command": f"python experiments/sweeps.py{shown} --episodes {options.episodes}",
                 "commit": options.commit,
+                "note": options.note,
                 "machine": describe_machine(),
                 "seconds": time.monotonic() - started,
                 "episodes": options.episodes,

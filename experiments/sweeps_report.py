@@ -49,7 +49,7 @@ def report(results: dict) -> list[str]:
         "# Capture radius and evader speed",
         "",
         f"`{results['command']}` on {machine['device']}, JAX {machine['versions']['jax']}, commit {commit}: "
-        f"{results['seconds']:.0f} s.",
+        f"{results['seconds']:.0f} s. {results['note']}".rstrip(),
         "",
         f"Policies trained at a radius of {own_radius} m and an evader of {own_speed} m/s, at others without training anew; "
         f"{limit}, drawn starts, {results['episodes']} episodes per seed and cell. Seeds: {seeds}. Capture rate / "
