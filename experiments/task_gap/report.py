@@ -167,8 +167,9 @@ def markdown(cases, options, measured, machine) -> str:
     lines = [
         "# The gap in the task: nominal simulator, flights' world, corrected simulator",
         "",
-        f"`python -m experiments.task_gap --policy {options.policy} --seed {options.seed} --episodes {options.episodes}` "
-        f"on {machine['device']}, JAX {machine['versions']['jax']}, commit {machine['commit']}.",
+        f"`python -m experiments.task_gap --policy {options.policy} --seed {options.seed} --episodes {options.episodes} "
+        f"--substeps {' '.join(map(str, options.substeps))} --conditions {' '.join(map(repr, options.conditions))}` on "
+        f"{machine['device']}, JAX {machine['versions']['jax']}, commit {machine['commit']}.",
         "",
         METHOD,
     ]
