@@ -9,7 +9,6 @@ Writes experiments/results/drawn_starts.json and .md.
 import argparse
 import functools
 import time
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +16,7 @@ import numpy as np
 import optax
 from ablations import table
 from headline import GOAL_COLLISION
+from pages import page_parser, publish
 from prediction_flights import layout_tasks
 
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, Task, action_to_command
@@ -25,10 +25,8 @@ from openjax.pursuit.observation import rotation_axes
 from openjax.pursuit.settings import SOLID_RADIUS
 from openjax.runs.command_line import run_command
 from openjax.runs.machine import describe_machine
-from openjax.runs.settings_files import read_json, write_json
 from openjax.vehicle import DroneState, make_drones_step
 
-RESULTS = Path(__file__).parent / "results"
 STEPS = 200
 """Control steps that are flown; then all is calm."""
 HOLD = 4
@@ -205,20 +203,10 @@ def report(results: dict) -> list[str]:
 
 def main(arguments: list[str]) -> int:
     """Optimise or read, write both files, print the page."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = page_parser(__doc__, "drawn_starts")
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--iterations", type=int, default=60)
-    parser.add_argument("--report", action="store_true", help="from the stored results")
-    parser.add_argument("--out", type=Path, default=RESULTS / "drawn_starts")
-    options = parser.parse_args(arguments)
-    data = options.out.with_suffix(".json")
-    if not options.report:
-        write_json(data, study(options))
-    lines = report(read_json(data))
-    options.out.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    print("\n".join(lines))
+    publish(parser.parse_args(arguments), study, report)
     return 0
 
 

@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from pages import page_parser, publish
 
 from openjax.policy import Policy
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings
@@ -20,9 +21,7 @@ from openjax.runs.evaluation import Evaluator, evaluate_scenarios, layout_slots
 from openjax.runs.machine import describe_machine
 from openjax.runs.policies import load_policy
 from openjax.runs.policy_files import shipped_policies
-from openjax.runs.settings_files import read_json, write_json
 
-RESULTS = Path(__file__).parent / "results"
 CONDITIONS = {
     "clamp, drawn starts": {"speed_limit": "clamp", "start_attitude": "drawn"},
     "clamp, level starts": {"speed_limit": "clamp", "start_attitude": "level"},
@@ -167,34 +166,26 @@ def report(results: dict) -> list[str]:
     return lines
 
 
+def study(options: argparse.Namespace) -> dict:
+    """Fly the shipped seeds under all conditions."""
+    started = time.monotonic()
+    records = {
+        condition: {name: fly(name, changes, options.episodes) for name in seeds_of_open()}
+        for condition, changes in CONDITIONS.items()
+    }
+    return {
+        "command": f"python experiments/headline.py --episodes {options.episodes}",
+        "machine": describe_machine(),
+        "seconds": time.monotonic() - started,
+        "records": records,
+    }
+
+
 def main(arguments: list[str]) -> int:
     """Evaluate and write both files."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = page_parser(__doc__, "headline")
     parser.add_argument("--episodes", type=int, default=100)
-    parser.add_argument("--report", action="store_true", help="from the stored results")
-    parser.add_argument("--out", type=Path, default=RESULTS / "headline")
-    options = parser.parse_args(arguments)
-    data = options.out.with_suffix(".json")
-    if not options.report:
-        started = time.monotonic()
-        records = {
-            condition: {name: fly(name, changes, options.episodes) for name in seeds_of_open()}
-            for condition, changes in CONDITIONS.items()
-        }
-        write_json(
-            data,
-            {
-                "command": f"python experiments/headline.py --episodes {options.episodes}",
-                "machine": describe_machine(),
-                "seconds": time.monotonic() - started,
-                "records": records,
-            },
-        )
-    lines = report(read_json(data))
-    options.out.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    print("\n".join(lines))
+    publish(parser.parse_args(arguments), study, report)
     return 0
 
 

@@ -11,12 +11,12 @@ import dataclasses
 import os
 import time
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import prediction_flights as flying
+from pages import page_parser, publish
 from prediction_report import draw, report
 from predictors import (
     HORIZONS,
@@ -37,9 +37,7 @@ from openjax.runs.command_line import run_command
 from openjax.runs.evaluation import layout_slots
 from openjax.runs.machine import describe_machine
 from openjax.runs.policies import load_policy
-from openjax.runs.settings_files import read_json, write_json
 
-RESULTS = Path(__file__).parent / "results"
 EXPANSIONS = 20
 
 
@@ -125,9 +123,7 @@ def plain(values: np.ndarray) -> list:
 
 def main(arguments: list[str]) -> int:
     """Study or read it, write the three files, print the page."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = page_parser(__doc__, "prediction")
     parser.add_argument("--policy", default="open", help="a shipped policy, a run or a policy file")
     parser.add_argument("--worlds", type=int, default=8192, help="episodes to train on")
     parser.add_argument("--held-back", type=int, default=4096, help="other training tasks to compare on")
@@ -140,17 +136,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--episode-length", type=int, default=0, help="shorter episodes, to try the command")
     parser.add_argument("--commit", default="", help="where the machine has no repository")
     parser.add_argument("--note", default="")
-    parser.add_argument("--report", action="store_true", help="from the stored results")
-    parser.add_argument("--out", type=Path, default=RESULTS / "prediction")
-    options = parser.parse_args(arguments)
-    data = options.out.with_suffix(".json")
-    if not options.report:
-        write_json(data, study(options))
-    results = read_json(data)
-    lines = report(results)
-    options.out.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    draw(results, options.out.with_suffix(".png"))
-    print("\n".join(lines))
+    publish(parser.parse_args(arguments), study, report, draw)
     return 0
 
 

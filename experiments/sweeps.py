@@ -10,11 +10,11 @@ import copy
 import dataclasses
 import functools
 import time
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from pages import page_parser, publish
 from prediction_flights import layout_tasks
 from sweeps_report import draw, report
 
@@ -26,9 +26,8 @@ from openjax.runs.evaluation import layout_slots
 from openjax.runs.machine import describe_machine
 from openjax.runs.policies import load_policy
 from openjax.runs.policy_files import shipped_policies
-from openjax.runs.settings_files import read_json, to_plain, write_json
+from openjax.runs.settings_files import to_plain
 
-RESULTS = Path(__file__).parent / "results"
 RADII = (0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5)
 SPEEDS = (1.0, 1.3, 1.6, 2.0, 2.4, 2.8)
 
@@ -139,11 +138,31 @@ def _environment(settings):
     return Pursuit(settings)
 
 
+def study(options: argparse.Namespace) -> dict:
+    """Fly every policy over all radii and speeds."""
+    started = time.monotonic()
+    changes = {"speed_limit": options.speed_limit}
+    policies = [of_policy(name, options.episodes, changes) for name in options.policy]
+    shown = "" if options.policy == shipped_policies() else f" --policy {' '.join(options.policy)}"
+    shown += "" if options.speed_limit == "clamp" else f" --speed-limit {options.speed_limit}"
+    return {
+        "command": f"python experiments/sweeps.py{shown} --episodes {options.episodes}",
+        "commit": options.commit,
+        "note": options.note,
+        "machine": describe_machine(),
+        "seconds": time.monotonic() - started,
+        "episodes": options.episodes,
+        "speed_limit": options.speed_limit,
+        "layouts": list(SCENARIOS),
+        "speeds": SPEEDS,
+        "radii": RADII,
+        "policies": policies,
+    }
+
+
 def main(arguments: list[str]) -> int:
     """Sweep or read it, write the three files, print the page."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = page_parser(__doc__, "sweeps")
     parser.add_argument(
         "--policy", nargs="+", default=shipped_policies(), help="by default all that are shipped"
     )
@@ -151,37 +170,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--speed-limit", choices=("clamp", "none"), default="clamp")
     parser.add_argument("--commit", default="", help="where the machine has no repository")
     parser.add_argument("--note", default="")
-    parser.add_argument("--report", action="store_true", help="from the stored results")
-    parser.add_argument("--out", type=Path, default=RESULTS / "sweeps")
-    options = parser.parse_args(arguments)
-    data = options.out.with_suffix(".json")
-    if not options.report:
-        started = time.monotonic()
-        changes = {"speed_limit": options.speed_limit}
-        policies = [of_policy(name, options.episodes, changes) for name in options.policy]
-        shown = "" if options.policy == shipped_policies() else f" --policy {' '.join(options.policy)}"
-        shown += "" if options.speed_limit == "clamp" else f" --speed-limit {options.speed_limit}"
-        write_json(
-            data,
-            {
-                "command": f"python experiments/sweeps.py{shown} --episodes {options.episodes}",
-                "commit": options.commit,
-                "note": options.note,
-                "machine": describe_machine(),
-                "seconds": time.monotonic() - started,
-                "episodes": options.episodes,
-                "speed_limit": options.speed_limit,
-                "layouts": list(SCENARIOS),
-                "speeds": SPEEDS,
-                "radii": RADII,
-                "policies": policies,
-            },
-        )
-    results = read_json(data)
-    lines = report(results)
-    options.out.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    draw(results, options.out.with_suffix(".png"))
-    print("\n".join(lines))
+    publish(parser.parse_args(arguments), study, report, draw)
     return 0
 
 

@@ -39,23 +39,42 @@ def calibration_error(pairs, weight, bins=10):
     return float(total / weight.sum())
 
 
+# a row is (record, answer, prediction, decision)
+def _right(row):
+    return metrics.first(row[2], row[1]) == metrics.true_class(row[1])
+
+
+def _says_unknown(row):
+    return "unknown" in row[2]["effects"]
+
+
+def _wrong(row):
+    return len(row[2]["effects"]) > 0 and not _says_unknown(row)
+
+
+def _exact(row):
+    return metrics.set_f1(row[2], row[1]) == 1.0
+
+
+def _rate(flags):
+    return f"{np.mean(list(flags)):.3f}"
+
+
 def show(judged, misses=False):
     """Print the figures of [(record, decision, settings)]."""
     rows = [(r, r["answer"], prediction_of(found, s), found) for r, found, s in judged]
-    pick = lambda *kinds: [row for row in rows if row[0]["kind"] in kinds and not row[0]["twin"]]  # noqa: E731
-    right = lambda row: metrics.first(row[2], row[1]) == metrics.true_class(row[1])  # noqa: E731
-    says = lambda row: "unknown" in row[2]["effects"]  # noqa: E731
-    wrong = lambda row: len(row[2]["effects"]) > 0 and not says(row)  # noqa: E731
-    exact = lambda row: metrics.set_f1(row[2], row[1]) == 1.0  # noqa: E731
-    rate = lambda flags: f"{np.mean(list(flags)):.3f}"  # noqa: E731
+
+    def pick(*kinds):
+        return [row for row in rows if row[0]["kind"] in kinds and not row[0]["twin"]]
+
     single, none, pair = pick("single"), pick("none"), pick("pair")
     strong = [row for row in single if row[0]["severity"] >= 2.0]
     print(
-        "top1", rate(map(right, single + none)), "top2", rate(metrics.in_first_two(p, a) for _, a, p, _ in single + none),
-        "strong", rate(map(right, strong)), "exact single", rate(map(exact, single)),
-        "| pair f1", rate(metrics.set_f1(p, a) for _, a, p, _ in pair), "exact", rate(map(exact, pair)),
-        "| none alarm", rate(bool(row[2]["effects"]) for row in none), "false unknown", rate(map(says, single)),
-        "| silent", rate(not row[2]["effects"] for row in pick("not_testable")),
+        "top1", _rate(map(_right, single + none)), "top2", _rate(metrics.in_first_two(p, a) for _, a, p, _ in single + none),
+        "strong", _rate(map(_right, strong)), "exact single", _rate(map(_exact, single)),
+        "| pair f1", _rate(metrics.set_f1(p, a) for _, a, p, _ in pair), "exact", _rate(map(_exact, pair)),
+        "| none alarm", _rate(bool(row[2]["effects"]) for row in none), "false unknown", _rate(map(_says_unknown, single)),
+        "| silent", _rate(not row[2]["effects"] for row in pick("not_testable")),
     )  # fmt: skip
     twins = [row for row in rows if row[0]["twin"]]
     for name, group in (
@@ -70,9 +89,9 @@ def show(judged, misses=False):
                 name,
                 len(group),
                 "unknown",
-                rate(map(says, group)),
+                _rate(map(_says_unknown, group)),
                 "wrong name",
-                rate(map(wrong, group)),
+                _rate(map(_wrong, group)),
             )
     everything = [row for row in rows if not row[0]["twin"]]
     error, table = metrics.calibration(metrics.top_pairs([(a, p) for _, a, p, _ in everything]))
@@ -83,11 +102,11 @@ def show(judged, misses=False):
     )
     classes = {}
     for row in single:
-        classes.setdefault(row[0]["truth"][0], []).append(right(row))
+        classes.setdefault(row[0]["truth"][0], []).append(_right(row))
     print("  ", {k: f"{sum(v)}/{len(v)}" for k, v in classes.items()})
     if misses:
         for r, _, p, found in rows:
-            fine = says((r, _, p)) if r["kind"] in ("unknown", "left_out") else exact((r, _, p))
+            fine = _says_unknown((r, _, p)) if r["kind"] in ("unknown", "left_out") else _exact((r, _, p))
             if fine or r["twin"]:
                 continue
             causes = "+".join(f"{c['effect']}/{c['form']}" for c in r["answer"]["causes"])

@@ -137,10 +137,10 @@ class TrainSettings:
         return self.start_groups * self.episodes_per_task * max(1, self.restart_every)
 
     @property
-    def restart_ages(self) -> tuple[int, int, int]:
-        """First, end and step of the ages (in rollouts) at which worlds start anew before their group's episodes end."""
+    def restart_ages(self) -> range:
+        """Ages (in rollouts) at which worlds start anew before their group's episodes end."""
         every = self.restart_steps // self.rollout_length
-        return every, self.start_groups, every
+        return range(every, self.start_groups, every)
 
     @property
     def steps_per_update(self) -> int:

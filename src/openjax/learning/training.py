@@ -175,7 +175,7 @@ def make_training_step(
         worlds = _set_group((observation, state), fresh, group, settings.start_groups)
         if settings.restart_every:
             # and so do the worlds that are started anew within the episodes of other groups
-            ages = np.arange(*settings.restart_ages)  # in rollouts
+            ages = np.array(settings.restart_ages)
             number = num_envs // settings.start_groups // settings.restart_every * len(ages)
             keys = (jax.random.fold_in(task_key, 1), jax.random.fold_in(reset_key, 1))
             fresh = _fresh(settings, environment, archive, *keys, number, axis)

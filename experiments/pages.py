@@ -1,0 +1,36 @@
+"""What the scripts that make a page have in common: measure or read what was stored, write both files and a figure."""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from openjax.runs.settings_files import read_json, write_json
+
+RESULTS = Path(__file__).parent / "results"
+
+
+def page_parser(doc: str, name: str) -> argparse.ArgumentParser:
+    """A parser with `--report` and, by default for the page `name`, `--out`."""
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--report", action="store_true", help="from the stored results")
+    parser.add_argument("--out", type=Path, default=RESULTS / name)
+    return parser
+
+
+def publish(
+    options: argparse.Namespace,
+    study: Callable[[argparse.Namespace], Any],
+    report: Callable[[Any], list[str]],
+    draw: Callable[[Any, Path], None] | None = None,
+) -> None:
+    """Store what `study` finds (unless told to read it), then write and print the page made from what is stored."""
+    data = options.out.with_suffix(".json")
+    if not options.report:
+        write_json(data, study(options))
+    results = read_json(data)
+    lines = report(results)
+    options.out.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    if draw is not None:
+        draw(results, options.out.with_suffix(".png"))
+    print("\n".join(lines))
