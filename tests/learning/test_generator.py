@@ -68,6 +68,17 @@ def test_turned_uniform_tasks_come_from_all_sides():
     assert np.histogram(angle, 4, (-np.pi, np.pi))[0].min() > 150
 
 
+def test_a_share_of_uniform_tasks_has_its_pillars_in_a_row():
+    rows = dataclasses.replace(NOMINAL, row_share=0.25)
+    plain, varied = generated(NOMINAL, empty_archive(GAME, 8)), generated(rows, empty_archive(GAME, 8))
+    np.testing.assert_array_equal(varied.pursuer_position, plain.pursuer_position)
+    changed = np.asarray(varied.pillar_position != plain.pillar_position).any(axis=(1, 2))
+    np.testing.assert_allclose(changed.mean(), 0.25, atol=0.05)
+    shifted = generated(dataclasses.replace(NOMINAL, pillar_shift=0.05), empty_archive(GAME, 8))
+    moved = np.asarray(shifted.pillar_position - plain.pillar_position)
+    assert 0.04 < np.abs(moved).max() <= 0.05 + 1e-6
+
+
 def test_unsolved_tasks_of_whole_episodes_enter():
     success = jnp.array([0.0, 0.25, 0.5, 0.75, 0.9, 1.0, 0.75])
     complete = jnp.array([True] * 6 + [False])

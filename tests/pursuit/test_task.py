@@ -5,7 +5,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from openjax.pursuit import PursuitSettings, Task, expand_task, turn_task, uniform_task
+from openjax.pursuit import (
+    PursuitSettings,
+    Task,
+    expand_task,
+    line_up_pillars,
+    shift_pillars,
+    turn_task,
+    uniform_task,
+)
 from openjax.pursuit.task import start_attitude, starts_clear
 
 SETTINGS = PursuitSettings()
@@ -135,6 +143,38 @@ def test_turning_keeps_all_distances(uniform):
     np.testing.assert_array_equal(turned.pursuer_position[..., 2], uniform.pursuer_position[..., 2])
     angle = np.arctan2(turned.evader_position[:, 1], turned.evader_position[:, 0])
     assert np.histogram(angle, 8, (-np.pi, np.pi))[0].min() > DRAWS / 16  # from all sides
+
+
+def test_shifted_pillars_leave_the_grid_and_keep_clear_of_starts(uniform):
+    shift = jax.jit(jax.vmap(lambda key, task: shift_pillars(SETTINGS, key, task, 0.1)))
+    shifted = shift(keys(31), uniform)
+    assert_clear(shifted)
+    moved = np.asarray(shifted.pillar_position - uniform.pillar_position)[np.asarray(uniform.pillar_active)]
+    assert 0.099 < np.abs(moved).max() <= 0.1 + 1e-6
+    stayed = (moved == 0.0).all(axis=-1)
+    assert 0.0 < stayed.mean() < 0.2  # those that would have come too close
+    np.testing.assert_allclose(moved[~stayed].mean(axis=0), 0.0, atol=0.005)
+    assert np.linalg.norm(shifted.pillar_position, axis=-1).max() < 0.8
+    np.testing.assert_array_equal(shifted.pursuer_position, uniform.pursuer_position)
+
+
+def test_pillars_in_a_row_stand_between_the_sides(uniform):
+    lined = jax.jit(jax.vmap(lambda key, task: line_up_pillars(SETTINGS, key, task)))(keys(32), uniform)
+    assert_clear(lined)
+    active = np.asarray(lined.pillar_active)
+    np.testing.assert_array_equal(active, uniform.pillar_active)
+    whole = (np.asarray(lined.pillar_position != uniform.pillar_position).any(axis=-1) | ~active).all(axis=-1)
+    assert whole.mean() > 0.1  # rows of which no pillar had to stay
+    for pillars, used in zip(
+        np.asarray(lined.pillar_position, np.float64)[whole], active[whole], strict=True
+    ):
+        step = np.diff(pillars[used], axis=0)
+        spacing = np.linalg.norm(step, axis=-1)
+        np.testing.assert_allclose(spacing, spacing[0], atol=1e-5)
+        assert 0.2 - 1e-5 <= spacing[0] <= 0.4 + 1e-5
+        np.testing.assert_allclose(step, np.broadcast_to(step[0], step.shape), atol=1e-5)
+        assert np.abs(step[0, 0]) <= step[0, 1] + 1e-5  # across the line between the sides, within 45 degrees
+        assert np.abs(pillars[used].mean(axis=0)).max() <= 0.2 + 1e-5
 
 
 def test_start_attitudes():

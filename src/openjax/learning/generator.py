@@ -5,7 +5,16 @@ import jax.numpy as jnp
 
 from openjax.learning.archive import TaskArchive, draw, insert
 from openjax.learning.settings import GeneratorSettings
-from openjax.pursuit import EpisodeStatistics, PursuitSettings, Task, expand_task, turn_task, uniform_task
+from openjax.pursuit import (
+    EpisodeStatistics,
+    PursuitSettings,
+    Task,
+    expand_task,
+    line_up_pillars,
+    shift_pillars,
+    turn_task,
+    uniform_task,
+)
 
 
 def generate_task(
@@ -14,6 +23,7 @@ def generate_task(
     """Draw one task: with probability p an archived one, expanded, else a uniform one."""
     uniform_key, turn_key, choice_key, draw_key, expand_key = jax.random.split(key, 5)
     uniform = uniform_task(environment, uniform_key)
+    uniform = _vary_pillars(settings, environment, jax.random.fold_in(uniform_key, 1), uniform)
     if settings.turn:
         uniform = turn_task(turn_key, uniform)
     if not settings.enabled:
@@ -42,3 +52,15 @@ def select(
     """
     unsolved = (success >= settings.success_low) & (success <= settings.success_high)
     return insert(archive, tasks, success, unsolved & complete)
+
+
+def _vary_pillars(settings, environment, key, task):
+    """Other pillars than the paper's uniform tasks have: some of them in a row, all off the grid."""
+    choice_key, row_key, shift_key = jax.random.split(key, 3)
+    if settings.row_share:
+        row = jax.random.uniform(choice_key) < settings.row_share
+        lined_up = line_up_pillars(environment, row_key, task)
+        task = jax.tree.map(lambda a, b: jnp.where(row, a, b), lined_up, task)
+    if settings.pillar_shift:
+        task = shift_pillars(environment, shift_key, task, settings.pillar_shift)
+    return task

@@ -48,6 +48,10 @@ class GeneratorSettings:
     """Tasks in the archive."""
     turn: bool = True
     """Turn uniform tasks about the arena's axis, so that they come from all sides (the paper's come from one)."""
+    pillar_shift: float = 0.0
+    """Pillars of uniform tasks are moved by up to this along x and y (m), off the grid on which the paper's stand."""
+    row_share: float = 0.0
+    """Share of the uniform tasks whose pillars stand in a row between the two sides (none of the paper's)."""
     expansion: float = 0.7
     """Probability p of local expansion of an archived task, else a uniform one."""
     success_low: float = 0.5
@@ -181,9 +185,9 @@ def paper() -> TrainSettings:
         mappo=MappoSettings(
             learning_rate=1e-3, clip=0.2, clip_end=0.05, penalty_start=0.03, penalty_ramp=0.7
         ),
-        generator=GeneratorSettings(wall_distance=0.05),
+        generator=GeneratorSettings(wall_distance=0.05, pillar_shift=0.1, row_share=0.25),
         num_envs=5120,
-        total_steps=270_000_000,
+        total_steps=320_000_000,
         restart_every=4,
         restart_steps=80,
         evaluation_interval=40,

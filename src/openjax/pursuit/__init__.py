@@ -5,7 +5,7 @@ from openjax.pursuit.observation import Observation
 from openjax.pursuit.scenarios import SCENARIOS, Scenario, find_scenario, scenario_settings, scenario_task
 from openjax.pursuit.settings import PursuitSettings, RewardSettings
 from openjax.pursuit.statistics import EpisodeStatistics
-from openjax.pursuit.task import Task, expand_task, turn_task, uniform_task
+from openjax.pursuit.task import Task, expand_task, line_up_pillars, shift_pillars, turn_task, uniform_task
 
 __all__ = [
     "SCENARIOS",
@@ -22,9 +22,11 @@ __all__ = [
     "expand_task",
     "find_scenario",
     "hover_action",
+    "line_up_pillars",
     "make",
     "scenario_settings",
     "scenario_task",
+    "shift_pillars",
     "turn_task",
     "uniform_task",
 ]

@@ -16,6 +16,9 @@ START_Z = 0.1
 PILLAR_GRID = 0.2
 PILLAR_REACH = 0.8
 """Pillars of uniform tasks stand on cells of this grid whose centre is closer to the axis than this (m)."""
+ROW_OFFSET = 0.2
+ROW_SPACING = (0.2, 0.4)
+"""Pillars in a row: its middle's largest offset from the axis along x and y, and the distance of neighbours (m)."""
 EXPANSION = 0.1
 """Local expansion moves each vehicle by up to this along each axis (m): the paper's delta."""
 WALL_DISTANCE = 0.1
@@ -119,6 +122,38 @@ def expand_task(
     clear = jax.vmap(lambda candidate: starts_clear(settings, candidate))(candidates)
     first = jnp.argmax(clear)
     return jax.tree.map(lambda drawn, seed: jnp.where(jnp.any(clear), drawn[first], seed), candidates, task)
+
+
+def shift_pillars(settings: PursuitSettings, key: jax.Array, task: Task, reach: float) -> Task:
+    """Move each pillar by up to `reach` (m) along x and y; those that would come too close to a start stay."""
+    offset = jax.random.uniform(key, task.pillar_position.shape, jnp.float32, -reach, reach)
+    return _move_pillars(settings, task, task.pillar_position + offset)
+
+
+def line_up_pillars(settings: PursuitSettings, key: jax.Array, task: Task) -> Task:
+    """Put the pillars of a uniform task in a row across the arena, between the pursuers' side and the evader's.
+
+    The row's middle lies within 0.2 m of the axis along x and y, it is turned by up to 45 degrees, and its pillars
+    stand 0.2 m (touching) to 0.4 m apart. Those that would come too close to a start or to the wall stay.
+    """
+    middle_key, angle_key, spacing_key = jax.random.split(key, 3)
+    middle = jax.random.uniform(middle_key, (2,), jnp.float32, -ROW_OFFSET, ROW_OFFSET)
+    angle = jax.random.uniform(angle_key, (), jnp.float32, -np.pi / 4, np.pi / 4)
+    spacing = jax.random.uniform(spacing_key, (), jnp.float32, *ROW_SPACING)
+    number = jnp.sum(task.pillar_active)
+    along = (jnp.arange(task.pillar_active.shape[0]) - (number - 1) / 2) * spacing
+    direction = jnp.stack([-jnp.sin(angle), jnp.cos(angle)])
+    return _move_pillars(settings, task, middle + along[:, None] * direction)
+
+
+def _move_pillars(settings, task, moved):
+    """The task with those pillars moved that stay within reach of the axis and clear of all starts."""
+    vehicles = jnp.concatenate([task.pursuer_position, task.evader_position[None]])[:, :2]
+    distance = jnp.linalg.norm(moved[:, None] - vehicles[None], axis=-1)
+    clear = jnp.all(distance >= settings.pillar_radius + settings.pillar_clearance, axis=-1)
+    inside = jnp.linalg.norm(moved, axis=-1) < PILLAR_REACH
+    accepted = (clear & inside & task.pillar_active)[:, None]
+    return task.replace(pillar_position=jnp.where(accepted, moved, task.pillar_position))
 
 
 def turn_task(key: jax.Array, task: Task) -> Task:
