@@ -71,7 +71,9 @@ def make_world(n_pillars: int, n_others: int, dt: float, contacts: bool) -> Worl
 
 def _as_dtype(tree, dtype):
     def convert(leaf):
-        return jnp.asarray(leaf, dtype if np.issubdtype(leaf.dtype, np.floating) else None)
+        kind = dtype if np.issubdtype(leaf.dtype, np.floating) else leaf.dtype
+        # empty arrays are made here: closed over by a shard_map, they crash the compiler of JAX 0.11
+        return jnp.asarray(leaf, kind) if leaf.size else jnp.zeros(leaf.shape, kind)
 
     return jax.tree.map(convert, tree)
 
