@@ -12,8 +12,8 @@ import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as pallas_triton
 
+from openjax.platform import on_platform
 from openjax.policy.activation import activation, activation_slope
-from openjax.policy.platform import on_platform
 
 ROWS = 64
 """Samples that one program of the kernel works on."""

@@ -14,6 +14,7 @@ from openjax.vehicle.mjx_body import make_world, mjx_step
 from openjax.vehicle.parameters import Vehicle
 from openjax.vehicle.rate_controller import rate_controller
 from openjax.vehicle.rigid_body import rigid_step, rotate
+from openjax.vehicle.rigid_kernel import step_many
 from openjax.vehicle.rotors import rotor_reaction, rotor_speed_step, rotor_thrust
 from openjax.vehicle.solids import others, place_solids
 from openjax.vehicle.state import DroneState
@@ -50,6 +51,8 @@ class DronesStep:
         dtype = drones.position.dtype
         vehicle = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), vehicle)
         command = jnp.asarray(command, dtype)
+        if self.physics == "rigid" and not self.effects and dtype == jnp.float32:
+            return step_many(self._free_flight, vehicle, drones, command)
         parameters = composition.complete_parameters(self.effects, effect_parameters, dtype)
         vehicle = composition.change_body(self.effects, parameters, vehicle)
         if self.effects:
@@ -94,6 +97,18 @@ class DronesStep:
             return drones
         parameters = composition.complete_parameters(self.effects, effect_parameters, drones.position.dtype)
         return jax.vmap(lambda drone: composition.seen_state(self.effects, parameters, drone))(drones)
+
+    def _free_flight(self, vehicle, drone, command):
+        """One drone that nothing acts on but its rotors and gravity."""
+        dt = self.dt / self.substeps
+        for _ in range(self.substeps):
+            moved, force, torque = self._motors(vehicle, {}, drone, command, None, dt)
+            body = (drone.position, drone.quaternion, drone.velocity, drone.body_rates, force, torque)
+            position, quaternion, velocity, body_rates = rigid_step(vehicle, *body, dt)
+            drone = moved.replace(
+                position=position, quaternion=quaternion, velocity=velocity, body_rates=body_rates
+            )
+        return drone
 
     def _contexts(self, vehicle, drones, dt) -> Context:
         neighbours = drones.position[others(drones.position.shape[0])]
