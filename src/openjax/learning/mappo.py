@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
+from jax.flatten_util import ravel_pytree
 
 from openjax.learning.advantages import generalised_advantages
 from openjax.learning.devices import joint_moments, mean_over_devices
@@ -174,7 +175,8 @@ def update_policy(
         actor_gradient, critic_gradient, watch = mean_over_devices(
             (actor_gradient, critic_gradient, watch), axis
         )
-        watch |= {"actor_gradient": optax.global_norm(actor_gradient)}
+        # of one vector, like the optimiser's: a norm leaf by leaf is twenty kernels more
+        watch |= {"actor_gradient": jnp.linalg.norm(ravel_pytree(actor_gradient)[0])}
         actor_update, actor_state = optimisers[0].update(actor_gradient, actor_state, actor)
         critic_update, critic_state = optimisers[1].update(critic_gradient, critic_state, critic)
         actor = optax.apply_updates(actor, actor_update)
