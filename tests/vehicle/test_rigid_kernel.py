@@ -62,6 +62,14 @@ def test_mapped_over_worlds_and_over_vehicles():
         )
 
 
+def test_memory_of_effects_that_the_step_does_not_have_is_left_alone():
+    drones, command = drawn(3)
+    memory = {"delay": jnp.arange(30.0).reshape(3, 5, 2), "age": jnp.arange(3)}
+    stepped = fly(VEHICLE, drones.replace(effect_memory=memory), command)
+    jax.tree.map(np.testing.assert_array_equal, stepped.effect_memory, memory)
+    assert_close(stepped.replace(effect_memory=()), fly(VEHICLE, drones, command))
+
+
 def test_worlds_become_more_drones_of_one_call():
     drones, command = drawn(6, 3)
     traced = str(jax.make_jaxpr(jax.vmap(lambda d, c: step_many(ONE, VEHICLE, d, c)))(drones, command))

@@ -52,7 +52,9 @@ class DronesStep:
         vehicle = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), vehicle)
         command = jnp.asarray(command, dtype)
         if self.physics == "rigid" and not self.effects and dtype == jnp.float32:
-            return step_many(self._free_flight, vehicle, drones, command)
+            memory = drones.effect_memory  # of other effects than this step's, if any
+            drones = step_many(self._free_flight, vehicle, drones.replace(effect_memory=()), command)
+            return drones.replace(effect_memory=memory)
         parameters = composition.complete_parameters(self.effects, effect_parameters, dtype)
         vehicle = composition.change_body(self.effects, parameters, vehicle)
         if self.effects:

@@ -30,8 +30,8 @@ OneStep = Callable[[Vehicle, DroneState, jax.Array], DroneState]
 def step_many(one: OneStep, vehicle: Vehicle, drones: DroneState, command) -> DroneState:
     """`one(vehicle, drone, command)` for each of n drones (leading axis) of one vehicle, float32 throughout.
 
-    On NVIDIA GPUs in one kernel, elsewhere mapped. May be mapped further, over drones (still one kernel) and vehicles
-    (not); derivatives are those of `one`.
+    The drones have no effect memory. On NVIDIA GPUs in one kernel, elsewhere mapped. May be mapped further, over drones
+    (still one kernel) and vehicles (not); derivatives are those of `one`.
     """
     return _derived(one)(vehicle, drones, command)
 
@@ -87,7 +87,8 @@ def kernel_call(one: OneStep, vehicle: Vehicle, drones: DroneState, command, int
     constants = jax.tree.leaves(vehicle)
     shapes = [jnp.shape(leaf) for leaf in constants]
     packed = jnp.concatenate([jnp.ravel(leaf) for leaf in constants])
-    packed = jnp.pad(packed, (0, 128 - packed.shape[0]))
+    # a block's size is a power of two
+    packed = jnp.pad(packed, (0, (1 << (packed.shape[0] - 1).bit_length()) - packed.shape[0]))
     traced = jax.make_jaxpr(one)(vehicle, *structure.unflatten([leaf[0] for leaf in leaves]))
     results = len(jax.tree.leaves(drones))
 
