@@ -1,6 +1,6 @@
-"""The headline table from the shipped policies: `python experiments/headline.py [--episodes 100]`.
+"""The headline table from the shipped policies: `python experiments/headline.py [--episodes 100] [--policy NAME ...]`.
 
-Evaluates all shipped seeds of OPEN on all six layouts, with the speed clamp from drawn and from level starts, and without the
+Evaluates all shipped seeds of OPEN (or other policies) on all six layouts, with the speed clamp from drawn and from level starts, and without the
 clamp, and holds them against this project's goals. Writes experiments/results/headline.json and .md; `--report` writes
 the latter again from the former.
 """
@@ -167,14 +167,16 @@ def report(results: dict) -> list[str]:
 
 
 def study(options: argparse.Namespace) -> dict:
-    """Fly the shipped seeds under all conditions."""
+    """Fly the policies under all conditions."""
     started = time.monotonic()
+    names = options.policy or seeds_of_open()
     records = {
-        condition: {name: fly(name, changes, options.episodes) for name in seeds_of_open()}
+        condition: {name: fly(name, changes, options.episodes) for name in names}
         for condition, changes in CONDITIONS.items()
     }
+    chosen = f" --policy {' '.join(options.policy)}" if options.policy else ""
     return {
-        "command": f"python experiments/headline.py --episodes {options.episodes}",
+        "command": f"python experiments/headline.py --episodes {options.episodes}{chosen}",
         "machine": describe_machine(),
         "seconds": time.monotonic() - started,
         "records": records,
@@ -185,6 +187,9 @@ def main(arguments: list[str]) -> int:
     """Evaluate and write both files."""
     parser = page_parser(__doc__, "headline")
     parser.add_argument("--episodes", type=int, default=100)
+    parser.add_argument(
+        "--policy", nargs="+", help="shipped names, runs or policy files; by default OPEN's seeds"
+    )
     publish(parser.parse_args(arguments), study, report)
     return 0
 
