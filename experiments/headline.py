@@ -1,8 +1,8 @@
 """The headline table from the shipped policies: `python experiments/headline.py [--episodes 100] [--policy NAME ...]`.
 
-Evaluates all shipped seeds of OPEN (or other policies) on all six layouts, with the speed clamp from drawn and from level starts, and without the
-clamp, and holds them against this project's goals. Writes experiments/results/headline.json and .md; `--report` writes
-the latter again from the former.
+Evaluates all shipped seeds of OPEN (or other policies) on all six layouts, with the speed clamp from drawn and from level
+starts, and without the clamp, and holds them against this project's goals. Writes experiments/results/headline.json and
+.md (`--out`: others); `--report` writes the latter again from the former.
 """
 
 import argparse
@@ -125,7 +125,7 @@ def report(results: dict) -> list[str]:
         f"`{results['command']}` on {machine['device']}, JAX {machine['versions']['jax']}, commit {machine['commit']}. "
         f"{len(names)} training seeds ({', '.join(names)}), {episodes} episodes each per layout; mean (standard deviation "
         "over seeds). The layouts were never trained on nor used to choose checkpoints. How the policies were trained: "
-        "h200_runs.md.",
+        "h200_runs.md, ablations.md.",
         "",
         "## Goals (clamp, drawn starts)",
         "",
