@@ -11,7 +11,7 @@ from openjax.vehicle.rigid_kernel import DRONES, kernel_call, step_many
 
 VEHICLE = load_vehicle()
 STEP = make_drones_step(physics="rigid", dt=0.01, substeps=2)
-ONE = STEP._free_flight
+ONE = STEP.free_flight
 
 
 def drawn(*lead):

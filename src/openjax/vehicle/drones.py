@@ -53,7 +53,7 @@ class DronesStep:
         command = jnp.asarray(command, dtype)
         if self.physics == "rigid" and not self.effects and dtype == jnp.float32:
             memory = drones.effect_memory  # of other effects than this step's, if any
-            drones = step_many(self._free_flight, vehicle, drones.replace(effect_memory=()), command)
+            drones = step_many(self.free_flight, vehicle, drones.replace(effect_memory=()), command)
             return drones.replace(effect_memory=memory)
         parameters = composition.complete_parameters(self.effects, effect_parameters, dtype)
         vehicle = composition.change_body(self.effects, parameters, vehicle)
@@ -78,6 +78,18 @@ class DronesStep:
             drones = drones.replace(effect_memory=memory)
         return drones
 
+    def free_flight(self, vehicle, drone, command):
+        """One drone (no leading axis) after one step of `dt` seconds, on which nothing acts but its rotors and gravity."""
+        dt = self.dt / self.substeps
+        for _ in range(self.substeps):
+            moved, force, torque = self._motors(vehicle, {}, drone, command, None, dt)
+            body = (drone.position, drone.quaternion, drone.velocity, drone.body_rates, force, torque)
+            position, quaternion, velocity, body_rates = rigid_step(vehicle, *body, dt)
+            drone = moved.replace(
+                position=position, quaternion=quaternion, velocity=velocity, body_rates=body_rates
+            )
+        return drone
+
     def reset(self, vehicle: Vehicle, drones: DroneState, key=None) -> DroneState:
         """`drones` (leading axis N) with the effects' memory as at the start of an episode.
 
@@ -99,18 +111,6 @@ class DronesStep:
             return drones
         parameters = composition.complete_parameters(self.effects, effect_parameters, drones.position.dtype)
         return jax.vmap(lambda drone: composition.seen_state(self.effects, parameters, drone))(drones)
-
-    def _free_flight(self, vehicle, drone, command):
-        """One drone that nothing acts on but its rotors and gravity."""
-        dt = self.dt / self.substeps
-        for _ in range(self.substeps):
-            moved, force, torque = self._motors(vehicle, {}, drone, command, None, dt)
-            body = (drone.position, drone.quaternion, drone.velocity, drone.body_rates, force, torque)
-            position, quaternion, velocity, body_rates = rigid_step(vehicle, *body, dt)
-            drone = moved.replace(
-                position=position, quaternion=quaternion, velocity=velocity, body_rates=body_rates
-            )
-        return drone
 
     def _contexts(self, vehicle, drones, dt) -> Context:
         neighbours = drones.position[others(drones.position.shape[0])]
