@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as pallas_triton
 
-from openjax.platform import on_platform
+from openjax.platform import on_platform, whole_blocks
 from openjax.policy.activation import activation, activation_slope
 
 ROWS = 8
@@ -195,15 +195,6 @@ def _backward_kernel(layout, q_ref, own_ref, x_ref, w_ref, g_ref, dq_ref, down_r
         dq_ref[:, h * f : (h + 1) * f] = (dquery[h] * layout.scale).astype(dq_ref.dtype)
 
 
-def _padded(query, own, inputs, *more):
-    """Samples padded to whole blocks."""
-    extra = -own.shape[0] % ROWS
-    if not extra:
-        return query, own, inputs, *more
-    rows = [jnp.pad(a, ((0, extra), (0, 0))) for a in (query, own, *more)]
-    return rows[0], rows[1], jnp.pad(inputs, ((0, 0), (0, extra))), *rows[2:]
-
-
 def _block_specs(layout, inputs, weights):
     wide = pl.BlockSpec((ROWS, layout.heads * layout.features), lambda i: (i, 0))
     narrow = pl.BlockSpec((ROWS, layout.features), lambda i: (i, 0))
@@ -214,7 +205,8 @@ def _block_specs(layout, inputs, weights):
 
 def _forward_kernel_call(layout, query, own, inputs, weights, interpret=False):
     batch = own.shape[0]
-    query, own, inputs = _padded(query, own, inputs)
+    query, own = whole_blocks(query, ROWS), whole_blocks(own, ROWS)
+    inputs = whole_blocks(inputs, ROWS, axis=1)
     wide, narrow, numbers, whole = _block_specs(layout, inputs, weights)
     mean = pl.pallas_call(
         functools.partial(_forward_kernel, layout),
@@ -231,7 +223,8 @@ def _forward_kernel_call(layout, query, own, inputs, weights, interpret=False):
 
 def _backward_kernel_call(layout, query, own, inputs, weights, gradient, interpret=False):
     batch = own.shape[0]
-    query, own, inputs, gradient = _padded(query, own, inputs, gradient)
+    query, own, gradient = (whole_blocks(samples, ROWS) for samples in (query, own, gradient))
+    inputs = whole_blocks(inputs, ROWS, axis=1)
     wide, narrow, numbers, whole = _block_specs(layout, inputs, weights)
     number = len(layout.entities)
     dquery, down, dlinear = pl.pallas_call(

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as pallas_triton
 
-from openjax.platform import on_platform
+from openjax.platform import on_platform, whole_blocks
 from openjax.policy.activation import activation, activation_slope
 
 ROWS = 64
@@ -98,13 +98,8 @@ def _backward_kernel(activate, x_ref, affine_ref, g_ref, dx_ref, daffine_ref):
     daffine_ref[0, 2, :] = jnp.sum(dout, axis=0)
 
 
-def _padded(*arrays):
-    extra = -arrays[0].shape[0] % ROWS
-    return [jnp.pad(a, ((0, extra), (0, 0))) for a in arrays] if extra else list(arrays)
-
-
 def _forward_kernel_call(activate, x, affine, interpret=False):
-    (padded,) = _padded(x)
+    padded = whole_blocks(x, ROWS)
     block = pl.BlockSpec((ROWS, x.shape[1]), lambda i: (i, 0))
     out = pl.pallas_call(
         functools.partial(_forward_kernel, activate),
@@ -121,7 +116,7 @@ def _forward_kernel_call(activate, x, affine, interpret=False):
 
 def _backward_kernel_call(activate, x, affine, gradient, interpret=False):
     # samples that only fill the last block have no gradient, so they add nothing to the sums
-    padded, padded_gradient = _padded(x, gradient)
+    padded, padded_gradient = whole_blocks(x, ROWS), whole_blocks(gradient, ROWS)
     programs, features = padded.shape[0] // ROWS, x.shape[1]
     block = pl.BlockSpec((ROWS, features), lambda i: (i, 0))
     dx, parts = pl.pallas_call(

@@ -40,11 +40,8 @@ class Task:
 def starts_clear(settings: PursuitSettings, task: Task) -> jax.Array:
     """Whether no pursuer starts in a breach and the evader starts outside all pillars. () bool."""
     breach = breaches(settings, task.pursuer_position, task.pillar_position, task.pillar_active)
-    distance = jnp.linalg.norm(task.evader_position[:2] - task.pillar_position, axis=-1)
-    evader_blocked = jnp.any(
-        task.pillar_active & (distance < settings.pillar_radius + settings.pillar_clearance)
-    )
-    return ~(jnp.any(breach.total > 0) | evader_blocked)
+    clear_of_evader = _clear_of(settings, task.pillar_position, task.evader_position[None, :2])
+    return ~(jnp.any(breach.total > 0) | jnp.any(task.pillar_active & ~clear_of_evader))
 
 
 def pillar_cells() -> np.ndarray:
@@ -76,10 +73,8 @@ def uniform_task(settings: PursuitSettings, key: jax.Array) -> Task:
 
     cells = jnp.asarray(pillar_cells(), jnp.float32)
     vehicles = jnp.concatenate([pursuers, evader[None]])[:, :2]
-    distance = jnp.linalg.norm(cells[:, None] - vehicles[None], axis=-1)
     own_cell = jnp.all(jnp.abs(cells[:, None] - vehicles[None]) <= PILLAR_GRID / 2, axis=-1)
-    clear = settings.pillar_radius + settings.pillar_clearance
-    free = ~jnp.any(own_cell | (distance < clear), axis=-1)
+    free = _clear_of(settings, cells, vehicles) & ~jnp.any(own_cell, axis=-1)
     rank = jnp.where(free, jax.random.uniform(cell_key, (cells.shape[0],)), -1.0)
     chosen = jax.lax.top_k(rank, settings.max_pillars)[1]
     number = jax.random.randint(number_key, (), settings.min_pillars, settings.max_pillars + 1)
@@ -149,11 +144,15 @@ def line_up_pillars(settings: PursuitSettings, key: jax.Array, task: Task) -> Ta
 def _move_pillars(settings, task, moved):
     """The task with those pillars moved that stay within reach of the axis and clear of all starts."""
     vehicles = jnp.concatenate([task.pursuer_position, task.evader_position[None]])[:, :2]
-    distance = jnp.linalg.norm(moved[:, None] - vehicles[None], axis=-1)
-    clear = jnp.all(distance >= settings.pillar_radius + settings.pillar_clearance, axis=-1)
     inside = jnp.linalg.norm(moved, axis=-1) < PILLAR_REACH
-    accepted = (clear & inside & task.pillar_active)[:, None]
+    accepted = (_clear_of(settings, moved, vehicles) & inside & task.pillar_active)[:, None]
     return task.replace(pillar_position=jnp.where(accepted, moved, task.pillar_position))
+
+
+def _clear_of(settings, pillars, vehicles):
+    """(P,) whether pillars at (P, 2) keep their distance from all vehicles at (K, 2)."""
+    distance = jnp.linalg.norm(pillars[:, None] - vehicles[None], axis=-1)
+    return jnp.all(distance >= settings.pillar_radius + settings.pillar_clearance, axis=-1)
 
 
 def turn_task(key: jax.Array, task: Task) -> Task:

@@ -80,14 +80,8 @@ class DronesStep:
 
     def free_flight(self, vehicle, drone, command):
         """One drone (no leading axis) after one step of `dt` seconds, on which nothing acts but its rotors and gravity."""
-        dt = self.dt / self.substeps
         for _ in range(self.substeps):
-            moved, force, torque = self._motors(vehicle, {}, drone, command, None, dt)
-            body = (drone.position, drone.quaternion, drone.velocity, drone.body_rates, force, torque)
-            position, quaternion, velocity, body_rates = rigid_step(vehicle, *body, dt)
-            drone = moved.replace(
-                position=position, quaternion=quaternion, velocity=velocity, body_rates=body_rates
-            )
+            drone = self._rigid_substep(vehicle, {}, drone, command, None)
         return drone
 
     def reset(self, vehicle: Vehicle, drones: DroneState, key=None) -> DroneState:
@@ -131,22 +125,27 @@ class DronesStep:
     def _substep(self, vehicle, parameters, drones, command, pillar_position, pillar_active):
         dt = self.dt / self.substeps
         contexts = self._contexts(vehicle, drones, dt) if self.effects else None
+        if self.physics == "rigid":
+            free = lambda *drone: self._rigid_substep(vehicle, parameters, *drone)  # noqa: E731
+            return jax.vmap(free)(drones, command, contexts)
         motors = lambda *drone: self._motors(vehicle, parameters, *drone, dt)  # noqa: E731
         moved, force, torque = jax.vmap(motors)(drones, command, contexts)
         body = (drones.position, drones.quaternion, drones.velocity, drones.body_rates, force, torque)
-        if self.physics == "rigid":
-            body = jax.vmap(lambda *parts: rigid_step(vehicle, *parts, dt))(*body)
-        elif self.contacts:
+        if self.contacts:
             world = make_world(pillar_position.shape[0], drones.position.shape[0] - 1, dt, True)
             shapes = place_solids(drones.position, drones.velocity, pillar_position, pillar_active, dt)
             body = jax.vmap(lambda *parts: mjx_step(world, vehicle, *parts, dt))(shapes, *body)
         else:
             world = make_world(0, 0, dt, False)
             body = jax.vmap(lambda *parts: mjx_step(world, vehicle, None, *parts, dt))(*body)
-        position, quaternion, velocity, body_rates = body
-        return moved.replace(
-            position=position, quaternion=quaternion, velocity=velocity, body_rates=body_rates
-        )
+        return _with_body(moved, body)
+
+    def _rigid_substep(self, vehicle, parameters, drone, command, context):
+        """One drone after a substep of `rigid`."""
+        dt = self.dt / self.substeps
+        moved, force, torque = self._motors(vehicle, parameters, drone, command, context, dt)
+        body = (drone.position, drone.quaternion, drone.velocity, drone.body_rates, force, torque)
+        return _with_body(moved, rigid_step(vehicle, *body, dt))
 
     def _motors(self, vehicle, parameters, drone, command, context, dt):
         """One drone up to the wrench on its body: its new controller and rotors, force world, torque body."""
@@ -165,6 +164,12 @@ class DronesStep:
             force, torque = force + more_force, torque + more_torque
         drone = drone.replace(rotor_speed=speed, rate_integral=integral, previous_body_rates=drone.body_rates)
         return drone, rotate(drone.quaternion, force), torque
+
+
+def _with_body(drone, body):
+    """`drone` with the position, quaternion, velocity and body rates of `body`."""
+    position, quaternion, velocity, body_rates = body
+    return drone.replace(position=position, quaternion=quaternion, velocity=velocity, body_rates=body_rates)
 
 
 def make_drones_step(

@@ -15,7 +15,7 @@ import numpy as np
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as pallas_triton
 
-from openjax.platform import on_platform
+from openjax.platform import on_platform, whole_blocks
 from openjax.vehicle.componentwise import evaluate, split
 from openjax.vehicle.parameters import Vehicle
 from openjax.vehicle.state import DroneState
@@ -33,26 +33,12 @@ def step_many(one: OneStep, vehicle: Vehicle, drones: DroneState, command) -> Dr
     The drones have no effect memory. On NVIDIA GPUs in one kernel, elsewhere mapped. May be mapped further, over drones
     (still one kernel) and vehicles (not); derivatives are those of `one`.
     """
-    return _derived(one)(vehicle, drones, command)
+    return _mapped_step(one)(vehicle, drones, command)
 
 
 @functools.lru_cache(maxsize=64)
-def _derived(one):
-    mapped = jax.vmap(one, (None, 0, 0))
-
-    @jax.custom_jvp
-    def step(vehicle, drones, command):
-        return _flattening(one)(vehicle, drones, command)
-
-    @step.defjvp
-    def _(primals, tangents):
-        return jax.jvp(mapped, primals, tangents)
-
-    return step
-
-
-def _flattening(one):
-    """The step of n drones, which takes a further mapped axis as more drones."""
+def _mapped_step(one):
+    """`step_many` of one function. A further mapped axis becomes more drones."""
     mapped = jax.vmap(one, (None, 0, 0))
 
     @jax.custom_batching.custom_vmap
@@ -74,16 +60,16 @@ def _flattening(one):
             stepped = jax.tree.map(lambda leaf: leaf.reshape(axis_size, -1, *leaf.shape[1:]), stepped)
         return stepped, jax.tree.map(lambda _: True, stepped)
 
-    return step
+    derived = jax.custom_jvp(step)
+    derived.defjvp(lambda primals, tangents: jax.jvp(mapped, primals, tangents))
+    return derived
 
 
 def kernel_call(one: OneStep, vehicle: Vehicle, drones: DroneState, command, interpret=False) -> DroneState:
     """`step_many` by the kernel; `interpret` runs it anywhere, slowly."""
     number = command.shape[0]
     leaves, structure = jax.tree.flatten((drones, command))
-    extra = -number % DRONES
-    if extra:
-        leaves = [jnp.pad(leaf, ((0, extra), (0, 0)), mode="edge") for leaf in leaves]
+    leaves = [whole_blocks(leaf, DRONES, mode="edge") for leaf in leaves]
     constants = jax.tree.leaves(vehicle)
     shapes = [jnp.shape(leaf) for leaf in constants]
     packed = jnp.concatenate([jnp.ravel(leaf) for leaf in constants])
@@ -109,7 +95,7 @@ def kernel_call(one: OneStep, vehicle: Vehicle, drones: DroneState, command, int
     stepped = pl.pallas_call(
         kernel,
         out_shape=[jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves[:results]],
-        grid=((number + extra) // DRONES,),
+        grid=(leaves[0].shape[0] // DRONES,),
         in_specs=[pl.BlockSpec(packed.shape, lambda i: (0,)), *blocks],
         out_specs=blocks[:results],
         input_output_aliases={i + 1: i for i in range(results)},
