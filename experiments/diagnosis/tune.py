@@ -79,7 +79,7 @@ def load(files):
             # As the decision reads them now.
             if record["rate_loop"] is not None:
                 score = linear_score(np.array(record["rate_loop"]).sum(0), np.array([0.4, 0.4, 0.4]))
-                paths |= {"rate": decision.rate_score(score), "rate_lost": decision.lost_score(score)}
+                paths["rate"] = decision.rate_score(score)
             curve = next((f for f in record["fits"] if f["effects"] == ("thrust_curve",)), None)
             paths["flat"] = curve is not None and decision.flat(*curve["theta"][:3])
             records.append(

@@ -122,7 +122,6 @@ def path_scores(evidence: Evidence) -> dict:
         "sets": {k: score_of(v) - evidence.nothing.score for k, v in evidence.sets.items()},
         "radio": None if evidence.radio is None else (dict(evidence.radio.gain), evidence.radio.loss),
         "rate": None if evidence.rate_loop is None else rate_score(evidence.rate_loop.score()),
-        "rate_lost": None if evidence.rate_loop is None else lost_score(evidence.rate_loop.score()),
         "pose": None if evidence.pose is None else evidence.pose.score()[0],
         "exposure": dict(evidence.exposure),
         "flat": flat_curve(evidence.sets.get(("thrust_curve",))),
@@ -156,11 +155,6 @@ def rate_score(score) -> float:
     saw other rates than the log, that isn't a change of gains (`firmware.lost_share`)."""
     value, theta, _ = score
     return float(value * (1.0 - firmware.lost_share(theta)))
-
-
-def lost_score(score) -> float:
-    """Nats for a rate loop that saw other rates than the log."""
-    return float(score[0]) - rate_score(score)
 
 
 def combine(paths: dict, effects: set[str], s: Settings) -> dict[tuple[str, ...], float]:

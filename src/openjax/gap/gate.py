@@ -66,16 +66,15 @@ def features(left: Left, nothing: Left, paths: dict, effects, chosen, null: Null
     """The signs, by name: what the chosen set leaves, beside what no effect leaves. paths as `decision.path_scores`,
     effects of the library."""
     bands, before, out = _bands(left, null), _bands(nothing, null), {}
-    motion, accelerometer = np.sort(bands[:12]), np.sort(bands[12:])
+    motion = bands[:12].max()
     rest = np.asarray(left.rest, float)
     z = (rest - np.asarray(null.rest)) / np.asarray(null.rest_scale)
-    out |= {"motion": motion[-1], "motion wide": motion[-3], "accelerometer": accelerometer[-1]}
-    out |= {"motion kept": motion[-1] / (before[:12].max() + 0.5), "fast torque": bands[[2, 5]].max()}
     out |= {
-        "predicted": rest[18:22].max(),
-        "uneven": np.log1p(max(z[24:28].max(), 0.0)),
-        "incoherent": rest[30],
+        "motion": motion,
+        "motion kept": motion / (before[:12].max() + 0.5),
+        "accelerometer": bands[12:].max(),
     }
+    out |= {"predicted": rest[18:22].max(), "uneven": np.log1p(max(z[24:28].max(), 0.0))}
     room = left.room
     gains = column_gains(np.asarray(room["push"]), np.asarray(room["weight"]), np.asarray(room["group"]))
     usual = np.array([null.columns.get(n, (20.0, 20.0)) for n in room["names"]]).T
@@ -122,10 +121,8 @@ def _in_vain(paths: dict, effects) -> dict[str, float]:
         gain, _ = paths["radio"]
         radio = max(gain.values()) - max(v for k, v in gain.items() if set(k) <= set(effects))
     pose, rate = max(paths["pose"] or 0.0, 0.0), max(paths["rate"] or 0.0, 0.0)
-    lost = max(paths.get("rate_lost") or 0.0, 0.0)
     return {
         "radio in vain": float(np.log1p(radio)),
         "pose in vain": 0.0 if "state_latency" in effects else float(np.log1p(pose)),
         "rate in vain": 0.0 if "rate_gains" in effects else float(np.log1p(rate)),
-        "rate lost": float(np.log1p(lost)),
     }

@@ -15,7 +15,7 @@ import numpy as np
 
 from openjax.gap.hypotheses import SetFit, noise_of, without_nuisances
 from openjax.gap.library import prior
-from openjax.gap.replay import FORCE, RATES, SKIP, VELOCITY, Replay
+from openjax.gap.replay import FORCE, SKIP, VELOCITY, Replay, torque_channels
 from openjax.gap.replay import GROUPS as NOISE_GROUPS
 from openjax.gap.track import Track, rotation, smooth
 from openjax.vehicle.effects.effect import ARENA_CEILING
@@ -123,10 +123,9 @@ def _without_own(grams: np.ndarray, fit: SetFit) -> np.ndarray:
 
 def channels(track: Track, group: str, values: np.ndarray) -> np.ndarray:
     """Channels (T, 9) of an acceleration (T, 3) of the body frame: linear (m/s^2) or angular (rad/s^2)."""
-    out = np.zeros((len(track), 9))
     if group.startswith("torque"):
-        out[1:, RATES] = np.cumsum(values[:-1], 0) * track.dt
-        return out
+        return torque_channels(values, track.dt)
+    out = np.zeros((len(track), 9))
     turn = rotation(track.quaternion) if track.quaternion is not None else np.eye(3)[None]
     out[1:, VELOCITY] = (
         np.cumsum(np.einsum("tij,tj->ti", turn, values) if len(turn) > 1 else values, 0)[:-1] * track.dt

@@ -208,10 +208,7 @@ def weigh_sets(replay: Replay, library: Library, exposure=None) -> dict[tuple[st
     sums = LinearSums(replay, [found[e,] for e in effects], found[()])
     pairs = {pair: sums.score(pair) for pair in itertools.combinations(effects, 2)}
     first = max((k for k in found if k), key=lambda k: found[k].score)
-    beside = {
-        tuple(sorted((*first, e), key=effects.index)): score
-        for e, score in _beside(replay, found, first, effects).items()
-    }
+    beside = _beside(replay, found, first, effects)
     _refit(replay, found, pairs | beside, BESIDE, among=beside)
     _refit(replay, found, pairs | beside, REFITTED)
     best = max(
@@ -220,9 +217,7 @@ def weigh_sets(replay: Replay, library: Library, exposure=None) -> dict[tuple[st
     alone = max(score_of(found[k]) for k in found if len(k) == 1)
     if score_of(found[best]) < alone + WORTH_A_THIRD:
         return found
-    third = _beside(replay, found, best, effects)
-    triples = {tuple(sorted((*best, e), key=effects.index)): score for e, score in third.items()}
-    _refit(replay, found, triples, TRIPLES)
+    _refit(replay, found, _beside(replay, found, best, effects), TRIPLES)
     return found
 
 
@@ -235,8 +230,8 @@ def weigh_singles(replay: Replay, library: Library, exposure=None) -> dict[tuple
     return found
 
 
-def _beside(replay: Replay, found, key, effects) -> dict[str, float]:
-    """Linearised score of each further effect beside a fitted set: its derivatives there, and its step to where it
+def _beside(replay: Replay, found, key, effects) -> dict[tuple[str, ...], float]:
+    """Linearised score of a fitted set with each further effect: its derivatives there, and its step to where it
     was fitted alone (some effects have no derivative where they are absent)."""
     base = found[key]
     others = [e for e in effects if e not in key]
@@ -269,7 +264,7 @@ def _beside(replay: Replay, found, key, effects) -> dict[str, float]:
         hessian = own_gram[1:, 1:] + prior_part
         push = own_gram[1:, 0] - prior_part @ off
         volume = np.linalg.slogdet(hessian)[1] - np.linalg.slogdet(prior_part)[1]
-        out[effect] = float(
+        out[tuple(sorted((*key, effect), key=effects.index))] = float(
             -0.5 * own_gram[0, 0]
             - 0.5 * off @ prior_part @ off
             + 0.5 * push @ np.linalg.solve(hessian, push)
@@ -325,7 +320,7 @@ def _best_start(replay: Replay, effect: str) -> np.ndarray:
 
 def _refit(replay, found, scores, count, among=None) -> None:
     """Fit the `count` best sets in full, of those in `among`; the others keep their linearised scores."""
-    ranked = sorted((k for k in (scores if among is None else among)), key=lambda k: -scores[k])[:count]
+    ranked = sorted(scores if among is None else among, key=lambda k: -scores[k])[:count]
     for chosen in ranked:
         if not isinstance(found.get(chosen), SetFit):
             found[chosen] = fit_set(replay, chosen, joint_start(replay, found, chosen), 4)

@@ -319,10 +319,10 @@ def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> list[np.
         column = -moved(np.cross(np.asarray(path.body_rates, float)[:rows], body))
         column[:, VELOCITY] += smooth(np.gradient(track.velocity, track.dt, axis=0), 0.05, track.dt)
         columns.append(column * POSE_SHIFT)
-    return columns + [_torque_column(t, track.dt) * WAKE_TORQUE for t in _wake_torques(track, turn)]
+    return columns + [torque_channels(t, track.dt) * WAKE_TORQUE for t in _wake_torques(track, turn)]
 
 
-def _torque_column(acceleration: np.ndarray, dt: float) -> np.ndarray:
+def torque_channels(acceleration: np.ndarray, dt: float) -> np.ndarray:
     """Channels (T, 9) of an angular acceleration (T, 3)."""
     column = np.zeros((len(acceleration), 9))
     column[1:, RATES] = np.cumsum(acceleration[:-1], 0) * dt

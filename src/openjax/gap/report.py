@@ -167,12 +167,15 @@ def to_fly(report: Report) -> tuple[dict, dict]:
     # What wasn't fitted keeps the value at which it does nothing.
     values = {e: EFFECTS[e].none() | found for e, found in values.items()}
     evidence = report.plots.get("evidence")
-    voltage = [t.voltage for t in evidence.tracks if t.voltage is not None] if evidence is not None else []
-    if voltage and "battery_sag" in values:
-        values["battery_sag"] |= {"full": float(np.median(np.concatenate(voltage))), "discharge": 0.0}
-    if voltage and "thrust_saturation" in values:
+    logged = [t.voltage for t in evidence.tracks if t.voltage is not None] if evidence is not None else []
+    if not logged:
+        return values, intervals
+    voltage = float(np.median(np.concatenate(logged)))
+    if "battery_sag" in values:
+        values["battery_sag"] |= {"full": voltage, "discharge": 0.0}
+    if "thrust_saturation" in values:
         own, reach = values["thrust_saturation"], intervals["thrust_saturation"]
-        factor = 1.0 + own["voltage_slope"] * (float(np.median(np.concatenate(voltage))) - REFERENCE_VOLTAGE)
+        factor = 1.0 + own["voltage_slope"] * (voltage - REFERENCE_VOLTAGE)
         own |= {"limit": own["limit"] * factor, "voltage_slope": 0.0}
         reach["limit"] = tuple(factor * v for v in reach["limit"])
         reach.pop("voltage_slope", None)
