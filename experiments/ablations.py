@@ -15,13 +15,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from pages import RESULTS, table
 from run_comparison import VARIANTS, band, by_variant, main_effects, read_run, savings, steps_to
 
 from openjax.pursuit import SCENARIOS
 from openjax.runs.command_line import run_command
 from openjax.runs.settings_files import read_json, write_json
 
-RESULTS = Path(__file__).parent / "results"
 REACH = 0.95
 METRICS = (
     ("capture_rate", "capture rate", 3),
@@ -84,12 +84,6 @@ def spread(values: list, digits: int) -> str:
         return "–"
     deviation = f" ({np.std(values, ddof=1):.{digits}f})" if len(values) > 1 else ""
     return f"{np.mean(values):.{digits}f}{deviation}"
-
-
-def table(heads: list[str], rows: list[list[str]]) -> list[str]:
-    """A Markdown table."""
-    lines = [heads, ["---"] * len(heads), *rows]
-    return ["| " + " | ".join(line) + " |" for line in lines]
 
 
 def layout_lines(runs: dict[str, list[dict]]) -> list[str]:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import topologies
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from pages import page_parser, publish
+from pages import page_parser, publish, table
 
 from openjax.errors import UserError
 from openjax.learning import abstract_carry, make_training_step, preset
@@ -133,14 +133,13 @@ def report(results: dict) -> list[str]:
         "Not tuned by measuring, as on a real GPU it would be. A turn of the training step's loops is a step of the rollout, "
         "a step of the predictor's update and a gradient step of the policy's update; the loop of two fusions sums advantages.",
         "",
-        f"| program | turns | {' | '.join(STARTED)} | together |",
-        "|---" * (len(STARTED) + 3) + "|",
     ]
+    rows = []
     for name, found in results["programs"].items():
         for loop in found:
             counts = [loop.get(kind, 0) for kind in STARTED]
-            lines.append(f"| {name} | {loop['turns']} | {' | '.join(map(str, counts))} | {sum(counts)} |")
-    return lines
+            rows.append([name, *map(str, (loop["turns"], *counts, sum(counts)))])
+    return lines + table(["program", "turns", *STARTED, "together"], rows)
 
 
 def main(arguments: list[str]) -> int:

@@ -14,9 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from ablations import table
 from headline import GOAL_COLLISION
-from pages import page_parser, publish
+from pages import page_parser, publish, table
 from prediction_flights import layout_tasks
 
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, Task, action_to_command

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from pages import page_parser, publish
+from pages import page_parser, publish, table
 
 from openjax.policy import Policy
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings
@@ -129,41 +129,34 @@ def report(results: dict) -> list[str]:
         "",
         "## Goals (clamp, drawn starts)",
         "",
-        "| figure | goal | value | reached |",
-        "|---|---|---|---|",
     ]
-    lines += [
-        f"| {figure} | {goal} | {value} | {'yes' if reached else 'no'} |"
-        for figure, goal, value, reached in goals(first)
-    ]
+    lines += table(
+        ["figure", "goal", "value", "reached"],
+        [[*entries, "yes" if reached else "no"] for *entries, reached in goals(first)],
+    )
     for condition, layouts in by_layout.items():
-        lines += [
-            "",
-            f"## {condition}",
-            "",
-            f"| layout | capture rate, lowest seed | {' | '.join(COLUMNS.values())} | paper: rate, step, collisions |",
-            "|---" * (len(COLUMNS) + 3) + "|",
-        ]
-        for layout, rows in layouts.items():
-            paper = "{:.3f}, {}, {:.3f}".format(*PAPER[layout]) if layout in PAPER else "–"
-            lines.append(
-                f"| {layout} | {min(row['capture_rate'] for row in rows):.2f} | "
-                + " | ".join(across_seeds(rows, field) for field in COLUMNS)
-                + f" | {paper} |"
-            )
-    lines += [
-        "",
-        "## Prediction of the next position (m), clamp, drawn starts",
-        "",
-        "| layout | predictor | keeping the last seen position | paper |",
-        "|---|---|---|---|",
-    ]
-    lines += [
-        f"| {layout} | {across_seeds(rows, 'prediction_error')} | {across_seeds(rows, 'last_seen_error')} | "
-        f"{PAPER_PREDICTION.get(layout, '–')} |"
-        for layout, rows in first.items()
-    ]
-    return lines
+        lines += ["", f"## {condition}", ""]
+        lines += table(
+            ["layout", "capture rate, lowest seed", *COLUMNS.values(), "paper: rate, step, collisions"],
+            [
+                [
+                    layout,
+                    f"{min(row['capture_rate'] for row in rows):.2f}",
+                    *(across_seeds(rows, field) for field in COLUMNS),
+                    "{:.3f}, {}, {:.3f}".format(*PAPER[layout]) if layout in PAPER else "–",
+                ]
+                for layout, rows in layouts.items()
+            ],
+        )
+    lines += ["", "## Prediction of the next position (m), clamp, drawn starts", ""]
+    errors = ("prediction_error", "last_seen_error")
+    return lines + table(
+        ["layout", "predictor", "keeping the last seen position", "paper"],
+        [
+            [layout, *(across_seeds(rows, field) for field in errors), str(PAPER_PREDICTION.get(layout, "–"))]
+            for layout, rows in first.items()
+        ],
+    )
 
 
 def study(options: argparse.Namespace) -> dict:

@@ -34,3 +34,9 @@ def publish(
     if draw is not None:
         draw(results, options.out.with_suffix(".png"))
     print("\n".join(lines))
+
+
+def table(heads: list[str], rows: list[list[str]]) -> list[str]:
+    """A Markdown table."""
+    lines = [heads, ["---"] * len(heads), *rows]
+    return ["| " + " | ".join(line) + " |" for line in lines]

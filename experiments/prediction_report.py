@@ -3,7 +3,8 @@
 from pathlib import Path
 
 import numpy as np
-from ablations import PAPER_PREDICTION, table
+from ablations import PAPER_PREDICTION
+from pages import table
 
 SEEN, LOST, NOT_YET, ALL = 0, 1, 2, 3
 PAPER = "paper: 1–5 ahead, absolute, step size 1e-4"

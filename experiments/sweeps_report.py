@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from ablations import table
+from pages import table
 from run_comparison import VARIANTS, variant_of
 
 FOUR = ("wall", "narrow_gap", "random", "passage")

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.withheld.diagnose_all import SINGLE_THREAD
+from experiments.withheld.diagnose_all import SINGLE_THREAD, results_in_time, shuffled
 
 LEAST_LEFT_OUT = 1.8  # severity from which a single cause is read again with the effect left out
 
@@ -160,8 +160,7 @@ def jobs_of(pairs, twins=True):
             if answer["kind"] == "single" and answer["severity_ratio"] >= LEAST_LEFT_OUT and twins:
                 twin = answer | {"kind": "left_out", "effects": ["unknown"], "twin": True}
                 second.append((key + "/left_out", logs / name, tuple(LEFT_OUT[answer["effects"][0]]), twin))
-    order = np.random.default_rng(0).permutation(len(first))  # what time cuts off is a fair sample
-    return [first[i] for i in order] + second
+    return shuffled(first) + second
 
 
 def main():
@@ -184,14 +183,8 @@ def main():
         os.environ.setdefault(key, value)
     records = {}
     pool = multiprocessing.get_context("spawn").Pool(min(options.jobs, len(work)))
-    results = pool.imap_unordered(read_case, work)
-    for _ in work:
-        left = options.seconds - (time.perf_counter() - start)
-        try:
-            key, record = results.next(timeout=max(left, 0.01))
-        except multiprocessing.TimeoutError:
-            print(f"time is up after {len(records)} of {len(work)}", flush=True)
-            break
+    left = options.seconds - (time.perf_counter() - start)
+    for key, record in results_in_time(pool.imap_unordered(read_case, work), len(work), left):
         records[key] = record
         if len(records) % 20 == 0 or len(work) < 40:
             spent = time.perf_counter() - start
