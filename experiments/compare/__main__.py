@@ -40,7 +40,7 @@ class CompareCommand:
     """Drones per world."""
     environments: tuple[int, ...] = (4096, 32768)
     """Worlds of the games."""
-    training: tuple[int, ...] = (20480,)
+    training: tuple[int, ...] = (5120,)
     """Worlds of the training steps (JaxMARL's also with its own number)."""
     preset: str = "paper"
     """Preset of our training step."""
