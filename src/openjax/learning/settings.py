@@ -183,19 +183,14 @@ def paper() -> TrainSettings:
         ),
         network=NetworkSettings(heads=2, compute_type="bfloat16"),
         mappo=MappoSettings(
-            learning_rate=1e-3,
-            minibatches=32,
-            clip=0.2,
-            clip_end=0.05,
-            penalty_start=0.03,
-            penalty_ramp=0.7,
+            learning_rate=1e-3, clip=0.2, clip_end=0.05, penalty_start=0.03, penalty_ramp=0.7
         ),
         generator=GeneratorSettings(wall_distance=0.05, pillar_shift=0.1, row_share=0.25),
-        num_envs=20_480,
-        total_steps=440_000_000,
+        num_envs=5120,
+        total_steps=320_000_000,
         restart_every=4,
         restart_steps=80,
-        evaluation_interval=20,
+        evaluation_interval=40,
         evaluation_episodes=512,
     )
 
