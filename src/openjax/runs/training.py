@@ -75,8 +75,10 @@ def run_job(job: TrainingJob, directory: RunDirectory, resume: bool, console: Co
         step = guarded(
             make_device_step(settings, job.environment, job.devices), shardings, everywhere(job.devices)
         )
+        ahead = processes.number == 1  # several processes must compile in the same order
+        step_ready = compile_ahead(step, abstract) if ahead else _nothing  # takes longest, so it comes first
         held_back = _held_back(job)
-        step_ready, evaluation_ready = _compile_ahead(job, step, held_back, abstract)
+        evaluation_ready = _evaluation_ahead(held_back, abstract) if ahead else _nothing
         carry, update, seconds = _first_carry(job, abstract, directory, checkpoints, resume, progress)
         if processes.is_first:
             directory.write_settings(settings, job.facts)
@@ -136,15 +138,14 @@ def run_job(job: TrainingJob, directory: RunDirectory, resume: bool, console: Co
     return 0
 
 
-def _compile_ahead(job, step, held_back, abstract):
-    """Start to compile the step and the evaluation; functions that wait for them.
+def _nothing() -> None:
+    """There is nothing to wait for."""
 
-    Not with several processes, which must compile in the same order.
-    """
-    if job.processes.number > 1:
-        return (lambda: None), (lambda: None)
+
+def _evaluation_ahead(held_back, abstract):
+    """Start to compile the evaluation; a function that waits for it."""
     policy = abstract_like(abstract.policy, jax.sharding.SingleDeviceSharding(jax.local_devices()[0]))
-    return compile_ahead(step, abstract), held_back.evaluator.compile_ahead(policy, held_back.tasks)
+    return held_back.evaluator.compile_ahead(policy, held_back.tasks)
 
 
 def _first_carry(job, abstract, directory, checkpoints, resume, progress):
