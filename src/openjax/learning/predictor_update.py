@@ -6,7 +6,14 @@ import optax
 
 from openjax.learning.devices import mean_over_devices
 from openjax.learning.rollout import Rollout
-from openjax.policy import Policy
+from openjax.policy import Policy, PredictorSettings
+
+
+def make_predictor_optimiser(settings: PredictorSettings, total_updates: int) -> optax.GradientTransformation:
+    """Adam, with gradients cut at norm 1 and a step size that changes linearly over the run."""
+    steps = total_updates * settings.steps
+    schedule = optax.linear_schedule(settings.learning_rate, settings.learning_rate_end, steps)
+    return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
 
 
 def windows_and_labels(

@@ -14,7 +14,7 @@ from openjax.learning.archive import TaskArchive, empty_archive
 from openjax.learning.devices import gather_over_devices, mean_over_devices, own_keys
 from openjax.learning.generator import generate_task, select, successes
 from openjax.learning.mappo import ValueScale, initial_value_scale, make_optimiser, update_policy
-from openjax.learning.predictor_update import update_predictor
+from openjax.learning.predictor_update import make_predictor_optimiser, update_predictor
 from openjax.learning.rollout import collect
 from openjax.learning.settings import TrainSettings
 from openjax.policy import Policy, PolicyParameters
@@ -54,9 +54,7 @@ def build(settings: TrainSettings, environment: Pursuit | None = None) -> Buildi
         environment=environment,
         policy=Policy.for_environment(environment, settings.network, settings.predictor),
         optimisers=make_optimiser(settings.mappo, settings.total_updates),
-        predictor_optimiser=optax.chain(
-            optax.clip_by_global_norm(1.0), optax.adam(settings.predictor.learning_rate)
-        ),
+        predictor_optimiser=make_predictor_optimiser(settings.predictor, settings.total_updates),
     )
 
 
