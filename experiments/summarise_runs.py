@@ -9,6 +9,8 @@ import json
 import statistics
 from pathlib import Path
 
+from pages import table
+
 from openjax.runs.settings_files import write_json
 
 
@@ -36,11 +38,7 @@ def first_reaching(evaluations: list[dict], rate: float, field: str = "capture_r
 
 def learning_against_spread(runs: dict[str, dict]) -> list[str]:
     """Improvement on the held-back tasks in standard deviations over the runs' ends."""
-    lines = ["", "Learning against spread, held-back tasks:", ""]
-    lines += [
-        "| figure | before, mean | after, each run | improvement over standard deviation |",
-        "|---|---|---|---|",
-    ]
+    rows = []
     for field in ("episode_return", "collision_rate"):
         before, after = (
             [
@@ -55,8 +53,9 @@ def learning_against_spread(runs: dict[str, dict]) -> list[str]:
         shown = ", ".join(f"{value:.3f}" for value in after)
         spread = statistics.stdev(after)
         ratio = change / spread if spread else float("inf")
-        lines.append(f"| {field} | {statistics.mean(before):.3f} | {shown} | {ratio:.1f} |")
-    return lines
+        rows.append([field, f"{statistics.mean(before):.3f}", shown, f"{ratio:.1f}"])
+    heads = ["figure", "before, mean", "after, each run", "improvement over standard deviation"]
+    return ["", "Learning against spread, held-back tasks:", "", *table(heads, rows)]
 
 
 def main() -> None:
@@ -75,7 +74,7 @@ def main() -> None:
     heads += ["env steps/s, evaluations included", "held-back capture ≥ .95", "≥ .99"]
     heads += ["far tasks ≥ .95", "≥ .99"] if far else []
     heads += ["held-back capture, collisions at the end"] + (["far tasks"] if far else [])
-    lines += ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
+    rows = []
     for name, run in runs.items():
         entries = run["evaluations"]
         last = entries[-1]
@@ -84,21 +83,23 @@ def main() -> None:
         kinds = ("", "far_") if far else ("",)
         cells += [first_reaching(entries, r, f"{kind}capture_rate") for kind in kinds for r in (0.95, 0.99)]
         cells += [f"{last[f'{k}capture_rate']:.3f}, {last[f'{k}collision_rate']:.4f}" for k in kinds]
-        lines.append("| " + " | ".join(cells) + " |")
+        rows.append(cells)
     lines += [
+        *table(heads, rows),
         "",
         "Layouts after training, evaluated on the same machine (capture rate / capture step / collision rate / "
         "crash rate):",
         "",
     ]
     names = [row["scenario"] for row in next(iter(runs.values()))["layouts"]["after"]]
-    lines += ["| run | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
+    rows = []
     for name, run in runs.items():
         cells = [
             f"{row['capture_rate']:.2f} / {row['capture_step']:.0f} / {row['collision_rate']:.4f} / {row['crash_rate']:.2f}"
             for row in run["layouts"]["after"]
         ]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+        rows.append([name, *cells])
+    lines += table(["run", *names], rows)
     if len(runs) > 1:
         lines += learning_against_spread(runs)
     arguments.out.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")
