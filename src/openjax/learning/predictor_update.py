@@ -10,10 +10,11 @@ from openjax.policy import Policy, PredictorSettings
 
 
 def make_predictor_optimiser(settings: PredictorSettings, total_updates: int) -> optax.GradientTransformation:
-    """Adam, with gradients cut at norm 1 and a step size that changes linearly over the run."""
-    steps = total_updates * settings.steps
-    schedule = optax.linear_schedule(settings.learning_rate, settings.learning_rate_end, steps)
-    return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
+    """Adam, with gradients cut at norm 1."""
+    step_size = settings.learning_rate
+    if settings.decay:
+        step_size = optax.linear_schedule(step_size, 0.0, total_updates * settings.steps)
+    return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(step_size))
 
 
 def windows_and_labels(

@@ -42,9 +42,9 @@ class PredictorSettings:
     relative: bool = True
     """Predict the displacement from where the evader was last seen; False: positions in the arena, as in the paper."""
     learning_rate: float = 1e-3
-    """Adam step size at the start; 1e-4 in the paper ..."""
-    learning_rate_end: float = 1e-3
-    """... which changes linearly to this over `total_steps`; the paper's stays."""
+    """Adam step size; 1e-4 in the paper."""
+    decay: bool = False
+    """Let the step size fall linearly to zero over `total_steps`; the paper's stays."""
     windows: int = 8
     """Windows of each environment's rollout that one iteration trains on."""
     steps: int = 4
