@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from pages import page_parser, publish, table
 
+from openjax.learning import TrainSettings
 from openjax.policy import Policy
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings
 from openjax.runs.command_line import run_command
@@ -66,14 +67,16 @@ def fly(
     return evaluate_scenarios(evaluator, loaded.parameters, scenarios, episodes, 0, EXTRA)[0]
 
 
-def seeds_of_open() -> list[str]:
-    """Shipped policies that were trained with predictor, generator and clamp, by seed."""
+def shipped_with_clamp() -> dict[str, TrainSettings]:
+    """Settings of the shipped policies that were trained in the paper's game, by name."""
     settings = {name: load_policy(name).settings for name in shipped_policies()}
-    whole = [
-        name
-        for name, s in settings.items()
-        if s.predictor.enabled and s.generator.enabled and s.environment.speed_limit == "clamp"
-    ]
+    return {name: s for name, s in settings.items() if s.environment.speed_limit == "clamp"}
+
+
+def seeds_of_open() -> list[str]:
+    """Those of them with predictor and generator, by seed."""
+    settings = shipped_with_clamp()
+    whole = [name for name, s in settings.items() if s.predictor.enabled and s.generator.enabled]
     return sorted(whole, key=lambda name: settings[name].seed)
 
 

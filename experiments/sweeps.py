@@ -14,6 +14,7 @@ import time
 import jax
 import jax.numpy as jnp
 import numpy as np
+from headline import shipped_with_clamp
 from pages import page_parser, publish
 from prediction_flights import layout_tasks
 from sweeps_report import draw, report
@@ -25,7 +26,6 @@ from openjax.runs.command_line import run_command
 from openjax.runs.evaluation import layout_slots
 from openjax.runs.machine import describe_machine
 from openjax.runs.policies import load_policy
-from openjax.runs.policy_files import shipped_policies
 from openjax.runs.settings_files import to_plain
 
 RADII = (0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5)
@@ -142,8 +142,8 @@ def study(options: argparse.Namespace) -> dict:
     """Fly every policy over all radii and speeds."""
     started = time.monotonic()
     changes = {"speed_limit": options.speed_limit}
-    policies = [of_policy(name, options.episodes, changes) for name in options.policy]
-    shown = "" if options.policy == shipped_policies() else f" --policy {' '.join(options.policy)}"
+    policies = [of_policy(name, options.episodes, changes) for name in options.policy or shipped_with_clamp()]
+    shown = f" --policy {' '.join(options.policy)}" if options.policy else ""
     shown += "" if options.speed_limit == "clamp" else f" --speed-limit {options.speed_limit}"
     return {
         "command": f"python experiments/sweeps.py{shown} --episodes {options.episodes}",
@@ -164,7 +164,7 @@ def main(arguments: list[str]) -> int:
     """Sweep or read it, write the three files, print the page."""
     parser = page_parser(__doc__, "sweeps")
     parser.add_argument(
-        "--policy", nargs="+", default=shipped_policies(), help="by default all that are shipped"
+        "--policy", nargs="+", help="by default all that ship and were trained with the clamp"
     )
     parser.add_argument("--episodes", type=int, default=100, help="per layout and speed")
     parser.add_argument("--speed-limit", choices=("clamp", "none"), default="clamp")
