@@ -15,7 +15,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from pages import RESULTS, table
+from headline import PAPER as PAPER_OPEN
+from headline import PAPER_PREDICTION
+from pages import RESULTS, spread, table
 from run_comparison import VARIANTS, band, by_variant, main_effects, read_run, savings, steps_to
 
 from openjax.pursuit import SCENARIOS
@@ -30,21 +32,16 @@ METRICS = (
     ("crash_rate", "crash rate", 3),
 )
 # The paper's tables of the four layouts: capture rate, capture step, collision rate.
-PAPER = {
-    ("wall", "OPEN"): (0.987, 480, 0.000),
+PAPER = {(layout, "OPEN"): figures for layout, figures in PAPER_OPEN.items()} | {
     ("wall", "MAPPO"): (0.817, 569, 0.010),
-    ("narrow_gap", "OPEN"): (1.000, 526, 0.017),
     ("narrow_gap", "MAPPO"): (0.917, 484, 0.039),
-    ("random", "OPEN"): (1.000, 330, 0.011),
     ("random", "MAPPO + predictor"): (1.000, 301, 0.012),
     ("random", "MAPPO + generator"): (0.967, 477, 0.107),
     ("random", "MAPPO"): (0.783, 494, 0.168),
-    ("passage", "OPEN"): (1.000, 330, 0.006),
     ("passage", "MAPPO + predictor"): (0.886, 428, 0.013),
     ("passage", "MAPPO + generator"): (0.727, 602, 0.216),
     ("passage", "MAPPO"): (0.617, 541, 0.013),
 }
-PAPER_PREDICTION = {"wall": 0.054, "narrow_gap": 0.084, "random": 0.109, "passage": 0.081}
 
 
 def outcomes(fields: list[str]) -> list[tuple[str, int, Callable]]:
@@ -75,15 +72,6 @@ def outcomes(fields: list[str]) -> list[tuple[str, int, Callable]]:
 def kind_of(field: str) -> str:
     """Which held-back tasks a capture rate is of."""
     return "uniform" if field == "capture_rate" else field.removesuffix("capture_rate").strip("_/ ")
-
-
-def spread(values: list, digits: int) -> str:
-    """Mean and standard deviation over the seeds."""
-    values = [value for value in values if value is not None]
-    if not values:
-        return "–"
-    deviation = f" ({np.std(values, ddof=1):.{digits}f})" if len(values) > 1 else ""
-    return f"{np.mean(values):.{digits}f}{deviation}"
 
 
 def layout_lines(runs: dict[str, list[dict]]) -> list[str]:

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from pages import page_parser, publish, table
+from pages import page_parser, publish, spread, table
 
 from openjax.learning import TrainSettings
 from openjax.policy import Policy
@@ -28,7 +28,7 @@ CONDITIONS = {
     "clamp, level starts": {"speed_limit": "clamp", "start_attitude": "level"},
     "no clamp, drawn starts": {"speed_limit": "none", "start_attitude": "drawn"},
 }
-# The paper's table and the goals of this project: capture rate, capture step, collision rate.
+# The paper's table of OPEN and the goals of this project: capture rate, capture step, collision rate.
 PAPER = {
     "wall": (0.987, 480, 0.000),
     "narrow_gap": (1.0, 526, 0.017),
@@ -81,13 +81,9 @@ def seeds_of_open() -> list[str]:
 
 
 def across_seeds(rows: list[dict], field: str) -> str:
-    """Mean and sample standard deviation over the seeds."""
-    values = [row[field] for row in rows if row[field] is not None]
-    if not values:
-        return "–"
+    """Mean and standard deviation over the seeds."""
     digits = 0 if field == "capture_step" else 4 if "collision" in field or "error" in field else 3
-    deviation = f" ({np.std(values, ddof=1):.{digits}f})" if len(values) > 1 else ""
-    return f"{np.mean(values):.{digits}f}{deviation}"
+    return spread([row[field] for row in rows], digits)
 
 
 def goals(by_layout: dict[str, list[dict]]) -> list[tuple[str, str, str, bool]]:

@@ -5,6 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from openjax.runs.settings_files import read_json, write_json
 
 RESULTS = Path(__file__).parent / "results"
@@ -40,3 +42,12 @@ def table(heads: list[str], rows: list[list[str]]) -> list[str]:
     """A Markdown table."""
     lines = [heads, ["---"] * len(heads), *rows]
     return ["| " + " | ".join(line) + " |" for line in lines]
+
+
+def spread(values: list[float | None], digits: int) -> str:
+    """Mean and, of several, sample standard deviation; None is left out."""
+    values = [value for value in values if value is not None]
+    if not values:
+        return "–"
+    deviation = f" ({np.std(values, ddof=1):.{digits}f})" if len(values) > 1 else ""
+    return f"{np.mean(values):.{digits}f}{deviation}"

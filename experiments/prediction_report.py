@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from ablations import PAPER_PREDICTION
+from headline import PAPER_PREDICTION
 from pages import table
 
 SEEN, LOST, NOT_YET, ALL = 0, 1, 2, 3
