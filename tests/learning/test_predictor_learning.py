@@ -6,7 +6,11 @@ import numpy as np
 import optax
 import pytest
 
-from openjax.learning.predictor_update import update_predictor, windows_and_labels
+from openjax.learning.predictor_update import (
+    make_predictor_optimiser,
+    update_predictor,
+    windows_and_labels,
+)
 from openjax.learning.rollout import Rollout, collect
 from openjax.policy import NetworkSettings, Policy, PredictorSettings, gaussian_log_prob
 from openjax.pursuit import Observation, Pursuit, PursuitSettings
@@ -171,3 +175,17 @@ def test_learns_a_circling_evader():
     np.testing.assert_allclose(kept, [0.013, 0.065], rtol=0.02)
     assert (np.asarray(learnt) < 0.4 * np.asarray(kept)).all(), learnt
     assert loss[-10:].mean() < 0.1 * loss[0]
+
+
+@pytest.mark.parametrize("decay", [False, True])
+def test_step_size_stays_or_reaches_zero_at_the_end_of_the_run(decay):
+    """Adam's steps along a constant gradient are as large as its step size."""
+    updates = 5
+    settings = PredictorSettings(learning_rate=0.1, decay=decay, windows=8, steps=4)
+    optimiser = make_predictor_optimiser(settings, updates)
+    state, moved = optimiser.init(jnp.zeros(())), []
+    for _ in range(updates * settings.steps + 1):
+        step, state = optimiser.update(jnp.ones(()), state)
+        moved.append(-float(step))
+    expected = 0.1 * (np.linspace(1, 0, len(moved)) if decay else np.ones(len(moved)))
+    np.testing.assert_allclose(moved, expected, rtol=1e-4, atol=1e-7)

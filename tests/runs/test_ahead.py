@@ -1,7 +1,10 @@
 """What was compiled ahead is found by the call, else every program would be compiled twice."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
+import pytest
 
 from openjax.runs.ahead import compile_ahead
 from openjax.runs.checkpoints import abstract_like, place
@@ -35,3 +38,17 @@ def test_call_finds_what_was_compiled_ahead():
         assert compiled  # the listener hears a compilation
     finally:
         jax.monitoring.clear_event_listeners()
+
+
+def test_what_goes_wrong_in_tracing_is_raised():
+    with pytest.raises(AttributeError):
+        compile_ahead(jax.jit(lambda x: x.nothing), jnp.zeros(3))
+
+
+def test_what_goes_wrong_in_the_compiler_is_raised_when_waited_for():
+    def fail():
+        raise MemoryError("too large")
+
+    wait = compile_ahead(SimpleNamespace(lower=lambda *_: SimpleNamespace(compile=fail)))
+    with pytest.raises(MemoryError, match="too large"):
+        wait()
