@@ -19,6 +19,7 @@ from typing import Annotated, Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pages
 import tyro
 
 from openjax.errors import UserError
@@ -162,19 +163,15 @@ def row_of(case: Case, times: Sequence[float], trace: float, compile_: float) ->
 
 def table(rows: Sequence[dict]) -> list[str]:
     """The rows as a Markdown table."""
+    heads = ["what grows", "devices", "worlds", "minibatches", "training step [s]", "env steps/s"]
     one = rows[0]["env_steps_per_second"]
-    lines = [
-        "| what grows | devices | worlds | minibatches | training step [s] | env steps/s | against one device | "
-        "per device |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    body = []
     for row in rows:
         gain = row["env_steps_per_second"] / one
-        lines.append(
-            f"| {row['kind']} | {row['devices']} | {row['num_envs']:,} | {row['minibatches']} | {row['seconds']:.3f} | "
-            f"{row['env_steps_per_second']:,.0f} | {gain:.2f} | {gain / row['devices']:.2f} |"
-        )
-    return lines
+        sizes = [row["kind"], str(row["devices"]), f"{row['num_envs']:,}", str(row["minibatches"])]
+        speeds = [f"{row['seconds']:.3f}", f"{row['env_steps_per_second']:,.0f}"]
+        body.append([*sizes, *speeds, f"{gain:.2f}", f"{gain / row['devices']:.2f}"])
+    return pages.table([*heads, "against one device", "per device"], body)
 
 
 def report(facts: dict, settings: TrainSettings, rows: Sequence[dict], left_out: Sequence[str]) -> str:

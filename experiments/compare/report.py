@@ -2,6 +2,8 @@
 
 from collections.abc import Iterable, Sequence
 
+from experiments.pages import table
+
 AIM = 5.0
 
 ALIKE = """\
@@ -79,20 +81,16 @@ def drone_table(rows: Iterable[dict]) -> list[str]:
     found = {(r["worlds"], r["agents"], r["variant"]): r for r in rows if r["group"] == "drones"}
     variants = [v for v in ("attitude", "rigid", "mjx free", "mjx") if any(key[2] == v for key in found)]
     ours = [v for v in variants if v != "attitude"]
-    lines = [
-        "| worlds | drones each | crazyflow body_rate | "
-        + " | ".join(f"crazyflow {v}" if v == "attitude" else v for v in variants)
-        + " | "
-        + " | ".join(f"{v} / crazyflow" for v in ours)
-        + " |",
-        "|" + "---|" * (3 + len(variants) + len(ours)),
-    ]
+    heads = ["worlds", "drones each", "crazyflow body_rate"]
+    heads += [f"crazyflow {v}" if v == "attitude" else v for v in variants]
+    heads += [f"{v} / crazyflow" for v in ours]
+    body = []
     for worlds, agents in sorted({key[:2] for key in found}, key=lambda size: (size[1], size[0])):
         at = {variant: found.get((worlds, agents, variant)) for variant in ("body_rate", *variants)}
         cells = [f"{worlds:,}", str(agents), *(_cell(row) for row in at.values())]
         cells += [_ratio(at[v], at["body_rate"]) for v in ours]
-        lines.append(f"| {' | '.join(cells)} |")
-    return lines
+        body.append(cells)
+    return table(heads, body)
 
 
 def verdict(rows: Iterable[dict]) -> list[str]:
@@ -123,26 +121,19 @@ def verdict(rows: Iterable[dict]) -> list[str]:
 
 
 def _plain_table(rows, group):
-    lines = [
-        "| system | what | worlds | agents | environment steps/s | agent steps/s |",
-        "|---|---|---|---|---|---|",
-    ]
+    body = []
     for row in rows:
         if row["group"] == group:
             agent_steps = row["agent_steps_per_second"]
-            lines.append(
-                f"| {row['system']} | {row['variant']} | {row['worlds']:,} | {row['agents']} | {_cell(row, 'env')} | "
-                f"{'' if agent_steps is None else _number(agent_steps)} |"
-            )
-    return lines
+            cells = [row["system"], row["variant"], f"{row['worlds']:,}", str(row["agents"])]
+            body.append([*cells, _cell(row, "env"), "" if agent_steps is None else _number(agent_steps)])
+    return table(["system", "what", "worlds", "agents", "environment steps/s", "agent steps/s"], body)
 
 
 def _everything(rows):
-    lines = [
-        "| group | system | what | worlds | agents | steps per call | calls | median, ms | slowest, ms | "
-        "compilation, s | memory of a call, MB |",
-        "|" + "---|" * 11,
-    ]
+    heads = ["group", "system", "what", "worlds", "agents", "steps per call", "calls", "median, ms"]
+    heads += ["slowest, ms", "compilation, s", "memory of a call, MB"]
+    body = []
     for row in rows:
         start = [row["group"], row["system"], row["variant"]]
         start += [f"{row['worlds']:,}", str(row["agents"]), str(row["steps"])]
@@ -152,8 +143,8 @@ def _everything(rows):
             memory = row["memory"]
             cells = [str(row["calls"]), f"{1e3 * row['seconds']:.2f}", f"{1e3 * row['slowest']:.2f}"]
             cells += [f"{row['compile_seconds']:.1f}", "" if memory is None else f"{memory / 1e6:,.0f}"]
-        lines.append(f"| {' | '.join([*start, *cells])} |")
-    return lines
+        body.append([*start, *cells])
+    return table(heads, body)
 
 
 def _cell(row, unit="agent"):
