@@ -99,3 +99,5 @@ def test_collisions_may_spoil_a_success():
     assert successes(NOMINAL, statistics).tolist() == [True, True, False]
     strict = dataclasses.replace(NOMINAL, collision_tolerance=0.1)
     assert successes(strict, statistics).tolist() == [True, False, False]
+    # while a tenth of the penalties counts, up to 0.1 ** 0.1 = 0.79 is tolerated
+    assert successes(strict, statistics, jnp.float32(0.1)).tolist() == [True, True, False]

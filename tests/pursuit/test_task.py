@@ -8,6 +8,7 @@ import pytest
 from openjax.pursuit import (
     PursuitSettings,
     Task,
+    close_starts,
     expand_task,
     line_up_pillars,
     shift_pillars,
@@ -175,6 +176,22 @@ def test_pillars_in_a_row_stand_between_the_sides(uniform):
         np.testing.assert_allclose(step, np.broadcast_to(step[0], step.shape), atol=1e-5)
         assert np.abs(step[0, 0]) <= step[0, 1] + 1e-5  # across the line between the sides, within 45 degrees
         assert np.abs(pillars[used].mean(axis=0)).max() <= 0.2 + 1e-5
+
+
+def test_close_starts_leave_little_room_beside_a_pillar_or_another_pursuer(uniform):
+    close = jax.jit(jax.vmap(lambda key, task: close_starts(SETTINGS, key, task, 0.5)))(keys(33), uniform)
+    assert_clear(close)
+    assert np.abs(close.pursuer_position[..., 2] - 0.6).max() <= 0.1 + 1e-6
+    for name in ("evader_position", "pillar_position", "pillar_active"):
+        np.testing.assert_array_equal(getattr(close, name), getattr(uniform, name))
+    moved = np.asarray(close.pursuer_position != uniform.pursuer_position).any(axis=-1)
+    np.testing.assert_allclose(moved.mean(), 0.5, atol=0.1)  # fewer where there is no room
+    between, pillars, _ = distances(close)
+    to_pursuer = between.reshape(DRAWS, 3, 2).min(axis=-1) < 0.14 + 0.05 + 1e-5
+    to_pillar = pillars.min(axis=-1) < 0.07 + 0.05 + 1e-5
+    # the pursuer that one was put beside may itself have moved away
+    assert (to_pursuer | to_pillar)[moved].mean() > 0.85
+    assert to_pursuer[moved].mean() > 0.15 and to_pillar[moved].mean() > 0.6
 
 
 def test_start_attitudes():

@@ -33,9 +33,15 @@ def generate_task(
     return jax.tree.map(lambda a, b: jnp.where(local, a, b), expanded, uniform)
 
 
-def successes(settings: GeneratorSettings, statistics: EpisodeStatistics) -> jax.Array:
-    """Whether episodes count as solved: captured, and (by setting) with few collisions. Any leading axes."""
-    return statistics.captured & (statistics.collision_rate <= settings.collision_tolerance)
+def successes(
+    settings: GeneratorSettings, statistics: EpisodeStatistics, penalty_share: jax.Array | float = 1.0
+) -> jax.Array:
+    """Whether episodes count as solved: captured, and (by setting) with few collisions. Any leading axes.
+
+    `penalty_share` is the share of the penalties that counts by now (0 to 1). As it grows, the tolerated collision rate
+    falls from one to the setting: before the penalties teach to avoid collisions, they'd keep the archive empty.
+    """
+    return statistics.captured & (statistics.collision_rate <= settings.collision_tolerance**penalty_share)
 
 
 def select(

@@ -62,7 +62,8 @@ class GeneratorSettings:
     episodes_per_task: int = 4
     """Environments that share one task, so that its success rate can be told."""
     collision_tolerance: float = 1.0
-    """An episode counts as success if it captures and its collision rate stays below this (1: capture alone)."""
+    """An episode counts as success if it captures and its collision rate stays below this (1: capture alone), once the
+    penalties count in full; before that, more is tolerated (this to the power of the penalties' share)."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,8 @@ class TrainSettings:
     the hardest part of an episode; 0: none are."""
     restart_steps: int = 160
     """Multiple of `rollout_length`; the value of what would have come is estimated, as after every rollout."""
+    restart_close: float = 0.0
+    """Share of the pursuers in worlds that are started anew which start close to a pillar or another pursuer."""
     evaluation_interval: int = 50
     """Iterations between evaluations on held-back uniform tasks."""
     evaluation_episodes: int = 256
@@ -179,17 +182,20 @@ def paper() -> TrainSettings:
     return TrainSettings(
         environment=PursuitSettings(
             observe_position=True,
-            reward=RewardSettings(collision=40.0, crash=20.0, margin=0.03, lookahead=0.15),
+            reward=RewardSettings(collision=40.0, crash=80.0, margin=0.03, lookahead=0.15),
         ),
         network=NetworkSettings(heads=2, compute_type="bfloat16"),
         mappo=MappoSettings(
             learning_rate=1e-3, clip=0.2, clip_end=0.05, penalty_start=0.03, penalty_ramp=0.7
         ),
-        generator=GeneratorSettings(wall_distance=0.05, pillar_shift=0.1, row_share=0.25),
+        generator=GeneratorSettings(
+            wall_distance=0.05, pillar_shift=0.1, row_share=0.25, collision_tolerance=0.002
+        ),
         num_envs=5120,
         total_steps=320_000_000,
         restart_every=4,
         restart_steps=80,
+        restart_close=0.5,
         evaluation_interval=40,
         evaluation_episodes=512,
     )

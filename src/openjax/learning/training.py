@@ -18,7 +18,7 @@ from openjax.learning.predictor_update import make_predictor_optimiser, update_p
 from openjax.learning.rollout import collect
 from openjax.learning.settings import TrainSettings
 from openjax.policy import Policy, PolicyParameters
-from openjax.pursuit import Observation, Pursuit, PursuitState
+from openjax.pursuit import Observation, Pursuit, PursuitState, close_starts
 
 
 @struct.dataclass
@@ -116,6 +116,7 @@ def make_training_step(
         num_envs = carry.state.step.shape[0]  # of this device
 
         # rollout
+        penalty_share = _penalty_share(settings, carry.update)
         shape = (settings.rollout_length, settings.environment.num_pursuers, 4)
         noise = jax.vmap(lambda k: jax.random.normal(k, shape))(own_keys(noise_key, num_envs, axis))
         rollout, observation, state = collect(
@@ -125,7 +126,7 @@ def make_training_step(
             carry.observation,
             carry.state,
             jnp.moveaxis(noise, 1, 0),
-            _penalty_share(settings, carry.update),
+            penalty_share,
         )
         last_predicted = policy.predict(carry.policy, observation)
 
@@ -167,7 +168,7 @@ def make_training_step(
         # selection of tasks: the one start group whose episodes have just ended gets new ones
         group = (settings.start_groups - 1 - carry.update) % settings.start_groups
         ended = _group(state, group, settings.start_groups)
-        archive, counted = _selection(settings, carry.archive, ended, axis)
+        archive, counted = _selection(settings, carry.archive, ended, penalty_share, axis)
         metrics |= counted
         fresh = _fresh(settings, environment, archive, task_key, reset_key, ended.step.shape[0], axis)
         worlds = _set_group((observation, state), fresh, group, settings.start_groups)
@@ -176,7 +177,7 @@ def make_training_step(
             ages = np.array(settings.restart_ages)
             number = num_envs // settings.start_groups // settings.restart_every * len(ages)
             keys = (jax.random.fold_in(task_key, 1), jax.random.fold_in(reset_key, 1))
-            fresh = _fresh(settings, environment, archive, *keys, number, axis)
+            fresh = _fresh(settings, environment, archive, *keys, number, axis, settings.restart_close)
             worlds = _set_restarted(settings, worlds, fresh, (group + ages) % settings.start_groups)
         observation, state = worlds
 
@@ -205,15 +206,18 @@ def _penalty_share(settings, update):
     return start + (1.0 - start) * jnp.minimum(progress, 1.0)
 
 
-def _tasks(settings, archive, keys):
-    """One task per key, repeated for the environments that share it."""
+def _tasks(settings, archive, keys, close=0.0):
+    """One task per key, repeated for the environments that share it; a share of pursuers starts close to something."""
     tasks = jax.vmap(lambda k: generate_task(settings.generator, settings.environment, archive, k))(keys)
+    if close:
+        moved = jax.vmap(lambda k, task: close_starts(settings.environment, k, task, close))
+        tasks = moved(jax.vmap(lambda k: jax.random.fold_in(k, 1))(keys), tasks)
     return jax.tree.map(lambda x: jnp.repeat(x, settings.episodes_per_task, axis=0), tasks)
 
 
-def _fresh(settings, environment, archive, task_key, reset_key, number, axis):
+def _fresh(settings, environment, archive, task_key, reset_key, number, axis, close=0.0):
     """Observations and states of `number` worlds of this device at the start of newly drawn tasks."""
-    tasks = _tasks(settings, archive, own_keys(task_key, number // settings.episodes_per_task, axis))
+    tasks = _tasks(settings, archive, own_keys(task_key, number // settings.episodes_per_task, axis), close)
     return jax.vmap(environment.reset_to)(own_keys(reset_key, number, axis), tasks)
 
 
@@ -235,12 +239,12 @@ def _lasting(settings, number):
     return task % settings.restart_every != 0 if settings.restart_every else np.ones(number, bool)
 
 
-def _selection(settings, archive, ended, axis):
+def _selection(settings, archive, ended, penalty_share, axis):
     """Put unsolved tasks of ended episodes into the archive; and what these episodes were like."""
     statistics = ended.statistics
     complete = statistics.steps >= settings.environment.episode_length
     share = settings.episodes_per_task
-    solved = successes(settings.generator, statistics).astype(jnp.float32).reshape(-1, share)
+    solved = successes(settings.generator, statistics, penalty_share).astype(jnp.float32).reshape(-1, share)
     if settings.generator.enabled:
         tasks = jax.tree.map(lambda x: x[::share], ended.task)
         candidates = gather_over_devices((tasks, jnp.mean(solved, axis=1), complete[::share]), axis)

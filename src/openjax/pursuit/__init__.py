@@ -5,7 +5,15 @@ from openjax.pursuit.observation import Observation
 from openjax.pursuit.scenarios import SCENARIOS, Scenario, find_scenario, scenario_settings, scenario_task
 from openjax.pursuit.settings import PursuitSettings, RewardSettings
 from openjax.pursuit.statistics import EpisodeStatistics
-from openjax.pursuit.task import Task, expand_task, line_up_pillars, shift_pillars, turn_task, uniform_task
+from openjax.pursuit.task import (
+    Task,
+    close_starts,
+    expand_task,
+    line_up_pillars,
+    shift_pillars,
+    turn_task,
+    uniform_task,
+)
 
 __all__ = [
     "SCENARIOS",
@@ -19,6 +27,7 @@ __all__ = [
     "StepInfo",
     "Task",
     "action_to_command",
+    "close_starts",
     "expand_task",
     "find_scenario",
     "hover_action",

@@ -23,6 +23,8 @@ EXPANSION = 0.1
 """Local expansion moves each vehicle by up to this along each axis (m): the paper's delta."""
 WALL_DISTANCE = 0.1
 """Local expansion keeps starts this far from the arena's wall (m): the released code's."""
+CLOSE = 0.05
+"""Close starts are up to this much farther from a pillar or another pursuer than the safety distance (m)."""
 CANDIDATES = 8
 """Draws of a start among which the first good one is taken; more for more than three pursuers."""
 
@@ -113,6 +115,45 @@ def expand_task(
             evader_position=move(evader_key, task.evader_position),
         )
 
+    return _first_clear(settings, draw, key, task)
+
+
+def close_starts(settings: PursuitSettings, key: jax.Array, task: Task, share: float) -> Task:
+    """Put a `share` (0 to 1) of the pursuers next to a pillar or another pursuer: starts that leave the least room.
+
+    They stand 0 to 0.05 m outside the safety distance of one that is drawn at random, in any direction, within 0.1 m of
+    half the arena's height. Among a few draws the first that starts clear is taken, else the task itself.
+    """
+    n, slots = task.pursuer_position.shape[0], task.pillar_active.shape[0]
+    middle = settings.arena_height / 2
+
+    def draw(key):
+        choice_key, which_key, direction_key, gap_key = jax.random.split(key, 4)
+        old = task.pursuer_position
+        # pillars that stand, and the other pursuers, are as likely as each other
+        others = jnp.concatenate([jnp.broadcast_to(task.pillar_active, (n, slots)), ~jnp.eye(n, dtype=bool)], axis=1)
+        which = jax.random.categorical(which_key, jnp.where(others, 0.0, -jnp.inf))[:, None]
+        direction = jax.random.normal(direction_key, (n, 3))
+        gap = jax.random.uniform(gap_key, (n, 1), jnp.float32, 0.0, CLOSE)
+
+        flat = direction[:, :2] / jnp.linalg.norm(direction[:, :2], axis=-1, keepdims=True)
+        pillar = task.pillar_position[jnp.minimum(which[:, 0], slots - 1)]
+        beside_pillar = pillar + (settings.pillar_radius + settings.pillar_clearance + gap) * flat
+        direction = direction / jnp.linalg.norm(direction, axis=-1, keepdims=True)
+        pursuer = old[jnp.maximum(which[:, 0] - slots, 0)]
+        beside_pursuer = pursuer + (settings.drone_clearance + gap) * direction
+        close = jnp.where(
+            which < slots, jnp.concatenate([beside_pillar, old[:, 2:]], axis=-1), beside_pursuer
+        )
+        close = close.at[:, 2].set(jnp.clip(close[:, 2], middle - START_Z, middle + START_Z))
+        moved = jax.random.uniform(choice_key, (n, 1)) < share
+        return task.replace(pursuer_position=jnp.where(moved, close, old))
+
+    return _first_clear(settings, draw, key, task)
+
+
+def _first_clear(settings, draw, key, task):
+    """The first of a few tasks drawn by `draw(key)` that starts clear, else `task`."""
     candidates = jax.vmap(draw)(jax.random.split(key, CANDIDATES))
     clear = jax.vmap(lambda candidate: starts_clear(settings, candidate))(candidates)
     first = jnp.argmax(clear)
