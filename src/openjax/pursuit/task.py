@@ -131,7 +131,9 @@ def close_starts(settings: PursuitSettings, key: jax.Array, task: Task, share: f
         choice_key, which_key, direction_key, gap_key = jax.random.split(key, 4)
         old = task.pursuer_position
         # pillars that stand, and the other pursuers, are as likely as each other
-        others = jnp.concatenate([jnp.broadcast_to(task.pillar_active, (n, slots)), ~jnp.eye(n, dtype=bool)], axis=1)
+        others = jnp.concatenate(
+            [jnp.broadcast_to(task.pillar_active, (n, slots)), ~jnp.eye(n, dtype=bool)], axis=1
+        )
         which = jax.random.categorical(which_key, jnp.where(others, 0.0, -jnp.inf))[:, None]
         direction = jax.random.normal(direction_key, (n, 3))
         gap = jax.random.uniform(gap_key, (n, 1), jnp.float32, 0.0, CLOSE)
