@@ -21,7 +21,7 @@ SETTINGS = PursuitSettings(
     start_attitude="level",
     speed_limit="none",
     physics="rigid",
-    reward=RewardSettings(smoothness=2.0, crash=7.0),
+    reward=RewardSettings(smoothness=2.0, crash=7.0, first_crash=5.0),
 )
 STILL = ((0.0, 0.0, 0.0),) * 3
 
@@ -106,7 +106,7 @@ def test_drones_too_close_and_touching(play):
     touching = [(0.5, 0, 0.6), (0.5, 0.095, 0.6), (-0.5, 0, 0.6)]
     statistics, _, info = play(task(touching, (0, 0, 0.6)))
     assert statistics.crashed
-    np.testing.assert_allclose(info.penalty, [[-17, -17, 0]] * 4, atol=1e-5)
+    np.testing.assert_allclose(info.penalty, [[-22, -22, 0]] + [[-17, -17, 0]] * 3, atol=1e-5)
 
 
 def test_every_breach_counts():
@@ -133,7 +133,8 @@ def test_crashes():
 
 
 def test_margin_widens_the_reward_only():
-    environment = Pursuit(dataclasses.replace(SETTINGS, reward=RewardSettings(margin=0.02)))
+    weights = RewardSettings(crash=7.0, first_crash=5.0, margin=0.02)
+    environment = Pursuit(dataclasses.replace(SETTINGS, reward=weights))
 
     @jax.jit
     def first_step(task):
@@ -144,6 +145,8 @@ def test_margin_widens_the_reward_only():
 
     penalty, statistics = first_step(task([(0.5, 0, 0.6), (0.5, 0.15, 0.6), (-0.5, 0, 0.6)], (0, 0, 0.6)))
     assert penalty.tolist() == [-10, -10, 0] and statistics.collision_rate == 0
+    penalty, statistics = first_step(task([(0.5, 0, 0.6), (0.5, 0.11, 0.6), (-0.5, 0, 0.6)], (0, 0, 0.6)))
+    assert penalty.tolist() == [-17, -17, 0] and not statistics.crashed  # an early crash is no first one
 
 
 def test_lookahead_counts_in_the_reward_what_comes_at_the_present_velocity():

@@ -182,7 +182,9 @@ def paper() -> TrainSettings:
     return TrainSettings(
         environment=PursuitSettings(
             observe_position=True,
-            reward=RewardSettings(collision=40.0, crash=80.0, margin=0.03, lookahead=0.15),
+            reward=RewardSettings(
+                collision=40.0, crash=40.0, first_crash=2000.0, margin=0.03, lookahead=0.15
+            ),
         ),
         network=NetworkSettings(heads=2, compute_type="bfloat16"),
         mappo=MappoSettings(

@@ -190,8 +190,17 @@ class Pursuit:
         crash = crashed(settings, position, body_z_up, *pillars)
         distance = jnp.sqrt(jnp.sum((position - evader) ** 2, axis=-1) + 1e-12)
         counted, counted_crash = self._counted(breach, crash, drones, body_z_up, pillars)
+        first_crash = crash & ~state.statistics.crashed
         rewards, penalty = reward(
-            settings, captured, distance, counted, too_fast, counted_crash, action, state.previous_action
+            settings,
+            captured,
+            distance,
+            counted,
+            too_fast,
+            counted_crash,
+            first_crash,
+            action,
+            state.previous_action,
         )
 
         newest = frame(settings, step, position, evader, velocity, seen)

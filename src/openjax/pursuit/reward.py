@@ -29,16 +29,18 @@ def reward(
     breach: Breaches,
     too_fast: jax.Array,
     crash: jax.Array,
+    first_crash: jax.Array,
     action: jax.Array,
     previous_action: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     """(N,) reward of each pursuer, and (N,) the penalties that it holds (at most 0).
 
-    `captured` (N,) bool rewards all; `distance` (N,) to the evader (m), `breach`, `too_fast` and `crash` (N,) bool and
-    the change of the squashed command `action` (N, 4) count for each pursuer.
+    `captured` (N,) bool rewards all; `distance` (N,) to the evader (m), `breach`, `too_fast`, `crash` and `first_crash`
+    (N,) bool and the change of the squashed command `action` (N, 4) count for each pursuer.
     """
     weights = settings.reward
     penalty = -weights.collision * breach.total - weights.over_speed * too_fast - weights.crash * crash
+    penalty = penalty - weights.first_crash * first_crash
     change = jnp.sqrt(jnp.sum((action - previous_action) ** 2, axis=-1) + 1e-12)
     task = weights.capture * jnp.any(captured) - weights.distance * distance
     return task + weights.smoothness * jnp.exp(-change) + penalty, penalty

@@ -28,6 +28,9 @@ class RewardSettings:
     """Weight of exp(-|a_t - a_{t-1}|); 2.0 in the paper's second stage."""
     crash: float = 0.0
     """Subtracted in each step in which a pursuer touches something solid or tips over (not in the paper)."""
+    first_crash: float = 0.0
+    """Subtracted once, of the pursuers that crash first in an episode, and not early by margin or lookahead: while they
+    count a start close to a pillar as a crash anyhow, nothing else would be lost by touching it (not in the paper)."""
     margin: float = 0.0
     """The reward counts breaches, floor and tilt (as a cosine) this much early; the metrics don't (m; not in the paper)."""
     lookahead: float = 0.0
