@@ -183,7 +183,7 @@ def paper() -> TrainSettings:
         environment=PursuitSettings(
             observe_position=True,
             reward=RewardSettings(
-                collision=40.0, crash=40.0, first_crash=2000.0, margin=0.03, lookahead=0.15
+                collision=40.0, crash=20.0, first_crash=5000.0, margin=0.03, lookahead=0.15
             ),
         ),
         network=NetworkSettings(heads=2, compute_type="bfloat16"),
@@ -194,7 +194,7 @@ def paper() -> TrainSettings:
             wall_distance=0.05, pillar_shift=0.1, row_share=0.25, collision_tolerance=0.002
         ),
         num_envs=5120,
-        total_steps=320_000_000,
+        total_steps=350_000_000,
         restart_every=4,
         restart_steps=80,
         restart_close=0.5,
