@@ -39,7 +39,9 @@ def recorded():
     @jax.jit
     def play(parameters, observation, state, key, share):
         noise = jax.random.normal(key, (STEPS, WORLDS, GAME.num_pursuers, 4))
-        rollout, last, after = collect(environment, policy, parameters, observation, state, noise, share)
+        rollout, last, after = collect(
+            environment, policy, parameters, observation, state, noise, share, share
+        )
 
         def one(carry, action):
             observation, state = carry
@@ -50,8 +52,9 @@ def recorded():
 
         (own_last, _), account = jax.lax.scan(one, (observation, state), rollout.action)
         mean, log_std = policy.distribution(parameters.actor, rollout.observation, rollout.predicted)
-        density = gaussian_log_prob(rollout.action, mean, log_std)
-        return rollout, last, after, (account, own_last, density)
+        density = gaussian_log_prob(rollout.action, mean, log_std + jnp.log(share))
+        own_noise = (rollout.action - mean) / (share * jnp.exp(log_std))
+        return rollout, last, after, (account, own_last, density, own_noise - noise)
 
     reset = jax.jit(jax.vmap(environment.reset))
     observation, state = reset(jax.random.split(jax.random.key(0), WORLDS))
@@ -67,12 +70,15 @@ def recorded():
 
 def test_a_rollout_is_what_the_game_says(recorded):
     _, runs = recorded
-    for (_, rollout, last, (account, own_last, density)), share in zip(runs, (1.0, 0.25), strict=True):
+    for (_, rollout, last, (account, own_last, density, noise_error)), share in zip(
+        runs, (1.0, 0.25), strict=True
+    ):
         observation, evader, reward, penalty = account
         np.testing.assert_allclose(rollout.observation.self_state, observation.self_state, atol=1e-5)
         np.testing.assert_allclose(last.self_state, own_last.self_state, atol=1e-5)
         np.testing.assert_allclose(rollout.evader, evader, atol=1e-5)
         np.testing.assert_allclose(rollout.log_prob, density, atol=1e-3)
+        np.testing.assert_allclose(noise_error, 0.0, atol=1e-3)
         # with a share of the penalties the rest of them is given back
         assert penalty.min() <= -10
         np.testing.assert_allclose(rollout.reward, reward - (1 - share) * penalty, atol=1e-4)
@@ -84,7 +90,7 @@ def test_windows_and_labels_are_those_of_the_game_and_cross_no_reset(recorded):
     policy, runs = recorded
     room = STEPS - HORIZONS[-1] + 1
     times = jnp.tile(jnp.arange(room), (WORLDS, 1))
-    for start, rollout, _, ((observation, evader, _, _), _, _) in runs:
+    for start, rollout, _, ((observation, evader, _, _), *_) in runs:
         frames, last_seen, positions = windows_and_labels(policy, 2, start.frames, rollout, times)
         assert frames.shape[1:3] == (room, 3)
         for world in range(WORLDS):

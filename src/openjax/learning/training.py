@@ -13,7 +13,13 @@ from flax import struct
 from openjax.learning.archive import TaskArchive, empty_archive
 from openjax.learning.devices import gather_over_devices, mean_over_devices, own_keys
 from openjax.learning.generator import generate_task, select, successes
-from openjax.learning.mappo import ValueScale, initial_value_scale, make_optimiser, update_policy
+from openjax.learning.mappo import (
+    ValueScale,
+    exploration,
+    initial_value_scale,
+    make_optimiser,
+    update_policy,
+)
 from openjax.learning.predictor_update import make_predictor_optimiser, update_predictor
 from openjax.learning.rollout import collect
 from openjax.learning.settings import TrainSettings
@@ -116,7 +122,8 @@ def make_training_step(
         num_envs = carry.state.step.shape[0]  # of this device
 
         # rollout
-        penalty_share = _penalty_share(settings, carry.update)
+        progress = carry.update.astype(jnp.float32) / settings.total_updates
+        penalty_share = _penalty_share(settings, progress)
         shape = (settings.rollout_length, settings.environment.num_pursuers, 4)
         noise = jax.vmap(lambda k: jax.random.normal(k, shape))(own_keys(noise_key, num_envs, axis))
         rollout, observation, state = collect(
@@ -127,6 +134,7 @@ def make_training_step(
             carry.state,
             jnp.moveaxis(noise, 1, 0),
             penalty_share,
+            exploration(settings.mappo, progress),
         )
         last_predicted = policy.predict(carry.policy, observation)
 
@@ -161,7 +169,7 @@ def make_training_step(
             last_predicted,
             shuffle_key,
             axis,
-            carry.update.astype(jnp.float32) / settings.total_updates,
+            progress,
         )
         metrics |= watched
 
@@ -199,11 +207,10 @@ def make_training_step(
     return training_step
 
 
-def _penalty_share(settings, update):
-    """Share of the penalties that counts in this update: a ramp from its start to one."""
+def _penalty_share(settings, progress):
+    """Share of the penalties that counts when a share `progress` of the run is done: a ramp from its start to one."""
     start = settings.mappo.penalty_start
-    progress = update.astype(jnp.float32) / (settings.total_updates * max(settings.mappo.penalty_ramp, 1e-6))
-    return start + (1.0 - start) * jnp.minimum(progress, 1.0)
+    return start + (1.0 - start) * jnp.minimum(progress / max(settings.mappo.penalty_ramp, 1e-6), 1.0)
 
 
 def _tasks(settings, archive, keys, close=0.0):
