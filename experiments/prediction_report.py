@@ -16,6 +16,7 @@ QUESTIONS = (
         "1–40 ahead, absolute",
     ),
     ("longer horizons", DEFAULT, "1–5 ahead, relative"),
+    ("errors scaled, nothing from before it was first seen", DEFAULT, "squared error of all windows"),
     ("frames 40 ms apart", "spacing 4", DEFAULT),
     ("frames 80 ms apart", "spacing 8", DEFAULT),
     ("twice as many frames, 80 ms apart", "20 frames, spacing 8", "spacing 8"),

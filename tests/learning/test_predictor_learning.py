@@ -1,5 +1,7 @@
 """Rollouts and the predictor's training on them."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 
 from openjax.learning.predictor_update import (
     make_predictor_optimiser,
+    prediction_loss,
     update_predictor,
     windows_and_labels,
 )
@@ -148,7 +151,7 @@ def test_learns_a_circling_evader():
         parameters, state, loss = update_predictor(
             policy,
             optimiser,
-            1,
+            PursuitSettings(),
             parameters,
             state,
             earlier,
@@ -181,6 +184,22 @@ def test_learns_a_circling_evader():
     np.testing.assert_allclose(kept, [0.013, 0.065], rtol=0.02)
     assert (np.asarray(learnt) < 0.4 * np.asarray(kept)).all(), learnt
     assert loss[-10:].mean() < 0.1 * loss[0]
+
+
+def test_the_loss_counts_in_flown_distances_what_was_seen_before():
+    """The evader flies 0.02 m in one step here and 0.2 m in ten."""
+    game = PursuitSettings(evader_speed=2.0, arena_height=1.0)
+    settings = PredictorSettings(horizons=(1, 10))
+    true = jnp.zeros((2, 2, 3))
+    predicted = true.at[:, 0, 0].set(0.02).at[:, 1, 0].set(0.4)  # one and two flown distances too far along x
+    last_seen = jnp.array([[0.0, 0.0, 0.5], [0.1, 0.0, 0.5]])  # the first stands for: not yet seen
+
+    def loss(predicted, **changes):
+        changed = dataclasses.replace(settings, **changes)
+        return float(prediction_loss(changed, game, predicted, last_seen, true))
+
+    assert loss(predicted) == pytest.approx((1 + 4) / 12, rel=1e-5)
+    assert loss(predicted, loss="squared") == pytest.approx((0.02**2 + 0.4**2) / 6, rel=1e-5)
 
 
 @pytest.mark.parametrize("decay", [False, True])

@@ -7,6 +7,7 @@ import optax
 from openjax.learning.devices import mean_over_devices
 from openjax.learning.rollout import Rollout
 from openjax.policy import Policy, PredictorSettings
+from openjax.pursuit import PursuitSettings
 
 
 def make_predictor_optimiser(settings: PredictorSettings, total_updates: int) -> optax.GradientTransformation:
@@ -48,10 +49,30 @@ def windows_and_labels(
     return frames, last_seen, positions
 
 
+def prediction_loss(
+    settings: PredictorSettings,
+    game: PursuitSettings,
+    predicted: jax.Array,
+    last_seen: jax.Array,
+    positions: jax.Array,
+) -> jax.Array:
+    """() loss of predictions (..., K, 3), given last_seen (..., 3) and the true positions (..., K, 3).
+
+    Squared errors are nearly all those of the longest horizon, and of windows that end before the evader was first seen:
+    nothing can be learnt from these, but what is learnt from them is carried over to where it is lost from sight.
+    """
+    error = predicted - positions
+    if settings.loss == "squared":
+        return jnp.mean(error**2)
+    flown = game.evader_speed * game.time_step * jnp.array(settings.horizons, jnp.float32)
+    was_seen = jnp.any(last_seen != jnp.array(game.middle, jnp.float32), axis=-1)
+    return jnp.mean(was_seen[..., None, None] * (error / flown[:, None]) ** 2)
+
+
 def update_predictor(
     policy: Policy,
     optimiser: optax.GradientTransformation,
-    history_spacing: int,
+    game: PursuitSettings,
     parameters,
     optimiser_state,
     earlier: jax.Array,
@@ -62,12 +83,12 @@ def update_predictor(
     """A few gradient steps on random windows of each environment; `keys` (E,).
 
     Returns:
-        parameters, optimiser state, mean squared error () in m^2 per coordinate.
+        parameters, optimiser state, mean loss ().
     """
     settings = policy.predictor
     room = rollout.reward.shape[0] - settings.horizons[-1] + 1
     times = jax.vmap(lambda key: jax.random.permutation(key, room)[: settings.windows])(keys)
-    data = windows_and_labels(policy, history_spacing, earlier, rollout, times)
+    data = windows_and_labels(policy, game.history_spacing, earlier, rollout, times)
     # (steps, E, windows / steps, ...): every gradient step sees other windows of every environment
     data = jax.tree.map(
         lambda x: jnp.moveaxis(x.reshape(x.shape[0], settings.steps, -1, *x.shape[2:]), 1, 0), data
@@ -75,7 +96,7 @@ def update_predictor(
 
     def loss(parameters, frames, last_seen, positions):
         predicted = policy.predict_from(parameters, frames, last_seen)
-        return jnp.mean((predicted - positions) ** 2)
+        return prediction_loss(settings, game, predicted, last_seen, positions)
 
     def one(carry, batch):
         parameters, optimiser_state = carry

@@ -145,7 +145,7 @@ def make_training_step(
             predictor, predictor_optimiser, loss = update_predictor(
                 policy,
                 parts.predictor_optimiser,
-                settings.environment.history_spacing,
+                settings.environment,
                 predictor,
                 predictor_optimiser,
                 carry.state.frames,

@@ -41,9 +41,12 @@ class PredictorSettings:
     """Control steps ahead at which positions are predicted; the first is 1. The paper's are 1 to 5."""
     relative: bool = True
     """Predict the displacement from where the evader was last seen; False: positions in the arena, as in the paper."""
+    loss: Literal["scaled", "squared"] = "scaled"
+    """Mean squared error. "scaled": in units of how far the evader flies in that time, without the windows that end before
+    it was first seen; "squared": in metres, of all windows, as in the paper."""
     learning_rate: float = 1e-3
     """Adam step size; 1e-4 in the paper."""
-    decay: bool = False
+    decay: bool = True
     """Let the step size fall linearly to zero over `total_steps`; the paper's stays."""
     windows: int = 8
     """Windows of each environment's rollout that one iteration trains on."""

@@ -112,7 +112,7 @@ class Pursuit:
         seen = jnp.any(in_sight)
         still = jnp.zeros(3, jnp.float32)
         step = jnp.zeros((), jnp.int32)
-        middle = jnp.array([0.0, 0.0, settings.arena_height / 2], jnp.float32)
+        middle = jnp.array(settings.middle, jnp.float32)
         first = frame(settings, step, task.pursuer_position, task.evader_position, still, seen)
         frames = jnp.broadcast_to(
             first, (settings.history_length * settings.history_spacing, settings.frame_size)

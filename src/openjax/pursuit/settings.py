@@ -114,6 +114,11 @@ class PursuitSettings:
             need(getattr(self, name) > 0, f"{name} is {getattr(self, name)}; it must be positive")
 
     @property
+    def middle(self) -> tuple[float, float, float]:
+        """The arena's middle (m), where the evader is taken to be until it is first seen."""
+        return (0.0, 0.0, self.arena_height / 2)
+
+    @property
     def frame_size(self) -> int:
         """Numbers in one frame of the history: time, evader position and velocity, pursuer positions."""
         return 1 + 3 + 3 + 3 * self.num_pursuers
