@@ -124,32 +124,32 @@ def close_starts(settings: PursuitSettings, key: jax.Array, task: Task, share: f
     They stand 0 to 0.05 m outside the safety distance of one that is drawn at random, in any direction, within 0.1 m of
     half the arena's height. Among a few draws the first that starts clear is taken, else the task itself.
     """
-    n, slots = task.pursuer_position.shape[0], task.pillar_active.shape[0]
+    start, pillars = task.pursuer_position, task.pillar_position
+    n, slots = start.shape[0], pillars.shape[0]
     middle = settings.arena_height / 2
+    # what pursuer i can be put beside, (n, slots + n): pillars that stand, at its own height, and the other pursuers
+    possible = jnp.concatenate(
+        [jnp.broadcast_to(task.pillar_active, (n, slots)), ~jnp.eye(n, dtype=bool)], axis=1
+    )
+    height = jnp.broadcast_to(start[:, None, 2:], (n, slots, 1))
+    beside = jnp.concatenate([jnp.broadcast_to(pillars, (n, slots, 2)), height], axis=-1)
+    beside = jnp.concatenate([beside, jnp.broadcast_to(start, (n, n, 3))], axis=1)
 
     def draw(key):
         choice_key, which_key, direction_key, gap_key = jax.random.split(key, 4)
-        old = task.pursuer_position
-        # pillars that stand, and the other pursuers, are as likely as each other
-        others = jnp.concatenate(
-            [jnp.broadcast_to(task.pillar_active, (n, slots)), ~jnp.eye(n, dtype=bool)], axis=1
+        which = jax.random.categorical(which_key, jnp.where(possible, 0.0, -jnp.inf))
+        pillar = (which < slots)[:, None]
+        away = jax.random.normal(direction_key, (n, 3))
+        away = jnp.where(pillar, away.at[:, 2].set(0.0), away)
+        away = away / jnp.linalg.norm(away, axis=-1, keepdims=True)
+        clearance = jnp.where(
+            pillar, settings.pillar_radius + settings.pillar_clearance, settings.drone_clearance
         )
-        which = jax.random.categorical(which_key, jnp.where(others, 0.0, -jnp.inf))[:, None]
-        direction = jax.random.normal(direction_key, (n, 3))
         gap = jax.random.uniform(gap_key, (n, 1), jnp.float32, 0.0, CLOSE)
-
-        flat = direction[:, :2] / jnp.linalg.norm(direction[:, :2], axis=-1, keepdims=True)
-        pillar = task.pillar_position[jnp.minimum(which[:, 0], slots - 1)]
-        beside_pillar = pillar + (settings.pillar_radius + settings.pillar_clearance + gap) * flat
-        direction = direction / jnp.linalg.norm(direction, axis=-1, keepdims=True)
-        pursuer = old[jnp.maximum(which[:, 0] - slots, 0)]
-        beside_pursuer = pursuer + (settings.drone_clearance + gap) * direction
-        close = jnp.where(
-            which < slots, jnp.concatenate([beside_pillar, old[:, 2:]], axis=-1), beside_pursuer
-        )
+        close = beside[jnp.arange(n), which] + (clearance + gap) * away
         close = close.at[:, 2].set(jnp.clip(close[:, 2], middle - START_Z, middle + START_Z))
         moved = jax.random.uniform(choice_key, (n, 1)) < share
-        return task.replace(pursuer_position=jnp.where(moved, close, old))
+        return task.replace(pursuer_position=jnp.where(moved, close, start))
 
     return _first_clear(settings, draw, key, task)
 
