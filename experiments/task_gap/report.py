@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments.pages import table
 from experiments.task_gap.jobs import world_folder, world_name
 from openjax.runs.machine import describe_machine
 from openjax.runs.settings_files import write_json
@@ -193,34 +194,32 @@ The simulator steps its rate loop at 100 Hz like the policy by default; at 500 H
 
 
 def _summary_table(summary):
-    lines = [
-        "| figure | gap before | gap after | closed | 95 % | mean absolute, before → after | cases | clear before, after "
-        "| gap of none |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+    heads = ["figure", "gap before", "gap after", "closed", "95 %", "mean absolute, before → after", "cases"]
+    heads += ["clear before, after", "gap of none"]
+    rows = []
     for figure, (title, style) in FIGURES.items():
         s = summary.get("caused", {}).get(figure)
         if s is None:
             continue
         style = ".1f" if figure == "capture_step" else ".4f"
-        closed = "–" if s["closed"] is None else f"{s['closed']:.2f}"
-        interval = "–" if s["interval95"] is None else "{:.2f} to {:.2f}".format(*s["interval95"])
-        calm = f"{summary['none'][figure]:{style}}" if "none" in summary else "–"
-        lines.append(
-            f"| {title} | {s['before']:{style}} | {s['after']:{style}} | {closed} | {interval} | "
-            f"{s['mean_absolute_before']:{style}} → {s['mean_absolute_after']:{style}} | {s['cases']} | "
-            f"{s['clear_before']}, {s['clear_after']} | {calm} |"
+        rows.append(
+            [
+                title,
+                f"{s['before']:{style}}",
+                f"{s['after']:{style}}",
+                "–" if s["closed"] is None else f"{s['closed']:.2f}",
+                "–" if s["interval95"] is None else "{:.2f} to {:.2f}".format(*s["interval95"]),
+                f"{s['mean_absolute_before']:{style}} → {s['mean_absolute_after']:{style}}",
+                str(s["cases"]),
+                f"{s['clear_before']}, {s['clear_after']}",
+                f"{summary['none'][figure]:{style}}" if "none" in summary else "–",
+            ]
         )
-    return lines
+    return table(heads, rows)
 
 
 def _case_table(cases, told, rows):
-    lines = [
-        "Each cell: nominal, flights, corrected (gap to the flights before → after).",
-        "",
-        "| cause (form, size) | diagnosed | episodes | " + " | ".join(t for t, _ in FIGURES.values()) + " |",
-        "|---|---|---|" + "---|" * len(FIGURES),
-    ]
+    shown = []
     for case in cases:
         row = rows.get(case.name)
         if row is None:
@@ -235,5 +234,10 @@ def _case_table(cases, told, rows):
             cells.append(
                 f"{r['nominal']:{style}}, {r['plant']:{style}}, {r['corrected']:{style}} ({gaps[0]} → {gaps[1]})"
             )
-        lines.append("| " + " | ".join(cells) + " |")
-    return lines
+        shown.append(cells)
+    heads = ["cause (form, size)", "diagnosed", "episodes", *(title for title, _ in FIGURES.values())]
+    return [
+        "Each cell: nominal, flights, corrected (gap to the flights before → after).",
+        "",
+        *table(heads, shown),
+    ]
