@@ -157,7 +157,7 @@ def last_known(settings: PursuitSettings, flights: Flights) -> tuple[jax.Array, 
     index = flights.last_index
     ever = (index >= 0)[..., None]
     world = jnp.arange(index.shape[0])[:, None]
-    middle = jnp.array([0.0, 0.0, settings.arena_height / 2], jnp.float32)
+    middle = jnp.array(settings.middle, jnp.float32)
     at = jnp.maximum(index, 0)
     position = jnp.where(ever, flights.evader[world, at], middle)
     velocity = jnp.where(ever, flights.velocity[world, at], 0.0)
@@ -173,7 +173,7 @@ def evader_rule(
     pursuers don't move it; from the present on they're taken to fly straight on.
     """
     dt = settings.time_step
-    middle = jnp.array([0.0, 0.0, settings.arena_height / 2], jnp.float32)
+    middle = jnp.array(settings.middle, jnp.float32)
 
     def of_world(flight):
         pillars = flight.pillar_position, flight.pillar_active

@@ -9,7 +9,7 @@ import numpy as np
 import optax
 from prediction_flights import Flights, inside, last_known
 
-from openjax.learning.predictor_update import prediction_loss
+from openjax.learning.predictor_update import make_predictor_optimiser, prediction_loss
 from openjax.policy import PredictorSettings
 from openjax.policy.predictor import EvaderPredictor
 from openjax.pursuit import PursuitSettings
@@ -104,9 +104,14 @@ def frames_of(variant: Variant, settings: PursuitSettings, flights: Flights) -> 
 
 
 def own_settings(variant: Variant) -> PredictorSettings:
-    """The variant as the package's own settings, as far as they go."""
+    """The variant as the package's own settings, as far as they go; one gradient step per update."""
     return PredictorSettings(
-        units=variant.units, horizons=variant.horizons, relative=variant.relative, loss=variant.loss
+        units=variant.units,
+        horizons=variant.horizons,
+        relative=variant.relative,
+        loss=variant.loss,
+        learning_rate=variant.learning_rate,
+        steps=1,
     )
 
 
@@ -139,17 +144,14 @@ def train(
     frames = frames_of(variant, settings, flights)
     position = last_known(settings, flights)[0]
     worlds, length = flights.seen.shape
-    net = network(variant, settings)
-    optimiser = optax.chain(
-        optax.clip_by_global_norm(1.0),
-        optax.adam(optax.linear_schedule(variant.learning_rate, 0.0, budget.updates)),
-    )
+    own, net = own_settings(variant), network(variant, settings)
+    optimiser = make_predictor_optimiser(own, budget.updates)
     ahead = np.array(variant.horizons)
 
     def loss(parameters, world, time):
         predicted = net.apply(parameters, window(variant, frames, world, time), position[world, time])
         true = flights.evader[world[:, None], time[:, None] + ahead]
-        return prediction_loss(own_settings(variant), settings, predicted, position[world, time], true)
+        return prediction_loss(own, settings, predicted, position[world, time], true)
 
     def update(carry, key):
         parameters, state = carry

@@ -73,11 +73,7 @@ def exploration(settings: MappoSettings, progress: jax.Array | float) -> jax.Arr
 
 
 def policy_loss(
-    settings: MappoSettings,
-    policy: Policy,
-    actor: Any,
-    batch: Batch,
-    progress: jax.Array | float,
+    settings: MappoSettings, policy: Policy, actor: Any, batch: Batch, progress: jax.Array | float
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Surrogate with clipped ratio, minus the entropy bonus; and what to watch. `progress` as in `update_policy`."""
     clip = settings.clip + (settings.clip_end - settings.clip) * progress

@@ -13,13 +13,7 @@ from flax import struct
 from openjax.learning.archive import TaskArchive, empty_archive
 from openjax.learning.devices import gather_over_devices, mean_over_devices, own_keys
 from openjax.learning.generator import generate_task, select, successes
-from openjax.learning.mappo import (
-    ValueScale,
-    exploration,
-    initial_value_scale,
-    make_optimiser,
-    update_policy,
-)
+from openjax.learning.mappo import ValueScale, exploration, initial_value_scale, make_optimiser, update_policy
 from openjax.learning.predictor_update import make_predictor_optimiser, update_predictor
 from openjax.learning.rollout import collect
 from openjax.learning.settings import TrainSettings
@@ -215,11 +209,12 @@ def _penalty_share(settings, progress):
 
 def _tasks(settings, archive, keys, close=0.0):
     """One task per key, repeated for the environments that share it; a share of pursuers starts close to something."""
-    tasks = jax.vmap(lambda k: generate_task(settings.generator, settings.environment, archive, k))(keys)
-    if close:
-        moved = jax.vmap(lambda k, task: close_starts(settings.environment, k, task, close))
-        tasks = moved(jax.vmap(lambda k: jax.random.fold_in(k, 1))(keys), tasks)
-    return jax.tree.map(lambda x: jnp.repeat(x, settings.episodes_per_task, axis=0), tasks)
+
+    def one(key):
+        task = generate_task(settings.generator, settings.environment, archive, key)
+        return close_starts(settings.environment, jax.random.fold_in(key, 1), task, close) if close else task
+
+    return jax.tree.map(lambda x: jnp.repeat(x, settings.episodes_per_task, axis=0), jax.vmap(one)(keys))
 
 
 def _fresh(settings, environment, archive, task_key, reset_key, number, axis, close=0.0):

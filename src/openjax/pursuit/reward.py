@@ -39,8 +39,8 @@ def reward(
     (N,) bool and the change of the squashed command `action` (N, 4) count for each pursuer.
     """
     weights = settings.reward
-    penalty = -weights.collision * breach.total - weights.over_speed * too_fast - weights.crash * crash
-    penalty = penalty - weights.first_crash * first_crash
+    penalty = -weights.collision * breach.total - weights.over_speed * too_fast
+    penalty = penalty - weights.crash * crash - weights.first_crash * first_crash
     change = jnp.sqrt(jnp.sum((action - previous_action) ** 2, axis=-1) + 1e-12)
     task = weights.capture * jnp.any(captured) - weights.distance * distance
     return task + weights.smoothness * jnp.exp(-change) + penalty, penalty

@@ -106,9 +106,7 @@ def expand_task(
             radius = jnp.linalg.norm(moved[..., :2], axis=-1, keepdims=True)
             reach = settings.arena_radius - wall_distance
             xy = moved[..., :2] * jnp.minimum(1.0, reach / jnp.maximum(radius, 1e-6))
-            middle = settings.arena_height / 2
-            z = jnp.clip(moved[..., 2:], middle - START_Z, middle + START_Z)
-            return jnp.concatenate([xy, z], axis=-1)
+            return jnp.concatenate([xy, _start_height(settings, moved[..., 2:])], axis=-1)
 
         return task.replace(
             pursuer_position=move(pursuer_key, task.pursuer_position),
@@ -126,7 +124,6 @@ def close_starts(settings: PursuitSettings, key: jax.Array, task: Task, share: f
     """
     start, pillars = task.pursuer_position, task.pillar_position
     n, slots = start.shape[0], pillars.shape[0]
-    middle = settings.arena_height / 2
     # what pursuer i can be put beside, (n, slots + n): pillars that stand, at its own height, and the other pursuers
     possible = jnp.concatenate(
         [jnp.broadcast_to(task.pillar_active, (n, slots)), ~jnp.eye(n, dtype=bool)], axis=1
@@ -147,11 +144,17 @@ def close_starts(settings: PursuitSettings, key: jax.Array, task: Task, share: f
         )
         gap = jax.random.uniform(gap_key, (n, 1), jnp.float32, 0.0, CLOSE)
         close = beside[jnp.arange(n), which] + (clearance + gap) * away
-        close = close.at[:, 2].set(jnp.clip(close[:, 2], middle - START_Z, middle + START_Z))
+        close = close.at[:, 2].set(_start_height(settings, close[:, 2]))
         moved = jax.random.uniform(choice_key, (n, 1)) < share
         return task.replace(pursuer_position=jnp.where(moved, close, start))
 
     return _first_clear(settings, draw, key, task)
+
+
+def _start_height(settings, z):
+    """Heights z (m), cut to those at which a vehicle may start."""
+    middle = settings.arena_height / 2
+    return jnp.clip(z, middle - START_Z, middle + START_Z)
 
 
 def _first_clear(settings, draw, key, task):
