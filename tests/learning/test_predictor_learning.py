@@ -42,9 +42,7 @@ def recorded():
     @jax.jit
     def play(parameters, observation, state, key, share):
         noise = jax.random.normal(key, (STEPS, WORLDS, GAME.num_pursuers, 4))
-        rollout, last, after = collect(
-            environment, policy, parameters, observation, state, noise, share, share
-        )
+        rollout, last, after = collect(environment, policy, parameters, observation, state, noise, share)
 
         def one(carry, action):
             observation, state = carry
@@ -55,8 +53,8 @@ def recorded():
 
         (own_last, _), account = jax.lax.scan(one, (observation, state), rollout.action)
         mean, log_std = policy.distribution(parameters.actor, rollout.observation, rollout.predicted)
-        density = gaussian_log_prob(rollout.action, mean, log_std + jnp.log(share))
-        own_noise = (rollout.action - mean) / (share * jnp.exp(log_std))
+        density = gaussian_log_prob(rollout.action, mean, log_std)
+        own_noise = (rollout.action - mean) / jnp.exp(log_std)
         return rollout, last, after, (account, own_last, density, own_noise - noise)
 
     reset = jax.jit(jax.vmap(environment.reset))

@@ -20,7 +20,6 @@ from openjax.learning import (
     preset,
     summarise,
 )
-from openjax.learning.mappo import exploration
 from openjax.learning.training import _initial_carry, _penalty_share
 from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import SCENARIOS, PursuitSettings, hover_action, scenario_task
@@ -174,16 +173,6 @@ def test_penalties_ramp_up():
     share = [float(_penalty_share(SETTINGS, progress)) for progress in (0.0, 0.2, 0.5, 0.9)]
     np.testing.assert_allclose(share, [0.2, 0.52, 1.0, 1.0], atol=1e-6)
     assert float(_penalty_share(TrainSettings(), 0.0)) == 1.0
-
-
-def test_exploration_fades_alike_in_rollout_and_update():
-    mappo = dataclasses.replace(SETTINGS.mappo, exploration_end=0.2, learning_rate=0.0)
-    settings = dataclasses.replace(SETTINGS, mappo=mappo)
-    assert [exploration(mappo, progress) for progress in (0.0, 0.5, 1.0)] == pytest.approx([1.0, 0.6, 0.2])
-    carry = init_carry(settings, jax.random.key(0)).replace(update=jnp.int32(5))
-    _, metrics = jax.jit(make_training_step(settings))(carry)
-    # nothing is learnt, so the probability of every action is still that of the rollout
-    assert abs(metrics["kl"]) < 1e-6 and metrics["clipped"] == 0.0
 
 
 def test_evaluation_of_a_policy_that_hovers():

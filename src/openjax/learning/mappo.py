@@ -67,18 +67,12 @@ def make_optimiser(
     return one(), one()
 
 
-def exploration(settings: MappoSettings, progress: jax.Array | float) -> jax.Array | float:
-    """Share of the actions' learnt standard deviation that is left when a share `progress` of the run is done."""
-    return 1.0 + (settings.exploration_end - 1.0) * progress
-
-
 def policy_loss(
     settings: MappoSettings, policy: Policy, actor: Any, batch: Batch, progress: jax.Array | float
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Surrogate with clipped ratio, minus the entropy bonus; and what to watch. `progress` as in `update_policy`."""
     clip = settings.clip + (settings.clip_end - settings.clip) * progress
     mean, log_std = policy.distribution(actor, batch.observation, batch.predicted)
-    log_std = log_std + jnp.log(exploration(settings, progress))
     log_ratio = gaussian_log_prob(batch.action, mean, log_std) - batch.log_prob
     ratio = jnp.exp(log_ratio)
     clipped = jnp.clip(ratio, 1.0 - clip, 1.0 + clip)
@@ -126,7 +120,7 @@ def update_policy(
         last_predicted: (E, K, 3) its prediction.
         key: shuffles, the same on all devices.
         axis: name of the devices' axis.
-        progress: () share of the run that is done, for the clip range and the exploration.
+        progress: () share of the run that is done, for the clip range.
 
     Returns:
         (actor, critic), optimiser states, value scale, dict of () metrics.

@@ -35,7 +35,6 @@ def collect(
     state: PursuitState,
     noise: jax.Array,
     penalty_share: jax.Array | float = 1.0,
-    exploration: jax.Array | float = 1.0,
 ) -> tuple[Rollout, Observation, PursuitState]:
     """Act with exploration for T steps in E worlds.
 
@@ -47,7 +46,6 @@ def collect(
         state: (E, ...).
         noise: (T, E, N, 4) standard normal, drawn ahead in one go.
         penalty_share: () share of the reward's penalties that counts.
-        exploration: () share of the actions' standard deviation.
 
     Returns:
         the rollout, and observation and state after it.
@@ -59,7 +57,6 @@ def collect(
         observation, state = carry
         predicted = policy.predict(parameters, observation)
         mean, log_std = policy.distribution(parameters.actor, observation, predicted)
-        log_std = log_std + jnp.log(exploration)
         action = mean + jnp.exp(log_std) * noise
         log_prob = gaussian_log_prob(action, mean, log_std)
         following, state, reward, terminated, truncated, info = step(unused_key, state, policy.action(action))

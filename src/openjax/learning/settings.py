@@ -22,8 +22,6 @@ class MappoSettings:
     """... which changes linearly to this over `total_steps`."""
     entropy: float = 1e-3
     """Weight of the entropy."""
-    exploration_end: float = 1.0
-    """Share of the actions' learnt standard deviation that is left at the end; it falls linearly from one."""
     discount: float = 0.995
     trace: float = 0.95
     """Lambda of the generalised advantage estimate."""

@@ -13,7 +13,7 @@ from flax import struct
 from openjax.learning.archive import TaskArchive, empty_archive
 from openjax.learning.devices import gather_over_devices, mean_over_devices, own_keys
 from openjax.learning.generator import generate_task, select, successes
-from openjax.learning.mappo import ValueScale, exploration, initial_value_scale, make_optimiser, update_policy
+from openjax.learning.mappo import ValueScale, initial_value_scale, make_optimiser, update_policy
 from openjax.learning.predictor_update import make_predictor_optimiser, update_predictor
 from openjax.learning.rollout import collect
 from openjax.learning.settings import TrainSettings
@@ -128,7 +128,6 @@ def make_training_step(
             carry.state,
             jnp.moveaxis(noise, 1, 0),
             penalty_share,
-            exploration(settings.mappo, progress),
         )
         last_predicted = policy.predict(carry.policy, observation)
 
