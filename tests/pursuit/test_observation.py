@@ -12,6 +12,7 @@ from openjax.pursuit.observation import frame, observe, rotation_axes
 
 POSITION = np.array([[0.4, 0.0, 0.5], [0.0, 0.2, 0.7], [-0.2, -0.4, 0.6]], np.float32)
 TURNED = np.array([np.sqrt(0.5), 0, 0, np.sqrt(0.5)], np.float32)  # yaw by 90 degrees
+ROLLED = np.array([np.sqrt(0.5), np.sqrt(0.5), 0, 0], np.float32)  # roll by 90 degrees
 EVADER = np.array([-0.6, 0.1, 0.6], np.float32)
 PILLARS = np.array([[0.0, 0.0], [0.4, 0.3], [-0.4, -0.1], [0.5, 0.5]], np.float32)
 
@@ -19,13 +20,13 @@ PILLARS = np.array([[0.0, 0.0], [0.4, 0.3], [-0.4, -0.1], [0.5, 0.5]], np.float3
 _observe = functools.partial(jax.jit, static_argnums=0)(observe)
 
 
-def observed(seen=True, active=(True,) * 4, pillars=PILLARS, **changes):
+def observed(seen=True, active=(True,) * 4, pillars=PILLARS, quaternion=TURNED, **changes):
     settings = PursuitSettings(episode_length=800, **changes)
     return _observe(
         settings,
         jnp.int32(200),
         jnp.asarray(POSITION),
-        jnp.asarray(np.stack([[1, 0, 0, 0], TURNED, [1, 0, 0, 0]]), jnp.float32),
+        jnp.asarray(np.stack([[1, 0, 0, 0], quaternion, [1, 0, 0, 0]]), jnp.float32),
         jnp.asarray(0.1 * np.arange(9).reshape(3, 3), jnp.float32),
         jnp.asarray(EVADER),
         jnp.array([1.3, 0.0, 0.0]),
@@ -69,6 +70,16 @@ def test_others_are_relative_and_in_order():
     for i, (first, second) in enumerate([(1, 2), (0, 2), (0, 1)]):
         np.testing.assert_allclose(others[i, 0], POSITION[i] - POSITION[first], atol=1e-6)
         np.testing.assert_allclose(others[i, 1], POSITION[i] - POSITION[second], atol=1e-6)
+
+
+def test_motion_of_the_others():
+    moving = np.asarray(observed(observe_others_motion=True, quaternion=ROLLED).others)
+    np.testing.assert_allclose(moving[..., :3], observed().others, atol=1e-6)
+    # velocities are 0.1 (0, 1, 2), 0.1 (3, 4, 5), 0.1 (6, 7, 8); the second pursuer is rolled by 90 degrees
+    np.testing.assert_allclose(moving[0, :, 3:6], [[-0.3] * 3, [-0.6] * 3], atol=1e-6)
+    np.testing.assert_allclose(moving[1, :, 3:6], [[0.3] * 3, [-0.3] * 3], atol=1e-6)
+    np.testing.assert_allclose(moving[0, :, 6:], [[0, -1, 0], [0, 0, 1]], atol=1e-6)
+    np.testing.assert_allclose(moving[1, :, 6:], [[0, 0, 1], [0, 0, 1]], atol=1e-6)
 
 
 @pytest.mark.parametrize(

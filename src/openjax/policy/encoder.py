@@ -29,7 +29,7 @@ class SelfAttention(nn.Module):
     def __call__(
         self, own: jax.Array, others: jax.Array, pillars: jax.Array, pillar_seen: jax.Array
     ) -> jax.Array:
-        """own (B, F) embedded; others (B, A, 3), pillars (B, k, 5) as observed; pillar_seen (B, k) bool -> (B, F)."""
+        """own (B, F) embedded; others (B, A, O), pillars (B, k, 5) as observed; pillar_seen (B, k) bool -> (B, F)."""
         f, h = self.features, self.heads
         width = f // h
         orthogonal = nn.initializers.orthogonal()
@@ -111,7 +111,7 @@ class Encoder(nn.Module):
     def __call__(
         self, self_state: jax.Array, others: jax.Array, pillars: jax.Array, pillar_seen: jax.Array
     ) -> jax.Array:
-        """self_state (..., S), others (..., A, 3), pillars (..., k, 5), pillar_seen (..., k) bool -> (..., F)."""
+        """self_state (..., S), others (..., A, O), pillars (..., k, 5), pillar_seen (..., k) bool -> (..., F)."""
         leading = self_state.shape[:-1]
         rows = len(leading)
 

@@ -15,7 +15,7 @@ class Observation:
     self_state: (
         jax.Array
     )  # (N, S) evader, quaternion wxyz, velocity, body x axis, body z axis, t/T x 4 [, position]
-    others: jax.Array  # (N, N - 1, 3) the other pursuers
+    others: jax.Array  # (N, N - 1, O) other pursuers: relative position [, relative velocity, body z axis]
     pillars: jax.Array  # (N, k, 5) nearest pillars: position relative to their centre (3), height, radius
     pillar_seen: jax.Array  # (N, k) bool, slots in use
     privileged: (
@@ -74,6 +74,8 @@ def observe(
 
     index = jnp.array([[j for j in range(n) if j != i] for i in range(n)], jnp.int32).reshape(n, n - 1)
     others = position[:, None] - position[index]
+    if settings.observe_others_motion:
+        others = jnp.concatenate([others, velocity[:, None] - velocity[index], body_z[index]], axis=-1)
 
     pillars, pillar_seen = _nearest_pillars(settings, position, pillar_position, pillar_active)
     privileged = jnp.concatenate(
