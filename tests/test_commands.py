@@ -263,9 +263,10 @@ def test_shipped_policies_act_in_their_game_and_refuse_another():
         observation, _ = jax.jit(environment.reset)(jax.random.key(0))
         action = policy(observation)
         assert action.shape == (3, 4) and bool((abs(action) <= 1).all()), name
-    other = openjax.make(policy.settings.environment, history_length=3)
-    with pytest.raises(openjax.UserError, match="make its game with"):
-        policy(jax.eval_shape(other.reset, jax.random.key(0))[0])
+    for changes in ({"history_length": 3}, {"observe_others_motion": True}):
+        other = openjax.make(policy.settings.environment, **changes)
+        with pytest.raises(openjax.UserError, match="make its game with"):
+            policy(jax.eval_shape(other.reset, jax.random.key(0))[0])
 
 
 def test_benchmark_writes_table_and_file(tmp_path, shared_cache):

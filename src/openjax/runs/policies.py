@@ -32,12 +32,16 @@ class LoadedPolicy:
           UserError: the observation is that of another game.
         """
         game = self.settings.environment
-        given = (observation.self_state.shape[-1], *observation.frames.shape[-2:])
-        expected = (game.self_size, game.history_length, game.frame_size)
+        given = (
+            observation.self_state.shape[-1],
+            observation.others.shape[-1],
+            *observation.frames.shape[-2:],
+        )
+        expected = (game.self_size, game.others_size, game.history_length, game.frame_size)
         if given != expected:
             raise UserError(
-                f"policy {self.source} observes {expected} numbers (own state, history), here are {given}; "
-                "make its game with openjax.make(policy.settings.environment)"
+                f"policy {self.source} observes {expected} numbers (own state, another pursuer, history), "
+                f"here are {given}; make its game with openjax.make(policy.settings.environment)"
             )
         return self.policy.act(self.parameters, observation)
 
