@@ -68,10 +68,9 @@ def make_optimiser(
 
 
 def policy_loss(
-    settings: MappoSettings, policy: Policy, actor: Any, batch: Batch, progress: jax.Array | float
+    settings: MappoSettings, policy: Policy, actor: Any, batch: Batch, clip: jax.Array
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Surrogate with clipped ratio, minus the entropy bonus; and what to watch. `progress` as in `update_policy`."""
-    clip = settings.clip + (settings.clip_end - settings.clip) * progress
+    """Surrogate, its ratio clipped to 1 +- `clip` (), minus the entropy bonus; and what to watch."""
     mean, log_std = policy.distribution(actor, batch.observation, batch.predicted)
     log_ratio = gaussian_log_prob(batch.action, mean, log_std) - batch.log_prob
     ratio = jnp.exp(log_ratio)
@@ -161,12 +160,13 @@ def update_policy(
         target=(returns - mean) / std,
     )
     batch = _partition(batch, settings.minibatches)
+    clip = settings.clip + (settings.clip_end - settings.clip) * progress
 
     def gradient_step(carry, index):
         (actor, critic), (actor_state, critic_state) = carry
         part = jax.tree.map(lambda x: x[index], batch)
         (actor_loss, watch), actor_gradient = jax.value_and_grad(
-            lambda p: policy_loss(settings, policy, p, part, progress), has_aux=True
+            lambda p: policy_loss(settings, policy, p, part, clip), has_aux=True
         )(actor)
         critic_loss, critic_gradient = jax.value_and_grad(lambda p: value_loss(settings, policy, p, part))(
             critic
