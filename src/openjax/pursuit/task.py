@@ -119,34 +119,39 @@ def expand_task(
 def close_starts(settings: PursuitSettings, key: jax.Array, task: Task, share: float) -> Task:
     """Put a `share` (0 to 1) of the pursuers next to a pillar or another pursuer: starts that leave the least room.
 
-    They stand 0 to 0.05 m outside the safety distance of one that is drawn at random, in any direction, within 0.1 m of
-    half the arena's height. Among a few draws the first that starts clear is taken, else the task itself.
+    They stand 0 to 0.05 m outside its safety distance, in any direction, within 0.1 m of half the arena's height. One
+    is placed after the other: beside a pillar, or beside a pursuer whose start is settled, with equal odds where there
+    are both. Among a few draws the first that starts clear is taken, else the task itself.
     """
-    start, pillars = task.pursuer_position, task.pillar_position
-    n, slots = start.shape[0], pillars.shape[0]
-    # what pursuer i can be put beside, (n, slots + n): pillars that stand, at its own height, and the other pursuers
-    possible = jnp.concatenate(
-        [jnp.broadcast_to(task.pillar_active, (n, slots)), ~jnp.eye(n, dtype=bool)], axis=1
-    )
-    height = jnp.broadcast_to(start[:, None, 2:], (n, slots, 1))
-    beside = jnp.concatenate([jnp.broadcast_to(pillars, (n, slots, 2)), height], axis=-1)
-    beside = jnp.concatenate([beside, jnp.broadcast_to(start, (n, n, 3))], axis=1)
+    start, n = task.pursuer_position, task.pursuer_position.shape[0]
+    no_pillar = ~jnp.any(task.pillar_active)
+
+    def place(position, i, key):
+        """All positions (N, 3) after pursuer i was put beside a pillar or one of those before it."""
+        kind_key, which_key, direction_key, gap_key = jax.random.split(key, 4)
+        pillar = jax.random.categorical(which_key, jnp.where(task.pillar_active, 0.0, -jnp.inf))
+        anchor = jnp.append(task.pillar_position[pillar], position[i, 2])
+        clearance = settings.pillar_radius + settings.pillar_clearance
+        away = jax.random.normal(direction_key, (3,))
+        if i > 0:
+            by_pursuer = jax.random.bernoulli(kind_key) | no_pillar
+            anchor = jnp.where(by_pursuer, position[jax.random.randint(which_key, (), 0, i)], anchor)
+            clearance = jnp.where(by_pursuer, settings.drone_clearance, clearance)
+        else:
+            by_pursuer = False
+        away = away.at[2].multiply(by_pursuer)  # a pillar is as high as the arena
+        gap = jax.random.uniform(gap_key, (), jnp.float32, 0.0, CLOSE)
+        close = anchor + (clearance + gap) * away / jnp.linalg.norm(away)
+        close = close.at[2].set(_start_height(settings, close[2]))
+        return jnp.where(no_pillar & ~by_pursuer, position, position.at[i].set(close))
 
     def draw(key):
-        choice_key, which_key, direction_key, gap_key = jax.random.split(key, 4)
-        which = jax.random.categorical(which_key, jnp.where(possible, 0.0, -jnp.inf))
-        pillar = (which < slots)[:, None]
-        away = jax.random.normal(direction_key, (n, 3))
-        away = jnp.where(pillar, away.at[:, 2].set(0.0), away)
-        away = away / jnp.linalg.norm(away, axis=-1, keepdims=True)
-        clearance = jnp.where(
-            pillar, settings.pillar_radius + settings.pillar_clearance, settings.drone_clearance
-        )
-        gap = jax.random.uniform(gap_key, (n, 1), jnp.float32, 0.0, CLOSE)
-        close = beside[jnp.arange(n), which] + (clearance + gap) * away
-        close = close.at[:, 2].set(_start_height(settings, close[:, 2]))
-        moved = jax.random.uniform(choice_key, (n, 1)) < share
-        return task.replace(pursuer_position=jnp.where(moved, close, start))
+        choice_key, place_key = jax.random.split(key)
+        moved = jax.random.uniform(choice_key, (n,)) < share
+        position = start
+        for i, key in enumerate(jax.random.split(place_key, n)):
+            position = jnp.where(moved[i], place(position, i, key), position)
+        return task.replace(pursuer_position=position)
 
     return _first_clear(settings, draw, key, task)
 
