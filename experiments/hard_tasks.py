@@ -1,0 +1,127 @@
+"""Rare failures of policies, on tasks enough to count them: `python experiments/hard_tasks.py [--policy NAME ...]`.
+
+The layouts' hundred episodes can't tell a crash in a hundred from one in a thousand, and nothing may be chosen by them.
+So policies are compared on three kinds of other tasks: uniform ones, uniform ones with their pillars in a row (which
+hide the evader and have to be flown round), and uniform ones turned about the axis in which every pursuer that can be
+starts close to a pillar or another pursuer. Writes experiments/results/hard_tasks.json and .md.
+"""
+
+import time
+
+import jax
+import numpy as np
+from headline import seeds_of_open
+from pages import page_parser, publish, table
+
+from openjax.learning import make_evaluate, summarise
+from openjax.pursuit import Pursuit, PursuitSettings, close_starts, line_up_pillars, turn_task, uniform_task
+from openjax.runs.command_line import run_command
+from openjax.runs.held_back import uniform_tasks
+from openjax.runs.machine import describe_machine
+from openjax.runs.policies import load_policy
+
+KEY = 77_000_001
+"""From which rows and close starts are drawn, the same for all policies."""
+BATCH = 512
+"""Episodes per call of the compiled evaluation."""
+
+
+def row(settings: PursuitSettings, key: jax.Array):
+    """A uniform task with its pillars in a row."""
+    task_key, row_key = jax.random.split(key)
+    return line_up_pillars(settings, row_key, uniform_task(settings, task_key))
+
+
+def close(settings: PursuitSettings, key: jax.Array):
+    """A turned uniform task in which as many pursuers as possible start close to something."""
+    task_key, turn_key, close_key = jax.random.split(key, 3)
+    task = turn_task(turn_key, uniform_task(settings, task_key))
+    return close_starts(settings, close_key, task, 1.0)
+
+
+def drawn(settings: PursuitSettings, draw, number: int):
+    """`number` tasks by `draw(settings, key)`."""
+    keys = jax.random.split(jax.random.key(KEY), number)
+    return jax.jit(jax.vmap(lambda key: draw(settings, key)))(keys)
+
+
+def fly(policy: str, number: int) -> dict[str, dict]:
+    """Summary per kind of task, in the game in which the policy was trained; `number` uniform tasks."""
+    loaded = load_policy(policy)
+    settings = loaded.settings.environment
+    evaluate = jax.jit(make_evaluate(Pursuit(settings), loaded.policy))
+    kinds = {
+        "uniform": uniform_tasks(settings, number, settings.max_pillars),
+        "row": drawn(settings, row, number // 4),
+        "close": drawn(settings, close, number // 2),
+    }
+    found = {}
+    for kind, tasks in kinds.items():
+        parts = []
+        for start in range(0, tasks.evader_position.shape[0], BATCH):
+            batch = jax.tree.map(lambda leaf, start=start: leaf[start : start + BATCH], tasks)
+            key = jax.random.fold_in(jax.random.key(0), start)
+            parts.append(jax.tree.map(np.asarray, evaluate(loaded.parameters, batch, key)))
+        whole = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+        found[kind] = {
+            "episodes": len(whole.statistics.crashed),
+            "crashes": int(whole.statistics.crashed.sum()),
+            **summarise(whole),
+        }
+    return found
+
+
+def report(results: dict) -> list[str]:
+    """The page."""
+    machine = results["machine"]
+    rows = [
+        [
+            name,
+            kind,
+            f"{found['crashes']} of {found['episodes']}",
+            f"{found['collision_rate']:.4f}",
+            f"{found['capture_rate']:.4f}",
+            f"{found['capture_step']:.0f}",
+        ]
+        for name, kinds in results["policies"].items()
+        for kind, found in kinds.items()
+    ]
+    return [
+        "# Rare failures, on many tasks",
+        "",
+        f"`{results['command']}` on {machine['device']}, JAX {machine['versions']['jax']}, commit {machine['commit']}: "
+        f"{results['seconds']:.0f} s. Uniform: held-back uniform tasks; row: their pillars in a row; close: all pursuers "
+        "that can be start close to a pillar or another pursuer. Each policy in the game that it was trained in; start "
+        "attitudes drawn.",
+        "",
+        *table(["policy", "tasks", "crashes", "collision rate", "capture rate", "capture step"], rows),
+    ]
+
+
+def study(options) -> dict:
+    """Fly the policies."""
+    started = time.monotonic()
+    names = options.policy or seeds_of_open()
+    chosen = f" --policy {' '.join(options.policy)}" if options.policy else ""
+    policies = {name: fly(name, options.number) for name in names}
+    return {
+        "command": f"python experiments/hard_tasks.py --number {options.number}{chosen}",
+        "machine": describe_machine(),
+        "seconds": time.monotonic() - started,
+        "policies": policies,
+    }
+
+
+def main(arguments: list[str]) -> int:
+    """Evaluate and write both files."""
+    parser = page_parser(__doc__, "hard_tasks")
+    parser.add_argument("--policy", nargs="+", help="names, runs or policy files; by default OPEN's seeds")
+    parser.add_argument(
+        "--number", type=int, default=4096, help="uniform tasks; a quarter and half of it of the others"
+    )
+    publish(parser.parse_args(arguments), study, report)
+    return 0
+
+
+if __name__ == "__main__":
+    run_command(main)
