@@ -130,15 +130,14 @@ def close_starts(settings: PursuitSettings, key: jax.Array, task: Task, share: f
         """All positions (N, 3) after pursuer i was put beside a pillar or one of those before it."""
         kind_key, which_key, direction_key, gap_key = jax.random.split(key, 4)
         pillar = jax.random.categorical(which_key, jnp.where(task.pillar_active, 0.0, -jnp.inf))
-        anchor = jnp.append(task.pillar_position[pillar], position[i, 2])
-        clearance = settings.pillar_radius + settings.pillar_clearance
+        beside = jnp.append(task.pillar_position[pillar], position[i, 2])
+        by_pursuer = (jax.random.bernoulli(kind_key) | no_pillar) & (i > 0)
+        before = jax.random.randint(which_key, (), 0, max(i, 1))
+        anchor = jnp.where(by_pursuer, position[before], beside)
+        clearance = jnp.where(
+            by_pursuer, settings.drone_clearance, settings.pillar_radius + settings.pillar_clearance
+        )
         away = jax.random.normal(direction_key, (3,))
-        if i > 0:
-            by_pursuer = jax.random.bernoulli(kind_key) | no_pillar
-            anchor = jnp.where(by_pursuer, position[jax.random.randint(which_key, (), 0, i)], anchor)
-            clearance = jnp.where(by_pursuer, settings.drone_clearance, clearance)
-        else:
-            by_pursuer = False
         away = away.at[2].multiply(by_pursuer)  # a pillar is as high as the arena
         gap = jax.random.uniform(gap_key, (), jnp.float32, 0.0, CLOSE)
         close = anchor + (clearance + gap) * away / jnp.linalg.norm(away)
