@@ -9,12 +9,11 @@ starts close to a pillar or another pursuer. Writes experiments/results/hard_tas
 import time
 
 import jax
-import numpy as np
-from headline import seeds_of_open
+from headline import evaluator_of, seeds_of_open
 from pages import page_parser, publish, table
 
-from openjax.learning import make_evaluate, summarise
-from openjax.pursuit import Pursuit, PursuitSettings, close_starts, line_up_pillars, turn_task, uniform_task
+from openjax.learning import summarise
+from openjax.pursuit import PursuitSettings, close_starts, line_up_pillars, turn_task, uniform_task
 from openjax.runs.command_line import run_command
 from openjax.runs.held_back import uniform_tasks
 from openjax.runs.machine import describe_machine
@@ -49,7 +48,7 @@ def fly(policy: str, number: int) -> dict[str, dict]:
     """Summary per kind of task, in the game in which the policy was trained; `number` uniform tasks."""
     loaded = load_policy(policy)
     settings = loaded.settings.environment
-    evaluate = jax.jit(make_evaluate(Pursuit(settings), loaded.policy))
+    evaluator = evaluator_of(settings, loaded.policy, BATCH)
     kinds = {
         "uniform": uniform_tasks(settings, number, settings.max_pillars),
         "row": drawn(settings, row, number // 4),
@@ -57,16 +56,11 @@ def fly(policy: str, number: int) -> dict[str, dict]:
     }
     found = {}
     for kind, tasks in kinds.items():
-        parts = []
-        for start in range(0, tasks.evader_position.shape[0], BATCH):
-            batch = jax.tree.map(lambda leaf, start=start: leaf[start : start + BATCH], tasks)
-            key = jax.random.fold_in(jax.random.key(0), start)
-            parts.append(jax.tree.map(np.asarray, evaluate(loaded.parameters, batch, key)))
-        whole = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+        evaluation, _ = evaluator(loaded.parameters, tasks, jax.random.key(0))
         found[kind] = {
-            "episodes": len(whole.statistics.crashed),
-            "crashes": int(whole.statistics.crashed.sum()),
-            **summarise(whole),
+            "episodes": len(evaluation.statistics.crashed),
+            "crashes": int(evaluation.statistics.crashed.sum()),
+            **summarise(evaluation),
         }
     return found
 
