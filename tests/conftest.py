@@ -1,7 +1,9 @@
-"""Settings of the whole suite: it compiles much and computes little, so the compiler may leave out costly passes."""
+"""Settings and fixtures of the whole suite: it compiles much and computes little, so the compiler may leave out costly passes."""
 
 import os
 from importlib.metadata import version
+
+import pytest
 
 _flags = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 if version("jaxlib").startswith("0.10."):
@@ -9,3 +11,40 @@ if version("jaxlib").startswith("0.10."):
     _flags += " --xla_cpu_use_fusion_emitters=false"
 os.environ.setdefault("XLA_FLAGS", _flags)
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+VEHICLE_TOML = """
+[vehicle]
+name = "crazyflie-2.1"
+mass = 0.0321
+mass_weighed = true
+
+[motor]
+command = "thrust"
+"""
+
+
+@pytest.fixture(scope="session")
+def sample_columns():
+    """Columns of three sample flights of the nominal vehicle: {"flight_a": {"t": ..., ...}, ...}."""
+    from openjax.gap.samples import fly, references
+    from openjax.vehicle import load_vehicle
+
+    vehicle = load_vehicle()
+    return {
+        name: fly(vehicle, vehicle, reference, seed)[0]
+        for seed, (name, reference) in enumerate(references(seed=1, duration=8.0).items())
+    }
+
+
+@pytest.fixture
+def case_folder(tmp_path, sample_columns):
+    """A case folder with the three sample flights."""
+    from openjax.flights.reading import write_csv
+    from openjax.gap.samples import log_of
+
+    folder = tmp_path / "case"
+    folder.mkdir()
+    (folder / "vehicle.toml").write_text(VEHICLE_TOML)
+    for name, columns in sample_columns.items():
+        write_csv(folder / f"{name}.csv.gz", log_of([columns], name))
+    return folder

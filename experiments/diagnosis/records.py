@@ -37,8 +37,8 @@ def read_case(job):
 
 
 def _read(folder, without, answer):
+    from openjax.flights.case import load_case
     from openjax.gap import decision
-    from openjax.gap.case import load_case
     from openjax.gap.diagnosis import left_by
     from openjax.gap.evidence import gather
     from openjax.gap.hypotheses import SetFit

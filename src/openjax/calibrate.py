@@ -34,8 +34,8 @@ class Arguments:
 
 def run(arguments: Arguments, console: Console):
     """Calibrate, print and write; returns the Calibration. Raises UserError; writes nothing then."""
+    from openjax.flights.case import load_case
     from openjax.gap.calibration import calibrate
-    from openjax.gap.case import load_case
     from openjax.vehicle.vehicle_file import load_vehicle_file, save_vehicle_file
 
     out = arguments.case / "vehicle_calibrated.toml" if arguments.out is None else arguments.out

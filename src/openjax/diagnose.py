@@ -68,8 +68,8 @@ def run(options: Options) -> int:
         if (options.out / name).exists() and not options.overwrite:
             raise UserError(f"{options.out / name} already exists: choose another --out or give --overwrite")
 
+    from openjax.flights.case import load_case
     from openjax.gap import decision
-    from openjax.gap.case import load_case
     from openjax.gap.diagnosis import diagnose_case
     from openjax.gap.library import library
 

@@ -56,7 +56,7 @@ class Arguments:
 def make_case(arguments: Arguments) -> list[Path]:
     """Write the case; returns its files. Raises UserError for an unknown effect or a folder that isn't
     empty."""
-    from openjax.gap.reading import LOG_COLUMNS, write_csv
+    from openjax.flights.reading import LOG_COLUMNS, write_csv
     from openjax.gap.samples import SAMPLE_STRENGTHS, fly, log_of, references
     from openjax.vehicle import load_vehicle
 

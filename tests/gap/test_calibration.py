@@ -11,11 +11,11 @@ import pytest
 
 from openjax.calibrate import main
 from openjax.errors import UserError
+from openjax.flights.case import load_case
+from openjax.flights.checks import check_flight
+from openjax.flights.flight import Case
+from openjax.flights.reading import flights_of
 from openjax.gap.calibration import calibrate
-from openjax.gap.case import load_case
-from openjax.gap.checks import check_flight
-from openjax.gap.flight import Case
-from openjax.gap.reading import flights_of
 from openjax.gap.samples import fly, log_of, references
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.vehicle_file import VehicleFile, load_vehicle_file

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from openjax.errors import UserError
+from openjax.flights.track import Track
 from openjax.gap import decision, estimator, firmware
-from openjax.gap.track import Track
 from openjax.vehicle.effects import EFFECTS
 
 ALL = set(EFFECTS)

@@ -5,9 +5,9 @@ import json
 import pytest
 
 from openjax.diagnose import main
-from openjax.gap.case import load_case
+from openjax.flights.case import load_case
+from openjax.flights.reading import write_csv
 from openjax.gap.diagnosis import diagnose_case
-from openjax.gap.reading import write_csv
 from openjax.gap.report import VERDICTS
 from openjax.gap.samples import fly, log_of, references
 from openjax.gap.where import CHANNELS, REGIMES

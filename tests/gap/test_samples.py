@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from openjax.errors import UserError
-from openjax.gap.case import load_case
+from openjax.flights.case import load_case
 from openjax.gap.samples import SAMPLE_STRENGTHS, fly, references
 from openjax.sample_flights import main
 from openjax.vehicle import load_vehicle

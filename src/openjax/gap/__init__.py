@@ -1,16 +1,21 @@
-"""Flight logs and what separates them from the simulator: reading, checking, calibrating, diagnosing."""
+"""What separates flights from the simulator: calibrating and diagnosing. Reading and checking: `openjax.flights`."""
 
 import importlib
 
-from openjax.gap.flight import Case, Flight, Issue
+from openjax.flights.flight import Case, Flight, Issue
 
-_ELSEWHERE = {"load_case": "case", "diagnose": "diagnosis", "diagnose_case": "diagnosis", "Report": "report"}
+_ELSEWHERE = {
+    "load_case": "openjax.flights.case",
+    "diagnose": "openjax.gap.diagnosis",
+    "diagnose_case": "openjax.gap.diagnosis",
+    "Report": "openjax.gap.report",
+}
 
 __all__ = ["Case", "Flight", "Issue", *_ELSEWHERE]
 
 
 def __getattr__(name: str):
-    # Reading pulls in the vehicle (and JAX); the containers alone stay light to import.
+    # Diagnosing pulls in the vehicle (and JAX); the containers alone stay light to import.
     if name in _ELSEWHERE:
-        return getattr(importlib.import_module(f"openjax.gap.{_ELSEWHERE[name]}"), name)
+        return getattr(importlib.import_module(_ELSEWHERE[name]), name)
     raise AttributeError(name)

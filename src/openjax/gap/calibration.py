@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from openjax.errors import UserError
+from openjax.flights.flight import Case
+from openjax.flights.track import tracks_of
 from openjax.gap.calibration_fit import CalibrationFit
-from openjax.gap.flight import Case
-from openjax.gap.track import tracks_of
 from openjax.vehicle.vehicle_file import CALIBRATED_UNITS, CalibratedValue
 
 Z90 = 1.645

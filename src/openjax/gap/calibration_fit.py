@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from openjax.errors import UserError
+from openjax.flights.flight import Case
+from openjax.flights.track import Track
 from openjax.gap.calibration_model import LAG_PRIOR, STEP, build, parameter_names, prior_of
-from openjax.gap.flight import Case
-from openjax.gap.track import Track
 
 _ITERATIONS = 8
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
-from openjax.gap.track import Track, rotation
+from openjax.flights.track import Track, rotation
 
 WINDOW = 0.5  # s
 BLOCK = 1.0  # s, errors are taken as independent between blocks, not between rows

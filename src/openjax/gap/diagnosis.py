@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import t as student
 
+from openjax.flights.flight import Case, Flight, Issue
 from openjax.gap import decision as rules
 from openjax.gap import gate
 from openjax.gap.evidence import Evidence, gather
-from openjax.gap.flight import Case, Flight, Issue
 from openjax.gap.headroom import look_around
 from openjax.gap.how_far import held_out_residuals, shrink
 from openjax.gap.hypotheses import SetFit

@@ -8,15 +8,15 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from openjax.errors import UserError
+from openjax.flights.flight import Case
+from openjax.flights.track import Track, tracks_of
 from openjax.gap import estimator, firmware
 from openjax.gap.firmware import Radio
-from openjax.gap.flight import Case
 from openjax.gap.hypotheses import SetFit, fit_set, joint_start, model_noise, score_of, weigh_sets
 from openjax.gap.library import ABSENT, NUISANCES, PWM_NUISANCES, Library
 from openjax.gap.linear_path import LinearPath
 from openjax.gap.observer import TICKS
 from openjax.gap.replay import Replay, make_replay
-from openjax.gap.track import Track, tracks_of
 
 CLEAR_DELAY = 0.002  # s of pose delay above which the pose is moved before the physics is read
 CLEAR_SCORE = 3.0  # nats, likewise

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from openjax.flights.track import Track, smooth
 from openjax.gap.linear_path import LinearPath, fit_linear_path
 from openjax.gap.observer import GYRO_GAIN, TICKS, observe
 from openjax.gap.replay import bucket, padded
-from openjax.gap.track import Track, smooth
 from openjax.vehicle.rate_controller import mixer
 
 GAIN_STEP = 0.05

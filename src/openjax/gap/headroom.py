@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from openjax.flights.track import Track, rotation, smooth
 from openjax.gap.hypotheses import SetFit, noise_of, without_nuisances
 from openjax.gap.library import prior
 from openjax.gap.replay import FORCE, SKIP, VELOCITY, Replay, torque_channels
 from openjax.gap.replay import GROUPS as NOISE_GROUPS
-from openjax.gap.track import Track, rotation, smooth
 from openjax.vehicle.effects.effect import ARENA_CEILING
 
 GROUPS = ("force_xy", "force_z", "torque_xy", "torque_z")

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from openjax.flights.track import smooth
 from openjax.gap.evidence import Evidence
 from openjax.gap.hypotheses import SetFit, fit_set, without_nuisances
 from openjax.gap.replay import SKIP
-from openjax.gap.track import smooth
 
 METRIC = (
     "rms over channels of prediction error / noise floor on held-out flights (velocity over 0.25 s, "

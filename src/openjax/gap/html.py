@@ -12,11 +12,11 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
+from openjax.flights.track import rotation, smooth
 from openjax.gap.how_far import HORIZONS, held_out_residuals
 from openjax.gap.hypotheses import score_of
 from openjax.gap.report import Report
 from openjax.gap.rest import disturbances
-from openjax.gap.track import rotation, smooth
 from openjax.gap.where import CHANNELS, REGIMES
 
 STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:62rem;margin:2rem auto;padding:0 1rem;color:#222}

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import jax
 import numpy as np
 
+from openjax.flights.track import Track, rotation, smooth
 from openjax.gap.library import ABSENT, MOTOR_SHIFT, NUISANCES, PHYSICS_EFFECTS, PLACE, STEP, THETA
 from openjax.gap.physics import Path, compiled_physics
-from openjax.gap.track import Track, rotation, smooth
 from openjax.gap.whitening import Noise, first_noise, whiten
 from openjax.vehicle.effects.effect import ARENA_CEILING
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from openjax.flights.track import Track, rotation, smooth
 from openjax.gap.hypotheses import SetFit, without_nuisances
 from openjax.gap.replay import FORCE, RATES, SKIP, VELOCITY, Replay
-from openjax.gap.track import Track, rotation, smooth
 
 BANDS = ((0.3, 1.5), (1.5, 5.0), (5.0, 12.0))  # Hz
 SENSOR_BAND = (25.0, 45.0)  # Hz, where the logs hold sensor noise only

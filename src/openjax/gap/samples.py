@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from openjax.gap.reading import LogTable
+from openjax.flights.reading import LogTable
 from openjax.vehicle import (
     DroneState,
     Vehicle,

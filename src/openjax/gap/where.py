@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from openjax.flights.track import Track, smooth
 from openjax.gap.evidence import Evidence
 from openjax.gap.hypotheses import SetFit
 from openjax.gap.replay import SKIP
 from openjax.gap.rest import disturbances, residuals_of
-from openjax.gap.track import Track, smooth
 
 CHANNELS = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z", "estimator", "firmware")
 REGIMES = (

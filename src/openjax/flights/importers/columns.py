@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from openjax.errors import UserError
-from openjax.gap.reading import CHANNEL_COLUMNS, LOG_COLUMNS, LogError, LogTable
+from openjax.flights.reading import CHANNEL_COLUMNS, LOG_COLUMNS, LogError, LogTable
 
 MAPPING_FILE = "columns.toml"
 EULER = ("roll", "pitch", "yaw")

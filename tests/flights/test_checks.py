@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from openjax.errors import UserError
-from openjax.gap.case import load_case
-from openjax.gap.checks import check_flight
-from openjax.gap.reading import LogTable, flights_of, write_csv
+from openjax.flights.case import load_case
+from openjax.flights.checks import check_flight
+from openjax.flights.reading import LogTable, flights_of, write_csv
 from openjax.gap.samples import log_of
 from openjax.vehicle import load_vehicle
 

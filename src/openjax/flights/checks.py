@@ -7,9 +7,9 @@ import dataclasses
 
 import numpy as np
 
-from openjax.gap.consistency import check_consistency
-from openjax.gap.flight import CHANNELS, Flight, Issue
-from openjax.gap.reading import CHANNEL_COLUMNS
+from openjax.flights.consistency import check_consistency
+from openjax.flights.flight import CHANNELS, Flight, Issue
+from openjax.flights.reading import CHANNEL_COLUMNS
 
 SHORTEST = 2.0  # s airborne: windows of 0.5 s, and a few of them
 SLOWEST = 0.05  # s between rows

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from openjax.errors import UserError
-from openjax.gap.flight import Flight
+from openjax.flights.flight import Flight
 
 # Channel of a Flight: the log's columns, in order.
 CHANNEL_COLUMNS = {

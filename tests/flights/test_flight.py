@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from openjax.gap.flight import Case, Flight
+from openjax.flights.flight import Case, Flight
 
 
 def flight(time, **channels):

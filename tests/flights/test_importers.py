@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from openjax.errors import UserError
-from openjax.gap.case import load_case
-from openjax.gap.importers import find_logs, load_mapping, read_log
-from openjax.gap.reading import LogError, write_csv
+from openjax.flights.case import load_case
+from openjax.flights.importers import find_logs, load_mapping, read_log
+from openjax.flights.reading import LogError, write_csv
 from openjax.gap.samples import log_of
 
 DEGREES = 180 / np.pi

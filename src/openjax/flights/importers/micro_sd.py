@@ -14,8 +14,8 @@ from zlib import crc32
 
 import numpy as np
 
-from openjax.gap.importers.columns import UNITS, ColumnMapping, Source, Stream, merge_streams
-from openjax.gap.reading import LogError, LogTable
+from openjax.flights.importers.columns import UNITS, ColumnMapping, Source, Stream, merge_streams
+from openjax.flights.reading import LogError, LogTable
 
 MAGIC = 0xBC
 _VERSIONS = {1: ("<HI", 1e-3), 2: ("<HQ", 1e-6)}

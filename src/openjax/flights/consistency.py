@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
-from openjax.gap.flight import Flight, Issue
+from openjax.flights.flight import Flight, Issue
 
 RATE = 100.0  # Hz, common clock of the comparisons
 KINEMATIC_BAND = (0.3, 4.0)  # Hz: above drift and offsets, below most of the sensors' noise and delays

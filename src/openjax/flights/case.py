@@ -7,10 +7,10 @@ from pathlib import Path
 import jax.numpy as jnp
 
 from openjax.errors import UserError
-from openjax.gap.checks import check_flight, duplicates
-from openjax.gap.flight import Case, Flight, Issue
-from openjax.gap.importers import MAPPING_FILE, ColumnMapping, find_logs, load_mapping, read_log
-from openjax.gap.reading import LogError, flights_of
+from openjax.flights.checks import check_flight, duplicates
+from openjax.flights.flight import Case, Flight, Issue
+from openjax.flights.importers import MAPPING_FILE, ColumnMapping, find_logs, load_mapping, read_log
+from openjax.flights.reading import LogError, flights_of
 from openjax.vehicle.vehicle_file import VehicleFile, load_vehicle_file
 
 

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from openjax.errors import UserError
-from openjax.gap.importers.columns import ColumnMapping, Source, Stream, merge_streams
-from openjax.gap.reading import CHANNEL_COLUMNS, LogError, LogTable
+from openjax.flights.importers.columns import ColumnMapping, Source, Stream, merge_streams
+from openjax.flights.reading import CHANNEL_COLUMNS, LogError, LogTable
 
 _POSITION, _QUATERNION = CHANNEL_COLUMNS["position"], CHANNEL_COLUMNS["quaternion"]
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from openjax.gap.flight import Case, Flight
+from openjax.flights.flight import Case, Flight
 
 Array = np.ndarray
 GRID_PERIOD = 0.01  # s, the step of the simulator

@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from openjax.gap.reading import LogError, LogTable, flights_of, read_csv, write_csv
+from openjax.flights.reading import LogError, LogTable, flights_of, read_csv, write_csv
 
 HEADER = "t,wx,wy,wz,ax,ay,az,m1,m2,m3,m4,vbat\n"
 

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from openjax.gap.importers.columns import MAPPING_FILE, ColumnMapping, load_mapping
-from openjax.gap.importers.micro_sd import is_micro_sd, read_micro_sd
-from openjax.gap.importers.ros2 import is_bag, read_bag
-from openjax.gap.reading import LogTable, read_csv
+from openjax.flights.importers.columns import MAPPING_FILE, ColumnMapping, load_mapping
+from openjax.flights.importers.micro_sd import is_micro_sd, read_micro_sd
+from openjax.flights.importers.ros2 import is_bag, read_bag
+from openjax.flights.reading import LogTable, read_csv
 
 __all__ = ["MAPPING_FILE", "ColumnMapping", "find_logs", "load_mapping", "read_log"]
 
