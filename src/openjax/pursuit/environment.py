@@ -12,6 +12,7 @@ from openjax.pursuit.observation import Observation, frame, observe, rotation_ax
 from openjax.pursuit.reward import captures, over_speed, reward
 from openjax.pursuit.sensing import line_of_sight
 from openjax.pursuit.settings import PursuitSettings
+from openjax.pursuit.spaces import Box
 from openjax.pursuit.statistics import EpisodeStatistics, count, empty_statistics
 from openjax.pursuit.task import Task, start_attitude, uniform_task
 from openjax.vehicle import DroneState, Vehicle, hover_state, load_vehicle, make_drones_step
@@ -93,6 +94,17 @@ class Pursuit:
             substeps=self.settings.substeps,
             effects=self.effects,
         )
+
+    @property
+    def action_space(self) -> Box:
+        """Actions (N, 4) of all pursuers: collective thrust, roll, pitch and yaw rate, in -1..1."""
+        return Box(-1.0, 1.0, (self.settings.num_pursuers, 4))
+
+    @property
+    def observation_space(self) -> Observation:
+        """An `Observation` whose leaves are the boxes of its arrays."""
+        kinds = jax.eval_shape(lambda key: self.reset(key)[0], jax.random.key(0))
+        return jax.tree.map(lambda kind: Box(-jnp.inf, jnp.inf, kind.shape, kind.dtype), kinds)
 
     def reset(self, key: jax.Array) -> tuple[Observation, PursuitState]:
         """Start an episode of a uniformly drawn task."""

@@ -1,0 +1,82 @@
+"""The game with JaxMARL's manners: dictionaries by agent, `step` that starts anew where an episode ends.
+
+It has the methods of `jaxmarl.environments.MultiAgentEnv` without needing JaxMARL: everything is pure, so its trainers
+can map and compile it.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+
+from openjax.interfaces.flat import ACTION_SIZE, flat_observation, flat_size
+from openjax.pursuit import Pursuit, PursuitState
+from openjax.pursuit.spaces import Box
+
+
+class PursuitMultiAgentEnv:
+    """Agents `pursuer_0` ...; each observes (D,) float32 (`flat_observation`) and acts with (4,) in -1..1.
+
+    Args:
+        environment: the game; None is the nominal one.
+    """
+
+    def __init__(self, environment: Pursuit | None = None):
+        self.environment = environment or Pursuit()
+        self.num_agents = self.environment.settings.num_pursuers
+        self.agents = [f"pursuer_{i}" for i in range(self.num_agents)]
+        size = flat_size(self.environment.settings)
+        self.observation_spaces = {agent: Box(-jnp.inf, jnp.inf, (size,)) for agent in self.agents}
+        self.action_spaces = {agent: Box(-1.0, 1.0, (ACTION_SIZE,)) for agent in self.agents}
+
+    @property
+    def name(self) -> str:
+        """The environment's name."""
+        return "openjax_pursuit"
+
+    def observation_space(self, agent: str) -> Box:
+        """Of one agent."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> Box:
+        """Of one agent."""
+        return self.action_spaces[agent]
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def reset(self, key: jax.Array) -> tuple[dict[str, jax.Array], PursuitState]:
+        """Start an episode of a uniformly drawn task."""
+        observation, state = self.environment.reset(key)
+        return self._by_agent(flat_observation(observation)), state
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def step(self, key: jax.Array, state: PursuitState, actions: dict[str, jax.Array], reset_state=None):
+        """`step_env`, and a new episode (of `reset_state`, where given) in place of one that has ended."""
+        key, reset_key = jax.random.split(key)
+        after = self.step_env(key, state, actions)
+        if reset_state is None:
+            fresh = self.reset(reset_key)
+        else:
+            fresh = self.get_obs(reset_state), reset_state
+        over = after[3]["__all__"]
+        observations, state = jax.tree.map(lambda new, old: jnp.where(over, new, old), fresh, after[:2])
+        return observations, state, *after[2:]
+
+    def step_env(self, key: jax.Array, state: PursuitState, actions: dict[str, jax.Array]):
+        """One control step: observations, state, rewards, dones (with `__all__`), infos, all by agent."""
+        action = jnp.stack([actions[agent] for agent in self.agents])
+        observation, state, reward, terminated, truncated, info = self.environment.step(key, state, action)
+        over = terminated | truncated
+        dones = {agent: over for agent in self.agents} | {"__all__": over}
+        infos = {"captured": info.captured, "crashed": info.crashed}  # (N,) each
+        return self._by_agent(flat_observation(observation)), state, self._by_agent(reward), dones, infos
+
+    def get_obs(self, state: PursuitState) -> dict[str, jax.Array]:
+        """Observations of a state."""
+        return self._by_agent(flat_observation(self.environment.observe(state)))
+
+    def get_avail_actions(self, state: PursuitState) -> dict[str, jax.Array]:
+        """All actions are possible."""
+        return {agent: jnp.ones(ACTION_SIZE) for agent in self.agents}
+
+    def _by_agent(self, rows):
+        return {agent: rows[i] for i, agent in enumerate(self.agents)}

@@ -1,0 +1,89 @@
+"""One world as a PettingZoo `ParallelEnv` (`pip install "openjax[interfaces]"`)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium import spaces
+from pettingzoo import ParallelEnv
+
+from openjax.interfaces.flat import ACTION_SIZE, flat_observation, flat_size, to_numpy
+from openjax.pursuit import Pursuit
+
+
+class PursuitParallelEnv(ParallelEnv):
+    """Agents `pursuer_0` ... act together; each observes (D,) float32 (`flat_observation`) and acts with (4,) in -1..1.
+
+    Every pursuer gets its own reward. An episode ends for all at once, after `settings.episode_length` steps.
+
+    Args:
+        environment: the game; None is the nominal one.
+    """
+
+    metadata = {"name": "openjax_pursuit_v0", "render_modes": [], "is_parallelizable": True}  # noqa: RUF012
+
+    def __init__(self, environment: Pursuit | None = None):
+        self.environment = environment or Pursuit()
+        settings = self.environment.settings
+        self.possible_agents = [f"pursuer_{i}" for i in range(settings.num_pursuers)]
+        self.agents: list[str] = []
+        self.render_mode = None
+        self._observation_space = spaces.Box(-np.inf, np.inf, (flat_size(settings),), np.float32)
+        self._action_space = spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
+        self._key = jax.random.key(0)
+        self._state = None
+        self._reset = jax.jit(self._pure_reset)
+        self._step = jax.jit(self._pure_step)
+
+    def observation_space(self, agent: str) -> spaces.Box:
+        """Of one agent."""
+        return self._observation_space
+
+    def action_space(self, agent: str) -> spaces.Box:
+        """Of one agent."""
+        return self._action_space
+
+    def reset(self, seed: int | None = None, options: dict | None = None):
+        """Start an episode; `seed` determines it and those that follow. `options` are ignored."""
+        if seed is not None:
+            self._key = jax.random.key(seed)
+        self._key, key = jax.random.split(self._key)
+        self.agents = list(self.possible_agents)
+        observation, self._state = self._reset(key)
+        return self._by_agent(observation), {agent: {} for agent in self.agents}
+
+    def step(self, actions: dict[str, np.ndarray]):
+        """One control step of all agents."""
+        action = jnp.stack([jnp.asarray(actions[agent], jnp.float32) for agent in self.possible_agents])
+        observation, self._state, reward, terminated, truncated, info = self._step(self._state, action)
+        captured, crashed = to_numpy((info.captured, info.crashed))
+        agents = self.agents
+        everyone = range(len(agents))
+        infos = {
+            a: {"captured": bool(captured[i]), "crashed": bool(crashed[i])} for i, a in enumerate(agents)
+        }
+        result = (
+            self._by_agent(observation),
+            {agents[i]: float(reward[i]) for i in everyone},
+            {agents[i]: bool(terminated) for i in everyone},
+            {agents[i]: bool(truncated) for i in everyone},
+            infos,
+        )
+        if terminated or truncated:
+            self.agents = []
+        return result
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    def _by_agent(self, observation):
+        rows = to_numpy(observation)
+        return {agent: rows[i] for i, agent in enumerate(self.possible_agents)}
+
+    def _pure_reset(self, key):
+        observation, state = self.environment.reset(key)
+        return flat_observation(observation), state
+
+    def _pure_step(self, state, action):
+        # the game draws nothing after its reset: the key is for the interface only
+        observation, *rest = self.environment.step(jax.random.key(0), state, action)
+        return flat_observation(observation), *rest

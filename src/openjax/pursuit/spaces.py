@@ -1,0 +1,31 @@
+"""What actions and observations can be: boxes, without another library."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Box:
+    """Arrays of one shape whose numbers lie between `low` and `high`."""
+
+    low: float
+    high: float
+    shape: tuple[int, ...]
+    dtype: type = jnp.float32
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Uniform between finite bounds, else normal; booleans by a fair coin."""
+        if self.dtype == jnp.bool_:
+            return jax.random.bernoulli(key, 0.5, self.shape)
+        if np.isfinite(self.low) and np.isfinite(self.high):
+            return jax.random.uniform(key, self.shape, self.dtype, self.low, self.high)
+        return jax.random.normal(key, self.shape, self.dtype)
+
+    def contains(self, x: jax.Array) -> bool:
+        """Whether an array is of this kind, on the host."""
+        x = np.asarray(x)
+        fits = x.shape == self.shape and np.can_cast(x.dtype, np.dtype(self.dtype), "same_kind")
+        return bool(fits and np.all(x >= self.low) and np.all(x <= self.high))

@@ -1,0 +1,102 @@
+"""Other libraries' interfaces: their own API tests, and that the game behind them is the same."""
+
+import warnings
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pettingzoo.test import parallel_api_test, parallel_seed_test
+
+import openjax
+from openjax.interfaces.flat import flat_observation, flat_size
+from openjax.interfaces.gymnasium import PursuitVectorEnv
+from openjax.interfaces.jaxmarl import PursuitMultiAgentEnv
+from openjax.interfaces.pettingzoo import PursuitParallelEnv
+
+LENGTH = 5
+
+
+@pytest.fixture(scope="module")
+def game():
+    return openjax.make(physics="rigid", episode_length=LENGTH)
+
+
+def test_flat_observation_is_all_that_a_pursuer_has(game):
+    observation, _ = game.reset(jax.random.key(0))
+    flat = flat_observation(observation)
+    assert flat.shape == (3, flat_size(game.settings))
+    start = game.settings.self_size
+    np.testing.assert_array_equal(
+        flat[1, start : start + 3], observation.position[1] - observation.position[0]
+    )
+    np.testing.assert_allclose(flat[:, -3:], observation.position - observation.last_seen, atol=1e-7)
+
+
+def test_spaces_hold_what_the_game_gives(game):
+    observation, _ = game.reset(jax.random.key(1))
+    assert jax.tree.all(jax.tree.map(lambda space, x: space.contains(x), game.observation_space, observation))
+    assert game.action_space.contains(game.action_space.sample(jax.random.key(2)))
+    assert not game.action_space.contains(np.full((3, 4), 1.5, np.float32))
+    assert not game.action_space.contains(np.zeros((2, 4), np.float32))
+
+
+def test_pettingzoo_passes_its_own_api_test(game):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        parallel_api_test(PursuitParallelEnv(game), num_cycles=3 * LENGTH)
+        parallel_seed_test(lambda: PursuitParallelEnv(game), num_cycles=LENGTH)
+
+
+def test_gymnasium_vector_env_starts_ended_worlds_anew(game):
+    worlds = PursuitVectorEnv(4, game)
+    assert isinstance(worlds, gymnasium.vector.VectorEnv)
+    first, _ = worlds.reset(seed=3)
+    again, _ = PursuitVectorEnv(4, game).reset(seed=3)
+    np.testing.assert_array_equal(first, again)
+    worlds.action_space.seed(0)
+    for step in range(1, 2 * LENGTH + 1):
+        action = worlds.action_space.sample()
+        observation, reward, terminated, truncated, infos = worlds.step(action)
+        assert worlds.observation_space.contains(observation)
+        assert reward.shape == terminated.shape == truncated.shape == (4,)
+        assert terminated.all() == (step % LENGTH == 0) and not truncated.any()
+        assert ("final_obs" in infos) == (step % LENGTH == 0)
+    assert not np.allclose(observation, infos["final_obs"])
+    # the observed time is that of a start, and of an end
+    time = game.settings.self_size - 1
+    np.testing.assert_allclose(observation[:, time], 0.0)
+    np.testing.assert_allclose(infos["final_obs"][:, time], 1.0)
+
+
+def test_gymnasium_passes_its_recorder(game):
+    worlds = gymnasium.wrappers.vector.RecordEpisodeStatistics(PursuitVectorEnv(2, game))
+    worlds.reset(seed=0)
+    total = np.zeros(2)
+    for _ in range(LENGTH):
+        *_, infos = step = worlds.step(np.zeros(worlds.action_space.shape, np.float32))
+        total += step[1]
+    np.testing.assert_allclose(infos["episode"]["r"], total, rtol=1e-5)
+    np.testing.assert_array_equal(infos["episode"]["l"], LENGTH)
+
+
+def test_jaxmarl_interface_is_the_game_and_starts_anew(game):
+    adapter = PursuitMultiAgentEnv(game)
+    key = jax.random.key(4)
+    observations, state = adapter.reset(key)
+    jitted = jax.jit(game.step)
+    expected, expected_state = game.reset(key)
+    np.testing.assert_allclose(observations["pursuer_2"], flat_observation(expected)[2], atol=1e-6)
+    actions = {agent: adapter.action_space(agent).sample(jax.random.key(5)) for agent in adapter.agents}
+    for step in range(1, LENGTH + 1):
+        observations, state, rewards, dones, _ = adapter.step(key, state, actions)
+        action = jnp.stack([actions[agent] for agent in adapter.agents])
+        _, expected_state, reward, *_ = jitted(key, expected_state, action)
+        np.testing.assert_allclose([rewards[agent] for agent in adapter.agents], reward, rtol=1e-5)
+        assert bool(dones["__all__"]) == (step == LENGTH)
+    assert int(state.step) == 0  # a new episode
+    _, state, *_ = jax.vmap(adapter.step, in_axes=(0, 0, None))(
+        jax.random.split(key, 2), jax.vmap(adapter.reset)(jax.random.split(key, 2))[1], actions
+    )
+    assert state.step.tolist() == [1, 1]
