@@ -18,10 +18,10 @@ from jax.experimental import topologies
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from pages import page_parser, publish, table
 
+from openjax.commands.command_line import run_command
+from openjax.commands.machine import describe_machine
 from openjax.errors import UserError
 from openjax.learning import abstract_carry, make_training_step, preset
-from openjax.runs.command_line import run_command
-from openjax.runs.machine import describe_machine
 from openjax.vehicle import hover_state, load_vehicle, make_drones_step
 
 # Facts of the device that the compiler asks for; from XLA's own list (openxla/xla, xla/backends/gpu/target_config/specs).

@@ -18,12 +18,12 @@ from headline import GOAL_COLLISION
 from pages import page_parser, publish, table
 from prediction_flights import layout_tasks
 
+from openjax.commands.command_line import run_command
+from openjax.commands.machine import describe_machine
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, Task, action_to_command
 from openjax.pursuit.collisions import breaches, crashed, drone_distance, pillar_distance
 from openjax.pursuit.observation import rotation_axes
 from openjax.pursuit.settings import SOLID_RADIUS
-from openjax.runs.command_line import run_command
-from openjax.runs.machine import describe_machine
 from openjax.vehicle import DroneState, make_drones_step
 
 STEPS = 200

@@ -12,12 +12,12 @@ import jax
 from headline import evaluator_of, seeds_of_open
 from pages import page_parser, publish, table
 
+from openjax.commands.command_line import run_command
+from openjax.commands.machine import describe_machine
+from openjax.commands.validation import uniform_tasks
 from openjax.learning import summarise
 from openjax.pursuit import PursuitSettings, close_starts, line_up_pillars, turn_task, uniform_task
-from openjax.runs.command_line import run_command
-from openjax.runs.held_back import uniform_tasks
-from openjax.runs.machine import describe_machine
-from openjax.runs.policies import load_policy
+from openjax.store.policies import load_policy
 
 KEY = 77_000_001
 """From which rows and close starts are drawn, the same for all policies."""

@@ -14,14 +14,14 @@ from pathlib import Path
 import numpy as np
 from pages import page_parser, publish, spread, table
 
+from openjax.commands.command_line import run_command
+from openjax.commands.evaluator import Evaluator, evaluate_scenarios, layout_slots
+from openjax.commands.machine import describe_machine
 from openjax.learning import TrainSettings
 from openjax.policy import Policy
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings
-from openjax.runs.command_line import run_command
-from openjax.runs.evaluation import Evaluator, evaluate_scenarios, layout_slots
-from openjax.runs.machine import describe_machine
-from openjax.runs.policies import load_policy
-from openjax.runs.policy_files import shipped_policies
+from openjax.store.policies import load_policy
+from openjax.store.policy_files import shipped_policies
 
 CONDITIONS = {
     "clamp, drawn starts": {"speed_limit": "clamp", "start_attitude": "drawn"},

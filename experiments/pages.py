@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from openjax.runs.settings_files import read_json, write_json
+from openjax.store.settings_files import read_json, write_json
 
 RESULTS = Path(__file__).parent / "results"
 

@@ -32,11 +32,11 @@ from predictors import (
     visibility,
 )
 
+from openjax.commands.command_line import run_command
+from openjax.commands.evaluator import layout_slots
+from openjax.commands.machine import describe_machine
 from openjax.pursuit import SCENARIOS, Pursuit
-from openjax.runs.command_line import run_command
-from openjax.runs.evaluation import layout_slots
-from openjax.runs.machine import describe_machine
-from openjax.runs.policies import load_policy
+from openjax.store.policies import load_policy
 
 EXPANSIONS = 20
 

@@ -22,14 +22,14 @@ import numpy as np
 import pages
 import tyro
 
+from openjax.cluster.devices import carry_shardings, check_devices, everywhere, make_device_step
+from openjax.commands.command_line import parse, peek, run_command
+from openjax.commands.loop import guarded
+from openjax.commands.machine import describe_machine
 from openjax.errors import UserError
 from openjax.learning import TrainCarry, TrainSettings, build, init_carry, preset
-from openjax.runs.checkpoints import place
-from openjax.runs.command_line import parse, peek, run_command
-from openjax.runs.devices import carry_shardings, check_devices, everywhere, make_device_step
-from openjax.runs.loop import guarded
-from openjax.runs.machine import describe_machine
-from openjax.runs.settings_files import write_json
+from openjax.store.checkpoints import place
+from openjax.store.settings_files import write_json
 
 PROGRAM = "python experiments/scaling.py"
 Kind = Literal["weak", "weak_batches", "strong"]

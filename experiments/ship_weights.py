@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from openjax.runs.command_line import run_command
-from openjax.runs.policies import load_policy
-from openjax.runs.policy_files import WEIGHTS, load_policy_file, save_policy_file
+from openjax.commands.command_line import run_command
+from openjax.store.policies import load_policy
+from openjax.store.policy_files import WEIGHTS, load_policy_file, save_policy_file
 
 
 def main(arguments: list[str]) -> None:

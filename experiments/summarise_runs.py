@@ -11,7 +11,7 @@ from pathlib import Path
 
 from pages import table
 
-from openjax.runs.settings_files import write_json
+from openjax.store.settings_files import write_json
 
 
 def summary(run: Path) -> dict:

@@ -19,14 +19,14 @@ from pages import page_parser, publish
 from prediction_flights import layout_tasks
 from sweeps_report import draw, report
 
+from openjax.commands.command_line import run_command
+from openjax.commands.evaluator import layout_slots
+from openjax.commands.machine import describe_machine
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, Task
 from openjax.pursuit.reward import captures
-from openjax.runs.command_line import run_command
-from openjax.runs.evaluation import layout_slots
-from openjax.runs.machine import describe_machine
-from openjax.runs.policies import load_policy
-from openjax.runs.settings_files import to_plain
+from openjax.store.policies import load_policy
+from openjax.store.settings_files import to_plain
 
 RADII = (0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5)
 SPEEDS = (1.0, 1.3, 1.6, 2.0, 2.4, 2.8)

@@ -14,12 +14,12 @@ import pytest
 
 import openjax
 from openjax import benchmark, evaluate, train
-from openjax.runs import training
-from openjax.runs.checkpoints import Checkpoints, is_checkpoint, load_arrays
-from openjax.runs.command_line import run_command
-from openjax.runs.evaluation import FIELDS
-from openjax.runs.metrics import read_metrics
-from openjax.runs.policy_files import shipped_policies
+from openjax.commands import training_job
+from openjax.commands.command_line import run_command
+from openjax.commands.evaluator import FIELDS
+from openjax.show.metrics import read_metrics
+from openjax.store.checkpoints import Checkpoints, is_checkpoint, load_arrays
+from openjax.store.policy_files import shipped_policies
 
 UPDATES = 24
 TINY = (
@@ -173,10 +173,10 @@ def test_signal_saves_and_exits_cleanly(whole_run, tmp_path, shared_cache, train
 COMPILES_ONCE = """
 import sys, jax
 from openjax.learning import TrainSettings, init_carry, make_training_step
-from openjax.runs.checkpoints import Checkpoints, abstract_like, place
-from openjax.runs.environments import make_environment
-from openjax.runs.loop import guarded
-from openjax.runs.run_directory import open_run
+from openjax.store.checkpoints import Checkpoints, abstract_like, place
+from openjax.store.environments import make_environment
+from openjax.commands.loop import guarded
+from openjax.store.run_directory import open_run
 
 run = open_run(sys.argv[1])
 settings = run.read_settings(TrainSettings)
@@ -211,7 +211,7 @@ def test_nan_stops_the_run_and_leaves_the_state(tmp_path, monkeypatch, capsys, s
 
         return step
 
-    monkeypatch.setattr(training, "make_device_step", make_broken_step)
+    monkeypatch.setattr(training_job, "make_device_step", make_broken_step)
     out = tmp_path / "broken"
     status, _ = in_process(train.main, [*TINY, *STEPS, "--out", out], monkeypatch, capsys)
     assert status == 1
@@ -333,7 +333,7 @@ def test_bad_input_is_one_line_and_status_2(
 
 
 def test_overwrite_replaces_the_run_and_keeps_foreign_files(tmp_path):
-    from openjax.runs.run_directory import create_run
+    from openjax.store.run_directory import create_run
 
     run = create_run(tmp_path / "run", overwrite=False)
     run.write_settings({}, {})

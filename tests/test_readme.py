@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 import openjax
 from openjax import calibrate, diagnose, sample_flights
-from openjax.runs.environments import make_environment
+from openjax.store.environments import make_environment
 from openjax.vehicle.vehicle_file import load_vehicle_file
 
 ROOT = Path(__file__).parents[1]

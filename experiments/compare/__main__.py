@@ -17,11 +17,11 @@ import jax
 from experiments.compare import drones, games, report
 from experiments.compare.case import Case
 from experiments.compare.stand_ins import use_stand_ins
+from openjax.commands.command_line import parse, run_command
+from openjax.commands.machine import describe_machine
+from openjax.commands.timing import time_compiled
 from openjax.errors import UserError
-from openjax.runs.command_line import parse, run_command
-from openjax.runs.machine import describe_machine
-from openjax.runs.settings_files import write_json
-from openjax.runs.timing import time_compiled
+from openjax.store.settings_files import write_json
 
 PROGRAM = "python -m experiments.compare"
 RESULTS = Path(__file__).parents[1] / "results"

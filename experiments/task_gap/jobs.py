@@ -71,7 +71,7 @@ def do(job: Job) -> tuple[str, float]:
 def _fly(job):
     from experiments.task_gap.flights import corrected_effects
     from experiments.task_gap.game import fly_plant, fly_simulator
-    from openjax.runs.policies import load_policy
+    from openjax.store.policies import load_policy
 
     loaded = load_policy(job.policy)
     settings = dataclasses.replace(loaded.settings.environment, **CONDITIONS[job.condition])

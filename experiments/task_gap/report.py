@@ -7,8 +7,8 @@ import numpy as np
 
 from experiments.pages import table
 from experiments.task_gap.jobs import world_folder, world_name
-from openjax.runs.machine import describe_machine
-from openjax.runs.settings_files import write_json
+from openjax.commands.machine import describe_machine
+from openjax.store.settings_files import write_json
 
 FIGURES = {
     "captured": ("capture rate", ".3f"),

@@ -17,7 +17,7 @@ _PUBLIC = {
     "SCENARIOS": "openjax.pursuit",
     "Task": "openjax.pursuit",
     "UserError": "openjax.errors",
-    "load_policy": "openjax.runs.policies",
+    "load_policy": "openjax.store.policies",
     "make": "openjax.pursuit",
 }
 

@@ -16,15 +16,15 @@ import tyro
 from rich import box
 from rich.table import Table
 
+from openjax.commands.command_line import output_console, parse, peek, run_command
+from openjax.commands.machine import describe_machine
+from openjax.commands.timing import Timing, time_compiled
 from openjax.errors import UserError
 from openjax.learning import TrainSettings, build, init_carry, make_training_step, preset
 from openjax.learning.rollout import collect
 from openjax.pursuit import Pursuit, hover_action, uniform_task
 from openjax.pursuit.environment import action_to_command
-from openjax.runs.command_line import output_console, parse, peek, run_command
-from openjax.runs.machine import describe_machine
-from openjax.runs.settings_files import write_json
-from openjax.runs.timing import Timing, time_compiled
+from openjax.store.settings_files import write_json
 from openjax.vehicle import hover_state, load_vehicle, make_drones_step
 
 PROGRAM = "python -m openjax.benchmark"

@@ -14,8 +14,8 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from openjax.commands.command_line import output_console, parse, run_command
 from openjax.errors import UserError
-from openjax.runs.command_line import output_console, parse, run_command
 
 PROGRAM = "python -m openjax.calibrate"
 

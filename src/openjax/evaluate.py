@@ -11,9 +11,9 @@ from pathlib import Path
 
 import tyro
 
+from openjax.commands.command_line import output_console, parse, run_command
 from openjax.errors import UserError
 from openjax.pursuit import SCENARIOS, PursuitSettings, find_scenario
-from openjax.runs.command_line import output_console, parse, run_command
 
 PROGRAM = "python -m openjax.evaluate"
 
@@ -51,7 +51,7 @@ def main(arguments: Sequence[str]) -> int:
     """The command; returns its exit status."""
     command = parse(EvaluateCommand, EvaluateCommand(), arguments, PROGRAM)
     _check(command)
-    from openjax.runs.policies import load_policy
+    from openjax.store.policies import load_policy
 
     evaluators: dict = {}
     results = []
@@ -65,7 +65,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def evaluate(command: EvaluateCommand, loaded, evaluators: dict) -> list[dict]:
-    """One record per scenario; see `openjax.runs.evaluation.FIELDS`.
+    """One record per scenario; see `openjax.commands.evaluator.FIELDS`.
 
     Args:
       command: what to fly, with the game's settings.
@@ -75,8 +75,8 @@ def evaluate(command: EvaluateCommand, loaded, evaluators: dict) -> list[dict]:
     Raises:
       UserError: an unusable layout, or a game that the policy can't play.
     """
-    from openjax.runs.environments import make_environment
-    from openjax.runs.evaluation import Evaluator, evaluate_scenarios, layout_slots
+    from openjax.commands.evaluator import Evaluator, evaluate_scenarios, layout_slots
+    from openjax.store.environments import make_environment
 
     settings = command.environment
     if command.scenario == "all":
@@ -118,8 +118,8 @@ def _check_sizes(settings, trained):
 
 def _show(command, results):
     """Print the tables and write the file: a record, a list of them, or such a list by policy."""
-    from openjax.runs.evaluation import results_table, spread_table
-    from openjax.runs.settings_files import write_json
+    from openjax.commands.evaluator import results_table, spread_table
+    from openjax.store.settings_files import write_json
 
     console = output_console()
     for source, rows in results:

@@ -12,8 +12,8 @@ from typing import Annotated
 
 import tyro
 
+from openjax.commands.command_line import output_console, parse, run_command
 from openjax.errors import UserError
-from openjax.runs.command_line import output_console, parse, run_command
 
 PROGRAM = "python -m openjax.sample_flights"
 

@@ -1,6 +1,6 @@
 """Train pursuers: `python -m openjax.train [--preset quick|paper] [--out DIR] [--any.setting value]`.
 
-Writes a run directory (see `openjax.runs.run_directory`) with logs, checkpoints, the best policy and
+Writes a run directory (see `openjax.store.run_directory`) with logs, checkpoints, the best policy and
 pictures. Ctrl-C or SIGTERM saves and exits; `--resume DIR` goes on exactly where it stopped.
 """
 
@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Sequence
 
-from openjax.runs.command_line import peek, run_command
+from openjax.commands.command_line import peek, run_command
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -16,8 +16,8 @@ def main(arguments: Sequence[str]) -> int:
     started = time.monotonic()
     if not {"-h", "--help"} & set(arguments) and peek(arguments, "process_id") in (None, "0"):
         print("openjax.train: loading JAX and MuJoCo ...", flush=True)  # takes seconds; nobody should wonder
-    from openjax.runs.joining import joined
-    from openjax.runs.training_command import membership, read_command, start
+    from openjax.cluster.joining import joined
+    from openjax.commands.training_command import membership, read_command, start
 
     with joined(membership(arguments)) as processes:
         return start(read_command(arguments), arguments, started, processes)

@@ -17,10 +17,10 @@ from run_comparison import VARIANTS, by_variant, main_effects, read_run, savings
 
 from openjax.errors import UserError
 from openjax.learning import GeneratorSettings, MappoSettings, TrainSettings, build, make_training_step
-from openjax.learning.training import _initial_carry
+from openjax.learning.training_step import _initial_carry
 from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings
-from openjax.runs.run_directory import create_run
+from openjax.store.run_directory import create_run
 
 TINY = TrainSettings(
     environment=PursuitSettings(episode_length=12, physics="rigid", history_length=3),

@@ -20,7 +20,7 @@ from openjax.learning import (
     preset,
     summarise,
 )
-from openjax.learning.training import _initial_carry, _penalty_share
+from openjax.learning.training_step import _initial_carry, _penalty_share
 from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import SCENARIOS, PursuitSettings, hover_action, scenario_task
 

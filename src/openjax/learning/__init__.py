@@ -2,7 +2,7 @@
 
 from openjax.learning.evaluation import Evaluation, Trajectory, make_evaluate, summarise
 from openjax.learning.settings import PRESETS, GeneratorSettings, MappoSettings, TrainSettings, preset
-from openjax.learning.training import TrainCarry, abstract_carry, build, init_carry, make_training_step
+from openjax.learning.training_step import TrainCarry, abstract_carry, build, init_carry, make_training_step
 
 __all__ = [
     "PRESETS",

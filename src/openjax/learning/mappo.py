@@ -9,7 +9,7 @@ from flax import struct
 from jax.flatten_util import ravel_pytree
 
 from openjax.learning.advantages import generalised_advantages
-from openjax.learning.devices import joint_moments, mean_over_devices
+from openjax.learning.collectives import joint_moments, mean_over_devices
 from openjax.learning.rollout import Rollout
 from openjax.learning.settings import MappoSettings
 from openjax.policy import Policy, gaussian_entropy, gaussian_log_prob

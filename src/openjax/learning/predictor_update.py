@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from openjax.learning.devices import mean_over_devices
+from openjax.learning.collectives import mean_over_devices
 from openjax.learning.rollout import Rollout
 from openjax.policy import Policy, PredictorSettings
 from openjax.pursuit import PursuitSettings

@@ -9,8 +9,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from openjax.runs.metrics import read_metrics
-from openjax.runs.trajectory import Trajectory
+from openjax.show.metrics import read_metrics
+from openjax.show.trajectory import Trajectory
 
 PURSUER_COLORS = ("tab:blue", "tab:green", "tab:purple", "tab:cyan", "tab:olive", "tab:brown", "navy", "teal")
 EVADER_COLOR = "tab:red"

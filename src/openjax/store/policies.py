@@ -9,10 +9,10 @@ from openjax.errors import UserError
 from openjax.learning import TrainSettings
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Observation, Pursuit
-from openjax.runs.checkpoints import Checkpoints, is_checkpoint, load_arrays
-from openjax.runs.policy_files import WEIGHTS, fill, load_policy_file, shipped_policies
-from openjax.runs.run_directory import RunDirectory, is_run
-from openjax.runs.settings_files import from_plain
+from openjax.store.checkpoints import Checkpoints, is_checkpoint, load_arrays
+from openjax.store.policy_files import WEIGHTS, fill, load_policy_file, shipped_policies
+from openjax.store.run_directory import RunDirectory, is_run
+from openjax.store.settings_files import from_plain
 
 
 @dataclasses.dataclass(frozen=True)

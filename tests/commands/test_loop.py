@@ -11,10 +11,10 @@ import pytest
 from flax import struct
 from rich.console import Console
 
-from openjax.runs.checkpoints import Checkpoints, abstract_like, is_checkpoint, named_leaves, place
-from openjax.runs.loop import NotFiniteError, Plan, StopRequest, guarded, run_updates
-from openjax.runs.metrics import MetricsWriter, read_metrics
-from openjax.runs.progress import Progress
+from openjax.commands.loop import NotFiniteError, Plan, StopRequest, guarded, run_updates
+from openjax.show.metrics import MetricsWriter, read_metrics
+from openjax.show.progress import Progress
+from openjax.store.checkpoints import Checkpoints, abstract_like, is_checkpoint, named_leaves, place
 
 
 @struct.dataclass

@@ -1,4 +1,4 @@
-"""Draws an episode with MuJoCo's renderer: `python -m openjax.runs.mujoco_rendering FLIGHT.npz OUT.gif`.
+"""Draws an episode with MuJoCo's renderer: `python -m openjax.show.mujoco_rendering FLIGHT.npz OUT.gif`.
 
 The scene is for the eye only: bodies are moved by the recorded poses, nothing is simulated.
 """
@@ -10,8 +10,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from openjax.runs.trajectory import Trajectory
-from openjax.runs.videos import frame_indices, write_gif
+from openjax.show.trajectory import Trajectory
+from openjax.show.videos import frame_indices, write_gif
 
 WIDTH, HEIGHT = 480, 400
 _COLORS = (

@@ -10,16 +10,16 @@ from typing import Annotated
 import jax
 import tyro
 
+from openjax.cluster.joining import Membership, find_membership
+from openjax.cluster.processes import Processes
+from openjax.commands.command_line import output_console, parse, peek
+from openjax.commands.machine import describe_machine
+from openjax.commands.training_job import TrainingJob, run_job
 from openjax.errors import UserError
 from openjax.learning import TrainSettings, preset
-from openjax.runs.command_line import output_console, parse, peek
-from openjax.runs.environments import make_environment
-from openjax.runs.joining import Membership, find_membership
-from openjax.runs.machine import describe_machine
-from openjax.runs.processes import Processes
-from openjax.runs.run_directory import RunDirectory, check_free, create_run, open_run
-from openjax.runs.settings_files import to_plain
-from openjax.runs.training import TrainingJob, run_job
+from openjax.store.environments import make_environment
+from openjax.store.run_directory import RunDirectory, check_free, create_run, open_run
+from openjax.store.settings_files import to_plain
 
 PROGRAM = "python -m openjax.train"
 

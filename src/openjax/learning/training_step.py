@@ -11,7 +11,7 @@ import optax
 from flax import struct
 
 from openjax.learning.archive import TaskArchive, empty_archive
-from openjax.learning.devices import gather_over_devices, mean_over_devices, own_keys
+from openjax.learning.collectives import gather_over_devices, mean_over_devices, own_keys
 from openjax.learning.generator import generate_task, select, successes
 from openjax.learning.mappo import ValueScale, initial_value_scale, make_optimiser, update_policy
 from openjax.learning.predictor_update import make_predictor_optimiser, update_predictor
@@ -105,7 +105,7 @@ def make_training_step(
 ) -> Callable[[TrainCarry], tuple[TrainCarry, dict[str, jax.Array]]]:
     """The training step `carry -> (carry, metrics)`; compile it with `jax.jit(step, donate_argnums=0)`.
 
-    `axis` names the axis of devices when it runs under `shard_map` (see `openjax.runs.devices`).
+    `axis` names the axis of devices when it runs under `shard_map` (see `openjax.cluster.devices`).
     Metrics are () float32, counted over the rollout or over the episodes that ended with it.
     """
     parts = build(settings, environment)

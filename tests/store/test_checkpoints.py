@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from openjax.errors import UserError
-from openjax.runs.checkpoints import Checkpoints, abstract_like, load_arrays, load_state, place
+from openjax.store.checkpoints import Checkpoints, abstract_like, load_arrays, load_state, place
 
 
 def init():

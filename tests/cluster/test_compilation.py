@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from openjax.runs.ahead import compile_ahead
-from openjax.runs.checkpoints import abstract_like, place
-from openjax.runs.loop import guarded
+from openjax.cluster.compilation import compile_ahead
+from openjax.commands.loop import guarded
+from openjax.store.checkpoints import abstract_like, place
 
 
 def start():

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from openjax.errors import UserError
-from openjax.runs.settings_files import SETTINGS_FILE, from_plain, read_json, write_json
+from openjax.store.settings_files import SETTINGS_FILE, from_plain, read_json, write_json
 
 _FORMAT = "openjax run 1"
 _FILES = (

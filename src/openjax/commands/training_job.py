@@ -7,29 +7,29 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from openjax.learning import TrainSettings, abstract_carry, build, init_carry, summarise
-from openjax.policy import PolicyParameters
-from openjax.pursuit import SCENARIOS, Pursuit
-from openjax.runs.ahead import compile_ahead
-from openjax.runs.checkpoints import Checkpoints, abstract_like, load_arrays, named_leaves, place
-from openjax.runs.devices import carry_shardings, check_devices, everywhere, make_device_step, own_copy
-from openjax.runs.evaluation import (
+from openjax.cluster.compilation import compile_ahead
+from openjax.cluster.devices import carry_shardings, check_devices, everywhere, make_device_step, own_copy
+from openjax.cluster.processes import Processes
+from openjax.commands.evaluator import (
     before_after_table,
     evaluate_scenarios,
     layout_slots,
     record_of,
 )
-from openjax.runs.held_back import HeldBack, flat_metrics, selection_score
-from openjax.runs.loop import NotFiniteError, Plan, StopRequest, guarded, run_updates
-from openjax.runs.metrics import METRICS_FILE, MetricsWriter, NoMetrics
-from openjax.runs.plots import plot_training, plot_trajectories
-from openjax.runs.policies import abstract_parameters, load_policy
-from openjax.runs.policy_files import fill, load_policy_file, save_policy_file
-from openjax.runs.processes import Processes
-from openjax.runs.progress import Progress
-from openjax.runs.run_directory import RunDirectory
-from openjax.runs.settings_files import write_json
-from openjax.runs.videos import animate
+from openjax.commands.loop import NotFiniteError, Plan, StopRequest, guarded, run_updates
+from openjax.commands.validation import HeldBack, flat_metrics, selection_score
+from openjax.learning import TrainSettings, abstract_carry, build, init_carry, summarise
+from openjax.policy import PolicyParameters
+from openjax.pursuit import SCENARIOS, Pursuit
+from openjax.show.metrics import METRICS_FILE, MetricsWriter, NoMetrics
+from openjax.show.plots import plot_training, plot_trajectories
+from openjax.show.progress import Progress
+from openjax.show.videos import animate
+from openjax.store.checkpoints import Checkpoints, abstract_like, load_arrays, named_leaves, place
+from openjax.store.policies import abstract_parameters, load_policy
+from openjax.store.policy_files import fill, load_policy_file, save_policy_file
+from openjax.store.run_directory import RunDirectory
+from openjax.store.settings_files import write_json
 
 _BESIDE_RECORD = ("episode_return", "last_seen_error")
 

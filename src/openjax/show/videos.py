@@ -15,8 +15,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from openjax.runs.plots import EVADER_COLOR, PURSUER_COLORS, draw_arena
-from openjax.runs.trajectory import Trajectory
+from openjax.show.plots import EVADER_COLOR, PURSUER_COLORS, draw_arena
+from openjax.show.trajectory import Trajectory
 
 FRAMES_PER_SECOND = 12.5
 _BACKENDS = ("egl", "osmesa", "glfw")
@@ -72,7 +72,7 @@ def _animate_with_mujoco(path, trajectory):
         flight, drawn = Path(directory) / "flight.npz", Path(directory) / "flight.gif"
         trajectory.save(flight)
         for backend in (chosen,) if chosen else usable:
-            command = [sys.executable, "-m", "openjax.runs.mujoco_rendering", str(flight), str(drawn)]
+            command = [sys.executable, "-m", "openjax.show.mujoco_rendering", str(flight), str(drawn)]
             environment = {**os.environ, "MUJOCO_GL": backend}
             if backend in ("egl", "osmesa"):
                 environment["PYOPENGL_PLATFORM"] = backend

@@ -10,12 +10,12 @@ import pytest
 from PIL import Image
 
 from openjax.errors import UserError
-from openjax.runs.metrics import MetricsWriter, read_metrics
-from openjax.runs.plots import plot_training, plot_trajectories
-from openjax.runs.policy_files import fill, load_policy_file, save_policy_file
-from openjax.runs.settings_files import from_plain, to_plain
-from openjax.runs.trajectory import Trajectory
-from openjax.runs.videos import animate
+from openjax.show.metrics import MetricsWriter, read_metrics
+from openjax.show.plots import plot_training, plot_trajectories
+from openjax.show.trajectory import Trajectory
+from openjax.show.videos import animate
+from openjax.store.policy_files import fill, load_policy_file, save_policy_file
+from openjax.store.settings_files import from_plain, to_plain
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,11 +13,11 @@ from importlib.metadata import version
 
 import pytest
 
+from openjax.cluster.joining import Membership, find_membership
+from openjax.cluster.relay import __file__ as RELAY
+from openjax.commands.training_command import membership
 from openjax.errors import UserError
-from openjax.runs import coordinator_relay
-from openjax.runs.joining import Membership, find_membership
-from openjax.runs.metrics import read_metrics
-from openjax.runs.training_command import membership
+from openjax.show.metrics import read_metrics
 
 UPDATES = 3
 OPTIONS = """
@@ -34,12 +34,12 @@ import sys
 from pathlib import Path
 import jax, numpy as np
 from openjax.learning import TrainSettings, build, init_carry
-from openjax.learning.training import _initial_carry
+from openjax.learning.training_step import _initial_carry
 from openjax.pursuit import Pursuit
-from openjax.runs.checkpoints import Checkpoints, load_arrays, named_leaves, place
-from openjax.runs.devices import carry_shardings, everywhere, make_device_step
-from openjax.runs.loop import guarded
-from openjax.runs.run_directory import RunDirectory
+from openjax.store.checkpoints import Checkpoints, load_arrays, named_leaves, place
+from openjax.cluster.devices import carry_shardings, everywhere, make_device_step
+from openjax.commands.loop import guarded
+from openjax.store.run_directory import RunDirectory
 
 run, directory, UPDATES = RunDirectory(Path(sys.argv[1])), Path(sys.argv[2]), int(sys.argv[3])
 settings = run.read_settings(TrainSettings)
@@ -112,8 +112,8 @@ print("same")
 # Both wait for each other for ever.
 WAITING = """
 import sys
-from openjax.runs.joining import Membership, _connected
-from openjax.runs.processes import Processes
+from openjax.cluster.joining import Membership, _connected
+from openjax.cluster.processes import Processes
 
 membership = Membership(sys.argv[1], 2, int(sys.argv[2]), "deactivate")
 with _connected(membership) as (connections, _):
@@ -232,7 +232,7 @@ def test_relay_holds_connections_when_the_coordinator_dies():
         inner = coordinator.getsockname()[1]
         port = int(free_address().split(":")[1])
         relay = subprocess.Popen(
-            [sys.executable, "-I", coordinator_relay.__file__, str(port), str(inner), "1"],
+            [sys.executable, "-I", RELAY, str(port), str(inner), "1"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
         )
@@ -259,7 +259,7 @@ def test_relay_passes_the_end_of_the_processes_own_connections_on():
     with socket.create_server(("127.0.0.1", 0)) as own:
         inner, port = own.getsockname()[1], int(free_address().split(":")[1])
         relay = subprocess.Popen(
-            [sys.executable, "-I", coordinator_relay.__file__, str(port), "1", str(inner)],
+            [sys.executable, "-I", RELAY, str(port), "1", str(inner)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
         )

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from openjax.learning.devices import mean_over_devices
+from openjax.learning.collectives import mean_over_devices
 
 DEVICES = 4
 

@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from openjax.runs.checkpoints import Checkpoints, named_leaves, save_state
-from openjax.runs.metrics import MetricsWriter
-from openjax.runs.progress import Progress
-from openjax.runs.settings_files import write_json
+from openjax.show.metrics import MetricsWriter
+from openjax.show.progress import Progress
+from openjax.store.checkpoints import Checkpoints, named_leaves, save_state
+from openjax.store.settings_files import write_json
 
 NOT_FINITE = "not_finite"
 

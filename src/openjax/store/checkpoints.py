@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from orbax.checkpoint.experimental import v1 as orbax
 
+from openjax.cluster.processes import Processes
 from openjax.errors import UserError
-from openjax.runs.processes import Processes
 
 _DIGITS = 9
 

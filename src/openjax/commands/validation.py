@@ -5,10 +5,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from openjax.commands.evaluator import Evaluator
 from openjax.learning import Evaluation
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Pursuit, PursuitSettings, Task, expand_task, turn_task, uniform_task
-from openjax.runs.evaluation import Evaluator
 
 HELD_BACK_KEY = 20_000_003
 """The held-back tasks are drawn from this key in all runs, so that runs can be compared."""

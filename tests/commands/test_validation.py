@@ -4,11 +4,11 @@ import jax
 import numpy as np
 import pytest
 
+from openjax.commands.evaluator import Evaluator
+from openjax.commands.validation import HeldBack, far_tasks, uniform_tasks
 from openjax.policy import NetworkSettings, Policy, PredictorSettings
 from openjax.pursuit import Pursuit, PursuitSettings
 from openjax.pursuit.task import START_X, starts_clear
-from openjax.runs.evaluation import Evaluator
-from openjax.runs.held_back import HeldBack, far_tasks, uniform_tasks
 
 SETTINGS = PursuitSettings()
 

@@ -11,9 +11,9 @@ import sys
 import time
 from collections.abc import Iterator
 
+from openjax.cluster import relay
+from openjax.cluster.processes import Processes, encoded
 from openjax.errors import UserError
-from openjax.runs import coordinator_relay
-from openjax.runs.processes import Processes, encoded
 
 JOIN = 300.0
 """Seconds to wait for all processes at the start."""
@@ -145,7 +145,7 @@ def _relay(port, own_port):
     with socket.create_server(("127.0.0.1", 0)) as free:
         coordinator_port = free.getsockname()[1]
     process = subprocess.Popen(
-        [sys.executable, "-I", coordinator_relay.__file__, str(port), str(coordinator_port), str(own_port)],
+        [sys.executable, "-I", relay.__file__, str(port), str(coordinator_port), str(own_port)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from openjax.errors import UserError
-from openjax.runs.checkpoints import named_leaves
-from openjax.runs.settings_files import to_plain
+from openjax.store.checkpoints import named_leaves
+from openjax.store.settings_files import to_plain
 
 _FORMAT = "openjax policy 1"
 _HEADER = "openjax.json"

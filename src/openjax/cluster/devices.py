@@ -1,6 +1,6 @@
 """A training run on several devices, of one host or of many: the worlds are shared out, all else is the same on each.
 
-The step sees its own device's worlds and averages over all where it must (`openjax.learning.devices`), so
+The step sees its own device's worlds and averages over all where it must (`openjax.learning.collectives`), so
 that one device and many give the same result on the same worlds, up to the order of sums.
 """
 

@@ -4,7 +4,7 @@ JAX ends a process at once, by a stack trace, when its connection to the coordin
 here such a connection stays open when process 0 dies, and the process has time to say in one line what happened. The
 processes' own connections, which begin with a line of JSON, close as usual; by that the loss is noticed.
 
-Needs nothing but Python:  python coordinator_relay.py PORT COORDINATOR_PORT OWN_PORT
+Needs nothing but Python:  python relay.py PORT COORDINATOR_PORT OWN_PORT
 """
 
 import asyncio
