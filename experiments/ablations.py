@@ -2,11 +2,11 @@
 
 RUN are directories of `openjax.train` that differ in seed, predictor and generator alone:
 
-    python -m openjax.train --preset paper --seed S --evaluation_interval 12
+    python -m openjax.train --preset paper --seed S --validation_interval 12
         [--predictor.enabled False] [--generator.enabled False] [--generator.turn False]
 
 Writes experiments/results/ablations.json, .md and .png: the layouts per variant, the error of the predicted next
-position, and the capture rate on held-back uniform tasks against environment steps. Without RUN the last two are
+position, and the capture rate on validation uniform tasks against environment steps. Without RUN the last two are
 written again from the first.
 """
 
@@ -45,18 +45,18 @@ PAPER = {(layout, "OPEN"): figures for layout, figures in PAPER_OPEN.items()} | 
 
 
 def outcomes(fields: list[str]) -> list[tuple[str, int, Callable]]:
-    """What the parts are judged by: name, digits, function of a run; `fields` are capture rates on held-back sets."""
+    """What the parts are judged by: name, digits, function of a run; `fields` are capture rates on validation sets."""
 
     def over_layouts(field, names):
         return lambda run: float(np.mean([r[field] for r in run["layouts"] if r["scenario"] in names]))
 
     def millions(field):
-        return lambda run: (lambda s: s and s / 1e6)(steps_to(run["held_back"], REACH, field))
+        return lambda run: (lambda s: s and s / 1e6)(steps_to(run["validation"], REACH, field))
 
     four = ("wall", "narrow_gap", "random", "passage")
     return [
         *(
-            (f"steps to {REACH} on held-back {kind_of(field)} tasks (M)", 1, millions(field))
+            (f"steps to {REACH} on validation {kind_of(field)} tasks (M)", 1, millions(field))
             for field in fields
         ),
         ("capture rate, the paper's four layouts", 4, over_layouts("capture_rate", four)),
@@ -70,7 +70,7 @@ def outcomes(fields: list[str]) -> list[tuple[str, int, Callable]]:
 
 
 def kind_of(field: str) -> str:
-    """Which held-back tasks a capture rate is of."""
+    """Which validation tasks a capture rate is of."""
     return "uniform" if field == "capture_rate" else field.removesuffix("capture_rate").strip("_/ ")
 
 
@@ -128,7 +128,7 @@ def report(runs: dict[str, list[dict]], facts: dict) -> list[str]:
         "",
         "A step of one world is one environment step. All worlds of a run are counted, with those that fly tasks of "
         "the archive: the generator tells a task's success rate from the very episodes that train the policy and "
-        "flies none beside them. The held-back evaluations are not counted, in no variant.",
+        "flies none beside them. The validation results are not counted, in no variant.",
         "",
         f"## Layouts (speed clamp, drawn starts, {everyone[0]['layouts'][0]['episodes']} episodes per seed)",
         "",
@@ -141,12 +141,12 @@ def report(runs: dict[str, list[dict]], facts: dict) -> list[str]:
         "",
         *prediction_lines(runs),
     ]
-    fields = [name for name in everyone[0]["held_back"][0] if name.endswith("capture_rate")]
+    fields = [name for name in everyone[0]["validation"][0] if name.endswith("capture_rate")]
     for field in fields:
-        interval = np.median(np.diff([r["steps"] for r in everyone[0]["held_back"]])) / 1e6
+        interval = np.median(np.diff([r["steps"] for r in everyone[0]["validation"]])) / 1e6
         lines += [
             "",
-            f"## Environment steps to a capture rate of {REACH} on held-back {kind_of(field)} tasks",
+            f"## Environment steps to a capture rate of {REACH} on validation {kind_of(field)} tasks",
             "",
             f"First evaluation that reaches it; there is one every {interval:.1f} M steps.",
             "",
@@ -199,11 +199,11 @@ def draw(runs: dict[str, list[dict]], path: Path) -> None:
     FigureCanvasAgg(figure)
     axes = figure.subplots(2, 3)
     colors = dict(zip(VARIANTS, ("tab:red", "tab:blue", "tab:green", "0.3", "tab:olive"), strict=True))
-    far = all("far_capture_rate" in r for group in runs.values() for run in group for r in run["held_back"])
+    far = all("far_capture_rate" in r for group in runs.values() for run in group for r in run["validation"])
     for axis, field, label in (
-        (axes[0, 0], "capture_rate", "capture rate, held-back uniform tasks"),
-        (axes[0, 1], "far_capture_rate", "capture rate, held-back far tasks"),
-        (axes[0, 2], "capture_step", "capture step, held-back uniform tasks"),
+        (axes[0, 0], "capture_rate", "capture rate, validation uniform tasks"),
+        (axes[0, 1], "far_capture_rate", "capture rate, validation far tasks"),
+        (axes[0, 2], "capture_step", "capture step, validation uniform tasks"),
     ):
         if field.startswith("far") and not far:
             axis.set_axis_off()

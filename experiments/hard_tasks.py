@@ -84,7 +84,7 @@ def report(results: dict) -> list[str]:
         "# Rare failures, on many tasks",
         "",
         f"`{results['command']}` on {machine['device']}, JAX {machine['versions']['jax']}, commit {machine['commit']}: "
-        f"{results['seconds']:.0f} s. Uniform: held-back uniform tasks; row: their pillars in a row; close: all pursuers "
+        f"{results['seconds']:.0f} s. Uniform: validation uniform tasks; row: their pillars in a row; close: all pursuers "
         "that can be start close to a pillar or another pursuer. Each policy in the game that it was trained in; start "
         "attitudes drawn.",
         "",

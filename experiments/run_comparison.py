@@ -19,7 +19,7 @@ VARIANTS = ("OPEN", "MAPPO + predictor", "MAPPO + generator", "MAPPO", "MAPPO, o
 SWITCHES = {"seed": (), "enabled": ("predictor", "generator"), "turn": ("generator",)}
 """Settings in which runs may differ, and the groups they belong to."""
 CURVES = ("capture_rate", "capture_step", "collision_rate", "crash_rate")
-"""What is kept of the held-back evaluations."""
+"""What is kept of the validation results."""
 
 
 def variant_of(settings: dict) -> str:
@@ -44,7 +44,7 @@ def common_settings(settings: dict, group: str = "") -> dict:
 
 
 def read_run(path: Path, episodes: int) -> dict:
-    """One run as plain values: variant, seed, held-back curve and layouts.
+    """One run as plain values: variant, seed, validation curve and layouts.
 
     Raises:
       UserError: no run, no evaluations, or steps that aren't those of all its worlds.
@@ -54,12 +54,12 @@ def read_run(path: Path, episodes: int) -> dict:
     settings = stored["settings"]
     per_update = settings["num_envs"] * settings["rollout_length"]
     curve = []
-    for record in read_metrics(run.path / METRICS_FILE, "evaluation"):
+    for record in read_metrics(run.path / METRICS_FILE, "validation"):
         if record["steps"] != record["update"] * per_update:
             raise UserError(
                 f"{path}: {record['steps']} steps after {record['update']} updates of {per_update}"
             )
-        # other held-back sets, where a run has them, carry a prefix
+        # other validation sets, where a run has them, carry a prefix
         kept = {name: value for name, value in record.items() if name.endswith(CURVES)}
         curve.append({name: record[name] for name in ("steps", "seconds")} | kept)
     if not curve:
@@ -71,7 +71,7 @@ def read_run(path: Path, episodes: int) -> dict:
         "machine": stored.get("machine"),
         "steps": curve[-1]["steps"],
         "settings": common_settings(settings),
-        "held_back": curve,
+        "validation": curve,
         "layouts": layouts_of(run, episodes),
     }
 
@@ -95,14 +95,14 @@ def steps_to(curve: list[dict], rate: float, field: str = "capture_rate") -> int
 
 
 def band(runs: list[dict], field: str) -> tuple[np.ndarray, np.ndarray]:
-    """Steps (T,) and values (seeds, T) of a variant's held-back curves, as far as all of them go.
+    """Steps (T,) and values (seeds, T) of a variant's validation curves, as far as all of them go.
 
     Runs with other intervals between evaluations are interpolated on the first one's.
     """
-    end = min(run["held_back"][-1]["steps"] for run in runs)
-    grid = np.array([r["steps"] for r in runs[0]["held_back"] if r["steps"] <= end], float)
+    end = min(run["validation"][-1]["steps"] for run in runs)
+    grid = np.array([r["steps"] for r in runs[0]["validation"] if r["steps"] <= end], float)
     values = [
-        np.interp(grid, [r["steps"] for r in run["held_back"]], [r[field] for r in run["held_back"]])
+        np.interp(grid, [r["steps"] for r in run["validation"]], [r[field] for r in run["validation"]])
         for run in runs
     ]
     return grid, np.array(values)
@@ -115,7 +115,7 @@ def savings(runs: dict[str, list[dict]], field: str, rate: float) -> list[tuple[
     reaches it counts with all its steps, which makes the ratio a bound.
     """
     reached = {
-        name: [steps_to(run["held_back"], rate, field) for run in group] for name, group in runs.items()
+        name: [steps_to(run["validation"], rate, field) for run in group] for name, group in runs.items()
     }
     rows = []
     for name, steps in reached.items():

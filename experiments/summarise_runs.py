@@ -1,6 +1,6 @@
 """Summary of training runs: `python experiments/summarise_runs.py OUT.json NAME=RUN ... [--note TEXT] [--commit HASH]`.
 
-Keeps what a run's directory says of itself: settings, evaluations on the held-back tasks, the layouts before and after.
+Keeps what a run's directory says of itself: settings, evaluations on the validation tasks, the layouts before and after.
 Writes OUT.json and a table beside it.
 """
 
@@ -23,13 +23,13 @@ def summary(run: Path) -> dict:
         "settings": json.loads((run / "settings.json").read_text(encoding="utf-8")),
         "first_update_seconds": first["seconds"],
         "steps_per_second": (last["steps"] - first["steps"]) / max(last["seconds"] - first["seconds"], 1e-9),
-        "evaluations": [line for line in lines if line["event"] == "evaluation"],
+        "evaluations": [line for line in lines if line["event"] == "validation"],
         "layouts": json.loads((run / "layouts.json").read_text(encoding="utf-8")),
     }
 
 
 def first_reaching(evaluations: list[dict], rate: float, field: str = "capture_rate") -> str:
-    """Environment steps and seconds until a held-back capture rate first reaches `rate`."""
+    """Environment steps and seconds until a validation capture rate first reaches `rate`."""
     for entry in evaluations:
         if entry.get(field, 0.0) >= rate:
             return f"{entry['steps'] / 1e6:.0f} M, {entry['seconds']:.0f} s"
@@ -37,7 +37,7 @@ def first_reaching(evaluations: list[dict], rate: float, field: str = "capture_r
 
 
 def learning_against_spread(runs: dict[str, dict]) -> list[str]:
-    """Improvement on the held-back tasks in standard deviations over the runs' ends."""
+    """Improvement on the validation tasks in standard deviations over the runs' ends."""
     rows = []
     for field in ("episode_return", "collision_rate"):
         before, after = (
@@ -45,7 +45,7 @@ def learning_against_spread(runs: dict[str, dict]) -> list[str]:
                 row[field]
                 for run in runs.values()
                 for row in run["layouts"][when]
-                if row["scenario"] == "held_back"
+                if row["scenario"] == "validation"
             ]
             for when in ("before", "after")
         )
@@ -55,7 +55,7 @@ def learning_against_spread(runs: dict[str, dict]) -> list[str]:
         ratio = change / spread if spread else float("inf")
         rows.append([field, f"{statistics.mean(before):.3f}", shown, f"{ratio:.1f}"])
     heads = ["figure", "before, mean", "after, each run", "improvement over standard deviation"]
-    return ["", "Learning against spread, held-back tasks:", "", *table(heads, rows)]
+    return ["", "Learning against spread, validation tasks:", "", *table(heads, rows)]
 
 
 def main() -> None:
@@ -71,9 +71,9 @@ def main() -> None:
     lines = ["# Training runs", "", f"{arguments.note} Commit {arguments.commit}.", ""]
     far = all("far_capture_rate" in entry for run in runs.values() for entry in run["evaluations"])
     heads = ["run", "env steps", "seconds, compilation included", "of them before the first update's end"]
-    heads += ["env steps/s, evaluations included", "held-back capture ≥ .95", "≥ .99"]
+    heads += ["env steps/s, evaluations included", "validation capture ≥ .95", "≥ .99"]
     heads += ["far tasks ≥ .95", "≥ .99"] if far else []
-    heads += ["held-back capture, collisions at the end"] + (["far tasks"] if far else [])
+    heads += ["validation capture, collisions at the end"] + (["far tasks"] if far else [])
     rows = []
     for name, run in runs.items():
         entries = run["evaluations"]

@@ -27,7 +27,7 @@ TINY = (
     "--network.features 8 --network.heads 2 "
     "--predictor.units 4 --predictor.windows 4 --predictor.steps 2 --predictor.horizons 1 2 "
     "--mappo.minibatches 2 --mappo.epochs 1 --generator.capacity 8 "
-    "--evaluation_interval 3 --evaluation_episodes 4"
+    "--validation_interval 3 --validation_episodes 4"
 ).split()
 STEPS = ["--steps", str(UPDATES * 160), "--layout_episodes", "4"]
 
@@ -99,7 +99,7 @@ def test_train_shows_progress_and_leaves_what_the_readme_says(whole_run):
         "loading JAX",
         "compiling the training step",
         "steps/s",
-        "held-back tasks",
+        "validation tasks",
         "Before and after",
     ):
         assert line in printed
@@ -115,7 +115,7 @@ def test_train_shows_progress_and_leaves_what_the_readme_says(whole_run):
     assert [r["update"] for r in read_metrics(out / "metrics.jsonl", "train")] == list(range(1, UPDATES + 1))
     layouts = json.loads((out / "layouts.json").read_text())
     scenarios = [row["scenario"] for row in layouts["after"]]
-    assert scenarios[:3] == ["held_back", "held_back_far", "wall"]
+    assert scenarios[:3] == ["validation", "validation_far", "wall"]
     assert layouts["machine"]["versions"]["jax"] == jax.__version__
 
 
@@ -179,7 +179,7 @@ from openjax.commands.loop import guarded
 from openjax.store.run_directory import open_run
 
 run = open_run(sys.argv[1])
-settings = run.read_settings(TrainSettings)
+settings = run.read_settings()
 environment = make_environment(
     settings.environment, run.optional("vehicle.toml"), run.optional("effects.toml")
 )
@@ -263,7 +263,7 @@ def test_shipped_policies_act_in_their_game_and_refuse_another():
         observation, _ = jax.jit(environment.reset)(jax.random.key(0))
         action = policy(observation)
         assert action.shape == (3, 4) and bool((abs(action) <= 1).all()), name
-    for changes in ({"history_length": 3}, {"observe_others_motion": True}):
+    for changes in ({"history_length": 3}, {"observe_time": False}):
         other = openjax.make(policy.settings.environment, **changes)
         with pytest.raises(openjax.UserError, match="make its game with"):
             policy(jax.eval_shape(other.reset, jax.random.key(0))[0])

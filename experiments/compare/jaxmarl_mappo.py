@@ -105,7 +105,7 @@ def make_update(
     actor = Recurrent(settings.features, environment.action_space(agents[0]).n, 0.01)
     critic = Recurrent(settings.features, 1, 1.0)
     optimiser = optax.chain(
-        optax.clip_by_global_norm(settings.gradient_norm), optax.adam(settings.learning_rate, eps=1e-5)
+        optax.clip_by_global_norm(settings.max_grad_norm), optax.adam(settings.learning_rate, eps=1e-5)
     )
     envs = settings.num_envs
     actors = len(agents) * envs
@@ -164,7 +164,10 @@ def make_update(
         advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
         clipped = jnp.clip(ratio, 1 - settings.clip, 1 + settings.clip)
         entropy = -jnp.sum(jnp.exp(logits) * logits, axis=-1).mean()
-        return -jnp.minimum(ratio * advantage, clipped * advantage).mean() - settings.entropy * entropy
+        return (
+            -jnp.minimum(ratio * advantage, clipped * advantage).mean()
+            - settings.entropy_coefficient * entropy
+        )
 
     def critic_loss(parameters, memory, batch, target):
         value = critic.apply(parameters, memory, batch.world, batch.started)[1][..., 0]
@@ -220,7 +223,7 @@ def _advantage(settings, batch, last_value):
         later, next_value = carry
         going_on = 1.0 - t.ended
         error = t.reward + settings.discount * next_value * going_on - t.value
-        later = error + settings.discount * settings.trace * going_on * later
+        later = error + settings.discount * settings.gae_lambda * going_on * later
         return (later, t.value), later
 
     return jax.lax.scan(one, (jnp.zeros_like(last_value), last_value), batch, reverse=True, unroll=16)[1]

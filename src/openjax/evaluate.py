@@ -108,7 +108,7 @@ def _check(command):
 
 def _check_sizes(settings, trained):
     """Settings that shape the networks' inputs can't differ from those of the training."""
-    for name in ("self_size", "others_size", "observed_pillars", "history_length", "frame_size"):
+    for name in ("self_size", "observed_pillars", "history_length", "frame_size"):
         if getattr(settings, name) != getattr(trained, name):
             raise UserError(
                 f"the policy was trained with {name} {getattr(trained, name)}, here it's "

@@ -25,7 +25,7 @@ OPTIONS = """
     --network.features 8 --network.heads 2 --predictor.units 4 --predictor.windows 2 --predictor.steps 1
     --predictor.horizons 1 2 --mappo.minibatches 2 --mappo.epochs 1 --generator.capacity 8
     --generator.success_low 0.0 --generator.success_high 1.0 --generator.episodes_per_task 2
-    --num_envs 32 --rollout_length 10 --restart_every 2 --restart_steps 10 --total_steps 100000000 --evaluation_episodes 2
+    --num_envs 32 --rollout_length 10 --restart_every 2 --restart_steps 10 --total_steps 100000000 --validation_episodes 2
 """.split()
 
 # The same run on one device and on four of one process, next to that of two processes with two devices each.
@@ -42,7 +42,7 @@ from openjax.commands.loop import guarded
 from openjax.store.run_directory import RunDirectory
 
 run, directory, UPDATES = RunDirectory(Path(sys.argv[1])), Path(sys.argv[2]), int(sys.argv[3])
-settings = run.read_settings(TrainSettings)
+settings = run.read_settings()
 environment = Pursuit(settings.environment)
 parts = build(settings, environment)
 shapes = jax.eval_shape(lambda: _initial_carry(settings, parts, jax.random.key(0)))
@@ -159,7 +159,7 @@ def killed(tmp_path_factory):
     processes = []
     for i in range(2):
         job = ("--coordinator_address", address, "--num_processes", 2, "--process_id", i)
-        options = (*job, "--devices", "all", "--out", run, "--evaluation_interval", UPDATES)
+        options = (*job, "--devices", "all", "--out", run, "--validation_interval", UPDATES)
         with open(directory / f"{i}.out", "w") as out, open(directory / f"{i}.err", "w") as err:
             processes.append(train(*options, env=environment_with(2), stdout=out, stderr=err))
     try:
@@ -187,7 +187,7 @@ def test_only_the_first_process_writes_and_shows(killed):
     shown = (
         "compiling",
         "training",
-        "held-back",
+        "validation",
         "steps/s",
     )  # what the first one tells, beside libraries' notes
     assert not [word for word in shown if word in other], other

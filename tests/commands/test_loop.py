@@ -64,7 +64,7 @@ def run(directory, compiled_step, updates, resume=False, evaluate=None, **plan):
     else:
         carry = place(init())
     metrics = MetricsWriter(directory, resumed_update=first if resume else None, tensorboard=False)
-    plan = Plan(total_updates=updates, steps_per_update=10, **{"evaluation_interval": 4, **plan})
+    plan = Plan(total_updates=updates, steps_per_update=10, **{"validation_interval": 4, **plan})
     with (
         Progress("toy", 10 * updates, Console(quiet=True)) as progress,
         StopRequest() as stop,
@@ -132,7 +132,7 @@ def test_signal_saves_and_stops(tmp_path, compiled, number):
 
         return kill_and_score
 
-    outcome = run(tmp_path, compiled, 1000, evaluate=evaluate, evaluation_interval=3)
+    outcome = run(tmp_path, compiled, 1000, evaluate=evaluate, validation_interval=3)
     assert outcome.stopped_by == signal.Signals(number).name
     assert outcome.update < 10
     assert Checkpoints(tmp_path / "checkpoints").latest().update == outcome.update

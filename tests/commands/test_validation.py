@@ -1,11 +1,11 @@
-"""The held-back tasks: the same for all runs, the far ones as far as an archive reaches, chosen by the uniform ones."""
+"""The validation tasks: the same for all runs, the far ones as far as an archive reaches, chosen by the uniform ones."""
 
 import jax
 import numpy as np
 import pytest
 
 from openjax.commands.evaluator import Evaluator
-from openjax.commands.validation import HeldBack, far_tasks, uniform_tasks
+from openjax.commands.validation import Validation, far_tasks, uniform_tasks
 from openjax.policy import NetworkSettings, Policy, PredictorSettings
 from openjax.pursuit import Pursuit, PursuitSettings
 from openjax.pursuit.task import START_X, starts_clear
@@ -48,8 +48,8 @@ def test_uniform_tasks_fly_as_they_would_alone():
         environment, NetworkSettings(features=8, heads=2), PredictorSettings(units=4)
     )
     parameters = policy.init(jax.random.key(1), environment.reset(jax.random.key(0))[0])
-    held_back = HeldBack(environment, settings, policy, 4)
-    uniform, far, _ = held_back(parameters)
+    validation = Validation(environment, settings, policy, 4)
+    uniform, far, _ = validation(parameters)
     alone, _ = Evaluator(environment, policy, 4)(parameters, uniform_tasks(settings, 4, 5), jax.random.key(0))
     for together, expected in zip(jax.tree.leaves(uniform), jax.tree.leaves(alone), strict=True):
         np.testing.assert_allclose(together, expected, rtol=1e-5, atol=1e-6)

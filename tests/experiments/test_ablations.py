@@ -34,7 +34,7 @@ TINY = TrainSettings(
 
 
 def run_of(variant, seed, rates, layouts=None, length=10):
-    """A run whose held-back capture rate is `rates`, one evaluation every `length` steps."""
+    """A run whose validation capture rate is `rates`, one evaluation every `length` steps."""
     curve = [
         {"steps": length * (i + 1), "seconds": 0.0, "capture_rate": r, "capture_step": 800 * (1 - r)}
         for i, r in enumerate(rates)
@@ -54,7 +54,7 @@ def run_of(variant, seed, rates, layouts=None, length=10):
         "machine": None,
         "steps": curve[-1]["steps"],
         "settings": {"num_envs": 12, "total_steps": 100},
-        "held_back": curve,
+        "validation": curve,
         "layouts": [{"scenario": name, **row} for name in SCENARIOS],
     }
 
@@ -96,7 +96,7 @@ def test_a_run_is_read_with_its_variant_and_refused_if_steps_are_missing(tmp_pat
         run = create_run(tmp_path / str(number), overwrite=False)
         run.write_settings(settings, {"command": "train", "machine": {}})
         evaluation = {
-            "event": "evaluation",
+            "event": "validation",
             "update": 5,
             "steps": 240,
             "seconds": 1.0,
@@ -109,7 +109,7 @@ def test_a_run_is_read_with_its_variant_and_refused_if_steps_are_missing(tmp_pat
         )
         record = read_run(run.path, episodes=4)
         assert record["variant"] == variant and record["layouts"] == [{"flown": 4}]
-        assert record["held_back"] == [
+        assert record["validation"] == [
             {"steps": 240, "seconds": 1.0, "capture_rate": 0.5, "far_capture_rate": 0.25}
         ]
     (run.path / "metrics.jsonl").write_text(json.dumps(evaluation | {"steps": 60}))
@@ -119,8 +119,8 @@ def test_a_run_is_read_with_its_variant_and_refused_if_steps_are_missing(tmp_pat
 
 def test_steps_to_a_rate_and_what_is_saved_against_mappo():
     fast, slow, never = [0.1, 0.96, 0.9, 1.0], [0.1, 0.2, 0.9, 0.97], [0.1, 0.2, 0.3, 0.4]
-    assert steps_to(run_of("OPEN", 0, fast)["held_back"], 0.95) == 20
-    assert steps_to(run_of("OPEN", 0, never)["held_back"], 0.95) is None
+    assert steps_to(run_of("OPEN", 0, fast)["validation"], 0.95) == 20
+    assert steps_to(run_of("OPEN", 0, never)["validation"], 0.95) is None
     runs = by_variant(
         [
             run_of("MAPPO", 0, slow),
@@ -147,7 +147,7 @@ def test_runs_that_differ_in_more_than_the_switches_are_refused():
     with pytest.raises(UserError, match="a seed was given twice"):
         by_variant([run_of("OPEN", 0, [1.0]), run_of("OPEN", 0, [1.0])])
     flat = run_comparison.common_settings(json.loads(json.dumps(dataclasses.asdict(TINY))))
-    assert "num_envs" in flat and "predictor.units" in flat and "mappo.clip" in flat
+    assert "num_envs" in flat and "predictor.units" in flat and "mappo.clip_epsilon" in flat
     assert not {"seed", "predictor.enabled", "generator.enabled", "generator.turn"} & set(flat)
 
 

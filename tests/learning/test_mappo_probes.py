@@ -14,7 +14,13 @@ from openjax.pursuit import Observation
 STEPS, WORLDS, UPDATES = 2, 64, 120
 DISCOUNT = 0.5
 SETTINGS = MappoSettings(
-    learning_rate=5e-3, epochs=4, minibatches=2, clip=0.2, entropy=0.0, discount=DISCOUNT, reward_scale=1.0
+    learning_rate=5e-3,
+    epochs=4,
+    minibatches=2,
+    clip_epsilon=0.2,
+    entropy_coefficient=0.0,
+    discount=DISCOUNT,
+    reward_scale=1.0,
 )
 POLICY = Policy(
     NetworkSettings(features=16, heads=2, critic_input="observation"),

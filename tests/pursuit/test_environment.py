@@ -65,7 +65,7 @@ def test_the_end_is_terminal_where_the_time_is_observed(observe_time):
     "changes",
     [
         dict(num_pursuers=1, observe_position=True, min_pillars=0, max_pillars=0, history_spacing=2),
-        dict(num_pursuers=8, max_pillars=2, min_pillars=0, speed_limit="none", observe_others_motion=True),
+        dict(num_pursuers=8, max_pillars=2, min_pillars=0, speed_limit="none"),
         dict(
             arena_radius=2.0,
             arena_height=3.0,
@@ -90,7 +90,7 @@ def test_other_sizes(changes):
     first, second, state, reward, *_ = play(KEY)
     n = settings.num_pursuers
     assert first.self_state.shape == (n, settings.self_size)
-    assert first.others.shape == (n, n - 1, settings.others_size)
+    assert first.others.shape == (n, n - 1, 3)
     assert first.privileged.shape == (n, settings.privileged_size)
     assert first.pillars.shape == (n, settings.observed_pillars, 5)
     assert first.frames.shape == (settings.history_length, settings.frame_size)

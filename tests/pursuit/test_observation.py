@@ -72,16 +72,6 @@ def test_others_are_relative_and_in_order():
         np.testing.assert_allclose(others[i, 1], POSITION[i] - POSITION[second], atol=1e-6)
 
 
-def test_motion_of_the_others():
-    moving = np.asarray(observed(observe_others_motion=True, quaternion=ROLLED).others)
-    np.testing.assert_allclose(moving[..., :3], observed().others, atol=1e-6)
-    # velocities are 0.1 (0, 1, 2), 0.1 (3, 4, 5), 0.1 (6, 7, 8); the second pursuer is rolled by 90 degrees
-    np.testing.assert_allclose(moving[0, :, 3:6], [[-0.3] * 3, [-0.6] * 3], atol=1e-6)
-    np.testing.assert_allclose(moving[1, :, 3:6], [[0.3] * 3, [-0.3] * 3], atol=1e-6)
-    np.testing.assert_allclose(moving[0, :, 6:], [[0, -1, 0], [0, 0, 1]], atol=1e-6)
-    np.testing.assert_allclose(moving[1, :, 6:], [[0, 0, 1], [0, 0, 1]], atol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("active", "orders"),
     [

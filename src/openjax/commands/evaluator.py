@@ -1,4 +1,4 @@
-"""Evaluation of policies on layouts and on held-back tasks, as tables, records and trajectories."""
+"""Evaluation of policies on layouts and on validation tasks, as tables, records and trajectories."""
 
 import math
 from collections.abc import Callable, Sequence

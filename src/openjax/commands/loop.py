@@ -37,8 +37,8 @@ class Plan:
     total_updates: int
     steps_per_update: int
     """Environment steps of one update."""
-    evaluation_interval: int
-    """Updates between evaluations on the held-back tasks; each writes a checkpoint."""
+    validation_interval: int
+    """Updates between evaluations on the validation tasks; each writes a checkpoint."""
     checkpoint_seconds: float = 60.0
     """Longest time without a checkpoint."""
     time_limit: float = float("inf")
@@ -141,7 +141,7 @@ def run_updates(
       checkpoints, metrics, progress: where to save, log and show.
       directory: the run's directory; the state with a NaN is left in `not_finite` there.
       stop: asks for an early end.
-      evaluate: carry -> (score, metrics) on the held-back tasks; must not touch the carry.
+      evaluate: carry -> (score, metrics) on the validation tasks; must not touch the carry.
       first_update: updates done before (a resumed run).
       seconds: training time spent before.
       everyone: gathers a value of each process, as `Processes.everyone` does.
@@ -186,17 +186,17 @@ def run_updates(
             if pending is not None:
                 finish(pending)
             pending = (update, values, broken)
-            due = update % plan.evaluation_interval == 0 or update == plan.total_updates
+            due = update % plan.validation_interval == 0 or update == plan.total_updates
             reason, late = decide()
             if not overlap or due or late or reason:
                 finish(pending)
                 pending = None
             score = None
             if due and evaluate is not None:
-                progress.phase("evaluating on held-back tasks", announce=False)
-                score, held_back = evaluate(carry)
-                metrics.write("evaluation", update, update * plan.steps_per_update, elapsed(), held_back)
-                progress.held_back(held_back, is_best=score >= best_score)
+                progress.phase("evaluating on validation tasks", announce=False)
+                score, validation = evaluate(carry)
+                metrics.write("validation", update, update * plan.steps_per_update, elapsed(), validation)
+                progress.validation(validation, is_best=score >= best_score)
                 best_score = max(score, best_score)
             if due or late:
                 checkpoints.save(update, carry, score, {"seconds": elapsed()})

@@ -75,7 +75,7 @@ def read_command(arguments: Sequence[str]) -> TrainCommand:
     if resume is not None:
         if name is not None:
             raise UserError("--preset and --resume exclude each other: a resumed run keeps its settings")
-        default = open_run(Path(resume)).read_settings(TrainSettings)
+        default = open_run(Path(resume)).read_settings()
     else:
         default = preset(name or default_preset())
     command = parse(TrainCommand, TrainCommand(settings=default), arguments, PROGRAM)

@@ -17,7 +17,7 @@ from openjax.commands.evaluator import (
     record_of,
 )
 from openjax.commands.loop import NotFiniteError, Plan, StopRequest, guarded, run_updates
-from openjax.commands.validation import HeldBack, flat_metrics, selection_score
+from openjax.commands.validation import Validation, flat_metrics, selection_score
 from openjax.learning import TrainSettings, abstract_carry, build, init_carry, summarise
 from openjax.policy import PolicyParameters
 from openjax.pursuit import SCENARIOS, Pursuit
@@ -77,8 +77,8 @@ def run_job(job: TrainingJob, directory: RunDirectory, resume: bool, console: Co
         )
         ahead = processes.number == 1  # several processes must compile in the same order
         step_ready = compile_ahead(step, abstract) if ahead else _nothing  # takes longest, so it comes first
-        held_back = _held_back(job)
-        evaluation_ready = _evaluation_ahead(held_back, abstract) if ahead else _nothing
+        validation = _validation(job)
+        evaluation_ready = _validation_ahead(validation, abstract) if ahead else _nothing
         carry, update, seconds = _first_carry(job, abstract, directory, checkpoints, resume, progress)
         if processes.is_first:
             directory.write_settings(settings, job.facts)
@@ -87,7 +87,7 @@ def run_job(job: TrainingJob, directory: RunDirectory, resume: bool, console: Co
             if not processes.is_first:
                 return processes.of_first()
             evaluation_ready()
-            uniform, far = (summarise(part) for part in held_back(own_copy(carry.policy))[:2])
+            uniform, far = (summarise(part) for part in validation(own_copy(carry.policy))[:2])
             score = selection_score(uniform)
             return processes.of_first((score, {**flat_metrics(uniform, far), "score": score}))
 
@@ -104,7 +104,7 @@ def run_job(job: TrainingJob, directory: RunDirectory, resume: bool, console: Co
                 Plan(
                     total_updates=settings.total_updates,
                     steps_per_update=settings.steps_per_update,
-                    evaluation_interval=settings.evaluation_interval,
+                    validation_interval=settings.validation_interval,
                     time_limit=seconds + job.time_limit,
                 ),
                 checkpoints=checkpoints,
@@ -132,7 +132,7 @@ def run_job(job: TrainingJob, directory: RunDirectory, resume: bool, console: Co
                 f"go on with python -m openjax.train --resume {directory.path}"
             )
             return 0
-        table = _report(job, directory, held_back, outcome, progress)
+        table = _report(job, directory, validation, outcome, progress)
     console.print(table)
     console.print(f"run, policy and pictures are in {directory.path}", soft_wrap=True)
     return 0
@@ -142,10 +142,10 @@ def _nothing() -> None:
     """There is nothing to wait for."""
 
 
-def _evaluation_ahead(held_back, abstract):
+def _validation_ahead(validation, abstract):
     """Start to compile the evaluation; a function that waits for it."""
     policy = abstract_like(abstract.policy, jax.sharding.SingleDeviceSharding(jax.local_devices()[0]))
-    return held_back.evaluator.compile_ahead(policy, held_back.tasks)
+    return validation.evaluator.compile_ahead(policy, validation.tasks)
 
 
 def _first_carry(job, abstract, directory, checkpoints, resume, progress):
@@ -177,8 +177,8 @@ def _start_parameters(job) -> PolicyParameters:
     return fill(abstract, named_leaves(loaded.parameters), f"--start_from {job.start_from}")
 
 
-def _held_back(job):
-    """The held-back tasks and the compiled evaluation, which has room for the layouts' pillars."""
+def _validation(job):
+    """The validation tasks and their compiled evaluation, which has room for the layouts' pillars."""
     settings, environment = job.settings, job.environment
     wide = Pursuit(
         dataclasses.replace(settings.environment, max_pillars=layout_slots(settings.environment)),
@@ -187,7 +187,7 @@ def _held_back(job):
         environment.effect_parameters,
     )
     policy = build(settings, environment).policy
-    return HeldBack(wide, settings.environment, policy, settings.evaluation_episodes)
+    return Validation(wide, settings.environment, policy, settings.validation_episodes)
 
 
 def _save_best(job, directory, checkpoints, outcome):
@@ -198,14 +198,14 @@ def _save_best(job, directory, checkpoints, outcome):
     notes = {
         "update": record.update,
         "steps": record.update * job.settings.steps_per_update,
-        "held_back_score": record.score,
+        "validation_score": record.score,
         "seconds": record.notes.get("seconds"),
         **job.facts,
     }
     save_policy_file(directory.policy, parameters, job.settings, notes, storage="float32")
 
 
-def _report(job, directory, held_back, outcome, progress):
+def _report(job, directory, validation, outcome, progress):
     """Evaluate the first and the best policy on the layouts and draw the best one's flights."""
     settings = job.settings
     fitting = [s for s in SCENARIOS.values() if len(s.pursuers) == settings.environment.num_pursuers]
@@ -214,15 +214,15 @@ def _report(job, directory, held_back, outcome, progress):
     for moment, path in (("before", directory.start_policy), ("after", directory.policy)):
         progress.phase(f"evaluating the policy {moment} training on the layouts")
         parameters = fill(abstract, load_policy_file(path)[0], str(path))
-        *evaluations, records = held_back(parameters)
+        *evaluations, records = validation(parameters)
         rows[moment] = [
-            record_of(name, held_back.number, summarise(evaluation), _BESIDE_RECORD)
-            for name, evaluation in zip(("held_back", "held_back_far"), evaluations, strict=True)
+            record_of(name, validation.number, summarise(evaluation), _BESIDE_RECORD)
+            for name, evaluation in zip(("validation", "validation_far"), evaluations, strict=True)
         ]
-        flights = [_flight(held_back, records, i) for i in range(min(3, held_back.number))]
+        flights = [_flight(validation, records, i) for i in range(min(3, validation.number))]
         if fitting:
             layouts, flights = evaluate_scenarios(
-                held_back.evaluator, parameters, fitting, job.layout_episodes, seed=0, extra=_BESIDE_RECORD
+                validation.evaluator, parameters, fitting, job.layout_episodes, seed=0, extra=_BESIDE_RECORD
             )
             rows[moment] += layouts
     progress.phase("drawing")
@@ -244,6 +244,6 @@ def _report(job, directory, held_back, outcome, progress):
     return before_after_table(rows["before"], rows["after"])
 
 
-def _flight(held_back, records, episode):
-    task = jax.tree.map(lambda leaf: np.asarray(leaf[episode]), held_back.tasks)
-    return held_back.evaluator.trajectory(records, episode, task, f"held-back task {episode + 1}")
+def _flight(validation, records, episode):
+    task = jax.tree.map(lambda leaf: np.asarray(leaf[episode]), validation.tasks)
+    return validation.evaluator.trajectory(records, episode, task, f"validation task {episode + 1}")

@@ -1,4 +1,4 @@
-"""Held-back tasks: the same in every run, to watch it and to choose its best checkpoint. Never the layouts."""
+"""Validation tasks, never trained on: the same in every run, to watch it and to choose its best checkpoint. Never the layouts."""
 
 from typing import Any
 
@@ -10,22 +10,22 @@ from openjax.learning import Evaluation
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Pursuit, PursuitSettings, Task, expand_task, turn_task, uniform_task
 
-HELD_BACK_KEY = 20_000_003
-"""The held-back tasks are drawn from this key in all runs, so that runs can be compared."""
+VALIDATION_KEY = 20_000_003
+"""The validation tasks are drawn from this key in all runs, so that runs can be compared."""
 
 FAR_EXPANSIONS = 20
 """Local expansions that lead to a far task: 0.26 m along each axis in the mean square, where nothing stops them."""
 
 
 def uniform_tasks(settings: PursuitSettings, number: int, slots: int) -> Task:
-    """The first `number` held-back uniform tasks, with `slots` pillar slots."""
-    keys = jax.random.split(jax.random.key(HELD_BACK_KEY), number)
+    """The first `number` validation uniform tasks, with `slots` pillar slots."""
+    keys = jax.random.split(jax.random.key(VALIDATION_KEY), number)
     tasks = jax.jit(jax.vmap(lambda key: uniform_task(settings, key)))(keys)
     return _with_slots(tasks, slots)
 
 
 def far_tasks(settings: PursuitSettings, number: int, slots: int) -> Task:
-    """The first `number` held-back far tasks, with `slots` pillar slots.
+    """The first `number` validation far tasks, with `slots` pillar slots.
 
     Other uniform tasks, turned about the arena's axis and expanded as those in a generator's archive are: starts up
     to 0.1 m from the arena's wall, and pursuers that start apart from each other or around the evader.
@@ -37,11 +37,11 @@ def far_tasks(settings: PursuitSettings, number: int, slots: int) -> Task:
         keys = jax.random.split(expand_key, FAR_EXPANSIONS)
         return jax.lax.scan(lambda task, key: (expand_task(settings, key, task), None), task, keys)[0]
 
-    keys = jax.random.split(jax.random.fold_in(jax.random.key(HELD_BACK_KEY), 1), number)
+    keys = jax.random.split(jax.random.fold_in(jax.random.key(VALIDATION_KEY), 1), number)
     return _with_slots(jax.jit(jax.vmap(draw))(keys), slots)
 
 
-class HeldBack:
+class Validation:
     """`number` uniform and as many far tasks, flown in one call of one compiled evaluation.
 
     Args:
@@ -67,7 +67,7 @@ class HeldBack:
 
 
 def selection_score(summary: dict) -> float:
-    """By which the best checkpoint is chosen, on the uniform held-back tasks.
+    """By which the best checkpoint is chosen, on the uniform validation tasks.
 
     Captures count, breaches and crashes cost; the return settles it while nothing is captured yet.
     """

@@ -22,7 +22,7 @@ class Evaluation:
 
 
 @struct.dataclass
-class Trajectory:
+class EpisodeRecord:
     """B episodes of T steps, for pictures."""
 
     pursuers: jax.Array  # (B, T, N, 3) m
@@ -35,7 +35,7 @@ class Trajectory:
 
 def make_evaluate(
     environment: Pursuit, policy: Policy, trajectory: bool = False
-) -> Callable[[PolicyParameters, Task, jax.Array], Evaluation | tuple[Evaluation, Trajectory]]:
+) -> Callable[[PolicyParameters, Task, jax.Array], Evaluation | tuple[Evaluation, EpisodeRecord]]:
     """`evaluate(parameters, tasks, key)`: one episode per task (leading axis B), to be compiled by the caller.
 
     With `trajectory` it returns positions of every step as well.
@@ -59,7 +59,7 @@ def make_evaluate(
             )
             record = None
             if trajectory:
-                record = Trajectory(
+                record = EpisodeRecord(
                     pursuers=state.drones.position,
                     quaternion=state.drones.quaternion,
                     evader=state.evader_position,

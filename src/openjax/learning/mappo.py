@@ -60,7 +60,7 @@ def make_optimiser(
     schedule = optax.linear_schedule(settings.learning_rate, 0.0, steps)
 
     def one():
-        adam = optax.chain(optax.clip_by_global_norm(settings.gradient_norm), optax.adam(schedule, eps=1e-5))
+        adam = optax.chain(optax.clip_by_global_norm(settings.max_grad_norm), optax.adam(schedule, eps=1e-5))
         # one vector instead of dozens of small arrays: on a GPU their updates cost by number, not by size
         return optax.flatten(adam)
 
@@ -82,7 +82,7 @@ def policy_loss(
         "clipped": jnp.mean(jnp.abs(ratio - 1.0) > clip),
         "entropy": entropy,
     }
-    return -surrogate - settings.entropy * entropy, watch
+    return -surrogate - settings.entropy_coefficient * entropy, watch
 
 
 def value_loss(settings: MappoSettings, policy: Policy, critic: Any, batch: Batch) -> jax.Array:
@@ -137,7 +137,7 @@ def update_policy(
         jnp.broadcast_to(rollout.terminated[..., None], per_pursuer),
         jnp.broadcast_to(rollout.truncated[..., None], per_pursuer),
         settings.discount,
-        settings.trace,
+        settings.gae_lambda,
     )
     returns = advantage + value
     explained = 1.0 - joint_moments(advantage, axis)[1] ** 2 / (joint_moments(returns, axis)[1] ** 2 + 1e-8)
@@ -160,7 +160,7 @@ def update_policy(
         target=(returns - mean) / std,
     )
     batch = _partition(batch, settings.minibatches)
-    clip = settings.clip + (settings.clip_end - settings.clip) * progress
+    clip = settings.clip_epsilon + (settings.clip_epsilon_end - settings.clip_epsilon) * progress
 
     def gradient_step(carry, index):
         (actor, critic), (actor_state, critic_state) = carry

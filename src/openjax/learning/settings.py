@@ -16,16 +16,16 @@ class MappoSettings:
     """Adam step size at the start; falls linearly to zero over `total_steps`."""
     epochs: int = 4
     minibatches: int = 16
-    clip: float = 0.1
+    clip_epsilon: float = 0.1
     """Clip range of the probability ratio at the start ..."""
-    clip_end: float = 0.1
+    clip_epsilon_end: float = 0.1
     """... which changes linearly to this over `total_steps`."""
-    entropy: float = 1e-3
+    entropy_coefficient: float = 1e-3
     """Weight of the entropy."""
     discount: float = 0.995
-    trace: float = 0.95
+    gae_lambda: float = 0.95
     """Lambda of the generalised advantage estimate."""
-    gradient_norm: float = 10.0
+    max_grad_norm: float = 10.0
     """Global norm to which gradients are cut, actor and critic each."""
     huber: float = 10.0
     """Where the value loss turns linear, in standard deviations of the returns."""
@@ -88,10 +88,10 @@ class TrainSettings:
     """Multiple of `rollout_length`; the value of what would have come is estimated, as after every rollout."""
     restart_close: float = 0.0
     """Share of the pursuers in worlds that are started anew which start close to a pillar or another pursuer."""
-    evaluation_interval: int = 50
-    """Iterations between evaluations on held-back uniform tasks."""
-    evaluation_episodes: int = 256
-    """Held-back uniform tasks, and as many far ones."""
+    validation_interval: int = 50
+    """Iterations between validations, on uniform tasks that are never trained on."""
+    validation_episodes: int = 256
+    """Uniform tasks that are never trained on, and as many far ones."""
     seed: int = 0
 
     def __post_init__(self):
@@ -167,13 +167,15 @@ def quick() -> TrainSettings:
         # in so short a run the mean policy learns faster this way; over longer ones the other is better
         network=NetworkSettings(features=64, squash="sample"),
         predictor=PredictorSettings(units=32),
-        mappo=MappoSettings(learning_rate=1e-3, minibatches=8, clip=0.2, clip_end=0.2, discount=0.99),
+        mappo=MappoSettings(
+            learning_rate=1e-3, minibatches=8, clip_epsilon=0.2, clip_epsilon_end=0.2, discount=0.99
+        ),
         # few tasks reach the archive in so short a run; drawn from too often, they'd be all that is learnt
         generator=GeneratorSettings(capacity=500, expansion=0.3),
         num_envs=80,
         total_steps=1_000_000,
-        evaluation_interval=50,
-        evaluation_episodes=64,
+        validation_interval=50,
+        validation_episodes=64,
     )
 
 
@@ -188,7 +190,7 @@ def paper() -> TrainSettings:
         ),
         network=NetworkSettings(heads=2, compute_type="bfloat16"),
         mappo=MappoSettings(
-            learning_rate=1e-3, clip=0.2, clip_end=0.05, penalty_start=0.03, penalty_ramp=0.7
+            learning_rate=1e-3, clip_epsilon=0.2, clip_epsilon_end=0.05, penalty_start=0.03, penalty_ramp=0.7
         ),
         generator=GeneratorSettings(
             wall_distance=0.05, pillar_shift=0.1, row_share=0.25, collision_tolerance=0.002
@@ -198,8 +200,8 @@ def paper() -> TrainSettings:
         restart_every=4,
         restart_steps=80,
         restart_close=0.5,
-        evaluation_interval=40,
-        evaluation_episodes=512,
+        validation_interval=40,
+        validation_episodes=512,
     )
 
 

@@ -74,8 +74,6 @@ def observe(
 
     index = jnp.array([[j for j in range(n) if j != i] for i in range(n)], jnp.int32).reshape(n, n - 1)
     others = position[:, None] - position[index]
-    if settings.observe_others_motion:
-        others = jnp.concatenate([others, velocity[:, None] - velocity[index], body_z[index]], axis=-1)
 
     pillars, pillar_seen = _nearest_pillars(settings, position, pillar_position, pillar_active)
     privileged = jnp.concatenate(

@@ -79,9 +79,6 @@ class PursuitSettings:
     """Observe t/T; then the end of an episode is terminal, otherwise it is a truncation."""
     observe_position: bool = False
     """Also observe the own position in the arena (not in the paper, where the arena's bounds stay unseen)."""
-    observe_others_motion: bool = False
-    """Also observe the other pursuers' velocities and body z axes (not in the paper): the actor has no memory, so it
-    can't tell from positions alone where another one is going."""
     history_length: int = 10
     """Frames that the evader predictor sees."""
     history_spacing: int = 1
@@ -130,11 +127,6 @@ class PursuitSettings:
     def self_size(self) -> int:
         """Numbers of a pursuer's own part of the observation, without the predicted positions."""
         return 3 + 4 + 3 + 3 + 3 + (4 if self.observe_time else 0) + (3 if self.observe_position else 0)
-
-    @property
-    def others_size(self) -> int:
-        """Length of what a pursuer observes of another one."""
-        return 3 + (3 + 3 if self.observe_others_motion else 0)
 
     @property
     def privileged_size(self) -> int:

@@ -48,7 +48,7 @@ class MetricsWriter:
         """Log one record.
 
         Args:
-          event: what it's about: `train` or `evaluation`; the prefix of the TensorBoard tags.
+          event: what it's about: `train` or `validation`; the prefix of the TensorBoard tags.
           update: training updates done.
           steps: environment steps done.
           seconds: training time so far, without the time between a kill and its resume.

@@ -78,14 +78,14 @@ def draw_from_above(axes: Axes, trajectory: Trajectory) -> None:
 
 
 def plot_training(path: Path, metrics_path: Path) -> None:
-    """Training curves and the held-back evaluations of a metrics file, over environment steps."""
+    """Training curves and the validation results of a metrics file, over environment steps."""
     training = list(read_metrics(metrics_path, "train"))
-    evaluation = list(read_metrics(metrics_path, "evaluation"))
+    evaluation = list(read_metrics(metrics_path, "validation"))
     figure = Figure(figsize=(11, 6), layout="constrained")
     for axes, (name, label) in zip(figure.subplots(2, 3).ravel(), _CURVES, strict=True):
         for records, style, legend in (
             (training, {"color": "tab:blue", "linewidth": 1}, "training"),
-            (evaluation, {"color": "tab:orange", "marker": "o", "markersize": 3}, "held-back tasks"),
+            (evaluation, {"color": "tab:orange", "marker": "o", "markersize": 3}, "validation tasks"),
         ):
             points = [(r["steps"], r[name]) for r in records if r.get(name) is not None]
             if points:

@@ -38,7 +38,7 @@ class Progress:
         self._rate = 0.0
         self._last = None  # (time, steps) of the last update, for the speed
         self._values: dict[str, float] = {}
-        self._held_back: dict[str, float] = {}
+        self._validation: dict[str, float] = {}
         self._last_line = 0.0
         self._live = None
         self._spinner = Spinner("dots", text="")
@@ -89,12 +89,12 @@ class Progress:
             self._last_line = now
             self._print(f"{self._speed()} | " + ", ".join(f"{k} {v}" for k, v in self._shown(values)))
 
-    def held_back(self, values: dict[str, float], is_best: bool) -> None:
-        """Result of an evaluation on the held-back tasks."""
-        self._held_back = values
+    def validation(self, values: dict[str, float], is_best: bool) -> None:
+        """Result of an evaluation on the validation tasks."""
+        self._validation = values
         if self._live is None:
             shown = ", ".join(f"{k} {v}" for k, v in self._shown(values))
-            self._print(f"held-back tasks: {shown}{' (best so far)' if is_best else ''}")
+            self._print(f"validation tasks: {shown}{' (best so far)' if is_best else ''}")
 
     def _shown(self, values):
         return [(label, _number(values[name])) for name, label in _SHOWN.items() if name in values]
@@ -114,14 +114,14 @@ class Progress:
         seconds = time.monotonic() - self._phase_start
         self._spinner.update(text=Text(f"{self._phase}  {seconds:.0f} s"))
         rows = [self._spinner, ProgressBar(total=self._total, completed=self._steps), Text(self._speed())]
-        if self._values or self._held_back:
+        if self._values or self._validation:
             table = Table.grid(padding=(0, 3))
-            table.add_row("", Text("training", style="bold"), Text("held-back tasks", style="bold"))
-            held_back = dict(self._shown(self._held_back))
+            table.add_row("", Text("training", style="bold"), Text("validation tasks", style="bold"))
+            validation = dict(self._shown(self._validation))
             training = dict(self._shown(self._values))
             for label in _SHOWN.values():
-                if label in training or label in held_back:
-                    table.add_row(Text(label), training.get(label, ""), held_back.get(label, ""))
+                if label in training or label in validation:
+                    table.add_row(Text(label), training.get(label, ""), validation.get(label, ""))
             rows.append(table)
         return Panel(Group(*rows), title=self._title, title_align="left")
 

@@ -29,7 +29,7 @@ class CheckpointRecord:
     update: int
     """Training updates done when it was written."""
     score: float | None
-    """Score of the held-back evaluation at this update; None where none was made."""
+    """Score of the validation at this update; None where none was made."""
     notes: dict
     """Host-side facts that a resumed run goes on from (seconds so far and the like)."""
 
@@ -144,7 +144,7 @@ def is_checkpoint(path: Path) -> bool:
 
 
 class Checkpoints:
-    """The checkpoints of one run: the last few and the best by held-back evaluation are kept.
+    """The checkpoints of one run: the last few and the best by validation are kept.
 
     Of several processes all write and read their part, in the same order; they share the directory.
     """

@@ -10,9 +10,9 @@ from openjax.learning import TrainSettings
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Observation, Pursuit
 from openjax.store.checkpoints import Checkpoints, is_checkpoint, load_arrays
+from openjax.store.old_names import train_settings
 from openjax.store.policy_files import WEIGHTS, fill, load_policy_file, shipped_policies
 from openjax.store.run_directory import RunDirectory, is_run
-from openjax.store.settings_files import from_plain
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,15 +32,11 @@ class LoadedPolicy:
           UserError: the observation is that of another game.
         """
         game = self.settings.environment
-        given = (
-            observation.self_state.shape[-1],
-            observation.others.shape[-1],
-            *observation.frames.shape[-2:],
-        )
-        expected = (game.self_size, game.others_size, game.history_length, game.frame_size)
+        given = (observation.self_state.shape[-1], *observation.frames.shape[-2:])
+        expected = (game.self_size, game.history_length, game.frame_size)
         if given != expected:
             raise UserError(
-                f"policy {self.source} observes {expected} numbers (own state, another pursuer, history), "
+                f"policy {self.source} observes {expected} numbers (own state, history), "
                 f"here are {given}; make its game with openjax.make(policy.settings.environment)"
             )
         return self.policy.act(self.parameters, observation)
@@ -65,7 +61,7 @@ def load_policy(name_or_path: str | Path) -> LoadedPolicy:
         return _from_file(path, source)
     if is_checkpoint(path) and is_run(path.parent.parent):
         run = RunDirectory(path.parent.parent)
-        return _build(run.read_settings(TrainSettings), load_arrays(path, "policy/"), source, "policy/")
+        return _build(run.read_settings(), load_arrays(path, "policy/"), source, "policy/")
     if path.exists():
         raise UserError(
             f"{path} is no policy; expected a .npz file, a run of openjax.train or one of its checkpoints"
@@ -83,7 +79,7 @@ def abstract_parameters(environment: Pursuit, policy: Policy) -> PolicyParameter
 
 def _from_file(path, source):
     leaves, settings, _ = load_policy_file(path)
-    return _build(from_plain(TrainSettings, settings, f"the settings of {path}"), leaves, source)
+    return _build(train_settings(settings, f"the settings of {path}"), leaves, source)
 
 
 def _from_run(run, source):
@@ -93,7 +89,7 @@ def _from_run(run, source):
     record = checkpoints.best() or checkpoints.latest()
     if record is None:
         raise UserError(f"{run.path} holds no policy and no checkpoint yet")
-    return _build(run.read_settings(TrainSettings), load_arrays(record.path, "policy/"), source, "policy/")
+    return _build(run.read_settings(), load_arrays(record.path, "policy/"), source, "policy/")
 
 
 def _build(settings, leaves, source, prefix=""):

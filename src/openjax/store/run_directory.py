@@ -3,7 +3,7 @@
 settings.json      everything that determines the run; a policy or checkpoint needs nothing else
 vehicle.toml, effects.toml   copies of what it flew with, if not the nominal vehicle
 metrics.jsonl, tensorboard/  the logs
-checkpoints/       whole training states: the last ones and the best by the held-back tasks
+checkpoints/       whole training states: the last ones and the best by the validation tasks
 policy_start.npz, policy.npz  the policy before training and the best one
 layouts.json       before and after, per layout
 training.png, trajectories.png, chase.gif
@@ -16,7 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from openjax.errors import UserError
-from openjax.store.settings_files import SETTINGS_FILE, from_plain, read_json, write_json
+from openjax.learning import TrainSettings
+from openjax.store.old_names import train_settings
+from openjax.store.settings_files import SETTINGS_FILE, read_json, write_json
 
 _FORMAT = "openjax run 1"
 _FILES = (
@@ -65,8 +67,8 @@ class RunDirectory:
         """Record the settings (nested dataclass) and facts like machine and command line."""
         write_json(self.settings_file, {"format": _FORMAT, "settings": settings, **facts})
 
-    def read_settings(self, kind: type) -> Any:
-        """The settings as the dataclass `kind`.
+    def read_settings(self) -> TrainSettings:
+        """The settings of the run.
 
         Raises:
           UserError: not written by openjax, or with settings that this version doesn't know.
@@ -74,7 +76,7 @@ class RunDirectory:
         stored = read_json(self.settings_file)
         if not isinstance(stored, dict) or stored.get("format") != _FORMAT:
             raise UserError(f"{self.settings_file} isn't of the format {_FORMAT!r}")
-        return from_plain(kind, stored["settings"], str(self.settings_file))
+        return train_settings(stored.get("settings"), str(self.settings_file))
 
 
 def is_run(path: Path) -> bool:

@@ -1,0 +1,55 @@
+"""Settings as earlier versions wrote them: old policies and runs keep loading."""
+
+from typing import Any
+
+from openjax.learning import TrainSettings
+from openjax.store.settings_files import from_plain
+
+_RENAMED = {
+    "validation_interval": "evaluation_interval",
+    "validation_episodes": "evaluation_episodes",
+    "mappo.clip_epsilon": "clip",
+    "mappo.clip_epsilon_end": "clip_end",
+    "mappo.entropy_coefficient": "entropy",
+    "mappo.gae_lambda": "trace",
+    "mappo.max_grad_norm": "gradient_norm",
+}
+"""Where a setting is now, and its old name in the same group."""
+
+_REMOVED = {"environment.observe_others_motion": False}
+"""Settings that are gone, with the only value that means what is done today."""
+
+
+def train_settings(stored: Any, where: str) -> TrainSettings:
+    """The settings of a run from what a file holds of them.
+
+    Args:
+      stored: plain values, under today's names or earlier ones.
+      where: names the file in errors.
+
+    Raises:
+      UserError: an unknown setting, or a value that doesn't fit.
+    """
+    return from_plain(TrainSettings, _current_names(stored), where)
+
+
+def _current_names(stored):
+    if not isinstance(stored, dict):
+        return stored
+    current = {name: dict(value) if isinstance(value, dict) else value for name, value in stored.items()}
+    for path, old in _RENAMED.items():
+        group, name = _place(current, path)
+        if old in group and name not in group:
+            group[name] = group.pop(old)
+    for path, value in _REMOVED.items():
+        group, name = _place(current, path)
+        if name in group and group[name] == value:
+            del group[name]
+    return current
+
+
+def _place(settings, path):
+    """The group (dict) and the last name of a setting with dots."""
+    group, _, name = path.rpartition(".")
+    found = settings.get(group, {}) if group else settings
+    return found if isinstance(found, dict) else {}, name
