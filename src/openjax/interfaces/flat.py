@@ -12,7 +12,7 @@ ACTION_SIZE = 4
 
 def flat_size(settings: PursuitSettings) -> int:
     """Numbers that one pursuer observes in `flat_observation`."""
-    others = (settings.num_pursuers - 1) * settings.others_size
+    others = (settings.num_pursuers - 1) * 3
     return settings.self_size + others + settings.observed_pillars * 5 + 3
 
 
