@@ -9,6 +9,7 @@ import pytest
 
 from openjax.pursuit import PursuitSettings
 from openjax.pursuit.observation import frame, observe, rotation_axes
+from openjax.vehicle import hover_state, load_vehicle
 
 POSITION = np.array([[0.4, 0.0, 0.5], [0.0, 0.2, 0.7], [-0.2, -0.4, 0.6]], np.float32)
 TURNED = np.array([np.sqrt(0.5), 0, 0, np.sqrt(0.5)], np.float32)  # yaw by 90 degrees
@@ -22,12 +23,16 @@ _observe = functools.partial(jax.jit, static_argnums=0)(observe)
 
 def observed(seen=True, active=(True,) * 4, pillars=PILLARS, quaternion=TURNED, **changes):
     settings = PursuitSettings(episode_length=800, **changes)
+    quaternion = jnp.asarray(np.stack([[1, 0, 0, 0], quaternion, [1, 0, 0, 0]]), jnp.float32)
+    velocity = jnp.asarray(0.1 * np.arange(9).reshape(3, 3), jnp.float32)
+    drones = hover_state(load_vehicle(), jnp.asarray(POSITION), quaternion, velocity)
     return _observe(
         settings,
         jnp.int32(200),
-        jnp.asarray(POSITION),
-        jnp.asarray(np.stack([[1, 0, 0, 0], quaternion, [1, 0, 0, 0]]), jnp.float32),
-        jnp.asarray(0.1 * np.arange(9).reshape(3, 3), jnp.float32),
+        drones,
+        drones,
+        None,
+        None,
         jnp.asarray(EVADER),
         jnp.array([1.3, 0.0, 0.0]),
         jnp.asarray(seen),

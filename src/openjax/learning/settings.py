@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from openjax.errors import UserError
 from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import PursuitSettings, RewardSettings
+from openjax.vehicle.family import FLIGHT_FAMILY
 
 
 @dataclass(frozen=True)
@@ -205,7 +206,26 @@ def paper() -> TrainSettings:
     )
 
 
-PRESETS = {"quick": quick, "paper": paper}
+def flight() -> TrainSettings:
+    """Policies to be flown: no clamp on the speed, the rate loop at 500 Hz, every pursuer its own vehicle."""
+    base = paper()
+    return dataclasses.replace(
+        base,
+        environment=dataclasses.replace(
+            base.environment,
+            speed_limit="none",
+            substeps=5,
+            physics="stops",
+            vehicles=FLIGHT_FAMILY,
+            rare_vehicles=0.5,
+            observe_history=8,
+            # without the clamp, a first crash at 5,000 teaches to stay away from rows of pillars
+            reward=dataclasses.replace(base.environment.reward, crash=40.0, first_crash=1000.0),
+        ),
+    )
+
+
+PRESETS = {"quick": quick, "paper": paper, "flight": flight}
 
 
 def preset(name: str, **changes) -> TrainSettings:

@@ -8,7 +8,7 @@ from flax import struct
 
 from openjax.pursuit.collisions import Breaches, breaches, crashed
 from openjax.pursuit.evader import evader_velocity
-from openjax.pursuit.observation import Observation, frame, observe, rotation_axes
+from openjax.pursuit.observation import Observation, frame, observe, own_frame, rotation_axes
 from openjax.pursuit.reward import captures, over_speed, reward
 from openjax.pursuit.sensing import line_of_sight
 from openjax.pursuit.settings import PursuitSettings
@@ -16,6 +16,7 @@ from openjax.pursuit.spaces import Box
 from openjax.pursuit.statistics import EpisodeStatistics, count, empty_statistics
 from openjax.pursuit.task import Task, start_attitude, uniform_task
 from openjax.vehicle import DroneState, Vehicle, hover_state, load_vehicle, make_drones_step
+from openjax.vehicle.family import draw_vehicles, family_effects, standard_parameters
 
 THRUST_LIMIT = 0.9
 """The commanded thrust is cut here, as a fraction of the maximum (SPEC section 2)."""
@@ -27,11 +28,17 @@ class PursuitState:
 
     task: Task
     drones: DroneState  # leading axis N
+    vehicles: dict[
+        str, dict[str, jax.Array]
+    ]  # effect -> parameter -> (N,), drawn at the start; empty: nominal vehicles
     evader_position: jax.Array  # (3,) m, world
     evader_velocity: jax.Array  # (3,) m/s, world
     last_seen: jax.Array  # (3,) where the evader was last seen; the arena's middle before that
     in_sight: jax.Array  # (N,) bool, which pursuers see the evader
     frames: jax.Array  # (n * spacing, F) history, oldest first
+    own_history: (
+        jax.Array | None
+    )  # (H * spacing, N, OWN_FRAME) as seen, oldest first; None where it isn't observed
     previous_action: jax.Array  # (N, 4) squashed command of the last step
     step: jax.Array  # () int32, control steps since the start
     statistics: EpisodeStatistics
@@ -88,11 +95,12 @@ class Pursuit:
         self.vehicle = vehicle if vehicle is not None else load_vehicle()
         self.effects = tuple(effects)
         self.effect_parameters = effect_parameters or {}
+        drawn = family_effects(self.settings.vehicles)
         self._drones_step = make_drones_step(
             physics=self.settings.physics,
             dt=self.settings.time_step,
             substeps=self.settings.substeps,
-            effects=self.effects,
+            effects=(*drawn, *self.effects),
         )
 
     @property
@@ -118,6 +126,15 @@ class Pursuit:
         quaternion = start_attitude(settings, attitude_key)
         drones = jax.vmap(lambda p, q: hover_state(self.vehicle, p, q))(task.pursuer_position, quaternion)
         drones = self._drones_step.reset(self.vehicle, drones, effect_key)
+        vehicles = draw_vehicles(
+            settings.vehicles, jax.random.fold_in(key, 2), settings.num_pursuers, settings.rare_vehicles
+        )
+        action = jnp.broadcast_to(hover_action(self.vehicle), (settings.num_pursuers, 4))
+        own_history = None
+        if settings.observe_history:
+            own_history = own_frame(drones.quaternion, drones.velocity, action)
+            steps = settings.observe_history * settings.observe_history_spacing
+            own_history = jnp.broadcast_to(own_history, (steps, *own_history.shape))
         in_sight = line_of_sight(
             settings, task.pursuer_position, task.evader_position, task.pillar_position, task.pillar_active
         )
@@ -132,12 +149,14 @@ class Pursuit:
         state = PursuitState(
             task=task,
             drones=drones,
+            vehicles=vehicles,
             evader_position=task.evader_position,
             evader_velocity=still,
             last_seen=jnp.where(seen, task.evader_position, middle),
             in_sight=in_sight,
             frames=frames,
-            previous_action=jnp.broadcast_to(hover_action(self.vehicle), (settings.num_pursuers, 4)),
+            own_history=own_history,
+            previous_action=action,
             step=step,
             statistics=empty_statistics(settings.episode_length),
         )
@@ -145,13 +164,26 @@ class Pursuit:
 
     def observe(self, state: PursuitState) -> Observation:
         """The observation of a state; effects on the sensors act on what a pursuer knows of all pursuers."""
-        seen = self._drones_step.seen(state.drones, self.effect_parameters)
+        return self._observe(state, self._seen(state.drones, state.vehicles))
+
+    def _parameters(self, vehicles):
+        """Parameters of all effects: those drawn for the episode, and this environment's own, which go first."""
+        return {**vehicles, **self.effect_parameters}
+
+    def _seen(self, drones, vehicles):
+        return self._drones_step.seen(drones, self._parameters(vehicles))
+
+    def _observe(self, state, seen):
+        settings = self.settings
         return observe(
-            self.settings,
+            settings,
             state.step,
-            seen.position,
-            seen.quaternion,
-            seen.velocity,
+            state.drones,
+            seen,
+            state.own_history[settings.observe_history_spacing - 1 :: settings.observe_history_spacing]
+            if settings.observe_history
+            else None,
+            standard_parameters(settings.vehicles, state.vehicles) if settings.vehicles else None,
             state.evader_position,
             state.evader_velocity,
             state.seen,
@@ -185,7 +217,11 @@ class Pursuit:
         evader = state.evader_position + settings.time_step * velocity
 
         drones = self._drones_step(
-            self.vehicle, state.drones, action_to_command(action), *pillars, self.effect_parameters
+            self.vehicle,
+            state.drones,
+            action_to_command(action),
+            *pillars,
+            self._parameters(state.vehicles),
         )
         if settings.speed_limit == "clamp":
             speed = jnp.sqrt(jnp.sum(drones.velocity**2, axis=-1, keepdims=True) + 1e-12)
@@ -215,15 +251,22 @@ class Pursuit:
             state.previous_action,
         )
 
-        newest = frame(settings, step, position, evader, velocity, seen)
+        seen_drones = self._seen(drones, state.vehicles)
+        newest = frame(settings, step, seen_drones.position, evader, velocity, seen)
+        own_history = state.own_history
+        if settings.observe_history:
+            now = own_frame(seen_drones.quaternion, seen_drones.velocity, action)
+            own_history = jnp.concatenate([own_history[1:], now[None]])
         state = PursuitState(
             task=task,
             drones=drones,
+            vehicles=state.vehicles,
             evader_position=evader,
             evader_velocity=velocity,
             last_seen=jnp.where(seen, evader, state.last_seen),
             in_sight=in_sight,
             frames=jnp.concatenate([state.frames[1:], newest[None]]),
+            own_history=own_history,
             previous_action=action,
             step=step,
             statistics=count(state.statistics, step, captured, breach, too_fast, crash, rewards),
@@ -235,7 +278,7 @@ class Pursuit:
         info = StepInfo(
             captured=captured, seen=seen, breaches=breach, over_speed=too_fast, crashed=crash, penalty=penalty
         )
-        return self.observe(state), state, rewards, terminated, truncated, info
+        return self._observe(state, seen_drones), state, rewards, terminated, truncated, info
 
     def _counted(self, breach, crash, drones, body_z_up, pillars):
         """The breaches (N,) and crashes (N,) that the reward counts: those of the metrics, early by margin and lookahead."""

@@ -6,6 +6,7 @@ from flax import struct
 
 from openjax.pursuit.collisions import pillar_distance
 from openjax.pursuit.settings import HIDDEN, PursuitSettings
+from openjax.vehicle import DroneState
 
 
 @struct.dataclass
@@ -14,13 +15,13 @@ class Observation:
 
     self_state: (
         jax.Array
-    )  # (N, S) evader, quaternion wxyz, velocity, body x axis, body z axis, t/T x 4 [, position]
+    )  # (N, S) evader, quaternion wxyz, velocity, body x, body z axis, t/T x 4 [, position] [, history]
     others: jax.Array  # (N, N - 1, O) other pursuers: relative position [, relative velocity, body z axis]
     pillars: jax.Array  # (N, k, 5) nearest pillars: position relative to their centre (3), height, radius
     pillar_seen: jax.Array  # (N, k) bool, slots in use
     privileged: (
         jax.Array
-    )  # (N, 10) true relative evader position, its velocity, own position, seen: for the critic
+    )  # (N, Q) true relative evader position, its velocity, own position, seen [, own velocity, vehicle]
     position: jax.Array  # (N, 3) own positions, to express predicted positions relative to them
     last_seen: jax.Array  # (3,) where the evader was last seen
     frames: jax.Array  # (n, F) history for the predictor, oldest first
@@ -48,12 +49,18 @@ def frame(
     return jnp.concatenate([time, evader, pursuers.ravel()])
 
 
+def own_frame(quaternion: jax.Array, velocity: jax.Array, action: jax.Array) -> jax.Array:
+    """(N, OWN_FRAME) what N pursuers remember of a moment: (N, 3) velocity, body x and z axes, the action before it."""
+    return jnp.concatenate([velocity, *rotation_axes(quaternion), action], axis=-1)
+
+
 def observe(
     settings: PursuitSettings,
     step: jax.Array,
-    position: jax.Array,
-    quaternion: jax.Array,
-    velocity: jax.Array,
+    drones: DroneState,
+    seen_drones: DroneState,
+    own_history: jax.Array,
+    vehicles: jax.Array | None,
     evader: jax.Array,
     evader_velocity: jax.Array,
     seen: jax.Array,
@@ -62,8 +69,13 @@ def observe(
     pillar_position: jax.Array,
     pillar_active: jax.Array,
 ) -> Observation:
-    """Build the observation of all N pursuers; the evader seen by one (`seen`, ()) is seen by all."""
+    """Build the observation of all N pursuers; the evader seen by one (`seen`, ()) is seen by all.
+
+    `seen_drones` is what sensors tell of `drones`; own_history (H, N, OWN_FRAME) oldest first; vehicles (N, R) for the
+    critic, or None where all are nominal.
+    """
     n = settings.num_pursuers
+    position, quaternion, velocity = seen_drones.position, seen_drones.quaternion, seen_drones.velocity
     to_evader = position - evader
     body_x, body_z = rotation_axes(quaternion)
     parts = [jnp.where(seen, to_evader, HIDDEN), quaternion, velocity, body_x, body_z]
@@ -71,26 +83,27 @@ def observe(
         parts.append(jnp.broadcast_to(step.astype(jnp.float32) / settings.episode_length, (n, 4)))
     if settings.observe_position:
         parts.append(position)
+    if settings.observe_history:
+        parts.append(jnp.moveaxis(own_history, 0, 1).reshape(n, -1))
 
     index = jnp.array([[j for j in range(n) if j != i] for i in range(n)], jnp.int32).reshape(n, n - 1)
     others = position[:, None] - position[index]
 
     pillars, pillar_seen = _nearest_pillars(settings, position, pillar_position, pillar_active)
-    privileged = jnp.concatenate(
-        [
-            to_evader,
-            jnp.broadcast_to(evader_velocity, (n, 3)),
-            position,
-            jnp.broadcast_to(seen.astype(jnp.float32), (n, 1)),
-        ],
-        axis=-1,
-    )
+    true_parts = [
+        drones.position - evader,
+        jnp.broadcast_to(evader_velocity, (n, 3)),
+        drones.position,
+        jnp.broadcast_to(seen.astype(jnp.float32), (n, 1)),
+    ]
+    if vehicles is not None:
+        true_parts += [drones.velocity, vehicles]
     return Observation(
         self_state=jnp.concatenate(parts, axis=-1),
         others=others,
         pillars=pillars,
         pillar_seen=pillar_seen,
-        privileged=privileged,
+        privileged=jnp.concatenate(true_parts, axis=-1),
         position=position,
         last_seen=last_seen,
         frames=frames,

@@ -4,9 +4,13 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from openjax.errors import UserError
+from openjax.vehicle.family import check_ranges
 
 HIDDEN = -5.0
 """What stands in an observation for something that isn't seen (the paper's marker value)."""
+
+OWN_FRAME = 13
+"""Numbers in a frame of the own history: velocity, body x and z axes, command."""
 
 SOLID_RADIUS = 0.05
 """Radius (m) of the sphere that makes a drone solid."""
@@ -71,14 +75,25 @@ class PursuitSettings:
     """Control step (s)."""
     substeps: int = 1
     """Physics (and rate controller) steps per control step."""
-    physics: Literal["mjx", "rigid"] = "mjx"
-    """"mjx": MuJoCo MJX with solid floor, pillars and drones; "rigid": free flight, nothing is solid."""
+    physics: Literal["mjx", "rigid", "stops"] = "mjx"
+    """"mjx": MuJoCo MJX with solid floor, pillars and drones; "rigid": free flight, nothing is solid; "stops": free flight,
+    and drones are put back out of floor, pillars and one another once per control step."""
+    vehicles: tuple[tuple[str, float, float, float, float], ...] = ()
+    """Family from which every pursuer's vehicle is drawn in each episode: parameters of effects (`motor_lag.extra_up`), each
+    with its range and the wider range of the rare; see `openjax.vehicle.family`. Empty: the nominal vehicle."""
+    rare_vehicles: float = 0.0
+    """Share of the vehicles of which one effect is drawn from its wider range."""
     observed_pillars: int = 3
     """Nearest pillars that a pursuer observes."""
     observe_time: bool = True
     """Observe t/T; then the end of an episode is terminal, otherwise it is a truncation."""
     observe_position: bool = False
     """Also observe the own position in the arena (not in the paper, where the arena's bounds stay unseen)."""
+    observe_history: int = 0
+    """Also observe this many of the last frames of the own velocity, attitude and command (not in the paper): they show how
+    this vehicle answers, and which commands are still on their way."""
+    observe_history_spacing: int = 1
+    """Control steps between two of these frames."""
     history_length: int = 10
     """Frames that the evader predictor sees."""
     history_spacing: int = 1
@@ -102,6 +117,15 @@ class PursuitSettings:
         )
         need(self.history_length >= 1, f"history_length is {self.history_length}; it must be at least 1")
         need(self.history_spacing >= 1, f"history_spacing is {self.history_spacing}; it must be at least 1")
+        need(self.observe_history >= 0, f"observe_history is {self.observe_history}; it can't be negative")
+        need(
+            self.observe_history_spacing >= 1,
+            f"observe_history_spacing is {self.observe_history_spacing}; it must be at least 1",
+        )
+        need(
+            0.0 <= self.rare_vehicles <= 1.0, f"rare_vehicles is {self.rare_vehicles}; it must lie in 0 to 1"
+        )
+        check_ranges(self.vehicles)
         for name in (
             "arena_radius",
             "arena_height",
@@ -126,9 +150,10 @@ class PursuitSettings:
     @property
     def self_size(self) -> int:
         """Numbers of a pursuer's own part of the observation, without the predicted positions."""
-        return 3 + 4 + 3 + 3 + 3 + (4 if self.observe_time else 0) + (3 if self.observe_position else 0)
+        own = 3 + 4 + 3 + 3 + 3 + (4 if self.observe_time else 0) + (3 if self.observe_position else 0)
+        return own + OWN_FRAME * self.observe_history
 
     @property
     def privileged_size(self) -> int:
         """Numbers of the privileged part of the observation, for the critic."""
-        return 3 + 3 + 3 + 1
+        return 3 + 3 + 3 + 1 + (3 + len(self.vehicles) if self.vehicles else 0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, field
 
 import jax
@@ -18,9 +19,10 @@ from openjax.vehicle.rigid_kernel import step_many
 from openjax.vehicle.rotors import rotor_reaction, rotor_speed_step, rotor_thrust
 from openjax.vehicle.solids import others, place_solids
 from openjax.vehicle.state import DroneState
+from openjax.vehicle.stops import stop
 from openjax.vehicle.wrench import total_wrench
 
-PHYSICS = ("mjx", "rigid")
+PHYSICS = ("mjx", "rigid", "stops")
 
 
 @dataclass(frozen=True)
@@ -45,8 +47,8 @@ class DronesStep:
         """`drones` (leading axis N) after one step of `dt` seconds.
 
         command (N, 4) as for `rate_controller`, pillar_position (P, 2) m, pillar_active (P,) bool,
-        effect_parameters {effect: {parameter: array}} for the effects of this step; what is left out has no
-        effect. The arithmetic is done in the precision of the drones' state.
+        effect_parameters {effect: {parameter: () or (N,) array}} for the effects of this step, of all drones or of
+        each; what is left out has no effect. The arithmetic is done in the precision of the drones' state.
         """
         dtype = drones.position.dtype
         vehicle = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), vehicle)
@@ -55,8 +57,8 @@ class DronesStep:
             memory = drones.effect_memory  # of other effects than this step's, if any
             drones = step_many(self.free_flight, vehicle, drones.replace(effect_memory=()), command)
             return drones.replace(effect_memory=memory)
-        parameters = composition.complete_parameters(self.effects, effect_parameters, dtype)
-        vehicle = composition.change_body(self.effects, parameters, vehicle)
+        parameters = self._parameters(effect_parameters, drones)
+        vehicle = self._body(vehicle, parameters)
         if self.effects:
             if not isinstance(drones.effect_memory, dict):
                 raise UserError(
@@ -71,6 +73,8 @@ class DronesStep:
             drones, _ = substep(drones, None)
         else:
             drones, _ = jax.lax.scan(substep, drones, None, length=self.substeps)
+        if self.physics == "stops":
+            drones = stop(drones, pillar_position, pillar_active)
         if self.effects:
             memory = jax.vmap(
                 lambda drone: composition.record(self.effects, drone.effect_memory, drone, self.dt)
@@ -103,42 +107,58 @@ class DronesStep:
         """
         if not self.effects:
             return drones
-        parameters = composition.complete_parameters(self.effects, effect_parameters, drones.position.dtype)
-        return jax.vmap(lambda drone: composition.seen_state(self.effects, parameters, drone))(drones)
+        parameters = self._parameters(effect_parameters, drones)
+        axis = _drones_axis(parameters)
+        return jax.vmap(functools.partial(composition.seen_state, self.effects), (axis, 0))(
+            parameters, drones
+        )
+
+    def _parameters(self, given, drones):
+        """Parameters of every effect, all () where all drones share them, else all (N,)."""
+        parameters = composition.complete_parameters(self.effects, given, drones.position.dtype)
+        if all(leaf.ndim == 0 for leaf in jax.tree.leaves(parameters)):
+            return parameters
+        number = drones.position.shape[0]
+        return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (number,)), parameters)
+
+    def _body(self, vehicle, parameters):
+        """The vehicle that really flies; with parameters of each drone, every leaf has their axis first."""
+        change = lambda parameters: composition.change_body(self.effects, parameters, vehicle)  # noqa: E731
+        return change(parameters) if _drones_axis(parameters) is None else jax.vmap(change)(parameters)
 
     def _contexts(self, vehicle, drones, dt) -> Context:
         neighbours = drones.position[others(drones.position.shape[0])]
 
-        def context(drone, neighbour):
+        def context(vehicle, drone, neighbour):
             air_time = drone.effect_memory[composition.AIR_TIME]
             return make_context(vehicle, drone, others_position=neighbour, air_time=air_time, dt=dt)
 
-        return jax.vmap(context)(drones, neighbours)
+        return jax.vmap(context, (_vehicles_axis(vehicle), 0, 0))(vehicle, drones, neighbours)
 
     def _receive(self, vehicle, parameters, drones, command):
         """The commands that reach the rate controllers, and the drones with the memory of it."""
         contexts = self._contexts(vehicle, drones, self.dt)
-        change = lambda *drone: composition.change_command(self.effects, parameters, *drone)  # noqa: E731
-        command, memory = jax.vmap(change)(drones.effect_memory, command, contexts)
+        change = functools.partial(composition.change_command, self.effects)
+        axes = (_drones_axis(parameters), 0, 0, 0)
+        command, memory = jax.vmap(change, axes)(parameters, drones.effect_memory, command, contexts)
         return command, drones.replace(effect_memory=memory)
 
     def _substep(self, vehicle, parameters, drones, command, pillar_position, pillar_active):
         dt = self.dt / self.substeps
         contexts = self._contexts(vehicle, drones, dt) if self.effects else None
-        if self.physics == "rigid":
-            free = lambda *drone: self._rigid_substep(vehicle, parameters, *drone)  # noqa: E731
-            return jax.vmap(free)(drones, command, contexts)
-        motors = lambda *drone: self._motors(vehicle, parameters, *drone, dt)  # noqa: E731
-        moved, force, torque = jax.vmap(motors)(drones, command, contexts)
+        axes = (_vehicles_axis(vehicle), _drones_axis(parameters), 0, 0, 0)
+        if self.physics != "mjx":
+            return jax.vmap(self._rigid_substep, axes)(vehicle, parameters, drones, command, contexts)
+        motors = lambda *drone: self._motors(*drone, dt)  # noqa: E731
+        moved, force, torque = jax.vmap(motors, axes)(vehicle, parameters, drones, command, contexts)
         body = (drones.position, drones.quaternion, drones.velocity, drones.body_rates, force, torque)
+        world, shapes = make_world(0, 0, dt, False), None
         if self.contacts:
             world = make_world(pillar_position.shape[0], drones.position.shape[0] - 1, dt, True)
             shapes = place_solids(drones.position, drones.velocity, pillar_position, pillar_active, dt)
-            body = jax.vmap(lambda *parts: mjx_step(world, vehicle, *parts, dt))(shapes, *body)
-        else:
-            world = make_world(0, 0, dt, False)
-            body = jax.vmap(lambda *parts: mjx_step(world, vehicle, None, *parts, dt))(*body)
-        return _with_body(moved, body)
+        axes = (axes[0], None if shapes is None else 0, *(0 for _ in body))
+        move = lambda vehicle, *parts: mjx_step(world, vehicle, *parts, dt)  # noqa: E731
+        return _with_body(moved, jax.vmap(move, axes)(vehicle, shapes, *body))
 
     def _rigid_substep(self, vehicle, parameters, drone, command, context):
         """One drone after a substep of `rigid`."""
@@ -166,6 +186,16 @@ class DronesStep:
         return drone, rotate(drone.quaternion, force), torque
 
 
+def _drones_axis(parameters):
+    """0 where the effects' parameters are those of each drone, None where all drones share them."""
+    return 0 if any(leaf.ndim for leaf in jax.tree.leaves(parameters)) else None
+
+
+def _vehicles_axis(vehicle):
+    """0 where the leaves of `vehicle` are those of each drone, None where all drones are alike."""
+    return 0 if vehicle.mass.ndim else None
+
+
 def _with_body(drone, body):
     """`drone` with the position, quaternion, velocity and body rates of `body`."""
     position, quaternion, velocity, body_rates = body
@@ -184,7 +214,8 @@ def make_drones_step(
     """Make the step of N drones of one world.
 
     physics "mjx": MuJoCo MJX, in which floor, pillars and other drones are solid unless `contacts` is off;
-    "rigid": the same free-flight equations written out, nothing is solid. dt is the step in seconds;
+    "rigid": the same free-flight equations written out, nothing is solid; "stops": these, and drones are put back
+    out of solid things once per step. dt is the step in seconds;
     `substeps` divide it, and the rate controller runs in each. `effects` (names or `Effect`s) are modelled
     beyond the nominal vehicle. Within a substep: controller on the present state, motors, rotor speeds,
     wrench from the updated rotor speeds, body.
