@@ -9,7 +9,7 @@ import pytest
 from openjax.errors import UserError
 from openjax.flights.case import load_case
 from openjax.flights.importers import find_logs, load_mapping, read_log
-from openjax.flights.reading import LogError, write_csv
+from openjax.flights.reading import LogError, flights_of, write_csv
 from openjax.gap.samples import log_of
 
 DEGREES = 180 / np.pi
@@ -80,6 +80,30 @@ def test_micro_sd_streams_are_put_on_the_imu_clock(tmp_path, columns):
     assert np.isfinite(table.columns["vbat"]).sum() == 8
     # Every second pose was logged; the rows between are interpolated.
     np.testing.assert_allclose(table.columns["x"][:-1], columns["x"][:-1], atol=1e-3)
+
+
+def test_the_controllers_variables_stand_for_motors_and_gyroscope(tmp_path, columns):
+    """What a log of the controller holds: mixer inputs, gyroscope in the firmware's sense, vertical force."""
+    m = 65535 * np.stack([columns[f"m{i}"] for i in "1234"])
+    inputs = {
+        "thrust": m.mean(0),
+        "roll": (m[2] + m[3] - m[0] - m[1]) / 2,
+        "pitch": (m[0] + m[3] - m[1] - m[2]) / 2,
+        "yaw": (m[0] + m[2] - m[1] - m[3]) / 4,
+    }
+    variables = {f"controller.cmd_{n}": ("f", v) for n, v in inputs.items()}
+    variables |= {f"stateEstimate.{a}": ("f", columns[a]) for a in "xyz"}
+    variables |= {"controller.r_roll": ("f", columns["wx"]), "controller.r_pitch": ("f", -columns["wy"])}
+    variables |= {
+        "controller.r_yaw": ("f", columns["wz"]),
+        "controller.accelz": ("f", columns["az"] / 9.80665),
+    }
+    (tmp_path / "log04").write_bytes(micro_sd([("fixedFrequency", 10_000, variables)]))
+    table = read_log(tmp_path / "log04")
+    assert "mixer" in table.remarks[0]
+    assert_same(table, {n: columns[n] for n in ("m1", "m2", "m3", "m4", "wx", "wy", "wz", "az", "x")})
+    (flight,), _ = flights_of(table)
+    assert flight.specific_force is None and flight.vertical_force is not None
 
 
 def test_a_micro_sd_log_cut_off_is_read_as_far_as_it_goes(tmp_path, columns):

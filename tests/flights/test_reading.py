@@ -6,6 +6,7 @@ import time
 import numpy as np
 import pytest
 
+from openjax.flights import reading
 from openjax.flights.reading import LogError, LogTable, flights_of, read_csv, write_csv
 
 HEADER = "t,wx,wy,wz,ax,ay,az,m1,m2,m3,m4,vbat\n"
@@ -74,7 +75,9 @@ def test_a_channel_with_a_missing_column_is_left_out_and_named(tmp_path):
         ("t;wx\n0;1\n", "separated by ';'"),
         ("t,wx,wx\n0,1,2\n", "'wx' occurs more than once"),
         ("t,wx\n0,1\n0.01,fast\n", "line 3, column wx: 'fast' is no number"),
-        ("t,wx\n0,1\n0.01\n", "line 3 has 1 cells"),
+        ("t,wx\n0,1\n0.01\n0.02,1\n", "line 3 has 1 cells, the header 2"),
+        ("t,wx\n0,1\n0.01,2,3\n", "line 3 has 3 cells, the header 2"),
+        ("colour,shape\n0,1\n", "no known column"),
         ("wx,wy\n0,1\n", "no column t"),
     ],
 )
@@ -94,6 +97,30 @@ def test_corrupt_files_say_so(tmp_path, data):
     path.write_bytes(data if data[:1] == b"\x1f" else gzip.compress(data))
     with pytest.raises(LogError):
         read_csv(path)
+
+
+@pytest.mark.parametrize("end", ["\r", "\r\n"])
+def test_other_line_ends_and_a_last_line_cut_off(tmp_path, end):
+    text = end.join(["t,wx,wy,wz", *(f"{k / 100:.2f},1,2,3" for k in range(50_000)), "500.00,1"])
+    start = time.perf_counter()
+    table = read_csv(write(tmp_path / "log.csv", text))
+    assert time.perf_counter() - start < 2.0
+    assert len(table.columns["t"]) == 50_000 and table.columns["wz"][-1] == 3.0
+    assert table.remarks == ("the last line is cut off and left out",)
+
+
+def test_a_file_that_unpacks_to_gigabytes_is_refused_before_it_does(tmp_path, monkeypatch):
+    monkeypatch.setattr(reading, "LARGEST", 1 << 20)
+    path = tmp_path / "log.csv.gz"
+    path.write_bytes(gzip.compress(b"t,wx\n" + b"0," * (1 << 21)))
+    with pytest.raises(LogError, match="more than 1 MB"):
+        read_csv(path)
+
+
+def test_absurd_values_are_not_sampled(tmp_path):
+    text = "t,wx,wy,wz\n" + "0.00,1,2,3\n" * 3 + "0.01,1e300,2,3\n0.02,-inf,2,3\n"
+    (flight,), remarks = flights_of(read_csv(write(tmp_path / "log.csv", text)))
+    assert np.isfinite(flight.body_rates).sum() == 13 and len(remarks) == 2
 
 
 def test_ten_seconds_at_a_kilohertz_are_read_in_a_moment(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -14,8 +15,10 @@ from openjax.flights.reading import LogError, flights_of
 from openjax.vehicle.vehicle_file import VehicleFile, load_vehicle_file
 
 
-def load_case(path: str | Path, dtype=jnp.float32) -> Case:
-    """Read a case folder: its `vehicle.toml` and its logs (CSV, micro-SD logs, ROS 2 bags).
+def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> Case:
+    """Read a case folder: its `vehicle.toml` and its logs (CSV, micro-SD logs, ROS 2 bags). For a `comparison`
+    with other flights motor commands alone are enough, and without a vehicle file the nominal vehicle is
+    taken.
 
     Logs that can't be used are left out and named in `quality` (`refused`). Raises UserError for a folder
     that isn't a case, an unusable vehicle file, or if no log is left.
@@ -26,7 +29,8 @@ def load_case(path: str | Path, dtype=jnp.float32) -> Case:
     logs = find_logs(path)
     if not logs:
         raise UserError(f"{path}: holds no flight log (.csv, .csv.gz, micro-SD log or ROS 2 bag)")
-    vehicle_file = load_vehicle_file(path / "vehicle.toml", dtype)
+    described = (path / "vehicle.toml").exists() or not comparison
+    vehicle_file = load_vehicle_file(path / "vehicle.toml" if described else None, dtype)
     mapping = load_mapping(path / MAPPING_FILE) if (path / MAPPING_FILE).exists() else None
     flights, issues = [], []
     for log in logs:
@@ -41,7 +45,9 @@ def load_case(path: str | Path, dtype=jnp.float32) -> Case:
     flights = [f for f in flights if f.log not in copies]
     kept = []
     for flight in flights:
-        checked, found = check_flight(flight, vehicle_file.vehicle_of(flight.vehicle), vehicle_file.log)
+        checked, found = check_flight(
+            flight, vehicle_file.vehicle_of(flight.vehicle), vehicle_file.log, comparison
+        )
         issues += found
         kept += [] if checked is None else [checked]
     if not kept:
@@ -49,6 +55,9 @@ def load_case(path: str | Path, dtype=jnp.float32) -> Case:
         first = f"{reasons[0].flight}: {reasons[0].issue}" if reasons else "no vehicle in any log"
         more = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
         raise UserError(f"{path}: no flight can be used: {first}{more}")
+    # A thrust error is told from the mass only where every vehicle that flew was weighed.
+    weighed = all(vehicle_file.mass_weighed_of(flight.vehicle) for flight in kept)
+    vehicle_file = dataclasses.replace(vehicle_file, mass_weighed=weighed)
     return Case(path.resolve().name, tuple(kept), vehicle_file, tuple(issues), path)
 
 

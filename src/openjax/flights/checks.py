@@ -24,23 +24,27 @@ class _Refused(Exception):
         self.kind = kind
 
 
-def check_flight(flight: Flight, vehicle, log: dict | None = None) -> tuple[Flight | None, list[Issue]]:
+def check_flight(
+    flight: Flight, vehicle, log: dict | None = None, comparison: bool = False
+) -> tuple[Flight | None, list[Issue]]:
     """Check one flight as read. Returns it sorted, cleaned and cut to its airborne part, or None if it can't
     be used, and the findings. `vehicle` is the nominal vehicle, `log` the vehicle file's `[log]` table
-    (floor_z)."""
+    (floor_z). For a `comparison` of flights with flights the motor commands alone are enough, and every
+    airborne stretch is kept, not only the longest."""
     issues: list[Issue] = []
 
     def note(kind: str, text: str) -> None:
         issues.append(Issue(flight.name, text, kind=kind))
 
     try:
-        _has_what_is_needed(flight)
+        _has_what_is_needed(flight, comparison)
         checked = _in_time(flight, note)
         checked = _clean(checked, note)
         checked = _in_range(checked, note)
         checked = _derive_velocity(checked, note)
-        checked = _airborne(checked, (log or {}).get("floor_z"), note)
-        _has_what_is_needed(checked)
+        checked = _derive_rates(checked, note)
+        checked = _airborne(checked, (log or {}).get("floor_z"), note, comparison)
+        _has_what_is_needed(checked, comparison)
     except _Refused as refused:
         return None, [*issues, Issue(flight.name, str(refused), refused=True, kind=refused.kind)]
     found = check_consistency(checked, vehicle)
@@ -58,7 +62,11 @@ def duplicates(flights: list[Flight]) -> dict[str, str]:
     return copies
 
 
-def _has_what_is_needed(flight: Flight) -> None:
+def _has_what_is_needed(flight: Flight, comparison: bool) -> None:
+    if comparison:
+        if not flight.has_motors:
+            raise _Refused("columns", "holds no motor commands (m1..m4), which a comparison needs")
+        return
     if not (flight.has_pose or flight.has_imu):
         pose, imu = "x, y, z, qw, qx, qy, qz", "ax, ay, az, wx, wy, wz"
         sensors = f"position and orientation ({pose}) or accelerometer and gyroscope ({imu})"
@@ -119,7 +127,7 @@ def _clean(flight: Flight, note) -> Flight:
         values = getattr(flight, channel)
         if values is None:
             continue
-        columns, table = CHANNEL_COLUMNS[channel], values.reshape(len(values), -1)
+        columns, table = CHANNEL_COLUMNS.get(channel, ("az",)), values.reshape(len(values), -1)
         rows = np.flatnonzero(np.isfinite(table).all(1))
         if len(rows) < 2:
             raise _Refused("corrupt", f"{', '.join(columns)}: hardly any row holds a number")
@@ -250,24 +258,53 @@ def _derive_velocity(flight: Flight, note) -> Flight:
     rows = np.flatnonzero(np.isfinite(flight.position).all(1))
     if len(rows) < 2 * half + 1:
         raise _Refused("short", f"only {len(rows)} rows hold a position")
-    # Windowed least squares on [1, dt, dt^2] handles uneven steps; sums run over a sliding window of rows.
-    index = np.clip(np.arange(len(rows)), half, len(rows) - half - 1)[:, None] + np.arange(-half, half + 1)
-    dt = time[index] - time[:, None]
-    basis = np.stack([np.ones_like(dt), dt, dt**2], -1)
-    normal = np.einsum("rki,rkj->rij", basis, basis)
-    moment = np.einsum("rki,rkc->ric", basis, position[index])
-    scale = np.array([1.0, 1e-2, 1e-4])  # keeps the normal equations well conditioned
-    solved = np.linalg.solve(normal / np.outer(scale, scale) * 1.0, moment / scale[:, None])
-    velocity[rows] = solved[:, 1] / scale[1]
-    jump = np.abs(dt).max(1) > 0.25
+    velocity[rows], reach = _slopes(time, position, half)
+    jump = reach > 0.25
     velocity[rows[jump]] = np.nan
     note("columns", "no velocity was logged: it is derived from position")
     return dataclasses.replace(flight, velocity=velocity, velocity_derived=True)
 
 
-def _airborne(flight: Flight, floor_z: float | None, note) -> Flight:
-    """Cut to the longest airborne stretch. Off the ground: motors give at least 40 % of their usual command,
-    and the vehicle isn't at rest on the floor; shorter dips (half a second) are manoeuvres."""
+def _slopes(time: np.ndarray, values: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives (R, C) of values (R, C) by local quadratic fits over 2 `half` + 1 rows (Savitzky-Golay, for
+    uneven steps too), and how far in time (R,) each fit reaches."""
+    index = np.clip(np.arange(len(time)), half, len(time) - half - 1)[:, None] + np.arange(-half, half + 1)
+    dt = time[index] - time[:, None]
+    basis = np.stack([np.ones_like(dt), dt, dt**2], -1)
+    normal = np.einsum("rki,rkj->rij", basis, basis)
+    moment = np.einsum("rki,rkc->ric", basis, values[index])
+    scale = np.array([1.0, 1e-2, 1e-4])  # keeps the normal equations well conditioned
+    solved = np.linalg.solve(normal / np.outer(scale, scale), moment / scale[:, None])
+    return solved[:, 1] / scale[1], np.abs(dt).max(1)
+
+
+def _derive_rates(flight: Flight, note) -> Flight:
+    """Body rates from the attitude where no gyroscope was logged: w = 2 (q* dq/dt), local quadratic fits."""
+    if flight.body_rates is not None or flight.quaternion is None:
+        return flight
+    time, attitude = flight.sampled("quaternion")
+    half = max(2, round(0.025 / max(float(np.median(np.diff(time))), 1e-4)))
+    if len(time) < 2 * half + 1:
+        return flight
+    slope, reach = _slopes(time, attitude, half)
+    w, x, y, z = attitude.T
+    dw, dx, dy, dz = slope.T
+    rates = 2.0 * np.stack([
+        w * dx - x * dw - y * dz + z * dy,
+        w * dy - y * dw - z * dx + x * dz,
+        w * dz - z * dw - x * dy + y * dx,
+    ], 1)  # fmt: skip
+    rates[reach > 0.25] = np.nan
+    derived = np.full((len(flight), 3), np.nan)
+    derived[np.isfinite(flight.quaternion).all(1)] = rates
+    note("columns", "no gyroscope was logged: body rates are derived from the attitude")
+    return dataclasses.replace(flight, body_rates=derived, body_rates_derived=True)
+
+
+def _airborne(flight: Flight, floor_z: float | None, note, every: bool = False) -> Flight:
+    """Cut to the longest airborne stretch, or to `every` one of a useful length. Off the ground: motors give
+    at least 40 % of their usual command, and the vehicle isn't at rest on the floor; shorter dips (half a
+    second) are manoeuvres."""
     drive = flight.motor_command if flight.motor_command is not None else flight.command_thrust
     drive = drive if drive.ndim == 1 else drive.mean(1)
     rows = np.isfinite(drive)
@@ -289,6 +326,11 @@ def _airborne(flight: Flight, floor_z: float | None, note) -> Flight:
     airborne = flight.time[stop - 1] - flight.time[start]
     if airborne < SHORTEST:
         raise _Refused("short", f"airborne for {airborne:.1f} s only; at least {SHORTEST:g} s are needed")
+    if every:
+        kept = np.zeros(len(flight), bool)
+        for first, last in runs:
+            kept[first:last] = flight.time[last - 1] - flight.time[first] >= SHORTEST
+        return flight.rows(kept)
     if stop - start < len(flight):
         cut = flight.duration - airborne
         note("ground", f"{cut:.1f} s on the ground are cut away (kept: t = {flight.time[start]:.2f} "

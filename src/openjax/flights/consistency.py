@@ -85,7 +85,7 @@ def check_consistency(flight: Flight, vehicle) -> list[Issue]:
     if grid is None:
         return []
     found: list[tuple[str, str]] = []
-    gyro = _on(flight, "body_rates", grid)
+    gyro = None if flight.body_rates_derived else _on(flight, "body_rates", grid)
     quaternion = _on(flight, "quaternion", grid)
     position = _on(flight, "position", grid)
     force = _on(flight, "specific_force", grid)

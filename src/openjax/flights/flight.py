@@ -22,7 +22,7 @@ Array = np.ndarray
 # Channels of a Flight in the order of the log format; each is None where it wasn't logged.
 CHANNELS = (
     "position", "quaternion", "velocity", "body_rates", "specific_force",
-    "command_thrust", "command_body_rates", "motor_command", "battery_voltage",
+    "command_thrust", "command_body_rates", "motor_command", "battery_voltage", "vertical_force",
 )  # fmt: skip
 
 
@@ -62,7 +62,9 @@ class Flight:
     command_body_rates: Array | None = None  # (T, 3) rad/s, commanded body rates
     motor_command: Array | None = None  # (T, 4) 0..1, meaning by the vehicle file's `motor_command`
     battery_voltage: Array | None = None  # (T,) V, under load
+    vertical_force: Array | None = None  # (T,) m/s^2, body z, where the accelerometer's z alone was logged
     velocity_derived: bool = False  # True: differentiated from position by the reader, not logged
+    body_rates_derived: bool = False  # True: differentiated from the attitude by the reader, no gyroscope
     fingerprint: str = ""  # hash of the whole log's values, the same for copies under other names
 
     def __len__(self) -> int:

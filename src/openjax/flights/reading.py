@@ -32,6 +32,9 @@ CHANNEL_COLUMNS = {
 }
 LOG_COLUMNS = ("t", "vehicle", *(c for columns in CHANNEL_COLUMNS.values() for c in columns))
 
+LARGEST = 256 << 20  # bytes of text in one log: a quarter of an hour at 1 kHz; more is no flight log
+LARGEST_VALUE = 1e6  # no sensor's reading in SI units is larger; squares of what is would overflow
+
 _EMPTY_CELL = re.compile(r"(?<=,)[ \t]*(?=[,\n])|^[ \t]*(?=,)", re.MULTILINE)
 _NOT_A_NUMBER = re.compile(r"(?<=[,\n ])[-+]?(?:nan|na|n/a|null|none)(?=[,\n ])", re.IGNORECASE)
 
@@ -75,14 +78,18 @@ def read_csv(path: str | Path, delimiter: str = ",", known: tuple[str, ...] | No
         body = body.replace(delimiter, ",")
     if not body.endswith("\n"):
         body += "\n"
+    body, remarks = _without_last_if_cut(body, len(names))
 
     text_columns = {"vehicle"} if known is not None else {"vehicle", *_text_columns(names, body)}
     kept = [i for i, n in enumerate(names) if n and n not in text_columns and (known is None or n in known)]
     unknown = [n for n in names if n and known is not None and n not in known]
-    remarks = (
-        [f"unknown column{'s' * (len(unknown) > 1)} left out: {', '.join(unknown[:8])}"] if unknown else []
-    )
+    if unknown:
+        remarks.append(f"unknown column{'s' * (len(unknown) > 1)} left out: {', '.join(unknown[:8])}")
+    if not kept:
+        raise LogError(f"holds no known column (it has {', '.join(names[:6])})")
 
+    if (_cells_per_line(body) != len(names)).any():
+        raise LogError(_why_not(body, names, kept, ValueError("rows of unequal length")))
     # An empty cell becomes NaN; a written "nan" becomes infinite, so that the two can be told apart
     # afterwards.
     spelt = _NOT_A_NUMBER.search(body) is not None
@@ -90,7 +97,7 @@ def read_csv(path: str | Path, delimiter: str = ",", known: tuple[str, ...] | No
     numbers = _EMPTY_CELL.sub("nan", numbers)
     try:
         values = np.loadtxt(io.StringIO(numbers), delimiter=",", usecols=kept, ndmin=2, comments=None)
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:
         raise LogError(_why_not(body, names, kept, error)) from error
     columns = {}
     for i, column in zip(kept, values.T, strict=True):
@@ -104,7 +111,7 @@ def read_csv(path: str | Path, delimiter: str = ",", known: tuple[str, ...] | No
             raise LogError("column t is empty")
     if "vehicle" in names:
         k = names.index("vehicle")
-        ids = [line.split(",")[k].strip().strip('"') or "0" for line in body.split("\n") if line.strip()]
+        ids = [line.split(",", k + 1)[k].strip(' \t"') or "0" for line in body.split("\n") if line.strip()]
         vehicle = np.array(ids)
     else:
         vehicle = np.full(len(values), "0")
@@ -123,7 +130,17 @@ def flights_of(
         found = [n for n in names if n in table.columns]
         if len(found) == len(names):
             values = np.stack([table.columns[n] for n in names], 1)
+            absurd = np.abs(values) > LARGEST_VALUE
+            if absurd.any():
+                remarks.append(
+                    f"{', '.join(names)}: {absurd.sum()} values beyond 1e6 are taken as not sampled"
+                )
+                values = np.where(absurd, np.nan, values)
+            if np.isnan(values).all():
+                continue
             channels[channel] = values[:, 0] if len(names) == 1 else values
+        elif found == ["az"]:
+            channels["vertical_force"] = table.columns["az"]
         elif found:
             missing = [n for n in names if n not in table.columns]
             remarks.append(f"{', '.join(found)} without {', '.join(missing)}: {channel} is left out")
@@ -161,15 +178,38 @@ def write_csv(path: str | Path, table: LogTable, decimals: dict[str, int] | None
 
 
 def _text(path: Path) -> str:
+    """A file's text with line ends of one kind. Never unpacks more than LARGEST bytes."""
     try:
-        data = path.read_bytes()
-        if path.suffix == ".gz":
-            data = gzip.decompress(data)
-        return data.decode("utf-8-sig").replace("\r\n", "\n")
+        with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
+            data = file.read(LARGEST + 1)
     except (OSError, EOFError, zlib.error) as error:
         raise LogError(f"can't be read: {error}") from error
+    if len(data) > LARGEST:
+        raise LogError(f"holds more than {LARGEST >> 20} MB of text: no log of a flight; cut it into flights")
+    if b"\0" in data:
+        raise LogError("not a text file in UTF-8")
+    try:
+        text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise LogError("not a text file in UTF-8") from error
+    return text.replace("\r\n", "\n").replace("\r", "\n").lstrip("\n")
+
+
+def _cells_per_line(body: str) -> np.ndarray:
+    """Cells in each line of `body` that isn't blank."""
+    data = np.frombuffer(body.encode(), np.uint8)
+    ends = np.flatnonzero(data == ord("\n"))
+    commas = np.searchsorted(np.flatnonzero(data == ord(",")), ends)
+    solid = np.searchsorted(np.flatnonzero(data > ord(" ")), ends)
+    return (np.diff(commas, prepend=0) + 1)[np.diff(solid, prepend=0) > 0]
+
+
+def _without_last_if_cut(body: str, cells: int) -> tuple[str, list[str]]:
+    """The body without its last line if that has too few cells: power was cut while it was written."""
+    lines = body.rstrip().rsplit("\n", 1)
+    if len(lines) == 2 and lines[1].count(",") + 1 < cells:
+        return lines[0] + "\n", ["the last line is cut off and left out"]
+    return body, []
 
 
 def _text_columns(names: list[str], body: str) -> list[str]:

@@ -36,6 +36,8 @@ CALIBRATED_UNITS = MappingProxyType({
     "inertia": "kg m^2",
 })  # fmt: skip
 
+LEAST_MASS = 0.005  # kg; the lightest frame with battery weighs twice that
+
 _TABLES = {"vehicle", "vehicles", "motor", "log", "calibrated"}
 _VEHICLE_KEYS = {"name", "mass", "mass_weighed"}
 _MOTOR_KEYS = {"command", "order", "spin", "notes", "thrust_map", "torque_per_thrust"}
@@ -164,6 +166,10 @@ def _from_tables(tables: dict, path: Path, dtype) -> VehicleFile:
             f'{path}: motor.spin is {list(spin)}; it must hold two "cw" and two "ccw", in the order m1..m4'
         )
 
+    floor = log.get("floor_z", 0.0)
+    if isinstance(floor, bool) or not isinstance(floor, int | float) or not abs(floor) < 1e3:
+        raise UserError(f"{path}: log.floor_z is {floor!r}; it must be a number of metres")
+
     nominal = load_vehicle(dtype=dtype)
     changes: dict[str, Any] = {}
     if "mass" in vehicle_table:
@@ -234,8 +240,9 @@ def _check_vehicle_table(table: dict, path: Path, where: str) -> None:
     _only(table, _VEHICLE_KEYS, path, where)
     if "mass" in table:
         _positive(table["mass"], path, f"{where} mass")
-        if table["mass"] > 1.0:
-            raise UserError(f"{path}: {where} mass = {table['mass']} kg is no Crazyflie; is it in grams?")
+        if not LEAST_MASS <= table["mass"] <= 1.0:
+            hint = "; is it in grams?" if table["mass"] > 1.0 else ""
+            raise UserError(f"{path}: {where} mass = {table['mass']} kg is no Crazyflie{hint}")
     if not isinstance(table.get("mass_weighed", False), bool):
         raise UserError(f"{path}: {where} mass_weighed must be true or false")
     if not isinstance(table.get("name", ""), str):

@@ -15,7 +15,7 @@ from zlib import crc32
 import numpy as np
 
 from openjax.flights.importers.columns import UNITS, ColumnMapping, Source, Stream, merge_streams
-from openjax.flights.reading import LogError, LogTable
+from openjax.flights.reading import LARGEST, LogError, LogTable
 
 MAGIC = 0xBC
 _VERSIONS = {1: ("<HI", 1e-3), 2: ("<HQ", 1e-6)}
@@ -23,29 +23,39 @@ _TYPES = set("bBhHiIqQefd")
 
 
 def _firmware_sources() -> dict[str, list[Source]]:
-    """Log variables of the firmware that hold each column, best first. `controller.pitchRate` and
-    `stateEstimate.pitch` are in the firmware's legacy sense, opposite to a rotation about y."""
-    deg, g = UNITS["deg"], UNITS["g"]
+    """Log variables of the firmware that hold each column, best first. `controller.pitchRate`, `r_pitch`,
+    `stateEstimate.pitch`, `stabilizer.pitch` and `ratePitch` are in the firmware's legacy sense, opposite to a
+    rotation about y."""
+    deg, g, mrad = UNITS["deg"], UNITS["g"], UNITS["mrad/s"]
     sources = {
         "vbat": [Source("pm.vbat"), Source("pm.vbatMV", 1e-3)],
         "cmd_thrust": [Source("controller.cmd_thrust", UNITS["16bit"])],
         "cmd_wx": [Source("controller.rollRate", deg)],
         "cmd_wy": [Source("controller.pitchRate", -deg)],
         "cmd_wz": [Source("controller.yawRate", deg)],
-        "roll": [Source("stateEstimate.roll", deg)],
-        "pitch": [Source("stateEstimate.pitch", -deg)],
-        "yaw": [Source("stateEstimate.yaw", deg)],
     }
+    for angle, sign in (("roll", 1.0), ("pitch", -1.0), ("yaw", 1.0)):
+        sources[angle] = [
+            Source(f"stateEstimate.{angle}", sign * deg),
+            Source(f"stabilizer.{angle}", sign * deg),
+        ]
     for axis in "xyz":
         sources[axis] = [Source(f"stateEstimate.{axis}"), Source(f"stateEstimateZ.{axis}", 1e-3)]
         sources[f"v{axis}"] = [Source(f"stateEstimate.v{axis}"), Source(f"stateEstimateZ.v{axis}", 1e-3)]
-        sources[f"w{axis}"] = [Source(f"gyro.{axis}", deg)]
+        angle, sign = {"x": ("roll", 1.0), "y": ("pitch", -1.0), "z": ("yaw", 1.0)}[axis]
+        sources[f"w{axis}"] = [
+            Source(f"gyro.{axis}", deg),
+            Source(f"controller.r_{angle}", sign),
+            Source(f"stateEstimateZ.rate{angle.capitalize()}", sign * mrad),
+        ]
         sources[f"a{axis}"] = [Source(f"acc.{axis}", g)]
-    for part in "wxyz":
-        sources[f"q{part}"] = [Source(f"stateEstimate.q{part}")]
+    sources["az"].append(Source("controller.accelz", g))
+    for number, part in enumerate("wxyz"):
+        sources[f"q{part}"] = [Source(f"stateEstimate.q{part}"), Source(f"kalman.q{number}")]
     for motor in "1234":
         sources[f"m{motor}"] = [
             Source(f"motor.m{motor}", UNITS["16bit"]),
+            Source(f"mixer.m{motor}", UNITS["16bit"]),
             Source(f"pwm.m{motor}_pwm", UNITS["16bit"]),
         ]
     return sources
@@ -69,7 +79,10 @@ def read_micro_sd(path: str | Path, mapping: ColumnMapping | None = None) -> Log
     Raises LogError if it isn't such a log, or holds nothing that can be used.
     """
     path = Path(path)
+    if path.stat().st_size > LARGEST:
+        raise LogError(f"holds more than {LARGEST >> 20} MB: no log of a flight")
     streams, remarks = decode(path.read_bytes())
+    streams = [with_mixer(stream) for stream in streams]
     names = {name for stream in streams for name in stream.values}
     if mapping is not None:
         columns = {c: s for c, s in mapping.columns.items() if c not in ("t", "vehicle")}
@@ -80,9 +93,25 @@ def read_micro_sd(path: str | Path, mapping: ColumnMapping | None = None) -> Log
             c: next((s for s in options if s.name in names), None) for c, options in FIRMWARE_SOURCES.items()
         }
         columns = {c: s for c, s in columns.items() if s is not None}
+        if columns.get("m1", Source("")).name == "mixer.m1":
+            remarks.append("no motor commands were logged: they are made from the mixer's inputs")
     merged = merge_streams(streams, columns)
     merged["t"] = merged["t"] - merged["t"][0]
     return LogTable(path.name, merged, np.full(len(merged["t"]), "0"), tuple(remarks))
+
+
+def with_mixer(stream: Stream) -> Stream:
+    """The stream with `mixer.m1` to `mixer.m4`, 0 to 65535, where it holds the mixer's four inputs: what the
+    firmware's legacy power distribution (power_distribution_quadrotor.c) makes of them, before the battery
+    compensation."""
+    inputs = [stream.values.get(f"controller.cmd_{name}") for name in ("thrust", "roll", "pitch", "yaw")]
+    if any(values is None for values in inputs):
+        return stream
+    thrust, roll, pitch, yaw = inputs[0], inputs[1] / 2, inputs[2] / 2, inputs[3]
+    motors = (thrust - roll + pitch + yaw, thrust - roll - pitch - yaw,
+              thrust + roll - pitch + yaw, thrust + roll + pitch - yaw)  # fmt: skip
+    mixed = {f"mixer.m{i}": np.clip(m, 0.0, 65535.0) for i, m in enumerate(motors, 1)}
+    return Stream(stream.time, stream.values | mixed)
 
 
 def decode(data: bytes) -> tuple[list[Stream], list[str]]:
