@@ -93,6 +93,7 @@ def joined(membership: Membership | None) -> Iterator[Processes]:
         return
     with _connected(membership) as (connections, bind_address):
         processes = Processes(membership.num_processes, membership.process_id, connections)
+        _tune_alone()
         try:
             import jax
 
@@ -119,6 +120,15 @@ def joined(membership: Membership | None) -> Iterator[Processes]:
             # JAX would wait for the others at exit; once this error is told, nothing is left to do.
             atexit.register(os._exit, status)
             raise
+
+
+def _tune_alone():
+    """Have XLA choose its GPU kernels in each process by itself. Shared, all processes wait for each other's choices in
+    every program, also in one that only process 0 compiles.
+    """
+    flags = os.environ.get("XLA_FLAGS", "")
+    if "xla_gpu_shard_autotuning" not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} --xla_gpu_shard_autotuning=false".strip()
 
 
 def _one_line(error):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -63,10 +64,15 @@ def world_xml(n_pillars: int, n_others: int, dt: float, contacts: bool = True) -
 def make_world(n_pillars: int, n_others: int, dt: float, contacts: bool) -> World:
     """The compiled world; numpy arrays, so that it can be closed over by compiled code of any precision."""
     model = mujoco.MjModel.from_xml_string(world_xml(n_pillars, n_others, dt, contacts))
-    with jax.ensure_compile_time_eval():
-        mjx_model = mjx.put_model(model)
-        mjx_data = mjx.make_data(mjx_model)
-        return World(*jax.tree.map(np.asarray, (mjx_model, mjx_data)))
+    device = jax.local_devices()[0]  # of several processes each builds its own
+
+    def build():
+        mjx_model = mjx.put_model(model, device, impl="jax")
+        return World(*jax.tree.map(np.asarray, (mjx_model, mjx.make_data(mjx_model, device))))
+
+    # A thread of its own knows nothing of the caller's trace or mesh, which may span other processes' devices.
+    with ThreadPoolExecutor(max_workers=1) as pool:
+        return pool.submit(build).result()
 
 
 def _as_dtype(tree, dtype):
