@@ -173,7 +173,7 @@ def _rollout(settings, num_envs, steps):
     parameters = jax.jit(parts.policy.init)(jax.random.key(1), first)
 
     def run(parameters, observation, state, key):
-        shape = (steps, num_envs, settings.environment.num_pursuers, 4)
+        shape = (steps, num_envs, settings.environment.num_pursuers, parts.policy.sample_size)
         return collect(
             environment, parts.policy, parameters, observation, state, jax.random.normal(key, shape)
         )

@@ -27,7 +27,8 @@ class EvaluateCommand:
     """
 
     policy: tuple[str, ...] = ("open",)
-    """A run's directory, a policy file (.npz), a checkpoint, or the name of a policy in the package.
+    """A run's directory, a policy file (.npz), a checkpoint, or the name of a policy in the package or of a heuristic:
+    angelani, janosov, apf.
 
     Of several, for example one per training seed, mean and standard deviation are shown too."""
     scenario: str = "all"
@@ -85,10 +86,10 @@ def evaluate(command: EvaluateCommand, loaded, evaluators: dict) -> list[dict]:
         scenarios = [find_scenario(command.scenario, settings)]
     slots = max(layout_slots(settings), *(len(scenario.pillars) for scenario in scenarios))
     settings = dataclasses.replace(settings, max_pillars=slots, num_pursuers=len(scenarios[0].pursuers))
-    _check_sizes(settings, loaded.settings.environment)
+    environment = make_environment(settings, command.vehicle, command.effects)
+    loaded = loaded.in_game(environment)
     kind = (settings, loaded.policy)
     if kind not in evaluators:
-        environment = make_environment(settings, command.vehicle, command.effects)
         evaluators[kind] = Evaluator(environment, loaded.policy, command.episodes)
     return evaluate_scenarios(evaluators[kind], loaded.parameters, scenarios, command.episodes, command.seed)[
         0
@@ -104,16 +105,6 @@ def _check(command):
         raise UserError(
             f"--json {command.json}: the directory {command.json.absolute().parent} doesn't exist"
         )
-
-
-def _check_sizes(settings, trained):
-    """Settings that shape the networks' inputs can't differ from those of the training."""
-    for name in ("self_size", "observed_pillars", "history_length", "frame_size"):
-        if getattr(settings, name) != getattr(trained, name):
-            raise UserError(
-                f"the policy was trained with {name} {getattr(trained, name)}, here it's "
-                f"{getattr(settings, name)}: pursuers, observation and history must stay as in training"
-            )
 
 
 def _show(command, results):

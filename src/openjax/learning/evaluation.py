@@ -52,7 +52,7 @@ def make_evaluate(
             predicted = policy.predict(parameters, observation)
             mean, _ = policy.distribution(parameters.actor, observation, predicted)
             last_seen = observation.last_seen
-            observation, state, _, _, _, info = step(step_key, state, policy.action(mean))
+            observation, state, _, _, _, info = step(step_key, state, policy.action(mean, observation))
             guesses = [last_seen if predicted is None else predicted[:, 0], last_seen]
             errors = errors + jnp.stack(
                 [jnp.linalg.norm(guess - state.evader_position, axis=-1) for guess in guesses]

@@ -46,7 +46,7 @@ class Batch:
 
     observation: Observation
     predicted: jax.Array | None  # (..., K, 3)
-    action: jax.Array  # (..., N, 4)
+    action: jax.Array  # (..., N, A)
     log_prob: jax.Array  # (..., N)
     advantage: jax.Array  # (..., N)
     target: jax.Array  # (..., N) normalised returns

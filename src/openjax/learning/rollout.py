@@ -14,7 +14,7 @@ class Rollout:
 
     observation: Observation  # (T, E, ...), before the step; `frames` (T, E, 1, F)
     predicted: jax.Array | None  # (T, E, K, 3) m, predicted evader positions; None without predictor
-    action: jax.Array  # (T, E, N, 4) samples of the policy's Gaussian
+    action: jax.Array  # (T, E, N, A) samples of the policy's Gaussian
     log_prob: jax.Array  # (T, E, N)
     reward: jax.Array  # (T, E, N)
     terminated: jax.Array  # (T, E) bool
@@ -44,7 +44,7 @@ def collect(
         parameters: theirs.
         observation: (E, ...) of `state`.
         state: (E, ...).
-        noise: (T, E, N, 4) standard normal, drawn ahead in one go.
+        noise: (T, E, N, A) standard normal, drawn ahead in one go.
         penalty_share: () share of the reward's penalties that counts.
 
     Returns:
@@ -59,7 +59,9 @@ def collect(
         mean, log_std = policy.distribution(parameters.actor, observation, predicted)
         action = mean + jnp.exp(log_std) * noise
         log_prob = gaussian_log_prob(action, mean, log_std)
-        following, state, reward, terminated, truncated, info = step(unused_key, state, policy.action(action))
+        following, state, reward, terminated, truncated, info = step(
+            unused_key, state, policy.action(action, observation)
+        )
         record = Rollout(
             observation=newest_frame(observation),
             predicted=predicted,

@@ -10,6 +10,7 @@ import numpy as np
 import optax
 from flax import struct
 
+from openjax.baselines import make_policy
 from openjax.learning.archive import TaskArchive, empty_archive
 from openjax.learning.collectives import gather_over_devices, mean_over_devices, own_keys
 from openjax.learning.generator import generate_task, select, successes
@@ -52,7 +53,7 @@ def build(settings: TrainSettings, environment: Pursuit | None = None) -> Buildi
     environment = environment or Pursuit(settings.environment)
     return Building(
         environment=environment,
-        policy=Policy.for_environment(environment, settings.network, settings.predictor),
+        policy=make_policy(environment, settings.network, settings.predictor),
         optimisers=make_optimiser(settings.mappo, settings.total_updates),
         predictor_optimiser=make_predictor_optimiser(settings.predictor, settings.total_updates),
     )
@@ -118,7 +119,7 @@ def make_training_step(
         # rollout
         progress = carry.update.astype(jnp.float32) / settings.total_updates
         penalty_share = _penalty_share(settings, progress)
-        shape = (settings.rollout_length, settings.environment.num_pursuers, 4)
+        shape = (settings.rollout_length, settings.environment.num_pursuers, policy.sample_size)
         noise = jax.vmap(lambda k: jax.random.normal(k, shape))(own_keys(noise_key, num_envs, axis))
         rollout, observation, state = collect(
             environment,

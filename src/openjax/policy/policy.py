@@ -88,8 +88,16 @@ class Policy:
         """Mean (..., N, 4) and log standard deviation (4,) of the Gaussian over samples; see `action`."""
         return self._actor.apply(actor, observation, predicted)
 
-    def action(self, sample: jax.Array) -> jax.Array:
-        """The action (..., N, 4) in -1..1 that a sample of the Gaussian, or its mean, stands for."""
+    @property
+    def sample_size(self) -> int:
+        """Numbers of one pursuer's sample."""
+        return len(self.initial_action)
+
+    def action(self, sample: jax.Array, observation: Observation | None = None) -> jax.Array:
+        """The action (..., N, 4) in -1..1 that a sample of the Gaussian, or its mean, stands for.
+
+        Policies whose samples aren't commands work it out from the `observation` (`openjax.baselines.dacoop`).
+        """
         return jnp.clip(sample, -1.0, 1.0) if self.network.squash == "mean" else jnp.tanh(sample)
 
     def value(self, critic: Any, observation: Observation, predicted: jax.Array | None) -> jax.Array:
@@ -99,7 +107,7 @@ class Policy:
     def act(self, parameters: PolicyParameters, observation: Observation) -> jax.Array:
         """The mean policy's action (..., N, 4) in -1..1."""
         predicted = self.predict(parameters, observation)
-        return self.action(self.distribution(parameters.actor, observation, predicted)[0])
+        return self.action(self.distribution(parameters.actor, observation, predicted)[0], observation)
 
 
 def gaussian_log_prob(sample: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:

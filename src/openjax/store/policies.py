@@ -5,6 +5,7 @@ from pathlib import Path
 
 import jax
 
+from openjax.baselines import METHODS, Heuristic, make_policy
 from openjax.errors import UserError
 from openjax.learning import TrainSettings
 from openjax.policy import Policy, PolicyParameters
@@ -17,13 +18,31 @@ from openjax.store.run_directory import RunDirectory, is_run
 
 @dataclasses.dataclass(frozen=True)
 class LoadedPolicy:
-    """A trained policy, called with observations of its game: `openjax.make(policy.settings.environment)`."""
+    """A trained policy or a heuristic, called with observations of its game: `openjax.make(policy.settings.environment)`."""
 
-    policy: Policy
+    policy: Policy | Heuristic
     parameters: PolicyParameters
     settings: TrainSettings
-    """What it was trained with."""
+    """What it was trained with; of a heuristic, the game's defaults."""
     source: str
+
+    def in_game(self, environment: Pursuit) -> "LoadedPolicy":
+        """The policy for another game than its own: another arena, vehicle or number of pillars.
+
+        Raises:
+          UserError: it can't play that one.
+        """
+        if isinstance(self.policy, Heuristic):
+            policy = Heuristic.for_environment(self.policy.name, environment)
+            return dataclasses.replace(self, policy=policy)
+        game, own = environment.settings, self.settings.environment
+        for name in ("self_size", "observed_pillars", "history_length", "frame_size"):
+            if getattr(game, name) != getattr(own, name):
+                raise UserError(
+                    f"the policy was trained with {name} {getattr(own, name)}, here it's "
+                    f"{getattr(game, name)}: pursuers, observation and history must stay as in training"
+                )
+        return self
 
     def __call__(self, observation: Observation) -> jax.Array:
         """The mean policy's action (..., N, 4) in -1..1: collective thrust, roll, pitch and yaw rate.
@@ -46,13 +65,15 @@ def load_policy(name_or_path: str | Path) -> LoadedPolicy:
     """Load a policy.
 
     Args:
-      name_or_path: a name from `shipped_policies()`, a policy file (.npz), a run's directory (its best
+      name_or_path: a name from `known_policies()`, a policy file (.npz), a run's directory (its best
         policy) or a checkpoint's directory inside a run.
 
     Raises:
       UserError: nothing of that kind is there, or it's of another shape than its settings say.
     """
     path, source = Path(name_or_path), str(name_or_path)
+    if source in METHODS:
+        return _heuristic(source)
     if str(name_or_path) in shipped_policies():
         return _from_file(WEIGHTS / f"{name_or_path}.npz", source)
     if is_run(path):
@@ -66,10 +87,21 @@ def load_policy(name_or_path: str | Path) -> LoadedPolicy:
         raise UserError(
             f"{path} is no policy; expected a .npz file, a run of openjax.train or one of its checkpoints"
         )
-    names = ", ".join(shipped_policies()) or "none"
+    names = ", ".join(known_policies())
     raise UserError(
         f"policy {name_or_path}: no such file or directory, nor shipped with the package ({names})"
     )
+
+
+def known_policies() -> list[str]:
+    """Names that `load_policy` knows: heuristics and the policies inside the package."""
+    return [*METHODS, *shipped_policies()]
+
+
+def _heuristic(name):
+    settings = TrainSettings()
+    policy = Heuristic.for_environment(name, Pursuit(settings.environment))
+    return LoadedPolicy(policy, policy.parameters(), settings, name)
 
 
 def abstract_parameters(environment: Pursuit, policy: Policy) -> PolicyParameters:
@@ -98,7 +130,7 @@ def _build(settings, leaves, source, prefix=""):
             settings, network=dataclasses.replace(settings.network, compute_type="float32")
         )
     environment = Pursuit(settings.environment)
-    policy = Policy.for_environment(environment, settings.network, settings.predictor)
+    policy = make_policy(environment, settings.network, settings.predictor)
     abstract = abstract_parameters(environment, policy)
     if not any(name.startswith(f"{prefix}critic") for name in leaves):
         # Shipped without: flying needs no critic.

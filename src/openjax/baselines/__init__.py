@@ -1,0 +1,15 @@
+"""The methods that the paper compares with: Angelani, Janosov, potential field, DACOOP; see docs/methods.md."""
+
+from openjax.baselines.dacoop import DacoopPolicy
+from openjax.baselines.heuristic import METHODS, Heuristic
+from openjax.baselines.velocity_controller import velocity_action
+from openjax.policy import NetworkSettings, Policy, PredictorSettings
+from openjax.pursuit import Pursuit
+
+__all__ = ["METHODS", "DacoopPolicy", "Heuristic", "make_policy", "velocity_action"]
+
+
+def make_policy(environment: Pursuit, network: NetworkSettings, predictor: PredictorSettings) -> Policy:
+    """The policy for an environment, of the kind that `network.output` says."""
+    kind = DacoopPolicy if network.output == "field" else Policy
+    return kind.for_environment(environment, network, predictor)

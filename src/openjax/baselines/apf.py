@@ -1,0 +1,88 @@
+"""Artificial potential field with wall following, as in DACOOP (Zhang et al., 2022) after Koren and Borenstein (1991).
+
+Attraction to the evader, repulsion from the nearest obstacle, and between pursuers a force that repels at close range and
+attracts at long. Where attraction and repulsion together point away from the evader (the local minimum that Koren and
+Borenstein describe), the pursuer flies along the obstacle instead.
+"""
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from openjax.baselines.parameters import parameter
+from openjax.baselines.surroundings import Craft, Surroundings, length, level, unit, upward
+
+SAFE_OBSTACLE = 0.07
+"""Distance from a surface at which its repulsion grows without bound (m): the game's safety distance."""
+SAFE_PURSUER = 0.14
+"""The same between two pursuers (m)."""
+NEAREST = 0.005
+"""Distances beyond the safe ones are taken to be at least this (m), so that forces stay finite."""
+
+
+@struct.dataclass
+class ApfParameters:
+    """Forces are relative to the attraction, which is 1."""
+
+    repulsion: jax.Array = parameter(1e-3, 1e-6, 0.03)
+    """eta: scale of the obstacles' repulsion (m^3)."""
+    influence: jax.Array = parameter(0.3, 0.05, 0.6)
+    """rho: distance from a surface beyond which it doesn't repel (m)."""
+    balance: jax.Array = parameter(0.2, 0.003, 1.0)
+    """lambda: of the force between pursuers, 1/2 - lambda / d: they keep 2 lambda apart (m)."""
+
+
+@struct.dataclass
+class Forces:
+    """The parts of the field, (..., N, 3) each, without unit."""
+
+    attraction: jax.Array
+    repulsion: jax.Array  # from the nearest pillar or the wall, and from floor and ceiling
+    individual: jax.Array  # mean over the other pursuers
+
+
+def forces(parameters: ApfParameters, known: Surroundings) -> Forces:
+    """The field at each pursuer; parameters () or (..., N)."""
+    eta, rho = parameters.repulsion, parameters.influence
+
+    def push(gap):
+        """eta (1/d - 1/rho) / d^2 of the distance beyond the safe one."""
+        d = jnp.maximum(gap - SAFE_OBSTACLE, NEAREST)
+        return jnp.where(d < rho, eta * (1.0 / d - 1.0 / rho) / d**2, 0.0)
+
+    # one-hot of the nearest: a gather is slower for a handful
+    gap = jnp.min(known.obstacle_distance, axis=-1)
+    nearest = (known.obstacle_distance == gap[..., None])[..., None]
+    normal = unit(jnp.sum(jnp.where(nearest, known.obstacle_normal, 0.0), axis=-2))
+    vertical = push(known.floor_distance) - push(known.ceiling_distance)
+    distance = length(known.from_others)
+    beyond = jnp.maximum(distance - SAFE_PURSUER, NEAREST)
+    balance = jnp.asarray(parameters.balance)[..., None, None]
+    pull = -known.from_others / distance * (0.5 - balance / beyond)
+    return Forces(
+        attraction=unit(known.target - known.position),
+        repulsion=level(push(gap)[..., None] * normal) + upward(vertical),
+        individual=jnp.sum(pull, axis=-2) / max(known.from_others.shape[-2], 1),
+    )
+
+
+def apf(craft: Craft, parameters: ApfParameters, known: Surroundings) -> jax.Array:
+    """Desired velocities (..., N, 3), m/s, world: along the field, or along an obstacle that is in the way."""
+    field = forces(parameters, known)
+    total = field.attraction + field.repulsion + field.individual
+    blocked = jnp.sum((field.attraction + field.repulsion) * field.attraction, axis=-1, keepdims=True) < 0.0
+    along = wall_following(field, known.velocity)
+    return craft.speed * jnp.where(blocked, along, unit(total))
+
+
+def wall_following(field: Forces, velocity: jax.Array) -> jax.Array:
+    """(..., N, 3) unit vector along the nearest obstacle: the side to which the other pursuers push or, where they push
+    less than the evader pulls, the side to which the pursuer flies anyhow. Height is kept by the field."""
+    x, y = field.repulsion[..., 0], field.repulsion[..., 1]
+    left = jnp.stack([-y, x], axis=-1)
+    left = left / length(left)
+    pushed = length(field.individual) > 1.0
+    heading = jnp.where(pushed, field.individual, unit(velocity))[..., :2]
+    side = jnp.where(jnp.sum(left * heading, axis=-1, keepdims=True) >= 0.0, 1.0, -1.0)
+    climb = field.attraction + field.repulsion + field.individual
+    return unit(level(side * left) + upward(unit(climb)[..., 2]))

@@ -1,0 +1,66 @@
+"""DACOOP (Zhang et al., 2022, Multi-robot cooperative pursuit via potential field-enhanced reinforcement learning).
+
+A network turns the two main parameters of the potential field at every step and for each pursuer: the scale of the
+obstacles' repulsion and the balance of the force between pursuers. As in the paper, MAPPO learns them in place of D3QN,
+so they are continuous. The network is the actor that plain MAPPO has; its two outputs, in -1..1, are positions between
+the ends of both ranges, on a logarithmic scale, and the start of training flies the field that the search found.
+"""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+
+from openjax.baselines.apf import ApfParameters, apf
+from openjax.baselines.parameters import best, ranges
+from openjax.baselines.surroundings import Craft, surroundings
+from openjax.baselines.velocity_controller import velocity_action
+from openjax.policy import NetworkSettings, Policy, PredictorSettings
+from openjax.pursuit import Observation, Pursuit
+
+LEARNED = ("repulsion", "balance")
+
+
+@dataclasses.dataclass(frozen=True)
+class DacoopPolicy(Policy):
+    """A policy whose samples are parameters of the field instead of commands."""
+
+    craft: Craft = dataclasses.field(default_factory=Craft)
+
+    @classmethod
+    def for_environment(
+        cls, environment: Pursuit, network: NetworkSettings, predictor: PredictorSettings
+    ) -> "DacoopPolicy":
+        """The policy for an environment; its mean starts at the parameters of `apf`."""
+        start = best("apf", ApfParameters)
+        places = [_place(name, float(getattr(start, name))) for name in LEARNED]
+        return cls(
+            network=network,
+            predictor=predictor,
+            arena_radius=environment.settings.arena_radius,
+            arena_height=environment.settings.arena_height,
+            initial_action=tuple(math.atanh(min(max(place, -0.95), 0.95)) for place in places),
+            craft=Craft.of(environment),
+        )
+
+    def action(self, sample: jax.Array, observation: Observation) -> jax.Array:
+        """The action (..., N, 4) in -1..1 that a sample (..., N, 2) of the Gaussian, or its mean, stands for."""
+        parameters = field_parameters(super().action(sample, observation))
+        desired = apf(self.craft, parameters, surroundings(self.craft, observation))
+        return velocity_action(self.craft, observation, desired)
+
+
+def field_parameters(output: jax.Array) -> ApfParameters:
+    """The field (leaves (..., N)) that outputs (..., N, 2) in -1..1 stand for."""
+    learned = {}
+    for i, name in enumerate(LEARNED):
+        low, high = ranges(ApfParameters)[name]
+        learned[name] = low * (high / low) ** (0.5 * (output[..., i] + 1.0))
+    influence = jnp.broadcast_to(best("apf", ApfParameters).influence, output.shape[:-1])
+    return ApfParameters(influence=influence, **learned)
+
+
+def _place(name, value):
+    low, high = ranges(ApfParameters)[name]
+    return 2.0 * math.log(value / low) / math.log(high / low) - 1.0

@@ -1,0 +1,87 @@
+"""The methods without a network, as policies like any other."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from openjax.baselines.angelani import AngelaniParameters, angelani
+from openjax.baselines.apf import ApfParameters, apf
+from openjax.baselines.janosov import JanosovParameters, janosov
+from openjax.baselines.parameters import best
+from openjax.baselines.surroundings import Craft, Surroundings, surroundings
+from openjax.baselines.velocity_controller import velocity_action
+from openjax.errors import UserError
+from openjax.policy import PolicyParameters, PredictorSettings
+from openjax.pursuit import Observation, Pursuit
+
+SLOWEST_CONTROL = 0.03
+"""Control step (s) beyond which the velocity controller's attitude loop would ring."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Method:
+    """A rule that turns surroundings into desired velocities, and the kind of its parameters."""
+
+    kind: type
+    rule: Callable[[Craft, Any, Surroundings], jax.Array]
+
+
+METHODS = {
+    "angelani": Method(AngelaniParameters, angelani),
+    "janosov": Method(JanosovParameters, janosov),
+    "apf": Method(ApfParameters, apf),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Heuristic:
+    """A method of `METHODS` with the interface of `openjax.policy.Policy`; its parameters stand in the actor's place."""
+
+    name: str
+    craft: Craft = dataclasses.field(default_factory=Craft)
+    predictor: PredictorSettings = dataclasses.field(default_factory=lambda: PredictorSettings(enabled=False))
+
+    @classmethod
+    def for_environment(cls, name: str, environment: Pursuit) -> "Heuristic":
+        """A method for an environment's arena and vehicle.
+
+        Raises:
+            UserError: the velocity controller can't fly there.
+        """
+        craft, settings = Craft.of(environment), environment.settings
+        if settings.time_step > SLOWEST_CONTROL:
+            raise UserError(
+                f"{name}: its velocity controller can't fly control steps of {settings.time_step} s; "
+                f"at most {SLOWEST_CONTROL} s are possible"
+            )
+        if craft.hover_thrust > 0.8:
+            raise UserError(
+                f"{name}: a vehicle that hovers at {craft.hover_thrust:.2f} of its thrust leaves its velocity "
+                "controller no room; at most 0.8 is possible"
+            )
+        return cls(name, craft)
+
+    def parameters(self) -> PolicyParameters:
+        """The parameters that the search found."""
+        return PolicyParameters(actor=best(self.name, METHODS[self.name].kind), critic={}, predictor={})
+
+    def predict(self, parameters: PolicyParameters, observation: Observation) -> None:
+        """No method here predicts by a network."""
+
+    def distribution(
+        self, actor: Any, observation: Observation, predicted: None
+    ) -> tuple[jax.Array, jax.Array]:
+        """Action (..., N, 4) in -1..1 and log standard deviation (4,): none, heuristics don't explore."""
+        desired = METHODS[self.name].rule(self.craft, actor, surroundings(self.craft, observation))
+        return velocity_action(self.craft, observation, desired), jnp.full(4, -jnp.inf)
+
+    def action(self, sample: jax.Array, observation: Observation) -> jax.Array:
+        """The sample is the action."""
+        return sample
+
+    def act(self, parameters: PolicyParameters, observation: Observation) -> jax.Array:
+        """Action (..., N, 4) in -1..1."""
+        return self.distribution(parameters.actor, observation, None)[0]

@@ -1,0 +1,124 @@
+"""What a pursuer knows of its surroundings, read out of its observation in plain terms."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from openjax.pursuit import Observation, Pursuit
+from openjax.pursuit.settings import HIDDEN
+
+QUATERNION = slice(3, 7)
+VELOCITY = slice(7, 10)
+"""Where they stand in a pursuer's own part of the observation (`openjax.pursuit.observation`)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Craft:
+    """What a pursuer knows before it starts: its arena and its vehicle."""
+
+    arena_radius: float = 0.9
+    """m"""
+    arena_height: float = 1.2
+    """m"""
+    speed: float = 0.98
+    """Speed that the methods command (m/s): short of the largest by the velocity controller's overshoot."""
+    hover_thrust: float = 0.625
+    """Collective thrust that carries the vehicle, as a share of the largest."""
+    history_seconds: float = 0.09
+    """Time between the first and the last frame of the observed history (s)."""
+
+    @classmethod
+    def of(cls, environment: Pursuit) -> "Craft":
+        """The craft of an environment's pursuers."""
+        settings, vehicle = environment.settings, environment.vehicle
+        most = 4 * vehicle.thrust_constant * vehicle.max_rotor_speed**2
+        return cls(
+            arena_radius=settings.arena_radius,
+            arena_height=settings.arena_height,
+            speed=0.98 * settings.max_speed,
+            hover_thrust=round(float(vehicle.mass * vehicle.gravity / most), 6),
+            history_seconds=(settings.history_length - 1) * settings.history_spacing * settings.time_step,
+        )
+
+
+@struct.dataclass
+class Surroundings:
+    """N pursuers' surroundings; leading axes as in the observation. World frame, m and m/s."""
+
+    position: jax.Array  # (..., N, 3)
+    velocity: jax.Array  # (..., N, 3)
+    target: jax.Array  # (..., N, 3) the evader; where it was last seen while it is hidden, the middle before
+    target_velocity: jax.Array  # (..., N, 3) zero while it is hidden
+    from_others: jax.Array  # (..., N, N - 1, 3) position relative to each other pursuer
+    from_others_velocity: jax.Array  # (..., N, N - 1, 3) velocity relative to each other pursuer
+    team_velocity: jax.Array  # (..., N, 3) mean velocity of all pursuers
+    obstacle_normal: (
+        jax.Array
+    )  # (..., N, k + 1, 2) away from each pillar in sight and from the arena's wall, unit
+    obstacle_distance: jax.Array  # (..., N, k + 1) to their surface; infinite where there is no pillar
+    floor_distance: jax.Array  # (..., N)
+    ceiling_distance: jax.Array  # (..., N)
+
+
+def surroundings(craft: Craft, observation: Observation) -> Surroundings:
+    """Read an observation of (..., N) pursuers.
+
+    The others' velocities are those of the observed history, mean over its length (0.09 s by default): a pursuer
+    measures no velocity but its own.
+    """
+    position = observation.position
+    number = position.shape[-2]
+    newest = observation.frames[..., -1, :]
+    seen = newest[..., 1:2] > 0.9 * HIDDEN
+    per_pursuer = (*position.shape[:-2], number, 3)
+
+    def for_all(vector):
+        return jnp.broadcast_to(vector[..., None, :], per_pursuer)
+
+    moved = newest[..., 7:] - observation.frames[..., 0, 7:]
+    velocities = moved.reshape(per_pursuer) / max(craft.history_seconds, 1e-6)
+    index = jnp.array([[j for j in range(number) if j != i] for i in range(number)], jnp.int32)
+    index = index.reshape(number, number - 1)
+
+    pillar = observation.pillars
+    across = jnp.sqrt(jnp.sum(pillar[..., :2] ** 2, axis=-1) + 1e-12)
+    to_pillar = jnp.where(observation.pillar_seen, across - pillar[..., 4], jnp.inf)
+    radius = jnp.sqrt(jnp.sum(position[..., :2] ** 2, axis=-1, keepdims=True) + 1e-12)
+    normal = jnp.concatenate(
+        [pillar[..., :2] / across[..., None], (-position[..., :2] / radius)[..., None, :]], axis=-2
+    )
+    return Surroundings(
+        position=position,
+        velocity=observation.self_state[..., VELOCITY],
+        target=for_all(observation.last_seen),
+        target_velocity=for_all(jnp.where(seen, newest[..., 4:7], 0.0)),
+        from_others=observation.others[..., :3],
+        from_others_velocity=velocities[..., :, None, :] - velocities[..., index, :],
+        team_velocity=for_all(jnp.mean(velocities, axis=-2)),
+        obstacle_normal=normal,
+        obstacle_distance=jnp.concatenate([to_pillar, craft.arena_radius - radius], axis=-1),
+        floor_distance=position[..., 2],
+        ceiling_distance=craft.arena_height - position[..., 2],
+    )
+
+
+def length(vector: jax.Array) -> jax.Array:
+    """(..., 1) Euclidean length of (..., d), with a gradient at zero."""
+    return jnp.sqrt(jnp.sum(vector**2, axis=-1, keepdims=True) + 1e-12)
+
+
+def unit(vector: jax.Array) -> jax.Array:
+    """(..., d) of length one; (nearly) zero stays zero."""
+    return vector / length(vector)
+
+
+def level(vector: jax.Array) -> jax.Array:
+    """(..., 2) in the plane as (..., 3)."""
+    return jnp.concatenate([vector, jnp.zeros_like(vector[..., :1])], axis=-1)
+
+
+def upward(height: jax.Array) -> jax.Array:
+    """(...,) along z as (..., 3)."""
+    return jnp.stack([jnp.zeros_like(height), jnp.zeros_like(height), height], axis=-1)

@@ -1,0 +1,47 @@
+"""The velocity controller: a point mass's velocity as thrust and body rates of the real vehicle.
+
+A desired velocity becomes an acceleration, that a direction and size of the thrust, and the body's z axis is turned
+there: the translational half of the geometric controller of Lee, Leok and McClamroch (2010), with the attitude loop left
+to the vehicle's own rate controller. A function of the observation alone, without memory.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from openjax.baselines.surroundings import QUATERNION, VELOCITY, Craft, length, unit
+from openjax.pursuit import Observation
+from openjax.pursuit.observation import rotation_axes
+
+VELOCITY_GAIN = 6.0
+"""1/s, velocity error to acceleration: slower than the attitude, whose lag is that of the motors (25 ms) and of the turn."""
+ATTITUDE_GAIN = 15.0
+"""1/s, error of the body's z axis (rad) to body rates."""
+YAW_GAIN = 2.0
+"""1/s, yaw (rad) to yaw rate: the nose is turned to the world's x axis."""
+MAX_TILT = 0.7
+"""Tangent of the largest tilt that is commanded (35 degrees)."""
+CLIMB_LIMITS = (-0.5, 0.3)
+"""Vertical acceleration in units of gravity; thrust over weight is 1.44 with the commanded thrust cut at 0.9."""
+GRAVITY = 9.81
+"""m/s^2"""
+
+
+def velocity_action(craft: Craft, observation: Observation, desired: jax.Array) -> jax.Array:
+    """(..., N, 4) action in -1..1 (thrust, body rates) that flies the desired velocities (..., N, 3) in m/s, world."""
+    own = observation.self_state
+    body_x, body_z = rotation_axes(own[..., QUATERNION])
+    thrust = VELOCITY_GAIN / GRAVITY * (desired - own[..., VELOCITY])  # in units of the weight
+    rise = 1.0 + jnp.clip(thrust[..., 2:], *CLIMB_LIMITS)
+    lean = thrust[..., :2]
+    lean = lean * jnp.minimum(1.0, MAX_TILT * rise / length(lean))
+    thrust = jnp.concatenate([lean, rise], axis=-1)
+    share = craft.hover_thrust * jnp.sum(thrust * body_z, axis=-1)
+    turn = ATTITUDE_GAIN * jnp.cross(body_z, unit(thrust))
+    yaw = jnp.arctan2(body_x[..., 1], body_x[..., 0])
+    roll_rate, pitch_rate = _dot(turn, body_x), _dot(turn, jnp.cross(body_z, body_x))
+    rates = jnp.stack([roll_rate, pitch_rate, -YAW_GAIN * yaw], axis=-1)
+    return jnp.clip(jnp.concatenate([2.0 * share[..., None] - 1.0, rates / jnp.pi], axis=-1), -1.0, 1.0)
+
+
+def _dot(a, b):
+    return jnp.sum(a * b, axis=-1)
