@@ -38,7 +38,7 @@ class BenchmarkCommand:
     """Measure steps per second of each layer, from the physics to the whole training step."""
 
     preset: str | None = None
-    """quick or paper: networks and learner; by default what fits the machine."""
+    """quick, paper, flight, mappo or dacoop: networks and learner; by default what fits the machine."""
     envs: tuple[int, ...] = ()
     """Environment counts; by default a sweep that fits the machine."""
     training_envs: tuple[int, ...] = ()

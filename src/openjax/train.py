@@ -1,4 +1,4 @@
-"""Train pursuers: `python -m openjax.train [--preset quick|paper] [--out DIR] [--any.setting value]`.
+"""Train pursuers: `python -m openjax.train [--preset NAME] [--out DIR] [--any.setting value]`.
 
 Writes a run directory (see `openjax.store.run_directory`) with logs, checkpoints, the best policy and
 pictures. Ctrl-C or SIGTERM saves and exits; `--resume DIR` goes on exactly where it stopped.

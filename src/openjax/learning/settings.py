@@ -225,7 +225,29 @@ def flight() -> TrainSettings:
     )
 
 
-PRESETS = {"quick": quick, "paper": paper, "flight": flight}
+def mappo() -> TrainSettings:
+    """The paper's plain MAPPO, without predictor and generator, with penalties under which it learns to catch: where a
+    first crash costs 5,000, only the generator's tasks lead past hovering."""
+    base = paper()
+    reward = dataclasses.replace(base.environment.reward, first_crash=0.0)
+    return dataclasses.replace(
+        base,
+        environment=dataclasses.replace(base.environment, reward=reward),
+        predictor=dataclasses.replace(base.predictor, enabled=False),
+        generator=dataclasses.replace(base.generator, enabled=False),
+        restart_close=0.0,
+    )
+
+
+def dacoop() -> TrainSettings:
+    """DACOOP: plain MAPPO puts out the parameters of a potential field (`openjax.baselines.dacoop`)."""
+    base = mappo()
+    return dataclasses.replace(
+        base, network=dataclasses.replace(base.network, output="field"), total_steps=100_000_000
+    )
+
+
+PRESETS = {"quick": quick, "paper": paper, "flight": flight, "mappo": mappo, "dacoop": dacoop}
 
 
 def preset(name: str, **changes) -> TrainSettings:
