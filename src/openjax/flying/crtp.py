@@ -1,0 +1,105 @@
+"""CRTP, the protocol between a Crazyflie and a ground station: ports, types, packed numbers.
+
+Facts from Bitcraze's protocol documentation (https://www.bitcraze.io/documentation/repository/crazyflie-firmware/
+master/functional-areas/crtp/); a packet is one byte of header and up to 30 bytes of data.
+"""
+
+from __future__ import annotations
+
+import struct
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+
+PROTOCOL_VERSION = 12
+"""The version answered: tables of contents with 16-bit ids (4 and up), arming by the supervisor's port (12)."""
+MAX_DATA = 30
+MAX_LOG_DATA = 26
+"""Bytes of variables in one log packet; the rest is the block's id and the time stamp."""
+FULL_SCALE = 65535
+"""Motor commands, thrust set-points: 16 bit."""
+
+
+class Port(IntEnum):
+    CONSOLE = 0x0
+    PARAMETERS = 0x2
+    COMMANDER = 0x3
+    MEMORY = 0x4
+    LOG = 0x5
+    LOCALIZATION = 0x6
+    COMMANDER_GENERIC = 0x7
+    SUPERVISOR = 0x9
+    PLATFORM = 0xD
+    LINK = 0xF
+
+
+class Packet(NamedTuple):
+    """One packet: port 0..15, channel 0..3, data."""
+
+    port: int
+    channel: int
+    data: bytes
+
+    def encode(self) -> bytes:
+        """The packet as it is sent. The two middle bits of the header are set, as ever."""
+        return bytes([(self.port << 4) | 0x0C | self.channel]) + self.data
+
+
+def decode(raw: bytes) -> Packet:
+    """The packet in `raw`, which holds at least its header."""
+    return Packet(raw[0] >> 4, raw[0] & 0x03, raw[1:])
+
+
+# Names of C types -> (number in the table of contents, struct format).
+LOG_TYPES = {
+    "uint8_t": (1, "B"),
+    "uint16_t": (2, "H"),
+    "uint32_t": (3, "I"),
+    "int8_t": (4, "b"),
+    "int16_t": (5, "h"),
+    "int32_t": (6, "i"),
+    "float": (7, "f"),
+    "FP16": (8, "e"),
+}
+PARAMETER_TYPES = {"uint8_t": (0x08, "B"), "uint16_t": (0x09, "H"), "float": (0x06, "f")}
+READ_ONLY = 0x40
+"""Added to a parameter's type in the table of contents."""
+LOG_FORMATS = dict(LOG_TYPES.values())
+_INTEGER_BITS = {"B": (0, 8), "H": (0, 16), "I": (0, 32), "b": (1, 8), "h": (1, 16), "i": (1, 32)}
+
+
+def pack_number(fmt: str, value: float) -> bytes:
+    """`value` in the struct format `fmt`, cut to what an integer type holds."""
+    if fmt in _INTEGER_BITS:
+        signed, bits = _INTEGER_BITS[fmt]
+        low, high = (-(1 << (bits - 1)), (1 << (bits - 1)) - 1) if signed else (0, (1 << bits) - 1)
+        value = min(max(round(value), low), high)
+    return struct.pack("<" + fmt, value)
+
+
+def compress_quaternion(wxyz) -> int:
+    """A unit quaternion (4,) wxyz in 32 bits: which component is largest, then sign and 9 bits of the others."""
+    xyzw = np.roll(np.asarray(wxyz, float), -1)
+    xyzw = xyzw / np.linalg.norm(xyzw)
+    largest = int(np.argmax(np.abs(xyzw)))
+    packed = largest
+    for i in range(4):
+        if i != largest:
+            negative = int((xyzw[i] < 0) != (xyzw[largest] < 0))
+            size = min(round(511 * abs(xyzw[i]) * 2**0.5), 511)
+            packed = packed << 10 | negative << 9 | size
+    return packed
+
+
+def expand_quaternion(packed: int) -> np.ndarray:
+    """(4,) wxyz from 32 bits, see `compress_quaternion`; precise to about 1e-3."""
+    xyzw, largest, square = np.zeros(4), packed >> 30, 0.0
+    for i in (3, 2, 1, 0):
+        if i != largest:
+            value = (packed & 0x1FF) / 511 / 2**0.5
+            xyzw[i] = -value if packed & 0x200 else value
+            square += value * value
+            packed >>= 10
+    xyzw[largest] = max(0.0, 1.0 - square) ** 0.5
+    return np.roll(xyzw, 1)

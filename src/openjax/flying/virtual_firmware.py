@@ -1,0 +1,432 @@
+"""What a Crazyflie's firmware answers over CRTP: parameters, log blocks, set-points, arming, external pose.
+
+One vehicle, without sockets or clock: packets in, packets out. Set-points of body rates or angles with thrust are
+flown; position set-points, trajectories and memories are not there.
+"""
+
+from __future__ import annotations
+
+import errno
+import struct
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from openjax.flying.crtp import (
+    FULL_SCALE,
+    LOG_FORMATS,
+    LOG_TYPES,
+    MAX_LOG_DATA,
+    PARAMETER_TYPES,
+    PROTOCOL_VERSION,
+    READ_ONLY,
+    Packet,
+    Port,
+    compress_quaternion,
+    decode,
+    pack_number,
+)
+
+LEVEL_AFTER = 0.5
+"""Set-points older than this (s) are replaced by a level attitude at the same thrust (firmware: supervisor.c)."""
+STOP_AFTER = 2.0
+"""Set-points older than this (s) stop the motors and disarm."""
+WATCHDOG = 1.0
+"""Once an emergency-stop watchdog was started, it stops the motors unless it is repeated within this time (s)."""
+MAX_BLOCKS = 16
+MAX_VARIABLES = 128
+THRUST_CUT = 60000
+"""The legacy commander cuts thrust here and takes less than 1000 as none (16 bit)."""
+
+OFF, RATES, ANGLES = 0.0, 1.0, 2.0
+"""Modes of a set-point."""
+
+
+@dataclass(frozen=True)
+class SetPoint:
+    """What the stabiliser is asked for: roll, pitch (rad or, by `mode`, rad/s), yaw rate (rad/s), thrust 0..1."""
+
+    mode: float = OFF
+    roll: float = 0.0
+    pitch: float = 0.0
+    yaw_rate: float = 0.0
+    thrust: float = 0.0
+
+    def array(self) -> np.ndarray:
+        """(5,) float32 in the order of the fields."""
+        return np.array([self.mode, self.roll, self.pitch, self.yaw_rate, self.thrust], np.float32)
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """What the firmware knows of its vehicle; SI units, frames as everywhere in openjax."""
+
+    position: np.ndarray  # (3,) m
+    velocity: np.ndarray  # (3,) m/s
+    quaternion: np.ndarray  # (4,) wxyz
+    body_rates: np.ndarray  # (3,) rad/s
+    specific_force: np.ndarray  # (3,) m/s^2, body
+    motor_command: np.ndarray  # (4,) 0..1
+    voltage: float = 4.1  # V
+
+
+def _roll_pitch_yaw(q):
+    """Degrees; pitch with the firmware's inverted sign."""
+    w, x, y, z = q
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return np.degrees(roll), -np.degrees(pitch), np.degrees(yaw)
+
+
+def _log_variables() -> dict[str, tuple[str, Callable]]:
+    """Name -> C type and value of (firmware, sensors): the variables that a flight needs, named as on board."""
+    table: dict[str, tuple[str, Callable]] = {}
+    for i, axis in enumerate("xyz"):
+        table[f"stateEstimate.{axis}"] = ("float", lambda f, s, i=i: s.position[i])
+        table[f"stateEstimate.v{axis}"] = ("float", lambda f, s, i=i: s.velocity[i])
+        table[f"stateEstimateZ.{axis}"] = ("int16_t", lambda f, s, i=i: 1000 * s.position[i])
+        table[f"stateEstimateZ.v{axis}"] = ("int16_t", lambda f, s, i=i: 1000 * s.velocity[i])
+        table[f"acc.{axis}"] = ("float", lambda f, s, i=i: s.specific_force[i] / 9.81)
+        table[f"gyro.{axis}"] = ("float", lambda f, s, i=i: np.degrees(s.body_rates[i]))
+        table[f"locSrv.{axis}"] = ("float", lambda f, s, i=i: f.external_pose[i])
+    for i, name in enumerate(("roll", "pitch", "yaw")):
+        table[f"stateEstimate.{name}"] = ("float", lambda f, s, i=i: _roll_pitch_yaw(s.quaternion)[i])
+    for i, name in enumerate(("qw", "qx", "qy", "qz")):
+        table[f"stateEstimate.{name}"] = ("float", lambda f, s, i=i: s.quaternion[i])
+        table[f"locSrv.{name}"] = ("float", lambda f, s, i=i: f.external_pose[3 + i])
+        table[f"motor.m{i + 1}"] = ("uint16_t", lambda f, s, i=i: FULL_SCALE * s.motor_command[i])
+    table["stateEstimateZ.quat"] = ("uint32_t", lambda f, s: compress_quaternion(s.quaternion))
+    table["pm.vbat"] = ("float", lambda f, s: s.voltage)
+    table["pm.vbatMV"] = ("uint16_t", lambda f, s: 1000 * s.voltage)
+    table["supervisor.info"] = ("uint16_t", lambda f, s: f.supervisor_info)
+    return dict(sorted(table.items()))
+
+
+LOG_VARIABLES = _log_variables()
+_LOG_NAMES = tuple(LOG_VARIABLES)
+PARAMETERS = {
+    "commander.enHighLevel": ("uint8_t", 0),
+    "firmware.modified": ("uint8_t", 1),
+    "firmware.revision0": ("uint16_t", 0),
+    "flightmode.stabModePitch": ("uint8_t", 1),
+    "flightmode.stabModeRoll": ("uint8_t", 1),
+    "flightmode.stabModeYaw": ("uint8_t", 0),
+    "kalman.resetEstimation": ("uint8_t", 0),
+    "locSrv.extPosStdDev": ("float", 0.01),
+    "locSrv.extQuatStdDev": ("float", 4.5e-3),
+    "stabilizer.controller": ("uint8_t", 1),
+    "stabilizer.estimator": ("uint8_t", 2),
+}
+"""Name -> C type and first value. Written values are kept and change nothing."""
+_PARAMETER_NAMES = tuple(PARAMETERS)
+_READ_ONLY_GROUP = "firmware"
+
+
+def _crc(table) -> int:
+    return zlib.crc32(repr([(name, table[name][0]) for name in table]).encode())
+
+
+LOG_CRC, PARAMETER_CRC = _crc(LOG_VARIABLES), _crc(PARAMETERS)
+
+
+@dataclass
+class _Block:
+    variables: list[tuple[str, str]] = field(default_factory=list)  # name, struct format
+    period: float = 0.0  # s; 0 while stopped
+    due: float = 0.0  # s
+
+    def size(self) -> int:
+        return sum(struct.calcsize(fmt) for _, fmt in self.variables)
+
+
+class VirtualFirmware:
+    """One virtual Crazyflie's firmware. Times are seconds of one clock that the caller owns."""
+
+    def __init__(self, needs_arming: bool = True):
+        """`needs_arming`: motors stay off until armed; otherwise armed from the start, as on brushed Crazyflies."""
+        self.auto_arm = not needs_arming
+        self.armed = self.auto_arm
+        self.crashed = False
+        self.emergency = False
+        self.flying = False
+        self.external_pose = np.array([0, 0, 0, 1, 0, 0, 0], float)  # position, quaternion wxyz
+        self.external_poses = 0
+        self.parameters = {name: value for name, (_, value) in PARAMETERS.items()}
+        self._blocks: dict[int, _Block] = {}
+        self._set_point = SetPoint()
+        self._set_point_time: float | None = None
+        self._watchdog_time: float | None = None
+        self.set_points = 0
+
+    # -- set-points and supervision
+
+    @property
+    def supervisor_info(self) -> int:
+        """The supervisor's bits: can be armed, is armed, auto arming, can fly, is flying, tumbled, locked, crashed."""
+        ready = not (self.crashed or self.emergency)
+        bits = (
+            ready and not self.armed,
+            self.armed,
+            self.auto_arm,
+            ready and self.armed,
+            self.flying,
+            self.crashed,
+            self.emergency,
+            self.crashed,
+        )
+        return sum(int(bit) << i for i, bit in enumerate(bits))
+
+    def set_point(self, now: float) -> SetPoint:
+        """What the stabiliser is asked for at `now`, watchdogs and supervision included."""
+        if self._watchdog_time is not None and now - self._watchdog_time > WATCHDOG:
+            self.emergency = True
+        if self._set_point_time is None or not self.armed or self.crashed or self.emergency:
+            return SetPoint()
+        age = now - self._set_point_time
+        if age > STOP_AFTER:
+            self._disarm()
+            return SetPoint()
+        if self._set_point.mode != OFF and age > LEVEL_AFTER:
+            return SetPoint(ANGLES, 0.0, 0.0, 0.0, self._set_point.thrust)
+        return self._set_point
+
+    def crash(self) -> None:
+        """The vehicle hit something: motors off until a recovery is asked for."""
+        self.crashed = True
+        self._disarm()
+
+    def _disarm(self):
+        self.armed, self._set_point, self._set_point_time = self.auto_arm, SetPoint(), None
+
+    # -- packets in
+
+    def receive(self, raw: bytes, now: float) -> list[bytes]:
+        """Answers to one packet. What can't be understood is left without one, as on board."""
+        if not raw:
+            return []
+        if raw == b"\xff":  # the null packet of a scan
+            return [raw]
+        packet = decode(raw)
+        handler = {
+            Port.LINK: self._link,
+            Port.PLATFORM: self._platform,
+            Port.SUPERVISOR: self._supervisor,
+            Port.LOG: self._log,
+            Port.PARAMETERS: self._parameter,
+            Port.MEMORY: self._memory,
+            Port.LOCALIZATION: self._localization,
+            Port.COMMANDER: self._commander,
+            Port.COMMANDER_GENERIC: self._generic,
+        }.get(packet.port)
+        if handler is None:
+            return []
+        try:
+            answers = handler(packet, now)
+        except (struct.error, IndexError):  # shorter than its kind
+            return []
+        return [answer.encode() for answer in answers]
+
+    def _link(self, packet, now):
+        if packet.channel == 0:  # echo
+            return [packet]
+        return [packet._replace(data=b"Bitcraze Crazyflie\0")] if packet.channel == 1 else []
+
+    def _platform(self, packet, now):
+        command = packet.data[0]
+        if packet.channel == 1:
+            answer = {0: bytes([PROTOCOL_VERSION]), 1: b"openjax virtual", 2: b"CF21"}.get(command, b"")
+            return [packet._replace(data=bytes([command]) + answer)]
+        if packet.channel == 0 and command == 1:
+            return [packet._replace(data=bytes([command, *self._arm(bool(packet.data[1]))]))]
+        return []
+
+    def _arm(self, do_arm):
+        """Success, and whether it's armed now."""
+        if do_arm:
+            success = not (self.crashed or self.emergency)
+            self.armed = success or self.auto_arm
+        else:
+            success = True
+            self._disarm()
+        return int(success), int(self.armed)
+
+    def _supervisor(self, packet, now):
+        command = packet.data[0]
+        answer = None
+        if packet.channel == 0 and command == 0x0C:
+            answer = struct.pack("<H", self.supervisor_info)
+        elif packet.channel == 1 and command == 0x01:
+            answer = bytes(self._arm(bool(packet.data[1])))
+        elif packet.channel == 1 and command == 0x02:
+            self.crashed = False
+            answer = bytes([1, 1])
+        elif packet.channel == 1 and command == 0x03:
+            self.emergency = True
+            answer = b""
+        elif packet.channel == 1 and command == 0x04:
+            self._watchdog_time = now
+            answer = b""
+        return [] if answer is None else [packet._replace(data=bytes([command | 0x80]) + answer)]
+
+    def _memory(self, packet, now):
+        return [packet._replace(data=b"\x01\x00")] if packet.channel == 0 and packet.data[0] == 1 else []
+
+    def _localization(self, packet, now):
+        if packet.channel == 0:
+            self.external_pose[:3] = struct.unpack("<3f", packet.data[:12])
+            self.external_poses += 1
+        elif packet.data[0] == 8:
+            x, y, z, qx, qy, qz, qw = struct.unpack("<7f", packet.data[1:29])
+            self.external_pose[:] = x, y, z, qw, qx, qy, qz
+            self.external_poses += 1
+        elif packet.data[0] == 3:
+            self.emergency = True
+        elif packet.data[0] == 4:
+            self._watchdog_time = now
+        return []
+
+    def _commander(self, packet, now):
+        roll, pitch, yaw_rate, thrust = struct.unpack("<fffH", packet.data[:14])
+        thrust = 0 if thrust < 1000 else min(thrust, THRUST_CUT)
+        rates = self.parameters["flightmode.stabModeRoll"] == 0
+        self._accept(RATES if rates else ANGLES, roll, pitch, yaw_rate, thrust, now)
+        return []
+
+    def _generic(self, packet, now):
+        if packet.channel != 0:
+            return []
+        if packet.data[0] == 0:
+            self._set_point, self._set_point_time = SetPoint(), now
+            self.set_points += 1
+        elif packet.data[0] == 11:
+            roll, pitch, yaw_rate, thrust, rate = struct.unpack("<fffHB", packet.data[1:16])
+            self._accept(RATES if rate else ANGLES, roll, pitch, yaw_rate, thrust, now)
+        return []
+
+    def _accept(self, mode, roll, pitch, yaw_rate, thrust, now):
+        """Degrees in the firmware's frame, where pitch points the other way."""
+        if not all(map(np.isfinite, (roll, pitch, yaw_rate))):
+            return
+        self.set_points += 1
+        roll, pitch, yaw_rate = np.radians((roll, -pitch, yaw_rate)).tolist()
+        self._set_point_time = now
+        self._set_point = (
+            SetPoint() if thrust == 0 else SetPoint(mode, roll, pitch, yaw_rate, thrust / (FULL_SCALE + 1))
+        )
+
+    # -- tables of contents
+
+    def _contents(self, packet, names, crc, limits, type_of):
+        command = packet.data[0]
+        if command == 3:
+            return [packet._replace(data=struct.pack("<BHI", 3, len(names), crc) + limits)]
+        if command == 2:
+            (ident,) = struct.unpack("<H", packet.data[1:3])
+            if ident >= len(names):
+                return [packet._replace(data=b"\x02")]
+            name = names[ident].replace(".", "\0").encode() + b"\0"
+            return [packet._replace(data=packet.data[:3] + bytes([type_of(names[ident])]) + name)]
+        return []
+
+    def _log(self, packet, now):
+        if packet.channel == 0:
+            return self._contents(
+                packet,
+                _LOG_NAMES,
+                LOG_CRC,
+                bytes([MAX_BLOCKS, MAX_VARIABLES]),
+                lambda name: LOG_TYPES[LOG_VARIABLES[name][0]][0],
+            )
+        if packet.channel != 1:
+            return []
+        command = packet.data[0]
+        ident = packet.data[1] if len(packet.data) > 1 else 0
+        return [packet._replace(data=bytes([command, ident, self._log_control(command, ident, packet, now)]))]
+
+    def _log_control(self, command, ident, packet, now) -> int:
+        """The status of a command on log blocks: 0 or an errno."""
+        if command == 5:
+            self._blocks.clear()
+            return 0
+        if command == 6:
+            if ident in self._blocks:
+                return errno.EEXIST
+            if len(self._blocks) >= MAX_BLOCKS:
+                return errno.ENOMEM
+            self._blocks[ident] = _Block()
+            return self._append(ident, packet.data[2:])
+        if command not in (2, 3, 4, 7, 8):
+            return errno.ENOEXEC
+        if ident not in self._blocks:
+            return errno.ENOENT
+        block = self._blocks[ident]
+        if command == 2:
+            del self._blocks[ident]
+        elif command == 4:
+            block.period = 0.0
+        elif command == 7:
+            return self._append(ident, packet.data[2:])
+        else:
+            block.period = packet.data[2] * 0.01
+            if command == 8:
+                block.period = struct.unpack("<H", packet.data[2:4])[0] * 1e-3
+            block.due = now + block.period
+        return 0
+
+    def _append(self, ident, data) -> int:
+        block = self._blocks[ident]
+        for kind, variable in struct.iter_unpack("<BH", data[: len(data) // 3 * 3]):
+            if variable >= len(_LOG_NAMES) or kind & 0x0F not in LOG_FORMATS:
+                return errno.ENOENT
+            fmt = LOG_FORMATS[kind & 0x0F]
+            if block.size() + struct.calcsize(fmt) > MAX_LOG_DATA:
+                return errno.E2BIG
+            if sum(len(b.variables) for b in self._blocks.values()) >= MAX_VARIABLES:
+                return errno.ENOMEM
+            block.variables.append((_LOG_NAMES[variable], fmt))
+        return 0
+
+    def _parameter(self, packet, now):
+        if packet.channel == 0:
+
+            def type_of(name):
+                read_only = name.split(".")[0] == _READ_ONLY_GROUP
+                return PARAMETER_TYPES[PARAMETERS[name][0]][0] | (READ_ONLY if read_only else 0)
+
+            return self._contents(packet, _PARAMETER_NAMES, PARAMETER_CRC, b"", type_of)
+        if packet.channel in (1, 2):
+            (ident,) = struct.unpack("<H", packet.data[:2])
+            if ident >= len(_PARAMETER_NAMES):
+                return [packet._replace(data=packet.data[:2] + bytes([errno.ENOENT]))]
+            name = _PARAMETER_NAMES[ident]
+            fmt = PARAMETER_TYPES[PARAMETERS[name][0]][1]
+            if packet.channel == 2 and name.split(".")[0] != _READ_ONLY_GROUP:
+                (self.parameters[name],) = struct.unpack("<" + fmt, packet.data[2:])
+            status = b"\0" if packet.channel == 1 else b""
+            return [packet._replace(data=packet.data[:2] + status + pack_number(fmt, self.parameters[name]))]
+        return [packet._replace(data=packet.data[:3] + bytes([errno.ENOENT]))]
+
+    # -- log data out
+
+    def next_log(self) -> float:
+        """When the next log packet is due (s); infinite if no block runs."""
+        return min((b.due for b in self._blocks.values() if b.period > 0), default=np.inf)
+
+    def log_packets(self, now: float, sensors: Sensors) -> list[bytes]:
+        """The log packets due at `now`, stamped with it in milliseconds."""
+        packets = []
+        for ident, block in self._blocks.items():
+            if block.period <= 0 or now < block.due:
+                continue
+            block.due += block.period
+            if block.due <= now:  # too late for the ones between, which are left out
+                block.due = now + block.period
+            stamp = struct.pack("<I", int(now * 1000) & 0xFFFFFF)[:3]
+            values = b"".join(
+                pack_number(fmt, LOG_VARIABLES[name][1](self, sensors)) for name, fmt in block.variables
+            )
+            packets.append(Packet(Port.LOG, 2, bytes([ident]) + stamp + values).encode())
+        return packets

@@ -1,0 +1,116 @@
+"""The link of a virtual Crazyflie: UDP, one packet a datagram, with latency, jitter and loss to order."""
+
+from __future__ import annotations
+
+import heapq
+import random
+import socket
+from dataclasses import dataclass
+
+from openjax.errors import UserError
+from openjax.flying.crtp import Port
+
+BASE_PORT = 19850
+"""`cflib` scans this port and the nine after it."""
+
+
+@dataclass(frozen=True)
+class LinkFaults:
+    """What the link does to the two streams of a flight. Requests and their answers pass: a radio sends them again."""
+
+    latency_ms: float = 0.0
+    """Set-points arrive this much later (ms)."""
+    jitter_ms: float = 0.0
+    """Up to this much more, drawn for each set-point (ms)."""
+    loss: float = 0.0
+    """Share of the set-points that never arrive."""
+    pose_latency_ms: float = 0.0
+    """Log data arrive this much later (ms)."""
+    pose_loss: float = 0.0
+    """Share of the log data that never arrive."""
+
+    def __post_init__(self):
+        for name in ("loss", "pose_loss"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise UserError(f"--{name} is {getattr(self, name)}; a share from 0 to 1 would be right")
+        for name in ("latency_ms", "jitter_ms", "pose_latency_ms"):
+            if not 0.0 <= getattr(self, name) <= 1000.0:
+                raise UserError(f"--{name} is {getattr(self, name)}; 0 to 1000 would be right")
+
+
+class VirtualLink:
+    """One vehicle's socket. Times are those of the caller's clock, in seconds."""
+
+    def __init__(self, host: str, port: int, faults: LinkFaults, seed: int):
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self.socket.bind((host, port))
+        except OSError as error:
+            self.socket.close()
+            raise UserError(
+                f"UDP port {port} of {host} can't be had ({error.strerror}); choose another --port"
+            ) from error
+        self.socket.setblocking(False)
+        self.faults, self._random, self._peer = faults, random.Random(seed), None
+        self._incoming: list = []
+        self._outgoing: list = []
+        self._count = 0
+        self.lost = 0
+
+    @property
+    def port(self) -> int:
+        return self.socket.getsockname()[1]
+
+    def poll(self, now: float) -> None:
+        """Take in what has arrived at the socket."""
+        while True:
+            try:
+                raw, peer = self.socket.recvfrom(64)
+            except BlockingIOError:
+                return
+            except ConnectionError:  # a peer that has gone
+                continue
+            if not raw:
+                continue
+            self._peer = peer
+            delay = 0.0
+            if raw[0] >> 4 in (Port.COMMANDER, Port.COMMANDER_GENERIC):
+                if self._random.random() < self.faults.loss:
+                    self.lost += 1
+                    continue
+                jitter = self._random.random() * self.faults.jitter_ms
+                delay = 1e-3 * (self.faults.latency_ms + jitter)
+            self._count += 1
+            heapq.heappush(self._incoming, (now + delay, self._count, raw))
+
+    def next_due(self) -> float:
+        """When the next packet in either direction is due; infinite if none waits."""
+        return min((queue[0][0] for queue in (self._incoming, self._outgoing) if queue), default=float("inf"))
+
+    def received(self, now: float):
+        """The packets that have come through by `now`, in order: time, bytes."""
+        while self._incoming and self._incoming[0][0] <= now:
+            due, _, raw = heapq.heappop(self._incoming)
+            yield due, raw
+
+    def send(self, raw: bytes, now: float) -> None:
+        """Send a packet to whoever spoke last."""
+        log_data = raw[0] >> 4 == Port.LOG and raw[0] & 3 == 2
+        if log_data and self._random.random() < self.faults.pose_loss:
+            return
+        self._count += 1
+        delay = 1e-3 * self.faults.pose_latency_ms if log_data else 0.0
+        heapq.heappush(self._outgoing, (now + delay, self._count, raw))
+
+    def flush(self, now: float) -> None:
+        """Put on the wire what is due."""
+        while self._outgoing and self._outgoing[0][0] <= now:
+            _, _, raw = heapq.heappop(self._outgoing)
+            if self._peer is not None:
+                try:
+                    self.socket.sendto(raw, self._peer)
+                except OSError:  # nobody listens there any more
+                    pass
+
+    def close(self) -> None:
+        self.socket.close()

@@ -1,0 +1,95 @@
+"""`python -m openjax.virtual_crazyflie`: Crazyflies that are simulated, for everything that speaks to real ones.
+
+They answer CRTP over UDP as `cflib` expects (`udp://127.0.0.1:19850` and on); inside fly openjax's vehicles in real
+time, rate loop at 500 Hz, with any effects, and a link with latency and loss to order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import tyro
+
+from openjax.errors import UserError
+from openjax.flying.virtual_link import BASE_PORT, LinkFaults
+from openjax.runs.command_line import output_console, parse, run_command
+
+PROGRAM = "python -m openjax.virtual_crazyflie"
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Fly virtual Crazyflies until interrupted; each has a port of its own."""
+
+    number: int = 3
+    """How many."""
+    host: str = "127.0.0.1"
+    """Address to listen at."""
+    port: int = BASE_PORT
+    """UDP port of the first; cflib's scan looks at 19850 to 19859."""
+    scenario: str = "wall"
+    """They stand below the pursuers' starts of this layout (a name or a TOML file); more of them in a row behind."""
+    vehicle: Path | None = None
+    """The vehicle inside (vehicle.toml); by default the nominal Crazyflie."""
+    effects: Path | None = None
+    """Physical effects that it suffers from (effects.toml)."""
+    battery: float = 1.0
+    """Charge at the start, 0 to 1."""
+    endurance: float = 420.0
+    """Seconds of hover that a full battery lasts."""
+    needs_arming: bool = True
+    """Motors stay off until armed; False: armed from the start, as brushed Crazyflies are."""
+    seconds: float = float("inf")
+    """End after this time."""
+    seed: int = 0
+    """Draws losses and jitter."""
+    link: tyro.conf.OmitArgPrefixes[LinkFaults] = field(default_factory=LinkFaults)
+
+
+def make(arguments: Arguments):
+    """The virtual Crazyflies, listening. Raises UserError for what can't be."""
+    from openjax.flying.virtual_process import VirtualCrazyflies
+    from openjax.flying.virtual_vehicles import VirtualVehicles
+    from openjax.pursuit import PursuitSettings, find_scenario
+    from openjax.vehicle.effects import load_effects
+    from openjax.vehicle.vehicle_file import load_vehicle_file
+
+    if not 1 <= arguments.number <= 10:
+        raise UserError(f"--number is {arguments.number}; 1 to 10 are possible")
+    if not 0.0 <= arguments.battery <= 1.0 or not arguments.endurance > 0.0:
+        raise UserError("--battery must lie between 0 and 1, --endurance above 0 s")
+    scenario = find_scenario(arguments.scenario, PursuitSettings())
+    stands = [start[:2] for start in scenario.pursuers][: arguments.number]
+    stands += [(0.2 * i, -1.4) for i in range(arguments.number - len(stands))]
+    effects, parameters = load_effects(arguments.effects) if arguments.effects else ((), {})
+    vehicles = VirtualVehicles(
+        load_vehicle_file(arguments.vehicle).vehicle,
+        stands,
+        effects,
+        parameters,
+        arguments.battery,
+        arguments.endurance,
+    )
+    return VirtualCrazyflies(
+        vehicles, arguments.host, arguments.port, arguments.link, arguments.seed, arguments.needs_arming
+    )
+
+
+def main(arguments: Sequence[str]) -> None:
+    parsed = parse(Arguments, Arguments(), arguments, PROGRAM)
+    virtual = make(parsed)
+    console = output_console()
+    try:
+        console.print(f"listening: --uri {' '.join(virtual.uris)}")
+        virtual.run(lambda: virtual.time >= parsed.seconds)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        virtual.close()
+    console.print(f"{virtual.time:.0f} s; {virtual.late} steps late by more than 20 ms")
+
+
+if __name__ == "__main__":
+    run_command(main)
