@@ -28,6 +28,7 @@ from openjax.flying.crtp import (
     decode,
     pack_number,
 )
+from openjax.flying.set_point import ANGLES, OFF, RATES, SetPoint
 
 LEVEL_AFTER = 0.5
 """Set-points older than this (s) are replaced by a level attitude at the same thrust (firmware: supervisor.c)."""
@@ -39,24 +40,6 @@ MAX_BLOCKS = 16
 MAX_VARIABLES = 128
 THRUST_CUT = 60000
 """The legacy commander cuts thrust here and takes less than 1000 as none (16 bit)."""
-
-OFF, RATES, ANGLES = 0.0, 1.0, 2.0
-"""Modes of a set-point."""
-
-
-@dataclass(frozen=True)
-class SetPoint:
-    """What the stabiliser is asked for: roll, pitch (rad or, by `mode`, rad/s), yaw rate (rad/s), thrust 0..1."""
-
-    mode: float = OFF
-    roll: float = 0.0
-    pitch: float = 0.0
-    yaw_rate: float = 0.0
-    thrust: float = 0.0
-
-    def array(self) -> np.ndarray:
-        """(5,) float32 in the order of the fields."""
-        return np.array([self.mode, self.roll, self.pitch, self.yaw_rate, self.thrust], np.float32)
 
 
 @dataclass(frozen=True)

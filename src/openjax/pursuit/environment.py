@@ -209,23 +209,33 @@ class Pursuit:
         del key
         settings, task = self.settings, state.task
         action = jnp.clip(action.astype(jnp.float32), -1.0, 1.0)
-        pillars = (task.pillar_position, task.pillar_active)
-
-        velocity = evader_velocity(
-            settings, state.evader_position, state.drones.position, state.in_sight, *pillars
-        )
-        evader = state.evader_position + settings.time_step * velocity
-
         drones = self._drones_step(
             self.vehicle,
             state.drones,
             action_to_command(action),
-            *pillars,
+            task.pillar_position,
+            task.pillar_active,
             self._parameters(state.vehicles),
         )
         if settings.speed_limit == "clamp":
             speed = jnp.sqrt(jnp.sum(drones.velocity**2, axis=-1, keepdims=True) + 1e-12)
             drones = drones.replace(velocity=drones.velocity * jnp.minimum(1.0, settings.max_speed / speed))
+        return self.follow(state, action, drones)
+
+    def follow(
+        self, state: PursuitState, action: jax.Array, drones: DroneState
+    ) -> tuple[Observation, PursuitState, jax.Array, jax.Array, jax.Array, StepInfo]:
+        """The game's part of a step that began at `state` with `action` and ended with the pursuers as `drones`.
+
+        `step` is physics and this; where the pursuers are flown by something else, real vehicles say, this alone.
+        Returns what `step` does.
+        """
+        settings, task = self.settings, state.task
+        pillars = (task.pillar_position, task.pillar_active)
+        velocity = evader_velocity(
+            settings, state.evader_position, state.drones.position, state.in_sight, *pillars
+        )
+        evader = state.evader_position + settings.time_step * velocity
 
         step = state.step + 1
         position = drones.position

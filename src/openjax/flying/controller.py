@@ -1,0 +1,101 @@
+"""Flying to a point: position and velocity to a set-point, for take-off, waiting, landing and getting out of trouble.
+
+A cascade of proportional loops; what it asks for beyond hovering is small, so it needs no more of the vehicle than the
+thrust at which it hovers. Plain numbers instead of arrays: it runs a few times per tick, where JAX would cost more.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from openjax.flying.set_point import ANGLES, RATES, SetPoint
+
+Vector = tuple[float, float, float]
+GRAVITY = 9.81
+POSITION_GAIN = 2.5
+"""Velocity asked for per position error (1/s)."""
+VELOCITY_GAIN = 5.0
+"""Acceleration asked for per velocity error (1/s)."""
+ANGLE_GAIN = 8.0
+"""Body rate asked for per angle error (1/s), where body rates are sent."""
+YAW_GAIN = 1.5
+TILT_LIMIT = math.radians(35.0)
+CLIMB_LIMIT = 4.0
+"""Largest vertical acceleration asked for (m/s^2)."""
+
+
+class Pose(NamedTuple):
+    """Where a vehicle is; world frame, SI units, quaternion wxyz body to world."""
+
+    time: float  # s, host clock, when it was measured
+    position: Vector
+    velocity: Vector
+    quaternion: tuple[float, float, float, float]
+    body_rates: Vector = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Airframe:
+    """What the controller knows of a vehicle."""
+
+    hover_thrust: float = 0.6246
+    """Share of the maximal thrust at which it hovers."""
+
+
+def roll_pitch_yaw(quaternion) -> Vector:
+    """Angles (rad) of a quaternion wxyz, in the order yaw, pitch, roll about moving axes."""
+    w, x, y, z = quaternion
+    return (
+        math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+        math.asin(min(max(2 * (w * y - z * x), -1.0), 1.0)),
+        math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+    )
+
+
+def up(quaternion) -> float:
+    """World z component of the body's z axis."""
+    _, x, y, _ = quaternion
+    return 1.0 - 2.0 * (x * x + y * y)
+
+
+def wanted_velocity(position: Vector, target: Vector, speed: float) -> Vector:
+    """The velocity that leads from `position` to `target`, of at most `speed` (m/s)."""
+    wanted = [POSITION_GAIN * (t - p) for t, p in zip(target, position, strict=True)]
+    size = math.sqrt(sum(v * v for v in wanted))
+    share = min(1.0, speed / size) if size > 0 else 1.0
+    return tuple(v * share for v in wanted)
+
+
+def wanted_acceleration(velocity: Vector, wanted: Vector) -> Vector:
+    """The acceleration (m/s^2, world) that leads from a velocity to the `wanted` one, within the tilt limit."""
+    ax, ay, az = (VELOCITY_GAIN * (w - v) for w, v in zip(wanted, velocity, strict=True))
+    az = min(max(az, -CLIMB_LIMIT), CLIMB_LIMIT)
+    level = math.hypot(ax, ay)
+    most = (GRAVITY + az) * math.tan(TILT_LIMIT)
+    share = most / level if level > most else 1.0
+    return ax * share, ay * share, az
+
+
+def accelerate(
+    quaternion, acceleration: Vector, airframe: Airframe, trim: float, mode: int = ANGLES
+) -> SetPoint:
+    """The set-point for an acceleration (m/s^2, world) at an attitude, yaw to zero.
+
+    `trim` is added to the hover thrust. `mode` RATES tracks the angles here instead of on board.
+    """
+    ax, ay, az = acceleration
+    roll, pitch, yaw = roll_pitch_yaw(quaternion)
+    forward = ax * math.cos(yaw) + ay * math.sin(yaw)
+    left = -ax * math.sin(yaw) + ay * math.cos(yaw)
+    lift = math.sqrt((GRAVITY + az) ** 2 + forward**2 + left**2)
+    wanted_pitch = math.atan2(forward, GRAVITY + az)
+    wanted_roll = math.asin(min(max(-left / lift, -1.0), 1.0))
+    thrust = (airframe.hover_thrust + trim) * lift / GRAVITY
+    yaw_rate = -YAW_GAIN * yaw
+    if mode == RATES:
+        return SetPoint(
+            RATES, ANGLE_GAIN * (wanted_roll - roll), ANGLE_GAIN * (wanted_pitch - pitch), yaw_rate, thrust
+        )
+    return SetPoint(ANGLES, wanted_roll, wanted_pitch, yaw_rate, thrust)

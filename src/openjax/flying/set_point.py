@@ -1,0 +1,65 @@
+"""Set-points: what a vehicle is asked for, and what of it fits into the packet that `cflib` sends."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+OFF, RATES, ANGLES = 0, 1, 2
+"""Modes of a set-point: motors off; roll and pitch as body rates; as angles."""
+
+_LEAST, _MOST = 10001, 60000
+"""Thrust counts of 0 and 100 % in `send_setpoint_manual`."""
+_COUNTS = 65536
+"""Motor counts of full thrust."""
+LEAST_THRUST, MOST_THRUST = _LEAST / _COUNTS, _MOST / _COUNTS
+"""No set-point but "off" asks for less, none for more."""
+
+
+@dataclass(frozen=True)
+class SetPoint:
+    """Roll, pitch (rad or, by `mode`, rad/s; body frame, pitch positive nose down), yaw rate (rad/s), thrust 0..1 of
+    the four rotors' maximum."""
+
+    mode: int = OFF
+    roll: float = 0.0
+    pitch: float = 0.0
+    yaw_rate: float = 0.0
+    thrust: float = 0.0
+
+    def array(self) -> np.ndarray:
+        """(5,) float32 in the order of the fields."""
+        return np.array([self.mode, self.roll, self.pitch, self.yaw_rate, self.thrust], np.float32)
+
+
+def manual_arguments(set_point: SetPoint) -> tuple[float, float, float, float, bool]:
+    """Arguments of `cflib`'s `send_setpoint_manual` for a set-point that isn't off: degrees, thrust in percent.
+
+    `cflib` turns pitch around for the firmware, whose pitch points the other way, so here it's openjax's.
+    """
+    percent = 100.0 * (set_point.thrust * _COUNTS - _LEAST) / (_MOST - _LEAST)
+    return (
+        math.degrees(set_point.roll),
+        math.degrees(set_point.pitch),
+        math.degrees(set_point.yaw_rate),
+        min(max(percent, 0.0), 100.0),
+        set_point.mode == RATES,
+    )
+
+
+def as_sent(set_point: SetPoint) -> SetPoint:
+    """The set-point with the thrust that is left of it in a packet: that is what a log should hold."""
+    return replace(set_point, thrust=min(max(set_point.thrust, LEAST_THRUST), MOST_THRUST))
+
+
+def from_action(action, thrust_limit: float) -> SetPoint:
+    """The set-point of a policy's action (4,) in -1..1: thrust, roll, pitch and yaw rate up to pi rad/s.
+
+    The same numbers as `openjax.pursuit.environment.action_to_command`, without a trip to JAX.
+    """
+    thrust, roll, pitch, yaw = (min(max(float(x), -1.0), 1.0) for x in action)
+    return SetPoint(
+        RATES, math.pi * roll, math.pi * pitch, math.pi * yaw, min(0.5 * (thrust + 1.0), thrust_limit)
+    )
