@@ -10,8 +10,10 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from experiments.task_gap import air, flights, game
+from experiments.task_gap import flights
 from experiments.withheld import body, cases, causes, plant
+from experiments.worlds import game
+from experiments.worlds import plant as air
 from openjax.pursuit import Pursuit, PursuitSettings
 
 TICKS = 60

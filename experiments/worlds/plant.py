@@ -1,4 +1,4 @@
-"""The withheld plant flown by commands from outside: bodies that take a command every 10 ms.
+"""The withheld plant as a world: bodies that take a command every 10 ms; 1 kHz inside, no code of the simulator.
 
 `plant.fly` follows references with its own controller from take-off to landing. A game needs the next state
 before it knows the next command, a speed limit after each tick and solid things. So the plant's parts are put
@@ -10,7 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from experiments.withheld import body as b
-from experiments.withheld import plant, plant_effects
+from experiments.withheld import causes, plant, plant_effects, sensors
+from experiments.withheld.cases import case_rng
+from experiments.worlds.world import Poses, per_world
+from openjax.pursuit import Task
+from openjax.vehicle import DroneState
 
 RADIUS = 0.05  # m, the solid sphere of a drone
 PILLAR_RADIUS, PILLAR_HEIGHT = 0.1, 1.2  # m
@@ -101,7 +105,8 @@ class Air:
 
     def measure(self):
         """Position (3, B), quaternion (4, B) and velocity (3, B) as the motion capture gives them at this tick."""
-        k, n, noise = self.tick, SUBSTEPS * self.tick, self.noise
+        n, noise = SUBSTEPS * self.tick, self.noise
+        k = min(self.tick, len(noise["position"]) - 1)
         self._remember(n)
         late = noise["mocap_delay"] + noise["mocap_jitter"][k]
         late = late + self.p["pose_delay"] + self.p["pose_jitter"] * noise["pose_jitter"][k]
@@ -200,3 +205,74 @@ class Air:
         self.position = position + plant.DT * velocity + 0.5 * plant.DT**2 * accel
         self.velocity = velocity + plant.DT * accel
         self.q = b.turn(q, self.rates, plant.DT)
+
+
+class PlantWorld:
+    """Vehicles of the withheld plant, each with its own noise and all with the same cause, or none.
+
+    Args:
+      drones: (W, N, ...) at the start.
+      tasks: (W, ...), for their pillars.
+      ticks: control steps to be flown at most.
+      seed, number: of the case: its sensors and cause.
+      cause: of `withheld.causes`, or None.
+      first: number of the first episode, from which its noise is drawn.
+    """
+
+    def __init__(
+        self,
+        drones: DroneState,
+        tasks: Task,
+        ticks: int,
+        seed: int,
+        number: int = 0,
+        cause: dict | None = None,
+        first: int = 0,
+    ):
+        worlds, self.team = drones.position.shape[:2]
+        count = worlds * self.team
+        shared = sensors.draw_case(case_rng(seed, number, 1))
+        noises = []
+        for world in range(worlds):
+            rng = case_rng(seed, number, 3, first + world)
+            voltage = shared["voltage"] + rng.uniform(-0.25, 0.15)
+            for _ in range(self.team):
+                drawn = sensors.draw_flight(rng, shared, ticks, voltage + rng.uniform(-0.02, 0.02))
+                noises.append({name: value for name, value in drawn.items() if name not in ("gyro", "accel")})
+        parameters = b.nominal_parameters(count)
+        parameters["rotor_gain"] *= 1 + shared["thrust_offset"]
+        arrival = np.repeat(10.0 * np.arange(ticks)[:, None], count, axis=1)
+        if cause is not None:
+            causes.apply(cause, parameters, np.arange(count), arrival, case_rng(seed, number, 4, first))
+        index = np.arange(count).reshape(worlds, self.team)
+        self.air = Air(
+            parameters,
+            sensors.stack(noises),
+            arrival,
+            np.asarray(drones.position, float).reshape(count, 3).T,
+            np.asarray(drones.quaternion, float).reshape(count, 4).T,
+            partners=[np.roll(index, -shift, axis=1).ravel() for shift in range(1, self.team)],
+            solids=solids_of(tasks, self.team),
+        )
+
+    def poses(self) -> Poses:
+        """Where the vehicles are."""
+        return per_world(self.team, self.air.position, self.air.q, self.air.velocity)
+
+    def measure(self) -> Poses:
+        """Where the motion capture sees them."""
+        return per_world(self.team, *self.air.measure())
+
+    def fly(self, command, max_speed=None) -> None:
+        """One tick."""
+        self.air.fly(command.reshape(-1, 4).T, max_speed)
+
+
+def solids_of(tasks: Task, team: int) -> Solids:
+    """What is solid in the worlds of `tasks`, for bodies of teams that are neighbours."""
+    pillars = np.asarray(tasks.pillar_position, float)  # (W, P, 2)
+    return Solids(
+        pillar=np.repeat(np.moveaxis(pillars, (0, 1, 2), (2, 1, 0)), team, axis=2),
+        active=np.repeat(np.asarray(tasks.pillar_active).T, team, axis=1),
+        team=team,
+    )

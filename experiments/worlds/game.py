@@ -1,0 +1,110 @@
+"""The game around vehicles that fly elsewhere.
+
+It is `openjax.pursuit`'s own step, in which only the drones' step is replaced by poses from outside.
+"""
+
+import functools
+from collections.abc import Callable
+
+import jax
+import numpy as np
+
+from experiments.worlds.world import World
+from openjax.pursuit import EpisodeStatistics, Pursuit, PursuitSettings, Task, action_to_command
+from openjax.vehicle import DroneState
+
+
+class FlownElsewhere:
+    """Stands in for a drones' step: the next state and what is seen of it lie in the drones' memory."""
+
+    def reset(self, vehicle, drones: DroneState, key=None) -> DroneState:
+        """Drones that are where they are, and seen there."""
+        del vehicle, key
+        return remember(drones, pose_of(drones), pose_of(drones))
+
+    def __call__(self, vehicle, drones: DroneState, *_) -> DroneState:
+        """The drones where they were flown to."""
+        del vehicle
+        return drones.replace(**drones.effect_memory["flown"])
+
+    def seen(self, drones: DroneState, effect_parameters=None) -> DroneState:
+        """The drones as they were measured."""
+        del effect_parameters
+        return drones.replace(**drones.effect_memory["seen"])
+
+
+def pose_of(drones: DroneState) -> dict:
+    """What a world elsewhere says of drones."""
+    return {name: getattr(drones, name) for name in ("position", "quaternion", "velocity")}
+
+
+def remember(drones: DroneState, flown: dict, seen: dict) -> DroneState:
+    """The drones with their next state and what is seen of it in their memory."""
+    return drones.replace(effect_memory={"flown": flown, "seen": seen})
+
+
+class FlownPursuit(Pursuit):
+    """The game of drones that fly elsewhere."""
+
+    def __init__(self, settings: PursuitSettings):
+        super().__init__(settings)
+        self._drones_step = FlownElsewhere()
+
+
+def play(
+    loaded,
+    settings: PursuitSettings,
+    tasks: Task,
+    keys: jax.Array,
+    make_world: Callable[[DroneState, Task], World],
+    watch: Callable | None = None,
+) -> tuple[EpisodeStatistics, list]:
+    """Episodes of a policy's mean in a world.
+
+    Args:
+      loaded: from `openjax.load_policy`.
+      settings: the game.
+      tasks: leading axis W.
+      keys: (W,) draw the start attitudes.
+      make_world: of the drones (W, N, ...) at the start and the tasks.
+      watch: (state, action) -> anything, after each step; mapped over worlds and compiled.
+
+    Returns:
+      statistics (W,), and what `watch` said of each step.
+    """
+    reset, look, act, advance = _compiled(settings, loaded.policy, watch)
+    state = reset(keys, tasks)
+    world = make_world(state.drones, tasks)
+    limit = settings.max_speed if settings.speed_limit == "clamp" else None
+    observation, watched = look(state, world.measure()), []
+    for _ in range(settings.episode_length):
+        action, command = act(loaded.parameters, observation)
+        world.fly(np.asarray(command, float), limit)
+        observation, state, said = advance(state, action, world.poses(), world.measure())
+        watched.append(said)
+    return state.statistics, watched
+
+
+@functools.cache
+def _compiled(settings, policy, watch):
+    """The game's start, its observation of measured poses, the policy, and the game's step with poses from outside."""
+    game = FlownPursuit(settings)
+
+    def observe(state, seen):
+        return game.observe(state.replace(drones=remember(state.drones, seen, seen)))
+
+    def act(weights, observation):
+        action = policy.act(weights, observation)
+        return action, action_to_command(action)
+
+    def advance(state, action, flown, seen):
+        state = state.replace(drones=remember(state.drones, flown, seen))
+        observation, state, *_ = game.step(None, state, action)
+        return observation, state, None if watch is None else watch(state, action)
+
+    return (
+        jax.jit(jax.vmap(lambda key, task: game.reset_to(key, task)[1])),
+        jax.jit(jax.vmap(observe)),
+        jax.jit(act),
+        jax.jit(jax.vmap(advance)),
+    )
