@@ -23,6 +23,7 @@ from openjax.commands.machine import describe_machine
 from openjax.errors import UserError
 from openjax.learning import abstract_carry, make_training_step, preset
 from openjax.vehicle import hover_state, load_vehicle, make_drones_step
+from openjax.vehicle.rigid_kernel import mapped_step
 
 # Facts of the device that the compiler asks for; from XLA's own list (openxla/xla, xla/backends/gpu/target_config/specs).
 H200 = """
@@ -90,12 +91,12 @@ def loops(text: str) -> list[dict]:
 
 def rigid_step(drones: int, one_kernel: bool) -> str:
     """Steps of the nominal vehicle in free flight."""
-    vehicle, step = load_vehicle(), make_drones_step(physics="rigid", dt=0.002)
+    vehicle, step = load_vehicle(), make_drones_step(physics="rigid", dt=0.002, contacts=False)
 
     def one(drone, command):
         if one_kernel:
             return step(vehicle, drone, command, jnp.zeros((1, 2)), jnp.zeros(1, bool))
-        return jax.vmap(lambda d, c: step.free_flight(vehicle, d, c))(drone, command)
+        return mapped_step(step.fused, vehicle, drone, command, ())
 
     def run(drone, command):
         return jax.lax.scan(lambda d, _: (one(d, command), None), drone, None, length=STEPS)[0]

@@ -28,9 +28,10 @@ from openjax.store.settings_files import write_json
 from openjax.vehicle import hover_state, load_vehicle, make_drones_step
 
 PROGRAM = "python -m openjax.benchmark"
-PARTS = ("rigid", "mjx_free", "mjx", "environment", "rollout", "training")
+PHYSICS = ("rigid_free", "rigid", "mjx_free", "mjx")
+PARTS = (*PHYSICS, "environment", "rollout", "training")
 
-Part = Literal["rigid", "mjx_free", "mjx", "environment", "rollout", "training"]
+Part = Literal["rigid_free", "rigid", "mjx_free", "mjx", "environment", "rollout", "training"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,10 +126,10 @@ def _physics(part, settings, num_envs, steps):
     """Drones of each world hover among a task's pillars and turn slowly."""
     game, vehicle = settings.environment, load_vehicle()
     drones_step = make_drones_step(
-        physics="rigid" if part == "rigid" else "mjx",
+        physics=part.removesuffix("_free"),
         dt=game.time_step,
         substeps=game.substeps,
-        contacts=part == "mjx",
+        contacts=not part.endswith("_free"),
     )
     tasks = _tasks(game, num_envs)
     drones = jax.jit(jax.vmap(lambda task: hover_state(vehicle, task.pursuer_position)))(tasks)
@@ -191,7 +192,7 @@ def _row(part, num_envs, steps, settings, timing: Timing) -> dict:
     speed = None if timing.seconds is None else num_envs * steps / timing.seconds
     return {
         "part": part,
-        "physics": settings.environment.physics if part not in PARTS[:3] else part.split("_")[0],
+        "physics": settings.environment.physics if part not in PHYSICS else part.split("_")[0],
         "num_envs": num_envs,
         "num_drones": settings.environment.num_pursuers,
         "steps_per_call": steps,

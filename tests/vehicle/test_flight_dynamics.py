@@ -28,7 +28,7 @@ def vehicle():
 @pytest.fixture(scope="module")
 def fly(vehicle):
     """fly(start, command (N, 4), 100 n): states of a flight by `rigid`, compiled once."""
-    step = make_drones_step("rigid")
+    step = make_drones_step("rigid", contacts=False)
 
     @jax.jit
     def second(start, command):

@@ -7,11 +7,12 @@ import pytest
 
 from openjax.vehicle import hover_state, load_vehicle, make_drones_step
 from openjax.vehicle.componentwise import evaluate, split
-from openjax.vehicle.rigid_kernel import DRONES, kernel_call, step_many
+from openjax.vehicle.rigid_kernel import WORLDS, kernel_call, mapped_step
 
 VEHICLE = load_vehicle()
-STEP = make_drones_step(physics="rigid", dt=0.01, substeps=2)
-ONE = STEP.free_flight
+FREE = make_drones_step(physics="rigid", dt=0.01, substeps=2, contacts=False)
+AMONG_SOLIDS = make_drones_step(physics="rigid", dt=0.01, substeps=2)
+NO_PILLARS = jnp.zeros((1, 2)), jnp.zeros(1, bool)
 
 
 def drawn(*lead):
@@ -28,38 +29,60 @@ def drawn(*lead):
     return structure.unflatten(leaves), command
 
 
-def assert_close(got, expected):
+def crowded(worlds):
+    """Worlds of three drones close to the floor, each other and four pillars, of which one isn't there."""
+    drones, command = drawn(worlds, 3)
+    position = drones.position * jnp.array([0.1, 0.1, 0.01]) + jnp.array([0, 0, 0.06])
+    pillars = jnp.array([[0.3, 0.0], [-0.2, 0.1], [0.0, 0.25], [0.1, -0.2]])
+    active = jnp.array([True, True, True, False])
+    drones = drones.replace(position=position)
+    lead = (worlds, *pillars.shape)
+    return drones, command, (jnp.broadcast_to(pillars, lead), jnp.broadcast_to(active, lead[:2]))
+
+
+def assert_close(got, expected, tolerance=2e-5):
     for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
-        np.testing.assert_allclose(a, b, rtol=2e-5, atol=2e-5)
+        np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance)
 
 
 def fly(vehicle, drones, command):
-    return STEP(vehicle, drones, command, jnp.zeros((1, 2)), jnp.zeros(1, bool))
+    return FREE(vehicle, drones, command, *NO_PILLARS)
+
+
+def fly_plainly(vehicle, drones, command):
+    """The formulas of free flight, of drones (n, ...)."""
+    return mapped_step(FREE.fused, vehicle, drones, command, ())
 
 
 def test_kernel_computes_the_step_of_each_drone():
-    drones, command = drawn(DRONES + 5)  # the last block is only partly filled
-    stepped = kernel_call(ONE, VEHICLE, drones, command, interpret=True)
-    assert_close(stepped, jax.vmap(ONE, (None, 0, 0))(VEHICLE, drones, command))
+    drones, command = drawn(WORLDS + 5, 1)  # the last block is only partly filled
+    stepped = kernel_call(FREE.fused, VEHICLE, drones, command, (), interpret=True)
+    assert_close(stepped, jax.vmap(lambda d, c: fly_plainly(VEHICLE, d, c))(drones, command))
+
+
+def test_kernel_computes_contacts():
+    drones, command, pillars = crowded(WORLDS + 5)
+    among = AMONG_SOLIDS.fused
+    stepped = kernel_call(among, VEHICLE, drones, command, pillars, interpret=True)
+    expected = jax.vmap(lambda *world: mapped_step(among, VEHICLE, *world))(drones, command, pillars)
+    assert_close(stepped, expected, 1e-4)
+    free = jax.vmap(lambda d, c: fly_plainly(VEHICLE, d, c))(drones, command)
+    assert (np.abs(free.velocity - expected.velocity).max(-1) > 0.1).mean() > 0.5, "most must touch something"
 
 
 def test_mapped_over_worlds_and_over_vehicles():
     drones, command = drawn(5, 3)
-    expected = jax.vmap(jax.vmap(ONE, (None, 0, 0)), (None, 0, 0))(VEHICLE, drones, command)
+    expected = jax.vmap(lambda d, c: fly_plainly(VEHICLE, d, c))(drones, command)
     assert_close(jax.vmap(lambda d, c: fly(VEHICLE, d, c))(drones, command), expected)
     one_command = jax.vmap(lambda d: fly(VEHICLE, d, command[0]))(drones)
-    assert_close(
-        one_command, jax.vmap(jax.vmap(ONE, (None, 0, 0)), (None, 0, None))(VEHICLE, drones, command[0])
-    )
+    assert_close(one_command, jax.vmap(lambda d: fly_plainly(VEHICLE, d, command[0]))(drones))
     heavier = jax.tree.map(lambda leaf: jnp.stack([leaf, 1.2 * leaf]), VEHICLE)
     first = jax.tree.map(lambda leaf: leaf[0], drones)
     both = jax.vmap(lambda vehicle: fly(vehicle, first, command[0]))(heavier)
     for i in range(2):
         vehicle = jax.tree.map(lambda leaf, i=i: leaf[i], heavier)
-        assert_close(
-            jax.tree.map(lambda leaf, i=i: leaf[i], both),
-            jax.vmap(ONE, (None, 0, 0))(vehicle, first, command[0]),
-        )
+        got = jax.tree.map(lambda leaf, i=i: leaf[i], both)
+        assert_close(got, fly_plainly(vehicle, first, command[0]))
 
 
 def test_memory_of_effects_that_the_step_does_not_have_is_left_alone():
@@ -70,10 +93,16 @@ def test_memory_of_effects_that_the_step_does_not_have_is_left_alone():
     assert_close(stepped.replace(effect_memory=()), fly(VEHICLE, drones, command))
 
 
-def test_worlds_become_more_drones_of_one_call():
-    drones, command = drawn(6, 3)
-    traced = str(jax.make_jaxpr(jax.vmap(lambda d, c: step_many(ONE, VEHICLE, d, c)))(drones, command))
-    assert "f32[18,3]" in traced and "platform_index" in traced
+def test_worlds_become_more_worlds_of_one_call():
+    drones, command, pillars = crowded(6)
+    step = lambda drones, command, pillars: AMONG_SOLIDS(VEHICLE, drones, command, *pillars)  # noqa: E731
+    twice = jax.tree.map(lambda leaf: leaf.reshape(2, 3, *leaf.shape[1:]), (drones, command, pillars))
+    traced = jax.make_jaxpr(jax.vmap(jax.vmap(step)))(*twice)
+    assert "f32[6,3,3]" in str(traced) and "platform_index" in str(traced)
+    got = jax.vmap(jax.vmap(step))(*twice)
+    for i in range(6):
+        one = step(*jax.tree.map(lambda leaf, i=i: leaf[i], (drones, command, pillars)))
+        assert_close(jax.tree.map(lambda leaf, i=i: leaf[i // 3, i % 3], got), one)
 
 
 @pytest.mark.parametrize("argument", ["vehicle", "command"])
@@ -86,7 +115,7 @@ def test_derivatives_are_those_of_the_step(argument):
 
     place = {"vehicle": 1, "command": 2}[argument]
     got = jax.grad(height, place)(fly, VEHICLE.mass, command)
-    expected = jax.grad(height, place)(jax.vmap(ONE, (None, 0, 0)), VEHICLE.mass, command)
+    expected = jax.grad(height, place)(fly_plainly, VEHICLE.mass, command)
     np.testing.assert_allclose(got, expected, rtol=1e-4)
     assert np.abs(expected).max() > 0
 

@@ -101,6 +101,9 @@ class Pursuit:
             dt=self.settings.time_step,
             substeps=self.settings.substeps,
             effects=(*drawn, *self.effects),
+            contacts=self.settings.contacts,
+            pillar_radius=self.settings.pillar_radius,
+            pillar_height=self.settings.arena_height,
         )
 
     @property

@@ -76,8 +76,10 @@ class PursuitSettings:
     substeps: int = 1
     """Physics (and rate controller) steps per control step."""
     physics: Literal["mjx", "rigid", "stops"] = "mjx"
-    """"mjx": MuJoCo MJX with solid floor, pillars and drones; "rigid": free flight, nothing is solid; "stops": free flight,
-    and drones are put back out of floor, pillars and one another once per control step."""
+    """"mjx": MuJoCo MJX, the reference; "rigid": the same equations written out, contacts included, many times faster;
+    "stops": free flight, and drones are put back out of floor, pillars and one another once per control step."""
+    contacts: bool = True
+    """Floor, pillars and other drones are solid; False: free flight, in which nothing is touched."""
     vehicles: tuple[tuple[str, float, float, float, float], ...] = ()
     """Family from which every pursuer's vehicle is drawn in each episode: parameters of effects (`motor_lag.extra_up`), each
     with its range and the wider range of the rare; see `openjax.vehicle.family`. Empty: the nominal vehicle."""

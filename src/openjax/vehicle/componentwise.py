@@ -17,6 +17,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 _CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call")
+_REDUCTIONS = {"reduce_sum": operator.add, "reduce_or": operator.or_, "reduce_and": operator.and_}
 _ELEMENTWISE = frozenset(
     "abs add and atan2 clamp convert_element_type copy cos div eq exp expm1 ge gt integer_pow le log lt max min mul ne "
     "neg not or pow rsqrt select_n sign sin sqrt square sub tanh".split()
@@ -72,8 +73,10 @@ def _apply(equation, inputs):
         return _evaluate(inner.jaxpr, inner.consts, inputs)
     if name in _ELEMENTWISE:
         return [_each(lambda *operands: _bind(equation, operands), *inputs)]
-    if name == "reduce_sum":
-        return [_total(inputs[0], parameters["axes"])]
+    if name in _REDUCTIONS:
+        return [_total(_REDUCTIONS[name], inputs[0], parameters["axes"])]
+    if name == "stop_gradient":  # nothing is differentiated here
+        return inputs
     if name not in _MOVES:
         raise NotImplementedError(f"component by component: {name}")
     return [_MOVES[name](inputs, parameters)]
@@ -124,8 +127,8 @@ def _bind(equation, operands):
     return equation.primitive.bind(*alike, **equation.params)
 
 
-def _total(array, axes):
+def _total(combine, array, axes):
     kept = [axis for axis in range(array.ndim) if axis not in axes]
     shape = [array.shape[axis] for axis in kept]
     rows = array.transpose(*kept, *axes).reshape(int(np.prod(shape)), -1)
-    return split(functools.reduce(operator.add, row) for row in rows).reshape(shape)
+    return split(functools.reduce(combine, row) for row in rows).reshape(shape)

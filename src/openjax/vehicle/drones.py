@@ -15,9 +15,17 @@ from openjax.vehicle.mjx_body import make_world, mjx_step
 from openjax.vehicle.parameters import Vehicle
 from openjax.vehicle.rate_controller import rate_controller
 from openjax.vehicle.rigid_body import rigid_step, rotate
-from openjax.vehicle.rigid_kernel import step_many
+from openjax.vehicle.rigid_kernel import FusedStep, step_many
 from openjax.vehicle.rotors import rotor_reaction, rotor_speed_step, rotor_thrust
-from openjax.vehicle.solids import others, place_solids
+from openjax.vehicle.solids import (
+    PillarShape,
+    Surroundings,
+    contact_acceleration,
+    encounters,
+    others,
+    place_solids,
+    surroundings,
+)
 from openjax.vehicle.state import DroneState
 from openjax.vehicle.stops import stop
 from openjax.vehicle.wrench import total_wrench
@@ -33,6 +41,7 @@ class DronesStep:
     dt: float
     substeps: int
     contacts: bool
+    pillar: PillarShape
     effects: tuple[Effect, ...] = field(repr=False)
 
     def __call__(
@@ -55,7 +64,8 @@ class DronesStep:
         command = jnp.asarray(command, dtype)
         if self.physics == "rigid" and not self.effects and dtype == jnp.float32:
             memory = drones.effect_memory  # of other effects than this step's, if any
-            drones = step_many(self.free_flight, vehicle, drones.replace(effect_memory=()), command)
+            pillars = (pillar_position, pillar_active) if self.contacts else None
+            drones = step_many(self.fused, vehicle, drones.replace(effect_memory=()), command, pillars)
             return drones.replace(effect_memory=memory)
         parameters = self._parameters(effect_parameters, drones)
         vehicle = self._body(vehicle, parameters)
@@ -82,11 +92,10 @@ class DronesStep:
             drones = drones.replace(effect_memory=memory)
         return drones
 
-    def free_flight(self, vehicle, drone, command):
-        """One drone (no leading axis) after one step of `dt` seconds, on which nothing acts but its rotors and gravity."""
-        for _ in range(self.substeps):
-            drone = self._rigid_substep(vehicle, {}, drone, command, None)
-        return drone
+    @property
+    def fused(self) -> FusedStep:
+        """`rigid` without effects, for `step_many`."""
+        return FusedStep(self._plain_substep, self.substeps)
 
     def reset(self, vehicle: Vehicle, drones: DroneState, key=None) -> DroneState:
         """`drones` (leading axis N) with the effects' memory as at the start of an episode.
@@ -147,25 +156,40 @@ class DronesStep:
         dt = self.dt / self.substeps
         contexts = self._contexts(vehicle, drones, dt) if self.effects else None
         axes = (_vehicles_axis(vehicle), _drones_axis(parameters), 0, 0, 0)
+        around = None
+        if self.contacts and self.physics != "stops":
+            around = surroundings(drones.position, drones.velocity, pillar_position, pillar_active)
         if self.physics != "mjx":
-            return jax.vmap(self._rigid_substep, axes)(vehicle, parameters, drones, command, contexts)
+            move = jax.vmap(self._rigid_substep, (*axes, None if around is None else 0))
+            return move(vehicle, parameters, drones, command, contexts, around)
         motors = lambda *drone: self._motors(*drone, dt)  # noqa: E731
         moved, force, torque = jax.vmap(motors, axes)(vehicle, parameters, drones, command, contexts)
         body = (drones.position, drones.quaternion, drones.velocity, drones.body_rates, force, torque)
-        world, shapes = make_world(0, 0, dt, False), None
+        world, shapes = make_world(self.pillar, 0, 0, dt, False), None
         if self.contacts:
-            world = make_world(pillar_position.shape[0], drones.position.shape[0] - 1, dt, True)
-            shapes = place_solids(drones.position, drones.velocity, pillar_position, pillar_active, dt)
+            world = make_world(self.pillar, pillar_position.shape[0], drones.position.shape[0] - 1, dt, True)
+            place = lambda *drone: place_solids(encounters(self.pillar, *drone, dt))  # noqa: E731
+            shapes = jax.vmap(place)(drones.position, drones.velocity, around)
         axes = (axes[0], None if shapes is None else 0, *(0 for _ in body))
         move = lambda vehicle, *parts: mjx_step(world, vehicle, *parts, dt)  # noqa: E731
         return _with_body(moved, jax.vmap(move, axes)(vehicle, shapes, *body))
 
-    def _rigid_substep(self, vehicle, parameters, drone, command, context):
-        """One drone after a substep of `rigid`."""
+    def _rigid_substep(self, vehicle, parameters, drone, command, context, around: Surroundings | None):
+        """One drone after a substep of `rigid`, in free flight if nothing is around."""
         dt = self.dt / self.substeps
         moved, force, torque = self._motors(vehicle, parameters, drone, command, context, dt)
         body = (drone.position, drone.quaternion, drone.velocity, drone.body_rates, force, torque)
-        return _with_body(moved, rigid_step(vehicle, *body, dt))
+        contact = None
+        if around is not None:
+
+            def contact(free):
+                return contact_acceleration(self.pillar, drone.position, drone.velocity, free, around, dt)
+
+        return _with_body(moved, rigid_step(vehicle, *body, dt, contact))
+
+    def _plain_substep(self, vehicle, drone, command, around):
+        """One drone after a substep of `rigid` without effects."""
+        return self._rigid_substep(vehicle, {}, drone, command, None, around)
 
     def _motors(self, vehicle, parameters, drone, command, context, dt):
         """One drone up to the wrench on its body: its new controller and rotors, force world, torque body."""
@@ -210,13 +234,15 @@ def make_drones_step(
     contacts: bool = True,
     max_pillars: int | None = None,
     num_drones: int | None = None,
+    pillar_radius: float = PillarShape.radius,
+    pillar_height: float = PillarShape.height,
 ) -> DronesStep:
     """Make the step of N drones of one world.
 
-    physics "mjx": MuJoCo MJX, in which floor, pillars and other drones are solid unless `contacts` is off;
-    "rigid": the same free-flight equations written out, nothing is solid; "stops": these, and drones are put back
-    out of solid things once per step. dt is the step in seconds;
-    `substeps` divide it, and the rate controller runs in each. `effects` (names or `Effect`s) are modelled
+    physics "mjx": MuJoCo MJX; "rigid": the same equations written out, many times faster. In both floor, pillars
+    (of `pillar_radius` and `pillar_height`, m) and other drones are solid unless `contacts` is off. "stops": free
+    flight, and drones are put back out of solid things once per step. dt is the step
+    in seconds; `substeps` divide it, and the rate controller runs in each. `effects` (names or `Effect`s) are modelled
     beyond the nominal vehicle. Within a substep: controller on the present state, motors, rotor speeds,
     wrench from the updated rotor speeds, body.
 
@@ -228,6 +254,7 @@ def make_drones_step(
         raise UserError(f"physics {physics!r} is unknown; one of {', '.join(PHYSICS)} would be right")
     if substeps < 1 or dt <= 0:
         raise UserError(f"dt {dt} with {substeps} substeps: dt > 0 and substeps >= 1 would be right")
+    pillar = PillarShape(pillar_radius, pillar_height)
     if physics == "mjx" and contacts and max_pillars is not None and num_drones is not None:
-        make_world(max_pillars, num_drones - 1, dt / substeps, True)
-    return DronesStep(physics, dt, substeps, contacts, composition.resolve(effects))
+        make_world(pillar, max_pillars, num_drones - 1, dt / substeps, True)
+    return DronesStep(physics, dt, substeps, contacts, pillar, composition.resolve(effects))

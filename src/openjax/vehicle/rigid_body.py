@@ -57,12 +57,18 @@ def euler_step(position, quaternion, velocity, body_rates, acceleration, angular
     return position + dt * velocity, quaternion_integrate(quaternion, body_rates, dt), velocity, body_rates
 
 
-def rigid_step(vehicle: Vehicle, position, quaternion, velocity, body_rates, force_world, torque_body, dt):
+def rigid_step(
+    vehicle: Vehicle, position, quaternion, velocity, body_rates, force_world, torque_body, dt, contact=None
+):
     """Position, quaternion, velocity and body rates of one drone after dt seconds, frames as in `DroneState`.
 
     force_world (3,) N without gravity, torque_body (3,) N m about the centre of mass. Newton-Euler equations.
+    `contact`, if any, maps the acceleration (3,) m/s^2 that the drone would have in free flight to what contacts add.
     """
     acceleration = force_world / vehicle.mass - vehicle.gravity * jnp.array([0, 0, 1], position.dtype)
+    if contact is not None:
+        # as by MJX, gradients are those of free flight: what contacts add is a constant to them
+        acceleration = acceleration + jax.lax.stop_gradient(contact(acceleration))
     momentum = vehicle.inertia * body_rates
     angular_acceleration = (torque_body - cross(body_rates, momentum)) / vehicle.inertia
     return euler_step(position, quaternion, velocity, body_rates, acceleration, angular_acceleration, dt)

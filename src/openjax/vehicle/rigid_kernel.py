@@ -1,13 +1,15 @@
-"""The rigid step of many drones in one GPU kernel.
+"""The rigid step of many worlds in one GPU kernel.
 
-XLA splits the step into some ten kernels, each of which reads and writes all drones' states; with tens of thousands
-of drones most of the time is spent on starting them. Here every drone's state is read once and written once.
+XLA splits the step into some ten kernels (more with contacts), each of which reads and writes all drones' states; with
+tens of thousands of drones most of the time is spent on starting them. Here every drone's state is read once and written
+once. One thread holds all drones of a world, which therefore know of each other without a detour through memory.
 """
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,89 +20,136 @@ from jax.experimental.pallas import triton as pallas_triton
 from openjax.platform import on_platform, whole_blocks
 from openjax.vehicle.componentwise import evaluate, split
 from openjax.vehicle.parameters import Vehicle
+from openjax.vehicle.solids import Surroundings, others, surroundings
 from openjax.vehicle.state import DroneState
 
-DRONES = 128
-"""Drones of one program."""
+WORLDS = 128
+"""Worlds of one program."""
 WARPS = 4
 
-OneStep = Callable[[Vehicle, DroneState, jax.Array], DroneState]
+
+class FusedStep(NamedTuple):
+    """What a step does to one drone: hashable, since compiled code is kept for each."""
+
+    substep: Callable[[Vehicle, DroneState, jax.Array, Surroundings | None], DroneState]
+    """(vehicle, drone, command (4,), what is around it or None in free flight) -> the drone a substep later."""
+    substeps: int
 
 
-def step_many(one: OneStep, vehicle: Vehicle, drones: DroneState, command) -> DroneState:
-    """`one(vehicle, drone, command)` for each of n drones (leading axis) of one vehicle, float32 throughout.
+def step_many(step: FusedStep, vehicle: Vehicle, drones: DroneState, command, pillars=None) -> DroneState:
+    """The n drones (leading axis) of one world after a step, float32 throughout.
 
-    The drones have no effect memory. On NVIDIA GPUs in one kernel, elsewhere mapped. May be mapped further, over drones
-    (still one kernel) and vehicles (not); derivatives are those of `one`.
+    The drones are of one vehicle and have no effect memory. `pillars`: position (P, 2) m and active (P,) bool, or None
+    for free flight, in which drones don't notice each other. On NVIDIA GPUs in one kernel, elsewhere mapped. May be
+    mapped further, over worlds (still one kernel) and vehicles (not); derivatives are those of `mapped_step`.
     """
-    return _mapped_step(one)(vehicle, drones, command)
+    if pillars is None:  # every drone is a world of its own
+        alone = jax.tree.map(lambda leaf: leaf[:, None], (drones, command))
+        return jax.tree.map(lambda leaf: leaf[:, 0], _many_worlds(step)(vehicle, *alone, ()))
+    world = jax.tree.map(lambda leaf: leaf[None], (drones, command, tuple(pillars)))
+    return jax.tree.map(lambda leaf: leaf[0], _many_worlds(step)(vehicle, *world))
+
+
+def mapped_step(step: FusedStep, vehicle: Vehicle, drones: DroneState, command, pillars) -> DroneState:
+    """The n drones of one world after a step, by the formulas as they stand; `pillars` () in free flight."""
+    for _ in range(step.substeps):
+        around = surroundings(drones.position, drones.velocity, *pillars) if pillars else None
+        drones = jax.vmap(step.substep, (None, 0, 0, 0))(vehicle, drones, command, around)
+    return drones
 
 
 @functools.lru_cache(maxsize=64)
-def _mapped_step(one):
-    """`step_many` of one function. A further mapped axis becomes more drones."""
-    mapped = jax.vmap(one, (None, 0, 0))
+def _many_worlds(step):
+    """`step` of W worlds. A further mapped axis becomes more worlds."""
+    mapped = jax.vmap(functools.partial(mapped_step, step), (None, 0, 0, 0))
 
     @jax.custom_batching.custom_vmap
-    def step(vehicle, drones, command):
-        return on_platform(mapped, functools.partial(kernel_call, one))(vehicle, drones, command)
+    def run(vehicle, drones, command, pillars):
+        return on_platform(mapped, functools.partial(kernel_call, step))(vehicle, drones, command, pillars)
 
-    @step.def_vmap
-    def _(axis_size, in_batched, vehicle, drones, command):
+    @run.def_vmap
+    def _(axis_size, in_batched, vehicle, *worlds):
         if any(jax.tree.leaves(in_batched[0])):
             axes = jax.tree.map(lambda batched: 0 if batched else None, tuple(in_batched))
-            stepped = jax.vmap(mapped, axes)(vehicle, drones, command)
+            stepped = jax.vmap(mapped, axes)(vehicle, *worlds)
         else:
 
             def flat(leaf, batched):
                 leaf = leaf if batched else jnp.broadcast_to(leaf, (axis_size, *leaf.shape))
                 return leaf.reshape(-1, *leaf.shape[2:])
 
-            stepped = step(vehicle, *jax.tree.map(flat, (drones, command), tuple(in_batched[1:])))
+            stepped = run(vehicle, *jax.tree.map(flat, worlds, tuple(in_batched[1:])))
             stepped = jax.tree.map(lambda leaf: leaf.reshape(axis_size, -1, *leaf.shape[1:]), stepped)
         return stepped, jax.tree.map(lambda _: True, stepped)
 
-    derived = jax.custom_jvp(step)
+    derived = jax.custom_jvp(run)
     derived.defjvp(lambda primals, tangents: jax.jvp(mapped, primals, tangents))
     return derived
 
 
-def kernel_call(one: OneStep, vehicle: Vehicle, drones: DroneState, command, interpret=False) -> DroneState:
-    """`step_many` by the kernel; `interpret` runs it anywhere, slowly."""
-    number = command.shape[0]
+def kernel_call(
+    step: FusedStep, vehicle: Vehicle, drones: DroneState, command, pillars, interpret=False
+) -> DroneState:
+    """`step` of W worlds of n drones by the kernel; `interpret` runs it anywhere, slowly.
+
+    drones (W, n, ...), command (W, n, 4), pillars () or (W, P, 2) and (W, P).
+    """
+    number, n = command.shape[:2]
+    if pillars:
+        pillars = (pillars[0], pillars[1].astype(jnp.float32))
     leaves, structure = jax.tree.flatten((drones, command))
-    leaves = [whole_blocks(leaf, DRONES, mode="edge") for leaf in leaves]
+    results = len(leaves) - 1
+    inputs = [leaf.reshape(number, -1) for leaf in (*leaves, *pillars)]
+    inputs = [whole_blocks(leaf, WORLDS, mode="edge") for leaf in inputs]
     constants = jax.tree.leaves(vehicle)
-    shapes = [jnp.shape(leaf) for leaf in constants]
     packed = jnp.concatenate([jnp.ravel(leaf) for leaf in constants])
     # a block's size is a power of two
     packed = jnp.pad(packed, (0, (1 << (packed.shape[0] - 1).bit_length()) - packed.shape[0]))
-    traced = jax.make_jaxpr(one)(vehicle, *structure.unflatten([leaf[0] for leaf in leaves]))
-    results = len(jax.tree.leaves(drones))
+
+    drone, one_command = structure.unflatten([leaf[0, 0] for leaf in leaves])
+    around = None
+    if pillars:
+        first = jax.tree.map(lambda leaf: leaf[0], (drones, pillars))
+        around = surroundings(first[0].position, first[0].velocity, first[1][0], first[1][1] > 0)
+        around = jax.tree.map(lambda leaf: leaf[0], around)
+    traced = jax.make_jaxpr(step.substep)(vehicle, drone, one_command, around)
 
     def kernel(packed_ref, *refs):
-        inputs, outputs = refs[: len(leaves)], refs[len(leaves) :]
-        arguments, start = [], 0
-        for shape in shapes:
-            size = int(np.prod(shape))
-            arguments.append(split(packed_ref[start + i] for i in range(size)).reshape(shape))
-            start += size
-        for ref in inputs:
-            arguments.append(split(ref[:, i] for i in range(ref.shape[1])))
-        for ref, values in zip(outputs, evaluate(traced, arguments), strict=True):
-            for i, value in enumerate(values):
-                ref[:, i] = jnp.broadcast_to(value, (DRONES,))
+        vehicle_parts, start = [], 0
+        for leaf in constants:
+            parts = split(packed_ref[start + i] for i in range(leaf.size))
+            vehicle_parts.append(parts.reshape(leaf.shape))
+            start += leaf.size
+        parts = [split(ref[:, i] for i in range(ref.shape[1])) for ref in refs[: len(inputs)]]
+        world = [p.reshape(n, *leaf.shape[2:]) for p, leaf in zip(parts[:results], leaves, strict=False)]
+        commands = parts[results].reshape(n, 4)
+        solids = []
+        if pillars:
+            position, active = parts[results + 1 :]
+            solids = [position.reshape(-1, 2), split(part > 0.5 for part in active)]
+        for _ in range(step.substeps):
+            now = structure.unflatten([*world, commands])[0]
+            moved = []
+            for i in range(n):
+                own = [leaf[i] for leaf in world]
+                seen = [now.position[others(n)[i]], now.velocity[others(n)[i]]] if pillars else []
+                moved.append(evaluate(traced, [*vehicle_parts, *own, commands[i], *solids, *seen]))
+            world = [np.stack(leaf) for leaf in zip(*moved, strict=True)]
+        for ref, values in zip(refs[len(inputs) :], world, strict=True):
+            for i, value in enumerate(values.ravel()):
+                ref[:, i] = jnp.broadcast_to(value, (WORLDS,))
 
-    blocks = [pl.BlockSpec((DRONES, leaf.shape[1]), lambda i: (i, 0)) for leaf in leaves]
+    blocks = [pl.BlockSpec((WORLDS, leaf.shape[1]), lambda i: (i, 0)) for leaf in inputs]
     stepped = pl.pallas_call(
         kernel,
-        out_shape=[jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves[:results]],
-        grid=(leaves[0].shape[0] // DRONES,),
+        out_shape=[jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in inputs[:results]],
+        grid=(inputs[0].shape[0] // WORLDS,),
         in_specs=[pl.BlockSpec(packed.shape, lambda i: (0,)), *blocks],
         out_specs=blocks[:results],
         input_output_aliases={i + 1: i for i in range(results)},
         interpret=interpret,
         compiler_params=pallas_triton.CompilerParams(num_warps=WARPS, num_stages=1),
         name="rigid_step",
-    )(packed, *leaves)
-    return jax.tree.unflatten(jax.tree.structure(drones), [leaf[:number] for leaf in stepped])
+    )(packed, *inputs)
+    stepped = [leaf[:number].reshape(old.shape) for leaf, old in zip(stepped, leaves, strict=False)]
+    return jax.tree.unflatten(jax.tree.structure(drones), stepped)

@@ -1,23 +1,55 @@
 """Solid things around a drone: the floor, vertical pillars, the other drones; and how contact with them acts.
 
-A test of present positions would let a drone sink in by the way of one step before anything stops it. So MJX
-is shown each thing moved along the present normal of contact to where its surface will be, seen from the
+A test of present positions would let a drone sink in by the way of one step before anything stops it. So the
+solver is shown each thing moved along the present normal of contact to where its surface will be, seen from the
 drone, at the end of the step if nothing intervened. A contact then stops the drone at the surface, in the
 step in which it would have passed it. While one thing is hit, whatever else is near is shown as just
 touching: it may not be approached faster because of that impact, which keeps a drone from being squeezed
 through a gap narrower than itself.
+
+The same contacts are solved by MuJoCo MJX (`place_solids`, `mjx_body`) and, written out, by `contact_acceleration`.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
+import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 DRONE_RADIUS = 0.05  # m, the solid sphere of a drone
-PILLAR_RADIUS = 0.1  # m
-PILLAR_HEIGHT = 1.2  # m, of the cylindrical part, which stands on the floor; rounded above
 PARKED = -100.0  # m, height of a pillar that isn't there
+
+
+@dataclass(frozen=True)
+class PillarShape:
+    """Pillars: vertical, standing on the floor, rounded above the cylindrical part. Lengths in m."""
+
+    radius: float = 0.1
+    height: float = 1.2
+
+
+@flax.struct.dataclass
+class Surroundings:
+    """What one drone may touch beside the floor: P pillar slots and K other drones."""
+
+    pillar_position: jax.Array  # (P, 2) m, axis of each pillar
+    pillar_active: jax.Array  # (P,) bool, slots in use
+    other_position: jax.Array  # (K, 3) m
+    other_velocity: jax.Array  # (K, 3) m/s
+
+
+@flax.struct.dataclass
+class Encounters:
+    """One drone beside its solid things: floor, P pillars, K other drones, in this order (M = 1 + P + K)."""
+
+    origin: jax.Array  # (M, 3) m, where each shape stands; the floor's below the drone
+    normal: jax.Array  # (M, 3) unit vector from the nearest point of each thing to the drone
+    gap: jax.Array  # (M,) m, between the surfaces now
+    shown: jax.Array  # (M,) m, the gap that the solver of contacts is shown; < 0: it acts
+
 
 # Contacts in MuJoCo's direct form: acceleration along the normal >= -stiffness * gap - damping * speed,
 # `gap` being the
@@ -35,22 +67,25 @@ _NEAR = 0.04  # m, gap within which a thing counts as near: the way of a fast dr
 _TOUCHING = -1e-6  # m, gap at which a contact acts but doesn't push
 
 
-def solids_xml(n_pillars: int, n_others: int, dt: float) -> tuple[str, str]:
+def solids_xml(pillar: PillarShape, n_pillars: int, n_others: int, dt: float) -> tuple[str, str]:
     """MJCF of the shapes (floor, pillars, other drones) and of their contact pairs with the geom "drone"."""
     shapes = ['<geom name="floor" type="plane" size="0 0 1"/>']
-    pairs = [("floor", _FIXED)]
     for k in range(n_pillars):
-        shapes.append(f'<geom name="pillar_{k}" type="capsule" size="{PILLAR_RADIUS} {PILLAR_HEIGHT / 2}"/>')
-        pairs.append((f"pillar_{k}", _FIXED))
+        shapes.append(f'<geom name="pillar_{k}" type="capsule" size="{pillar.radius} {pillar.height / 2}"/>')
     for k in range(n_others):
         shapes.append(f'<geom name="other_{k}" type="sphere" size="{DRONE_RADIUS}"/>')
-        pairs.append((f"other_{k}", _DRONE))
+    names = ["floor", *(f"pillar_{k}" for k in range(n_pillars)), *(f"other_{k}" for k in range(n_others))]
     contacts = (
         f'<pair geom1="drone" geom2="{name}" condim="1" '
         f'solref="{-stiffness / dt**2} {-damping / dt}" solimp="{impedance} {impedance} 0.001"/>'
-        for name, (stiffness, damping, impedance) in pairs
+        for name, (stiffness, damping, impedance) in zip(names, _contacts(n_pillars, n_others), strict=True)
     )
     return "".join(shapes), "".join(contacts)
+
+
+def _contacts(n_pillars, n_others):
+    """(M, 3) stiffness, damping and impedance of the contact with each thing."""
+    return np.array([_FIXED] * (1 + n_pillars) + [_DRONE] * n_others)
 
 
 def others(n: int) -> np.ndarray:
@@ -58,35 +93,87 @@ def others(n: int) -> np.ndarray:
     return np.array([[j for j in range(n) if j != i] for i in range(n)], int).reshape(n, n - 1)
 
 
-def place_solids(position, velocity, pillar_position, pillar_active, dt) -> jax.Array:
-    """Where each drone's shapes are shown to it for a step of dt seconds, (N, 1 + P + N - 1, 3) m.
+def surroundings(position, velocity, pillar_position, pillar_active) -> Surroundings:
+    """What each of N drones may touch, leading axis N.
 
-    position and velocity (N, 3) of the drones, pillar_position (P, 2) m, pillar_active (P,). The shapes are
-    in the order of `solids_xml`.
+    position and velocity (N, 3) of the drones, pillar_position (P, 2) m, pillar_active (P,).
     """
-    n, p = position.shape[0], pillar_position.shape[0]
-    dtype = position.dtype
-    height = jnp.where(pillar_active.astype(bool), PILLAR_HEIGHT / 2, PARKED).astype(dtype)
-    pillars = jnp.concatenate([pillar_position.astype(dtype), height[:, None]], axis=1)
-    radius = np.r_[DRONE_RADIUS, np.full(p, PILLAR_RADIUS + DRONE_RADIUS), np.full(n - 1, 2 * DRONE_RADIUS)]
-    radius = jnp.asarray(radius, dtype)
-    flat = jnp.array([1, 1, 0], dtype)
+    n = position.shape[0]
 
-    def seen_by_one(position, velocity, other_position, other_velocity):
-        half = PILLAR_HEIGHT / 2
-        level = jnp.clip(position[2] - height, -half, half) + height
-        axes = jnp.concatenate([pillars[:, :2], level[:, None]], axis=1)
-        nearest = jnp.concatenate([(position * flat)[None], axes, other_position])
-        origin = jnp.concatenate([(position * flat)[None], pillars, other_position])
-        moving = jnp.concatenate([jnp.zeros((1 + p, 3), dtype), other_velocity])
-        away = position - nearest
-        distance = jnp.sqrt(jnp.sum(away * away, axis=-1) + 1e-12)
-        normal = away / distance[:, None]
-        gap = distance - radius
-        gap_ahead = gap + dt * jnp.sum(normal * (velocity - moving), axis=-1)
-        hit = jnp.any(gap_ahead < 0.0)
-        shown = jnp.where(hit & (gap < _NEAR) & (gap_ahead >= 0.0), _TOUCHING, gap_ahead)
-        return origin - normal * (shown - gap)[:, None]
+    def each(array):
+        return jnp.broadcast_to(array, (n, *array.shape))
 
     neighbours = others(n)
-    return jax.vmap(seen_by_one)(position, velocity, position[neighbours], velocity[neighbours])
+    return Surroundings(
+        pillar_position=each(pillar_position.astype(position.dtype)),
+        pillar_active=each(pillar_active),
+        other_position=position[neighbours],
+        other_velocity=velocity[neighbours],
+    )
+
+
+def encounters(pillar: PillarShape, position, velocity, around: Surroundings, dt) -> Encounters:
+    """One drone at `position` (3,) m with `velocity` (3,) m/s beside its solid things, for a step of dt seconds."""
+    dtype, half = position.dtype, pillar.height / 2
+    p, k = around.pillar_position.shape[0], around.other_position.shape[0]
+    height = jnp.where(around.pillar_active, half, PARKED).astype(dtype)[:, None]
+    below = (position * jnp.array([1, 1, 0], dtype))[None]
+    level = jnp.clip(position[2] - height, -half, half) + height
+    axis = jnp.concatenate([around.pillar_position, level], axis=1)
+    middle = jnp.concatenate([around.pillar_position, height], axis=1)
+    nearest = jnp.concatenate([below, axis, around.other_position])
+    moving = jnp.concatenate([jnp.zeros((1 + p, 3), dtype), around.other_velocity])
+    radius = np.r_[DRONE_RADIUS, np.full(p, pillar.radius + DRONE_RADIUS), np.full(k, 2 * DRONE_RADIUS)]
+    away = position - nearest
+    distance = jnp.sqrt(jnp.sum(away * away, axis=-1) + 1e-12)
+    normal = away / distance[:, None]
+    gap = distance - jnp.asarray(radius, dtype)
+    gap_ahead = gap + dt * jnp.sum(normal * (velocity - moving), axis=-1)
+    hit = jnp.any(gap_ahead < 0.0)
+    return Encounters(
+        origin=jnp.concatenate([below, middle, around.other_position]),
+        normal=normal,
+        gap=gap,
+        shown=jnp.where(hit & (gap < _NEAR) & (gap_ahead >= 0.0), _TOUCHING, gap_ahead),
+    )
+
+
+def place_solids(met: Encounters) -> jax.Array:
+    """Where one drone's shapes are shown to it, (M, 3) m, in the order of `solids_xml`."""
+    return met.origin - met.normal * (met.shown - met.gap)[:, None]
+
+
+def contact_acceleration(
+    pillar: PillarShape, position, velocity, acceleration, around: Surroundings, dt
+) -> jax.Array:
+    """What contacts add over a step of dt seconds to the `acceleration` (3,) m/s^2 that a drone would have without them.
+
+    MuJoCo's soft contacts (its documentation, "Computation": constraint model, primal problem) written out for a sphere
+    without friction. They act on its centre along the normals, so its mass cancels and three unknowns are left,
+
+        argmin_a |a - a_free|^2 / 2 + sum_i w_i min(0, n_i a - r_i)^2 / 2,
+
+    with weights w_i = d / (1 - d) of the impedance d and reference accelerations r_i = -(b n_i v + k gap_i) / d. As the
+    MJCF's solver does, this takes one Newton step from a_free: exact unless the step brings in another contact.
+    """
+    met = encounters(pillar, position, velocity, around, dt)
+    contacts = _contacts(around.pillar_position.shape[0], around.other_position.shape[0])
+    stiffness, damping, impedance = (jnp.asarray(column, velocity.dtype) for column in contacts.T)
+    approach = jnp.sum(met.normal * velocity, axis=-1)
+    reference = -(damping / dt * approach + stiffness / dt**2 * met.shown) / impedance
+    residual = jnp.sum(met.normal * acceleration, axis=-1) - reference
+    weight = jnp.where((met.shown < 0.0) & (residual < 0.0), impedance / (1.0 - impedance), 0.0)
+    push = -jnp.sum((weight * residual)[:, None] * met.normal, axis=0)
+
+    # (1 + sum_i w_i n_i n_i^T) step = push, by an LDL^T factorisation
+    x, y, z = met.normal[:, 0], met.normal[:, 1], met.normal[:, 2]
+    xx, yy, zz = (1.0 + jnp.sum(weight * a * a) for a in (x, y, z))
+    xy, xz, yz = (jnp.sum(weight * a * b) for a, b in ((x, y), (x, z), (y, z)))
+    l_y, l_z = xy / xx, xz / xx
+    d_y, e = yy - l_y * xy, yz - l_z * xy
+    l_zy = e / d_y
+    d_z = zz - l_z * xz - l_zy * e
+    f_y = push[1] - l_y * push[0]
+    step_z = (push[2] - l_z * push[0] - l_zy * f_y) / d_z
+    step_y = f_y / d_y - l_zy * step_z
+    return jnp.stack([push[0] / xx - l_y * step_y - l_z * step_z, step_y, step_z])

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from openjax.vehicle.solids import DRONE_RADIUS, PILLAR_RADIUS
+from openjax.vehicle.solids import DRONE_RADIUS, PillarShape
 from openjax.vehicle.state import DroneState
 
 
@@ -17,7 +17,7 @@ def stop(drones: DroneState, pillar_position, pillar_active) -> DroneState:
     if pillar_position.shape[0]:
         away = position[:, None, :2] - pillar_position[None]
         position, velocity = _push(
-            position, velocity, away, PILLAR_RADIUS + DRONE_RADIUS, pillar_active[None], 1.0
+            position, velocity, away, PillarShape.radius + DRONE_RADIUS, pillar_active[None], 1.0
         )
     if position.shape[0] > 1:
         apart = position[:, None] - position[None]
