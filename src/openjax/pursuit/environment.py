@@ -82,6 +82,7 @@ class Pursuit:
         vehicle: the pursuers' vehicle; None is the nominal Crazyflie.
         effects: names of physical effects to fly with (`openjax.vehicle.effects`).
         effect_parameters: their parameters, {effect: {parameter: value}}.
+        vehicle_bounds: (R, 4) bounds of `settings.vehicles` that go before those written there.
     """
 
     def __init__(
@@ -90,11 +91,13 @@ class Pursuit:
         vehicle: Vehicle | None = None,
         effects: tuple[str, ...] = (),
         effect_parameters: dict | None = None,
+        vehicle_bounds: jax.Array | None = None,
     ):
         self.settings = settings or PursuitSettings()
         self.vehicle = vehicle if vehicle is not None else load_vehicle()
         self.effects = tuple(effects)
         self.effect_parameters = effect_parameters or {}
+        self.vehicle_bounds = vehicle_bounds
         drawn = family_effects(self.settings.vehicles)
         self._drones_step = make_drones_step(
             physics=self.settings.physics,
@@ -130,7 +133,11 @@ class Pursuit:
         drones = jax.vmap(lambda p, q: hover_state(self.vehicle, p, q))(task.pursuer_position, quaternion)
         drones = self._drones_step.reset(self.vehicle, drones, effect_key)
         vehicles = draw_vehicles(
-            settings.vehicles, jax.random.fold_in(key, 2), settings.num_pursuers, settings.rare_vehicles
+            settings.vehicles,
+            jax.random.fold_in(key, 2),
+            settings.num_pursuers,
+            settings.rare_vehicles,
+            self.vehicle_bounds,
         )
         action = jnp.broadcast_to(hover_action(self.vehicle), (settings.num_pursuers, 4))
         own_history = None

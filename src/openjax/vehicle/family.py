@@ -67,17 +67,27 @@ def family_effects(ranges: Sequence[VehicleRange]) -> tuple[Effect, ...]:
     return tuple(effects[name] for name in sorted(effects))
 
 
+def family_bounds(ranges: Sequence[VehicleRange]) -> np.ndarray:
+    """(R, 4) low, high, rare low and rare high of each range."""
+    return np.array([entry[1:] for entry in ranges], np.float32)
+
+
 def draw_vehicles(
-    ranges: Sequence[VehicleRange], key: jax.Array, number: int, rare: float = 0.0
+    ranges: Sequence[VehicleRange],
+    key: jax.Array,
+    number: int,
+    rare: float = 0.0,
+    bounds: jax.Array | None = None,
 ) -> dict[str, dict[str, jax.Array]]:
     """Effect parameters {effect: {parameter: (number,)}} of `number` vehicles, each drawn by itself.
 
-    With probability `rare` one effect of a vehicle, any with equal odds, is drawn from its rare bounds.
+    With probability `rare` one effect of a vehicle, any with equal odds, is drawn from its rare bounds. `bounds` (R, 4)
+    take the place of those in `ranges`: they may be known only after the program was compiled.
     """
     if not ranges:
         return {}
     names = [effect.name for effect in family_effects(ranges)]
-    bounds = np.array([entry[1:] for entry in ranges], np.float32)
+    bounds = family_bounds(ranges) if bounds is None else bounds
     owner = np.array([names.index(entry[0].partition(".")[0]) for entry in ranges])
     value_key, chosen_key, rare_key = jax.random.split(key, 3)
     share = jax.random.uniform(value_key, (number, len(ranges)))
@@ -190,3 +200,33 @@ FLIGHT_SOURCES: dict[str, tuple[float, float, float, float, str]] = {
 FLIGHT_FAMILY: tuple[VehicleRange, ...] = tuple(
     VehicleRange(name, *entry[:4]) for name, entry in FLIGHT_SOURCES.items()
 )
+
+
+def adapted_family(
+    values: dict[str, dict[str, float]],
+    intervals: dict[str, dict[str, tuple[float, float]]],
+    rest: float = 0.35,
+) -> tuple[VehicleRange, ...]:
+    """The family of one vehicle that was diagnosed: what was found, within its intervals, and a share of all else.
+
+    It holds every parameter there is, so that families of any two diagnoses differ in their bounds only.
+
+    Args:
+      values: {effect: {parameter: value}} of the effects that were found.
+      intervals: their 90 % intervals, where known; else a tenth of the value either way.
+      rest: the part of `FLIGHT_FAMILY`'s ranges that remains for effects that weren't found: flights can't rule them out.
+    """
+    family = []
+    for effect in known_effects().values():
+        found = values.get(effect.name)
+        for key, parameter in effect.parameters.items():
+            name = f"{effect.name}.{key}"
+            if found is None:
+                low, high = FLIGHT_SOURCES.get(name, (parameter.none, parameter.none))[:2]
+                low, high = (parameter.none + rest * (bound - parameter.none) for bound in (low, high))
+            else:
+                value = found.get(key, parameter.none)
+                margin = 0.1 * abs(value - parameter.none)
+                low, high = intervals.get(effect.name, {}).get(key, (value - margin, value + margin))
+            family.append(VehicleRange(name, float(low), float(high), float(low), float(high)))
+    return tuple(family)

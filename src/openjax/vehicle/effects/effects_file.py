@@ -103,3 +103,15 @@ def save_effects(
     partial = path.with_name(path.name + ".partial")
     partial.write_text(tomlkit.dumps(document), encoding="utf-8")
     partial.replace(path)
+
+
+def load_intervals(path: str | Path) -> dict[str, dict[str, tuple[float, float]]]:
+    """90 % intervals {effect: {parameter: (low, high)}} of an effects file that `load_effects` accepts."""
+    table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    found: dict[str, dict[str, tuple[float, float]]] = {}
+    for name, entries in table.items():
+        for key, entry in entries.items() if isinstance(entries, dict) else ():
+            interval = entry.get("interval90") if isinstance(entry, dict) else None
+            if interval is not None and len(interval) == 2 and interval[0] <= interval[1]:
+                found.setdefault(name, {})[key] = (float(interval[0]), float(interval[1]))
+    return found

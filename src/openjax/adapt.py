@@ -1,0 +1,257 @@
+"""From flights to a better policy: `python -m openjax.adapt FLIGHTS --policy NAME --out DIR`.
+
+Diagnoses the flights, draws vehicles from the intervals of what was found, fine-tunes the policy on them, and measures
+both policies on tasks and vehicles that neither was trained on. Writes DIR/policy.npz, adapt.json and adapt.html.
+"""
+
+import base64
+import dataclasses
+import html
+import io
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from openjax.commands.command_line import output_console, parse, run_command
+from openjax.errors import UserError
+from openjax.learning.adaptation import AdaptSettings
+
+PROGRAM = "python -m openjax.adapt"
+FIGURES = ("capture_rate", "capture_step", "collision_rate", "crash_rate", "over_speed_rate")
+
+
+@dataclasses.dataclass(frozen=True)
+class AdaptCommand:
+    """Diagnose flights and fine-tune a policy to the vehicle that flew them."""
+
+    flights: Annotated[Path, tyro.conf.Positional] = Path("flights")
+    """Folder of flight logs with a vehicle.toml, or an effects.toml of a diagnosis made before."""
+    policy: str = "flight"
+    """A run, a policy file or the name of a policy in the package; it should know a history of its own flight."""
+    out: Path = Path("adapted")
+    """Directory for what is found."""
+    episodes: int = 1024
+    """Episodes by which the policies are measured."""
+    seed: int = 0
+    overwrite: bool = False
+    """Replace what --out already holds."""
+    training: AdaptSettings = dataclasses.field(default_factory=AdaptSettings)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """The command; returns its exit status."""
+    command = parse(AdaptCommand, AdaptCommand(), arguments, PROGRAM)
+    if not command.flights.exists():
+        raise UserError(f"{command.flights}: no such folder of flights, nor effects.toml")
+    if command.out.exists() and not command.overwrite:
+        raise UserError(f"{command.out} already exists: choose another --out or give --overwrite")
+    if command.episodes < 1 or command.training.updates < 1 or command.training.warm_up < 0:
+        raise UserError("--episodes and --training.updates must be positive, --training.warm_up not negative")
+    results = adapt(command)
+    console = output_console()
+    for line in in_words(results):
+        console.print(line, soft_wrap=True)
+    console.print(f"policy, figures and page are in {command.out}", soft_wrap=True)
+    return 0
+
+
+def adapt(command: AdaptCommand) -> dict:
+    """Do all of it and write it down. Raises UserError for flights that can't be diagnosed or an unusable policy."""
+    started = time.monotonic()
+    diagnosis = _Diagnosis(command)
+    try:
+        import jax
+
+        from openjax.commands.machine import describe_machine
+        from openjax.commands.validation import selection_score, uniform_tasks
+        from openjax.learning import summarise
+        from openjax.learning.adaptation import adapting_settings, bounds_of, fine_tune, make_adaptation
+        from openjax.store.policies import load_policy
+        from openjax.store.policy_files import save_policy_file
+        from openjax.store.settings_files import write_json
+        from openjax.vehicle.effects.effects_file import load_effects, load_intervals
+        from openjax.vehicle.family import adapted_family
+
+        loaded = load_policy(command.policy)
+        settings = adapting_settings(loaded.settings, command.training)
+        adaptation = make_adaptation(settings)
+        key = jax.random.key(command.seed)
+        tasks = uniform_tasks(settings.environment, 2 * command.episodes, settings.environment.max_pillars)
+        chosen_by = jax.tree.map(lambda leaf: leaf[: command.episodes], tasks)
+        measured_on = jax.tree.map(lambda leaf: leaf[command.episodes :], tasks)
+        parameters = loaded.parameters.replace(critic={})
+        ready = _compile(adaptation, parameters, chosen_by, bounds_of({}, {}))
+
+        effects = diagnosis()
+        names, values = load_effects(effects)
+        intervals = load_intervals(effects)
+        seconds = {"diagnosis": time.monotonic() - started}
+        bounds = bounds_of(values, intervals)
+        ready()
+        seconds["compiled"] = time.monotonic() - started
+        tuned, history = fine_tune(adaptation, parameters, bounds, command.training.warm_up, key)
+        tuned = tuned.replace(critic={})
+        seconds["fine-tuned"] = time.monotonic() - started
+
+        def figures(parameters, tasks, number):
+            return summarise(adaptation.evaluate(parameters, tasks, jax.random.fold_in(key, number), bounds))
+
+        scores = [selection_score(figures(p, chosen_by, 1)) for p in (parameters, tuned)]
+        better = scores[1] >= scores[0]
+        before, after = (figures(p, measured_on, 2) for p in (parameters, tuned))
+        seconds["measured"] = time.monotonic() - started
+    finally:
+        diagnosis.stop()
+    family = adapted_family(values, intervals)
+    results = {
+        "command": f"{PROGRAM} {command.flights} --policy {command.policy} --out {command.out}",
+        "machine": describe_machine(),
+        "policy": command.policy,
+        "effects": list(names),
+        "parameters": [
+            {"parameter": name, "value": values.get(effect, {}).get(key), "low": low, "high": high}
+            for name, low, high, _, _ in family
+            for effect, _, key in [name.partition(".")]
+            if effect in values
+        ],
+        "episodes": command.episodes,
+        "before": {name: before[name] for name in FIGURES},
+        "after": {name: after[name] for name in FIGURES},
+        "kept": "fine-tuned" if better else "the policy as it was",
+        "history": [{name: row[name] for name in FIGURES} for row in history],
+        "warm_up": command.training.warm_up,
+        "seconds": seconds,
+    }
+    own = dataclasses.replace(
+        settings, environment=dataclasses.replace(settings.environment, vehicles=family)
+    )
+    command.out.mkdir(parents=True, exist_ok=True)
+    kept = tuned if better else parameters
+    notes = {"adapted_from": command.policy, "effects": values, "machine": results["machine"]}
+    save_policy_file(command.out / "policy.npz", kept, own, notes, storage="float32")
+    write_json(command.out / "adapt.json", results)
+    (command.out / "adapt.html").write_text(page(results), encoding="utf-8")
+    return results
+
+
+class _Diagnosis:
+    """A diagnosis that runs beside the compiler; called, it waits for the effects file that it writes."""
+
+    def __init__(self, command: AdaptCommand):
+        self.out, self.process = command.out / "diagnosis", None
+        self.effects = command.flights
+        if command.flights.is_dir():
+            if self.out.exists():
+                shutil.rmtree(self.out)
+            self.effects = self.out / command.flights.resolve().name / "effects.toml"
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "openjax.diagnose", str(command.flights), "--out", str(self.out)],
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                text=True,
+                env=os.environ | {"JAX_PLATFORMS": "cpu"},  # the accelerator is the trainer's
+            )
+
+    def __call__(self) -> Path:
+        if self.process is not None:
+            complaint = self.process.communicate()[1].strip()
+            if self.process.returncode != 0:
+                last = complaint.splitlines()[-1] if complaint else "it ended without a word"
+                raise UserError(f"{self.effects.parent.name}: no diagnosis: {last.removeprefix('error: ')}")
+        return self.effects
+
+    def stop(self) -> None:
+        """End it if it is still running."""
+        if self.process is not None and self.process.poll() is None:
+            self.process.terminate()
+            self.process.wait()
+
+
+def _compile(adaptation, parameters, tasks, bounds):
+    """Start to compile the training step and the evaluation; a function that waits for both."""
+    import jax
+
+    from openjax.cluster.compilation import compile_ahead
+
+    key = jax.random.key(0)
+    carry = jax.eval_shape(adaptation.start, key, bounds)
+    waits = [
+        compile_ahead(adaptation.step, carry, bounds),
+        compile_ahead(adaptation.evaluate, parameters, tasks, key, bounds),
+    ]
+    return lambda: [wait() for wait in waits]
+
+
+def in_words(results: dict) -> list[str]:
+    """What was found and gained."""
+    effects = ", ".join(results["effects"]) or "no effect: the simulator is right to within the noise"
+    before, after = results["before"], results["after"]
+    changes = "; ".join(
+        f"{name.replace('_', ' ')} {before[name]:.4g} → {after[name]:.4g}" for name in FIGURES
+    )
+    return [
+        f"Found: {effects}.",
+        f"On {results['episodes']} tasks that neither was trained on, vehicles drawn from what was found: {changes}.",
+        f"Kept: {results['kept']}. {results['seconds']['measured']:.0f} s.",
+    ]
+
+
+def page(results: dict) -> str:
+    """One self-contained HTML page."""
+    rows = "".join(
+        f"<tr><td>{html.escape(row['parameter'])}</td><td>{row['value']:.4g}</td>"
+        f"<td>{row['low']:.4g} … {row['high']:.4g}</td></tr>"
+        for row in results["parameters"]
+        if row["value"] is not None
+    )
+    figures = "".join(
+        f"<tr><td>{name.replace('_', ' ')}</td><td>{results['before'][name]:.4f}</td><td>{results['after'][name]:.4f}</td></tr>"
+        for name in FIGURES
+    )
+    words = "".join(f"<p>{html.escape(line)}</p>" for line in in_words(results))
+    steps = "".join(f"<li>{name}: {seconds:.0f} s</li>" for name, seconds in results["seconds"].items())
+    return (
+        "<!doctype html><meta charset='utf-8'><title>Adapted policy</title>"
+        "<style>body{font:16px/1.5 sans-serif;max-width:56em;margin:2em auto;padding:0 1em}"
+        "table{border-collapse:collapse;margin:1em 0}td,th{border-bottom:1px solid #ccc;padding:.2em 1em;text-align:left}"
+        "img{max-width:100%}</style>"
+        f"<h1>From flights to a better policy</h1>{words}"
+        f"<h2>What it gained</h2><table><tr><th></th><th>before</th><th>after</th></tr>{figures}</table>"
+        f"<img alt='before, after and on the way' src='data:image/png;base64,{_picture(results)}'>"
+        f"<h2>The vehicle</h2><table><tr><th>parameter</th><th>found</th><th>drawn from</th></tr>{rows}</table>"
+        "<p>Of effects that weren't found, a third of the ranges that real flights justify was drawn as well: "
+        "flights can't rule them out.</p>"
+        f"<h2>Time since the start</h2><ul>{steps}</ul>"
+        f"<p><code>{html.escape(results['command'])}</code></p>"
+    )
+
+
+def _picture(results):
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 3.2), layout="constrained")
+    shown = ("capture_step", "collision_rate", "crash_rate")
+    for axes, name in zip(figure.subplots(1, len(shown)), shown, strict=True):
+        course = [row[name] for row in results["history"]]
+        axes.plot(range(1, len(course) + 1), course, color="0.6", label="with exploration, while training")
+        axes.axvspan(0, results["warm_up"], color="0.93", label="critic alone")
+        axes.axhline(results["before"][name], color="tab:red", label="before")
+        axes.axhline(results["after"][name], color="tab:blue", label="after")
+        axes.set(title=name.replace("_", " "), xlabel="training step", ylim=(0, None))
+    figure.axes[0].legend(fontsize="x-small")
+    FigureCanvasAgg(figure)
+    data = io.BytesIO()
+    figure.savefig(data, dpi=110)
+    return base64.b64encode(data.getvalue()).decode()
+
+
+if __name__ == "__main__":
+    sys.exit(run_command(main))

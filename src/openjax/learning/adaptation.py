@@ -1,0 +1,129 @@
+"""Fine-tuning a policy to one diagnosed vehicle, by programs that are compiled before the diagnosis is known."""
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from openjax.learning.evaluation import Evaluation, make_evaluate
+from openjax.learning.settings import TrainSettings
+from openjax.learning.training_step import TrainCarry, build, init_carry, make_training_step
+from openjax.policy import Policy, PolicyParameters
+from openjax.pursuit import Pursuit, Task
+from openjax.vehicle.family import adapted_family, family_bounds
+
+
+@dataclass(frozen=True)
+class AdaptSettings:
+    """How a policy is fine-tuned."""
+
+    num_envs: int = 5120
+    updates: int = 60
+    """Training steps of the policy, after ..."""
+    warm_up: int = 20
+    """... those in which only the critic learns: shipped policies come without one, and a wrong one spoils the policy."""
+    learning_rate: float = 3e-4
+    clip_epsilon: float = 0.1
+
+
+def adapting_settings(trained: TrainSettings, settings: AdaptSettings) -> TrainSettings:
+    """The training's settings for fine-tuning: penalties in full, small steps, vehicles of every kind of effect."""
+    num_envs = max(settings.num_envs // trained.world_unit, 1) * trained.world_unit
+    minibatches = max(n for n in range(1, trained.mappo.minibatches + 1) if num_envs % n == 0)
+    return dataclasses.replace(
+        trained,
+        environment=dataclasses.replace(
+            trained.environment, vehicles=adapted_family({}, {}), rare_vehicles=0.0
+        ),
+        mappo=dataclasses.replace(
+            trained.mappo,
+            learning_rate=settings.learning_rate,
+            clip_epsilon=settings.clip_epsilon,
+            clip_epsilon_end=settings.clip_epsilon,
+            penalty_start=1.0,
+            minibatches=minibatches,
+        ),
+        num_envs=num_envs,
+        total_steps=(settings.updates + settings.warm_up) * num_envs * trained.rollout_length,
+    )
+
+
+@dataclass(frozen=True)
+class Adaptation:
+    """The compiled programs: the training step and the evaluation, both for vehicles whose bounds are an argument."""
+
+    settings: TrainSettings
+    policy: Policy
+    start: Callable[[jax.Array, jax.Array], TrainCarry]
+    """(key, bounds) -> carry."""
+    step: Callable[[TrainCarry, jax.Array], tuple[TrainCarry, dict[str, jax.Array]]]
+    """(carry, bounds) -> carry, metrics; the carry is donated."""
+    evaluate: Callable[[PolicyParameters, Task, jax.Array, jax.Array], Evaluation]
+    """(parameters, tasks, key, bounds) -> one episode per task."""
+
+
+def make_adaptation(settings: TrainSettings) -> Adaptation:
+    """The programs for `adapting_settings`, not compiled yet."""
+
+    def environment(bounds):
+        return Pursuit(settings.environment, vehicle_bounds=bounds)
+
+    policy = build(settings).policy
+    return Adaptation(
+        settings=settings,
+        policy=policy,
+        start=lambda key, bounds: init_carry(settings, key, environment(bounds)),
+        step=jax.jit(
+            lambda carry, bounds: make_training_step(settings, environment(bounds))(carry), donate_argnums=0
+        ),
+        evaluate=jax.jit(
+            lambda parameters, tasks, key, bounds: make_evaluate(environment(bounds), policy)(
+                parameters, tasks, key
+            )
+        ),
+    )
+
+
+def fine_tune(
+    adaptation: Adaptation,
+    parameters: PolicyParameters,
+    bounds: jax.Array,
+    warm_up: int,
+    key: jax.Array,
+    tell: Callable[[int, dict[str, float]], Any] = lambda update, metrics: None,
+) -> tuple[PolicyParameters, list[dict[str, float]]]:
+    """Train `parameters` (critic left aside) on vehicles within `bounds` (R, 4).
+
+    In the first `warm_up` steps actor and predictor are put back after each step. `tell` hears of every training step.
+    Returns the parameters after it and the metrics of each step.
+    """
+    bounds = jnp.asarray(bounds)
+    carry = adaptation.start(key, bounds)
+    learnt = carry.policy.replace(actor=parameters.actor, predictor=parameters.predictor)
+    fixed = jax.tree.map(jnp.copy, (learnt.actor, learnt.predictor, carry.actor_optimiser))
+    carry, history = carry.replace(policy=jax.tree.map(jnp.copy, learnt)), []
+    for update in range(adaptation.settings.total_updates):
+        carry, metrics = adaptation.step(carry, bounds)
+        if update < warm_up:
+            actor, predictor, optimiser = jax.tree.map(jnp.copy, fixed)
+            carry = carry.replace(
+                policy=carry.policy.replace(actor=actor, predictor=predictor),
+                actor_optimiser=_at_step(optimiser, carry.actor_optimiser),
+            )
+        metrics = {name: float(value) for name, value in metrics.items()}
+        history.append(metrics)
+        tell(update + 1, metrics)
+    return carry.policy, history
+
+
+def _at_step(fresh, used):
+    """Optimiser state `fresh`, with the counts of steps of `used`, so that the step size goes on falling."""
+    return jax.tree.map(lambda new, old: old if jnp.issubdtype(old.dtype, jnp.integer) else new, fresh, used)
+
+
+def bounds_of(values, intervals) -> jax.Array:
+    """(R, 4) bounds of the family of a diagnosed vehicle; see `adapted_family`."""
+    return jnp.asarray(family_bounds(adapted_family(values, intervals)))
