@@ -13,6 +13,7 @@ from openjax.learning.settings import TrainSettings
 from openjax.learning.training_step import TrainCarry, build, init_carry, make_training_step
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Pursuit, Task
+from openjax.vehicle import load_vehicle
 from openjax.vehicle.family import adapted_family, family_bounds
 
 
@@ -68,8 +69,10 @@ class Adaptation:
 def make_adaptation(settings: TrainSettings) -> Adaptation:
     """The programs for `adapting_settings`, not compiled yet."""
 
+    vehicle = load_vehicle()
+
     def environment(bounds):
-        return Pursuit(settings.environment, vehicle_bounds=bounds)
+        return Pursuit(settings.environment, vehicle, vehicle_bounds=bounds)
 
     policy = build(settings).policy
     return Adaptation(

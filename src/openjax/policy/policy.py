@@ -38,7 +38,9 @@ class Policy:
         cls, environment: Pursuit, network: NetworkSettings, predictor: PredictorSettings
     ) -> "Policy":
         """The policy for an environment: its arena's size, and a start that hovers its vehicle."""
-        hover = np.arctanh(np.clip(np.asarray(hover_action(environment.vehicle), np.float64), -0.99, 0.99))
+        with jax.ensure_compile_time_eval():  # an environment may be made inside a compiled program
+            hover = np.asarray(hover_action(environment.vehicle), np.float64)
+        hover = np.arctanh(np.clip(hover, -0.99, 0.99))
         return cls(
             network=network,
             predictor=predictor,

@@ -1,0 +1,90 @@
+"""From flights to a fine-tuned policy, at a tiny size: what is drawn, what is written, what is refused."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from openjax import adapt
+from openjax.errors import UserError
+from openjax.learning import TrainSettings, build
+from openjax.learning.adaptation import AdaptSettings, adapting_settings, bounds_of
+from openjax.learning.settings import GeneratorSettings, MappoSettings
+from openjax.policy import NetworkSettings, PredictorSettings
+from openjax.pursuit import PursuitSettings
+from openjax.store.policies import load_policy
+from openjax.store.policy_files import save_policy_file
+from openjax.vehicle import family
+from openjax.vehicle.effects import save_effects
+from openjax.vehicle.family import adapted_family
+
+TINY = TrainSettings(
+    environment=PursuitSettings(
+        physics="stops", speed_limit="none", episode_length=8, observe_history=2, history_length=2
+    ),
+    network=NetworkSettings(features=8, heads=1),
+    predictor=PredictorSettings(enabled=False),
+    mappo=MappoSettings(minibatches=2, epochs=1),
+    generator=GeneratorSettings(capacity=8, episodes_per_task=2),
+    num_envs=8,
+    rollout_length=4,
+)
+VALUES = {"motor_lag": {"extra_up": 0.04, "extra_down": 0.03}}
+INTERVALS = {"motor_lag": {"extra_up": (0.035, 0.045)}}
+
+
+@pytest.fixture
+def policy_file(tmp_path):
+    parts = build(TINY)
+    start = lambda key: parts.policy.init(key, parts.environment.reset(key)[0])  # noqa: E731
+    path = tmp_path / "policy.npz"
+    save_policy_file(path, jax.jit(start)(jax.random.key(1)), TINY)
+    return path
+
+
+def test_vehicles_are_drawn_from_the_intervals_and_a_share_of_all_else():
+    drawn = {name: bounds for name, *bounds in adapted_family(VALUES, INTERVALS)}
+    assert drawn["motor_lag.extra_up"][:2] == pytest.approx([0.035, 0.045])
+    assert drawn["motor_lag.extra_down"][:2] == pytest.approx([0.027, 0.033])
+    assert drawn["rotor_drag.d_xy"][:2] == pytest.approx([0.0, 0.35 * 0.015])
+    assert drawn["yaw_torque.ratio"][:2] == pytest.approx([1 - 0.35 * 0.85, 1 + 0.35 * 0.1])
+    assert drawn["ceiling_effect.strength"][:2] == [0.0, 0.0]
+    assert bounds_of(VALUES, INTERVALS).shape == bounds_of({}, {}).shape
+
+
+def test_settings_for_fine_tuning_fit_together():
+    settings = adapting_settings(TINY, AdaptSettings(num_envs=30, updates=3, warm_up=2))
+    assert settings.num_envs == 28 and settings.total_updates == 5 and settings.mappo.penalty_start == 1.0
+
+
+def test_a_policy_is_fine_tuned_measured_and_written(policy_file, tmp_path, monkeypatch):
+    few = {
+        name: family.known_effects()[name] for name in ("motor_lag", "mass")
+    }  # the others take long to compile
+    monkeypatch.setattr(family, "known_effects", lambda: few)
+    effects = tmp_path / "effects.toml"
+    save_effects(effects, VALUES, INTERVALS)
+    training = AdaptSettings(num_envs=8, updates=1, warm_up=1)
+    command = adapt.AdaptCommand(effects, str(policy_file), tmp_path / "out", episodes=2, training=training)
+    results = adapt.adapt(command)
+    assert json.loads((command.out / "adapt.json").read_text())["effects"] == ["motor_lag"]
+    assert "motor_lag.extra_up" in (command.out / "adapt.html").read_text()
+    before, after = load_policy(policy_file), load_policy(command.out / "policy.npz")
+    assert dict((name, low) for name, low, *_ in after.settings.environment.vehicles)[
+        "motor_lag.extra_up"
+    ] == pytest.approx(0.035)
+    changed = not np.allclose(
+        *(jax.tree.leaves(loaded.parameters.actor)[0] for loaded in (before, after)), atol=1e-5
+    )
+    assert changed == (results["kept"] == "fine-tuned")
+    with pytest.raises(UserError, match="already exists"):
+        adapt.main([str(effects), "--policy", str(policy_file), "--out", str(command.out)])
+
+
+def test_what_is_not_there_is_refused_before_anything_is_written(tmp_path):
+    with pytest.raises(UserError, match="no such folder"):
+        adapt.main([str(tmp_path / "nothing"), "--out", str(tmp_path / "out")])
+    with pytest.raises(UserError, match="positive"):
+        adapt.main([str(tmp_path), "--out", str(tmp_path / "out"), "--episodes", "0"])
+    assert not (tmp_path / "out").exists()
