@@ -1,0 +1,284 @@
+"""The plant: quadrotors at 1 kHz under a firmware rate loop at 500 Hz with its filters and an off-board controller.
+
+`fly` integrates a whole batch of bodies at once (NumPy, body index last) and returns the true motion every 2 ms.
+`Body` is the physics alone; `measure` steps it over short windows. Euler angles appear nowhere in the physics;
+integration is semi-implicit with a second-order position.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from experiments.exam import effects
+from experiments.exam import vehicle as v
+from experiments.exam.controllers import Controllers
+from experiments.exam.unknowns import Unknowns
+
+DT = 0.001
+SAMPLE = 0.002  # s, at which the truth is kept and the rate loop runs
+PER_TICK = 5  # samples in a tick of the off-board controller, 10 ms
+
+
+@dataclass
+class Batch:
+    """Everything that decides a batch of B bodies over K ticks of 10 ms."""
+
+    told: list  # B `vehicle.Told`
+    parameters: dict  # arrays of `vehicle.nominal_parameters`
+    reference: dict  # position, velocity, acceleration (K, 3, B), yaw, yaw_rate (K, B), pulses (K, 4, B)
+    controllers: list  # B names
+    partner: np.ndarray  # (B,) index of the vehicle that may fly above; itself if alone
+    arrival: np.ndarray  # (K, B) ms at which the command of tick k reaches the vehicle; >= 10**8: lost
+    air: dict  # see `sensors.draw_air`
+    unknowns: dict = field(default_factory=dict)  # name -> {"strength": (B,), "shape": (8, B)}
+
+
+class Filter:
+    """Second-order Butterworth low-pass of (n, B) signals at 500 Hz; `cut` (B,) Hz, 0 lets everything through."""
+
+    def __init__(self, cut, rows, start):
+        on = cut > 0
+        k = np.tan(np.pi * np.where(on, cut, 1.0) * SAMPLE)
+        scale = 1.0 / (1.0 + np.sqrt(2.0) * k + k * k)
+        self.b0, self.b1, self.b2 = (
+            np.where(on, c * k * k * scale, float(i == 0)) for i, c in enumerate((1, 2, 1))
+        )
+        self.a1 = np.where(on, 2 * (k * k - 1) * scale, 0.0)
+        self.a2 = np.where(on, (1 - np.sqrt(2.0) * k + k * k) * scale, 0.0)
+        self.any = bool(on.any())
+        self.one = np.broadcast_to(start, (rows, len(cut))) * (1 - self.b0)
+        self.two = np.broadcast_to(start, (rows, len(cut))) * (self.b2 - self.a2)
+
+    def __call__(self, x):
+        if not self.any:
+            return x
+        y = self.b0 * x + self.one
+        self.one = self.b1 * x - self.a1 * y + self.two
+        self.two = self.b2 * x - self.a2 * y
+        return y
+
+
+class Firmware:
+    """Rate loop of the firmware at 500 Hz: filters of gyroscope and derivative, PID in counts, mixer."""
+
+    def __init__(self, p, gyro, integral=None):
+        self.p, count = p, gyro.shape[1]
+        self.limit = v.INTEGRAL_LIMIT[:, None]
+        self.integral = np.zeros((3, count)) if integral is None else integral.copy()
+        self.gyro_filter = Filter(p["gyro_cut"], 3, gyro)
+        self.slope_filter = Filter(p["derivative_cut"], 3, 0.0)
+        self.keep = np.where(p["d_filter"] > 0, np.exp(-SAMPLE / np.maximum(p["d_filter"], 1e-6)), 0.0)
+        self.slow = bool(self.keep.any())
+        self.previous, self.slope = gyro.copy(), np.zeros((3, count))
+
+    def filtered(self, gyro):
+        """The gyroscope as the loop and the log get it."""
+        return self.gyro_filter(gyro)
+
+    def __call__(self, command, gyro):
+        """Motor commands (4, B) from the command in force (4, B) and the filtered gyroscope (3, B)."""
+        p = self.p
+        error = np.rad2deg(command[1:] - gyro)
+        self.integral = np.minimum(np.maximum(self.integral + SAMPLE * error, -self.limit), self.limit)
+        slope = self.slope_filter(np.rad2deg(self.previous - gyro) / SAMPLE)
+        self.slope = self.keep * self.slope + (1 - self.keep) * slope if self.slow else slope
+        self.previous = gyro
+        return v.mix(command[0], p["kp"] * error + p["ki"] * self.integral + p["kd"] * self.slope)
+
+
+class Body:
+    """Rotors, forces and the rigid body of a batch; state position, velocity, rates (3, B), q, rotor (4, B)."""
+
+    def __init__(self, p, neutral, position, velocity, q, rates, rotor):
+        self.p, self.active = p, effects.Active(p, neutral)
+        self.position, self.velocity, self.q, self.rates = position, velocity, q, rates
+        self.rotor, self.drive, self.specific = rotor, rotor.copy(), np.zeros_like(rates)
+        self.count = rates.shape[1]
+        self.wake = bool(np.any(p["wake"] != 0))
+        self.inverse = np.moveaxis(np.linalg.inv(np.moveaxis(p["inertia"], 2, 0)), 0, 2)
+        self.diagonal = not np.any(p["inertia"][~np.eye(3, dtype=bool)])
+        self.principal = p["inertia"][np.arange(3), np.arange(3)]
+        self.arm_x, self.arm_y = v.ROTOR_X[:, None] - p["com"][0], v.ROTOR_Y[:, None] - p["com"][1]
+        self.up, self.down = 1 - np.exp(-DT / p["tau_up"]), 1 - np.exp(-DT / p["tau_down"])
+        self.second = np.where(p["tau_second"] > 0, 1 - np.exp(-DT / np.maximum(p["tau_second"], 1e-4)), 1.0)
+        self.lifts = p["thrust_constant"] * p["rotor_gain"]
+        self.reacts = p["torque_ratio"] * p["torque_gain"] * v.SPIN[:, None] * self.lifts
+        self.zero = np.zeros(self.count)
+
+    def step(self, m, voltage, load, gust_force, gust_torque, slow, other, unknowns=None, time=0.0):
+        """One millisecond under motor commands m (4, B); `other` (3, B) is the vehicle that may fly above."""
+        p, zero = self.p, self.zero
+        u = effects.motor_demand(p, self.active, m, voltage, load)
+        if unknowns:
+            u = unknowns.motors(u, time)
+        self.drive = self.drive + self.second * (v.MAX_SPEED * np.sqrt(u) - self.drive)
+        self.rotor = self.rotor + np.where(self.drive > self.rotor, self.up, self.down) * (
+            self.drive - self.rotor
+        )
+        squared = self.rotor * self.rotor
+        thrust = self.lifts * squared * effects.surface_gain(p, self.active, self.position, self.q)
+        moment = np.stack(
+            [(self.arm_y * thrust).sum(0), -(self.arm_x * thrust).sum(0), (self.reacts * squared).sum(0)]
+        )
+        force, torque = effects.air_forces(
+            p, self.active, self.q, self.velocity, self.rates, self.rotor, thrust, self.position, slow
+        )
+        force[2] += thrust.sum(axis=0)
+        outside = gust_force
+        if self.wake:
+            pull, gradient = effects.wake_force(p, self.position, other)
+            outside = outside + np.stack([zero, zero, pull])
+            torque = torque + v.rotate_back(self.q, np.stack([gradient[1], -gradient[0], zero])) * v.ARM**2
+        force = force + v.rotate_back(self.q, outside)
+        torque = torque + moment + gust_torque
+        if unknowns:
+            more_force, more_torque = unknowns.wrench(
+                time, self.position, self.q, self.velocity, self.rates, thrust, moment, p["mass"]
+            )
+            force, torque = force + more_force, torque + more_torque
+        specific = force / p["mass"]
+        accel = v.rotate(self.q, specific)
+        accel[2] -= v.GRAVITY
+        if self.diagonal:
+            turning = (torque - v.cross(self.rates, self.principal * self.rates)) / self.principal
+        else:
+            momentum = np.einsum("ijb,jb->ib", p["inertia"], self.rates)
+            turning = np.einsum("ijb,jb->ib", self.inverse, torque - v.cross(self.rates, momentum))
+        self.rates = self.rates + DT * turning
+        self.position = self.position + DT * self.velocity + 0.5 * DT * DT * accel
+        self.velocity = self.velocity + DT * accel
+        self.q = v.turn(self.q, self.rates, DT)
+        self.specific = specific
+
+
+class Battery:
+    """Voltage (B,) V: open-circuit voltage falls with the charge used, the terminals sag with the current."""
+
+    def __init__(self, air, hover):
+        self.air, self.used, self.load = air, np.zeros(len(hover)), hover.copy()
+
+    def step(self, m, dt):
+        current = (m * np.sqrt(m)).mean(axis=0)
+        self.used = self.used + dt * current
+        self.load = self.load + (dt / 0.04) * (current - self.load)
+        return (
+            self.air["open_voltage"] - self.air["discharge"] * self.used - self.air["resistance"] * self.load
+        )
+
+
+def received(arrival, steps):
+    """(steps, B) index of the newest command that has arrived by each ms; -1 before the first."""
+    ticks, count = arrival.shape
+    table = np.full((steps, count), -1, dtype=np.int32)
+    columns = np.arange(count)
+    for k in range(ticks):
+        inside = arrival[k] < steps
+        ms = arrival[k][inside]
+        table[ms, columns[inside]] = np.maximum(table[ms, columns[inside]], k)
+    return np.maximum.accumulate(table, axis=0)
+
+
+KEPT = {
+    "position": 3,
+    "velocity": 3,
+    "quaternion": 4,
+    "rates": 3,
+    "specific": 3,
+    "gyro": 3,
+    "rotor": 4,
+    "motor": 4,
+}
+KEPT |= {"integral": 3, "applied": 4}
+
+
+def fly(batch):
+    """Fly the batch: dict of true signals every 2 ms, (S, n, B) float32, and commands (K, 4, B) as issued.
+
+    `gyro` is the firmware's gyroscope (bias, noise, filter), `applied` the command in force, `motor` what the firmware
+    asks for in the 2 ms from that sample on; `voltage` (S, B); `crashed` (B,) sample of the first breach (floor, tilt
+    above 85 degrees, 2.5 m away), S if none.
+    """
+    p, reference, air = batch.parameters, batch.reference, batch.air
+    ticks, _, count = reference["position"].shape
+    neutral = v.nominal_parameters(batch.told)
+    table = received(batch.arrival, 10 * ticks)
+    unknowns = Unknowns(batch.unknowns, count)
+    hover = np.array([t.hover for t in batch.told])
+    most = np.array([4 * t.thrust_constant * v.MAX_SPEED**2 for t in batch.told])
+    control = Controllers(batch.controllers, neutral["mass"], most, reference)
+
+    half = 0.5 * reference["yaw"][0]
+    q = np.stack([np.cos(half), np.zeros(count), np.zeros(count), np.sin(half)])
+    rotor = np.tile(v.MAX_SPEED * np.sqrt(hover), (4, 1))
+    start = np.concatenate([hover[None], np.zeros((3, count))])
+    body = Body(
+        p, neutral, reference["position"][0].copy(), np.zeros((3, count)), q, np.zeros((3, count)), rotor
+    )
+    body.specific = np.tile([[0.0], [0.0], [v.GRAVITY]], (1, count))
+    firmware = Firmware(p, air["gyro_bias"].astype(float))
+    battery = Battery(air, hover)
+    voltage = battery.step(np.tile(hover, (4, 1)), 0.0)
+    command = np.zeros((ticks, 4, count))
+    samples = PER_TICK * ticks
+    out = {name: np.zeros((samples, size, count), np.float32) for name, size in KEPT.items()}
+    out |= {name: np.zeros((samples, count), np.float32) for name in ("voltage", "load")}
+    crashed, columns = np.full(count, samples), np.arange(count)
+    lever = bool(np.any(p["imu_lever"] != 0))
+
+    for s in range(samples):
+        k, part = divmod(s, PER_TICK)
+        if part == 0:
+            bad = (body.position[2] < 0.015) | (1 - 2 * (body.q[1] ** 2 + body.q[2] ** 2) < 0.087)
+            bad |= ((body.position**2).sum(axis=0) > 2.5**2) | ~np.isfinite(body.position[0])
+            crashed = np.where(bad & (crashed == samples), s, crashed)
+            dead = crashed < samples
+            if dead.any():  # parked, so that one wreck does not spoil the arithmetic of the batch
+                body.position[:, dead], body.velocity[:, dead] = reference["position"][k][:, dead], 0.0
+                body.rates[:, dead], body.q[:, dead] = 0.0, np.array([[1.0], [0], [0], [0]])
+        gyro = firmware.filtered(p["gyro_gain"] * body.rates + air["gyro_bias"] + air["gyro"][s])
+        specific = effects.seen_by_accelerometer(p, body.specific, body.rates) if lever else body.specific
+        for name, value in (
+            ("position", body.position),
+            ("velocity", body.velocity),
+            ("quaternion", body.q),
+            ("rates", body.rates),
+            ("specific", specific),
+            ("gyro", gyro),
+            ("rotor", body.rotor),
+            ("integral", firmware.integral),
+        ):
+            out[name][s] = value
+        out["voltage"][s], out["load"][s] = voltage, battery.load
+        if part == 0:
+            late = air["pose_delay"] + p["pose_delay"] + p["pose_jitter"] * air["pose_jitter"][k]
+            back = np.clip(np.maximum(late, 0.0) / 2.0, 0.0, s)
+            whole = back.astype(int)
+            rest = back - whole
+
+            def seen(name, whole=whole, rest=rest, s=s):
+                newer = out[name][s - whole, :, columns].T.astype(float)
+                return newer + rest * (out[name][np.maximum(s - whole - 1, 0), :, columns].T - newer)
+
+            seen_q = v.multiply(seen("quaternion"), air["seen_attitude"][k])
+            seen_q /= np.sqrt((seen_q * seen_q).sum(axis=0))
+            command[k] = control(
+                k,
+                seen("position") + air["seen_position"][k],
+                seen_q,
+                seen("velocity") + air["seen_velocity"][k],
+            )
+        index = table[2 * s]
+        now = np.where(index >= 0, command[np.maximum(index, 0), :, columns].T, start)
+        m = firmware(now, gyro)
+        out["applied"][s], out["motor"][s] = now, m
+        voltage = battery.step(m, SAMPLE)
+        force, torque, slow = air["gust_force"][k], air["gust_torque"][k], air["slow"][k]
+        other = body.position[:, batch.partner] + np.where(batch.partner == columns, -10.0, 0.0) * np.array(
+            [[0], [0], [1.0]]
+        )
+        for half_step in range(2):
+            time = SAMPLE * s + DT * half_step
+            body.step(m, voltage, battery.load, force, torque, slow, other, unknowns, time)
+    out["command"], out["crashed"] = command.astype(np.float32), crashed
+    out["pose_delay"], out["pose_jitter"] = 1e-3 * p["pose_delay"], 1e-3 * p["pose_jitter"]
+    return out
