@@ -38,6 +38,36 @@ def publish(
     print("\n".join(lines))
 
 
+def where(results: dict) -> str:
+    """Command, machine and commit of what was stored, as a sentence."""
+    machine = results["machine"]
+    commit = results.get("commit") or machine.get("commit") or "unknown"
+    return (
+        f"`{results['command']}` on {machine['device']}, JAX {machine['versions']['jax']}, commit {commit}."
+    )
+
+
+def page_from_tables(
+    doc: str,
+    name: str,
+    report: Callable[[Any], list[str]],
+    arguments: list[str],
+    draw: Callable[[Any, Path], None] | None = None,
+) -> int:
+    """Write and print the page `name` (and its figure) from what tables.py stored."""
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--flights", type=Path, default=RESULTS / "tables.json", help="what tables.py stored")
+    parser.add_argument("--out", type=Path, default=RESULTS / name)
+    options = parser.parse_args(arguments)
+    results = read_json(options.flights)
+    lines = report(results)
+    options.out.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    if draw is not None:
+        draw(results, options.out.with_suffix(".png"))
+    print("\n".join(lines))
+    return 0
+
+
 def table(heads: list[str], rows: list[list[str]]) -> list[str]:
     """A Markdown table."""
     lines = [heads, ["---"] * len(heads), *rows]

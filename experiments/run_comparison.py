@@ -23,7 +23,9 @@ CURVES = ("capture_rate", "capture_step", "collision_rate", "crash_rate")
 
 
 def variant_of(settings: dict) -> str:
-    """Which of `VARIANTS` plain settings make."""
+    """Which of `VARIANTS` plain settings make, or DACOOP."""
+    if settings["network"].get("output") == "field":
+        return "DACOOP"
     predictor, generator = settings["predictor"]["enabled"], settings["generator"]["enabled"]
     if not settings["generator"]["turn"]:
         if predictor or generator:

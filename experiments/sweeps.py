@@ -1,8 +1,8 @@
-"""Capture radius and evader speed: `python experiments/sweeps.py [--policy NAME|PATH ...] [--episodes 100]`.
+"""All methods over the capture radius and the evader's speed: `python experiments/sweeps.py [--episodes 50]`.
 
-Evaluates policies, trained at one radius and one speed, at others on the six layouts, as the paper's two sweeps do in `empty` and
-`passage`. All speeds and layouts fly in one compiled call; the radius changes nothing but what counts as a capture, so each
-flight tells it for all radii. Writes experiments/results/sweeps.json, .md and .png; `--report` writes the last two again.
+As in the paper's two figures: the radius in `empty`, the speed in `passage`; policies trained at one radius and one speed fly
+at others. The radius changes nothing but what counts as a capture, so each flight tells it for all radii; all speeds fly in
+one compiled call. Writes experiments/results/sweeps.json, .md and .png; `--report` writes the last two again.
 """
 
 import argparse
@@ -10,26 +10,26 @@ import copy
 import dataclasses
 import functools
 import time
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from headline import shipped_with_clamp
-from pages import page_parser, publish
-from prediction_flights import layout_tasks
-from sweeps_report import draw, report
+from pages import page_parser, publish, spread, table, where
+from roster import COLORS, METHODS, seeds_of
 
 from openjax.commands.command_line import run_command
-from openjax.commands.evaluator import layout_slots
+from openjax.commands.evaluator import layout_slots, repeat_task
 from openjax.commands.machine import describe_machine
 from openjax.policy import Policy, PolicyParameters
-from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, Task
+from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, RewardSettings, Task, scenario_task
 from openjax.pursuit.reward import captures
 from openjax.store.policies import load_policy
-from openjax.store.settings_files import to_plain
 
 RADII = (0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5)
-SPEEDS = (1.0, 1.3, 1.6, 2.0, 2.4, 2.8)
+SPEEDS = (1.0, 1.2, 1.3, 1.4, 1.6, 1.8, 2.0, 2.3, 2.6)
+RADIUS, SPEED = 0.3, 1.3
+"""Of the training."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,34 +101,35 @@ def sweep(
     return first, jnp.stack([counted.collision_rate, counted.crashed.astype(jnp.float32)], axis=-1)
 
 
-def of_policy(name: str, episodes: int, changes: dict) -> dict:
-    """Figures of one policy by layout, speed and radius."""
+def of_policy(name: str, seed: int, episodes: int, changes: dict) -> dict:
+    """Captures of one policy over the radii in `empty` and over the speeds in `passage`."""
     loaded = load_policy(name)
-    settings = dataclasses.replace(loaded.settings.environment, **changes)
-    settings = dataclasses.replace(settings, max_pillars=layout_slots(settings))
-    number = len(SCENARIOS) * episodes
-    tasks = jax.tree.map(lambda leaf: jnp.concatenate([leaf] * len(SPEEDS)), layout_tasks(settings, episodes))
+    game = dataclasses.replace(loaded.settings.environment, reward=RewardSettings(), **changes)
+    game = dataclasses.replace(game, max_pillars=layout_slots(game))
+    cells = [("empty", SPEED)] + [("passage", speed) for speed in SPEEDS]
+    tasks = [repeat_task(scenario_task(game, SCENARIOS[layout]), episodes) for layout, _ in cells]
     first, counted = sweep(
-        _environment(settings),
+        _environment(game),
         loaded.policy,
         RADII,
         loaded.parameters,
-        tasks,
-        jnp.repeat(jnp.array(SPEEDS, jnp.float32), number),
-        jax.random.key(0),
+        jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *tasks),
+        jnp.repeat(jnp.array([speed for _, speed in cells], jnp.float32), episodes),
+        jax.random.key(seed),
     )
-    shape = (len(SPEEDS), len(SCENARIOS), episodes, -1)
-    first, counted = (np.asarray(leaf, float).reshape(shape).swapaxes(0, 1) for leaf in (first, counted))
-    missed = first > settings.episode_length
+    first = np.asarray(first).reshape(len(cells), episodes, len(RADII))
+    counted = np.asarray(counted, float).reshape(len(cells), episodes, 2).mean(axis=1)
+    missed = first > game.episode_length
+    rate = np.round(1 - missed.mean(axis=1), 5)
+    step = np.round(np.where(missed, game.episode_length, first).mean(axis=1), 2)
+    own = RADII.index(RADIUS)
     return {
-        "policy": name,
-        "settings": to_plain(loaded.settings),
-        # (layouts, speeds, radii)
-        "capture_rate": np.round(1 - missed.mean(axis=2), 5).tolist(),
-        "capture_step": np.round(np.where(missed, settings.episode_length, first).mean(axis=2), 2).tolist(),
-        # (layouts, speeds)
-        "collision_rate": np.round(counted[..., 0].mean(axis=2), 6).tolist(),
-        "crash_rate": np.round(counted[..., 1].mean(axis=2), 5).tolist(),
+        "radius": {"capture_rate": rate[0].tolist(), "capture_step": step[0].tolist()},
+        "speed": {
+            "capture_rate": rate[1:, own].tolist(),
+            "capture_step": step[1:, own].tolist(),
+            "collision_rate": np.round(counted[1:, 0], 6).tolist(),
+        },
     }
 
 
@@ -139,37 +140,111 @@ def _environment(settings):
 
 
 def study(options: argparse.Namespace) -> dict:
-    """Fly every policy over all radii and speeds."""
+    """Fly every method's seeds over all radii and speeds."""
     started = time.monotonic()
     changes = {"speed_limit": options.speed_limit}
-    policies = [of_policy(name, options.episodes, changes) for name in options.policy or shipped_with_clamp()]
-    shown = f" --policy {' '.join(options.policy)}" if options.policy else ""
-    shown += "" if options.speed_limit == "clamp" else f" --speed-limit {options.speed_limit}"
+    methods = {}
+    for label in options.methods:
+        methods[label] = [of_policy(name, seed, options.episodes, changes) for name, seed in seeds_of(label)]
+        print(f"{time.monotonic() - started:5.0f} s  {label}", flush=True)
+    limit = "" if options.speed_limit == "clamp" else f" --speed-limit {options.speed_limit}"
     return {
-        "command": f"python experiments/sweeps.py{shown} --episodes {options.episodes}",
+        "command": f"python experiments/sweeps.py --episodes {options.episodes}{limit}",
         "commit": options.commit,
-        "note": options.note,
         "machine": describe_machine(),
         "seconds": time.monotonic() - started,
         "episodes": options.episodes,
         "speed_limit": options.speed_limit,
-        "layouts": list(SCENARIOS),
-        "speeds": SPEEDS,
-        "radii": RADII,
-        "policies": policies,
+        "methods": {label: seeds for label, seeds in methods.items() if seeds},
     }
+
+
+def report(results: dict) -> list[str]:
+    """The page."""
+    limit = "speed clamp" if results["speed_limit"] == "clamp" else "no speed clamp"
+    lines = [
+        "# Capture radius and evader speed",
+        "",
+        f"{where(results)} {results['episodes']} episodes per seed and cell, three seeds, {limit}, drawn starts. Every policy "
+        f"is the one of the main table, trained or searched at a radius of {RADIUS} m and {SPEED} m/s only. Capture rate "
+        "(standard deviation over seeds) / capture step. The paper shows both as figures without numbers.",
+    ]
+    for title, axis, values, unit in (
+        ("Capture radius, in `empty`", "radius", RADII, "m"),
+        ("Evader speed, in `passage`", "speed", SPEEDS, "m/s"),
+    ):
+        rows = []
+        for label, seeds in results["methods"].items():
+            cells = []
+            for i in range(len(values)):
+                rate = spread([seed[axis]["capture_rate"][i] for seed in seeds], 2)
+                cells.append(f"{rate} / {np.mean([seed[axis]['capture_step'][i] for seed in seeds]):.0f}")
+            rows.append([label, *cells])
+        lines += ["", f"## {title}", "", *table(["method", *(f"{value} {unit}" for value in values)], rows)]
+        lines += ["", not_above(results["methods"], axis, values, unit)]
+    return [*lines, "", "![Capture rate and step over radius and speed](sweeps.png)"]
+
+
+def not_above(methods: dict, axis: str, values: tuple[float, ...], unit: str) -> str:
+    """Where OPEN catches less often than another method, or as often and later."""
+    found = []
+    for label, seeds in methods.items():
+        if label == "OPEN" or "OPEN" not in methods:
+            continue
+        for i, value in enumerate(values):
+            (rate, step), (best, early) = (
+                [
+                    np.mean([seed[axis][name][i] for seed in group])
+                    for name in ("capture_rate", "capture_step")
+                ]
+                for group in (seeds, methods["OPEN"])
+            )
+            if rate > best + 1e-9 or (abs(rate - best) < 1e-9 and step < early):
+                found.append(
+                    f"{label} at {value} {unit} ({rate:.2f} / {step:.0f} against {best:.2f} / {early:.0f})"
+                )
+    return (
+        "OPEN isn't above: " + "; ".join(found) + "." if found else "OPEN is above every method everywhere."
+    )
+
+
+def draw(results: dict, path: Path) -> None:
+    """Capture rate and step over radius and over speed, mean and range over seeds."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 6.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(2, 2, sharex="col", sharey="row")
+    for j, (axis, x, own, label) in enumerate(
+        (
+            ("radius", RADII, RADIUS, "capture radius in empty (m)"),
+            ("speed", SPEEDS, SPEED, "evader speed in passage (m/s)"),
+        )
+    ):
+        for i, name in enumerate(("capture_rate", "capture_step")):
+            for method, seeds in results["methods"].items():
+                values = np.array([seed[axis][name] for seed in seeds])
+                line = {"color": COLORS[method], "marker": "o", "markersize": 3, "label": method}
+                axes[i, j].plot(x, values.mean(axis=0), **line)
+                axes[i, j].fill_between(
+                    x, values.min(axis=0), values.max(axis=0), color=COLORS[method], alpha=0.15, linewidth=0
+                )
+            axes[i, j].axvline(own, color="black", linewidth=0.8, linestyle=":")
+            axes[i, j].grid(alpha=0.3)
+            axes[i, 0].set_ylabel(name.replace("_", " "))
+        axes[1, j].set_xlabel(label)
+    axes[0, 0].legend(fontsize="small", title="mean and range over seeds", title_fontsize="small")
+    figure.savefig(path, dpi=100)
 
 
 def main(arguments: list[str]) -> int:
     """Sweep or read it, write the three files, print the page."""
     parser = page_parser(__doc__, "sweeps")
-    parser.add_argument(
-        "--policy", nargs="+", help="by default all that ship and were trained with the clamp"
-    )
-    parser.add_argument("--episodes", type=int, default=100, help="per layout and speed")
+    parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
+    parser.add_argument("--episodes", type=int, default=50, help="per seed, and per radius or speed")
     parser.add_argument("--speed-limit", choices=("clamp", "none"), default="clamp")
     parser.add_argument("--commit", default="", help="where the machine has no repository")
-    parser.add_argument("--note", default="")
     publish(parser.parse_args(arguments), study, report, draw)
     return 0
 

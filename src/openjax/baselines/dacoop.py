@@ -3,7 +3,7 @@
 A network turns the two main parameters of the potential field at every step and for each pursuer: the scale of the
 obstacles' repulsion and the balance of the force between pursuers. As in the paper, MAPPO learns them in place of D3QN,
 so they are continuous. The network is the actor that plain MAPPO has; its two outputs, in -1..1, are positions between
-the ends of both ranges, on a logarithmic scale, and the start of training flies the field that the search found.
+the ends of both ranges, on a logarithmic scale, and training starts from the field of `START`.
 """
 
 import dataclasses
@@ -13,13 +13,15 @@ import jax
 import jax.numpy as jnp
 
 from openjax.baselines.apf import ApfParameters, apf
-from openjax.baselines.parameters import best, ranges
+from openjax.baselines.parameters import ranges
 from openjax.baselines.surroundings import Craft, surroundings
 from openjax.baselines.velocity_controller import velocity_action
 from openjax.policy import NetworkSettings, Policy, PredictorSettings
 from openjax.pursuit import Observation, Pursuit
 
 LEARNED = ("repulsion", "balance")
+START = ApfParameters(repulsion=1e-3, influence=0.3, balance=0.2)
+"""The field at the start of training; the influence stays, also of shipped weights, whatever a later search finds."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,9 +34,8 @@ class DacoopPolicy(Policy):
     def for_environment(
         cls, environment: Pursuit, network: NetworkSettings, predictor: PredictorSettings
     ) -> "DacoopPolicy":
-        """The policy for an environment; its mean starts at the parameters of `apf`."""
-        start = best("apf", ApfParameters)
-        places = [_place(name, float(getattr(start, name))) for name in LEARNED]
+        """The policy for an environment; its mean starts at `START`."""
+        places = [_place(name, getattr(START, name)) for name in LEARNED]
         return cls(
             network=network,
             predictor=predictor,
@@ -57,7 +58,7 @@ def field_parameters(output: jax.Array) -> ApfParameters:
     for i, name in enumerate(LEARNED):
         low, high = ranges(ApfParameters)[name]
         learned[name] = low * (high / low) ** (0.5 * (output[..., i] + 1.0))
-    influence = jnp.broadcast_to(best("apf", ApfParameters).influence, output.shape[:-1])
+    influence = jnp.full(output.shape[:-1], START.influence)
     return ApfParameters(influence=influence, **learned)
 
 

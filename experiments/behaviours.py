@@ -1,0 +1,184 @@
+"""The paper's behaviours, measured and drawn: `python experiments/behaviours.py`, from what tables.py stored.
+
+The paper shows four by pictures: surrounding from both sides (wall), a shortcut instead of following (narrow_gap), finding
+the evader behind pillars (random, and hidden, where nobody sees it at the start), blocking all three ways out (passage).
+Here each is a number for every method, beside one episode from above. Writes experiments/results/behaviours.md and .png.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pages import page_from_tables, spread, table, where
+from roster import METHODS
+
+from openjax.commands.command_line import run_command
+from openjax.pursuit import SCENARIOS, PursuitSettings
+from openjax.show.plots import draw_from_above
+from openjax.show.trajectory import Trajectory
+
+END = 0.5
+"""wall: its ends are ways round at |y| beyond this (m); its pillars reach to .55."""
+CORRIDORS = (-0.2, 0.3)
+"""passage: the rows of pillars at these y (m) part three ways."""
+EVERY = 8
+"""Steps between the points of a path that is kept for the picture."""
+MEASURES = {
+    "wall": {"both sides": "pursuers round both ends of the wall at the same time, before the capture"},
+    "narrow_gap": {
+        "met": "captured from ahead: the evader flies towards the one that catches it",
+        "shorter way": "way of the one that catches it, as a share of the evader's",
+    },
+    "random": {
+        "seen": "first step in which anyone sees it",
+        "lost": "share of steps until the capture without sight",
+    },
+    "hidden": {
+        "seen": "first step in which anyone sees it",
+        "lost": "share of steps until the capture without sight",
+    },
+    "passage": {
+        "three ways": "a pursuer in each of the three corridors at the same time, before the capture"
+    },
+}
+
+
+def measure(layout: str, paths: Any, statistics: Any) -> dict[str, float | None]:
+    """What `MEASURES` names, mean over B episodes; of those with a capture where only they tell ("met", "shorter way").
+
+    Args:
+        layout: a name of `MEASURES`.
+        paths: pursuers (B, T, N, 3), evader (B, T, 3), seen (B, T), captured (B, T, N).
+        statistics: `EpisodeStatistics` with leading axis B.
+    """
+    pursuers, evader = np.asarray(paths.pursuers), np.asarray(paths.evader)
+    caught = np.asarray(statistics.captured)
+    end = np.asarray(statistics.capture_step)
+    before = np.arange(pursuers.shape[1])[None] < end[:, None]
+    x, y = pursuers[..., 0], pursuers[..., 1]
+    if layout == "wall":
+        # beyond the middle plane or in line with the wall: not merely on the way there
+        there = x < 0.15
+        sides = [np.any(there & (sign * y > END), axis=-1) for sign in (1.0, -1.0)]
+        return {"both sides": float(np.mean(np.any(sides[0] & sides[1] & before, axis=1)))}
+    if layout == "passage":
+        low, high = CORRIDORS
+        ways = (y < low, (y > low) & (y < high), y > high)
+        blocked = np.all([np.any(way, axis=-1) for way in ways], axis=0)
+        return {"three ways": float(np.mean(np.any(blocked & before, axis=1)))}
+    if layout == "narrow_gap":
+        met, ways = [], []
+        for b in np.flatnonzero(caught):
+            last = end[b] - 1
+            who = int(np.argmax(paths.captured[b, last]))
+            velocity = evader[b, last] - evader[b, max(last - 5, 0)]
+            met.append(np.dot(velocity, pursuers[b, last, who] - evader[b, last]) > 0.0)
+            ways.append(_way(pursuers[b, : last + 1, who]) / max(_way(evader[b, : last + 1]), 1e-6))
+        return {"met": _mean(met), "shorter way": _mean(ways)}
+    seen = np.asarray(paths.seen)
+    first = np.where(seen.any(axis=1), seen.argmax(axis=1) + 1, seen.shape[1])
+    lost = np.sum(~seen & before, axis=1) / np.maximum(np.sum(before, axis=1), 1)
+    return {"seen": float(np.mean(first)), "lost": float(np.mean(lost))}
+
+
+def one_episode(paths: Any) -> dict[str, list]:
+    """The first episode's paths up to a second after its capture, thinned out."""
+    caught = np.asarray(paths.captured[0]).any(axis=-1)
+    end = min(int(np.argmax(caught)) + 100, len(caught)) if caught.any() else len(caught)
+
+    def thin(values):
+        return np.round(np.asarray(values)[0, :end:EVERY], 3).tolist()
+
+    return {
+        "pursuers": thin(paths.pursuers),
+        "evader": thin(paths.evader),
+        "capture": int(np.argmax(caught)) // EVERY if caught.any() else None,
+    }
+
+
+def _way(positions):
+    return float(np.sum(np.linalg.norm(np.diff(positions, axis=0), axis=-1)))
+
+
+def _mean(values):
+    return float(np.mean(values)) if values else None
+
+
+def flights_of(results: dict, method: str) -> list[dict]:
+    """A method's flights with the clamp, one per seed."""
+    return [f for f in results["flights"] if f["method"] == method and f["condition"] == "clamp"]
+
+
+def report(results: dict) -> list[str]:
+    """The page."""
+    rows = []
+    for layout, measures in MEASURES.items():
+        for name in measures:
+            cells = []
+            for method in METHODS:
+                values = [f["layouts"][layout]["behaviour"][name] for f in flights_of(results, method)]
+                cells.append(spread(values, 0 if name == "seen" else 2))
+            rows.append([layout, name, *cells])
+    lines = [
+        "# What the pursuers do",
+        "",
+        f"{where(results)} {results['episodes']} episodes per seed, speed clamp, drawn starts; mean (standard deviation over "
+        "seeds). The paper names these behaviours and shows a picture of each; it has no numbers for them.",
+        "",
+    ]
+    lines += [
+        f"* {layout}, {name}: {text}" for layout, all_ in MEASURES.items() for name, text in all_.items()
+    ]
+    lines += ["", *table(["layout", "behaviour", *METHODS], rows)]
+    return [*lines, "", "![One episode of each method on each layout](behaviours.png)"]
+
+
+def draw(results: dict, path: Path) -> None:
+    """One episode of every method's first seed on the paper's four layouts."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    layouts = [layout for layout in MEASURES if layout != "hidden"]
+    shown = [method for method in METHODS if flights_of(results, method)]
+    figure = Figure(figsize=(3.1 * len(shown), 3.3 * len(layouts)), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(len(layouts), len(shown), squeeze=False)
+    for i, layout in enumerate(layouts):
+        for j, method in enumerate(shown):
+            flown = flights_of(results, method)[0]["layouts"][layout]
+            told = ", ".join(
+                f"{name} {value:.2g}" for name, value in flown["behaviour"].items() if value is not None
+            )
+            draw_from_above(axes[i, j], trajectory_of(flown["paths"], layout, f"{method}: {told}"))
+            axes[i, j].title.set_fontsize("small")
+    figure.savefig(path, dpi=70)
+
+
+def trajectory_of(paths: dict, layout: str, title: str) -> Trajectory:
+    """A kept path as what is drawn."""
+    pursuers, settings = np.array(paths["pursuers"]), PursuitSettings()
+    captured = np.zeros(pursuers.shape[:2], bool)
+    if paths["capture"] is not None:
+        captured[paths["capture"] :] = True
+    return Trajectory(
+        title=title,
+        pursuer_position=pursuers,
+        pursuer_quaternion=np.broadcast_to([1.0, 0.0, 0.0, 0.0], (*pursuers.shape[:2], 4)),
+        evader_position=np.array(paths["evader"]),
+        captured=captured,
+        pillar_position=np.array(SCENARIOS[layout].pillars).reshape(-1, 2),
+        arena_radius=settings.arena_radius,
+        arena_height=settings.arena_height,
+        pillar_radius=settings.pillar_radius,
+        capture_radius=settings.capture_radius,
+        time_step=EVERY * settings.time_step,
+    )
+
+
+def main(arguments: list[str]) -> int:
+    """Write page and picture, print the page."""
+    return page_from_tables(__doc__, "behaviours", report, arguments, draw)
+
+
+if __name__ == "__main__":
+    run_command(main)
