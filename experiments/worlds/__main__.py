@@ -52,6 +52,7 @@ VEHICLE = {
 SEED = 500  # of the plant's and RotorPy's sensors; used for nothing else
 PLAIN = ("nominal", "table", "plant", "rotorpy")
 CAUSES = tuple(f"plant:{effect}" for effect in SIZES)
+FAST = 10.0  # Hz
 FIGURES = ("captured", "capture_step", "collision_rate", "crashed", "over_speed_rate")
 
 
@@ -111,9 +112,28 @@ def do(job: Job) -> tuple[Job, dict[str, list[float]], float]:
         np.arange(job.start, job.start + job.number)
     )
     make = functools.partial(make_world, job.world, settings.episode_length, job.start)
-    statistics, _ = play(loaded, settings, tasks, keys, make)
+    statistics, actions = play(loaded, settings, tasks, keys, make, command_of)
     figures = {name: np.asarray(getattr(statistics, name), float).tolist() for name in FIGURES}
+    figures |= smoothness(np.stack(actions), settings.time_step)
     return job, figures, time.perf_counter() - begin
+
+
+def command_of(state, action):
+    """What `play` keeps of a step."""
+    del state
+    return action
+
+
+def smoothness(actions: np.ndarray, time_step: float) -> dict[str, list[float]]:
+    """How smooth commands (T, W, N, 4) in -1..1 are, of each world.
+
+    `change`: mean norm of a command's change; `fast`: share of the commands' variance above 10 Hz.
+    """
+    change = np.linalg.norm(np.diff(actions, axis=0), axis=-1).mean(axis=(0, 2))
+    power = np.abs(np.fft.rfft(actions - actions.mean(axis=0), axis=0)) ** 2
+    high = np.fft.rfftfreq(len(actions), time_step) > FAST
+    fast = power[high].sum(axis=(0, 2, 3)) / (power.sum(axis=(0, 2, 3)) + 1e-12)
+    return {"change": change.tolist(), "fast": fast.tolist()}
 
 
 def study(options: argparse.Namespace) -> dict:
@@ -165,7 +185,8 @@ def report(results: dict) -> list[str]:
         f"`{results['command']}`, JAX {machine['versions']['jax']}, commit {machine['commit']}: {results['seconds']:.0f} s. "
         "No clamp, drawn starts. Nominal: the simulator (MJX) with the rate loop at 500 Hz; table: the same with motors 40 ms "
         "slower, commands 15 ms and poses 10 ms late, and drag of .0125 N s/m; plant: the withheld plant (1 kHz, no shared "
-        "code), also with each of its causes at three quarters of its range; rotorpy: RotorPy's own Crazyflie.",
+        "code), also with each of its causes at three quarters of its range; rotorpy: RotorPy's own Crazyflie. Change: mean norm "
+        "of a command's change in a step, commands in -1 to 1; above 10 Hz: that share of the commands' variance.",
         "",
     ]
     rows = []
@@ -175,7 +196,19 @@ def report(results: dict) -> list[str]:
                 rows.append([world, policy, layout, *_cells(record)])
             if worlds.get(world):
                 rows.append([world, policy, "**mean**", *_cells(_mean(list(worlds[world].values())))])
-    heads = ["world", "policy", "layout", "episodes", "capture", "step", "collision", "crash", "over speed"]
+    heads = [
+        "world",
+        "policy",
+        "layout",
+        "episodes",
+        "capture",
+        "step",
+        "collision",
+        "crash",
+        "over speed",
+        "change",
+        "above 10 Hz",
+    ]
     return lines + table(heads, rows)
 
 
@@ -194,6 +227,8 @@ def _cells(record):
         f"{record['collision_rate']:.4f}",
         f"{record['crashed']:.3f}",
         f"{record['over_speed_rate']:.3f}",
+        f"{record['change']:.3f}",
+        f"{record['fast']:.3f}",
     ]
 
 

@@ -1,0 +1,52 @@
+"""Worlds that aren't the simulator: the same start, one tick at a time, and how smooth commands are."""
+
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+from experiments.worlds.__main__ import make_world, smoothness
+from openjax.pursuit import Pursuit, PursuitSettings
+
+
+@pytest.fixture(scope="module")
+def start():
+    environment = Pursuit(PursuitSettings(physics="rigid", start_attitude="level"))
+    return jax.jit(jax.vmap(environment.reset))(jax.random.split(jax.random.key(2), 2))[1]
+
+
+@pytest.mark.parametrize("name", ["nominal", "plant", "rotorpy"])
+def test_worlds_fly_alike_for_a_moment(start, name):
+    """The same numbers in, the same flight out, as far as vehicles are alike: hover, then a pitch rate."""
+    if name == "rotorpy":
+        pytest.importorskip("rotorpy")
+    world = make_world(name, 20, 0, start.drones, start.task)
+    position = np.asarray(start.drones.position)
+    for poses in (world.poses(), world.measure()):
+        np.testing.assert_allclose(poses["position"], position, atol=3e-3)
+        assert poses["quaternion"].shape == (2, 3, 4)
+    command = np.zeros((2, 3, 4))
+    command[..., 0], command[..., 2] = 0.62, 1.0
+    for _ in range(10):
+        world.fly(command)
+    after = world.poses()
+    assert np.abs(after["position"] - position).max() < 0.03
+    pitch = 2 * after["quaternion"][..., 2] / after["quaternion"][..., 0]
+    np.testing.assert_allclose(pitch, 0.07, atol=0.04)  # 1 rad/s after the motors' lag
+    np.testing.assert_allclose(world.measure()["position"], after["position"], atol=5e-3)
+    world.fly(100 * command, max_speed=0.01)
+    assert np.linalg.norm(world.poses()["velocity"], axis=-1).max() < 0.01 + 1e-4
+
+
+def test_smoothness_of_known_commands():
+    time = 0.01 * np.arange(800)
+    slow, quick = np.sin(2 * np.pi * 2 * time), np.sin(2 * np.pi * 20 * time)
+    actions = np.zeros((800, 3, 1, 4))
+    actions[:, 0, 0, 1], actions[:, 1, 0, 1], actions[:, 2, 0, 1] = slow, quick, slow + quick
+    found = smoothness(actions, 0.01)
+    np.testing.assert_allclose(found["fast"], [0.0, 1.0, 0.5], atol=1e-3)
+    assert found["change"][1] > 5 * found["change"][0]
