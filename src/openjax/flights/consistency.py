@@ -13,18 +13,26 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import butter, sosfiltfilt
 
 from openjax.flights.flight import Flight, Issue
+from openjax.flights.signals import (
+    GRAVITY,
+    RATE,
+    acceleration_of,
+    clock_of,
+    first_order,
+    in_band,
+    on_clock,
+    rates_of,
+    to_body,
+    up_of,
+)
 
-RATE = 100.0  # Hz, common clock of the comparisons
 KINEMATIC_BAND = (0.3, 4.0)  # Hz: above drift and offsets, below most of the sensors' noise and delays
 TORQUE_BAND = (0.5, 8.0)
 LAGS = np.arange(-6, 7, 2)  # samples of the common clock; clock offsets between streams are a nuisance
 LEAST_RATE = 0.03  # rad/s rms in the band, below which an axis can't be judged against the pose
 LEAST_COMMANDED = 0.2  # rad/s, the same against commands: in a quiet loop they oppose what the air does
-LONGEST = 30.0  # s, enough to tell
-GRAVITY = 9.81
 _FITS, _BETTER = 0.65, 0.6  # correlation of an axis that fits; least gain in their sum of another labelling
 
 _AXES = "xyz"
@@ -81,46 +89,33 @@ def check_consistency(flight: Flight, vehicle) -> list[Issue]:
     """Findings on axes, conventions, units and motor order of a flight that has passed the other checks
     (sorted, finite, airborne). `vehicle` gives the rotors' places and spins. Every finding refuses the
     flight."""
-    grid = _grid(flight)
+    grid = clock_of(flight)
     if grid is None:
         return []
     found: list[tuple[str, str]] = []
-    gyro = None if flight.body_rates_derived else _on(flight, "body_rates", grid)
-    quaternion = _on(flight, "quaternion", grid)
-    position = _on(flight, "position", grid)
-    force = _on(flight, "specific_force", grid)
+    gyro = None if flight.body_rates_derived else on_clock(flight, "body_rates", grid)
+    quaternion = on_clock(flight, "quaternion", grid)
+    position = on_clock(flight, "position", grid)
+    force = on_clock(flight, "specific_force", grid)
 
     found += _gravity(force)
     if quaternion is not None and not found:
         found += _pose(quaternion, position, gyro, force)
     if position is not None and flight.velocity is not None and not flight.velocity_derived:
-        found += _velocity(position, _on(flight, "velocity", grid), quaternion)
+        found += _velocity(position, on_clock(flight, "velocity", grid), quaternion)
     rates = gyro if gyro is not None else (None if quaternion is None else rates_of(quaternion))
     if rates is not None and not found:
         if flight.command_body_rates is not None:
-            found += _commands(_on(flight, "command_body_rates", grid), rates)
+            found += _commands(on_clock(flight, "command_body_rates", grid), rates)
         if flight.motor_command is not None and not found:
-            found += _motors(_on(flight, "motor_command", grid), rates, vehicle)
+            found += _motors(on_clock(flight, "motor_command", grid), rates, vehicle)
     return [Issue(flight.name, text, refused=True, kind=kind) for kind, text in found]
-
-
-def rates_of(quaternion: np.ndarray) -> np.ndarray:
-    """Body rates (T, 3) rad/s of attitudes (T, 4) on the common clock, by central differences."""
-    before, after = np.roll(quaternion, 1, 0), np.roll(quaternion, -1, 0)
-    w = (before * after).sum(1)
-    vector = (
-        before[:, :1] * after[:, 1:] - after[:, :1] * before[:, 1:] - np.cross(before[:, 1:], after[:, 1:])
-    )
-    rates = 2.0 * np.arctan2(np.linalg.norm(vector, axis=1), np.abs(w))[:, None] * np.sign(w)[:, None]
-    rates = rates * vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-12) * RATE / 2
-    rates[[0, -1]] = rates[[1, -2]]
-    return rates
 
 
 def match_axes(measured: np.ndarray, reference: np.ndarray, least: float = 0.0) -> Match:
     """Compare (T, 3) with (T, 3) on the common clock in `band` Hz, over all 48 relabellings and a few
     time shifts."""
-    y, x = _band(measured, KINEMATIC_BAND), _band(reference, KINEMATIC_BAND)
+    y, x = in_band(measured, KINEMATIC_BAND), in_band(reference, KINEMATIC_BAND)
     correlations = np.stack([_correlation(y, np.roll(x, lag, 0)) for lag in LAGS])  # (L, 3, 3)
     scores = [
         sum(signs[i] * correlations[:, i, order[i]] for i in range(3)).max() for order, signs in _RELABELLINGS
@@ -180,7 +175,7 @@ def _pose(quaternion, position, gyro, force) -> list[tuple[str, str]]:
         if gyro is not None:
             pair.append(match_axes(gyro, rates_of(attitude), LEAST_RATE))
         if position is not None:
-            pair.append(match_axes(_acceleration(position), _path_acceleration(attitude, force)))
+            pair.append(match_axes(acceleration_of(position), _path_acceleration(attitude, force)))
         matches[name] = pair
     logged = matches[""]
     if any(m.wrong for m in logged):
@@ -214,7 +209,7 @@ def _pose(quaternion, position, gyro, force) -> list[tuple[str, str]]:
 def _velocity(position, velocity, quaternion) -> list[tuple[str, str]]:
     derived = np.gradient(position, 1 / RATE, axis=0)
     match = match_axes(velocity, derived)
-    if match.wrong and quaternion is not None and match_axes(velocity, _to_body(quaternion, derived)).fits:
+    if match.wrong and quaternion is not None and match_axes(velocity, to_body(quaternion, derived)).fits:
         return [("axes", "vx, vy, vz are in the body frame; the log format wants the world frame")]
     if match.wrong:
         return [("axes", f"velocity axes: {match.words(('vx', 'vy', 'vz'))} of the position's derivative")]
@@ -237,8 +232,8 @@ def _motors(motor, rates, vehicle) -> list[tuple[str, str]]:
     place = np.asarray(vehicle.rotor_position, float)
     arms = np.stack([place[:, 1], -place[:, 0]])  # roll, pitch torque per thrust
     spin = np.asarray(vehicle.rotor_spin, float)
-    measured = _band(np.gradient(rates, 1 / RATE, axis=0), TORQUE_BAND)
-    lagged = _band(_first_order(motor, float(vehicle.motor_time_constant)), TORQUE_BAND)
+    measured = in_band(np.gradient(rates, 1 / RATE, axis=0), TORQUE_BAND)
+    lagged = in_band(first_order(motor, float(vehicle.motor_time_constant)), TORQUE_BAND)
     if (lagged.std(0) < 1e-6).all():
         return []
     # (3, 4) correlations of each axis with each motor aren't enough: motors are correlated. Score whole
@@ -281,58 +276,7 @@ def _scale(
 def _path_acceleration(quaternion, force) -> np.ndarray:
     """Acceleration (T, 3) m/s^2, world, of a vehicle whose specific force lies along body z."""
     size = np.full(len(quaternion), GRAVITY) if force is None else force[:, 2]
-    w, x, y, z = quaternion.T
-    up = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], 1)
-    return up * size[:, None] - [0.0, 0.0, GRAVITY]
-
-
-def _to_body(quaternion, vector) -> np.ndarray:
-    w, u = quaternion[:, :1], -quaternion[:, 1:]
-    t = 2.0 * np.cross(u, vector)
-    return vector + w * t + np.cross(u, t)
-
-
-def _acceleration(position) -> np.ndarray:
-    return np.gradient(np.gradient(position, 1 / RATE, axis=0), 1 / RATE, axis=0)
-
-
-def _first_order(values, time_constant) -> np.ndarray:
-    out, blend = np.array(values), -np.expm1(-1 / (RATE * time_constant))
-    for k in range(1, len(out)):
-        out[k] = out[k - 1] + blend * (values[k - 1] - out[k - 1])
-    return out
-
-
-def _grid(flight: Flight) -> np.ndarray | None:
-    """The common clock over the longest stretch without gaps; None if that is too short to tell anything."""
-    stretch = max(flight.stretches(max(0.1, 5 * flight.row_period)), key=lambda s: s.stop - s.start)
-    start, stop = flight.time[stretch.start], flight.time[stretch.stop - 1]
-    if stop - start < 1.5:
-        return None
-    return np.arange(start, min(stop, start + LONGEST), 1 / RATE)
-
-
-def _on(flight: Flight, channel: str, grid: np.ndarray) -> np.ndarray | None:
-    """A channel on the common clock; fast channels are averaged over the clock's period first."""
-    values = getattr(flight, channel)
-    if values is None:
-        return None
-    at, values = flight.sampled(channel)
-    if len(at) < 10:
-        return None
-    step = float(np.median(np.diff(at)))
-    if step < 0.7 / RATE and channel != "quaternion":
-        width = round(1 / (RATE * step))
-        kernel = np.ones(width) / width
-        values = np.stack([np.convolve(c, kernel, mode="same") for c in values.T], 1)
-    out = np.stack([np.interp(grid, at, column) for column in values.T], 1)
-    return out / np.linalg.norm(out, axis=1, keepdims=True) if channel == "quaternion" else out
-
-
-def _band(values: np.ndarray, band: tuple[float, float]) -> np.ndarray:
-    sos = butter(2, band, "bandpass", fs=RATE, output="sos")
-    edge = min(20, len(values) // 8)  # rows at the ends where filter and differences aren't trustworthy
-    return sosfiltfilt(sos, values - values.mean(0), axis=0)[edge:-edge]
+    return up_of(quaternion) * size[:, None] - [0.0, 0.0, GRAVITY]
 
 
 def _correlation(y: np.ndarray, x: np.ndarray) -> np.ndarray:

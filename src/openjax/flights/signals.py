@@ -1,0 +1,88 @@
+"""Signals of a flight on one even clock, for the checks that compare channels with each other."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+from scipy.signal import butter, lfilter, sosfiltfilt
+from scipy.signal.windows import tukey
+
+from openjax.flights.flight import Flight
+
+RATE = 100.0  # Hz, common clock of the comparisons
+LONGEST = 30.0  # s, enough to tell
+FADE = 0.5  # s
+GRAVITY = 9.81  # m/s^2
+
+
+def clock_of(flight: Flight) -> np.ndarray | None:
+    """The common clock over the longest stretch without gaps; None if that is too short to tell anything."""
+    stretch = max(flight.stretches(max(0.1, 5 * flight.row_period)), key=lambda s: s.stop - s.start)
+    start, stop = flight.time[stretch.start], flight.time[stretch.stop - 1]
+    if stop - start < 1.5:
+        return None
+    return np.arange(start, min(stop, start + LONGEST), 1 / RATE)
+
+
+def on_clock(flight: Flight, channel: str, grid: np.ndarray) -> np.ndarray | None:
+    """A channel (T, C) on the common clock; fast channels are averaged over the clock's period first."""
+    values = getattr(flight, channel)
+    if values is None:
+        return None
+    at, values = flight.sampled(channel)
+    if len(at) < 10:
+        return None
+    values = values.reshape(len(values), -1)
+    step = float(np.median(np.diff(at)))
+    if step < 0.7 / RATE and channel != "quaternion":
+        width = round(1 / (RATE * step))
+        values = uniform_filter1d(values, width, axis=0, mode="nearest")
+    out = np.stack([np.interp(grid, at, column) for column in values.T], 1)
+    return out / np.linalg.norm(out, axis=1, keepdims=True) if channel == "quaternion" else out
+
+
+def in_band(values: np.ndarray, band: tuple[float, float]) -> np.ndarray:
+    """`values` (T, C) between two frequencies, without delay, and without the ends where that isn't right."""
+    sos = butter(2, band, "bandpass", fs=RATE, output="sos")
+    edge = min(20, len(values) // 8)  # rows at the ends where filter and differences aren't trustworthy
+    # Faded in and out: a filter this slow would carry the last row's noise far into the flight.
+    fade = tukey(len(values), min(1.0, 2 * FADE * RATE / len(values)))[:, None]
+    return sosfiltfilt(sos, fade * (values - values.mean(0)), axis=0)[edge:-edge]
+
+
+def rates_of(quaternion: np.ndarray) -> np.ndarray:
+    """Body rates (T, 3) rad/s of attitudes (T, 4) on the common clock, by central differences."""
+    before, after = np.roll(quaternion, 1, 0), np.roll(quaternion, -1, 0)
+    w = (before * after).sum(1)
+    vector = (
+        before[:, :1] * after[:, 1:] - after[:, :1] * before[:, 1:] - np.cross(before[:, 1:], after[:, 1:])
+    )
+    rates = 2.0 * np.arctan2(np.linalg.norm(vector, axis=1), np.abs(w))[:, None] * np.sign(w)[:, None]
+    rates = rates * vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-12) * RATE / 2
+    rates[[0, -1]] = rates[[1, -2]]
+    return rates
+
+
+def acceleration_of(position: np.ndarray) -> np.ndarray:
+    """Second differences (T, 3) of positions."""
+    return np.gradient(np.gradient(position, 1 / RATE, axis=0), 1 / RATE, axis=0)
+
+
+def first_order(values: np.ndarray, time_constant: float) -> np.ndarray:
+    """`values` (T, C) behind a first-order lag of `time_constant` s, settled at the start."""
+    blend = -np.expm1(-1 / (RATE * time_constant))
+    start = (1.0 - blend) * values[:1]
+    return lfilter([0.0, blend], [1.0, blend - 1.0], values, axis=0, zi=start)[0]
+
+
+def up_of(quaternion: np.ndarray) -> np.ndarray:
+    """Body z in the world (T, 3) of attitudes (T, 4)."""
+    w, x, y, z = quaternion.T
+    return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], 1)
+
+
+def to_body(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """World vectors (T, 3) in the body frame of attitudes (T, 4)."""
+    w, u = quaternion[:, :1], -quaternion[:, 1:]
+    t = 2.0 * np.cross(u, vector)
+    return vector + w * t + np.cross(u, t)
