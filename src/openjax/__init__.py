@@ -19,15 +19,19 @@ _PUBLIC = {
     "UserError": "openjax.errors",
     "load_policy": "openjax.store.policies",
     "make": "openjax.pursuit",
+    "preset": "openjax.learning",
 }
+_COMMANDS = ("evaluate", "train")  # modules that can be called
 
-__all__ = sorted(_PUBLIC)
+__all__ = sorted([*_PUBLIC, *_COMMANDS])
 
 
 def __getattr__(name: str):
     # imported on first use: `python -m openjax.diagnose --help` needn't wait for MuJoCo
     if name in _PUBLIC:
         return getattr(importlib.import_module(_PUBLIC[name]), name)
+    if name in _COMMANDS:
+        return importlib.import_module(f"openjax.{name}")
     raise AttributeError(f"module 'openjax' has no attribute {name!r}")
 
 

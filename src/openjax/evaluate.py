@@ -2,6 +2,7 @@
 
 Prints, and with `--json` writes, for each scenario: scenario, episodes, capture_rate, capture_step,
 collision_rate, collision_parts, crash_rate, over_speed_rate, prediction_error.
+From Python: `openjax.evaluate(policy, scenario)`, see `openjax.commands.calls.evaluate`.
 """
 
 import dataclasses
@@ -11,11 +12,14 @@ from pathlib import Path
 
 import tyro
 
+from openjax.commands.callable_module import make_callable
 from openjax.commands.command_line import output_console, parse, run_command
 from openjax.errors import UserError
 from openjax.pursuit import SCENARIOS, PursuitSettings, find_scenario
 
 PROGRAM = "python -m openjax.evaluate"
+CALL = "evaluate"
+make_callable(__name__)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,12 +64,12 @@ def main(arguments: Sequence[str]) -> int:
         # Once more, with the game of this policy as the default.
         default = dataclasses.replace(EvaluateCommand(), environment=loaded.settings.environment)
         own = parse(EvaluateCommand, default, arguments, PROGRAM)
-        results.append((loaded.source, evaluate(own, loaded, evaluators)))
+        results.append((loaded.source, records_of_policy(own, loaded, evaluators)))
     _show(command, results)
     return 0
 
 
-def evaluate(command: EvaluateCommand, loaded, evaluators: dict) -> list[dict]:
+def records_of_policy(command: EvaluateCommand, loaded, evaluators: dict) -> list[dict]:
     """One record per scenario; see `openjax.commands.evaluator.FIELDS`.
 
     Args:

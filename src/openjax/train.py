@@ -2,13 +2,18 @@
 
 Writes a run directory (see `openjax.store.run_directory`) with logs, checkpoints, the best policy and
 pictures. Ctrl-C or SIGTERM saves and exits; `--resume DIR` goes on exactly where it stopped.
+From Python: `openjax.train(settings, out)`, see `openjax.commands.calls.train`.
 """
 
 import sys
 import time
 from collections.abc import Sequence
 
+from openjax.commands.callable_module import make_callable
 from openjax.commands.command_line import peek, run_command
+
+CALL = "train"
+make_callable(__name__)
 
 
 def main(arguments: Sequence[str]) -> int:

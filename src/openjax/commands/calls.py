@@ -1,0 +1,99 @@
+"""The commands as functions: what `openjax.train(...)` and `openjax.evaluate(...)` do in Python."""
+
+import dataclasses
+import time
+from pathlib import Path
+
+from openjax.cluster.processes import Processes
+from openjax.commands.training_command import TrainCommand, default_preset, start
+from openjax.errors import UserError
+from openjax.learning import TrainSettings, preset
+from openjax.store.policies import LoadedPolicy, load_policy
+
+
+def train(
+    settings: TrainSettings | None = None,
+    out: str | Path | None = None,
+    *,
+    minutes: float | None = None,
+    start_from: str | None = None,
+    devices: str = "1",
+    vehicle: str | Path | None = None,
+    effects: str | Path | None = None,
+    overwrite: bool = False,
+) -> LoadedPolicy:
+    """Train as `python -m openjax.train` does, with its progress, checkpoints and pictures.
+
+    Args:
+      settings: of the run; None is the preset for this machine (`openjax.preset`).
+      out: directory of the run; None is runs/DATE.
+      minutes: stop after this time.
+      start_from: policy whose networks the run starts with.
+      devices: how many, or "all".
+      vehicle, effects: files to fly with, vehicle.toml and effects.toml.
+      overwrite: replace a run that `out` already holds.
+
+    Returns:
+      The best policy of the run.
+
+    Raises:
+      UserError: settings or files that can't be used, or a run that ended by a NaN.
+    """
+    settings = settings or preset(default_preset())
+    out = Path(out) if out is not None else Path("runs") / time.strftime("%Y%m%d-%H%M%S")
+    command = TrainCommand(
+        out=out,
+        minutes=minutes,
+        start_from=start_from,
+        devices=str(devices),
+        vehicle=None if vehicle is None else Path(vehicle),
+        effects=None if effects is None else Path(effects),
+        overwrite=overwrite,
+        settings=settings,
+    )
+    if start(command, ["(called from Python)"], time.monotonic(), Processes()):
+        raise UserError(f"training in {out} stopped at a NaN; what is left to look at lies there")
+    return load_policy(out)
+
+
+def evaluate(
+    policy: LoadedPolicy | str | Path,
+    scenario: str = "all",
+    *,
+    episodes: int = 100,
+    seed: int = 0,
+    vehicle: str | Path | None = None,
+    effects: str | Path | None = None,
+    **changes,
+) -> dict | list[dict]:
+    """Fly a policy's mean on layouts as `python -m openjax.evaluate` does.
+
+    Args:
+      policy: a loaded policy, or what `openjax.load_policy` takes.
+      scenario: a layout's name, a TOML file with an own one, or "all".
+      episodes: per layout.
+      seed: draws the start attitudes.
+      vehicle, effects: files to fly with, vehicle.toml and effects.toml.
+      changes: of the game that the policy was trained in, for example speed_limit="none".
+
+    Returns:
+      A record, or a list of them for "all": scenario, episodes, capture_rate, capture_step, collision_rate,
+      collision_parts, crash_rate, over_speed_rate, prediction_error.
+
+    Raises:
+      UserError: an unusable layout, or a game that the policy can't play.
+    """
+    from openjax.evaluate import EvaluateCommand, records_of_policy
+
+    loaded = policy if isinstance(policy, LoadedPolicy) else load_policy(policy)
+    command = EvaluateCommand(
+        policy=(loaded.source,),
+        scenario=str(scenario),
+        episodes=episodes,
+        seed=seed,
+        vehicle=None if vehicle is None else Path(vehicle),
+        effects=None if effects is None else Path(effects),
+        environment=dataclasses.replace(loaded.settings.environment, **changes),
+    )
+    records = records_of_policy(command, loaded, {})
+    return records if scenario == "all" else records[0]
