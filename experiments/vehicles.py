@@ -1,0 +1,180 @@
+"""Policies on vehicles that they weren't made for: `python experiments/vehicles.py [--policy NAME ...] [--number 1024]`.
+
+No clamp, rate loop at 500 Hz, solid contacts. Vehicles: the nominal one; `table`, with motors 40 ms slower, commands 15 ms
+and poses 10 ms late, and drag; the family of the preset `flight`, ordinary and whole; and for each of its effects vehicles
+that are out of the ordinary in it alone. Tasks: held-back uniform ones, with rows of pillars, with close starts, and at the
+end the six layouts, for the first three kinds of vehicles. Nothing is chosen by the layouts. Writes
+experiments/results/vehicles.json and .md (`--out`: others).
+"""
+
+import dataclasses
+import functools
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from hard_tasks import close, drawn, row
+from pages import page_parser, publish, table
+
+from openjax.commands.command_line import run_command
+from openjax.commands.evaluator import layout_slots, repeat_task
+from openjax.commands.machine import describe_machine
+from openjax.commands.validation import uniform_tasks
+from openjax.learning import make_evaluate, summarise
+from openjax.pursuit import SCENARIOS, Pursuit, scenario_task
+from openjax.store.policies import load_policy
+from openjax.vehicle import load_vehicle
+from openjax.vehicle.family import FLIGHT_FAMILY, family_bounds, find_parameter
+
+TABLE = {
+    "motor_lag.extra_up": 0.04,
+    "motor_lag.extra_down": 0.04,
+    "command_latency.delay": 0.015,
+    "state_latency.delay": 0.01,
+    "rotor_drag.d_xy": 0.0125,
+    "rotor_drag.d_z": 0.0125,
+}
+NAMES = [entry[0] for entry in FLIGHT_FAMILY]
+EFFECTS = sorted({name.partition(".")[0] for name in NAMES})
+WHOLE = "family"
+
+
+def vehicles() -> dict[str, np.ndarray]:
+    """Bounds (R, 4) of each kind of vehicle; only the whole family has any that are rare."""
+    bounds = family_bounds(FLIGHT_FAMILY)
+    none = np.repeat([[find_parameter(name)[1].none] for name in NAMES], 4, axis=1).astype(np.float32)
+    one = none.copy()
+    for name, value in TABLE.items():
+        one[NAMES.index(name)] = value
+    ordinary = np.tile(bounds[:, :2], 2)
+    kinds = {"nominal": none, "table": one, "ordinary": ordinary, WHOLE: bounds}
+    for effect in EFFECTS:
+        own = np.array([name.partition(".")[0] == effect for name in NAMES])
+        kinds[effect] = np.where(own[:, None], np.tile(bounds[:, 2:], 2), ordinary)
+    return kinds
+
+
+@functools.cache
+def program(settings, policy):
+    """The compiled evaluation: (parameters, tasks, key, bounds (R, 4)) -> Evaluation."""
+    vehicle = load_vehicle()
+
+    def run(parameters, tasks, key, bounds):
+        environment = Pursuit(settings, vehicle, vehicle_bounds=bounds)
+        return make_evaluate(environment, policy)(parameters, tasks, key)
+
+    return jax.jit(run)
+
+
+def fly(name: str, number: int, layouts: int, physics: str) -> dict[str, dict[str, dict]]:
+    """Summaries by vehicle and kind of task."""
+    loaded = load_policy(name)
+    game = dataclasses.replace(
+        loaded.settings.environment,
+        speed_limit="none",
+        substeps=5,
+        physics=physics,
+        vehicles=FLIGHT_FAMILY,
+        rare_vehicles=0.5,
+        max_pillars=layout_slots(loaded.settings.environment),
+    )
+    drawn_from = loaded.settings.environment
+    slots = game.max_pillars
+    tasks = {
+        "uniform": uniform_tasks(drawn_from, number, slots),
+        "row": widened(drawn(drawn_from, row, number), slots),
+        "close": widened(drawn(drawn_from, close, number), slots),
+    }
+    repeated = [repeat_task(scenario_task(game, SCENARIOS[layout]), layouts) for layout in SCENARIOS]
+    flat = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *repeated)
+    found: dict[str, dict[str, dict]] = {}
+    run = program(game, loaded.policy)
+    for kind, bounds in vehicles().items():
+        shown = tasks if kind in ("nominal", "table", "ordinary", WHOLE) else {"uniform": tasks["uniform"]}
+        own = found.setdefault(kind, {})
+        for task_kind, drawn_tasks in shown.items():
+            own[task_kind] = summarise(run(loaded.parameters, drawn_tasks, jax.random.key(0), bounds))
+        if layouts and kind in ("nominal", "table", WHOLE):
+            together = run(loaded.parameters, flat, jax.random.key(1), bounds)
+            for i, layout in enumerate(SCENARIOS):
+                part = slice(i * layouts, (i + 1) * layouts)
+                own[layout] = summarise(jax.tree.map(lambda leaf, part=part: leaf[part], together))
+        for task_kind, summary in own.items():
+            print(name, kind, task_kind, " ".join(cells(summary)), flush=True)
+    return found
+
+
+def widened(tasks, slots: int):
+    """`tasks` with more pillar slots, unused."""
+    extra = slots - tasks.pillar_active.shape[-1]
+    return tasks.replace(
+        pillar_position=jnp.pad(tasks.pillar_position, ((0, 0), (0, extra), (0, 0))),
+        pillar_active=jnp.pad(tasks.pillar_active, ((0, 0), (0, extra))),
+    )
+
+
+def cells(summary: dict) -> list[str]:
+    """What the page says of a summary."""
+    return [
+        f"{summary['capture_rate']:.3f}",
+        f"{summary['capture_step']:.0f}",
+        f"{summary['collision_rate']:.4f}",
+        f"{summary['crash_rate']:.4f}",
+        f"{summary['over_speed_rate']:.4f}",
+    ]
+
+
+def study(options) -> dict:
+    """Fly the policies."""
+    started = time.monotonic()
+    policies = {name: fly(name, options.number, options.layouts, options.physics) for name in options.policy}
+    return {
+        "command": f"python experiments/vehicles.py --policy {' '.join(options.policy)} --number {options.number} "
+        f"--layouts {options.layouts} --physics {options.physics}",
+        "machine": describe_machine(),
+        "seconds": time.monotonic() - started,
+        "number": options.number,
+        "layouts": options.layouts,
+        "policies": policies,
+    }
+
+
+def report(results: dict) -> list[str]:
+    """The page."""
+    machine = results["machine"]
+    rows = [
+        [name, kind, tasks, *cells(summary)]
+        for name, kinds in results["policies"].items()
+        for kind, found in kinds.items()
+        for tasks, summary in found.items()
+    ]
+    return [
+        "# Policies on other vehicles",
+        "",
+        f"`{results['command']}` on {machine['device']}, JAX {machine['versions']['jax']}, commit {machine['commit']}: "
+        f"{results['seconds']:.0f} s. No clamp, rate loop at 500 Hz, drawn starts; {results['number']} held-back tasks of each "
+        f"kind, {results['layouts']} episodes of each layout. Nominal: the nominal vehicle; table: motors 40 ms slower, "
+        "commands 15 ms and poses 10 ms late, drag of .0125 N s/m; ordinary and family: the vehicles of the preset flight "
+        "without and with the rare ones; a name: all vehicles out of the ordinary in that effect.",
+        "",
+        *table(
+            ["policy", "vehicle", "tasks", "capture", "step", "collision", "crash", "over speed"],
+            rows,
+        ),
+    ]
+
+
+def main(arguments: list[str]) -> int:
+    """Evaluate and write both files."""
+    parser = page_parser(__doc__, "vehicles")
+    parser.add_argument("--policy", nargs="+", default=["open", "flight"], help="names, runs or policy files")
+    parser.add_argument("--number", type=int, default=1024, help="tasks of each kind")
+    parser.add_argument("--layouts", type=int, default=0, help="episodes of each layout; 0: none")
+    parser.add_argument("--physics", default="rigid")
+    publish(parser.parse_args(arguments), study, report)
+    return 0
+
+
+if __name__ == "__main__":
+    run_command(main)
