@@ -25,8 +25,14 @@ def test_every_command_and_target_of_the_readme_exists():
     assert len(modules) >= 5
     for module in modules:
         assert importlib.util.find_spec(module), module
-    for path in re.findall(r"\]\((experiments/[^)]+)\)", README):
+    for path in re.findall(r"\]\(((?:experiments|docs|examples)[^)#]*)\)", README):
         assert (ROOT / path).exists(), path
+
+
+def test_links_between_the_pages_lead_somewhere():
+    for page in sorted((ROOT / "docs").glob("*.md")):
+        for path in re.findall(r"\]\((?!http)([^)#]+)", page.read_text(encoding="utf-8")):
+            assert (page.parent / path).exists(), f"{page.name}: {path}"
 
 
 def test_from_sample_flights_to_a_corrected_simulator(tmp_path):
