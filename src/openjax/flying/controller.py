@@ -60,6 +60,22 @@ def up(quaternion) -> float:
     return 1.0 - 2.0 * (x * x + y * y)
 
 
+def moved_on(pose: Pose, now: float) -> Pose:
+    """The pose at `now` (s) if velocity and body rates have stayed what they were."""
+    age = now - pose.time
+    position = tuple(p + age * v for p, v in zip(pose.position, pose.velocity, strict=True))
+    w, x, y, z = pose.quaternion
+    a, b, c = (0.5 * age * rate for rate in pose.body_rates)
+    turned = (
+        w - x * a - y * b - z * c,
+        x + w * a + y * c - z * b,
+        y + w * b + z * a - x * c,
+        z + w * c + x * b - y * a,
+    )
+    size = math.sqrt(sum(q * q for q in turned))
+    return pose._replace(time=now, position=position, quaternion=tuple(q / size for q in turned))
+
+
 def wanted_velocity(position: Vector, target: Vector, speed: float) -> Vector:
     """The velocity that leads from `position` to `target`, of at most `speed` (m/s)."""
     wanted = [POSITION_GAIN * (t - p) for t, p in zip(target, position, strict=True)]

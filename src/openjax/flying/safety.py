@@ -21,6 +21,7 @@ from openjax.flying.controller import (
     Pose,
     Vector,
     accelerate,
+    moved_on,
     up,
     wanted_acceleration,
     wanted_velocity,
@@ -208,13 +209,10 @@ def _sense(settings, drone, sighting, now, dt):
     """The drone with its estimate brought to `now`: the newest pose moved on, or reckoned from the last estimate."""
     pose = sighting.pose
     if usable(pose) and now - pose.time <= settings.pose_timeout:
-        age = max(now - pose.time, 0.0)
-        position = tuple(p + age * v for p, v in zip(pose.position, pose.velocity, strict=True))
-        _, x, y, _ = pose.quaternion
-        w, z = pose.quaternion[0], pose.quaternion[3]
-        lift = max(up(pose.quaternion), 0.3)
+        estimate = moved_on(pose, max(now, pose.time))
+        w, x, y, z = estimate.quaternion
+        lift = max(up(estimate.quaternion), 0.3)
         tilt = (2 * (x * z + w * y) / lift * GRAVITY, 2 * (y * z - w * x) / lift * GRAVITY, 0.0)
-        estimate = pose._replace(time=now, position=position)
         return replace(drone, estimate=estimate, acceleration=tilt)
     if drone.estimate is None:
         return drone

@@ -1,0 +1,222 @@
+"""`python -m openjax.fly --policy PATH --uri URI [URI ...]`: fly a policy on Crazyflies, real or virtual.
+
+A hundred times a second from poses to body rates and thrust, through the real `cflib`. The flight is written as a case
+that `python -m openjax.diagnose` reads.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import select
+import shutil
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import tyro
+
+from openjax.errors import UserError
+from openjax.flying.safety import Request, SafetySettings
+from openjax.runs.command_line import output_console, parse, run_command
+
+PROGRAM = "python -m openjax.fly"
+KEYS = {" ": Request.STOP, "q": Request.STOP, "l": Request.LAND, "h": Request.HOLD}
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Fly a policy on as many Crazyflies as it has pursuers, and log it for the diagnosis.
+
+    While it flies: space or q stops all motors, l lands, h waits; Ctrl-C lands.
+    """
+
+    policy: str = "open"
+    """A run's directory, a policy file (.npz), or the name of a policy in the package."""
+    uri: tuple[str, ...] = ("udp://127.0.0.1:19850", "udp://127.0.0.1:19851", "udp://127.0.0.1:19852")
+    """One vehicle per pursuer: udp://HOST:PORT (virtual), radio://0/80/2M/E7E7E7E7E7 (real)."""
+    evader_uri: str | None = None
+    """A further vehicle that flies the evader by the game's rule; without it the evader is a point in the computer."""
+    scenario: str = "wall"
+    """Layout: a name or a TOML file. Pillars exist in the computer only, unless you put them up."""
+    episodes: int = 1
+    """Games, one after the other. Between them all fly straight back: with real pillars leave it at 1."""
+    episode_seconds: float = float("inf")
+    """End each game after this time; otherwise it lasts as long as in training."""
+    out: Path | None = None
+    """Folder for the logs, a case for openjax.diagnose; must not exist or be empty."""
+    vehicle: Path | None = None
+    """What flies (vehicle.toml), for the hover thrust and the case."""
+    body_logs: int | None = None
+    """Log blocks of motors and accelerometer per vehicle, 0 to 5; default 5 over UDP, 1 over radio."""
+    motion_capture: str | None = None
+    """MODULE:FUNCTION that feeds poses; default: the vehicles' own estimates. See openjax.flying.motion_capture."""
+    safety: SafetySettings = field(default_factory=SafetySettings)
+
+
+def main(arguments: Sequence[str]) -> int:
+    parsed = parse(Arguments, Arguments(), arguments, PROGRAM)
+    flight = fly(parsed)
+    return 0 if flight is not None else 2
+
+
+def fly(arguments: Arguments):
+    """Fly; returns the record. Raises UserError for what can't be."""
+    _check(arguments)
+    console = output_console()
+    console.print("loading the policy, compiling the tick ...")
+    from openjax.flying.flight_files import write_case
+    from openjax.flying.game import Game
+    from openjax.flying.loop import Flight, Plan
+    from openjax.flying.swarm import Swarm
+    from openjax.pursuit import find_scenario, scenario_task
+    from openjax.runs.policies import load_policy
+    from openjax.vehicle.vehicle_file import load_vehicle_file
+
+    policy = load_policy(arguments.policy)
+    settings = policy.settings.environment
+    if len(arguments.uri) != settings.num_pursuers:
+        raise UserError(
+            f"--uri names {len(arguments.uri)} vehicles, the policy flies {settings.num_pursuers}"
+        )
+    scenario = find_scenario(arguments.scenario, settings)
+    if len(scenario.pursuers) != settings.num_pursuers:
+        raise UserError(
+            f"--scenario {scenario.name} has {len(scenario.pursuers)} pursuers, the policy {settings.num_pursuers}"
+        )
+    slots = max(settings.max_pillars, len(scenario.pillars))
+    game = Game(policy, scenario_task(dataclasses.replace(settings, max_pillars=slots), scenario))
+    vehicle = load_vehicle_file(arguments.vehicle)
+    game.hover_thrust = _hover_thrust(vehicle.vehicle)
+    uris = [*arguments.uri, *([arguments.evader_uri] if arguments.evader_uri else [])]
+    body_logs = arguments.body_logs
+    if body_logs is None:
+        body_logs = 5 if all(uri.startswith("udp:") for uri in uris) else 1
+    swarm = Swarm(uris, body_logs)
+    console.print(f"connecting to {', '.join(uris)} ...")
+    swarm.connect()
+    plan = Plan(arguments.episodes, arguments.episode_seconds)
+    with _Keys() as keys:
+        try:
+            _wait_for_poses(swarm)
+            swarm.arm()
+            swarm.record()
+            console.print("flying: space or q stops all motors, l or Ctrl-C lands")
+            flight = Flight(swarm, game, arguments.safety, plan, keys)
+            record = _until_down(flight, keys)
+        except KeyboardInterrupt:
+            swarm.emergency_stop()
+            raise
+        finally:
+            swarm.arm(False)
+            swarm.close()
+    about = {
+        "policy": policy.source,
+        "scenario": scenario.name,
+        "uris": uris,
+        "reasons": [d.reason for d in flight.state.drones],
+    }
+    _show(console, record, flight)
+    if arguments.out is not None:
+        described = dataclasses.replace(
+            vehicle, path=None, log={"source": f"openjax.fly, policy {policy.source}", "floor_z": 0.0}
+        )
+        _write(arguments.out, lambda folder: write_case(folder, swarm.members, record, described, about))
+        console.print(f"{arguments.out}: next, python -m openjax.diagnose {arguments.out}")
+    return record
+
+
+def _check(arguments):
+    if arguments.episodes < 1:
+        raise UserError(f"--episodes is {arguments.episodes}; it must be at least 1")
+    if arguments.body_logs is not None and not 0 <= arguments.body_logs <= 5:
+        raise UserError(f"--body_logs is {arguments.body_logs}; 0 to 5 are possible")
+    if len(set(arguments.uri)) < len(arguments.uri):
+        raise UserError("--uri names a vehicle twice")
+    out = arguments.out
+    if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise UserError(f"{out}: exists and isn't an empty folder; name another one")
+
+
+def _hover_thrust(vehicle) -> float:
+    most = 4 * vehicle.thrust_constant * vehicle.max_rotor_speed**2
+    return float(vehicle.mass * vehicle.gravity / most)
+
+
+def _wait_for_poses(swarm, timeout=5.0):
+    import time
+
+    deadline = time.monotonic() + timeout
+    while any(s.pose is None for s in swarm.sightings()):
+        if time.monotonic() > deadline:
+            silent = [m.uri for m in swarm.members if m.pose is None]
+            raise UserError(f"no pose from {', '.join(silent)} within {timeout:g} s; is its position known?")
+        time.sleep(0.02)
+
+
+def _until_down(flight, keys):
+    """The flight's record; the first Ctrl-C lands, a second one stops."""
+    try:
+        return flight.run()
+    except KeyboardInterrupt:
+        keys.pressed = Request.LAND
+        return flight.run()
+
+
+def _write(out: Path, write) -> None:
+    """Written beside the place and moved there at the end: an interrupted write leaves no half case."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as scratch:
+        folder = Path(scratch) / "case"
+        folder.mkdir()
+        write(folder)
+        if out.exists():
+            out.rmdir()
+        shutil.move(folder, out)
+
+
+def _show(console, record, flight):
+    timing = record.timing()
+    age = timing["command_age_ms"]
+    console.print(
+        f"{timing['seconds']:.1f} s, {timing['ticks']} ticks: command age {age['p50']:.2f} ms median, "
+        f"{age['p99']:.2f} ms p99; {timing['missed_deadlines']} missed deadlines ({timing['missed_share']:.2%})"
+    )
+    for number, game in enumerate(record.episodes):
+        caught = f"caught at step {game['capture_step']}" if game["capture_step"] else "not caught"
+        console.print(f"game {number}: {caught}, {game['steps']} steps, {game['breaches']} with a breach")
+    for i, drone in enumerate(flight.state.drones):
+        if drone.reason not in ("", "asked to land"):
+            console.print(f"vehicle {i}: {drone.mode.value}, {drone.reason}")
+
+
+class _Keys:
+    """Keys of a terminal as requests, without waiting for them."""
+
+    def __init__(self):
+        self.pressed, self._restore = Request.NONE, None
+
+    def __enter__(self):
+        if sys.stdin.isatty():
+            import termios
+            import tty
+
+            before = termios.tcgetattr(sys.stdin)
+            tty.setcbreak(sys.stdin)
+            self._restore = lambda: termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+        return self
+
+    def __exit__(self, *_):
+        if self._restore is not None:
+            self._restore()
+
+    def __call__(self) -> Request:
+        request, self.pressed = self.pressed, Request.NONE
+        if self._restore is not None and select.select([sys.stdin], [], [], 0)[0]:
+            request = KEYS.get(sys.stdin.read(1), request)
+        return request
+
+
+if __name__ == "__main__":
+    run_command(main)

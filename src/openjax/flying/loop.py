@@ -1,0 +1,286 @@
+"""The loop: a hundred times a second from poses to set-points, on time, with a record of how well that went."""
+
+from __future__ import annotations
+
+import gc
+import math
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from openjax.flying.controller import Airframe, Pose, accelerate, moved_on, wanted_acceleration
+from openjax.flying.game import THRUST_LIMIT, Game
+from openjax.flying.safety import (
+    Event,
+    Mode,
+    Request,
+    SafetySettings,
+    Sighting,
+    State,
+    initial_state,
+    step,
+)
+from openjax.flying.set_point import OFF, RATES, SetPoint, as_sent, from_action
+
+PERIOD = 0.01
+"""s"""
+MARGIN = 1.0e-3
+"""The tick is placed this long after the newest poses usually arrive (s)."""
+SPIN = 3e-4
+"""The last part of a wait is spent awake (s)."""
+
+
+class Vehicles(Protocol):
+    """What the loop needs of the vehicles; `Swarm` is one."""
+
+    def sightings(self) -> tuple[Sighting, ...]: ...
+
+    def send(self, set_points) -> float: ...
+
+    def arrivals(self) -> tuple[float, ...]:
+        """When each vehicle's newest pose arrived (s, host)."""
+        ...
+
+
+@dataclass
+class Record:
+    """What happened at every tick of a flight."""
+
+    due: list[float] = field(default_factory=list)  # s, host
+    sent: list[float] = field(default_factory=list)  # s, when the last set-point had left
+    age: list[tuple[float, ...]] = field(default_factory=list)  # s, of each vehicle's newest pose when sent
+    set_points: list[tuple[SetPoint, ...]] = field(default_factory=list)  # as they fit into their packets
+    modes: list[tuple[Mode, ...]] = field(default_factory=list)
+    fenced: list[tuple[bool, ...]] = field(default_factory=list)
+    episode: list[int] = field(default_factory=list)  # -1 outside of episodes
+    evader: list[tuple[float, ...]] = field(default_factory=list)  # m
+    episodes: list[dict] = field(default_factory=list)
+
+    def timing(self) -> dict:
+        """Command age (ms) and missed deadlines of all ticks. A tick's deadline is the next tick's due time."""
+        if not self.due:
+            return {"ticks": 0}
+        age = 1e3 * np.array(self.age).max(1)
+        work = 1e3 * (np.array(self.sent) - np.array(self.due))
+        gaps = 1e3 * np.diff(self.sent)
+        return {
+            "ticks": len(self.due),
+            "seconds": round(self.sent[-1] - self.due[0], 2),
+            "command_age_ms": _percentiles(age),
+            "due_to_sent_ms": _percentiles(work),
+            "between_set_points_ms": _percentiles(gaps) if len(gaps) else {},
+            "missed_deadlines": int((work > 1e3 * PERIOD).sum()),
+            "missed_share": float((work > 1e3 * PERIOD).mean()),
+        }
+
+
+def _percentiles(values) -> dict:
+    at = np.percentile(values, [50, 99, 99.9, 100])
+    return {n: round(float(v), 3) for n, v in zip(("p50", "p99", "p99.9", "max"), at, strict=True)}
+
+
+class Pace:
+    """When the ticks are due: every 10 ms, drifting to just after the moment at which poses arrive."""
+
+    def __init__(self, now: float):
+        self.due = now
+
+    def next(self, now: float, arrivals: tuple[float, ...]) -> float:
+        """The next tick's time, after one at `now` that found poses that had arrived at `arrivals` (s)."""
+        ages = sorted((self.due - a) % PERIOD for a in arrivals if math.isfinite(a) and now - a < 0.1)
+        shift = 0.0
+        if ages:
+            # poses come in a bunch: the newest of a bunch is the one after the longest pause
+            gaps = [ages[0] + PERIOD - ages[-1], *(b - a for a, b in zip(ages, ages[1:], strict=False))]
+            newest = ages[max(range(len(gaps)), key=gaps.__getitem__)]
+            error = (newest - MARGIN + PERIOD / 2) % PERIOD - PERIOD / 2
+            shift = min(max(0.02 * error, -1e-4), 1e-4)
+        self.due += PERIOD - shift
+        if self.due < now:  # too late for it: go on from here
+            self.due = now
+        return self.due
+
+
+def wait_until(due: float, clock: Callable[[], float]) -> None:
+    """Return at `due` (s)."""
+    while (left := due - clock()) > 0:
+        if left > SPIN:
+            time.sleep(left - SPIN)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be flown."""
+
+    episodes: int = 1
+    """Games, one after the other; between them all fly back to their starts."""
+    episode_seconds: float = math.inf
+    """End each game after this time, if it isn't over before (s)."""
+    transfer_timeout: float = 20.0
+    """Land if the starts aren't reached within this time (s)."""
+    settle: float = 0.3
+    """Wait this long at the starts (s)."""
+
+
+class Flight:
+    """One flight: take-off, games, landing.
+
+    Args:
+        vehicles: links to them; the pursuers first, then, where it's a vehicle, the evader.
+        game: the policy and its game.
+        safety: limits.
+        plan: what to fly.
+        requests: asked at every tick for what the operator wants.
+        beat: called at every tick with time, state and set-points.
+        clock: host time (s).
+    """
+
+    def __init__(
+        self,
+        vehicles: Vehicles,
+        game: Game,
+        safety: SafetySettings,
+        plan: Plan,
+        requests: Callable[[], Request] = lambda: Request.NONE,
+        beat: Callable[[float, State], None] | None = None,
+        clock: Callable[[], float] = time.perf_counter,
+    ):
+        self.vehicles, self.game, self.safety, self.plan = vehicles, game, safety, plan
+        self._requests, self._beat, self._now = requests, beat, clock
+        task, settings = game.task, game.settings
+        self._pursuers = settings.num_pursuers
+        starts = [tuple(map(float, p)) for p in np.asarray(task.pursuer_position)]
+        self._evader_flies = len(vehicles.sightings()) > self._pursuers
+        if self._evader_flies:
+            starts.append(tuple(map(float, np.asarray(task.evader_position))))
+        pillars = [
+            (float(x), float(y), settings.pillar_radius)
+            for (x, y), active in zip(task.pillar_position, task.pillar_active, strict=True)
+            if active
+        ]
+        self.state = initial_state(starts, pillars, Airframe(game.hover_thrust))
+        self.record = Record()
+        self._play, self._episode, self._begun = None, -1, 0.0
+        self._since = 0.0
+        self._flown = 0
+
+    def run(self) -> Record:
+        """Fly it. Returns when all motors are off."""
+        switch = sys.getswitchinterval()
+        sys.setswitchinterval(5e-4)  # the link's threads and this one share one interpreter
+        gc.collect()
+        gc.disable()
+        try:
+            pace = Pace(self._now())
+            self._since = self._now()
+            while True:
+                now = self._now()
+                self.tick(now, pace.due)
+                if not self.state.flying and self.state.time - self._since > 0.5 and self._finished():
+                    break
+                wait_until(pace.next(self._now(), self.vehicles.arrivals()), self._now)
+        finally:
+            gc.enable()
+            sys.setswitchinterval(switch)
+        return self.record
+
+    def _finished(self) -> bool:
+        return self.state.all_in(Mode.LANDED, Mode.STOPPED) or (
+            self.state.all_in(Mode.GROUND, Mode.LANDED, Mode.STOPPED)
+            and any(d.reason for d in self.state.drones)
+        )
+
+    def tick(self, now: float, due: float) -> None:
+        """One tick at `now` that was due at `due` (s)."""
+        sightings = self.vehicles.sightings()
+        arrivals = self.vehicles.arrivals()
+        request = self._requests() or self._planned(now)
+        actions = None
+        playing = self.state.drones[0].mode is Mode.PURSUIT or request is Request.PURSUE
+        if playing and all(s.pose is not None for s in sightings):
+            actions = self._actions(now, sightings, request is Request.PURSUE)
+        event = Event(now, sightings, actions, request)
+        self.state, set_points = step(self.safety, self.state, event)
+        sent = self.vehicles.send(set_points)
+        if self._beat is not None:
+            self._beat(now, self.state)
+        self._keep(due, sent, arrivals, set_points)
+        if self._episode >= 0 and not any(m is Mode.PURSUIT for m in self.state.modes):
+            self._end_episode("safety")
+
+    def _planned(self, now) -> Request:
+        """What the plan asks for at this tick."""
+        state, plan = self.state, self.plan
+        waited = now - self._since
+        if state.all_in(Mode.GROUND):
+            return Request.TRANSFER
+        if state.all_in(Mode.READY) and self._episode < 0:
+            if now - max(d.since for d in state.drones) < plan.settle:
+                return Request.NONE
+            if self._flown >= plan.episodes:
+                return Request.LAND
+            return Request.PURSUE
+        if any(m in (Mode.TRANSFER, Mode.READY) for m in state.modes) and waited > plan.transfer_timeout:
+            return Request.LAND
+        if self._episode >= 0 and (self._play.over or now - self._begun > plan.episode_seconds):
+            self._end_episode("over")
+            self._since = now
+            return Request.TRANSFER if self._flown < plan.episodes else Request.LAND
+        return Request.NONE
+
+    def _actions(self, now, sightings, first):
+        """The set-points that the policy, and the evader's rule, ask for."""
+        poses = [moved_on(s.pose, max(now, s.pose.time)) for s in sightings]
+        if first:
+            self._play = self.game.start(poses[: self._pursuers])
+            self._episode, self._begun = self._flown, now
+            self.record.episodes.append(
+                {"capture_step": None, "breaches": 0, "crash": False, "steps": 0, "end": "", "over_speed": 0}
+            )
+        else:
+            evader = np.array(poses[-1].position) if self._evader_flies else None
+            self._play = self.game.step(poses[: self._pursuers], evader)
+            notes = self.record.episodes[-1]
+            notes["steps"] += 1
+            if self._play.captured and notes["capture_step"] is None:
+                notes["capture_step"] = notes["steps"]
+            notes["breaches"] += int(self._play.breaches.any())
+            notes["crash"] |= bool(self._play.crashed.any())
+            fastest = max(math.dist(p.velocity, (0, 0, 0)) for p in poses[: self._pursuers])
+            notes["over_speed"] += fastest > 1.01 * self.game.settings.max_speed
+        set_points = [from_action(a, THRUST_LIMIT) for a in self._play.action]
+        if self._evader_flies:
+            wanted = tuple(float(v) for v in self._play.evader_velocity)
+            acceleration = wanted_acceleration(poses[-1].velocity, wanted)
+            drone = self.state.drones[-1]
+            set_points.append(
+                accelerate(poses[-1].quaternion, acceleration, self.state.airframe, drone.trim, RATES)
+            )
+        return tuple(set_points)
+
+    def _end_episode(self, why):
+        self.record.episodes[-1]["end"] = why
+        self._episode = -1
+        self._flown += 1
+
+    def _keep(self, due, sent, arrivals, set_points):
+        record = self.record
+        record.due.append(due)
+        record.sent.append(sent)
+        record.age.append(tuple(sent - a for a in arrivals))
+        record.set_points.append(tuple(s if s.mode == OFF else as_sent(s) for s in set_points))
+        record.modes.append(self.state.modes)
+        record.fenced.append(tuple(d.fenced for d in self.state.drones))
+        record.episode.append(self._episode)
+        record.evader.append(
+            tuple(self._play.evader_position.tolist()) if self._play is not None else (math.nan,) * 3
+        )
+
+
+def measured(pose: Pose) -> tuple[float, ...]:
+    """The pose's numbers in the order of a log's columns: position, quaternion, velocity, body rates."""
+    return (*pose.position, *pose.quaternion, *pose.velocity, *pose.body_rates)

@@ -1,0 +1,242 @@
+"""The vehicles over `cflib`: connections, log blocks in, set-points out. The only module that imports it.
+
+`cflib` is GPLv3 and an extra: `pip install "openjax[fly]"`.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import struct
+import threading
+import time
+import warnings
+from collections.abc import Callable, Sequence
+
+from openjax.errors import UserError
+from openjax.flying.controller import Pose
+from openjax.flying.crtp import expand_quaternion
+from openjax.flying.safety import Sighting
+from openjax.flying.set_point import OFF, SetPoint, manual_arguments
+
+PERIOD_MS = 10
+"""Of the log blocks: the shortest that the protocol knows."""
+POSE_BLOCK = (
+    *((f"stateEstimateZ.{v}", "int16_t") for v in ("x", "y", "z", "vx", "vy", "vz")),
+    ("stateEstimateZ.quat", "uint32_t"),
+    *((f"gyro.{v}", "FP16") for v in "xyz"),
+    ("pm.vbatMV", "uint16_t"),
+)
+BODY_BLOCK = (
+    *((f"motor.m{i}", "uint16_t") for i in range(1, 5)),
+    *((f"acc.{v}", "FP16") for v in "xyz"),
+)
+DRIFT = 5e-5
+"""How fast two clocks may part (s/s)."""
+_WRAP = 1 << 24
+
+
+class _Clock:
+    """On-board milliseconds (24 bit) to host seconds: the packet that came through fastest sets the difference."""
+
+    def __init__(self):
+        self.offset, self._last, self._stamp, self._base = math.inf, 0.0, None, 0
+
+    def host(self, stamp: int, arrival: float) -> float:
+        if self._stamp is not None and stamp < self._stamp - _WRAP // 2:
+            self._base += _WRAP
+        self._stamp = stamp
+        own = 1e-3 * (stamp + self._base)
+        if math.isfinite(self.offset):
+            self.offset += DRIFT * (arrival - self._last)
+        self.offset, self._last = min(self.offset, arrival - own), arrival
+        return own + self.offset
+
+
+class Member:
+    """One vehicle of the swarm."""
+
+    def __init__(self, uri: str, clock: Callable[[], float]):
+        self.uri, self._now, self._onboard = uri, clock, _Clock()
+        self.pose: Pose | None = None
+        self.arrival = -math.inf  # host s, of the newest pose
+        self.heard = clock()
+        self.voltage = math.nan
+        self.error: str | None = None
+        self.poses: list[tuple[float, Pose, float]] = []  # arrival, pose, voltage
+        self.bodies: list[tuple[float, tuple[float, ...]]] = []  # measured at, m1..m4 0..1, specific force
+        self.recording = False
+        self.crazyflie = None
+        self.blocks: list = []
+
+    def pose_arrived(self, stamp: int, data: dict, _block=None) -> None:
+        """A pose block, called by cflib's thread."""
+        now = self._now()
+        values = [data[name] for name, _ in POSE_BLOCK]
+        pose = Pose(
+            self._onboard.host(stamp, now),
+            tuple(1e-3 * v for v in values[:3]),
+            tuple(1e-3 * v for v in values[3:6]),
+            tuple(expand_quaternion(values[6]).tolist()),
+            tuple(math.radians(v) for v in values[7:10]),
+        )
+        self.voltage = 1e-3 * values[10]
+        self.pose, self.arrival, self.heard = pose, now, now
+        if self.recording:
+            self.poses.append((now, pose, self.voltage))
+
+    def body_arrived(self, stamp: int, data: dict, _block=None) -> None:
+        """A block of motors and accelerometer."""
+        now = self._now()
+        self.heard = now
+        if self.recording:
+            motors = tuple(data[name] / 65536 for name, _ in BODY_BLOCK[:4])
+            force = tuple(9.81 * data[name] for name, _ in BODY_BLOCK[4:])
+            self.bodies.append((self._onboard.host(stamp, now), motors + force))
+
+
+class Swarm:
+    """Crazyflies, real or virtual, in one process.
+
+    Args:
+        uris: as `cflib` writes them: `radio://0/80/2M/E7E7E7E7E7`, `udp://127.0.0.1:19850`.
+        body_logs: log blocks of motors and accelerometer for each vehicle, spread over the 10 ms; more of them tell
+            the diagnosis more exactly when a command arrived, and take more of the link. 0 to 5.
+        clock: host time (s).
+    """
+
+    def __init__(
+        self, uris: Sequence[str], body_logs: int = 1, clock: Callable[[], float] = time.perf_counter
+    ):
+        self._now, self._body_logs = clock, body_logs
+        self.members = [Member(uri, clock) for uri in uris]
+
+    def connect(self, timeout: float = 20.0) -> None:
+        """Open all links and start the log blocks.
+
+        Raises:
+          UserError: cflib isn't there, a vehicle doesn't answer, or lacks a variable.
+        """
+        try:
+            import cflib.crtp
+            from cflib.crazyflie import Crazyflie
+        except ImportError as error:
+            raise UserError('cflib is missing: pip install "openjax[fly]" (it is GPLv3)') from error
+        for name in ("cflib.crazyflie", "cflib.crazyflie.toccache", "cflib.crazyflie.log"):
+            logging.getLogger(name).setLevel(logging.CRITICAL)
+        if not cflib.crtp.CLASSES:
+            cflib.crtp.init_drivers()
+        try:
+            for member in self.members:
+                self._open(member, Crazyflie, timeout)
+            self._start_logs(timeout)
+        except BaseException:
+            self.close()
+            raise
+
+    def _open(self, member, make, timeout):
+        done = threading.Event()
+        member.crazyflie = crazyflie = make()
+        crazyflie.fully_connected.add_callback(lambda _uri: done.set())
+
+        def failed(_uri, message):
+            member.error = str(message).strip().splitlines()[0]
+            done.set()
+
+        crazyflie.connection_failed.add_callback(failed)
+        crazyflie.connection_lost.add_callback(failed)
+        crazyflie.open_link(member.uri)
+        if not done.wait(timeout):
+            member.error = f"no answer in {timeout:g} s"
+        if member.error is not None:
+            raise UserError(
+                f"{member.uri}: no connection ({member.error}); is the vehicle on, the URI right?"
+            )
+
+    def _start_logs(self, timeout):
+        from cflib.crazyflie.log import LogConfig
+
+        kinds = [POSE_BLOCK] + [BODY_BLOCK] * self._body_logs
+        for member in self.members:
+            for number, kind in enumerate(kinds):
+                block = LogConfig(f"openjax{number}", PERIOD_MS)
+                for name, fetch_as in kind:
+                    block.add_variable(name, fetch_as)
+                arrived = member.pose_arrived if kind is POSE_BLOCK else member.body_arrived
+                block.data_received_cb.add_callback(arrived)
+                try:
+                    member.crazyflie.log.add_config(block)
+                except (KeyError, AttributeError) as error:
+                    raise UserError(
+                        f"{member.uri}: its firmware can't log what is needed ({error})"
+                    ) from error
+                block.start()
+                member.blocks.append(block)
+        deadline = self._now() + timeout
+        while not all(b.started for m in self.members for b in m.blocks):
+            if self._now() > deadline:
+                raise UserError(f"the log blocks didn't start within {timeout:g} s")
+            time.sleep(0.01)
+        # Once more, in step: all poses at the same moment, the other blocks spread over the 10 ms.
+        begin = self._now() + 0.01
+        for number in range(len(kinds)):
+            while self._now() < begin + number * 1e-3 * PERIOD_MS / len(kinds):
+                time.sleep(1e-4)
+            for member in self.members:
+                member.blocks[number].start()
+
+    def arm(self, on: bool = True) -> None:
+        """Arm or disarm all."""
+        for member in self.members:
+            if member.crazyflie is not None and member.crazyflie.link is not None:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")  # older firmware: cflib falls back by itself
+                    member.crazyflie.supervisor.send_arming_request(on)
+
+    def emergency_stop(self) -> None:
+        """Stop all motors at once; the vehicles must be restarted afterwards."""
+        for member in self.members:
+            if member.crazyflie is not None and member.crazyflie.link is not None:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")
+                    member.crazyflie.supervisor.send_emergency_stop()
+
+    def sightings(self) -> tuple[Sighting, ...]:
+        """What is known of each vehicle now."""
+        return tuple(Sighting(m.pose, m.heard, m.voltage) for m in self.members)
+
+    def arrivals(self) -> tuple[float, ...]:
+        """When each vehicle's newest pose arrived (s, host)."""
+        return tuple(m.arrival for m in self.members)
+
+    def send(self, set_points: Sequence[SetPoint]) -> float:
+        """Send each vehicle its set-point; returns when the last one left (s)."""
+        for member, set_point in zip(self.members, set_points, strict=True):
+            commander = member.crazyflie.commander
+            if set_point.mode == OFF:
+                commander.send_stop_setpoint()
+            else:
+                commander.send_setpoint_manual(*manual_arguments(set_point))
+        return self._now()
+
+    def send_pose(self, i: int, position, quaternion) -> None:
+        """Tell vehicle i where motion capture sees it: (3,) m, (4,) wxyz."""
+        w, x, y, z = quaternion
+        self.members[i].crazyflie.loc.send_extpose(tuple(position), (x, y, z, w))
+
+    def record(self, on: bool = True) -> None:
+        """Keep all samples from now on (or no longer)."""
+        for member in self.members:
+            member.recording = on
+
+    def close(self) -> None:
+        """Motors off, links closed."""
+        for member in self.members:
+            if member.crazyflie is not None:
+                try:
+                    if member.crazyflie.link is not None:
+                        member.crazyflie.commander.send_stop_setpoint()
+                    member.crazyflie.close_link()
+                except (OSError, struct.error):  # the link is gone already
+                    pass
+                member.crazyflie = None
