@@ -15,11 +15,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import tyro
-
+from openjax.commands.command_line import output_console, parse, run_command
 from openjax.errors import UserError
 from openjax.flying.safety import Request, SafetySettings
-from openjax.runs.command_line import output_console, parse, run_command
 
 PROGRAM = "python -m openjax.fly"
 KEYS = {" ": Request.STOP, "q": Request.STOP, "l": Request.LAND, "h": Request.HOLD}
@@ -71,7 +69,7 @@ def fly(arguments: Arguments):
     from openjax.flying.loop import Flight, Plan
     from openjax.flying.swarm import Swarm
     from openjax.pursuit import find_scenario, scenario_task
-    from openjax.runs.policies import load_policy
+    from openjax.store.policies import load_policy
     from openjax.vehicle.vehicle_file import load_vehicle_file
 
     policy = load_policy(arguments.policy)

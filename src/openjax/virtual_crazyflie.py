@@ -12,9 +12,9 @@ from pathlib import Path
 
 import tyro
 
+from openjax.commands.command_line import output_console, parse, run_command
 from openjax.errors import UserError
 from openjax.flying.virtual_link import BASE_PORT, LinkFaults
-from openjax.runs.command_line import output_console, parse, run_command
 
 PROGRAM = "python -m openjax.virtual_crazyflie"
 

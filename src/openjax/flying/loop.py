@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import itertools
 import math
 import sys
 import time
@@ -95,7 +96,7 @@ class Pace:
         shift = 0.0
         if ages:
             # poses come in a bunch: the newest of a bunch is the one after the longest pause
-            gaps = [ages[0] + PERIOD - ages[-1], *(b - a for a, b in zip(ages, ages[1:], strict=False))]
+            gaps = [ages[0] + PERIOD - ages[-1], *(b - a for a, b in itertools.pairwise(ages))]
             newest = ages[max(range(len(gaps)), key=gaps.__getitem__)]
             error = (newest - MARGIN + PERIOD / 2) % PERIOD - PERIOD / 2
             shift = min(max(0.02 * error, -1e-4), 1e-4)
@@ -200,7 +201,7 @@ class Flight:
         arrivals = self.vehicles.arrivals()
         request = self._requests() or self._planned(now)
         actions = None
-        playing = self.state.drones[0].mode is Mode.PURSUIT or request is Request.PURSUE
+        playing = self._episode >= 0 or request is Request.PURSUE
         if playing and all(s.pose is not None for s in sightings):
             actions = self._actions(now, sightings, request is Request.PURSUE)
         event = Event(now, sightings, actions, request)

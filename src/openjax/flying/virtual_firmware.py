@@ -291,14 +291,15 @@ class VirtualFirmware:
 
     def _accept(self, mode, roll, pitch, yaw_rate, thrust, now):
         """Degrees in the firmware's frame, where pitch points the other way."""
-        if not all(map(np.isfinite, (roll, pitch, yaw_rate))):
-            return
+        if all(map(np.isfinite, (roll, pitch, yaw_rate))):
+            angles = np.radians((roll, -pitch, yaw_rate)).tolist()
+            self.accept(SetPoint(mode, *angles, thrust / (FULL_SCALE + 1)), now)
+
+    def accept(self, set_point: SetPoint, now: float) -> None:
+        """Take a set-point as it comes out of a packet: no thrust means motors off."""
         self.set_points += 1
-        roll, pitch, yaw_rate = np.radians((roll, -pitch, yaw_rate)).tolist()
         self._set_point_time = now
-        self._set_point = (
-            SetPoint() if thrust == 0 else SetPoint(mode, roll, pitch, yaw_rate, thrust / (FULL_SCALE + 1))
-        )
+        self._set_point = SetPoint() if set_point.thrust == 0.0 else set_point
 
     # -- tables of contents
 

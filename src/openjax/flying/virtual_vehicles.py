@@ -65,7 +65,7 @@ class VirtualVehicles:
         battery: float = 1.0,
         endurance: float = 420.0,
     ):
-        self._step = make_drones_step("rigid", dt=STEP, effects=effects)
+        self._step = make_drones_step("rigid", dt=STEP, effects=effects, contacts=False)
         for effect in self._step.effects:
             if effect.command is not None:
                 raise UserError(
