@@ -65,6 +65,7 @@ def fly(arguments: Arguments):
     console = output_console()
     console.print("loading the policy, compiling the tick ...")
     from openjax.flying.flight_files import write_case
+    from openjax.flying import real_time
     from openjax.flying.game import Game
     from openjax.flying.loop import Flight, Plan
     from openjax.flying.swarm import Swarm
@@ -72,6 +73,7 @@ def fly(arguments: Arguments):
     from openjax.store.policies import load_policy
     from openjax.vehicle.vehicle_file import load_vehicle_file
 
+    real_time.prepare()
     policy = load_policy(arguments.policy)
     settings = policy.settings.environment
     if len(arguments.uri) != settings.num_pursuers:

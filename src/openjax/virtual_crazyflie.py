@@ -79,6 +79,9 @@ def make(arguments: Arguments):
 
 def main(arguments: Sequence[str]) -> None:
     parsed = parse(Arguments, Arguments(), arguments, PROGRAM)
+    from openjax.flying import real_time
+
+    real_time.prepare()
     virtual = make(parsed)
     console = output_console()
     try:

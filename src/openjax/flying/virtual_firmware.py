@@ -405,9 +405,8 @@ class VirtualFirmware:
         for ident, block in self._blocks.items():
             if block.period <= 0 or now < block.due:
                 continue
-            block.due += block.period
-            if block.due <= now:  # too late for the ones between, which are left out
-                block.due = now + block.period
+            # in step with its start; what came due in between is left out
+            block.due += block.period * (1 + int((now - block.due) / block.period))
             stamp = struct.pack("<I", int(now * 1000) & 0xFFFFFF)[:3]
             values = b"".join(
                 pack_number(fmt, LOG_VARIABLES[name][1](self, sensors)) for name, fmt in block.variables

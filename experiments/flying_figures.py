@@ -1,0 +1,194 @@
+"""Figures of the flying loop: `python experiments/flying_figures.py OUT [--minutes 10]`.
+
+Everything goes through the commands that a user types, in processes of their own, with the real cflib over UDP:
+* long: three virtual Crazyflies, game after game, for the minutes given: command age, missed deadlines, captures.
+* links: flights with set-points that come late or get lost; each is a case for the diagnosis (see `diagnose`).
+* simulator: the same policy on the same layouts in the simulator alone, from level starts without clamp.
+
+`python experiments/flying_figures.py OUT --part diagnose` diagnoses the cases of an earlier run.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import tyro
+
+LAYOUTS = ("wall", "narrow_gap", "random", "passage", "hidden")
+LINKS = (
+    (0.0, 0.0), (6.0, 0.0), (12.0, 0.0), (20.0, 0.0), (30.0, 0.0),
+    (0.0, 0.05), (0.0, 0.1), (0.0, 0.2), (12.0, 0.05), (20.0, 0.1),
+)  # fmt: skip
+"""Latency (ms) and loss of the set-points."""
+PORTS = 19860
+"""Beyond those that cflib scans; each pair of processes has ten."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Measure the flying loop."""
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """Folder for logs and figures."""
+    part: Literal["all", "long", "links", "simulator", "diagnose"] = "all"
+    policy: str = "no_clamp_seed_0"
+    minutes: float = 10.0
+    """Of the long flight."""
+    at_once: int = 3
+    """Pairs of processes for the links."""
+    games: int = 4
+    """Per link."""
+    virtual: tuple[str, ...] = ()
+    """Further options of the virtual Crazyflies, as NAME=VALUE."""
+
+
+def pair(arguments, number: int, out: Path, virtual: list[str], fly: list[str], seconds: float) -> dict:
+    """Fly with virtual Crazyflies of their own; what flight.json says, or why there is none."""
+    port = PORTS + 10 * number
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "OMP_NUM_THREADS": "1"}
+    own = [f"--{option}" for option in arguments.virtual]
+    command = [sys.executable, "-m", "openjax.virtual_crazyflie", "--port", str(port), *virtual, *own]
+    vehicles = subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    try:
+        said = vehicles.stdout.readline()
+        if "listening" not in said:
+            return {"error": said + vehicles.stdout.read()}
+        uris = [f"udp://127.0.0.1:{port + i}" for i in range(3)]
+        command = [sys.executable, "-m", "openjax.fly", "--policy", arguments.policy, "--out", str(out), *fly]
+        ran = subprocess.run(
+            [*command, "--uri", *uris],
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=seconds,
+            check=False,
+        )
+        if not (out / "flight.json").exists():
+            return {"error": ran.stdout[-600:] + ran.stderr[-1500:]}
+        return json.loads((out / "flight.json").read_text(encoding="utf-8"))
+    except subprocess.TimeoutExpired:
+        return {"error": f"not over after {seconds:g} s"}
+    finally:
+        vehicles.terminate()
+        vehicles.wait()
+
+
+def long(arguments) -> dict:
+    """Games on the layouts in turn, one flight each, until the minutes are over."""
+    flights, begin, share = {}, time.monotonic(), 60 * arguments.minutes / len(LAYOUTS)
+    for layout in LAYOUTS:
+        games = max(1, int((share - 5) / 10.5))
+        out = arguments.out / f"long_{layout}"
+        options = ["--scenario", layout, "--episodes", str(games)]
+        flights[layout] = pair(
+            arguments, 0, out, ["--scenario", layout, "--endurance", "3600"], options, 4 * share + 120
+        )
+        print(
+            layout,
+            f"{time.monotonic() - begin:.0f} s",
+            json.dumps(flights[layout].get("timing", flights[layout])),
+        )
+    return flights
+
+
+def links(arguments) -> dict:
+    """One case per link."""
+
+    def fly(number):
+        latency, loss = LINKS[number]
+        name = f"latency_{latency:g}_loss_{100 * loss:g}"
+        virtual = [
+            "--latency_ms",
+            str(latency),
+            "--loss",
+            str(loss),
+            "--seed",
+            str(number),
+            "--scenario",
+            "random",
+        ]
+        options = ["--scenario", "random", "--episodes", str(arguments.games)]
+        result = pair(
+            arguments, 1 + number, arguments.out / name, virtual, options, 60 + 20 * arguments.games
+        )
+        return name, {"latency_ms": latency, "loss": loss, **result}
+
+    with ThreadPoolExecutor(arguments.at_once) as pool:
+        return dict(pool.map(fly, range(len(LINKS))))
+
+
+def simulator(arguments) -> dict:
+    """Capture steps of 10 games per layout in the simulator."""
+    out = arguments.out / "simulator.json"
+    command = [sys.executable, "-m", "openjax.evaluate", "--policy", arguments.policy, "--episodes", "10"]
+    game = {"speed_limit": "none", "substeps": "5", "start_attitude": "level"}
+    command += [f"--environment.{name}={value}" for name, value in game.items()]
+    subprocess.run([*command, "--json", str(out)], check=True, env={**os.environ, "JAX_PLATFORMS": "cpu"})
+    return {row["scenario"]: row for row in json.loads(out.read_text(encoding="utf-8"))}
+
+
+def diagnose(arguments, flown: dict) -> dict:
+    """What `python -m openjax.diagnose` makes of the cases of `links`."""
+    cases = [str(arguments.out / name) for name in flown if "error" not in flown[name]]
+    predictions = arguments.out / "predictions.json"
+    command = [sys.executable, "-m", "openjax.diagnose", *cases, "--out", str(arguments.out / "diagnosis")]
+    command += ["--overwrite", "--predictions", str(predictions), "--no-html"]
+    subprocess.run(command, check=False, env={**os.environ, "JAX_PLATFORMS": "cpu"})
+    return json.loads(predictions.read_text(encoding="utf-8"))
+
+
+def capture_table(figures) -> list[str]:
+    """Flown and simulated captures, by layout."""
+    rows = [
+        "| layout | games | captured, flown | step, flown | captured, simulated | step, simulated | ratio |",
+        "|---|" + 6 * "---|",
+    ]
+    for layout, flight in figures["long"].items():
+        if "error" in flight:
+            rows.append(f"| {layout} | {' '.join(flight['error'].split())[-200:]} |")
+            continue
+        games = [g for g in flight["games"] if g["end"] == "over"]
+        steps = [g["capture_step"] or 800 for g in games]
+        row = figures.get("simulator", {}).get(layout)
+        mean = float(np.mean(steps)) if steps else float("nan")
+        caught = float(np.mean([g["capture_step"] is not None for g in games])) if games else float("nan")
+        simulated = (row["capture_rate"], row["capture_step"]) if row else (float("nan"), float("nan"))
+        rows.append(
+            f"| {layout} | {len(games)} | {caught:.2f} | {mean:.0f} | {simulated[0]:.2f} | {simulated[1]:.0f} "
+            f"| {mean / simulated[1]:.2f} |"
+        )
+    return rows
+
+
+def main() -> None:
+    arguments = tyro.cli(Arguments)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    path = arguments.out / "figures.json"
+    figures = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    parts = ("long", "links", "simulator") if arguments.part == "all" else (arguments.part,)
+    with ThreadPoolExecutor(len(parts)) as pool:
+        work = {"long": long, "links": links, "simulator": simulator}
+        results = {part: pool.submit(work[part], arguments) for part in parts if part in work}
+        figures |= {part: result.result() for part, result in results.items()}
+    if arguments.part == "diagnose":
+        figures["diagnosis"] = diagnose(arguments, figures["links"])
+    path.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+    if "long" in figures:
+        print("\n".join(capture_table(figures)))
+    for name, flight in figures.get("links", {}).items():
+        print(name, flight.get("error") or [g["steps"] for g in flight["games"]], flight.get("reasons"))
+
+
+if __name__ == "__main__":
+    main()
