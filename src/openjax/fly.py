@@ -64,8 +64,8 @@ def fly(arguments: Arguments):
     _check(arguments)
     console = output_console()
     console.print("loading the policy, compiling the tick ...")
-    from openjax.flying.flight_files import write_case
     from openjax.flying import real_time
+    from openjax.flying.flight_files import write_case
     from openjax.flying.game import Game
     from openjax.flying.loop import Flight, Plan
     from openjax.flying.swarm import Swarm
