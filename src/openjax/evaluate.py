@@ -64,13 +64,13 @@ def main(arguments: Sequence[str]) -> int:
         # Once more, with the game of this policy as the default.
         default = dataclasses.replace(EvaluateCommand(), environment=loaded.settings.environment)
         own = parse(EvaluateCommand, default, arguments, PROGRAM)
-        results.append((loaded.source, records_of_policy(own, loaded, evaluators)))
+        results.append((loaded.source, fly_scenarios(own, loaded, evaluators)[0]))
     _show(command, results)
     return 0
 
 
-def records_of_policy(command: EvaluateCommand, loaded, evaluators: dict) -> list[dict]:
-    """One record per scenario; see `openjax.commands.evaluator.FIELDS`.
+def fly_scenarios(command: EvaluateCommand, loaded, evaluators: dict) -> tuple[list[dict], list]:
+    """A record (see `openjax.commands.evaluator.FIELDS`) and the first episode's `Trajectory` per scenario.
 
     Args:
       command: what to fly, with the game's settings.
@@ -95,9 +95,7 @@ def records_of_policy(command: EvaluateCommand, loaded, evaluators: dict) -> lis
     kind = (settings, loaded.policy)
     if kind not in evaluators:
         evaluators[kind] = Evaluator(environment, loaded.policy, command.episodes)
-    return evaluate_scenarios(evaluators[kind], loaded.parameters, scenarios, command.episodes, command.seed)[
-        0
-    ]
+    return evaluate_scenarios(evaluators[kind], loaded.parameters, scenarios, command.episodes, command.seed)
 
 
 def _check(command):

@@ -83,7 +83,7 @@ def evaluate(
     Raises:
       UserError: an unusable layout, or a game that the policy can't play.
     """
-    from openjax.evaluate import EvaluateCommand, records_of_policy
+    from openjax.evaluate import EvaluateCommand, fly_scenarios
 
     loaded = policy if isinstance(policy, LoadedPolicy) else load_policy(policy)
     command = EvaluateCommand(
@@ -95,5 +95,5 @@ def evaluate(
         effects=None if effects is None else Path(effects),
         environment=dataclasses.replace(loaded.settings.environment, **changes),
     )
-    records = records_of_policy(command, loaded, {})
+    records, _ = fly_scenarios(command, loaded, {})
     return records if scenario == "all" else records[0]
