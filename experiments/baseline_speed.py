@@ -44,8 +44,8 @@ def study(options: argparse.Namespace) -> dict:
             "physics": physics,
             "speed": steps_per_second(name, physics, options.envs, options.steps),
         }
+        for name in options.methods
         for physics in ("mjx", "rigid")
-        for name in METHODS
     ]
     return {
         "command": f"python experiments/baseline_speed.py --envs {options.envs} --steps {options.steps}",
@@ -76,7 +76,7 @@ def report(results: dict) -> list[str]:
                 for physics in ("mjx", "rigid")
             ),
         ]
-        for name in METHODS
+        for name in dict.fromkeys(row["method"] for row in results["rows"])
     ]
     return lines + table(["method", "`mjx`", "`rigid`"], rows)
 
@@ -84,6 +84,7 @@ def report(results: dict) -> list[str]:
 def main(arguments: list[str]) -> int:
     """Measure or read it, write both files, print the page."""
     parser = page_parser(__doc__, "baseline_speed")
+    parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=list(METHODS))
     parser.add_argument("--envs", type=int, default=32768)
     parser.add_argument("--steps", type=int, default=50, help="control steps per call")
     parser.add_argument("--commit", default="", help="where the machine has no repository")

@@ -142,14 +142,14 @@ def _environment(settings):
 def study(options: argparse.Namespace) -> dict:
     """Fly every method's seeds over all radii and speeds."""
     started = time.monotonic()
-    changes = {"speed_limit": options.speed_limit}
+    changes = {"speed_limit": options.speed_limit, "physics": options.physics}
     methods = {}
     for label in options.methods:
         methods[label] = [of_policy(name, seed, options.episodes, changes) for name, seed in seeds_of(label)]
         print(f"{time.monotonic() - started:5.0f} s  {label}", flush=True)
     limit = "" if options.speed_limit == "clamp" else f" --speed-limit {options.speed_limit}"
     return {
-        "command": f"python experiments/sweeps.py --episodes {options.episodes}{limit}",
+        "command": f"python experiments/sweeps.py --episodes {options.episodes} --physics {options.physics}{limit}",
         "commit": options.commit,
         "machine": describe_machine(),
         "seconds": time.monotonic() - started,
@@ -244,6 +244,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
     parser.add_argument("--episodes", type=int, default=50, help="per seed, and per radius or speed")
     parser.add_argument("--speed-limit", choices=("clamp", "none"), default="clamp")
+    parser.add_argument("--physics", choices=("rigid", "mjx"), default="rigid", help="mjx: the same, slower")
     parser.add_argument("--commit", default="", help="where the machine has no repository")
     publish(parser.parse_args(arguments), study, report, draw)
     return 0

@@ -73,13 +73,14 @@ def study(options: argparse.Namespace) -> dict:
         conditions = CONDITIONS if label in ("Angelani", "Janosov", "APF") else {"clamp": CONDITIONS["clamp"]}
         for condition, changes in conditions.items():
             for name, seed in seeds_of(label):
+                changes = {**changes, "physics": options.physics}
                 flown = fly(name, seed, layouts, changes, options.episodes)
                 flights.append(
                     {"method": label, "policy": name, "seed": seed, "condition": condition, "layouts": flown}
                 )
                 print(f"{time.monotonic() - started:5.0f} s  {label}: {name}, {condition}", flush=True)
     return {
-        "command": f"python experiments/tables.py --episodes {options.episodes}",
+        "command": f"python experiments/tables.py --episodes {options.episodes} --physics {options.physics}",
         "commit": options.commit,
         "machine": describe_machine(),
         "seconds": time.monotonic() - started,
@@ -95,6 +96,7 @@ def main(arguments: list[str]) -> int:
     )
     parser.add_argument("--report", action="store_true", help="from the stored flights")
     parser.add_argument("--episodes", type=int, default=100, help="per seed and layout")
+    parser.add_argument("--physics", choices=("rigid", "mjx"), default="rigid", help="mjx: the same, slower")
     parser.add_argument("--commit", default="", help="where the machine has no repository")
     parser.add_argument("--out", type=Path, default=RESULTS, help="directory")
     options = parser.parse_args(arguments)
@@ -104,7 +106,8 @@ def main(arguments: list[str]) -> int:
     for page in PAGES:
         page.main(["--flights", str(flights), "--out", str(options.out / page.__name__)])
     learning_curves.main(["--out", str(options.out / "learning_curves")])
-    swept = ["--report"] if options.report else ["--episodes", str(max(1, options.episodes // 2))]
+    episodes = str(max(1, options.episodes // 2))
+    swept = ["--report"] if options.report else ["--episodes", episodes, "--physics", options.physics]
     sweeps.main([*swept, "--commit", options.commit, "--out", str(options.out / "sweeps")])
     return 0
 

@@ -102,10 +102,10 @@ def test_janosovs_walls_stop_a_pursuer_at_their_surface_and_are_not_felt_beyond_
 
 
 def test_the_fields_forces_in_closed_form():
-    parameters = ApfParameters(repulsion=1e-3, influence=0.3, balance=0.1)
-    # 0.17 m from a pillar's surface: 0.1 m beyond the safe distance; others 0.34 m apart: 0.2 m beyond theirs
+    parameters = ApfParameters(repulsion=1e-3, influence=0.3, margin=0.1, balance=0.1)
+    # 0.2 m from a pillar's surface: 0.1 m beyond the margin; others 0.34 m apart: 0.2 m beyond theirs
     known = situation(
-        [[-0.27, 0.0, 1.0], [-0.27, 0.34, 1.0]], [0.0, 2.0, 1.0], pillars=[(0.0, 0.0), (0.0, -4.0)]
+        [[-0.3, 0.0, 1.0], [-0.3, 0.34, 1.0]], [0.0, 2.0, 1.0], pillars=[(0.0, 0.0), (0.0, -4.0)]
     )
     field = forces(parameters, known)
     push = 1e-3 * (1 / 0.1 - 1 / 0.3) / 0.1**2
@@ -117,7 +117,7 @@ def test_the_fields_forces_in_closed_form():
 
 @pytest.mark.parametrize("drift", [-1.0, 1.0])
 def test_in_front_of_a_pillar_the_field_follows_its_wall_to_the_side_it_flies_to(drift):
-    parameters = ApfParameters(repulsion=0.01, influence=0.3, balance=0.1)
+    parameters = ApfParameters(repulsion=0.01, influence=0.3, margin=0.07, balance=0.1)
     known = situation(
         [[-0.2, 0.0, 1.0]], [1.0, 0.0, 1.0], velocity=[[0.3, 0.2 * drift, 0.0]], pillars=[(0.0, 0.0)]
     )
@@ -129,8 +129,15 @@ def test_in_front_of_a_pillar_the_field_follows_its_wall_to_the_side_it_flies_to
     assert apf(CRAFT, parameters, past)[0, 0] > 0.5 * CRAFT.speed
 
 
+def test_inside_the_margin_it_turns_away_from_the_obstacle_as_well():
+    parameters = ApfParameters(repulsion=0.01, influence=0.3, margin=0.12, balance=0.1)
+    known = situation([[-0.2, 0.0, 1.0]], [1.0, 0.0, 1.0], velocity=[[0.3, 0.2, 0.0]], pillars=[(0.0, 0.0)])
+    expected = CRAFT.speed * unit([-1.0, 1.0, 0.0])
+    np.testing.assert_allclose(apf(CRAFT, parameters, known)[0], expected, atol=1e-3)
+
+
 def test_following_a_wall_a_pursuer_yields_to_others_that_push_harder_than_the_evader_pulls():
-    parameters = ApfParameters(repulsion=0.01, influence=0.3, balance=0.5)
+    parameters = ApfParameters(repulsion=0.01, influence=0.3, margin=0.07, balance=0.5)
     known = situation(
         [[-0.2, 0.0, 1.0], [-0.2, 0.3, 1.0]],
         [1.0, 0.0, 1.0],

@@ -12,10 +12,8 @@ from flax import struct
 from openjax.baselines.parameters import parameter
 from openjax.baselines.surroundings import Craft, Surroundings, length, level, unit, upward
 
-SAFE_OBSTACLE = 0.07
-"""Distance from a surface at which its repulsion grows without bound (m): the game's safety distance."""
 SAFE_PURSUER = 0.14
-"""The same between two pursuers (m)."""
+"""Distance between two pursuers at which their repulsion grows without bound (m): the game's safety distance."""
 NEAREST = 0.005
 """Distances beyond the safe ones are taken to be at least this (m), so that forces stay finite."""
 
@@ -28,6 +26,8 @@ class ApfParameters:
     """eta: scale of the obstacles' repulsion (m^3)."""
     influence: jax.Array = parameter(0.3, 0.05, 0.6)
     """rho: distance from a surface beyond which it doesn't repel (m)."""
+    margin: jax.Array = parameter(0.1, 0.05, 0.25)
+    """Distance from a surface at which its repulsion grows without bound (m); the robot's radius in the source."""
     balance: jax.Array = parameter(0.2, 0.003, 1.0)
     """lambda: of the force between pursuers, 1/2 - lambda / d: they keep 2 lambda apart (m)."""
 
@@ -39,6 +39,7 @@ class Forces:
     attraction: jax.Array
     repulsion: jax.Array  # from the nearest pillar or the wall, and from floor and ceiling
     individual: jax.Array  # mean over the other pursuers
+    inside: jax.Array  # (..., N) bool, nearer to an obstacle than the margin
 
 
 def forces(parameters: ApfParameters, known: Surroundings) -> Forces:
@@ -46,8 +47,8 @@ def forces(parameters: ApfParameters, known: Surroundings) -> Forces:
     eta, rho = parameters.repulsion, parameters.influence
 
     def push(gap):
-        """eta (1/d - 1/rho) / d^2 of the distance beyond the safe one."""
-        d = jnp.maximum(gap - SAFE_OBSTACLE, NEAREST)
+        """eta (1/d - 1/rho) / d^2 of the distance beyond the margin."""
+        d = jnp.maximum(gap - parameters.margin, NEAREST)
         return jnp.where(d < rho, eta * (1.0 / d - 1.0 / rho) / d**2, 0.0)
 
     # one-hot of the nearest: a gather is slower for a handful
@@ -63,6 +64,7 @@ def forces(parameters: ApfParameters, known: Surroundings) -> Forces:
         attraction=unit(known.target - known.position),
         repulsion=level(push(gap)[..., None] * normal) + upward(vertical),
         individual=jnp.sum(pull, axis=-2) / max(known.from_others.shape[-2], 1),
+        inside=gap < parameters.margin,
     )
 
 
@@ -77,12 +79,13 @@ def apf(craft: Craft, parameters: ApfParameters, known: Surroundings) -> jax.Arr
 
 def wall_following(field: Forces, velocity: jax.Array) -> jax.Array:
     """(..., N, 3) unit vector along the nearest obstacle: the side to which the other pursuers push or, where they push
-    less than the evader pulls, the side to which the pursuer flies anyhow. Height is kept by the field."""
-    x, y = field.repulsion[..., 0], field.repulsion[..., 1]
-    left = jnp.stack([-y, x], axis=-1)
-    left = left / length(left)
+    less than the evader pulls, the side to which the pursuer flies anyhow. Inside the margin it turns half away from the
+    obstacle; its height is the field's."""
+    away = unit(field.repulsion[..., :2])
+    left = jnp.stack([-away[..., 1], away[..., 0]], axis=-1)
     pushed = length(field.individual) > 1.0
     heading = jnp.where(pushed, field.individual, unit(velocity))[..., :2]
     side = jnp.where(jnp.sum(left * heading, axis=-1, keepdims=True) >= 0.0, 1.0, -1.0)
     climb = field.attraction + field.repulsion + field.individual
-    return unit(level(side * left) + upward(unit(climb)[..., 2]))
+    along = side * left + jnp.where(field.inside[..., None], away, 0.0)
+    return unit(level(along) + upward(unit(climb)[..., 2]))

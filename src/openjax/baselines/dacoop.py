@@ -10,7 +10,6 @@ import dataclasses
 import math
 
 import jax
-import jax.numpy as jnp
 
 from openjax.baselines.apf import ApfParameters, apf
 from openjax.baselines.parameters import ranges
@@ -20,8 +19,8 @@ from openjax.policy import NetworkSettings, Policy, PredictorSettings
 from openjax.pursuit import Observation, Pursuit
 
 LEARNED = ("repulsion", "balance")
-START = ApfParameters(repulsion=1e-3, influence=0.3, balance=0.2)
-"""The field at the start of training; the influence stays, also of shipped weights, whatever a later search finds."""
+START = ApfParameters(repulsion=1e-3, influence=0.3, margin=0.1, balance=0.2)
+"""The field at the start of training; what isn't learnt stays, also of shipped weights, whatever a search finds."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,8 +57,8 @@ def field_parameters(output: jax.Array) -> ApfParameters:
     for i, name in enumerate(LEARNED):
         low, high = ranges(ApfParameters)[name]
         learned[name] = low * (high / low) ** (0.5 * (output[..., i] + 1.0))
-    influence = jnp.full(output.shape[:-1], START.influence)
-    return ApfParameters(influence=influence, **learned)
+    fixed = {name: getattr(START, name) for name in ranges(ApfParameters) if name not in LEARNED}
+    return ApfParameters(**fixed, **learned)
 
 
 def _place(name, value):
