@@ -4,6 +4,7 @@ import dataclasses
 import time
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
@@ -20,6 +21,7 @@ from openjax.commands.loop import NotFiniteError, Plan, StopRequest, guarded, ru
 from openjax.commands.validation import Validation, flat_metrics, selection_score
 from openjax.learning import TrainSettings, abstract_carry, build, init_carry, summarise
 from openjax.policy import PolicyParameters
+from openjax.policy.growth import with_longer_history
 from openjax.pursuit import SCENARIOS, Pursuit
 from openjax.show.metrics import METRICS_FILE, MetricsWriter, NoMetrics
 from openjax.show.plots import plot_training, plot_trajectories
@@ -57,7 +59,7 @@ class TrainingJob:
         """Raises UserError for what doesn't fit together, before any directory is touched."""
         check_devices(self.settings, self.devices)
         if self.start_from is not None:
-            _start_parameters(self)
+            _start_parameters(self, _abstract_parameters(self))
 
 
 def run_job(job: TrainingJob, directory: RunDirectory, resume: bool, console: Console) -> int:
@@ -157,7 +159,7 @@ def _first_carry(job, abstract, directory, checkpoints, resume, progress):
         return carry, record.update, float(record.notes.get("seconds", 0.0))
     carry = init_carry(settings, jax.random.key(settings.seed), job.environment)
     if job.start_from is not None:
-        carry = carry.replace(policy=_start_parameters(job))
+        carry = carry.replace(policy=_start_parameters(job, carry.policy))
     carry = place(carry, carry_shardings(job.devices))
     if job.processes.is_first:
         save_policy_file(directory.start_policy, carry.policy, settings, {"update": 0}, storage="float32")
@@ -171,10 +173,21 @@ def _advice(checkpoints, directory):
     return f"go on with python -m openjax.train --resume {directory.path} --devices all"
 
 
-def _start_parameters(job) -> PolicyParameters:
+def _start_parameters(job, fresh: PolicyParameters) -> PolicyParameters:
+    """Those of the policy that the run starts from; `fresh` ones where it has no critic, or one of another game."""
     loaded = load_policy(job.start_from)
-    abstract = abstract_parameters(job.environment, build(job.settings, job.environment).policy)
-    return fill(abstract, named_leaves(loaded.parameters), f"--start_from {job.start_from}")
+    settings = loaded.settings
+    own = with_longer_history(
+        loaded.parameters, settings.predictor, settings.environment, job.settings.environment
+    )
+    kept = fresh.replace(critic={})
+    kept = fill(kept, named_leaves(own.replace(critic={})), f"--start_from {job.start_from}")
+    fits = jax.tree.map(jnp.shape, own.critic) == jax.tree.map(jnp.shape, fresh.critic)
+    return kept.replace(critic=own.critic if fits else fresh.critic)
+
+
+def _abstract_parameters(job) -> PolicyParameters:
+    return abstract_parameters(job.environment, build(job.settings, job.environment).policy)
 
 
 def _validation(job):

@@ -55,16 +55,19 @@ class Batch:
 def make_optimiser(
     settings: MappoSettings, total_updates: int
 ) -> tuple[optax.GradientTransformation, optax.GradientTransformation]:
-    """Optimisers of actor and critic; the step size falls linearly to zero over the run."""
+    """Optimisers of actor and critic; the step size falls linearly to zero over the run, the actor's may start late."""
     steps = total_updates * settings.epochs * settings.minibatches
     schedule = optax.linear_schedule(settings.learning_rate, 0.0, steps)
 
-    def one():
+    def late(count):
+        return jnp.where(count < settings.actor_start * steps, 0.0, schedule(count))
+
+    def one(schedule):
         adam = optax.chain(optax.clip_by_global_norm(settings.max_grad_norm), optax.adam(schedule, eps=1e-5))
         # one vector instead of dozens of small arrays: on a GPU their updates cost by number, not by size
         return optax.flatten(adam)
 
-    return one(), one()
+    return one(late if settings.actor_start else schedule), one(schedule)
 
 
 def policy_loss(

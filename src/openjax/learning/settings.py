@@ -15,6 +15,9 @@ class MappoSettings:
 
     learning_rate: float = 5e-4
     """Adam step size at the start; falls linearly to zero over `total_steps`."""
+    actor_start: float = 0.0
+    """Share of the run before the actor begins to learn: a run that starts from a policy without its critic learns that
+    first."""
     epochs: int = 4
     minibatches: int = 16
     clip_epsilon: float = 0.1

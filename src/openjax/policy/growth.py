@@ -1,0 +1,36 @@
+"""A policy for a game in which it observes more of its own history: the same policy until it learns to use it."""
+
+from typing import Any
+
+import jax.numpy as jnp
+
+from openjax.policy.policy import PolicyParameters
+from openjax.policy.settings import PredictorSettings
+from openjax.pursuit.settings import OWN_FRAME, PursuitSettings
+
+
+def with_longer_history(
+    parameters: PolicyParameters, predictor: PredictorSettings, old: PursuitSettings, new: PursuitSettings
+) -> PolicyParameters:
+    """`parameters` of a policy trained in the game `old`, for the game `new`, which observes as long a history or longer.
+
+    The first layer's weights for the additional, older frames are zero. The critic, which may see other privileged
+    numbers as well, is left out where the history grows.
+    """
+    more = (new.observe_history - old.observe_history) * OWN_FRAME
+    if more <= 0:
+        return parameters
+    before = old.self_size - old.observe_history * OWN_FRAME
+    inputs = old.self_size + (3 * len(predictor.horizons) if predictor.enabled else 0)
+
+    def grown(actor: Any) -> Any:
+        params = dict(actor["params"])
+        encoder = dict(params["encoder"])
+        kernel = encoder["self_1"]["kernel"][:inputs]
+        zeros = jnp.zeros((more, kernel.shape[1]), kernel.dtype)
+        kernel = jnp.concatenate([kernel[:before], zeros, kernel[before:]])
+        kernel = jnp.pad(kernel, ((0, -kernel.shape[0] % 8), (0, 0)))  # as the encoder pads its inputs
+        encoder["self_1"] = {**encoder["self_1"], "kernel": kernel}
+        return {**actor, "params": {**params, "encoder": encoder}}
+
+    return parameters.replace(actor=grown(parameters.actor), critic={})

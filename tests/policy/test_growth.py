@@ -1,0 +1,46 @@
+"""A policy that observes a longer history than it was trained with does what it did, until it learns."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from openjax.policy import NetworkSettings, Policy, PredictorSettings
+from openjax.policy.growth import with_longer_history
+from openjax.pursuit import Pursuit, PursuitSettings
+
+
+@pytest.mark.parametrize("frames, predicts", [(0, True), (2, False)])
+def test_the_grown_policy_acts_alike(frames, predicts):
+    old = PursuitSettings(physics="rigid", observe_position=True, observe_history=frames)
+    new = dataclasses.replace(old, observe_history=3)
+    network, predictor = NetworkSettings(features=8, heads=2), PredictorSettings(enabled=predicts, units=4)
+    worlds = [Pursuit(settings) for settings in (old, new)]
+    policies = [Policy.for_environment(world, network, predictor) for world in worlds]
+
+    @jax.jit
+    def both(key):
+        observations = []
+        for world in worlds:
+            state = world.reset(key)[1]
+            history = state.own_history
+            if history is not None:  # the same newest frames in both
+                count = jnp.arange(history.shape[0], 0, -1, dtype=jnp.float32)
+                state = state.replace(own_history=history + 0.1 * count[:, None, None])
+            observations.append(world.observe(state))
+        parameters = policies[0].init(key, observations[0])
+        actor = jax.tree.map(lambda x: x + 0.3 * jax.random.normal(key, x.shape), parameters.actor)
+        parameters = parameters.replace(actor=actor)
+        grown = with_longer_history(parameters, predictor, old, new)
+        return policies[0].act(parameters, observations[0]), policies[1].act(grown, observations[1])
+
+    before, after = both(jax.random.key(0))
+    np.testing.assert_allclose(before, after, atol=1e-5)
+    assert np.abs(before).max() < 1.0
+
+
+def test_a_policy_of_the_same_history_is_left_alone():
+    settings = PursuitSettings()
+    assert with_longer_history("anything", PredictorSettings(), settings, settings) == "anything"
