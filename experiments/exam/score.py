@@ -399,40 +399,49 @@ def number(value):
     return "–" if value is None else f"{value:.3f}" if abs(value) < 10 else f"{value:.1f}"
 
 
-def markdown(title, result):
-    """The table of one column, and where the misses lie."""
-    lines = [f"## {title}", "", "cases: " + ", ".join(f"{n} {c}" for c, n in result["counts"].items()), ""]
-    lines += ["| figure | goal | value | 95 % | n |", "|---|---|---|---|---|"]
-    for key, (what, goal, larger) in FIGURES.items():
-        f = result["figures"][key]
-        aim = "" if goal is None else f"{'≥' if larger else '≤'} {goal:g}"
-        met = (
-            goal is not None
-            and f["value"] is not None
-            and (f["value"] >= goal if larger else f["value"] <= goal)
-        )
-        interval = f"{number(f['low'])} to {number(f['high'])}" if f["low"] is not None and f["n"] else ""
-        star = "**" if met else ""
-        lines.append(f"| {what} | {aim} | {star}{number(f['value'])}{star} | {interval} | {f['n']} |")
+def cell(f, goal=None, larger=True):
+    """One figure with its interval and n; bold where the goal is reached."""
+    if f["value"] is None:
+        return "–"
+    met = goal is not None and (f["value"] >= goal if larger else f["value"] <= goal)
+    star = "**" if met else ""
+    inside = f"{number(f['low'])}–{number(f['high'])}, {f['n']}" if f["low"] is not None else f"{f['n']}"
+    return f"{star}{number(f['value'])}{star} [{inside}]"
+
+
+def groups(result):
+    """Paragraphs that say where the misses lie."""
+    lines = []
     for key, what in (
         ("per_effect", "Single causes, right"),
-        ("per_severity", "by severity"),
+        ("per_severity", "By severity"),
         ("per_unknown", "Unknown kinds, called unknown"),
         ("per_garbage", "Garbage, called garbage"),
         ("per_sensors", "Single or none, right, by sensors"),
-        ("per_rate", "by log rate, Hz"),
-        ("per_turbulence", "by turbulence"),
-        ("per_controller", "by controller"),
+        ("per_rate", "By log rate, Hz"),
+        ("per_turbulence", "By turbulence"),
+        ("per_controller", "By controller"),
         (
             "per_missing",
-            "by missing channels (p pose, g gyroscope, a accelerometer, c commands, m motors, v voltage)",
+            "By missing channels (p pose, g gyroscope, a accelerometer, c commands, m motors, v voltage)",
         ),
     ):
         parts = [
             f"{k or 'none missing'} {round(v['value'] * v['n'])}/{v['n']}" for k, v in result[key].items()
         ]
-        lines += ["", f"{what}: " + ", ".join(parts) + "."]
-    return "\n".join(lines) + "\n"
+        if parts:
+            lines += [f"{what}: " + ", ".join(parts) + ".", ""]
+    return lines
+
+
+def markdown(title, result):
+    """The table of one column, and where the misses lie."""
+    lines = [f"## {title}", "", "cases: " + ", ".join(f"{n} {c}" for c, n in result["counts"].items()), ""]
+    lines += ["| figure | goal | value [95 %, n] |", "|---|---|---|"]
+    for key, (what, goal, larger) in FIGURES.items():
+        aim = "" if goal is None else f"{'≥' if larger else '≤'} {goal:g}"
+        lines.append(f"| {what} | {aim} | {cell(result['figures'][key], goal, larger)} |")
+    return "\n".join([*lines, "", *groups(result)]) + "\n"
 
 
 def misses(answers, result, predictions):
