@@ -22,7 +22,7 @@ from openjax.commands.evaluator import layout_slots, repeat_task
 from openjax.commands.machine import describe_machine
 from openjax.commands.validation import uniform_tasks
 from openjax.learning import make_evaluate, summarise
-from openjax.pursuit import SCENARIOS, Pursuit, scenario_task
+from openjax.pursuit import SCENARIOS, Pursuit, RewardSettings, scenario_task
 from openjax.store.policies import load_policy
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.family import FLIGHT_FAMILY, family_bounds, find_parameter
@@ -78,6 +78,7 @@ def fly(name: str, number: int, layouts: int, physics: str) -> dict[str, dict[st
         vehicles=FLIGHT_FAMILY,
         rare_vehicles=0.5,
         max_pillars=layout_slots(loaded.settings.environment),
+        reward=RewardSettings(),  # counts for nothing here: the same program for policies that differ in it
     )
     drawn_from = loaded.settings.environment
     slots = game.max_pillars

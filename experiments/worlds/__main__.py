@@ -152,8 +152,10 @@ def study(options: argparse.Namespace) -> dict:
             place = found.setdefault(job.policy, {}).setdefault(job.world, {}).setdefault(job.layout, {})
             for name, values in figures.items():
                 place.setdefault(name, []).extend(values)
+            means = " ".join(f"{name} {np.mean(values):.3f}" for name, values in figures.items())
             print(
-                f"{done}/{len(jobs)} {job} {seconds:.0f} s, {time.monotonic() - started:.0f} s in all",
+                f"{done}/{len(jobs)} {job.policy} {job.world} {job.layout} {job.start} {means} ({seconds:.0f} s, "
+                f"{time.monotonic() - started:.0f} s in all)",
                 flush=True,
             )
     records = {
