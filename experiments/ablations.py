@@ -21,8 +21,9 @@ from pages import RESULTS, spread, table
 from run_comparison import VARIANTS, band, by_variant, main_effects, read_run, savings, steps_to
 
 from openjax.commands.command_line import run_command
+from openjax.files import read_json
 from openjax.pursuit import SCENARIOS
-from openjax.store.settings_files import read_json, write_json
+from openjax.store.settings_files import write_json
 
 REACH = 0.95
 METRICS = (

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from openjax.store.settings_files import read_json, write_json
+from openjax.files import read_json
+from openjax.store.settings_files import write_json
 
 RESULTS = Path(__file__).parent / "results"
 

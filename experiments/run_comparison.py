@@ -9,10 +9,10 @@ from headline import fly
 from scipy.stats import t as student
 
 from openjax.errors import UserError
+from openjax.files import read_json
 from openjax.pursuit import SCENARIOS
 from openjax.show.metrics import METRICS_FILE, read_metrics
 from openjax.store.run_directory import RunDirectory, open_run
-from openjax.store.settings_files import read_json
 
 VARIANTS = ("OPEN", "MAPPO + predictor", "MAPPO + generator", "MAPPO", "MAPPO, one-sided tasks")
 """In the order of the paper; the last draws the paper's uniform tasks, which all have the evader on one side."""

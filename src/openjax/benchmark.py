@@ -20,10 +20,12 @@ from openjax.commands.command_line import output_console, parse, peek, run_comma
 from openjax.commands.machine import describe_machine
 from openjax.commands.timing import Timing, time_compiled
 from openjax.errors import UserError
+from openjax.files import check_output
 from openjax.learning import TrainSettings, build, init_carry, make_training_step, preset
 from openjax.learning.rollout import collect
 from openjax.pursuit import Pursuit, hover_action, uniform_task
 from openjax.pursuit.environment import action_to_command
+from openjax.ranges import Interval
 from openjax.store.settings_files import write_json
 from openjax.vehicle import hover_state, load_vehicle, make_drones_step
 
@@ -40,15 +42,15 @@ class BenchmarkCommand:
 
     preset: str | None = None
     """quick, paper, flight, mappo or dacoop: networks and learner; by default what fits the machine."""
-    envs: tuple[int, ...] = ()
+    envs: Annotated[tuple[int, ...], Interval("[1, 16777216]")] = ()
     """Environment counts; by default a sweep that fits the machine."""
-    training_envs: tuple[int, ...] = ()
+    training_envs: Annotated[tuple[int, ...], Interval("[1, 16777216]")] = ()
     """Environment counts of the training step; by default those of --envs it can use."""
     parts: tuple[Part, ...] = PARTS
     """What to measure."""
-    steps: int = 50
+    steps: Annotated[int, Interval("[1, 100000]")] = 50
     """Control steps per call of physics, environment and rollout."""
-    seconds: float = 1.0
+    seconds: Annotated[float, Interval("(0, 3600]")] = 1.0
     """Shortest time to measure each."""
     json: Path = Path("benchmark.json")
     """File of the results."""
@@ -66,12 +68,7 @@ def main(arguments: Sequence[str]) -> int:
         settings=preset(peek(arguments, "preset") or ("quick" if on_cpu else "paper")),
     )
     command = parse(BenchmarkCommand, default, arguments, PROGRAM)
-    if min(command.envs + command.training_envs, default=1) < 1 or command.steps < 1 or command.seconds <= 0:
-        raise UserError("--envs, --training_envs, --steps and --seconds must be positive")
-    if not command.json.absolute().parent.is_dir():
-        raise UserError(
-            f"--json {command.json}: the directory {command.json.absolute().parent} doesn't exist"
-        )
+    check_output(command.json, "--json")
     machine = describe_machine()
     print(f"{machine['device']}, JAX {machine['versions']['jax']}, commit {machine['commit']}", flush=True)
     rows = []

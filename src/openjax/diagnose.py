@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import os
-import shutil
 import sys
-import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from openjax.commands.command_line import one_line, output_console, parse, run_command
 from openjax.errors import UserError
+from openjax.files import check_output_folder, replacing, write_json
+
+PROGRAM = "python -m openjax.diagnose"
 
 
 @dataclass(frozen=True)
@@ -40,24 +42,17 @@ class Options:
     """Replace reports that are already in OUT."""
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the command; the exit status is 0, or 2 if nothing could be diagnosed or the input is wrong."""
-    options = tyro.cli(Options, args=arguments, prog="python -m openjax.diagnose")
-    try:
-        return run(options)
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+def main(arguments: Sequence[str]) -> int:
+    """Run the command; the exit status is 0, or 2 if nothing could be diagnosed."""
+    return run(parse(Options, Options(cases=tyro.MISSING), arguments, PROGRAM))
 
 
 def run(options: Options) -> int:
     """Diagnose every case; a case that can't be used is named and the rest goes on. Raises UserError for
     bad options."""
-    from rich.console import Console
-
     # Small matrices: more threads than one only wait for each other. Read when NumPy is loaded, below.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    console = Console()
+    console = output_console()
     if not options.cases:
         raise UserError("no case given: name at least one folder of flight logs with a vehicle.toml")
     names = [c.resolve().name for c in options.cases]
@@ -67,6 +62,12 @@ def run(options: Options) -> int:
     for name in names:
         if (options.out / name).exists() and not options.overwrite:
             raise UserError(f"{options.out / name} already exists: choose another --out or give --overwrite")
+
+    check_output_folder(options.out, "--out")
+    if options.predictions is not None:
+        check_output_folder(options.predictions.absolute().parent, "--predictions")
+        if options.predictions.is_dir():
+            raise UserError(f"--predictions {options.predictions}: is a folder; a file is needed")
 
     from openjax.flights.case import load_case
     from openjax.gap import decision
@@ -86,15 +87,12 @@ def run(options: Options) -> int:
                 _write(report, options.out / name, options.html)
         except UserError as error:
             failed += 1
-            print(f"error: {error}", file=sys.stderr)
+            print(f"error: {one_line(error)}", file=sys.stderr)
             continue
         predictions[name] = report.prediction()
         _show(console, report, options.out / name)
     if options.predictions is not None and predictions:
-        partial = options.predictions.with_name(options.predictions.name + ".partial")
-        options.predictions.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text(json.dumps(predictions, indent=1) + "\n", encoding="utf-8")
-        partial.replace(options.predictions)
+        write_json(options.predictions, predictions)
     return 2 if failed == len(names) else 0
 
 
@@ -102,17 +100,9 @@ def _write(report, folder: Path, pictures: bool) -> None:
     """All files of a report, or none: written beside the place and moved there at the end."""
     from openjax.gap.report import write_report
 
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    try:
+    with replacing(folder) as partial:
+        partial.mkdir()
         write_report(report, partial, pictures)
-        partial.chmod(0o755)
-        if folder.exists():
-            shutil.rmtree(folder)
-        partial.replace(folder)
-    except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
 
 
 def _show(console, report, folder: Path) -> None:
@@ -125,4 +115,4 @@ def _show(console, report, folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(main)

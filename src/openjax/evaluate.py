@@ -9,13 +9,16 @@ import dataclasses
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
 from openjax.commands.callable_module import make_callable
 from openjax.commands.command_line import output_console, parse, run_command
 from openjax.errors import UserError
+from openjax.files import check_output
 from openjax.pursuit import SCENARIOS, PursuitSettings, find_scenario
+from openjax.ranges import Interval, Seed
 
 PROGRAM = "python -m openjax.evaluate"
 CALL = "evaluate"
@@ -37,10 +40,12 @@ class EvaluateCommand:
     Of several, for example one per training seed, mean and standard deviation are shown too."""
     scenario: str = "all"
     """wall, narrow_gap, random, passage, empty, hidden, a TOML file with an own layout, or all six."""
-    episodes: int = 100
+    episodes: Annotated[int, Interval("[1, 1000000]")] = 100
     """Episodes per scenario."""
-    seed: int = 0
+    seed: Seed = 0
     """Draws the start attitudes."""
+    compilation_cache: bool = True
+    """Keep compiled programs in the user's cache folder."""
     json: Path | None = None
     """File to write the records to: an object for one scenario, a list for all."""
     vehicle: Path | None = None
@@ -56,7 +61,11 @@ def main(arguments: Sequence[str]) -> int:
     """The command; returns its exit status."""
     command = parse(EvaluateCommand, EvaluateCommand(), arguments, PROGRAM)
     _check(command)
+    from openjax.cluster.compilation import cache_programs
     from openjax.store.policies import load_policy
+
+    if command.compilation_cache:
+        cache_programs()
 
     evaluators: dict = {}
     results = []
@@ -101,12 +110,7 @@ def fly_scenarios(command: EvaluateCommand, loaded, evaluators: dict) -> tuple[l
 def _check(command):
     if not command.policy:
         raise UserError("--policy needs at least one policy")
-    if command.episodes < 1:
-        raise UserError(f"--episodes is {command.episodes}; it must be positive")
-    if command.json is not None and not command.json.absolute().parent.is_dir():
-        raise UserError(
-            f"--json {command.json}: the directory {command.json.absolute().parent} doesn't exist"
-        )
+    check_output(command.json, "--json")
 
 
 def _show(command, results):

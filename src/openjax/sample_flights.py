@@ -14,6 +14,7 @@ import tyro
 
 from openjax.commands.command_line import output_console, parse, run_command
 from openjax.errors import UserError
+from openjax.ranges import Interval, Seed
 
 PROGRAM = "python -m openjax.sample_flights"
 
@@ -47,9 +48,9 @@ class Arguments:
     """Folder to write the case to; must not exist or be empty."""
     effect: str = "none"
     """What the vehicle suffers from that the simulator doesn't know: an effect's name, or "none"."""
-    duration: float = 10.0
+    duration: Annotated[float, Interval("[3, 120]")] = 10.0
     """Seconds per flight."""
-    seed: int = 0
+    seed: Seed = 0
     """Random numbers: trajectories, noise, biases."""
 
 
@@ -63,8 +64,6 @@ def make_case(arguments: Arguments) -> list[Path]:
     if arguments.effect not in ("none", *SAMPLE_STRENGTHS):
         known = ", ".join(("none", *SAMPLE_STRENGTHS))
         raise UserError(f"--effect {arguments.effect}: no such effect; known are {known}")
-    if not 3.0 <= arguments.duration <= 120.0:
-        raise UserError(f"--duration {arguments.duration:g}: must be between 3 and 120 seconds")
     out = arguments.out
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UserError(f"{out}: exists and isn't an empty folder; name another one")

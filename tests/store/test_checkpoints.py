@@ -52,6 +52,46 @@ def test_damaged_checkpoint_falls_back_to_the_one_before(run):
     assert len(warnings) == 1 and "000000002" in warnings[0]
 
 
+def test_any_changed_byte_is_found(run):
+    """Flipped bits, cut ends and missing files, anywhere in the newest checkpoint, its checksums included."""
+    rng = np.random.default_rng(0)
+    kept = run.directory.with_name("kept")
+    shutil.copytree(run.directory, kept)
+    files = sorted(file for file in kept.rglob("*") if file.is_file() and "000000002" in str(file))
+    abstract = abstract_like(place(init()))
+    for number in range(2 * len(files)):
+        shutil.rmtree(run.directory)
+        shutil.copytree(kept, run.directory)
+        damaged = run.directory / files[number % len(files)].relative_to(kept)
+        content = bytearray(damaged.read_bytes())
+        if not content:
+            damaged.unlink()
+        elif number % 3 == 0:
+            damaged.write_bytes(content[: rng.integers(len(content))])
+        else:
+            content[rng.integers(len(content))] ^= 1 << rng.integers(8)
+            damaged.write_bytes(content)
+        again = Checkpoints(run.directory)
+        carry, record = again.restore_latest(abstract)
+        assert record.update == 1 and int(carry["n"]) == 1, damaged
+        assert again.load_best("n", lambda text: None)[1].update == 1
+
+
+def test_a_damaged_best_checkpoint_gives_way_to_the_next_best(run):
+    run.save(3, with_n(3), score=0.5)
+    run.save(4, with_n(4), score=0.4)
+    run.wait()
+    assert run.best().update == 3
+    file = max(run.best().path.rglob("*"), key=lambda file: file.is_file() and file.stat().st_size)
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)
+    warnings = []
+    leaves, record = run.load_best("n", warnings.append)
+    assert record.update == 4 and int(leaves["n"]) == 4
+    assert len(warnings) == 1 and "000000003 is damaged" in warnings[0]
+
+
 def test_other_shape_is_named(run):
     def other():
         return {**init(), "actor": {"kernel": jnp.ones((3, 5))}}

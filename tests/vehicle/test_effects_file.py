@@ -37,6 +37,8 @@ def test_bare_numbers_and_missing_parameters(tmp_path):
         ('[rotor_drag]\nd_xy = "0.01"\n', "must be a finite number"),
         ("[rotor_drag]\nd_xy = nan\n", "must be a finite number"),
         ("[rotor_drag]\nd_xy = {}\n", "must be a finite number"),
+        ("[rotor_drag]\nd_xy = 1e30\n", "far from what occurs"),
+        ("x = " + "[" * 5000 + "]" * 5000, "nested more than"),
         ("[rotor_drag\n", "not readable as TOML"),
     ],
 )

@@ -92,7 +92,7 @@ def test_saving_keeps_text_and_comments_and_replaces_the_calibration(tmp_path):
     assert float(again.vehicle.motor_time_constant) == pytest.approx(0.031)
     assert again.calibrated["motor_time_constant"] == value
     assert again.log["anything"] == [1, 2]
-    assert list(tmp_path.glob("*.partial")) == []
+    assert list(tmp_path.glob(".writing-*")) == []
 
 
 def test_a_file_made_from_nothing_reads_back(tmp_path):
@@ -120,7 +120,10 @@ def test_a_file_made_from_nothing_reads_back(tmp_path):
         ("[calibrated.mass]\nvalue = 0.03", "interval90"),
         ("[calibrated.mass]\nvalue = 30\ninterval90 = [29, 31]\nunit = 'g'", "must be in 'kg'"),
         ("[calibrated.inertia]\nvalue = 1e-5\ninterval90 = [1e-5, 2e-5]", "3 numbers"),
-        ("[vehicle", "not valid TOML"),
+        ("[calibrated.mass]\nvalue = 1e-9\ninterval90 = [0, 1]", "far from the nominal"),
+        ("[log]\nx = " + "[" * 500 + "]" * 500, "nested more than"),
+        ("[log]\nx = 1" + "0" * 40, "more than 64 bits"),
+        ("[vehicle", "not readable as TOML"),
     ],
 )
 def test_a_slip_is_one_clear_line(tmp_path, text, reason):

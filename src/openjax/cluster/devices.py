@@ -4,6 +4,7 @@ The step sees its own device's worlds and averages over all where it must (`open
 that one device and many give the same result on the same worlds, up to the order of sums.
 """
 
+import os
 from typing import Any
 
 import jax
@@ -34,6 +35,39 @@ def check_devices(settings: TrainSettings, number: int) -> None:
             f"num_envs {settings.num_envs} can't be shared out to {number} devices; {possible} could, "
             f"or --devices {' or '.join(map(str, fewer))}"
         )
+
+
+def check_memory(settings: TrainSettings, number: int) -> None:
+    """Whether what the worlds, a rollout and the archive hold at least fits into `number` devices.
+
+    Raises:
+      UserError: it doesn't; said before anything is compiled.
+    """
+    game = settings.environment
+    tasks = 3 * game.num_pursuers + 3 + 3 * game.max_pillars
+    observed = game.self_size + game.privileged_size + 5 * game.observed_pillars
+    history = game.history_length * game.history_spacing * game.frame_size
+    per_world = tasks + history + settings.rollout_length * game.num_pursuers * observed
+    shared_out = settings.num_envs * per_world / number
+    validation = 2 * settings.validation_episodes * (tasks + history)
+    needed = 4 * (shared_out + settings.generator.capacity * tasks + validation)
+    if needed > (memory := _memory()):
+        raise UserError(
+            f"{settings.num_envs} worlds of {settings.rollout_length} steps need at least {needed / 2**30:.0f} GiB on each "
+            f"of {number} devices, which has {memory / 2**30:.0f}; fewer --num_envs need less"
+        )
+
+
+def _memory():
+    """Bytes of one device; for a CPU those of the whole machine."""
+    device = jax.local_devices()[0]
+    statistics = None if device.platform == "cpu" else device.memory_stats()
+    if statistics and "bytes_limit" in statistics:
+        return statistics["bytes_limit"]
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError, OSError):
+        return float("inf")
 
 
 def carry_shardings(number: int) -> TrainCarry | jax.sharding.Sharding:

@@ -58,8 +58,8 @@ def find_membership(
         )
     address, number, index = given
     host, _, port = address.rpartition(":")
-    if not host or not port.isdecimal() or not 0 < int(port) < 65536:
-        raise UserError(f"--coordinator_address is {address!r}; expected host:port of process 0")
+    if not (host and port.isdecimal() and len(port) <= 5 and 0 < int(port) < 65536):
+        raise UserError(f"--coordinator_address is {address[:80]!r}; expected host:port of process 0")
     if number < 1 or not 0 <= index < number:
         raise UserError(
             f"--process_id {index} and --num_processes {number}: expected an id from 0 to the number less one"

@@ -36,7 +36,7 @@ class Processes:
     def __init__(self, number: int = 1, index: int = 0, connections: dict | None = None):
         """`connections`: (socket, host) by process: to all others on process 0, to process 0 elsewhere."""
         self.number, self.index = number, index
-        self.advice: Callable[[], str] = lambda: "start it again"
+        self.advice = "start it again"
         self._links = {
             other: _Link(connection, other, host, self._receive, self._gone)
             for other, (connection, host) in (connections or {}).items()
@@ -111,7 +111,8 @@ class Processes:
     def _gone(self, other: int, host: str, why: str) -> None:
         if not self._closing.is_set():
             text = f"process {other} of {self.number} (on {host}) was lost: {why}"
-            self._end(1, f"{text}; {self._advice()}", {"lost": f"{text}; {self._advice()}"}, but=other)
+            text = f"{text}; {self.advice}"
+            self._end(1, text, {"lost": text}, but=other)
 
     def _end(self, status: int, text: str, message: dict, but: int | None = None) -> None:
         """Say it once and end at once: the main thread may wait for the lost process for ever."""
@@ -126,12 +127,6 @@ class Processes:
             if self.is_first and other != but:
                 link.wait_closed(GRACE)
         os._exit(status)
-
-    def _advice(self):
-        try:
-            return self.advice()
-        except Exception:  # it looks at files, which may be what is gone
-            return "start it again"
 
     def _send_all(self, message, but=None):
         for other, link in self._links.items():

@@ -14,8 +14,12 @@ from typing import TypeVar
 from rich.console import Console
 
 from openjax.errors import UserError
+from openjax.ranges import check_intervals, ranged_fields
 
 Command = TypeVar("Command")
+
+LONGEST = 500
+"""Characters of an error's line."""
 
 _BOX = "╭╮╰╯│─ "
 
@@ -30,7 +34,7 @@ def parse(command: type[Command], default: Command, arguments: Sequence[str], pr
       program: the name for the help text.
 
     Raises:
-      UserError: unknown option or unusable value, in one line. `--help` prints and exits with status 0.
+      UserError: unknown option, unusable value or one outside its interval, in one line. `--help` prints and exits with status 0.
     """
     import tyro
 
@@ -39,7 +43,12 @@ def parse(command: type[Command], default: Command, arguments: Sequence[str], pr
     try:
         with contextlib.redirect_stderr(complaint):
             parsed, unknown = tyro.cli(
-                command, args=arguments, default=default, prog=program, return_unknown_args=True
+                command,
+                args=arguments,
+                default=default,
+                prog=program,
+                return_unknown_args=True,
+                registry=_showing_intervals(),
             )
     except SystemExit as stop:
         if stop.code in (0, None):
@@ -47,7 +56,39 @@ def parse(command: type[Command], default: Command, arguments: Sequence[str], pr
         raise UserError(_one_line(complaint.getvalue())) from None
     if unknown:
         raise UserError(_unknown(unknown[0], default, program))
+    check_intervals(parsed, "--")
     return parsed
+
+
+def _showing_intervals():
+    """Rules for tyro by which `--help` shows the interval of a setting after what it means."""
+    from tyro.constructors import ConstructorRegistry
+
+    registry, inside = ConstructorRegistry(), set()
+
+    @registry.struct_rule
+    def with_intervals(info):
+        kind = info.type
+        if not dataclasses.is_dataclass(kind) or kind in inside:
+            return None
+        inside.add(kind)
+        try:
+            spec = ConstructorRegistry.get_struct_spec(info)
+        finally:
+            inside.discard(kind)
+        intervals = {field.name: field.interval for field in ranged_fields(kind)}
+        if not intervals or not hasattr(spec, "fields"):
+            return spec
+
+        def shown(field):
+            if field.name not in intervals:
+                return field
+            text = field.helptext() if callable(field.helptext) else field.helptext
+            return dataclasses.replace(field, helptext=f"{text or ''} In {intervals[field.name]}.".strip())
+
+        return dataclasses.replace(spec, fields=tuple(shown(field) for field in spec.fields))
+
+    return registry
 
 
 def peek(arguments: Sequence[str], name: str) -> str | None:
@@ -71,22 +112,54 @@ def output_console() -> Console:
 
 
 def run_command(main: Callable[[Sequence[str]], int | None]) -> None:
-    """Run a command's `main(arguments)` and exit: 0, its own status, or 2 with one line for a UserError."""
+    """Run a command's `main(arguments)` and exit: 0, its own status, or 2 with one line for whatever isn't ours to mend."""
     quiet_libraries()
+    for stream in (sys.stdout, sys.stderr):  # a terminal may not know every character
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="replace")
     try:
         status = main(sys.argv[1:])
-    except UserError as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        status = 2
+        sys.stdout.flush()
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         status = 130
     except BrokenPipeError:  # the reader, head or less, has gone
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _discard_output()
         status = 0
-    sys.stdout.flush()
-    sys.stderr.flush()
+    except Exception as error:
+        line = one_line(error)
+        if line is None:
+            raise
+        with contextlib.suppress(OSError):
+            print(f"error: {line}", file=sys.stderr, flush=True)
+        if isinstance(error, OSError):
+            _discard_output()
+        status = 2
     raise SystemExit(status or 0)
+
+
+def one_line(error: BaseException) -> str | None:
+    """What to tell of an error that the user or the machine made, in one line; None: it's a mistake in openjax."""
+    text = " ".join(str(error).split())
+    if isinstance(error, OSError):
+        reason = error.strerror or text or type(error).__name__
+        where = f"{error.filename}: " if error.filename is not None else ""
+        text = f"{where}{reason[:1].lower()}{reason[1:]}"
+    elif isinstance(error, MemoryError):
+        text = "not enough memory"
+    elif type(error).__name__ in ("JaxRuntimeError", "XlaRuntimeError") and "RESOURCE_EXHAUSTED" in text:
+        text = f"not enough memory on the device; fewer --num_envs need less ({text})"
+    elif type(error) is RuntimeError and text.startswith("Unable to initialize backend"):
+        text = f"JAX finds no device: {text}"
+    elif not isinstance(error, UserError):
+        return None
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
+
+
+def _discard_output() -> None:
+    """Send what may still be in the buffer of standard output nowhere, so that the exit doesn't trip over it."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def quiet_libraries() -> None:

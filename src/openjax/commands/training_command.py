@@ -1,5 +1,6 @@
 """Options of `openjax.train`, their checks, and the start of a run: everything before the first array."""
 
+import contextlib
 import dataclasses
 import shutil
 import time
@@ -10,6 +11,7 @@ from typing import Annotated
 import jax
 import tyro
 
+from openjax.cluster.compilation import cache_programs
 from openjax.cluster.joining import Membership, find_membership
 from openjax.cluster.processes import Processes
 from openjax.commands.command_line import output_console, parse, peek
@@ -17,11 +19,15 @@ from openjax.commands.machine import describe_machine
 from openjax.commands.training_job import TrainingJob, run_job
 from openjax.errors import UserError
 from openjax.learning import TrainSettings, preset
+from openjax.ranges import Interval
 from openjax.store.environments import make_environment
-from openjax.store.run_directory import RunDirectory, check_free, create_run, open_run
+from openjax.store.run_directory import RunDirectory, check_free, create_run, locked, open_run
 from openjax.store.settings_files import to_plain
 
 PROGRAM = "python -m openjax.train"
+
+MAY_CHANGE = ("total_steps", "validation_interval", "validation_episodes")
+"""Settings that a resumed run may have otherwise; all else goes on as it was."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,9 +42,9 @@ class TrainCommand:
     """quick: minutes on two CPU cores; paper: the paper's task on an accelerator; by default what fits."""
     out: Path | None = None
     """Directory of the run; by default runs/DATE-PRESET."""
-    steps: int | None = None
+    steps: Annotated[int | None, Interval("[1, 1e15]")] = None
     """Environment steps of the whole run, short for --total_steps."""
-    minutes: float | None = None
+    minutes: Annotated[float | None, Interval("(0, 1000000]")] = None
     """Stop after this time, compilation included; a resumed run has it anew."""
     resume: Path | None = None
     """Go on with the run in this directory, exactly where it stopped."""
@@ -54,11 +60,13 @@ class TrainCommand:
     """Number of devices to train on, or all (of all processes)."""
     coordinator_address: str | None = None
     """With several processes: host:port of process 0. Slurm and Open MPI tell it."""
-    num_processes: int | None = None
+    num_processes: Annotated[int | None, Interval("[1, 100000]")] = None
     """How many processes train together, for example one per host. Slurm and Open MPI tell it."""
-    process_id: int | None = None
+    process_id: Annotated[int | None, Interval("[0, 99999]")] = None
     """Which of them this one is, from 0. Slurm and Open MPI tell it."""
-    layout_episodes: int | None = None
+    compilation_cache: bool = True
+    """Keep compiled programs in the user's cache folder, so that the next run starts sooner."""
+    layout_episodes: Annotated[int | None, Interval("[1, 100000]")] = None
     """Episodes per layout in the final table; by default 100 on an accelerator, 32 on a CPU."""
     settings: Annotated[tyro.conf.FlagConversionOff[TrainSettings], tyro.conf.arg(name="")] = (
         dataclasses.field(default_factory=TrainSettings)
@@ -79,6 +87,8 @@ def read_command(arguments: Sequence[str]) -> TrainCommand:
     else:
         default = preset(name or default_preset())
     command = parse(TrainCommand, TrainCommand(settings=default), arguments, PROGRAM)
+    if resume is not None:
+        _check_kept(default, command.settings)
     if command.steps is not None:
         settings = dataclasses.replace(command.settings, total_steps=command.steps)
         command = dataclasses.replace(command, settings=settings)
@@ -96,8 +106,8 @@ def membership(arguments: Sequence[str]) -> Membership | None:
 
     def number(name):
         text = peek(arguments, name)
-        if text is not None and not text.isdecimal():
-            raise UserError(f"--{name} is {text!r}; expected a number")
+        if text is not None and not (text.isdecimal() and len(text) <= 9):
+            raise UserError(f"--{name} is {text[:40]!r}; expected a number")
         return None if text is None else int(text)
 
     return find_membership(
@@ -116,10 +126,13 @@ def default_preset() -> str:
 def start(command: TrainCommand, arguments: Sequence[str], started: float, processes: Processes) -> int:
     """Make the run's directory, or open it, and train. Returns the exit status."""
     _check_same(command, processes)
+    if command.compilation_cache:
+        cache_programs()
     # Everything that can be wrong with the files is found before the directory is touched.
     resumed = None if command.resume is None else open_run(command.resume)
     vehicle = command.vehicle or (resumed.optional("vehicle.toml") if resumed else None)
     effects = command.effects or (resumed.optional("effects.toml") if resumed else None)
+    start_from = command.start_from or (resumed.read_facts().get("start_from") if resumed else None)
     environment = make_environment(command.settings.environment, vehicle, effects)
     devices = _devices(command.devices)
     name = command.preset or default_preset()
@@ -130,28 +143,32 @@ def start(command: TrainCommand, arguments: Sequence[str], started: float, proce
     job = TrainingJob(
         settings=command.settings,
         environment=environment,
-        start_from=command.start_from,
+        start_from=start_from,
         devices=devices,
         processes=processes,
         time_limit=float("inf") if command.minutes is None else 60.0 * command.minutes,
         layout_episodes=command.layout_episodes or (32 if jax.default_backend() == "cpu" else 100),
-        facts={"command": " ".join([PROGRAM, *arguments]), "machine": describe_machine()},
+        facts={
+            "command": " ".join([PROGRAM, *arguments]),
+            "machine": describe_machine(),
+            "start_from": start_from,
+        },
         started=started,
     )
     job.check()
     processes.everyone()  # a mistake shows before any process changes a file
-    if resumed is not None:
-        return run_job(job, resumed, resume=True, console=output_console())
-    directory = RunDirectory(out)
-    if processes.is_first:
-        directory = create_run(out, command.overwrite)
-        _copy_files(directory, vehicle, effects)
-    processes.everyone()
-    if not out.is_dir():
-        raise UserError(
-            f"{out} isn't there on the host of process {processes.index}; all hosts must share it"
-        )
-    return run_job(job, directory, resume=False, console=output_console())
+    directory = resumed or RunDirectory(out)
+    with locked(directory.path) if processes.is_first else contextlib.nullcontext():
+        if resumed is None and processes.is_first:
+            create_run(out, command.overwrite)
+            _copy_files(directory, vehicle, effects)
+            directory.write_settings(command.settings, job.facts)
+        processes.everyone()
+        if not directory.path.is_dir():
+            raise UserError(
+                f"{directory.path} isn't there on the host of process {processes.index}; all hosts must share it"
+            )
+        return run_job(job, directory, console=output_console())
 
 
 def _check_same(command, processes):
@@ -165,18 +182,29 @@ def _check_same(command, processes):
             )
 
 
+def _check_kept(stored, given):
+    """Raises UserError for settings beside --resume that the run can't take up in its middle."""
+
+    def differing(stored, given, prefix=""):
+        for name, value in stored.items():
+            if isinstance(value, dict):
+                yield from differing(value, given[name], f"{prefix}{name}.")
+            elif given[name] != value:
+                yield f"{prefix}{name}"
+
+    for name in differing(to_plain(stored), to_plain(given)):
+        if name not in MAY_CHANGE:
+            raise UserError(
+                f"--{name} can't change when a run is resumed; {', '.join(MAY_CHANGE)} can, or start another run "
+                "with --start_from"
+            )
+
+
 def _check(command):
     def need(condition, text):
         if not condition:
             raise UserError(text)
 
-    need(
-        command.minutes is None or command.minutes > 0, f"--minutes is {command.minutes}; it must be positive"
-    )
-    need(
-        command.layout_episodes is None or command.layout_episodes > 0,
-        f"--layout_episodes is {command.layout_episodes}; it must be positive",
-    )
     if command.resume is None:
         return
     need(
@@ -192,9 +220,9 @@ def _devices(text):
     available = len(jax.devices())
     if text == "all":
         return available
-    if not text.isdecimal() or not 1 <= int(text) <= available:
+    if not (text.isdecimal() and len(text) <= 9 and 1 <= int(text) <= available):
         raise UserError(
-            f"--devices is {text!r}; expected all or a number up to the {available} that are here"
+            f"--devices is {text[:40]!r}; expected all or a number up to the {available} that are here"
         )
     return int(text)
 

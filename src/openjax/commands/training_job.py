@@ -9,7 +9,14 @@ import numpy as np
 from rich.console import Console
 
 from openjax.cluster.compilation import compile_ahead
-from openjax.cluster.devices import carry_shardings, check_devices, everywhere, make_device_step, own_copy
+from openjax.cluster.devices import (
+    carry_shardings,
+    check_devices,
+    check_memory,
+    everywhere,
+    make_device_step,
+    own_copy,
+)
 from openjax.cluster.processes import Processes
 from openjax.commands.evaluator import (
     before_after_table,
@@ -24,10 +31,8 @@ from openjax.policy import PolicyParameters
 from openjax.policy.growth import with_longer_history
 from openjax.pursuit import SCENARIOS, Pursuit
 from openjax.show.metrics import METRICS_FILE, MetricsWriter, NoMetrics
-from openjax.show.plots import plot_training, plot_trajectories
 from openjax.show.progress import Progress
-from openjax.show.videos import animate
-from openjax.store.checkpoints import Checkpoints, abstract_like, load_arrays, named_leaves, place
+from openjax.store.checkpoints import Checkpoints, abstract_like, named_leaves, place
 from openjax.store.policies import abstract_parameters, load_policy
 from openjax.store.policy_files import fill, load_policy_file, save_policy_file
 from openjax.store.run_directory import RunDirectory
@@ -58,19 +63,24 @@ class TrainingJob:
     def check(self) -> None:
         """Raises UserError for what doesn't fit together, before any directory is touched."""
         check_devices(self.settings, self.devices)
+        check_memory(self.settings, self.devices)
         if self.start_from is not None:
             _start_parameters(self, _abstract_parameters(self))
 
 
-def run_job(job: TrainingJob, directory: RunDirectory, resume: bool, console: Console) -> int:
-    """Train, then write the report. Returns the exit status: 0, or 1 after a NaN."""
+def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
+    """Train from the last checkpoint on, or from the start where there is none, then write the report.
+
+    Returns:
+      the exit status: 0, or 1 after a NaN.
+    """
     settings, processes = job.settings, job.processes
     if not processes.is_first:
         console = Console(quiet=True)
     title = f"openjax.train → {directory.path}"
     with StopRequest() as stop, Progress(title, settings.total_steps, console) as progress:
         checkpoints = Checkpoints(directory.checkpoints, processes=processes)
-        processes.advice = lambda: _advice(checkpoints, directory)
+        processes.advice = f"go on with python -m openjax.train --resume {directory.path} --devices all"
         progress.phase("compiling the start: networks, first tasks")
         shardings = carry_shardings(job.devices)
         abstract = abstract_like(abstract_carry(settings, job.environment), shardings)
@@ -81,7 +91,7 @@ def run_job(job: TrainingJob, directory: RunDirectory, resume: bool, console: Co
         step_ready = compile_ahead(step, abstract) if ahead else _nothing  # takes longest, so it comes first
         validation = _validation(job)
         evaluation_ready = _validation_ahead(validation, abstract) if ahead else _nothing
-        carry, update, seconds = _first_carry(job, abstract, directory, checkpoints, resume, progress)
+        carry, update, seconds = _first_carry(job, abstract, directory, checkpoints, progress)
         if processes.is_first:
             directory.write_settings(settings, job.facts)
 
@@ -96,7 +106,7 @@ def run_job(job: TrainingJob, directory: RunDirectory, resume: bool, console: Co
         metrics = NoMetrics()
         if processes.is_first:
             steps = update * settings.steps_per_update
-            metrics = MetricsWriter(directory.path, update if resume else None, resumed_steps=steps)
+            metrics = MetricsWriter(directory.path, update or None, resumed_steps=steps)
         try:
             progress.phase("compiling the training step")
             step_ready()
@@ -127,7 +137,7 @@ def run_job(job: TrainingJob, directory: RunDirectory, resume: bool, console: Co
         signals = [name for name in processes.everyone(stop.name) if name is not None]
         if not processes.is_first:
             return 0
-        _save_best(job, directory, checkpoints, outcome)
+        _save_best(job, directory, checkpoints, outcome, progress.message)
         if signals:
             progress.message(
                 f"{signals[0]}: saved at update {outcome.update}; "
@@ -150,10 +160,11 @@ def _validation_ahead(validation, abstract):
     return validation.evaluator.compile_ahead(policy, validation.tasks)
 
 
-def _first_carry(job, abstract, directory, checkpoints, resume, progress):
+def _first_carry(job, abstract, directory, checkpoints, progress):
     """The carry to start from, the updates done and the seconds spent; `abstract` is its kind."""
     settings = job.settings
-    if resume:
+    checkpoints.remove_unfinished()
+    if job.processes.of_first(checkpoints.any_finished()):
         carry, record = checkpoints.restore_latest(abstract, progress.message)
         progress.message(f"resumed at update {record.update} of {settings.total_updates}")
         return carry, record.update, float(record.notes.get("seconds", 0.0))
@@ -164,13 +175,6 @@ def _first_carry(job, abstract, directory, checkpoints, resume, progress):
     if job.processes.is_first:
         save_policy_file(directory.start_policy, carry.policy, settings, {"update": 0}, storage="float32")
     return carry, 0, 0.0
-
-
-def _advice(checkpoints, directory):
-    """What to do when another process is lost."""
-    if checkpoints.latest() is None:
-        return "there is no checkpoint yet, start again"
-    return f"go on with python -m openjax.train --resume {directory.path} --devices all"
 
 
 def _start_parameters(job, fresh: PolicyParameters) -> PolicyParameters:
@@ -203,11 +207,11 @@ def _validation(job):
     return Validation(wide, settings.environment, policy, settings.validation_episodes)
 
 
-def _save_best(job, directory, checkpoints, outcome):
+def _save_best(job, directory, checkpoints, outcome, warn):
     """Write the policy of the best checkpoint, or of the latest where none was evaluated."""
-    record = checkpoints.best() or checkpoints.latest()
+    leaves, record = checkpoints.load_best("policy/", warn)
     abstract = jax.eval_shape(lambda: outcome.carry.policy)
-    parameters = fill(abstract, load_arrays(record.path, "policy/"), str(record.path), "policy/")
+    parameters = fill(abstract, leaves, str(record.path), "policy/")
     notes = {
         "update": record.update,
         "steps": record.update * job.settings.steps_per_update,
@@ -220,6 +224,9 @@ def _save_best(job, directory, checkpoints, outcome):
 
 def _report(job, directory, validation, outcome, progress):
     """Evaluate the first and the best policy on the layouts and draw the best one's flights."""
+    from openjax.show.plots import plot_training, plot_trajectories
+    from openjax.show.videos import animate
+
     settings = job.settings
     fitting = [s for s in SCENARIOS.values() if len(s.pursuers) == settings.environment.num_pursuers]
     abstract = jax.eval_shape(lambda: outcome.carry.policy)

@@ -2,10 +2,12 @@
 
 import dataclasses
 from dataclasses import dataclass, field
+from typing import Annotated
 
 from openjax.errors import UserError
 from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import PursuitSettings, RewardSettings
+from openjax.ranges import Interval, Seed, check_intervals
 from openjax.vehicle.family import FLIGHT_FAMILY
 
 
@@ -13,33 +15,36 @@ from openjax.vehicle.family import FLIGHT_FAMILY
 class MappoSettings:
     """Multi-agent PPO with a shared actor."""
 
-    learning_rate: float = 5e-4
+    learning_rate: Annotated[float, Interval("(0, 1]")] = 5e-4
     """Adam step size at the start; falls linearly to zero over `total_steps`."""
-    actor_start: float = 0.0
+    actor_start: Annotated[float, Interval("[0, 1]")] = 0.0
     """Share of the run before the actor begins to learn: a run that starts from a policy without its critic learns that
     first."""
-    epochs: int = 4
-    minibatches: int = 16
-    clip_epsilon: float = 0.1
+    epochs: Annotated[int, Interval("[1, 1000]")] = 4
+    minibatches: Annotated[int, Interval("[1, 100000]")] = 16
+    clip_epsilon: Annotated[float, Interval("(0, 10]")] = 0.1
     """Clip range of the probability ratio at the start ..."""
-    clip_epsilon_end: float = 0.1
+    clip_epsilon_end: Annotated[float, Interval("(0, 10]")] = 0.1
     """... which changes linearly to this over `total_steps`."""
-    entropy_coefficient: float = 1e-3
+    entropy_coefficient: Annotated[float, Interval("[0, 10]")] = 1e-3
     """Weight of the entropy."""
-    discount: float = 0.995
-    gae_lambda: float = 0.95
+    discount: Annotated[float, Interval("[0, 1]")] = 0.995
+    gae_lambda: Annotated[float, Interval("[0, 1]")] = 0.95
     """Lambda of the generalised advantage estimate."""
-    max_grad_norm: float = 10.0
+    max_grad_norm: Annotated[float, Interval("(0, 1e6]")] = 10.0
     """Global norm to which gradients are cut, actor and critic each."""
-    huber: float = 10.0
+    huber: Annotated[float, Interval("(0, 1e6]")] = 10.0
     """Where the value loss turns linear, in standard deviations of the returns."""
-    value_memory: float = 0.95
+    value_memory: Annotated[float, Interval("[0, 1)")] = 0.95
     """Share of the old mean and variance of the returns that value normalisation keeps per iteration."""
-    reward_scale: float = 0.1
-    penalty_start: float = 1.0
+    reward_scale: Annotated[float, Interval("(0, 1e6]")] = 0.1
+    penalty_start: Annotated[float, Interval("[0, 1]")] = 1.0
     """Share of the penalties (collision, speed, crash) at the start of the run ..."""
-    penalty_ramp: float = 0.5
+    penalty_ramp: Annotated[float, Interval("[0, 1]")] = 0.5
     """... which rises linearly to one over this share of the run."""
+
+    def __post_init__(self):
+        check_intervals(self, "mappo.")
 
 
 @dataclass(frozen=True)
@@ -48,26 +53,33 @@ class GeneratorSettings:
 
     enabled: bool = True
     """Draw tasks from the archive of unsolved ones; False: uniform tasks only."""
-    capacity: int = 5000
+    capacity: Annotated[int, Interval("[1, 10000000]")] = 5000
     """Tasks in the archive."""
     turn: bool = True
     """Turn uniform tasks about the arena's axis, so that they come from all sides (the paper's come from one)."""
-    pillar_shift: float = 0.0
+    pillar_shift: Annotated[float, Interval("[0, 10]")] = 0.0
     """Pillars of uniform tasks are moved by up to this along x and y (m), off the grid on which the paper's stand."""
-    row_share: float = 0.0
+    row_share: Annotated[float, Interval("[0, 1]")] = 0.0
     """Share of the uniform tasks whose pillars stand in a row between the two sides (none of the paper's)."""
-    expansion: float = 0.7
+    expansion: Annotated[float, Interval("[0, 1]")] = 0.7
     """Probability p of local expansion of an archived task, else a uniform one."""
-    success_low: float = 0.5
-    success_high: float = 0.9
+    success_low: Annotated[float, Interval("[0, 1]")] = 0.5
+    success_high: Annotated[float, Interval("[0, 1]")] = 0.9
     """A task enters the archive if its success rate lies between these."""
-    wall_distance: float = 0.1
+    wall_distance: Annotated[float, Interval("[0, 10]")] = 0.1
     """Expanded starts keep this far from the arena's wall (m); 0.1 in the released code."""
-    episodes_per_task: int = 4
+    episodes_per_task: Annotated[int, Interval("[1, 100000]")] = 4
     """Environments that share one task, so that its success rate can be told."""
-    collision_tolerance: float = 1.0
+    collision_tolerance: Annotated[float, Interval("(0, 1]")] = 1.0
     """An episode counts as success if it captures and its collision rate stays below this (1: capture alone), once the
     penalties count in full; before that, more is tolerated (this to the power of the penalties' share)."""
+
+    def __post_init__(self):
+        check_intervals(self, "generator.")
+        if self.success_low > self.success_high:
+            raise UserError(
+                f"generator.success_low {self.success_low} is more than generator.success_high {self.success_high}"
+            )
 
 
 @dataclass(frozen=True)
@@ -79,38 +91,40 @@ class TrainSettings:
     predictor: PredictorSettings = field(default_factory=PredictorSettings)
     mappo: MappoSettings = field(default_factory=MappoSettings)
     generator: GeneratorSettings = field(default_factory=GeneratorSettings)
-    num_envs: int = 2560
+    num_envs: Annotated[int, Interval("[1, 16777216]")] = 2560
     """Worlds that are simulated at once."""
-    rollout_length: int = 80
+    rollout_length: Annotated[int, Interval("[1, 100000]")] = 80
     """Control steps per iteration; divides the episode's length, so that episodes end between rollouts."""
-    total_steps: int = 400_000_000
+    total_steps: Annotated[int, Interval("[1, 1e15]")] = 400_000_000
     """Environment steps of the run (one step moves one world, all its pursuers)."""
-    restart_every: int = 0
+    restart_every: Annotated[int, Interval("[0, 100000]")] = 0
     """The worlds of every n-th task are started anew after `restart_steps` already, so that more is learnt of starts,
     the hardest part of an episode; 0: none are."""
-    restart_steps: int = 160
+    restart_steps: Annotated[int, Interval("[1, 100000]")] = 160
     """Multiple of `rollout_length`; the value of what would have come is estimated, as after every rollout."""
-    restart_close: float = 0.0
+    restart_close: Annotated[float, Interval("[0, 1]")] = 0.0
     """Share of the pursuers in worlds that are started anew which start close to a pillar or another pursuer."""
-    validation_interval: int = 50
+    validation_interval: Annotated[int, Interval("[1, 1000000]")] = 50
     """Iterations between validations, on uniform tasks that are never trained on."""
-    validation_episodes: int = 256
+    validation_episodes: Annotated[int, Interval("[1, 1000000]")] = 256
     """Uniform tasks that are never trained on, and as many far ones."""
-    seed: int = 0
+    seed: Seed = 0
 
     def __post_init__(self):
+        check_intervals(self)
+
         def need(condition, text):
             if not condition:
                 raise UserError(text)
 
         length, rollout = self.environment.episode_length, self.rollout_length
         need(
-            rollout >= 1 and length % rollout == 0,
+            length % rollout == 0,
             f"rollout_length {rollout} must divide environment.episode_length {length}",
         )
         unit = self.world_unit
         need(
-            self.num_envs >= unit and self.num_envs % unit == 0,
+            self.num_envs % unit == 0,
             f"num_envs {self.num_envs} must be a multiple of {unit} (start groups times episodes per task"
             + (", times restart_every)" if self.restart_every else ")"),
         )
@@ -130,7 +144,14 @@ class TrainSettings:
                 f"predictor: {self.predictor.windows} windows and horizon {self.predictor.horizons[-1]} "
                 f"do not fit into rollout_length {rollout}",
             )
-        need(self.total_steps >= 1, f"total_steps is {self.total_steps}; it must be positive")
+        need(
+            self.restart_every or not self.restart_close,
+            f"restart_close {self.restart_close} needs restart_every; without it no world is started anew",
+        )
+        need(
+            self.total_updates < 2**31,
+            f"total_steps {self.total_steps} are {self.total_updates} updates; fewer than 2^31 are possible",
+        )
 
     @property
     def start_groups(self) -> int:

@@ -1,22 +1,24 @@
 """Settings of the networks."""
 
+import itertools
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from openjax.errors import UserError
+from openjax.ranges import Interval, check_intervals
 
 
 @dataclass(frozen=True)
 class NetworkSettings:
     """Actor and critic: an attention encoder each (the paper's figure 3)."""
 
-    features: int = 128
+    features: Annotated[int, Interval("[1, 8192]")] = 128
     """Width of the entity embeddings and of all layers."""
-    heads: int = 4
+    heads: Annotated[int, Interval("[1, 256]")] = 4
     """Attention heads."""
     compute_type: Literal["float32", "bfloat16"] = "float32"
     """Arithmetic of the networks; parameters stay in float32."""
-    initial_log_std: float = -0.5
+    initial_log_std: Annotated[float, Interval("[-10, 2]")] = -0.5
     """Start of the Gaussian policy's state-independent log standard deviation."""
     squash: Literal["mean", "sample"] = "mean"
     """What the tanh bounds. "mean": exploration is added after it and cut at the bounds, so that the mean policy does
@@ -28,6 +30,7 @@ class NetworkSettings:
     """"state": the critic also sees the true evader, its velocity and the own position; "observation": what the actor sees."""
 
     def __post_init__(self):
+        check_intervals(self, "network.")
         if self.features % self.heads:
             raise UserError(f"network: features {self.features} must be a multiple of heads {self.heads}")
 
@@ -38,26 +41,28 @@ class PredictorSettings:
 
     enabled: bool = True
     """Predict the evader and let the policy observe the prediction."""
-    units: int = 64
+    units: Annotated[int, Interval("[1, 8192]")] = 64
     """Width of the LSTM."""
-    horizons: tuple[int, ...] = (1, 5, 10, 20, 40)
+    horizons: Annotated[tuple[int, ...], Interval("[1, 10000]")] = (1, 5, 10, 20, 40)
     """Control steps ahead at which positions are predicted; the first is 1. The paper's are 1 to 5."""
     relative: bool = True
     """Predict the displacement from where the evader was last seen; False: positions in the arena, as in the paper."""
     loss: Literal["scaled", "squared"] = "scaled"
     """Mean squared error. "scaled": in units of how far the evader flies in that time, without the windows that end before
     it was first seen; "squared": in metres, of all windows, as in the paper."""
-    learning_rate: float = 1e-3
+    learning_rate: Annotated[float, Interval("(0, 1]")] = 1e-3
     """Adam step size; 1e-4 in the paper."""
     decay: bool = True
     """Let the step size fall linearly to zero over `total_steps`; the paper's stays."""
-    windows: int = 8
+    windows: Annotated[int, Interval("[1, 1000]")] = 8
     """Windows of each environment's rollout that one iteration trains on."""
-    steps: int = 4
+    steps: Annotated[int, Interval("[1, 1000]")] = 4
     """Gradient steps per iteration, over disjoint windows."""
 
     def __post_init__(self):
-        if not self.horizons or self.horizons[0] != 1 or any(h < 1 for h in self.horizons):
-            raise UserError(f"predictor: horizons {self.horizons} must start with 1 and be positive")
+        check_intervals(self, "predictor.")
+        rising = all(near < far for near, far in itertools.pairwise(self.horizons))
+        if not self.horizons or self.horizons[0] != 1 or not rising:
+            raise UserError(f"predictor.horizons {list(self.horizons)[:20]} must start with 1 and rise")
         if self.windows % self.steps:
             raise UserError(f"predictor: windows {self.windows} must be a multiple of steps {self.steps}")

@@ -1,15 +1,18 @@
 """The six test layouts, and a user's own as a TOML file."""
 
 import dataclasses
-import tomllib
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 
 from openjax.errors import UserError
+from openjax.files import read_toml
 from openjax.pursuit.settings import SOLID_RADIUS, PursuitSettings
 from openjax.pursuit.task import Task
+
+MOST_PILLARS = 32
+"""Of a layout; each costs time in every step."""
 
 FLIGHT_HEIGHT = 0.5
 """All vehicles of the six layouts start at this height (m)."""
@@ -116,19 +119,14 @@ def find_scenario(name_or_path: str, settings: PursuitSettings) -> Scenario:
     path = Path(name_or_path)
     if path.suffix != ".toml":
         raise UserError(f"scenario {name_or_path}: not one of {', '.join(SCENARIOS)} and not a .toml file")
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"scenario {path}: can't be read ({error})") from error
-    except tomllib.TOMLDecodeError as error:
-        raise UserError(f"scenario {path}: is not valid TOML ({error})") from error
+    data = read_toml(path, "layout")
     unknown = sorted(set(data) - {"name", "pillars", "pursuers", "evader"})
     if unknown:
         raise UserError(
             f"scenario {path}: unknown key {unknown[0]}; possible are name, pillars, pursuers, evader"
         )
     scenario = Scenario(
-        name=str(data.get("name", path.stem)),
+        name=str(data.get("name", path.stem))[:80],
         pillars=_points(path, data, "pillars", 2, ()),
         pursuers=_points(path, data, "pursuers", 3, None),
         evader=_points(path, {"evader": [data.get("evader")]}, "evader", 3, None)[0],
@@ -142,7 +140,9 @@ def _points(path, data, key, size, default):
     if values is None:
         raise UserError(f"scenario {path}: {key} is missing; it lists points of {size} numbers in metres")
     if not isinstance(values, list | tuple):
-        raise UserError(f"scenario {path}: {key} is {values}; it lists points of {size} numbers in metres")
+        raise UserError(
+            f"scenario {path}: {key} is {str(values)[:60]}; it lists points of {size} numbers in metres"
+        )
     points = []
     for value in values:
         good = isinstance(value, list) and len(value) == size
@@ -150,7 +150,9 @@ def _points(path, data, key, size, default):
             isinstance(x, int | float) and not isinstance(x, bool) and np.isfinite(x) for x in value
         )
         if not good:
-            raise UserError(f"scenario {path}: {key} holds {value}; a point is {size} numbers in metres")
+            raise UserError(
+                f"scenario {path}: {key} holds {str(value)[:60]}; a point is {size} numbers in metres"
+            )
         points.append(tuple(float(x) for x in value))
     return tuple(points)
 
@@ -158,6 +160,10 @@ def _points(path, data, key, size, default):
 def _check(path, scenario, settings):
     if not 1 <= len(scenario.pursuers) <= 8:
         raise UserError(f"scenario {path}: has {len(scenario.pursuers)} pursuers; 1 to 8 are possible")
+    if len(scenario.pillars) > MOST_PILLARS:
+        raise UserError(
+            f"scenario {path}: has {len(scenario.pillars)} pillars; up to {MOST_PILLARS} are possible"
+        )
     radius, height = settings.arena_radius, settings.arena_height
     for x, y in scenario.pillars:
         if np.hypot(x, y) > radius:

@@ -2,9 +2,11 @@
 
 import json
 import math
-import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
+
+from openjax.files import replacing
 
 METRICS_FILE = "metrics.jsonl"
 
@@ -39,8 +41,7 @@ class MetricsWriter:
         self._file = open(path, "ab", buffering=0)
         self._events = None
         if tensorboard:
-            from tensorboardX import SummaryWriter
-
+            SummaryWriter = _summary_writer()
             purge_step = None if resumed_update is None else resumed_steps + 1
             self._events = SummaryWriter(str(directory / "tensorboard"), purge_step=purge_step, flush_secs=10)
 
@@ -70,6 +71,20 @@ class MetricsWriter:
             self._events.close()
 
 
+def _summary_writer():
+    """tensorboardX' writer. On its import it would also load torch, where that is installed, which takes seconds."""
+    missing = object()
+    torch = sys.modules.get("torch", missing)
+    if torch is missing:
+        sys.modules["torch"] = None  # an import of it fails, which tensorboardX takes for its absence
+    try:
+        from tensorboardX import SummaryWriter
+    finally:
+        if torch is missing:
+            del sys.modules["torch"]
+    return SummaryWriter
+
+
 class NoMetrics:
     """In the place of a `MetricsWriter` where another process writes."""
 
@@ -97,9 +112,7 @@ def truncate_metrics(path: Path, update: int) -> None:
     path = Path(path)
     if not path.exists():
         return
-    temporary = path.with_name(path.name + ".writing")
-    with open(temporary, "w", encoding="utf-8") as kept:
+    with replacing(path) as partial, open(partial, "w", encoding="utf-8") as kept:
         for record in read_metrics(path):
             if record["update"] <= update:
                 kept.write(json.dumps(record) + "\n")
-    os.replace(temporary, path)

@@ -9,6 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
+from openjax.files import replacing
 from openjax.show.metrics import read_metrics
 from openjax.show.trajectory import Trajectory
 
@@ -98,6 +99,5 @@ def plot_training(path: Path, metrics_path: Path) -> None:
 
 def _save(figure, path):
     FigureCanvasAgg(figure)
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=120)
+    with replacing(path) as partial:
+        figure.savefig(partial, dpi=120)

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from openjax.files import replacing
+
 
 @dataclasses.dataclass(frozen=True)
 class Trajectory:
@@ -30,7 +32,8 @@ class Trajectory:
 
     def save(self, path: Path) -> None:
         """Write as .npz."""
-        np.savez_compressed(path, **{name: np.asarray(value) for name, value in vars(self).items()})
+        with replacing(path) as partial:
+            np.savez_compressed(partial, **{name: np.asarray(value) for name, value in vars(self).items()})
 
     @classmethod
     def load(cls, path: Path) -> "Trajectory":

@@ -15,6 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
+from openjax.files import replacing
 from openjax.show.plots import EVADER_COLOR, PURSUER_COLORS, draw_arena
 from openjax.show.trajectory import Trajectory
 
@@ -35,7 +36,6 @@ def animate(path: Path, trajectory: Trajectory, renderer: str = "auto") -> str:
       The renderer that drew it: `mujoco` with the backend's name, or `matplotlib`.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     if renderer != "matplotlib":
         backend = _animate_with_mujoco(path, trajectory)
         if backend is not None:
@@ -59,9 +59,10 @@ def write_gif(path: Path, frames: list[np.ndarray]) -> None:
     sample = np.concatenate(frames[:: max(1, len(frames) // 6)])
     palette = Image.fromarray(sample).quantize(255, method=Image.Quantize.MAXCOVERAGE)
     images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    images[0].save(
-        path, save_all=True, append_images=images[1:], duration=round(1000 / FRAMES_PER_SECOND), loop=0
-    )
+    with replacing(path) as partial:
+        images[0].save(
+            partial, save_all=True, append_images=images[1:], duration=round(1000 / FRAMES_PER_SECOND), loop=0
+        )
 
 
 def _animate_with_mujoco(path, trajectory):
@@ -81,7 +82,8 @@ def _animate_with_mujoco(path, trajectory):
             except (OSError, subprocess.TimeoutExpired):
                 continue
             if done.returncode == 0 and drawn.exists():
-                path.write_bytes(drawn.read_bytes())
+                with replacing(path) as partial:
+                    partial.write_bytes(drawn.read_bytes())
                 return backend
     return None
 

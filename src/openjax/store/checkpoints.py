@@ -1,24 +1,32 @@
-"""Checkpoints of a whole training carry: atomic, exact, the last good one found again after any kill.
+"""Checkpoints of a whole training carry: atomic, exact, the last good one found again after any kill or damage.
 
-Orbax stands behind this module only. A carry is any pytree of arrays; optimiser states, typed random keys and
-counters are leaves like all others, so nothing can be forgotten. Leaves are stored under their path in the
-tree, which makes a carry of another shape a readable error instead of a wrong run.
+A checkpoint NAME is a folder of orbax's and, written after it, NAME.sha256 with the checksums of all its files: it
+counts once that is there, and only while they agree. Orbax stands behind this module only.
+
+A carry is any pytree of arrays; optimiser states, typed random keys and counters are leaves like all others, so nothing
+can be forgotten. Leaves are stored under their path in the tree, which makes a carry of another shape a readable error
+instead of a wrong run.
 """
 
 import dataclasses
+import functools
+import hashlib
 import shutil
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from orbax.checkpoint.experimental import v1 as orbax
 
 from openjax.cluster.processes import Processes
 from openjax.errors import UserError
+from openjax.files import WRITING, write_text
 
 _DIGITS = 9
+_CHECKSUMS = ".sha256"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,24 +95,24 @@ def abstract_like(carry: Any, shardings: Any = None) -> Any:
 
 def save_state(path: Path, carry: Any, notes: dict | None = None) -> None:
     """Write one carry to the directory `path`, in place of what is there; it appears whole or not at all."""
+    path = Path(path)
     if jax.process_index() == 0:
-        shutil.rmtree(path, ignore_errors=True)
-    _start_save(Path(path), carry, notes or {}).result()
+        _remove(path)
+    _commit(path, _start_save(path, carry, notes or {}))
 
 
 def load_state(path: Path, abstract: Any) -> Any:
     """Read a carry whose shapes, dtypes and shardings are those of `abstract` (from `abstract_like`).
 
     Raises:
-      UserError: not a checkpoint, or one of another shape.
+      UserError: not a checkpoint, a damaged one (`DamagedError`), or one of another shape.
     """
     path = Path(path).absolute()
-    if not is_checkpoint(path):
-        raise UserError(f"{path} is no checkpoint; expected a directory written by openjax.train")
-    stored = orbax.metadata(path).metadata
+    _check(path)
+    stored = _orbax().metadata(path).metadata
     wanted = {name: leaf for name, leaf in named_leaves(abstract).items() if leaf.size}
     _check_same_shapes(path, stored, wanted)
-    arrays = orbax.load(path, wanted)
+    arrays = _orbax().load(path, wanted)
     # Orbax can't write arrays without elements; they hold nothing, so they are made anew.
     leaves = [
         arrays[name] if leaf.size else jnp.zeros(leaf.shape, leaf.dtype, device=leaf.sharding)
@@ -117,21 +125,23 @@ def load_arrays(path: Path, prefix: str = "") -> dict[str, np.ndarray]:
     """Leaves by path as host arrays, without knowing the tree; only those whose path starts with `prefix`.
 
     Read by this process alone.
+
+    Raises:
+      UserError: not a checkpoint, or a damaged one.
     """
     path = Path(path).absolute()
-    if not is_checkpoint(path):
-        raise UserError(f"{path} is no checkpoint; expected a directory written by openjax.train")
+    _check(path)
     sharding = _default_sharding()
     wanted = {
         name: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
         if name.startswith(prefix)
-        else orbax.PLACEHOLDER
-        for name, leaf in orbax.metadata(path).metadata.items()
+        else _orbax().PLACEHOLDER
+        for name, leaf in _orbax().metadata(path).metadata.items()
     }
     this = jax.process_index()
-    alone = orbax.options.MultiprocessingOptions(primary_host=this, active_processes={this})
-    with orbax.Context(multiprocessing_options=alone):
-        loaded = {name: leaf for name, leaf in orbax.load(path, wanted).items() if name.startswith(prefix)}
+    alone = _orbax().options.MultiprocessingOptions(primary_host=this, active_processes={this})
+    with _orbax().Context(multiprocessing_options=alone):
+        loaded = {name: leaf for name, leaf in _orbax().load(path, wanted).items() if name.startswith(prefix)}
     is_key = {name: jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) for name, leaf in loaded.items()}
     return {
         name: np.asarray(jax.random.key_data(leaf) if is_key[name] else leaf) for name, leaf in loaded.items()
@@ -139,8 +149,13 @@ def load_arrays(path: Path, prefix: str = "") -> dict[str, np.ndarray]:
 
 
 def is_checkpoint(path: Path) -> bool:
-    """True for a committed checkpoint; half-written ones carry another name until they are whole."""
-    return _metadata(Path(path)) is not None
+    """True for a finished checkpoint, whether its files are still as they were written or not."""
+    path = Path(path)
+    return path.is_dir() and _checksums_file(path).is_file()
+
+
+class DamagedError(UserError):
+    """A checkpoint's files aren't as they were written."""
 
 
 class Checkpoints:
@@ -153,22 +168,47 @@ class Checkpoints:
         self.directory = Path(directory).absolute()
         self.keep_last = keep_last
         self._processes = processes or Processes()
-        self._pending = None
-        self._known: dict[str, CheckpointRecord] = {}  # a committed checkpoint doesn't change
+        self._pending: Future | None = None
+        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="checkpoint")
+        self._known: dict[str, CheckpointRecord] = {}  # a finished checkpoint doesn't change
+        self._damaged: dict[str, str] = {}
 
     def records(self) -> list[CheckpointRecord]:
-        """Committed checkpoints, oldest first."""
+        """Finished and undamaged checkpoints, oldest first."""
         found = []
         for path in sorted(self.directory.glob("[0-9]" * _DIGITS)):
-            metadata = None if path.name in self._known else _metadata(path)
-            if metadata is not None:
-                notes = dict(metadata.custom_metadata or {})
-                self._known[path.name] = CheckpointRecord(
-                    path, int(path.name), notes.pop("score", None), notes
-                )
-            if path.name in self._known:
-                found.append(self._known[path.name])
+            if not is_checkpoint(path) or path.name in self._damaged:
+                continue
+            if path.name not in self._known:
+                try:
+                    self._known[path.name] = _record(path)
+                except DamagedError as error:
+                    self._damaged[path.name] = str(error)
+                    continue
+            found.append(self._known[path.name])
         return found
+
+    def any_finished(self) -> bool:
+        """Whether there is a checkpoint, damaged or not."""
+        return any(is_checkpoint(path) for path in self.directory.glob("[0-9]" * _DIGITS))
+
+    def load_best(
+        self, prefix: str, warn: Callable[[str], None]
+    ) -> tuple[dict[str, np.ndarray], CheckpointRecord]:
+        """Leaves (see `load_arrays`) of the best checkpoint, or of the latest where none has a score.
+
+        One that is damaged is passed over with a warning.
+
+        Raises:
+          UserError: none is left.
+        """
+        while record := self.best() or self.latest():
+            try:
+                return load_arrays(record.path, prefix), record
+            except DamagedError as error:
+                warn(f"{error}; using the next best")
+                self._damaged[record.path.name] = str(error)
+        raise UserError(f"{self.directory} holds no checkpoint that can be read")
 
     def best(self) -> CheckpointRecord | None:
         """The highest score, the later one of equals; None while nothing was evaluated."""
@@ -187,11 +227,13 @@ class Checkpoints:
         """
         self.wait()
         path = self.directory / f"{update:0{_DIGITS}d}"
-        if self._processes.of_first(is_checkpoint(path)):
+        if self._processes.of_first(is_checkpoint(path) and path.name not in self._damaged):
             return
         if self._processes.is_first:
-            shutil.rmtree(path, ignore_errors=True)
-        self._pending = _start_save(path, carry, {**(notes or {}), "score": score})
+            _remove(path)
+            self._known.pop(path.name, None), self._damaged.pop(path.name, None)
+        started = _start_save(path, carry, {**(notes or {}), "score": score})
+        self._pending = self._pool.submit(_commit, path, started)
 
     def wait(self) -> None:
         """Block until the checkpoint under way is on disk, then drop the ones that are no longer kept."""
@@ -204,7 +246,7 @@ class Checkpoints:
         records, best = self.records(), self.best()
         for record in records[: -self.keep_last]:
             if best is None or record.path != best.path:
-                shutil.rmtree(record.path, ignore_errors=True)
+                _remove(record.path)
 
     def restore_latest(self, abstract: Any, warn=lambda text: None) -> tuple[Any, CheckpointRecord]:
         """The newest checkpoint that can be read; damaged ones are passed over with a warning.
@@ -214,10 +256,14 @@ class Checkpoints:
         """
         self.remove_unfinished()
         records = {record.path.name: record for record in self.records()}
+        for text in self._damaged.values():
+            warn(f"{text}; using the one before it")
         for name in reversed(self._processes.of_first(list(records))):
             path, failure, carry = self.directory / name, None, None
             try:
                 carry = load_state(path, abstract)
+            except DamagedError:
+                failure = "damaged"
             except UserError:
                 raise
             except Exception as error:  # orbax and tensorstore raise many kinds on damaged files
@@ -232,19 +278,77 @@ class Checkpoints:
         """Delete what a killed write left behind."""
         if not self._processes.is_first or not self.directory.is_dir():
             return
-        for path in self.directory.iterdir():
-            if path.is_dir() and "tmp" in path.name:
+        for path in list(self.directory.iterdir()):
+            if path.is_dir() and not is_checkpoint(path):
                 shutil.rmtree(path, ignore_errors=True)
+            elif path.name.startswith(WRITING):
+                path.unlink(missing_ok=True)
 
 
-def _metadata(path):
-    """Orbax's metadata of a committed checkpoint, else None."""
-    if not path.is_dir():
-        return None
+@functools.cache
+def _orbax():
+    """Loaded late: it takes a second or two, which pass while a run's programs are compiled."""
+    from orbax.checkpoint.experimental import v1
+
+    return v1
+
+
+def _record(path):
+    """What is known of a checkpoint. Raises DamagedError."""
+    _check(path)
     try:
-        return orbax.metadata(path.absolute())
-    except Exception:  # whatever orbax and tensorstore make of a foreign or damaged directory: it's none
-        return None
+        notes = dict(_orbax().metadata(path.absolute()).custom_metadata or {})
+    except Exception as error:  # orbax and tensorstore raise many kinds
+        raise DamagedError(f"checkpoint {path} can't be read ({type(error).__name__})") from error
+    return CheckpointRecord(path, int(path.name), notes.pop("score", None), notes)
+
+
+def _commit(path, started):
+    """Wait until orbax has written a checkpoint, and seal it by its checksums."""
+    started.result()
+    if jax.process_index() == 0:
+        lines = [f"{_checksum(file)}  {file.relative_to(path).as_posix()}" for file in _files(path)]
+        write_text(_checksums_file(path), "\n".join(lines) + "\n")
+
+
+def _check(path):
+    """Raises UserError where no checkpoint is, and DamagedError where its files aren't as they were written."""
+    if not is_checkpoint(path):
+        raise UserError(f"{path} is no checkpoint; expected a directory written by openjax.train")
+    try:
+        lines = _checksums_file(path).read_text(encoding="utf-8").splitlines()
+        expected = {name: checksum for checksum, _, name in (line.partition("  ") for line in lines)}
+        found = {file.relative_to(path).as_posix(): file for file in _files(path)}
+        different = sorted(expected.keys() ^ found.keys())
+        different += [
+            name
+            for name in sorted(expected.keys() & found.keys())
+            if _checksum(found[name]) != expected[name]
+        ]
+    except (OSError, UnicodeDecodeError) as error:
+        raise DamagedError(f"checkpoint {path} is damaged ({error})") from error
+    if different or not expected:
+        where = different[0] if different else _CHECKSUMS
+        raise DamagedError(f"checkpoint {path} is damaged: {where[:80]} isn't as it was written")
+
+
+def _files(path):
+    return sorted(file for file in path.rglob("*") if file.is_file())
+
+
+def _checksum(file):
+    with open(file, "rb") as content:
+        return hashlib.file_digest(content, "sha256").hexdigest()
+
+
+def _checksums_file(path):
+    return path.with_name(path.name + _CHECKSUMS)
+
+
+def _remove(path):
+    """Delete a checkpoint; its checksums go first, so that a half-deleted one is none."""
+    _checksums_file(path).unlink(missing_ok=True)
+    shutil.rmtree(path, ignore_errors=True)
 
 
 def _default_sharding():
@@ -254,7 +358,7 @@ def _default_sharding():
 def _start_save(path, carry, notes):
     arrays = {name: leaf for name, leaf in named_leaves(carry).items() if leaf.size}
     path.parent.mkdir(parents=True, exist_ok=True)
-    return orbax.save_async(path.absolute(), arrays, custom_metadata=notes)
+    return _orbax().save_async(path.absolute(), arrays, custom_metadata=notes)
 
 
 def _check_same_shapes(path, stored, wanted):

@@ -118,10 +118,10 @@ def _from_run(run, source):
     if run.policy.exists():
         return _from_file(run.policy, source)
     checkpoints = Checkpoints(run.checkpoints)
-    record = checkpoints.best() or checkpoints.latest()
-    if record is None:
+    if not checkpoints.any_finished():
         raise UserError(f"{run.path} holds no policy and no checkpoint yet")
-    return _build(run.read_settings(), load_arrays(record.path, "policy/"), source, "policy/")
+    leaves, _ = checkpoints.load_best("policy/", lambda text: None)
+    return _build(run.read_settings(), leaves, source, "policy/")
 
 
 def _build(settings, leaves, source, prefix=""):

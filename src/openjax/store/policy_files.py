@@ -5,7 +5,9 @@ them, and a note of where they come from. Floating-point arrays are stored as fl
 size, about three decimal digits), other kinds stay as they are.
 """
 
+import io
 import json
+import math
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -15,11 +17,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from openjax.errors import UserError
+from openjax.files import replacing
 from openjax.store.checkpoints import named_leaves
 from openjax.store.settings_files import to_plain
 
 _FORMAT = "openjax policy 1"
 _HEADER = "openjax.json"
+LARGEST = 512 * 2**20
+"""Bytes of the arrays of a policy file that is read."""
+
 WEIGHTS = Path(__file__).resolve().parents[1] / "weights"
 
 
@@ -42,11 +48,8 @@ def save_policy_file(
         header["dtypes"][name] = str(leaf.dtype)
         arrays[name] = array.astype(storage) if np.issubdtype(array.dtype, np.floating) else array
     arrays[_HEADER] = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".writing.npz")
-    np.savez_compressed(temporary, **arrays)
-    temporary.replace(path)
+    with replacing(path) as partial:
+        np.savez_compressed(partial, **arrays)
 
 
 def load_policy_file(path: Path) -> tuple[dict[str, np.ndarray], dict, dict]:
@@ -56,17 +59,58 @@ def load_policy_file(path: Path) -> tuple[dict[str, np.ndarray], dict, dict]:
       UserError: no policy file, or one of another format.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            stored = {name: archive[name] for name in archive.files}
+        stored = _read_arrays(Path(path))
         header = json.loads(stored.pop(_HEADER).tobytes())
+        if not isinstance(header, dict) or header.get("format") != _FORMAT:
+            raise UserError(f"{path} isn't of the format {_FORMAT!r}")
+        leaves = {name: array.astype(_dtype(header["dtypes"][name])) for name, array in stored.items()}
+        settings, notes = header["settings"], header["notes"]
+    except UserError:
+        raise
     except OSError as error:
         raise UserError(f"{path} can't be read: {error.strerror or error}") from error
-    except (ValueError, KeyError, zipfile.BadZipFile, EOFError) as error:
-        raise UserError(f"{path} is no policy file; expected one written by openjax.train (.npz)") from error
-    if header.get("format") != _FORMAT:
-        raise UserError(f"{path} has the format {header.get('format')!r}; expected {_FORMAT!r}")
-    leaves = {name: array.astype(jnp.dtype(header["dtypes"][name])) for name, array in stored.items()}
-    return leaves, header["settings"], header["notes"]
+    except Exception as error:  # a damaged or foreign archive fails in every way that zipfile and NumPy know
+        raise UserError(
+            f"{path} is no policy file, or it's damaged ({type(error).__name__}); expected one written by "
+            "openjax.train (.npz)"
+        ) from error
+    broken = [name for name, leaf in leaves.items() if not np.isfinite(leaf.astype(np.float32)).all()]
+    if broken:
+        raise UserError(f"{path} holds numbers that aren't finite, in {broken[0]}")
+    return leaves, settings, notes
+
+
+def _read_arrays(path):
+    """The arrays of an .npz file, none of them larger than the file says beforehand."""
+    arrays = {}
+    with zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        if sum(member.file_size for member in members) > LARGEST:
+            raise UserError(f"{path} holds more than {LARGEST >> 20} MiB; no policy of openjax is so large")
+        for member in members:
+            data = archive.read(member)  # checks its checksum
+            stream = io.BytesIO(data)
+            version = np.lib.format.read_magic(stream)
+            read_header = np.lib.format.read_array_header_1_0
+            if version != (1, 0):
+                raise ValueError(f"version {version}")
+            shape, fortran, dtype = read_header(stream)
+            content = data[stream.tell() :]
+            if dtype.hasobject or math.prod(shape) * dtype.itemsize != len(content):
+                raise ValueError("its header doesn't fit")
+            order = "F" if fortran else "C"
+            arrays[member.filename.removesuffix(".npy")] = np.frombuffer(content, dtype).reshape(
+                shape, order=order
+            )
+    return arrays
+
+
+def _dtype(name):
+    """The type of a leaf: one that networks have."""
+    dtype = jnp.dtype(name)
+    if dtype.kind not in "fiub" and dtype != jnp.bfloat16:
+        raise ValueError(f"type {name}")
+    return dtype
 
 
 def fill(abstract: Any, leaves: dict[str, np.ndarray], where: str, prefix: str = "") -> Any:

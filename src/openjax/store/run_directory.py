@@ -8,17 +8,23 @@ policy_start.npz, policy.npz  the policy before training and the best one
 layouts.json       before and after, per layout
 training.png, trajectories.png, chase.gif
 not_finite/        only after a NaN: the state that holds it
+run.lock           while a process trains here
 """
 
+import contextlib
 import dataclasses
+import fcntl
+import os
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from openjax.errors import UserError
+from openjax.files import WRITING, check_output_folder, read_json, remove_unfinished
 from openjax.learning import TrainSettings
 from openjax.store.old_names import train_settings
-from openjax.store.settings_files import SETTINGS_FILE, read_json, write_json
+from openjax.store.settings_files import SETTINGS_FILE, write_json
 
 _FORMAT = "openjax run 1"
 _FILES = (
@@ -34,6 +40,7 @@ _FILES = (
     "chase.gif",
 )
 _FOLDERS = ("checkpoints", "tensorboard", "not_finite")
+_LOCK = "run.lock"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,6 +73,10 @@ class RunDirectory:
     def write_settings(self, settings: Any, facts: dict) -> None:
         """Record the settings (nested dataclass) and facts like machine and command line."""
         write_json(self.settings_file, {"format": _FORMAT, "settings": settings, **facts})
+
+    def read_facts(self) -> dict:
+        """What `write_settings` was told beside the settings."""
+        return read_json(self.settings_file)
 
     def read_settings(self) -> TrainSettings:
         """The settings of the run.
@@ -100,23 +111,29 @@ def open_run(path: Path) -> RunDirectory:
 def check_free(path: Path, overwrite: bool) -> None:
     """Whether a new run may be written to `path`; changes nothing.
 
+    What a run left that was killed before it had settings is in nobody's way.
+
     Raises:
-      UserError: it holds a run and `overwrite` is False, or it holds other things.
+      UserError: it holds a run and `overwrite` is False, or it holds other things, or can't be written to.
     """
     path = Path(path)
     if path.exists() and not path.is_dir():
         raise UserError(f"{path} is a file; --out takes a directory")
+    check_output_folder(path, "--out")
     if is_run(path):
         if not overwrite:
             raise UserError(
                 f"{path} already holds a run; --resume {path} goes on with it, --overwrite replaces it"
             )
-    elif path.is_dir() and any(path.iterdir()):
+    elif path.is_dir() and any(not _is_ours(entry.name) for entry in path.iterdir()):
         raise UserError(f"{path} holds files that are no run; choose another --out")
 
 
 def create_run(path: Path, overwrite: bool) -> RunDirectory:
-    """An empty run directory; with `overwrite` a run that is there is removed, and only its own files."""
+    """An empty run directory; with `overwrite` a run that is there is removed, and only its own files.
+
+    Call it inside `locked`.
+    """
     check_free(path, overwrite)
     path = Path(path)
     path.mkdir(parents=True, exist_ok=True)
@@ -125,4 +142,44 @@ def create_run(path: Path, overwrite: bool) -> RunDirectory:
         (path / name).unlink(missing_ok=True)
     for name in _FOLDERS:
         shutil.rmtree(path / name, ignore_errors=True)
+    remove_unfinished(path)
     return RunDirectory(path)
+
+
+@contextlib.contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Keep the directory, which is made where it isn't there, for this process; its end gives it free, also a kill.
+
+    Raises:
+      UserError: another process trains there.
+    """
+    path = Path(path)
+    path.mkdir(parents=True, exist_ok=True)
+    file = path / _LOCK
+    while True:
+        descriptor = os.open(file, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(descriptor)
+            raise UserError(
+                f"another process trains in {path}; wait for it, or choose another --out"
+            ) from None
+        except OSError:  # a file system without locks
+            break
+        # Its last holder may have removed the file since it was opened here.
+        with contextlib.suppress(FileNotFoundError):
+            if os.stat(file).st_ino == os.fstat(descriptor).st_ino:
+                break
+        os.close(descriptor)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            file.unlink()
+        os.close(descriptor)
+
+
+def _is_ours(name):
+    """Whether a run writes something of this name, or left it unfinished."""
+    return name in (*_FILES, *_FOLDERS, _LOCK) or name.startswith(WRITING)

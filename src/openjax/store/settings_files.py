@@ -1,13 +1,12 @@
 """Settings as JSON: nested frozen dataclasses to plain values and back, strictly."""
 
 import dataclasses
-import json
-import os
 import types
 import typing
 from pathlib import Path
 from typing import Any
 
+from openjax import files
 from openjax.errors import UserError
 
 SETTINGS_FILE = "settings.json"
@@ -91,19 +90,5 @@ def _union_from_plain(arguments, value, where):
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write JSON so that a reader sees the old file or the new one, never a half."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".writing")
-    temporary.write_text(json.dumps(to_plain(value), indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(temporary, path)
-
-
-def read_json(path: Path) -> Any:
-    """Raises UserError when the file is missing or no JSON."""
-    try:
-        return json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UserError(f"{path} can't be read: {error.strerror}") from error
-    except ValueError as error:
-        raise UserError(f"{path} is no JSON file: {error}") from error
+    """Write settings and results (see `to_plain`) as JSON, whole or not at all."""
+    files.write_json(path, to_plain(value))

@@ -19,6 +19,7 @@ import numpy as np
 import tomlkit
 
 from openjax.errors import UserError
+from openjax.files import read_toml, write_text
 from openjax.vehicle import Vehicle, load_vehicle
 
 NOMINAL_ORDER = ("front_right", "rear_right", "rear_left", "front_left")
@@ -35,6 +36,9 @@ CALIBRATED_UNITS = MappingProxyType({
     "motor_time_constant": "s",
     "inertia": "kg m^2",
 })  # fmt: skip
+
+FAR = 100.0
+"""A calibrated value may be this many times the nominal one, or this part of it."""
 
 LEAST_MASS = 0.005  # kg; the lightest frame with battery weighs twice that
 
@@ -105,17 +109,7 @@ def load_vehicle_file(path: str | Path | None = None, dtype=jnp.float32) -> Vehi
     path = Path(path)
     if path.is_dir():
         path = path / "vehicle.toml"
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(
-            f"{path}: can't read the vehicle file ({error.__class__.__name__}); a case needs one"
-        ) from error
-    try:
-        tables = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise UserError(f"{path}: not valid TOML: {error}") from error
-    return _from_tables(tables, path, dtype)
+    return _from_tables(read_toml(path, "vehicle file"), path, dtype)
 
 
 def save_vehicle_file(path: str | Path, vehicle_file: VehicleFile) -> None:
@@ -136,9 +130,7 @@ def save_vehicle_file(path: str | Path, vehicle_file: VehicleFile) -> None:
         document.add("calibrated", tables)
     text = tomlkit.dumps(document)
     _from_tables(tomllib.loads(text), Path(path), jnp.float32)  # never write what can't be read back
-    temporary = Path(path).with_suffix(".toml.partial")
-    temporary.write_text(text, encoding="utf-8")
-    temporary.replace(path)
+    write_text(path, text)
 
 
 def _from_tables(tables: dict, path: Path, dtype) -> VehicleFile:
@@ -178,7 +170,7 @@ def _from_tables(tables: dict, path: Path, dtype) -> VehicleFile:
     place = {name: spin[i] for i, name in enumerate(order)}
     changes["rotor_spin"] = [1.0 if place[name] == "cw" else -1.0 for name in NOMINAL_ORDER]
     torque_per_thrust = motor.get("torque_per_thrust")
-    calibrated = _calibrated(_table(tables, "calibrated", path), path)
+    calibrated = _calibrated(_table(tables, "calibrated", path), path, nominal)
     for name, entry in calibrated.items():
         changes[name] = entry.value if name == "inertia" else entry.value[0]
     if torque_per_thrust is not None:
@@ -205,7 +197,7 @@ def _from_tables(tables: dict, path: Path, dtype) -> VehicleFile:
     )
 
 
-def _calibrated(table: dict, path: Path) -> dict[str, CalibratedValue]:
+def _calibrated(table: dict, path: Path, nominal: Vehicle) -> dict[str, CalibratedValue]:
     _only(table, set(CALIBRATED_UNITS), path, "[calibrated]")
     result = {}
     for name, entry in table.items():
@@ -227,6 +219,9 @@ def _calibrated(table: dict, path: Path) -> dict[str, CalibratedValue]:
             raise UserError(
                 f"{path}: {where} needs value ({n} number{'s' * (n > 1)}) and interval90 ([low, high] each)"
             )
+        usual = np.atleast_1d(np.asarray(getattr(nominal, name)))
+        if not ((usual / FAR <= value) & (value <= usual * FAR)).all():
+            raise UserError(f"{path}: {where}: {value.tolist()} is far from the nominal {usual.tolist()}")
         if not (np.isfinite(value).all() and (value > 0).all() and (interval[:, 0] <= interval[:, 1]).all()):
             raise UserError(
                 f"{path}: {where}: values must be positive and finite, and low must not exceed high"

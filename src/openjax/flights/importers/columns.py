@@ -17,13 +17,13 @@ quaternion.
 from __future__ import annotations
 
 import math
-import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from openjax.errors import UserError
+from openjax.files import read_toml
 from openjax.flights.reading import CHANNEL_COLUMNS, LOG_COLUMNS, LogError, LogTable
 
 MAPPING_FILE = "columns.toml"
@@ -88,10 +88,7 @@ class ColumnMapping:
 def load_mapping(path: str | Path) -> ColumnMapping:
     """Read a `columns.toml`. Raises UserError for an unknown key, column or unit."""
     path = Path(path)
-    try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise UserError(f"{path}: not a readable TOML file: {error}") from error
+    tables = read_toml(path, "table of columns")
     unknown = sorted(set(tables) - {"delimiter", "columns"})
     if unknown or not isinstance(tables.get("columns"), dict):
         problem = f"unknown key {unknown[0]!r}" if unknown else "no table [columns]"

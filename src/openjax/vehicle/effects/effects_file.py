@@ -12,7 +12,6 @@ parameter's own is an error, so that nothing is converted silently.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -20,8 +19,12 @@ import numpy as np
 import tomlkit
 
 from openjax.errors import UserError
+from openjax.files import read_toml, write_text
 from openjax.vehicle.effects.effect import Parameter
 from openjax.vehicle.effects.registry import EFFECTS
+
+FAR = 100.0
+"""Values may lie outside of a parameter's usual range by this many of its widths."""
 
 _KEYS = {"value", "unit", "interval90"}
 
@@ -33,12 +36,7 @@ def load_effects(path: str | Path) -> tuple[tuple[str, ...], dict[str, dict[str,
     numbers.
     """
     path = Path(path)
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such effects file") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
-        raise UserError(f"{path}: not readable as TOML ({error})") from None
+    table = read_toml(path, "effects file")
     table.pop("notes", None)
     parameters = {}
     for name, entries in table.items():
@@ -64,6 +62,9 @@ def _value(path: Path, name: str, key: str, entry, parameter: Parameter) -> floa
         entry = entry.get("value")
     if isinstance(entry, bool) or not isinstance(entry, int | float) or not np.isfinite(entry):
         raise UserError(f"{where} must be a finite number in {parameter.unit}")
+    low, high = parameter.prior
+    if not low - FAR * (high - low) <= entry <= high + FAR * (high - low):
+        raise UserError(f"{where} = {entry:g} {parameter.unit} is far from what occurs, {low:g} to {high:g}")
     return float(entry)
 
 
@@ -99,15 +100,12 @@ def save_effects(
                 entry.append("interval90", [float(bound) for bound in interval])
             table.append(key, entry)
         document.append(name, table)
-    path = Path(path)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(tomlkit.dumps(document), encoding="utf-8")
-    partial.replace(path)
+    write_text(path, tomlkit.dumps(document))
 
 
 def load_intervals(path: str | Path) -> dict[str, dict[str, tuple[float, float]]]:
     """90 % intervals {effect: {parameter: (low, high)}} of an effects file that `load_effects` accepts."""
-    table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    table = read_toml(path, "effects file")
     found: dict[str, dict[str, tuple[float, float]]] = {}
     for name, entries in table.items():
         for key, entry in entries.items() if isinstance(entries, dict) else ():

@@ -1,0 +1,158 @@
+"""Files that people hand in, read strictly; files that openjax writes, whole or not at all."""
+
+import contextlib
+import json
+import os
+import shutil
+import tempfile
+import tomllib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from openjax.errors import UserError
+
+LARGEST_TEXT = 16 * 2**20
+"""Bytes of the largest TOML or JSON file that is read."""
+
+DEEPEST = 32
+"""Levels of nesting in a TOML or JSON file."""
+
+WRITING = ".writing-"
+"""What the names of unfinished files begin with; only a killed process leaves one behind."""
+
+
+def read_toml(path: str | Path, what: str = "file") -> dict[str, Any]:
+    """The tables of a TOML file that a person may have written.
+
+    Args:
+      path: the file.
+      what: names it in errors, for example `effects file`.
+
+    Raises:
+      UserError: it's missing, too large, no TOML or nested too deep, or holds integers of more than 64 bits.
+    """
+    return _read(path, what, "TOML", tomllib.loads)
+
+
+def read_json(path: str | Path, what: str = "file") -> Any:
+    """The value in a JSON file, as strictly as `read_toml`."""
+    return _read(path, what, "JSON", json.loads)
+
+
+def _read(path, what, language, parse: Callable[[str], Any]):
+    path = Path(path)
+    try:
+        if not path.exists():
+            raise UserError(f"{path}: no such {what}")
+        if not path.is_file():
+            raise UserError(f"{path}: is no file; the {what} is one")
+        if path.stat().st_size > LARGEST_TEXT:
+            raise UserError(f"{path}: {path.stat().st_size} bytes are too many for a {what}")
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path}: not readable as {language} (byte {error.start} is not UTF-8)") from None
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path}: can't be read ({getattr(error, 'strerror', None) or error})") from None
+    try:
+        value = parse(text)
+    except RecursionError:
+        raise UserError(f"{path}: nested more than {DEEPEST} levels deep") from None
+    except ValueError as error:
+        raise UserError(f"{path}: not readable as {language} ({error})") from None
+    _check_plain(path, value)
+    return value
+
+
+def _check_plain(path, value):
+    """Raises UserError for nesting and integers that nothing here can mean."""
+    level = [value]
+    for _ in range(DEEPEST):
+        inner = []
+        for entry in level:
+            if isinstance(entry, dict):
+                inner += entry.values()
+            elif isinstance(entry, list):
+                inner += entry
+            elif isinstance(entry, int) and not -(2**63) <= entry < 2**64:
+                raise UserError(f"{path}: holds an integer of more than 64 bits")
+        if not inner:
+            return
+        level = inner
+    raise UserError(f"{path}: nested more than {DEEPEST} levels deep")
+
+
+@contextlib.contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """A path to write a file or folder to; it takes the place of `path` when the block ends without an error.
+
+    Readers see what was there before or the whole of the new; after an error nothing of the new is left. Whatever the
+    disk or the permissions have against it is an `OSError`.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # the suffix stays the last, since some writers choose their format by it
+    partial = path.with_name(f"{WRITING}{os.getpid()}-{path.name}")
+    try:
+        yield partial
+        if path.is_dir() and not path.is_symlink():
+            if not partial.is_dir():
+                raise IsADirectoryError(21, "is a folder", str(path))
+            shutil.rmtree(path)
+        os.replace(partial, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            shutil.rmtree(partial) if partial.is_dir() else partial.unlink(missing_ok=True)
+        raise
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a UTF-8 file in one piece."""
+    with replacing(path) as partial:
+        partial.write_text(text, encoding="utf-8")
+
+
+def write_json(path: str | Path, value: Any) -> None:
+    """Write plain values (no NaN) as JSON, in one piece."""
+    write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
+
+
+def check_output(path: str | Path | None, option: str) -> None:
+    """Whether a file can be written later, asked before the work that leads to it; None is fine.
+
+    Raises:
+      UserError: its folder is missing or can't be written to, or it's a folder itself.
+    """
+    if path is None:
+        return
+    path = Path(path).absolute()
+    try:
+        if path.is_dir():
+            raise UserError(f"{option} {path}: is a folder; a file is needed")
+        if not path.parent.is_dir():
+            raise UserError(f"{option} {path}: the folder {path.parent} doesn't exist")
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+        if path.exists() and not os.access(path, os.W_OK):
+            raise UserError(f"{option} {path}: may not be written to")
+    except OSError as error:
+        raise UserError(f"{option} {path}: can't be written there ({error.strerror or error})") from None
+
+
+def check_output_folder(path: str | Path, option: str) -> None:
+    """Whether a folder is there or can be made, and can be written to; changes nothing. Raises UserError."""
+    path = Path(path).absolute()
+    try:
+        there = next(folder for folder in (path, *path.parents) if folder.exists())
+        if not there.is_dir():
+            raise UserError(f"{option} {path}: {there} is a file; a folder is needed")
+        with tempfile.TemporaryFile(dir=there):
+            pass
+    except OSError as error:
+        raise UserError(f"{option} {path}: can't be written there ({error.strerror or error})") from None
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Delete what killed processes left of files they were writing."""
+    for path in folder.glob(f"{WRITING}*"):
+        shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)

@@ -1,0 +1,119 @@
+"""Ranges of settings, declared once: in the type of the field that they belong to.
+
+    learning_rate: Annotated[float, Interval("(0, 1]")] = 5e-4
+
+`check_intervals` validates by them, `--help` shows them, and one test draws values from inside and outside of each.
+"""
+
+import dataclasses
+import functools
+import math
+import numbers
+import re
+import types
+import typing
+from typing import Annotated, Any
+
+from openjax.errors import UserError
+
+_NOTATION = re.compile(r"([\[(])\s*([^,\s]+)\s*,\s*([^,\s]+)\s*([\])])")
+
+
+@dataclasses.dataclass(frozen=True)
+class Interval:
+    """The numbers that a setting may have, in the notation of mathematics: "[1, 8]", "(0, 1]". Always bounded."""
+
+    notation: str
+
+    def __post_init__(self):
+        if not (
+            self._parts and math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high
+        ):
+            raise ValueError(f"{self.notation!r} is no bounded interval")
+
+    @functools.cached_property
+    def _parts(self):
+        return _NOTATION.fullmatch(self.notation)
+
+    @property
+    def low(self) -> float:
+        return float(self._parts[2])
+
+    @property
+    def high(self) -> float:
+        return float(self._parts[3])
+
+    def __contains__(self, value: float) -> bool:
+        above = value > self.low if self._parts[1] == "(" else value >= self.low
+        return bool(above and (value < self.high if self._parts[4] == ")" else value <= self.high))
+
+    def __str__(self) -> str:
+        return self.notation
+
+
+Seed = Annotated[int, Interval("[0, 4294967295]")]
+"""What `jax.random.key` takes."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Ranged:
+    """A field of a settings class that holds one number, several, or, where `optional`, nothing."""
+
+    name: str
+    kind: type
+    """int or float."""
+    interval: Interval
+    several: bool
+    optional: bool
+
+
+@functools.cache
+def ranged_fields(settings: type) -> tuple[Ranged, ...]:
+    """The fields of a dataclass that declare an interval."""
+    found = []
+    for name, hint in typing.get_type_hints(settings, include_extras=True).items():
+        interval = next(
+            (entry for entry in getattr(hint, "__metadata__", ()) if isinstance(entry, Interval)), None
+        )
+        if interval is None:
+            continue
+        kind = typing.get_args(hint)[0]
+        optional = isinstance(kind, types.UnionType)
+        if optional:
+            kind = next(entry for entry in typing.get_args(kind) if entry is not type(None))
+        several = typing.get_origin(kind) is tuple
+        found.append(Ranged(name, typing.get_args(kind)[0] if several else kind, interval, several, optional))
+    return tuple(found)
+
+
+def check_intervals(settings: Any, group: str = "") -> None:
+    """Whether every number of a dataclass lies in its interval.
+
+    Args:
+      settings: dataclass; nested ones check themselves.
+      group: what stands before a field's name in the error, for example `mappo.`.
+
+    Raises:
+      UserError: one doesn't, with its name and interval.
+    """
+    for field in ranged_fields(type(settings)):
+        given = getattr(settings, field.name)
+        if given is None and field.optional:
+            continue
+        if field.several and not isinstance(given, tuple | list):
+            raise UserError(f"{group}{field.name} is {_shown(given)}; it must be a list of numbers")
+        kind = numbers.Integral if field.kind is int else numbers.Real
+        for value in given if field.several else (given,):
+            if isinstance(value, bool) or not isinstance(value, kind) or value not in field.interval:
+                whole = "a whole number in" if field.kind is int else "in"
+                raise UserError(
+                    f"{group}{field.name} is {_shown(value)}; it must be {whole} {field.interval}"
+                )
+
+
+def _shown(value):
+    """A value as it may stand in one line."""
+    if isinstance(value, int) and abs(value) >= 10**20:
+        return "a number of more than 20 digits"
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

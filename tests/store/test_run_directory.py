@@ -1,0 +1,72 @@
+"""Run directories: one process at a time, nothing foreign overwritten, a killed start in nobody's way."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from openjax.errors import UserError
+from openjax.learning import preset
+from openjax.store.run_directory import check_free, create_run, locked, open_run
+
+HOLD = """
+import sys, time
+from openjax.store.run_directory import locked
+with locked(sys.argv[1]):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_a_directory_is_for_one_process_until_it_ends_or_is_killed(tmp_path):
+    run = tmp_path / "run"
+    holder = subprocess.Popen([sys.executable, "-c", HOLD, str(run)], stdout=subprocess.PIPE, text=True)
+    assert holder.stdout.readline() == "held\n"
+    with pytest.raises(UserError, match="another process trains"), locked(run):
+        pass
+    holder.send_signal(signal.SIGKILL)
+    holder.communicate()
+    assert os.listdir(run) == ["run.lock"]  # which holds nobody up
+    check_free(run, overwrite=False)
+    with locked(run):
+        with pytest.raises(UserError, match="another process trains"), locked(run):
+            pass
+        create_run(run, overwrite=False)
+    assert os.listdir(run) == []
+
+
+def test_what_a_killed_start_left_is_taken_over_but_nothing_else(tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    for name in ("vehicle.toml", ".writing-123-settings.json", "run.lock"):
+        (run / name).write_text("")
+    (run / "checkpoints").mkdir()
+    check_free(run, overwrite=False)
+    with pytest.raises(UserError, match="is no run"):
+        open_run(run)
+    create_run(run, overwrite=False)
+    assert [path.name for path in run.iterdir()] == ["run.lock"]
+    (run / "thesis.tex").write_text("")
+    for overwrite in (False, True):
+        with pytest.raises(UserError, match="holds files that are no run"):
+            check_free(run, overwrite)
+
+
+def test_settings_of_an_earlier_version_keep_loading(tmp_path):
+    run = create_run(tmp_path, overwrite=False)
+    run.write_settings(preset("quick"), {})
+    text = run.settings_file.read_text()
+    for new, old in (("clip_epsilon_end", "clip_end"), ("clip_epsilon", "clip"), ("gae_lambda", "trace")):
+        text = text.replace(f'"{new}"', f'"{old}"')
+    text = text.replace("validation_", "evaluation_").replace(
+        '"observe_time"', '"observe_others_motion": false, "observe_time"'
+    )
+    run.settings_file.write_text(text)
+    assert run.read_settings() == preset("quick")
+    run.settings_file.write_text(
+        text.replace('"observe_others_motion": false', '"observe_others_motion": true')
+    )
+    with pytest.raises(UserError, match="unknown setting 'observe_others_motion'"):
+        run.read_settings()
