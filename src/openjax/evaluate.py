@@ -60,22 +60,34 @@ class EvaluateCommand:
 def main(arguments: Sequence[str]) -> int:
     """The command; returns its exit status."""
     command = parse(EvaluateCommand, EvaluateCommand(), arguments, PROGRAM)
-    _check(command)
-    from openjax.cluster.compilation import cache_programs
+    if command.compilation_cache:
+        from openjax.cluster.compilation import cache_programs
+
+        cache_programs()
+    evaluators: dict = {}
+    policies = prepare(command, arguments)
+    _show(command, [(loaded.source, fly_scenarios(own, loaded, evaluators)[0]) for own, loaded in policies])
+    return 0
+
+
+def prepare(command: EvaluateCommand, arguments: Sequence[str]) -> list[tuple]:
+    """Each policy, and the command with that policy's own game as the default; all that can be wrong was looked at.
+
+    Raises:
+      UserError: an unusable file or layout, or a game that a policy can't play.
+    """
     from openjax.store.policies import load_policy
 
-    if command.compilation_cache:
-        cache_programs()
-
-    evaluators: dict = {}
-    results = []
+    if not command.policy:
+        raise UserError("--policy needs at least one policy")
+    check_output(command.json, "--json")
+    policies = []
     for loaded in [load_policy(name) for name in command.policy]:
-        # Once more, with the game of this policy as the default.
         default = dataclasses.replace(EvaluateCommand(), environment=loaded.settings.environment)
         own = parse(EvaluateCommand, default, arguments, PROGRAM)
-        results.append((loaded.source, fly_scenarios(own, loaded, evaluators)[0]))
-    _show(command, results)
-    return 0
+        _game(own, loaded)
+        policies.append((own, loaded))
+    return policies
 
 
 def fly_scenarios(command: EvaluateCommand, loaded, evaluators: dict) -> tuple[list[dict], list]:
@@ -89,7 +101,18 @@ def fly_scenarios(command: EvaluateCommand, loaded, evaluators: dict) -> tuple[l
     Raises:
       UserError: an unusable layout, or a game that the policy can't play.
     """
-    from openjax.commands.evaluator import Evaluator, evaluate_scenarios, layout_slots
+    from openjax.commands.evaluator import Evaluator, evaluate_scenarios
+
+    game, loaded, scenarios = _game(command, loaded)
+    kind = (game.settings, loaded.policy)
+    if kind not in evaluators:
+        evaluators[kind] = Evaluator(game, loaded.policy, command.episodes)
+    return evaluate_scenarios(evaluators[kind], loaded.parameters, scenarios, command.episodes, command.seed)
+
+
+def _game(command, loaded):
+    """The game of a command, the policy in it, and the scenarios."""
+    from openjax.commands.evaluator import layout_slots
     from openjax.store.environments import make_environment
 
     settings = command.environment
@@ -100,17 +123,7 @@ def fly_scenarios(command: EvaluateCommand, loaded, evaluators: dict) -> tuple[l
     slots = max(layout_slots(settings), *(len(scenario.pillars) for scenario in scenarios))
     settings = dataclasses.replace(settings, max_pillars=slots, num_pursuers=len(scenarios[0].pursuers))
     environment = make_environment(settings, command.vehicle, command.effects)
-    loaded = loaded.in_game(environment)
-    kind = (settings, loaded.policy)
-    if kind not in evaluators:
-        evaluators[kind] = Evaluator(environment, loaded.policy, command.episodes)
-    return evaluate_scenarios(evaluators[kind], loaded.parameters, scenarios, command.episodes, command.seed)
-
-
-def _check(command):
-    if not command.policy:
-        raise UserError("--policy needs at least one policy")
-    check_output(command.json, "--json")
+    return environment, loaded.in_game(environment), scenarios
 
 
 def _show(command, results):

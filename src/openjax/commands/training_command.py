@@ -128,15 +128,38 @@ def start(command: TrainCommand, arguments: Sequence[str], started: float, proce
     _check_same(command, processes)
     if command.compilation_cache:
         cache_programs()
-    # Everything that can be wrong with the files is found before the directory is touched.
+    job, directory, files = prepare(command, arguments, started, processes)
+    processes.everyone()  # a mistake shows before any process changes a file
+    with locked(directory.path) if processes.is_first else contextlib.nullcontext():
+        if command.resume is None and processes.is_first:
+            create_run(directory.path, command.overwrite)
+            for name, path in files.items():
+                shutil.copyfile(path, directory.path / name)
+            directory.write_settings(command.settings, job.facts)
+        processes.everyone()
+        if not directory.path.is_dir():
+            raise UserError(
+                f"{directory.path} isn't there on the host of process {processes.index}; all hosts must share it"
+            )
+        return run_job(job, directory, console=output_console())
+
+
+def prepare(
+    command: TrainCommand, arguments: Sequence[str], started: float, processes: Processes
+) -> tuple[TrainingJob, RunDirectory, dict[str, Path]]:
+    """What to train, where, and the files to copy there, by their names; nothing is changed yet.
+
+    Raises:
+      UserError: whatever can be wrong with the files or the settings.
+    """
     resumed = None if command.resume is None else open_run(command.resume)
     vehicle = command.vehicle or (resumed.optional("vehicle.toml") if resumed else None)
     effects = command.effects or (resumed.optional("effects.toml") if resumed else None)
     start_from = command.start_from or (resumed.read_facts().get("start_from") if resumed else None)
     environment = make_environment(command.settings.environment, vehicle, effects)
     devices = _devices(command.devices)
-    name = command.preset or default_preset()
     if resumed is None:
+        name = command.preset or default_preset()
         out = command.out or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{name}"
         out = Path(processes.of_first(str(out)))
         check_free(out, command.overwrite)
@@ -156,19 +179,8 @@ def start(command: TrainCommand, arguments: Sequence[str], started: float, proce
         started=started,
     )
     job.check()
-    processes.everyone()  # a mistake shows before any process changes a file
-    directory = resumed or RunDirectory(out)
-    with locked(directory.path) if processes.is_first else contextlib.nullcontext():
-        if resumed is None and processes.is_first:
-            create_run(out, command.overwrite)
-            _copy_files(directory, vehicle, effects)
-            directory.write_settings(command.settings, job.facts)
-        processes.everyone()
-        if not directory.path.is_dir():
-            raise UserError(
-                f"{directory.path} isn't there on the host of process {processes.index}; all hosts must share it"
-            )
-        return run_job(job, directory, console=output_console())
+    files = {"vehicle.toml": vehicle, "effects.toml": effects}
+    return job, resumed or RunDirectory(out), {name: path for name, path in files.items() if path is not None}
 
 
 def _check_same(command, processes):
@@ -225,9 +237,3 @@ def _devices(text):
             f"--devices is {text[:40]!r}; expected all or a number up to the {available} that are here"
         )
     return int(text)
-
-
-def _copy_files(directory: RunDirectory, vehicle, effects):
-    for name, path in (("vehicle.toml", vehicle), ("effects.toml", effects)):
-        if path is not None:
-            shutil.copyfile(path, directory.path / name)
