@@ -23,8 +23,8 @@ from openjax.commands.machine import describe_machine
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, Task, action_to_command
 from openjax.pursuit.collisions import breaches, crashed, drone_distance, pillar_distance
 from openjax.pursuit.observation import rotation_axes
-from openjax.pursuit.settings import SOLID_RADIUS
 from openjax.vehicle import DroneState, make_drones_step
+from openjax.vehicle.solids import DRONE_RADIUS
 
 STEPS = 200
 """Control steps that are flown; then all is calm."""
@@ -78,9 +78,9 @@ def fly(environment: Pursuit, task: Task, drones: DroneState, plan: dict[str, ja
             near(settings.arena_height - position[:, 2], 0.0),
         ]
         solid = [
-            near(to_pillar, SOLID_RADIUS),
-            near(apart, 2 * SOLID_RADIUS),
-            near(position[:, 2], SOLID_RADIUS),
+            near(to_pillar, DRONE_RADIUS),
+            near(apart, 2 * DRONE_RADIUS),
+            near(position[:, 2], DRONE_RADIUS),
             near(up, 0.0),
         ]
         free = jnp.prod(jnp.stack([jnp.prod(1 - count) for count, _ in kinds]))

@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from openjax.pursuit.settings import SOLID_RADIUS, PursuitSettings
+from openjax.pursuit.settings import PursuitSettings
+from openjax.vehicle.solids import DRONE_RADIUS
 
 TOUCH = 1e-3
 """A gap between solids below this (m) counts as touching: contacts are soft by a fraction of it."""
@@ -70,10 +71,10 @@ def crashed(
 
     `body_z_up` (N,) is the world z component of the body's z axis. `margin` widens every limit (m; and the cosine).
     """
-    reach = SOLID_RADIUS + TOUCH + margin
+    reach = DRONE_RADIUS + TOUCH + margin
     on_floor = position[:, 2] < reach
     on_pillar = jnp.any(
         pillar_active & (pillar_distance(settings, position, pillar_position) < reach), axis=-1
     )
-    on_drone = jnp.any(drone_distance(position) < SOLID_RADIUS + reach, axis=-1)
+    on_drone = jnp.any(drone_distance(position) < DRONE_RADIUS + reach, axis=-1)
     return on_floor | on_pillar | on_drone | (body_z_up < margin)

@@ -105,8 +105,7 @@ class Pursuit:
             substeps=self.settings.substeps,
             effects=(*drawn, *self.effects),
             contacts=self.settings.contacts,
-            pillar_radius=self.settings.pillar_radius,
-            pillar_height=self.settings.arena_height,
+            arena=self.settings.arena,
         )
 
     @property

@@ -8,8 +8,9 @@ import numpy as np
 
 from openjax.errors import UserError
 from openjax.files import read_toml
-from openjax.pursuit.settings import SOLID_RADIUS, PursuitSettings
+from openjax.pursuit.settings import PursuitSettings
 from openjax.pursuit.task import Task
+from openjax.vehicle.solids import DRONE_RADIUS
 
 MOST_PILLARS = 32
 """Of a layout; each costs time in every step."""
@@ -179,12 +180,12 @@ def _check(path, scenario, settings):
                 f"scenario {path}: {who} starts at ({x}, {y}, {z}), outside the arena of {radius} m by {height} m"
             )
         for px, py in scenario.pillars:
-            reach = settings.pillar_radius + SOLID_RADIUS
+            reach = settings.pillar_radius + DRONE_RADIUS
             if np.hypot(x - px, y - py) < reach:
                 raise UserError(
                     f"scenario {path}: pillar ({px}, {py}) stands over the start of {who} (within {reach} m)"
                 )
     for i, a in enumerate(scenario.pursuers):
         for b in scenario.pursuers[:i]:
-            if np.linalg.norm(np.subtract(a, b)) < 2 * SOLID_RADIUS:
+            if np.linalg.norm(np.subtract(a, b)) < 2 * DRONE_RADIUS:
                 raise UserError(f"scenario {path}: two pursuers start inside each other at {a} and {b}")

@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 from openjax.errors import UserError
 from openjax.ranges import Interval, check_intervals
+from openjax.vehicle.arena import Arena
 from openjax.vehicle.family import check_ranges
 
 HIDDEN = -5.0
@@ -12,9 +13,6 @@ HIDDEN = -5.0
 
 OWN_FRAME = 13
 """Numbers in a frame of the own history: velocity, body x and z axes, command."""
-
-SOLID_RADIUS = 0.05
-"""Radius (m) of the sphere that makes a drone solid."""
 
 
 @dataclass(frozen=True)
@@ -113,6 +111,11 @@ class PursuitSettings:
                 f"environment.min_pillars {self.min_pillars} is more than environment.max_pillars {self.max_pillars}"
             )
         check_ranges(self.vehicles)
+
+    @property
+    def arena(self) -> Arena:
+        """The sizes that vehicles, effects and pictures need."""
+        return Arena(self.arena_radius, self.arena_height, self.pillar_radius)
 
     @property
     def middle(self) -> tuple[float, float, float]:

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from openjax.errors import UserError
+from openjax.vehicle.arena import Arena
 from openjax.vehicle.effects import composition
 from openjax.vehicle.effects.effect import Context, Effect, make_context
 from openjax.vehicle.mjx_body import make_world, mjx_step
@@ -18,7 +19,6 @@ from openjax.vehicle.rigid_body import rigid_step, rotate
 from openjax.vehicle.rigid_kernel import FusedStep, step_many
 from openjax.vehicle.rotors import rotor_reaction, rotor_speed_step, rotor_thrust
 from openjax.vehicle.solids import (
-    PillarShape,
     Surroundings,
     contact_acceleration,
     encounters,
@@ -41,7 +41,7 @@ class DronesStep:
     dt: float
     substeps: int
     contacts: bool
-    pillar: PillarShape
+    arena: Arena
     effects: tuple[Effect, ...] = field(repr=False)
 
     def __call__(
@@ -84,7 +84,7 @@ class DronesStep:
         else:
             drones, _ = jax.lax.scan(substep, drones, None, length=self.substeps)
         if self.physics == "stops":
-            drones = stop(drones, pillar_position, pillar_active)
+            drones = stop(self.arena, drones, pillar_position, pillar_active)
         if self.effects:
             memory = jax.vmap(
                 lambda drone: composition.record(self.effects, drone.effect_memory, drone, self.dt)
@@ -139,8 +139,14 @@ class DronesStep:
         neighbours = drones.position[others(drones.position.shape[0])]
 
         def context(vehicle, drone, neighbour):
-            air_time = drone.effect_memory[composition.AIR_TIME]
-            return make_context(vehicle, drone, others_position=neighbour, air_time=air_time, dt=dt)
+            return make_context(
+                vehicle,
+                drone,
+                others_position=neighbour,
+                air_time=drone.effect_memory[composition.AIR_TIME],
+                ceiling_height=self.arena.height,
+                dt=dt,
+            )
 
         return jax.vmap(context, (_vehicles_axis(vehicle), 0, 0))(vehicle, drones, neighbours)
 
@@ -165,10 +171,10 @@ class DronesStep:
         motors = lambda *drone: self._motors(*drone, dt)  # noqa: E731
         moved, force, torque = jax.vmap(motors, axes)(vehicle, parameters, drones, command, contexts)
         body = (drones.position, drones.quaternion, drones.velocity, drones.body_rates, force, torque)
-        world, shapes = make_world(self.pillar, 0, 0, dt, False), None
+        world, shapes = make_world(self.arena, 0, 0, dt, False), None
         if self.contacts:
-            world = make_world(self.pillar, pillar_position.shape[0], drones.position.shape[0] - 1, dt, True)
-            place = lambda *drone: place_solids(encounters(self.pillar, *drone, dt))  # noqa: E731
+            world = make_world(self.arena, pillar_position.shape[0], drones.position.shape[0] - 1, dt, True)
+            place = lambda *drone: place_solids(encounters(self.arena, *drone, dt))  # noqa: E731
             shapes = jax.vmap(place)(drones.position, drones.velocity, around)
         axes = (axes[0], None if shapes is None else 0, *(0 for _ in body))
         move = lambda vehicle, *parts: mjx_step(world, vehicle, *parts, dt)  # noqa: E731
@@ -183,7 +189,7 @@ class DronesStep:
         if around is not None:
 
             def contact(free):
-                return contact_acceleration(self.pillar, drone.position, drone.velocity, free, around, dt)
+                return contact_acceleration(self.arena, drone.position, drone.velocity, free, around, dt)
 
         return _with_body(moved, rigid_step(vehicle, *body, dt, contact))
 
@@ -234,13 +240,12 @@ def make_drones_step(
     contacts: bool = True,
     max_pillars: int | None = None,
     num_drones: int | None = None,
-    pillar_radius: float = PillarShape.radius,
-    pillar_height: float = PillarShape.height,
+    arena: Arena = Arena(),  # noqa: B008
 ) -> DronesStep:
     """Make the step of N drones of one world.
 
     physics "mjx": MuJoCo MJX; "rigid": the same equations written out, many times faster. In both floor, pillars
-    (of `pillar_radius` and `pillar_height`, m) and other drones are solid unless `contacts` is off. "stops": free
+    (of the `arena`'s sizes) and other drones are solid unless `contacts` is off. "stops": free
     flight, and drones are put back out of solid things once per step. dt is the step
     in seconds; `substeps` divide it, and the rate controller runs in each. `effects` (names or `Effect`s) are modelled
     beyond the nominal vehicle. Within a substep: controller on the present state, motors, rotor speeds,
@@ -254,7 +259,6 @@ def make_drones_step(
         raise UserError(f"physics {physics!r} is unknown; one of {', '.join(PHYSICS)} would be right")
     if substeps < 1 or dt <= 0:
         raise UserError(f"dt {dt} with {substeps} substeps: dt > 0 and substeps >= 1 would be right")
-    pillar = PillarShape(pillar_radius, pillar_height)
     if physics == "mjx" and contacts and max_pillars is not None and num_drones is not None:
-        make_world(pillar, max_pillars, num_drones - 1, dt / substeps, True)
-    return DronesStep(physics, dt, substeps, contacts, pillar, composition.resolve(effects))
+        make_world(arena, max_pillars, num_drones - 1, dt / substeps, True)
+    return DronesStep(physics, dt, substeps, contacts, arena, composition.resolve(effects))

@@ -19,9 +19,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from openjax.vehicle.arena import Arena
 from openjax.vehicle.parameters import Vehicle, assets_directory, read_mjcf
 from openjax.vehicle.rigid_body import euler_step
-from openjax.vehicle.solids import DRONE_RADIUS, PillarShape, solids_xml
+from openjax.vehicle.solids import DRONE_RADIUS, solids_xml
 
 # MJX prints two lines when its optional backend is not installed; it is not used here.
 with contextlib.redirect_stdout(io.StringIO()):
@@ -35,13 +36,13 @@ class World(NamedTuple):
     data: mjx.Data
 
 
-def world_xml(pillar: PillarShape, n_pillars: int, n_others: int, dt: float, contacts: bool = True) -> str:
+def world_xml(arena: Arena, n_pillars: int, n_others: int, dt: float, contacts: bool = True) -> str:
     """MJCF of one drone; a step lasts dt seconds. The drone's geom comes after those of `solids_xml`.
 
     One Newton iteration finds the contact forces for the things that are hit, without a loop.
     """
     nominal = read_mjcf(str(assets_directory() / "crazyflie.xml"))
-    shapes, pairs = solids_xml(pillar, n_pillars, n_others, dt) if contacts else ("", "")
+    shapes, pairs = solids_xml(arena, n_pillars, n_others, dt) if contacts else ("", "")
     inertia = " ".join(str(value) for value in nominal["inertia"].tolist())
     return f"""<mujoco>
       <option timestep="{dt}" integrator="Euler" solver="Newton" iterations="1" ls_iterations="1"
@@ -61,9 +62,9 @@ def world_xml(pillar: PillarShape, n_pillars: int, n_others: int, dt: float, con
 
 
 @lru_cache(maxsize=32)
-def make_world(pillar: PillarShape, n_pillars: int, n_others: int, dt: float, contacts: bool) -> World:
+def make_world(arena: Arena, n_pillars: int, n_others: int, dt: float, contacts: bool) -> World:
     """The compiled world; numpy arrays, so that it can be closed over by compiled code of any precision."""
-    model = mujoco.MjModel.from_xml_string(world_xml(pillar, n_pillars, n_others, dt, contacts))
+    model = mujoco.MjModel.from_xml_string(world_xml(arena, n_pillars, n_others, dt, contacts))
     device = jax.local_devices()[0]  # of several processes each builds its own
 
     def build():

@@ -12,23 +12,15 @@ The same contacts are solved by MuJoCo MJX (`place_solids`, `mjx_body`) and, wri
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from openjax.vehicle.arena import Arena
+
 DRONE_RADIUS = 0.05  # m, the solid sphere of a drone
 PARKED = -100.0  # m, height of a pillar that isn't there
-
-
-@dataclass(frozen=True)
-class PillarShape:
-    """Pillars: vertical, standing on the floor, rounded above the cylindrical part. Lengths in m."""
-
-    radius: float = 0.1
-    height: float = 1.2
 
 
 @flax.struct.dataclass
@@ -67,11 +59,13 @@ _NEAR = 0.04  # m, gap within which a thing counts as near: the way of a fast dr
 _TOUCHING = -1e-6  # m, gap at which a contact acts but doesn't push
 
 
-def solids_xml(pillar: PillarShape, n_pillars: int, n_others: int, dt: float) -> tuple[str, str]:
+def solids_xml(arena: Arena, n_pillars: int, n_others: int, dt: float) -> tuple[str, str]:
     """MJCF of the shapes (floor, pillars, other drones) and of their contact pairs with the geom "drone"."""
     shapes = ['<geom name="floor" type="plane" size="0 0 1"/>']
     for k in range(n_pillars):
-        shapes.append(f'<geom name="pillar_{k}" type="capsule" size="{pillar.radius} {pillar.height / 2}"/>')
+        shapes.append(
+            f'<geom name="pillar_{k}" type="capsule" size="{arena.pillar_radius} {arena.height / 2}"/>'
+        )
     for k in range(n_others):
         shapes.append(f'<geom name="other_{k}" type="sphere" size="{DRONE_RADIUS}"/>')
     names = ["floor", *(f"pillar_{k}" for k in range(n_pillars)), *(f"other_{k}" for k in range(n_others))]
@@ -112,9 +106,9 @@ def surroundings(position, velocity, pillar_position, pillar_active) -> Surround
     )
 
 
-def encounters(pillar: PillarShape, position, velocity, around: Surroundings, dt) -> Encounters:
+def encounters(arena: Arena, position, velocity, around: Surroundings, dt) -> Encounters:
     """One drone at `position` (3,) m with `velocity` (3,) m/s beside its solid things, for a step of dt seconds."""
-    dtype, half = position.dtype, pillar.height / 2
+    dtype, half = position.dtype, arena.height / 2
     p, k = around.pillar_position.shape[0], around.other_position.shape[0]
     height = jnp.where(around.pillar_active, half, PARKED).astype(dtype)[:, None]
     below = (position * jnp.array([1, 1, 0], dtype))[None]
@@ -123,7 +117,7 @@ def encounters(pillar: PillarShape, position, velocity, around: Surroundings, dt
     middle = jnp.concatenate([around.pillar_position, height], axis=1)
     nearest = jnp.concatenate([below, axis, around.other_position])
     moving = jnp.concatenate([jnp.zeros((1 + p, 3), dtype), around.other_velocity])
-    radius = np.r_[DRONE_RADIUS, np.full(p, pillar.radius + DRONE_RADIUS), np.full(k, 2 * DRONE_RADIUS)]
+    radius = np.r_[DRONE_RADIUS, np.full(p, arena.pillar_radius + DRONE_RADIUS), np.full(k, 2 * DRONE_RADIUS)]
     away = position - nearest
     distance = jnp.sqrt(jnp.sum(away * away, axis=-1) + 1e-12)
     normal = away / distance[:, None]
@@ -144,7 +138,7 @@ def place_solids(met: Encounters) -> jax.Array:
 
 
 def contact_acceleration(
-    pillar: PillarShape, position, velocity, acceleration, around: Surroundings, dt
+    arena: Arena, position, velocity, acceleration, around: Surroundings, dt
 ) -> jax.Array:
     """What contacts add over a step of dt seconds to the `acceleration` (3,) m/s^2 that a drone would have without them.
 
@@ -156,7 +150,7 @@ def contact_acceleration(
     with weights w_i = d / (1 - d) of the impedance d and reference accelerations r_i = -(b n_i v + k gap_i) / d. As the
     MJCF's solver does, this takes one Newton step from a_free: exact unless the step brings in another contact.
     """
-    met = encounters(pillar, position, velocity, around, dt)
+    met = encounters(arena, position, velocity, around, dt)
     contacts = _contacts(around.pillar_position.shape[0], around.other_position.shape[0])
     stiffness, damping, impedance = (jnp.asarray(column, velocity.dtype) for column in contacts.T)
     approach = jnp.sum(met.normal * velocity, axis=-1)

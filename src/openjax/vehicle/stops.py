@@ -7,17 +7,18 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from openjax.vehicle.solids import DRONE_RADIUS, PillarShape
+from openjax.vehicle.arena import Arena
+from openjax.vehicle.solids import DRONE_RADIUS
 from openjax.vehicle.state import DroneState
 
 
-def stop(drones: DroneState, pillar_position, pillar_active) -> DroneState:
+def stop(arena: Arena, drones: DroneState, pillar_position, pillar_active) -> DroneState:
     """`drones` (leading axis N) out of the floor, pillars (P, 2) m in use (P,) and one another; no friction, no bounce."""
     position, velocity = drones.position, drones.velocity
     if pillar_position.shape[0]:
         away = position[:, None, :2] - pillar_position[None]
         position, velocity = _push(
-            position, velocity, away, PillarShape.radius + DRONE_RADIUS, pillar_active[None], 1.0
+            position, velocity, away, arena.pillar_radius + DRONE_RADIUS, pillar_active[None], 1.0
         )
     if position.shape[0] > 1:
         apart = position[:, None] - position[None]

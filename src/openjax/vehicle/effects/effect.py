@@ -10,10 +10,11 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
+from openjax.vehicle.arena import Arena
 from openjax.vehicle.parameters import Vehicle
 from openjax.vehicle.state import DroneState
 
-ARENA_CEILING = 1.2  # m
+ARENA_CEILING = Arena.height  # m
 
 
 @flax.struct.dataclass
