@@ -26,7 +26,7 @@ class ApfParameters:
     """eta: scale of the obstacles' repulsion (m^3)."""
     influence: jax.Array = parameter(0.3, 0.05, 0.6)
     """rho: distance from a surface beyond which it doesn't repel (m)."""
-    margin: jax.Array = parameter(0.1, 0.05, 0.25)
+    margin: jax.Array = parameter(0.14, 0.05, 0.25)
     """Distance from a surface at which its repulsion grows without bound (m); the robot's radius in the source."""
     balance: jax.Array = parameter(0.2, 0.003, 1.0)
     """lambda: of the force between pursuers, 1/2 - lambda / d: they keep 2 lambda apart (m)."""
