@@ -1,7 +1,8 @@
 """Figures of the flying loop: `python experiments/flying_figures.py OUT [--minutes 10]`.
 
 Everything goes through the commands that a user types, in processes of their own, with the real cflib over UDP:
-* long: three virtual Crazyflies, game after game, for the minutes given: command age, missed deadlines, captures.
+* long: three virtual Crazyflies, game after game, for the minutes given: command age, missed deadlines.
+* layouts: a few games on each layout: captures.
 * links: flights with set-points that come late or get lost; each is a case for the diagnosis (see `diagnose`).
 * simulator: the same policy on the same layouts in the simulator alone, from level starts without clamp.
 
@@ -14,7 +15,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,12 +39,12 @@ class Arguments:
 
     out: Annotated[Path, tyro.conf.Positional]
     """Folder for logs and figures."""
-    part: Literal["all", "long", "links", "simulator", "diagnose"] = "all"
+    part: Literal["all", "long", "layouts", "links", "simulator", "diagnose"] = "all"
     policy: str = "no_clamp_seed_0"
     minutes: float = 10.0
     """Of the long flight."""
-    at_once: int = 3
-    """Pairs of processes for the links."""
+    at_once: int = 4
+    """Pairs of processes beside the long flight's."""
     games: int = 4
     """Per link."""
     virtual: tuple[str, ...] = ()
@@ -74,6 +74,7 @@ def pair(arguments, number: int, out: Path, virtual: list[str], fly: list[str], 
             timeout=seconds,
             check=False,
         )
+        print(out.name, " ".join((ran.stdout[-500:] + ran.stderr[-1500:]).split()), flush=True)
         if not (out / "flight.json").exists():
             return {"error": ran.stdout[-600:] + ran.stderr[-1500:]}
         return json.loads((out / "flight.json").read_text(encoding="utf-8"))
@@ -85,21 +86,27 @@ def pair(arguments, number: int, out: Path, virtual: list[str], fly: list[str], 
 
 
 def long(arguments) -> dict:
-    """Games on the layouts in turn, one flight each, until the minutes are over."""
-    flights, begin, share = {}, time.monotonic(), 60 * arguments.minutes / len(LAYOUTS)
-    for layout in LAYOUTS:
-        games = max(1, int((share - 5) / 10.5))
-        out = arguments.out / f"long_{layout}"
-        options = ["--scenario", layout, "--episodes", str(games)]
-        flights[layout] = pair(
-            arguments, 0, out, ["--scenario", layout, "--endurance", "3600"], options, 4 * share + 120
+    """One flight, game after game, until the minutes are over."""
+    games = max(1, int(60 * arguments.minutes / 10.8))
+    options = ["--scenario", "wall", "--episodes", str(games)]
+    return pair(
+        arguments, 0, arguments.out / "long", ["--endurance", "7200"], options, 90 * arguments.minutes + 120
+    )
+
+
+def layouts(arguments) -> dict:
+    """A few games on each layout."""
+
+    def fly(number):
+        layout = LAYOUTS[number]
+        options = ["--scenario", layout, "--episodes", str(arguments.games)]
+        out = arguments.out / f"layout_{layout}"
+        return layout, pair(
+            arguments, 20 + number, out, ["--scenario", layout], options, 120 + 20 * arguments.games
         )
-        print(
-            layout,
-            f"{time.monotonic() - begin:.0f} s",
-            json.dumps(flights[layout].get("timing", flights[layout])),
-        )
-    return flights
+
+    with ThreadPoolExecutor(max(1, arguments.at_once // 2)) as pool:
+        return dict(pool.map(fly, range(len(LAYOUTS))))
 
 
 def links(arguments) -> dict:
@@ -124,7 +131,7 @@ def links(arguments) -> dict:
         )
         return name, {"latency_ms": latency, "loss": loss, **result}
 
-    with ThreadPoolExecutor(arguments.at_once) as pool:
+    with ThreadPoolExecutor(max(1, arguments.at_once // 2)) as pool:
         return dict(pool.map(fly, range(len(LINKS))))
 
 
@@ -154,7 +161,7 @@ def capture_table(figures) -> list[str]:
         "| layout | games | captured, flown | step, flown | captured, simulated | step, simulated | ratio |",
         "|---|" + 6 * "---|",
     ]
-    for layout, flight in figures["long"].items():
+    for layout, flight in figures["layouts"].items():
         if "error" in flight:
             rows.append(f"| {layout} | {' '.join(flight['error'].split())[-200:]} |")
             continue
@@ -176,15 +183,23 @@ def main() -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
     path = arguments.out / "figures.json"
     figures = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    parts = ("long", "links", "simulator") if arguments.part == "all" else (arguments.part,)
+    parts = ("long", "layouts", "links", "simulator") if arguments.part == "all" else (arguments.part,)
+    work = {"long": long, "layouts": layouts, "links": links, "simulator": simulator}
+
+    def run(part):
+        figures[part] = work[part](arguments)
+        path.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+
     with ThreadPoolExecutor(len(parts)) as pool:
-        work = {"long": long, "links": links, "simulator": simulator}
-        results = {part: pool.submit(work[part], arguments) for part in parts if part in work}
-        figures |= {part: result.result() for part, result in results.items()}
+        list(pool.map(run, [part for part in parts if part in work]))
     if arguments.part == "diagnose":
         figures["diagnosis"] = diagnose(arguments, figures["links"])
     path.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
     if "long" in figures:
+        print(
+            "long", json.dumps(figures["long"].get("timing", figures["long"])), figures["long"].get("reasons")
+        )
+    if "layouts" in figures:
         print("\n".join(capture_table(figures)))
     for name, flight in figures.get("links", {}).items():
         print(name, flight.get("error") or [g["steps"] for g in flight["games"]], flight.get("reasons"))
