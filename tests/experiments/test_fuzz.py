@@ -1,0 +1,27 @@
+"""A few hundred hostile inputs and a few damaged checkpoints; `experiments/fuzz.py` tries thousands."""
+
+import sys
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
+
+import fuzz
+
+NUMBER = {"settings files": 60, "layouts": 60, "effects files": 60, "vehicle files": 60}
+
+
+@pytest.mark.parametrize("kind", fuzz.KINDS)
+def test_hostile_input_is_refused_in_one_line_or_taken_sanely(kind):
+    cases = fuzz.try_cases(kind, range(NUMBER.get(kind, 15)))
+    failed = [(seed, text) for _, seed, outcome, text in cases if outcome == "failed"]
+    assert not failed, failed[0]
+    assert Counter(outcome for _, _, outcome, _ in cases)["refused"]
+
+
+def test_no_damage_to_a_checkpoint_goes_unseen(tmp_path):
+    carries = fuzz.make_checkpoints(tmp_path)
+    outcomes = Counter(fuzz.try_damages(tmp_path, carries, range(12)))
+    assert set(outcomes) <= {"same", "before", "refused"} and outcomes["before"]
