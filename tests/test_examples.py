@@ -23,6 +23,14 @@ def test_own_game_captures(capsys):
     assert captured >= 32  # of 64: the controller of the example flies
 
 
+def test_own_controller_is_flown_like_a_policy(capsys):
+    runpy.run_path(str(EXAMPLES / "own_controller.py"))
+    rows = {line.split()[0]: line.split() for line in capsys.readouterr().out.splitlines()}
+    captured = {name: float(row[2].rstrip(",")) for name, row in rows.items()}
+    assert captured["open"] == 1.0  # the shipped policy, in the same game
+    assert captured["chase"] < captured["open"]  # running after a faster one isn't enough
+
+
 def test_training_from_python_gives_a_policy(tmp_path, monkeypatch, capsys):
     tiny = openjax.preset("quick")
     tiny = dataclasses.replace(

@@ -2,12 +2,18 @@
 
 import dataclasses
 import time
+from collections.abc import Callable
 from pathlib import Path
 
+import jax
+
 from openjax.cluster.processes import Processes
+from openjax.commands.own_controller import OwnController
 from openjax.commands.training_command import TrainCommand, default_preset, start
 from openjax.errors import UserError
 from openjax.learning import TrainSettings, preset
+from openjax.policy import PolicyParameters
+from openjax.pursuit import Observation, PursuitSettings
 from openjax.store.policies import LoadedPolicy, load_policy
 
 
@@ -57,7 +63,7 @@ def train(
 
 
 def evaluate(
-    policy: LoadedPolicy | str | Path,
+    policy: LoadedPolicy | str | Path | Callable[[Observation], jax.Array],
     scenario: str = "all",
     *,
     episodes: int = 100,
@@ -69,7 +75,8 @@ def evaluate(
     """Fly a policy's mean on layouts as `python -m openjax.evaluate` does.
 
     Args:
-      policy: a loaded policy, or what `openjax.load_policy` takes.
+      policy: a loaded policy, what `openjax.load_policy` takes, or a pure function from the `Observation` of one world
+        to actions (N, 4) in -1..1, which flies the nominal game.
       scenario: a layout's name, a TOML file with an own one, or "all".
       episodes: per layout.
       seed: draws the start attitudes.
@@ -85,15 +92,20 @@ def evaluate(
     """
     from openjax.evaluate import EvaluateCommand, fly_scenarios
 
-    loaded = policy if isinstance(policy, LoadedPolicy) else load_policy(policy)
+    if isinstance(policy, str | Path):
+        policy = load_policy(policy)
+    elif not isinstance(policy, LoadedPolicy):
+        nothing = PolicyParameters(actor={}, critic={}, predictor={})
+        settings = TrainSettings(environment=PursuitSettings(**changes))
+        policy = LoadedPolicy(OwnController(policy), nothing, settings, "own controller")
     command = EvaluateCommand(
-        policy=(loaded.source,),
+        policy=(policy.source,),
         scenario=str(scenario),
         episodes=episodes,
         seed=seed,
         vehicle=None if vehicle is None else Path(vehicle),
         effects=None if effects is None else Path(effects),
-        environment=dataclasses.replace(loaded.settings.environment, **changes),
+        environment=dataclasses.replace(policy.settings.environment, **changes),
     )
-    records, _ = fly_scenarios(command, loaded, {})
+    records, _ = fly_scenarios(command, policy, {})
     return records if scenario == "all" else records[0]
