@@ -3,7 +3,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: train test lint benchmark evaluate withheld clean
+.PHONY: train test lint benchmark evaluate tables withheld clean
 
 # `make train` accepts extra options: make train ARGS="--preset paper --seed 1"
 train: $(READY)
@@ -21,6 +21,9 @@ benchmark: $(READY)
 
 evaluate: $(READY)
 	$(BIN)/python -m openjax.evaluate --policy open open_seed_1 open_seed_2 --scenario all $(ARGS)
+
+tables: $(READY)
+	$(BIN)/python experiments/tables.py $(ARGS)
 
 withheld: $(READY)
 	$(BIN)/python experiments/withheld/run.py $(ARGS)
