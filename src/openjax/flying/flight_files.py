@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from openjax.flights.reading import CHANNEL_COLUMNS, LogTable, write_csv
-from openjax.flying.loop import Record, measured
+from openjax.flying.loop import Record, measured_numbers
 from openjax.flying.set_point import RATES
 from openjax.vehicle.vehicle_file import VehicleFile, save_vehicle_file
 
@@ -60,7 +60,7 @@ def _table(name, members, record, ticks) -> LogTable:
     for i, member in enumerate(members):
         samples: dict[float, dict] = {}
         for _, pose, voltage in member.poses:
-            values = dict(zip(_POSE, measured(pose), strict=True))
+            values = dict(zip(_POSE, measured_numbers(pose), strict=True))
             samples.setdefault(round(pose.time, 4), {}).update(values, vbat=voltage)
         for at, values in member.bodies:
             samples.setdefault(round(at, 4), {}).update(zip(_BODY, values, strict=True))

@@ -14,11 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from openjax.flying.controller import Pose
-from openjax.pursuit import Pursuit, Task
-from openjax.pursuit.environment import THRUST_LIMIT
-from openjax.vehicle import hover_state
-
-__all__ = ["THRUST_LIMIT", "Game", "Play"]
+from openjax.pursuit import Pursuit, Task, hover_action
 
 FIELDS = (("position", 3), ("quaternion", 4), ("velocity", 3), ("body_rates", 3))
 
@@ -35,6 +31,52 @@ class Play(NamedTuple):
     crashed: np.ndarray  # (N,)
 
 
+def game_functions(policy, task: Task):
+    """The game's settings and hover thrust, and its two steps as pure functions of arrays, to compile or to map.
+
+    first(poses (N, 13)) -> state, action (N, 4): an episode begins with the pursuers at `poses`.
+    tick(state, action, poses, evader (3,), evader_measured ()) -> state, action, *fields of `Play` but the first: one
+    control step later they are at `poses`.
+    """
+    # what shapes a training world, but not a measured one: the vehicles drawn for it, the clamp
+    settings = dataclasses.replace(policy.settings.environment, vehicles=(), speed_limit="none")
+    environment = Pursuit(settings)
+
+    def drones_of(poses):
+        drones, start = {}, 0
+        for name, size in FIELDS:
+            drones[name] = poses[:, start : start + size]
+            start += size
+        size = jnp.linalg.norm(drones["quaternion"], axis=1, keepdims=True)
+        return drones | {"quaternion": drones["quaternion"] / size}
+
+    def first(poses):
+        drones = drones_of(poses)
+        _, state = environment.reset_to(jax.random.key(0), task.replace(pursuer_position=drones["position"]))
+        state = state.replace(drones=state.drones.replace(**drones))
+        return state, policy(environment.observe(state))
+
+    def tick(state, action, poses, evader, evader_measured):
+        # a real evader is where it is, not where the rule would have put it
+        place = jnp.where(evader_measured, evader, state.evader_position)
+        state = state.replace(evader_position=place)
+        drones = state.drones.replace(**drones_of(poses))
+        observation, state, _, terminated, truncated, info = environment.follow(state, action, drones)
+        return (
+            state,
+            policy(observation),
+            state.evader_position,
+            state.evader_velocity,
+            jnp.any(info.captured),
+            terminated | truncated,
+            info.breaches.total,
+            info.crashed,
+        )
+
+    vehicle = environment.vehicle
+    return settings, float(hover_action(vehicle)[0] + 1.0) / 2.0, first, tick
+
+
 class Game:
     """A policy's game with measured pursuers.
 
@@ -44,80 +86,35 @@ class Game:
     """
 
     def __init__(self, policy, task: Task):
-        # what shapes a training world, but not a measured one: the vehicles drawn for it, the clamp
-        settings = dataclasses.replace(policy.settings.environment, vehicles=(), speed_limit="none")
-        self.settings, self.task = settings, task
-        environment = Pursuit(settings)
-        self.hover_thrust = float(
-            environment.vehicle.mass
-            * environment.vehicle.gravity
-            / (4 * environment.vehicle.thrust_constant * environment.vehicle.max_rotor_speed**2)
-        )
-
-        def drones_of(poses):
-            drones, start = {}, 0
-            for name, size in FIELDS:
-                drones[name] = poses[:, start : start + size]
-                start += size
-            drones["quaternion"] = drones["quaternion"] / jnp.linalg.norm(
-                drones["quaternion"], axis=1, keepdims=True
-            )
-            return drones
-
-        def first(poses):
-            drones = drones_of(poses)
-            _, state = environment.reset_to(
-                jax.random.key(0), task.replace(pursuer_position=drones["position"])
-            )
-            nominal = jax.vmap(lambda p: hover_state(environment.vehicle, p))(drones["position"])
-            state = state.replace(drones=state.drones.replace(rotor_speed=nominal.rotor_speed, **drones))
-            return state, policy(environment.observe(state)), state.evader_position
-
-        def tick(state, action, poses, evader, evader_measured):
-            # a real evader is where it is, not where the rule would have put it
-            state = state.replace(evader_position=jnp.where(evader_measured, evader, state.evader_position))
-            drones = state.drones.replace(**drones_of(poses))
-            observation, state, _, terminated, truncated, info = environment.follow(state, action, drones)
-            action = policy(observation)
-            return (
-                state,
-                action,
-                state.evader_position,
-                state.evader_velocity,
-                jnp.any(info.captured),
-                terminated | truncated,
-                info.breaches.total,
-                info.crashed,
-            )
-
-        example = np.zeros((settings.num_pursuers, sum(size for _, size in FIELDS)), np.float32)
-        example[:, 3] = 1.0
+        self.task = task
+        self.settings, self.hover_thrust, first, tick = game_functions(policy, task)
+        example = pose_array([Pose(0.0, (0.0, 0.0, 0.5), (0.0,) * 3, (1.0, 0.0, 0.0, 0.0))])
+        example = np.repeat(example, self.settings.num_pursuers, 0)
         self._first = jax.jit(first).lower(example).compile()
-        state, action, _ = jax.eval_shape(first, example)
-        self._tick = (
-            jax.jit(tick).lower(state, action, example, np.zeros(3, np.float32), np.zeros((), bool)).compile()
-        )
+        state, action = jax.eval_shape(first, example)
+        nowhere = (np.zeros(3, np.float32), np.zeros((), bool))
+        self._tick = jax.jit(tick).lower(state, action, example, *nowhere).compile()
         self._state, self._action = None, None
 
     def start(self, poses: list[Pose]) -> Play:
         """Begin an episode with the pursuers at `poses`."""
-        self._state, action, evader = self._first(_array(poses))
-        self._action = action
+        self._state, self._action = self._first(pose_array(poses))
         n = self.settings.num_pursuers
+        evader = np.asarray(self.task.evader_position)
         return Play(
-            np.asarray(action), np.asarray(evader), np.zeros(3), False, False, np.zeros(n), np.zeros(n, bool)
+            np.asarray(self._action), evader, np.zeros(3), False, False, np.zeros(n), np.zeros(n, bool)
         )
 
     def step(self, poses: list[Pose], evader: np.ndarray | None = None) -> Play:
         """One control step later the pursuers are at `poses`, the evader, if it is measured, at (3,) `evader`."""
         measured = np.asarray(evader is not None)
         place = np.zeros(3, np.float32) if evader is None else np.asarray(evader, np.float32)
-        self._state, self._action, *rest = self._tick(
-            self._state, self._action, _array(poses), place, measured
-        )
-        action, position, velocity, captured, over, breaches, crashed = map(np.asarray, (self._action, *rest))
+        self._state, *rest = self._tick(self._state, self._action, pose_array(poses), place, measured)
+        self._action = rest[0]
+        action, position, velocity, captured, over, breaches, crashed = map(np.asarray, rest)
         return Play(action, position, velocity, bool(captured), bool(over), breaches, crashed)
 
 
-def _array(poses) -> np.ndarray:
+def pose_array(poses) -> np.ndarray:
+    """(N, 13) position, quaternion, velocity, body rates."""
     return np.array([[x for name, _ in FIELDS for x in getattr(p, name)] for p in poses], np.float32)

@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from openjax.flying.controller import Airframe, Pose, accelerate, moved_on, wanted_acceleration
-from openjax.flying.game import THRUST_LIMIT, Game
+from openjax.flying.game import Game
 from openjax.flying.safety import (
     Event,
     Mode,
@@ -26,6 +26,7 @@ from openjax.flying.safety import (
     step,
 )
 from openjax.flying.set_point import OFF, RATES, SetPoint, as_sent, from_action
+from openjax.pursuit.environment import THRUST_LIMIT
 
 PERIOD = 0.01
 """s"""
@@ -282,6 +283,6 @@ class Flight:
         )
 
 
-def measured(pose: Pose) -> tuple[float, ...]:
+def measured_numbers(pose: Pose) -> tuple[float, ...]:
     """The pose's numbers in the order of a log's columns: position, quaternion, velocity, body rates."""
     return (*pose.position, *pose.quaternion, *pose.velocity, *pose.body_rates)

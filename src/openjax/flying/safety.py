@@ -355,6 +355,8 @@ def _wanted(settings, state, drone, i) -> Vector:
         return x, y, z
     if position[2] < 0.2:  # straight up first
         x = y = 0.0
+    if math.dist(position, drone.anchor) < 0.3:  # starts may be close to each other
+        return x, y, z
     for j, other in enumerate(state.drones):  # around each other, to the right
         if j == i or other.estimate is None or other.mode not in FLYING:
             continue
