@@ -75,6 +75,8 @@ class Active:
 def motor_demand(p, active, m, voltage, load):
     """Motor commands (4, B) to effective thrust fraction: thrust map, battery, saturation, in this order."""
     u, hover = m, p["hover"]
+    if active("curve_map"):
+        u = p["curve_map"][0] + (p["curve_map"][1] + p["curve_map"][2] * m) * m
     if active("curve_quadratic"):
         u = u + p["curve_quadratic"] * (m - hover) * (m - p["curve_root"])
     if active("curve_power"):

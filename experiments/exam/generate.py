@@ -104,7 +104,11 @@ class Fleet:
             links[columns] = any(c["effect"] in LINK for c in own)
             firmware[columns] = any(c["effect"] in FIRMWARE and c not in own for c in flew)
         known = [[c for c in own if c["effect"] in VOCABULARY] for own in causes_of]
-        rms = measure.errors(self.flown, self.told, self.model(known)[0], self.partner, firmware, links)
+        return self.errors_of(self.model(known)[0], firmware, links)
+
+    def errors_of(self, parameters, firmware, links):
+        """Mean squares (12, variants) of a model; see `measure.errors`."""
+        rms = measure.errors(self.flown, self.told, parameters, self.partner, firmware, links)
         return np.stack([(rms[:, c] ** 2).mean(axis=1) for c in self.columns], axis=1)
 
     def energies(self):

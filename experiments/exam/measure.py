@@ -105,11 +105,13 @@ def _motor_errors(flown, parameters, other_firmware, links):
         return out
     p = {k: parameters[k][..., own] for k in ("kp", "ki", "kd", "gyro_cut", "derivative_cut", "d_filter")}
     gyro, applied, motor = (flown[k][..., own].astype(float) for k in ("gyro", "applied", "motor"))
-    issued = flown["command"][..., own].astype(float)
+    issued, late = flown["command"][..., own].astype(float), parameters["link_delay"][own] / 2.0
+    each = np.arange(len(own))
     firmware = Firmware(p, gyro[0], flown["integral"][0][:, own].astype(float))
     error = np.zeros((samples, 3, len(own)))
     for s in range(samples):
-        now = np.where(links[own], applied[s], issued[s // PER_TICK])
+        tick = np.maximum((s - late) // PER_TICK, 0).astype(int)
+        now = np.where(links[own], applied[s], issued[tick, :, each].T)
         error[s] = MIX @ (motor[s] - firmware(now, gyro[s]))
     error -= uniform_filter1d(error, 250, axis=0)
     inside = (np.arange(samples) >= FIRST)[:, None] & (

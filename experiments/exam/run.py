@@ -93,9 +93,13 @@ def sit(column, options, count):
     print(f"{column}: answers {digest}", flush=True)
     limit = ["--seconds", options.seconds] if options.seconds else []
     step("diagnose", logs, "--out", out, "--jobs", options.jobs, *limit)
+    closed = None
+    if column in cases.COLUMN:
+        step("closed", answers, out, "--out", work / "closed.json", "--jobs", options.jobs)
+        closed = json.loads((work / "closed.json").read_text())
     told, predictions = json.loads(answers.read_text())["cases"], score.collect(out)
     missing = sorted(set(told) - set(predictions))
-    result = score.score({n: a for n, a in told.items() if n in predictions}, predictions)
+    result = score.score({n: a for n, a in told.items() if n in predictions}, predictions, closed)
     result |= {
         "answers_sha256": digest,
         "not_reached": missing,

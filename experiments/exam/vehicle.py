@@ -139,6 +139,7 @@ NEUTRAL = {
     "wake_spread": 0.1,
     "wake_jet": 0.0,
     "gyro_gain": 1.0,
+    "link_delay": 0.0,  # ms, of a model that knows a delay of the commands
     "pose_delay": 0.0,  # ms
     "pose_jitter": 0.0,
     "d_filter": 0.0,  # s, of an effect; the firmware's own is `derivative_cut`
@@ -166,6 +167,9 @@ def nominal_parameters(told):
         "tau_up": tau.copy(),
         "tau_down": tau.copy(),
         "rotor_gain": np.ones((4, count)),
+        "curve_map": np.tile(
+            [[0.0], [1.0], [0.0]], (1, count)
+        ),  # offset, slope, curvature of the thrust in the command
         "com": np.zeros((3, count)),
         "wind": np.zeros((3, count)),
         "kp": rows(RATE_KP),

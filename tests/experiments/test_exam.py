@@ -8,6 +8,7 @@ from scipy.signal import butter, lfilter
 
 from experiments.exam import (
     cases,
+    closed,
     effects,
     garbage,
     generate,
@@ -258,12 +259,11 @@ def test_written_cases_can_be_read_and_say_what_they_hold(tmp_path, monkeypatch)
     from openjax.flights.case import load_case
 
     monkeypatch.setattr(cases, "TICKS", 300)
-    drawn = [
-        cases.draw_case(5, "known", n, kind, n)
-        for n, kind in enumerate(("single", "unknown", "pair", "none"), 1)
-    ]
+    single = (cases.draw_case(5, "known", 1, "single", i) for i in range(20))
+    thrust = next(s for s in single if s["causes"][0]["effect"] == "thrust_scale")
+    drawn = [thrust, cases.draw_case(5, "known", 2, "pair", 0)]
     for spec in drawn:
-        spec["ticks"] = [300] * len(spec["ticks"])
+        spec |= {"ticks": [300] * 3, "missions": [("laps",)] * 3}
     monkeypatch.setattr(cases, "draw_cases", lambda *_: drawn)
     answers = generate.generate(5, "known", 2, tmp_path / "logs", progress=False)
     digest = generate.write_answers(tmp_path / "answers.json", answers, 5, "known")
@@ -274,6 +274,12 @@ def test_written_cases_can_be_read_and_say_what_they_hold(tmp_path, monkeypatch)
         assert answer["gap"]["before"] >= 0.99
         if answer["category"] == "pair":
             assert sum(answer["shares"].values()) == pytest.approx(1.0, abs=0.35)
+        else:  # the truth, said by a report, closes the whole gap
+            scale = {"scale": {"value": answer["causes"][0]["magnitudes"]["scale"]}}
+            report = {"effects": ["thrust_scale"], "parameters": {"thrust_scale": scale}}
+            sealed = {"seed": 5, "column": "known", "cases": {answer["case"]: answer | {"severity": "high"}}}
+            share = closed.close_all(sealed, {answer["case"]: {"report": report}})[answer["case"]]
+            assert share == pytest.approx(1.0, abs=0.05)
         mass = answer["told"]["mass"]
         assert f"mass = {mass:.5f}" in (tmp_path / "logs" / answer["case"] / "vehicle.toml").read_text()
 
@@ -349,7 +355,7 @@ def test_the_scorer_counts_right():
     assert f["share_error"] == pytest.approx(0.1)
     assert f["traceback"] == pytest.approx(1 / 17)
     assert f["seconds"] == 1.0
-    assert score.gap_closed(*rows["right"]) == pytest.approx(0.8)
+    assert score.gap_said(*rows["right"]) == pytest.approx(0.8)
     assert "| single cause: first name right |" in score.markdown("x", result)
     assert len(score.misses(answers, result, {k: p for k, (_, p) in rows.items()})) == 9
     json.dumps(result)
