@@ -61,6 +61,15 @@ FAMILIES = (
     ("command_latency", "packet_loss"),
 )
 
+# (effect, form) -> names that describe a part of it: no mistake beside its own
+PARTS = {
+    ("mass", "payload"): ("inertia",),
+    ("rotor_drag", "raised_hub"): ("blade_flapping",),
+    ("motor_imbalance", "one_weak"): ("thrust_scale", "mass"),
+    ("command_latency", "spikes"): ("packet_loss",),
+    ("rate_gains", "filtered_d"): ("motor_lag",),
+}
+
 
 class Active:
     """Which parameters differ from their neutral value somewhere in the batch."""
@@ -89,7 +98,7 @@ def motor_demand(p, active, m, voltage, load):
         drop = np.clip(p["sag_reference"] - voltage, -1.0, None)
         u = u * (1.0 - p["sag_quadratic"] * (drop + 0.6 * drop * np.abs(drop)))
     if active("sag_load"):
-        u = u * (1.0 - p["sag_load"] * ((p["sag_reference"] - voltage) + 0.25 * (load - 0.6)))
+        u = u * (1.0 - p["sag_load"] * ((p["sag_reference"] - voltage) + 0.1 * (load - 0.6)))
     if active("limit"):
         top = p["limit"] * (1.0 + p["limit_voltage"] * (voltage - 3.6))
         knee = np.maximum(p["limit_knee"], 1e-6)

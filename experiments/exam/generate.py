@@ -276,6 +276,7 @@ def _answer(fleet, i, squares, floor, folder, of_flight):
     if category == "single" and severity < 0.5:
         category = "not_testable"  # the cause is there, and these sensors can't show it
     total = max(float(excess.sum()), 1e-12)
+    parts = [n for c in own for n in effects.PARTS.get((c["effect"], c["form"]), ())]
     gap = {k: float(np.sqrt(energy[k][np.isfinite(floor)].mean())) for k in ("nominal", "truth")}
     expected = {"none": ["none"], "not_testable": ["none"], "unknown": ["unknown"], "garbage": ["garbage"]}
     return {
@@ -284,7 +285,8 @@ def _answer(fleet, i, squares, floor, folder, of_flight):
         "effects": names or ([spec["garbage"]] if spec["garbage"] else []),
         "expected": expected.get(category, names),
         "acceptable": {n: accepted(n, spec["told"].weighed) for n in names if n in VOCABULARY},
-        "also_fine": spec["also_fine"] + (names if category == "not_testable" else []),
+        "also_fine": spec["also_fine"] + parts + (names if category == "not_testable" else []),
+        "in_sensors": bool(set(names) & set(unknowns.SENSOR_KINDS)),
         "causes": [c | {"magnitudes": m} for c, m in zip(own, fleet.magnitudes[i], strict=True)],
         "severity": cases.label(severity) if own else None,
         "severity_ratio": round(severity, 3),

@@ -32,7 +32,7 @@ STRANGERS = {
     "cable_weight": (0.5, 6.0, "g per m", ("climb", "spiral"), ("mass", "thrust_scale")),
     "draught": (5.0, 60.0, "mN", (), ("wind",)),
     "marker_jumps": (0.01, 0.05, "m", ("agile", "step"), ()),
-    "flexing_arm": (0.02, 0.25, "1 per N", ("agile", "climb"), ("thrust_curve",)),
+    "flexing_arm": (0.02, 0.25, "1 per N", ("agile", "climb"), ("thrust_curve", "motor_imbalance")),
     "moving_passenger": (0.5, 4.0, "mm", (), ("com_offset",)),
 }
 ALL = KINDS | STRANGERS
