@@ -16,12 +16,16 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as pallas_triton
 
 from openjax.platform import on_platform, whole_blocks
-from openjax.policy.activation import activation, activation_slope
+from openjax.policy.activation import activation, activation_and_slope, kernel_arithmetic
 
 ROWS = 8
-"""Samples that one program of the kernel works on; with more, the backward kernel's registers spill (3 times slower)."""
+"""Samples that one program of the kernel works on at a time: with more, the backward kernel's registers spill."""
 
-WARPS = 4
+BLOCK = 64
+"""Samples of one program of the backward kernel, which adds up their gradients of the weights."""
+
+FORWARD_WARPS = 4
+BACKWARD_WARPS = 8
 
 
 class EntityKind(NamedTuple):
@@ -47,61 +51,71 @@ class Layout(NamedTuple):
             for _ in range(kind.count):
                 rows.append((row, kind.size, weight))
                 row += kind.size
-            weight += kind.size + 1
+            weight += kind.size + 2
         return rows
 
     @property
     def input_rows(self) -> int:
-        """Inputs of all entities; a bias on each entity's score follows them."""
+        """Numbers of all entities; a bias on each entity's score follows them."""
         return sum(kind.count * kind.size for kind in self.kinds)
 
 
 def attend(
-    query: jax.Array, own: jax.Array, inputs: jax.Array, weights: jax.Array, layout: Layout
+    query: jax.Array,
+    own: jax.Array,
+    inputs: jax.Array,
+    inverse: jax.Array,
+    weights: jax.Array,
+    layout: Layout,
 ) -> jax.Array:
     """Weighted mean of entities for each head.
 
-    Entity 0 is `own`; entity m is activation(W' x_m + b) with the weights of its kind. With score
+    Entity 0 is `own`; entity m is activation(inverse_m (W' x_m + b) + c) with the weights of its kind. With score
     s_hm = scale * query_h . e_m + bias_m, the result of head h is sum_m softmax(s_h)_m e_m.
 
     Args:
         query: (B, heads * features), one query per head in the space of the embeddings.
         own: (B, features).
         inputs: (input_rows + entities, B) float32: all entities' numbers, then the biases (a large negative one masks).
-        weights: (sum of size + 1 over kinds, features) float32: per kind its matrix, then its bias.
+        inverse: (entities, B) float32, by which the linear layer's output is scaled.
+        weights: (sum of size + 2 over kinds, features) float32: per kind its matrix W, then b and c.
         layout: sizes.
 
-    All but the biases in `inputs` are differentiable.
+    All but `inputs` are differentiable.
 
     Returns:
         (B, heads * features) in the type of `query`.
     """
-    return _attend(query, own, inputs, weights, layout)
+    return _attend(query, own, inputs, inverse, weights, layout)
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(4,))
-def _attend(query, own, inputs, weights, layout):
-    return on_platform(_reference, _forward_kernel_call, layout)(query, own, inputs, weights)
+@functools.partial(jax.custom_vjp, nondiff_argnums=(5,))
+def _attend(query, own, inputs, inverse, weights, layout):
+    return on_platform(_reference, _forward_kernel_call, layout)(query, own, inputs, inverse, weights)
 
 
-def _attend_forward(query, own, inputs, weights, layout):
-    return _attend(query, own, inputs, weights, layout), (query, own, inputs, weights)
+def _attend_forward(query, own, inputs, inverse, weights, layout):
+    saved = (query, own, inputs, inverse, weights)
+    return _attend(*saved, layout), saved
 
 
 def _attend_backward(layout, saved, gradient):
-    return on_platform(_reference_backward, _backward_kernel_call, layout)(*saved, gradient)
+    dquery, down, dinverse, dweights = on_platform(_reference_backward, _backward_kernel_call, layout)(
+        *saved, gradient
+    )
+    return dquery, down, jnp.zeros_like(saved[2]), dinverse, dweights
 
 
 _attend.defvjp(_attend_forward, _attend_backward)
 
 
-def _reference(layout, query, own, inputs, weights):
+def _reference(layout, query, own, inputs, inverse, weights):
     """The formula as it stands."""
     batch = own.shape[0]
     entities = [own.astype(jnp.float32)]
-    for row, size, weight in layout.entities:
+    for m, (row, size, weight) in enumerate(layout.entities):
         linear = inputs[row : row + size].T @ weights[weight : weight + size] + weights[weight + size]
-        entities.append(activation(linear))
+        entities.append(activation(inverse[m][:, None] * linear + weights[weight + size + 1]))
     entities = jnp.stack(entities, axis=1)
     heads = query.reshape(batch, layout.heads, layout.features).astype(jnp.float32)
     score = layout.scale * jnp.einsum("bhf,bmf->bhm", heads, entities)
@@ -111,20 +125,21 @@ def _reference(layout, query, own, inputs, weights):
     return mean.reshape(batch, -1).astype(query.dtype)
 
 
-def _reference_backward(layout, query, own, inputs, weights, gradient):
-    _, pullback = jax.vjp(functools.partial(_reference, layout), query, own, inputs, weights)
+def _reference_backward(layout, query, own, inputs, inverse, weights, gradient):
+    def of_differentiable(query, own, inverse, weights):
+        return _reference(layout, query, own, inputs, inverse, weights)
+
+    _, pullback = jax.vjp(of_differentiable, query, own, inverse, weights)
     return pullback(gradient)
 
 
-def _entity(layout, own, x, w_ref, m):
-    """Entity m of a block of samples: (rows, F) float32, and its value before the activation (None for the pursuer)."""
-    if m == 0:
-        return own, None
-    row, size, weight = layout.entities[m - 1]
+def _linear(layout, add, x, inverse, w_ref, m):
+    """W' x + b of entity m + 1 for a block of samples, (rows, F) float32, and that times inverse + c."""
+    row, size, weight = layout.entities[m]
     linear = w_ref[weight + size, :][None, :]
     for i in range(size):
-        linear = linear + x(row + i)[:, None] * w_ref[weight + i, :][None, :]
-    return activation(linear), linear
+        linear = add(x(row + i)[:, None], w_ref[weight + i, :][None, :], linear)
+    return linear, add(inverse(m)[:, None], linear, w_ref[weight + size + 1, :][None, :])
 
 
 def _softmax(scores):
@@ -135,133 +150,143 @@ def _softmax(scores):
     return [p / total for p in parts]
 
 
-def _forward_kernel(layout, q_ref, own_ref, x_ref, w_ref, out_ref):
-    f, heads, number = layout.features, layout.heads, len(layout.entities) + 1
-    own = own_ref[...].astype(jnp.float32)
-    query = [q_ref[:, h * f : (h + 1) * f].astype(jnp.float32) * layout.scale for h in range(heads)]
+def _forward_kernel(layout, arithmetic, q_ref, own_ref, x_ref, inverse_ref, w_ref, out_ref):
+    f, heads, number, add = layout.features, layout.heads, len(layout.entities), arithmetic.multiply_add
 
     def x(row):
         return x_ref[row, :]
 
-    scores = [[] for _ in range(heads)]
+    def inverse(m):
+        return inverse_ref[m, :]
+
+    entities = [own_ref[...].astype(jnp.float32)]
     for m in range(number):
-        entity, _ = _entity(layout, own, x, w_ref, m)
-        for h in range(heads):
-            score = jnp.sum(query[h] * entity, axis=1)
-            scores[h].append(score if m == 0 else score + x(layout.input_rows + m - 1))
-    weight = [_softmax(s) for s in scores]
-    mean = [jnp.zeros_like(own) for _ in range(heads)]
-    for m in range(number):
-        entity, _ = _entity(layout, own, x, w_ref, m)
-        for h in range(heads):
-            mean[h] = mean[h] + weight[h][m][:, None] * entity
+        entities.append(activation(_linear(layout, add, x, inverse, w_ref, m)[1], arithmetic))
     for h in range(heads):
-        out_ref[:, h * f : (h + 1) * f] = mean[h].astype(out_ref.dtype)
+        query = q_ref[:, h * f : (h + 1) * f].astype(jnp.float32) * layout.scale
+        scores = [jnp.sum(query * entity, axis=1) for entity in entities]
+        scores = [scores[0], *(scores[m + 1] + x(layout.input_rows + m) for m in range(number))]
+        mean = jnp.zeros_like(query)
+        for weight, entity in zip(_softmax(scores), entities, strict=True):
+            mean = add(weight[:, None], entity, mean)
+        out_ref[:, h * f : (h + 1) * f] = mean.astype(out_ref.dtype)
 
 
-def _backward_kernel(layout, q_ref, own_ref, x_ref, w_ref, g_ref, dq_ref, down_ref, dlinear_ref):
-    f, heads, number = layout.features, layout.heads, len(layout.entities) + 1
-    own = own_ref[...].astype(jnp.float32)
-    query = [q_ref[:, h * f : (h + 1) * f].astype(jnp.float32) * layout.scale for h in range(heads)]
-    gradient = [g_ref[:, h * f : (h + 1) * f].astype(jnp.float32) for h in range(heads)]
+def _backward_kernel(
+    layout,
+    arithmetic,
+    q_ref,
+    own_ref,
+    x_ref,
+    inverse_ref,
+    w_ref,
+    g_ref,
+    dq_ref,
+    down_ref,
+    dinverse_ref,
+    dw_ref,
+):
+    f, heads, number, add = layout.features, layout.heads, len(layout.entities), arithmetic.multiply_add
 
-    def x(row):
-        return x_ref[row, :]
+    def block(j, sums):
+        rows = pl.ds(j * ROWS, ROWS)
 
-    scores, dweights = [[] for _ in range(heads)], [[] for _ in range(heads)]
-    for m in range(number):
-        entity, _ = _entity(layout, own, x, w_ref, m)
+        def x(row):
+            return x_ref[row, rows]
+
+        def inverse(m):
+            return inverse_ref[m, rows]
+
+        entities, slopes, linears = [own_ref[rows, :].astype(jnp.float32)], [], []
+        for m in range(number):
+            linear, normal = _linear(layout, add, x, inverse, w_ref, m)
+            entity, slope = activation_and_slope(normal, arithmetic)
+            entities.append(entity)
+            slopes.append(slope)
+            linears.append(linear)
+        dentities = [jnp.zeros_like(entities[0]) for _ in entities]
         for h in range(heads):
-            score = jnp.sum(query[h] * entity, axis=1)
-            scores[h].append(score if m == 0 else score + x(layout.input_rows + m - 1))
-            dweights[h].append(jnp.sum(gradient[h] * entity, axis=1))
-    weight = [_softmax(s) for s in scores]
-    dscore = []
-    for h in range(heads):
-        mean = functools.reduce(jnp.add, [w * d for w, d in zip(weight[h], dweights[h], strict=True)])
-        dscore.append([w * (d - mean) for w, d in zip(weight[h], dweights[h], strict=True)])
-    dquery = [jnp.zeros_like(own) for _ in range(heads)]
-    for m in range(number):
-        entity, linear = _entity(layout, own, x, w_ref, m)
-        dentity = jnp.zeros_like(own)
-        for h in range(heads):
-            dentity = dentity + weight[h][m][:, None] * gradient[h] + dscore[h][m][:, None] * query[h]
-            dquery[h] = dquery[h] + dscore[h][m][:, None] * entity
-        if m == 0:
-            down_ref[...] = dentity.astype(down_ref.dtype)
-        else:
-            dlinear_ref[m - 1, :, :] = (dentity * activation_slope(linear)).astype(dlinear_ref.dtype)
-    for h in range(heads):
-        dq_ref[:, h * f : (h + 1) * f] = (dquery[h] * layout.scale).astype(dq_ref.dtype)
+            query = q_ref[rows, h * f : (h + 1) * f].astype(jnp.float32) * layout.scale
+            gradient = g_ref[rows, h * f : (h + 1) * f].astype(jnp.float32)
+            scores = [jnp.sum(query * entity, axis=1) for entity in entities]
+            scores = [scores[0], *(scores[m + 1] + x(layout.input_rows + m) for m in range(number))]
+            weight = _softmax(scores)
+            dweight = [jnp.sum(gradient * entity, axis=1) for entity in entities]
+            mean = functools.reduce(jnp.add, [w * d for w, d in zip(weight, dweight, strict=True)])
+            dquery = jnp.zeros_like(query)
+            for m, entity in enumerate(entities):
+                dscore = (weight[m] * (dweight[m] - mean))[:, None]
+                dquery = add(dscore, entity, dquery)
+                dentities[m] = add(weight[m][:, None], gradient, add(dscore, query, dentities[m]))
+            dq_ref[rows, h * f : (h + 1) * f] = (dquery * layout.scale).astype(dq_ref.dtype)
+        down_ref[rows, :] = dentities[0].astype(down_ref.dtype)
+        sums = list(sums)
+        for m, (row, size, weight) in enumerate(layout.entities):
+            dnormal = dentities[m + 1] * slopes[m]
+            dinverse_ref[m, rows] = jnp.sum(dnormal * linears[m], axis=1)
+            dlinear = dnormal * inverse(m)[:, None]
+            for i in range(size):
+                sums[weight + i] = add(dlinear, x(row + i)[:, None], sums[weight + i])
+            sums[weight + size] = sums[weight + size] + dlinear
+            sums[weight + size + 1] = sums[weight + size + 1] + dnormal
+        return tuple(sums)
+
+    start = tuple(jnp.zeros((ROWS, f), jnp.float32) for _ in range(dw_ref.shape[1]))
+    for i, total in enumerate(jax.lax.fori_loop(0, BLOCK // ROWS, block, start)):
+        dw_ref[0, i, :] = jnp.sum(total, axis=0)
 
 
-def _block_specs(layout, inputs, weights):
-    wide = pl.BlockSpec((ROWS, layout.heads * layout.features), lambda i: (i, 0))
-    narrow = pl.BlockSpec((ROWS, layout.features), lambda i: (i, 0))
-    numbers = pl.BlockSpec((inputs.shape[0], ROWS), lambda i: (0, i))
-    whole = pl.BlockSpec(weights.shape, lambda i: (0, 0))
-    return wide, narrow, numbers, whole
+def _block_specs(layout, rows, *arrays):
+    """Specifications of arrays in blocks of samples: (B, n) by rows, (n, B) by columns."""
+    return [
+        pl.BlockSpec((rows, array.shape[1]), lambda i: (i, 0))
+        if by_rows
+        else pl.BlockSpec((array.shape[0], rows), lambda i: (0, i))
+        for array, by_rows in arrays
+    ]
 
 
-def _forward_kernel_call(layout, query, own, inputs, weights, interpret=False):
+def _forward_kernel_call(layout, query, own, inputs, inverse, weights, interpret=False):
     batch = own.shape[0]
     query, own = whole_blocks(query, ROWS), whole_blocks(own, ROWS)
-    inputs = whole_blocks(inputs, ROWS, axis=1)
-    wide, narrow, numbers, whole = _block_specs(layout, inputs, weights)
+    inputs, inverse = whole_blocks(inputs, ROWS, axis=1), whole_blocks(inverse, ROWS, axis=1)
+    specs = _block_specs(layout, ROWS, (query, True), (own, True), (inputs, False), (inverse, False))
     mean = pl.pallas_call(
-        functools.partial(_forward_kernel, layout),
+        functools.partial(_forward_kernel, layout, kernel_arithmetic(query.dtype, interpret)),
         out_shape=jax.ShapeDtypeStruct(query.shape, query.dtype),
         grid=(own.shape[0] // ROWS,),
-        in_specs=[wide, narrow, numbers, whole],
-        out_specs=wide,
+        in_specs=[*specs, pl.BlockSpec(weights.shape, lambda i: (0, 0))],
+        out_specs=specs[0],
         interpret=interpret,
-        compiler_params=pallas_triton.CompilerParams(num_warps=WARPS, num_stages=1),
+        compiler_params=pallas_triton.CompilerParams(num_warps=FORWARD_WARPS, num_stages=1),
         name="attend",
-    )(query, own, inputs, weights)
+    )(query, own, inputs, inverse, weights)
     return mean[:batch]
 
 
-def _backward_kernel_call(layout, query, own, inputs, weights, gradient, interpret=False):
+def _backward_kernel_call(layout, query, own, inputs, inverse, weights, gradient, interpret=False):
     batch = own.shape[0]
-    query, own, gradient = (whole_blocks(samples, ROWS) for samples in (query, own, gradient))
-    inputs = whole_blocks(inputs, ROWS, axis=1)
-    wide, narrow, numbers, whole = _block_specs(layout, inputs, weights)
-    number = len(layout.entities)
-    dquery, down, dlinear = pl.pallas_call(
-        functools.partial(_backward_kernel, layout),
+    # samples that only fill the last block have no gradient, so they add nothing to the sums
+    query, own, gradient = (whole_blocks(samples, BLOCK) for samples in (query, own, gradient))
+    inputs = whole_blocks(inputs, BLOCK, axis=1)
+    inverse = whole_blocks(inverse, BLOCK, axis=1)
+    wide, narrow, numbers, scales = _block_specs(
+        layout, BLOCK, (query, True), (own, True), (inputs, False), (inverse, False)
+    )
+    programs = own.shape[0] // BLOCK
+    dquery, down, dinverse, parts = pl.pallas_call(
+        functools.partial(_backward_kernel, layout, kernel_arithmetic(query.dtype, interpret)),
         out_shape=(
             jax.ShapeDtypeStruct(query.shape, query.dtype),
             jax.ShapeDtypeStruct(own.shape, own.dtype),
-            jax.ShapeDtypeStruct((number, *own.shape), own.dtype),
+            jax.ShapeDtypeStruct(inverse.shape, inverse.dtype),
+            jax.ShapeDtypeStruct((programs, *weights.shape), jnp.float32),
         ),
-        grid=(own.shape[0] // ROWS,),
-        in_specs=[wide, narrow, numbers, whole, wide],
-        out_specs=(wide, narrow, pl.BlockSpec((number, ROWS, layout.features), lambda i: (0, i, 0))),
+        grid=(programs,),
+        in_specs=[wide, narrow, numbers, scales, pl.BlockSpec(weights.shape, lambda i: (0, 0)), wide],
+        out_specs=(wide, narrow, scales, pl.BlockSpec((1, *weights.shape), lambda i: (i, 0, 0))),
         interpret=interpret,
-        compiler_params=pallas_triton.CompilerParams(num_warps=WARPS, num_stages=1),
+        compiler_params=pallas_triton.CompilerParams(num_warps=BACKWARD_WARPS, num_stages=1),
         name="attend_backward",
-    )(query, own, inputs, weights, gradient)
-    # what is left are products over the batch, with the inputs and with the weights of each kind
-    weight_grads, input_grads, start, first = [], [], 0, 0
-    for kind in layout.kinds:
-        size, part = kind.size, dlinear[start : start + kind.count]
-        row = layout.entities[start][0]
-        x = inputs[row : row + kind.count * size].reshape(kind.count, size, -1)
-        # the bias is one more input that is always one
-        x = jnp.concatenate([x, jnp.ones_like(x[:, :1])], axis=1).astype(part.dtype)
-        weight_grads.append(jnp.einsum("mib,mbf->if", x, part, preferred_element_type=jnp.float32))
-        kernel = weights[first : first + size].astype(part.dtype)
-        input_grads.append(
-            jnp.einsum("mbf,if->mib", part, kernel, preferred_element_type=jnp.float32).reshape(
-                -1, part.shape[1]
-            )
-        )
-        start, first = start + kind.count, first + size + 1
-    # the scores' biases mask, they are not learnt
-    input_grads.append(jnp.zeros((number, inputs.shape[1]), inputs.dtype))
-    return (
-        dquery[:batch],
-        down[:batch],
-        jnp.concatenate(input_grads)[:, :batch],
-        jnp.concatenate(weight_grads),
-    )
+    )(query, own, inputs, inverse, weights, gradient)
+    return dquery[:batch], down[:batch], dinverse[:, :batch], jnp.sum(parts, axis=0)

@@ -47,7 +47,7 @@ class SelfAttention(nn.Module):
             kernel("value", (f, f)).reshape(f, h, width),
             kernel("output", (f, f)).reshape(h, width, f),
         )
-        kinds, weights, inputs, bias = [], [], [], []
+        kinds, weights, inputs, inverses, bias = [], [], [], [], []
         embed = nn.initializers.orthogonal(2**0.5)
         seen = jnp.where(pillar_seen, 0.0, MASKED)
         for name, x, b in (("others", others, jnp.zeros(others.shape[:-1])), ("pillars", pillars, seen)):
@@ -60,18 +60,20 @@ class SelfAttention(nn.Module):
                     kernel(f"{name}_bias", (1, f), nn.initializers.zeros_init()),
                 ]
             )
-            x, linear = normalised_linear(x, linear)
-            kinds.append(EntityKind(count, size + 1))
+            inverse, linear = normalised_linear(x, linear)
+            kinds.append(EntityKind(count, size))
             weights += [
                 linear * kernel(f"{name}_scale", (f,), nn.initializers.ones_init()),
                 kernel(f"{name}_shift", (1, f), nn.initializers.zeros_init()),
             ]
-            inputs.append(x.reshape(x.shape[0], count * (size + 1)))
+            inputs.append(x.reshape(x.shape[0], count * size))
+            inverses.append(inverse)
             bias.append(b)
         mean = attend(
             own.astype(self.dtype) @ query.reshape(f, h * f).astype(self.dtype),
             own,
             jnp.concatenate(inputs + bias, axis=1).astype(jnp.float32).T,
+            jnp.concatenate(inverses, axis=1).T,
             jnp.concatenate(weights),
             Layout(f, h, tuple(kinds), width**-0.5),
         )
@@ -81,23 +83,22 @@ class SelfAttention(nn.Module):
 def normalised_linear(x: jax.Array, linear: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Layer normalisation of a linear layer, without its output.
 
-    Mean and variance over the features of W' x are a linear and a quadratic form of the few numbers x, so scaled
-    inputs and centred weights give the normalised output.
+    Mean and variance over the features of W' x are a linear and a quadratic form of the few numbers x, so centred
+    weights and the inverse standard deviation give the normalised output.
 
     Args:
         x: (..., size).
         linear: (size + 1, F), the bias last.
 
     Returns:
-        inputs (..., size + 1) and weights (size + 1, F), whose product is LayerNorm(linear' [x, 1]).
+        inverse standard deviations (...) and weights (size + 1, F): their product with [x, 1] is
+        LayerNorm(linear' [x, 1]).
     """
     x = jnp.concatenate([x, jnp.ones_like(x[..., :1])], axis=-1)
     centred = linear - jnp.mean(linear, axis=1, keepdims=True)
     covariance = jnp.matmul(centred, centred.T, precision=jax.lax.Precision.HIGHEST) / linear.shape[1]
-    variance = jnp.sum(
-        jnp.matmul(x, covariance, precision=jax.lax.Precision.HIGHEST) * x, axis=-1, keepdims=True
-    )
-    return x * jax.lax.rsqrt(variance + 1e-6), centred
+    variance = jnp.sum(jnp.matmul(x, covariance, precision=jax.lax.Precision.HIGHEST) * x, axis=-1)
+    return jax.lax.rsqrt(variance + 1e-6), centred
 
 
 class Encoder(nn.Module):

@@ -13,7 +13,7 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as pallas_triton
 
 from openjax.platform import on_platform, whole_blocks
-from openjax.policy.activation import activation, activation_slope
+from openjax.policy.activation import activation, activation_and_slope, kernel_arithmetic
 
 ROWS = 64
 """Samples that one program of the kernel works on."""
@@ -75,23 +75,24 @@ def _reference_backward(activate, x, affine, gradient):
     return pullback(gradient)
 
 
-def _forward_kernel(activate, x_ref, affine_ref, out_ref):
+def _forward_kernel(activate, arithmetic, x_ref, affine_ref, out_ref):
     standard, _ = _standardised(x_ref[...], affine_ref[0, :][None, :])
-    out = affine_ref[1, :][None, :] * standard + affine_ref[2, :][None, :]
-    out_ref[...] = (activation(out) if activate else out).astype(out_ref.dtype)
+    out = arithmetic.multiply_add(standard, affine_ref[1, :][None, :], affine_ref[2, :][None, :])
+    out_ref[...] = (activation(out, arithmetic) if activate else out).astype(out_ref.dtype)
 
 
-def _backward_kernel(activate, x_ref, affine_ref, g_ref, dx_ref, daffine_ref):
+def _backward_kernel(activate, arithmetic, x_ref, affine_ref, g_ref, dx_ref, daffine_ref):
     standard, inverse = _standardised(x_ref[...], affine_ref[0, :][None, :])
     scale = affine_ref[1, :][None, :]
     dout = g_ref[...].astype(jnp.float32)
     if activate:
-        dout = dout * activation_slope(scale * standard + affine_ref[2, :][None, :])
+        out = arithmetic.multiply_add(standard, scale, affine_ref[2, :][None, :])
+        dout = dout * activation_and_slope(out, arithmetic)[1]
     dstandard = dout * scale
     features = standard.shape[-1]
     mean = jnp.sum(dstandard, axis=-1, keepdims=True) / features
     along = jnp.sum(dstandard * standard, axis=-1, keepdims=True) / features
-    dx = inverse * (dstandard - mean - standard * along)
+    dx = inverse * arithmetic.multiply_add(standard, -along, dstandard - mean)
     dx_ref[...] = dx.astype(dx_ref.dtype)
     daffine_ref[0, 0, :] = jnp.sum(dx, axis=0)
     daffine_ref[0, 1, :] = jnp.sum(dout * standard, axis=0)
@@ -102,7 +103,7 @@ def _forward_kernel_call(activate, x, affine, interpret=False):
     padded = whole_blocks(x, ROWS)
     block = pl.BlockSpec((ROWS, x.shape[1]), lambda i: (i, 0))
     out = pl.pallas_call(
-        functools.partial(_forward_kernel, activate),
+        functools.partial(_forward_kernel, activate, kernel_arithmetic(x.dtype, interpret)),
         out_shape=jax.ShapeDtypeStruct(padded.shape, padded.dtype),
         grid=(padded.shape[0] // ROWS,),
         in_specs=[block, pl.BlockSpec(affine.shape, lambda i: (0, 0))],
@@ -120,7 +121,7 @@ def _backward_kernel_call(activate, x, affine, gradient, interpret=False):
     programs, features = padded.shape[0] // ROWS, x.shape[1]
     block = pl.BlockSpec((ROWS, features), lambda i: (i, 0))
     dx, parts = pl.pallas_call(
-        functools.partial(_backward_kernel, activate),
+        functools.partial(_backward_kernel, activate, kernel_arithmetic(x.dtype, interpret)),
         out_shape=(
             jax.ShapeDtypeStruct(padded.shape, padded.dtype),
             jax.ShapeDtypeStruct((programs, 3, features), jnp.float32),
