@@ -109,7 +109,7 @@ def learn():
             jax.random.split(jax.random.key(1), UPDATES),
         )
         mean, std = scale.moments
-        value = mean + std * POLICY.value(critic, corners, None)[..., 0]
+        value = mean + std * POLICY.value(actor, critic, corners, None)[..., 0]
         return value, POLICY.action(POLICY.distribution(actor, corners, None)[0])[..., 0, :]
 
     def call(

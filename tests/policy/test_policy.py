@@ -41,7 +41,7 @@ def functions(policy):
     def both(parameters, observation):
         predicted = policy.predict(parameters, observation)
         mean, _ = policy.distribution(parameters.actor, observation, predicted)
-        return mean, policy.value(parameters.critic, observation, predicted)
+        return mean, policy.value(parameters.actor, parameters.critic, observation, predicted)
 
     return jax.jit(policy.init), jax.jit(both)
 
@@ -112,7 +112,7 @@ def test_a_critic_of_observations_does_not_see_it():
     policy = Policy(network, PredictorSettings(enabled=False))
     observation = observation_of(4)
     parameters = jax.jit(policy.init)(jax.random.key(0), observation)
-    value = jax.jit(lambda observation: policy.value(parameters.critic, observation, None))
+    value = jax.jit(lambda observation: policy.value(parameters.actor, parameters.critic, observation, None))
     more = observation.replace(privileged=observation.privileged + 1)
     np.testing.assert_array_equal(value(observation), value(more))
 

@@ -70,28 +70,30 @@ def make_optimiser(
     return one(late if settings.actor_start else schedule), one(schedule)
 
 
-def policy_loss(
-    settings: MappoSettings, policy: Policy, actor: Any, batch: Batch, clip: jax.Array
+def loss(
+    settings: MappoSettings, policy: Policy, parameters: tuple[Any, Any], batch: Batch, clip: jax.Array
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Surrogate, its ratio clipped to 1 +- `clip` (), minus the entropy bonus; and what to watch."""
-    mean, log_std = policy.distribution(actor, batch.observation, batch.predicted)
+    """Sum of actor's and critic's () loss, `parameters` (actor, critic); and what to watch.
+
+    The actor's is the surrogate, its ratio clipped to 1 +- `clip` (), minus the entropy bonus; the critic's the Huber
+    loss of normalised values. Unless they share an encoder, neither's gradient knows of the other.
+    """
+    mean, log_std, value = policy.evaluate(*parameters, batch.observation, batch.predicted)
     log_ratio = gaussian_log_prob(batch.action, mean, log_std) - batch.log_prob
     ratio = jnp.exp(log_ratio)
     clipped = jnp.clip(ratio, 1.0 - clip, 1.0 + clip)
     surrogate = jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
     entropy = gaussian_entropy(log_std)
+    policy_loss = -surrogate - settings.entropy_coefficient * entropy
+    value_loss = jnp.mean(optax.huber_loss(value, batch.target, delta=settings.huber))
     watch = {
         "kl": jnp.mean(ratio - 1.0 - log_ratio),
         "clipped": jnp.mean(jnp.abs(ratio - 1.0) > clip),
         "entropy": entropy,
+        "policy_loss": policy_loss,
+        "value_loss": value_loss,
     }
-    return -surrogate - settings.entropy_coefficient * entropy, watch
-
-
-def value_loss(settings: MappoSettings, policy: Policy, critic: Any, batch: Batch) -> jax.Array:
-    """Huber loss of normalised values."""
-    value = policy.value(critic, batch.observation, batch.predicted)
-    return jnp.mean(optax.huber_loss(value, batch.target, delta=settings.huber))
+    return policy_loss + settings.value_coefficient * value_loss, watch
 
 
 def update_policy(
@@ -127,10 +129,9 @@ def update_policy(
     Returns:
         (actor, critic), optimiser states, value scale, dict of () metrics.
     """
-    critic = parameters[1]
     mean, std = scale.moments
-    value = mean + std * policy.value(critic, rollout.observation, rollout.predicted)
-    last_value = mean + std * policy.value(critic, last, last_predicted)
+    value = mean + std * policy.value(*parameters, rollout.observation, rollout.predicted)
+    last_value = mean + std * policy.value(*parameters, last, last_predicted)
     next_value = jnp.concatenate([value[1:], last_value[None]])
     per_pursuer = value.shape
     advantage = generalised_advantages(
@@ -168,13 +169,10 @@ def update_policy(
     def gradient_step(carry, index):
         (actor, critic), (actor_state, critic_state) = carry
         part = jax.tree.map(lambda x: x[index], batch)
-        (actor_loss, watch), actor_gradient = jax.value_and_grad(
-            lambda p: policy_loss(settings, policy, p, part, clip), has_aux=True
-        )(actor)
-        critic_loss, critic_gradient = jax.value_and_grad(lambda p: value_loss(settings, policy, p, part))(
-            critic
+        gradient, watch = jax.grad(lambda p: loss(settings, policy, p, part, clip), has_aux=True)(
+            (actor, critic)
         )
-        watch |= {"policy_loss": actor_loss, "value_loss": critic_loss}
+        actor_gradient, critic_gradient = gradient
         actor_gradient, critic_gradient, watch = mean_over_devices(
             (actor_gradient, critic_gradient, watch), axis
         )

@@ -35,6 +35,8 @@ class MappoSettings:
     """Global norm to which gradients are cut, actor and critic each."""
     huber: Annotated[float, Interval("(0, 1e6]")] = 10.0
     """Where the value loss turns linear, in standard deviations of the returns."""
+    value_coefficient: Annotated[float, Interval("(0, 1000]")] = 1.0
+    """Weight of the value loss; it matters where actor and critic share an encoder."""
     value_memory: Annotated[float, Interval("[0, 1)")] = 0.95
     """Share of the old mean and variance of the returns that value normalisation keeps per iteration."""
     reward_scale: Annotated[float, Interval("(0, 1e6]")] = 0.1

@@ -6,7 +6,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from openjax.policy.encoder import Encoder, HiddenLayer
+from openjax.policy.encoder import Encoder, HiddenLayer, padded
 from openjax.policy.settings import NetworkSettings
 from openjax.pursuit import Observation
 
@@ -19,8 +19,11 @@ class Actor(nn.Module):
     """Mean before the tanh at initialisation: hovering."""
 
     @nn.compact
-    def __call__(self, observation: Observation, predicted: jax.Array | None) -> tuple[jax.Array, jax.Array]:
-        """Observation of (..., N) pursuers, predicted (..., K, 3) positions or None -> mean (..., N, 4), log_std (4,)."""
+    def __call__(
+        self, observation: Observation, predicted: jax.Array | None
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Observation of (..., N) pursuers, predicted (..., K, 3) positions or None -> mean (..., N, 4), log_std (4,) and
+        what the encoder made of it (..., N, features)."""
         settings = self.settings
         hidden = Encoder(settings.features, settings.heads, jnp.dtype(settings.compute_type), name="encoder")(
             own_features(observation, predicted),
@@ -39,7 +42,7 @@ class Actor(nn.Module):
         log_std = self.param(
             "log_std", nn.initializers.constant(settings.initial_log_std), (len(self.initial_action),)
         )
-        return (jnp.tanh(mean) if settings.squash == "mean" else mean), log_std
+        return (jnp.tanh(mean) if settings.squash == "mean" else mean), log_std, hidden
 
 
 class Critic(nn.Module):
@@ -48,19 +51,30 @@ class Critic(nn.Module):
     settings: NetworkSettings
 
     @nn.compact
-    def __call__(self, observation: Observation, predicted: jax.Array | None) -> jax.Array:
-        """Observation of (..., N) pursuers, predicted (..., K, 3) positions or None -> (..., N)."""
+    def __call__(
+        self, observation: Observation, predicted: jax.Array | None, encoded: jax.Array | None = None
+    ) -> jax.Array:
+        """Observation of (..., N) pursuers, predicted (..., K, 3) positions or None -> (..., N).
+
+        `encoded` (..., N, features) is what the actor's encoder made of it, if the encoder is shared.
+        """
         settings = self.settings
         dtype = jnp.dtype(settings.compute_type)
-        own = own_features(observation, predicted)
-        if settings.critic_input == "state":
-            own = jnp.concatenate([own, observation.privileged], axis=-1)
-        hidden = Encoder(settings.features, settings.heads, dtype, name="encoder")(
-            own, observation.others, observation.pillars, observation.pillar_seen
-        )
+        sees_state = settings.critic_input == "state"
+        if settings.shared_encoder:
+            hidden = encoded
+            if sees_state:
+                hidden = padded(jnp.concatenate([encoded, observation.privileged.astype(dtype)], axis=-1))
+        else:
+            own = own_features(observation, predicted)
+            if sees_state:
+                own = jnp.concatenate([own, observation.privileged], axis=-1)
+            hidden = Encoder(settings.features, settings.heads, dtype, name="encoder")(
+                own, observation.others, observation.pillars, observation.pillar_seen
+            )
         leading = hidden.shape[:-1]
         hidden = HiddenLayer(settings.features, dtype, name="hidden")(
-            hidden.reshape(math.prod(leading), settings.features)
+            hidden.reshape(math.prod(leading), hidden.shape[-1])
         )
         value = nn.Dense(1, dtype=jnp.float32, kernel_init=nn.initializers.orthogonal(1.0), name="value")(
             hidden

@@ -69,9 +69,10 @@ class Policy:
             predictor = self._predictor.init(predictor_key, observation.frames, observation.last_seen)
         parameters = PolicyParameters(actor={}, critic={}, predictor=predictor)
         predicted = self.predict(parameters, observation)
+        actor = self._actor.init(actor_key, observation, predicted)
+        encoded = self._actor.apply(actor, observation, predicted)[2]
         return parameters.replace(
-            actor=self._actor.init(actor_key, observation, predicted),
-            critic=self._critic.init(critic_key, observation, predicted),
+            actor=actor, critic=self._critic.init(critic_key, observation, predicted, encoded)
         )
 
     def predict(self, parameters: PolicyParameters, observation: Observation) -> jax.Array | None:
@@ -88,7 +89,7 @@ class Policy:
         self, actor: Any, observation: Observation, predicted: jax.Array | None
     ) -> tuple[jax.Array, jax.Array]:
         """Mean (..., N, 4) and log standard deviation (4,) of the Gaussian over samples; see `action`."""
-        return self._actor.apply(actor, observation, predicted)
+        return self._actor.apply(actor, observation, predicted)[:2]
 
     @property
     def sample_size(self) -> int:
@@ -102,9 +103,18 @@ class Policy:
         """
         return jnp.clip(sample, -1.0, 1.0) if self.network.squash == "mean" else jnp.tanh(sample)
 
-    def value(self, critic: Any, observation: Observation, predicted: jax.Array | None) -> jax.Array:
-        """Normalised values (..., N)."""
-        return self._critic.apply(critic, observation, predicted)
+    def value(
+        self, actor: Any, critic: Any, observation: Observation, predicted: jax.Array | None
+    ) -> jax.Array:
+        """Normalised values (..., N); the actor's parameters matter if its encoder is shared."""
+        return self.evaluate(actor, critic, observation, predicted)[2]
+
+    def evaluate(
+        self, actor: Any, critic: Any, observation: Observation, predicted: jax.Array | None
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """`distribution` and `value`: mean (..., N, 4), log standard deviation (4,), value (..., N)."""
+        mean, log_std, encoded = self._actor.apply(actor, observation, predicted)
+        return mean, log_std, self._critic.apply(critic, observation, predicted, encoded)
 
     def act(self, parameters: PolicyParameters, observation: Observation) -> jax.Array:
         """The mean policy's action (..., N, 4) in -1..1."""

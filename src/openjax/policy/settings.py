@@ -28,6 +28,9 @@ class NetworkSettings:
     velocity controller flies (DACOOP)."""
     critic_input: Literal["state", "observation"] = "state"
     """"state": the critic also sees the true evader, its velocity and the own position; "observation": what the actor sees."""
+    shared_encoder: bool = False
+    """The critic is a layer on the actor's encoder, which halves the cost of an update; what it sees beside the actor joins
+    behind the encoder. False: an encoder each."""
 
     def __post_init__(self):
         check_intervals(self, "network.")
