@@ -2,7 +2,7 @@
 
     python -m experiments.worlds [--policy open flight] [--world nominal plant ...] [--episodes 100] [--jobs N]
 
-Worlds: the nominal simulator (MJX, rate loop at 500 Hz); `table`, the same with the slower vehicle of VEHICLE; `plant`,
+Worlds: the nominal simulator (rate loop at 500 Hz); `table`, the same with the slower vehicle of VEHICLE; `plant`,
 the withheld plant, and with `plant:motor_lag` and so on each of its causes at three quarters of its range; `rotorpy`,
 RotorPy's own Crazyflie. Writes experiments/results/worlds.json and .md (--out).
 """
@@ -185,7 +185,7 @@ def report(results: dict) -> list[str]:
         "# Policies in worlds that aren't the simulator",
         "",
         f"`{results['command']}`, JAX {machine['versions']['jax']}, commit {machine['commit']}: {results['seconds']:.0f} s. "
-        "No clamp, drawn starts. Nominal: the simulator (MJX) with the rate loop at 500 Hz; table: the same with motors 40 ms "
+        "No clamp, drawn starts. Nominal: the simulator with the rate loop at 500 Hz; table: the same with motors 40 ms "
         "slower, commands 15 ms and poses 10 ms late, and drag of .0125 N s/m; plant: the withheld plant (1 kHz, no shared "
         "code), also with each of its causes at three quarters of its range; rotorpy: RotorPy's own Crazyflie. Change: mean norm "
         "of a command's change in a step, commands in -1 to 1; above 10 Hz: that share of the commands' variance.",

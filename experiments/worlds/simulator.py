@@ -1,4 +1,4 @@
-"""The simulator itself as a world: nominal, or with effects; MJX, the rate loop at 500 Hz."""
+"""The simulator itself as a world: nominal, or with effects; the rate loop at 500 Hz."""
 
 import functools
 
@@ -31,7 +31,7 @@ class SimulatorWorld:
       physics: see `openjax.vehicle.make_drones_step`.
     """
 
-    def __init__(self, drones: DroneState, tasks: Task, effects: dict | None = None, physics: str = "mjx"):
+    def __init__(self, drones: DroneState, tasks: Task, effects: dict | None = None, physics: str = "rigid"):
         self.effects = effects or {}
         self._fly, reset, self._seen = _compiled(physics, tuple(sorted(self.effects)))
         keys = jax.random.split(jax.random.key(1), drones.position.shape[0])

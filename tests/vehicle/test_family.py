@@ -12,8 +12,10 @@ from openjax.vehicle.family import (
     VehicleRange,
     check_ranges,
     draw_vehicles,
+    family_bounds,
     family_effects,
     find_parameter,
+    narrowed_bounds,
     standard_parameters,
 )
 
@@ -49,6 +51,12 @@ def test_standard_parameters_are_zero_without_the_effect():
     np.testing.assert_allclose(standard_parameters(FLIGHT_FAMILY, none), 0.0, atol=1e-6)
     spread = np.std(standard_parameters(FLIGHT_FAMILY, draw_vehicles(FLIGHT_FAMILY, KEY, 500, 0.5)), axis=0)
     assert spread.min() > 0.01 and spread.max() < 3.0
+
+
+def test_a_family_grows_from_the_nominal_vehicle():
+    np.testing.assert_allclose(narrowed_bounds(SMALL, 0.0), 0.0)
+    np.testing.assert_allclose(narrowed_bounds(SMALL, 1.0), family_bounds(SMALL))
+    np.testing.assert_allclose(narrowed_bounds(SMALL, 0.5)[1], [0.005, 0.01, 0.025, 0.03])
 
 
 @pytest.mark.parametrize(

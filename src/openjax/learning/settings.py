@@ -106,6 +106,10 @@ class TrainSettings:
     """Multiple of `rollout_length`; the value of what would have come is estimated, as after every rollout."""
     restart_close: Annotated[float, Interval("[0, 1]")] = 0.0
     """Share of the pursuers in worlds that are started anew which start close to a pillar or another pursuer."""
+    vehicles_start: Annotated[float, Interval("[0, 1]")] = 0.0
+    """Share of the run in which all vehicles are nominal; after it, the family `environment.vehicles` grows about them ..."""
+    vehicles_ramp: Annotated[float, Interval("[0, 1]")] = 0.0
+    """... to its whole size over this share of the run."""
     validation_interval: Annotated[int, Interval("[1, 1000000]")] = 50
     """Iterations between validations, on uniform tasks that are never trained on."""
     validation_episodes: Annotated[int, Interval("[1, 1000000]")] = 256

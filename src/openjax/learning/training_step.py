@@ -20,6 +20,7 @@ from openjax.learning.rollout import collect
 from openjax.learning.settings import TrainSettings
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Observation, Pursuit, PursuitState, close_starts
+from openjax.vehicle.family import narrowed_bounds
 
 
 @struct.dataclass
@@ -72,7 +73,7 @@ def abstract_carry(settings: TrainSettings, environment: Pursuit | None = None) 
 
 
 def _initial_carry(settings, parts, key):
-    environment = parts.environment
+    environment = _with_vehicles_of(settings, parts.environment, 0.0)
     archive = empty_archive(settings.environment, settings.generator.capacity)
     key, policy_key, task_key, reset_key = jax.random.split(key, 4)
     tasks = _tasks(
@@ -119,6 +120,7 @@ def make_training_step(
         # rollout
         progress = carry.update.astype(jnp.float32) / settings.total_updates
         penalty_share = _penalty_share(settings, progress)
+        starting = _with_vehicles_of(settings, environment, progress)
         shape = (settings.rollout_length, settings.environment.num_pursuers, policy.sample_size)
         noise = jax.vmap(lambda k: jax.random.normal(k, shape))(own_keys(noise_key, num_envs, axis))
         rollout, observation, state = collect(
@@ -172,14 +174,14 @@ def make_training_step(
         ended = _group(state, group, settings.start_groups)
         archive, counted = _selection(settings, carry.archive, ended, penalty_share, axis)
         metrics |= counted
-        fresh = _fresh(settings, environment, archive, task_key, reset_key, ended.step.shape[0], axis)
+        fresh = _fresh(settings, starting, archive, task_key, reset_key, ended.step.shape[0], axis)
         worlds = _set_group((observation, state), fresh, group, settings.start_groups)
         if settings.restart_every:
             # and so do the worlds that are started anew within the episodes of other groups
             ages = np.array(settings.restart_ages)
             number = num_envs // settings.start_groups // settings.restart_every * len(ages)
             keys = (jax.random.fold_in(task_key, 1), jax.random.fold_in(reset_key, 1))
-            fresh = _fresh(settings, environment, archive, *keys, number, axis, settings.restart_close)
+            fresh = _fresh(settings, starting, archive, *keys, number, axis, settings.restart_close)
             worlds = _set_restarted(settings, worlds, fresh, (group + ages) % settings.start_groups)
         observation, state = worlds
 
@@ -205,6 +207,15 @@ def _penalty_share(settings, progress):
     """Share of the penalties that counts when a share `progress` of the run is done: a ramp from its start to one."""
     start = settings.mappo.penalty_start
     return start + (1.0 - start) * jnp.minimum(progress / max(settings.mappo.penalty_ramp, 1e-6), 1.0)
+
+
+def _with_vehicles_of(settings, environment, progress):
+    """The environment whose episodes start with the vehicles of that moment of the run."""
+    family = settings.environment.vehicles
+    if not family or not (settings.vehicles_start or settings.vehicles_ramp):
+        return environment
+    share = jnp.clip((progress - settings.vehicles_start) / max(settings.vehicles_ramp, 1e-6), 0.0, 1.0)
+    return environment.with_bounds(narrowed_bounds(family, share))
 
 
 def _tasks(settings, archive, keys, close=0.0):

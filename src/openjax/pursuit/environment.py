@@ -1,5 +1,6 @@
 """The environment: reset and step as pure functions of arrays."""
 
+import copy
 import dataclasses
 
 import jax
@@ -170,6 +171,12 @@ class Pursuit:
             statistics=empty_statistics(settings.episode_length),
         )
         return self.observe(state), state
+
+    def with_bounds(self, vehicle_bounds: jax.Array) -> "Pursuit":
+        """The same game with vehicles drawn within these bounds (R, 4)."""
+        other = copy.copy(self)
+        other.vehicle_bounds = vehicle_bounds
+        return other
 
     def observe(self, state: PursuitState) -> Observation:
         """The observation of a state; effects on the sensors act on what a pursuer knows of all pursuers."""

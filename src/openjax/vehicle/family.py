@@ -72,6 +72,12 @@ def family_bounds(ranges: Sequence[VehicleRange]) -> np.ndarray:
     return np.array([entry[1:] for entry in ranges], np.float32)
 
 
+def narrowed_bounds(ranges: Sequence[VehicleRange], share) -> jax.Array:
+    """(R, 4) bounds of the family of which only this `share` () is left about the nominal vehicle."""
+    none = np.array([[find_parameter(entry[0])[1].none] for entry in ranges], np.float32)
+    return none + share * (family_bounds(ranges) - none)
+
+
 def draw_vehicles(
     ranges: Sequence[VehicleRange],
     key: jax.Array,
