@@ -28,6 +28,9 @@ class Options:
 
     cases: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Folders of flight logs, each with a vehicle.toml."""
+    reference: tuple[Path, ...] = ()
+    """Folders of earlier flights of the same vehicle: report what changed since instead (changes.html and
+    changes.json); one folder per day tells how far days differ. Motor commands alone are enough."""
     out: Path = Path("diagnosis")
     """Where the reports go, one folder per case."""
     predictions: Path | None = None
@@ -69,6 +72,9 @@ def run(options: Options) -> int:
         if options.predictions.is_dir():
             raise UserError(f"--predictions {options.predictions}: is a folder; a file is needed")
 
+    if options.reference:
+        return _compare(options, names, console)
+
     from openjax.flights.case import load_case
     from openjax.gap import decision
     from openjax.gap.diagnosis import diagnose_case
@@ -91,6 +97,39 @@ def run(options: Options) -> int:
             continue
         predictions[name] = report.prediction()
         _show(console, report, options.out / name)
+    if options.predictions is not None and predictions:
+        write_json(options.predictions, predictions)
+    return 2 if failed == len(names) else 0
+
+
+def _compare(options: Options, names: list[str], console) -> int:
+    """What changed in each case since the reference."""
+    from rich.panel import Panel
+    from rich.text import Text
+
+    from openjax.gap import changes, changes_report
+
+    predictions, failed = {}, 0
+    for folder, name in zip(options.cases, names, strict=True):
+        try:
+            with console.status(f"{name}: comparing"):
+                change = changes.compare(folder, options.reference)
+                with replacing(options.out / name) as partial:
+                    partial.mkdir()
+                    changes_report.write(change, partial, options.html)
+        except UserError as error:
+            failed += 1
+            print(f"error: {one_line(error)}", file=sys.stderr)
+            continue
+        predictions[name] = changes_report.prediction(change)
+        body = "\n".join(
+            [
+                *changes_report.in_words(change),
+                f"({options.out / name}/changes.{'html' if options.html else 'json'})",
+            ]
+        )
+        title = f"{name}: {'changed' if change.changed else 'no change'}"
+        console.print(Panel(Text(body), title=title, title_align="left"))
     if options.predictions is not None and predictions:
         write_json(options.predictions, predictions)
     return 2 if failed == len(names) else 0

@@ -6,6 +6,7 @@ import dataclasses
 from pathlib import Path
 
 import jax.numpy as jnp
+import numpy as np
 
 from openjax.errors import UserError
 from openjax.flights.checks import check_flight, duplicates
@@ -59,6 +60,15 @@ def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> 
     weighed = all(vehicle_file.mass_weighed_of(flight.vehicle) for flight in kept)
     vehicle_file = dataclasses.replace(vehicle_file, mass_weighed=weighed)
     return Case(path.resolve().name, tuple(kept), vehicle_file, tuple(issues), path)
+
+
+def _check(flight: Flight, vehicle_file: VehicleFile, comparison: bool) -> tuple[Flight | None, list[Issue]]:
+    try:
+        return check_flight(flight, vehicle_file.vehicle_of(flight.vehicle), vehicle_file.log, comparison)
+    except (ArithmeticError, ValueError, IndexError, np.linalg.LinAlgError) as error:
+        # Values that no check has foreseen: this flight can't be used, the others can.
+        text = f"can't be checked ({type(error).__name__}: {error})".split("\n")[0]
+        return None, [Issue(flight.name, text, refused=True, kind="corrupt")]
 
 
 def _read(

@@ -44,8 +44,8 @@ VOLTAGE_SPREAD = 0.1  # V, by which flights without a logged voltage may differ
 
 PRIOR_CHANGED = 0.5
 CAUSES = {
-    "one rotor weaker": 0.4,
-    "two rotors weaker": 0.2,
+    "one rotor weaker": 0.3,
+    "two rotors weaker": 0.3,
     "weight": 0.2,
     "whole vehicle": 0.1,
     "something else": 0.1,
@@ -111,7 +111,8 @@ class Change:
     """What differs between two sets of flights.
 
     `probability` that the vehicle changed, and whether its trims did (`trims_changed`). `places` {rotors: p} and
-    `causes` {cause: p} say how probable each is if the trims changed; rotors count 1 to 4 as logged (m1..m4).
+    `causes` {cause: p} say how probable each is if the trims changed (`causes_here`: at the most probable place);
+    rotors count 1 to 4 as logged (m1..m4).
     `size` is the thrust that was lost, as a share of one rotor's, at the most probable place (for a weight: its share
     of a rotor's load); `trims` are the differences, their intervals with the spread of a day in them; `least` is
     the loss of a single rotor that these flights would have shown.
@@ -124,6 +125,7 @@ class Change:
     rotors: tuple[int, ...]
     side: str
     causes: dict[str, float]
+    causes_here: dict[str, float]
     places: dict[tuple[int, ...], float]
     size: Interval
     trims: dict[str, Interval]
@@ -141,11 +143,10 @@ class Change:
 
     @property
     def likely_causes(self) -> tuple[str, ...]:
-        """The most probable cause and those that these flights can't split from it."""
-        top = max(self.causes.values())
-        return tuple(
-            sorted((c for c, p in self.causes.items() if p > 0.25 * top), key=lambda c: -self.causes[c])
-        )
+        """The most probable cause at the most probable place, and those that these flights can't split from it."""
+        top = max(self.causes_here.values())
+        likely = [c for c, p in self.causes_here.items() if p > 0.25 * top]
+        return tuple(sorted(likely, key=lambda c: -self.causes_here[c]))
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -233,7 +234,7 @@ def change_between(
     others = _others(new, old)
     evidence = _weigh(hypotheses, difference, scale, freedom, _support(others))
     logged = [case.vehicle_file.motor_permutation[j] + 1 for j in range(4)]
-    place = max(evidence.places, key=lambda p: evidence.places[p])
+    place, within = evidence.place()
     unchanged = 1.0 - evidence.changed
     for other in others:
         unchanged *= 1.0 - other.probability if not other.name.endswith("noise") else 1.0
@@ -246,8 +247,9 @@ def change_between(
         rotors=tuple(sorted(logged[j] for j in place)),
         side=ROTOR_PLACES[place[0]] if len(place) == 1 else _SIDES.get(place, ""),
         causes=evidence.causes,
+        causes_here=evidence.causes_at(within),
         places={tuple(sorted(logged[j] for j in p)): share for p, share in evidence.places.items()},
-        size=evidence.size(place),
+        size=evidence.size(within),
         trims={
             n: Interval(float(d), float(d - r), float(d + r))
             for n, d, r in zip(TRIMS, difference, reach, strict=True)
@@ -420,9 +422,29 @@ class _Evidence:
     posterior: np.ndarray
     hypotheses: _Hypotheses
 
-    def size(self, place: tuple[int, ...]) -> Interval:
-        """Median and 90 % interval of the size at a place."""
-        here = self.hypotheses.place == self.hypotheses.places.index(place)
+    def place(self) -> tuple[tuple[int, ...], list[tuple[int, ...]]]:
+        """The smallest place that holds more than half of the probability, and the places within it: a rotor, two
+        rotors, a side (one or both of its rotors), else what is most probable."""
+        best = max(self.places, key=lambda p: self.places[p])
+        if self.places[best] > 0.5:
+            return best, [best]
+        sides = {side: [side, side[:1], side[1:]] for side, name in _SIDES.items() if name != "diagonal"}
+        shares = {side: sum(self.places[p] for p in within) for side, within in sides.items()}
+        side = max(shares, key=lambda p: shares[p])
+        return (side, sides[side]) if shares[side] > 0.5 else (best, [best])
+
+    def _within(self, places: list[tuple[int, ...]]) -> np.ndarray:
+        return np.isin(self.hypotheses.place, [self.hypotheses.places.index(p) for p in places])
+
+    def causes_at(self, places: list[tuple[int, ...]]) -> dict[str, float]:
+        """Probability of each cause at some places."""
+        here = self._within(places)
+        each = np.bincount(self.hypotheses.cause[here], self.posterior[here], len(CAUSES))
+        return dict(zip(CAUSES, (each / each.sum()).tolist(), strict=True))
+
+    def size(self, places: list[tuple[int, ...]]) -> Interval:
+        """Median and 90 % interval of the size at some places."""
+        here = self._within(places)
         order = np.argsort(self.hypotheses.size[here])
         share = np.cumsum(self.posterior[here][order])
         values = self.hypotheses.size[here][order]
