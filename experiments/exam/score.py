@@ -6,9 +6,9 @@ prints the table; `score` and `collect` give the figures as plain data. Every sh
 1927), every median one by bootstrap. A case of the answers without a report is a miss in all figures.
 
 What is read of `report.json`: `verdict`; `effects` (names, best first; "unknown" may stand among them); `probabilities`;
-`parameters` {effect: {name: {value, interval90}}}; `shares` {effect: {value, interval90} or a number} of the gap's
-excess over the floor; `gap` {before, after, floor, reduction}, in floors; `contradictions` (a list: the channels that
-contradict each other). A log that is refused with a one-line reason counts as called garbage too.
+`parameters` {effect: {name: {value, interval90}}}; `shares` {"effects": {effect: {value, interval90}}} of the gap's excess
+over the floor; `gap` {before, after, floor, reduction}, in floors; `contradictions` (a list: the channels that contradict
+each other). A log that is refused with a one-line reason counts as called garbage too.
 """
 
 import argparse
@@ -254,6 +254,7 @@ def score(answers, predictions, closed=None):
         "per_sensors": table(lambda a: a["sensors"]["kind"], of("single", "none")),
         "per_rate": table(lambda a: a["sensors"]["rate"], of("single", "none")),
         "per_turbulence": table(lambda a: a["sensors"]["turbulence"], of("single", "none")),
+        "per_motor_columns": table(lambda a: a["sensors"].get("motor"), of("single", "none")),
         "per_controller": table(lambda a: a["controller"], of("single", "none")),
         "per_missing": table(
             lambda a: "".join(c for c in "pgacmv" if c not in a["sensors"]["channels"]), of("single", "none")
@@ -287,6 +288,7 @@ def top_probability(answer, prediction):
 def share_errors(answer, prediction):
     """[{"effect", "said", "true"}] of the true effects' shares of the gap, where the report gives one."""
     said = (prediction["report"] or {}).get("shares") or {}
+    said = said.get("effects", said)
     out = []
     for effect, true in answer["shares"].items():
         entry = next((said[n] for n in [effect, *answer["acceptable"].get(effect, [])] if n in said), None)
@@ -434,6 +436,7 @@ def groups(result):
         ("per_sensors", "Single or none, right, by sensors"),
         ("per_rate", "By log rate, Hz"),
         ("per_turbulence", "By turbulence"),
+        ("per_motor_columns", "By motor columns, mean over the row or snapshot"),
         ("per_controller", "By controller"),
         (
             "per_missing",

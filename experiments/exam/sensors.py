@@ -97,7 +97,7 @@ def draw(rng, kind, needed="", turbulence=None):
         "position": 2.0e-4 * size,  # m, white
         "angle": 1.8e-3 * size,  # rad, white
         "accel": 0.16 * size,
-        "gyro": 0.012 * size,
+        "gyro": 0.008 * size,
         "colour": 0.0,  # rms of the coloured part, in units of the white one
         "colour_time": float(np.exp(rng.uniform(np.log(0.02), np.log(0.3)))),
         "accel_cut": 30.0 if filtered else 0.0,
