@@ -1,5 +1,7 @@
 """Probe environments whose values and best actions are known, each of which isolates one part of MAPPO."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -149,3 +151,16 @@ def test_a_cut_episode_goes_on_in_the_value(learn):
 def test_the_policy_finds_the_action_that_the_observation_asks_for(learn):
     _, action = learn(by_action=1.0)
     np.testing.assert_allclose(action[..., 0], [[-0.5, -0.5], [0.5, 0.5]], atol=0.15)
+
+
+def test_the_actor_can_start_to_learn_later_than_the_critic():
+    settings = dataclasses.replace(SETTINGS, actor_start=0.5, epochs=1, minibatches=1)
+    parameter, moves = jnp.ones(3), []
+    for optimiser in make_optimiser(settings, 4):
+        state, own = optimiser.init(parameter), []
+        for _ in range(4):
+            change, state = optimiser.update(parameter, state, parameter)
+            own.append(float(jnp.abs(change).max()))
+        moves.append(own)
+    assert moves[0][:2] == [0.0, 0.0] and min(moves[0][2:]) > 0.0
+    assert min(moves[1]) > 0.0
