@@ -47,8 +47,11 @@ def adapting_settings(trained: TrainSettings, settings: AdaptSettings) -> TrainS
             clip_epsilon=settings.clip_epsilon,
             clip_epsilon_end=settings.clip_epsilon,
             penalty_start=1.0,
+            actor_start=0.0,
             minibatches=minibatches,
         ),
+        vehicles_start=0.0,
+        vehicles_ramp=0.0,
         num_envs=num_envs,
         total_steps=(settings.updates + settings.warm_up) * num_envs * trained.rollout_length,
     )
