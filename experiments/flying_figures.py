@@ -66,6 +66,7 @@ def pair(arguments, number: int, out: Path, virtual: list[str], fly: list[str], 
             return {"error": said + vehicles.stdout.read()}
         uris = [f"udp://127.0.0.1:{port + i}" for i in range(3)]
         command = [sys.executable, "-m", "openjax.fly", "--policy", arguments.policy, "--out", str(out), *fly]
+        command += ["--guard_after", "1.0"]  # a stall is to be measured, not to end the measurement
         ran = subprocess.run(
             [*command, "--uri", *uris],
             env=environment,

@@ -50,6 +50,13 @@ class Arguments:
     """Log blocks of motors and accelerometer per vehicle, 0 to 5; default 5 over UDP, 1 over radio."""
     motion_capture: str | None = None
     """MODULE:FUNCTION that feeds poses; default: the vehicles' own estimates. See openjax.flying.motion_capture."""
+    guard: bool = True
+    """A second process lands the vehicles if this one stops."""
+    guard_after: float = 0.1
+    """Silence of this one after which it does (s)."""
+    watchdog: bool = False
+    """Let the firmware stop the motors 1 s after the last set-point (otherwise 2 s); the vehicles must be restarted after
+    every flight."""
     safety: SafetySettings = field(default_factory=SafetySettings)
 
 
@@ -67,6 +74,7 @@ def fly(arguments: Arguments):
     from openjax.flying import real_time
     from openjax.flying.flight_files import write_case
     from openjax.flying.game import Game
+    from openjax.flying.guard import Guard
     from openjax.flying.loop import Flight, Plan
     from openjax.flying.swarm import Swarm
     from openjax.pursuit import find_scenario, scenario_task
@@ -93,22 +101,31 @@ def fly(arguments: Arguments):
     body_logs = arguments.body_logs
     if body_logs is None:
         body_logs = 5 if all(uri.startswith("udp:") for uri in uris) else 1
-    swarm = Swarm(uris, body_logs)
+    swarm = Swarm(uris, body_logs, arguments.watchdog)
     console.print(f"connecting to {', '.join(uris)} ...")
     swarm.connect()
     plan = Plan(arguments.episodes, arguments.episode_seconds)
+    guard = None
     with _Keys() as keys:
         try:
             _wait_for_poses(swarm)
+            flight = Flight(swarm, game, arguments.safety, plan, keys)
+            if arguments.guard:
+                guard = flight.beat = Guard(
+                    uris, swarm.pose_blocks(), arguments.safety, flight.state, arguments.guard_after
+                )
+                if not guard.wait():
+                    raise UserError("the guard's process didn't start; --guard False flies without it")
             swarm.arm()
             swarm.record()
             console.print("flying: space or q stops all motors, l or Ctrl-C lands")
-            flight = Flight(swarm, game, arguments.safety, plan, keys)
             record = _until_down(flight, keys)
         except KeyboardInterrupt:
             swarm.emergency_stop()
             raise
         finally:
+            if guard is not None:
+                guard.close()
             swarm.arm(False)
             swarm.close()
     about = {

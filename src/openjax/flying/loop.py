@@ -137,7 +137,7 @@ class Flight:
         safety: limits.
         plan: what to fly.
         requests: asked at every tick for what the operator wants.
-        beat: called at every tick with time, state and set-points.
+        beat: called at every tick with time and state, see `openjax.flying.guard`.
         clock: host time (s).
     """
 
@@ -152,7 +152,7 @@ class Flight:
         clock: Callable[[], float] = time.perf_counter,
     ):
         self.vehicles, self.game, self.safety, self.plan = vehicles, game, safety, plan
-        self._requests, self._beat, self._now = requests, beat, clock
+        self._requests, self.beat, self._now = requests, beat, clock
         task, settings = game.task, game.settings
         self._pursuers = settings.num_pursuers
         starts = [tuple(map(float, p)) for p in np.asarray(task.pursuer_position)]
@@ -208,8 +208,8 @@ class Flight:
         event = Event(now, sightings, actions, request)
         self.state, set_points = step(self.safety, self.state, event)
         sent = self.vehicles.send(set_points)
-        if self._beat is not None:
-            self._beat(now, self.state)
+        if self.beat is not None:
+            self.beat(now, self.state)
         self._keep(due, sent, arrivals, set_points)
         if self._episode >= 0 and not any(m is Mode.PURSUIT for m in self.state.modes):
             self._end_episode("safety")

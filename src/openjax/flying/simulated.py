@@ -39,8 +39,8 @@ class Faults:
 class SimulatedSwarm:
     """N vehicles that are advanced by `advance`."""
 
-    def __init__(self, vehicles: VirtualVehicles, seed: int = 0):
-        self.vehicles, self.now = vehicles, 0.0
+    def __init__(self, vehicles: VirtualVehicles, seed: int = 0, watchdog: bool = False):
+        self.vehicles, self.now, self._watchdog = vehicles, 0.0, watchdog
         n = vehicles.number
         self.firmware = [VirtualFirmware(needs_arming=False) for _ in range(n)]
         self.faults = [Faults() for _ in range(n)]
@@ -60,8 +60,9 @@ class SimulatedSwarm:
         return tuple(pose.time if pose is not None else -np.inf for pose in self._poses)
 
     def send(self, set_points) -> float:
+        """Send each vehicle its set-point, or nothing where it is None."""
         for i, set_point in enumerate(set_points):
-            if self._random.random() >= self.faults[i].command_loss:
+            if set_point is not None and self._random.random() >= self.faults[i].command_loss:
                 self._waiting.append((self._steps + self.faults[i].command_delay, i, set_point))
         return self.now
 
@@ -86,6 +87,8 @@ class SimulatedSwarm:
         for due, i, set_point in self._waiting:
             if due <= self._steps:
                 self.firmware[i].accept(set_point, self._steps * STEP)
+                if self._watchdog:
+                    self.firmware[i].feed_watchdog(self._steps * STEP)
         self._waiting = [w for w in self._waiting if w[0] > self._steps]
 
     def _look(self):

@@ -176,6 +176,10 @@ class VirtualFirmware:
             return SetPoint(ANGLES, 0.0, 0.0, 0.0, self._set_point.thrust)
         return self._set_point
 
+    def feed_watchdog(self, now: float) -> None:
+        """Start or restart the emergency-stop watchdog."""
+        self._watchdog_time = now
+
     def crash(self) -> None:
         """The vehicle hit something: motors off until a recovery is asked for."""
         self.crashed = True
@@ -250,7 +254,7 @@ class VirtualFirmware:
             self.emergency = True
             answer = b""
         elif packet.channel == 1 and command == 0x04:
-            self._watchdog_time = now
+            self.feed_watchdog(now)
             answer = b""
         return [] if answer is None else [packet._replace(data=bytes([command | 0x80]) + answer)]
 
@@ -268,7 +272,7 @@ class VirtualFirmware:
         elif packet.data[0] == 3:
             self.emergency = True
         elif packet.data[0] == 4:
-            self._watchdog_time = now
+            self.feed_watchdog(now)
         return []
 
     def _commander(self, packet, now):

@@ -46,11 +46,12 @@ class VirtualVehicles:
 
     Args:
         vehicle: their parameters.
-        position: (N, 2) m, where they stand.
+        position: (N, 2) m, where they stand; (N, 3) where they hover if `flying`.
         effects: names of effects; those that delay or lose commands belong to the link instead.
         effect_parameters: {effect: {parameter: value}}.
         battery: charge at the start, 0..1.
         endurance: s of hover that empty a full battery.
+        flying: they begin hovering in the air instead.
 
     Raises:
         UserError: an unknown effect, or one that acts on commands.
@@ -64,6 +65,7 @@ class VirtualVehicles:
         effect_parameters=None,
         battery: float = 1.0,
         endurance: float = 420.0,
+        flying: bool = False,
     ):
         self._step = make_drones_step("rigid", dt=STEP, effects=effects, contacts=False)
         for effect in self._step.effects:
@@ -73,8 +75,9 @@ class VirtualVehicles:
                 )
         position = np.atleast_2d(np.asarray(position, np.float32))
         self.number = len(position)
-        drones = hover_state(vehicle, np.concatenate([position, np.zeros((self.number, 1))], 1))
-        drones = drones.replace(rotor_speed=jnp.zeros_like(drones.rotor_speed))
+        height = position[:, 2:] if flying else np.zeros((self.number, 1), np.float32)
+        drones = hover_state(vehicle, np.concatenate([position[:, :2], height], 1))
+        drones = drones.replace(rotor_speed=drones.rotor_speed * flying)
         drones = self._step.reset(vehicle, drones, jax.random.key(0))
         flat, unflatten = ravel_pytree(drones)
         self._state = np.asarray(flat)
@@ -86,7 +89,7 @@ class VirtualVehicles:
         self._hover = float(vehicle.mass * vehicle.gravity) / float(
             4 * vehicle.thrust_constant * vehicle.max_rotor_speed**2
         )
-        self.report = self.advance(np.zeros((self.number, 5), np.float32), 1)
+        self.report = self.advance(np.zeros((self.number, 5), np.float32), 0)
 
     def advance(self, set_points: np.ndarray, steps: int) -> Report:
         """What is sensed after `steps` steps under constant set-points (N, 5), see `SetPoint.array`."""
@@ -153,7 +156,8 @@ def _advance(drones_step, vehicle, parameters, unflatten, flat, set_points, step
 
     drones = unflatten(flat)
     number = drones.position.shape[0]
-    nothing = (jnp.zeros((number, 4)), jnp.zeros((number, 3)), jnp.zeros(number, bool))
+    gravity = jnp.zeros((number, 3)).at[:, 2].set(vehicle.gravity)
+    nothing = (jnp.zeros((number, 4)), gravity, jnp.zeros(number, bool))
     drones, (motor, force, on_floor), crashed = jax.lax.fori_loop(
         0, steps, step, (drones, nothing, jnp.zeros(number, bool))
     )
