@@ -23,7 +23,8 @@ from openjax.commands.machine import describe_machine
 from openjax.learning import make_evaluate
 from openjax.policy import PolicyParameters
 from openjax.pursuit import Pursuit, PursuitSettings, Task, line_up_pillars, turn_task, uniform_task
-from openjax.store.settings_files import read_json, write_json
+from openjax.files import read_json
+from openjax.store.settings_files import write_json
 
 WORLDS = 32768
 """Worlds that fly at once."""

@@ -149,8 +149,9 @@ def draw(results: dict, path: Path) -> None:
             told = ", ".join(
                 f"{name} {value:.2g}" for name, value in flown["behaviour"].items() if value is not None
             )
-            draw_from_above(axes[i, j], trajectory_of(flown["paths"], layout, f"{method}: {told}"))
-            axes[i, j].title.set_fontsize("small")
+            draw_from_above(axes[i, j], trajectory_of(flown["paths"], layout, told))
+            axes[i, j].title.set_fontsize("x-small")
+            axes[i, j].set(xlabel=method if i == len(layouts) - 1 else "", ylabel=layout if j == 0 else "")
     figure.savefig(path, dpi=70)
 
 

@@ -13,7 +13,8 @@ from roster import COLORS
 from run_comparison import band, read_run, steps_to
 
 from openjax.commands.command_line import run_command
-from openjax.store.settings_files import read_json, write_json
+from openjax.files import read_json
+from openjax.store.settings_files import write_json
 
 RATES = (0.5, 0.9, 0.95)
 METHOD_RUNS = RESULTS / "method_runs.json"

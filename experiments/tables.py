@@ -1,82 +1,92 @@
 """The paper's tables and figures from the shipped weights: `python experiments/tables.py [--episodes 100]`, or `make tables`.
 
-Flies every method on the layouts once and stores what came of it in experiments/results/tables.json; then each script
-named in `PAGES` writes its page from there, and sweeps.py flies its own. `--report` writes the pages again.
+Flies every method once, all its layouts, capture radii and evader speeds in one compiled call, and stores what came of it in
+experiments/results/tables.json; each script named in `PAGES` then writes its page from there. `--report` writes the pages
+again.
 """
 
 import argparse
 import dataclasses
-import functools
 import time
 from pathlib import Path
 
 import behaviours
 import jax
+import jax.numpy as jnp
 import learning_curves
 import numpy as np
 import sweeps
 import tab_main
 import tab_ood
 import tab_prediction
+from flights import environment_of, fly
 from pages import RESULTS
 from roster import ABLATIONS, METHODS, seeds_of
 
+from openjax.baselines import METHODS as HEURISTICS
 from openjax.commands.command_line import run_command
-from openjax.commands.evaluator import Evaluator, layout_slots, record_of, repeat_task
+from openjax.commands.evaluator import layout_slots, record_of, repeat_task
 from openjax.commands.machine import describe_machine
 from openjax.learning import summarise
-from openjax.policy import Policy
-from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, RewardSettings, scenario_task
+from openjax.pursuit import SCENARIOS, RewardSettings, scenario_task
 from openjax.store.policies import load_policy
 from openjax.store.settings_files import write_json
 
-PAGES = (tab_main, tab_ood, tab_prediction, behaviours)
+PAGES = (tab_main, tab_ood, tab_prediction, behaviours, sweeps)
 LAYOUTS = ("wall", "narrow_gap", "random", "passage", "hidden")
-OOD_LAYOUTS = ("random", "passage")
-CONDITIONS = {"clamp": {"speed_limit": "clamp"}, "no clamp": {"speed_limit": "none"}}
+LIMITS = {"clamp": "clamp", "no clamp": "none"}
 
 
-@functools.cache
-def evaluator_of(settings: PursuitSettings, policy: Policy, episodes: int) -> Evaluator:
-    """One compiled evaluation for all policies of a kind."""
-    return Evaluator(Pursuit(settings), policy, episodes)
-
-
-def fly(name: str, seed: int, layouts: tuple[str, ...], changes: dict, episodes: int) -> dict[str, dict]:
-    """By layout: the record of a policy, what it did there, and the paths of one episode."""
+def of_policy(name: str, seed: int, changes: dict, episodes: int) -> dict:
+    """By layout: the record of a policy, what it did there, the paths of one episode; and its two sweeps."""
     loaded = load_policy(name)
     game = loaded.settings.environment
     # the reward changes nothing that is counted here; one for all saves compilations
     game = dataclasses.replace(game, max_pillars=layout_slots(game), reward=RewardSettings(), **changes)
-    evaluator = evaluator_of(game, loaded.policy, episodes)
-    flown = {}
-    for layout in layouts:
-        task = scenario_task(game, SCENARIOS[layout])
-        evaluation, batches = evaluator(loaded.parameters, repeat_task(task, episodes), jax.random.key(seed))
-        paths = jax.tree.map(np.asarray, batches[0].replace(predicted=None))
-        row = record_of(layout, episodes, summarise(evaluation), ("last_seen_error",))
-        flown[layout] = {
+    # layout, evader speed, episodes
+    cells = [(layout, game.evader_speed, episodes) for layout in LAYOUTS]
+    cells += [(layout, speed, max(1, episodes // 2)) for layout, speed in sweeps.CELLS]
+    tasks = [repeat_task(scenario_task(game, SCENARIOS[layout]), number) for layout, _, number in cells]
+    environment = environment_of(game)
+    flown = fly(
+        environment,
+        loaded.in_game(environment).policy,
+        sweeps.RADII,
+        loaded.parameters,
+        jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *tasks),
+        jnp.concatenate([jnp.full(number, speed, jnp.float32) for _, speed, number in cells]),
+        jax.random.key(seed),
+    )
+    flown = jax.tree.map(np.asarray, flown)
+    ends = np.cumsum([number for *_, number in cells])
+    parts = [
+        jax.tree.map(lambda leaf, end=end, number=number: leaf[end - number : end], flown)
+        for end, (*_, number) in zip(ends, cells, strict=True)
+    ]
+    layouts = {}
+    for layout, part in zip(LAYOUTS, parts, strict=False):
+        row = record_of(layout, episodes, summarise(part.evaluation), ("last_seen_error",))
+        layouts[layout] = {
             "record": row,
-            "behaviour": behaviours.measure(layout, paths, evaluation.statistics),
-            "paths": behaviours.one_episode(paths),
+            "behaviour": behaviours.measure(layout, part.paths, part.evaluation.statistics),
+            "paths": behaviours.one_episode(part.paths),
         }
-    return flown
+    return {"layouts": layouts, "sweeps": sweeps.figures(parts[len(LAYOUTS) :], game.episode_length)}
 
 
 def study(options: argparse.Namespace) -> dict:
-    """Every method on the paper's layouts and where the evader hides; the ablations where the paper shows them."""
+    """Every method and the ablations, with the clamp; heuristics without it, too, since no training chose their speed."""
     started = time.monotonic()
     flights = []
     for label in (*METHODS, *ABLATIONS):
-        layouts = LAYOUTS if label in METHODS else OOD_LAYOUTS
-        # what learning isn't in flies honest physics too: its speed is its own choice
-        conditions = CONDITIONS if label in ("Angelani", "Janosov", "APF") else {"clamp": CONDITIONS["clamp"]}
-        for condition, changes in conditions.items():
+        for condition, limit in LIMITS.items():
+            if condition != "clamp" and METHODS.get(label) not in HEURISTICS:
+                continue
             for name, seed in seeds_of(label):
-                changes = {**changes, "physics": options.physics}
-                flown = fly(name, seed, layouts, changes, options.episodes)
+                changes = {"speed_limit": limit, "physics": options.physics}
+                flown = of_policy(name, seed, changes, options.episodes)
                 flights.append(
-                    {"method": label, "policy": name, "seed": seed, "condition": condition, "layouts": flown}
+                    {"method": label, "policy": name, "seed": seed, "condition": condition, **flown}
                 )
                 print(f"{time.monotonic() - started:5.0f} s  {label}: {name}, {condition}", flush=True)
     return {
@@ -95,7 +105,7 @@ def main(arguments: list[str]) -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--report", action="store_true", help="from the stored flights")
-    parser.add_argument("--episodes", type=int, default=100, help="per seed and layout")
+    parser.add_argument("--episodes", type=int, default=100, help="per seed and layout; half for the sweeps")
     parser.add_argument("--physics", choices=("rigid", "mjx"), default="rigid", help="mjx: the same, slower")
     parser.add_argument("--commit", default="", help="where the machine has no repository")
     parser.add_argument("--out", type=Path, default=RESULTS, help="directory")
@@ -106,9 +116,6 @@ def main(arguments: list[str]) -> int:
     for page in PAGES:
         page.main(["--flights", str(flights), "--out", str(options.out / page.__name__)])
     learning_curves.main(["--out", str(options.out / "learning_curves")])
-    episodes = str(max(1, options.episodes // 2))
-    swept = ["--report"] if options.report else ["--episodes", episodes, "--physics", options.physics]
-    sweeps.main([*swept, "--commit", options.commit, "--out", str(options.out / "sweeps")])
     return 0
 
 

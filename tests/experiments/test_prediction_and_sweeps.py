@@ -15,8 +15,8 @@ from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "experiments"))
 import predictors
+from flights import fly as fly_swept
 from prediction_flights import evader_rule, fly, layout_tasks, training_tasks
-from sweeps import sweep
 
 SETTINGS = PursuitSettings(
     physics="rigid", episode_length=60, max_pillars=6, history_length=4, history_spacing=3
@@ -97,7 +97,8 @@ def test_training_learns(flights):
 def test_swept_speed_and_radius_are_those_of_a_game_with_them(game):
     environment, policy, parameters, tasks = game
     radii, speeds = (0.3, 0.6), jnp.where(jnp.arange(WORLDS) < 6, 1.3, 2.0)
-    first, counted = sweep(environment, policy, radii, parameters, tasks, speeds, jax.random.key(5))
+    flown = fly_swept(environment, policy, radii, parameters, tasks, speeds, jax.random.key(5))
+    first = np.asarray(flown.first)
     keys = jax.random.split(jax.random.key(5), WORLDS)
     other = dataclasses.replace(SETTINGS, evader_speed=2.0, capture_radius=0.6)
     own = Pursuit(other)
@@ -114,5 +115,8 @@ def test_swept_speed_and_radius_are_those_of_a_game_with_them(game):
     np.testing.assert_array_equal(captured, expected.captured[6:])
     assert 0 < captured.sum()
     np.testing.assert_array_equal(first[6:, 1][captured], expected.capture_step[6:][captured])
-    np.testing.assert_allclose(counted[6:, 0], expected.collision_rate[6:], atol=1e-6)
+    statistics = flown.evaluation.statistics
+    np.testing.assert_allclose(statistics.collision_rate[6:], expected.collision_rate[6:], atol=1e-6)
+    own_radius = np.where(first[:, 0] > other.episode_length, other.episode_length, first[:, 0])
+    np.testing.assert_array_equal(statistics.capture_step, own_radius)
     assert (np.asarray(first[:, 1]) <= np.asarray(first[:, 0])).all()
