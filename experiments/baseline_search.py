@@ -20,10 +20,10 @@ from openjax.baselines import METHODS, Heuristic
 from openjax.baselines.parameters import FOUND, draw, ranges
 from openjax.commands.command_line import run_command
 from openjax.commands.machine import describe_machine
+from openjax.files import read_json
 from openjax.learning import make_evaluate
 from openjax.policy import PolicyParameters
 from openjax.pursuit import Pursuit, PursuitSettings, Task, line_up_pillars, turn_task, uniform_task
-from openjax.files import read_json
 from openjax.store.settings_files import write_json
 
 WORLDS = 32768

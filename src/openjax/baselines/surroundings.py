@@ -33,12 +33,14 @@ class Craft:
     def of(cls, environment: Pursuit) -> "Craft":
         """The craft of an environment's pursuers."""
         settings, vehicle = environment.settings, environment.vehicle
-        most = 4 * vehicle.thrust_constant * vehicle.max_rotor_speed**2
+        with jax.ensure_compile_time_eval():  # an environment may be made inside a compiled program
+            most = 4 * vehicle.thrust_constant * vehicle.max_rotor_speed**2
+            hover = round(float(vehicle.mass * vehicle.gravity / most), 6)
         return cls(
             arena_radius=settings.arena_radius,
             arena_height=settings.arena_height,
             speed=0.98 * settings.max_speed,
-            hover_thrust=round(float(vehicle.mass * vehicle.gravity / most), 6),
+            hover_thrust=hover,
             history_seconds=(settings.history_length - 1) * settings.history_spacing * settings.time_step,
         )
 
