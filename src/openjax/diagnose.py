@@ -37,8 +37,6 @@ class Options:
     """Also write all cases' answers into this one JSON file."""
     without: tuple[str, ...] = ()
     """Effects that the library must do without."""
-    settings: Path | None = None
-    """A JSON file with other decision settings."""
     html: bool = True
     """Write report.html (pictures take about a second per case)."""
     overwrite: bool = False
@@ -76,11 +74,9 @@ def run(options: Options) -> int:
         return _compare(options, names, console)
 
     from openjax.flights.case import load_case
-    from openjax.gap import decision
     from openjax.gap.diagnosis import diagnose_case
     from openjax.gap.library import library
 
-    settings = decision.load_settings(options.settings)
     library(options.without)
     predictions, failed = {}, 0
     for folder, name in zip(options.cases, names, strict=True):
@@ -88,7 +84,7 @@ def run(options: Options) -> int:
             with console.status(f"{name}: reading") as status:
                 case = load_case(folder)
                 tell = lambda text, name=name: status.update(f"{name}: {text}")  # noqa: E731
-                report = diagnose_case(case, settings, options.without, tell)
+                report = diagnose_case(case, options.without, tell)
                 tell("writing the report")
                 _write(report, options.out / name, options.html)
         except UserError as error:

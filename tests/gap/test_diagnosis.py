@@ -60,6 +60,8 @@ def test_a_known_cause_is_named_with_its_size(reports):
     half = 0.5 * (estimate.interval90[1] - estimate.interval90[0])
     assert abs(estimate.value - DRAG["d_xy"]) < 3 * half < 0.01
     assert report.gap.reduction > 0.3 and report.gap.interval90[0] > 0
+    share = report.shares.effects["rotor_drag"]
+    assert share.value > 0.9 and share.interval90[0] > 0.8 and report.shares.unexplained.value < 0.1
     assert report.where[0].channel.startswith("force") and report.where[0].after < report.where[0].before
 
 
@@ -105,6 +107,9 @@ def test_the_report_has_the_agreed_form(reports):
         assert all(p["channel"] in CHANNELS and p["regime"] in REGIMES for p in data["where"])
         assert {"metric", "before", "after", "floor", "reduction", "interval90"} <= set(data["gap"])
         assert set(data["not_testable"]) <= set(EFFECTS)
+        first = data["effects"][0] if data["effects"] else "none"
+        assert data["probabilities"][first] == max(data["probabilities"].values())
+        assert set(data["shares"]["effects"]) == set(data["effects"]) - {"unknown"} == set(data["parameters"])
         prediction = report.prediction()
         assert set(prediction) == {"effects", "probabilities", "where", "reduction", "not_testable"}
         assert sum(prediction["probabilities"].values()) == pytest.approx(1.0, abs=1e-3)

@@ -1,4 +1,4 @@
-"""The whole diagnosis of one case: evidence, decision, estimates, report."""
+"""The whole diagnosis of one case: evidence, selection, shares, words, report."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ import numpy as np
 from scipy.stats import t as student
 
 from openjax.flights.flight import Case, Flight, Issue
-from openjax.gap import decision as rules
-from openjax.gap import gate
+from openjax.gap import verdict as rules
 from openjax.gap.evidence import Evidence, gather
-from openjax.gap.headroom import look_around
-from openjax.gap.how_far import held_out_residuals, shrink
 from openjax.gap.hypotheses import SetFit
 from openjax.gap.library import FITS, PLACE, Library, library, path_of
 from openjax.gap.linear_path import linear_score
 from openjax.gap.report import Estimate, Report
-from openjax.gap.rest import CHANNELS, Rest, look
+from openjax.gap.rest import Rest, look
+from openjax.gap.selection import Selection, select
+from openjax.gap.shares import ERROR_NAMES, split
+from openjax.gap.table import BOUND, judge, with_effects
 from openjax.gap.where import locate
 from openjax.vehicle.effects import EFFECTS
 from openjax.vehicle.vehicle_file import VehicleFile, load_vehicle_file
 
-EQUAL = 0.05  # share of the best set's probability at which a substitute counts as equivalent
+CLASS = 10.0  # nats below which another effect in a name's place does as well
 # Pairs that motion alone can't split, whatever their scores, unless something was measured beforehand.
 ALWAYS_EQUAL = (("mass", "thrust_scale"),)
 NEXT_FLIGHT = {
@@ -54,7 +54,6 @@ NEXT_FLIGHT = {
 def diagnose(
     flights: Sequence[Flight],
     vehicle: VehicleFile | None = None,
-    settings: rules.Settings | None = None,
     without: Iterable[str] = (),
     name: str = "case",
     quality: Sequence[Issue] = (),
@@ -66,138 +65,71 @@ def diagnose(
     `without` effects that the library must do without. Raises UserError where the flights are too short or
     hold no commands."""
     vehicle = load_vehicle_file() if vehicle is None else vehicle
-    return diagnose_case(Case(name, tuple(flights), vehicle, tuple(quality)), settings, without, progress)
+    return diagnose_case(Case(name, tuple(flights), vehicle, tuple(quality)), without, progress)
 
 
-def diagnose_case(case: Case, settings=None, without: Iterable[str] = (), progress=None) -> Report:
+def diagnose_case(case: Case, without: Iterable[str] = (), progress=None) -> Report:
     """`diagnose` for a loaded case. `progress(text)` is called as the work goes on."""
     begin = time.perf_counter()
-    settings = rules.load_settings() if settings is None else settings
     evidence = gather(case, library(without), progress)
     if progress:
-        progress("deciding")
-    report = conclude(evidence, settings)
-    return replace(report, seconds=time.perf_counter() - begin)
+        progress("trying every effect that the flights can show")
+    return replace(conclude(evidence), seconds=time.perf_counter() - begin)
 
 
-def conclude(evidence: Evidence, settings: rules.Settings) -> Report:
+def conclude(evidence: Evidence) -> Report:
     """The report that the evidence supports."""
-    first = rules.decide(evidence, None, settings)
-    left = rules.best_fit(evidence, first.best)
-    rest = look(evidence.replay, left)
-    signs = signs_of(evidence, left, rest, first.best, settings) if settings.unknown else None
-    found = rules.decide(evidence, signs, settings)
-    unknown = found.unknown > settings.unknown_threshold
-    effects = ("unknown", *_partly(evidence, found.best)) if unknown else found.best
-    named = [e for e in effects if e != "unknown"]
-    fit = rules.best_fit(evidence, named)
-    held_out = held_out_residuals(evidence, fit)
-    gap = shrink(evidence, held_out, named)
-    missing = not_testable(evidence, settings)
-    verdict = "unknown" if unknown else "effect" if effects else "none"
-    if verdict == "none" and len(missing) >= len(evidence.library.effects) // 2:
-        verdict = "not_testable"
-    equivalent = equivalents(evidence, found, named)
-    ranked = sorted(found.probabilities, key=lambda e: -found.probabilities[e])
-    second = next((e for e in ranked if e not in effects and not (e == "none" and not effects)), "")
-    chance = found.probabilities.get(second, 0.0)
-    splitter = named[0] if named else (second if second in NEXT_FLIGHT else (missing[0] if missing else ""))
+    selection = select(evidence)
+    rest = look(evidence, selection)
+    named = [*selection.effects, *rules.other_paths(evidence)]
+    parts = split(evidence, selection, rest, named)
+    missing = rules.not_testable(evidence)
+    found = rules.decide(evidence, selection, rest, parts, missing)
+    named = [e for e in found.effects if e != "unknown"]
+    equivalent = equivalents(evidence, selection, named)
+    chances = found.probabilities
+    ranked = sorted(chances, key=lambda e: -chances[e])
+    second = next(
+        (e for e in ranked if e not in found.effects and not (e == "none" and not found.effects)), ""
+    )
+    splitter = next((o for e in named for o in equivalent.get(e, ())), missing[0] if missing else second)
     return Report(
         case=evidence.case.name,
-        verdict=verdict,
-        effects=tuple(effects),
-        probabilities=dict.fromkeys(EFFECTS, 0.0) | found.probabilities,
+        verdict=found.word,
+        effects=found.effects,
+        probabilities=chances,
+        shares=parts,
         equivalent=equivalent,
-        parameters=estimates(evidence, fit, named, settings),
-        where=locate(evidence, fit, named),
-        gap=gap,
+        parameters=estimates(evidence, selection.fit, named),
+        where=locate(evidence, selection.fit, named),
+        gap=parts.gap,
         not_testable=missing,
-        next_flight=NEXT_FLIGHT.get(second if second in NEXT_FLIGHT and chance > 0.02 else splitter, ""),
+        next_flight=NEXT_FLIGHT.get(splitter, ""),
         quality=[{"flight": i.flight, "issue": i.issue} for i in evidence.case.quality],
-        runner_up=f"{second} ({chance:.2f})" if second else "",
-        rest=_rest_in_words(rest) if unknown else "",
-        nearest=_nearest(evidence, left, first.best, settings) if unknown else "",
-        nuisances=_nuisances(evidence, fit),
-        plots={"evidence": evidence, "fit": fit, "held_out": held_out, "rest": rest, "decision": found},
+        runner_up=f"{second} ({chances[second]:.2f})" if second and chances[second] > 0.01 else "",
+        rest=_rest_in_words(rest),
+        sensors=tuple(evidence.sensors.findings.values()),
+        nuisances=_nuisances(evidence, selection),
+        plots={"evidence": evidence, "selection": selection},
     )
 
 
-def _nearest(evidence: Evidence, fit: SetFit, best, settings: rules.Settings) -> str:
-    """What the known effects alone would say, in words: not an answer, but where to look."""
-    if not fit.effects:
-        return ""
-    found = estimates(evidence, fit, fit.effects, settings)
-    shown = [f"{e} ({', '.join(v.in_words(p) for p, v in own.items())})" for e, own in found.items()]
-    gap = shrink(evidence, held_out_residuals(evidence, fit), best)
-    return (
-        f"Of the known effects these come nearest: {'; '.join(shown)}; with them the gap on held-out flights would go from "
-        f"{gap.before:.2f} to {gap.after:.2f}."
-    )
-
-
-def signs_of(
-    evidence: Evidence, fit: SetFit, rest: Rest, chosen, settings: rules.Settings
-) -> dict[str, float]:
-    """What the unknown gate weighs, about the fit of the chosen set."""
-    left = left_by(evidence, fit, rest)
-    nothing = left if not fit.effects else left_by(evidence, evidence.nothing)
-    paths = rules.path_scores(evidence)
-    return gate.features(left, nothing, paths, evidence.library.effects, chosen, settings.null)
-
-
-def left_by(evidence: Evidence, fit: SetFit, rest: Rest | None = None) -> gate.Left:
-    """What a fitted set leaves."""
-    rest = look(evidence.replay, fit) if rest is None else rest
-    room = gate.summary(look_around(evidence.replay, fit))
-    taken = evidence.replay.nuisance_estimates([c[0] for c in fit.columns])
-    size = min(map(len, taken))
-    return gate.Left(rest.vector(), room, np.mean([t[:size] for t in taken], 0))
-
-
-def _partly(evidence: Evidence, best) -> list[str]:
-    """Of the named effects those that clearly explain a part although something unknown acts: the first,
-    if any."""
-    for effect in best:
-        if path_of(effect) != "physics":
-            return [effect]
-    return []
-
-
-def not_testable(evidence: Evidence, settings: rules.Settings) -> list[str]:
-    """Effects of the library that, at a usual size, these flights would not show."""
-    missing = [e for e in evidence.library.physics if evidence.exposure.get(e, 0.0) < settings.testable]
-    if evidence.radio is None or evidence.radio.informative < 30:
-        missing += [e for e in ("command_latency", "packet_loss") if e in evidence.library.effects]
-    if evidence.rate_loop is None:
-        missing += [e for e in ("rate_gains",) if e in evidence.library.effects]
-    if evidence.pose is None:
-        missing += [e for e in ("state_latency",) if e in evidence.library.effects]
-    return missing
-
-
-def equivalents(evidence: Evidence, found: rules.Decision, named) -> dict[str, list[str]]:
-    """For each named effect those that would do nearly as well in its place."""
-    top = max(found.posterior.values())
+def equivalents(evidence: Evidence, selection: Selection, named) -> dict[str, list[str]]:
+    """For each named effect those that would do as well in its place."""
     out = {}
     for effect in named:
-        rest = frozenset(found.best) - {effect}
-        others = [
-            next(iter(set(key) - rest))
-            for key, p in found.posterior.items()
-            if len(key) == len(found.best) and rest < frozenset(key) and effect not in key and p > EQUAL * top
-        ]
+        others = [o for o, nats in selection.swaps.get(effect, {}).items() if nats > -CLASS]
         for pair in ALWAYS_EQUAL:
-            weighed = evidence.case.vehicle_file.mass_weighed
-            if effect in pair and not weighed:
+            if effect in pair and not evidence.case.vehicle_file.mass_weighed:
                 others += [e for e in pair if e != effect and e in evidence.library.effects]
         if others:
             out[effect] = sorted(set(others))
     return out
 
 
-def estimates(evidence: Evidence, fit: SetFit, named, settings) -> dict[str, dict[str, Estimate]]:
-    """Parameters of the named effects with 90 % intervals: the larger of the model's and the flights' own
-    spread, and what an inexact form and the nuisances leave besides, a share of the effect's size."""
+def estimates(evidence: Evidence, fit: SetFit, named) -> dict[str, dict[str, Estimate]]:
+    """Parameters of the named effects with 90 % intervals, from the model or, where they disagree more, from the
+    flights' own spread."""
     out = {}
     deviation = robust_deviation(fit)
     for effect in named:
@@ -210,8 +142,7 @@ def estimates(evidence: Evidence, fit: SetFit, named, settings) -> dict[str, dic
                 value, spread = float(fit.theta[place]), float(deviation[list(fit.index).index(place)])
             else:
                 value, spread = _path_estimate(evidence, effect, number)
-            share = settings.form_error.get(effect, settings.usual_form_error)
-            reach = 1.645 * float(np.hypot(spread, share * abs(value - parameter.none)))
+            reach = 1.645 * spread
             values[fitted.name] = Estimate(
                 value, parameter.unit, (value - reach, value + reach), parameter.prior
             )
@@ -255,47 +186,31 @@ def _path_estimate(evidence: Evidence, effect: str, number: int) -> tuple[float,
 
 
 def _rest_in_words(rest: Rest) -> str:
-    best = int(np.argmax(rest.explained))
-    if rest.explained[best] > 0.1:
-        drivers = ", ".join(rest.drivers.get(CHANNELS[best], []))
-        return (
-            f"A flexible model predicts {100 * rest.explained[best]:.0f} % of the rest in "
-            f"{CHANNELS[best].replace('_', ' ')} "
-            f"on held-out flights, mostly from: {drivers}."
-        )
-    worst = int(np.argmax(rest.bands.max(1)))
-    return f"The rest is strongest in {CHANNELS[worst].replace('_', ' ')} and follows no variable of the log."
-
-
-def _nuisances(evidence: Evidence, fit: SetFit) -> dict[str, str]:
-    """What the nuisances took, as text, from the first track of each flight."""
-    numbers = [" ".join(key[:2]) for key in evidence.replay.numbers]
-    names = (
-        *numbers,
-        "motor clock",
-        "frame tilt x",
-        "frame tilt y",
-        "accelerometer bias x",
-        "accelerometer bias y",
-        "accelerometer bias z",
-        "IMU tilt x",
-        "IMU tilt y",
-        "IMU tilt z",
-        "gyroscopic torque x",
-        "gyroscopic torque y",
-        "gyroscopic torque z",
-        "roll and pitch damping",
-        "yaw damping",
-        "pose clock",
+    best = int(np.argmax(rest.predicted))
+    if rest.predicted[best] <= rules.FOLLOWED or rest.nats < rules.LEAST_NATS:
+        return ""
+    return (
+        f"What is left in {ERROR_NAMES[best]} isn't noise: {100 * rest.predicted[best]:.0f} % of it follows "
+        f"{'; '.join(rest.followed)} on stretches left out."
     )
-    taken = []
-    for number, column in enumerate(fit.columns):
-        n = evidence.replay.whitened_nuisances[number].reshape(len(evidence.replay.nuisances[number]), -1)
-        w = evidence.replay.whiten(column[0], number).ravel()
-        taken.append(np.linalg.solve(np.eye(len(n)) + n @ n.T, n @ w))
-    size = min(len(t) for t in taken)
-    mean = np.mean([t[:size] for t in taken], 0)
-    return {name: f"{value:+.2f} of its usual size" for name, value in zip(names, mean, strict=False)}
+
+
+def _nuisances(evidence: Evidence, selection: Selection) -> dict[str, str]:
+    """What the vehicle's numbers and the sensors' mounting took, in usual sizes; a number at its bound says so."""
+    names = [" ".join(key[:2]) for key in evidence.replay.numbers] + SHARED
+    taken = judge(selection.table, with_effects(selection.table)).taken.mean(0)
+    at = lambda v: ", at its bound" if abs(v) > 0.99 * BOUND else ""  # noqa: E731
+    return {n: f"{v:+.2f} of its usual size{at(v)}" for n, v in zip(names, taken, strict=False)}
+
+
+# Shared nuisances beyond the vehicle's numbers, in the replay's order.
+SHARED = [
+    *(f"frame tilt {a}" for a in "xy"),
+    *(f"IMU tilt {a}" for a in "xyz"),
+    *(f"gyroscopic torque {a}" for a in "xyz"),
+    "roll and pitch damping",
+    "yaw damping",
+]
 
 
 __all__ = ["Library", "conclude", "diagnose", "diagnose_case", "library"]

@@ -12,7 +12,8 @@ from openjax.flights.flight import Case
 from openjax.flights.track import Track, tracks_of
 from openjax.gap import estimator, firmware
 from openjax.gap.firmware import Radio
-from openjax.gap.hypotheses import SetFit, fit_set, joint_start, model_noise, score_of, weigh_sets
+from openjax.gap.hypotheses import SetFit, fit_set, joint_start, model_noise, score_of, weigh_singles
+from openjax.gap.kinematics import Kinematics, corrected, read_kinematics
 from openjax.gap.library import ABSENT, NUISANCES, PWM_NUISANCES, Library
 from openjax.gap.linear_path import LinearPath
 from openjax.gap.observer import TICKS
@@ -54,6 +55,7 @@ class Evidence:
     radio: Radio | None
     rate_loop: LinearPath | None
     pose: LinearPath | None
+    sensors: Kinematics
     seconds: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -96,12 +98,13 @@ def gather(case: Case, library: Library, progress=None) -> Evidence:
     names = list(dict.fromkeys(t.flight for t in tracks))
     flight_of = np.array([names.index(t.flight) for t in tracks])
 
-    pose = None
-    if all(t.quaternion is not None for t in tracks):
-        pose = estimator.read_estimator(tracks, flight_of)
-        score, delay, _ = pose.score()
-        if "state_latency" in library.effects and score > CLEAR_SCORE and abs(delay[0]) > CLEAR_DELAY:
-            tracks = [estimator.undelayed(t, float(delay[0])) for t in tracks]
+    late = "state_latency" in library.effects
+    pose, tracks = _pose(tracks, flight_of, late)
+    sensors = read_kinematics(tracks)
+    if sensors.findings:
+        tracks = [corrected(t, sensors) for t in tracks]
+        if pose is not None:
+            pose = estimator.read_estimator(tracks, flight_of) if not _late(pose) else pose
     radio, arrived = None, None
     tracks = [firmware.with_motors(t, v) for t, v in zip(tracks, vehicles, strict=True)]
     if all(t.command is not None and t.motors_logged for t in tracks):
@@ -111,7 +114,7 @@ def gather(case: Case, library: Library, progress=None) -> Evidence:
     lap("paths")
     tell("replaying the flights")
     numbers = PWM_NUISANCES if case.vehicle_file.motor_command == "pwm" else NUISANCES
-    found = _physics(tracks, vehicles, arrived, flight_of, library, numbers)
+    found = _physics(tracks, vehicles, arrived, flight_of, library, numbers, sensors.one_clock)
     lap("first look")
     known = ()
     for _ in range(LOOKS - 1):
@@ -130,12 +133,41 @@ def gather(case: Case, library: Library, progress=None) -> Evidence:
                 np.gradient((m - p)[0, :, :3], track.dt, axis=0)
                 for track, m, p in zip(tracks, moved, plain, strict=True)
             ]
-        found = _physics(tracks, vehicles, arrived, flight_of, library, numbers, pushes, gains)
+        found = _physics(
+            tracks, vehicles, arrived, flight_of, library, numbers, sensors.one_clock, pushes, gains, found[1]
+        )
         lap("next look")
     replay, sets, exposure, floor, rate_loop = found
     return Evidence(
-        case, library, tracks, vehicles, replay, sets, exposure, floor, radio, rate_loop, pose, seconds
+        case,
+        library,
+        tracks,
+        vehicles,
+        replay,
+        sets,
+        exposure,
+        floor,
+        radio,
+        rate_loop,
+        pose,
+        sensors,
+        seconds,
     )
+
+
+def _pose(tracks, flight_of, late: bool):
+    """The pose's path, and the tracks with their pose on the gyroscope's clock where it clearly is late."""
+    if any(t.quaternion is None for t in tracks):
+        return None, tracks
+    pose = estimator.read_estimator(tracks, flight_of)
+    if late and _late(pose):
+        tracks = [estimator.undelayed(t, float(pose.score()[1][0])) for t in tracks]
+    return pose, tracks
+
+
+def _late(pose: LinearPath) -> bool:
+    score, delay, _ = pose.score()
+    return score > CLEAR_SCORE and abs(delay[0]) > CLEAR_DELAY
 
 
 def _clear_gains(rate_loop: LinearPath | None, library: Library):
@@ -146,16 +178,18 @@ def _clear_gains(rate_loop: LinearPath | None, library: Library):
     return np.clip(theta, -0.7, 1.5) if score > CLEAR_GAINS and firmware.lost_share(theta) == 0.0 else None
 
 
-def _physics(tracks, vehicles, arrived, flight_of, library, numbers, pushes=None, gains=None):
+def _physics(
+    tracks, vehicles, arrived, flight_of, library, numbers, one_clock, pushes=None, gains=None, before=None
+):
     """Replay, scores of the sets, exposure, floor residuals and the rate loop's path."""
-    rate_loop, ticks, surprise = None, [np.repeat(t.motor[:, None], TICKS, 1) for t in tracks], None
+    rate_loop, ticks = None, [np.repeat(t.motor[:, None], TICKS, 1) for t in tracks]
     if arrived is not None:
         base = np.zeros(3) if gains is None else gains
         loop = firmware.read_rate_loop(tracks, vehicles, arrived, flight_of, pushes, base)
-        rate_loop, ticks, surprise = loop.path, loop.ticks, loop.surprise
-    replay = make_replay(tracks, vehicles, ticks, surprise, numbers)
+        rate_loop, ticks = loop.path, loop.ticks
+    replay = make_replay(tracks, vehicles, ticks, numbers, one_clock)
     floor, exposure = model_noise(replay, library)
     for effect, channel in NEEDS.items():
         if any(getattr(t, channel) is None for t in tracks):
             exposure[effect] = 0.0
-    return replay, weigh_sets(replay, library, exposure), exposure, floor, rate_loop
+    return replay, weigh_singles(replay, library, exposure, before), exposure, floor, rate_loop

@@ -25,8 +25,6 @@ GAIN_TOLERANCE = ((0.02, 0.3), (0.4, 0.004), (0.12, 0.1))
 # factor, it saw other rates than the log: noise or a late or lost command weakens the fastest column most.
 LOST_D = (-0.4, -0.3)
 LOST_RATIO = (1.2, 1.0)
-LARGEST_SURPRISE = 2.5  # usual deviations
-CLEAR_SCORE = 5.0  # nats above which other gains are taken into account
 USUAL_GYRO_NOISE = 0.0165  # rad/s, of those flights by `gyro_noise`
 GYRO_TILT = 0.01  # rad, between the logged gyro and the one that the controller uses
 LONGEST_DELAY = 0.1  # s
@@ -144,7 +142,7 @@ def with_motors(track: Track, vehicle) -> Track:
     track = dataclasses.replace(track, motor=np.repeat(track.command[:, :1], 4, 1))
     gains = np.ones((1, 3), np.float32)
     for _ in range(2):
-        wanted, _, _ = _observe_twice(track, vehicle, link, gains)
+        wanted, _ = _observe_twice(track, vehicle, link, gains)
         track = dataclasses.replace(track, motor=wanted[0], motors_logged=False)
     return track
 
@@ -166,15 +164,14 @@ def _observe_twice(track: Track, vehicle, link, gains, push=None):
     inside a row are right whatever the physics."""
     rows, size = len(track), bucket(len(track))
     inputs = [padded(v, size) for v in (in_force(track, link), track.motor, track.body_rates)]
-    push, causal = padded(np.zeros((rows, 3)) if push is None else push, size), None
+    push = padded(np.zeros((rows, 3)) if push is None else push, size)
     for _ in range(2):
         wanted, sent, rates = observe(gains, vehicle, *inputs, push, np.float32(track.dt))
-        causal = np.asarray(wanted, float)[:, :rows] if causal is None else causal
         miss = track.body_rates[1:] - np.asarray(rates[0], float)[: rows - 1]
         step = miss.copy()  # undo the observer's own correction of what it missed before
         step[1:] -= (1.0 - GYRO_GAIN) * miss[:-1]
         push = push + padded(smooth(np.concatenate([step, step[-1:]]), 0.06, track.dt) / track.dt, size)
-    return np.asarray(wanted, float)[:, :rows], causal, np.asarray(sent[0])[:rows]
+    return np.asarray(wanted, float)[:, :rows], np.asarray(sent[0])[:rows]
 
 
 def gyro_noise(rates: np.ndarray) -> float:
@@ -201,7 +198,6 @@ class RateLoop:
 
     path: LinearPath
     ticks: list[np.ndarray]
-    surprise: list[np.ndarray]
 
 
 def read_rate_loop(tracks, vehicles, arrived, flight_of, pushes=None, base=(0.0, 0.0, 0.0)) -> RateLoop:
@@ -210,11 +206,10 @@ def read_rate_loop(tracks, vehicles, arrived, flight_of, pushes=None, base=(0.0,
     around which the loop is linearised."""
     base = np.asarray(base, float)
     gains = (1.0 + base + np.concatenate([np.zeros((1, 3)), GAIN_STEP * np.eye(3)])).astype(np.float32)
-    y, columns, nuisances, masks, ticks, foreseen = [], [], [], [], [], []
+    y, columns, nuisances, masks, ticks = [], [], [], [], []
     for number, (track, vehicle, link) in enumerate(zip(tracks, vehicles, arrived, strict=True)):
         push = None if pushes is None else pushes[number]
-        wanted, causal, sent = _observe_twice(track, vehicle, link, gains, push)
-        foreseen.append(causal)
+        wanted, sent = _observe_twice(track, vehicle, link, gains, push)
         ticks.append(sent)
         outputs = np.linalg.pinv(np.asarray(mixer(vehicle), float)).T  # motors to roll, pitch, yaw
         demand, logged = wanted @ outputs, track.motor @ outputs
@@ -238,15 +233,4 @@ def read_rate_loop(tracks, vehicles, arrived, flight_of, pushes=None, base=(0.0,
     tolerance = tuple((least, per_row * worse) for least, per_row in GAIN_TOLERANCE)
     groups = (((0, 1), False), ((2,), False))
     path = fit_linear_path(y, columns, nuisances, flight_of, (0.4, 0.4, 0.4), groups, masks, tolerance)
-    score, theta, _ = path.score()
-    if score < CLEAR_SCORE:
-        theta = base
-    surprise = []
-    for track, vehicle, wanted, mask in zip(tracks, vehicles, foreseen, masks, strict=True):
-        known = wanted[0] + np.tensordot(theta - base, wanted[1:] - wanted[0], 1) / GAIN_STEP
-        beyond = (track.motor - known) @ np.linalg.pinv(np.asarray(mixer(vehicle), float)).T
-        beyond = (beyond - np.median(beyond[mask > 0], axis=0) if mask.any() else beyond) * mask[:, None]
-        # Only what gusts do: larger surprises are causes at work, and must be explained, not taken as known.
-        usual = 1.4826 * np.median(np.abs(beyond[mask > 0]), axis=0) if mask.any() else np.zeros(3)
-        surprise.append(np.clip(beyond, -LARGEST_SURPRISE * usual, LARGEST_SURPRISE * usual))
-    return RateLoop(path, ticks, surprise)
+    return RateLoop(path, ticks)

@@ -13,10 +13,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from openjax.flights.track import rotation, smooth
-from openjax.gap.how_far import HORIZONS, held_out_residuals
-from openjax.gap.hypotheses import score_of
 from openjax.gap.report import Report
-from openjax.gap.rest import disturbances
+from openjax.gap.rest import disturbances, residuals_of
+from openjax.gap.table import HORIZONS
 from openjax.gap.where import CHANNELS, REGIMES
 
 STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:62rem;margin:2rem auto;padding:0 1rem;color:#222}
@@ -38,9 +37,9 @@ def html_of(report: Report) -> str:
         body.append("<h2>Parameters</h2>" + _parameters(report))
     if report.plots:
         pictures = (
+            ("Shares of the gap", _shares),
             ("Where the gap lies", _where),
-            ("What each cause explains, and what is left", _ranking),
-            ("A held-out flight", _overlay),
+            ("A flight before and after", _overlay),
             ("The rest against the effect's own coordinate", _coordinate),
         )
         for title, draw in pictures:
@@ -112,39 +111,23 @@ def _where(report: Report):
     return figure
 
 
-def _ranking(report: Report):
-    evidence = report.plots["evidence"]
-    nothing = evidence.nothing
-    gains, errors, names = [], [], []
-    singles = [k for k in evidence.sets if len(k) == 1]
-    for key in sorted(singles, key=lambda k: -score_of(evidence.sets[k]))[:8]:
-        per_flight = 0.5 * (nothing.grams[:, 0, 0] - evidence.sets[key].grams[:, 0, 0])
-        gains.append(per_flight.sum())
-        errors.append(per_flight.std(ddof=1) * np.sqrt(len(per_flight)) if len(per_flight) > 1 else 0.0)
-        names.append(key[0])
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 2.8))
-    left.barh(names[::-1], gains[::-1], xerr=errors[::-1], color="#2b6cb0", ecolor="#888")
-    head = max(
-        0.5 * nothing.grams[:, 0, 0].sum()
-        - 0.5 * sum(float((evidence.replay.whiten(r, k) ** 2).sum()) for k, r in enumerate(evidence.floor)),
-        0.0,
-    )
-    left.axvline(head, color="#c53030", ls="--", lw=1, label="all effects together")
-    left.set_xscale("symlog", linthresh=10)
-    left.set_xlabel("log-likelihood gained (nats), spread over flights")
-    left.legend(fontsize=8)
+def _shares(report: Report):
+    """The split of the gap, and what it was and is."""
+    parts = {
+        **report.shares.effects,
+        "sensors and clocks": report.shares.sensors,
+        "unexplained": report.shares.unexplained,
+    }
+    names = list(parts)[::-1]
+    values = np.array([parts[n].value for n in names])
+    low, high = np.array([parts[n].interval90 for n in names]).T
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 0.6 + 0.45 * max(len(names), 4)))
+    left.barh(names, values, xerr=[values - low, high - values], color="#2b6cb0", ecolor="#888")
+    left.set_xlabel("share of the gap's square, 90 % interval")
     left.tick_params(labelsize=8)
     gap = report.gap
     right.bar(
-        [
-            "before",
-            "after " + "+".join(e for e in report.effects if e != "unknown")
-            if report.parameters
-            else "after",
-            "floor",
-        ],
-        [gap.before, gap.after, gap.floor],
-        color=["#c53030", "#2b6cb0", "#999"],
+        ["before", "after", "floor"], [gap.before, gap.after, gap.floor], color=["#c53030", "#2b6cb0", "#999"]
     )
     right.set_ylabel("gap, units of the floor")
     right.tick_params(labelsize=8)
@@ -154,9 +137,8 @@ def _ranking(report: Report):
 def _overlay(report: Report):
     evidence = report.plots["evidence"]
     track = evidence.tracks[-1]
-    before = held_out_residuals(evidence, evidence.nothing)[-1]
-    after = report.plots["held_out"][-1]
-    floor = evidence.floor[-1]
+    before = residuals_of(evidence.replay, evidence.nothing)[-1]
+    after = residuals_of(evidence.replay, report.plots["selection"].fit)[-1]
     step = max(round(HORIZONS["velocity"] / track.dt), 1)
     axis = 3 + int(np.argmax([np.std(before[step:, 3 + a] - before[:-step, 3 + a]) for a in range(3)]))
     if not evidence.replay.usable[3]:
@@ -168,8 +150,8 @@ def _overlay(report: Report):
         (after, "#2b6cb0", "with the named effects"),
     ):
         left.plot(time, residual[step:, axis] - residual[:-step, axis], color=colour, lw=0.9, label=label)
-    band = 1.645 * np.std(floor[step:, axis] - floor[:-step, axis])
-    left.axhspan(-band, band, color="#999", alpha=0.3, lw=0, label="90 % of the noise")
+    band = 1.645 * np.std(after[step:, axis] - after[:-step, axis])
+    left.axhspan(-band, band, color="#999", alpha=0.3, lw=0, label="90 % of what is left")
     left.set_xlabel("s")
     unit = "m/s" if axis >= 3 else "rad/s"
     left.set_ylabel(
@@ -178,7 +160,7 @@ def _overlay(report: Report):
     )
     left.legend(fontsize=8)
     rows = [max(round(h / track.dt), 1) for h in (0.02, 0.05, 0.1, 0.25, 0.5, 1.0)]
-    for residual, colour in ((before, "#c53030"), (after, "#2b6cb0"), (floor, "#999")):
+    for residual, colour in ((before, "#c53030"), (after, "#2b6cb0")):
         right.loglog(
             [r * track.dt for r in rows],
             [np.std(residual[r:, axis] - residual[:-r, axis]) for r in rows],
@@ -208,7 +190,7 @@ def _coordinate(report: Report):
         return None
     points = {0: [], 1: []}
     for kind, residuals in enumerate(
-        (held_out_residuals(evidence, evidence.nothing), report.plots["held_out"])
+        residuals_of(evidence.replay, f) for f in (evidence.nothing, report.plots["selection"].fit)
     ):
         for number, residual in enumerate(residuals):
             track = evidence.tracks[number]

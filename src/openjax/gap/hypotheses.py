@@ -62,7 +62,8 @@ def fit_set(replay: Replay, effects, start: np.ndarray | None = None, iterations
         start = ABSENT.copy()
         for effect in effects:
             start[places((effect,))] = start_of(effect)
-    theta, best = start.copy(), None
+    theta, best = ABSENT.copy(), None
+    theta[index] = start[index]  # what isn't in the set is absent
     reach = 3.0 / np.sqrt(np.diag(precision)) if len(index) else np.zeros(0)
     for iteration in range(iterations + 1):
         columns = replay.linearised(theta, index)
@@ -161,9 +162,6 @@ def model_noise(replay: Replay, library: Library) -> tuple[list[np.ndarray], dic
             for left, calm in zip(residuals, nothing, strict=True):
                 left[:, axes] = calm[:, axes]
     replay.set_noise(chosen)
-    replay.loosen_calm_flights()
-    taken = weights() if any(c is f for c, f in zip(chosen, together, strict=True)) else None
-    replay.settle_surprise([c[0] if taken is None else c[0] - np.tensordot(taken, c[1:], 1) for c in columns])
     shown = np.diag(replay.grams(columns).sum(0))[1 + size :]
     exposure = {e: 0.0 for e in library.physics}
     for effect, square in zip(firsts, shown, strict=True):
@@ -221,12 +219,17 @@ def weigh_sets(replay: Replay, library: Library, exposure=None) -> dict[tuple[st
     return found
 
 
-def weigh_singles(replay: Replay, library: Library, exposure=None) -> dict[tuple[str, ...], SetFit]:
-    """Full fits of no effect and of every effect alone that the flights could show."""
+def weigh_singles(
+    replay: Replay, library: Library, exposure=None, before=None
+) -> dict[tuple[str, ...], SetFit]:
+    """Full fits of no effect and of every effect alone that the flights could show; `before`: what an earlier look
+    found, to start from."""
     found = {(): fit_set(replay, ())}
     for effect in library.physics:
         if exposure is None or exposure.get(effect, 1.0) >= UNEXPOSED:
-            found[effect,] = fit_set(replay, (effect,), _best_start(replay, effect))
+            known = before is not None and (effect,) in before
+            start = before[effect,].theta if known else _best_start(replay, effect)
+            found[effect,] = fit_set(replay, (effect,), start)
     return found
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import jax
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from openjax.flights.track import Track, rotation, smooth
 from openjax.gap.library import ABSENT, MOTOR_SHIFT, NUISANCES, PHYSICS_EFFECTS, PLACE, STEP, THETA
@@ -31,26 +32,11 @@ TILT = np.radians(0.5)  # between tracked frame and thrust axis
 IMU_TILT = 0.01  # rad, between the IMU's axes and the body's
 GYROSCOPIC = 0.1  # relative to the moments of inertia
 DAMPING = 0.15  # 1/s, of the body rates by what the rotors do
+APART = 0.03  # s, the same of motor commands whose stream isn't on the pose's clock
 ACCELEROMETER_BIAS = 0.4  # m/s^2
 POSE_SHIFT = 0.0015  # s between motion capture and the vehicle's clock
 WAKE_TORQUE = 15.0  # rad/s^2 at the edge of another vehicle's wake, which no simple form of it has right
 WAKE_WIDTHS = (0.05, 0.1)  # m
-
-
-# How the body rates follow the controller's surprise (rad/s per share of thrust): its sum, then 1 to 5 rows
-# later, with
-# spreads. Measured on nominal flights of the tuning plant, where it hardly varies; the spreads leave room for
-# others.
-SURPRISE = {
-    (0, 1): ((-1.87, 0.1, -0.3, -0.1, 0.05, 0.0), (0.3, 0.25, 0.25, 0.25, 0.25, 0.25)),
-    (2,): ((-3.0, -1.4, -0.6, -0.2, 0.0, 0.0), (0.7, 0.7, 0.6, 0.6, 0.6, 0.6)),
-}
-
-
-# Share of the torque that may be missing, times the mean square of its derivative per row in units of the
-# noise: measured on hovering nominal flights of the tuning plant.
-CALM_TORQUE = 0.15
-SETTLED = 0.3  # of those spreads, once a case's own values are known
 
 
 def bucket(length: int) -> int:
@@ -79,8 +65,8 @@ class Replay:
     usable: np.ndarray
     noises: tuple[Noise, ...] = ()
     whitened_nuisances: list | None = None
+    projections: list | None = None  # (N, M) per track: whitened nuisances times (1 + n n')^(-1/2)
     numbers: tuple = NUISANCES  # the vehicle's numbers among the nuisances, which come first
-    surprise_columns: int = 0  # the last so many nuisances are the controller as a sensor
 
     def predict(self, theta: np.ndarray, track: int | None = None) -> list[np.ndarray]:
         """Channels (B, T, 9) of each track (or of one) for parameter vectors theta (B, P)."""
@@ -99,29 +85,15 @@ class Replay:
             )
         return out
 
-    def settle_surprise(self, residuals) -> None:
-        """Take what the rates owe to the controller's surprise from the residuals [(T, 9)] of a good
-        explanation, and hold it nearly fixed from now on."""
-        if not self.surprise_columns:
-            return
-        last = slice(-self.surprise_columns, None)
-        taken = np.mean([t[last] for t in self.nuisance_estimates(residuals)], 0)
-        for number in range(len(self.tracks)):
-            self.measured[number] = self.measured[number] - np.tensordot(
-                taken, self.nuisances[number][last], 1
-            )
-            self.nuisances[number][last] *= SETTLED
-        self.set_noise(self.noises)
-
-    def loosen_calm_flights(self) -> None:
-        """Free the torque per motor command where little is flown: what is left is feedback against gusts."""
-        for number, columns in enumerate(self.nuisances):
-            for place, (effect, _, spread) in enumerate(self.numbers):
-                if effect == "inertia":
-                    w = self.whitened_nuisances[number][place]
-                    power = float((w * w).sum()) / spread**2 / w.shape[0]
-                    columns[place] *= (spread + CALM_TORQUE / max(power, 1e-3)) / spread
-        self.set_noise(self.noises)
+    def shared_nuisances(self, count: int) -> np.ndarray:
+        """(count,) whether a nuisance belongs to the vehicle (and so to all flights) or to a track."""
+        own = len(self.numbers)
+        shared = np.ones(count, bool)
+        shared[own] = False  # the motors' clock
+        shared[own + 3 : own + 6] = False  # accelerometer bias
+        if self.usable[3]:
+            shared[own + 14] = False  # pose clock
+        return shared
 
     def nuisance_estimates(self, residuals) -> list[np.ndarray]:
         """Most likely nuisances (N,) of each track, in their standard deviations, given residuals (T, 9)."""
@@ -148,12 +120,14 @@ class Replay:
             flights=names,
             flight_of=np.array([f - (f > flight) for f in self.flight_of[keep]]),
             whitened_nuisances=pick(self.whitened_nuisances),
+            projections=pick(self.projections),
         )
 
     def set_noise(self, noises) -> None:
         """Use these noise models; unlogged channels get none and count nothing."""
         self.noises = tuple(noises)
         self.whitened_nuisances = [self.whiten(n, k) for k, n in enumerate(self.nuisances)]
+        self.projections = [projection(n.reshape(len(n), -1)) for n in self.whitened_nuisances]
 
     def whiten(self, x: np.ndarray, track: int) -> np.ndarray:
         """x (..., T, 9) of a track -> (..., T', 9) in units of the noise, without the first moments."""
@@ -162,12 +136,12 @@ class Replay:
 
     def grams(self, columns: list[np.ndarray]) -> np.ndarray:
         """Inner products (F, C, C) per flight of columns [(C, T, 9) per track], nuisances marginalised."""
-        total = 0.0
         size = len(columns[0])
         total = np.zeros((len(self.flights), size, size))
         for number, column in enumerate(columns):
             w = self.whiten(column, number).reshape(size, -1)
-            total[self.flight_of[number]] += marginal_gram(w, self.whitened_nuisances[number])
+            cross = w @ self.projections[number].T
+            total[self.flight_of[number]] += w @ w.T - cross @ cross.T
         return total
 
     def linearised(self, theta: np.ndarray, index: np.ndarray) -> list[np.ndarray]:
@@ -180,6 +154,13 @@ class Replay:
             np.concatenate([(y - p[0])[None], (p[1:] - p[:1]) / steps])
             for y, p in zip(self.measured, self.predict(batch), strict=True)
         ]
+
+
+def projection(nuisances: np.ndarray) -> np.ndarray:
+    """(N, M) rows p such that w w' - (w p')(w p')' is the gram of w (C, M) once nuisances (N, M) of unit prior
+    variance are marginalised."""
+    root = np.linalg.cholesky(np.eye(len(nuisances)) + nuisances @ nuisances.T)
+    return solve_triangular(root, nuisances, lower=True, check_finite=False)
 
 
 def marginal_gram(w: np.ndarray, nuisances: np.ndarray) -> np.ndarray:
@@ -199,11 +180,10 @@ def _integrated(rows: np.ndarray, dt: float) -> np.ndarray:
     return np.concatenate([integral, specific], 2)
 
 
-def make_replay(tracks, vehicles, motor_ticks, surprise=None, numbers=NUISANCES) -> Replay:
+def make_replay(tracks, vehicles, motor_ticks, numbers=NUISANCES, one_clock=True) -> Replay:
     """Replay of tracks with their nominal vehicles and motor commands (T, TICKS, 4) of the rate loop's ticks.
-
-    surprise [(T, 3)]: what the rate controller did beyond foresight (`RateLoop`), a second sensor of the
-    body rates."""
+    Without `one_clock` the IMU's stream and the motors' are apart by unknown times: the IMU counts nothing, and the motors
+    may be off by tens of milliseconds."""
     paths = [jax.device_put(_path(t, m)) for t, m in zip(tracks, motor_ticks, strict=True)]
     measured = [_measured(t) for t in tracks]
     usable = np.ones(9)
@@ -211,6 +191,8 @@ def make_replay(tracks, vehicles, motor_ticks, surprise=None, numbers=NUISANCES)
         usable[VELOCITY] = 0.0
     if any(t.specific_force is None for t in tracks):
         usable[FORCE] = 0.0
+    if not one_clock and usable[3]:
+        usable[RATES] = usable[FORCE] = 0.0
     flights = tuple(dict.fromkeys(t.flight for t in tracks))
     replay = Replay(
         list(tracks),
@@ -225,7 +207,7 @@ def make_replay(tracks, vehicles, motor_ticks, surprise=None, numbers=NUISANCES)
         numbers=numbers,
     )
     index = [PLACE[key[:2]] for key in numbers] + [len(ABSENT) - 1]
-    spread = np.array([key[2] for key in numbers] + [MOTOR_SHIFT])
+    spread = np.array([key[2] for key in numbers] + [MOTOR_SHIFT if one_clock else APART])
     batch = np.repeat(ABSENT[None], 1 + len(index), 0)
     batch[np.arange(len(index)) + 1, index] += STEP[index]
     for number, track in enumerate(tracks):
@@ -233,11 +215,6 @@ def make_replay(tracks, vehicles, motor_ticks, surprise=None, numbers=NUISANCES)
         replay.nominal.append(base)
         columns = [(m - base) * s for m, s in zip(moved, spread / STEP[index], strict=True)]
         columns += _sensor_nuisances(track, paths[number], base)
-        if surprise is not None:
-            usual, more = _controller_as_sensor(surprise[number])
-            measured[number] -= usual
-            columns += more
-            replay.surprise_columns = len(more)
         replay.nuisances.append(np.stack(columns))
     replay.set_noise([first_noise(a, i, d) for (a, i), d in zip(GROUPS, FIRST_NOISE, strict=True)])
     return replay
@@ -343,25 +320,3 @@ def _wake_torques(track: Track, turn: np.ndarray) -> list[np.ndarray]:
         world = np.stack([-gap[..., 1], gap[..., 0], np.zeros_like(gap[..., 0])], -1) * strength
         out.append(np.einsum("tji,tj->ti", turn, world.sum(0)))
     return out
-
-
-def _controller_as_sensor(surprise: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """What the rate controller's surprise (T, 3) says about the rates that follow: the usual (T, 9), and
-    nuisances for what may differ from it.
-
-    The controller acts on the true rates with a better gyroscope than the log's, so the motors know of a
-    gust before the log does. Without this a model that makes the motors weak predicts better than the true
-    one, since feedback against gusts looks like motors without effect (closed-loop identification)."""
-
-    def later(values, rows):
-        return np.concatenate([np.zeros((rows, 3)), values[: len(values) - rows]])
-
-    usual, columns = np.zeros((len(surprise), 9)), []
-    shapes = [later(np.cumsum(surprise, 0), 1), *(later(surprise, k) for k in range(1, 6))]
-    for axes, (means, spreads) in SURPRISE.items():
-        for shape, mean, spread in zip(shapes, means, spreads, strict=True):
-            column = np.zeros((len(surprise), 9))
-            column[:, axes] = shape[:, axes]
-            usual += mean * column
-            columns.append(spread * column)
-    return usual, columns

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from openjax.gap.how_far import Gap
+from openjax.gap.shares import Gap, Split
 from openjax.gap.where import Place, in_words
 from openjax.vehicle.effects import EFFECTS, save_effects
 
@@ -44,6 +44,7 @@ class Report:
     verdict: str
     effects: tuple[str, ...]
     probabilities: dict[str, float]
+    shares: Split
     equivalent: dict[str, list[str]]
     parameters: dict[str, dict[str, Estimate]]
     where: list[Place]
@@ -53,7 +54,7 @@ class Report:
     quality: list[dict[str, str]]
     runner_up: str = ""
     rest: str = ""
-    nearest: str = ""
+    sensors: tuple[str, ...] = ()
     nuisances: dict[str, str] = field(default_factory=dict)
     seconds: float = 0.0
     plots: dict = field(default_factory=dict, repr=False)
@@ -74,6 +75,11 @@ class Report:
             "verdict": self.verdict,
             "effects": list(self.effects),
             "probabilities": {k: round(v, 6) for k, v in self.probabilities.items()},
+            "shares": {
+                "effects": {e: _share(v) for e, v in self.shares.effects.items()},
+                "sensors": _share(self.shares.sensors),
+                "unexplained": _share(self.shares.unexplained),
+            },
             "equivalent": self.equivalent,
             "parameters": {
                 e: {
@@ -110,31 +116,34 @@ class Report:
             "quality": self.quality,
             "runner_up": self.runner_up,
             "rest": self.rest,
-            "nearest": self.nearest,
+            "sensors": list(self.sensors),
             "nuisances": self.nuisances,
         }
 
+    def shares_in_words(self) -> str:
+        """ "rotor_drag .52 [.47, .56], motor_lag .17 [.12, .21]; sensors and clocks .03; unexplained .11" """
+        named = [(e, self.shares.effects[e]) for e in self.effects if e != "unknown"]
+        parts = ", ".join(
+            f"{e} {_short(v.value)} [{_short(v.interval90[0])}, {_short(v.interval90[1])}]" for e, v in named
+        )
+        rest = f"sensors and clocks {_short(self.shares.sensors.value)}; unexplained {_short(self.shares.unexplained.value)}"
+        return f"Shares of the gap: {parts}; {rest}." if parts else f"Shares of the gap: {rest}."
+
     def in_words(self) -> list[str]:
-        """The verdict in a few plain sentences."""
-        chance = self.probabilities
-        lines = []
-        if self.verdict == "effect":
-            names = " and ".join(self.effects)
-            lines.append(f"Cause: {names} (probability {sum(chance.get(e, 0.0) for e in self.effects):.2f}).")
-        elif self.verdict == "unknown":
-            named = [e for e in self.effects if e != "unknown"]
-            more = f"; part of it looks like {named[0]}" if named else ""
-            lines.append(
-                f"Something acts that no known effect explains (probability {chance['unknown']:.2f}){more}."
-            )
-        elif self.verdict == "not_testable":
+        """The shares, then what they mean, in a few plain sentences."""
+        lines = [self.shares_in_words()] if self.effects or self.sensors else []
+        if self.verdict == "not_testable":
             lines.append("No effect is seen, but these flights could not show most of those that are usual.")
-        else:
+        elif self.verdict == "none":
+            chance = self.probabilities["none"]
             lines.append(
-                "The simulator agrees with these flights to within the noise "
-                f"(probability {chance['none']:.2f})."
+                f"The simulator agrees with these flights to within the noise (probability {chance:.2f})."
             )
-        lines += [text for text in (self.rest, self.nearest) if text]
+        elif self.effects == ("unknown",):
+            chance = self.probabilities["unknown"]
+            lines.append(f"Something acts that no known effect explains (probability {chance:.2f}).")
+        lines += [f"Sensors: {text}." for text in self.sensors]
+        lines += [self.rest] if self.rest else []
         lines.append(f"Where: {in_words(self.where)}.")
         for effect, values in self.parameters.items():
             shown = ", ".join(v.in_words(p) + (" (unusual)" if v.unusual else "") for p, v in values.items())
@@ -157,6 +166,14 @@ class Report:
         if self.next_flight:
             lines.append(f"Fly next: {self.next_flight}")
         return lines
+
+
+def _share(share) -> dict:
+    return {"value": round(share.value, 4), "interval90": [round(v, 4) for v in share.interval90]}
+
+
+def _short(value: float) -> str:
+    return f"{value:.2f}".replace("0.", ".", 1)
 
 
 def to_fly(report: Report) -> tuple[dict, dict]:

@@ -1,9 +1,9 @@
-"""What a hypothesis leaves: is it noise and gusts, or something that no effect of the library explains?
+"""What the accepted effects leave: how much of it follows anything that the log knows, on stretches left out.
 
-Three looks at the rest of the best hypothesis, none of which knows the effects: how strong it is by
-frequency band against the sensors' own noise, how much of it a flexible model of the state predicts on
-flights that it wasn't fitted to, and how unevenly it comes. Each is a number per channel; the tuning turns
-them into a probability."""
+A dictionary of plain regressors - place, motion, motor commands, voltage, the vehicle above - pushes and turns the
+vehicle along each axis, without any effect's form. Its columns go through the same replay, noise models, nuisances and
+folds as the effects do. Angular accelerations, which share the gyroscope's noise with what is to be explained, are not
+among them, and what hardly happened in the flights is kept small."""
 
 from __future__ import annotations
 
@@ -12,36 +12,160 @@ from dataclasses import dataclass
 import numpy as np
 
 from openjax.flights.track import Track, rotation, smooth
+from openjax.gap.evidence import Evidence
 from openjax.gap.hypotheses import SetFit, without_nuisances
-from openjax.gap.replay import FORCE, RATES, SKIP, VELOCITY, Replay
+from openjax.gap.replay import FORCE, RATES, VELOCITY, Replay, torque_channels
+from openjax.gap.selection import Selection, testable
+from openjax.gap.table import Model, build, judge, with_effects
+from openjax.vehicle.effects.effect import ARENA_CEILING
 
-BANDS = ((0.3, 1.5), (1.5, 5.0), (5.0, 12.0))  # Hz
-SENSOR_BAND = (25.0, 45.0)  # Hz, where the logs hold sensor noise only
-CHANNELS = ("torque_xy", "torque_z", "force_xy", "force_z", "accelerometer_xy", "accelerometer_z")
-AXES = ((0, 1), (2,), (3, 4), (5,), (6, 7), (8,))
-RIDGE = 30.0  # prior precision of the flexible model's standardised coefficients, per second of flight
-BLOCK = 0.5  # s
+SPREAD = 0.3  # m/s^2 and, times TORQUE, rad/s^2: prior rms of a regressor's part of the motion
+TORQUE = 10.0
+RADIUS = 0.023  # m, of a propeller
+RARE = 0.3  # of a regressor's usual size: one that happened less is not blown up
+WIDTH = 0.25  # m of the radial functions of the place
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Rest:
-    """`bands` (6, 3): log power by channel and band over sensor noise, `levels` the same as densities;
-    `explained` (6,): share of the rest's power that the flexible model predicts on held-out flights;
-    `uneven` (6,): log ratio of the largest to the median power of half-second blocks; `incoherent`:
-    disagreement of the flights about the parameters, per parameter; `drivers` {channel: names of the
-    regressors that carry most}."""
+    """`predicted` (6,) share of each channel's squared error on stretches left out that the dictionary predicts
+    (rates x, y, z, velocity x, y, z), `nats` of likelihood that it adds there, `followed` the regressors that carry
+    most, in words."""
 
-    bands: np.ndarray
-    levels: np.ndarray
-    explained: np.ndarray
-    uneven: np.ndarray
-    incoherent: float
-    drivers: dict[str, list[str]]
+    predicted: np.ndarray
+    nats: float
+    followed: tuple[str, ...]
 
-    def vector(self) -> np.ndarray:
-        return np.concatenate(
-            [self.bands.ravel(), self.explained, self.uneven, [self.incoherent], self.levels.ravel()]
-        )
+
+def look(evidence: Evidence, selection: Selection) -> Rest:
+    """What the dictionary predicts of what the selection leaves."""
+    replay = evidence.replay
+    tables = [dictionary(t) for t in replay.tracks]
+    names = [n for n in tables[0] if all(n in t for t in tables)]
+    usual = {n: tables[0][n][2] for n in names}
+    size = {n: np.sqrt(np.mean(np.concatenate([t[n][1] for t in tables]) ** 2)) for n in names}
+    names = [n for n in names if size[n] > 1e-3 * usual[n]]
+    more = [
+        np.stack([channels(track, t[n][0], t[n][1] / max(size[n], RARE * usual[n])) for n in names])
+        for track, t in zip(replay.tracks, tables, strict=True)
+    ]
+    table = build(
+        replay, selection.fit, {e: f for e, f in testable(evidence).items() if e in selection.effects}, more
+    )
+    plain = with_effects(table)
+    extra = table.more
+    spread = np.array([SPREAD * (TORQUE if tables[0][n][0] == "torque" else 1.0) for n in names])
+    wide = Model(
+        plain.parts,
+        np.concatenate([plain.free, extra]).astype(int),
+        np.concatenate([plain.mean, np.zeros(len(extra))]),
+        _diagonal(plain.precision, 1.0 / spread**2),
+    )
+    now, then = judge(table, plain), judge(table, wide)
+    left = now.squares.sum(0)
+    predicted = np.where(table.usable > 0, 1.0 - then.squares.sum(0) / np.maximum(left, 1e-30), 0.0)
+    white = table.white.sum(0)
+    alone = white[0, extra] ** 2 / (white[extra, extra] + 1.0 / spread**2)
+    order = np.argsort(-alone)[:3]
+    return Rest(
+        np.maximum(predicted, 0.0), float((then.nats - now.nats).sum()), tuple(names[k] for k in order)
+    )
+
+
+def _diagonal(block: np.ndarray, more: np.ndarray) -> np.ndarray:
+    size = len(block) + len(more)
+    out = np.zeros((size, size))
+    out[: len(block), : len(block)] = block
+    out[np.arange(len(block), size), np.arange(len(block), size)] = more
+    return out
+
+
+def channels(track: Track, kind: str, values: np.ndarray) -> np.ndarray:
+    """Channels (T, 9) of an acceleration (T, 3) of the body frame: "force" m/s^2 or "torque" rad/s^2."""
+    if kind == "torque":
+        return torque_channels(values, track.dt)
+    out = np.zeros((len(track), 9))
+    turned = (
+        values if track.quaternion is None else np.einsum("tij,tj->ti", rotation(track.quaternion), values)
+    )
+    out[1:, VELOCITY] = np.cumsum(turned, 0)[:-1] * track.dt
+    out[:, FORCE] = values
+    return out
+
+
+def dictionary(track: Track) -> dict[str, tuple[str, np.ndarray, float]]:
+    """{name: (kind, acceleration (T, 3) of the body frame, usual size)}."""
+    rows = len(track)
+    turn = rotation(track.quaternion) if track.quaternion is not None else np.tile(np.eye(3), (rows, 1, 1))
+    velocity = track.velocity if track.velocity is not None else np.zeros((rows, 3))
+    v = smooth(np.einsum("tji,tj->ti", turn, velocity), 0.1, track.dt)
+    speed = np.linalg.norm(v, axis=1)
+    w = smooth(track.body_rates, 0.1, track.dt)
+    thrust = smooth(track.motor.mean(1), 0.05, track.dt)
+    over = thrust - 0.62
+    mix = np.array([[-1, -1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]]) / 4.0
+    square = smooth((track.motor - 0.62) ** 2 @ mix.T, 0.05, track.dt)
+    heading = np.arctan2(turn[:, 1, 0], turn[:, 0, 0])
+    time = (track.time - track.time[0]) / 10.0 - 0.5
+    out: dict[str, tuple[str, np.ndarray, float]] = {}
+
+    def add(kind, name, axis, values, usual=1.0):
+        vector = values if axis is None else values[:, None] * np.eye(3)[axis]
+        out[f"{kind} {'' if axis is None else 'xyz'[axis] + ' '}by {name}"] = (kind, vector, usual)
+
+    for axis in (0, 1):
+        add("force", "velocity", axis, v[:, axis])
+        add("force", "velocity squared", axis, v[:, axis] * speed)
+        add("force", "velocity times thrust", axis, v[:, axis] * over, 0.1)
+        add("force", "velocity across", axis, v[:, 1 - axis])
+        add("force", "thrust", axis, thrust)
+        add("force", f"wind along world {'xy'[axis]}", None, turn[:, axis])
+        add("torque", "velocity", axis, v[:, 1 - axis])
+        add("torque", "thrust", axis, thrust)
+        add("torque", "rates across", axis, w[:, 1 - axis])
+        add("torque", "motor commands squared", axis, square[:, axis], 0.01)
+        add("torque", "tilt", axis, turn[:, 2, axis], 0.1)
+    for name, values, usual in (
+        ("vertical speed", v[:, 2], 0.3),
+        ("vertical speed times speed", v[:, 2] * speed, 0.3),
+        ("horizontal speed", (v[:, :2] ** 2).sum(1), 1.0),
+        ("sinking", np.minimum(v[:, 2], 0.0), 0.3),
+        ("thrust", over, 0.1),
+        ("thrust squared", over**2, 0.02),
+        ("high motor commands", np.maximum(track.motor - 0.75, 0.0).mean(1), 0.03),
+        ("time", time, 0.3),
+    ):
+        add("force", name, 2, values, usual)
+    add("torque", "rates x", 2, w[:, 0])
+    add("torque", "rates y", 2, w[:, 1])
+    add("torque", "thrust", 2, thrust)
+    add("torque", "motor commands squared", 2, square[:, 2], 0.01)
+    add("torque", "heading, sine", 2, np.sin(heading))
+    add("torque", "heading, cosine", 2, np.cos(heading))
+    add("torque", "change of thrust", 2, np.gradient(thrust, track.dt))
+    if track.voltage is not None:
+        add("force", "voltage", 2, track.voltage - 3.8, 0.1)
+    if track.position is not None:
+        place = track.position - [0.0, 0.0, 0.6]
+        height = np.maximum(track.position[:, 2], 0.0)
+        for axis in range(3):
+            for own in range(3):
+                pull = place[:, own : own + 1] * turn[:, axis]
+                add("force", f"place {'xyz'[own]} along world {'xyz'[axis]}", None, pull, 0.3)
+        add("force", "the floor near", 2, (RADIUS / (height + 0.03)) ** 2, 0.1)
+        ceiling = np.maximum(ARENA_CEILING - height, 0.0)
+        add("force", "the ceiling near", 2, (RADIUS / (ceiling + 0.05)) ** 2, 0.1)
+        for x in (-0.5, 0.0, 0.5):
+            for y in (-0.5, 0.0, 0.5):
+                bump = np.exp(-((place[:, 0] - x) ** 2 + (place[:, 1] - y) ** 2) / (2 * WIDTH**2))
+                add("force", f"the place ({x:g}, {y:g})", 2, bump, 0.3)
+        for k, other in enumerate(track.neighbours):
+            gap = other - track.position
+            below = (gap[:, 2] > 0.02) * np.exp(-np.maximum(gap[:, 2], 0.0) / 0.5)
+            for width in (0.05, 0.15):
+                near = below * np.exp(-(gap[:, 0] ** 2 + gap[:, 1] ** 2) / (2 * width**2))
+                add("force", f"vehicle {k} above, {width:g} m", 2, near, 0.1)
+    return out
 
 
 def residuals_of(replay: Replay, fit: SetFit) -> list[np.ndarray]:
@@ -50,8 +174,7 @@ def residuals_of(replay: Replay, fit: SetFit) -> list[np.ndarray]:
 
 
 def disturbances(track: Track, residual: np.ndarray) -> np.ndarray:
-    """The rest as accelerations (T, 9): angular (body), linear (body, from the velocity), specific force
-    (body)."""
+    """The rest as accelerations (T, 9): angular (body), linear (body, from the velocity), specific force (body)."""
     out = np.zeros_like(residual)
     out[:, RATES] = np.gradient(residual[:, RATES], track.dt, axis=0)
     world = np.gradient(residual[:, VELOCITY], track.dt, axis=0)
@@ -61,169 +184,3 @@ def disturbances(track: Track, residual: np.ndarray) -> np.ndarray:
     out[:, VELOCITY] = np.einsum("tji,tj->ti", turn, world)
     out[:, FORCE] = residual[:, FORCE]
     return out
-
-
-def look(replay: Replay, fit: SetFit) -> Rest:
-    """All three looks at what `fit` leaves."""
-    residuals = residuals_of(replay, fit)
-    rests = [disturbances(t, r) for t, r in zip(replay.tracks, residuals, strict=True)]
-    bands, levels = np.mean([_bands(t, r) for t, r in zip(replay.tracks, rests, strict=True)], 0)
-    calm = [smooth(r, 0.15, t.dt) for t, r in zip(replay.tracks, rests, strict=True)]
-    explained, drivers = _explained(replay, calm)
-    uneven = np.max([_uneven(t, r) for t, r in zip(replay.tracks, calm, strict=True)], 0)
-    return Rest(bands, levels, explained, uneven, _incoherent(fit), drivers)
-
-
-def _bands(track: Track, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """log10 power density (6, 3) in the bands over that of the sensors, each as the sensor sees it."""
-    rows = rest[int(SKIP / track.dt) :]
-    window = np.hanning(len(rows))[:, None]
-    power = np.abs(np.fft.rfft((rows - rows.mean(0)) * window, axis=0)) ** 2
-    frequency = np.fft.rfftfreq(len(rows), track.dt)
-    out, levels = np.zeros((len(AXES), len(BANDS))), np.zeros((len(AXES), len(BANDS)))
-    density = track.dt / (window**2).sum()
-    for number, axes in enumerate(AXES):
-        spectrum = power[:, list(axes)].mean(1)
-        top = (frequency > SENSOR_BAND[0]) & (frequency < SENSOR_BAND[1])
-        if not top.any():
-            top = frequency > 0.6 * frequency[-1]
-        level = spectrum[top].mean() + 1e-20
-        for band, (low, high) in enumerate(BANDS):
-            inside = (frequency > low) & (frequency <= high)
-            out[number, band] = np.log10((spectrum[inside].mean() + 1e-20) / level)
-            levels[number, band] = np.log10(spectrum[inside].mean() * density + 1e-20)
-    return out, levels
-
-
-def regressors(track: Track) -> tuple[list[str], np.ndarray]:
-    """A broad dictionary (T, K) of the state: velocity, attitude, rates, height, place, motors, voltage,
-    time."""
-    rows = len(track)
-    zero = np.zeros((rows, 3))
-    velocity = track.velocity if track.velocity is not None else zero
-    turn = rotation(track.quaternion) if track.quaternion is not None else np.tile(np.eye(3), (rows, 1, 1))
-    body = np.einsum("tji,tj->ti", turn, velocity)
-    rates = smooth(track.body_rates, 0.05, track.dt)
-    collective = smooth(track.motor.mean(1), 0.05, track.dt)
-    columns = {}
-    for axis, name in enumerate("xyz"):
-        columns[f"v_{name}"] = body[:, axis]
-        columns[f"v_{name}|v|"] = body[:, axis] * np.linalg.norm(body, axis=1)
-        columns[f"F v_{name}"] = body[:, axis] * (collective - collective.mean())
-        columns[f"w_{name}"] = rates[:, axis]
-        columns[f"dw_{name}"] = np.gradient(rates[:, axis], track.dt)
-        for other, label in ((0, "x"), (1, "y")):
-            columns[f"world {label} in {name}"] = turn[:, other, axis]
-        columns[f"up in {name}"] = turn[:, 2, axis]
-    columns |= {
-        "v_xy^2": (body[:, :2] ** 2).sum(1),
-        "v_z^2": body[:, 2] ** 2,
-        "sink": np.minimum(body[:, 2], 0.0),
-        "w_x w_y": rates[:, 0] * rates[:, 1],
-        "w_x w_z": rates[:, 0] * rates[:, 2],
-        "w_y w_z": rates[:, 1] * rates[:, 2],
-        "F": collective,
-        "F^2": collective**2,
-        "F^3": collective**3,
-        "dF/dt": np.gradient(collective, track.dt),
-        "high F": np.maximum(collective - np.quantile(collective, 0.8), 0.0),
-    }
-    mix = np.array([[-1, -1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]]) / 4.0
-    for name, row in zip(("roll", "pitch", "yaw"), mix, strict=True):
-        difference = smooth(track.motor @ row, 0.03, track.dt)
-        columns[f"{name} motors"] = difference
-        columns[f"F x {name} motors"] = difference * (collective - collective.mean())
-        columns[f"d {name} motors/dt"] = np.gradient(difference, track.dt)
-    if track.position is not None:
-        x, y, z = track.position.T
-        radius = np.hypot(x, y) + 1e-6
-        columns |= {
-            "z": z,
-            "near floor": (0.023 / (np.maximum(z, 0.0) + 0.03)) ** 2,
-            "near ceiling": (0.023 / (np.maximum(1.2 - z, 0.0) + 0.05)) ** 2,
-        }
-        outward = np.stack([x, y, 0 * x], 1) * (np.maximum(radius - 0.5, 0.0) / radius)[:, None]
-        for axis, name in enumerate("xyz"):
-            columns[f"place in {name}"] = np.einsum(
-                "tj,tj->t", track.position - track.position.mean(0), turn[:, :, axis]
-            )
-            columns[f"wall in {name}"] = np.einsum("tj,tj->t", outward, turn[:, :, axis])
-        for k, other in enumerate(track.neighbours):
-            gap = other - track.position
-            below = (gap[:, 2] > 0.02) * np.exp(-gap[:, 2] / 0.5)
-            for width in (0.05, 0.1, 0.2):
-                columns[f"under {k} ({width})"] = below * np.exp(
-                    -(gap[:, 0] ** 2 + gap[:, 1] ** 2) / (2 * width**2)
-                )
-    if track.voltage is not None:
-        columns["V"] = track.voltage
-    columns["t"] = track.time - track.time[0]
-    names = list(columns)
-    return names, smooth(np.stack([columns[n] for n in names], 1), 0.15, track.dt)
-
-
-def _explained(replay: Replay, calm: list[np.ndarray]) -> tuple[np.ndarray, dict[str, list[str]]]:
-    """Share of each channel's rest (6,) that ridge regression predicts on flights left out, at least 0."""
-    tables = [regressors(t) for t in replay.tracks]
-    shared = [n for n in tables[0][0] if all(n in names for names, _ in tables)]
-    features = [values[:, [names.index(n) for n in shared]] for names, values in tables]
-    skip = [int(SKIP / t.dt) for t in replay.tracks]
-    stacked = np.concatenate([f[s:] for f, s in zip(features, skip, strict=True)])
-    centre, scale = stacked.mean(0), stacked.std(0) + 1e-9
-    x = [(f[s:] - centre) / scale for f, s in zip(features, skip, strict=True)]
-    y = [c[s:] - c[s:].mean(0) for c, s in zip(calm, skip, strict=True)]
-    count = len(replay.flights)
-    share = np.zeros((len(AXES),))
-    if count < 2:
-        return share, {}
-    spread = np.std(np.concatenate(y), 0) + 1e-12
-    seconds = sum(len(t) * t.dt for t in replay.tracks)
-    rows = sum(len(v) for v in x)
-    penalty = RIDGE * rows / max(seconds, 1.0) * np.eye(len(shared)) / 10.0
-    before, after = np.zeros(9), np.zeros(9)
-    for held in range(count):
-        train = [k for k in range(len(x)) if replay.flight_of[k] != held]
-        a = sum(x[k].T @ x[k] for k in train) + penalty
-        b = sum(x[k].T @ y[k] for k in train)
-        weights = np.linalg.solve(a, b)
-        for k in (k for k in range(len(x)) if replay.flight_of[k] == held):
-            guess = x[k] @ weights
-            guess -= guess.mean(0)
-            before += (y[k] ** 2).sum(0)
-            after += ((y[k] - guess) ** 2).sum(0)
-    for number, axes in enumerate(AXES):
-        axes = list(axes)
-        share[number] = 1.0 - (after[axes] / spread[axes] ** 2).sum() / max(
-            (before[axes] / spread[axes] ** 2).sum(), 1e-12
-        )
-    everything = np.linalg.solve(
-        sum(v.T @ v for v in x) + penalty, sum(u.T @ v for u, v in zip(x, y, strict=True))
-    )
-    drivers = {}
-    for number, axes in enumerate(AXES):
-        size = np.abs(everything[:, list(axes)] / spread[list(axes)]).max(1)
-        drivers[CHANNELS[number]] = [shared[i] for i in np.argsort(-size)[:3]]
-    return np.maximum(share, 0.0) * (replay.usable[[a[0] for a in AXES]] > 0), drivers
-
-
-def _uneven(track: Track, calm: np.ndarray) -> np.ndarray:
-    """log ratio (6,) of the strongest to the median block's power."""
-    size = max(int(BLOCK / track.dt), 1)
-    rows = calm[int(SKIP / track.dt) :]
-    count = len(rows) // size
-    power = (rows[: count * size].reshape(count, size, 9) ** 2).mean(1) + 1e-20
-    return np.array(
-        [np.log(power[:, list(a)].mean(1).max() / np.median(power[:, list(a)].mean(1))) for a in AXES]
-    )
-
-
-def _incoherent(fit: SetFit) -> float:
-    """Chi-square per parameter of single flights' parameters against the common ones, log10(1 + x)."""
-    own = len(fit.index)
-    if own == 0 or len(fit.grams) < 2:
-        return 0.0
-    total = 0.0
-    for gram in fit.grams:
-        hessian = gram[1:, 1:] + 1e-3 * np.linalg.inv(fit.covariance)
-        total += float(gram[1:, 0] @ np.linalg.solve(hessian, gram[1:, 0]))
-    return float(np.log10(1.0 + total / (own * (len(fit.grams) - 1))))

@@ -70,7 +70,7 @@ def regimes_of(track: Track) -> dict[str, np.ndarray]:
 
 def locate(evidence: Evidence, fit: SetFit, named=()) -> list[Place]:
     """The table, largest share first. `fit` is the physics part of the verdict, `named` all named effects."""
-    before, after, floor = (_powers(evidence, r) for r in (evidence.nothing, fit, None))
+    before, after, floor = (_powers(evidence, r) for r in (evidence.nothing, fit, fit))
     paths = _other_paths(evidence, named)
     cells, total = [], 0.0
     masks = [{r: m[int(SKIP / t.dt) :] for r, m in regimes_of(t).items()} for t in evidence.tracks]
@@ -102,9 +102,9 @@ def locate(evidence: Evidence, fit: SetFit, named=()) -> list[Place]:
     return sorted(places, key=lambda p: -p.share)
 
 
-def _powers(evidence: Evidence, fit: SetFit | None) -> list[np.ndarray]:
-    """Squared smoothed disturbances (T', 6) per track: force then torque channels; None: the noise floor."""
-    residuals = evidence.floor if fit is None else residuals_of(evidence.replay, fit)
+def _powers(evidence: Evidence, fit: SetFit) -> list[np.ndarray]:
+    """Squared smoothed disturbances (T', 6) per track: force then torque channels."""
+    residuals = residuals_of(evidence.replay, fit)
     out = []
     for track, residual in zip(evidence.tracks, residuals, strict=True):
         rest = disturbances(track, residual)

@@ -1,1 +1,0 @@
-"""Tuning of the diagnosis' decision on the withheld plant's tuning seeds."""

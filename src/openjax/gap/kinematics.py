@@ -1,0 +1,171 @@
+"""Sensors against each other, without any dynamics: what rigid-body kinematics alone says about a log.
+
+Attitude's rate against the gyroscope gives the gyroscope's gain; the path's acceleration against the accelerometer,
+turned into the world, gives the tilt of the world in which motion capture reports. A sensor that is off by more
+than sensors usually are is a finding about the sensors, is corrected before the physics is read, and is no cause."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import butter, sosfiltfilt
+
+from openjax.flights.track import Track, rotation
+from openjax.gap.estimator import turn_increments
+
+BAND = (0.3, 6.0)  # Hz: above drift, below most of the sensors' noise
+SLOW = 2.0  # Hz, below which path and accelerometer are compared
+GRAVITY = 9.81  # m/s^2
+GAIN_BOUND = 0.03  # a gyroscope's gain may be off by so much
+TILT_BOUND = np.radians(1.5)  # of the world against gravity
+CLEAR = 5.0  # jackknife standard errors by which a finding must exceed nothing
+LEAST_RATE = 0.2  # rad/s rms in the band: an axis that hardly turns shows no gain
+COHERENT = 0.97  # correlation below which the two streams don't fit well enough to compare gains
+ONE_CLOCK = 0.93  # below which they don't share a clock
+EDGE = 0.3  # s at either end that the filters spoil
+GRANULE = 1.0  # s, unit of the jackknife
+
+
+@dataclass(frozen=True)
+class Kinematics:
+    """`gain` (3,) of the gyroscope with `gain_error` (3,), NaN where it couldn't be judged; `tilt` (2,) rad about the
+    world's x and y axes with `tilt_error` (2,), None without path or accelerometer; `coherence` (3,) of attitude's
+    rate and gyroscope, `turning` (3,) whether the flights turn enough to tell; `findings`: what is off, in words, by name."""
+
+    gain: np.ndarray
+    gain_error: np.ndarray
+    tilt: np.ndarray | None
+    tilt_error: np.ndarray | None
+    coherence: np.ndarray
+    turning: np.ndarray
+    findings: dict[str, str]
+
+    @property
+    def one_clock(self) -> bool:
+        """Whether attitude and gyroscope can be compared sample by sample: what their streams leave of each other is
+        noise, not time."""
+        return int((self.turning & (self.coherence < ONE_CLOCK)).sum()) < 2
+
+
+def read_kinematics(tracks: list[Track]) -> Kinematics:
+    """Compare the sensors of all tracks of one case."""
+    gain, error, coherence, turning = _gyroscope(tracks)
+    tilt, tilt_error = _world(tracks)
+    findings = {}
+    # Two axes alike are a sensor; one alone may be an axis that the flights hardly turn about.
+    off = (np.abs(gain - 1.0) > np.maximum(GAIN_BOUND, CLEAR * error)) & np.isfinite(gain)
+    if off.sum() >= 2:
+        words = ", ".join(f"{a} {g:.3f}" for a, g, o in zip("xyz", gain, off, strict=True) if o)
+        findings["gyroscope gain"] = f"the gyroscope reads {words} times the rate of the attitude"
+    if (turning & (coherence < ONE_CLOCK)).sum() >= 2:
+        words = ", ".join(f"{a} {c:.2f}" for a, c in zip("xyz", coherence, strict=True))
+        findings["clocks"] = (
+            f"gyroscope and attitude don't share a clock (correlation {words} between {BAND[0]} and {BAND[1]:g} Hz): "
+            "torques and lags can't be told from these logs"
+        )
+    if tilt is not None:
+        size = float(np.hypot(*tilt))
+        along = tilt / max(size, 1e-12)
+        if size > max(TILT_BOUND, CLEAR * float(np.sqrt(along**2 @ tilt_error**2))):
+            findings["world tilt"] = (
+                f"motion capture's world leans by {np.degrees(size):.1f} degrees against gravity "
+                f"({np.degrees(tilt[0]):+.1f} about x, {np.degrees(tilt[1]):+.1f} about y)"
+            )
+    return Kinematics(gain, error, tilt, tilt_error, coherence, turning, findings)
+
+
+def corrected(track: Track, found: Kinematics) -> Track:
+    """The track as it would read with sensors that agree."""
+    changes = {}
+    if "gyroscope gain" in found.findings:
+        changes["body_rates"] = track.body_rates / np.where(np.isfinite(found.gain), found.gain, 1.0)
+    if "world tilt" in found.findings:
+        x, y = -found.tilt  # small rotation that puts the world upright
+        turn = np.array([[1.0, 0.0, y], [0.0, 1.0, -x], [-y, x, 1.0]])
+        changes["position"] = track.position @ turn.T
+        changes["velocity"] = track.velocity @ turn.T
+        half = 0.5 * np.array([x, y, 0.0])
+        w, u = track.quaternion[:, :1], track.quaternion[:, 1:]
+        quaternion = np.concatenate([w - u @ half[:, None], u + w * half + np.cross(half, u)], 1)
+        changes["quaternion"] = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
+    return dataclasses.replace(track, **changes) if changes else track
+
+
+def _gyroscope(tracks) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Gain (3,), its error (3,) and the correlation (3,) of gyroscope and attitude's rate, axis by axis, in BAND; whether
+    an axis turns enough (3,)."""
+    sums = []  # per granule: (3, 3) sums of squares and products
+    for track in tracks:
+        if track.quaternion is None or track.body_rates is None:
+            continue
+        turned = turn_increments(track.quaternion) / track.dt
+        gyro = 0.5 * (track.body_rates[1:] + track.body_rates[:-1])
+        band = butter(2, BAND, "bandpass", fs=1.0 / track.dt, output="sos")
+        edge, size = int(EDGE / track.dt), max(int(GRANULE / track.dt), 1)
+        if len(gyro) < 4 * edge:
+            continue
+        a, b = (sosfiltfilt(band, v, axis=0)[edge:-edge] for v in (turned, gyro))
+        for k in range(0, len(a) - size // 2, size):
+            p, q = a[k : k + size], b[k : k + size]
+            sums.append(np.stack([(p * p).sum(0), (p * q).sum(0), (q * q).sum(0), np.full(3, len(p))]))
+    nothing = np.full(3, np.nan)
+    if len(sums) < 4:
+        return nothing, nothing, np.ones(3), np.zeros(3, bool)
+    sums = np.array(sums)
+    total = sums.sum(0)
+
+    def gains(s):
+        # Both have noise: the geometric mean of the two regressions.
+        return np.sqrt(s[2] / np.maximum(s[0], 1e-12)), s[1] / np.sqrt(np.maximum(s[0] * s[2], 1e-12))
+
+    gain, coherence = gains(total)
+    spread = np.array([gains(total - s)[0] for s in sums])
+    error = np.sqrt((len(sums) - 1) / len(sums) * ((spread - spread.mean(0)) ** 2).sum(0))
+    # The quieter of the two: noise alone is no motion.
+    turning = np.sqrt(np.minimum(total[0], total[2]) / total[3]) > LEAST_RATE
+    return np.where(turning & (coherence > COHERENT), gain, np.nan), error, coherence, turning
+
+
+def _world(tracks) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Tilt (2,) rad of the world about x and y and its error: the accelerometer, turned into the world, less the
+    path's acceleration and gravity, is fixed in the world; the accelerometer's bias (per flight) is fixed in the
+    body."""
+    grams = []
+    flights = list(dict.fromkeys(t.flight for t in tracks))
+    for track in tracks:
+        if track.quaternion is None or track.velocity is None or track.specific_force is None:
+            return None, None
+        turn = rotation(track.quaternion)
+        rest = np.einsum("tij,tj->ti", turn, track.specific_force) - np.array([0.0, 0.0, GRAVITY])
+        low = butter(2, SLOW, fs=1.0 / track.dt, output="sos")
+        edge, size = int(EDGE / track.dt), max(int(GRANULE / track.dt), 1)
+        rest = rest - np.gradient(track.velocity, track.dt, axis=0)
+        if len(rest) < 4 * edge:
+            continue
+        bias = np.zeros((len(track), 3, 2 + 3 * len(flights)))
+        bias[:, 0, 1] = GRAVITY  # gravity, seen from a world that leans
+        bias[:, 1, 0] = -GRAVITY
+        own = 2 + 3 * flights.index(track.flight)
+        bias[:, :, own : own + 3] = turn
+        both = np.concatenate([bias, rest[:, :, None]], 2).reshape(len(track), -1)
+        both = sosfiltfilt(low, both, axis=0)[edge:-edge].reshape(-1, 3, bias.shape[2] + 1)
+        for k in range(0, len(both) - size // 2, size):
+            part = both[k : k + size].reshape(-1, both.shape[2])
+            grams.append(part.T @ part)
+    if len(grams) < 4:
+        return None, None
+    grams = np.array(grams)
+    total = grams.sum(0)
+    rows = sum(len(t) for t in tracks)
+    ridge = np.zeros(len(total) - 1)
+    ridge[2:] = 1e-3 * rows / max(len(flights), 1)
+
+    def solve(gram):
+        return np.linalg.solve(gram[:-1, :-1] + np.diag(ridge), gram[:-1, -1])[:2]
+
+    tilt = solve(total)
+    spread = np.array([solve(total - g) for g in grams])
+    error = np.sqrt((len(grams) - 1) / len(grams) * ((spread - spread.mean(0)) ** 2).sum(0))
+    return tilt, error

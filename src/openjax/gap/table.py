@@ -1,0 +1,274 @@
+"""Everything that a set of effects could still become, as small matrices: the case linearised around a fitted set.
+
+A table holds, for every second of flight, inner products of all columns that a decision may combine - what is left,
+its derivatives with respect to every parameter, what each further effect would do as it was fitted alone, what each
+effect of the set does, and the nuisances - once whitened (likelihood) and once as errors of short predictions (gap). So
+adding, dropping and swapping effects on stretches left out costs nothing but linear algebra.
+
+Nuisances are bounded: numbers of the vehicle are shared by all flights of the case, biases and clocks belong to a track,
+and each stays within twice its usual size. One that ends there is a finding."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from openjax.gap.hypotheses import SetFit
+from openjax.gap.library import ABSENT, FITS, PLACE, places, prior
+from openjax.gap.replay import SKIP, Replay
+
+BLOCK = 1.0  # s: gusts and sensors forget within less
+BOUND = 2.0  # usual sizes that a nuisance may take
+HORIZONS = {"velocity": 0.25, "rates": 0.05}  # s of the predictions whose errors are the gap
+ERRORS = tuple((f"{kind} {axis}", 3 * number + k) for number, kind in enumerate(("rates", "velocity"))
+               for k, axis in enumerate("xyz"))  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """`white` (B, C, C) and `error` (B, 6, C, C) by block; `rows` (B,) that count; `track_of`, `flight_of`, `fold_of`
+    (B,). Columns: 0 is what is left; `derivative` {place: column}; `step` {effect: column}; `part` {effect: column};
+    `more` those that a caller
+    added; the last are nuisances, of which `shared` (N,) are the case's and the others a track's."""
+
+    fit: SetFit
+    white: np.ndarray
+    error: np.ndarray
+    rows: np.ndarray
+    track_of: np.ndarray
+    flight_of: np.ndarray
+    fold_of: np.ndarray
+    derivative: dict[int, int]
+    step: dict[str, int]
+    part: dict[str, int]
+    more: np.ndarray
+    shared: np.ndarray
+    usable: np.ndarray  # (6,) of the errors
+
+    @property
+    def size(self) -> int:
+        return self.white.shape[1]
+
+    @property
+    def nuisances(self) -> np.ndarray:
+        return np.arange(self.size - len(self.shared), self.size)
+
+    @cached_property
+    def folds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Whitened sums (folds, C, C), and the track (folds,) that each belongs to."""
+        count = int(self.fold_of.max()) + 1
+        sums = np.stack([self.white[self.fold_of == k].sum(0) for k in range(count)])
+        return sums, np.array([self.track_of[np.argmax(self.fold_of == k)] for k in range(count)])
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """One combination of a table's columns: column 0 and `parts` are there, the coefficients of `free` are fitted, with
+    prior `mean` and `precision`; `bound`: the box of the nuisances in their usual sizes (0: without them)."""
+
+    parts: tuple[int, ...]
+    free: np.ndarray
+    mean: np.ndarray
+    precision: np.ndarray
+    bound: float = BOUND
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A model on stretches left out: `nats` (B,) minus half the whitened sum of squares, `squares` (B, 6) of the
+    errors, `taken` (folds, N) of the shared nuisances."""
+
+    nats: np.ndarray
+    squares: np.ndarray
+    taken: np.ndarray
+
+
+def build(replay: Replay, fit: SetFit, singles: dict[str, SetFit], more=None) -> Table:
+    """The table around a fitted set; `singles` {effect: its fit alone} are the effects that may come in, `more` [(K, T,
+    9)] further columns of each track."""
+    own = fit.effects
+    others = [e for e in singles if e not in own]
+    index = np.array(
+        sorted({int(i) for e in (*own, *others) for i in places((e,))} | set(fit.index.tolist())), int
+    )
+    points = []
+    for effect in others:
+        point = fit.theta.copy()
+        point[places((effect,))] = singles[effect].theta[places((effect,))]
+        points.append(point)
+    for effect in own:
+        point = fit.theta.copy()
+        point[places((effect,))] = ABSENT[places((effect,))]
+        points.append(point)
+    columns = replay.linearised(fit.theta, index)
+    moved = replay.predict(np.array(points)) if points else [np.zeros((0, *y.shape)) for y in replay.measured]
+    white, error, rows, track_of, fold_of = [], [], [], [], []
+    added = [()] * len(replay.tracks) if more is None else [(m,) for m in more]
+    most = max(len(n) for n in replay.nuisances)
+    for number, (c, m, track) in enumerate(zip(columns, moved, replay.tracks, strict=True)):
+        now = replay.measured[number] - c[0]
+        nuisances = replay.nuisances[number]
+        extra = np.zeros((most - len(nuisances), *now.shape))
+        x = np.concatenate(
+            [c, m[: len(others)] - now, now - m[len(others) :], *added[number], nuisances, extra]
+        )
+        skip, size = int(SKIP / track.dt), max(int(BLOCK / track.dt), 1)
+        w = replay.whiten(x, number)
+        e = _errors(x, track.dt)
+        count = max(w.shape[1] // size, 1)
+        for k, (a, b) in enumerate(zip(np.array_split(w, count, 1), _split(e, skip, count), strict=True)):
+            flat = a.reshape(len(x), -1)
+            white.append(flat @ flat.T)
+            error.append(np.einsum("ctk,dtk->kcd", b, b, optimize=True))
+            rows.append(b.shape[1])
+            track_of.append(number)
+            fold_of.append(2 * number + (2 * k >= count))
+    track_of = np.array(track_of)
+    at = 1 + len(index)
+    return Table(
+        fit, np.array(white), np.array(error), np.array(rows), track_of, replay.flight_of[track_of],
+        np.unique(fold_of, return_inverse=True)[1],
+        {int(i): 1 + k for k, i in enumerate(index)},
+        {e: at + k for k, e in enumerate(others)},
+        {e: at + len(others) + k for k, e in enumerate(own)},
+        at + len(others) + len(own) + np.arange(0 if more is None else len(more[0])),
+        replay.shared_nuisances(most),
+        replay.usable[:6],
+    )  # fmt: skip
+
+
+def _errors(x: np.ndarray, dt: float) -> np.ndarray:
+    """Errors (C, T, 6) of predictions over HORIZONS that end at each row."""
+    out = np.zeros((*x.shape[:2], 6))
+    for k, kind in enumerate(("rates", "velocity")):
+        step = max(round(HORIZONS[kind] / dt), 1)
+        out[:, step:, 3 * k : 3 * k + 3] = (x[:, step:] - x[:, :-step])[..., 3 * k : 3 * k + 3]
+    return out
+
+
+def _split(e: np.ndarray, skip: int, count: int) -> list[np.ndarray]:
+    first = max(skip, 25)
+    return np.array_split(e[:, first:], count, 1)
+
+
+def with_effects(table: Table, add=(), drop=()) -> Model:
+    """The table's set with effects that come in as they were fitted alone (and may move from there) or go."""
+    kept = tuple(e for e in table.fit.effects if e not in drop)
+    index, mean, precision = prior(kept)
+    own = np.array([table.derivative[int(i)] for i in index], int)
+    # The set's parameters: coefficients count from where they were fitted.
+    mean = mean - table.fit.theta[index] if len(index) else mean
+    free, means, blocks = [own], [mean], [precision]
+    for effect in add:
+        if effect in table.step:
+            free.append(np.array([table.step[effect]]))
+            means.append(np.array([0.0]))
+            blocks.append(np.eye(1))
+        spread = np.array([p.spread for p in FITS[effect].parameters])
+        inside = [k for k, i in enumerate(places((effect,))) if table.derivative[int(i)] not in own]
+        free.append(np.array([table.derivative[int(places((effect,))[k])] for k in inside], int))
+        means.append(np.zeros(len(inside)))
+        blocks.append(np.diag(1.0 / spread[inside] ** 2))
+    free = np.concatenate(free)
+    size = len(free)
+    out, at = np.zeros((size, size)), 0
+    for block in blocks:
+        out[at : at + len(block), at : at + len(block)] = block
+        at += len(block)
+    return Model(tuple(table.part[e] for e in drop), free.astype(int), np.concatenate(means), out)
+
+
+def solve(table: Table, model: Model, left_out: int | None = None) -> np.ndarray:
+    """Coefficients (tracks, C) of every column, fitted to all folds but one."""
+    sums, tracks = table.folds
+    names = np.unique(table.track_of)
+    shared = table.nuisances[table.shared]
+    own = table.nuisances[~table.shared]
+    if model.bound == 0.0:
+        shared, own = shared[:0], own[:0]
+    p, s, n = len(model.free), len(shared), len(own)
+    size = p + s + n * len(names)
+    hessian, push = np.zeros((size, size)), np.zeros(size)
+    hessian[:p, :p] = model.precision
+    push[:p] = model.precision @ model.mean
+    hessian[np.arange(p, size), np.arange(p, size)] = 1.0
+    for k, track in enumerate(names):
+        used = [f for f in np.flatnonzero(tracks == track) if f != left_out]
+        if not used:
+            continue
+        gram = sums[used].sum(0)
+        columns = np.concatenate([model.free, shared, own])
+        here = np.concatenate([np.arange(p + s), p + s + n * k + np.arange(n)])
+        target = gram[:, 0] + gram[:, list(model.parts)].sum(1)
+        hessian[np.ix_(here, here)] += gram[np.ix_(columns, columns)]
+        push[here] += target[columns]
+    found = _bounded(hessian, push, p, model.bound)
+    out = np.zeros((len(names), table.size))
+    out[:, 0] = 1.0
+    out[:, list(model.parts)] = 1.0
+    for k in range(len(names)):
+        out[k, model.free] -= found[:p]
+        out[k, shared] = -found[p : p + s]
+        out[k, own] = -found[p + s + n * k : p + s + n * (k + 1)]
+    return out
+
+
+def _bounded(hessian, push, free: int, bound: float) -> np.ndarray:
+    """Minimum of x'Hx/2 - push'x with |x| <= bound beyond the first `free` entries, by fixing what leaves the box."""
+    found = np.zeros(len(push))
+    open_ = np.ones(len(push), bool)
+    for _ in range(len(push)):
+        inside = np.flatnonzero(open_)
+        rest = push[inside] - hessian[np.ix_(inside, np.flatnonzero(~open_))] @ found[~open_]
+        found[inside] = np.linalg.solve(hessian[np.ix_(inside, inside)], rest)
+        beyond = open_ & (np.abs(found) > bound) & (np.arange(len(push)) >= free)
+        if not beyond.any():
+            break
+        found[beyond] = np.sign(found[beyond]) * bound
+        open_ &= ~beyond
+    return found
+
+
+def judge(table: Table, model: Model) -> Judged:
+    """The model on each fold, fitted to all others."""
+    nats, squares = np.zeros(len(table.white)), np.zeros((len(table.white), 6))
+    taken = []
+    for fold in range(len(table.folds[0])):
+        coefficients = solve(table, model, fold)
+        blocks = np.flatnonzero(table.fold_of == fold)
+        u = coefficients[table.track_of[blocks[0]]]
+        nats[blocks] = -0.5 * np.einsum("c,bcd,d->b", u, table.white[blocks], u)
+        squares[blocks] = np.einsum("c,bkcd,d->bk", u, table.error[blocks], u)
+        taken.append(-u[table.nuisances[table.shared]])
+    return Judged(nats, squares, np.array(taken))
+
+
+def in_sample(table: Table, model: Model) -> Judged:
+    """The model fitted to everything, on everything."""
+    u = solve(table, model)[table.track_of]
+    nats = -0.5 * np.einsum("bc,bcd,bd->b", u, table.white, u)
+    squares = np.einsum("bc,bkcd,bd->bk", u, table.error, u)
+    return Judged(nats, squares, -u[:1, table.nuisances[table.shared]])
+
+
+def level(squares: np.ndarray, floor: np.ndarray) -> float:
+    """The gap: rms over channels of each channel's error over its floor (6,), both sums over the same rows."""
+    use = floor > 0
+    return float(np.sqrt(np.mean(squares.sum(0)[use] / floor[use])))
+
+
+__all__ = [
+    "ERRORS",
+    "PLACE",
+    "Judged",
+    "Model",
+    "Table",
+    "build",
+    "in_sample",
+    "judge",
+    "level",
+    "solve",
+    "with_effects",
+]

@@ -1,0 +1,129 @@
+"""From gains and shares to words and probabilities: what is named, what is left, what couldn't be seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from openjax.gap.evidence import Evidence
+from openjax.gap.rest import Rest
+from openjax.gap.selection import LEAST_GAIN, LEAST_NATS, TESTABLE, Selection
+from openjax.gap.shares import Split
+from openjax.vehicle.effects import EFFECTS
+
+CLOCK = 0.003  # s by which the clocks of a log may differ
+CLEAR = 3.0  # standard errors
+LEAST_LOSS = 0.01  # of the packets
+FOLLOWED = 0.2  # of a channel's rest that follows something in the log: something is left to explain
+UNKNOWN_SHARE = 0.2  # of the gap, from which an unexplained rest is named beside the effects
+TEMPERATURE = (
+    4.0  # divides differences of log-likelihood: residuals are never quite as independent as they count
+)
+SURE = 0.97  # no name is more certain than this
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """`word` of report.VERDICTS; `effects` by share, "unknown" among them where the rest is material."""
+
+    word: str
+    effects: tuple[str, ...]
+    probabilities: dict[str, float]
+
+
+def other_paths(evidence: Evidence) -> list[str]:
+    """Effects of radio, rate loop and pose that the log shows."""
+    found, known = [], evidence.library.effects
+    radio = evidence.radio
+    if radio is not None:
+        late = "command_latency" in known and radio.delay > CLOCK
+        lossy = (
+            "packet_loss" in known and radio.loss > LEAST_LOSS and radio.informative * radio.loss > LEAST_NATS
+        )
+        gain, key = (
+            radio.gain,
+            tuple(n for n, on in (("command_latency", late), ("packet_loss", lossy)) if on),
+        )
+        for name in key:
+            if gain[key] - gain[tuple(n for n in key if n != name)] > LEAST_NATS * TEMPERATURE:
+                found.append(name)
+    if evidence.rate_loop is not None and "rate_gains" in known:
+        nats, theta, covariance = evidence.rate_loop.score()
+        clear = np.abs(theta) > np.maximum(CLEAR * np.sqrt(np.diag(covariance)), 0.05)
+        if nats > LEAST_NATS * TEMPERATURE and clear.any():
+            found.append("rate_gains")
+    if evidence.pose is not None and "state_latency" in known:
+        nats, delay, covariance = evidence.pose.score()
+        if nats > LEAST_NATS and delay[0] > max(CLOCK, CLEAR * float(np.sqrt(covariance[0, 0]))):
+            found.append("state_latency")
+    return found
+
+
+def not_testable(evidence: Evidence) -> list[str]:
+    """Effects of the library that, at a usual size, these flights would not show."""
+    missing = [e for e in evidence.library.physics if evidence.exposure.get(e, 0.0) < TESTABLE]
+    if evidence.radio is None or evidence.radio.informative < 30:
+        missing += [e for e in ("command_latency", "packet_loss") if e in evidence.library.effects]
+    if evidence.rate_loop is None:
+        missing += [e for e in ("rate_gains",) if e in evidence.library.effects]
+    if evidence.pose is None:
+        missing += [e for e in ("state_latency",) if e in evidence.library.effects]
+    return missing
+
+
+def decide(evidence: Evidence, selection: Selection, rest: Rest, parts: Split, missing) -> Verdict:
+    """The words that the shares give, and how sure they are."""
+    named = sorted(parts.effects, key=lambda e: -parts.effects[e].value)
+    left = rest.nats > LEAST_NATS and rest.predicted.max() > FOLLOWED
+    strange = bool(set(evidence.sensors.findings) - {"clocks"}) or (
+        left and (not named or parts.unexplained.value > UNKNOWN_SHARE)
+    )
+    effects = list(named)
+    if strange:
+        sizes = [parts.effects[e].value for e in named]
+        place = int(np.searchsorted(-np.array(sizes), -parts.unexplained.value)) if sizes else 0
+        effects.insert(place, "unknown")
+    if not named:
+        word = "unknown" if strange else "none"
+    else:
+        word = "unknown" if effects[0] == "unknown" else "effect"
+    if word == "none" and len(missing) >= len(evidence.library.effects) // 2:
+        word = "not_testable"
+    return Verdict(word, tuple(effects), _probabilities(evidence, selection, parts, rest, effects))
+
+
+def _probabilities(evidence, selection, parts: Split, rest: Rest, effects) -> dict[str, float]:
+    """How likely each is the strongest cause. Shares say which of the named is the largest; what would do nearly as
+    well in a name's place, or was nearly accepted, takes what its likelihood leaves it."""
+    weights = dict.fromkeys((*EFFECTS, "none", "unknown"), 1e-6)
+    if effects:
+        strength = {
+            e: max(parts.unexplained.value if e == "unknown" else parts.effects[e].value, 0.02)
+            for e in effects
+        }
+        strength |= {"unknown": max(strength.get("unknown", 0.0), 0.1)} if "unknown" in effects else {}
+        for effect, share in strength.items():
+            weights[effect] += share**3
+            for other, nats in selection.swaps.get(effect, {}).items():
+                weights[other] += share**3 * float(np.exp(min(nats / TEMPERATURE, 0.0)))
+        margin = min((selection.gains[e].nats for e in effects if e in selection.gains), default=1e3)
+        weights["none"] += weights[effects[0]] * float(np.exp(-max(margin, 0.0) / TEMPERATURE))
+    else:
+        weights["none"] = 1.0
+        for effect, gain in selection.offered.items():
+            nearly = min(max(gain.floors / LEAST_GAIN, 0.0), 1.0) ** 2
+            weights[effect] += (
+                0.5 * nearly * float(np.exp(min((gain.nats - 2 * LEAST_NATS) / TEMPERATURE, 0.0)))
+            )
+        if selection.offered:
+            weights["unknown"] += 0.5 * min(float(rest.predicted.max()) / FOLLOWED, 1.0) ** 2
+    doubt = 1.0 - SURE
+    total = sum(weights.values())
+    chance = {k: SURE * v / total for k, v in weights.items()}
+    first = effects[0] if effects else "none"
+    chance["unknown" if first != "unknown" else "none"] += doubt
+    if max(chance, key=chance.get) != first:  # the first word is the most probable
+        top = max(chance, key=chance.get)
+        chance[first], chance[top] = chance[top], chance[first]
+    return chance

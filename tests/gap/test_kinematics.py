@@ -1,0 +1,66 @@
+"""Sensors against each other: what is wrong with a sensor is found, measured and corrected, whatever flies."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from openjax.flights.track import Track, rotation
+from openjax.gap.kinematics import corrected, read_kinematics
+
+
+def _track(gain=1.0, tilt=0.0, seed=1, rows=1500):
+    """A made flight: smooth rates, attitude by integration, a path whose acceleration the accelerometer feels."""
+    rng, dt = np.random.default_rng(seed), 0.01
+    time = dt * np.arange(rows)
+    rates = np.stack([1.5 * np.sin(2 * np.pi * f * time + k) for k, f in enumerate((0.9, 1.3, 0.6))], 1)
+    quaternion = np.zeros((rows, 4))
+    quaternion[0, 0] = 1.0
+    for k in range(1, rows):
+        half = 0.25 * dt * (rates[k] + rates[k - 1])
+        w, u = quaternion[k - 1, 0], quaternion[k - 1, 1:]
+        quaternion[k] = np.r_[w - u @ half, u + w * half + np.cross(u, half)]
+        quaternion[k] /= np.linalg.norm(quaternion[k])
+    acceleration = np.stack([np.sin(2 * np.pi * f * time) for f in (0.5, 0.7, 0.4)], 1)
+    velocity = np.cumsum(acceleration, 0) * dt
+    force = np.einsum("tji,tj->ti", rotation(quaternion), acceleration + [0.0, 0.0, 9.81])
+    lean = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(tilt), -np.sin(tilt)], [0.0, np.sin(tilt), np.cos(tilt)]])
+    half = np.array([np.sin(tilt / 2), 0.0, 0.0])
+    w, u = quaternion[:, :1], quaternion[:, 1:]
+    leaned = np.concatenate([w * np.cos(tilt / 2) - u @ half[:, None], u * np.cos(tilt / 2) + w * half
+                             + np.cross(half, u)], 1)  # fmt: skip
+    return Track(
+        name="a", flight="a", dt=dt, time=time, position=velocity @ lean.T, quaternion=leaned,
+        velocity=velocity @ lean.T + 0.005 * rng.standard_normal((rows, 3)),
+        body_rates=gain * rates + 0.02 * rng.standard_normal((rows, 3)) + 0.01,
+        specific_force=force + 0.15 * rng.standard_normal((rows, 3)) + [0.2, -0.1, 0.1],
+        command=None, motor=None, voltage=None, neighbours=np.zeros((0, rows, 3)),
+    )  # fmt: skip
+
+
+def test_sensors_that_agree_are_no_finding():
+    assert read_kinematics([_track(), _track(seed=2)]).findings == {}
+
+
+@pytest.mark.parametrize("gain", [0.9, 1.15])
+def test_a_gyroscope_with_another_gain_is_found_and_corrected(gain):
+    tracks = [_track(gain=gain)]
+    found = read_kinematics(tracks)
+    assert found.gain == pytest.approx(gain, abs=0.01) and list(found.findings) == ["gyroscope gain"]
+    assert read_kinematics([corrected(t, found) for t in tracks]).findings == {}
+
+
+def test_a_world_that_leans_is_found_and_put_upright():
+    tracks = [_track(tilt=np.radians(4.0))]
+    found = read_kinematics(tracks)
+    assert np.degrees(found.tilt) == pytest.approx([4.0, 0.0], abs=0.4) and list(found.findings) == [
+        "world tilt"
+    ]
+    assert read_kinematics([corrected(t, found) for t in tracks]).findings == {}
+
+
+def test_streams_on_clocks_that_wander_tell_no_gain():
+    track = _track()
+    late = np.interp(track.time + 0.12 * np.sin(track.time), track.time, track.time)
+    rates = np.stack([np.interp(late, track.time, c) for c in 1.1 * track.body_rates.T], 1)
+    assert read_kinematics([dataclasses.replace(track, body_rates=rates)]).findings == {}
