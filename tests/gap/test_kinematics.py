@@ -23,7 +23,7 @@ def _track(gain=1.0, tilt=0.0, seed=1, rows=1500):
         quaternion[k] /= np.linalg.norm(quaternion[k])
     acceleration = np.stack([np.sin(2 * np.pi * f * time) for f in (0.5, 0.7, 0.4)], 1)
     velocity = np.cumsum(acceleration, 0) * dt
-    force = np.einsum("tji,tj->ti", rotation(quaternion), acceleration + [0.0, 0.0, 9.81])
+    force = np.einsum("tji,tj->ti", rotation(quaternion), acceleration + np.array([0.0, 0.0, 9.81]))
     lean = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(tilt), -np.sin(tilt)], [0.0, np.sin(tilt), np.cos(tilt)]])
     half = np.array([np.sin(tilt / 2), 0.0, 0.0])
     w, u = quaternion[:, :1], quaternion[:, 1:]
@@ -33,7 +33,7 @@ def _track(gain=1.0, tilt=0.0, seed=1, rows=1500):
         name="a", flight="a", dt=dt, time=time, position=velocity @ lean.T, quaternion=leaned,
         velocity=velocity @ lean.T + 0.005 * rng.standard_normal((rows, 3)),
         body_rates=gain * rates + 0.02 * rng.standard_normal((rows, 3)) + 0.01,
-        specific_force=force + 0.15 * rng.standard_normal((rows, 3)) + [0.2, -0.1, 0.1],
+        specific_force=force + 0.15 * rng.standard_normal((rows, 3)) + np.array([0.2, -0.1, 0.1]),
         command=None, motor=None, voltage=None, neighbours=np.zeros((0, rows, 3)),
     )  # fmt: skip
 

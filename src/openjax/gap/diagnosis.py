@@ -210,6 +210,8 @@ SHARED = [
     *(f"gyroscopic torque {a}" for a in "xyz"),
     "roll and pitch damping",
     "yaw damping",
+    "level of the world x",
+    "level of the world y",
 ]
 
 

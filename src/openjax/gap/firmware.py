@@ -27,6 +27,7 @@ LOST_D = (-0.4, -0.3)
 LOST_RATIO = (1.2, 1.0)
 USUAL_GYRO_NOISE = 0.0165  # rad/s, of those flights by `gyro_noise`
 GYRO_TILT = 0.01  # rad, between the logged gyro and the one that the controller uses
+FILTER_DELAY = 0.003  # s, of low-passes in the firmware
 LONGEST_DELAY = 0.1  # s
 DELAY_STEP = 0.0005  # s
 TOLERANCE = 3e-4  # of thrust: rounding of the logs and of the firmware's integers
@@ -225,6 +226,8 @@ def read_rate_loop(tracks, vehicles, arrived, flight_of, pushes=None, base=(0.0,
             for axis in np.eye(3)
             for f in (0.3 * axis * np.ones_like(logged), 0.03 * axis * integral * time)
         ]
+        # Low-passes before the gains delay what they act on, by times that aren't known.
+        trims += [FILTER_DELAY * np.gradient(columns[-1][k], track.dt, axis=0) for k in (0, 2)]
         nuisances.append(np.stack(trims))
         clean = ((track.motor < 0.997) & (track.motor > 0.003)).all(1)
         masks.append(1.0 - (np.convolve(~clean, np.ones(12))[: len(clean)] > 0))

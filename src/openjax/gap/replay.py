@@ -29,6 +29,7 @@ BUCKETS = (256, 512, 1024, 2048, 4096, 8192, 16384, 32768)
 BATCH = 8
 # Nuisances and their standard deviations; see GAP: free in every hypothesis.
 TILT = np.radians(0.5)  # between tracked frame and thrust axis
+LEVEL = np.radians(0.15)  # of motion capture's world
 IMU_TILT = 0.01  # rad, between the IMU's axes and the body's
 GYROSCOPIC = 0.1  # relative to the moments of inertia
 DAMPING = 0.15  # 1/s, of the body rates by what the rotors do
@@ -92,7 +93,7 @@ class Replay:
         shared[own] = False  # the motors' clock
         shared[own + 3 : own + 6] = False  # accelerometer bias
         if self.usable[3]:
-            shared[own + 14] = False  # pose clock
+            shared[own + 16] = False  # pose clock
         return shared
 
     def nuisance_estimates(self, residuals) -> list[np.ndarray]:
@@ -261,7 +262,7 @@ def _measured(track: Track) -> np.ndarray:
 
 def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> list[np.ndarray]:
     """Tilt of the tracked frame (2), accelerometer bias (3), tilt of the IMU (3), gyroscopic torques (3),
-    damping (2), clock of the motion capture: columns (T, 9)."""
+    damping (2), levelling of the world (2), clock of the motion capture: columns (T, 9)."""
     rows = len(track)
     turn = rotation(np.asarray(path.quaternion, float)[:rows])
     specific = np.gradient(nominal[:, VELOCITY], track.dt, axis=0) + np.array([0.0, 0.0, 9.81])
@@ -292,6 +293,10 @@ def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> list[np.
         column = np.zeros((rows, 9))
         column[:, axes] = -np.cumsum(rates, 0)[:, axes] * track.dt
         columns.append(column * DAMPING)
+    for axis in range(2):  # motion capture's world against gravity
+        column = np.zeros((rows, 9))
+        column[:, 3 + axis] = 9.81 * LEVEL * track.dt * np.arange(rows)
+        columns.append(column)
     if track.velocity is not None:
         column = -moved(np.cross(np.asarray(path.body_rates, float)[:rows], body))
         column[:, VELOCITY] += smooth(np.gradient(track.velocity, track.dt, axis=0), 0.05, track.dt)

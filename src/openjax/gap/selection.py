@@ -12,23 +12,28 @@ import numpy as np
 
 from openjax.gap.evidence import Evidence
 from openjax.gap.hypotheses import SetFit, fit_set
-from openjax.gap.library import places
+from openjax.gap.library import ABSENT, PLACE, places, prior, start_of
 from openjax.gap.table import Judged, Table, build, judge, level, with_effects
 
 # The decision's numbers. None was learned from a plant.
 LEAST_GAIN = 0.02  # floors by which an effect must shrink the gap on stretches left out
 LEAST_NATS = 5.0  # by which it must raise their likelihood even without the second of flight that gains most:
 # very strong evidence, in the usual words
-LEAST_SHARE = 0.01  # of the gap: below, an effect is what the others' forms have wrong
+LEAST_SHARE = 0.01  # of the gap's rms above its floor: below, an effect is what the others' forms have wrong
 TESTABLE = 6.0  # nats that an effect of usual size must leave in these flights
 MOST = 6  # effects at once
-TRIED = 2  # candidates fitted in full at each step
+OPENINGS = 3  # effects from which a search begins
+LEFT_MUCH = 1.2  # of the squares that noise alone leaves: a search from several beginnings is worth its time
+ROUNDS = 2  # of widening and swapping
+TRIED = 2  # candidates of each kind fitted in full at each step
+CALM = 0.1  # m/s: air that moves less is calm
+UNKNOWN_MAP = {"mass", "thrust_scale", "battery_sag", "thrust_curve", "thrust_saturation"}  # with duty cycles
 
 
 @dataclass(frozen=True)
 class Gain:
     """What an effect adds on stretches left out, all others refitted: `nats`, and `steady` ones without the best second
-    of flight, `floors` of the gap, `share` of its power above what all together leave."""
+    of flight, `floors` of the gap, `share` of its rms above what all together leave."""
 
     nats: float
     steady: float
@@ -60,34 +65,72 @@ def select(evidence: Evidence) -> Selection:
     fit = evidence.nothing
     table = build(replay, fit, singles)
     now = judge(table, with_effects(table))
-    for _ in range(MOST):
-        best = None
-        for effect in _ranked(table, singles, now)[:TRIED]:
-            tried = _joined(replay, fit, singles, effect)
-            if best is None or tried.score > best.score:
-                best = tried
-        if best is None:
+    swaps: dict[str, dict[str, float]] = {}
+    for _ in range(ROUNDS):
+        fit, table, now = _widened(replay, fit, table, now, singles)
+        before = fit
+        fit, table, now, swaps = _swapped(replay, fit, table, now, singles)
+        if fit is before:
             break
-        wider = build(replay, best, singles)
-        whole = judge(wider, with_effects(wider))
-        added = next(e for e in best.effects if e not in fit.effects)
-        if not gain_of(wider, whole, added).accepted:
-            break
-        fit, table, now = best, wider, whole
         fit, table, now = _pruned(replay, fit, table, now, singles)
-    fit, table, now, swaps = _swapped(replay, fit, table, now, singles)
-    fit, table, now = _pruned(replay, fit, table, now, singles)
     gains = {e: gain_of(table, now, e) for e in fit.effects}
     offered = {e: _offer(table, now, e) for e in table.step}
     return Selection(tuple(sorted(gains, key=lambda e: -gains[e].floors)), fit, table, gains, offered, swaps)
 
 
+def _widened(replay, fit, table, now, singles):
+    """The set with everything that stays for what it adds."""
+    while len(fit.effects) < MOST:
+        if fit.effects:
+            tried = [_joined(replay, fit, singles, e) for e in _ranked(table, singles, now)]
+        else:
+            tried = _openings(replay, fit, singles)
+        better = [f for f in tried if is_itself(f) and f.score > fit.score + LEAST_NATS]
+        for candidate in sorted(better, key=lambda f: -f.score):
+            wider = build(replay, candidate, singles)
+            whole = judge(wider, with_effects(wider))
+            added = [e for e in candidate.effects if e not in fit.effects]
+            if any(gain_of(wider, whole, e).accepted for e in added):
+                break
+        else:
+            break
+        fit, table, now = _pruned(replay, candidate, wider, whole, singles)
+    return fit, table, now
+
+
+def _openings(replay, nothing: SetFit, singles) -> list[SetFit]:
+    """What to begin with: the best effects alone and, where they leave much, the best with one more each, so that what
+    two effects do together isn't given to a third that looks like both."""
+    alone = sorted((f for f in singles.values() if is_itself(f)), key=lambda f: -f.score)
+    if not alone:
+        return []
+    best = alone[0].score - nothing.score
+    first = [f for f in alone[:OPENINGS] if f.score - nothing.score > 0.5 * best]
+    rows = sum(len(t) for t in replay.tracks) * replay.usable.sum()
+    if alone[0].objective < LEFT_MUCH * 0.5 * rows:
+        return alone[: TRIED + 1]
+    pairs = {}
+    for fit in first:
+        table = build(replay, fit, singles)
+        now = judge(table, with_effects(table))
+        for effect in _ranked(table, singles, now):
+            key = frozenset((*fit.effects, effect))
+            if key not in pairs:
+                pairs[key] = _joined(replay, fit, singles, effect)
+    return [*alone[: TRIED + 1], *pairs.values()]
+
+
 def testable(evidence: Evidence) -> dict[str, SetFit]:
-    """{effect: its fit alone} of the physics effects that would show at their usual size."""
+    """{effect: its fit alone} of the physics effects that would show at their usual size. Where motor commands are duty
+    cycles, what the unknown map to thrust can imitate isn't among them."""
+    barred = UNKNOWN_MAP if evidence.case.vehicle_file.motor_command == "pwm" else set()
     return {
         k[0]: f
         for k, f in evidence.sets.items()
-        if len(k) == 1 and isinstance(f, SetFit) and evidence.exposure.get(k[0], 0.0) >= TESTABLE
+        if len(k) == 1
+        and k[0] not in barred
+        and isinstance(f, SetFit)
+        and evidence.exposure.get(k[0], 0.0) >= TESTABLE
     }
 
 
@@ -109,13 +152,12 @@ def _offer(table: Table, now: Judged, effect: str) -> Gain:
 def _gain(table: Table, without: Judged, whole: Judged, nothing: Judged) -> Gain:
     floor = floor_of(table, whole)
     nats = whole.nats - without.nats
-    power = lambda j: level(j.squares, floor) ** 2  # noqa: E731
-    total = max(power(nothing) - 1.0, 1e-9)
+    less = level(without.squares, floor) - 1.0
     return Gain(
         float(nats.sum()),
         float(nats.sum() - max(nats.max(), 0.0)),
-        level(without.squares, floor) - 1.0,
-        (power(without) - 1.0) / total,
+        less,
+        less / max(level(nothing.squares, floor) - 1.0, 1e-9),
     )
 
 
@@ -125,27 +167,54 @@ def floor_of(table: Table, whole: Judged) -> np.ndarray:
 
 
 def _ranked(table: Table, singles, now: Judged) -> list[str]:
-    """Effects outside the table's set that promise anything, best first."""
-    found = {}
-    for effect in table.step:
-        more = judge(table, with_effects(table, add=(effect,)))
-        # Alone, an effect's own fit is exact, and the table only a straight line to it.
-        found[effect] = (more.nats - now.nats).sum()
-        if not table.fit.effects:
-            found[effect] = singles[effect].score
-    if not table.fit.effects:
-        return sorted(found, key=lambda e: -found[e])
-    return sorted((e for e, v in found.items() if v > 0.0), key=lambda e: -found[e])
+    """Effects outside the table's set that promise most: by a straight line beside the set, and alone."""
+    alone = sorted(table.step, key=lambda e: -singles[e].score)
+    line = {e: (judge(table, with_effects(table, add=(e,))).nats - now.nats).sum() for e in table.step}
+    best = [e for e in sorted(line, key=lambda e: -line[e]) if line[e] > 0.0][: TRIED + 1]
+    return list(dict.fromkeys([*best, *(e for e in alone[:TRIED] if line[e] > 0.0)]))
 
 
-def _joined(replay, fit: SetFit, singles, effect: str) -> SetFit:
-    """The set with one more effect, fitted from where both were."""
-    if not fit.effects:
+def is_itself(fit: SetFit) -> bool:
+    """Whether no effect of a set is by its fitted value another one: air that doesn't move is drag, a thrust curve that
+    doesn't bend is a thrust scale."""
+    deviation = dict(zip(fit.index.tolist(), np.sqrt(np.diag(fit.covariance)), strict=True))
+    if "wind" in fit.effects:
+        places_ = [PLACE["wind", a] for a in "xy"]
+        speed = float(np.hypot(*fit.theta[places_]))
+        if speed < max(CALM, 3.0 * max(deviation[i] for i in places_)):
+            return False
+    if "thrust_curve" in fit.effects:
+        offset, slope, curvature = (
+            fit.theta[PLACE["thrust_curve", p]] for p in ("offset", "slope", "curvature")
+        )
+        thrust = np.linspace(0.45, 0.85, 9)
+        change = offset / thrust + slope + curvature * thrust - 1.0
+        if np.ptp(change) < 0.5 * abs(change.mean()):
+            return False
+    return True
+
+
+def _joined(replay, fit: SetFit, singles, effect: str, without: str | None = None) -> SetFit:
+    """The set with one more effect (in another's place, if given), fitted from the best of a few starts: both as they
+    were, the new one at its usual start, either alone."""
+    rest = [e for e in fit.effects if e != without]
+    if not rest:
         return singles[effect]
-    start = fit.theta.copy()
-    start[places((effect,))] = singles[effect].theta[places((effect,))]
-    order = [e for e in singles if e in (*fit.effects, effect)]
-    return fit_set(replay, order, start)
+    base = fit.theta.copy()
+    if without is not None:
+        base[places((without,))] = ABSENT[places((without,))]
+    own, starts = places((effect,)), []
+    for values in (singles[effect].theta[own], start_of(effect), ABSENT[own]):
+        starts.append(base.copy())
+        starts[-1][own] = values
+    starts.append(singles[effect].theta)
+    starts = np.array(starts)
+    order = [e for e in singles if e in (*rest, effect)]
+    index, mean, precision = prior(order)
+    left = [y[None] - p for y, p in zip(replay.measured, replay.predict(starts), strict=True)]
+    off = starts[:, index] - mean
+    objective = np.diag(replay.grams(left).sum(0)) + np.einsum("ki,ij,kj->k", off, precision, off)
+    return fit_set(replay, order, starts[int(np.argmin(objective))])
 
 
 def _pruned(replay, fit, table, now, singles):
@@ -171,11 +240,11 @@ def _swapped(replay, fit, table, now, singles):
             more = judge(table, with_effects(table, add=(other,), drop=(effect,)))
             lines[other] = singles[other].score if not rest else float((more.nats - now.nats).sum())
         tried = {}
-        for other in sorted(lines, key=lambda o: -lines[o])[:TRIED]:
-            start = fit.theta.copy()
-            start[places((other,))] = singles[other].theta[places((other,))]
-            order = [e for e in singles if e in (*rest, other)]
-            tried[other] = singles[other] if not rest else fit_set(replay, order, start)
+        alone = sorted(lines, key=lambda o: -singles[o].score)[:TRIED]
+        for other in dict.fromkeys([*sorted(lines, key=lambda o: -lines[o])[:TRIED], *alone]):
+            found = _joined(replay, fit, singles, other, without=effect)
+            if is_itself(found):
+                tried[other] = found
         gains = {o: f.score - fit.score for o, f in tried.items()}
         best = max(gains, key=gains.get, default=None)
         if best is not None and gains[best] > LEAST_NATS:

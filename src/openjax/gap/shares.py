@@ -17,7 +17,7 @@ from openjax.gap.evidence import Evidence
 from openjax.gap.replay import SKIP
 from openjax.gap.rest import Rest
 from openjax.gap.selection import LEAST_GAIN, Selection
-from openjax.gap.table import BLOCK, ERRORS, Model, judge, with_effects
+from openjax.gap.table import ERRORS, keep, with_effects
 
 METRIC = (
     "rms over channels of prediction error / noise floor on stretches left out (velocity over 0.25 s, body rates over "
@@ -38,8 +38,8 @@ class Share:
 
 @dataclass(frozen=True)
 class Gap:
-    """`before` (no effect, nuisances within their bounds), `after` and `floor` in units of the floor; `reduction` is 1 -
-    after / before."""
+    """`before` (no effect; sensors and clocks as the flights show them), `after` and `floor`, in units of the floor;
+    `reduction` is 1 - after / before."""
 
     metric: str
     before: float
@@ -131,10 +131,10 @@ def _squares(evidence: Evidence, selection: Selection, physics, named, sensors=T
     """{channel: (B,) mean squared errors by second of flight} with the effects `physics` of the selection's and those
     of `named` that act on other paths; `sensors`: nuisances within their bounds, or none."""
     table = selection.table
-    model = with_effects(table, drop=tuple(e for e in selection.fit.effects if e not in physics))
-    if not sensors:
-        model = Model(model.parts, model.free, model.mean, model.precision, 0.0)
-    squares = judge(table, model).squares / table.rows[:, None]
+    # How a duty cycle becomes thrust is no sensor's fault and no effect: the map that the flights ask for stays.
+    numbers = len(evidence.replay.numbers) if evidence.case.vehicle_file.motor_command == "pwm" else 0
+    drop = tuple(e for e in selection.fit.effects if e not in physics)
+    squares = keep(table, with_effects(table), drop, sensors, numbers) / table.rows[:, None]
     out = {n: squares[:, k] for k, (n, _) in enumerate(ERRORS) if table.usable[k] > 0}
     counts = [int((table.track_of == k).sum()) for k in range(len(evidence.tracks))]
 
@@ -160,6 +160,3 @@ def _squares(evidence: Evidence, selection: Selection, physics, named, sensors=T
         misfit = evidence.radio.misfit[key]
         out["motors all"] = np.full(len(table.rows), misfit**2 + THRUST_FLOOR**2)
     return out
-
-
-__all__ = ["BLOCK", "Gap", "Share", "Split", "split"]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from openjax.flights.track import smooth
 from openjax.gap.evidence import Evidence
 from openjax.gap.rest import Rest
 from openjax.gap.selection import LEAST_GAIN, LEAST_NATS, TESTABLE, Selection
@@ -15,6 +16,7 @@ from openjax.vehicle.effects import EFFECTS
 CLOCK = 0.003  # s by which the clocks of a log may differ
 CLEAR = 3.0  # standard errors
 LEAST_LOSS = 0.01  # of the packets
+LEAST_CHANGE = 0.05  # of a gain
 FOLLOWED = 0.2  # of a channel's rest that follows something in the log: something is left to explain
 UNKNOWN_SHARE = 0.2  # of the gap, from which an unexplained rest is named beside the effects
 TEMPERATURE = (
@@ -38,20 +40,25 @@ def other_paths(evidence: Evidence) -> list[str]:
     radio = evidence.radio
     if radio is not None:
         late = "command_latency" in known and radio.delay > CLOCK
-        lossy = (
-            "packet_loss" in known and radio.loss > LEAST_LOSS and radio.informative * radio.loss > LEAST_NATS
-        )
-        gain, key = (
-            radio.gain,
-            tuple(n for n, on in (("command_latency", late), ("packet_loss", lossy)) if on),
-        )
+        lost = radio.informative * radio.loss
+        lossy = "packet_loss" in known and radio.loss > LEAST_LOSS and lost > LEAST_NATS
+        key = tuple(n for n, on in (("command_latency", late), ("packet_loss", lossy)) if on)
+        gain = radio.gain
         for name in key:
             if gain[key] - gain[tuple(n for n in key if n != name)] > LEAST_NATS * TEMPERATURE:
                 found.append(name)
     if evidence.rate_loop is not None and "rate_gains" in known:
-        nats, theta, covariance = evidence.rate_loop.score()
-        clear = np.abs(theta) > np.maximum(CLEAR * np.sqrt(np.diag(covariance)), 0.05)
-        if nats > LEAST_NATS * TEMPERATURE and clear.any():
+        path = evidence.rate_loop
+        nats, theta, covariance = path.score()
+        clear = np.abs(theta) > np.maximum(CLEAR * np.sqrt(np.diag(covariance)), LEAST_CHANGE)
+        before, after = (
+            np.mean(
+                [(smooth(r, 0.05, t.dt) ** 2).mean(0) for r, t in zip(rest, evidence.tracks, strict=True)], 0
+            )
+            for rest in (path.before, path.residual)
+        )
+        material = float(np.mean(before / after)) - 1.0 > 2.0 * LEAST_GAIN
+        if nats > LEAST_NATS * TEMPERATURE and clear.any() and material:
             found.append("rate_gains")
     if evidence.pose is not None and "state_latency" in known:
         nats, delay, covariance = evidence.pose.score()
