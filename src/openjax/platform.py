@@ -1,16 +1,28 @@
 """Choosing between a formula and its hand-written kernel, and what kernels need of their arrays."""
 
 import functools
+import importlib.util
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 
 
+@functools.cache
+def can_compile_for_cuda() -> bool:
+    """Whether JAX's CUDA compiler is installed: without it, nobody asks for kernels, and they needn't be traced."""
+    names = ("xla_cuda13", "xla_cuda12")
+    return importlib.util.find_spec("jax_plugins") is not None and any(
+        importlib.util.find_spec(f"jax_plugins.{name}") is not None for name in names
+    )
+
+
 def on_platform(reference: Callable, kernel: Callable, *static) -> Callable:
     """A function of arrays that runs `kernel` on NVIDIA GPUs and `reference` elsewhere; `static` come first."""
 
     def run(*arrays):
+        if not can_compile_for_cuda():
+            return reference(*static, *arrays)
         return jax.lax.platform_dependent(
             *arrays, default=functools.partial(reference, *static), cuda=functools.partial(kernel, *static)
         )

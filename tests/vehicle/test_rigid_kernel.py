@@ -1,5 +1,7 @@
 """The rigid step of many drones: its kernel (in interpret mode), its maps and its derivatives against the mapped step."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +13,7 @@ from openjax.vehicle.rigid_kernel import WORLDS, kernel_call, mapped_step
 
 VEHICLE = load_vehicle()
 FREE = make_drones_step(physics="rigid", dt=0.01, substeps=2, contacts=False)
-AMONG_SOLIDS = make_drones_step(physics="rigid", dt=0.01, substeps=2)
+AMONG_SOLIDS = make_drones_step(physics="rigid", dt=0.01)
 NO_PILLARS = jnp.zeros((1, 2)), jnp.zeros(1, bool)
 
 
@@ -30,13 +32,12 @@ def drawn(*lead):
 
 
 def crowded(worlds):
-    """Worlds of three drones close to the floor, each other and four pillars, of which one isn't there."""
-    drones, command = drawn(worlds, 3)
-    position = drones.position * jnp.array([0.1, 0.1, 0.01]) + jnp.array([0, 0, 0.06])
-    pillars = jnp.array([[0.3, 0.0], [-0.2, 0.1], [0.0, 0.25], [0.1, -0.2]])
-    active = jnp.array([True, True, True, False])
-    drones = drones.replace(position=position)
+    """Worlds of two drones close to the floor, each other and two pillars, of which one isn't there."""
+    drones, command = drawn(worlds, 2)
+    position = drones.position * jnp.array([0.05, 0.05, 0.01]) + jnp.array([0, 0, 0.06])
+    pillars, active = jnp.array([[0.2, 0.0], [-0.1, -0.1]]), jnp.array([True, False])
     lead = (worlds, *pillars.shape)
+    drones = drones.replace(position=position)
     return drones, command, (jnp.broadcast_to(pillars, lead), jnp.broadcast_to(active, lead[:2]))
 
 
@@ -72,17 +73,17 @@ def test_kernel_computes_contacts():
 
 def test_mapped_over_worlds_and_over_vehicles():
     drones, command = drawn(5, 3)
-    expected = jax.vmap(lambda d, c: fly_plainly(VEHICLE, d, c))(drones, command)
-    assert_close(jax.vmap(lambda d, c: fly(VEHICLE, d, c))(drones, command), expected)
-    one_command = jax.vmap(lambda d: fly(VEHICLE, d, command[0]))(drones)
-    assert_close(one_command, jax.vmap(lambda d: fly_plainly(VEHICLE, d, command[0]))(drones))
+    expected = jax.jit(jax.vmap(lambda d, c: fly_plainly(VEHICLE, d, c)))(drones, command)
+    assert_close(jax.jit(jax.vmap(lambda d, c: fly(VEHICLE, d, c)))(drones, command), expected)
+    one_command = jax.jit(jax.vmap(lambda d: fly(VEHICLE, d, command[0])))(drones)
+    assert_close(one_command, jax.jit(jax.vmap(lambda d: fly_plainly(VEHICLE, d, command[0])))(drones))
     heavier = jax.tree.map(lambda leaf: jnp.stack([leaf, 1.2 * leaf]), VEHICLE)
     first = jax.tree.map(lambda leaf: leaf[0], drones)
-    both = jax.vmap(lambda vehicle: fly(vehicle, first, command[0]))(heavier)
+    both = jax.jit(jax.vmap(lambda vehicle: fly(vehicle, first, command[0])))(heavier)
     for i in range(2):
         vehicle = jax.tree.map(lambda leaf, i=i: leaf[i], heavier)
         got = jax.tree.map(lambda leaf, i=i: leaf[i], both)
-        assert_close(got, fly_plainly(vehicle, first, command[0]))
+        assert_close(got, jax.jit(fly_plainly)(vehicle, first, command[0]))
 
 
 def test_memory_of_effects_that_the_step_does_not_have_is_left_alone():
@@ -93,16 +94,18 @@ def test_memory_of_effects_that_the_step_does_not_have_is_left_alone():
     assert_close(stepped.replace(effect_memory=()), fly(VEHICLE, drones, command))
 
 
-def test_worlds_become_more_worlds_of_one_call():
+def test_worlds_become_more_worlds_of_one_call(monkeypatch):
     drones, command, pillars = crowded(6)
     step = lambda drones, command, pillars: AMONG_SOLIDS(VEHICLE, drones, command, *pillars)  # noqa: E731
     twice = jax.tree.map(lambda leaf: leaf.reshape(2, 3, *leaf.shape[1:]), (drones, command, pillars))
-    traced = jax.make_jaxpr(jax.vmap(jax.vmap(step)))(*twice)
-    assert "f32[6,3,3]" in str(traced) and "platform_index" in str(traced)
-    got = jax.vmap(jax.vmap(step))(*twice)
-    for i in range(6):
-        one = step(*jax.tree.map(lambda leaf, i=i: leaf[i], (drones, command, pillars)))
-        assert_close(jax.tree.map(lambda leaf, i=i: leaf[i // 3, i % 3], got), one)
+    got = jax.jit(jax.vmap(jax.vmap(step)))(*twice)
+    expected = jax.jit(jax.vmap(lambda *world: mapped_step(AMONG_SOLIDS.fused, VEHICLE, *world)))(
+        drones, command, pillars
+    )
+    assert_close(jax.tree.map(lambda leaf: leaf.reshape(6, *leaf.shape[2:]), got), expected)
+    monkeypatch.setattr("openjax.platform.can_compile_for_cuda", lambda: True)
+    traced = str(jax.make_jaxpr(jax.vmap(jax.vmap(step)))(*twice))
+    assert "f32[6,2,3]" in traced and "platform_index" in traced
 
 
 @pytest.mark.parametrize("argument", ["vehicle", "command"])
@@ -114,8 +117,8 @@ def test_derivatives_are_those_of_the_step(argument):
         return jnp.sum(step(vehicle, drones, command).velocity[:, 2] ** 2)
 
     place = {"vehicle": 1, "command": 2}[argument]
-    got = jax.grad(height, place)(fly, VEHICLE.mass, command)
-    expected = jax.grad(height, place)(fly_plainly, VEHICLE.mass, command)
+    got = jax.jit(jax.grad(partial(height, fly), place - 1))(VEHICLE.mass, command)
+    expected = jax.jit(jax.grad(partial(height, fly_plainly), place - 1))(VEHICLE.mass, command)
     np.testing.assert_allclose(got, expected, rtol=1e-4)
     assert np.abs(expected).max() > 0
 
