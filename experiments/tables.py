@@ -27,6 +27,7 @@ from openjax.baselines import METHODS as HEURISTICS
 from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import layout_slots, record_of, repeat_task
 from openjax.commands.machine import describe_machine
+from openjax.files import read_json
 from openjax.learning import summarise
 from openjax.pursuit import SCENARIOS, RewardSettings, scenario_task
 from openjax.store.policies import load_policy
@@ -34,6 +35,7 @@ from openjax.store.settings_files import write_json
 
 PAGES = (tab_main, tab_ood, tab_prediction, behaviours, sweeps)
 LAYOUTS = ("wall", "narrow_gap", "random", "passage", "hidden")
+LABELS = (*METHODS, *ABLATIONS)
 LIMITS = {"clamp": "clamp", "no clamp": "none"}
 
 
@@ -75,10 +77,17 @@ def of_policy(name: str, seed: int, changes: dict, episodes: int) -> dict:
 
 
 def study(options: argparse.Namespace) -> dict:
-    """Every method and the ablations, with the clamp; heuristics without it, too, since no training chose their speed."""
+    """Every method and the ablations, with the clamp; heuristics without it, too, since no training chose their speed.
+
+    What stands in the file already of methods that aren't named is kept, if it was flown alike.
+    """
     started = time.monotonic()
-    flights = []
-    for label in (*METHODS, *ABLATIONS):
+    alike = {"episodes": options.episodes, "physics": options.physics}
+    stored = options.out / "tables.json"
+    kept = read_json(stored) if stored.exists() and len(options.methods) < len(LABELS) else {}
+    kept = kept.get("flights", []) if {name: kept.get(name) for name in alike} == alike else []
+    flights = [flight for flight in kept if flight["method"] not in options.methods]
+    for label in options.methods:
         for condition, limit in LIMITS.items():
             if condition != "clamp" and METHODS.get(label) not in HEURISTICS:
                 continue
@@ -94,7 +103,7 @@ def study(options: argparse.Namespace) -> dict:
         "commit": options.commit,
         "machine": describe_machine(),
         "seconds": time.monotonic() - started,
-        "episodes": options.episodes,
+        **alike,
         "flights": flights,
     }
 
@@ -107,6 +116,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--report", action="store_true", help="from the stored flights")
     parser.add_argument("--episodes", type=int, default=100, help="per seed and layout; half for the sweeps")
     parser.add_argument("--physics", choices=("rigid", "mjx"), default="rigid", help="mjx: the same, slower")
+    parser.add_argument("--methods", nargs="+", choices=LABELS, default=list(LABELS), help="fly these anew")
     parser.add_argument("--commit", default="", help="where the machine has no repository")
     parser.add_argument("--out", type=Path, default=RESULTS, help="directory")
     options = parser.parse_args(arguments)
