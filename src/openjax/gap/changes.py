@@ -54,7 +54,7 @@ USUAL_CHANGE = 0.15  # of a rotor's command, or of the weight
 STRONGER = 0.15  # share of changes the other way: a mended rotor, a weight taken off
 INEXACT = 0.25  # of each trim of a cause: real changes don't follow their pattern exactly
 LEAST_PARTNER = 0.25  # a second rotor that changed by less than this share of the first isn't one
-DRAWS = 4096  # of a cause's size and pattern
+DRAWS = 2048  # of a cause's size and pattern
 
 # What is cut, bent or taped on also shakes: the noise of gyroscope and motors rises by some 40 % or more, though air
 # and battery move it as well. So it may support a change of the trims, within bounds, never start one.
@@ -175,10 +175,10 @@ def compare(flights: Path, references: Sequence[Path]) -> Change:
     """What changed in the flights of a folder against those of one or more reference folders (days).
 
     Raises UserError for a folder without a usable flight and for flights of several vehicles."""
-    new_case, new, quality = _read(Path(flights))
+    new_case, new, quality = read(Path(flights))
     old: list[FlightFigures] = []
     for folder in references:
-        case, figures, found = _read(Path(folder))
+        case, figures, found = read(Path(folder))
         if {f.vehicle for f in case.flights} != {f.vehicle for f in new_case.flights}:
             raise UserError(f"{folder}: holds flights of another vehicle than {flights}")
         old += figures
@@ -186,7 +186,7 @@ def compare(flights: Path, references: Sequence[Path]) -> Change:
     return change_between(Path(flights).resolve().name, new, old, new_case, tuple(quality))
 
 
-def _read(folder: Path) -> tuple[Case, list[FlightFigures], list[Issue]]:
+def read(folder: Path) -> tuple[Case, list[FlightFigures], list[Issue]]:
     case = load_case(folder, comparison=True)
     if len({f.vehicle for f in case.flights}) > 1:
         raise UserError(f"{folder}: holds several vehicles; a comparison is of one vehicle with itself")
@@ -487,7 +487,7 @@ def _least(hypotheses, mixer, trims, scale, freedom) -> float:
     worst = 0.0
     for rotor in range(4):
         low, high = 0.0, 1.0
-        for _ in range(7):
+        for _ in range(8):
             middle = 0.5 * (low + high)
             command = level.copy()
             command[rotor] *= 1.0 + middle

@@ -1,0 +1,130 @@
+"""What changed, on real flights with known changes: CrazyPAD (github.com/AerialRoboticsUUST/CrazyPAD, commit 5448265, MIT;
+Masalimov et al., Data 2024, 9(6), 79), micro-SD logs of two Crazyflies without orientation.
+
+    python experiments/changes.py open FOLDER      # conditions in folders, labels.json: table with the truth beside
+    python experiments/changes.py answer FOLDER    # reference/ and case_*/: answers alone, as JSON
+
+`open` compares every condition with all normal flights, and each day of normal flights with the other days; the table
+goes to experiments/results/changes_e8.md. `answer` writes experiments/results/changes_e9.json. Nothing is fitted to
+either: what the comparison assumes stands at the top of `openjax/gap/changes.py`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+from scipy.stats import spearmanr
+
+from openjax.gap import changes
+from openjax.gap.changes_report import prediction
+
+RESULTS = Path(__file__).parent / "results"
+
+
+def commit() -> str:
+    """The commit that is checked out."""
+    return subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True
+    ).stdout.strip()
+
+
+def answer(folder: Path) -> dict:
+    """{case: prediction} of every case_* against reference/."""
+    out = {}
+    for case in sorted(folder.glob("case_*")):
+        change = changes.compare(case, [folder / "reference"])
+        out[case.name] = prediction(change) | {"least_shown": round(change.least, 4)}
+        print(case.name, out[case.name], flush=True)
+    return out
+
+
+def open_table(folder: Path) -> str:
+    """The table of an open vehicle, as Markdown."""
+    labels = json.loads((folder / "labels.json").read_text())
+    read = {name: changes.read(folder / name) for name in labels}
+    (normal,) = [name for name, label in labels.items() if label["cause"] == "none"]
+    case, reference, _ = read[normal]
+    rows, cuts = [], []
+
+    def compare(name, truth, new, old):
+        change = changes.change_between(name, new, old, case)
+        answer = prediction(change)
+        rotors = "+".join(f"m{r}" for r in answer["rotors"]) or "–"
+        low, high = change.size.low, change.size.high
+        rows.append((
+            name, truth, len(new), f"{change.probability:.2f}", "yes" if change.changed else "no", rotors,
+            ", ".join(change.likely_causes) if change.changed else "–",
+            f"{100 * change.size.value:.0f} [{100 * low:.0f}, {100 * high:.0f}]", f"{100 * change.least:.0f}",
+        ))  # fmt: skip
+        return change
+
+    days = list(dict.fromkeys(f.day for f in reference))
+    quiet = [
+        compare(f"normal flights, day {k + 1}", "none", [f for f in reference if f.day == day],
+                [f for f in reference if f.day != day])
+        for k, day in enumerate(days)
+    ]  # fmt: skip
+    single = [
+        changes.change_between(
+            "one", [dataclasses.replace(f, day="one")], [g for g in reference if g.day != f.day], case
+        )
+        for f in reference
+    ]
+    named = {True: [], False: []}
+    for name, label in labels.items():
+        if name == normal:
+            continue
+        millimetres = sum(label.get("mm", {}).values())
+        truth = label["cause"] + (f", {millimetres:g} mm" if millimetres else "")
+        truth += " " + "+".join(f"m{r}" for r in label["rotors"])
+        change = compare(name, truth, read[name][1], reference)
+        if label["cause"] == "tape":
+            quiet.append(change)
+        if label["cause"] == "cut":
+            cuts.append((millimetres, change.size.value))
+            if change.changed:
+                named[set(label["rotors"]) <= set(change.rotors)].append(name)
+    large = [name for name, label in labels.items() if sum(label.get("mm", {}).values()) >= 4]
+    found = [r for r in rows if r[0] in large and r[4] == "yes"]
+    header = ("condition", "truth", "flights", "P(changed)", "changed", "rotors", "cause",
+              "thrust lost, % of a rotor's [90 %]", "least that shows, %")  # fmt: skip
+    lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
+    lines += ["| " + " | ".join(map(str, row)) + " |" for row in rows]
+    silent = sum(not c.changed for c in quiet)
+    alone = sum(not c.changed for c in single)
+    figures = [
+        f"* normal flights of another day and tape: no change in {silent} of {len(quiet)}; "
+        f"each normal flight alone against the other days: {alone} of {len(single)}",
+        f"* a rotor cut by 4 mm or more: changed in {len(found)} of {len(large)}",
+        f"* cuts that were found: the rotor right in {len(named[True])} of {len(named[True]) + len(named[False])}",
+        f"* size against millimetres: Spearman {spearmanr(*zip(*cuts, strict=True)).statistic:.2f} over {len(cuts)} cuts",
+    ]
+    return "\n".join([*lines, "", *figures])
+
+
+def main() -> None:
+    """Run one of the two."""
+    what, folder = sys.argv[1], Path(sys.argv[2])
+    if what == "open":
+        text = (
+            "# What changed: real flights of one Crazyflie with known changes (CrazyPAD, vehicle E8)\n\n"
+            f"`python experiments/changes.py open FOLDER` at {commit()}; two cores. Every condition against all normal\n"
+            "flights (twelve logs, three days by their trims), every day of normal flights against the others. Logs of the\n"
+            "motors and of the controller together; no orientation, in motor logs no gyroscope.\n\n"
+        )
+        (RESULTS / "changes_e8.md").write_text(text + open_table(folder) + "\n", encoding="utf-8")
+    else:
+        found = {
+            "commit": commit(),
+            "command": "python experiments/changes.py answer FOLDER",
+            "cases": answer(folder),
+        }
+        (RESULTS / "changes_e9.json").write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
