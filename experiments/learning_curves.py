@@ -1,8 +1,8 @@
 """Learning curves from committed histories: `python experiments/learning_curves.py [RUN ...]`.
 
-Capture rate, capture step and collision rate on the validation tasks against environment steps, for OPEN and its variants
-(ablations.json) and the methods trained beside them (method_runs.json, written anew when directories of `openjax.train` are
-given). Writes experiments/results/learning_curves.md and .png.
+Capture rate, capture step and collision rate on the validation tasks against environment steps: OPEN (h200_runs.json) and
+the other methods as shipped, each trained under penalties with which it learns to catch (method_runs.json, in which a RUN of
+`openjax.train` takes the place of those of its variant). Writes experiments/results/learning_curves.md and .png.
 """
 
 import argparse
@@ -26,12 +26,20 @@ PAPER = (
 
 
 def histories() -> dict[str, list[dict]]:
-    """Runs by variant: those of method_runs.json take the place of older ones of the same variant."""
+    """Runs by variant, those of the shipped weights."""
+    open_runs = read_json(RESULTS / "h200_runs.json")
+    runs = [
+        {
+            "variant": "OPEN",
+            "command": run["settings"]["command"],
+            "machine": {"commit": open_runs["commit"]} | run["settings"]["machine"],
+            "steps": run["evaluations"][-1]["steps"],
+            "validation": run["evaluations"],
+        }
+        for run in open_runs["runs"].values()
+    ]
     groups: dict[str, list[dict]] = {}
-    newer = read_json(METHOD_RUNS)["runs"] if METHOD_RUNS.exists() else []
-    renewed = {run["variant"] for run in newer}
-    older = [run for run in read_json(RESULTS / "ablations.json")["runs"] if run["variant"] not in renewed]
-    for run in older + newer:
+    for run in runs + read_json(METHOD_RUNS)["runs"]:
         groups.setdefault(run["variant"], []).append(run)
     return {name: groups[name] for name in COLORS if name in groups}
 
@@ -47,16 +55,20 @@ def report(groups: dict[str, list[dict]]) -> list[str]:
         last = [run["validation"][-1] for run in runs]
         cells.append(", ".join(f"{record['capture_rate']:.3f}" for record in last))
         cells.append(", ".join(f"{record['collision_rate']:.4f}" for record in last))
-        rows.append([name, f"{runs[0]['steps'] / 1e6:.0f}", *cells, f"`{runs[0]['command']}`"])
+        machine = runs[0]["machine"]
+        made = f"`{runs[0]['command']}`, {machine['device']}, {(machine.get('commit') or 'unknown')[:7]}"
+        rows.append([name, f"{runs[0]['steps'] / 1e6:.0f}", *cells, made])
     heads = ["variant", "steps (M)", *(f"to {rate} (M)" for rate in RATES), "capture rate", "collision rate"]
     return [
         "# Learning curves",
         "",
-        "`python experiments/learning_curves.py`, from the histories in ablations.json and method_runs.json. Each seed, on "
+        "`python experiments/learning_curves.py`, from the histories in h200_runs.json and method_runs.json. Each seed, on "
         "validation tasks (uniform, never a layout): environment steps until the capture rate first reaches a level, and "
-        f"rates at the run's end. For comparison, {PAPER}.",
+        f"rates at the run's end. For comparison, {PAPER}. The commands are those of their commits: MAPPO and its variants flew "
+        "under the preset `paper` as it was then, without a penalty of 5,000 for an episode's first crash (now preset `mappo`); "
+        "with it, as OPEN has it, none of their seeds learns as well (ablations.md).",
         "",
-        *table([*heads, "first seed's command"], rows),
+        *table([*heads, "first seed's command, machine, commit"], rows),
         "",
         "![Learning curves](learning_curves.png)",
     ]
@@ -93,7 +105,13 @@ def main(arguments: list[str]) -> int:
     options = parser.parse_args(arguments)
     if options.runs:
         runs = [read_run(path, 100) for path in options.runs]
-        write_json(METHOD_RUNS, {"commit": options.commit, "runs": runs})
+        for run in runs:
+            run["machine"]["commit"] = run["machine"].get("commit") or options.commit
+            del run["layouts"]
+        renewed = {run["variant"] for run in runs}
+        stored = read_json(METHOD_RUNS)["runs"] if METHOD_RUNS.exists() else []
+        runs += [run for run in stored if run["variant"] not in renewed]
+        write_json(METHOD_RUNS, {"runs": runs})
     groups = histories()
     lines = report(groups)
     options.out.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")
