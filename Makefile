@@ -3,7 +3,7 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 
-.PHONY: train test lint benchmark evaluate tables withheld clean
+.PHONY: train test lint benchmark evaluate tables exam clean
 
 # `make train` accepts extra options: make train ARGS="--preset paper --seed 1"
 train: $(READY)
@@ -25,8 +25,8 @@ evaluate: $(READY)
 tables: $(READY)
 	$(BIN)/python experiments/tables.py $(ARGS)
 
-withheld: $(READY)
-	$(BIN)/python experiments/withheld/run.py $(ARGS)
+exam: $(READY)
+	$(BIN)/python -m experiments.exam.run $(ARGS)
 
 # One install for everything; again only when pyproject.toml changes. A GPU is used where nvidia-smi finds one.
 $(READY): pyproject.toml

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.withheld import cases, causes, generate, sensors
+from experiments.withheld import cases, causes, sensors
 from openjax.vehicle.effects import load_effects
 
 # Three quarters up GAP's usual ranges, in the units of `causes.LIMITS`; the plant's own forms.
@@ -51,7 +51,7 @@ class Case:
         return sensors.draw_case(cases.case_rng(self.seed, self.number, 1))
 
     def spec(self) -> dict:
-        """The case as `cases.Flights` and `generate.write_case` want it."""
+        """The case as `cases.Flights` and `cases.write_case` want it."""
         return {"number": self.number, "flights": self.missions, "mass_weighed": False, "name": self.name}
 
 
@@ -79,7 +79,7 @@ def write_flights(case: Case, folder: Path) -> dict:
     """Fly and log the three flights of a case; returns the magnitudes of the cause, its size and the flights' ticks.
 
     A vehicle that the plant's own controller can't keep in the air for 7 s of each flight gets a smaller cause
-    (`case.cause` is changed), as in the withheld check.
+    (`case.cause` is changed).
     """
     for _ in range(6):
         flights = cases.Flights(case.seed, [case.spec()])
@@ -87,7 +87,7 @@ def write_flights(case: Case, folder: Path) -> dict:
         if case.cause is None or flown["crashed"].min() >= SHORTEST:
             break
         case.cause["size"] *= 0.85
-    ticks = generate.write_case(folder, case.spec(), flights, flown, 0)
+    ticks = cases.write_case(folder, case.spec(), flights, flown, 0)
     return {
         "size": case.cause["size"] if case.cause else None,
         "form": case.cause["form"] if case.cause else None,

@@ -6,13 +6,12 @@ controller (100 Hz).
 integration is semi-implicit with a trapezoidal position.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from experiments.withheld import body as b
 from experiments.withheld import plant_effects as effects
-from experiments.withheld import unknowns
 
 DT = 0.001
 RING = 128  # ms of history kept for delayed poses
@@ -27,7 +26,6 @@ class Batch:
     partner: np.ndarray  # (B,) index of the vehicle that may fly above; itself if alone
     arrival: np.ndarray  # (K, B) ms at which the command of tick k reaches the vehicle; >= 10**8: lost
     noise: dict  # see `sensors.draw_noise`
-    strangers: dict = field(default_factory=dict)  # unknown causes: name -> (B,) strength and details
 
 
 def _received(arrival, steps):
@@ -83,7 +81,6 @@ def fly(batch):
     ticks, _, count = reference["position"].shape
     active = effects.Active(p, b.nominal_parameters(count))
     received = _received(batch.arrival, 10 * ticks)
-    strangers = unknowns.Strangers(batch.strangers, count)
 
     position = reference["position"][0].copy()
     velocity, rates = np.zeros((3, count)), np.zeros((3, count))
@@ -214,10 +211,8 @@ def fly(batch):
         load += (DT / 0.04) * (current - load)
         voltage = noise["open_voltage"] - noise["discharge"] * used - noise["resistance"] * load
         u = effects.motor_demand(p, active, m, voltage, load)
-        u = strangers.motors(u, n * DT, rotor)
         target = b.MAX_SPEED * np.sqrt(u)
         drive += second * (target - drive)
-        old = rotor
         rotor = rotor + np.where(drive > rotor, up_lag, down_lag) * (drive - rotor)
         squared = b.THRUST_CONSTANT * rotor * rotor * p["rotor_gain"]
         thrust = squared * effects.surface_gain(p, active, position, q)
@@ -240,9 +235,7 @@ def fly(batch):
             moment = moment + b.rotate_back(q, np.stack([gradient[1], -gradient[0], np.zeros(count)])) * (
                 b.ARM**2
             )
-        extra_force, extra_torque = strangers.wrench(n * DT, position, q, velocity, rates, rotor, old, thrust)
-        force = force + b.rotate_back(q, outside) + extra_force
-        moment = moment + extra_torque
+        force = force + b.rotate_back(q, outside)
         specific = force / p["mass"]
         accel = b.rotate(q, specific)
         accel[2] -= b.GRAVITY
