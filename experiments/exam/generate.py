@@ -321,9 +321,10 @@ def accepted(name, weighed):
     return classes.get(name, [name])
 
 
-def generate(seed, column, count, logs, jobs=1, only=None, chunk=8, progress=True):
-    """All cases; writes the logs and returns the answers, sorted by case."""
+def generate(seed, column, count, logs, jobs=1, only=None, chunk=8, progress=True, names=None):
+    """All cases, or those of `names`; writes the logs and returns the answers, sorted by case."""
     specs = cases.draw_cases(seed, column, count, only)
+    specs = [s for s in specs if names is None or s["name"] in names]
     size = max(1, min(chunk, math.ceil(len(specs) / jobs)))
     work = [(seed, column, specs[i : i + size], Path(logs)) for i in range(0, len(specs), size)]
     answers, start = [], time.perf_counter()
@@ -370,6 +371,7 @@ def main():
     parser.add_argument("--column", choices=list(cases.COLUMN), default="known")
     parser.add_argument("--count", type=int, default=60)
     parser.add_argument("--only", help="categories, comma-separated: " + ", ".join(cases.SHARES))
+    parser.add_argument("--cases", help="these cases of the plan alone, comma-separated: case_003,case_017")
     parser.add_argument("--logs", type=Path, required=True)
     parser.add_argument("--answers", type=Path, required=True)
     parser.add_argument("--jobs", type=int, default=1)
@@ -377,7 +379,10 @@ def main():
     if options.answers.resolve().is_relative_to(options.logs.resolve()):
         parser.error("--answers must not lie inside --logs")
     only = options.only.split(",") if options.only else None
-    answers = generate(options.seed, options.column, options.count, options.logs, options.jobs, only)
+    names = options.cases.split(",") if options.cases else None
+    answers = generate(
+        options.seed, options.column, options.count, options.logs, options.jobs, only, names=names
+    )
     print("sha256", write_answers(options.answers, answers, options.seed, options.column))
 
 
