@@ -72,7 +72,7 @@ def toml(told, source, pose_rate):
         'order = ["front_right", "rear_right", "rear_left", "front_left"]',
         'spin = ["ccw", "cw", "ccw", "cw"]',
     ]
-    if told.torque_ratio != TORQUE_RATIO:
+    if (told.torque_ratio, told.thrust_constant) != (TORQUE_RATIO, THRUST_CONSTANT):
         lines.append(f"torque_per_thrust = {told.torque_ratio:.4g}")
     lines += ["", "[log]", f'source = "{source}"', f"motion_capture_rate = {pose_rate}"]
     for name, value, nominal, unit in (
