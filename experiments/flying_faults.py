@@ -70,11 +70,11 @@ class Fault:
     amount: float = 0.0
 
 
-def draw_fault(seed: int) -> Fault:
-    """The fault number `seed`; the kinds take turns."""
+def draw_fault(seed: int, latest: float = LATEST) -> Fault:
+    """The fault number `seed`, which begins by `latest` (s); the kinds take turns."""
     rng = random.Random(seed)
     kind = KINDS[seed % len(KINDS)]
-    fault = partial(Fault, kind, rng.uniform(START, LATEST), rng.randrange(3))
+    fault = partial(Fault, kind, rng.uniform(START, latest), rng.randrange(3))
     if kind == "pose lost for a while":
         return fault(duration=rng.uniform(0.05, 1.0))
     if kind == "packets lost":
@@ -85,7 +85,7 @@ def draw_fault(seed: int) -> Fault:
 
 
 def fly(
-    seeds: list[int], layout: str, policy_name: str, watchdog=False, seconds: float = SECONDS
+    seeds: list[int], layout: str, policy_name: str, watchdog=False, latest=LATEST, seconds=SECONDS
 ) -> list[dict]:
     """Fly one fault per seed, side by side; a record of each."""
     import dataclasses
@@ -113,7 +113,7 @@ def fly(
     first, tick = jax.jit(jax.vmap(first)), jax.jit(jax.vmap(tick, in_axes=(0, 0, 0, None, None)))
     starts = np.array(scenario.pursuers)
     n, worlds = len(starts), len(seeds)
-    faults = [draw_fault(seed) for seed in seeds]
+    faults = [draw_fault(seed, latest) for seed in seeds]
     swarm = SimulatedSwarm(
         VirtualVehicles(load_vehicle(), np.tile(starts, (worlds, 1)), flying=True), seeds[0]
     )

@@ -32,8 +32,6 @@ PERIOD = 0.01
 """s"""
 MARGIN = 1.0e-3
 """The tick is placed this long after the newest poses usually arrive (s)."""
-SPIN = 3e-4
-"""The last part of a wait is spent awake (s)."""
 
 
 class Vehicles(Protocol):
@@ -109,9 +107,8 @@ class Pace:
 
 def wait_until(due: float, clock: Callable[[], float]) -> None:
     """Return at `due` (s)."""
-    while (left := due - clock()) > 0:
-        if left > SPIN:
-            time.sleep(left - SPIN)
+    while (left := due - clock()) > 0:  # asleep to the end: the link's threads need the interpreter meanwhile
+        time.sleep(left)
 
 
 @dataclass(frozen=True)
