@@ -30,11 +30,11 @@ class MappoSettings:
     minibatches: int = 4
     learning_rate: float = 2e-3
     discount: float = 0.99
-    trace: float = 0.95
+    gae_lambda: float = 0.95
     clip: float = 0.2
-    entropy: float = 0.01
+    entropy_coefficient: float = 0.01
     value_weight: float = 0.5
-    gradient_norm: float = 0.5
+    max_grad_norm: float = 0.5
 
 
 class Transition(NamedTuple):

@@ -21,6 +21,7 @@ SETTINGS = PursuitSettings(
     start_attitude="level",
     speed_limit="none",
     physics="rigid",
+    contacts=False,
     reward=RewardSettings(smoothness=2.0, crash=7.0, first_crash=5.0),
 )
 STILL = ((0.0, 0.0, 0.0),) * 3
