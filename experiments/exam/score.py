@@ -6,9 +6,9 @@ prints the table; `score` and `collect` give the figures as plain data. Every sh
 1927), every median one by bootstrap. A case of the answers without a report is a miss in all figures.
 
 What is read of `report.json`: `verdict`; `effects` (names, best first; "unknown" may stand among them); `probabilities`;
-`parameters` {effect: {name: {value, interval90}}}; `shares` {"effects": {effect: {value, interval90}}} of the gap's excess
-over the floor; `gap` {before, after, floor, reduction}, in floors; `contradictions` (a list: the channels that contradict
-each other). A log that is refused with a one-line reason counts as called garbage too.
+`parameters` {effect: {name: {value, interval90}}}; `shares` {"effects": {effect: {value, interval90}}, "sensors": …} of the
+gap's mean square; `gap` {before, after, floor, reduction}, in floors; `contradictions` (a list: the channels that
+contradict each other). A log that is refused with a one-line reason counts as called garbage too.
 """
 
 import argparse
@@ -286,15 +286,22 @@ def top_probability(answer, prediction):
 
 
 def share_errors(answer, prediction):
-    """[{"effect", "said", "true"}] of the true effects' shares of the gap, where the report gives one."""
+    """[{"effect", "said", "true"}] of the true effects' shares of the gap's mean square over the floor, where the report
+    gives one; what the report leaves to the sensors is no part of the whole here.
+    """
     said = (prediction["report"] or {}).get("shares") or {}
-    said = said.get("effects", said)
-    out = []
-    for effect, true in answer["shares"].items():
-        entry = next((said[n] for n in [effect, *answer["acceptable"].get(effect, [])] if n in said), None)
-        value = entry.get("value") if isinstance(entry, dict) else entry
-        if value is not None:
-            out.append({"effect": effect, "said": float(value), "true": true})
+    rest = 1.0 - (said.get("sensors") or {}).get("value", 0.0)
+    shares, out, energy = said.get("effects", {}), [], answer.get("energy")
+    if not energy or rest <= 0.02:
+        return out
+    total, truth = sum(energy["nominal"]), sum(energy["truth"])
+    for effect in answer["effects"]:
+        entry = next(
+            (shares[n] for n in [effect, *answer["acceptable"].get(effect, [])] if n in shares), None
+        )
+        if entry is not None and effect in energy:
+            true = (sum(energy[effect]) - truth) / total
+            out.append({"effect": effect, "said": float(entry["value"]) / rest, "true": true})
     return out
 
 

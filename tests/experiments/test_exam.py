@@ -314,13 +314,22 @@ def said(*names, verdict="effect", **report):
 def test_the_scorer_counts_right():
     refused = said() | {"report": None, "status": 2, "error": "error: no"}
     broken = said() | {"report": None, "traceback": "Traceback"}
-    drag = answer("single", "rotor_drag", shares={"rotor_drag": 1.0})
+    energy = {
+        "nominal": [5.0, 1.0],
+        "truth": [1.0, 1.0],
+        "rotor_drag": [5.0, 1.0],
+    }  # 4 of 6 come back without it
+    drag = answer("single", "rotor_drag", energy=energy)
     mass = answer("single", "mass", acceptable={"mass": ["mass", "thrust_scale"]})
     two = answer("pair", "wind", effects=["wind", "inertia"], expected=["wind", "inertia"])
     rows = {
         "right": (
             drag,
-            said("rotor_drag", shares={"rotor_drag": {"value": 0.9}}, gap={"before": 2.0, "reduction": 0.4}),
+            said(
+                "rotor_drag",
+                shares={"effects": {"rotor_drag": {"value": 0.45}}, "sensors": {"value": 0.1}},
+                gap={"before": 2.0, "reduction": 0.4},
+            ),
         ),
         "class": (mass, said("thrust_scale")),
         "second": (drag, said("wind", "rotor_drag")),
@@ -352,7 +361,7 @@ def test_the_scorer_counts_right():
     assert f["false_garbage"] == pytest.approx(1 / 14)
     assert f["pair_exact"] == 0.5
     assert f["pair_f1"] == pytest.approx((1 + 2 / 3) / 2)
-    assert f["share_error"] == pytest.approx(0.1)
+    assert f["share_error"] == pytest.approx(4 / 6 - 0.5)
     assert f["traceback"] == pytest.approx(1 / 17)
     assert f["seconds"] == 1.0
     assert score.gap_said(*rows["right"]) == pytest.approx(0.8)
