@@ -19,7 +19,7 @@ from pages import page_parser, publish, table
 from openjax.baselines import METHODS, Heuristic
 from openjax.baselines.parameters import FOUND, draw, ranges
 from openjax.commands.command_line import run_command
-from openjax.commands.machine import describe_machine
+from openjax.commands.machine import commit, describe_machine
 from openjax.files import read_json
 from openjax.learning import make_evaluate
 from openjax.policy import PolicyParameters
@@ -109,6 +109,7 @@ def of_method(name: str, options: argparse.Namespace) -> dict:
     values = {key: float(f"{float(leaf[winner]):.4g}") for key, leaf in vars(sets).items()}
     return {
         "method": name,
+        "commit": options.commit or commit()["commit"],
         "seconds_all_sets": seconds,
         "steps_all_sets": options.sets * options.tasks * games[0].episode_length,
         "seconds": time.monotonic() - started,
@@ -144,7 +145,6 @@ def study(options: argparse.Namespace) -> dict:
     return {
         "command": f"python experiments/baseline_search.py --sets {options.sets} --tasks {options.tasks} "
         f"--physics {options.physics}",
-        "commit": options.commit,
         "machine": describe_machine(),
         "options": {"sets": options.sets, "tasks": options.tasks, "physics": options.physics},
         "methods": found,
@@ -154,11 +154,10 @@ def study(options: argparse.Namespace) -> dict:
 def report(results: dict) -> list[str]:
     """The page."""
     machine, options = results["machine"], results["options"]
-    commit = results["commit"] or machine.get("commit") or "unknown"
     lines = [
         "# Parameters of the heuristics",
         "",
-        f"`{results['command']}` on {machine['device']}, JAX {machine['versions']['jax']}, commit {commit}.",
+        f"`{results['command']}` on {machine['device']}, JAX {machine['versions']['jax']}; commits below.",
         "",
         f"{options['sets']:,} parameter sets of each method (log-uniform; the first is the literature's, in our units), each "
         f'flown on the same {options["tasks"]} training tasks with `physics="{options["physics"]}"` and the speed clamp, drawn '
@@ -182,7 +181,8 @@ def report(results: dict) -> list[str]:
             "",
             f"## {name}",
             "",
-            f"All sets: {entry['seconds_all_sets']:.0f} s with compilation ({speed:.1f} M environment steps/s); "
+            f"Commit {entry['commit']}. All sets: {entry['seconds_all_sets']:.0f} s with compilation "
+            f"({speed:.1f} M environment steps/s); "
             f"final and third set included {entry['seconds']:.0f} s.",
             "",
             *table(
