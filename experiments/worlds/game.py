@@ -43,12 +43,9 @@ def remember(drones: DroneState, flown: dict, seen: dict) -> DroneState:
     return drones.replace(effect_memory={"flown": flown, "seen": seen})
 
 
-class FlownPursuit(Pursuit):
+def flown_pursuit(settings: PursuitSettings) -> Pursuit:
     """The game of drones that fly elsewhere."""
-
-    def __init__(self, settings: PursuitSettings):
-        super().__init__(settings)
-        self._drones_step = FlownElsewhere()
+    return Pursuit(settings, dynamics=FlownElsewhere())
 
 
 def play(
@@ -88,7 +85,7 @@ def play(
 @functools.cache
 def _compiled(settings, policy, watch):
     """The game's start, its observation of measured poses, the policy, and the game's step with poses from outside."""
-    game = FlownPursuit(settings)
+    game = flown_pursuit(settings)
 
     def observe(state, seen):
         return game.observe(state.replace(drones=remember(state.drones, seen, seen)))

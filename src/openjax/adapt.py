@@ -22,6 +22,7 @@ import tyro
 from openjax.commands.command_line import output_console, parse, run_command
 from openjax.errors import UserError
 from openjax.learning.adaptation import AdaptSettings
+from openjax.ranges import Interval, Seed
 
 PROGRAM = "python -m openjax.adapt"
 FIGURES = ("capture_rate", "capture_step", "collision_rate", "crash_rate", "over_speed_rate")
@@ -37,9 +38,9 @@ class AdaptCommand:
     """A run, a policy file or the name of a policy in the package; it should know a history of its own flight."""
     out: Path = Path("adapted")
     """Directory for what is found."""
-    episodes: int = 1024
+    episodes: Annotated[int, Interval("[1, 1000000]")] = 1024
     """Episodes by which the policies are measured."""
-    seed: int = 0
+    seed: Seed = 0
     overwrite: bool = False
     """Replace what --out already holds."""
     training: AdaptSettings = dataclasses.field(default_factory=AdaptSettings)

@@ -14,10 +14,12 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 from openjax.commands.command_line import output_console, parse, run_command
 from openjax.errors import UserError
 from openjax.flying.safety import Request, SafetySettings
+from openjax.ranges import Interval
 
 PROGRAM = "python -m openjax.fly"
 KEYS = {" ": Request.STOP, "q": Request.STOP, "l": Request.LAND, "h": Request.HOLD}
@@ -38,7 +40,7 @@ class Arguments:
     """A further vehicle that flies the evader by the game's rule; without it the evader is a point in the computer."""
     scenario: str = "wall"
     """Layout: a name or a TOML file. Pillars exist in the computer only, unless you put them up."""
-    episodes: int = 1
+    episodes: Annotated[int, Interval("[1, 100000]")] = 1
     """Games, one after the other. Between them all fly straight back: with real pillars leave it at 1."""
     episode_seconds: float = float("inf")
     """End each game after this time; otherwise it lasts as long as in training."""

@@ -7,10 +7,12 @@ import dataclasses
 import importlib.util
 import sys
 from collections.abc import Sequence
+from typing import Annotated
 
 from openjax.commands.command_line import parse, run_command
 from openjax.errors import UserError
 from openjax.evaluate import EvaluateCommand, fly_scenarios
+from openjax.ranges import Interval, Seed
 
 PROGRAM = "python -m openjax.view"
 
@@ -23,9 +25,9 @@ class ViewCommand:
     """A run's directory, a policy file (.npz), a checkpoint, or the name of a policy in the package."""
     scenario: str = "all"
     """wall, narrow_gap, random, passage, empty, hidden, a TOML file with an own layout, or all six."""
-    seed: int = 0
+    seed: Seed = 0
     """Draws the start attitudes."""
-    port: int = 8080
+    port: Annotated[int, Interval("[0, 65535]")] = 8080
     """Where the page is served, on this machine only."""
 
 

@@ -9,12 +9,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
 from openjax.commands.command_line import output_console, parse, run_command
 from openjax.errors import UserError
 from openjax.flying.virtual_link import BASE_PORT, LinkFaults
+from openjax.ranges import Interval, Seed
 
 PROGRAM = "python -m openjax.virtual_crazyflie"
 
@@ -23,11 +25,11 @@ PROGRAM = "python -m openjax.virtual_crazyflie"
 class Arguments:
     """Fly virtual Crazyflies until interrupted; each has a port of its own."""
 
-    number: int = 3
+    number: Annotated[int, Interval("[1, 100]")] = 3
     """How many."""
     host: str = "127.0.0.1"
     """Address to listen at."""
-    port: int = BASE_PORT
+    port: Annotated[int, Interval("[0, 65535]")] = BASE_PORT
     """UDP port of the first; cflib's scan looks at 19850 to 19859."""
     scenario: str = "wall"
     """They stand below the pursuers' starts of this layout (a name or a TOML file); more of them in a row behind."""
@@ -35,15 +37,15 @@ class Arguments:
     """The vehicle inside (vehicle.toml); by default the nominal Crazyflie."""
     effects: Path | None = None
     """Physical effects that it suffers from (effects.toml)."""
-    battery: float = 1.0
+    battery: Annotated[float, Interval("(0, 1]")] = 1.0
     """Charge at the start, 0 to 1."""
-    endurance: float = 420.0
+    endurance: Annotated[float, Interval("(0, 100000]")] = 420.0
     """Seconds of hover that a full battery lasts."""
     needs_arming: bool = True
     """Motors stay off until armed; False: armed from the start, as brushed Crazyflies are."""
     seconds: float = float("inf")
     """End after this time."""
-    seed: int = 0
+    seed: Seed = 0
     """Draws losses and jitter."""
     link: tyro.conf.OmitArgPrefixes[LinkFaults] = field(default_factory=LinkFaults)
 

@@ -78,7 +78,7 @@ def test_solids_stop_and_keep_momentum():
 def test_game_around_outside_poses_is_the_game():
     """Fed with the poses of the simulator's own drones, the game gives the simulator's observations and counts."""
     settings = PursuitSettings(physics="rigid", episode_length=20)
-    inside, outside = Pursuit(settings), game.FlownPursuit(settings)
+    inside, outside = Pursuit(settings), game.flown_pursuit(settings)
     key = jax.random.key(5)
     _, state = inside.reset(key)
     _, other = outside.reset(key)

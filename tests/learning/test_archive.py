@@ -1,5 +1,7 @@
 """Invariants of the task archive on random sequences of insertions, against the same rule in plain Python."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from openjax.learning.archive import descriptor, draw, empty_archive, insert
-from openjax.pursuit import PursuitSettings, Task
+from openjax.learning.archive import draw, empty_archive, insert
+from openjax.pursuit import PursuitSettings, Task, empty_task, task_descriptor
 
 CAPACITY, ENTERING = 5, 4
 GAME = PursuitSettings(num_pursuers=1, min_pillars=0, max_pillars=1)
@@ -35,7 +37,7 @@ def points_of(archive):
 
 @pytest.fixture(scope="module")
 def enter():
-    compiled = jax.jit(insert)
+    compiled = jax.jit(functools.partial(insert, descriptor=task_descriptor))
 
     def call(archive, points, accepted, success):
         return compiled(archive, tasks_at(points), jnp.asarray(success, jnp.float32), jnp.asarray(accepted))
@@ -63,7 +65,7 @@ insertion = st.lists(entry, min_size=ENTERING, max_size=ENTERING)
 @given(insertions=st.lists(insertion, min_size=1, max_size=5))
 @settings(max_examples=60, deadline=None, derandomize=True)
 def test_invariants(enter, insertions):
-    archive, content, serial = empty_archive(GAME, CAPACITY), [], 0
+    archive, content, serial = empty_archive(empty_task(GAME), CAPACITY), [], 0
     for entering in insertions:
         points, accepted = [p for p, _ in entering], [a for _, a in entering]
         success = [float(serial + i) for i in range(ENTERING)]  # tells every task apart
@@ -83,7 +85,7 @@ def test_invariants(enter, insertions):
 
 
 def test_of_a_cluster_the_older_go_first(enter):
-    archive = empty_archive(GAME, CAPACITY)
+    archive = empty_archive(empty_task(GAME), CAPACITY)
     archive = enter(archive, [(-3, 0), (0.1, 0), (0.2, 0), (3, 0)], [True] * 4, [1, 2, 3, 4])
     archive = enter(archive, [(0.3, 0), (0.4, 0), (0, 3), (0, -3)], [True] * 4, [5, 6, 7, 8])
     # 6 is the cluster's newest; of its older members none stays before the four far ones
@@ -92,15 +94,18 @@ def test_of_a_cluster_the_older_go_first(enter):
 
 def test_unused_pillars_do_not_tell_tasks_apart():
     tasks = tasks_at([(1, 1), (1, 1)]).replace(pillar_position=jnp.array([[[0.5, 0.5]], [[0.0, 0.2]]]))
-    a, b = descriptor(tasks)
+    a, b = task_descriptor(tasks)
     np.testing.assert_array_equal(a, b)
-    a, b = descriptor(tasks.replace(pillar_active=jnp.ones((2, 1), bool)))
+    a, b = task_descriptor(tasks.replace(pillar_active=jnp.ones((2, 1), bool)))
     assert np.any(a != b)
 
 
 def test_draws_are_uniform_over_used_slots(enter):
     archive = enter(
-        empty_archive(GAME, CAPACITY), [(1, 0), (2, 0), (3, 0), (4, 0)], [True, True, False, True], [0] * 4
+        empty_archive(empty_task(GAME), CAPACITY),
+        [(1, 0), (2, 0), (3, 0), (4, 0)],
+        [True, True, False, True],
+        [0] * 4,
     )
     drawn = jax.jit(jax.vmap(lambda key: draw(archive, key)))(jax.random.split(jax.random.key(0), 3000))
     x, number = np.unique(4 * np.asarray(drawn.pursuer_position[:, 0, 0]), return_counts=True)

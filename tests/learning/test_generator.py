@@ -11,7 +11,7 @@ import pytest
 from openjax.learning.archive import empty_archive
 from openjax.learning.generator import generate_task, select, successes
 from openjax.learning.settings import GeneratorSettings
-from openjax.pursuit import PursuitSettings, Task
+from openjax.pursuit import PursuitSettings, Task, empty_task
 from openjax.pursuit.statistics import empty_statistics
 
 GAME = PursuitSettings()
@@ -30,7 +30,7 @@ def generated(settings, archive):
 
 def archived():
     """An archive of one task that no uniform draw can give: pillars off the grid, all on the other side."""
-    archive = empty_archive(GAME, 8)
+    archive = empty_archive(empty_task(GAME), 8)
     task = Task(
         pursuer_position=jnp.array([[-0.5, 0, 0.6], [-0.5, 0.3, 0.6], [-0.5, -0.3, 0.6]]),
         evader_position=jnp.array([0.5, 0.0, 0.6]),
@@ -44,7 +44,7 @@ def archived():
 @pytest.mark.parametrize("switch", ["empty archive", "disabled"])
 def test_uniform_tasks_without_archived_ones(switch):
     if switch == "empty archive":
-        tasks = generated(NOMINAL, empty_archive(GAME, 8))
+        tasks = generated(NOMINAL, empty_archive(empty_task(GAME), 8))
     else:
         tasks = generated(dataclasses.replace(NOMINAL, enabled=False), archived()[0])
     assert tasks.pursuer_position[..., 0].min() >= 0.1 and tasks.evader_position[:, 0].max() <= -0.1
@@ -63,18 +63,21 @@ def test_archived_tasks_are_expanded_with_probability_p():
 
 
 def test_turned_uniform_tasks_come_from_all_sides():
-    tasks = generated(GeneratorSettings(capacity=8), empty_archive(GAME, 8))
+    tasks = generated(GeneratorSettings(capacity=8), empty_archive(empty_task(GAME), 8))
     angle = np.arctan2(tasks.evader_position[:, 1], tasks.evader_position[:, 0])
     assert np.histogram(angle, 4, (-np.pi, np.pi))[0].min() > 150
 
 
 def test_a_share_of_uniform_tasks_has_its_pillars_in_a_row():
     rows = dataclasses.replace(NOMINAL, row_share=0.25)
-    plain, varied = generated(NOMINAL, empty_archive(GAME, 8)), generated(rows, empty_archive(GAME, 8))
+    plain, varied = (
+        generated(NOMINAL, empty_archive(empty_task(GAME), 8)),
+        generated(rows, empty_archive(empty_task(GAME), 8)),
+    )
     np.testing.assert_array_equal(varied.pursuer_position, plain.pursuer_position)
     changed = np.asarray(varied.pillar_position != plain.pillar_position).any(axis=(1, 2))
     np.testing.assert_allclose(changed.mean(), 0.25, atol=0.05)
-    shifted = generated(dataclasses.replace(NOMINAL, pillar_shift=0.05), empty_archive(GAME, 8))
+    shifted = generated(dataclasses.replace(NOMINAL, pillar_shift=0.05), empty_archive(empty_task(GAME), 8))
     moved = np.asarray(shifted.pillar_position - plain.pillar_position)
     assert 0.04 < np.abs(moved).max() <= 0.05 + 1e-6
 
@@ -84,7 +87,9 @@ def test_unsolved_tasks_of_whole_episodes_enter():
     complete = jnp.array([True] * 6 + [False])
     tasks = jax.tree.map(lambda x: jnp.stack([x] * 7), archived()[1])
     tasks = tasks.replace(evader_position=0.1 * jnp.arange(21.0).reshape(7, 3))
-    archive = jax.jit(lambda *a: select(NOMINAL, *a))(empty_archive(GAME, 8), tasks, success, complete)
+    archive = jax.jit(lambda *a: select(NOMINAL, *a))(
+        empty_archive(empty_task(GAME), 8), tasks, success, complete
+    )
     assert int(archive.size) == 3
     np.testing.assert_allclose(archive.success[:3], [0.9, 0.75, 0.5], atol=1e-6)
     np.testing.assert_array_equal(archive.tasks.evader_position[:3], tasks.evader_position[4:1:-1])

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from openjax.pursuit import PursuitSettings
+from openjax.pursuit import Pursuit, PursuitSettings, Task
 from openjax.pursuit.observation import frame, observe, rotation_axes
 from openjax.vehicle import hover_state, load_vehicle
 
@@ -26,21 +26,21 @@ def observed(seen=True, active=(True,) * 4, pillars=PILLARS, quaternion=TURNED, 
     quaternion = jnp.asarray(np.stack([[1, 0, 0, 0], quaternion, [1, 0, 0, 0]]), jnp.float32)
     velocity = jnp.asarray(0.1 * np.arange(9).reshape(3, 3), jnp.float32)
     drones = hover_state(load_vehicle(), jnp.asarray(POSITION), quaternion, velocity)
-    return _observe(
-        settings,
-        jnp.int32(200),
-        drones,
-        drones,
-        None,
-        None,
-        jnp.asarray(EVADER),
-        jnp.array([1.3, 0.0, 0.0]),
-        jnp.asarray(seen),
-        jnp.array([0.1, 0.2, 0.3]),
-        jnp.zeros((10, 16)),
-        jnp.asarray(pillars),
-        jnp.asarray(active),
+    task = Task(
+        pursuer_position=jnp.asarray(POSITION),
+        evader_position=jnp.asarray(EVADER),
+        pillar_position=jnp.asarray(pillars),
+        pillar_active=jnp.asarray(active),
     )
+    _, state = Pursuit(settings).reset_to(jax.random.key(0), task)
+    state = state.replace(
+        step=jnp.int32(200),
+        drones=drones,
+        evader_velocity=jnp.array([1.3, 0.0, 0.0]),
+        in_sight=jnp.full(3, seen),
+        last_seen=jnp.array([0.1, 0.2, 0.3]),
+    )
+    return _observe(settings, state, drones)
 
 
 def test_own_part():

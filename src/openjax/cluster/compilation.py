@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 CACHE_SIZE = 2 * 2**30
 """Bytes that the cache of compiled programs may take; what was used longest ago goes first."""
@@ -76,6 +77,14 @@ def _bound(folder, size):
         total -= bytes_
 
 
+def in_background(make: Callable[[], Any]) -> Callable[[], Any]:
+    """Start to make something in a thread of its own; a function that waits for it and returns it, or raises its error."""
+    pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="background")
+    future = pool.submit(make)
+    pool.shutdown(wait=False)
+    return future.result
+
+
 def compile_ahead(function: Callable, *arguments) -> Callable[[], None]:
     """Start to compile a function of `jax.jit` for arguments of these shapes, dtypes and shardings.
 
@@ -89,12 +98,9 @@ def compile_ahead(function: Callable, *arguments) -> Callable[[], None]:
     Returns:
       a function that waits for the end, and raises what went wrong in the compiler.
     """
-    lowered = function.lower(*arguments)
-    pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="compile")
-    future = pool.submit(lowered.compile)
-    pool.shutdown(wait=False)
+    ready = in_background(function.lower(*arguments).compile)
 
     def wait() -> None:
-        future.result()
+        ready()
 
     return wait

@@ -1,6 +1,7 @@
 """One training run from its settings to its report: compile, train, evaluate, draw."""
 
 import dataclasses
+import functools
 import time
 
 import jax
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-from openjax.cluster.compilation import compile_ahead
+from openjax.cluster.compilation import compile_ahead, in_background
 from openjax.cluster.devices import (
     carry_shardings,
     check_devices,
@@ -26,13 +27,13 @@ from openjax.commands.evaluator import (
 )
 from openjax.commands.loop import NotFiniteError, Plan, StopRequest, guarded, run_updates
 from openjax.commands.validation import Validation, flat_metrics, selection_score
-from openjax.learning import TrainSettings, abstract_carry, build, init_carry, summarise
+from openjax.learning import TrainSettings, build, make_start, summarise
 from openjax.policy import PolicyParameters
 from openjax.policy.growth import with_longer_history
 from openjax.pursuit import SCENARIOS, Pursuit
 from openjax.show.metrics import METRICS_FILE, MetricsWriter, NoMetrics
 from openjax.show.progress import Progress
-from openjax.store.checkpoints import Checkpoints, abstract_like, named_leaves, place
+from openjax.store.checkpoints import Checkpoints, abstract_like, load_orbax, named_leaves, place
 from openjax.store.policies import abstract_parameters, load_policy
 from openjax.store.policy_files import fill, load_policy_file, save_policy_file
 from openjax.store.run_directory import RunDirectory
@@ -83,23 +84,21 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
         processes.advice = f"go on with python -m openjax.train --resume {directory.path} --devices all"
         progress.phase("compiling the start: networks, first tasks")
         shardings = carry_shardings(job.devices)
-        abstract = abstract_like(abstract_carry(settings, job.environment), shardings)
+        start = make_start(settings, job.environment)
+        abstract = abstract_like(jax.eval_shape(start, jax.random.key(settings.seed)), shardings)
         step = guarded(
             make_device_step(settings, job.environment, job.devices), shardings, everywhere(job.devices)
         )
         ahead = processes.number == 1  # several processes must compile in the same order
         step_ready = compile_ahead(step, abstract) if ahead else _nothing  # takes longest, so it comes first
-        validation = _validation(job)
-        evaluation_ready = _validation_ahead(validation, abstract) if ahead else _nothing
-        carry, update, seconds = _first_carry(job, abstract, directory, checkpoints, progress)
+        carry, update, seconds = _first_carry(job, start, abstract, directory, checkpoints, progress)
         if processes.is_first:
             directory.write_settings(settings, job.facts)
 
         def evaluate(carry):
             if not processes.is_first:
                 return processes.of_first()
-            evaluation_ready()
-            uniform, far = (summarise(part) for part in validation(own_copy(carry.policy))[:2])
+            uniform, far = (summarise(part) for part in validation()(own_copy(carry.policy))[:2])
             score = selection_score(uniform)
             return processes.of_first((score, {**flat_metrics(uniform, far), "score": score}))
 
@@ -110,6 +109,9 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
         try:
             progress.phase("compiling the training step")
             step_ready()
+            # not before: its tracing would hold up the training step's
+            make = functools.cache(functools.partial(_validation_ready, job, abstract))
+            validation = in_background(make) if ahead else make
             outcome = run_updates(
                 step,
                 carry,
@@ -144,7 +146,7 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
                 f"go on with python -m openjax.train --resume {directory.path}"
             )
             return 0
-        table = _report(job, directory, validation, outcome, progress)
+        table = _report(job, directory, validation(), outcome, progress)
     console.print(table)
     console.print(f"run, policy and pictures are in {directory.path}", soft_wrap=True)
     return 0
@@ -154,13 +156,16 @@ def _nothing() -> None:
     """There is nothing to wait for."""
 
 
-def _validation_ahead(validation, abstract):
-    """Start to compile the evaluation; a function that waits for it."""
+def _validation_ready(job, abstract):
+    """The validation, compiled; and what else is needed soon after the first update is loaded."""
+    load_orbax()
+    validation = _validation(job)
     policy = abstract_like(abstract.policy, jax.sharding.SingleDeviceSharding(jax.local_devices()[0]))
-    return validation.evaluator.compile_ahead(policy, validation.tasks)
+    validation.evaluator.compile_ahead(policy, validation.tasks)()
+    return validation
 
 
-def _first_carry(job, abstract, directory, checkpoints, progress):
+def _first_carry(job, start, abstract, directory, checkpoints, progress):
     """The carry to start from, the updates done and the seconds spent; `abstract` is its kind."""
     settings = job.settings
     checkpoints.remove_unfinished()
@@ -168,7 +173,7 @@ def _first_carry(job, abstract, directory, checkpoints, progress):
         carry, record = checkpoints.restore_latest(abstract, progress.message)
         progress.message(f"resumed at update {record.update} of {settings.total_updates}")
         return carry, record.update, float(record.notes.get("seconds", 0.0))
-    carry = init_carry(settings, jax.random.key(settings.seed), job.environment)
+    carry = start(jax.random.key(settings.seed))
     if job.start_from is not None:
         carry = carry.replace(policy=_start_parameters(job, carry.policy))
     carry = place(carry, carry_shardings(job.devices))

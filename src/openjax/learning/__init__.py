@@ -1,22 +1,17 @@
-"""Learning: rollout, advantages, MAPPO, predictor update, task archive and generator, the compiled training step."""
+"""Learning: rollout, advantages, MAPPO, predictor update, task archive and generator, schedule, the compiled training step."""
 
-from openjax.learning.evaluation import EpisodeRecord, Evaluation, make_evaluate, summarise
-from openjax.learning.settings import PRESETS, GeneratorSettings, MappoSettings, TrainSettings, preset
-from openjax.learning.training_step import TrainCarry, abstract_carry, build, init_carry, make_training_step
+from openjax.lazy import lazy_names
 
-__all__ = [
-    "PRESETS",
-    "EpisodeRecord",
-    "Evaluation",
-    "GeneratorSettings",
-    "MappoSettings",
-    "TrainCarry",
-    "TrainSettings",
-    "abstract_carry",
-    "build",
-    "init_carry",
-    "make_evaluate",
-    "make_training_step",
-    "preset",
-    "summarise",
-]
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__,
+    {
+        **dict.fromkeys(("EpisodeRecord", "Evaluation", "make_evaluate", "summarise"), "evaluation"),
+        **dict.fromkeys(
+            ("PRESETS", "GeneratorSettings", "MappoSettings", "TrainSettings", "preset"), "settings"
+        ),
+        **dict.fromkeys(
+            ("TrainCarry", "abstract_carry", "build", "init_carry", "make_start", "make_training_step"),
+            "training_step",
+        ),
+    },
+)

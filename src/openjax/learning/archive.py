@@ -1,47 +1,38 @@
 """The active archive: unsolved tasks as a pytree of arrays (the paper's Q_active)."""
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from openjax.pursuit import PursuitSettings, Task
-
-NEVER = jnp.iinfo(jnp.int32).min
-
 
 @struct.dataclass
 class TaskArchive:
-    """Tasks with leading axis C (capacity). Used slots come first, newest first."""
+    """Tasks (any pytree) with leading axis C (capacity). Used slots come first, newest first."""
 
-    tasks: Task
+    tasks: Any
     success: jax.Array  # (C,) float32, success rate at which each task entered
     size: jax.Array  # () int32, used slots
 
 
-def empty_archive(settings: PursuitSettings, capacity: int) -> TaskArchive:
-    """An archive without tasks."""
-    tasks = Task(
-        pursuer_position=jnp.zeros((capacity, settings.num_pursuers, 3), jnp.float32),
-        evader_position=jnp.zeros((capacity, 3), jnp.float32),
-        pillar_position=jnp.zeros((capacity, settings.max_pillars, 2), jnp.float32),
-        pillar_active=jnp.zeros((capacity, settings.max_pillars), bool),
-    )
+def empty_archive(task: Any, capacity: int) -> TaskArchive:
+    """An archive without tasks, for tasks like `task`."""
     return TaskArchive(
-        tasks=tasks, success=jnp.zeros((capacity,), jnp.float32), size=jnp.zeros((), jnp.int32)
+        tasks=jax.tree.map(lambda leaf: jnp.zeros((capacity, *leaf.shape), leaf.dtype), task),
+        success=jnp.zeros((capacity,), jnp.float32),
+        size=jnp.zeros((), jnp.int32),
     )
 
 
-def descriptor(tasks: Task) -> jax.Array:
-    """(M, D) what tells tasks apart: all start positions and the pillars in use (m)."""
-    pillars = jnp.where(tasks.pillar_active[..., None], tasks.pillar_position, 0.0)
-    m = pillars.shape[0]
-    return jnp.concatenate(
-        [tasks.pursuer_position.reshape(m, -1), tasks.evader_position.reshape(m, -1), pillars.reshape(m, -1)],
-        axis=-1,
-    )
-
-
-def insert(archive: TaskArchive, tasks: Task, success: jax.Array, accepted: jax.Array) -> TaskArchive:
+def insert(
+    archive: TaskArchive,
+    tasks: Any,
+    success: jax.Array,
+    accepted: jax.Array,
+    descriptor: Callable[[Any], jax.Array],
+) -> TaskArchive:
     """Add the accepted ones of M tasks; where there are more than slots, keep the spread.
 
     Every task's novelty is its distance to the nearest *newer* one, and the most novel stay: of a cluster the newest
@@ -53,6 +44,7 @@ def insert(archive: TaskArchive, tasks: Task, success: jax.Array, accepted: jax.
         tasks: leading axis M, newest last.
         success: (M,) success rates.
         accepted: (M,) bool, which of them enter.
+        descriptor: of tasks (M, ...) the (M, D) numbers by whose distance they are told apart.
     """
     capacity = archive.success.shape[0]
     m = success.shape[0]
@@ -79,7 +71,7 @@ def insert(archive: TaskArchive, tasks: Task, success: jax.Array, accepted: jax.
     )
 
 
-def draw(archive: TaskArchive, key: jax.Array) -> Task:
+def draw(archive: TaskArchive, key: jax.Array) -> Any:
     """One used task, uniformly; slot 0 (all zeros) of an empty archive: check `size` first."""
     slot = jax.random.randint(key, (), 0, jnp.maximum(archive.size, 1))
     return jax.tree.map(lambda leaf: leaf[slot], archive.tasks)

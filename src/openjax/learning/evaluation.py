@@ -86,7 +86,7 @@ def make_evaluate(
 
 
 def summarise(evaluation: Evaluation) -> dict[str, float]:
-    """The metrics of SPEC section 6 as means over the episodes."""
+    """Captures, breaches, crashes and errors as means over the episodes."""
     statistics = evaluation.statistics
     steps = jnp.maximum(statistics.steps, 1)
 

@@ -9,18 +9,32 @@ from openjax.pursuit import (
     EpisodeStatistics,
     PursuitSettings,
     Task,
+    close_starts,
     expand_task,
     line_up_pillars,
     shift_pillars,
+    task_descriptor,
     turn_task,
     uniform_task,
 )
 
 
 def generate_task(
-    settings: GeneratorSettings, environment: PursuitSettings, archive: TaskArchive, key: jax.Array
+    settings: GeneratorSettings,
+    environment: PursuitSettings,
+    archive: TaskArchive,
+    key: jax.Array,
+    close: float = 0.0,
 ) -> Task:
-    """Draw one task: with probability p an archived one, expanded, else a uniform one."""
+    """Draw one task: with probability p an archived one, expanded, else a uniform one.
+
+    A share `close` of its pursuers is put close to a pillar or to another one (not in the paper).
+    """
+    task = _archived_or_uniform(settings, environment, archive, key)
+    return close_starts(environment, jax.random.fold_in(key, 1), task, close) if close else task
+
+
+def _archived_or_uniform(settings, environment, archive, key):
     uniform_key, turn_key, choice_key, draw_key, expand_key = jax.random.split(key, 5)
     uniform = uniform_task(environment, uniform_key)
     uniform = _vary_pillars(settings, environment, jax.random.fold_in(uniform_key, 1), uniform)
@@ -57,7 +71,7 @@ def select(
         complete: (M,) bool, its episodes ran their full length (the first ones start late).
     """
     unsolved = (success >= settings.success_low) & (success <= settings.success_high)
-    return insert(archive, tasks, success, unsolved & complete)
+    return insert(archive, tasks, success, unsolved & complete, task_descriptor)
 
 
 def _vary_pillars(settings, environment, key, task):

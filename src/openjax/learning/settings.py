@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from openjax.errors import UserError
+from openjax.learning.schedule import Schedule
 from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import PursuitSettings, RewardSettings
 from openjax.ranges import Interval, Seed, check_intervals
@@ -175,10 +176,11 @@ class TrainSettings:
         return self.start_groups * self.episodes_per_task * max(1, self.restart_every)
 
     @property
-    def restart_ages(self) -> range:
-        """Ages (in rollouts) at which worlds start anew before their group's episodes end."""
+    def schedule(self) -> Schedule:
+        """Which worlds start when."""
         every = self.restart_steps // self.rollout_length
-        return range(every, self.start_groups, every)
+        ages = tuple(range(every, self.start_groups, every))
+        return Schedule(self.start_groups, self.episodes_per_task, self.restart_every, ages)
 
     @property
     def steps_per_update(self) -> int:

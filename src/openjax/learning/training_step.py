@@ -1,12 +1,12 @@
 """The compiled training step: rollout, predictor update, policy update, selection of tasks; one function of one carry."""
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from flax import struct
 
@@ -19,7 +19,7 @@ from openjax.learning.predictor_update import make_predictor_optimiser, update_p
 from openjax.learning.rollout import collect
 from openjax.learning.settings import TrainSettings
 from openjax.policy import Policy, PolicyParameters
-from openjax.pursuit import Observation, Pursuit, PursuitState, close_starts
+from openjax.pursuit import Observation, Pursuit, PursuitState, empty_task
 from openjax.vehicle.family import narrowed_bounds
 
 
@@ -60,32 +60,37 @@ def build(settings: TrainSettings, environment: Pursuit | None = None) -> Buildi
     )
 
 
-def init_carry(settings: TrainSettings, key: jax.Array, environment: Pursuit | None = None) -> TrainCarry:
-    """The start of a run: fresh networks, uniform tasks, an empty archive, staggered start times."""
+def make_start(
+    settings: TrainSettings, environment: Pursuit | None = None
+) -> Callable[[jax.Array], TrainCarry]:
+    """The start of a run, key -> carry, by `jax.jit`: fresh networks, uniform tasks, an empty archive, staggered starts.
+
+    `jax.eval_shape` of it tells the carry's shapes; it is traced once for both.
+    """
     parts = build(settings, environment)
-    return jax.jit(lambda key: _initial_carry(settings, parts, key))(key)
+    return jax.jit(functools.partial(_initial_carry, settings, parts))
+
+
+def init_carry(settings: TrainSettings, key: jax.Array, environment: Pursuit | None = None) -> TrainCarry:
+    """The carry at the start of a run; see `make_start`."""
+    return make_start(settings, environment)(key)
 
 
 def abstract_carry(settings: TrainSettings, environment: Pursuit | None = None) -> TrainCarry:
     """Shapes and dtypes of a run's carry, without computing one."""
-    parts = build(settings, environment)
-    return jax.eval_shape(lambda key: _initial_carry(settings, parts, key), jax.random.key(0))
+    return jax.eval_shape(make_start(settings, environment), jax.random.key(0))
 
 
 def _initial_carry(settings, parts, key):
     environment = _with_vehicles_of(settings, parts.environment, 0.0)
-    archive = empty_archive(settings.environment, settings.generator.capacity)
+    archive = empty_archive(empty_task(settings.environment), settings.generator.capacity)
     key, policy_key, task_key, reset_key = jax.random.split(key, 4)
     tasks = _tasks(
         settings, archive, jax.random.split(task_key, settings.num_envs // settings.episodes_per_task)
     )
-    # environment e belongs to start group e mod G; within a group, neighbours share a task
-    groups = settings.start_groups
-    tasks = jax.tree.map(lambda x: jnp.moveaxis(x.reshape(groups, -1, *x.shape[1:]), 0, 1), tasks)
-    tasks = jax.tree.map(lambda x: x.reshape(settings.num_envs, *x.shape[2:]), tasks)
+    tasks = settings.schedule.first(tasks, settings.num_envs)
     observation, state = jax.vmap(environment.reset_to)(jax.random.split(reset_key, settings.num_envs), tasks)
-    age = jnp.arange(settings.num_envs, dtype=jnp.int32) % groups
-    state = state.replace(step=age * settings.rollout_length)
+    state = state.replace(step=settings.schedule.age(settings.num_envs) * settings.rollout_length)
     observation = jax.vmap(environment.observe)(state)
     policy = parts.policy.init(policy_key, jax.tree.map(lambda x: x[0], observation))
     return TrainCarry(
@@ -111,7 +116,7 @@ def make_training_step(
     Metrics are () float32, counted over the rollout or over the episodes that ended with it.
     """
     parts = build(settings, environment)
-    environment, policy = parts.environment, parts.policy
+    environment, policy, schedule = parts.environment, parts.policy, settings.schedule
 
     def training_step(carry: TrainCarry) -> tuple[TrainCarry, dict[str, jax.Array]]:
         key, noise_key, window_key, shuffle_key, task_key, reset_key = jax.random.split(carry.key, 6)
@@ -170,19 +175,17 @@ def make_training_step(
         metrics |= watched
 
         # selection of tasks: the one start group whose episodes have just ended gets new ones
-        group = (settings.start_groups - 1 - carry.update) % settings.start_groups
-        ended = _group(state, group, settings.start_groups)
+        group = schedule.ending(carry.update)
+        ended = schedule.members(state, group)
         archive, counted = _selection(settings, carry.archive, ended, penalty_share, axis)
         metrics |= counted
         fresh = _fresh(settings, starting, archive, task_key, reset_key, ended.step.shape[0], axis)
-        worlds = _set_group((observation, state), fresh, group, settings.start_groups)
-        if settings.restart_every:
+        worlds = schedule.with_members((observation, state), fresh, group)
+        if number := schedule.restarts(num_envs):
             # and so do the worlds that are started anew within the episodes of other groups
-            ages = np.array(settings.restart_ages)
-            number = num_envs // settings.start_groups // settings.restart_every * len(ages)
             keys = (jax.random.fold_in(task_key, 1), jax.random.fold_in(reset_key, 1))
             fresh = _fresh(settings, starting, archive, *keys, number, axis, settings.restart_close)
-            worlds = _set_restarted(settings, worlds, fresh, (group + ages) % settings.start_groups)
+            worlds = schedule.with_restarts(worlds, fresh, group)
         observation, state = worlds
 
         carry = TrainCarry(
@@ -221,35 +224,14 @@ def _with_vehicles_of(settings, environment, progress):
 def _tasks(settings, archive, keys, close=0.0):
     """One task per key, repeated for the environments that share it; a share of pursuers starts close to something."""
 
-    def one(key):
-        task = generate_task(settings.generator, settings.environment, archive, key)
-        return close_starts(settings.environment, jax.random.fold_in(key, 1), task, close) if close else task
-
-    return jax.tree.map(lambda x: jnp.repeat(x, settings.episodes_per_task, axis=0), jax.vmap(one)(keys))
+    draw = functools.partial(generate_task, settings.generator, settings.environment, archive, close=close)
+    return jax.tree.map(lambda x: jnp.repeat(x, settings.episodes_per_task, axis=0), jax.vmap(draw)(keys))
 
 
 def _fresh(settings, environment, archive, task_key, reset_key, number, axis, close=0.0):
     """Observations and states of `number` worlds of this device at the start of newly drawn tasks."""
     tasks = _tasks(settings, archive, own_keys(task_key, number // settings.episodes_per_task, axis), close)
     return jax.vmap(environment.reset_to)(own_keys(reset_key, number, axis), tasks)
-
-
-def _set_restarted(settings, tree, new, groups):
-    """`tree` with the worlds of every n-th task of some groups (A,) replaced by `new`."""
-    share, period, every_group = settings.episodes_per_task, settings.restart_every, settings.start_groups
-
-    def put(x, new):
-        split = x.reshape(-1, period, share, every_group, *x.shape[1:])
-        new = jnp.swapaxes(new.reshape(split.shape[0], len(groups), share, *x.shape[1:]), 1, 2)
-        return split.at[:, 0].set(split[:, 0].at[:, :, groups].set(new)).reshape(x.shape)
-
-    return jax.tree.map(put, tree, new)
-
-
-def _lasting(settings, number):
-    """(number,) bool of a group's members: those that are not started anew within an episode."""
-    task = np.arange(number) // settings.episodes_per_task
-    return task % settings.restart_every != 0 if settings.restart_every else np.ones(number, bool)
 
 
 def _selection(settings, archive, ended, penalty_share, axis):
@@ -271,27 +253,7 @@ def _selection(settings, archive, ended, penalty_share, axis):
         "episode_return": statistics.episode_return,
         "success_rate": solved.ravel(),
     }
-    lasting = _lasting(settings, statistics.steps.shape[0])
+    lasting = settings.schedule.lasting(statistics.steps.shape[0])
     counted = {name: jnp.mean(value.astype(jnp.float32)[lasting]) for name, value in counted.items()}
     counted = mean_over_devices(counted, axis)
     return archive, counted | {"archive_size": archive.size}
-
-
-def _group(tree, group, groups):
-    """Environments e with e mod groups == group, of every leaf's leading axis."""
-    return jax.tree.map(
-        lambda x: jax.lax.dynamic_index_in_dim(
-            x.reshape(x.shape[0] // groups, groups, *x.shape[1:]), group, axis=1, keepdims=False
-        ),
-        tree,
-    )
-
-
-def _set_group(tree, new, group, groups):
-    """`tree` with that group's environments replaced by `new`."""
-
-    def put(x, new):
-        split = x.reshape(x.shape[0] // groups, groups, *x.shape[1:])
-        return jax.lax.dynamic_update_index_in_dim(split, new, group, axis=1).reshape(x.shape)
-
-    return jax.tree.map(put, tree, new)

@@ -1,13 +1,11 @@
 """The networks: attention encoder, actor, critic, evader predictor."""
 
-from openjax.policy.policy import Policy, PolicyParameters, gaussian_entropy, gaussian_log_prob
-from openjax.policy.settings import NetworkSettings, PredictorSettings
+from openjax.lazy import lazy_names
 
-__all__ = [
-    "NetworkSettings",
-    "Policy",
-    "PolicyParameters",
-    "PredictorSettings",
-    "gaussian_entropy",
-    "gaussian_log_prob",
-]
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__,
+    {
+        **dict.fromkeys(("Policy", "PolicyParameters", "gaussian_entropy", "gaussian_log_prob"), "policy"),
+        **dict.fromkeys(("NetworkSettings", "PredictorSettings"), "settings"),
+    },
+)

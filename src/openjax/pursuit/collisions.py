@@ -13,7 +13,7 @@ TOUCH = 1e-3
 
 @struct.dataclass
 class Breaches:
-    """Number of breaches of each pursuer in one step (SPEC section 5)."""
+    """Number of breaches of each pursuer in one step."""
 
     pillar: jax.Array  # (N,) float, pillars whose surface is too close
     drone: jax.Array  # (N,) float, other drones too close

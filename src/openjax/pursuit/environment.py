@@ -2,64 +2,27 @@
 
 import copy
 import dataclasses
+from dataclasses import dataclass
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
-from flax import struct
 
-from openjax.pursuit.collisions import Breaches, breaches, crashed
+from openjax.pursuit.collisions import breaches, crashed
 from openjax.pursuit.evader import evader_velocity
 from openjax.pursuit.observation import Observation, frame, observe, own_frame, rotation_axes
 from openjax.pursuit.reward import captures, over_speed, reward
 from openjax.pursuit.sensing import line_of_sight
 from openjax.pursuit.settings import PursuitSettings
 from openjax.pursuit.spaces import Box
-from openjax.pursuit.statistics import EpisodeStatistics, count, empty_statistics
+from openjax.pursuit.state import PursuitState, StepInfo
+from openjax.pursuit.statistics import count, empty_statistics
 from openjax.pursuit.task import Task, start_attitude, uniform_task
 from openjax.vehicle import DroneState, Vehicle, hover_state, load_vehicle, make_drones_step
-from openjax.vehicle.family import draw_vehicles, family_effects, standard_parameters
+from openjax.vehicle.family import draw_vehicles, family_effects
 
 THRUST_LIMIT = 0.9
-"""The commanded thrust is cut here, as a fraction of the maximum (SPEC section 2)."""
-
-
-@struct.dataclass
-class PursuitState:
-    """State of one world with N pursuers."""
-
-    task: Task
-    drones: DroneState  # leading axis N
-    vehicles: dict[
-        str, dict[str, jax.Array]
-    ]  # effect -> parameter -> (N,), drawn at the start; empty: nominal vehicles
-    evader_position: jax.Array  # (3,) m, world
-    evader_velocity: jax.Array  # (3,) m/s, world
-    last_seen: jax.Array  # (3,) where the evader was last seen; the arena's middle before that
-    in_sight: jax.Array  # (N,) bool, which pursuers see the evader
-    frames: jax.Array  # (n * spacing, F) history, oldest first
-    own_history: (
-        jax.Array | None
-    )  # (H * spacing, N, OWN_FRAME) as seen, oldest first; None where it isn't observed
-    previous_action: jax.Array  # (N, 4) squashed command of the last step
-    step: jax.Array  # () int32, control steps since the start
-    statistics: EpisodeStatistics
-
-    @property
-    def seen(self) -> jax.Array:
-        """() bool, some pursuer sees the evader."""
-        return jnp.any(self.in_sight, axis=-1)
-
-
-@struct.dataclass
-class StepInfo:
-    """What happened in one step, beside the reward."""
-
-    captured: jax.Array  # (N,) bool
-    seen: jax.Array  # () bool, some pursuer sees the evader
-    breaches: Breaches
-    over_speed: jax.Array  # (N,) bool
-    crashed: jax.Array  # (N,) bool
-    penalty: jax.Array  # (N,) the reward's penalties, at most 0
+"""The commanded thrust is cut here, as a fraction of the maximum (the paper's simulator does so)."""
 
 
 def hover_action(vehicle: Vehicle) -> jax.Array:
@@ -75,39 +38,63 @@ def action_to_command(action: jax.Array) -> jax.Array:
     return jnp.concatenate([thrust, jnp.pi * action[..., 1:]], axis=-1)
 
 
-class Pursuit:
-    """Pursuit-evasion by N quadrotors, as pure functions: map them with `jax.vmap`, compile them with `jax.jit`.
+class Dynamics(Protocol):
+    """What moves the pursuers: `openjax.vehicle.DronesStep`, or a world outside."""
 
-    Args:
-        settings: the game; see `PursuitSettings`.
-        vehicle: the pursuers' vehicle; None is the nominal Crazyflie.
-        effects: names of physical effects to fly with (`openjax.vehicle.effects`).
-        effect_parameters: their parameters, {effect: {parameter: value}}.
-        vehicle_bounds: (R, 4) bounds of `settings.vehicles` that go before those written there.
-    """
+    def reset(self, vehicle: Vehicle, drones: DroneState, key: jax.Array) -> DroneState:
+        """The drones (leading axis N) at the start of an episode."""
 
-    def __init__(
+    def __call__(
         self,
-        settings: PursuitSettings | None = None,
-        vehicle: Vehicle | None = None,
-        effects: tuple[str, ...] = (),
-        effect_parameters: dict | None = None,
-        vehicle_bounds: jax.Array | None = None,
-    ):
-        self.settings = settings or PursuitSettings()
-        self.vehicle = vehicle if vehicle is not None else load_vehicle()
-        self.effects = tuple(effects)
-        self.effect_parameters = effect_parameters or {}
-        self.vehicle_bounds = vehicle_bounds
-        drawn = family_effects(self.settings.vehicles)
-        self._drones_step = make_drones_step(
-            physics=self.settings.physics,
-            dt=self.settings.time_step,
-            substeps=self.settings.substeps,
-            effects=(*drawn, *self.effects),
-            contacts=self.settings.contacts,
-            arena=self.settings.arena,
-        )
+        vehicle: Vehicle,
+        drones: DroneState,
+        command: jax.Array,
+        pillar_position: jax.Array,
+        pillar_active: jax.Array,
+        effect_parameters: dict,
+    ) -> DroneState:
+        """The drones a control step later; see `openjax.vehicle.DronesStep`."""
+
+    def seen(self, drones: DroneState, effect_parameters: dict) -> DroneState:
+        """The drones as their sensors tell."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pursuit:
+    """Pursuit-evasion by N quadrotors, as pure functions: map them with `jax.vmap`, compile them with `jax.jit`."""
+
+    settings: PursuitSettings | None = None
+    """The game; None: the paper's."""
+    vehicle: Vehicle | None = None
+    """The pursuers' vehicle; None: the nominal Crazyflie."""
+    effects: tuple[str, ...] = ()
+    """Names of physical effects to fly with (`openjax.vehicle.effects`)."""
+    effect_parameters: dict | None = None
+    """Their parameters, {effect: {parameter: value}}."""
+    vehicle_bounds: jax.Array | None = None
+    """(R, 4) bounds of `settings.vehicles` that go before those written there."""
+    dynamics: Dynamics | None = None
+    """What moves the pursuers; None: the physics that the settings name, with the effects."""
+
+    def __post_init__(self):
+        settings = self.settings or PursuitSettings()
+        complete = {
+            "settings": settings,
+            "vehicle": load_vehicle() if self.vehicle is None else self.vehicle,
+            "effects": tuple(self.effects),
+            "effect_parameters": self.effect_parameters or {},
+            "dynamics": self.dynamics
+            or make_drones_step(
+                physics=settings.physics,
+                dt=settings.time_step,
+                substeps=settings.substeps,
+                effects=(*family_effects(settings.vehicles), *self.effects),
+                contacts=settings.contacts,
+                arena=settings.arena,
+            ),
+        }
+        for name, value in complete.items():
+            object.__setattr__(self, name, value)  # the one moment at which a frozen object is filled
 
     @property
     def action_space(self) -> Box:
@@ -131,7 +118,7 @@ class Pursuit:
         attitude_key, effect_key = jax.random.split(key)
         quaternion = start_attitude(settings, attitude_key)
         drones = jax.vmap(lambda p, q: hover_state(self.vehicle, p, q))(task.pursuer_position, quaternion)
-        drones = self._drones_step.reset(self.vehicle, drones, effect_key)
+        drones = self.dynamics.reset(self.vehicle, drones, effect_key)
         vehicles = draw_vehicles(
             settings.vehicles,
             jax.random.fold_in(key, 2),
@@ -180,34 +167,14 @@ class Pursuit:
 
     def observe(self, state: PursuitState) -> Observation:
         """The observation of a state; effects on the sensors act on what a pursuer knows of all pursuers."""
-        return self._observe(state, self._seen(state.drones, state.vehicles))
+        return observe(self.settings, state, self._seen(state.drones, state.vehicles))
 
     def _parameters(self, vehicles):
         """Parameters of all effects: those drawn for the episode, and this environment's own, which go first."""
         return {**vehicles, **self.effect_parameters}
 
     def _seen(self, drones, vehicles):
-        return self._drones_step.seen(drones, self._parameters(vehicles))
-
-    def _observe(self, state, seen):
-        settings = self.settings
-        return observe(
-            settings,
-            state.step,
-            state.drones,
-            seen,
-            state.own_history[settings.observe_history_spacing - 1 :: settings.observe_history_spacing]
-            if settings.observe_history
-            else None,
-            standard_parameters(settings.vehicles, state.vehicles) if settings.vehicles else None,
-            state.evader_position,
-            state.evader_velocity,
-            state.seen,
-            state.last_seen,
-            state.frames[self.settings.history_spacing - 1 :: self.settings.history_spacing],
-            state.task.pillar_position,
-            state.task.pillar_active,
-        )
+        return self.dynamics.seen(drones, self._parameters(vehicles))
 
     def step(
         self, key: jax.Array, state: PursuitState, action: jax.Array
@@ -225,7 +192,7 @@ class Pursuit:
         del key
         settings, task = self.settings, state.task
         action = jnp.clip(action.astype(jnp.float32), -1.0, 1.0)
-        drones = self._drones_step(
+        drones = self.dynamics(
             self.vehicle,
             state.drones,
             action_to_command(action),
@@ -246,77 +213,49 @@ class Pursuit:
         `step` is physics and this; where the pursuers are flown by something else, real vehicles say, this alone.
         Returns what `step` does.
         """
-        settings, task = self.settings, state.task
+        settings, task, before = self.settings, state.task, state
         pillars = (task.pillar_position, task.pillar_active)
         velocity = evader_velocity(
-            settings, state.evader_position, state.drones.position, state.in_sight, *pillars
+            settings, before.evader_position, before.drones.position, before.in_sight, *pillars
         )
-        evader = state.evader_position + settings.time_step * velocity
-
-        step = state.step + 1
+        evader = before.evader_position + settings.time_step * velocity
+        step = before.step + 1
         position = drones.position
         in_sight = line_of_sight(settings, position, evader, *pillars)
         seen = jnp.any(in_sight)
-        captured = captures(settings, position, evader, in_sight)
-        breach = breaches(settings, position, *pillars)
-        too_fast = over_speed(settings, drones.velocity)
-        body_z_up = rotation_axes(drones.quaternion)[1][:, 2]
-        crash = crashed(settings, position, body_z_up, *pillars)
-        distance = jnp.sqrt(jnp.sum((position - evader) ** 2, axis=-1) + 1e-12)
-        counted, counted_crash = self._counted(breach, crash, drones, body_z_up, pillars)
-        first_crash = crash & ~state.statistics.crashed
-        rewards, penalty = reward(
-            settings,
-            captured,
-            distance,
-            counted,
-            too_fast,
-            counted_crash,
-            first_crash,
-            action,
-            state.previous_action,
-        )
-
-        seen_drones = self._seen(drones, state.vehicles)
+        seen_drones = self._seen(drones, before.vehicles)
         newest = frame(settings, step, seen_drones.position, evader, velocity, seen)
-        own_history = state.own_history
+        own_history = before.own_history
         if settings.observe_history:
             now = own_frame(seen_drones.quaternion, seen_drones.velocity, action)
             own_history = jnp.concatenate([own_history[1:], now[None]])
-        state = PursuitState(
-            task=task,
+        state = before.replace(
             drones=drones,
-            vehicles=state.vehicles,
             evader_position=evader,
             evader_velocity=velocity,
-            last_seen=jnp.where(seen, evader, state.last_seen),
+            last_seen=jnp.where(seen, evader, before.last_seen),
             in_sight=in_sight,
-            frames=jnp.concatenate([state.frames[1:], newest[None]]),
+            frames=jnp.concatenate([before.frames[1:], newest[None]]),
             own_history=own_history,
             previous_action=action,
             step=step,
-            statistics=count(state.statistics, step, captured, breach, too_fast, crash, rewards),
         )
+        info = StepInfo(
+            captured=captures(settings, position, evader, in_sight),
+            seen=seen,
+            breaches=breaches(settings, position, *pillars),
+            over_speed=over_speed(settings, drones.velocity),
+            crashed=crashed(settings, position, rotation_axes(drones.quaternion)[1][:, 2], *pillars),
+            penalty=jnp.zeros(settings.num_pursuers, jnp.float32),
+        )
+        rewards, penalty = reward(settings, before, state, info)
+        info = info.replace(penalty=penalty)
+        state = state.replace(statistics=count(before.statistics, step, info, rewards))
         over = step >= settings.episode_length
         never = jnp.zeros((), bool)
         # an observed horizon is part of the task, so its end is terminal; an unobserved one only cuts the episode
         terminated, truncated = (over, never) if settings.observe_time else (never, over)
-        info = StepInfo(
-            captured=captured, seen=seen, breaches=breach, over_speed=too_fast, crashed=crash, penalty=penalty
-        )
-        return self._observe(state, seen_drones), state, rewards, terminated, truncated, info
-
-    def _counted(self, breach, crash, drones, body_z_up, pillars):
-        """The breaches (N,) and crashes (N,) that the reward counts: those of the metrics, early by margin and lookahead."""
-        settings, weights = self.settings, self.settings.reward
-        if weights.margin != 0.0:
-            breach = breaches(settings, drones.position, *pillars, weights.margin)
-            crash = crashed(settings, drones.position, body_z_up, *pillars, weights.margin)
-        if weights.lookahead != 0.0:
-            ahead = drones.position + weights.lookahead * drones.velocity
-            breach = jax.tree.map(jnp.maximum, breach, breaches(settings, ahead, *pillars))
-            crash = crash | crashed(settings, ahead, body_z_up, *pillars)
-        return breach, crash
+        return observe(settings, state, seen_drones), state, rewards, terminated, truncated, info
 
 
 def make(settings: PursuitSettings | None = None, **changes) -> Pursuit:

@@ -18,7 +18,7 @@ def evader_velocity(
     pillar_position: jax.Array,
     pillar_active: jax.Array,
 ) -> jax.Array:
-    """(3,) velocity (m/s, world) of the evader at (3,), memoryless, of constant speed (SPEC section 3).
+    """(3,) velocity (m/s, world) of the evader at (3,), memoryless, of constant speed.
 
     `pursuers` (N, 3) repel as 1/distance where `in_sight` (N,); bounds and pillars as 1/distance to their surface.
     """

@@ -1,4 +1,4 @@
-"""What each pursuer observes, and what the critic may see beside it (SPEC section 4)."""
+"""What each pursuer observes, and what the critic may see beside it."""
 
 import jax
 import jax.numpy as jnp
@@ -6,22 +6,22 @@ from flax import struct
 
 from openjax.pursuit.collisions import pillar_distance
 from openjax.pursuit.settings import HIDDEN, PursuitSettings
+from openjax.pursuit.state import PursuitState
 from openjax.vehicle import DroneState
+from openjax.vehicle.family import standard_parameters
 
 
 @struct.dataclass
 class Observation:
     """Observation of N pursuers. Relative positions point from the entity to the pursuer (p_i - p_entity), in metres."""
 
-    self_state: (
-        jax.Array
-    )  # (N, S) evader, quaternion wxyz, velocity, body x, body z axis, t/T x 4 [, position] [, history]
+    self_state: jax.Array
+    """(N, S) evader, quaternion wxyz, velocity, body x, body z axis, t/T x 4 [, position] [, history]"""
     others: jax.Array  # (N, N - 1, O) other pursuers: relative position [, relative velocity, body z axis]
     pillars: jax.Array  # (N, k, 5) nearest pillars: position relative to their centre (3), height, radius
     pillar_seen: jax.Array  # (N, k) bool, slots in use
-    privileged: (
-        jax.Array
-    )  # (N, Q) true relative evader position, its velocity, own position, seen [, own velocity, vehicle]
+    privileged: jax.Array
+    """(N, Q) true relative evader position, its velocity, own position, seen [, own velocity, vehicle]"""
     position: jax.Array  # (N, 3) own positions, to express predicted positions relative to them
     last_seen: jax.Array  # (3,) where the evader was last seen
     frames: jax.Array  # (n, F) history for the predictor, oldest first
@@ -54,50 +54,37 @@ def own_frame(quaternion: jax.Array, velocity: jax.Array, action: jax.Array) -> 
     return jnp.concatenate([velocity, *rotation_axes(quaternion), action], axis=-1)
 
 
-def observe(
-    settings: PursuitSettings,
-    step: jax.Array,
-    drones: DroneState,
-    seen_drones: DroneState,
-    own_history: jax.Array,
-    vehicles: jax.Array | None,
-    evader: jax.Array,
-    evader_velocity: jax.Array,
-    seen: jax.Array,
-    last_seen: jax.Array,
-    frames: jax.Array,
-    pillar_position: jax.Array,
-    pillar_active: jax.Array,
-) -> Observation:
-    """Build the observation of all N pursuers; the evader seen by one (`seen`, ()) is seen by all.
+def observe(settings: PursuitSettings, state: PursuitState, seen_drones: DroneState) -> Observation:
+    """The observation of all N pursuers in `state`; the evader seen by one is seen by all.
 
-    `seen_drones` is what sensors tell of `drones`; own_history (H, N, OWN_FRAME) oldest first; vehicles (N, R) for the
-    critic, or None where all are nominal.
+    `seen_drones` is what sensors tell of `state.drones`; only the critic sees these themselves.
     """
     n = settings.num_pursuers
+    evader, seen, task = state.evader_position, state.seen, state.task
     position, quaternion, velocity = seen_drones.position, seen_drones.quaternion, seen_drones.velocity
     to_evader = position - evader
     body_x, body_z = rotation_axes(quaternion)
     parts = [jnp.where(seen, to_evader, HIDDEN), quaternion, velocity, body_x, body_z]
     if settings.observe_time:
-        parts.append(jnp.broadcast_to(step.astype(jnp.float32) / settings.episode_length, (n, 4)))
+        parts.append(jnp.broadcast_to(state.step.astype(jnp.float32) / settings.episode_length, (n, 4)))
     if settings.observe_position:
         parts.append(position)
     if settings.observe_history:
-        parts.append(jnp.moveaxis(own_history, 0, 1).reshape(n, -1))
+        spacing = settings.observe_history_spacing
+        parts.append(jnp.moveaxis(state.own_history[spacing - 1 :: spacing], 0, 1).reshape(n, -1))
 
     index = jnp.array([[j for j in range(n) if j != i] for i in range(n)], jnp.int32).reshape(n, n - 1)
     others = position[:, None] - position[index]
 
-    pillars, pillar_seen = _nearest_pillars(settings, position, pillar_position, pillar_active)
+    pillars, pillar_seen = _nearest_pillars(settings, position, task.pillar_position, task.pillar_active)
     true_parts = [
-        drones.position - evader,
-        jnp.broadcast_to(evader_velocity, (n, 3)),
-        drones.position,
+        state.drones.position - evader,
+        jnp.broadcast_to(state.evader_velocity, (n, 3)),
+        state.drones.position,
         jnp.broadcast_to(seen.astype(jnp.float32), (n, 1)),
     ]
-    if vehicles is not None:
-        true_parts += [drones.velocity, vehicles]
+    if settings.vehicles:
+        true_parts += [state.drones.velocity, standard_parameters(settings.vehicles, state.vehicles)]
     return Observation(
         self_state=jnp.concatenate(parts, axis=-1),
         others=others,
@@ -105,8 +92,8 @@ def observe(
         pillar_seen=pillar_seen,
         privileged=jnp.concatenate(true_parts, axis=-1),
         position=position,
-        last_seen=last_seen,
-        frames=frames,
+        last_seen=state.last_seen,
+        frames=state.frames[settings.history_spacing - 1 :: settings.history_spacing],
     )
 
 

@@ -1,10 +1,12 @@
-"""The reward (SPEC section 5)."""
+"""The reward (the paper's section IV-A, and what was added to it)."""
 
 import jax
 import jax.numpy as jnp
 
-from openjax.pursuit.collisions import Breaches
+from openjax.pursuit.collisions import breaches, crashed
+from openjax.pursuit.observation import rotation_axes
 from openjax.pursuit.settings import PursuitSettings
+from openjax.pursuit.state import PursuitState, StepInfo
 
 OVER_SPEED = 1.01
 """Share of the maximal speed above which a step counts as over speed."""
@@ -23,24 +25,34 @@ def over_speed(settings: PursuitSettings, velocity: jax.Array) -> jax.Array:
 
 
 def reward(
-    settings: PursuitSettings,
-    captured: jax.Array,
-    distance: jax.Array,
-    breach: Breaches,
-    too_fast: jax.Array,
-    crash: jax.Array,
-    first_crash: jax.Array,
-    action: jax.Array,
-    previous_action: jax.Array,
+    settings: PursuitSettings, before: PursuitState, state: PursuitState, info: StepInfo
 ) -> tuple[jax.Array, jax.Array]:
-    """(N,) reward of each pursuer, and (N,) the penalties that it holds (at most 0).
+    """(N,) reward of each pursuer for a step from `before` to `state`, and (N,) the penalties in it (at most 0).
 
-    `captured` (N,) bool rewards all; `distance` (N,) to the evader (m), `breach`, `too_fast`, `crash` and `first_crash`
-    (N,) bool and the change of the squashed command `action` (N, 4) count for each pursuer.
+    A capture by any rewards all; distance to the evader, breaches, speed, crashes and the change of the squashed command
+    count for each.
     """
     weights = settings.reward
-    penalty = -weights.collision * breach.total - weights.over_speed * too_fast
+    breach, crash = _counted(settings, state, info)
+    first_crash = info.crashed & ~before.statistics.crashed
+    penalty = -weights.collision * breach.total - weights.over_speed * info.over_speed
     penalty = penalty - weights.crash * crash - weights.first_crash * first_crash
-    change = jnp.sqrt(jnp.sum((action - previous_action) ** 2, axis=-1) + 1e-12)
-    task = weights.capture * jnp.any(captured) - weights.distance * distance
+    distance = jnp.sqrt(jnp.sum((state.drones.position - state.evader_position) ** 2, axis=-1) + 1e-12)
+    change = jnp.sqrt(jnp.sum((state.previous_action - before.previous_action) ** 2, axis=-1) + 1e-12)
+    task = weights.capture * jnp.any(info.captured) - weights.distance * distance
     return task + weights.smoothness * jnp.exp(-change) + penalty, penalty
+
+
+def _counted(settings, state, info):
+    """The breaches (N,) and crashes (N,) that the reward counts: those of the metrics, early by margin and lookahead."""
+    weights, drones, breach, crash = settings.reward, state.drones, info.breaches, info.crashed
+    pillars = (state.task.pillar_position, state.task.pillar_active)
+    body_z_up = rotation_axes(drones.quaternion)[1][:, 2]
+    if weights.margin != 0.0:
+        breach = breaches(settings, drones.position, *pillars, weights.margin)
+        crash = crashed(settings, drones.position, body_z_up, *pillars, weights.margin)
+    if weights.lookahead != 0.0:
+        ahead = drones.position + weights.lookahead * drones.velocity
+        breach = jax.tree.map(jnp.maximum, breach, breaches(settings, ahead, *pillars))
+        crash = crash | crashed(settings, ahead, body_z_up, *pillars)
+    return breach, crash

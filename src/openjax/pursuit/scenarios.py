@@ -38,7 +38,7 @@ def _layout(name, pillars, pursuers, evader):
 
 _RIGHT = ((0.6, 0.0), (0.8, 0.0), (0.8, -0.2))
 
-# The first five are the released code's; in "hidden" nobody sees the evader at the start (SPEC section 6).
+# The first five are the released code's; in "hidden" nobody sees the evader at the start.
 SCENARIOS: dict[str, Scenario] = {
     layout.name: layout
     for layout in (

@@ -1,10 +1,15 @@
-"""What is counted over an episode: the paper's metrics and ours (SPEC section 6)."""
+"""What is counted over an episode: the paper's metrics and ours."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from openjax.pursuit.collisions import Breaches
+if TYPE_CHECKING:
+    from openjax.pursuit.state import StepInfo
 
 
 @struct.dataclass
@@ -51,17 +56,12 @@ def empty_statistics(episode_length: int) -> EpisodeStatistics:
 
 
 def count(
-    statistics: EpisodeStatistics,
-    step: jax.Array,
-    captured: jax.Array,
-    breach: Breaches,
-    too_fast: jax.Array,
-    crashed: jax.Array,
-    reward: jax.Array,
+    statistics: EpisodeStatistics, step: jax.Array, info: StepInfo, reward: jax.Array
 ) -> EpisodeStatistics:
-    """Add one step; `step` () is its number, counted from 1, the others are (N,) of the pursuers."""
-    now = jnp.any(captured)
+    """Add one step; `step` () is its number, counted from 1, `reward` (N,) is the pursuers'."""
+    now = jnp.any(info.captured)
     first = now & ~statistics.captured
+    breach = info.breaches
 
     def any_of(values):
         return jnp.any(values > 0).astype(jnp.float32)
@@ -74,7 +74,7 @@ def count(
         pillar_steps=statistics.pillar_steps + any_of(breach.pillar),
         drone_steps=statistics.drone_steps + any_of(breach.drone),
         bounds_steps=statistics.bounds_steps + any_of(breach.bounds),
-        over_speed_steps=statistics.over_speed_steps + any_of(too_fast),
-        crashed=statistics.crashed | jnp.any(crashed),
+        over_speed_steps=statistics.over_speed_steps + any_of(info.over_speed),
+        crashed=statistics.crashed | jnp.any(info.crashed),
         episode_return=statistics.episode_return + jnp.mean(reward),
     )

@@ -39,6 +39,26 @@ class Task:
     pillar_active: jax.Array  # (P,) bool, slots in use
 
 
+def empty_task(settings: PursuitSettings) -> Task:
+    """A task of zeros, of the game's shapes."""
+    return Task(
+        pursuer_position=jnp.zeros((settings.num_pursuers, 3), jnp.float32),
+        evader_position=jnp.zeros(3, jnp.float32),
+        pillar_position=jnp.zeros((settings.max_pillars, 2), jnp.float32),
+        pillar_active=jnp.zeros(settings.max_pillars, bool),
+    )
+
+
+def task_descriptor(tasks: Task) -> jax.Array:
+    """(M, D) what tells M tasks apart: all start positions and the pillars in use (m)."""
+    pillars = jnp.where(tasks.pillar_active[..., None], tasks.pillar_position, 0.0)
+    m = pillars.shape[0]
+    return jnp.concatenate(
+        [tasks.pursuer_position.reshape(m, -1), tasks.evader_position.reshape(m, -1), pillars.reshape(m, -1)],
+        axis=-1,
+    )
+
+
 def starts_clear(settings: PursuitSettings, task: Task) -> jax.Array:
     """Whether no pursuer starts in a breach and the evader starts outside all pillars. () bool."""
     breach = breaches(settings, task.pursuer_position, task.pillar_position, task.pillar_active)
@@ -57,7 +77,7 @@ def pillar_cells() -> np.ndarray:
 def uniform_task(settings: PursuitSettings, key: jax.Array) -> Task:
     """Draw a task uniformly: the paper's global exploration.
 
-    Pursuers on one side, the evader on the other, pillars on distinct free cells of a grid (SPEC section 6). Among a
+    Pursuers on one side, the evader on the other, pillars on distinct free cells of a grid. Among a
     few draws of the pursuers' starts the first without a breach is taken; cells too close to a start stay free.
     """
     n = settings.num_pursuers

@@ -109,10 +109,10 @@ def load_state(path: Path, abstract: Any) -> Any:
     """
     path = Path(path).absolute()
     _check(path)
-    stored = _orbax().metadata(path).metadata
+    stored = load_orbax().metadata(path).metadata
     wanted = {name: leaf for name, leaf in named_leaves(abstract).items() if leaf.size}
     _check_same_shapes(path, stored, wanted)
-    arrays = _orbax().load(path, wanted)
+    arrays = load_orbax().load(path, wanted)
     # Orbax can't write arrays without elements; they hold nothing, so they are made anew.
     leaves = [
         arrays[name] if leaf.size else jnp.zeros(leaf.shape, leaf.dtype, device=leaf.sharding)
@@ -135,13 +135,15 @@ def load_arrays(path: Path, prefix: str = "") -> dict[str, np.ndarray]:
     wanted = {
         name: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
         if name.startswith(prefix)
-        else _orbax().PLACEHOLDER
-        for name, leaf in _orbax().metadata(path).metadata.items()
+        else load_orbax().PLACEHOLDER
+        for name, leaf in load_orbax().metadata(path).metadata.items()
     }
     this = jax.process_index()
-    alone = _orbax().options.MultiprocessingOptions(primary_host=this, active_processes={this})
-    with _orbax().Context(multiprocessing_options=alone):
-        loaded = {name: leaf for name, leaf in _orbax().load(path, wanted).items() if name.startswith(prefix)}
+    alone = load_orbax().options.MultiprocessingOptions(primary_host=this, active_processes={this})
+    with load_orbax().Context(multiprocessing_options=alone):
+        loaded = {
+            name: leaf for name, leaf in load_orbax().load(path, wanted).items() if name.startswith(prefix)
+        }
     is_key = {name: jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) for name, leaf in loaded.items()}
     return {
         name: np.asarray(jax.random.key_data(leaf) if is_key[name] else leaf) for name, leaf in loaded.items()
@@ -286,7 +288,7 @@ class Checkpoints:
 
 
 @functools.cache
-def _orbax():
+def load_orbax():
     """Loaded late: it takes a second or two, which pass while a run's programs are compiled."""
     from orbax.checkpoint.experimental import v1
 
@@ -297,7 +299,7 @@ def _record(path):
     """What is known of a checkpoint. Raises DamagedError."""
     _check(path)
     try:
-        notes = dict(_orbax().metadata(path.absolute()).custom_metadata or {})
+        notes = dict(load_orbax().metadata(path.absolute()).custom_metadata or {})
     except Exception as error:  # orbax and tensorstore raise many kinds
         raise DamagedError(f"checkpoint {path} can't be read ({type(error).__name__})") from error
     return CheckpointRecord(path, int(path.name), notes.pop("score", None), notes)
@@ -358,7 +360,7 @@ def _default_sharding():
 def _start_save(path, carry, notes):
     arrays = {name: leaf for name, leaf in named_leaves(carry).items() if leaf.size}
     path.parent.mkdir(parents=True, exist_ok=True)
-    return _orbax().save_async(path.absolute(), arrays, custom_metadata=notes)
+    return load_orbax().save_async(path.absolute(), arrays, custom_metadata=notes)
 
 
 def _check_same_shapes(path, stored, wanted):

@@ -132,8 +132,9 @@ class DronesStep:
 
     def _body(self, vehicle, parameters):
         """The vehicle that really flies; with parameters of each drone, every leaf has their axis first."""
-        change = lambda parameters: composition.change_body(self.effects, parameters, vehicle)  # noqa: E731
-        return change(parameters) if _drones_axis(parameters) is None else jax.vmap(change)(parameters)
+        change = functools.partial(composition.change_body, self.effects)
+        each = _drones_axis(parameters) is not None
+        return jax.vmap(change, (0, None))(parameters, vehicle) if each else change(parameters, vehicle)
 
     def _contexts(self, vehicle, drones, dt) -> Context:
         neighbours = drones.position[others(drones.position.shape[0])]
@@ -168,16 +169,16 @@ class DronesStep:
         if self.physics != "mjx":
             move = jax.vmap(self._rigid_substep, (*axes, None if around is None else 0))
             return move(vehicle, parameters, drones, command, contexts, around)
-        motors = lambda *drone: self._motors(*drone, dt)  # noqa: E731
+        motors = functools.partial(self._motors, dt=dt)
         moved, force, torque = jax.vmap(motors, axes)(vehicle, parameters, drones, command, contexts)
         body = (drones.position, drones.quaternion, drones.velocity, drones.body_rates, force, torque)
         world, shapes = make_world(self.arena, 0, 0, dt, False), None
         if self.contacts:
             world = make_world(self.arena, pillar_position.shape[0], drones.position.shape[0] - 1, dt, True)
-            place = lambda *drone: place_solids(encounters(self.arena, *drone, dt))  # noqa: E731
-            shapes = jax.vmap(place)(drones.position, drones.velocity, around)
+            met = jax.vmap(functools.partial(encounters, self.arena, dt=dt))
+            shapes = jax.vmap(place_solids)(met(drones.position, drones.velocity, around))
         axes = (axes[0], None if shapes is None else 0, *(0 for _ in body))
-        move = lambda vehicle, *parts: mjx_step(world, vehicle, *parts, dt)  # noqa: E731
+        move = functools.partial(mjx_step, world, dt=dt)
         return _with_body(moved, jax.vmap(move, axes)(vehicle, shapes, *body))
 
     def _rigid_substep(self, vehicle, parameters, drone, command, context, around: Surroundings | None):

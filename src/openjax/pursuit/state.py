@@ -1,0 +1,47 @@
+"""The state of one world, and what happened in a step of it."""
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from openjax.pursuit.collisions import Breaches
+from openjax.pursuit.statistics import EpisodeStatistics
+from openjax.pursuit.task import Task
+from openjax.vehicle import DroneState
+
+
+@struct.dataclass
+class PursuitState:
+    """State of one world with N pursuers."""
+
+    task: Task
+    drones: DroneState  # leading axis N
+    vehicles: dict[str, dict[str, jax.Array]]
+    """effect -> parameter -> (N,), drawn at the start; empty: nominal vehicles"""
+    evader_position: jax.Array  # (3,) m, world
+    evader_velocity: jax.Array  # (3,) m/s, world
+    last_seen: jax.Array  # (3,) where the evader was last seen; the arena's middle before that
+    in_sight: jax.Array  # (N,) bool, which pursuers see the evader
+    frames: jax.Array  # (n * spacing, F) history, oldest first
+    own_history: jax.Array | None
+    """(H * spacing, N, OWN_FRAME) as seen, oldest first; None where it isn't observed"""
+    previous_action: jax.Array  # (N, 4) squashed command of the last step
+    step: jax.Array  # () int32, control steps since the start
+    statistics: EpisodeStatistics
+
+    @property
+    def seen(self) -> jax.Array:
+        """() bool, some pursuer sees the evader."""
+        return jnp.any(self.in_sight, axis=-1)
+
+
+@struct.dataclass
+class StepInfo:
+    """What happened in one step, beside the reward."""
+
+    captured: jax.Array  # (N,) bool
+    seen: jax.Array  # () bool, some pursuer sees the evader
+    breaches: Breaches
+    over_speed: jax.Array  # (N,) bool
+    crashed: jax.Array  # (N,) bool
+    penalty: jax.Array  # (N,) the reward's penalties, at most 0

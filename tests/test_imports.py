@@ -1,0 +1,21 @@
+"""What stands alone can be loaded alone: the paper's ideas without physics, commands' help without arrays."""
+
+import subprocess
+import sys
+
+import pytest
+
+
+@pytest.mark.parametrize(
+    ("modules", "unwanted"),
+    [
+        (("openjax.learning.advantages", "openjax.learning.archive", "openjax.learning.schedule"), "mujoco flax.linen"),
+        (("openjax.policy.predictor", "openjax.policy.attention"), "mujoco openjax.pursuit"),
+        (("openjax.files", "openjax.ranges", "openjax.errors"), "jax numpy"),
+        (("openjax.commands.training_job",), "orbax matplotlib tensorboardX torch PIL"),
+    ],
+)  # fmt: skip
+def test_modules_load_without_what_they_do_not_need(modules, unwanted):
+    script = f"import sys, {', '.join(modules)}; print([name for name in {unwanted.split()} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.stdout == "[]\n", done.stdout + done.stderr
