@@ -56,9 +56,8 @@ class Surroundings:
     from_others: jax.Array  # (..., N, N - 1, 3) position relative to each other pursuer
     from_others_velocity: jax.Array  # (..., N, N - 1, 3) velocity relative to each other pursuer
     team_velocity: jax.Array  # (..., N, 3) mean velocity of all pursuers
-    obstacle_normal: (
-        jax.Array
-    )  # (..., N, k + 1, 2) away from each pillar in sight and from the arena's wall, unit
+    obstacle_normal: jax.Array
+    """(..., N, k + 1, 2) away from each pillar in sight and from the arena's wall, unit"""
     obstacle_distance: jax.Array  # (..., N, k + 1) to their surface; infinite where there is no pillar
     floor_distance: jax.Array  # (..., N)
     ceiling_distance: jax.Array  # (..., N)

@@ -18,8 +18,7 @@ from openjax.vehicle.rate_controller import mixer
 
 GAIN_STEP = 0.05
 # For p, i, d: the share that the replay's step can imitate, and what gyro noise does per row (measured on
-# nominal
-# flights of the tuning plant).
+# nominal flights of the tuning plant).
 GAIN_TOLERANCE = ((0.02, 0.3), (0.4, 0.004), (0.12, 0.1))
 # Where a loop seems to have lost so much of its D gain (all of it, or none), and more of it than of its P gain by this
 # factor, it saw other rates than the log: noise or a late or lost command weakens the fastest column most.

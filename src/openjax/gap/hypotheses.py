@@ -150,9 +150,8 @@ def model_noise(replay: Replay, library: Library) -> tuple[list[np.ndarray], dic
 
     residuals, together = _settle(replay, columns, weights)
     # Where all effects together explain no more than so many parameters must, the noise is that of no effect:
-    # in calm
-    # flights feedback makes disturbances look like weak motors, and a noise model made under that would
-    # confirm it.
+    # in calm flights feedback makes disturbances look like weak motors, and a noise model made under that
+    # would confirm it.
     chosen = []
     for group, (none, full) in enumerate(zip(alone, together, strict=True)):
         axes = list(GROUPS[group][0])

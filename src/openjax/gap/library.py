@@ -145,8 +145,7 @@ FITS = {
     )
 }
 # Small errors of the vehicle's numbers that no effect is blamed for: GAP's "thrust offset up to 1 %", and
-# what the
-# replay's own step and the half-known motor commands inside a row leave.
+# what the replay's own step and the half-known motor commands inside a row leave.
 NUISANCES = (
     ("thrust_scale", "scale", 0.004),
     ("inertia", "xx", 0.01),
@@ -156,8 +155,7 @@ NUISANCES = (
     ("motor_lag", "extra_down", 3e-4),
 )
 # With duty cycles for motor commands the map to thrust is a guess: scale, shape, lag and torques are free,
-# and what
-# they can imitate isn't testable.
+# and what they can imitate isn't testable.
 PWM_NUISANCES = (
     ("thrust_scale", "scale", 0.3),
     ("inertia", "xx", 0.2),

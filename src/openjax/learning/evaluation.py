@@ -15,9 +15,8 @@ class Evaluation:
     """B episodes."""
 
     statistics: EpisodeStatistics  # (B,) each
-    prediction_error: (
-        jax.Array
-    )  # (B,) m, mean distance between predicted and true next position; NaN without predictor
+    prediction_error: jax.Array
+    """(B,) m, mean distance between predicted and true next position; NaN without predictor"""
     last_seen_error: jax.Array  # (B,) m, the same for keeping the last seen position
 
 

@@ -1,6 +1,5 @@
 """The environment: reset and step as pure functions of arrays."""
 
-import copy
 import dataclasses
 from dataclasses import dataclass
 from typing import Protocol
@@ -161,9 +160,7 @@ class Pursuit:
 
     def with_bounds(self, vehicle_bounds: jax.Array) -> "Pursuit":
         """The same game with vehicles drawn within these bounds (R, 4)."""
-        other = copy.copy(self)
-        other.vehicle_bounds = vehicle_bounds
-        return other
+        return dataclasses.replace(self, vehicle_bounds=vehicle_bounds)
 
     def observe(self, state: PursuitState) -> Observation:
         """The observation of a state; effects on the sensors act on what a pursuer knows of all pursuers."""

@@ -24,12 +24,10 @@ class Vehicle:
 
     mass: jax.Array  # () kg
     inertia: jax.Array  # (3,) kg m^2, principal, along the body axes
-    rotor_position: (
-        jax.Array
-    )  # (4, 3) m, body frame, m1 front right, m2 rear right, m3 rear left, m4 front left
-    rotor_spin: (
-        jax.Array
-    )  # (4,) +1: reaction torque on the body along +z (clockwise rotor), -1: counter-clockwise
+    rotor_position: jax.Array
+    """(4, 3) m, body frame, m1 front right, m2 rear right, m3 rear left, m4 front left"""
+    rotor_spin: jax.Array
+    """(4,) +1: reaction torque on the body along +z (clockwise rotor), -1: counter-clockwise"""
     thrust_constant: jax.Array  # () N s^2, thrust = thrust_constant * speed^2
     torque_constant: jax.Array  # () N m s^2, torque = spin * torque_constant * speed^2
     max_rotor_speed: jax.Array  # () rad/s

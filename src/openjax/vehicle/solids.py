@@ -43,15 +43,12 @@ class Encounters:
     shown: jax.Array  # (M,) m, the gap that the solver of contacts is shown; < 0: it acts
 
 
-# Contacts in MuJoCo's direct form: acceleration along the normal >= -stiffness * gap - damping * speed,
-# `gap` being the
-# one at the end of the step. (stiffness in 1/dt^2, damping in 1/dt, impedance: the share of that which is
-# enforced.)
-# Fixed things: together they cancel the approach in one step and close 0.4 of the gap, below the half at
-# which a
-# resting drone would chatter. Other drones: each of the pair takes half of the approach, an inelastic impact
-# of equal
-# masses that keeps their momentum; a low impedance, since the other gives way too.
+# Contacts in MuJoCo's direct form: acceleration along the normal >= -stiffness * gap - damping * speed, `gap`
+# being the one at the end of the step. (stiffness in 1/dt^2, damping in 1/dt, impedance: the share of that
+# which is enforced.) Fixed things: together they cancel the approach in one step and close 0.4 of the gap,
+# below the half at which a resting drone would chatter. Other drones: each of the pair takes half of the
+# approach, an inelastic impact of equal masses that keeps their momentum; a low impedance, since the other
+# gives way too.
 _FIXED = (0.4, 0.6, 0.99)
 _DRONE = (0.5, 0.0, 0.5)
 
