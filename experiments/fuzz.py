@@ -372,15 +372,15 @@ def _other_policy(rng, good, kind):
 
 
 KINDS: dict[str, tuple[Callable, int]] = {
-    "training command lines": (fuzz_train, 30),
-    "evaluation command lines": (fuzz_evaluate, 8),
-    "benchmark command lines": (fuzz_benchmark, 4),
-    "settings files": (fuzz_settings, 16),
-    "layouts": (fuzz_layout, 12),
-    "effects files": (fuzz_effects, 8),
-    "vehicle files": (fuzz_vehicle, 10),
-    "flight logs": (fuzz_log, 4),
-    "policy files": (fuzz_policy, 8),
+    "training command lines": (fuzz_train, 18),
+    "evaluation command lines": (fuzz_evaluate, 5),
+    "benchmark command lines": (fuzz_benchmark, 3),
+    "settings files": (fuzz_settings, 20),
+    "layouts": (fuzz_layout, 16),
+    "effects files": (fuzz_effects, 12),
+    "vehicle files": (fuzz_vehicle, 14),
+    "flight logs": (fuzz_log, 3),
+    "policy files": (fuzz_policy, 9),
 }
 """What is tried, and its share of the cases."""
 
@@ -484,39 +484,46 @@ def plan(cases: int, seed: int, piece: int = 20) -> list[tuple[str, range]]:
     return pieces
 
 
-def make_checkpoints(folder: Path):
-    """Two checkpoints of a tiny training carry, and the carries by update."""
+def make_checkpoints(folder: Path) -> None:
+    """Two checkpoints of a tiny training carry in `folder`/checkpoints, and all their bits in `folder`/UPDATE.npz."""
     import jax
 
-    from openjax.commands.training_command import read_command
     from openjax.learning import init_carry
-    from openjax.store.checkpoints import Checkpoints, place
+    from openjax.store.checkpoints import Checkpoints, named_leaves, place
 
-    settings = read_command(TINY).settings
-    checkpoints = Checkpoints(folder)
-    carries = {}
+    checkpoints = Checkpoints(folder / "checkpoints")
     for update in (1, 2):
-        carries[update] = place(init_carry(settings, jax.random.key(update)))
-        checkpoints.save(update, carries[update], score=float(update), notes={"seconds": 1.0})
+        carry = place(init_carry(_tiny_settings(), jax.random.key(update)))
+        np.savez(
+            folder / f"{update}.npz", **{name: _plain(leaf) for name, leaf in named_leaves(carry).items()}
+        )
+        checkpoints.save(update, carry, score=float(update), notes={"seconds": 1.0})
     checkpoints.wait()
-    return carries
 
 
-def try_damages(folder: Path, carries: dict, seeds: range) -> list[str]:
-    """Damage the newest checkpoint (now and then both) and restore: `same`, `before`, `refused` or what went wrong."""
+def _tiny_settings():
+    from openjax.commands.training_command import read_command
+
+    return read_command(TINY).settings
+
+
+def try_damages(folder: Path, seeds: range) -> list[str]:
+    """Damage the newest checkpoint (now and then either) and restore: `same`, `before`, `refused` or what went wrong."""
     from openjax.errors import UserError
-    from openjax.store.checkpoints import Checkpoints, abstract_like
+    from openjax.learning import abstract_carry
+    from openjax.store.checkpoints import Checkpoints, abstract_like, named_leaves
 
+    saved = {update: dict(np.load(folder / f"{update}.npz")) for update in (1, 2)}
+    abstract = abstract_like(abstract_carry(_tiny_settings()))
     outcomes = []
     for seed in seeds:
         rng = random.Random(f"damage {seed}")
         with tempfile.TemporaryDirectory() as scratch:
             copy = Path(scratch) / "checkpoints"
-            shutil.copytree(folder, copy)
-            hit = sorted(path for path in copy.rglob("*") if path.is_file() and "000000002" in str(path))
-            if rng.random() < 0.1:
-                hit = sorted(path for path in copy.rglob("*") if path.is_file())
-            file = rng.choice(hit)
+            shutil.copytree(folder / "checkpoints", copy)
+            files = sorted(path for path in copy.rglob("*") if path.is_file())
+            newest = [path for path in files if "000000002" in str(path)]
+            file = rng.choice(files if rng.random() < 0.1 else newest)
             before = file.read_bytes()
             if rng.random() < 0.1:
                 file.unlink()
@@ -524,10 +531,13 @@ def try_damages(folder: Path, carries: dict, seeds: range) -> list[str]:
                 file.write_bytes(changed_bytes(rng, before) if before else b"x")
             try:
                 found = Checkpoints(copy)
-                carry, record = found.restore_latest(abstract_like(carries[1]))
+                carry, record = found.restore_latest(abstract)
                 leaves, best = found.load_best("policy/", lambda text: None)
-                good = _same(carry, carries[record.update]) and all(
-                    np.array_equal(leaves[name], leaf) for name, leaf in _policy(carries[best.update]).items()
+                good = all(
+                    _plain(leaf).tobytes() == saved[record.update][name].tobytes()
+                    for name, leaf in named_leaves(carry).items()
+                ) and all(
+                    leaf.tobytes() == saved[best.update][name].tobytes() for name, leaf in leaves.items()
                 )
                 outcomes.append("silently wrong" if not good else "same" if record.update == 2 else "before")
             except UserError:
@@ -537,24 +547,12 @@ def try_damages(folder: Path, carries: dict, seeds: range) -> list[str]:
     return outcomes
 
 
-def _same(tree, other):
+def _plain(leaf):
+    """A leaf as an array on the host, keys by their data."""
     import jax
     import jax.numpy as jnp
 
-    def plain(leaf):
-        is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-        return np.asarray(jax.random.key_data(leaf) if is_key else leaf)
-
-    pairs = zip(jax.tree.leaves(tree), jax.tree.leaves(other), strict=True)
-    return all(plain(a).tobytes() == plain(b).tobytes() for a, b in pairs)
-
-
-def _policy(carry):
-    from openjax.store.checkpoints import named_leaves
-
-    return {
-        name: np.asarray(leaf) for name, leaf in named_leaves(carry).items() if name.startswith("policy/")
-    }
+    return np.asarray(jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf)
 
 
 def train(
@@ -626,8 +624,19 @@ def main(command: FuzzCommand) -> dict:
         "command": "python experiments/fuzz.py " + " ".join(sys.argv[1:]),
         "machine": describe_machine(),
     }
-    with ProcessPoolExecutor(command.workers, mp_context=get_context("spawn")) as pool:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        ProcessPoolExecutor(command.workers, mp_context=get_context("spawn")) as pool,
+    ):
+        scratch = Path(folder)
         pieces = [pool.submit(try_cases, *piece) for piece in plan(command.cases, command.seed)]
+        kills = _submit_kills(pool, scratch, command) if command.kills else []
+        if command.damages:
+            make_checkpoints(scratch)
+        damages = [
+            pool.submit(try_damages, scratch, range(first, min(first + 20, command.damages)))
+            for first in range(0, command.damages, 20)
+        ]
         found = [case for piece in as_completed(pieces) for case in piece.result()]
         results["cases"] = {
             kind: dict(Counter(outcome for name, _, outcome, _ in found if name == kind)) for kind in KINDS
@@ -637,37 +646,33 @@ def main(command: FuzzCommand) -> dict:
             for kind, seed, outcome, text in found
             if outcome == "failed"
         ]
-        results["case_seconds"] = round(time.monotonic() - started)
         print(
-            f"{len(found)} cases, {len(results['failures'])} failures, {results['case_seconds']} s",
+            f"{len(found)} cases, {len(results['failures'])} failures, {time.monotonic() - started:.0f} s",
             flush=True,
         )
-        with tempfile.TemporaryDirectory() as scratch:
-            if command.damages:
-                folder = Path(scratch) / "checkpoints"
-                carries = make_checkpoints(folder)
-                outcomes = try_damages(folder, carries, range(command.damages))
-                results["damages"] = dict(Counter(outcomes))
-                print(f"damages: {results['damages']}", flush=True)
-            if command.kills:
-                cache = Path(scratch) / "cache"
-                train(Path(scratch) / "first", command.updates, cache=cache)  # compiles
-                whole = Path(scratch) / "whole"
-                status, seconds, errors = train(whole, command.updates, cache=cache)
-                if status:
-                    raise SystemExit(f"the run itself failed: {errors}")
-                expected = result_of(whole)
-                instants = np.linspace(1.0, seconds, command.kills)
-                kills = [
-                    pool.submit(try_kill, Path(scratch), command.updates, float(instant), expected, cache)
-                    for instant in instants
-                ]
-                results["kills"] = [kill.result() for kill in kills]
-                print(f"kills: {Counter(kill['outcome'] for kill in results['kills'])}", flush=True)
+        results["damages"] = dict(Counter(outcome for piece in damages for outcome in piece.result()))
+        print(f"damages: {results['damages']}, {time.monotonic() - started:.0f} s", flush=True)
+        results["kills"] = [kill.result() for kill in kills]
+        print(f"kills: {Counter(kill['outcome'] for kill in results['kills'])}", flush=True)
     results["seconds"] = round(time.monotonic() - started)
     command.out.with_suffix(".json").write_text(json.dumps(results, indent=1) + "\n")
     command.out.with_suffix(".md").write_text(page(results))
     return results
+
+
+def _submit_kills(pool, scratch: Path, command: FuzzCommand) -> list:
+    """A run that nobody kills, and the tries to kill it, shared out."""
+    cache, whole = scratch / "cache", scratch / "whole"
+    train(scratch / "first", command.updates, cache=cache)  # compiles
+    status, seconds, errors = train(whole, command.updates, cache=cache)
+    if status:
+        raise SystemExit(f"the run itself failed: {errors}")
+    expected = result_of(whole)
+    instants = np.linspace(1.0, seconds, command.kills)
+    return [
+        pool.submit(try_kill, scratch, command.updates, float(instant), expected, cache)
+        for instant in instants
+    ]
 
 
 def page(results: dict) -> str:
@@ -695,7 +700,7 @@ def page(results: dict) -> str:
             "",
             f"Failed: {failure['kind']}, seed {failure['seed']}: `{failure['text'].splitlines()[-1][:300]}`",
         ]
-    if "damages" in results:
+    if results["damages"]:
         counts = results["damages"]
         told = ", ".join(f"{outcome}: {number}" for outcome, number in counts.items())
         lines += ["", f"Damages to checkpoints: {sum(counts.values())}. {told}."]
@@ -705,7 +710,7 @@ def page(results: dict) -> str:
         lines += [
             "refused: both were hit, or the only undamaged one was gone, and that is said in one line.)"
         ]
-    if "kills" in results:
+    if results["kills"]:
         lines += ["", f"Kills (SIGKILL): {len(results['kills'])}, {results['kills'][0]['seconds']} to "]
         lines[-1] += (
             f"{results['kills'][-1]['seconds']} s after the start of a run of that length; then gone on with to its end."

@@ -31,7 +31,7 @@ class MappoSettings:
     learning_rate: float = 2e-3
     discount: float = 0.99
     gae_lambda: float = 0.95
-    clip: float = 0.2
+    clip_epsilon: float = 0.2
     entropy_coefficient: float = 0.01
     value_weight: float = 0.5
     max_grad_norm: float = 0.5
@@ -162,7 +162,7 @@ def make_update(
         logits = jax.nn.log_softmax(logits)
         ratio = jnp.exp(_pick(logits, batch.action) - batch.log_probability)
         advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-        clipped = jnp.clip(ratio, 1 - settings.clip, 1 + settings.clip)
+        clipped = jnp.clip(ratio, 1 - settings.clip_epsilon, 1 + settings.clip_epsilon)
         entropy = -jnp.sum(jnp.exp(logits) * logits, axis=-1).mean()
         return (
             -jnp.minimum(ratio * advantage, clipped * advantage).mean()
@@ -171,7 +171,7 @@ def make_update(
 
     def critic_loss(parameters, memory, batch, target):
         value = critic.apply(parameters, memory, batch.world, batch.started)[1][..., 0]
-        clipped = batch.value + jnp.clip(value - batch.value, -settings.clip, settings.clip)
+        clipped = batch.value + jnp.clip(value - batch.value, -settings.clip_epsilon, settings.clip_epsilon)
         worst = jnp.maximum(jnp.square(value - target), jnp.square(clipped - target))
         return settings.value_weight * 0.5 * worst.mean()
 

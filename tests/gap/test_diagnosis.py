@@ -1,10 +1,13 @@
 """The diagnosis on flights whose cause is known: the right name, honest parameters, and honest refusals."""
 
 import json
+import sys
 
 import pytest
 
-from openjax.diagnose import main
+from openjax import diagnose
+from openjax.commands.command_line import one_line
+from openjax.errors import UserError
 from openjax.flights.case import load_case
 from openjax.flights.reading import write_csv
 from openjax.gap.diagnosis import diagnose_case
@@ -113,6 +116,15 @@ def test_the_report_has_the_agreed_form(reports):
         prediction = report.prediction()
         assert set(prediction) == {"effects", "probabilities", "where", "reduction", "not_testable"}
         assert sum(prediction["probabilities"].values()) == pytest.approx(1.0, abs=1e-3)
+
+
+def main(arguments):
+    """The command as `python -m openjax.diagnose` runs it: its exit status."""
+    try:
+        return diagnose.main(arguments)
+    except UserError as error:
+        print(f"error: {one_line(error)}", file=sys.stderr)
+        return 2
 
 
 def test_the_command_writes_everything_or_nothing(folders, tmp_path, capsys):

@@ -89,8 +89,7 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
         step = guarded(
             make_device_step(settings, job.environment, job.devices), shardings, everywhere(job.devices)
         )
-        ahead = processes.number == 1  # several processes must compile in the same order
-        step_ready = compile_ahead(step, abstract) if ahead else _nothing  # takes longest, so it comes first
+        step_ready = compile_ahead(step, abstract)  # takes longest, so it comes first
         carry, update, seconds = _first_carry(job, start, abstract, directory, checkpoints, progress)
         if processes.is_first:
             directory.write_settings(settings, job.facts)
@@ -110,8 +109,8 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
             progress.phase("compiling the training step")
             step_ready()
             # not before: its tracing would hold up the training step's
-            make = functools.cache(functools.partial(_validation_ready, job, abstract))
-            validation = in_background(make) if ahead else make
+            if processes.is_first:
+                validation = in_background(functools.partial(_validation_ready, job, abstract))
             outcome = run_updates(
                 step,
                 carry,
@@ -150,10 +149,6 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
     console.print(table)
     console.print(f"run, policy and pictures are in {directory.path}", soft_wrap=True)
     return 0
-
-
-def _nothing() -> None:
-    """There is nothing to wait for."""
 
 
 def _validation_ready(job, abstract):
