@@ -216,12 +216,13 @@ def paper() -> TrainSettings:
     """The paper's task on one large accelerator, in five minutes."""
     return TrainSettings(
         environment=PursuitSettings(
+            physics="rigid",
             observe_position=True,
             reward=RewardSettings(
                 collision=40.0, crash=20.0, first_crash=5000.0, margin=0.03, lookahead=0.15
             ),
         ),
-        network=NetworkSettings(heads=2, compute_type="bfloat16"),
+        network=NetworkSettings(heads=2, compute_type="bfloat16", shared_encoder=True),
         mappo=MappoSettings(
             learning_rate=1e-3, clip_epsilon=0.2, clip_epsilon_end=0.05, penalty_start=0.03, penalty_ramp=0.7
         ),
@@ -243,6 +244,7 @@ def flight() -> TrainSettings:
     base = paper()
     return dataclasses.replace(
         base,
+        network=dataclasses.replace(base.network, shared_encoder=False),
         environment=dataclasses.replace(
             base.environment,
             speed_limit="none",
