@@ -58,16 +58,17 @@ def make_case(arguments: Arguments) -> list[Path]:
     """Write the case; returns its files. Raises UserError for an unknown effect or a folder that isn't
     empty."""
     from openjax.flights.reading import LOG_COLUMNS, write_csv
-    from openjax.gap.samples import SAMPLE_STRENGTHS, fly, log_of, references
+    from openjax.gap.samples import fly, log_of, references
     from openjax.vehicle import load_vehicle
+    from openjax.vehicle.effects import EFFECTS
 
-    if arguments.effect not in ("none", *SAMPLE_STRENGTHS):
-        known = ", ".join(("none", *SAMPLE_STRENGTHS))
+    if arguments.effect not in ("none", *EFFECTS):
+        known = ", ".join(("none", *EFFECTS))
         raise UserError(f"--effect {arguments.effect}: no such effect; known are {known}")
     out = arguments.out
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UserError(f"{out}: exists and isn't an empty folder; name another one")
-    effects = {} if arguments.effect == "none" else {arguments.effect: SAMPLE_STRENGTHS[arguments.effect]}
+    effects = {} if arguments.effect == "none" else {arguments.effect: EFFECTS[arguments.effect].card.sample}
     vehicle = load_vehicle()
     decimals = {c: DECIMALS.get(c, _REST) for c in LOG_COLUMNS}
     flights = references(arguments.seed, arguments.duration, neighbour=arguments.effect == "downwash")

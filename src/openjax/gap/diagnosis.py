@@ -13,42 +13,19 @@ from openjax.flights.flight import Case, Flight, Issue
 from openjax.gap import verdict as rules
 from openjax.gap.evidence import Evidence, gather
 from openjax.gap.hypotheses import SetFit
-from openjax.gap.library import FITS, PLACE, Library, library, path_of
+from openjax.gap.library import CARDS, PLACE, Library, library, path_of
 from openjax.gap.linear_path import linear_score
 from openjax.gap.report import Estimate, Report
 from openjax.gap.rest import Rest, look
-from openjax.gap.selection import Selection, select
+from openjax.gap.selection import CLASS, Selection, select
 from openjax.gap.shares import ERROR_NAMES, split
 from openjax.gap.table import BOUND, judge, with_effects
 from openjax.gap.where import locate
 from openjax.vehicle.effects import EFFECTS
 from openjax.vehicle.vehicle_file import VehicleFile, load_vehicle_file
 
-CLASS = 10.0  # nats below which another effect in a name's place does as well
 # Pairs that motion alone can't split, whatever their scores, unless something was measured beforehand.
 ALWAYS_EQUAL = (("mass", "thrust_scale"),)
-NEXT_FLIGHT = {
-    "mass": "weigh the vehicle, then hover and climb hard: a weighed mass leaves only the thrust.",
-    "thrust_scale": "weigh the vehicle, then hover and climb hard: a weighed mass leaves only the thrust.",
-    "battery_sag": "the same hover on a full and on a nearly empty battery.",
-    "thrust_saturation": "short full-thrust climbs.",
-    "thrust_curve": "steps of collective thrust between 40 and 90 %.",
-    "rotor_drag": "fast straight passes in two headings, nose and side first.",
-    "blade_flapping": "fast straight passes with sudden stops, to load roll and pitch.",
-    "wind": "hover, turning slowly through a full circle of yaw.",
-    "ground_effect": "slow passes between 3 and 20 cm above the floor.",
-    "ceiling_effect": "slow passes just below the ceiling.",
-    "downwash": "a second vehicle crossing 15 to 50 cm above.",
-    "motor_lag": "roll, pitch and thrust doublets, as short as the vehicle allows.",
-    "motor_imbalance": "hover and climbs at several thrusts, with yaw free.",
-    "com_offset": "hover and climbs at several thrusts, with yaw free.",
-    "inertia": "roll, pitch and yaw doublets with the motor commands logged.",
-    "yaw_torque": "yaw doublets and steps.",
-    "command_latency": "steps of commanded thrust and rates, with motor commands logged.",
-    "packet_loss": "steps of commanded thrust and rates, with motor commands logged.",
-    "rate_gains": "roll, pitch and yaw doublets with commands and motor commands logged.",
-    "state_latency": "fast roll and pitch manoeuvres with pose and gyroscope logged.",
-}
 
 
 def diagnose(
@@ -104,7 +81,7 @@ def conclude(evidence: Evidence) -> Report:
         where=locate(evidence, selection.fit, named),
         gap=parts.gap,
         not_testable=missing,
-        next_flight=NEXT_FLIGHT.get(splitter, ""),
+        next_flight=CARDS[splitter].next_flight if splitter in CARDS else "",
         quality=[{"flight": i.flight, "issue": i.issue} for i in evidence.case.quality],
         runner_up=f"{second} ({chances[second]:.2f})" if second and chances[second] > 0.01 else "",
         rest=_rest_in_words(rest),
@@ -135,7 +112,7 @@ def estimates(evidence: Evidence, fit: SetFit, named) -> dict[str, dict[str, Est
     for effect in named:
         path = path_of(effect)
         values = {}
-        for number, fitted in enumerate(FITS[effect].parameters):
+        for number, fitted in enumerate(CARDS[effect].fitted):
             parameter = EFFECTS[effect].parameters[fitted.name]
             if path == "physics":
                 place = PLACE[effect, fitted.name]

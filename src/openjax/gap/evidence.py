@@ -12,25 +12,15 @@ from openjax.flights.flight import Case
 from openjax.flights.track import Track, tracks_of
 from openjax.gap import estimator, firmware
 from openjax.gap.firmware import Radio
-from openjax.gap.hypotheses import SetFit, fit_set, joint_start, model_noise, score_of, weigh_singles
+from openjax.gap.hypotheses import SetFit, model_noise, weigh_singles
 from openjax.gap.kinematics import Kinematics, corrected, read_kinematics
-from openjax.gap.library import ABSENT, NUISANCES, PWM_NUISANCES, Library
+from openjax.gap.library import ABSENT, CARDS, NUISANCES, PWM_NUISANCES, Library
 from openjax.gap.linear_path import LinearPath
 from openjax.gap.observer import TICKS
 from openjax.gap.replay import Replay, make_replay
 
 CLEAR_DELAY = 0.002  # s of pose delay above which the pose is moved before the physics is read
 CLEAR_SCORE = 3.0  # nats, likewise
-# Channels without which an effect can't be told, though it leaves a trace in others.
-NEEDS = {
-    "rotor_drag": "velocity",
-    "blade_flapping": "velocity",
-    "wind": "velocity",
-    "ground_effect": "position",
-    "ceiling_effect": "position",
-    "downwash": "position",
-    "battery_sag": "voltage",
-}
 CLEAR_GAINS = 20.0  # nats of the rate loop's path from which its gains are used to read it again
 LOOKS = 2  # at most
 WORTH_KNOWING = 15.0  # nats that an effect must add to be taken as known in the next look
@@ -49,7 +39,7 @@ class Evidence:
     tracks: list[Track]
     vehicles: list
     replay: Replay
-    sets: dict[tuple[str, ...], SetFit | float]
+    sets: dict[tuple[str, ...], SetFit]
     exposure: dict[str, float]
     floor: list[np.ndarray]  # (T, 9) residuals when all effects may act at once: sensors and gusts
     radio: Radio | None
@@ -61,18 +51,6 @@ class Evidence:
     @property
     def nothing(self) -> SetFit:
         return self.sets[()]
-
-    def gain(self, effects) -> float:
-        """Score of a physics set above no effect."""
-        return score_of(self.sets[tuple(effects)]) - self.nothing.score
-
-    def fit(self, effects) -> SetFit:
-        """The full fit of a physics set, made now if it was only weighed so far."""
-        effects = tuple(effects)
-        if not isinstance(self.sets.get(effects), SetFit):
-            start = joint_start(self.replay, self.sets, effects) if len(effects) > 1 else None
-            self.sets[effects] = fit_set(self.replay, effects, start)
-        return self.sets[effects]
 
 
 def gather(case: Case, library: Library, progress=None) -> Evidence:
@@ -189,7 +167,8 @@ def _physics(
         rate_loop, ticks = loop.path, loop.ticks
     replay = make_replay(tracks, vehicles, ticks, numbers, one_clock)
     floor, exposure = model_noise(replay, library)
-    for effect, channel in NEEDS.items():
-        if any(getattr(t, channel) is None for t in tracks):
+    for effect in library.physics:
+        needs = CARDS[effect].needs
+        if needs and any(getattr(t, needs) is None for t in tracks):
             exposure[effect] = 0.0
     return replay, weigh_singles(replay, library, exposure, before), exposure, floor, rate_loop

@@ -7,22 +7,17 @@ the other pairs are weighed by adding the linearised singles."""
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import norm
 
-from openjax.gap.library import ABSENT, FITS, PLACE, Library, places, prior, start_of
+from openjax.gap.library import ABSENT, CARDS, PLACE, Library, places, prior, start_of
 from openjax.gap.replay import GROUPS, SKIP, Replay
 from openjax.gap.whitening import Noise, fit_noise
 
 ITERATIONS = 6
 SMALL_STEP = 0.05  # nats: an improvement below this ends the search
-BESIDE = 4  # pairs with the best single effect fitted in full
-REFITTED = 3  # of the best pairs
-TRIPLES = 2
-WORTH_A_THIRD = 10.0  # nats: three effects are tried only where two beat one by this
 WORTH_ALL = 60.0  # nats: all effects together must explain this much of a channel to count in its noise model
 SIZES = (0.05, 4.0)  # of a start that is scaled
 UNEXPOSED = 0.5  # nats that a typical effect would leave: below, the effect isn't fitted at all
@@ -48,7 +43,7 @@ class SetFit:
         return {
             e: {
                 p.name: (float(self.theta[PLACE[e, p.name]]), float(deviation[PLACE[e, p.name]]))
-                for p in FITS[e].parameters
+                for p in CARDS[e].fitted
             }
             for e in self.effects
         }
@@ -102,7 +97,7 @@ def _sign_term(effects, index, theta, covariance) -> float:
     total = 0.0
     for place, deviation in zip(index, np.sqrt(np.diag(covariance)), strict=True):
         for effect in effects:
-            for parameter in FITS[effect].parameters:
+            for parameter in CARDS[effect].fitted:
                 if parameter.positive and PLACE[effect, parameter.name] == place:
                     total += norm.logcdf((theta[place] - ABSENT[place]) / deviation) + np.log(2.0)
     return float(total)
@@ -127,7 +122,7 @@ def model_noise(replay: Replay, library: Library) -> tuple[list[np.ndarray], dic
     theta = ABSENT.copy()
     ahead, firsts = [], []
     for effect in library.physics:
-        for number in range(1 + len(FITS[effect].others)):
+        for number in range(1 + len(CARDS[effect].others)):
             firsts.append(effect)
             point = ABSENT.copy()
             point[places((effect,))] = start_of(effect, number)
@@ -196,28 +191,6 @@ def without_nuisances(replay: Replay, residual: np.ndarray, track: int) -> np.nd
     return residual - np.tensordot(taken, replay.nuisances[track], 1)
 
 
-def weigh_sets(replay: Replay, library: Library, exposure=None) -> dict[tuple[str, ...], SetFit | float]:
-    """Score of every set up to pairs and of the best triples: a full fit, or a linearised score."""
-    found = weigh_singles(replay, library, exposure)
-    effects = tuple(e for e in library.physics if (e,) in found)
-    if len(effects) < 2:
-        return found
-    sums = LinearSums(replay, [found[e,] for e in effects], found[()])
-    pairs = {pair: sums.score(pair) for pair in itertools.combinations(effects, 2)}
-    first = max((k for k in found if k), key=lambda k: found[k].score)
-    beside = _beside(replay, found, first, effects)
-    _refit(replay, found, pairs | beside, BESIDE, among=beside)
-    _refit(replay, found, pairs | beside, REFITTED)
-    best = max(
-        (k for k, f in found.items() if len(k) == 2 and isinstance(f, SetFit)), key=lambda k: found[k].score
-    )
-    alone = max(score_of(found[k]) for k in found if len(k) == 1)
-    if score_of(found[best]) < alone + WORTH_A_THIRD:
-        return found
-    _refit(replay, found, _beside(replay, found, best, effects), TRIPLES)
-    return found
-
-
 def weigh_singles(
     replay: Replay, library: Library, exposure=None, before=None
 ) -> dict[tuple[str, ...], SetFit]:
@@ -232,80 +205,17 @@ def weigh_singles(
     return found
 
 
-def _beside(replay: Replay, found, key, effects) -> dict[tuple[str, ...], float]:
-    """Linearised score of a fitted set with each further effect: its derivatives there, and its step to where it
-    was fitted alone (some effects have no derivative where they are absent)."""
-    base = found[key]
-    others = [e for e in effects if e not in key]
-    own = base.index
-    more = np.concatenate([places((e,)) for e in others]) if others else np.zeros(0, int)
-    more = np.array([i for i in more if i not in own], int)
-    columns = replay.linearised(base.theta, np.concatenate([own, more]))
-    points = []
-    for effect in others:
-        point = base.theta.copy()
-        point[places((effect,))] = found[effect,].theta[places((effect,))]
-        points.append(point)
-    moved = replay.predict(np.array(points)) if points else []
-    columns = [
-        np.concatenate([c, m - (y - c[0])[None]])
-        for c, m, y in zip(columns, moved, replay.measured, strict=True)
-    ]
-    gram = replay.grams(columns).sum(0)
-    place = {int(i): 1 + k for k, i in enumerate(np.concatenate([own, more]))}
-    out = {}
-    for number, effect in enumerate(others):
-        index, mean, precision = prior((*key, effect))
-        pick = [0, *(place[int(i)] for i in index if int(i) in place), 1 + len(place) + number]
-        inside = [k for k, i in enumerate(index) if int(i) in place]
-        prior_part = np.zeros((len(inside) + 1, len(inside) + 1))
-        prior_part[:-1, :-1] = precision[np.ix_(inside, inside)]
-        prior_part[-1, -1] = 1.0
-        off = np.append((base.theta[index] - mean)[inside], 0.0)
-        own_gram = gram[np.ix_(pick, pick)]
-        hessian = own_gram[1:, 1:] + prior_part
-        push = own_gram[1:, 0] - prior_part @ off
-        volume = np.linalg.slogdet(hessian)[1] - np.linalg.slogdet(prior_part)[1]
-        out[tuple(sorted((*key, effect), key=effects.index))] = float(
-            -0.5 * own_gram[0, 0]
-            - 0.5 * off @ prior_part @ off
-            + 0.5 * push @ np.linalg.solve(hessian, push)
-            - 0.5 * volume
-        )
-    return out
-
-
-def joint_start(replay: Replay, found, effects) -> np.ndarray:
-    """Of the fitted parts of a set, alone or with the rest where it was fitted alone, the best start (P,)."""
-    effects = tuple(effects)
-    index, mean, precision = prior(effects)
-    points = []
-    for size in range(1, len(effects)):
-        for part in itertools.combinations(effects, size):
-            if not isinstance(found.get(part), SetFit):
-                continue
-            plain, full = found[part].theta.copy(), found[part].theta.copy()
-            for effect in effects:
-                if effect not in part and isinstance(found.get((effect,)), SetFit):
-                    full[places((effect,))] = found[effect,].theta[places((effect,))]
-            points += [plain, full]
-    residuals = [y[None] - p for y, p in zip(replay.measured, replay.predict(np.array(points)), strict=True)]
-    square = np.diag(replay.grams(residuals).sum(0))
-    off = np.array(points)[:, index] - mean
-    return points[int(np.argmin(square + np.einsum("ki,ij,kj->k", off, precision, off)))]
-
-
 def _best_start(replay: Replay, effect: str) -> np.ndarray:
     """Of an effect's starts the one that explains most by itself, at the size that explains most."""
     starts = []
-    for number in range(1 + len(FITS[effect].others)):
+    for number in range(1 + len(CARDS[effect].others)):
         start = ABSENT.copy()
         start[places((effect,))] = start_of(effect, number)
         starts.append(start)
     if len(starts) == 1:
         return starts[0]
     moved = replay.predict(np.array(starts))
-    if not FITS[effect].linear:
+    if not CARDS[effect].linear:
         residuals = [y[None] - p for y, p in zip(replay.measured, moved, strict=True)]
         return starts[int(np.argmin(np.diag(replay.grams(residuals).sum(0))))]
     columns = [
@@ -318,69 +228,3 @@ def _best_start(replay: Replay, effect: str) -> np.ndarray:
     first = places((effect,))[0]
     starts[best][first] *= size[best]
     return starts[best]
-
-
-def _refit(replay, found, scores, count, among=None) -> None:
-    """Fit the `count` best sets in full, of those in `among`; the others keep their linearised scores."""
-    ranked = sorted(scores if among is None else among, key=lambda k: -scores[k])[:count]
-    for chosen in ranked:
-        if not isinstance(found.get(chosen), SetFit):
-            found[chosen] = fit_set(replay, chosen, joint_start(replay, found, chosen), 4)
-    level = max(f.score for k, f in found.items() if isinstance(f, SetFit) and k in scores)
-    # A linearised score is an estimate: never let it beat a set that was fitted in full.
-    found.update({k: min(v, level) for k, v in scores.items() if not isinstance(found.get(k), SetFit)})
-
-
-def score_of(entry: SetFit | float) -> float:
-    return entry.score if isinstance(entry, SetFit) else entry
-
-
-class LinearSums:
-    """Joint scores of effects from their single fits: residuals and derivatives are taken to add up."""
-
-    def __init__(self, replay: Replay, singles: list[SetFit], nothing: SetFit):
-        columns = [[c[:1]] for c in nothing.columns]
-        self.row, self.own, self.theta = {}, {}, {}
-        at = 1
-        for fit in singles:
-            effect, own = fit.effects[0], len(places(fit.effects))
-            self.row[effect], self.own[effect], self.theta[effect] = (
-                at,
-                list(range(at + 1, at + 1 + own)),
-                fit.theta,
-            )
-            for number, column in enumerate(fit.columns):
-                columns[number].append(column[: 1 + own])
-            at += 1 + own
-        self.gram = replay.grams([np.concatenate(c) for c in columns]).sum(0)
-
-    def point(self, effects) -> np.ndarray:
-        """Where the single fits of `effects` are, taken together."""
-        theta = ABSENT.copy()
-        for effect in effects:
-            index = places((effect,))
-            theta[index] = self.theta[effect][index]
-        return theta
-
-    def score(self, effects) -> float:
-        """Log marginal likelihood of a set, without companions."""
-        pick = [j for e in effects for j in self.own[e]]
-        transform = np.zeros((1 + len(pick), len(self.gram)))
-        transform[0, 0] = 1.0 - len(effects)
-        for effect in effects:
-            transform[0, self.row[effect]] += 1.0
-        transform[np.arange(1, 1 + len(pick)), pick] = 1.0
-        gram = transform @ self.gram @ transform.T
-        size = len(pick)
-        index, mean, precision = prior(effects)
-        covariance = np.linalg.inv(precision)[:size, :size]
-        precision, off = np.linalg.inv(covariance), self.point(effects)[index[:size]] - mean[:size]
-        hessian = gram[1:, 1:] + precision
-        push = gram[1:, 0] - precision @ off
-        volume = np.linalg.slogdet(hessian)[1] - np.linalg.slogdet(precision)[1]
-        return float(
-            -0.5 * gram[0, 0]
-            - 0.5 * off @ precision @ off
-            + 0.5 * push @ np.linalg.solve(hessian, push)
-            - 0.5 * volume
-        )

@@ -7,7 +7,6 @@ flight."""
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 
 import jax
@@ -95,34 +94,6 @@ class Replay:
         if self.usable[3]:
             shared[own + 16] = False  # pose clock
         return shared
-
-    def nuisance_estimates(self, residuals) -> list[np.ndarray]:
-        """Most likely nuisances (N,) of each track, in their standard deviations, given residuals (T, 9)."""
-        out = []
-        for number, residual in enumerate(residuals):
-            n = self.whitened_nuisances[number].reshape(len(self.nuisances[number]), -1)
-            w = self.whiten(residual, number).ravel()
-            out.append(np.linalg.solve(np.eye(len(n)) + n @ n.T, n @ w))
-        return out
-
-    def without_flight(self, flight: int) -> Replay:
-        """The same replay without the tracks of one flight."""
-        keep = [k for k, f in enumerate(self.flight_of) if f != flight]
-        names = tuple(n for k, n in enumerate(self.flights) if k != flight)
-        pick = lambda values: [values[k] for k in keep]  # noqa: E731
-        return dataclasses.replace(
-            self,
-            tracks=pick(self.tracks),
-            vehicles=pick(self.vehicles),
-            paths=pick(self.paths),
-            measured=pick(self.measured),
-            nominal=pick(self.nominal),
-            nuisances=pick(self.nuisances),
-            flights=names,
-            flight_of=np.array([f - (f > flight) for f in self.flight_of[keep]]),
-            whitened_nuisances=pick(self.whitened_nuisances),
-            projections=pick(self.projections),
-        )
 
     def set_noise(self, noises) -> None:
         """Use these noise models; unlogged channels get none and count nothing."""

@@ -37,31 +37,6 @@ PERIOD = 0.01  # s, rows and off-board commands
 RATE_LOOPS = 5  # per row: 500 Hz
 SUBSTEPS = 2  # per rate loop: 1 kHz
 
-# What to fly with where a user names an effect only: within its usual range, strong enough to see, still
-# flyable.
-SAMPLE_STRENGTHS: Mapping[str, Mapping[str, float]] = {
-    "battery_sag": {"exponent": 1.0},
-    "blade_flapping": {"tilt": 0.02, "stiffness": 2e-4},
-    "ceiling_effect": {"strength": 0.6, "offset": 0.01},
-    "com_offset": {"x": 0.003, "y": -0.002},
-    "command_latency": {"delay": 0.03},
-    "downwash": {"force": 0.05, "length": 0.5, "width": 0.06, "spread": 0.1},
-    "ground_effect": {"strength": 0.8, "offset": 0.01},
-    "inertia": {"xx": 1.4, "yy": 1.4, "zz": 1.4},
-    "mass": {"extra": 0.003},
-    "motor_imbalance": {"m1": 0.06, "m2": -0.04, "m3": 0.02, "m4": -0.05},
-    "motor_lag": {"extra_up": 0.02, "extra_down": 0.03},
-    "packet_loss": {"probability": 0.2},
-    "rate_gains": {"p": 0.65, "i": 0.65, "d": 0.65},
-    "rotor_drag": {"d_xy": 0.015, "d_z": 0.005},
-    "state_latency": {"delay": 0.03},
-    "thrust_curve": {"curvature": 0.25},
-    "thrust_saturation": {"limit": 0.82},
-    "thrust_scale": {"scale": -0.08},
-    "wind": {"x": 1.2, "y": -0.8, "drag": 0.015},
-    "yaw_torque": {"ratio": 0.4},
-}
-
 
 @dataclass(frozen=True)
 class SensorModel:

@@ -12,7 +12,7 @@ import numpy as np
 
 from openjax.gap.evidence import Evidence
 from openjax.gap.hypotheses import SetFit, fit_set
-from openjax.gap.library import ABSENT, PLACE, places, prior, start_of
+from openjax.gap.library import ABSENT, CARDS, places, prior, start_of
 from openjax.gap.table import Judged, Table, build, judge, level, with_effects
 
 # The decision's numbers. None was learned from a plant.
@@ -25,9 +25,8 @@ MOST = 6  # effects at once
 OPENINGS = 3  # effects from which a search begins
 LEFT_MUCH = 1.2  # of the squares that noise alone leaves: a search from several beginnings is worth its time
 ROUNDS = 2  # of widening and swapping
+CLASS = 10.0  # nats within which two effects do equally well
 TRIED = 2  # candidates of each kind fitted in full at each step
-CALM = 0.1  # m/s: air that moves less is calm
-UNKNOWN_MAP = {"mass", "thrust_scale", "battery_sag", "thrust_curve", "thrust_saturation"}  # with duty cycles
 
 
 @dataclass(frozen=True)
@@ -123,12 +122,12 @@ def _openings(replay, nothing: SetFit, singles) -> list[SetFit]:
 def testable(evidence: Evidence) -> dict[str, SetFit]:
     """{effect: its fit alone} of the physics effects that would show at their usual size. Where motor commands are duty
     cycles, what the unknown map to thrust can imitate isn't among them."""
-    barred = UNKNOWN_MAP if evidence.case.vehicle_file.motor_command == "pwm" else set()
+    known = evidence.case.vehicle_file.motor_command != "pwm"
     return {
         k[0]: f
         for k, f in evidence.sets.items()
         if len(k) == 1
-        and k[0] not in barred
+        and (known or not CARDS[k[0]].thrust_map)
         and isinstance(f, SetFit)
         and evidence.exposure.get(k[0], 0.0) >= TESTABLE
     }
@@ -175,22 +174,14 @@ def _ranked(table: Table, singles, now: Judged) -> list[str]:
 
 
 def is_itself(fit: SetFit) -> bool:
-    """Whether no effect of a set is by its fitted value another one: air that doesn't move is drag, a thrust curve that
-    doesn't bend is a thrust scale."""
-    deviation = dict(zip(fit.index.tolist(), np.sqrt(np.diag(fit.covariance)), strict=True))
-    if "wind" in fit.effects:
-        places_ = [PLACE["wind", a] for a in "xy"]
-        speed = float(np.hypot(*fit.theta[places_]))
-        if speed < max(CALM, 3.0 * max(deviation[i] for i in places_)):
-            return False
-    if "thrust_curve" in fit.effects:
-        offset, slope, curvature = (
-            fit.theta[PLACE["thrust_curve", p]] for p in ("offset", "slope", "curvature")
-        )
-        thrust = np.linspace(0.45, 0.85, 9)
-        change = offset / thrust + slope + curvature * thrust - 1.0
-        if np.ptp(change) < 0.5 * abs(change.mean()):
-            return False
+    """Whether no effect of a set is by its fitted value another one."""
+    found = fit.parameters()
+    for effect in fit.effects:
+        test = CARDS[effect].is_itself
+        if test is not None:
+            value, deviation = ({k: v[n] for k, v in found[effect].items()} for n in (0, 1))
+            if not test(value, deviation):
+                return False
     return True
 
 
@@ -246,11 +237,15 @@ def _swapped(replay, fit, table, now, singles):
             if is_itself(found):
                 tried[other] = found
         gains = {o: f.score - fit.score for o, f in tried.items()}
-        best = max(gains, key=gains.get, default=None)
-        if best is not None and gains[best] > LEAST_NATS:
-            gains[effect] = 0.0
-            fit, level_ = tried[best], gains.pop(best)
-            swaps[best] = {o: v - level_ for o, v in gains.items()}
+        favoured = dict(gains)
+        commoner = CARDS[effect].commoner
+        if gains.get(commoner, -np.inf) > -CLASS:
+            favoured[commoner] += CLASS + LEAST_NATS
+        best = max(favoured, key=favoured.get, default=None)
+        if best is not None and favoured[best] > LEAST_NATS:
+            ahead = gains.pop(best)
+            swaps[best] = {o: v - ahead for o, v in (gains | {effect: 0.0}).items()}
+            fit = tried[best]
             table = build(replay, fit, singles)
             now = judge(table, with_effects(table))
         else:

@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from openjax.gap.hypotheses import SetFit
-from openjax.gap.library import ABSENT, FITS, PLACE, places, prior
+from openjax.gap.library import ABSENT, CARDS, PLACE, places, prior
 from openjax.gap.replay import SKIP, Replay
 
 BLOCK = 1.0  # s: gusts and sensors forget within less
@@ -166,7 +166,7 @@ def with_effects(table: Table, add=(), drop=()) -> Model:
             free.append(np.array([table.step[effect]]))
             means.append(np.array([0.0]))
             blocks.append(np.eye(1))
-        spread = np.array([p.spread for p in FITS[effect].parameters])
+        spread = np.array([p.spread for p in CARDS[effect].fitted])
         inside = [k for k, i in enumerate(places((effect,))) if table.derivative[int(i)] not in own]
         free.append(np.array([table.derivative[int(places((effect,))[k])] for k in inside], int))
         means.append(np.zeros(len(inside)))
@@ -263,14 +263,6 @@ def keep(table: Table, model: Model, drop=(), nuisances=True, numbers: int = 0) 
     return squares
 
 
-def in_sample(table: Table, model: Model) -> Judged:
-    """The model fitted to everything, on everything."""
-    u = solve(table, model)[table.track_of]
-    nats = -0.5 * np.einsum("bc,bcd,bd->b", u, table.white, u)
-    squares = np.einsum("bc,bkcd,bd->bk", u, table.error, u)
-    return Judged(nats, squares, -u[:1, table.nuisances[table.shared]])
-
-
 def level(squares: np.ndarray, floor: np.ndarray) -> float:
     """The gap: rms over channels of each channel's error over its floor (6,), both sums over the same rows."""
     use = floor > 0
@@ -284,7 +276,6 @@ __all__ = [
     "Model",
     "Table",
     "build",
-    "in_sample",
     "judge",
     "level",
     "solve",

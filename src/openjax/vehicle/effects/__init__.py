@@ -10,14 +10,16 @@ sample, to be mapped and differentiated. The force of rotor drag along a flight 
 """
 
 from openjax.vehicle.effects.composition import complete_parameters, initial_memory, resolve, seen_state
-from openjax.vehicle.effects.effect import Context, Effect, Parameter, make_context
+from openjax.vehicle.effects.effect import Card, Context, Effect, Fitted, Parameter, make_context
 from openjax.vehicle.effects.effects_file import load_effects, save_effects
 from openjax.vehicle.effects.registry import EFFECTS
 
 __all__ = [
     "EFFECTS",
+    "Card",
     "Context",
     "Effect",
+    "Fitted",
     "Parameter",
     "complete_parameters",
     "initial_memory",

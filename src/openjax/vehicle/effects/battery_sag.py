@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from openjax.vehicle.effects.effect import Effect, Parameter
+from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
 
 def voltage(parameters, context):
@@ -35,4 +35,16 @@ EFFECT = Effect(
         "discharge": Parameter("V/s", 0.0017, (0.001, 0.003), _CELL, "loss per second, where none is logged"),
     },
     motor=motor,
+    card=Card(
+        path="physics",
+        fitted=(
+            Fitted("exponent", mean=0.0, spread=1.0, start=0.5, step=0.01, positive=True),
+            Fitted("reference", mean=3.85, spread=0.15, start=3.85, step=0.01),
+        ),
+        needs="voltage",
+        coordinate="voltage",
+        thrust_map=True,
+        sample={"exponent": 1.0},
+        next_flight="the same hover on a full and on a nearly empty battery.",
+    ),
 )

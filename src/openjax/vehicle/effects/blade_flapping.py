@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from openjax.vehicle.effects.airspeed import body_velocity, hub_velocity, hub_wrench
-from openjax.vehicle.effects.effect import Effect, Parameter
+from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
 
 def wrench(parameters, context):
@@ -32,4 +32,16 @@ EFFECT = Effect(
         ),
     },
     wrench=wrench,
+    card=Card(
+        path="physics",
+        fitted=(
+            Fitted("tilt", mean=0.0, spread=0.02, start=0.005, step=0.0001, positive=True),
+            Fitted("stiffness", mean=0.0, spread=0.0002, start=3e-05, step=1e-06),
+        ),
+        needs="velocity",
+        coordinate="body velocity",
+        commoner="rotor_drag",
+        sample={"tilt": 0.02, "stiffness": 0.0002},
+        next_flight="fast straight passes with sudden stops, to load roll and pitch.",
+    ),
 )

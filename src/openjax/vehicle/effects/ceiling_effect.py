@@ -1,7 +1,7 @@
 """Rotors near the ceiling push more: they pull the vehicle up to it."""
 
 from openjax.vehicle.effects.airspeed import hub_height
-from openjax.vehicle.effects.effect import Effect, Parameter
+from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 from openjax.vehicle.effects.ground_effect import gain
 
 
@@ -21,4 +21,17 @@ EFFECT = Effect(
         "offset": Parameter("m", 0.0, (0.0, 0.03), "distance of the rotors from the tracked point"),
     },
     thrust=thrust,
+    card=Card(
+        path="physics",
+        fitted=(
+            Fitted("strength", mean=0.0, spread=0.8, start=0.4, step=0.01, positive=True),
+            Fitted("offset", mean=0.012, spread=0.025, start=0.012, step=0.0005),
+        ),
+        linear=True,
+        others=((0.4, 0.0), (0.4, 0.025), (0.4, 0.05)),
+        needs="position",
+        coordinate="height",
+        sample={"strength": 0.6, "offset": 0.01},
+        next_flight="slow passes just below the ceiling.",
+    ),
 )

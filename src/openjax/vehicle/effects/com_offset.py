@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from openjax.vehicle.effects.effect import Effect, Parameter
+from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
 
 def body(parameters, vehicle):
@@ -22,4 +22,13 @@ EFFECT = Effect(
         "z": Parameter("m", 0.0, (-0.01, 0.01), _SOURCE, "up; felt only through forces in the rotor plane"),
     },
     body=body,
+    card=Card(
+        path="physics",
+        fitted=(
+            Fitted("x", mean=0.0, spread=0.002, start=0.0003, step=2e-05),
+            Fitted("y", mean=0.0, spread=0.002, start=0.0003, step=2e-05),
+        ),
+        sample={"x": 0.003, "y": -0.002},
+        next_flight="hover and climbs at several thrusts, with yaw free.",
+    ),
 )

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from openjax.vehicle.effects.delay import fill, look_back, push
-from openjax.vehicle.effects.effect import Effect, Parameter
+from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 from openjax.vehicle.parameters import max_rotor_thrust
 
 
@@ -27,4 +27,10 @@ EFFECT = Effect(
     },
     command=command,
     initial_memory=initial_memory,
+    card=Card(
+        path="radio",
+        fitted=(Fitted("delay", mean=0.0, spread=0.02, start=0.01, step=0.0005, positive=True),),
+        sample={"delay": 0.03},
+        next_flight="steps of commanded thrust and rates, with motor commands logged.",
+    ),
 )

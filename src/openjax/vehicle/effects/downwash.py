@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from openjax.vehicle.effects.airspeed import hub_wrench
-from openjax.vehicle.effects.effect import Effect, Parameter
+from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 from openjax.vehicle.rigid_body import rotate, rotate_inverse
 
 
@@ -35,4 +35,19 @@ EFFECT = Effect(
         "spread": Parameter("1", 0.1, (0.0, 0.3), "turbulent jets widen by about 0.1 m per m"),
     },
     wrench=wrench,
+    card=Card(
+        path="physics",
+        fitted=(
+            Fitted("force", mean=0.0, spread=0.1, start=0.08, step=0.001, positive=True),
+            Fitted("length", mean=0.5, spread=0.25, start=0.5, step=0.005),
+            Fitted("width", mean=0.045, spread=0.012, start=0.045, step=0.0005),
+            Fitted("spread", mean=0.1, spread=0.06, start=0.1, step=0.002),
+        ),
+        linear=True,
+        others=((0.05, 0.8, 0.06, 0.15), (0.08, 0.3, 0.03, 0.08)),
+        needs="position",
+        coordinate="height below a neighbour",
+        sample={"force": 0.05, "length": 0.5, "width": 0.06, "spread": 0.1},
+        next_flight="a second vehicle crossing 15 to 50 cm above.",
+    ),
 )

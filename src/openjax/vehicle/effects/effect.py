@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import flax.struct
@@ -92,6 +92,53 @@ class Parameter:
     meaning: str = ""
 
 
+@dataclass(frozen=True)
+class Fitted:
+    """How one parameter is fitted: prior mean and standard deviation, start of the search, step of the difference
+    quotient, all in the parameter's unit. `positive`: a value below the effect-free one is implausible."""
+
+    name: str
+    mean: float
+    spread: float
+    start: float
+    step: float
+    positive: bool = False
+
+
+@dataclass(frozen=True)
+class Card:
+    """How an effect is told from flights.
+
+    path: by which way of the log it is read: "physics" (motors to motion), "radio", "rate_loop", "estimator".
+    fitted: its parameters; `common` is the spread that all share, `balanced`: their mean belongs to another effect and is
+        held near zero, `linear`: the first scales the whole effect, `others`: more starts of the search.
+    companions: ((effect, parameter, spread), ...) of other effects that may move a little whenever this one does, because
+        real effects seldom have exactly this form.
+    needs: the channel without which it can't be told, though it leaves a trace in others.
+    coordinate: the variable that it follows, for pictures.
+    thrust_map: a map from duty cycles to thrust that isn't known can imitate it.
+    commoner: an effect that is named instead where both do equally well.
+    is_itself({parameter: value}, {parameter: deviation}): whether it isn't by its fitted value another effect.
+    sample: a strength within its usual range to fly with, strong enough to see.
+    next_flight: what would show it, in words.
+    """
+
+    path: str
+    fitted: tuple[Fitted, ...]
+    common: float = 0.0
+    balanced: bool = False
+    linear: bool = False
+    others: tuple[tuple[float, ...], ...] = ()
+    companions: tuple[tuple[str, str, float], ...] = ()
+    needs: str = ""
+    coordinate: str = "thrust"
+    thrust_map: bool = False
+    commoner: str = ""
+    is_itself: Callable[[Mapping[str, float], Mapping[str, float]], bool] | None = None
+    sample: Mapping[str, float] = field(default_factory=dict)
+    next_flight: str = ""
+
+
 # Hooks of one drone; `parameters` is {name: () array}, `memory` a pytree of arrays.
 BodyHook = Callable[[Mapping[str, Any], Vehicle], Vehicle]
 CommandHook = Callable[[Mapping[str, Any], Any, jax.Array, Context], tuple[jax.Array, Any]]
@@ -115,6 +162,7 @@ class Effect:
     record(memory, state) -> memory: remembers the state at the end of a step, for `sensor`.
     initial_memory(vehicle, state, dt, key) -> memory: needed where `command`, `sensor` or `record` use one.
     random: whether `initial_memory` needs its key.
+    card: how the diagnosis tells it; without one it can be flown with, but not be diagnosed.
     """
 
     name: str
@@ -129,6 +177,7 @@ class Effect:
     record: Callable[[Any, DroneState], Any] | None = None
     initial_memory: Callable[[Vehicle, DroneState, float, Any], Any] | None = None
     random: bool = False
+    card: Card | None = None
 
     def none(self) -> dict[str, float]:
         """Parameters at which the effect is absent."""

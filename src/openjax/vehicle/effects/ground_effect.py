@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from openjax.vehicle.effects.airspeed import PROPELLER_RADIUS, hub_height
-from openjax.vehicle.effects.effect import Effect, Parameter
+from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
 
 def gain(strength, distance):
@@ -32,4 +32,17 @@ EFFECT = Effect(
         ),
     },
     thrust=thrust,
+    card=Card(
+        path="physics",
+        fitted=(
+            Fitted("strength", mean=0.0, spread=0.8, start=0.4, step=0.01, positive=True),
+            Fitted("offset", mean=0.012, spread=0.01, start=0.012, step=0.0005),
+        ),
+        linear=True,
+        others=((0.4, 0.0), (0.4, 0.025), (0.4, 0.05)),
+        needs="position",
+        coordinate="height",
+        sample={"strength": 0.8, "offset": 0.01},
+        next_flight="slow passes between 3 and 20 cm above the floor.",
+    ),
 )

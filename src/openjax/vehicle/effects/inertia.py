@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from openjax.vehicle.effects.effect import Effect, Parameter
+from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
 
 def body(parameters, vehicle):
@@ -18,4 +18,15 @@ EFFECT = Effect(
     description="moments of inertia as multiples of the assumed ones",
     parameters={axis: Parameter("1", 1.0, (0.7, 1.6), _SOURCE) for axis in ("xx", "yy", "zz")},
     body=body,
+    card=Card(
+        path="physics",
+        fitted=(
+            Fitted("xx", mean=1.0, spread=0.12, start=1.1, step=0.005),
+            Fitted("yy", mean=1.0, spread=0.12, start=1.1, step=0.005),
+            Fitted("zz", mean=1.0, spread=0.12, start=1.1, step=0.005),
+        ),
+        common=0.3,
+        sample={"xx": 1.4, "yy": 1.4, "zz": 1.4},
+        next_flight="roll, pitch and yaw doublets with the motor commands logged.",
+    ),
 )

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from openjax.vehicle.effects.effect import Effect, Parameter
+from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
 
 def thrust(parameters, thrust, reaction, context):
@@ -18,4 +18,16 @@ EFFECT = Effect(
     description="rotor i gives (1 + m_i) times its thrust and torque",
     parameters={name: Parameter("1", 0.0, (-0.15, 0.15), _SOURCE) for name in ("m1", "m2", "m3", "m4")},
     thrust=thrust,
+    card=Card(
+        path="physics",
+        fitted=(
+            Fitted("m1", mean=0.0, spread=0.05, start=0.02, step=0.001),
+            Fitted("m2", mean=0.0, spread=0.05, start=-0.01, step=0.001),
+            Fitted("m3", mean=0.0, spread=0.05, start=0.0, step=0.001),
+            Fitted("m4", mean=0.0, spread=0.05, start=-0.01, step=0.001),
+        ),
+        balanced=True,
+        sample={"m1": 0.06, "m2": -0.04, "m3": 0.02, "m4": -0.05},
+        next_flight="hover and climbs at several thrusts, with yaw free.",
+    ),
 )

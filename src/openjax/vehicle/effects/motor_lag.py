@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from openjax.vehicle.effects.effect import Effect, Parameter
+from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
 _SHORTEST = 1e-3  # s
 
@@ -27,4 +27,14 @@ EFFECT = Effect(
         ),
     },
     body=body,
+    card=Card(
+        path="physics",
+        fitted=(
+            Fitted("extra_up", mean=0.0, spread=0.03, start=0.01, step=0.0005),
+            Fitted("extra_down", mean=0.0, spread=0.03, start=0.01, step=0.0005),
+        ),
+        common=0.03,
+        sample={"extra_up": 0.02, "extra_down": 0.03},
+        next_flight="roll, pitch and thrust doublets, as short as the vehicle allows.",
+    ),
 )

@@ -8,7 +8,7 @@ that share.
 import jax
 import jax.numpy as jnp
 
-from openjax.vehicle.effects.effect import Effect, Parameter
+from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 from openjax.vehicle.parameters import max_rotor_thrust
 
 
@@ -37,4 +37,10 @@ EFFECT = Effect(
     command=command,
     initial_memory=initial_memory,
     random=True,
+    card=Card(
+        path="radio",
+        fitted=(Fitted("probability", mean=0.0, spread=0.15, start=0.05, step=0.01, positive=True),),
+        sample={"probability": 0.2},
+        next_flight="steps of commanded thrust and rates, with motor commands logged.",
+    ),
 )

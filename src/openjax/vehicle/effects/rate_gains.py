@@ -1,6 +1,6 @@
 """The rate controller on board isn't tuned as assumed."""
 
-from openjax.vehicle.effects.effect import Effect, Parameter
+from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
 
 def body(parameters, vehicle):
@@ -18,4 +18,14 @@ EFFECT = Effect(
     description="gains of the rate controller as multiples of the assumed ones",
     parameters={gain: Parameter("1", 1.0, (0.5, 2.0), _SOURCE) for gain in ("p", "i", "d")},
     body=body,
+    card=Card(
+        path="rate_loop",
+        fitted=(
+            Fitted("p", mean=1.0, spread=0.4, start=1.0, step=0.05),
+            Fitted("i", mean=1.0, spread=0.4, start=1.0, step=0.05),
+            Fitted("d", mean=1.0, spread=0.4, start=1.0, step=0.05),
+        ),
+        sample={"p": 0.65, "i": 0.65, "d": 0.65},
+        next_flight="roll, pitch and yaw doublets with commands and motor commands logged.",
+    ),
 )

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from openjax.vehicle.effects.airspeed import hub_velocity, hub_wrench
-from openjax.vehicle.effects.effect import Effect, Parameter
+from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
 
 def wrench(parameters, context):
@@ -24,4 +24,16 @@ EFFECT = Effect(
         "d_z": Parameter("N s/m", 0.0, (0.0, 0.03), _SOURCE, "along the rotor axes, all four rotors"),
     },
     wrench=wrench,
+    card=Card(
+        path="physics",
+        fitted=(
+            Fitted("d_xy", mean=0.0, spread=0.015, start=0.01, step=0.0001, positive=True),
+            Fitted("d_z", mean=0.0, spread=0.012, start=0.005, step=0.0001, positive=True),
+        ),
+        companions=(("blade_flapping", "stiffness", 4e-05),),
+        needs="velocity",
+        coordinate="body velocity",
+        sample={"d_xy": 0.015, "d_z": 0.005},
+        next_flight="fast straight passes in two headings, nose and side first.",
+    ),
 )

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from openjax.vehicle.effects.delay import fill, look_back, push
-from openjax.vehicle.effects.effect import Effect, Parameter
+from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
 
 def _pose(state):
@@ -40,4 +40,10 @@ EFFECT = Effect(
     sensor=sensor,
     record=record,
     initial_memory=initial_memory,
+    card=Card(
+        path="estimator",
+        fitted=(Fitted("delay", mean=0.0, spread=0.02, start=0.0, step=0.0005, positive=True),),
+        sample={"delay": 0.03},
+        next_flight="fast roll and pitch manoeuvres with pose and gyroscope logged.",
+    ),
 )

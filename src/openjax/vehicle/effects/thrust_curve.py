@@ -1,6 +1,8 @@
 """Thrust is not in proportion to the motor command."""
 
-from openjax.vehicle.effects.effect import Effect, Parameter
+import numpy as np
+
+from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
 
 def motor(parameters, motor_command, context):
@@ -12,6 +14,15 @@ def motor(parameters, motor_command, context):
 
 _SOURCE = "spread of quadratic thrust maps published for the Crazyflie, as shares of the largest thrust"
 
+
+def bends(value, deviation):
+    """Whether a fitted curve bends over the usual commands; if not, it is another thrust or mass."""
+    del deviation
+    commands = np.linspace(0.45, 0.85, 9)
+    change = value["offset"] / commands + value["slope"] + value["curvature"] * commands - 1.0
+    return bool(np.ptp(change) > 0.5 * abs(change.mean()))
+
+
 EFFECT = Effect(
     name="thrust_curve",
     description="thrust follows offset + slope m + curvature m^2 of the motor command m",
@@ -21,4 +32,16 @@ EFFECT = Effect(
         "curvature": Parameter("1", 0.0, (-0.3, 0.3), _SOURCE),
     },
     motor=motor,
+    card=Card(
+        path="physics",
+        fitted=(
+            Fitted("offset", mean=0.0, spread=0.08, start=0.02, step=0.001),
+            Fitted("slope", mean=1.0, spread=0.2, start=0.95, step=0.001),
+            Fitted("curvature", mean=0.0, spread=0.25, start=0.02, step=0.001),
+        ),
+        thrust_map=True,
+        is_itself=bends,
+        sample={"curvature": 0.25},
+        next_flight="steps of collective thrust between 40 and 90 %.",
+    ),
 )

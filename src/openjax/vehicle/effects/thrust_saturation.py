@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from openjax.vehicle.effects.effect import Effect, Parameter
+from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
 _REFERENCE_VOLTAGE = 3.9  # V
 
@@ -35,4 +35,15 @@ EFFECT = Effect(
         ),
     },
     motor=motor,
+    card=Card(
+        path="physics",
+        fitted=(
+            Fitted("limit", mean=0.8, spread=0.12, start=0.8, step=0.002),
+            Fitted("voltage_slope", mean=0.0, spread=0.1, start=0.0, step=0.01),
+        ),
+        others=((0.95, 0.0), (0.92, 0.0), (0.89, 0.0), (0.865, 0.0), (0.84, 0.0), (0.76, 0.0), (0.7, 0.0)),
+        thrust_map=True,
+        sample={"limit": 0.82},
+        next_flight="short full-thrust climbs.",
+    ),
 )

@@ -1,6 +1,6 @@
 """Every rotor pushes by the same factor more or less, its reaction torque with it."""
 
-from openjax.vehicle.effects.effect import Effect, Parameter
+from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
 
 def body(parameters, vehicle):
@@ -22,4 +22,12 @@ EFFECT = Effect(
         )
     },
     body=body,
+    card=Card(
+        path="physics",
+        fitted=(Fitted("scale", mean=0.0, spread=0.1, start=0.02, step=0.001),),
+        companions=(("yaw_torque", "ratio", 0.03),),
+        thrust_map=True,
+        sample={"scale": -0.08},
+        next_flight="weigh the vehicle, then hover and climb hard: a weighed mass leaves only the thrust.",
+    ),
 )

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from openjax.vehicle.effects.effect import Effect, Parameter
+from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 from openjax.vehicle.rigid_body import rotate_inverse
 
 
@@ -15,6 +15,15 @@ def wrench(parameters, context):
 
 _SOURCE = "indoor draughts and fans, 0.3-3 m/s"
 
+_CALM = 0.1  # m/s: air that moves less is calm
+
+
+def blows(value, deviation):
+    """Whether a fitted wind moves; if not, it is drag."""
+    speed = (value["x"] ** 2 + value["y"] ** 2) ** 0.5
+    return speed > max(_CALM, 3.0 * deviation["x"], 3.0 * deviation["y"])
+
+
 EFFECT = Effect(
     name="wind",
     description="drag against air that moves with a constant velocity in the world frame",
@@ -25,4 +34,18 @@ EFFECT = Effect(
         "drag": Parameter("N s/m", 0.0, (0.005, 0.03), "as for rotor_drag, isotropic"),
     },
     wrench=wrench,
+    card=Card(
+        path="physics",
+        fitted=(
+            Fitted("x", mean=0.0, spread=1.5, start=0.3, step=0.01),
+            Fitted("y", mean=0.0, spread=1.5, start=0.3, step=0.01),
+            Fitted("z", mean=0.0, spread=0.5, start=0.0, step=0.01),
+            Fitted("drag", mean=0.013, spread=0.006, start=0.013, step=0.0001, positive=True),
+        ),
+        needs="velocity",
+        coordinate="body velocity",
+        is_itself=blows,
+        sample={"x": 1.2, "y": -0.8, "drag": 0.015},
+        next_flight="hover, turning slowly through a full circle of yaw.",
+    ),
 )

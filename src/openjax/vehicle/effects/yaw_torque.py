@@ -1,6 +1,6 @@
 """The rotors' reaction torque differs from what is assumed, their thrust doesn't."""
 
-from openjax.vehicle.effects.effect import Effect, Parameter
+from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
 
 def body(parameters, vehicle):
@@ -19,4 +19,10 @@ EFFECT = Effect(
         )
     },
     body=body,
+    card=Card(
+        path="physics",
+        fitted=(Fitted("ratio", mean=1.0, spread=0.5, start=0.9, step=0.005),),
+        sample={"ratio": 0.4},
+        next_flight="yaw doublets and steps.",
+    ),
 )

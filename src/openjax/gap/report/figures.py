@@ -1,9 +1,8 @@
-"""The report as one HTML file: verdict, tables and pictures, nothing to fetch from elsewhere."""
+"""Pictures of a report."""
 
 from __future__ import annotations
 
 import base64
-import html
 import io
 
 import matplotlib
@@ -13,80 +12,32 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from openjax.flights.track import rotation, smooth
+from openjax.gap.library import CARDS
 from openjax.gap.report import Report
 from openjax.gap.rest import disturbances, residuals_of
 from openjax.gap.table import HORIZONS
 from openjax.gap.where import CHANNELS, REGIMES
 
-STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:62rem;margin:2rem auto;padding:0 1rem;color:#222}
-h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2rem}table{border-collapse:collapse;margin:.6rem 0}
-td,th{border-bottom:1px solid #ddd;padding:.2rem .7rem;text-align:left}img{max-width:100%}
-.verdict{background:#f3f6fa;
-padding: .8rem 1.2rem;border-left:4px solid #2b6cb0}.small{color:#666;font-size:.9em}"""
 
-
-def html_of(report: Report) -> str:
-    """The whole page as text."""
-    lines = report.in_words()
-    body = [
-        f"<h1>{html.escape(report.case)}: {html.escape(', '.join(report.effects) or report.verdict)}</h1>"
-    ]
-    body.append('<div class="verdict">' + "".join(f"<p>{html.escape(line)}</p>" for line in lines) + "</div>")
-    body.append("<h2>Causes</h2>" + _probabilities(report))
-    if report.parameters:
-        body.append("<h2>Parameters</h2>" + _parameters(report))
-    if report.plots:
-        pictures = (
-            ("Shares of the gap", _shares),
-            ("Where the gap lies", _where),
-            ("A flight before and after", _overlay),
-            ("The rest against the effect's own coordinate", _coordinate),
-        )
-        for title, draw in pictures:
-            figure = draw(report)
-            if figure is not None:
-                body.append(f"<h2>{title}</h2>{_image(figure)}")
-    if report.nuisances:
-        body.append(
-            "<h2>What the nuisances took</h2>" + _table([[k, v] for k, v in report.nuisances.items()])
-        )
-    if report.quality:
-        body.append("<h2>Data</h2>" + _table([[q["flight"], q["issue"]] for q in report.quality]))
-    body.append(f'<p class="small">Gap: {html.escape(report.gap.metric)}.</p>')
-    title = html.escape(f"Diagnosis of {report.case}")
-    page = f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
-    page += f"<style>{STYLE}</style></head>"
-    return page + "<body>" + "\n".join(body) + "</body></html>\n"
-
-
-def _table(rows, head=None) -> str:
-    lines = [] if head is None else ["<tr>" + "".join(f"<th>{html.escape(h)}</th>" for h in head) + "</tr>"]
-    lines += ["<tr>" + "".join(f"<td>{html.escape(str(c))}</td>" for c in row) + "</tr>" for row in rows]
-    return "<table>" + "".join(lines) + "</table>"
-
-
-def _probabilities(report: Report) -> str:
-    ranked = sorted(report.probabilities.items(), key=lambda item: -item[1])
-    return _table(
-        [[e, f"{p:.3f}"] for e, p in ranked[:8] if p > 5e-4], ("cause", "probability of being the strongest")
+def pictures(report: Report) -> list[tuple[str, str]]:
+    """(title, PNG in base64) of every picture that the report's arrays allow."""
+    if not report.plots:
+        return []
+    drawn = (
+        ("Shares of the gap", _shares),
+        ("Where the gap lies", _where),
+        ("A flight before and after", _overlay),
+        ("The rest against the effect's own coordinate", _coordinate),
     )
+    found = [(title, draw(report)) for title, draw in drawn]
+    return [(title, _encoded(figure)) for title, figure in found if figure is not None]
 
 
-def _parameters(report: Report) -> str:
-    rows = []
-    for effect, values in report.parameters.items():
-        for name, v in values.items():
-            interval = f"{v.interval90[0]:.4g} … {v.interval90[1]:.4g}"
-            usual = f"{v.usual[0]:g} … {v.usual[1]:g}" + (" (outside)" if v.unusual else "")
-            rows.append([effect, name, f"{v.value:.4g}", interval, v.unit, usual])
-    return _table(rows, ("effect", "parameter", "value", "90 % interval", "unit", "usual range"))
-
-
-def _image(figure) -> str:
+def _encoded(figure) -> str:
     data = io.BytesIO()
     figure.savefig(data, format="png", dpi=85, bbox_inches="tight")
     plt.close(figure)
-    return f'<img alt="" src="data:image/png;base64,{base64.b64encode(data.getvalue()).decode()}">'
+    return base64.b64encode(data.getvalue()).decode()
 
 
 def _where(report: Report):
@@ -177,17 +128,9 @@ def _coordinate(report: Report):
     """Force along the effect's channel against the variable that drives it, binned, before and after."""
     evidence = report.plots["evidence"]
     effect = next((e for e in report.effects if e != "unknown"), None)
-    picked = {
-        "rotor_drag": "v",
-        "wind": "v",
-        "blade_flapping": "v",
-        "ground_effect": "z",
-        "ceiling_effect": "z",
-        "downwash": "dz",
-        "battery_sag": "V",
-    }.get(effect, "F")
     if effect is None or not evidence.replay.usable[3]:
         return None
+    coordinate = CARDS[effect].coordinate
     points = {0: [], 1: []}
     for kind, residuals in enumerate(
         residuals_of(evidence.replay, f) for f in (evidence.nothing, report.plots["selection"].fit)
@@ -195,17 +138,17 @@ def _coordinate(report: Report):
         for number, residual in enumerate(residuals):
             track = evidence.tracks[number]
             rest = smooth(disturbances(track, residual), 0.12, track.dt)[:, 3:6]
-            if picked == "v":
+            if coordinate == "body velocity":
                 x = np.einsum("tji,tj->ti", rotation(track.quaternion), track.velocity)[:, 0]
                 y = rest[:, 0]
             else:
                 y = rest[:, 2]
                 x = {
-                    "z": track.position[:, 2],
-                    "F": smooth(track.motor.mean(1), 0.05, track.dt),
-                    "V": track.voltage if track.voltage is not None else track.time,
-                }.get(picked)
-                if picked == "dz":
+                    "height": track.position[:, 2],
+                    "thrust": smooth(track.motor.mean(1), 0.05, track.dt),
+                    "voltage": track.voltage if track.voltage is not None else track.time,
+                }.get(coordinate)
+                if coordinate == "height below a neighbour":
                     if not len(track.neighbours):
                         continue
                     x = track.neighbours[0][:, 2] - track.position[:, 2]
@@ -213,20 +156,14 @@ def _coordinate(report: Report):
     if not points[0]:
         return None
     figure, axis = plt.subplots(figsize=(6, 3))
-    names = {
-        "v": "body velocity x, m/s",
-        "z": "height, m",
-        "dz": "other vehicle above by, m",
-        "V": "voltage, V",
-        "F": "mean motor command",
-    }
     for kind, colour, label in ((0, "#c53030", "nominal"), (1, "#2b6cb0", "with the named effects")):
         data = np.concatenate(points[kind])
         edges = np.quantile(data[:, 0], np.linspace(0, 1, 16))
         bins = np.clip(np.searchsorted(edges, data[:, 0]) - 1, 0, 14)
         middle = [data[bins == b].mean(0) if (bins == b).any() else (np.nan, np.nan) for b in range(15)]
         axis.plot(*np.array(middle).T, "o-", color=colour, ms=3, label=label)
-    axis.set_xlabel(names[picked])
+    units = {"body velocity": " x, m/s", "voltage": ", V", "thrust": ", mean motor command"}
+    axis.set_xlabel(coordinate + units.get(coordinate, ", m"))
     axis.set_ylabel("unexplained acceleration, m/s²")
     axis.legend(fontsize=8)
     return figure

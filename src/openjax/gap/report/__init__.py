@@ -206,6 +206,6 @@ def write_report(report: Report, folder: Path, pictures: bool = True) -> None:
     values, intervals = to_fly(report)
     save_effects(folder / "effects.toml", values, intervals, notes=" ".join(report.in_words()[:2]))
     if pictures:
-        from openjax.gap.html import html_of
+        from openjax.gap.report.page import page_of
 
-        (folder / "report.html").write_text(html_of(report), encoding="utf-8")
+        (folder / "report.html").write_text(page_of(report), encoding="utf-8")
