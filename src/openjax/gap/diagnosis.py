@@ -86,6 +86,7 @@ def conclude(evidence: Evidence) -> Report:
         runner_up=f"{second} ({chances[second]:.2f})" if second and chances[second] > 0.01 else "",
         rest=_rest_in_words(rest),
         sensors=tuple(evidence.sensors.findings.values()),
+        contradictions=tuple(f"{i.flight}: {i.issue}" for i in evidence.case.quality if i.kind == "garbage"),
         nuisances=_nuisances(evidence, selection),
         plots={"evidence": evidence, "selection": selection},
     )

@@ -103,7 +103,9 @@ def decide(evidence: Evidence, selection: Selection, rest: Rest, parts: Split, m
 def _probabilities(evidence, selection, parts: Split, rest: Rest, effects) -> dict[str, float]:
     """How likely each is the strongest cause. Shares say which of the named is the largest; what would do nearly as
     well in a name's place, or was nearly accepted, takes what its likelihood leaves it."""
-    weights = dict.fromkeys((*EFFECTS, "none", "unknown"), 1e-6)
+    weights = dict.fromkeys(EFFECTS, 0.0) | dict.fromkeys(
+        (*evidence.library.effects, "none", "unknown"), 1e-6
+    )
     if effects:
         strength = {
             e: max(parts.unexplained.value if e == "unknown" else parts.effects[e].value, 0.02)

@@ -55,6 +55,7 @@ class Report:
     runner_up: str = ""
     rest: str = ""
     sensors: tuple[str, ...] = ()
+    contradictions: tuple[str, ...] = ()
     nuisances: dict[str, str] = field(default_factory=dict)
     seconds: float = 0.0
     plots: dict = field(default_factory=dict, repr=False)
@@ -117,6 +118,7 @@ class Report:
             "runner_up": self.runner_up,
             "rest": self.rest,
             "sensors": list(self.sensors),
+            "contradictions": list(self.contradictions),
             "nuisances": self.nuisances,
         }
 
