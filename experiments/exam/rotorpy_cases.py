@@ -341,11 +341,9 @@ def _answer(name, kind, told, drawn, names, joined, flights, effects, form, said
 
 def _size(effect, magnitudes):
     """How far a mass or thrust is off; the other causes need no size."""
-    return abs(
-        {"mass": magnitudes.get("ratio", 1.0) - 1, "thrust_scale": magnitudes.get("scale", 0.0)}.get(
-            effect, 0.0
-        )
-    )
+    if effect == "mass":
+        return abs(magnitudes["ratio"] - 1)
+    return abs(magnitudes["scale"]) if effect == "thrust_scale" else 0.0
 
 
 def main():

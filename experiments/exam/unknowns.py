@@ -25,7 +25,7 @@ KINDS = {
 }
 STRANGERS = {
     "motor_hiccups": (0.15, 0.9, "1", (), ("packet_loss",)),
-    "frame_resonance": (0.15, 0.9, "1", ("agile", "step"), ()),
+    "frame_resonance": (0.03, 0.6, "1", ("agile", "step"), ()),
     "magnet_point": (5.0, 50.0, "mN", ("agile", "low"), ()),
     "side_plume": (5.0, 40.0, "mN", ("fast", "agile"), ("wind",)),
     "coarse_steps": (0.02, 0.09, "1", ("agile", "climb"), ()),
@@ -33,7 +33,7 @@ STRANGERS = {
     "draught": (5.0, 60.0, "mN", (), ("wind",)),
     "marker_jumps": (0.01, 0.05, "m", ("agile", "step"), ()),
     "flexing_arm": (0.02, 0.25, "1 per N", ("agile", "climb"), ("thrust_curve", "motor_imbalance")),
-    "moving_passenger": (0.5, 4.0, "mm", (), ("com_offset",)),
+    "moving_passenger": (0.03, 1.5, "mm", (), ("com_offset",)),
 }
 ALL = KINDS | STRANGERS
 SENSOR_KINDS = ("gyro_scale", "world_tilt", "marker_jumps")  # act on the logs, see `sensors`
@@ -129,7 +129,7 @@ class Unknowns:
                 # the frame rings at 7 to 16 Hz when the rotors' moment pushes it
                 bend, speed = self.state.get(name, (np.zeros((2, self.count)), np.zeros((2, self.count))))
                 w = 2 * np.pi * (7.0 + 9.0 * shape[0])
-                speed = speed + 0.001 * (w * w * (moment[:2] - bend) - 0.12 * w * speed)
+                speed = speed + 0.001 * (w * w * (moment[:2] - bend) - 0.3 * w * speed)
                 bend = bend + 0.001 * speed
                 self.state[name] = (bend, speed)
                 torque = torque + np.concatenate([s * (bend - moment[:2]), zero[None]])
