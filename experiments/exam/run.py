@@ -184,7 +184,7 @@ def main():
         (RESULTS / "exam_plans.json").write_text(json.dumps(plans, indent=1) + "\n")
         print(json.dumps(plans, indent=1))
         return
-    wanted = {"stranger": options.stranger, "known": options.known, "rotorpy": options.rotorpy}
+    wanted = {"stranger": options.stranger, "rotorpy": options.rotorpy, "known": options.known}
     if not any(wanted.values()):
         parser.error("say how many cases: --known, --stranger or --rotorpy")
     if options.work.exists() and any(options.work.iterdir()):
