@@ -166,7 +166,7 @@ def test_a_mapped_csv_in_other_names_units_and_angles(tmp_path, columns):
         ("[columns]\nxx = 'a'", "unknown column 'xx'"),
         ("[columns]\nx = { from = 'a', unit = 'feet' }", "unknown unit 'feet'"),
         ("[columns]\nx = { form = 'a' }", "x must be"),
-        ("[columns", "not a readable TOML"),
+        ("[columns", "not readable as TOML"),
     ],
 )
 def test_a_mapping_with_a_slip_says_where(tmp_path, text, reason):

@@ -237,13 +237,17 @@ def _motors(motor, rates, vehicle) -> list[tuple[str, str]]:
     if (lagged.std(0) < 1e-6).all():
         return []
     # (3, 4) correlations of each axis with each motor aren't enough: motors are correlated. Score whole
-    # torques.
+    # torques, out of the moments of angular acceleration and motors at each clock offset.
+    shifted = np.stack([np.roll(lagged, lag, 0) for lag in LAGS])
+    cross = np.einsum("ti,ltj->lij", measured, shifted)
+    among = np.einsum("lti,ltj->lij", shifted, shifted)
+    size = np.sqrt((measured**2).sum(0))
     best, best_score, logged = None, -np.inf, None
-    shifted = [np.roll(lagged, lag, 0) for lag in LAGS]
     for order in itertools.permutations(range(4)):
         for flip in (1.0, -1.0):
             mixing = np.stack([arms[0][list(order)], arms[1][list(order)], flip * spin[list(order)]])
-            each = np.stack([_paired(measured, m @ mixing.T) for m in shifted])
+            power = np.einsum("ij,ljk,ik->li", mixing, among, mixing)
+            each = (mixing * cross).sum(2) / np.maximum(np.sqrt(np.maximum(power, 0.0)) * size, 1e-12)
             correlations = each[int(np.argmax(each.sum(1)))]
             if logged is None:
                 logged = correlations
@@ -287,8 +291,3 @@ def _clearly_better(best: np.ndarray, as_labelled: np.ndarray) -> np.ndarray:
     """Per axis: another labelling fits and the logged one fails, the less the better the other fits."""
     fails = (as_labelled < 0.3) | (best > as_labelled + 0.8) | ((best > 0.9) & (as_labelled < 0.6))
     return (best > _FITS) & fails
-
-
-def _paired(y: np.ndarray, x: np.ndarray) -> np.ndarray:
-    size = np.linalg.norm(y, axis=0) * np.linalg.norm(x, axis=0)
-    return (y * x).sum(0) / np.maximum(size, 1e-12)

@@ -92,9 +92,10 @@ def read_csv(path: str | Path, delimiter: str = ",", known: tuple[str, ...] | No
         raise LogError(_why_not(body, names, kept, ValueError("rows of unequal length")))
     # An empty cell becomes NaN; a written "nan" becomes infinite, so that the two can be told apart
     # afterwards.
-    spelt = _NOT_A_NUMBER.search(body) is not None
+    spelt = any(letter in body for letter in "nN") and _NOT_A_NUMBER.search(body) is not None
     numbers = _NOT_A_NUMBER.sub("inf", body) if spelt else body
-    numbers = _EMPTY_CELL.sub("nan", numbers)
+    if any(empty in numbers for empty in (",,", ",\n", "\n,", " ", "\t")) or numbers.startswith(","):
+        numbers = _EMPTY_CELL.sub("nan", numbers)
     try:
         values = np.loadtxt(io.StringIO(numbers), delimiter=",", usecols=kept, ndmin=2, comments=None)
     except (ValueError, OverflowError) as error:
