@@ -20,6 +20,7 @@ from openjax.commands.training_job import TrainingJob, run_job
 from openjax.errors import UserError
 from openjax.learning import TrainSettings, preset
 from openjax.ranges import Interval
+from openjax.store.checkpoints import Checkpoints
 from openjax.store.environments import make_environment
 from openjax.store.run_directory import RunDirectory, check_free, create_run, locked, open_run
 from openjax.store.settings_files import to_plain
@@ -155,7 +156,7 @@ def prepare(
     resumed = None if command.resume is None else open_run(command.resume)
     vehicle = command.vehicle or (resumed.optional("vehicle.toml") if resumed else None)
     effects = command.effects or (resumed.optional("effects.toml") if resumed else None)
-    start_from = command.start_from or (resumed.read_facts().get("start_from") if resumed else None)
+    start_from = resumed.read_facts().get("start_from") if resumed else _lasting(command.start_from)
     environment = make_environment(command.settings.environment, vehicle, effects)
     devices = _devices(command.devices)
     if resumed is None:
@@ -166,7 +167,8 @@ def prepare(
     job = TrainingJob(
         settings=command.settings,
         environment=environment,
-        start_from=start_from,
+        # what a run started from is needed again only where it was killed before its first checkpoint
+        start_from=None if resumed and Checkpoints(resumed.checkpoints).any_finished() else start_from,
         devices=devices,
         processes=processes,
         time_limit=float("inf") if command.minutes is None else 60.0 * command.minutes,
@@ -181,6 +183,13 @@ def prepare(
     job.check()
     files = {"vehicle.toml": vehicle, "effects.toml": effects}
     return job, resumed or RunDirectory(out), {name: path for name, path in files.items() if path is not None}
+
+
+def _lasting(start_from):
+    """The name of a policy, or a path that also holds in other folders."""
+    if start_from is None or not Path(start_from).exists():
+        return start_from
+    return str(Path(start_from).absolute())
 
 
 def _check_same(command, processes):

@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -36,6 +37,7 @@ class MetricsWriter:
         path = directory / METRICS_FILE
         if resumed_update is None:
             path.unlink(missing_ok=True)
+            shutil.rmtree(directory / "tensorboard", ignore_errors=True)
         else:
             truncate_metrics(path, resumed_update)
         self._file = open(path, "ab", buffering=0)
