@@ -22,6 +22,7 @@ from openjax.learning import TrainSettings, preset
 from openjax.ranges import Interval
 from openjax.store.checkpoints import Checkpoints
 from openjax.store.environments import make_environment
+from openjax.store.policies import known_policies
 from openjax.store.run_directory import RunDirectory, check_free, create_run, locked, open_run
 from openjax.store.settings_files import to_plain
 
@@ -187,7 +188,7 @@ def prepare(
 
 def _lasting(start_from):
     """The name of a policy, or a path that also holds in other folders."""
-    if start_from is None or not Path(start_from).exists():
+    if start_from is None or start_from in known_policies() or not Path(start_from).exists():
         return start_from
     return str(Path(start_from).absolute())
 
