@@ -47,6 +47,8 @@ class Arguments:
     """Pairs of processes beside the long flight's."""
     games: int = 4
     """Per link."""
+    body_logs: int = 5
+    """Log blocks of motors per vehicle: 5 tell the diagnosis most, 1 is what a radio carries."""
     virtual: tuple[str, ...] = ()
     """Further options of the virtual Crazyflies, as NAME=VALUE."""
 
@@ -66,6 +68,7 @@ def pair(arguments, number: int, out: Path, virtual: list[str], fly: list[str], 
             return {"error": said + vehicles.stdout.read()}
         uris = [f"udp://127.0.0.1:{port + i}" for i in range(3)]
         command = [sys.executable, "-m", "openjax.fly", "--policy", arguments.policy, "--out", str(out), *fly]
+        command += ["--body_logs", str(arguments.body_logs)]
         command += ["--guard_after", "1.0"]  # a stall is to be measured, not to end the measurement
         ran = subprocess.run(
             [*command, "--uri", *uris],

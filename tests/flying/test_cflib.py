@@ -97,8 +97,12 @@ class Hovering:
         return self._play(poses)
 
     def _play(self, poses):
-        # hover, level out: the body rates follow the tilt
-        action = [[2 * 0.6246 - 1, -2 * p.quaternion[1], -2 * p.quaternion[2], 0.0] for p in poses]
+        # hover, level out, and wobble: a log in which nothing changes is refused
+        wobble = 0.05 * np.sin(0.3 * self.steps + np.arange(3))
+        action = [
+            [0.2492 + wobble[2], wobble[0] - p.quaternion[1], wobble[1] - p.quaternion[2], wobble[2]]
+            for p in poses
+        ]
         nothing = np.zeros(3)
         return SimpleNamespace(
             action=np.array(action), evader_position=nothing, evader_velocity=nothing, captured=self.steps > 10,
@@ -143,7 +147,9 @@ def test_the_guard_lands_what_hangs_in_the_air(vehicles):
         time.sleep(0.01)
     swarm.arm()
     flight = Flight(swarm, Hovering(vehicles), PATIENT, Plan(episode_seconds=60.0))
+    deadline = time.monotonic() + 30.0
     while not flight.state.all_in(Mode.PURSUIT):
+        assert time.monotonic() < deadline, flight.state
         flight.tick(time.perf_counter(), time.perf_counter())
         time.sleep(0.008)
     assert vehicles.vehicles.report.position[:, 2].min() > 0.3

@@ -164,7 +164,7 @@ class Flight:
         self.state = initial_state(starts, pillars, Airframe(game.hover_thrust))
         self.record = Record()
         self._play, self._episode, self._begun = None, -1, 0.0
-        self._since = 0.0
+        self._since = clock()
         self._flown = 0
 
     def run(self) -> Record:
