@@ -1,6 +1,6 @@
 """Artificial potential field with wall following, as in DACOOP (Zhang et al., 2022) after Koren and Borenstein (1991).
 
-Attraction to the evader, repulsion from the nearest obstacle, and between pursuers a force that repels at close range and
+Attraction to the evader, repulsion from obstacles, and between pursuers a force that repels at close range and
 attracts at long. Where attraction and repulsion together point away from the evader (the local minimum that Koren and
 Borenstein describe), the pursuer flies along the obstacle instead.
 """
@@ -37,34 +37,31 @@ class Forces:
     """The parts of the field, (..., N, 3) each, without unit."""
 
     attraction: jax.Array
-    repulsion: jax.Array  # from the nearest pillar or the wall, and from floor and ceiling
+    repulsion: jax.Array  # from pillars, wall, floor and ceiling
     individual: jax.Array  # mean over the other pursuers
     inside: jax.Array  # (..., N) bool, nearer to an obstacle than the margin
 
 
 def forces(parameters: ApfParameters, known: Surroundings) -> Forces:
     """The field at each pursuer; parameters () or (..., N)."""
-    eta, rho = parameters.repulsion, parameters.influence
 
-    def push(gap):
+    def push(gap, eta, rho, margin):
         """eta (1/d - 1/rho) / d^2 of the distance beyond the margin."""
-        d = jnp.maximum(gap - parameters.margin, NEAREST)
+        d = jnp.maximum(gap - margin, NEAREST)
         return jnp.where(d < rho, eta * (1.0 / d - 1.0 / rho) / d**2, 0.0)
 
-    # one-hot of the nearest: a gather is slower for a handful
-    gap = jnp.min(known.obstacle_distance, axis=-1)
-    nearest = (known.obstacle_distance == gap[..., None])[..., None]
-    normal = unit(jnp.sum(jnp.where(nearest, known.obstacle_normal, 0.0), axis=-2))
-    vertical = push(known.floor_distance) - push(known.ceiling_distance)
+    scale = (parameters.repulsion, parameters.influence, parameters.margin)
+    each = push(known.obstacle_distance, *(jnp.asarray(x)[..., None] for x in scale))
+    vertical = push(known.floor_distance, *scale) - push(known.ceiling_distance, *scale)
     distance = length(known.from_others)
     beyond = jnp.maximum(distance - SAFE_PURSUER, NEAREST)
     balance = jnp.asarray(parameters.balance)[..., None, None]
     pull = -known.from_others / distance * (0.5 - balance / beyond)
     return Forces(
         attraction=unit(known.target - known.position),
-        repulsion=level(push(gap)[..., None] * normal) + upward(vertical),
+        repulsion=level(jnp.sum(each[..., None] * known.obstacle_normal, axis=-2)) + upward(vertical),
         individual=jnp.sum(pull, axis=-2) / max(known.from_others.shape[-2], 1),
-        inside=gap < parameters.margin,
+        inside=jnp.min(known.obstacle_distance, axis=-1) < parameters.margin,
     )
 
 
@@ -78,9 +75,11 @@ def apf(craft: Craft, parameters: ApfParameters, known: Surroundings) -> jax.Arr
 
 
 def wall_following(field: Forces, velocity: jax.Array) -> jax.Array:
-    """(..., N, 3) unit vector along the nearest obstacle: the side to which the other pursuers push or, where they push
-    less than the evader pulls, the side to which the pursuer flies anyhow. Inside the margin it turns half away from the
-    obstacle; its height is the field's."""
+    """(..., N, 3) unit vector at right angles to the obstacles' repulsion.
+
+    The side is that to which the other pursuers push or, where they push less than the evader pulls, that to which the
+    pursuer flies anyhow. Inside the margin it turns half away from the obstacle; its height is the field's.
+    """
     away = unit(field.repulsion[..., :2])
     left = jnp.stack([-away[..., 1], away[..., 0]], axis=-1)
     pushed = length(field.individual) > 1.0

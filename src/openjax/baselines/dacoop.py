@@ -19,7 +19,7 @@ from openjax.policy import NetworkSettings, Policy, PredictorSettings
 from openjax.pursuit import Observation, Pursuit
 
 LEARNED = ("repulsion", "balance")
-START = ApfParameters(repulsion=1e-3, influence=0.25, margin=0.14, balance=0.3)
+START = ApfParameters(repulsion=3e-3, influence=0.3, margin=0.1, balance=0.6)
 """The field at the start of training; what isn't learnt stays, also of shipped weights, whatever a search finds."""
 
 
