@@ -18,6 +18,8 @@ from openjax.ranges import check_intervals, ranged_fields
 
 Command = TypeVar("Command")
 
+_OF_THE_DISK = ("No space left on device", "Disk quota exceeded", "Read-only file system")
+
 LONGEST = 500
 """Characters of an error's line."""
 
@@ -151,6 +153,9 @@ def one_line(error: BaseException) -> str | None:
         text = f"not enough memory on the device; fewer --num_envs need less ({text})"
     elif type(error) is RuntimeError and text.startswith("Unable to initialize backend"):
         text = f"JAX finds no device: {text}"
+    elif reason := next((reason for reason in _OF_THE_DISK if reason in text), None):
+        # libraries that write in C++ tell it in an error of their own
+        text = f"{reason[:1].lower()}{reason[1:]} ({text})"
     elif not isinstance(error, UserError):
         return None
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."

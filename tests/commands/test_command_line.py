@@ -1,0 +1,60 @@
+"""One place turns whatever isn't openjax's to mend into one line with exit status 2; mistakes of openjax keep their trace."""
+
+import io
+import os
+import sys
+
+import pytest
+
+from openjax.commands.command_line import LONGEST, run_command
+from openjax.errors import UserError
+
+
+def raising(error):
+    def main(arguments):
+        raise error
+
+    return main
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (UserError("too\n  wide"), "error: too wide"),
+        (OSError(28, "No space left on device", "runs/a"), "error: runs/a: no space left on device"),
+        (PermissionError(13, "Permission denied", "out"), "error: out: permission denied"),
+        (
+            ValueError("tensorstore: No space left on device [/x]"),
+            "error: no space left on device (tensorstore",
+        ),
+        (MemoryError(), "error: not enough memory"),
+        (UserError("x" * 10_000), "error: xxx"),
+    ],
+)
+def test_what_the_machine_or_the_user_did_is_one_line(error, line, capsys):
+    with pytest.raises(SystemExit) as stop:
+        run_command(raising(error))
+    shown = capsys.readouterr().err
+    assert stop.value.code == 2
+    assert shown.startswith(line) and shown.count("\n") == 1 and len(shown) <= LONGEST + len("error: \n")
+
+
+def test_a_mistake_of_openjax_is_not_hidden():
+    with pytest.raises(ZeroDivisionError):
+        run_command(raising(ZeroDivisionError("division by zero")))
+
+
+def test_a_terminal_that_lacks_characters_and_a_full_disk_for_the_output(monkeypatch, capsys):
+    narrow = io.TextIOWrapper(io.BytesIO(), encoding="latin-1")
+    monkeypatch.setattr(sys, "stdout", narrow)
+    with pytest.raises(SystemExit) as stop:
+        run_command(lambda arguments: print("5 – 6 steps"))
+    assert stop.value.code == 0 and narrow.buffer.getvalue() == b"5 ? 6 steps\n"
+    if os.path.exists("/dev/full"):
+        with open("/dev/full", "w") as full:
+            monkeypatch.setattr(sys, "stdout", full)
+            with pytest.raises(SystemExit) as stop:
+                run_command(lambda arguments: print("something"))
+            monkeypatch.undo()
+        assert stop.value.code == 2
+        assert "no space left on device" in capsys.readouterr().err
