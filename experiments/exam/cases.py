@@ -82,7 +82,7 @@ def draw_case(seed, column, number, category, index):
     elif category == "unknown":
         kinds = _kinds(column, unknowns.KINDS, unknowns.STRANGERS)
         kind = kinds[(index + turn) % len(kinds)]
-        low, high, unit, exposing, fine = unknowns.ALL[kind]
+        (low, high), unit, exposing, fine = unknowns.ALL[kind]
         causes = [{"effect": kind, "form": "outside", "shape": rng.uniform(0, 1, 8).tolist()}]
         causes[0] |= {"size": float(low * (high / low) ** rng.uniform()), "unit": unit}
         targets, needed = [_target(rng, str(rng.choice(["medium", "high"])))], [exposing]
@@ -101,15 +101,15 @@ def draw_case(seed, column, number, category, index):
         channels = (garbage.KINDS | garbage.STRANGERS)[spoiled]
     elif category == "none":
         # the missions of some effect's cases, so that missions do not give the answer away
-        needed = [effects.EFFECTS[str(rng.choice(names))][2]]
+        needed = [effects.EFFECTS[str(rng.choice(names))].missions]
     if category in ("single", "pair"):
-        needed = [effects.EFFECTS[c["effect"]][2] for c in causes]
-        channels = "".join(effects.EFFECTS[c["effect"]][3] for c in causes)
+        needed = [effects.EFFECTS[c["effect"]].missions for c in causes]
+        channels = "".join(effects.EFFECTS[c["effect"]].needs for c in causes)
     style = str(rng.choice(list(STYLES)))
     if category == "not_testable":
         effect = causes[0]["effect"]
         flights = [(str(rng.choice(BLIND[effect])),) for _ in range(3)]
-        channels = effects.EFFECTS[effect][3]
+        channels = effects.EFFECTS[effect].needs
     else:
         flights = _missions(rng, needed, style, rng.random() < 0.12 and category != "garbage")
     kind = str(rng.choice(_kinds(column, sensors.KINDS, sensors.STRANGERS)))

@@ -81,7 +81,7 @@ def close_chunk(job):
         causes = [{k: x for k, x in c.items() if k != "magnitudes"} for c in answer["causes"]]
         variants.append((spec, causes))
     fleet = generate.Fleet(
-        seed, column, variants, {s["name"]: generate._bodies(seed, column, s) for s, _ in variants}
+        seed, column, variants, {s["name"]: generate.bodies(seed, column, s) for s, _ in variants}
     )
     p = fleet.model([[] for _ in variants])[0]
     links, firmware = np.zeros((2, len(fleet.told)), bool)

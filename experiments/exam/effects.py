@@ -5,6 +5,8 @@ eight uniform draws that fix everything else (signs, axes, ratios), once per cas
 close to what any library would write; the others are not. Arrays have the body index last.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from experiments.exam.vehicle import (
@@ -18,8 +20,17 @@ from experiments.exam.vehicle import (
     rotate_back,
 )
 
-# effect: (smallest, largest) size drawn, forms, missions that expose it, logged channels that it needs
-EFFECTS = {
+
+class Drawn(NamedTuple):
+    """What is drawn of an effect: (smallest, largest) size, forms, missions that expose it, logged channels that it needs."""
+
+    sizes: tuple
+    forms: tuple
+    missions: tuple
+    needs: str
+
+
+_EFFECTS = {
     "mass": ((0.02, 0.30), ("plain", "payload"), (), "m"),
     "thrust_scale": ((0.02, 0.22), ("plain", "thrust_only"), (), "m"),
     "battery_sag": ((0.10, 1.2), ("linear", "power", "quadratic", "load"), ("climb", "agile", "step"), "mv"),
@@ -51,6 +62,7 @@ EFFECTS = {
     "rate_gains": ((0.08, 1.0), ("gains", "filtered_d"), ("agile", "step", "yaw"), "gcm"),
     "state_latency": ((4.0, 60.0), ("constant", "jitter"), ("agile", "fast", "step"), "pg"),
 }
+EFFECTS = {name: Drawn(*drawn) for name, drawn in _EFFECTS.items()}
 # effects that can stand in for one another: not drawn together
 FAMILIES = (
     ("mass", "thrust_scale", "battery_sag"),
@@ -189,7 +201,7 @@ def seen_by_accelerometer(p, specific, rates):
 
 def draw(rng, effect, form=None):
     """A cause of the effect; the size lies within its usual range, the form is drawn unless given."""
-    (low, high), forms, _, _ = EFFECTS[effect]
+    (low, high), forms = EFFECTS[effect].sizes, EFFECTS[effect].forms
     form = str(rng.choice(forms)) if form is None else form
     size = low * (high / low) ** rng.uniform()
     return {"effect": effect, "form": form, "size": float(size), "shape": rng.uniform(0, 1, 8).tolist()}

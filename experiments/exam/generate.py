@@ -30,7 +30,7 @@ LINK = ("command_latency", "packet_loss")  # effects that the commands in force 
 FIRMWARE = (*LINK, "rate_gains")
 
 
-def _bodies(seed, column, spec):
+def bodies(seed, column, spec):
     """References, air and partners of a case's bodies, flight by flight."""
     rng = cases.case_rng(seed, column, spec["number"], 1)
     out, of_flight = [], []
@@ -62,7 +62,7 @@ class Fleet:
     """Bodies of several variants of several cases, flown as one batch."""
 
     def __init__(self, seed, column, variants, drawn):
-        """variants: list of (spec, causes); drawn: {case name: `_bodies`}."""
+        """variants: list of (spec, causes); drawn: {case name: `bodies`}."""
         self.seed, self.column, self.variants = seed, column, variants
         told, references, airs, partner, kinds, self.columns = [], [], [], [], [], []
         for spec, _ in variants:
@@ -172,11 +172,9 @@ def _variants(spec):
         return {"final": spec["causes"]}
     out = {"nominal": []} if spec["category"] == "unknown" else {}
     for i, cause in enumerate(spec["causes"]):
-        low, high = (
-            unknowns.ALL[cause["effect"]]
-            if spec["category"] == "unknown"
-            else effects.EFFECTS[cause["effect"]][0]
-        )[:2]
+        low, high = (unknowns.ALL if spec["category"] == "unknown" else effects.EFFECTS)[
+            cause["effect"]
+        ].sizes
         for n in range(SIZES):
             place = (n + cause["shape"][7]) / SIZES
             out[i, n] = [cause | {"size": float(low * (high / low) ** place)}]
@@ -201,7 +199,7 @@ def _ratios(before, after, floor):
 def fly_chunk(job):
     """Fly, choose and write a list of cases; returns their answers."""
     seed, column, specs, folder = job
-    drawn = {s["name"]: _bodies(seed, column, s) for s in specs}
+    drawn = {s["name"]: bodies(seed, column, s) for s in specs}
     tried = [(s, key, own) for s in specs for key, own in _variants(s).items()]
     first = Fleet(seed, column, [(s, own) for s, _, own in tried], drawn)
     energies = first.energies()

@@ -14,7 +14,7 @@ from scipy.ndimage import uniform_filter1d
 
 from experiments.exam import vehicle as v
 from experiments.exam.plant import PER_TICK, SAMPLE, Body, Firmware
-from experiments.exam.sensors import GROUPS, _at, _smooth_derivative
+from experiments.exam.sensors import GROUPS, at, smooth_derivative
 
 LONG, SHORT, TURN = 125, 25, 50  # samples of 2 ms
 EVERY, FIRST = 100, 500
@@ -34,7 +34,7 @@ def errors(flown, told, parameters, partner, other_firmware, links):
     starts = np.arange(FIRST, samples - LONG - 1, EVERY)
     valid = starts[:, None] + LONG < flown["crashed"][None] - 25
 
-    def at(name, offset=0):
+    def gather(name, offset=0):
         values = flown[name][starts + offset].astype(float)
         return np.moveaxis(values, 0, -2).reshape(*values.shape[1:-1], -1)
 
@@ -47,17 +47,22 @@ def errors(flown, told, parameters, partner, other_firmware, links):
         [[0], [0], [1.0]]
     )
     body = Body(
-        wide, wide_neutral, *(at(n) for n in ("position", "velocity", "quaternion", "rates", "rotor"))
+        wide, wide_neutral, *(gather(n) for n in ("position", "velocity", "quaternion", "rates", "rotor"))
     )
     q0, zero = body.q, np.zeros_like(body.rates)
     moved, turned = np.zeros_like(zero), np.zeros_like(zero)
     for s in range(LONG):
-        m, voltage, load, other = at("motor", s), at("voltage", s), at("load", s), at("position", s)
+        m, voltage, load, other = (
+            gather("motor", s),
+            gather("voltage", s),
+            gather("load", s),
+            gather("position", s),
+        )
         body.position, body.velocity, body.q, body.rates = (
             other,
-            at("velocity", s),
-            at("quaternion", s),
-            at("rates", s),
+            gather("velocity", s),
+            gather("quaternion", s),
+            gather("rates", s),
         )
         velocity, rates = body.velocity, body.rates
         for _ in range(2):
@@ -65,8 +70,8 @@ def errors(flown, told, parameters, partner, other_firmware, links):
         moved += body.velocity - velocity
         if s < SHORT:
             turned += body.rates - rates
-    velocity_error = v.rotate_back(q0, at("velocity", LONG) - at("velocity") - moved)
-    rate_error = at("rates", SHORT) - at("rates") - turned
+    velocity_error = v.rotate_back(q0, gather("velocity", LONG) - gather("velocity") - moved)
+    rate_error = gather("rates", SHORT) - gather("rates") - turned
 
     def rms(error):
         squares = np.where(valid, error.reshape(3, len(starts), count) ** 2, 0.0).sum(axis=1)
@@ -132,7 +137,7 @@ def sensor_floor(sensors, rows, flown, j):
         return t[ok], values[ok]
 
     def truth(name, times):
-        return _at(flown[name][:, :, j].astype(float), times)
+        return at(flown[name][:, :, j].astype(float), times)
 
     def change(times, e, horizon):
         h = max(1, round(horizon / np.median(np.diff(times))))
@@ -146,7 +151,7 @@ def sensor_floor(sensors, rows, flown, j):
         q, true_q = pose[:, 3:], truth("quaternion", times - delay)
         flip = np.array([[1.0], [-1], [-1], [-1]])
         angle = 2 * v.multiply(flip * true_q.T, q.T)[1:].T
-        drift = _smooth_derivative(
+        drift = smooth_derivative(
             pose[:, :3] - truth("position", times - delay), float(np.median(np.diff(times)))
         )
         out[:3] = change(times, drift, 0.25)
@@ -155,7 +160,7 @@ def sensor_floor(sensors, rows, flown, j):
             out[:3] = np.minimum(
                 out[:3], change(times_v, velocity - truth("velocity", times_v - delay), 0.25)
             )
-        out[3:6] = change(times, _smooth_derivative(angle, float(np.median(np.diff(times)))), 0.05)
+        out[3:6] = change(times, smooth_derivative(angle, float(np.median(np.diff(times)))), 0.05)
     if "a" in have:
         times, accel = table("a")
         e = accel - truth("specific", times)

@@ -186,7 +186,7 @@ def apply_nuisances(p, columns, sensors):
     p["gyro_cut"][columns], p["derivative_cut"][columns] = sensors["gyro_cut"], sensors["derivative_cut"]
 
 
-def _at(signal, times):
+def at(signal, times):
     """(S, n) or (S,) truth every 2 ms, at `times` (s), linearly."""
     place = np.clip(np.asarray(times) / SAMPLE, 0, len(signal) - 1.001)
     whole = place.astype(int)
@@ -212,12 +212,12 @@ def _pose(rng, sensors, flown, j, times, delay):
     size, n = sensors["size"], len(times)
     step = float(np.median(np.diff(times)))
     when = times - delay
-    position = _at(flown["position"][:, :, j].astype(float), when)
+    position = at(flown["position"][:, :, j].astype(float), when)
     position += sensors["position"] * rng.standard_normal((n, 3)) + coloured(
         rng, n, 3, 1.0, 1.5e-4 * size, step
     )
     angle = sensors["angle"] * rng.standard_normal((n, 3)) + coloured(rng, n, 3, 1.5, 8e-4 * size, step)
-    velocity = _at(flown["velocity"][:, :, j].astype(float), when)
+    velocity = at(flown["velocity"][:, :, j].astype(float), when)
     if sensors["kind"] == "estimator":  # smoothed: hardly any white noise, slow errors instead
         slow, time = sensors["colour"], sensors["colour_time"]
         wander = coloured(rng, n, 3, time, slow * 6e-4 * size, step)
@@ -225,17 +225,17 @@ def _pose(rng, sensors, flown, j, times, delay):
         angle = coloured(rng, n, 3, time, slow * 2.5e-3 * size, step)
         velocity += coloured(rng, n, 3, time, slow * 5e-3 * size, step)
     elif sensors["velocity"] == "derived":
-        velocity = _smooth_derivative(position, step)
+        velocity = smooth_derivative(position, step)
     else:
         velocity += 3e-3 * size * rng.standard_normal((n, 3)) + coloured(rng, n, 3, 0.3, 1e-3 * size, step)
     if sensors["kind"] == "coloured":
         velocity += coloured(rng, n, 3, sensors["colour_time"], 3e-3 * size * sensors["colour"], step)
-    q = _at(flown["quaternion"][:, :, j].astype(float), when)
+    q = at(flown["quaternion"][:, :, j].astype(float), when)
     q = vehicle.multiply(q.T, np.concatenate([np.ones((1, n)), 0.5 * angle.T]))
     return np.concatenate([position, _normal(q.T), velocity], axis=1)
 
 
-def _smooth_derivative(position, step):
+def smooth_derivative(position, step):
     """Least-squares slope over seven samples."""
     half = np.arange(-3, 4)
     padded = np.concatenate([np.repeat(position[:1], 3, 0), position, np.repeat(position[-1:], 3, 0)])
@@ -264,12 +264,12 @@ def log_rows(rng, sensors, flown, j, ticks, unknown=None):
 
     def stream(signal, times, clock=None):
         """A 500 Hz signal as its stream delivers it at `times`."""
-        late = 0.0 if wander is None or clock is None else _at(wander[:, clock], times)
+        late = 0.0 if wander is None or clock is None else at(wander[:, clock], times)
         if not sensors["stream_rate"]:
-            return _at(signal, times + late)
+            return at(signal, times + late)
         own = np.arange(0, seconds, 1 / sensors["stream_rate"])
-        late = 0.0 if np.ndim(late) == 0 else _at(wander[:, clock], own)
-        values = _at(signal, own + late)
+        late = 0.0 if np.ndim(late) == 0 else at(wander[:, clock], own)
+        values = at(signal, own + late)
         return np.stack([np.interp(times, own, values[:, i]) for i in range(values.shape[1])], axis=1)
 
     out = {"t": t}

@@ -4,12 +4,24 @@
 which no tuning ever met. Each has a strength per body (0: absent) and eight uniform draws, once per case.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from experiments.exam.vehicle import GRAVITY, SPIN, rotate_back
 
-# name -> (weakest, strongest, unit, missions that expose it, names that describe a part of it)
-KINDS = {
+
+class Kind(NamedTuple):
+    """An unknown cause: (smallest, largest) strength and unit, missions that expose it, names that describe a part of it."""
+
+    sizes: tuple
+    unit: str
+    missions: tuple
+    parts: tuple
+
+
+# name -> weakest, strongest, unit, missions, parts
+_KINDS = {
     "slung_load": (1.0, 7.0, "g", ("agile", "step"), ("mass", "thrust_scale")),
     "loose_propeller": (0.03, 0.4, "mN m", (), ()),
     "lateral_jet": (2.0, 25.0, "mN", (), ("wind",)),
@@ -23,7 +35,7 @@ KINDS = {
     "gyro_scale": (0.04, 0.15, "1", ("agile", "yaw"), ()),
     "world_tilt": (1.5, 5.0, "deg", ("fast", "laps"), ("wind",)),
 }
-STRANGERS = {
+_STRANGERS = {
     "motor_hiccups": (0.15, 0.9, "1", (), ("packet_loss",)),
     "frame_resonance": (0.03, 0.6, "1", ("agile", "step"), ()),
     "magnet_point": (5.0, 50.0, "mN", ("agile", "low"), ()),
@@ -35,6 +47,10 @@ STRANGERS = {
     "flexing_arm": (0.02, 0.25, "1 per N", ("agile", "climb"), ("thrust_curve", "motor_imbalance")),
     "moving_passenger": (0.03, 1.5, "mm", (), ("com_offset",)),
 }
+KINDS, STRANGERS = (
+    {name: Kind((low, high), *rest) for name, (low, high, *rest) in kinds.items()}
+    for kinds in (_KINDS, _STRANGERS)
+)
 ALL = KINDS | STRANGERS
 SENSOR_KINDS = ("gyro_scale", "world_tilt", "marker_jumps")  # act on the logs, see `sensors`
 

@@ -219,16 +219,18 @@ def test_the_stranger_column_shares_no_kind_with_the_known_one():
     assert again == known
     for c in known:
         for cause in c["causes"]:
-            needs = effects.EFFECTS.get(cause["effect"], ((), (), (), ""))[3]
+            needs = effects.EFFECTS[cause["effect"]].needs if cause["effect"] in effects.EFFECTS else ""
             assert set(needs) <= set(c["sensors"]["channels"])
 
 
 def test_every_unknown_kind_acts(hovering):
     _, _, flown = hovering
-    for name, (_, high, *_) in unknowns.ALL.items():
+    for name, kind in unknowns.ALL.items():
         if name in unknowns.SENSOR_KINDS:
             continue
-        strange = unknowns.Unknowns({name: {"strength": np.array([high]), "shape": np.full((8, 1), 0.37)}}, 1)
+        strange = unknowns.Unknowns(
+            {name: {"strength": np.array([kind.sizes[1]]), "shape": np.full((8, 1), 0.37)}}, 1
+        )
         u, moved = np.full((4, 1), 0.6), False
         for s in range(0, 1400, 7):
             state = [
