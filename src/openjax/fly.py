@@ -11,6 +11,7 @@ import select
 import shutil
 import sys
 import tempfile
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -78,6 +79,7 @@ def fly(arguments: Arguments):
     from openjax.flying.game import Game
     from openjax.flying.guard import Guard
     from openjax.flying.loop import Flight, Plan
+    from openjax.flying.motion_capture import MotionCaptured, find_feed
     from openjax.flying.swarm import Swarm
     from openjax.pursuit import find_scenario, scenario_task
     from openjax.store.policies import load_policy
@@ -103,6 +105,7 @@ def fly(arguments: Arguments):
     body_logs = arguments.body_logs
     if body_logs is None:
         body_logs = 5 if all(uri.startswith("udp:") for uri in uris) else 1
+    feed = find_feed(arguments.motion_capture) if arguments.motion_capture else None
     swarm = Swarm(uris, body_logs, arguments.watchdog)
     console.print(f"connecting to {', '.join(uris)} ...")
     swarm.connect()
@@ -110,8 +113,12 @@ def fly(arguments: Arguments):
     guard = None
     with _Keys() as keys:
         try:
-            _wait_for_poses(swarm)
-            flight = Flight(swarm, game, arguments.safety, plan, keys)
+            vehicles = swarm
+            if feed is not None:
+                vehicles = MotionCaptured(swarm)
+                vehicles.feed(feed)
+            _wait_for_poses(vehicles, uris)
+            flight = Flight(vehicles, game, arguments.safety, plan, keys)
             if arguments.guard:
                 guard = flight.beat = Guard(
                     uris, swarm.pose_blocks(), arguments.safety, flight.state, arguments.guard_after
@@ -163,13 +170,11 @@ def _hover_thrust(vehicle) -> float:
     return float(vehicle.mass * vehicle.gravity / most)
 
 
-def _wait_for_poses(swarm, timeout=5.0):
-    import time
-
+def _wait_for_poses(vehicles, uris, timeout=5.0):
     deadline = time.monotonic() + timeout
-    while any(s.pose is None for s in swarm.sightings()):
+    while any(s.pose is None for s in vehicles.sightings()):
         if time.monotonic() > deadline:
-            silent = [m.uri for m in swarm.members if m.pose is None]
+            silent = [uri for uri, s in zip(uris, vehicles.sightings(), strict=True) if s.pose is None]
             raise UserError(f"no pose from {', '.join(silent)} within {timeout:g} s; is its position known?")
         time.sleep(0.02)
 

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from openjax.flying.flight_files import write_case
 from openjax.flying.guard import _EACH, _HEAD, _MODES, land
 from openjax.flying.loop import Flight, Plan
+from openjax.flying.motion_capture import MotionCaptured
 from openjax.flying.safety import Mode, SafetySettings
 from openjax.flying.set_point import (
     ANGLES,
@@ -174,6 +175,26 @@ def test_the_guard_lands_what_hangs_in_the_air(vehicles):
     time.sleep(1.0)
     assert vehicles.vehicles.report.position[:, 2].max() < 0.05
     assert not any(firmware.crashed for firmware in vehicles.firmware)
+
+
+def test_motion_capture_is_seen_here_and_on_board(vehicles):
+    swarm = Swarm(vehicles.uris[:1], body_logs=0)
+    swarm.connect()
+    try:
+        captured = MotionCaptured(swarm)
+        before = vehicles.firmware[0].external_poses
+        for k in range(40):
+            captured.update(0, (0.3 + 0.005 * k, 0.0, 0.5), (1.0, 0.0, 0.0, 0.0), at=100.0 + 0.01 * k)
+        captured.update(0, (np.nan, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), at=101.0)
+        (sighting,) = captured.sightings()
+        assert captured.arrivals() == (100.0 + 0.01 * 39,)
+        np.testing.assert_allclose(sighting.pose.velocity, (0.5, 0.0, 0.0), atol=1e-3)
+        deadline = time.monotonic() + 5.0
+        while vehicles.firmware[0].external_poses < before + 40 and time.monotonic() < deadline:
+            time.sleep(0.01)
+        np.testing.assert_allclose(vehicles.firmware[0].external_pose[:4], (0.495, 0.0, 0.5, 1.0), atol=1e-6)
+    finally:
+        swarm.close()
 
 
 FROZEN = """

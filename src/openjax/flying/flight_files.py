@@ -61,7 +61,13 @@ def _table(name, members, record, ticks) -> LogTable:
         samples: dict[float, dict] = {}
         for _, pose, voltage in member.poses:
             values = dict(zip(_POSE, measured_numbers(pose), strict=True))
+            if member.seen:
+                values = {name: values[name] for name in _POSE[10:]}
             samples.setdefault(round(pose.time, 4), {}).update(values, vbat=voltage)
+        for pose in member.seen:  # motion capture in place of the estimate on board
+            samples.setdefault(round(pose.time, 4), {}).update(
+                zip(_POSE[:10], measured_numbers(pose)[:10], strict=True)
+            )
         for at, values in member.bodies:
             samples.setdefault(round(at, 4), {}).update(zip(_BODY, values, strict=True))
         for at in sorted(samples):

@@ -67,6 +67,7 @@ class Member:
         self.error: str | None = None
         self.poses: list[tuple[float, Pose, float]] = []  # arrival, pose, voltage
         self.bodies: list[tuple[float, tuple[float, ...]]] = []  # measured at, m1..m4 0..1, specific force
+        self.seen: list[Pose] = []  # by motion capture, where there is one
         self.recording = False
         self.crazyflie = None
         self.blocks: list = []
