@@ -110,8 +110,8 @@ def sit(column, options, count):
     return result
 
 
-def page(data):
-    """The results page: one table of all columns, then where each misses."""
+def page(data, reading=""):
+    """The results page: one table of all columns, the `reading` of them in words, then where each misses."""
     columns = [c for c in TITLES if c in data["columns"]]
     lines = ["# The exam of the diagnosis", ""]
     lines += [f"* {k}: `{v}`" if k == "command" else f"* {k}: {v}" for k, v in data["facts"].items()]
@@ -133,6 +133,7 @@ def page(data):
         aim = "" if goal is None else f"{'≥' if larger else '≤'} {goal:g}"
         cells = [score.cell(data["columns"][c]["figures"][key], goal, larger) for c in columns]
         lines.append(f"| {what} | {aim} | " + " | ".join(cells) + " |")
+    lines += ["", reading.strip()] if reading else []
     for c in columns:
         lines += ["", f"## {TITLES[c]}", "", *score.groups(data["columns"][c])]
     return "\n".join(lines) + "\n"
@@ -177,12 +178,24 @@ def main():
     )
     parser.add_argument("--results", type=Path, help="path of the page without ending")
     parser.add_argument("--commit", help="said on the page where git isn't there")
+    parser.add_argument(
+        "--report", action="store_true", help="the page again from what is stored, with NAME_reading.md in it"
+    )
     parser.add_argument("--plans", action="store_true", help="write the digests of the reported run's plans")
     options = parser.parse_args()
     if options.plans:
         plans = {c: {"seed": s, "count": n, "sha256": plan_digest(s, c, n)} for c, (s, n) in REPORTED.items()}
         (RESULTS / "exam_plans.json").write_text(json.dumps(plans, indent=1) + "\n")
         print(json.dumps(plans, indent=1))
+        return
+    if options.report:
+        path = options.results or RESULTS / "exam"
+        data, reading = (
+            json.loads(path.with_suffix(".json").read_text()),
+            path.with_name(path.name + "_reading.md"),
+        )
+        path.with_suffix(".md").write_text(page(data, reading.read_text() if reading.exists() else ""))
+        draw(data, path.with_suffix(".png"))
         return
     wanted = {"stranger": options.stranger, "rotorpy": options.rotorpy, "known": options.known}
     if not any(wanted.values()):
