@@ -38,7 +38,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from openjax.commands.command_line import LONGEST, one_line
+from openjax.commands.command_line import LONGEST, one_line, quiet_libraries
 
 SECONDS, MEGABYTES = 30.0, 1000.0
 
@@ -372,14 +372,14 @@ def _other_policy(rng, good, kind):
 
 
 KINDS: dict[str, tuple[Callable, int]] = {
-    "training command lines": (fuzz_train, 18),
-    "evaluation command lines": (fuzz_evaluate, 5),
-    "benchmark command lines": (fuzz_benchmark, 3),
-    "settings files": (fuzz_settings, 20),
-    "layouts": (fuzz_layout, 16),
-    "effects files": (fuzz_effects, 12),
-    "vehicle files": (fuzz_vehicle, 14),
-    "flight logs": (fuzz_log, 3),
+    "training command lines": (fuzz_train, 10),
+    "evaluation command lines": (fuzz_evaluate, 3),
+    "benchmark command lines": (fuzz_benchmark, 2),
+    "settings files": (fuzz_settings, 24),
+    "layouts": (fuzz_layout, 20),
+    "effects files": (fuzz_effects, 14),
+    "vehicle files": (fuzz_vehicle, 16),
+    "flight logs": (fuzz_log, 2),
     "policy files": (fuzz_policy, 9),
 }
 """What is tried, and its share of the cases."""
@@ -624,12 +624,21 @@ def main(command: FuzzCommand) -> dict:
         "command": "python experiments/fuzz.py " + " ".join(sys.argv[1:]),
         "machine": describe_machine(),
     }
+
+    def write():
+        """What is known by now, so that an interrupted run leaves it."""
+        results["seconds"] = round(time.monotonic() - started)
+        command.out.with_suffix(".json").write_text(json.dumps(results, indent=1) + "\n")
+        command.out.with_suffix(".md").write_text(page(results))
+
     with (
         tempfile.TemporaryDirectory() as folder,
-        ProcessPoolExecutor(command.workers, mp_context=get_context("spawn")) as pool,
+        ProcessPoolExecutor(command.workers, get_context("spawn"), quiet_libraries) as pool,
     ):
         scratch = Path(folder)
-        pieces = [pool.submit(try_cases, *piece) for piece in plan(command.cases, command.seed)]
+        todo = plan(command.cases, command.seed) if command.cases else []
+        # enough to do while the run that is to be killed is made; its copies come next
+        pieces = [pool.submit(try_cases, *piece) for piece in todo[::3]]
         kills = _submit_kills(pool, scratch, command) if command.kills else []
         if command.damages:
             make_checkpoints(scratch)
@@ -637,6 +646,7 @@ def main(command: FuzzCommand) -> dict:
             pool.submit(try_damages, scratch, range(first, min(first + 20, command.damages)))
             for first in range(0, command.damages, 20)
         ]
+        pieces += [pool.submit(try_cases, *piece) for n, piece in enumerate(todo) if n % 3]
         found = [case for piece in as_completed(pieces) for case in piece.result()]
         results["cases"] = {
             kind: dict(Counter(outcome for name, _, outcome, _ in found if name == kind)) for kind in KINDS
@@ -650,13 +660,13 @@ def main(command: FuzzCommand) -> dict:
             f"{len(found)} cases, {len(results['failures'])} failures, {time.monotonic() - started:.0f} s",
             flush=True,
         )
+        write()
         results["damages"] = dict(Counter(outcome for piece in damages for outcome in piece.result()))
         print(f"damages: {results['damages']}, {time.monotonic() - started:.0f} s", flush=True)
+        write()
         results["kills"] = [kill.result() for kill in kills]
         print(f"kills: {Counter(kill['outcome'] for kill in results['kills'])}", flush=True)
-    results["seconds"] = round(time.monotonic() - started)
-    command.out.with_suffix(".json").write_text(json.dumps(results, indent=1) + "\n")
-    command.out.with_suffix(".md").write_text(page(results))
+        write()
     return results
 
 
@@ -690,17 +700,19 @@ def page(results: dict) -> str:
         "| input | tried | refused in one line | accepted | failed |",
         "|---|---|---|---|---|",
     ]
+    if not results["failures"] and not any(results["cases"].values()):
+        lines = lines[:4]  # no cases were asked for
     total: Counter = Counter()
     for kind, counts in results["cases"].items():
         total.update(counts)
-        lines.append(_row(kind, counts))
-    lines.append(_row("all", total))
+        lines += [_row(kind, counts)] if counts else []
+    lines += [_row("all", total)] if total else []
     for failure in results["failures"][:20]:
         lines += [
             "",
             f"Failed: {failure['kind']}, seed {failure['seed']}: `{failure['text'].splitlines()[-1][:300]}`",
         ]
-    if results["damages"]:
+    if results.get("damages"):
         counts = results["damages"]
         told = ", ".join(f"{outcome}: {number}" for outcome, number in counts.items())
         lines += ["", f"Damages to checkpoints: {sum(counts.values())}. {told}."]
@@ -710,7 +722,7 @@ def page(results: dict) -> str:
         lines += [
             "refused: both were hit, or the only undamaged one was gone, and that is said in one line.)"
         ]
-    if results["kills"]:
+    if results.get("kills"):
         lines += ["", f"Kills (SIGKILL): {len(results['kills'])}, {results['kills'][0]['seconds']} to "]
         lines[-1] += (
             f"{results['kills'][-1]['seconds']} s after the start of a run of that length; then gone on with to its end."
