@@ -21,7 +21,7 @@ from openjax.show.metrics import read_metrics
 
 UPDATES = 3
 OPTIONS = """
-    --preset quick --environment.episode_length 20 --environment.capture_radius 1.0
+    --preset quick --environment.physics mjx --environment.episode_length 20 --environment.capture_radius 1.0
     --network.features 8 --network.heads 2 --predictor.units 4 --predictor.windows 2 --predictor.steps 1
     --predictor.horizons 1 2 --mappo.minibatches 2 --mappo.epochs 1 --generator.capacity 8
     --generator.success_low 0.0 --generator.success_high 1.0 --generator.episodes_per_task 2

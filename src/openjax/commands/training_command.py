@@ -19,6 +19,7 @@ from openjax.commands.machine import describe_machine
 from openjax.commands.training_job import TrainingJob, run_job
 from openjax.errors import UserError
 from openjax.learning import TrainSettings, preset
+from openjax.learning.settings import PRESETS
 from openjax.ranges import Interval
 from openjax.store.checkpoints import Checkpoints
 from openjax.store.environments import make_environment
@@ -41,7 +42,7 @@ class TrainCommand:
     """
 
     preset: str | None = None
-    """quick: minutes on two CPU cores; paper: the paper's task on an accelerator; by default what fits."""
+    """quick: minutes on two CPU cores, an easier game; paper: the paper's task on an accelerator; by default what fits."""
     out: Path | None = None
     """Directory of the run; by default runs/DATE-PRESET."""
     steps: Annotated[int | None, Interval("[1, 1e15]")] = None
@@ -138,12 +139,19 @@ def start(command: TrainCommand, arguments: Sequence[str], started: float, proce
             for name, path in files.items():
                 shutil.copyfile(path, directory.path / name)
             directory.write_settings(command.settings, job.facts)
+            _say_what_it_is(command)
         processes.everyone()
         if not directory.path.is_dir():
             raise UserError(
                 f"{directory.path} isn't there on the host of process {processes.index}; all hosts must share it"
             )
         return run_job(job, directory, console=output_console())
+
+
+def _say_what_it_is(command):
+    """What the chosen preset is, as nobody reads a table right who takes an easier game for the paper's."""
+    name = command.preset or default_preset()
+    output_console().print(f"preset {name}: {' '.join(PRESETS[name].__doc__.split())}", soft_wrap=True)
 
 
 def prepare(
