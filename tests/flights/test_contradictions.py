@@ -4,8 +4,11 @@ flights pass is tested with the other checks."""
 import numpy as np
 import pytest
 
+from openjax.errors import UserError
+from openjax.flights.case import load_case
 from openjax.flights.checks import check_flight
-from openjax.flights.reading import CHANNEL_COLUMNS, LogTable, flights_of
+from openjax.flights.reading import CHANNEL_COLUMNS, LogTable, flights_of, write_csv
+from openjax.gap.samples import log_of
 from openjax.vehicle import load_vehicle
 
 VEHICLE = load_vehicle()
@@ -67,3 +70,27 @@ def test_clocks_apart_filters_and_noise_are_no_contradiction(sample_columns):
         late[name] = columns[name] + 0.003 * rng.standard_normal(len(columns[name]))
     kept, found = refusals(late)
     assert found == [] and kept is not None
+
+
+def test_what_most_flights_contradict_the_calm_ones_must_show_to_be_right(case_folder, sample_columns):
+    """Swapped gyroscope columns in every log: where the vehicle hardly turns they don't show, and aren't trusted."""
+    swapped = {n: c | {"wx": c["wy"], "wy": c["wx"]} for n, c in sample_columns.items()}
+    calm = {n: v[:300] for n, v in swapped["flight_a"].items()}
+    rng = np.random.default_rng(4)
+    for names in (("qx", "qy", "qz"), ("wx", "wy", "wz")):
+        calm |= {n: 0.002 * rng.standard_normal(300) for n in names}
+    calm["qw"] = np.sqrt(1.0 - calm["qx"] ** 2 - calm["qy"] ** 2 - calm["qz"] ** 2)
+    still = {
+        n: 0.001 * rng.standard_normal(300)
+        for n in ("x", "y", "vx", "vy", "vz", "cmd_wx", "cmd_wy", "cmd_wz")
+    }
+    calm |= still | {"z": 0.5 + 0.001 * rng.standard_normal(300)}
+    calm |= {m: 0.5 + 0.01 * rng.standard_normal(300) for m in ("m1", "m2", "m3", "m4")}
+    calm |= {a: (9.81 if a == "az" else 0.0) + 0.1 * rng.standard_normal(300) for a in ("ax", "ay", "az")}
+    calm["cmd_thrust"] = (calm["m1"] + calm["m2"] + calm["m3"] + calm["m4"]) / 4
+    assert refusals(calm)[1] == []
+    for name in ("flight_b", "flight_c"):
+        write_csv(case_folder / f"{name}.csv.gz", log_of([swapped[name]], name))
+    write_csv(case_folder / "flight_a.csv.gz", log_of([calm], "flight_a"))
+    with pytest.raises(UserError, match="no flight can be used"):
+        load_case(case_folder)

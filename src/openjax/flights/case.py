@@ -10,6 +10,7 @@ import numpy as np
 
 from openjax.errors import UserError
 from openjax.flights.checks import check_flight, duplicates
+from openjax.flights.contradictions import SUBJECTS, accused_by, shown_right
 from openjax.flights.flight import Case, Flight, Issue
 from openjax.flights.importers import MAPPING_FILE, ColumnMapping, find_logs, load_mapping, read_log
 from openjax.flights.reading import LogError, flights_of
@@ -51,6 +52,8 @@ def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> 
         )
         issues += found
         kept += [] if checked is None else [checked]
+    kept, found = _unproven(kept, issues, vehicle_file)
+    issues += found
     if not kept:
         reasons = [i for i in issues if i.refused]
         first = f"{reasons[0].flight}: {reasons[0].issue}" if reasons else "no vehicle in any log"
@@ -60,6 +63,36 @@ def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> 
     weighed = all(vehicle_file.mass_weighed_of(flight.vehicle) for flight in kept)
     vehicle_file = dataclasses.replace(vehicle_file, mass_weighed=weighed)
     return Case(path.resolve().name, tuple(kept), vehicle_file, tuple(issues), path)
+
+
+def _unproven(
+    kept: list[Flight], issues: list[Issue], vehicle_file: VehicleFile
+) -> tuple[list[Flight], list[Issue]]:
+    """What most flights contradict, the others of the case must show to be right: columns are swapped, scaled or mixed
+    up for a whole case, and a calm flight only can't tell."""
+    accusing = [
+        i for i in issues if i.refused and i.kind in ("axes", "units", "motors", "quaternion", "garbage")
+    ]
+    accused = {subject: {i.flight for i in accusing if subject in accused_by(i)} for subject in SUBJECTS}
+    accused = {subject: flights for subject, flights in accused.items() if flights}
+    if not accused:
+        return kept, []
+    right = {f.name: shown_right(f, vehicle_file.vehicle_of(f.vehicle)) for f in kept}
+    out, found = [], []
+    for flight in kept:
+        doubts = [
+            (subject, against)
+            for subject, against in accused.items()
+            if subject not in right[flight.name]
+            and len(against) > sum(subject in shown for shown in right.values())
+        ]
+        if not doubts:
+            out.append(flight)
+            continue
+        subject, against = doubts[0]
+        text = f"{subject}: contradictory in {min(against)}, and too calm here to show that it is right"
+        found.append(Issue(flight.name, text, refused=True, kind="garbage"))
+    return out, found
 
 
 def _check(flight: Flight, vehicle_file: VehicleFile, comparison: bool) -> tuple[Flight | None, list[Issue]]:

@@ -12,6 +12,7 @@ air don't explain is named.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -99,6 +100,38 @@ def check_contradictions(flight: Flight, vehicle) -> list[Issue]:
     return [Issue(flight.name, f"contradictory: {text}", refused=True, kind="garbage") for text in found]
 
 
+# What a finding accuses, by the columns that it names.
+SUBJECTS = {
+    "gyroscope": ("wx", "wy", "wz", "gyroscope"),
+    "pose": ("x, y", "qw", "position axes", "quaternion", "quaternions", "the path's acceleration in"),
+    "velocity": ("vx", "vy", "vz"),
+    "accelerometer": ("ax", "ay", "az", "accelerometer"),
+    "motors": ("m1", "motor", "motors"),
+    "commands": ("cmd_",),
+}
+
+
+def accused_by(issue: Issue) -> set[str]:
+    """The channels that a finding accuses in other flights, too."""
+    if issue.kind == "units" and re.match("a[xyz]", issue.issue):
+        return set()  # gravity shows in every flight
+    head = issue.issue.partition(" against ")[0]
+    words = set(re.findall(r"[\w_]+", head))
+    return {
+        subject
+        for subject, marks in SUBJECTS.items()
+        if any(m in words if m.isidentifier() and not m.endswith("_") else m in head for m in marks)
+    }
+
+
+def shown_right(flight: Flight, vehicle) -> set[str]:
+    """The channels of a flight that were moved enough to be judged, and agree with the others."""
+    grid, shown = clock_of(flight), set()
+    if grid is not None:
+        _pairs(flight, vehicle, grid, shown)
+    return shown
+
+
 def _copied_columns(flight: Flight) -> list[str]:
     found = []
     for channel in ("position", "velocity", "body_rates", "specific_force"):
@@ -146,7 +179,8 @@ def _rows_at_random(flight: Flight) -> list[str]:
     return found
 
 
-def _pairs(flight: Flight, vehicle, grid: np.ndarray) -> list[str]:
+def _pairs(flight: Flight, vehicle, grid: np.ndarray, shown: set[str] | None = None) -> list[str]:
+    shown = set() if shown is None else shown
     position, quaternion = on_clock(flight, "position", grid), on_clock(flight, "quaternion", grid)
     velocity = None if flight.velocity_derived else on_clock(flight, "velocity", grid)
     gyro = None if flight.body_rates_derived else on_clock(flight, "body_rates", grid)
@@ -154,13 +188,17 @@ def _pairs(flight: Flight, vehicle, grid: np.ndarray) -> list[str]:
     up = None if quaternion is None else up_of(quaternion)
     found = []
 
-    def compare(names, measured, reference, band, least, what, unit, derivatives=(0, 0), either_sign=False):
+    def compare(
+        names, measured, reference, band, least, what, unit, derivatives=(0, 0), either_sign=False, shows=()
+    ):
         if measured is None or reference is None:
             return
         result = agreement(_columns(measured), _columns(reference), band, derivatives)
         tells = (result.reference > least) & (result.expected > TELLS)
         followed = np.abs(result.correlation) if either_sign else result.correlation
         bad = tells & (followed < AGREE * result.expected)
+        if tells.sum() >= (2 if len(tells) == 3 and np.ndim(least) == 0 else 1) and not bad.any():
+            shown.update(shows)
         if bad.any():
             worst = int(np.argmin(np.where(bad, followed, np.inf)))
             columns = ", ".join(n for n, b in zip(names, bad, strict=True) if b)
@@ -175,11 +213,23 @@ def _pairs(flight: Flight, vehicle, grid: np.ndarray) -> list[str]:
     rates = gyro
     if quaternion is not None:
         rates = rates_of(quaternion)
-        compare(names, gyro, rates, wide, 0.1, "the attitude's rate", "rad/s", (0, 1))
+        compare(
+            names, gyro, rates, wide, 0.1, "the attitude's rate", "rad/s", (0, 1), shows=("gyroscope", "pose")
+        )
     path = velocity
     if position is not None:
         path = np.gradient(position, 1 / RATE, axis=0)
-        compare(CHANNEL_COLUMNS["velocity"], velocity, path, low, 0.05, "the position's rate", "m/s", (0, 1))
+        compare(
+            CHANNEL_COLUMNS["velocity"],
+            velocity,
+            path,
+            low,
+            0.05,
+            "the position's rate",
+            "m/s",
+            (0, 1),
+            shows=("velocity",),
+        )
         path = path if velocity is None else velocity
     along = None
     if path is not None and up is not None:
@@ -188,14 +238,24 @@ def _pairs(flight: Flight, vehicle, grid: np.ndarray) -> list[str]:
         lift = GRAVITY if force is None else np.median(force[:, 2])
         compare(
             ("the path's acceleration in x", "in y"), acceleration[:, :2], lift * up[:, :2], low, 0.25,
-            "the attitude's thrust", "m/s^2", (order, 0),
+            "the attitude's thrust", "m/s^2", (order, 0), shows=("pose",),
         )  # fmt: skip
         felt = to_body(quaternion, acceleration + np.array([0.0, 0.0, GRAVITY]))
         along = felt[:, 2]
         # Sideways an attitude that is off by half a degree feels 0.1 m/s^2 that isn't there.
         least = np.array([0.6, 0.6, 0.1])
         names_of_force = CHANNEL_COLUMNS["specific_force"]
-        compare(names_of_force, force, felt, low, least, "the path's acceleration", "m/s^2", (0, order))
+        compare(
+            names_of_force,
+            force,
+            felt,
+            low,
+            least,
+            "the path's acceleration",
+            "m/s^2",
+            (0, order),
+            shows=("accelerometer",),
+        )
     motor, thrust = on_clock(flight, "motor_command", grid), on_clock(flight, "command_thrust", grid)
     felt = along if force is None else force[:, 2]
     collective = None if motor is None else motor.mean(1)
@@ -207,18 +267,17 @@ def _pairs(flight: Flight, vehicle, grid: np.ndarray) -> list[str]:
     if motor is not None and thrust is not None:
         compare(("cmd_thrust",), 100 * thrust, 100 * collective, wide, 1.0, "m1 + m2 + m3 + m4", "%")
     rates = gyro if gyro is not None else rates
-    helpless = (
-        motor is not None and float((motor > FULL).any(1).mean()) > 0.2
-    )  # nothing left to follow commands with
+    # A saturated vehicle has nothing left to follow commands with.
+    helpless = motor is not None and float((motor > FULL).any(1).mean()) > 0.2
     if rates is not None and not helpless:
         commands = on_clock(flight, "command_body_rates", grid)
         # A loop at rest opposes what the air does: either sign is a loop.
         compare(
             CHANNEL_COLUMNS["command_body_rates"], commands, rates, low, 0.4, "the body rates", "rad/s",
-            either_sign=True,
+            either_sign=True, shows=("commands",),
         )  # fmt: skip
         if motor is not None:
-            found += _torques(motor, rates, vehicle)
+            found += _torques(motor, rates, vehicle, shown)
     return found
 
 
@@ -226,7 +285,7 @@ def _columns(values: np.ndarray) -> np.ndarray:
     return values.reshape(len(values), -1)
 
 
-def _torques(motor: np.ndarray, rates: np.ndarray, vehicle) -> list[str]:
+def _torques(motor: np.ndarray, rates: np.ndarray, vehicle, shown: set[str]) -> list[str]:
     """Roll and pitch acceleration against the motors' torques, together."""
     place = np.asarray(vehicle.rotor_position, float)
     lagged = first_order(motor, float(vehicle.motor_time_constant))
@@ -234,6 +293,8 @@ def _torques(motor: np.ndarray, rates: np.ndarray, vehicle) -> list[str]:
     measured = np.gradient(rates[:, :2], 1 / RATE, axis=0)
     result = agreement(measured, torque, (0.7, 8.0))
     excited = in_band(rates[:, :2], (0.7, 8.0)).std(0) > 0.3
+    if excited.all() and result.correlation.min() > 0.4:
+        shown.add("motors")
     if excited.all() and result.correlation.max() < 0.15:
         return [
             "the motors' torques against the angular acceleration: correlation "
