@@ -19,7 +19,7 @@ from pages import page_parser, publish, table
 from openjax.baselines import METHODS, Heuristic
 from openjax.baselines.parameters import FOUND, draw, ranges
 from openjax.commands.command_line import run_command
-from openjax.commands.machine import commit, describe_machine
+from openjax.commands.machine import describe_machine
 from openjax.files import read_json
 from openjax.learning import make_evaluate
 from openjax.policy import PolicyParameters
@@ -30,9 +30,6 @@ WORLDS = 32768
 """Worlds that fly at once."""
 ROWS = 0.25
 """Share of the tasks whose pillars stand in a row."""
-FINALISTS = 32
-FINAL = 8
-"""The final and the third set have so many times the tasks of the first."""
 LIMITS = ("clamp", "none")
 FIGURES = ("capture_rate", "capture_step", "collision_rate", "crash_rate")
 
@@ -98,18 +95,22 @@ def of_method(name: str, options: argparse.Namespace) -> dict:
 
     first = measured(sets, keys[1], options.tasks, games[0])
     seconds = time.monotonic() - started
-    order = np.argsort(-score(first))[: min(FINALISTS, options.sets) - 1]
+    order = np.argsort(-score(first))[: min(options.finalists, options.sets) - 1]
     order = np.append(order[order != 0], 0)  # the literature's comes along
     few = jax.tree.map(lambda leaf: leaf[order], sets)
     # the final is flown with the clamp and without it, so that the winner needs neither
-    final = np.stack([measured(few, keys[2], FINAL * options.tasks, game) for game in games])
+    final = np.stack([measured(few, keys[2], options.final * options.tasks, game) for game in games])
     place = int(np.argmax(score(final).mean(axis=0)))
     winner = int(order[place])
-    third = np.stack([measured(few, keys[3], FINAL * options.tasks, game) for game in games])
+    third = np.stack([measured(few, keys[3], options.final * options.tasks, game) for game in games])
     values = {key: float(f"{float(leaf[winner]):.4g}") for key, leaf in vars(sets).items()}
     return {
         "method": name,
-        "commit": options.commit or commit()["commit"],
+        "command": command_of(options, name),
+        "machine": {"commit": options.commit or None} | describe_machine(),
+        "sets": options.sets,
+        "tasks": options.tasks,
+        "final_tasks": options.final * options.tasks,
         "seconds_all_sets": seconds,
         "steps_all_sets": options.sets * options.tasks * games[0].episode_length,
         "seconds": time.monotonic() - started,
@@ -142,28 +143,26 @@ def study(options: argparse.Namespace) -> dict:
         found = read_json(data)["methods"] | found
     if options.ship:
         write_json(FOUND, {name: entry["values"] for name, entry in found.items()})
-    return {
-        "command": f"python experiments/baseline_search.py --sets {options.sets} --tasks {options.tasks} "
-        f"--physics {options.physics}",
-        "machine": describe_machine(),
-        "options": {"sets": options.sets, "tasks": options.tasks, "physics": options.physics},
-        "methods": found,
-    }
+    return {"methods": found}
+
+
+def command_of(options: argparse.Namespace, name: str) -> str:
+    """What makes the result of one method again."""
+    return (
+        f"python experiments/baseline_search.py --methods {name} --sets {options.sets} --tasks {options.tasks} "
+        f"--finalists {options.finalists} --final {options.final} --physics {options.physics}"
+    )
 
 
 def report(results: dict) -> list[str]:
     """The page."""
-    machine, options = results["machine"], results["options"]
     lines = [
         "# Parameters of the heuristics",
         "",
-        f"`{results['command']}` on {machine['device']}, JAX {machine['versions']['jax']}; commits below.",
-        "",
-        f"{options['sets']:,} parameter sets of each method (log-uniform; the first is the literature's, in our units), each "
-        f'flown on the same {options["tasks"]} training tasks with `physics="{options["physics"]}"` and the speed clamp, drawn '
-        f"starts; the best {FINALISTS} again on {FINAL * options['tasks']:,} other tasks with the clamp and without it. "
+        "Parameter sets of each method (log-uniform; the first is the literature's, in our units) flown on the same training "
+        "tasks, with the speed clamp and drawn starts; the best again on other tasks with the clamp and without it. "
         "Score: capture rate - capture step / 2,000 - 10 × collision rate. The paper names neither its grid nor what it "
-        "chose by. The figures below come from a third set of tasks, on which nothing was chosen.",
+        "chose by. The first table comes from a third set of tasks, on which nothing was chosen.",
     ]
     rows = []
     for name, entry in results["methods"].items():
@@ -181,7 +180,11 @@ def report(results: dict) -> list[str]:
             "",
             f"## {name}",
             "",
-            f"Commit {entry['commit']}. All sets: {entry['seconds_all_sets']:.0f} s with compilation "
+            f"`{entry['command']}` on {entry['machine']['device']}, commit {entry['machine'].get('commit') or 'unknown'}: "
+            f"{entry['sets']:,} sets on {entry['tasks']} tasks, final and third set "
+            f"{entry['final_tasks']} tasks each. {entry.get('note', '')}",
+            "",
+            f"All sets: {entry['seconds_all_sets']:.0f} s with compilation "
             f"({speed:.1f} M environment steps/s); "
             f"final and third set included {entry['seconds']:.0f} s.",
             "",
@@ -207,6 +210,10 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=list(METHODS))
     parser.add_argument("--sets", type=int, default=4096)
     parser.add_argument("--tasks", type=int, default=64)
+    parser.add_argument("--finalists", type=int, default=32)
+    parser.add_argument(
+        "--final", type=int, default=8, help="tasks of the final and the third set, in those of the first"
+    )
     parser.add_argument("--physics", choices=("mjx", "rigid"), default="mjx")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--ship", action="store_true", help="also write the package's parameters")

@@ -1,6 +1,5 @@
 """Flights for the paper's tables: many episodes of one policy in one compiled call, each with its own evader speed."""
 
-import copy
 import dataclasses
 import functools
 from typing import Any
@@ -63,8 +62,7 @@ def fly(
     never, number = settings.episode_length + 1, speeds.shape[0]
 
     def step(state, action, speed):
-        swept = copy.copy(environment)
-        swept.settings = SweptSettings(**{**plain, "evader_speed": speed})
+        swept = dataclasses.replace(environment, settings=SweptSettings(**{**plain, "evader_speed": speed}))
         observation, state, *_, info = swept.step(jax.random.key(0), state, action)
         return observation, state, info
 

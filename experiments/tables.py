@@ -76,8 +76,8 @@ def of_policy(name: str, seed: int, changes: dict, episodes: int) -> dict:
     return {"layouts": layouts, "sweeps": sweeps.figures(parts[len(LAYOUTS) :], game.episode_length)}
 
 
-def study(options: argparse.Namespace) -> dict:
-    """Every method and the ablations, with the clamp; heuristics without it, too, since no training chose their speed.
+def study(options: argparse.Namespace) -> None:
+    """Fly and store all methods and the ablations, with the clamp; heuristics without it, too: no training chose their speed.
 
     What stands in the file already of methods that aren't named is kept, if it was flown alike.
     """
@@ -98,14 +98,11 @@ def study(options: argparse.Namespace) -> dict:
                     {"method": label, "policy": name, "seed": seed, "condition": condition, **flown}
                 )
                 print(f"{time.monotonic() - started:5.0f} s  {label}: {name}, {condition}", flush=True)
-    return {
-        "command": f"python experiments/tables.py --episodes {options.episodes} --physics {options.physics}",
-        "commit": options.commit,
-        "machine": describe_machine(),
-        "seconds": time.monotonic() - started,
-        **alike,
-        "flights": flights,
-    }
+        # after each method, so that an interrupted study leaves what it has
+        command = f"python experiments/tables.py --episodes {options.episodes} --physics {options.physics}"
+        results = {"command": command, "commit": options.commit, "machine": describe_machine()}
+        results |= {"seconds": time.monotonic() - started, **alike, "flights": flights}
+        write_json(stored, results)
 
 
 def main(arguments: list[str]) -> int:
@@ -122,7 +119,7 @@ def main(arguments: list[str]) -> int:
     options = parser.parse_args(arguments)
     flights = options.out / "tables.json"
     if not options.report:
-        write_json(flights, study(options))
+        study(options)
     for page in PAGES:
         page.main(["--flights", str(flights), "--out", str(options.out / page.__name__)])
     learning_curves.main(["--out", str(options.out / "learning_curves")])

@@ -9,11 +9,12 @@ import pytest
 
 import openjax
 from openjax.baselines import DacoopPolicy, Heuristic, velocity_action
+from openjax.baselines.apf import apf
 from openjax.baselines.dacoop import START
 from openjax.baselines.surroundings import Craft, surroundings
 from openjax.errors import UserError
 from openjax.evaluate import main
-from openjax.policy import NetworkSettings, PolicyParameters, PredictorSettings
+from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import Pursuit, PursuitSettings, Task
 
 HONEST = Pursuit(PursuitSettings(physics="rigid", speed_limit="none", num_pursuers=2))
@@ -97,8 +98,8 @@ def test_dacoop_flies_the_field_that_its_network_sets():
     start = jnp.broadcast_to(jnp.tanh(jnp.array(policy.initial_action)), (3, policy.sample_size))
     fly = jax.jit(policy.action)
     action = fly(start, observation)
-    field = PolicyParameters(actor=START, critic={}, predictor={})
-    expected = jax.jit(heuristic.act)(field, observation)
+    desired = apf(heuristic.craft, START, surroundings(heuristic.craft, observation), nearest=True)
+    expected = velocity_action(heuristic.craft, observation, desired)
     np.testing.assert_allclose(action, expected, atol=1e-3)
     # another balance, other commands: what the network puts out matters
     assert np.abs(fly(start.at[:, 1].add(-0.8), observation) - action).max() > 0.05
