@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator, Sequence
 from importlib import metadata
 from pathlib import Path
+from typing import Literal
 
 import jax
 
@@ -21,6 +22,7 @@ from openjax.commands.command_line import parse, run_command
 from openjax.commands.machine import describe_machine
 from openjax.commands.timing import time_compiled
 from openjax.errors import UserError
+from openjax.files import read_json
 from openjax.store.settings_files import write_json
 
 PROGRAM = "python -m experiments.compare"
@@ -52,6 +54,10 @@ class CompareCommand:
     """Time after which nothing new is begun."""
     out: Path = RESULTS
     """Directory of compare.json and compare.md."""
+    peers: Path | None = None
+    """An earlier compare.json whose rows of the other libraries stand in for those that aren't installed."""
+    only: tuple[Literal["drones", "training", "environment"], ...] = ("drones", "training", "environment")
+    """What to measure."""
     commit: str | None = None
     """Commit to name in the results where git can't tell."""
 
@@ -77,7 +83,14 @@ def main(arguments: Sequence[str]) -> int:
     }
     print(f"{machine['device']}, JAX {machine['versions']['jax']}, empty stand-ins: {stand_ins}", flush=True)
     rows = []
+    if command.peers:
+        earlier = read_json(command.peers)
+        rows = [row for row in earlier["rows"] if row["system"] != "openjax" and row["group"] in command.only]
+        facts["peers"] = {key: earlier["machine"][key] for key in ("device", "commit", "date")}
+        facts["peers"]["command"] = earlier["command"]
     for case in _cases(command):
+        if case.group not in command.only or (command.peers and case.system != "openjax"):
+            continue
         late = time.monotonic() - begun > command.seconds
         rows.append(_row(case, {"skipped": "time was up"} if late else _measure(case, command.min_seconds)))
         print(report.line(rows[-1]), flush=True)

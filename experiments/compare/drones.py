@@ -19,14 +19,16 @@ GRAVITY = 9.81
 # Drone steps per call of MJX: what takes about half a second on an H200.
 MJX_DRONE_STEPS = 30_000_000
 
-VARIANTS = ("rigid", "mjx free", "mjx")
+VARIANTS = ("rigid free", "rigid", "mjx free", "mjx")
+"""Ours; in those that aren't free, floor, pillars and other drones are solid."""
 
 
 def cases(worlds: tuple[int, ...], drones: tuple[int, ...], steps: int) -> Iterator[Case]:
-    """Every size with crazyflow's body-rate control, `rigid` and `mjx`; then the variants beside, at the middle size."""
+    """Every size with crazyflow's body-rate control, `rigid` without and with contacts, and `mjx`."""
     for num_drones in drones:
         for num_worlds in worlds:
             yield _crazyflow("body_rate", num_worlds, num_drones, steps)
+            yield _openjax("rigid free", num_worlds, num_drones, steps)
             yield _openjax("rigid", num_worlds, num_drones, steps)
             yield _openjax("mjx", num_worlds, num_drones, steps)
 
@@ -44,7 +46,7 @@ def _crazyflow(control, worlds, drones, steps):
 
 
 def _openjax(variant, worlds, drones, steps):
-    if variant != "rigid":
+    if variant.startswith("mjx"):
         steps = max(5, min(steps, MJX_DRONE_STEPS // (worlds * drones)))
     make = functools.partial(make_openjax, variant, worlds, drones, steps)
     return Case("drones", "openjax", variant, worlds, drones, steps, make)
@@ -95,9 +97,8 @@ def _speed_for_thrust(curve, thrust):
 def make_openjax(variant: str, worlds: int, drones: int, steps: int):
     """`steps` steps of our drones, hovering among the pillars of drawn tasks with a constant command."""
     vehicle = load_vehicle()
-    drones_step = make_drones_step(
-        physics="rigid" if variant == "rigid" else "mjx", dt=1 / FREQUENCY, contacts=variant == "mjx"
-    )
+    physics, _, free = variant.partition(" ")
+    drones_step = make_drones_step(physics=physics, dt=1 / FREQUENCY, contacts=not free)
     settings = PursuitSettings(num_pursuers=drones)
     keys = jax.random.split(jax.random.key(0), worlds)
     tasks = jax.jit(jax.vmap(lambda key: uniform_task(settings, key)))(keys)

@@ -15,8 +15,9 @@ DRONES = """\
 One drone step is, in all columns, one step of {milliseconds:g} ms without substeps: rate controller, motors, rotor forces, one
 semi-implicit Euler step of the rigid body ({steps} steps in one `lax.scan`, fewer for the largest `mjx`; constant
 command). crazyflow: `Sim(control="body_rate", dynamics="first_principles", integrator="symplectic_euler", freq={frequency})`,
-its default frequency, its own compiled `step`. Not the same task: `mjx` resolves contacts with floor, five pillars and
-the other drones in each step, crazyflow clips at the floor and leaves contacts to a query that isn't timed; crazyflow
+its default frequency, its own compiled `step`. Not the same task: `rigid` and `mjx` resolve contacts with floor, five
+pillars and the other drones in each step, crazyflow clips at the floor and leaves contacts to a query that isn't timed, like
+the columns that say "free"; crazyflow
 models linear drag and the propellers' inertia, which our nominal vehicle leaves out; its Crazyflie is another model
 (cf21B_500).
 """
@@ -58,6 +59,13 @@ def markdown(facts: dict, rows: Sequence[dict]) -> str:
         "",
         ALIKE,
     ]
+    if facts.get("peers"):
+        peers = facts["peers"]
+        lines += [
+            f"crazyflow and JaxMARL weren't installed: their rows are those of `{peers['command']}` on {peers['device']}, "
+            f"commit {peers['commit']}, {peers['date']}, made in the same way.",
+            "",
+        ]
     if facts["stand_ins"]:
         names = ", ".join(facts["stand_ins"])
         lines += [f"Not installed and replaced by empty modules, as nothing timed uses them: {names}.", ""]
@@ -79,7 +87,9 @@ def markdown(facts: dict, rows: Sequence[dict]) -> str:
 def drone_table(rows: Iterable[dict]) -> list[str]:
     """Drone steps per second by size: crazyflow, ours, and the ratio to crazyflow's body-rate control."""
     found = {(r["worlds"], r["agents"], r["variant"]): r for r in rows if r["group"] == "drones"}
-    variants = [v for v in ("attitude", "rigid", "mjx free", "mjx") if any(key[2] == v for key in found)]
+    variants = [
+        v for v in ("attitude", "rigid free", "rigid", "mjx free", "mjx") if any(key[2] == v for key in found)
+    ]
     ours = [v for v in variants if v != "attitude"]
     heads = ["worlds", "drones each", "crazyflow body_rate"]
     heads += [f"crazyflow {v}" if v == "attitude" else v for v in variants]
@@ -101,7 +111,7 @@ def verdict(rows: Iterable[dict]) -> list[str]:
         if r["group"] == "drones"
     }
     lines = []
-    for variant in ("rigid", "mjx"):
+    for variant in ("rigid free", "rigid", "mjx"):
         ratios = {}
         for (name, worlds, agents), speed in speeds.items():
             base = speeds.get(("body_rate", worlds, agents))

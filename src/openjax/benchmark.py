@@ -1,7 +1,8 @@
 """Speed on this machine: `python -m openjax.benchmark [--envs 1024 4096] [--json FILE]`.
 
-Steps per second of the physics (rigid; MJX with and without solids), of the environment, of rollouts with the
-policy and of the whole training step, over a sweep of environment counts. Same command on CPU and GPU.
+Steps per second of the physics (rigid and MJX, each with and without solids), of the environment, of rollouts with the
+policy and of the whole training step, over a sweep of environment counts; and where a training step's time goes, beside
+what a limit would be. Same command on CPU and GPU.
 """
 
 import dataclasses
@@ -18,6 +19,7 @@ from rich.table import Table
 
 from openjax.commands.command_line import output_console, parse, peek, run_command
 from openjax.commands.machine import describe_machine
+from openjax.commands.shares import measure, shares_table
 from openjax.commands.timing import Timing, time_compiled
 from openjax.errors import UserError
 from openjax.files import check_output
@@ -31,9 +33,9 @@ from openjax.vehicle import hover_state, load_vehicle, make_drones_step
 
 PROGRAM = "python -m openjax.benchmark"
 PHYSICS = ("rigid_free", "rigid", "mjx_free", "mjx")
-PARTS = (*PHYSICS, "environment", "rollout", "training")
+PARTS = (*PHYSICS, "environment", "rollout", "training", "shares")
 
-Part = Literal["rigid_free", "rigid", "mjx_free", "mjx", "environment", "rollout", "training"]
+Part = Literal["rigid_free", "rigid", "mjx_free", "mjx", "environment", "rollout", "training", "shares"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +47,7 @@ class BenchmarkCommand:
     envs: Annotated[tuple[int, ...], Interval("[1, 16777216]")] = ()
     """Environment counts; by default a sweep that fits the machine."""
     training_envs: Annotated[tuple[int, ...], Interval("[1, 16777216]")] = ()
-    """Environment counts of the training step; by default those of --envs it can use."""
+    """Environment counts of the training step and its shares; by default those that fit the machine."""
     parts: tuple[Part, ...] = PARTS
     """What to measure."""
     steps: Annotated[int, Interval("[1, 100000]")] = 50
@@ -71,17 +73,32 @@ def main(arguments: Sequence[str]) -> int:
     check_output(command.json, "--json")
     machine = describe_machine()
     print(f"{machine['device']}, JAX {machine['versions']['jax']}, commit {machine['commit']}", flush=True)
-    rows = []
+    rows, shares = [], []
+    facts = {"command": " ".join([PROGRAM, *arguments]), "machine": machine}
+    facts["compilation_cache"] = jax.config.jax_compilation_cache_dir is not None
+
+    def write():
+        """After each measurement, so that an interrupted sweep leaves what it has."""
+        write_json(command.json, {**facts, "settings": command.settings, "rows": rows, "shares": shares})
+
+    console = output_console()
     for part, num_envs, steps, function, inputs in _cases(command):
         timing = time_compiled(function, inputs, command.seconds)
         rows.append(_row(part, num_envs, steps, command.settings, timing))
         print(_line(rows[-1]), flush=True)
-        facts = {"command": " ".join([PROGRAM, *arguments]), "machine": machine}
-        facts["compilation_cache"] = jax.config.jax_compilation_cache_dir is not None
-        # After each measurement, so that an interrupted sweep leaves what it has.
-        write_json(command.json, {**facts, "settings": command.settings, "rows": rows})
-    console = output_console()
-    console.print(results_table(rows))
+        write()
+    if rows:
+        console.print(results_table(rows))
+    for num_envs in command.training_envs if "shares" in command.parts else ():
+        fitting = _fitting(command.settings, num_envs)
+        found = measure(fitting, lambda *program: time_compiled(*program, command.seconds).seconds)
+        if not found:
+            console.print(f"shares of {fitting.num_envs:,} environments: out of memory")
+            continue
+        console.print(shares_table(found, fitting))
+        parts = [dataclasses.asdict(share) | {"limit": share.limit} for share in found]
+        shares.append({"num_envs": fitting.num_envs, "parts": parts})
+        write()
     console.print(f"written to {command.json}")
     return 0
 
@@ -90,6 +107,8 @@ def _cases(command: BenchmarkCommand) -> Iterator[tuple[str, int, int, Callable,
     """(part, environments, control steps per call, function, its arguments), made one at a time."""
     settings = command.settings
     for part in command.parts:
+        if part == "shares":
+            continue
         for num_envs in command.training_envs if part == "training" else command.envs:
             if part == "training":
                 fitting = _fitting(settings, num_envs)

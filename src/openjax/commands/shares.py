@@ -1,0 +1,233 @@
+"""Where the time of a training step goes, and what a limit would be: its parts compiled and timed each on its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from rich import box
+from rich.table import Table
+
+from openjax.learning import TrainSettings, build, init_carry, make_training_step
+from openjax.learning.collectives import own_keys
+from openjax.learning.mappo import update_policy
+from openjax.learning.predictor_update import update_predictor
+from openjax.learning.rollout import collect
+from openjax.pursuit.environment import action_to_command
+
+BANDWIDTH = 4.3e12
+"""Bytes per second that an NVIDIA H200 was measured to read or write at best ..."""
+ARITHMETIC = 790e12
+"""... and floating-point operations per second of its matrix units in bfloat16."""
+
+
+@dataclass(frozen=True)
+class Share:
+    """One part of a training step."""
+
+    part: str
+    seconds: float
+    flops: float
+    """Arithmetic of the matrix products that it can't do without."""
+    bytes: float
+    """Bytes that it can't avoid to read or write."""
+
+    @property
+    def limit(self) -> float:
+        """Seconds that arithmetic or memory of an H200 would need."""
+        return max(self.flops / ARITHMETIC, self.bytes / BANDWIDTH)
+
+
+def measure(settings: TrainSettings, seconds_of: Callable[[Callable, tuple], float | None]) -> list[Share]:
+    """Parts of the training step, of which the last is the whole; empty if one of them runs out of memory.
+
+    `seconds_of` times a function of arrays. What only shows inside a larger part is the difference of two measurements:
+    game = environment - physics, policy = rollout - environment - prediction, rest = step - all of these.
+    """
+    parts, carry = build(settings), init_carry(settings, jax.random.key(0))
+    environment, policy, steps = parts.environment, parts.policy, settings.rollout_length
+    agents = settings.num_envs * settings.environment.num_pursuers
+    noise = jax.random.normal(
+        jax.random.key(1), (steps, settings.num_envs, settings.environment.num_pursuers, policy.sample_size)
+    )
+
+    def physics(state, noise):
+        def one(drones, noise):
+            command = action_to_command(jnp.tanh(noise[..., :4]))
+            move = jax.vmap(environment.dynamics, (None, 0, 0, 0, 0, 0 if state.vehicles else None))
+            pillars = (state.task.pillar_position, state.task.pillar_active)
+            effects = {**state.vehicles, **environment.effect_parameters}
+            return move(environment.vehicle, drones, command, *pillars, effects), None
+
+        return jax.lax.scan(one, state.drones, noise)[0]
+
+    def game(state, noise):
+        def one(state, noise):
+            step = jax.vmap(environment.step, (None, 0, 0))
+            observation, state, reward, *_ = step(jax.random.key(0), state, jnp.tanh(noise[..., :4]))
+            return state, (observation.replace(frames=observation.frames[:, -1:]), reward)
+
+        return jax.lax.scan(one, state, noise)
+
+    def rollout(carry, noise):
+        return collect(environment, policy, carry.policy, carry.observation, carry.state, noise)
+
+    def prediction(carry, noise):
+        def one(carry, _):
+            # shifted a little each time, so that the loop can't be taken apart
+            observation, shift = carry
+            predicted = policy.predict(
+                parameters, observation.replace(last_seen=observation.last_seen + shift)
+            )
+            return (observation, 1e-6 * jnp.mean(predicted)), predicted
+
+        parameters = carry.policy
+        return jax.lax.scan(one, (carry.observation, jnp.zeros(())), None, length=steps)
+
+    def learn_predictor(carry, rollout):
+        keys = own_keys(jax.random.key(2), settings.num_envs, None)
+        return update_predictor(
+            policy,
+            parts.predictor_optimiser,
+            settings.environment,
+            carry.policy.predictor,
+            carry.predictor_optimiser,
+            carry.state.frames,
+            rollout,
+            keys,
+            None,
+        )
+
+    def learn_policy(carry, rollout, observation):
+        return update_policy(
+            settings.mappo,
+            policy,
+            parts.optimisers,
+            (carry.policy.actor, carry.policy.critic),
+            (carry.actor_optimiser, carry.critic_optimiser),
+            carry.value_scale,
+            rollout,
+            observation,
+            policy.predict(carry.policy, observation),
+            jax.random.key(3),
+            None,
+        )
+
+    collected, observation, _ = jax.jit(rollout)(carry, noise)
+    programs: dict[str, tuple[Callable, tuple]] = {
+        "physics": (physics, (carry.state, noise)),
+        "environment": (game, (carry.state, noise)),
+        "rollout": (rollout, (carry, noise)),
+        "policy update": (learn_policy, (carry, collected, observation)),
+        "step": (make_training_step(settings), (carry,)),
+    }
+    if settings.predictor.enabled:
+        programs["prediction"] = (prediction, (carry, noise))
+        programs["predictor update"] = (learn_predictor, (carry, collected))
+    seconds = {name: seconds_of(*program) for name, program in programs.items()}
+    if None in seconds.values():
+        return []
+    prediction_seconds = seconds.get("prediction", 0.0)
+
+    samples = agents * steps
+    forward = 2 * _products(settings, carry.policy.actor) + 2 * _products(settings, carry.policy.critic)
+    acting = 2 * _products(settings, carry.policy.actor)
+    windows = settings.predictor.windows * settings.num_envs if settings.predictor.enabled else 0
+    predicting = (
+        2 * settings.environment.history_length * sum(x.size for x in jax.tree.leaves(carry.policy.predictor))
+    )
+    observed = _bytes(carry.observation.replace(frames=())) * steps
+    update = settings.mappo.epochs
+    shares = [
+        Share("physics", seconds["physics"], 0.0, 2 * _bytes(carry.state.drones) * steps),
+        Share(
+            "game",
+            seconds["environment"] - seconds["physics"],
+            0.0,
+            2 * _bytes(carry.state.replace(drones=(), task=())) * steps + observed,
+        ),
+        Share(
+            "policy",
+            seconds["rollout"] - seconds["environment"] - prediction_seconds,
+            acting * samples,
+            2 * observed,
+        ),
+    ]
+    if settings.predictor.enabled:
+        shares += [
+            Share(
+                "prediction",
+                prediction_seconds,
+                predicting * settings.num_envs * steps,
+                _bytes(carry.observation.frames) * steps,
+            ),
+            Share(
+                "predictor's update",
+                seconds["predictor update"],
+                3 * predicting * windows,
+                _bytes(carry.observation.frames) * settings.predictor.windows,
+            ),
+        ]
+    shares.append(
+        Share(
+            "policy's update",
+            seconds["policy update"],
+            (3 * update + 1) * forward * samples,
+            (update + 1) * observed,
+        )
+    )
+    rest = seconds["step"] - sum(share.seconds for share in shares)
+    shares.append(Share("rest (tasks, resets, noise)", rest, 0.0, 0.0))
+    flops, moved = sum(share.flops for share in shares), sum(share.bytes for share in shares)
+    return [*shares, Share("step", seconds["step"], flops, moved)]
+
+
+def _bytes(tree: Any) -> int:
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
+
+
+def _products(settings: TrainSettings, parameters: Any) -> int:
+    """Multiplications of one sample in a network's matrix products, its attention with keys and values folded."""
+    network, game = settings.network, settings.environment
+    uses = {"others_kernel": game.num_pursuers - 1, "pillars_kernel": game.observed_pillars}
+    # query and output are as wide as an embedding for each head, keys and values are folded into them
+    uses |= {"query": network.heads, "output": network.heads, "key": 0, "value": 0}
+    total = 0
+    for path, leaf in jax.tree_util.tree_flatten_with_path(parameters)[0]:
+        name = path[-1].key
+        if leaf.ndim == 2 and (name == "kernel" or name in uses):
+            total += math.prod(leaf.shape) * uses.get(name, 1)
+    entities = game.num_pursuers + game.observed_pillars
+    return total + (2 * network.heads * entities * network.features if total else 0)
+
+
+def shares_table(shares: list[Share], settings: TrainSettings) -> Table:
+    """Parts of the step as a table."""
+    speed = settings.steps_per_update / shares[-1].seconds
+    title = f"Where a training step's time goes: {settings.num_envs:,} worlds, {speed:,.0f} env steps/s"
+    caption = f"limit: {BANDWIDTH / 1e12:.1f} TB/s, {ARITHMETIC / 1e12:.0f} TFLOP/s (H200) for what must be moved or multiplied"
+    table = Table(
+        title=title,
+        title_justify="left",
+        caption=caption,
+        caption_justify="left",
+        box=box.SIMPLE,
+        pad_edge=False,
+    )
+    table.add_column("part")
+    for name in ("ms", "share", "GFLOP", "GB", "limit [ms]"):
+        table.add_column(name, justify="right")
+    for share in shares:
+        table.add_row(
+            share.part,
+            f"{share.seconds * 1e3:,.2f}",
+            f"{share.seconds / shares[-1].seconds:.0%}",
+            f"{share.flops / 1e9:,.1f}",
+            f"{share.bytes / 1e9:,.2f}",
+            f"{share.limit * 1e3:,.2f}",
+        )
+    return table
