@@ -111,9 +111,7 @@ def close_chunk(job):
 
 def close_all(answers, predictions, jobs=1, chunk=8):
     """{case: share closed} of the single causes and pairs that the logs show."""
-    specs = {
-        s["name"]: s for s in cases.draw_cases(answers["seed"], answers["column"], len(answers["cases"]))
-    }
+    specs = {s["name"]: s for s in cases.draw_cases(answers["seed"], answers["column"], answers["count"])}
     rows = []
     for name, answer in answers["cases"].items():
         report = (predictions.get(name) or {}).get("report")

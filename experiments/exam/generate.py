@@ -342,13 +342,14 @@ def generate(seed, column, count, logs, jobs=1, only=None, chunk=8, progress=Tru
     return sorted(answers, key=lambda a: a["case"])
 
 
-def write_answers(path, answers, seed, column):
+def write_answers(path, answers, seed, column, count=None):
     """Write the answers as JSON; returns the SHA-256 of the file."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     text = json.dumps(
         {
             "seed": seed,
+            "count": count or len(answers),  # of the plan that these cases are of
             "column": column,
             "channels": measure.CHANNELS,
             "cases": {a["case"]: a for a in answers},
@@ -381,7 +382,7 @@ def main():
     answers = generate(
         options.seed, options.column, options.count, options.logs, options.jobs, only, names=names
     )
-    print("sha256", write_answers(options.answers, answers, options.seed, options.column))
+    print("sha256", write_answers(options.answers, answers, options.seed, options.column, options.count))
 
 
 if __name__ == "__main__":

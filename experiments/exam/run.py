@@ -5,7 +5,8 @@
 
 Seeds below 100 are for development; the stranger's column is for reported runs. What a seed draws (categories, causes,
 sensors, vehicles, missions; before anything is flown) has a digest in `exam_plans.json`, committed before the run; the
-digest of the answers is on disk before the first diagnosis. Needs no network and no GPU.
+digest of the answers is on disk before the first diagnosis. A column whose `answers.json` lies in the work folder is taken as
+it is: `generate --cases` makes a part of a plan. Needs no network and no GPU.
 """
 
 import argparse
@@ -70,25 +71,13 @@ def sit(column, options, count):
     """One column: generate, seal, diagnose, score. Returns what is stored of it."""
     work = options.work / column
     logs, answers, out = work / "logs", work / "answers.json", work / "diagnoses"
-    if column == "rotorpy":
-        step(
-            "rotorpy_cases",
-            "--seed",
-            options.seed,
-            "--each",
-            count,
-            "--logs",
-            logs,
-            "--answers",
-            answers,
-            "--jobs",
-            options.jobs,
-        )
+    made = ["--seed", options.seed, "--logs", logs, "--answers", answers, "--jobs", options.jobs]
+    if answers.exists():
+        print(f"{column}: the cases in {work}", flush=True)
+    elif column == "rotorpy":
+        step("rotorpy_cases", "--each", count, *made)
     else:
-        step(
-            "generate", "--seed", options.seed, "--column", column, "--count", count, "--logs", logs, "--answers", answers,
-            "--jobs", options.jobs,
-        )  # fmt: skip
+        step("generate", "--column", column, "--count", count, *made)
     digest = answers.with_suffix(".sha256").read_text().strip()
     print(f"{column}: answers {digest}", flush=True)
     limit = ["--seconds", options.seconds] if options.seconds else []
@@ -200,7 +189,7 @@ def main():
     wanted = {"stranger": options.stranger, "rotorpy": options.rotorpy, "known": options.known}
     if not any(wanted.values()):
         parser.error("say how many cases: --known, --stranger or --rotorpy")
-    if options.work.exists() and any(options.work.iterdir()):
+    if any((options.work / column / "diagnoses").exists() for column in wanted):
         parser.error(f"{options.work} already holds a run: remove it or give another --work")
     data = {"facts": facts(options), "columns": {}}
     results = options.results or options.work / "exam"

@@ -279,7 +279,12 @@ def test_written_cases_can_be_read_and_say_what_they_hold(tmp_path, monkeypatch)
         else:  # the truth, said by a report, closes the whole gap
             scale = {"scale": {"value": answer["causes"][0]["magnitudes"]["scale"]}}
             report = {"effects": ["thrust_scale"], "parameters": {"thrust_scale": scale}}
-            sealed = {"seed": 5, "column": "known", "cases": {answer["case"]: answer | {"severity": "high"}}}
+            sealed = {
+                "seed": 5,
+                "column": "known",
+                "count": 2,
+                "cases": {answer["case"]: answer | {"severity": "high"}},
+            }
             share = closed.close_all(sealed, {answer["case"]: {"report": report}})[answer["case"]]
             assert share == pytest.approx(1.0, abs=0.05)
         mass = answer["told"]["mass"]
