@@ -3,6 +3,7 @@ Masalimov et al., Data 2024, 9(6), 79), micro-SD logs of two Crazyflies without 
 
     python experiments/changes.py open FOLDER      # conditions in folders, labels.json: table with the truth beside
     python experiments/changes.py answer FOLDER    # reference/ and case_*/: answers alone, as JSON
+    python experiments/changes.py figure FOLDER    # flies three days into an empty folder: the figure of docs/what_changed.md
 
 `open` compares every condition with all normal flights, and each day of normal flights with the other days; the table
 goes to experiments/results/changes_e8.md. `answer` writes experiments/results/changes_e9.json. Nothing is fitted to
@@ -17,10 +18,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 from scipy.stats import spearmanr
 
+from openjax.flights.reading import write_csv
 from openjax.gap import changes
-from openjax.gap.changes_report import prediction
+from openjax.gap.changes_report import draw, in_words, prediction
+from openjax.gap.samples import fly, log_of, references
+from openjax.vehicle import load_vehicle
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -106,8 +111,23 @@ def open_table(folder: Path) -> str:
     return "\n".join([*lines, "", *figures])
 
 
+def figure(folder: Path) -> list[str]:
+    """Two normal days, whose rotors differ by 2 % as new propellers do, and one with rotor 3 weaker by 22 %."""
+    vehicle, rng = load_vehicle(), np.random.default_rng(3)
+    for seed, (name, weaker) in enumerate({"friday": 0.0, "monday": 0.0, "tuesday": 0.22}.items(), 1):
+        (folder / name).mkdir(parents=True)
+        factors = 0.02 * rng.standard_normal(4) - weaker * np.array([0.0, 0.0, 1.0, 0.0])
+        effects = {"motor_imbalance": {f"m{i}": float(f) for i, f in enumerate(factors, 1)}}
+        for k, (flight, reference) in enumerate(references(seed=seed, duration=8.0).items()):
+            columns = fly(vehicle, vehicle, reference, 10 * seed + k, effects)
+            write_csv(folder / name / f"{flight}.csv.gz", log_of(columns, flight))
+    change = changes.compare(folder / "tuesday", [folder / "friday", folder / "monday"])
+    draw(change).savefig(Path(__file__).parents[1] / "docs" / "what_changed.png", dpi=90)
+    return in_words(change)
+
+
 def main() -> None:
-    """Run one of the two."""
+    """Run one of the three."""
     what, folder = sys.argv[1], Path(sys.argv[2])
     if what == "open":
         text = (
@@ -117,6 +137,8 @@ def main() -> None:
             "motors and of the controller together; no orientation, in motor logs no gyroscope.\n\n"
         )
         (RESULTS / "changes_e8.md").write_text(text + open_table(folder) + "\n", encoding="utf-8")
+    elif what == "figure":
+        print("\n".join(figure(folder)))
     else:
         found = {
             "commit": commit(),

@@ -72,14 +72,15 @@ def in_words(change: Change) -> list[str]:
     """The answer in a few plain sentences."""
     lines = []
     if change.trims_changed:
-        what = " or ".join(_cause_in_words(change, cause) for cause in change.likely_causes)
+        told = list(dict.fromkeys(_cause_in_words(change, cause) for cause in change.likely_causes))
+        what = " or ".join(told)
         lines.append(f"The vehicle changed (probability {change.probability:.2f}): {what}.")
         low, high = change.size.low, change.size.high
         lines.append(
             f"Size: {100 * change.size.value:.0f} % [{100 * low:.0f}, {100 * high:.0f}] of a rotor's thrust"
             + (" lost." if change.size.value > 0 else " (negative: it got stronger or lighter).")
         )
-        if len(change.likely_causes) > 1:
+        if len(told) > 1:
             lines.append(
                 "These flights can't split the causes named; a weighed vehicle or another propeller would."
             )
@@ -116,9 +117,9 @@ def in_words(change: Change) -> list[str]:
 def _cause_in_words(change: Change, cause: str) -> str:
     rotors = " and ".join(str(r) for r in change.rotors)
     weaker = "weaker" if change.size.value > 0 else "stronger"
+    if len(change.rotors) == 1 and cause.endswith("weaker"):
+        return f"rotor {rotors} ({change.side}) is {weaker}"
     if cause == "one rotor weaker":
-        if len(change.rotors) == 1:
-            return f"rotor {rotors} ({change.side}) is {weaker}"
         return f"one of rotors {rotors} ({change.side}) is {weaker}"
     if cause == "two rotors weaker":
         return f"rotors {rotors} ({change.side}) are {weaker}"
