@@ -153,7 +153,7 @@ def _clear_gains(rate_loop: LinearPath | None, library: Library):
     if rate_loop is None or "rate_gains" not in library.effects:
         return None
     score, theta, _ = rate_loop.score()
-    return np.clip(theta, -0.7, 1.5) if score > CLEAR_GAINS and firmware.lost_share(theta) == 0.0 else None
+    return np.clip(theta[:3], -0.7, 1.5) if score > CLEAR_GAINS else None
 
 
 def _physics(

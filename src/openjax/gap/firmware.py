@@ -17,14 +17,9 @@ from openjax.gap.replay import bucket, padded
 from openjax.vehicle.rate_controller import mixer
 
 GAIN_STEP = 0.05
-# For p, i, d: the share that the replay's step can imitate, and what gyro noise does per row (measured on
-# nominal flights of the tuning plant).
-GAIN_TOLERANCE = ((0.02, 0.3), (0.4, 0.004), (0.12, 0.1))
-# Where a loop seems to have lost so much of its D gain (all of it, or none), and more of it than of its P gain by this
-# factor, it saw other rates than the log: noise or a late or lost command weakens the fastest column most.
-LOST_D = (-0.4, -0.3)
-LOST_RATIO = (1.2, 1.0)
-USUAL_GYRO_NOISE = 0.0165  # rad/s, of those flights by `gyro_noise`
+GAIN_SPREAD = 0.4
+# Share of a gain that a firmware's own filters and limits may imitate, for p, i, d.
+GAIN_TOLERANCE = (0.02, 0.4, 0.15)
 GYRO_TILT = 0.01  # rad, between the logged gyro and the one that the controller uses
 FILTER_DELAY = 0.003  # s, of low-passes in the firmware
 LONGEST_DELAY = 0.1  # s
@@ -174,21 +169,6 @@ def _observe_twice(track: Track, vehicle, link, gains, push=None):
     return np.asarray(wanted, float)[:, :rows], np.asarray(sent[0])[:rows]
 
 
-def gyro_noise(rates: np.ndarray) -> float:
-    """White noise of a gyroscope log (T, 3), rad/s: from third differences, which motion hardly reaches at
-    100 Hz."""
-    return float(1.4826 * np.median(np.abs(np.diff(rates, 3, axis=0))) / np.sqrt(20.0))
-
-
-def lost_share(theta) -> float:
-    """How far (0 to 1) changes of the gains p, i, d look like a loop that saw other rates than the log."""
-    p, _, d = theta
-    if p >= 0.0 or d >= 0.0:
-        return 0.0
-    parts = [(v - none) / (whole - none) for v, (whole, none) in ((d, LOST_D), (d / p, LOST_RATIO))]
-    return float(np.prod(np.clip(parts, 0.0, 1.0)))
-
-
 @dataclass(frozen=True, eq=False)
 class RateLoop:
     """The rate controller read from what the motors differ by: `path` for its gains; the motor commands
@@ -213,8 +193,10 @@ def read_rate_loop(tracks, vehicles, arrived, flight_of, pushes=None, base=(0.0,
         ticks.append(sent)
         outputs = np.linalg.pinv(np.asarray(mixer(vehicle), float)).T  # motors to roll, pitch, yaw
         demand, logged = wanted @ outputs, track.motor @ outputs
-        columns.append((demand[1:] - demand[0]) / GAIN_STEP)
-        y.append(logged - demand[0] + np.tensordot(base, columns[-1], 1))
+        tied = (demand[1:] - demand[0]) / GAIN_STEP
+        # Yaw has gains of its own.
+        columns.append(np.concatenate([tied * [1.0, 1.0, 0.0], tied * [0.0, 0.0, 1.0]]))
+        y.append(logged - demand[0] + np.tensordot(base, tied, 1))
         time = (track.time - track.time[0])[:, None]
         integral = np.asarray(vehicle.rate_ki, float) * 57.3 / 65536.0
         seen = np.stack([np.cross(axis, track.body_rates) for axis in np.eye(3)]) * GYRO_TILT
@@ -226,13 +208,11 @@ def read_rate_loop(tracks, vehicles, arrived, flight_of, pushes=None, base=(0.0,
             for f in (0.3 * axis * np.ones_like(logged), 0.03 * axis * integral * time)
         ]
         # Low-passes before the gains delay what they act on, by times that aren't known.
-        trims += [FILTER_DELAY * np.gradient(columns[-1][k], track.dt, axis=0) for k in (0, 2)]
+        trims += [FILTER_DELAY * np.gradient(tied[k], track.dt, axis=0) for k in (0, 2)]
         nuisances.append(np.stack(trims))
         clean = ((track.motor < 0.997) & (track.motor > 0.003)).all(1)
         masks.append(1.0 - (np.convolve(~clean, np.ones(12))[: len(clean)] > 0))
-    noise = np.mean([gyro_noise(t.body_rates) for t in tracks])
-    worse = float(np.clip((noise / USUAL_GYRO_NOISE) ** 2, 0.5, 10.0))
-    tolerance = tuple((least, per_row * worse) for least, per_row in GAIN_TOLERANCE)
     groups = (((0, 1), False), ((2,), False))
-    path = fit_linear_path(y, columns, nuisances, flight_of, (0.4, 0.4, 0.4), groups, masks, tolerance)
+    spread = (GAIN_SPREAD,) * 6
+    path = fit_linear_path(y, columns, nuisances, flight_of, spread, groups, masks, 2 * GAIN_TOLERANCE)
     return RateLoop(path, ticks)

@@ -44,10 +44,7 @@ def fit_linear_path(
     """Fit tracks' y [(T, A)], columns [(P, T, A)], nuisances [(N, T, A)] (unit prior variance).
 
     groups: ((axes, integrated), ...) that share a noise model; masks [(T,)] are 0 in rows that must not
-    count. tolerance ((least share, noise per row), ...) for each coefficient: how far it may be off
-    without a cause, per flight. The second number is what noise in the column does (errors in variables):
-    it pulls a coefficient down by that number divided by the column's mean square, so calm flights say
-    little."""
+    count. tolerance (P,): share of each coefficient by which it may be off without a cause, per flight."""
     spread = np.asarray(spread, float)
     size = 1 + len(spread)
     flights = int(np.max(flight_of)) + 1
@@ -63,11 +60,7 @@ def fit_linear_path(
             rows += int(w.shape[1] if masks is None else masks[number][skip:].sum()) * w.shape[2]
             w = w.reshape(len(w), -1)
             if tolerance is not None:
-                per_row = [
-                    r * w.shape[1] / max(c @ c, 1e-9) for (_, r), c in zip(tolerance, w[1:size], strict=True)
-                ]
-                shares = [max(least, share) for (least, _), share in zip(tolerance, per_row, strict=True)]
-                w = np.concatenate([w, w[1:size] * np.array(shares)[:, None]])
+                w = np.concatenate([w, w[1:size] * np.array(tolerance)[:, None]])
             whitened.append(w)
             grams[flight_of[number]] += marginal_gram(whitened[-1][:size], whitened[-1][size:])
         _, theta, _ = linear_score(grams.sum(0), spread)

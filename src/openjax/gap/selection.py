@@ -241,6 +241,9 @@ def _swapped(replay, fit, table, now, singles):
         commoner = CARDS[effect].commoner
         if gains.get(commoner, -np.inf) > -CLASS:
             favoured[commoner] += CLASS + LEAST_NATS
+        for other in favoured:
+            if CARDS[other].commoner == effect:
+                favoured[other] -= CLASS
         best = max(favoured, key=favoured.get, default=None)
         if best is not None and favoured[best] > LEAST_NATS:
             ahead = gains.pop(best)

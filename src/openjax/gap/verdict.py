@@ -16,7 +16,7 @@ from openjax.vehicle.effects import EFFECTS
 CLOCK = 0.003  # s by which the clocks of a log may differ
 CLEAR = 3.0  # standard errors
 LEAST_LOSS = 0.01  # of the packets
-LEAST_CHANGE = 0.05  # of a gain
+LEAST_CHANGE = 0.07  # of a gain: filters of a firmware do less
 FOLLOWED = 0.2  # of a channel's rest that follows something in the log: something is left to explain
 UNKNOWN_SHARE = 0.2  # of the gap, from which an unexplained rest is named beside the effects
 TEMPERATURE = (
@@ -49,16 +49,17 @@ def other_paths(evidence: Evidence) -> list[str]:
                 found.append(name)
     if evidence.rate_loop is not None and "rate_gains" in known:
         path = evidence.rate_loop
-        nats, theta, covariance = path.score()
-        clear = np.abs(theta) > np.maximum(CLEAR * np.sqrt(np.diag(covariance)), LEAST_CHANGE)
+        _, theta, covariance = path.score()
+        # Integral gains follow trims and clamps; P and D tell.
+        clear = (np.abs(theta) > np.maximum(CLEAR * np.sqrt(np.diag(covariance)), LEAST_CHANGE))[[0, 2, 3, 5]]
         before, after = (
             np.mean(
                 [(smooth(r, 0.05, t.dt) ** 2).mean(0) for r, t in zip(rest, evidence.tracks, strict=True)], 0
             )
             for rest in (path.before, path.residual)
         )
-        material = float(np.mean(before / after)) - 1.0 > 2.0 * LEAST_GAIN
-        if nats > LEAST_NATS * TEMPERATURE and clear.any() and material:
+        material = float(np.mean(before / after)) - 1.0 > LEAST_GAIN
+        if clear.any() and material:
             found.append("rate_gains")
     if evidence.pose is not None and "state_latency" in known:
         nats, delay, covariance = evidence.pose.score()
