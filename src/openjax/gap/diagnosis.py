@@ -183,6 +183,10 @@ def _nuisances(evidence: Evidence, selection: Selection) -> dict[str, str]:
 
 # Shared nuisances beyond the vehicle's numbers, in the replay's order.
 SHARED = [
+    "feedback, roll and pitch",
+    "feedback, yaw",
+    "feedback's lag, roll and pitch",
+    "feedback's lag, yaw",
     *(f"frame tilt {a}" for a in "xy"),
     *(f"IMU tilt {a}" for a in "xyz"),
     *(f"gyroscopic torque {a}" for a in "xyz"),

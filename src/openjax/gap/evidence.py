@@ -79,7 +79,9 @@ def gather(case: Case, library: Library, progress=None) -> Evidence:
     late = "state_latency" in library.effects
     pose, tracks = _pose(tracks, flight_of, late)
     sensors = read_kinematics(tracks)
-    if sensors.findings:
+    if not sensors.one_clock:
+        pose = None
+    if sensors.upright is not None or sensors.findings:
         tracks = [corrected(t, sensors) for t in tracks]
         if pose is not None:
             pose = estimator.read_estimator(tracks, flight_of) if not _late(pose) else pose
@@ -88,6 +90,8 @@ def gather(case: Case, library: Library, progress=None) -> Evidence:
     if all(t.command is not None and t.motors_logged for t in tracks):
         radio = firmware.read_radio(tracks)
         allowed = {k: v for k, v in radio.gain.items() if all(e in library.effects for e in k)}
+        if not radio.readable:
+            allowed = {(): 0.0}
         arrived = radio.arrived[max(allowed, key=lambda k: allowed[k] - RADIO_COST * len(k))]
     lap("paths")
     tell("replaying the flights")
@@ -165,7 +169,9 @@ def _physics(
         base = np.zeros(3) if gains is None else gains
         loop = firmware.read_rate_loop(tracks, vehicles, arrived, flight_of, pushes, base)
         rate_loop, ticks = loop.path, loop.ticks
-    replay = make_replay(tracks, vehicles, ticks, numbers, one_clock)
+    links = arrived if arrived is not None else [None] * len(tracks)
+    back = [firmware.fed_back(t, v, link) for t, v, link in zip(tracks, vehicles, links, strict=True)]
+    replay = make_replay(tracks, vehicles, ticks, back, numbers, one_clock)
     floor, exposure = model_noise(replay, library)
     for effect in library.physics:
         needs = CARDS[effect].needs

@@ -9,15 +9,17 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import lfilter
 
 from openjax.flights.track import Track, smooth
 from openjax.gap.linear_path import LinearPath, fit_linear_path
-from openjax.gap.observer import GYRO_GAIN, TICKS, observe
+from openjax.gap.observer import GYRO_GAIN, TICKS, commanded, observe
 from openjax.gap.replay import bucket, padded
 from openjax.vehicle.rate_controller import mixer
 
 GAIN_STEP = 0.05
 GAIN_SPREAD = 0.4
+SLOW = 0.06  # s over which commands implied by motors and rates are smoothed
 # Share of a gain that a firmware's own filters and limits may imitate, for p, i, d.
 GAIN_TOLERANCE = (0.02, 0.4, 0.15)
 GYRO_TILT = 0.01  # rad, between the logged gyro and the one that the controller uses
@@ -25,6 +27,7 @@ FILTER_DELAY = 0.003  # s, of low-passes in the firmware
 LONGEST_DELAY = 0.1  # s
 DELAY_STEP = 0.0005  # s
 TOLERANCE = 3e-4  # of thrust: rounding of the logs and of the firmware's integers
+READABLE = 3e-3  # of thrust: mean misfit above which motors and commands aren't one stream
 INFORMATIVE = 1.5e-3  # smallest change of commanded thrust that shows whether a packet arrived
 
 
@@ -41,6 +44,22 @@ class Radio:
     arrived: dict
     misfit: dict
     informative: int
+
+    @property
+    def readable(self) -> bool:
+        """Whether the motors' stream follows the commands closely enough to tell single packets."""
+        return self.misfit["command_latency", "packet_loss"] < READABLE
+
+    def shown(self, known, clock: float, least_loss: float, least: float) -> tuple[str, ...]:
+        """Of the effects `known` those that the link shows: a delay beyond what clocks may differ by, more lost packets
+        than a share `least_loss` and a number `least`. A delay that jitters looks like lost packets."""
+        if not self.readable:
+            return ()
+        late = "command_latency" in known and self.delay > clock
+        lost = "packet_loss" in known and self.loss > least_loss and self.loss * self.informative > least
+        if late and self.misfit["command_latency", "packet_loss"] > 3.0 * TOLERANCE:
+            lost = False
+        return tuple(n for n, on in (("command_latency", late), ("packet_loss", lost)) if on)
 
 
 def read_radio(tracks: list[Track]) -> Radio:
@@ -169,6 +188,41 @@ def _observe_twice(track: Track, vehicle, link, gains, push=None):
     return np.asarray(wanted, float)[:, :rows], np.asarray(sent[0])[:rows]
 
 
+def fed_back(track: Track, vehicle, link=None) -> np.ndarray:
+    """Angular acceleration (T, 3), rad/s^2, of the part of the motor commands that commands didn't cause: feedback of
+    gyroscope noise and gusts.
+
+    In closed loop the motors answer what pushes the body, so a model that makes them weak predicts better than the true
+    one; only what commands cause tells how strong they are. Where no commands were logged, the nominal controller's
+    law says which ones its motors and rates imply, slowly."""
+    rows, size = len(track), bucket(len(track))
+    outputs = np.linalg.pinv(np.asarray(mixer(vehicle), float)).T
+    if track.command is not None:
+        sent = track.command if link is None else in_force(track, link).mean(1)
+    else:
+        gain = np.asarray(vehicle.rate_kp, float) * 57.3 / 65536.0
+        implied = track.motor @ outputs / gain + track.body_rates
+        sent = np.concatenate(
+            [track.motor.mean(1)[:, None], smooth(implied - implied.mean(0), SLOW, track.dt)], 1
+        )
+    caused = np.asarray(commanded(vehicle, padded(sent, size), np.float32(track.dt)), float)[:rows]
+    rest = track.motor - caused
+    rest = rest - rest.mean(0)
+    blend = -np.expm1(-track.dt / float(vehicle.motor_time_constant))
+    pushed = lfilter([blend], [1.0, blend - 1.0], rest, axis=0)
+    thrust = pushed * float(vehicle.thrust_constant * vehicle.max_rotor_speed**2)
+    place, spin = np.asarray(vehicle.rotor_position, float), np.asarray(vehicle.rotor_spin, float)
+    ratio = float(vehicle.torque_constant / vehicle.thrust_constant)
+    torque = np.stack([thrust @ place[:, 1], -thrust @ place[:, 0], ratio * (thrust @ spin)], 1)
+    return torque / np.asarray(vehicle.inertia, float)
+
+
+def gyro_noise(rates: np.ndarray) -> float:
+    """White noise of a gyroscope log (T, 3), rad/s: from third differences, which motion hardly reaches at
+    100 Hz."""
+    return float(1.4826 * np.median(np.abs(np.diff(rates, 3, axis=0))) / np.sqrt(20.0))
+
+
 @dataclass(frozen=True, eq=False)
 class RateLoop:
     """The rate controller read from what the motors differ by: `path` for its gains; the motor commands
@@ -186,7 +240,7 @@ def read_rate_loop(tracks, vehicles, arrived, flight_of, pushes=None, base=(0.0,
     around which the loop is linearised."""
     base = np.asarray(base, float)
     gains = (1.0 + base + np.concatenate([np.zeros((1, 3)), GAIN_STEP * np.eye(3)])).astype(np.float32)
-    y, columns, nuisances, masks, ticks = [], [], [], [], []
+    y, columns, nuisances, masks, ticks, noise = [], [], [], [], [], []
     for number, (track, vehicle, link) in enumerate(zip(tracks, vehicles, arrived, strict=True)):
         push = None if pushes is None else pushes[number]
         wanted, sent = _observe_twice(track, vehicle, link, gains, push)
@@ -197,6 +251,14 @@ def read_rate_loop(tracks, vehicles, arrived, flight_of, pushes=None, base=(0.0,
         # Yaw has gains of its own.
         columns.append(np.concatenate([tied * [1.0, 1.0, 0.0], tied * [0.0, 0.0, 1.0]]))
         y.append(logged - demand[0] + np.tensordot(base, tied, 1))
+        # What the gyroscope's noise does to the columns: a second dose of it, drawn.
+        dose = gyro_noise(track.body_rates) * np.random.default_rng(number).standard_normal(
+            track.body_rates.shape
+        )
+        noisy = dataclasses.replace(track, body_rates=track.body_rates + dose)
+        loud = _observe_twice(noisy, vehicle, link, gains, push)[0] @ outputs
+        more = (loud[1:] - loud[0]) / GAIN_STEP - tied
+        noise.append(np.concatenate([more * [1.0, 1.0, 0.0], more * [0.0, 0.0, 1.0]]))
         time = (track.time - track.time[0])[:, None]
         integral = np.asarray(vehicle.rate_ki, float) * 57.3 / 65536.0
         seen = np.stack([np.cross(axis, track.body_rates) for axis in np.eye(3)]) * GYRO_TILT
@@ -214,5 +276,5 @@ def read_rate_loop(tracks, vehicles, arrived, flight_of, pushes=None, base=(0.0,
         masks.append(1.0 - (np.convolve(~clean, np.ones(12))[: len(clean)] > 0))
     groups = (((0, 1), False), ((2,), False))
     spread = (GAIN_SPREAD,) * 6
-    path = fit_linear_path(y, columns, nuisances, flight_of, spread, groups, masks, 2 * GAIN_TOLERANCE)
+    path = fit_linear_path(y, columns, nuisances, flight_of, spread, groups, masks, 2 * GAIN_TOLERANCE, noise)
     return RateLoop(path, ticks)

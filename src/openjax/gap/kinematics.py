@@ -20,8 +20,9 @@ SLOW = 2.0  # Hz, below which path and accelerometer are compared
 GRAVITY = 9.81  # m/s^2
 GAIN_BOUND = 0.03  # a gyroscope's gain may be off by so much
 TILT_BOUND = np.radians(1.5)  # of the world against gravity
+SEEN = 3.0  # standard errors from which a tilt is taken off, finding or not
 CLEAR = 5.0  # jackknife standard errors by which a finding must exceed nothing
-LEAST_RATE = 0.2  # rad/s rms in the band: an axis that hardly turns shows no gain
+LEAST_RATE = 0.1  # rad/s rms in the band: an axis that hardly turns shows no gain
 COHERENT = 0.97  # correlation below which the two streams don't fit well enough to compare gains
 ONE_CLOCK = 0.93  # below which they don't share a clock
 EDGE = 0.3  # s at either end that the filters spoil
@@ -41,6 +42,13 @@ class Kinematics:
     coherence: np.ndarray
     turning: np.ndarray
     findings: dict[str, str]
+
+    @property
+    def upright(self) -> np.ndarray | None:
+        """Rotation (2,) rad about x and y that puts the world upright, where its tilt is clear, however small."""
+        if self.tilt is None or float(np.hypot(*self.tilt)) < SEEN * float(np.hypot(*self.tilt_error)):
+            return None
+        return -self.tilt
 
     @property
     def one_clock(self) -> bool:
@@ -81,8 +89,8 @@ def corrected(track: Track, found: Kinematics) -> Track:
     changes = {}
     if "gyroscope gain" in found.findings:
         changes["body_rates"] = track.body_rates / np.where(np.isfinite(found.gain), found.gain, 1.0)
-    if "world tilt" in found.findings:
-        x, y = -found.tilt  # small rotation that puts the world upright
+    if found.upright is not None:
+        x, y = found.upright  # small rotation that puts the world upright
         turn = np.array([[1.0, 0.0, y], [0.0, 1.0, -x], [-y, x, 1.0]])
         changes["position"] = track.position @ turn.T
         changes["velocity"] = track.velocity @ turn.T

@@ -39,12 +39,14 @@ def linear_score(gram: np.ndarray, spread: np.ndarray) -> tuple[float, np.ndarra
 
 
 def fit_linear_path(
-    y, columns, nuisances, flight_of, spread, groups, masks=None, tolerance=None, skip: int = 20
+    y, columns, nuisances, flight_of, spread, groups, masks=None, tolerance=None, noise=None, skip: int = 20
 ):
     """Fit tracks' y [(T, A)], columns [(P, T, A)], nuisances [(N, T, A)] (unit prior variance).
 
     groups: ((axes, integrated), ...) that share a noise model; masks [(T,)] are 0 in rows that must not
-    count. tolerance (P,): share of each coefficient by which it may be off without a cause, per flight."""
+    count. tolerance (P,): share of each coefficient by which it may be off without a cause, per flight; noise [(P, T, A)]:
+    a draw of what noise does to the columns, which pulls a coefficient down by its share of the column's power (errors in
+    variables), so calm flights say little."""
     spread = np.asarray(spread, float)
     size = 1 + len(spread)
     flights = int(np.max(flight_of)) + 1
@@ -60,7 +62,14 @@ def fit_linear_path(
             rows += int(w.shape[1] if masks is None else masks[number][skip:].sum()) * w.shape[2]
             w = w.reshape(len(w), -1)
             if tolerance is not None:
-                w = np.concatenate([w, w[1:size] * np.array(tolerance)[:, None]])
+                shares = np.array(tolerance)
+                if noise is not None:
+                    n = whiten(noises, noise[number])[:, skip:]
+                    n = n * (1.0 if masks is None else masks[number][skip:, None])
+                    shares = np.maximum(
+                        shares, (n**2).sum((1, 2)) / np.maximum((w[1:size] ** 2).sum(1), 1e-12)
+                    )
+                w = np.concatenate([w, w[1:size] * shares[:, None]])
             whitened.append(w)
             grams[flight_of[number]] += marginal_gram(whitened[-1][:size], whitened[-1][size:])
         _, theta, _ = linear_score(grams.sum(0), spread)

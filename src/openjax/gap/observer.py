@@ -72,3 +72,29 @@ def observe(gains, vehicle, command, motor, gyro, disturbance, dt):
     return jax.vmap(_observe, in_axes=(0, None, None, None, None, None, None))(
         gains, vehicle, command, motor, gyro, disturbance, dt
     )
+
+
+@jax.jit
+def commanded(vehicle, command, dt):
+    """Mean motor commands (T, 4) that the body-rate commands (T, 4) alone cause: the nominal loop around the nominal
+    vehicle, without gyroscope noise and air."""
+    h = dt / TICKS
+    at_rest = jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0])
+
+    def tick(carry, command):
+        rates, previous, integral, speed = carry
+        state = DroneState(*at_rest, jnp.zeros(3), rates, speed, integral, previous, ())
+        given, integral = rate_controller(vehicle, state, command, h)
+        given = jnp.clip(given, 0.0, 1.0)
+        speed = rotor_speed_step(vehicle, speed, given, h)
+        _, torque = total_wrench(vehicle, rotor_thrust(vehicle, speed), rotor_reaction(vehicle, speed))
+        after = rates + h * (torque - jnp.cross(rates, vehicle.inertia * rates)) / vehicle.inertia
+        return (after, rates, integral, speed), given
+
+    def row(carry, command):
+        carry, given = jax.lax.scan(lambda c, _: tick(c, command), carry, None, length=TICKS)
+        return carry, given.mean(0)
+
+    speed = vehicle.max_rotor_speed * jnp.sqrt(jnp.clip(jnp.full(4, command[0, 0]), 1e-4, 1.0))
+    start = (command[0, 1:], command[0, 1:], jnp.zeros(3), speed)
+    return jax.lax.scan(row, start, command)[1]

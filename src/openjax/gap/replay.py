@@ -35,6 +35,9 @@ DAMPING = 0.15  # 1/s, of the body rates by what the rotors do
 APART = 0.03  # s, the same of motor commands whose stream isn't on the pose's clock
 ACCELEROMETER_BIAS = 0.4  # m/s^2
 POSE_SHIFT = 0.0015  # s between motion capture and the vehicle's clock
+FEEDBACK = 0.5  # of the strength of what feedback makes of the motor commands
+FEEDBACK_LAG = 0.015  # s of the same
+FEEDBACK_COLUMNS = 4
 WAKE_TORQUE = 15.0  # rad/s^2 at the edge of another vehicle's wake, which no simple form of it has right
 WAKE_WIDTHS = (0.05, 0.1)  # m
 
@@ -90,6 +93,7 @@ class Replay:
         own = len(self.numbers)
         shared = np.ones(count, bool)
         shared[own] = False  # the motors' clock
+        own += FEEDBACK_COLUMNS
         shared[own + 3 : own + 6] = False  # accelerometer bias
         if self.usable[3]:
             shared[own + 16] = False  # pose clock
@@ -152,10 +156,11 @@ def _integrated(rows: np.ndarray, dt: float) -> np.ndarray:
     return np.concatenate([integral, specific], 2)
 
 
-def make_replay(tracks, vehicles, motor_ticks, numbers=NUISANCES, one_clock=True) -> Replay:
-    """Replay of tracks with their nominal vehicles and motor commands (T, TICKS, 4) of the rate loop's ticks.
-    Without `one_clock` the IMU's stream and the motors' are apart by unknown times: the IMU counts nothing, and the motors
-    may be off by tens of milliseconds."""
+def make_replay(tracks, vehicles, motor_ticks, fed_back, numbers=NUISANCES, one_clock=True) -> Replay:
+    """Replay of tracks with their nominal vehicles and motor commands (T, TICKS, 4) of the rate loop's ticks; fed_back
+    [(T, 3)]: angular acceleration of what feedback made of them, whose strength and lag are free. Without `one_clock`
+    the IMU's stream and the motors' are apart by unknown times: the IMU counts nothing, and the motors may be off by
+    tens of milliseconds."""
     paths = [jax.device_put(_path(t, m)) for t, m in zip(tracks, motor_ticks, strict=True)]
     measured = [_measured(t) for t in tracks]
     usable = np.ones(9)
@@ -186,7 +191,9 @@ def make_replay(tracks, vehicles, motor_ticks, numbers=NUISANCES, one_clock=True
         base, *moved = replay.predict(batch, number)[0]
         replay.nominal.append(base)
         columns = [(m - base) * s for m, s in zip(moved, spread / STEP[index], strict=True)]
-        columns += _sensor_nuisances(track, paths[number], base)
+        columns += _feedback_nuisances(track, fed_back[number]) + _sensor_nuisances(
+            track, paths[number], base
+        )
         replay.nuisances.append(np.stack(columns))
     replay.set_noise([first_noise(a, i, d) for (a, i), d in zip(GROUPS, FIRST_NOISE, strict=True)])
     return replay
@@ -273,6 +280,18 @@ def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> list[np.
         column[:, VELOCITY] += smooth(np.gradient(track.velocity, track.dt, axis=0), 0.05, track.dt)
         columns.append(column * POSE_SHIFT)
     return columns + [torque_channels(t, track.dt) * WAKE_TORQUE for t in _wake_torques(track, turn)]
+
+
+def _feedback_nuisances(track: Track, acceleration: np.ndarray) -> list[np.ndarray]:
+    """Columns (T, 9): strength of the motors' feedback part by roll and pitch, yaw; then its lag."""
+    columns = []
+    for part, spread in (
+        (acceleration, FEEDBACK),
+        (-np.gradient(acceleration, track.dt, axis=0), FEEDBACK_LAG),
+    ):
+        for axes in ([1.0, 1.0, 0.0], [0.0, 0.0, 1.0]):
+            columns.append(torque_channels(part * axes, track.dt) * spread)
+    return columns
 
 
 def torque_channels(acceleration: np.ndarray, dt: float) -> np.ndarray:

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from openjax.flights.track import smooth
 from openjax.gap.evidence import Evidence
 from openjax.gap.rest import Rest
 from openjax.gap.selection import LEAST_GAIN, LEAST_NATS, TESTABLE, Selection
@@ -16,7 +15,8 @@ from openjax.vehicle.effects import EFFECTS
 CLOCK = 0.003  # s by which the clocks of a log may differ
 CLEAR = 3.0  # standard errors
 LEAST_LOSS = 0.01  # of the packets
-LEAST_CHANGE = 0.07  # of a gain: filters of a firmware do less
+LEAST_CHANGE = 0.1  # of a gain: filters of a firmware do less
+LOST = 0.2  # of a gain
 FOLLOWED = 0.2  # of a channel's rest that follows something in the log: something is left to explain
 UNKNOWN_SHARE = 0.2  # of the gap, from which an unexplained rest is named beside the effects
 TEMPERATURE = (
@@ -39,28 +39,15 @@ def other_paths(evidence: Evidence) -> list[str]:
     found, known = [], evidence.library.effects
     radio = evidence.radio
     if radio is not None:
-        late = "command_latency" in known and radio.delay > CLOCK
-        lost = radio.informative * radio.loss
-        lossy = "packet_loss" in known and radio.loss > LEAST_LOSS and lost > LEAST_NATS
-        key = tuple(n for n, on in (("command_latency", late), ("packet_loss", lossy)) if on)
-        gain = radio.gain
-        for name in key:
-            if gain[key] - gain[tuple(n for n in key if n != name)] > LEAST_NATS * TEMPERATURE:
-                found.append(name)
+        key = radio.shown(known, CLOCK, LEAST_LOSS, LEAST_NATS)
+        found += [n for n in key if radio.gain[key] - radio.gain[_less(key, n)] > LEAST_NATS * TEMPERATURE]
     if evidence.rate_loop is not None and "rate_gains" in known:
-        path = evidence.rate_loop
-        _, theta, covariance = path.score()
-        # Integral gains follow trims and clamps; P and D tell.
-        clear = (np.abs(theta) > np.maximum(CLEAR * np.sqrt(np.diag(covariance)), LEAST_CHANGE))[[0, 2, 3, 5]]
-        before, after = (
-            np.mean(
-                [(smooth(r, 0.05, t.dt) ** 2).mean(0) for r, t in zip(rest, evidence.tracks, strict=True)], 0
-            )
-            for rest in (path.before, path.residual)
-        )
-        material = float(np.mean(before / after)) - 1.0 > LEAST_GAIN
-        if clear.any() and material:
-            found.append("rate_gains")
+        _, theta, covariance = evidence.rate_loop.score()
+        # P tells. A D that is lost faster than P is a low-pass or noise: the loop saw other rates than the log.
+        for p, d in ((0, 2), (3, 5)):
+            clear = abs(theta[p]) > max(CLEAR * float(np.sqrt(covariance[p, p])), LEAST_CHANGE)
+            if clear and theta[d] > theta[p] - LOST and "rate_gains" not in found:
+                found.append("rate_gains")
     if evidence.pose is not None and "state_latency" in known:
         nats, delay, covariance = evidence.pose.score()
         if nats > LEAST_NATS and delay[0] > max(CLOCK, CLEAR * float(np.sqrt(covariance[0, 0]))):
@@ -68,10 +55,14 @@ def other_paths(evidence: Evidence) -> list[str]:
     return found
 
 
+def _less(key: tuple[str, ...], name: str) -> tuple[str, ...]:
+    return tuple(n for n in key if n != name)
+
+
 def not_testable(evidence: Evidence) -> list[str]:
     """Effects of the library that, at a usual size, these flights would not show."""
     missing = [e for e in evidence.library.physics if evidence.exposure.get(e, 0.0) < TESTABLE]
-    if evidence.radio is None or evidence.radio.informative < 30:
+    if evidence.radio is None or evidence.radio.informative < 30 or not evidence.radio.readable:
         missing += [e for e in ("command_latency", "packet_loss") if e in evidence.library.effects]
     if evidence.rate_loop is None:
         missing += [e for e in ("rate_gains",) if e in evidence.library.effects]

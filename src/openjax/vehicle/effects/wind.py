@@ -44,6 +44,7 @@ EFFECT = Effect(
         ),
         needs="velocity",
         coordinate="body velocity",
+        commoner="rotor_drag",
         is_itself=blows,
         sample={"x": 1.2, "y": -0.8, "drag": 0.015},
         next_flight="hover, turning slowly through a full circle of yaw.",
