@@ -1,0 +1,46 @@
+"""What every effect's card must hold, and the bounded solution that all decisions rest on."""
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from openjax.gap.library import ABSENT, CARDS, STEP, THETA, places, prior, start_of
+from openjax.gap.table import _bounded
+from openjax.vehicle.effects import EFFECTS
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_a_card_is_complete(name):
+    effect, card = EFFECTS[name], EFFECTS[name].card
+    assert card.path in ("physics", "radio", "rate_loop", "estimator") and card.next_flight.endswith(".")
+    assert {p.name for p in card.fitted} <= set(effect.parameters) and set(card.sample) <= set(
+        effect.parameters
+    )
+    assert all(p.spread > 0 and p.step > 0 for p in card.fitted)
+    assert all(len(start) == len(card.fitted) for start in card.others)
+    assert all(parameter in EFFECTS[other].parameters for other, parameter, _ in card.companions)
+    assert not card.commoner or card.commoner in CARDS
+
+
+def test_every_fitted_parameter_has_its_own_place():
+    physics = [e for e in CARDS if CARDS[e].path == "physics"]
+    assert sorted(places(physics)) == list(range(len(THETA))) and len(ABSENT) == len(STEP) == len(THETA) + 1
+    for effect in physics:
+        index, mean, precision = prior((effect,))
+        assert len(index) == len(set(index)) == len(mean) and np.linalg.eigvalsh(precision).min() > 0
+        assert len(start_of(effect)) == len(CARDS[effect].fitted)
+
+
+def test_nuisances_stay_within_their_bounds():
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        root = rng.standard_normal((6, 6))
+        hessian, push = root @ root.T + np.eye(6), 20.0 * rng.standard_normal(6)
+        found = _bounded(hessian, push, 2, 1.5)
+        assert (np.abs(found[2:]) <= 1.5 + 1e-12).all()
+        cost = lambda x, h=hessian, p=push: 0.5 * x @ h @ x - p @ x  # noqa: E731
+        best = minimize(cost, np.zeros(6), bounds=[(None, None)] * 2 + [(-1.5, 1.5)] * 4).fun
+        free = cost(np.linalg.solve(hessian, push))
+        assert (
+            cost(found) - best <= 0.15 * (best - free) + 1e-6
+        )  # fixing what leaves the box comes close to the best
