@@ -26,11 +26,11 @@ def gaps(position):
     return position[..., 2].min() - 0.05, pillar.min(), np.min(pairs) - 0.1
 
 
-@pytest.fixture(scope="module")
-def fly():
+@pytest.fixture(scope="module", params=["mjx", "rigid"])
+def fly(request):
     """fly(position, velocity, quaternion, thrust) -> positions (150, 3, 3) and velocities of three drones."""
     vehicle = load_vehicle()
-    step = make_drones_step("mjx")
+    step = make_drones_step(request.param)
 
     @jax.jit
     def flight(position, velocity, quaternion, thrust):

@@ -237,7 +237,7 @@ def paper() -> TrainSettings:
                 collision=40.0, crash=20.0, first_crash=5000.0, margin=0.03, lookahead=0.15
             ),
         ),
-        network=NetworkSettings(heads=2, compute_type="bfloat16", shared_encoder=True),
+        network=NetworkSettings(heads=2, compute_type="bfloat16"),
         mappo=MappoSettings(
             learning_rate=1e-3, clip_epsilon=0.2, clip_epsilon_end=0.05, penalty_start=0.03, penalty_ramp=0.7
         ),
@@ -259,7 +259,6 @@ def flight() -> TrainSettings:
     base = paper()
     return dataclasses.replace(
         base,
-        network=dataclasses.replace(base.network, shared_encoder=False),
         environment=dataclasses.replace(
             base.environment,
             speed_limit="none",
