@@ -266,10 +266,14 @@ def flight() -> TrainSettings:
             physics="stops",
             vehicles=FLIGHT_FAMILY,
             rare_vehicles=0.5,
-            observe_history=8,
+            observe_history=12,
             # without the clamp, a first crash at 5,000 teaches to stay away from rows of pillars
             reward=dataclasses.replace(base.environment.reward, crash=40.0, first_crash=1000.0),
         ),
+        # flown from the start, the whole family teaches to hover out of harm's way and nothing else
+        vehicles_start=0.35,
+        vehicles_ramp=0.25,
+        total_steps=330_000_000,
     )
 
 
