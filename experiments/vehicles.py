@@ -95,15 +95,20 @@ def fly(name: str, number: int, layouts: int, physics: str) -> dict[str, dict[st
         shown = tasks if kind in ("nominal", "table", "ordinary", WHOLE) else {"uniform": tasks["uniform"]}
         own = found.setdefault(kind, {})
         for task_kind, drawn_tasks in shown.items():
-            own[task_kind] = summarise(run(loaded.parameters, drawn_tasks, jax.random.key(0), bounds))
+            own[task_kind] = finite(summarise(run(loaded.parameters, drawn_tasks, jax.random.key(0), bounds)))
         if layouts and kind in ("nominal", "table", WHOLE):
             together = run(loaded.parameters, flat, jax.random.key(1), bounds)
             for i, layout in enumerate(SCENARIOS):
                 part = slice(i * layouts, (i + 1) * layouts)
-                own[layout] = summarise(jax.tree.map(lambda leaf, part=part: leaf[part], together))
+                own[layout] = finite(summarise(jax.tree.map(lambda leaf, part=part: leaf[part], together)))
         for task_kind, summary in own.items():
             print(name, kind, task_kind, " ".join(cells(summary)), flush=True)
     return found
+
+
+def finite(summary: dict) -> dict:
+    """`summary` without what isn't a number."""
+    return {name: value for name, value in summary.items() if isinstance(value, dict) or np.isfinite(value)}
 
 
 def widened(tasks, slots: int):
@@ -157,7 +162,8 @@ def report(results: dict) -> list[str]:
         f"{results['seconds']:.0f} s. No clamp, rate loop at 500 Hz, drawn starts; {results['number']} held-back tasks of each "
         f"kind, {results['layouts']} episodes of each layout. Nominal: the nominal vehicle; table: motors 40 ms slower, "
         "commands 15 ms and poses 10 ms late, drag of .0125 N s/m; ordinary and family: the vehicles of the preset flight "
-        "without and with the rare ones; a name: all vehicles out of the ordinary in that effect.",
+        "without and with the rare ones; a name: all vehicles out of the ordinary in that effect. "
+        + results.get("note", ""),
         "",
         *table(
             ["policy", "vehicle", "tasks", "capture", "step", "collision", "crash", "over speed"],
