@@ -166,7 +166,7 @@ def report(results: dict) -> list[str]:
     ]
     rows = []
     for name, entry in results["methods"].items():
-        for label in ("winner", "literature"):
+        for label in entry["third"]:
             for limit, figures in zip(LIMITS, entry["third"][label], strict=True):
                 rows.append(
                     [name, label, limit, *(f"{x:.{d}f}" for x, d in zip(figures, (3, 0, 4, 3), strict=True))]
@@ -175,7 +175,13 @@ def report(results: dict) -> list[str]:
     heads = ["method", "parameters", "speed limit", *(figure.replace("_", " ") for figure in FIGURES)]
     lines += table(heads, rows)
     for name, entry in results["methods"].items():
-        speed = entry["steps_all_sets"] / entry["seconds_all_sets"] / 1e6
+        took = ""
+        if entry["seconds"]:
+            speed = entry["steps_all_sets"] / entry["seconds_all_sets"] / 1e6
+            took = (
+                f"All sets: {entry['seconds_all_sets']:.0f} s with compilation ({speed:.1f} M environment steps/s); "
+                f"final and third set included {entry['seconds']:.0f} s."
+            )
         lines += [
             "",
             f"## {name}",
@@ -184,9 +190,7 @@ def report(results: dict) -> list[str]:
             f"{entry['sets']:,} sets on {entry['tasks']} tasks, final and third set "
             f"{entry['final_tasks']} tasks each. {entry.get('note', '')}",
             "",
-            f"All sets: {entry['seconds_all_sets']:.0f} s with compilation "
-            f"({speed:.1f} M environment steps/s); "
-            f"final and third set included {entry['seconds']:.0f} s.",
+            took,
             "",
             *table(
                 ["parameter", "found", "literature's", "searched"],

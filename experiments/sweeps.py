@@ -93,9 +93,7 @@ def not_above(methods: dict, axis: str, values: tuple[float, ...], unit: str) ->
                 found.append(
                     f"{label} at {value} {unit} ({rate:.2f} / {step:.0f} against {best:.2f} / {early:.0f})"
                 )
-    return (
-        "OPEN isn't above: " + "; ".join(found) + "." if found else "OPEN is above every method everywhere."
-    )
+    return "OPEN isn't above: " + "; ".join(found) + "." if found else "No method is above OPEN anywhere."
 
 
 def draw(results: dict, path: Path) -> None:

@@ -106,7 +106,7 @@ def verdicts(flights: list[dict]) -> list[str]:
         "",
         "OPEN isn't better in every cell: " + "; ".join(below_open) + "."
         if below_open
-        else "OPEN is better in every cell.",
+        else "No method is better than OPEN in any cell.",
         "",
         "Worse than the paper's own value by more than its spread: "
         + ("; ".join(below_paper) or "none")

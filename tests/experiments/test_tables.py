@@ -95,4 +95,4 @@ def test_sweeps_say_where_open_is_not_above():
     methods = {"APF": seeds([0.5, 1.0], [700, 90]), "OPEN": seeds([0.4, 1.0], [700, 100])}
     text = sweeps.not_above(methods, "radius", (0.1, 0.3), "m")
     assert "APF at 0.1 m (0.50 / 700 against 0.40 / 700); APF at 0.3 m" in text
-    assert "above every method" in sweeps.not_above({"OPEN": methods["OPEN"]}, "radius", (0.1, 0.3), "m")
+    assert "No method is above" in sweeps.not_above({"OPEN": methods["OPEN"]}, "radius", (0.1, 0.3), "m")
