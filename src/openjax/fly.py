@@ -33,7 +33,7 @@ class Arguments:
     While it flies: space or q stops all motors, l lands, h waits; Ctrl-C lands.
     """
 
-    policy: str = "open"
+    policy: str = "flight"
     """A run's directory, a policy file (.npz), or the name of a policy in the package."""
     uri: tuple[str, ...] = ("udp://127.0.0.1:19850", "udp://127.0.0.1:19851", "udp://127.0.0.1:19852")
     """One vehicle per pursuer: udp://HOST:PORT (virtual), radio://0/80/2M/E7E7E7E7E7 (real)."""
