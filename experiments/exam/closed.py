@@ -103,8 +103,10 @@ def close_chunk(job):
         )
         known = np.isfinite(floor)
         quiet = np.maximum(floor[known] ** 2 - squares["truth"][known, i], 0.0)
-        gap = lambda x: np.sqrt(((x[known, i] + quiet) / floor[known] ** 2).mean())  # noqa: B023, E731
-        before, after, best = gap(squares["nominal"]), gap(said), gap(squares["truth"])
+        before, after, best = (
+            float(np.sqrt(((square[known, i] + quiet) / floor[known] ** 2).mean()))
+            for square in (squares["nominal"], said, squares["truth"])
+        )
         out[answer["case"]] = float((before - after) / max(before - best, 1e-9))
     return out
 

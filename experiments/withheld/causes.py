@@ -4,7 +4,7 @@ what has to be flown to see it.
 A cause is {"effect", "form", "size", "shape"}: `size` is the one number that severity calibration moves,
 `shape` are eight uniform draws that fix everything else (signs, axes, ratios), once per case. Form 0 is close
 to what any library would write; the others are not. `LIMITS` are the smallest and largest size that are
-drawn, about GAP.md's usual ranges.
+drawn, about the usual ranges of vehicles of this size.
 """
 
 import numpy as np
@@ -88,7 +88,7 @@ def apply(cause, p, columns, arrival=None, rng=None):
     """Write the cause into the parameters of the bodies `columns`; the link's effects change `arrival` (K, B)
     instead.
 
-    Returns the magnitudes in the units of GAP.md.
+    Returns the magnitudes in the units of `openjax.vehicle.effects`.
     """
     name, form, a, s = cause["effect"], cause["form"], float(cause["size"]), np.asarray(cause["shape"])
     sign = 1.0 if s[0] < 0.5 else -1.0
