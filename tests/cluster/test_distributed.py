@@ -18,6 +18,7 @@ from openjax.cluster.relay import __file__ as RELAY
 from openjax.commands.training_command import membership
 from openjax.errors import UserError
 from openjax.show.metrics import read_metrics
+from openjax.store.checkpoints import is_checkpoint
 
 UPDATES = 3
 OPTIONS = """
@@ -163,7 +164,7 @@ def killed(tmp_path_factory):
         with open(directory / f"{i}.out", "w") as out, open(directory / f"{i}.err", "w") as err:
             processes.append(train(*options, env=environment_with(2), stdout=out, stderr=err))
     try:
-        wait_for((run / "checkpoints" / f"{UPDATES:09d}").exists, processes)
+        wait_for(lambda: is_checkpoint(run / "checkpoints" / f"{UPDATES:09d}"), processes)
         processes[1].send_signal(signal.SIGKILL)
         start = time.monotonic()
         status = processes[0].wait(60)

@@ -63,4 +63,4 @@ def test_streams_on_clocks_that_wander_tell_no_gain():
     track = _track()
     late = np.interp(track.time + 0.12 * np.sin(track.time), track.time, track.time)
     rates = np.stack([np.interp(late, track.time, c) for c in 1.1 * track.body_rates.T], 1)
-    assert read_kinematics([dataclasses.replace(track, body_rates=rates)]).findings == {}
+    assert set(read_kinematics([dataclasses.replace(track, body_rates=rates)]).findings) == {"clocks"}
