@@ -1,20 +1,25 @@
 """The active archive: unsolved tasks as a pytree of arrays (the paper's Q_active)."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from flax import struct
 
 
-@struct.dataclass
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
 class TaskArchive:
     """Tasks (any pytree) with leading axis C (capacity). Used slots come first, newest first."""
 
     tasks: Any
     success: jax.Array  # (C,) float32, success rate at which each task entered
     size: jax.Array  # () int32, used slots
+
+    def replace(self, **changes) -> "TaskArchive":
+        """A copy with other values for the fields named."""
+        return dataclasses.replace(self, **changes)
 
 
 def empty_archive(task: Any, capacity: int) -> TaskArchive:

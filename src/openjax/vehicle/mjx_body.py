@@ -9,10 +9,11 @@ carried between steps.
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
-from typing import NamedTuple
+from functools import cache, lru_cache
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,9 +25,18 @@ from openjax.vehicle.parameters import Vehicle, assets_directory, read_mjcf
 from openjax.vehicle.rigid_body import euler_step
 from openjax.vehicle.solids import DRONE_RADIUS, solids_xml
 
-# MJX prints two lines when its optional backend is not installed; it is not used here.
-with contextlib.redirect_stdout(io.StringIO()):
+if TYPE_CHECKING:
     from mujoco import mjx
+
+
+@cache
+def _mjx():
+    """The module `mujoco.mjx`, loaded when it is first needed: the other physics does without it.
+
+    It prints two lines when its optional backend is not installed, which is not used here.
+    """
+    with contextlib.redirect_stdout(io.StringIO()):
+        return importlib.import_module("mujoco.mjx")
 
 
 class World(NamedTuple):
@@ -68,8 +78,8 @@ def make_world(arena: Arena, n_pillars: int, n_others: int, dt: float, contacts:
     device = jax.local_devices()[0]  # of several processes each builds its own
 
     def build():
-        mjx_model = mjx.put_model(model, device, impl="jax")
-        return World(*jax.tree.map(np.asarray, (mjx_model, mjx.make_data(mjx_model, device))))
+        mjx_model = _mjx().put_model(model, device, impl="jax")
+        return World(*jax.tree.map(np.asarray, (mjx_model, _mjx().make_data(mjx_model, device))))
 
     # A thread of its own knows nothing of the caller's trace or mesh, which may span other processes' devices.
     with ThreadPoolExecutor(max_workers=1) as pool:
@@ -90,6 +100,7 @@ def _forward(model, data, contacts: bool):
 
     The barrier keeps XLA from computing each collision once per entry of the contacts' Jacobian.
     """
+    mjx = _mjx()
     for stage in (mjx.kinematics, mjx.com_pos, mjx.crb, mjx.factor_m, mjx.collision):
         data = stage(model, data)
     data = jax.lax.optimization_barrier(data)
