@@ -104,7 +104,8 @@ def adapt(command: AdaptCommand) -> dict:
         def figures(parameters, tasks, number):
             return summarise(adaptation.evaluate(parameters, tasks, jax.random.fold_in(key, number), bounds))
 
-        scores = [selection_score(figures(p, chosen_by, 1)) for p in (parameters, tuned)]
+        length = settings.environment.episode_length
+        scores = [selection_score(figures(p, chosen_by, 1), length) for p in (parameters, tuned)]
         better = scores[1] >= scores[0]
         before, after = (figures(p, measured_on, 2) for p in (parameters, tuned))
         seconds["measured"] = time.monotonic() - started

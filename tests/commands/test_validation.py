@@ -1,13 +1,18 @@
 """The validation tasks: the same for all runs, the far ones as far as an archive reaches, chosen by the uniform ones."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from openjax.commands.evaluator import Evaluator
-from openjax.commands.validation import Validation, far_tasks, uniform_tasks
+from openjax.commands.validation import Validation, far_tasks, selection_score, uniform_tasks
+from openjax.learning import summarise
 from openjax.policy import NetworkSettings, Policy, PredictorSettings
-from openjax.pursuit import Pursuit, PursuitSettings
+from openjax.pursuit import Pursuit, PursuitSettings, RewardSettings
 from openjax.pursuit.task import START_X, starts_clear
 
 SETTINGS = PursuitSettings()
@@ -41,16 +46,54 @@ def test_fewer_tasks_are_the_first_of_more(far):
 
 
 def test_uniform_tasks_fly_as_they_would_alone():
-    """The far tasks beside them change nothing that a checkpoint is chosen by."""
-    settings = PursuitSettings(physics="rigid", episode_length=3)
-    environment = Pursuit(settings)
+    """The far tasks beside them change nothing that a checkpoint is chosen by, nor does what the reward weighs."""
+    game = PursuitSettings(physics="rigid", episode_length=3)
+    environment = Pursuit(game)
     policy = Policy.for_environment(
         environment, NetworkSettings(features=8, heads=2), PredictorSettings(units=4)
     )
     parameters = policy.init(jax.random.key(1), environment.reset(jax.random.key(0))[0])
-    validation = Validation(environment, settings, policy, 4)
+    validation = Validation(environment, game, policy, 4)
     uniform, far, _ = validation(parameters)
-    alone, _ = Evaluator(environment, policy, 4)(parameters, uniform_tasks(settings, 4, 5), jax.random.key(0))
-    for together, expected in zip(jax.tree.leaves(uniform), jax.tree.leaves(alone), strict=True):
-        np.testing.assert_allclose(together, expected, rtol=1e-5, atol=1e-6)
+    rewarded = dataclasses.replace(
+        game, reward=RewardSettings(smoothness=2.0, first_crash=5000.0, distance=3.0)
+    )
+    alone, _ = Evaluator(Pursuit(rewarded), policy, 4)(
+        parameters, uniform_tasks(game, 4, 5), jax.random.key(0)
+    )
+    together, by_itself = summarise(uniform), summarise(alone)
+    assert abs(together.pop("episode_return") - by_itself.pop("episode_return")) > 1.0
+    assert selection_score(together, 3) == pytest.approx(selection_score(by_itself, 3), abs=1e-6)
+    same = uniform.statistics.replace(episode_return=alone.statistics.episode_return)
+    expected = jax.tree.leaves(alone)
+    for leaf, other in zip(jax.tree.leaves(uniform.replace(statistics=same)), expected, strict=True):
+        np.testing.assert_allclose(leaf, other, rtol=1e-5, atol=1e-6)
     assert not np.allclose(far.statistics.episode_return, uniform.statistics.episode_return)
+
+
+LENGTH = 800
+RATES = ("capture_rate", "collision_rate", "crash_rate", "over_speed_rate")
+SUMMARIES = st.fixed_dictionaries(
+    {name: st.floats(0, 1) for name in RATES} | {"capture_step": st.floats(1, LENGTH)}
+)
+
+
+@settings(deadline=None)
+@given(SUMMARIES, st.sampled_from([*RATES, "capture_step"]), st.floats(1e-3, 1))
+def test_what_is_better_scores_higher(summary, name, amount):
+    """Captures up, anything else down: never lower, and higher by what can be told apart."""
+    good = 1.0 if name == "capture_rate" else -1.0
+    low, high = (1.0, LENGTH) if name == "capture_step" else (0.0, 1.0)
+    better = {**summary, name: float(np.clip(summary[name] + good * amount * (high - low), low, high))}
+    gained = abs(better[name] - summary[name]) / (high - low)
+    gain = selection_score(better, LENGTH) - selection_score(summary, LENGTH)
+    assert gain >= 0.04 * gained - 1e-12 and selection_score(summary, LENGTH) <= 1.0
+
+
+@settings(deadline=None)
+@given(SUMMARIES, st.floats(1, LENGTH))
+def test_no_capture_step_makes_up_for_many_failures(summary, step):
+    """However much sooner: not for a twentieth of the captures, a tenth of the crashes, a hundredth of the steps breached."""
+    for name, change in {"capture_rate": -0.05, "crash_rate": 0.1, "collision_rate": 0.01}.items():
+        worse = {**summary, name: summary[name] + change, "capture_step": step}
+        assert selection_score(worse, LENGTH) <= selection_score(summary, LENGTH) + 1e-9

@@ -151,7 +151,7 @@ def run_updates(
     """
     started = saved_at = time.monotonic()
     update, pending, best = first_update, None, checkpoints.best()
-    best_score = best.score if best else -float("inf")
+    best_score = best.score if best and best.score_rule == checkpoints.score_rule else -float("inf")
     overlap = jax.devices()[0].platform != "cpu" if plan.overlap is None else plan.overlap
     names = list(float_leaves(carry))
 

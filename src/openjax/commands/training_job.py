@@ -26,7 +26,7 @@ from openjax.commands.evaluator import (
     record_of,
 )
 from openjax.commands.loop import NotFiniteError, Plan, StopRequest, guarded, run_updates
-from openjax.commands.validation import Validation, flat_metrics, selection_score
+from openjax.commands.validation import SCORE_RULE, Validation, flat_metrics, selection_score
 from openjax.learning import TrainSettings, build, make_start, summarise
 from openjax.policy import PolicyParameters
 from openjax.policy.growth import with_longer_history
@@ -80,7 +80,7 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
         console = Console(quiet=True)
     title = f"openjax.train → {directory.path}"
     with StopRequest() as stop, Progress(title, settings.total_steps, console) as progress:
-        checkpoints = Checkpoints(directory.checkpoints, processes=processes)
+        checkpoints = Checkpoints(directory.checkpoints, processes=processes, score_rule=SCORE_RULE)
         processes.advice = f"go on with python -m openjax.train --resume {directory.path} --devices all"
         progress.phase("compiling the start: networks, first tasks")
         shardings = carry_shardings(job.devices)
@@ -98,7 +98,7 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
             if not processes.is_first:
                 return processes.of_first()
             uniform, far = (summarise(part) for part in validation()(own_copy(carry.policy))[:2])
-            score = selection_score(uniform)
+            score = selection_score(uniform, settings.environment.episode_length)
             return processes.of_first((score, {**flat_metrics(uniform, far), "score": score}))
 
         metrics = NoMetrics()
