@@ -3,7 +3,7 @@
     python -m experiments.adapting tune --cases DIR --policy flight --work DIR     (a GPU)
     python -m experiments.adapting fly --cases DIR --policy flight --work DIR [--jobs N] [--episodes 100]     (CPU cores)
 
-The vehicles are those of `experiments.task_gap`: the withheld plant with one cause each, their flights diagnosed by
+The vehicles are those of `experiments.task_gap`: the exam's plant with one cause each, their flights diagnosed by
 `openjax.gap`. `--cases` holds, of each, its NAME.json and NAME.toml (the effects that were found) as task_gap writes them.
 `tune` fine-tunes the policy to each; `fly` plays the same tasks in the plant with the vehicle that flew: the policy as it
 was, the adapted one, and the policy as it was on the plant's nominal vehicle. Loss is the difference to the latter. Writes
@@ -158,7 +158,7 @@ def report(results: dict) -> list[str]:
         "# What adapting wins back",
         "",
         f"`{results['command']}`, JAX {machine['versions']['jax']}, commit {machine['commit']}: {results['seconds']:.0f} s. "
-        f"{len(vehicles)} vehicles of the withheld plant with one cause each, {results['episodes']} uniform tasks each, no "
+        f"{len(vehicles)} vehicles of the exam's plant with one cause each, {results['episodes']} uniform tasks each, no "
         "clamp, drawn starts. Loss: the difference to the same policy on the plant's nominal vehicle, summed over the vehicles "
         "with which it loses anything.",
         "",

@@ -45,7 +45,7 @@ def _target(rng, band):
     return float(low * (high / low) ** rng.uniform())
 
 
-def _missions(rng, needed, style, two):
+def draw_missions(rng, needed, style, two):
     """Three flights, each a mission or a pair of them; what is needed is flown twice if there is room."""
     flights = [str(rng.choice(options)) for options in needed * 2 if options][:3]
     while len(flights) < 3:
@@ -111,7 +111,7 @@ def draw_case(seed, column, number, category, index):
         flights = [(str(rng.choice(BLIND[effect])),) for _ in range(3)]
         channels = effects.EFFECTS[effect].needs
     else:
-        flights = _missions(rng, needed, style, rng.random() < 0.12 and category != "garbage")
+        flights = draw_missions(rng, needed, style, rng.random() < 0.12 and category != "garbage")
     kind = str(rng.choice(_kinds(column, sensors.KINDS, sensors.STRANGERS)))
     fast = any(
         c["effect"] in ("command_latency", "packet_loss", "state_latency", "motor_lag") for c in causes

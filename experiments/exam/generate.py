@@ -164,6 +164,18 @@ def write_flight(path, vehicles, channels):
         packed.write(text.encode())
 
 
+def write_case(fleet, i, folder, spoiled=False):
+    """Write the logs and `vehicle.toml` of variant i into `folder`; returns its rows and the columns that were spoiled."""
+    spec, (rows, wrong) = fleet.variants[i][0], fleet.rows(i, spoiled)
+    folder.mkdir(parents=True, exist_ok=True)
+    for letter, flight in zip("abc", rows, strict=True):
+        write_flight(folder / f"flight_{letter}.csv.gz", flight, spec["sensors"]["channels"])
+    (folder / "vehicle.toml").write_text(
+        vehicle.toml(spec["told"], "simulated", spec["sensors"]["pose_rate"])
+    )
+    return rows, wrong
+
+
 def _variants(spec):
     """The sets of causes that a case is flown with: {key: causes}."""
     if not spec["causes"]:
@@ -252,13 +264,7 @@ def fly_chunk(job):
 def _answer(fleet, i, squares, floor, folder, of_flight):
     """Write the logs of variant i and describe the case."""
     spec, own = fleet.variants[i]
-    rows, wrong = fleet.rows(i, spoiled=True)
-    place = Path(folder) / spec["name"]
-    place.mkdir(parents=True, exist_ok=True)
-    for letter, flight in zip("abc", rows, strict=True):
-        write_flight(place / f"flight_{letter}.csv.gz", flight, spec["sensors"]["channels"])
-    (place / "vehicle.toml").write_text(vehicle.toml(spec["told"], "simulated", spec["sensors"]["pose_rate"]))
-
+    _, wrong = write_case(fleet, i, Path(folder) / spec["name"], spoiled=True)
     quiet = np.maximum(floor**2 - squares["truth"], 0.0)  # what the sensors add
     known = np.isfinite(floor)
     energy = {

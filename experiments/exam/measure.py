@@ -66,7 +66,7 @@ def errors(flown, told, parameters, partner, other_firmware, links):
         )
         velocity, rates = body.velocity, body.rates
         for _ in range(2):
-            body.step(m, voltage, load, zero, zero, 0.0, other[:, columns] + alone)
+            body.step(m, voltage, load, zero, zero, 0.0, [other[:, columns] + alone])
         moved += body.velocity - velocity
         if s < SHORT:
             turned += body.rates - rates

@@ -1,16 +1,16 @@
 """The plant: quadrotors at 1 kHz under a firmware rate loop at 500 Hz with its filters and an off-board controller.
 
-`fly` integrates a whole batch of bodies at once (NumPy, body index last) and returns the true motion every 2 ms.
-`Body` is the physics alone; `measure` steps it over short windows. Euler angles appear nowhere in the physics;
-integration is semi-implicit with a second-order position.
+Bodies are integrated as one batch (NumPy, body index last). `Body` is the physics alone; `measure` steps it over short
+windows. `Flight` is what flies: body, firmware, battery, link and the poses as they are seen, 2 ms at a time, under
+commands from anywhere. `fly` commands it with the exam's controllers along references and returns the true motion.
+Euler angles appear nowhere in the physics; integration is semi-implicit with a second-order position.
 """
 
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from experiments.exam import effects
-from experiments.exam import vehicle as v
+from experiments.exam import effects, vehicle
 from experiments.exam.controllers import Controllers
 from experiments.exam.unknowns import Unknowns
 
@@ -63,7 +63,7 @@ class Firmware:
 
     def __init__(self, p, gyro, integral=None):
         self.p, count = p, gyro.shape[1]
-        self.limit = v.INTEGRAL_LIMIT[:, None]
+        self.limit = vehicle.INTEGRAL_LIMIT[:, None]
         self.integral = np.zeros((3, count)) if integral is None else integral.copy()
         self.gyro_filter = Filter(p["gyro_cut"], 3, gyro)
         self.slope_filter = Filter(p["derivative_cut"], 3, 0.0)
@@ -83,7 +83,7 @@ class Firmware:
         slope = self.slope_filter(np.rad2deg(self.previous - gyro) / SAMPLE)
         self.slope = self.keep * self.slope + (1 - self.keep) * slope if self.slow else slope
         self.previous = gyro
-        return v.mix(command[0], p["kp"] * error + p["ki"] * self.integral + p["kd"] * self.slope)
+        return vehicle.mix(command[0], p["kp"] * error + p["ki"] * self.integral + p["kd"] * self.slope)
 
 
 class Body:
@@ -98,20 +98,23 @@ class Body:
         self.inverse = np.moveaxis(np.linalg.inv(np.moveaxis(p["inertia"], 2, 0)), 0, 2)
         self.diagonal = not np.any(p["inertia"][~np.eye(3, dtype=bool)])
         self.principal = p["inertia"][np.arange(3), np.arange(3)]
-        self.arm_x, self.arm_y = v.ROTOR_X[:, None] - p["com"][0], v.ROTOR_Y[:, None] - p["com"][1]
+        self.arm_x, self.arm_y = (
+            vehicle.ROTOR_X[:, None] - p["com"][0],
+            vehicle.ROTOR_Y[:, None] - p["com"][1],
+        )
         self.up, self.down = 1 - np.exp(-DT / p["tau_up"]), 1 - np.exp(-DT / p["tau_down"])
         self.second = np.where(p["tau_second"] > 0, 1 - np.exp(-DT / np.maximum(p["tau_second"], 1e-4)), 1.0)
         self.lifts = p["thrust_constant"] * p["rotor_gain"]
-        self.reacts = p["torque_ratio"] * p["torque_gain"] * v.SPIN[:, None] * self.lifts
+        self.reacts = p["torque_ratio"] * p["torque_gain"] * vehicle.SPIN[:, None] * self.lifts
         self.zero = np.zeros(self.count)
 
-    def step(self, m, voltage, load, gust_force, gust_torque, slow, other, unknowns=None, time=0.0):
-        """One millisecond under motor commands m (4, B); `other` (3, B) is the vehicle that may fly above."""
+    def step(self, m, voltage, load, gust_force, gust_torque, slow, others=(), unknowns=None, time=0.0):
+        """One millisecond under motor commands m (4, B); `others` are positions (3, B) of vehicles that may fly above."""
         p, zero = self.p, self.zero
         u = effects.motor_demand(p, self.active, m, voltage, load)
         if unknowns:
             u = unknowns.motors(u, time)
-        self.drive = self.drive + self.second * (v.MAX_SPEED * np.sqrt(u) - self.drive)
+        self.drive = self.drive + self.second * (vehicle.MAX_SPEED * np.sqrt(u) - self.drive)
         self.rotor = self.rotor + np.where(self.drive > self.rotor, self.up, self.down) * (
             self.drive - self.rotor
         )
@@ -125,11 +128,14 @@ class Body:
         )
         force[2] += thrust.sum(axis=0)
         outside = gust_force
-        if self.wake:
+        for other in others if self.wake else ():
             pull, gradient = effects.wake_force(p, self.position, other)
             outside = outside + np.stack([zero, zero, pull])
-            torque = torque + v.rotate_back(self.q, np.stack([gradient[1], -gradient[0], zero])) * v.ARM**2
-        force = force + v.rotate_back(self.q, outside)
+            torque = (
+                torque
+                + vehicle.rotate_back(self.q, np.stack([gradient[1], -gradient[0], zero])) * vehicle.ARM**2
+            )
+        force = force + vehicle.rotate_back(self.q, outside)
         torque = torque + moment + gust_torque
         if unknowns:
             more_force, more_torque = unknowns.wrench(
@@ -137,17 +143,17 @@ class Body:
             )
             force, torque = force + more_force, torque + more_torque
         specific = force / p["mass"]
-        accel = v.rotate(self.q, specific)
-        accel[2] -= v.GRAVITY
+        accel = vehicle.rotate(self.q, specific)
+        accel[2] -= vehicle.GRAVITY
         if self.diagonal:
-            turning = (torque - v.cross(self.rates, self.principal * self.rates)) / self.principal
+            turning = (torque - vehicle.cross(self.rates, self.principal * self.rates)) / self.principal
         else:
             momentum = np.einsum("ijb,jb->ib", p["inertia"], self.rates)
-            turning = np.einsum("ijb,jb->ib", self.inverse, torque - v.cross(self.rates, momentum))
+            turning = np.einsum("ijb,jb->ib", self.inverse, torque - vehicle.cross(self.rates, momentum))
         self.rates = self.rates + DT * turning
         self.position = self.position + DT * self.velocity + 0.5 * DT * DT * accel
         self.velocity = self.velocity + DT * accel
-        self.q = v.turn(self.q, self.rates, DT)
+        self.q = vehicle.turn(self.q, self.rates, DT)
         self.specific = specific
 
 
@@ -178,17 +184,106 @@ def received(arrival, steps):
     return np.maximum.accumulate(table, axis=0)
 
 
-KEPT = {
-    "position": 3,
-    "velocity": 3,
-    "quaternion": 4,
-    "rates": 3,
-    "specific": 3,
-    "gyro": 3,
-    "rotor": 4,
-    "motor": 4,
-}
-KEPT |= {"integral": 3, "applied": 4}
+class Flight:
+    """B vehicles in the air, at rest at the start, 2 ms at a time.
+
+    Args:
+      told: B `vehicle.Told`.
+      parameters: of `vehicle.nominal_parameters`, with causes and nuisances written in.
+      air: of `sensors.stack`, for as many ticks as are flown.
+      arrival: (K, B) ms at which the command of each tick reaches its vehicle; >= 10**8: lost.
+      position, quaternion: (3, B) m and (4, B) wxyz at the start.
+      partners: list of (B,) indices of vehicles that may fly above each body; a body's own index: none.
+      unknowns: as in `Batch`.
+      solids: anything with `stop(position, velocity)`, called after each ms, or None.
+    """
+
+    def __init__(
+        self, told, parameters, air, arrival, position, quaternion, partners=(), unknowns=None, solids=None
+    ):
+        ticks, count = arrival.shape
+        self.p, self.air, self.solids, self.sample = parameters, air, solids, 0
+        self.unknowns = Unknowns(unknowns or {}, count)
+        self.received = received(arrival, 10 * ticks)
+        hover = np.array([t.hover for t in told])
+        self.start = np.concatenate([hover[None], np.zeros((3, count))])
+        self.body = Body(
+            parameters,
+            vehicle.nominal_parameters(told),
+            np.array(position, float),
+            np.zeros((3, count)),
+            np.array(quaternion, float),
+            np.zeros((3, count)),
+            np.tile(vehicle.MAX_SPEED * np.sqrt(hover), (4, 1)),
+        )
+        self.body.specific = np.tile([[0.0], [0.0], [vehicle.GRAVITY]], (1, count))
+        self.firmware = Firmware(parameters, air["gyro_bias"].astype(float))
+        self.battery = Battery(air, hover)
+        self.voltage = self.battery.step(np.tile(hover, (4, 1)), 0.0)
+        self.commands = np.zeros((ticks, 4, count))
+        poses = (("position", 3), ("velocity", 3), ("quaternion", 4))
+        self.history = {n: np.zeros((PER_TICK * ticks, size, count), np.float32) for n, size in poses}
+        self.columns = np.arange(count)
+        far = np.array([[0.0], [0.0], [-10.0]])
+        self.partners = [(partner, np.where(partner == self.columns, far, 0.0)) for partner in partners]
+
+    def look(self):
+        """Sample the sensors: the pose into `history`, the firmware's gyroscope into `gyro`. Once before each `step`."""
+        s, body = self.sample, self.body
+        for name, kept in self.history.items():
+            kept[s] = body.q if name == "quaternion" else getattr(body, name)
+        self.gyro = self.firmware.filtered(
+            self.p["gyro_gain"] * body.rates + self.air["gyro_bias"] + self.air["gyro"][s]
+        )
+
+    def seen(self):
+        """Position (3, B), quaternion (4, B) and velocity (3, B) as the motion capture gives them now, late and noisy."""
+        p, air, s, k = self.p, self.air, self.sample, self.sample // PER_TICK
+        late = air["pose_delay"] + p["pose_delay"] + p["pose_jitter"] * air["pose_jitter"][k]
+        back = np.clip(np.maximum(late, 0.0) / 2.0, 0.0, s)
+        whole = back.astype(int)
+        rest = back - whole
+
+        def past(name):
+            newer = self.history[name][s - whole, :, self.columns].T.astype(float)
+            older = self.history[name][np.maximum(s - whole - 1, 0), :, self.columns].T
+            return newer + rest * (older - newer)
+
+        q = vehicle.multiply(past("quaternion"), air["seen_attitude"][k])
+        q /= np.sqrt((q * q).sum(axis=0))
+        return past("position") + air["seen_position"][k], q, past("velocity") + air["seen_velocity"][k]
+
+    def send(self, command):
+        """Issue this tick's command (4, B): thrust 0..1 and body rates rad/s."""
+        self.commands[self.sample // PER_TICK] = command
+
+    def step(self):
+        """Two milliseconds after `look`; returns the command in force and the motor commands (4, B)."""
+        s, k, air = self.sample, self.sample // PER_TICK, self.air
+        index = self.received[2 * s]
+        now = np.where(index >= 0, self.commands[np.maximum(index, 0), :, self.columns].T, self.start)
+        m = self.firmware(now, self.gyro)
+        self.voltage = self.battery.step(m, SAMPLE)
+        others = [self.body.position[:, partner] + away for partner, away in self.partners]
+        for half_step in range(2):
+            self.body.step(
+                m,
+                self.voltage,
+                self.battery.load,
+                air["gust_force"][k],
+                air["gust_torque"][k],
+                air["slow"][k],
+                others,
+                self.unknowns,
+                SAMPLE * s + DT * half_step,
+            )
+            if self.solids is not None:
+                self.solids.stop(self.body.position, self.body.velocity)
+        self.sample += 1
+        return now, m
+
+
+KEPT = {"rates": 3, "specific": 3, "gyro": 3, "rotor": 4, "motor": 4, "integral": 3, "applied": 4}
 
 
 def fly(batch):
@@ -198,32 +293,27 @@ def fly(batch):
     asks for in the 2 ms from that sample on; `voltage` (S, B); `crashed` (B,) sample of the first breach (floor, tilt
     above 85 degrees, 2.5 m away), S if none.
     """
-    p, reference, air = batch.parameters, batch.reference, batch.air
+    p, reference = batch.parameters, batch.reference
     ticks, _, count = reference["position"].shape
-    neutral = v.nominal_parameters(batch.told)
-    table = received(batch.arrival, 10 * ticks)
-    unknowns = Unknowns(batch.unknowns, count)
-    hover = np.array([t.hover for t in batch.told])
-    most = np.array([4 * t.thrust_constant * v.MAX_SPEED**2 for t in batch.told])
-    control = Controllers(batch.controllers, neutral["mass"], most, reference)
-
+    mass = np.array([t.mass for t in batch.told])
+    most = np.array([4 * t.thrust_constant * vehicle.MAX_SPEED**2 for t in batch.told])
+    control = Controllers(batch.controllers, mass, most, reference)
     half = 0.5 * reference["yaw"][0]
     q = np.stack([np.cos(half), np.zeros(count), np.zeros(count), np.sin(half)])
-    rotor = np.tile(v.MAX_SPEED * np.sqrt(hover), (4, 1))
-    start = np.concatenate([hover[None], np.zeros((3, count))])
-    body = Body(
-        p, neutral, reference["position"][0].copy(), np.zeros((3, count)), q, np.zeros((3, count)), rotor
+    flight = Flight(
+        batch.told,
+        p,
+        batch.air,
+        batch.arrival,
+        reference["position"][0],
+        q,
+        [batch.partner],
+        batch.unknowns,
     )
-    body.specific = np.tile([[0.0], [0.0], [v.GRAVITY]], (1, count))
-    firmware = Firmware(p, air["gyro_bias"].astype(float))
-    battery = Battery(air, hover)
-    voltage = battery.step(np.tile(hover, (4, 1)), 0.0)
-    command = np.zeros((ticks, 4, count))
-    samples = PER_TICK * ticks
+    body, samples = flight.body, PER_TICK * ticks
     out = {name: np.zeros((samples, size, count), np.float32) for name, size in KEPT.items()}
     out |= {name: np.zeros((samples, count), np.float32) for name in ("voltage", "load")}
-    crashed, columns = np.full(count, samples), np.arange(count)
-    lever = bool(np.any(p["imu_lever"] != 0))
+    crashed, lever = np.full(count, samples), bool(np.any(p["imu_lever"] != 0))
 
     for s in range(samples):
         k, part = divmod(s, PER_TICK)
@@ -235,50 +325,22 @@ def fly(batch):
             if dead.any():  # parked, so that one wreck does not spoil the arithmetic of the batch
                 body.position[:, dead], body.velocity[:, dead] = reference["position"][k][:, dead], 0.0
                 body.rates[:, dead], body.q[:, dead] = 0.0, np.array([[1.0], [0], [0], [0]])
-        gyro = firmware.filtered(p["gyro_gain"] * body.rates + air["gyro_bias"] + air["gyro"][s])
+        flight.look()
         specific = effects.seen_by_accelerometer(p, body.specific, body.rates) if lever else body.specific
         for name, value in (
-            ("position", body.position),
-            ("velocity", body.velocity),
-            ("quaternion", body.q),
             ("rates", body.rates),
             ("specific", specific),
-            ("gyro", gyro),
+            ("gyro", flight.gyro),
             ("rotor", body.rotor),
-            ("integral", firmware.integral),
+            ("integral", flight.firmware.integral),
+            ("voltage", flight.voltage),
+            ("load", flight.battery.load),
         ):
             out[name][s] = value
-        out["voltage"][s], out["load"][s] = voltage, battery.load
         if part == 0:
-            late = air["pose_delay"] + p["pose_delay"] + p["pose_jitter"] * air["pose_jitter"][k]
-            back = np.clip(np.maximum(late, 0.0) / 2.0, 0.0, s)
-            whole = back.astype(int)
-            rest = back - whole
-
-            def seen(name, whole=whole, rest=rest, s=s):
-                newer = out[name][s - whole, :, columns].T.astype(float)
-                return newer + rest * (out[name][np.maximum(s - whole - 1, 0), :, columns].T - newer)
-
-            seen_q = v.multiply(seen("quaternion"), air["seen_attitude"][k])
-            seen_q /= np.sqrt((seen_q * seen_q).sum(axis=0))
-            command[k] = control(
-                k,
-                seen("position") + air["seen_position"][k],
-                seen_q,
-                seen("velocity") + air["seen_velocity"][k],
-            )
-        index = table[2 * s]
-        now = np.where(index >= 0, command[np.maximum(index, 0), :, columns].T, start)
-        m = firmware(now, gyro)
-        out["applied"][s], out["motor"][s] = now, m
-        voltage = battery.step(m, SAMPLE)
-        force, torque, slow = air["gust_force"][k], air["gust_torque"][k], air["slow"][k]
-        other = body.position[:, batch.partner] + np.where(batch.partner == columns, -10.0, 0.0) * np.array(
-            [[0], [0], [1.0]]
-        )
-        for half_step in range(2):
-            time = SAMPLE * s + DT * half_step
-            body.step(m, voltage, battery.load, force, torque, slow, other, unknowns, time)
-    out["command"], out["crashed"] = command.astype(np.float32), crashed
+            flight.send(control(k, *flight.seen()))
+        out["applied"][s], out["motor"][s] = flight.step()
+    out |= flight.history
+    out["command"], out["crashed"] = flight.commands.astype(np.float32), crashed
     out["pose_delay"], out["pose_jitter"] = 1e-3 * p["pose_delay"], 1e-3 * p["pose_jitter"]
     return out

@@ -2,7 +2,7 @@
 
     python -m experiments.task_gap [--episodes 200] [--jobs N] [--work DIR] [--seconds 600]
 
-For each case: flights of the withheld plant with one cause are diagnosed (`openjax.gap`), and a shipped policy then
+For each case: flights of the exam's plant with one cause are diagnosed (`openjax.gap`), and a shipped policy then
 plays the same tasks from the same starts in the nominal simulator, in the plant with that cause, and in the simulator
 with the diagnosed effects.toml. Everything is kept in --work, so that a run that was cut short goes on. Writes
 RESULTS.json and RESULTS.md (--results).

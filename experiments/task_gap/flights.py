@@ -5,10 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.withheld import cases, causes, sensors
+from experiments.exam import cases, generate, vehicle
+from experiments.exam.effects import EFFECTS, draw
+from experiments.worlds.plant import rng_of, sensors_of
 from openjax.vehicle.effects import load_effects
 
-# Three quarters up GAP's usual ranges, in the units of `causes.LIMITS`; the plant's own forms.
+# Three quarters up the usual ranges, in the units of `effects.EFFECTS`; the plant's own forms.
 SIZES = {
     "motor_lag": 2.8,  # time constant 95 ms instead of 25
     "command_latency": 46.0,  # ms
@@ -18,7 +20,7 @@ SIZES = {
     "wind": 2.3,  # m/s
     "battery_sag": 0.3,  # of the thrust per volt
     "thrust_scale": 0.155,
-    "thrust_saturation": 0.15,  # the rotors top out at 0.75
+    "thrust_saturation": 0.66,  # of the room above hover: the rotors top out at 0.75
     "com_offset": 6.0,  # mm
     "motor_imbalance": 0.11,
     "yaw_torque": 0.64,  # 0.36 or 1.64 times the nominal
@@ -26,7 +28,7 @@ SIZES = {
     "downwash": 16.0,  # g
 }
 NONE = "none"
-SHORTEST = 700  # ticks of a flight
+SHORTEST = 0.7  # of a flight, before a vehicle crashes
 SATURATION_VOLTAGE = 3.9  # V, to which `thrust_saturation.limit` refers
 
 
@@ -45,14 +47,18 @@ class Case:
         """The name of the cause."""
         return self.cause["effect"] if self.cause else NONE
 
-    @property
-    def shared(self) -> dict:
-        """What all flights of the vehicle share, as `cases.Flights` draws it."""
-        return sensors.draw_case(cases.case_rng(self.seed, self.number, 1))
-
     def spec(self) -> dict:
-        """The case as `cases.Flights` and `cases.write_case` want it."""
-        return {"number": self.number, "flights": self.missions, "mass_weighed": False, "name": self.name}
+        """The case as the exam's generator wants it."""
+        return {
+            "name": self.name,
+            "number": self.number,
+            "missions": self.missions,
+            "ticks": [cases.TICKS] * len(self.missions),
+            "controller": "geometric",
+            "sensors": sensors_of(self.seed, self.number),
+            "told": vehicle.Told(),
+            "garbage": None,
+        }
 
 
 def make_cases(seed: int, replicates: int, nones: int, effects=tuple(SIZES)) -> list[Case]:
@@ -63,37 +69,39 @@ def make_cases(seed: int, replicates: int, nones: int, effects=tuple(SIZES)) -> 
     ]
     for effect, i in wanted:
         number = 1000 * (1 + (*SIZES, NONE).index(effect)) + i
-        rng = cases.case_rng(seed, number, 5)
-        cause = None
+        rng = rng_of(seed, number, 5)
+        cause, needed = None, []
         if effect != NONE:
-            forms = causes.FORMS[effect]
-            cause = causes.draw(rng, effect, forms[i % len(forms)]) | {"size": SIZES[effect]}
+            _, forms, exposing, _ = EFFECTS[effect]
+            form = forms[i % len(forms)]
+            cause, needed = draw(rng, effect, form) | {"size": SIZES[effect]}, [exposing]
             # opposite signs in turn
             cause["shape"][0] = (0.25, 0.9)[i % 2]
-        missions = cases.draw_missions(rng, [causes.EXPOSING.get(effect, ())], two=False)
-        out.append(Case(f"{effect}_{i}", seed, number, cause, [tuple(map(str, m)) for m in missions]))
+        missions = cases.draw_missions(rng, needed, "excite", two=False)
+        out.append(Case(f"{effect}_{i}", seed, number, cause, missions))
     return out
 
 
 def write_flights(case: Case, folder: Path) -> dict:
     """Fly and log the three flights of a case; returns the magnitudes of the cause, its size and the flights' ticks.
 
-    A vehicle that the plant's own controller can't keep in the air for 7 s of each flight gets a smaller cause
+    A vehicle that the plant's own controller can't keep in the air for most of each flight gets a smaller cause
     (`case.cause` is changed).
     """
+    spec = case.spec()
+    drawn = {case.name: generate.bodies(case.seed, "known", spec)}
     for _ in range(6):
-        flights = cases.Flights(case.seed, [case.spec()])
-        flown, magnitudes = flights.fly([[case.cause] if case.cause else []])
-        if case.cause is None or flown["crashed"].min() >= SHORTEST:
+        fleet = generate.Fleet(case.seed, "known", [(spec, [case.cause] if case.cause else [])], drawn)
+        if case.cause is None or fleet.lasts(0) >= SHORTEST:
             break
         case.cause["size"] *= 0.85
-    ticks = cases.write_case(folder, case.spec(), flights, flown, 0)
+    rows, _ = generate.write_case(fleet, 0, folder)
     return {
         "size": case.cause["size"] if case.cause else None,
         "form": case.cause["form"] if case.cause else None,
-        "magnitudes": _plain(magnitudes[0][0]) if case.cause else {},
+        "magnitudes": _plain(fleet.magnitudes[0][0]) if case.cause else {},
         "missions": [list(m) for m in case.missions],
-        "ticks": ticks,
+        "ticks": [len(flight[0]["t"]) for flight in rows],
     }
 
 

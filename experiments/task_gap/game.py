@@ -70,7 +70,7 @@ def fly_simulator(loaded, settings, start, number, effects=(), parameters=None) 
 
 
 def fly_plant(loaded, settings, start, number, case) -> dict[str, list[float]]:
-    """Episodes in the withheld plant with the causes of `case`; `flights.Case` says which vehicle flies."""
+    """Episodes in the exam's plant with the causes of `case`; `flights.Case` says which vehicle flies."""
     tasks, keys = draw_tasks(settings, start, number)
 
     def make_world(drones, tasks):

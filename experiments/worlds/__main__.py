@@ -3,7 +3,7 @@
     python -m experiments.worlds [--policy open flight] [--world nominal plant ...] [--episodes 100] [--jobs N]
 
 Worlds: the nominal simulator (rate loop at 500 Hz); `table`, the same with the slower vehicle of VEHICLE; `plant`,
-the withheld plant, and with `plant:motor_lag` and so on each of its causes at three quarters of its range; `rotorpy`,
+the exam's plant, and with `plant:motor_lag` and so on each of its causes at three quarters of its range; `rotorpy`,
 RotorPy's own Crazyflie. Writes experiments/results/worlds.json and .md (--out).
 """
 
@@ -27,11 +27,10 @@ for _name, _value in {
 import jax  # noqa: E402
 import numpy as np  # noqa: E402
 
+from experiments.exam import effects  # noqa: E402
 from experiments.task_gap.flights import SIZES  # noqa: E402
-from experiments.withheld import causes  # noqa: E402
-from experiments.withheld.cases import case_rng  # noqa: E402
 from experiments.worlds.game import play  # noqa: E402
-from experiments.worlds.plant import PlantWorld  # noqa: E402
+from experiments.worlds.plant import PlantWorld, rng_of  # noqa: E402
 from experiments.worlds.rotorpy import RotorPyWorld  # noqa: E402
 from experiments.worlds.simulator import SimulatorWorld  # noqa: E402
 from openjax.commands.evaluator import layout_slots  # noqa: E402
@@ -81,8 +80,8 @@ def make_world(world: str, ticks: int, start: int, drones, tasks):
     number = 0 if not effect else 1 + list(SIZES).index(effect)
     cause = None
     if effect:
-        cause = causes.draw(case_rng(SEED, number, 5), effect, causes.FORMS[effect][0])
-        cause["size"] = SIZES[effect]
+        form = effects.EFFECTS[effect].forms[0]
+        cause = effects.draw(rng_of(SEED, number, 5), effect, form) | {"size": SIZES[effect]}
     return PlantWorld(drones, tasks, ticks, SEED, number, cause, first=start)
 
 
@@ -186,7 +185,7 @@ def report(results: dict) -> list[str]:
         "",
         f"`{results['command']}`, JAX {machine['versions']['jax']}, commit {machine['commit']}: {results['seconds']:.0f} s. "
         "No clamp, drawn starts. Nominal: the simulator with the rate loop at 500 Hz; table: the same with motors 40 ms "
-        "slower, commands 15 ms and poses 10 ms late, and drag of .0125 N s/m; plant: the withheld plant (1 kHz, no shared "
+        "slower, commands 15 ms and poses 10 ms late, and drag of .0125 N s/m; plant: the exam's plant (1 kHz, no shared "
         "code), also with each of its causes at three quarters of its range; rotorpy: RotorPy's own Crazyflie. Change: mean norm "
         "of a command's change in a step, commands in -1 to 1; above 10 Hz: that share of the commands' variance.",
         "",

@@ -1,29 +1,28 @@
 """RotorPy 3 as a world (Folk, Paulos, Kumar 2023; the `dev` extra): its `Multirotor` and its own Crazyflie.
 
 Rigid body, rotors, drag at the hubs and motor lag are RotorPy's, with its identified Crazyflie: 30 g, motors of 72 ms,
-other thrust and torque constants. The firmware's rate loop at 500 Hz and the sensors' noise are those of the withheld
+other thrust and torque constants. The firmware's rate loop at 500 Hz and the sensors' noise are those of the exam's
 plant, since RotorPy's Crazyflie has no motor commands; commanded thrust is in units of the nominal vehicle's.
 """
 
 import numpy as np
 
-from experiments.withheld import body as b
-from experiments.withheld import sensors
-from experiments.withheld.cases import case_rng
-from experiments.worlds.plant import solids_of
+from experiments.exam import vehicle as v
+from experiments.exam.plant import PER_TICK, SAMPLE, Firmware
+from experiments.worlds.plant import air_of, limit_speed, sensors_of, solids_of
 from experiments.worlds.world import Poses, per_world
 from openjax.pursuit import Task
 from openjax.vehicle import DroneState
 
-DT = 0.002  # s, of the rate loop
+MOST_THRUST = v.THRUST_CONSTANT * v.MAX_SPEED**2  # N, of a nominal rotor
 
 
 def crazyflie() -> dict:
     """RotorPy's Crazyflie, with its rotors numbered and turning as the firmware has them."""
     from rotorpy.vehicles.crazyflie_params import quad_params
 
-    hubs = {f"r{i + 1}": np.array([b.ROTOR_X[i], b.ROTOR_Y[i], 0.0]) for i in range(4)}
-    return quad_params | {"rotor_pos": hubs, "rotor_directions": b.SPIN}
+    hubs = {f"r{i + 1}": np.array([v.ROTOR_X[i], v.ROTOR_Y[i], 0.0]) for i in range(4)}
+    return quad_params | {"rotor_pos": hubs, "rotor_directions": v.SPIN}
 
 
 class RotorPyWorld:
@@ -55,7 +54,7 @@ class RotorPyWorld:
         self.position = np.asarray(drones.position, float).reshape(count, 3).T.copy()
         self.q = np.asarray(drones.quaternion, float).reshape(count, 4).T.copy()
         self.velocity, self.rates = np.zeros((3, count)), np.zeros((3, count))
-        hover = np.sqrt(self.parameters["mass"] * b.GRAVITY / (4 * self.parameters["k_eta"]))
+        hover = np.sqrt(self.parameters["mass"] * v.GRAVITY / (4 * self.parameters["k_eta"]))
         self.states, self.models = [], []
         for i in range(count):
             state = {
@@ -73,16 +72,13 @@ class RotorPyWorld:
                     state,
                     control_abstraction="cmd_motor_speeds",
                     aero=True,
-                    integrator_kwargs={"method": "RK23", "first_step": DT, "rtol": 1e-3, "atol": 1e-5},
+                    integrator_kwargs={"method": "RK23", "first_step": SAMPLE, "rtol": 1e-3, "atol": 1e-5},
                 )
             )
-        shared = sensors.draw_case(case_rng(seed, 0, 1))
-        noises = []
-        for world in range(worlds):
-            rng = case_rng(seed, 0, 3, first + world)
-            noises += [sensors.draw_flight(rng, shared, ticks, shared["voltage"]) for _ in range(self.team)]
-        self.noise = sensors.stack(noises)
-        self.integral, self.previous = np.zeros((3, count)), np.zeros((3, count))
+        drawn = sensors_of(seed, 0)
+        self.air = air_of(drawn, seed, 0, ticks + 1, range(first, first + worlds), self.team)
+        nominal = v.nominal_parameters([v.Told()] * count)
+        self.firmware = Firmware(nominal, self.air["gyro_bias"].astype(float))
         self.solids, self.tick = solids_of(tasks, self.team), 0
 
     def poses(self) -> Poses:
@@ -91,35 +87,25 @@ class RotorPyWorld:
 
     def measure(self) -> Poses:
         """Poses as they were a few milliseconds ago, with the motion capture's noise."""
-        noise, k = self.noise, min(self.tick, len(self.noise["position"]) - 1)
-        late = 1e-3 * (noise["mocap_delay"] + noise["mocap_jitter"][k])
-        quaternion = b.multiply(b.turn(self.q, -self.rates, late), noise["attitude"][k])
+        air, k = self.air, self.tick
+        late = 1e-3 * air["pose_delay"]
+        quaternion = v.multiply(v.turn(self.q, -self.rates, late), air["seen_attitude"][k])
         quaternion /= np.sqrt((quaternion * quaternion).sum(axis=0))
-        position = self.position - late * self.velocity + noise["position"][k]
-        return per_world(self.team, position, quaternion, self.velocity + noise["velocity"][k])
+        position = self.position - late * self.velocity + air["seen_position"][k]
+        return per_world(self.team, position, quaternion, self.velocity + air["seen_velocity"][k])
 
     def fly(self, command, max_speed=None) -> None:
         """One tick: five times the rate loop and RotorPy's step, then solid things."""
         command = command.reshape(-1, 4).T
-        for sub in range(5):
-            loop = min(5 * self.tick + sub, len(self.noise["gyro_loop"]) - 1)
-            gyro = self.rates + self.noise["gyro_bias"] + self.noise["gyro_loop"][loop]
-            error = np.rad2deg(command[1:] - gyro)
-            limit = b.INTEGRAL_LIMIT[:, None]
-            self.integral = np.clip(self.integral + DT * error, -limit, limit)
-            slope = -np.rad2deg(gyro - self.previous) / DT
-            self.previous = gyro
-            gains = (gain[:, None] for gain in (b.RATE_KP, b.RATE_KI, b.RATE_KD))
-            parts = zip(gains, (error, self.integral, slope), strict=True)
-            motors = b.mix(command[0], sum(gain * part for gain, part in parts))
-            speeds = np.sqrt(motors * b.MAX_THRUST / self.parameters["k_eta"])
+        for part in range(PER_TICK):
+            noise = self.air["gyro_bias"] + self.air["gyro"][PER_TICK * self.tick + part]
+            motors = self.firmware(command, self.rates + noise)
+            speeds = np.sqrt(motors * MOST_THRUST / self.parameters["k_eta"])
             for i, model in enumerate(self.models):
-                self.states[i] = model.step(self.states[i], {"cmd_motor_speeds": speeds[:, i]}, DT)
+                self.states[i] = model.step(self.states[i], {"cmd_motor_speeds": speeds[:, i]}, SAMPLE)
             self._read()
         self.solids.stop(self.position, self.velocity)
-        if max_speed is not None:
-            speed = np.sqrt((self.velocity * self.velocity).sum(axis=0)) + 1e-12
-            self.velocity *= np.minimum(1.0, max_speed / speed)
+        limit_speed(self.velocity, max_speed)
         for i, state in enumerate(self.states):
             state["x"], state["v"] = self.position[:, i].copy(), self.velocity[:, i].copy()
         self.tick += 1

@@ -51,7 +51,6 @@ def steps(b, number, m=0.0):
             zero,
             zero,
             0.0,
-            zero - 10.0,
         )
 
 

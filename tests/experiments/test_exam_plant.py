@@ -1,4 +1,4 @@
-"""The withheld plant against the simulator, and its cases against one another."""
+"""The exam's plant against the simulator, and its cases against one another."""
 
 import sys
 from pathlib import Path
@@ -10,7 +10,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from experiments.withheld import cases
+from experiments.exam import cases, generate, sensors, vehicle
 from openjax.vehicle import (
     load_vehicle,
     rate_controller,
@@ -21,15 +21,35 @@ from openjax.vehicle import (
 )
 from openjax.vehicle.state import DroneState
 
+TICKS = 500
+FLIGHTS = {1: ("agile", "yaw", "fast"), 2: ("climb", "step", "agile")}
+
+
+def fly(*numbers):
+    """Nominal vehicles, told exactly, with hard manoeuvres in light turbulence."""
+    drawn = sensors.draw(np.random.default_rng(3), "white", "psgacmv", "light")
+    drawn |= {"constants_off": [0.0] * 5, "thrust_offset": 0.0, "gyro_cut": 0.0, "derivative_cut": 0.0}
+    specs = [
+        {
+            "name": f"case_{n}",
+            "number": n,
+            "missions": [(m,) for m in FLIGHTS[n]],
+            "sensors": drawn,
+            "told": vehicle.Told(),
+            "controller": "geometric",
+        }
+        for n in numbers
+    ]
+    bodies = {s["name"]: generate.bodies(5, "known", s) for s in specs}
+    return generate.Fleet(5, "known", [(s, []) for s in specs], bodies)
+
 
 @pytest.fixture(scope="module")
 def nominal():
-    """Two nominal cases with hard manoeuvres, as flown: (flights, flown)."""
-    flown = ([("agile",), ("yaw",), ("fast",)], [("climb",), ("step",), ("agile",)])
-    specs = [{"number": n, "flights": missions} for n, missions in enumerate(flown, 1)]
-    flights = cases.Flights(5, specs)
-    flown, _ = flights.fly([[], []])
-    return flights, flown
+    """Two nominal cases."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cases, "TICKS", TICKS)
+        yield fly(1, 2)
 
 
 def _replay(vehicle, start, motors, commands, from_commands):
@@ -37,10 +57,8 @@ def _replay(vehicle, start, motors, commands, from_commands):
     dt = 0.002
 
     def tick(carry, inputs):
-        m_logged, command = inputs
-
-        def step(carry, _):
-            state = carry
+        def step(state, inputs):
+            m_logged, command = inputs
             m, integral = rate_controller(vehicle, state, command, dt)
             m = m if from_commands else m_logged
             rotor = rotor_speed_step(vehicle, state.rotor_speed, m, dt)
@@ -66,7 +84,7 @@ def _replay(vehicle, start, motors, commands, from_commands):
             )
             return new, None
 
-        carry, _ = jax.lax.scan(step, carry, None, length=5)
+        carry, _ = jax.lax.scan(step, carry, inputs)
         return carry, (carry.velocity, carry.body_rates)
 
     return jax.lax.scan(tick, start, (motors, commands))[1]
@@ -80,15 +98,12 @@ def _world(q, v):
 @pytest.mark.parametrize("from_commands", [False, True])
 def test_nominal_plant_agrees_with_the_rigid_simulator(nominal, from_commands):
     # a wrong sign, unit, motor order, spin, gain or lag in either would show at many times the gusts
-    flights, flown = nominal
-    vehicle = load_vehicle()
-    vehicle = vehicle.replace(
-        thrust_constant=vehicle.thrust_constant * (1 + flights.specs[0]["thrust_offset"])
-    )
-    starts, length, bodies = np.arange(100, 800, 35), 20, flights.columns[0]
+    flown, bodies = nominal.flown, nominal.columns[0]
+    starts, length = np.arange(100, TICKS - 25, 20), 20
 
-    def gather(name):
-        return np.moveaxis(flown[name][starts][:, :, bodies], 2, 1).reshape(-1, flown[name].shape[1])
+    def gather(name, tick=0):
+        values = flown[name][5 * (starts + tick)].astype(float)
+        return np.moveaxis(values[:, :, bodies], 2, 1).reshape(-1, values.shape[1])
 
     start = DroneState(
         position=gather("position"),
@@ -103,14 +118,14 @@ def test_nominal_plant_agrees_with_the_rigid_simulator(nominal, from_commands):
     start = jax.tree.map(jnp.asarray, start)
 
     def windows(name):
-        cut = [np.moveaxis(flown[name][s : s + length][:, :, bodies], 2, 0) for s in starts]
-        return np.stack(cut).reshape(-1, length, 4)
+        cut = [np.moveaxis(flown[name][5 * k : 5 * (k + length)][:, :, bodies], 2, 0) for k in starts]
+        return np.stack(cut).reshape(-1, length, 5, 4)
 
-    replayed = jax.jit(jax.vmap(lambda s, m, c: _replay(vehicle, s, m, c, from_commands)))
-    velocity, rates = replayed(start, windows("motor"), windows("command"))
+    replayed = jax.jit(jax.vmap(lambda s, m, c: _replay(load_vehicle(), s, m, c, from_commands)))
+    velocity, rates = replayed(start, windows("motor"), windows("applied"))
 
     def error(name, values, ticks):
-        truth = np.moveaxis(flown[name][starts + ticks][:, :, bodies], 2, 1).reshape(-1, 3)
+        truth = gather(name, ticks)
         moved = truth - np.asarray(getattr(start, "velocity" if name == "velocity" else "body_rates"))
         return np.sqrt(np.mean((values[:, ticks - 1] - truth) ** 2, 0)), np.sqrt(np.mean(moved**2, 0))
 
@@ -122,7 +137,7 @@ def test_nominal_plant_agrees_with_the_rigid_simulator(nominal, from_commands):
 
 def test_a_case_does_not_depend_on_its_companions(nominal):
     # otherwise the number of processes would change the flights, and a seed would mean nothing
-    flights, flown = nominal
-    alone = cases.Flights(5, [flights.specs[1]])
-    again, _ = alone.fly([[]])
-    np.testing.assert_array_equal(again["velocity"], flown["velocity"][:, :, flights.columns[1]])
+    alone = fly(2)
+    np.testing.assert_array_equal(
+        alone.flown["velocity"], nominal.flown["velocity"][:, :, nominal.columns[1]]
+    )
