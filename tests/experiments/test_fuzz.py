@@ -1,4 +1,4 @@
-"""A few hundred hostile inputs and a few damaged checkpoints; `experiments/fuzz.py` tries thousands."""
+"""A few hundred hostile inputs and a few damaged checkpoints; `python -m experiments.fuzz` tries thousands."""
 
 import sys
 from collections import Counter
@@ -6,22 +6,24 @@ from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
+sys.path.insert(0, str(Path(__file__).parents[2]))
 
-import fuzz
+from experiments.fuzz.cases import try_cases
+from experiments.fuzz.damages import make_checkpoints, try_damages
+from experiments.fuzz.inputs import KINDS
 
 NUMBER = {"settings files": 60, "layouts": 60, "effects files": 60, "vehicle files": 60}
 
 
-@pytest.mark.parametrize("kind", fuzz.KINDS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_hostile_input_is_refused_in_one_line_or_taken_sanely(kind):
-    cases = fuzz.try_cases(kind, range(NUMBER.get(kind, 15)))
+    cases = try_cases(kind, range(NUMBER.get(kind, 15)))
     failed = [(seed, text) for _, seed, outcome, text in cases if outcome == "failed"]
     assert not failed, failed[0]
     assert Counter(outcome for _, _, outcome, _ in cases)["refused"]
 
 
 def test_no_damage_to_a_checkpoint_goes_unseen(tmp_path):
-    fuzz.make_checkpoints(tmp_path)
-    outcomes = Counter(fuzz.try_damages(tmp_path, range(12)))
+    make_checkpoints(tmp_path)
+    outcomes = Counter(try_damages(tmp_path, range(12)))
     assert set(outcomes) <= {"same", "before", "refused"} and outcomes["before"]

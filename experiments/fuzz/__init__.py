@@ -1,0 +1,1 @@
+"""Hostile input, damaged checkpoints, kills at any instant, and what openjax makes of them."""

@@ -1,0 +1,92 @@
+"""Cases: one hostile input each, and what openjax made of it."""
+
+import contextlib
+import dataclasses
+import io
+import math
+import random
+import resource
+import tempfile
+import time
+import traceback
+from pathlib import Path
+
+import numpy as np
+
+from experiments.fuzz.inputs import KINDS
+from openjax.commands.command_line import LONGEST, one_line
+
+SECONDS, MEGABYTES = 30.0, 1000.0
+
+_warm: set = set()
+
+
+def finite(tree) -> bool:
+    """Whether every number of plain values, dataclasses or arrays is finite."""
+    if dataclasses.is_dataclass(tree):
+        return all(finite(getattr(tree, field.name)) for field in dataclasses.fields(tree))
+    if isinstance(tree, dict):
+        return all(map(finite, tree.values()))
+    if isinstance(tree, tuple | list):
+        return all(map(finite, tree))
+    if isinstance(tree, float):
+        return math.isfinite(tree)
+    if hasattr(tree, "dtype") and np.issubdtype(np.asarray(tree).dtype, np.floating):
+        return bool(np.isfinite(np.asarray(tree)).all())
+    return True
+
+
+def try_case(kind: str, seed: int) -> tuple[str, str]:
+    """One case: `refused`, `accepted` or `failed`, and what is to be told of it."""
+    function = KINDS[kind][0]
+    rng = random.Random(f"{kind} {seed}")
+    memory, started = _megabytes(), time.process_time()
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder) / "work"
+        place.mkdir()
+        try:
+            with contextlib.redirect_stderr(io.StringIO()):
+                accepted = function(rng, place)
+            outcome, told = "accepted", ""
+            if not finite(accepted):
+                outcome, told = "failed", "nonsense accepted: a number that isn't finite"
+        except Exception as error:
+            told = one_line(error)
+            outcome = "refused"
+            if told is None or "\n" in told or not told or len(told) > LONGEST:
+                outcome, told = "failed", "".join(traceback.format_exception(error))[-2000:]
+        left = [
+            str(path) for path in place.rglob("*") if path.name.startswith(".writing") or path.name == "run"
+        ]
+        if left:
+            outcome, told = "failed", f"left behind: {left[:3]}"
+    if time.process_time() - started > SECONDS:
+        outcome, told = "failed", f"took {time.process_time() - started:.0f} s ({told})"
+    if _megabytes() - memory > MEGABYTES:
+        outcome, told = "failed", f"took {_megabytes() - memory:.0f} MB ({told})"
+    return outcome, told
+
+
+def _megabytes():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def try_cases(kind: str, seeds: range) -> list[tuple[str, int, str, str]]:
+    """Several cases: kind, seed, outcome, text."""
+    if kind not in _warm:  # what is loaded for the first of its kind isn't that case's fault
+        try_case(kind, -1)
+        _warm.add(kind)
+    return [(kind, seed, *try_case(kind, seed)) for seed in seeds]
+
+
+def plan(cases: int, seed: int, piece: int = 20) -> list[tuple[str, range]]:
+    """The cases, in pieces that one process does at a time."""
+    total = sum(share for _, share in KINDS.values())
+    pieces = []
+    for kind, (_, share) in KINDS.items():
+        number = max(1, round(cases * share / total))
+        first = seed * 1_000_000
+        pieces += [
+            (kind, range(i, min(i + piece, first + number))) for i in range(first, first + number, piece)
+        ]
+    return pieces
