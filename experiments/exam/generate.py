@@ -28,6 +28,8 @@ SIZES = 4
 VOCABULARY = list(effects.EFFECTS)
 LINK = ("command_latency", "packet_loss")  # effects that the commands in force tell
 FIRMWARE = (*LINK, "rate_gains")
+HIDDEN = 0.5  # floors; a cause that shows less can't be asked for
+FORCE, TORQUE, YAW = slice(0, 3), slice(3, 5), 5  # channels of `measure`; TORQUE: roll and pitch
 
 
 def bodies(seed, column, spec):
@@ -111,6 +113,17 @@ class Fleet:
         rms = measure.errors(self.flown, self.told, parameters, self.partner, firmware, links)
         return np.stack([(rms[:, c] ** 2).mean(axis=1) for c in self.columns], axis=1)
 
+    def replayed(self, i, parameters, motors=None, lasts=None):
+        """Mean squares (12,) of a model on variant i alone, driven by other motor commands (S, 4, n) than it got, if given;
+        `lasts` (n,): samples of them.
+        """
+        c, no = self.columns[i], np.zeros(len(self.columns[i]), bool)
+        flown = {k: x[..., c] for k, x in self.flown.items()}
+        if motors is not None:
+            flown |= {"motor": motors, "crashed": np.minimum(flown["crashed"], lasts)}
+        told, own = [self.told[j] for j in c], {k: x[..., c] for k, x in parameters.items()}
+        return (measure.errors(flown, told, own, self.partner[c] - c[0], no, no) ** 2).mean(axis=1)
+
     def energies(self):
         """{model: mean squares (12, variants)}: the nominal model, the true one, and the true one without its first or
         second cause.
@@ -180,8 +193,6 @@ def _variants(spec):
     """The sets of causes that a case is flown with: {key: causes}."""
     if not spec["causes"]:
         return {"final": []}
-    if spec["category"] == "not_testable":
-        return {"final": spec["causes"]}
     out = {"nominal": []} if spec["category"] == "unknown" else {}
     for i, cause in enumerate(spec["causes"]):
         low, high = (unknowns.ALL if spec["category"] == "unknown" else effects.EFFECTS)[
@@ -196,12 +207,18 @@ def _variants(spec):
 def _floors(fleet, i, turbulence):
     """Noise floor (12,) of a case from the logs of variant i and what turbulence leaves to the true model."""
     spec = fleet.variants[i][0]
-    rows, _ = fleet.rows(i)
+    rows = [r for flight in fleet.rows(i)[0] for r in flight]
     each = [
         measure.sensor_floor(spec["sensors"], r, fleet.flown, j)
-        for r, j in zip((r for flight in rows for r in flight), fleet.columns[i], strict=True)
+        for r, j in zip(rows, fleet.columns[i], strict=True)
     ]
-    return np.sqrt((np.array(each) ** 2).mean(axis=0) + turbulence)
+    left = turbulence.copy()
+    if "m" in spec["sensors"]["channels"]:
+        samples, lasts = len(fleet.flown["motor"]), [round(r["t"][-1] / plant.SAMPLE) for r in rows]
+        both = np.stack([measure.motors_of_log(r, samples) for r in rows], axis=-1)
+        logged = np.min([fleet.replayed(i, fleet.parameters, m, np.array(lasts)) for m in both], axis=0)
+        left[:6] = np.maximum(left[:6], logged[:6])
+    return np.sqrt((np.array(each) ** 2).mean(axis=0) + left)
 
 
 def _ratios(before, after, floor):
@@ -231,14 +248,15 @@ def fly_chunk(job):
                 at = place[name, (i, n)]
                 after = nominal[:, place[name, "nominal"]] if spec["category"] == "unknown" else truth[:, at]
                 severity = max(float(_ratios(nominal[:, at], after, floor).max()), 1e-3)
-                if cause["effect"] in unknowns.SENSOR_KINDS:
-                    severity = spec["targets"][i] * (
-                        1 + abs(n - 1.5)
-                    )  # the motion shows nothing: a middle size
-                options.append(
-                    (abs(math.log(severity / spec["targets"][i])) + 10 * (first.lasts(at) < 0.7), n, severity)
-                )
+                if cause["effect"] in unknowns.SENSOR_KINDS:  # the motion shows nothing: a middle size
+                    severity = spec["targets"][i] * (1 + abs(n - 1.5))
+                crash = 10 * (first.lasts(at) < 0.7)
+                if spec["category"] == "not_testable":  # as large as stays hidden
+                    options.append((crash + max(math.log(severity / HIDDEN), 0.0), -n, severity))
+                else:
+                    options.append((crash + abs(math.log(severity / spec["targets"][i])), n, severity))
             _, n, severity = min(options)
+            n = abs(n)
             cause |= {"size": tried[place[name, (i, n)]][2][0]["size"], "alone": round(severity, 3)}
             chosen[name] = place[name, (i, n)]
             if first.lasts(chosen[name]) < 0.7:  # every size crashes: less of it
@@ -270,28 +288,54 @@ def _answer(fleet, i, squares, floor, folder, of_flight):
     energy = {
         k: np.where(known, (x + np.where(known, quiet, 0.0)) / floor**2, 0.0) for k, x in squares.items()
     }
-    for j, cause in enumerate(own):
-        if cause["effect"] in VOCABULARY:
-            energy[cause["effect"]] = energy[j] if len(own) > 1 else energy["nominal"]
+    names, shows = [c["effect"] for c in own], {}
+    for j, name in enumerate(names):
+        if name in VOCABULARY:
+            energy[name] = energy[j] if len(own) > 1 else energy["nominal"]
+            shows[name] = np.sqrt(np.maximum(energy[name] - energy["truth"], 0.0))
     energy = {k: e for k, e in energy.items() if isinstance(k, str)}
     excess = energy["nominal"] - energy["truth"]
     severity = float(np.sqrt(np.maximum(excess, 0)).max())
-    category, names = spec["category"], [c["effect"] for c in own]
-    if category == "single" and severity < 0.5:
-        category = "not_testable"  # the cause is there, and these sensors can't show it
+    if set(names) & set(unknowns.SENSOR_KINDS):
+        seen = names  # the plant's measure reads no logs
+    elif spec["category"] == "pair":
+        seen = [n for n in names if shows[n].max() >= HIDDEN]
+        severity = float(shows[seen[0]].max()) if len(seen) == 1 else severity
+    else:
+        seen = names if severity >= HIDDEN else []
+    category = spec["category"]
+    if category in ("single", "pair", "not_testable"):
+        category = ("not_testable", "single", "pair")[len(seen)]
+    elif category == "unknown" and not seen:
+        category = "not_testable"
+    names = [*seen, *(n for n in names if n not in seen)]
     total = max(float(excess.sum()), 1e-12)
     parts = [n for c in own for n in effects.PARTS.get((c["effect"], c["form"]), ())]
+    magnitudes = [
+        m
+        | (
+            {"logged_ms": sensors.pose_lag(m["delay_ms"], spec["sensors"])}
+            if c["effect"] == "state_latency"
+            else {}
+        )
+        for c, m in zip(own, fleet.magnitudes[i], strict=True)
+    ]
     gap = {k: float(np.sqrt(energy[k][np.isfinite(floor)].mean())) for k in ("nominal", "truth")}
     expected = {"none": ["none"], "not_testable": ["none"], "unknown": ["unknown"], "garbage": ["garbage"]}
+    told = {
+        n: accepted(n, spec["told"].weighed, shows[n], _scale_stands_in(fleet, i, n, squares, floor))
+        for n in shows
+    }
     return {
         "case": spec["name"],
         "category": category,
         "effects": names or ([spec["garbage"]] if spec["garbage"] else []),
-        "expected": expected.get(category, names),
-        "acceptable": {n: accepted(n, spec["told"].weighed) for n in names if n in VOCABULARY},
-        "also_fine": spec["also_fine"] + parts + (names if category == "not_testable" else []),
+        "expected": expected.get(category, seen),
+        "acceptable": told,
+        "also_fine": spec["also_fine"] + parts + [n for n in names if n not in seen],
+        "held_ms": 1e3 / spec["sensors"]["pose_rate"] if sensors.holds_poses(spec["sensors"]) else None,
         "in_sensors": bool(set(names) & set(unknowns.SENSOR_KINDS)),
-        "causes": [c | {"magnitudes": m} for c, m in zip(own, fleet.magnitudes[i], strict=True)],
+        "causes": [c | {"magnitudes": m} for c, m in zip(own, magnitudes, strict=True)],
         "severity": cases.label(severity) if own else None,
         "severity_ratio": round(severity, 3),
         "shares": {
@@ -317,12 +361,44 @@ def _answer(fleet, i, squares, floor, folder, of_flight):
     }
 
 
-def accepted(name, weighed):
-    """Names that are right for a cause: those that such flights can't tell apart from it."""
-    if name in ("mass", "thrust_scale") and not weighed:
-        return ["mass", "thrust_scale"]
-    classes = {"yaw_torque": ["yaw_torque", "inertia"], "inertia": ["inertia", "rate_gains"]}
-    return classes.get(name, [name])
+def _scale_stands_in(fleet, i, name, squares, floor):
+    """Whether one constant factor on the thrust leaves less than `HIDDEN` floors of a cause in the map to thrust."""
+    if name not in ("battery_sag", "thrust_curve"):
+        return False
+    own, c = fleet.variants[i][1], fleet.columns[i]
+    others = [[k for k in causes if k["effect"] != name or causes is not own] for _, causes in fleet.variants]
+    without = fleet.model(others)[0]
+    some = slice(500, int(fleet.flown["crashed"][c].min()), 20)
+    m, voltage, load = (fleet.flown[k][some][..., c].astype(float) for k in ("motor", "voltage", "load"))
+    demands = []
+    for p in (fleet.parameters, without):
+        p = {k: x[..., c] for k, x in p.items()}
+        active = effects.Active(p, vehicle.nominal_parameters([fleet.told[j] for j in c]))
+        demands.append([effects.motor_demand(p, active, *now) for now in zip(m, voltage, load, strict=True)])
+    true, plain = np.array(demands)
+    without["rotor_gain"][:, c] *= (true * plain).sum() / (plain**2).sum()
+    left = fleet.replayed(i, without)[FORCE] - squares["truth"][FORCE]
+    return bool(np.sqrt(np.maximum(left, 0.0) / floor[FORCE] ** 2).max() < HIDDEN)
+
+
+def accepted(name, weighed, shows=None, scale=False):
+    """Names that are right for a cause: those that such flights can't tell apart from it.
+
+    `shows` (12,): what the cause shows in each channel, in floors; `scale`: a constant factor on the thrust stands in.
+    """
+    shows = np.full(12, np.inf) if shows is None else shows
+    out = [name]
+    if scale:
+        out.append("thrust_scale")
+    if set(out) & {"mass", "thrust_scale"} and not weighed:
+        out += [n for n in ("mass", "thrust_scale") if n not in out]
+    if name == "yaw_torque" or (name == "inertia" and shows[TORQUE].max() < HIDDEN):
+        out += ["inertia" if name == "yaw_torque" else "yaw_torque"]  # reaction torque and J_zz: one ratio
+    if name == "blade_flapping" and shows[TORQUE].max() < HIDDEN:
+        out.append("rotor_drag")  # only its torque tells it from drag
+    if name == "motor_imbalance" and shows[YAW] < HIDDEN:
+        out.append("com_offset")  # only its yaw trim tells it from an offset
+    return out
 
 
 def generate(seed, column, count, logs, jobs=1, only=None, chunk=8, progress=True, names=None):

@@ -5,7 +5,8 @@ velocity over 0.25 s (force, body axes) and of the body rates over 0.05 s (torqu
 velocity and rates at every step and the model's own rotors. The firmware is run along the true gyroscope and the
 commands as issued: motor commands (roll, pitch, yaw), without what is slower than half a second. The turn of the pose
 over 0.1 s is set against the body rates. Errors are divided by the case's noise floor: what is left with the true model
-(turbulence) together with what the case's sensors add over the same horizons. A channel that the logs do not hold has
+when the logged motor commands drive it (turbulence, and rows that see little of the motors) together with what the case's
+sensors add over the same horizons. A channel that the logs do not hold has
 no finite floor. Severity is the largest ratio of a channel; energies are mean squares in floors.
 """
 
@@ -127,6 +128,13 @@ def _motor_errors(flown, parameters, other_firmware, links):
     return out
 
 
+def motors_of_log(rows, samples):
+    """Motor commands every 2 ms as a reader of the log can have them, (2, S, 4): held over a row, straight between rows."""
+    times, logged = SAMPLE * np.arange(samples), np.stack([rows[c] for c in GROUPS["m"]], axis=1)
+    held = logged[np.maximum(np.searchsorted(rows["t"], times + 1e-6) - 1, 0)]
+    return np.stack([held, np.stack([np.interp(times, rows["t"], c) for c in logged.T], axis=1)])
+
+
 def sensor_floor(sensors, rows, flown, j):
     """(12,) what the case's sensors add to the errors of body j, over the same horizons; inf where nothing was logged."""
     have, t = sensors["channels"], rows["t"]
@@ -180,5 +188,11 @@ def sensor_floor(sensors, rows, flown, j):
         if "c" in have and "m" in have:
             slope = np.diff(flown["gyro"][:, :, j].astype(float), axis=0).std(axis=0) / SAMPLE
             counts = v.RATE_KP * np.rad2deg(noise) + 0.3 * v.RATE_KD * np.rad2deg(slope)
+            # commands that came between the rows are not in the log
+            issued, inside = flown["command"][:, 1:, j].astype(float), 0.01 * np.arange(len(flown["command"]))
+            last = np.searchsorted(t, inside + 1e-6) - 1
+            known = np.stack([rows[c] for c in GROUPS["c"][1:]], axis=1)[np.maximum(last, 0)]
+            missed = (issued - known)[(inside > 1.0) & (inside < t[-1])]
+            counts = np.hypot(counts, v.RATE_KP * np.rad2deg(np.sqrt((missed**2).mean(axis=0))))
             out[6:9] = np.hypot(counts / 65536.0 / np.array([2, 2, 1]), 1e-4 * sensors["quantum"] / 3.5)
     return out

@@ -163,6 +163,16 @@ def draw_air(rng, sensors, ticks, voltage, strong=1.0):
     }
 
 
+def holds_poses(sensors):
+    """Whether rows repeat the last pose, which makes them late by half the hold on average, whatever flies."""
+    return sensors["kind"] == "stale" and "p" in sensors["channels"]
+
+
+def pose_lag(delay_ms, sensors):
+    """By how much poses in the log are late, ms: the cause together with the motion capture's own; None if they are held."""
+    return None if holds_poses(sensors) else delay_ms + sensors["pose_delay"]
+
+
 def stack(flights):
     """List of `draw_air` dicts to one with the body index last."""
     return {key: np.stack([np.asarray(f[key]) for f in flights], axis=-1) for key in flights[0]}

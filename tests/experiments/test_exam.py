@@ -262,7 +262,9 @@ def test_written_cases_can_be_read_and_say_what_they_hold(tmp_path, monkeypatch)
     monkeypatch.setattr(cases, "TICKS", 300)
     single = (cases.draw_case(5, "known", 1, "single", i) for i in range(20))
     thrust = next(s for s in single if s["causes"][0]["effect"] == "thrust_scale")
-    drawn = [thrust, cases.draw_case(5, "known", 2, "pair", 0)]
+    hidden = (cases.draw_case(5, "known", 3, "not_testable", i) for i in range(8))
+    drag = next(s for s in hidden if s["causes"][0]["effect"] == "rotor_drag")
+    drawn = [thrust, cases.draw_case(5, "known", 2, "pair", 0), drag]
     for spec in drawn:
         spec |= {"ticks": [300] * 3, "missions": [("laps",)] * 3}
     monkeypatch.setattr(cases, "draw_cases", lambda *_: drawn)
@@ -275,6 +277,8 @@ def test_written_cases_can_be_read_and_say_what_they_hold(tmp_path, monkeypatch)
         assert answer["gap"]["before"] >= 0.99
         if answer["category"] == "pair":
             assert sum(answer["shares"].values()) == pytest.approx(1.0, abs=0.35)
+        elif answer["effects"] == ["rotor_drag"]:  # on laps it shows: the key may not call it hidden
+            assert answer["category"] == "single" and answer["expected"] == ["rotor_drag"]
         else:  # the truth, said by a report, closes the whole gap
             scale = {"scale": {"value": answer["causes"][0]["magnitudes"]["scale"]}}
             report = {"effects": ["thrust_scale"], "parameters": {"thrust_scale": scale}}
@@ -288,6 +292,48 @@ def test_written_cases_can_be_read_and_say_what_they_hold(tmp_path, monkeypatch)
             assert share == pytest.approx(1.0, abs=0.05)
         mass = answer["told"]["mass"]
         assert f"mass = {mass:.5f}" in (tmp_path / "logs" / answer["case"] / "vehicle.toml").read_text()
+
+
+def test_rows_that_see_little_of_the_motors_hide_torque(hovering):
+    """A key whose floor forgets this asks for torques that no reader of a slow log can see."""
+    many, p, flown = hovering
+    none, left = np.zeros(2, bool), {}
+    m = flown["motor"].copy()
+    m[::2], m[1::2] = (
+        m[::2] + 0.02,
+        m[1::2] - 0.02,
+    )  # the loop's own noise: fast, and without effect on the motion
+    for rate in (500, 50):
+        _, rows = log_of(flown | {"motor": m}, "white", rate=rate, motor="snapshot")
+        held, straight = measure.motors_of_log(rows, len(m))
+        logged = np.stack([held, held], axis=-1)
+        left[rate] = measure.errors(flown | {"motor": logged}, many, p, np.arange(2), none, none)[
+            3:6, 1
+        ].max()
+        assert straight.shape == held.shape
+    np.testing.assert_allclose(left[500], 0.0, atol=0.1)
+    assert left[50] > 5 * left[500]
+
+
+def test_names_that_logs_cannot_tell_apart_are_right_and_no_others():
+    seen, blind = np.full(12, 3.0), np.full(12, 3.0)
+    blind[3:6] = 0.1  # no torque shows
+    assert generate.accepted("inertia", False, seen) == ["inertia"]
+    assert generate.accepted("blade_flapping", False, seen) == ["blade_flapping"]
+    assert "rotor_drag" in generate.accepted("blade_flapping", False, blind)
+    assert generate.accepted("motor_imbalance", True, seen) == ["motor_imbalance"]
+    assert "com_offset" in generate.accepted("motor_imbalance", True, blind)
+    assert generate.accepted("battery_sag", True, seen, scale=True) == ["battery_sag", "thrust_scale"]
+    assert set(generate.accepted("battery_sag", False, seen, scale=True)) == {
+        "battery_sag",
+        "thrust_scale",
+        "mass",
+    }
+    held = answer("none") | {"held_ms": 20.0}
+    for late, right in ((0.012, True), (0.040, False)):
+        report = said("state_latency", parameters={"state_latency": {"delay": {"value": late}}})
+        assert score.judge(held, report)["right"] == right
+        assert not score.judge(answer("none"), report)["right"]
 
 
 def answer(category, effect=None, **more):
