@@ -78,9 +78,9 @@ def fly(arguments: Arguments):
     from openjax.flying.flight_files import write_case
     from openjax.flying.game import Game
     from openjax.flying.guard import Guard
+    from openjax.flying.links import Links
     from openjax.flying.loop import Flight, Plan
     from openjax.flying.motion_capture import MotionCaptured, find_feed
-    from openjax.flying.swarm import Swarm
     from openjax.pursuit import find_scenario, scenario_task
     from openjax.store.policies import load_policy
     from openjax.vehicle.vehicle_file import load_vehicle_file
@@ -106,37 +106,47 @@ def fly(arguments: Arguments):
     if body_logs is None:
         body_logs = 5 if all(uri.startswith("udp:") for uri in uris) else 1
     feed = find_feed(arguments.motion_capture) if arguments.motion_capture else None
-    swarm = Swarm(uris, body_logs, arguments.watchdog)
+    vehicles = links = Links(uris, body_logs, arguments.watchdog)
     console.print(f"connecting to {', '.join(uris)} ...")
-    swarm.connect()
+    links.connect()
     plan = Plan(arguments.episodes, arguments.episode_seconds)
-    guard = None
+    guard = flight = None
     with _Keys() as keys:
         try:
-            vehicles = swarm
             if feed is not None:
-                vehicles = MotionCaptured(swarm)
+                vehicles = MotionCaptured(links)
                 vehicles.feed(feed)
             _wait_for_poses(vehicles, uris)
             flight = Flight(vehicles, game, arguments.safety, plan, keys)
             if arguments.guard:
                 guard = flight.beat = Guard(
-                    uris, swarm.pose_blocks(), arguments.safety, flight.state, arguments.guard_after
+                    uris,
+                    links.pose_blocks(),
+                    arguments.safety,
+                    flight.state,
+                    arguments.guard_after,
+                    links.pid,
                 )
                 if not guard.wait():
                     raise UserError("the guard's process didn't start; --guard False flies without it")
-            swarm.arm()
-            swarm.record()
+            links.arm()
+            vehicles.record()
+            real_time.hurry()
             console.print("flying: space or q stops all motors, l or Ctrl-C lands")
             record = _until_down(flight, keys)
+            samples = vehicles.samples()
         except KeyboardInterrupt:
-            swarm.emergency_stop()
+            links.emergency_stop()
+            raise
+        except Exception as error:
+            if guard is not None and flight.state.flying:
+                console.print(f"error: {error}: the guard lands the vehicles", soft_wrap=True)
+                guard.hand_over()
             raise
         finally:
             if guard is not None:
                 guard.close()
-            swarm.arm(False)
-            swarm.close()
+            links.close()
     about = {
         "policy": policy.source,
         "scenario": scenario.name,
@@ -148,7 +158,7 @@ def fly(arguments: Arguments):
         described = dataclasses.replace(
             vehicle, path=None, log={"source": f"openjax.fly, policy {policy.source}", "floor_z": 0.0}
         )
-        _write(arguments.out, lambda folder: write_case(folder, swarm.members, record, described, about))
+        _write(arguments.out, lambda folder: write_case(folder, samples, record, described, about))
         console.print(f"{arguments.out}: next, python -m openjax.diagnose {arguments.out}")
     return record
 

@@ -87,6 +87,7 @@ def main(arguments: Sequence[str]) -> None:
     virtual = make(parsed)
     console = output_console()
     try:
+        real_time.hurry()
         console.print(f"listening: --uri {' '.join(virtual.uris)}")
         virtual.run(lambda: virtual.time >= parsed.seconds)
     except KeyboardInterrupt:

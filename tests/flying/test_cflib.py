@@ -1,9 +1,12 @@
 """With the real cflib over loopback: its packets mean what we mean, a flight from take-off to its log, the guard."""
 
+import os
+import signal
 import subprocess
 import sys
 import threading
 import time
+from contextlib import contextmanager
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,8 +17,10 @@ pytest.importorskip("cflib", reason='the extra "fly" is not installed')
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from openjax.errors import UserError
 from openjax.flying.flight_files import write_case
 from openjax.flying.guard import _EACH, _HEAD, _MODES, land
+from openjax.flying.links import Links
 from openjax.flying.loop import Flight, Plan
 from openjax.flying.motion_capture import MotionCaptured
 from openjax.flying.safety import Mode, SafetySettings
@@ -28,7 +33,6 @@ from openjax.flying.set_point import (
     as_sent,
     manual_arguments,
 )
-from openjax.flying.swarm import Swarm
 from openjax.flying.virtual_firmware import VirtualFirmware
 from openjax.flying.virtual_link import LinkFaults
 from openjax.flying.virtual_process import VirtualCrazyflies
@@ -61,17 +65,28 @@ def test_a_set_point_arrives_on_board_as_it_was_meant(mode, roll, pitch, yaw_rat
 
 
 @pytest.fixture(scope="module")
-def vehicles():
-    """Three virtual Crazyflies, flying in a thread of their own."""
-    inside = VirtualVehicles(load_vehicle(), [(0.4, 0.0), (0.4, 0.3), (0.4, -0.3)])
-    virtual = VirtualCrazyflies(inside, port=0, faults=LinkFaults())
-    over = threading.Event()
-    thread = threading.Thread(target=virtual.run, args=(over.is_set,), daemon=True)
-    thread.start()
-    yield virtual
-    over.set()
-    thread.join()
-    virtual.close()
+def uris():
+    """Three virtual Crazyflies, by the command that a user gives."""
+    command = [sys.executable, "-m", "openjax.virtual_crazyflie", "--port", "0"]
+    virtual = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        yield virtual.stdout.readline().split("--uri ")[1].split()
+    finally:
+        virtual.terminate()
+        virtual.wait()
+
+
+@contextmanager
+def connected(uris, body_logs):
+    """Links that know all poses."""
+    links = Links(uris, body_logs)
+    links.connect()
+    try:
+        while any(s.pose is None for s in links.sightings()):
+            links.wait(time.perf_counter() + 0.1)
+        yield links
+    finally:
+        links.close()
 
 
 class Hovering:
@@ -79,8 +94,8 @@ class Hovering:
 
     hover_thrust = 0.6246
 
-    def __init__(self, vehicles):
-        starts = np.concatenate([vehicles.vehicles.report.position[:, :2], np.full((3, 1), 0.4)], 1)
+    def __init__(self, links):
+        starts = np.array([(*s.pose.position[:2], 0.4) for s in links.sightings()])
         self.task = SimpleNamespace(
             pursuer_position=starts,
             evader_position=np.array([-0.5, 0.0, 0.5]),
@@ -111,24 +126,21 @@ class Hovering:
         )  # fmt: skip
 
 
-def test_a_flight_from_the_floor_to_its_log(vehicles, tmp_path):
-    swarm = Swarm(vehicles.uris, body_logs=1)
-    swarm.connect()
-    try:
-        while any(s.pose is None for s in swarm.sightings()):
-            time.sleep(0.01)
-        swarm.arm()
-        swarm.record()
-        plan = Plan(episode_seconds=2.3)
-        flight = Flight(swarm, Hovering(vehicles), PATIENT, plan)
+def test_a_flight_from_the_floor_to_its_log(uris, tmp_path):
+    with connected(uris, body_logs=1) as links:
+        links.arm()
+        links.record()
+        flight = Flight(links, Hovering(links), PATIENT, Plan(episode_seconds=2.3))
         record = flight.run()
-    finally:
-        swarm.close()
+        samples = links.samples()
     assert flight.state.all_in(Mode.LANDED)
-    assert max(p.position[2] for _, p, _ in swarm.members[0].poses) > 0.3
+    assert max(p.position[2] for _, p, _ in samples[0].poses) > 0.3
     assert record.episodes[0]["capture_step"] == 11
-    assert record.timing()["ticks"] > 200
-    write_case(tmp_path, swarm.members, record, load_vehicle_file(), {})
+    timing = record.timing()
+    assert timing["ticks"] > 200
+    # a set-point leaves after the poses that it was made of, and those were measured before they arrived
+    assert 0.0 < timing["command_age_ms"]["p50"] < timing["measured_to_sent_ms"]["p50"] < 10.0
+    write_case(tmp_path, samples, record, load_vehicle_file(), {})
 
     from openjax.flights.case import load_case
 
@@ -141,60 +153,70 @@ def test_a_flight_from_the_floor_to_its_log(vehicles, tmp_path):
         assert abs(np.nanmedian(flown.specific_force[:, 2]) - 9.81) < 1.0
 
 
-def test_the_guard_lands_what_hangs_in_the_air(vehicles):
-    swarm = Swarm(vehicles.uris, body_logs=0)
-    swarm.connect()
-    while any(s.pose is None for s in swarm.sightings()):
-        time.sleep(0.01)
-    swarm.arm()
-    flight = Flight(swarm, Hovering(vehicles), PATIENT, Plan(episode_seconds=60.0))
-    deadline = time.monotonic() + 30.0
-    while not flight.state.all_in(Mode.PURSUIT):
-        assert time.monotonic() < deadline, flight.state
-        flight.tick(time.perf_counter(), time.perf_counter())
-        time.sleep(0.008)
-    assert vehicles.vehicles.report.position[:, 2].min() > 0.3
-    blocks, state = swarm.pose_blocks(), flight.state
-    numbers = [time.perf_counter(), 1.0, 1.0]
-    for drone in state.drones:
-        e = drone.estimate
-        numbers += [_MODES.index(drone.mode), drone.trim, 1.0]
-        numbers += [*e.position, *e.velocity, *e.quaternion, *e.body_rates]
-    assert len(numbers) == _HEAD + 3 * _EACH
-    # the loop is silent from here on; the guard has links of its own
+def test_the_guard_lands_what_hangs_in_the_air(uris):
     import cflib.crtp
 
-    links = [cflib.crtp.get_link_driver(uri, lambda *_: None, lambda *_: None) for uri in vehicles.uris]
-    try:
-        last = land(numbers, links, vehicles.uris, blocks, PATIENT, state)
-    finally:
-        for link in links:
-            link.close()
-        swarm.close()
-    assert last.all_in(Mode.LANDED)
-    time.sleep(1.0)
-    assert vehicles.vehicles.report.position[:, 2].max() < 0.05
-    assert not any(firmware.crashed for firmware in vehicles.firmware)
+    cflib.crtp.init_drivers()
+    with connected(uris, body_logs=0) as links:
+        links.arm()
+        flight = Flight(links, Hovering(links), PATIENT, Plan(episode_seconds=60.0))
+        deadline = time.monotonic() + 30.0
+        while not flight.state.all_in(Mode.PURSUIT):
+            assert time.monotonic() < deadline, [(d.mode, d.reason) for d in flight.state.drones]
+            flight.tick(time.perf_counter(), time.perf_counter())
+            time.sleep(0.008)
+        assert min(s.pose.position[2] for s in links.sightings()) > 0.3
+        blocks, state = links.pose_blocks(), flight.state
+        numbers = [time.perf_counter(), 1.0, 1.0]
+        for drone in state.drones:
+            e = drone.estimate
+            numbers += [_MODES.index(drone.mode), drone.trim, 1.0]
+            numbers += [*e.position, *e.velocity, *e.quaternion, *e.body_rates]
+        assert len(numbers) == _HEAD + 3 * _EACH
+        # the loop is silent from here on; the guard has links of its own
+        own = [cflib.crtp.get_link_driver(uri, lambda *_: None, lambda *_: None) for uri in uris]
+        try:
+            last = land(numbers, own, uris, blocks, PATIENT, state)
+        finally:
+            for link in own:
+                link.close()
+    assert last.all_in(Mode.LANDED) and not any(d.reason == "pose lost" for d in last.drones)
+    with connected(uris, body_logs=0) as links:
+        assert max(s.pose.position[2] for s in links.sightings()) < 0.05
 
 
-def test_motion_capture_is_seen_here_and_on_board(vehicles):
-    swarm = Swarm(vehicles.uris[:1], body_logs=0)
-    swarm.connect()
+def test_a_broken_link_process_is_an_error_and_not_a_wait(uris):
+    with connected(uris, body_logs=0) as links:
+        os.kill(links.pid, signal.SIGKILL)
+        with pytest.raises(UserError, match="links' process"):
+            for _ in range(3):
+                links.send([SetPoint()] * 3)
+
+
+def test_motion_capture_is_seen_here_and_on_board():
+    """The virtual Crazyflie in a thread of this process, so that its firmware can be looked into."""
+    virtual = VirtualCrazyflies(VirtualVehicles(load_vehicle(), [(0.4, 0.0)]), port=0, faults=LinkFaults())
+    over = threading.Event()
+    thread = threading.Thread(target=virtual.run, args=(over.is_set,), daemon=True)
+    thread.start()
+    firmware = virtual.firmware[0]
     try:
-        captured = MotionCaptured(swarm)
-        before = vehicles.firmware[0].external_poses
-        for k in range(40):
-            captured.update(0, (0.3 + 0.005 * k, 0.0, 0.5), (1.0, 0.0, 0.0, 0.0), at=100.0 + 0.01 * k)
-        captured.update(0, (np.nan, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), at=101.0)
-        (sighting,) = captured.sightings()
-        assert captured.arrivals() == (100.0 + 0.01 * 39,)
-        np.testing.assert_allclose(sighting.pose.velocity, (0.5, 0.0, 0.0), atol=1e-3)
-        deadline = time.monotonic() + 5.0
-        while vehicles.firmware[0].external_poses < before + 40 and time.monotonic() < deadline:
-            time.sleep(0.01)
-        np.testing.assert_allclose(vehicles.firmware[0].external_pose[:4], (0.495, 0.0, 0.5, 1.0), atol=1e-6)
+        with connected(virtual.uris, body_logs=0) as links:
+            captured = MotionCaptured(links)
+            for k in range(40):
+                captured.update(0, (0.3 + 0.005 * k, 0.0, 0.5), (1.0, 0.0, 0.0, 0.0), at=100.0 + 0.01 * k)
+            captured.update(0, (np.nan, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), at=101.0)
+            (sighting,) = captured.sightings()
+            assert captured.arrivals() == (100.0 + 0.01 * 39,)
+            np.testing.assert_allclose(sighting.pose.velocity, (0.5, 0.0, 0.0), atol=1e-3)
+            deadline = time.monotonic() + 5.0
+            while firmware.external_poses < 40 and time.monotonic() < deadline:
+                time.sleep(0.01)
+            np.testing.assert_allclose(firmware.external_pose[:4], (0.495, 0.0, 0.5, 1.0), atol=1e-6)
     finally:
-        swarm.close()
+        over.set()
+        thread.join()
+        virtual.close()
 
 
 FROZEN = """

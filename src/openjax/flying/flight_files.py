@@ -28,12 +28,12 @@ _BODY = CHANNEL_COLUMNS["motor_command"] + CHANNEL_COLUMNS["specific_force"]
 _COMMAND = CHANNEL_COLUMNS["command_thrust"] + CHANNEL_COLUMNS["command_body_rates"]
 
 
-def write_case(folder: Path, members, record: Record, vehicle: VehicleFile, about: dict) -> list[Path]:
+def write_case(folder: Path, samples, record: Record, vehicle: VehicleFile, about: dict) -> list[Path]:
     """Write the case: one log per game long enough, vehicle.toml, flight.json. Returns the files.
 
     Args:
       folder: to write to; it must exist.
-      members: the swarm's vehicles with their recorded samples.
+      samples: what was recorded of each vehicle, see `openjax.flying.swarm.Samples`.
       record: of the loop.
       vehicle: what flew, for all I know.
       about: what flight.json is to say beside timing and games.
@@ -44,7 +44,7 @@ def write_case(folder: Path, members, record: Record, vehicle: VehicleFile, abou
         if not ticks or record.sent[ticks[-1]] - record.sent[ticks[0]] < SHORTEST:
             continue
         path = folder / f"game_{number:02d}.csv.gz"
-        write_csv(path, _table(path.name, members, record, ticks), DECIMALS)
+        write_csv(path, _table(path.name, samples, record, ticks), DECIMALS)
         files.append(path)
     save_vehicle_file(folder / "vehicle.toml", vehicle)
     text = json.dumps({**about, "timing": record.timing(), "games": record.episodes}, indent=1)
@@ -52,29 +52,29 @@ def write_case(folder: Path, members, record: Record, vehicle: VehicleFile, abou
     return [*files, folder / "vehicle.toml", folder / "flight.json"]
 
 
-def _table(name, members, record, ticks) -> LogTable:
+def _table(name, samples, record, ticks) -> LogTable:
     """One game's log."""
     begin, end = record.sent[ticks[0]], record.sent[ticks[-1]]
     sent = [record.sent[k] for k in ticks]
     rows, ids = [], []
-    for i, member in enumerate(members):
-        samples: dict[float, dict] = {}
-        for _, pose, voltage in member.poses:
+    for i, vehicle in enumerate(samples):
+        at_time: dict[float, dict] = {}
+        for _, pose, voltage in vehicle.poses:
             values = dict(zip(_POSE, measured_numbers(pose), strict=True))
-            if member.seen:
+            if vehicle.seen:
                 values = {name: values[name] for name in _POSE[10:]}
-            samples.setdefault(round(pose.time, 4), {}).update(values, vbat=voltage)
-        for pose in member.seen:  # motion capture in place of the estimate on board
-            samples.setdefault(round(pose.time, 4), {}).update(
+            at_time.setdefault(round(pose.time, 4), {}).update(values, vbat=voltage)
+        for pose in vehicle.seen:  # motion capture in place of the estimate on board
+            at_time.setdefault(round(pose.time, 4), {}).update(
                 zip(_POSE[:10], measured_numbers(pose)[:10], strict=True)
             )
-        for at, values in member.bodies:
-            samples.setdefault(round(at, 4), {}).update(zip(_BODY, values, strict=True))
-        for at in sorted(samples):
+        for at, values in vehicle.bodies:
+            at_time.setdefault(round(at, 4), {}).update(zip(_BODY, values, strict=True))
+        for at in sorted(at_time):
             if not begin <= at <= end:
                 continue
             command = record.set_points[ticks[max(bisect.bisect_right(sent, at) - 1, 0)]][i]
-            row = samples[at]
+            row = at_time[at]
             if command.mode == RATES:
                 numbers = (command.thrust, command.roll, command.pitch, command.yaw_rate)
                 row.update(zip(_COMMAND, numbers, strict=True))

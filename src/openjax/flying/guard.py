@@ -10,6 +10,7 @@ the other one has ended.
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import signal
@@ -18,6 +19,7 @@ import time
 from dataclasses import replace
 from types import SimpleNamespace
 
+from openjax.flying import real_time
 from openjax.flying.controller import Pose
 from openjax.flying.crtp import LOG_TYPES, Port
 from openjax.flying.safety import (
@@ -64,14 +66,23 @@ class Guard:
         safety: limits.
         state: of the loop's state machine; starts, pillars and airframe are taken from it.
         after: silence of the loop after which it flies (s).
+        links: the links' process, which it ends with the loop's.
     """
 
-    def __init__(self, uris, pose_blocks, safety: SafetySettings, state: State, after: float = TAKE_OVER):
+    def __init__(
+        self,
+        uris,
+        pose_blocks,
+        safety: SafetySettings,
+        state: State,
+        after: float = TAKE_OVER,
+        links: int | None = None,
+    ):
         context = multiprocessing.get_context("spawn")
         self._shared = context.RawArray("d", _HEAD + _EACH * len(uris))
         self._process = context.Process(
             target=watch,
-            args=(self._shared, tuple(uris), tuple(pose_blocks), safety, state, after, os.getpid()),
+            args=(self._shared, tuple(uris), tuple(pose_blocks), safety, state, after, os.getpid(), links),
             daemon=False,
             name="openjax guard",
         )
@@ -95,6 +106,11 @@ class Guard:
         self._shared[1] = float(state.flying)
         self._shared[0] = now
 
+    def hand_over(self) -> None:
+        """Let it fly on: it ends this process before it does."""
+        while self._process.is_alive():
+            time.sleep(0.1)
+
     def close(self) -> None:
         """End it; the vehicles are down or someone else's."""
         self._shared[1], self._shared[2] = 0.0, _OVER
@@ -103,13 +119,14 @@ class Guard:
             self._process.kill()
 
 
-def watch(shared, uris, pose_blocks, safety, state, after, parent) -> None:
+def watch(shared, uris, pose_blocks, safety, state, after, parent, links) -> None:
     """The guard's process."""
     import cflib.crtp
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the loop, which lands
     cflib.crtp.init_drivers()
-    links = {uri: _open(uri) for uri in uris if uri.startswith("udp:")}
+    real_time.hurry()
+    own = {uri: _open(uri) for uri in uris if uri.startswith("udp:")}
     shared[2] = _READY
     while shared[2] == _READY:
         time.sleep(CHECK)
@@ -118,14 +135,13 @@ def watch(shared, uris, pose_blocks, safety, state, after, parent) -> None:
             if os.getppid() != parent and shared[1] == 0.0:  # it ended, and nothing flies
                 break
             continue
-        try:
-            os.kill(parent, signal.SIGKILL)  # should it wake up, two would fly
-        except ProcessLookupError:
-            pass
-        links |= {uri: _open(uri) for uri in uris if uri not in links}
-        land(shared, [links[uri] for uri in uris], uris, pose_blocks, safety, state)
+        for process in (parent, links):  # should one wake up, two would fly
+            with contextlib.suppress(ProcessLookupError, TypeError):
+                os.kill(process, signal.SIGKILL)
+        own |= {uri: _open(uri) for uri in uris if uri not in own}
+        land(shared, [own[uri] for uri in uris], uris, pose_blocks, safety, state)
         break
-    for link in links.values():
+    for link in own.values():
         link.close()
 
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import gc
 import itertools
 import math
-import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -30,12 +29,16 @@ from openjax.pursuit.environment import THRUST_LIMIT
 
 PERIOD = 0.01
 """s"""
-MARGIN = 1.0e-3
-"""The tick is placed this long after the newest poses usually arrive (s)."""
+MARGIN = 2.0e-3
+"""A tick is due this long after the newest poses were measured (s), as far as the fastest packets tell."""
+PATIENCE = 3.0e-3
+"""It begins as soon as all poses are there, up to this much before or after it is due (s)."""
+GONE = 0.1
+"""A vehicle whose newest pose is older (s) isn't waited for."""
 
 
 class Vehicles(Protocol):
-    """What the loop needs of the vehicles; `Swarm` is one."""
+    """What the loop needs of the vehicles; `Links` are some."""
 
     def sightings(self) -> tuple[Sighting, ...]: ...
 
@@ -45,6 +48,10 @@ class Vehicles(Protocol):
         """When each vehicle's newest pose arrived (s, host)."""
         ...
 
+    def wait(self, until: float) -> None:
+        """Return at `until` (s), or as soon as a pose arrives."""
+        ...
+
 
 @dataclass
 class Record:
@@ -52,29 +59,41 @@ class Record:
 
     due: list[float] = field(default_factory=list)  # s, host
     sent: list[float] = field(default_factory=list)  # s, when the last set-point had left
-    age: list[tuple[float, ...]] = field(default_factory=list)  # s, of each vehicle's newest pose when sent
+    age: list[tuple[float, ...]] = field(
+        default_factory=list
+    )  # s, from each vehicle's newest pose's arrival to `sent`
+    measured: list[tuple[float, ...]] = field(
+        default_factory=list
+    )  # s, the same from when it was measured on board
     set_points: list[tuple[SetPoint, ...]] = field(default_factory=list)  # as they fit into their packets
     modes: list[tuple[Mode, ...]] = field(default_factory=list)
     fenced: list[tuple[bool, ...]] = field(default_factory=list)
     episode: list[int] = field(default_factory=list)  # -1 outside of episodes
     evader: list[tuple[float, ...]] = field(default_factory=list)  # m
     episodes: list[dict] = field(default_factory=list)
+    skipped: int = 0  # ticks that were left out because the one before took too long
 
     def timing(self) -> dict:
-        """Command age (ms) and missed deadlines of all ticks. A tick's deadline is the next tick's due time."""
+        """Command age (ms) and missed deadlines of all ticks. A tick's deadline is the next tick's due
+        time; a tick that was left out is a missed one.
+
+        `measured_to_sent_ms` counts from the moment on board, as far as the fastest packet of the flight tells it.
+        """
         if not self.due:
             return {"ticks": 0}
-        age = 1e3 * np.array(self.age).max(1)
+        age, measured = (1e3 * np.array(ages).max(1) for ages in (self.age, self.measured))
         work = 1e3 * (np.array(self.sent) - np.array(self.due))
         gaps = 1e3 * np.diff(self.sent)
+        missed = int((work > 1e3 * PERIOD).sum()) + self.skipped
         return {
             "ticks": len(self.due),
             "seconds": round(self.sent[-1] - self.due[0], 2),
             "command_age_ms": _percentiles(age),
+            "measured_to_sent_ms": _percentiles(measured),
             "due_to_sent_ms": _percentiles(work),
             "between_set_points_ms": _percentiles(gaps) if len(gaps) else {},
-            "missed_deadlines": int((work > 1e3 * PERIOD).sum()),
-            "missed_share": float((work > 1e3 * PERIOD).mean()),
+            "missed_deadlines": missed,
+            "missed_share": missed / (len(self.due) + self.skipped),
         }
 
 
@@ -84,31 +103,44 @@ def _percentiles(values) -> dict:
 
 
 class Pace:
-    """When the ticks are due: every 10 ms, drifting to just after the moment at which poses arrive."""
+    """When the ticks are due: every 10 ms, just after the moments at which poses are measured.
+
+    Those moments are regular, unlike arrivals: the vehicles send by clocks of their own, which drift a little.
+    """
 
     def __init__(self, now: float):
-        self.due = now
+        self.due, self.skipped, self._in_step = now, 0, False
 
-    def next(self, now: float, arrivals: tuple[float, ...]) -> float:
-        """The next tick's time, after one at `now` that found poses that had arrived at `arrivals` (s)."""
-        ages = sorted((self.due - a) % PERIOD for a in arrivals if math.isfinite(a) and now - a < 0.1)
+    def next(self, now: float, measured: Sequence[float]) -> float:
+        """The next tick's time, after one that ended at `now` and knew poses measured at `measured` (s)."""
+        ages = sorted((self.due - t) % PERIOD for t in measured if now - t < GONE)
         shift = 0.0
         if ages:
             # poses come in a bunch: the newest of a bunch is the one after the longest pause
             gaps = [ages[0] + PERIOD - ages[-1], *(b - a for a, b in itertools.pairwise(ages))]
             newest = ages[max(range(len(gaps)), key=gaps.__getitem__)]
             error = (newest - MARGIN + PERIOD / 2) % PERIOD - PERIOD / 2
-            shift = min(max(0.02 * error, -1e-4), 1e-4)
+            shift = min(max(0.02 * error, -1e-4), 1e-4) if self._in_step else error
+            self._in_step = True
         self.due += PERIOD - shift
-        if self.due < now:  # too late for it: go on from here
-            self.due = now
+        while self.due < now - PERIOD:  # that one can't be caught up with any more
+            self.due += PERIOD
+            self.skipped += 1
         return self.due
 
 
-def wait_until(due: float, clock: Callable[[], float]) -> None:
-    """Return at `due` (s)."""
-    while (left := due - clock()) > 0:  # asleep to the end: the link's threads need the interpreter meanwhile
-        time.sleep(left)
+def await_poses(vehicles: Vehicles, due: float, clock: Callable[[], float]) -> None:
+    """Return around `due` (s): as soon as each vehicle's newest pose is there that was measured before."""
+    while (now := clock()) < due + PATIENCE:
+        measured = _measured(vehicles.sightings())
+        complete = all(t > due - PERIOD or now - t > GONE for t in measured)
+        if complete and now >= due - PATIENCE:
+            return
+        vehicles.wait(due - PATIENCE if complete else due + PATIENCE)
+
+
+def _measured(sightings) -> tuple[float, ...]:
+    return tuple(-math.inf if s.pose is None else s.pose.time for s in sightings)
 
 
 @dataclass(frozen=True)
@@ -169,8 +201,6 @@ class Flight:
 
     def run(self) -> Record:
         """Fly it. Returns when all motors are off."""
-        switch = sys.getswitchinterval()
-        sys.setswitchinterval(5e-4)  # the link's threads and this one share one interpreter
         gc.collect()
         gc.disable()
         try:
@@ -181,10 +211,11 @@ class Flight:
                 self.tick(now, pace.due)
                 if not self.state.flying and self.state.time - self._since > 0.5 and self._finished():
                     break
-                wait_until(pace.next(self._now(), self.vehicles.arrivals()), self._now)
+                due = pace.next(self._now(), _measured(self.vehicles.sightings()))
+                self.record.skipped = pace.skipped
+                await_poses(self.vehicles, due, self._now)
         finally:
             gc.enable()
-            sys.setswitchinterval(switch)
         return self.record
 
     def _finished(self) -> bool:
@@ -195,8 +226,8 @@ class Flight:
 
     def tick(self, now: float, due: float) -> None:
         """One tick at `now` that was due at `due` (s)."""
-        sightings = self.vehicles.sightings()
         arrivals = self.vehicles.arrivals()
+        sightings = self.vehicles.sightings()
         request = self._requests() or self._planned(now)
         actions = None
         playing = self._episode >= 0 or request is Request.PURSUE
@@ -207,7 +238,7 @@ class Flight:
         sent = self.vehicles.send(set_points)
         if self.beat is not None:
             self.beat(now, self.state)
-        self._keep(due, sent, arrivals, set_points)
+        self._keep(due, sent, arrivals, sightings, set_points)
         if self._episode >= 0 and not any(m is Mode.PURSUIT for m in self.state.modes):
             self._end_episode("safety")
 
@@ -266,11 +297,12 @@ class Flight:
         self._episode = -1
         self._flown += 1
 
-    def _keep(self, due, sent, arrivals, set_points):
+    def _keep(self, due, sent, arrivals, sightings, set_points):
         record = self.record
         record.due.append(due)
         record.sent.append(sent)
         record.age.append(tuple(sent - a for a in arrivals))
+        record.measured.append(tuple(sent - s.pose.time if s.pose else math.inf for s in sightings))
         record.set_points.append(tuple(s if s.mode == OFF else as_sent(s) for s in set_points))
         record.modes.append(self.state.modes)
         record.fenced.append(tuple(d.fenced for d in self.state.drones))

@@ -13,6 +13,7 @@ gyroscope on board. Each pose is also sent to its vehicle, for the estimator on 
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import math
 import sys
@@ -23,8 +24,9 @@ from pathlib import Path
 
 from openjax.errors import UserError
 from openjax.flying.controller import Pose
+from openjax.flying.links import Links
 from openjax.flying.safety import Sighting
-from openjax.flying.swarm import Swarm
+from openjax.flying.swarm import Samples
 
 SMOOTHING = 0.02
 """Time constant of the velocity's low-pass (s)."""
@@ -43,16 +45,18 @@ def find_feed(name: str) -> Callable:
 
 
 class MotionCaptured:
-    """A swarm whose poses come from outside; to the loop what `Swarm` is.
+    """Vehicles whose poses come from outside; to the loop what `Links` is.
 
     Args:
-        swarm: its links.
+        links: to the vehicles.
         clock: host time (s).
     """
 
-    def __init__(self, swarm: Swarm, clock: Callable[[], float] = time.perf_counter):
-        self._swarm, self._now = swarm, clock
-        self._poses: list[Pose | None] = [None] * len(swarm.members)
+    def __init__(self, links: Links, clock: Callable[[], float] = time.perf_counter):
+        self._links, self._now = links, clock
+        self._poses: list[Pose | None] = [None] * len(links.poses)
+        self._seen: list[list[Pose]] = [[] for _ in links.poses]
+        self._recording, self._arrived = False, threading.Event()
 
     def feed(self, function: Callable) -> None:
         """Let `function(update)` run in a thread of its own."""
@@ -76,17 +80,33 @@ class MotionCaptured:
                 v + share * ((p - q) / step - v)
                 for p, q, v in zip(position, old.position, old.velocity, strict=True)
             )
-        member = self._swarm.members[vehicle]
-        rates = member.pose.body_rates if member.pose is not None else (0.0, 0.0, 0.0)
+        own = self._links.poses[vehicle]
+        rates = own.body_rates if own is not None else (0.0, 0.0, 0.0)
         pose = Pose(at, position, velocity, quaternion, rates)
         self._poses[vehicle] = pose
-        if member.recording:
-            member.seen.append(pose)
-        self._swarm.send_pose(vehicle, position, quaternion)
+        self._arrived.set()
+        if self._recording:
+            self._seen[vehicle].append(pose)
+        self._links.send_pose(vehicle, position, quaternion)
+
+    def record(self) -> None:
+        """Keep all samples from now on."""
+        self._recording = True
+        self._links.record()
+
+    def samples(self) -> list[Samples]:
+        """What was recorded of each vehicle, here and on board."""
+        both = zip(self._links.samples(), self._seen, strict=True)
+        return [dataclasses.replace(samples, seen=seen) for samples, seen in both]
+
+    def wait(self, until: float) -> None:
+        """Return at `until` (s), or as soon as a pose arrives."""
+        self._arrived.wait(max(until - self._now(), 0.0))
+        self._arrived.clear()
 
     def sightings(self) -> tuple[Sighting, ...]:
         """What is known of each vehicle now."""
-        own = self._swarm.sightings()
+        own = self._links.sightings()
         return tuple(Sighting(p, s.heard, s.voltage) for p, s in zip(self._poses, own, strict=True))
 
     def arrivals(self) -> tuple[float, ...]:
@@ -94,5 +114,5 @@ class MotionCaptured:
         return tuple(-math.inf if p is None else p.time for p in self._poses)
 
     def send(self, set_points) -> float:
-        """See `Swarm.send`."""
-        return self._swarm.send(set_points)
+        """See `Links.send`."""
+        return self._links.send(set_points)

@@ -12,11 +12,11 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 
 from openjax.errors import UserError
 from openjax.flying.controller import Pose
 from openjax.flying.crtp import expand_quaternion
-from openjax.flying.safety import Sighting
 from openjax.flying.set_point import OFF, SetPoint, manual_arguments
 
 PERIOD_MS = 10
@@ -55,6 +55,17 @@ class _Clock:
         return own + self.offset
 
 
+@dataclass
+class Samples:
+    """What was recorded of one vehicle; times are host seconds."""
+
+    poses: list[tuple[float, Pose, float]] = field(default_factory=list)  # arrival, pose, voltage
+    bodies: list[tuple[float, tuple[float, ...]]] = field(default_factory=list)
+    """When measured; m1..m4 0..1 and the specific force (m/s^2)."""
+    seen: list[Pose] = field(default_factory=list)
+    """By motion capture, where there is one."""
+
+
 class Member:
     """One vehicle of the swarm."""
 
@@ -65,10 +76,8 @@ class Member:
         self.heard = clock()
         self.voltage = math.nan
         self.error: str | None = None
-        self.poses: list[tuple[float, Pose, float]] = []  # arrival, pose, voltage
-        self.bodies: list[tuple[float, tuple[float, ...]]] = []  # measured at, m1..m4 0..1, specific force
-        self.seen: list[Pose] = []  # by motion capture, where there is one
-        self.recording = False
+        self.samples, self.recording = Samples(), False
+        self.listener: Callable[[bool], None] = lambda new_pose: None
         self.crazyflie = None
         self.blocks: list = []
 
@@ -86,7 +95,8 @@ class Member:
         self.voltage = 1e-3 * values[10]
         self.pose, self.arrival, self.heard = pose, now, now
         if self.recording:
-            self.poses.append((now, pose, self.voltage))
+            self.samples.poses.append((now, pose, self.voltage))
+        self.listener(True)
 
     def body_arrived(self, stamp: int, data: dict, _block=None) -> None:
         """A block of motors and accelerometer."""
@@ -95,11 +105,12 @@ class Member:
         if self.recording:
             motors = tuple(data[name] / 65536 for name, _ in BODY_BLOCK[:4])
             force = tuple(9.81 * data[name] for name, _ in BODY_BLOCK[4:])
-            self.bodies.append((self._onboard.host(stamp, now), motors + force))
+            self.samples.bodies.append((self._onboard.host(stamp, now), motors + force))
+        self.listener(False)
 
 
 class Swarm:
-    """Crazyflies, real or virtual, in one process.
+    """Crazyflies, real or virtual, in one process. `openjax.flying.links` runs it in one of its own.
 
     Args:
         uris: as `cflib` writes them: `radio://0/80/2M/E7E7E7E7E7`, `udp://127.0.0.1:19850`.
@@ -214,14 +225,6 @@ class Swarm:
         """The id of each vehicle's pose block."""
         return tuple(m.blocks[0].id for m in self.members)
 
-    def sightings(self) -> tuple[Sighting, ...]:
-        """What is known of each vehicle now."""
-        return tuple(Sighting(m.pose, m.heard, m.voltage) for m in self.members)
-
-    def arrivals(self) -> tuple[float, ...]:
-        """When each vehicle's newest pose arrived (s, host)."""
-        return tuple(m.arrival for m in self.members)
-
     def send(self, set_points: Sequence[SetPoint]) -> float:
         """Send each vehicle its set-point; returns when the last one left (s)."""
         for member, set_point in zip(self.members, set_points, strict=True):
@@ -247,8 +250,14 @@ class Swarm:
         for member in self.members:
             member.recording = on
 
+    def samples(self) -> list[Samples]:
+        """What was recorded of each vehicle until now."""
+        recorded = [member.samples for member in self.members]
+        return [Samples(list(s.poses), list(s.bodies)) for s in recorded]
+
     def close(self) -> None:
-        """Motors off, links closed."""
+        """Motors off, disarmed, links closed."""
+        self.arm(False)
         for member in self.members:
             if member.crazyflie is not None:
                 try:
