@@ -96,7 +96,8 @@ def fly(
     from openjax.flying.controller import Airframe, Pose, moved_on
     from openjax.flying.game import game_functions, pose_array
     from openjax.flying.guard import TAKE_OVER, take_over
-    from openjax.flying.safety import Drone, Event, Mode, Request, SafetySettings, initial_state, step
+    from openjax.flying.limits import SafetySettings
+    from openjax.flying.safety import Drone, Event, Mode, Request, initial_state, step
     from openjax.flying.set_point import from_action
     from openjax.flying.simulated import SimulatedSwarm
     from openjax.flying.virtual_vehicles import VirtualVehicles

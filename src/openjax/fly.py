@@ -19,7 +19,8 @@ from typing import Annotated
 
 from openjax.commands.command_line import output_console, parse, run_command
 from openjax.errors import UserError
-from openjax.flying.safety import Request, SafetySettings
+from openjax.flying.limits import SafetySettings
+from openjax.flying.safety import Request
 from openjax.ranges import Interval
 
 PROGRAM = "python -m openjax.fly"

@@ -20,10 +20,11 @@ from hypothesis import strategies as st
 from openjax.errors import UserError
 from openjax.flying.flight_files import write_case
 from openjax.flying.guard import _EACH, _HEAD, _MODES, land
+from openjax.flying.limits import SafetySettings
 from openjax.flying.links import Links
 from openjax.flying.loop import Flight, Plan
 from openjax.flying.motion_capture import MotionCaptured
-from openjax.flying.safety import Mode, SafetySettings
+from openjax.flying.safety import Mode
 from openjax.flying.set_point import (
     ANGLES,
     LEAST_THRUST,
@@ -223,7 +224,8 @@ FROZEN = """
 import os, signal, sys, time
 from openjax.flying.controller import Pose
 from openjax.flying.guard import Guard
-from openjax.flying.safety import Drone, Mode, SafetySettings, initial_state
+from openjax.flying.limits import SafetySettings
+from openjax.flying.safety import Drone, Mode, initial_state
 from dataclasses import replace
 
 if __name__ == "__main__":

@@ -13,16 +13,14 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from experiments.flying_faults import KINDS, fly, summary
 from openjax.flying.controller import Airframe, Pose
+from openjax.flying.limits import SafetySettings, fence_velocity, resting_places
 from openjax.flying.safety import (
     Drone,
     Event,
     Mode,
     Request,
-    SafetySettings,
     Sighting,
-    fence_velocity,
     initial_state,
-    resting_places,
     step,
 )
 from openjax.flying.set_point import OFF, RATES, SetPoint
@@ -105,10 +103,9 @@ def test_the_stop_key_stops_all_for_good():
 
 
 def test_resting_places_are_inside_apart_and_off_the_pillars():
-    state = initial_state(PLACES, [(0.5, 0.1, 0.1)])
     near = [(0.85, 0.05, 0.1), (0.86, 0.0, 1.19), (0.45, 0.12, 0.5)]
-    drones = [Drone(Mode.PURSUIT, estimate=Pose(0.0, p, (0.6, 0.0, 0.3), LEVEL)) for p in near]
-    places = resting_places(LIMITS, state, drones)
+    poses = [Pose(0.0, p, (0.6, 0.0, 0.3), LEVEL) for p in near]
+    places = resting_places(LIMITS, [(0.5, 0.1, 0.1)], poses)
     for i, (x, y, z) in enumerate(places):
         assert math.hypot(x, y) < LIMITS.arena_radius - 0.1
         assert 0.25 < z < LIMITS.arena_height - 0.25

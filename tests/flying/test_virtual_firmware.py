@@ -8,13 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openjax.flying.crtp import Packet, Port, compress_quaternion, decode, expand_quaternion, pack_number
+from openjax.flying.firmware_tables import LOG_VARIABLES, Sensors
 from openjax.flying.set_point import ANGLES, OFF, RATES, SetPoint
 from openjax.flying.virtual_firmware import (
     LEVEL_AFTER,
-    LOG_VARIABLES,
     STOP_AFTER,
     WATCHDOG,
-    Sensors,
     VirtualFirmware,
 )
 
@@ -52,8 +51,8 @@ def test_a_log_block_holds_what_was_asked_for_in_its_units_and_order():
     block = b"".join(struct.pack("<BH", kind, names.index(name)) for name, kind in wanted)
     assert ask(firmware, Port.LOG, 1, bytes([6, 9]) + block)[0].data == bytes([6, 9, 0])
     assert ask(firmware, Port.LOG, 1, [3, 9, 1])[0].data == bytes([3, 9, 0])
-    assert firmware.log_packets(0.009, SENSORS) == []
-    (raw,) = firmware.log_packets(0.0101, SENSORS)
+    assert firmware.logs.packets(firmware, 0.009, SENSORS) == []
+    (raw,) = firmware.logs.packets(firmware, 0.0101, SENSORS)
     packet = decode(raw)
     assert packet.data[:4] == bytes([9, 10, 0, 0])
     x, gyro, motor, voltage = struct.unpack("<heHH", packet.data[4:])
@@ -61,7 +60,7 @@ def test_a_log_block_holds_what_was_asked_for_in_its_units_and_order():
     assert gyro == pytest.approx(np.degrees(-0.2), rel=1e-3)
     assert motor == round(0.3 * 65535)
     # late or not, the next ones stay in step with the start
-    assert firmware.log_packets(0.0377, SENSORS) and firmware.next_log() == pytest.approx(0.04)
+    assert firmware.logs.packets(firmware, 0.0377, SENSORS) and firmware.logs.next() == pytest.approx(0.04)
 
 
 def test_a_block_longer_than_a_packet_is_refused():
@@ -77,6 +76,16 @@ def test_old_set_points_are_levelled_and_then_stop_the_motors():
     assert firmware.set_point(10.4).roll == 1.0
     assert firmware.set_point(10.01 + LEVEL_AFTER) == SetPoint(ANGLES, 0.0, 0.0, 0.0, 0.6)
     assert firmware.set_point(10.01 + STOP_AFTER).mode == OFF
+
+
+def test_a_vehicle_that_was_stopped_can_be_armed_and_flown_again():
+    firmware = VirtualFirmware()
+    ask(firmware, Port.SUPERVISOR, 1, [1, 0])
+    ask(firmware, Port.COMMANDER_GENERIC, 0, [0], 1.0)  # the stop at the end of a flight
+    ask(firmware, Port.SUPERVISOR, 1, [1, 1], 10.0)
+    assert firmware.set_point(10.0).mode == OFF
+    firmware.accept(SetPoint(RATES, thrust=0.6), 10.1)
+    assert firmware.set_point(10.1).mode == RATES
 
 
 def test_nothing_turns_before_arming_nor_after_an_emergency():

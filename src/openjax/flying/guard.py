@@ -22,15 +22,14 @@ from types import SimpleNamespace
 from openjax.flying import real_time
 from openjax.flying.controller import Pose
 from openjax.flying.crtp import LOG_TYPES, Port
+from openjax.flying.limits import SafetySettings, resting_places
 from openjax.flying.safety import (
     FLYING,
     Drone,
     Event,
     Mode,
-    SafetySettings,
     Sighting,
     State,
-    resting_places,
     step,
 )
 from openjax.flying.set_point import OFF, manual_arguments
@@ -47,7 +46,7 @@ _READY, _OVER = 1.0, 2.0
 
 def take_over(settings: SafetySettings, state: State, now: float) -> State:
     """The state in which another process goes on flying: all stop where they are, wait, and land."""
-    anchors = resting_places(settings, state, state.drones)
+    anchors = resting_places(settings, state.pillars, [d.estimate for d in state.drones])
     drones = tuple(
         replace(d, mode=Mode.HOLD, since=now, anchor=a, reason="the loop stopped")
         if d.mode in FLYING and d.mode not in (Mode.LAND, Mode.BLIND)

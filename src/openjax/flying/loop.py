@@ -14,11 +14,11 @@ import numpy as np
 
 from openjax.flying.controller import Airframe, Pose, accelerate, moved_on, wanted_acceleration
 from openjax.flying.game import Game
+from openjax.flying.limits import SafetySettings
 from openjax.flying.safety import (
     Event,
     Mode,
     Request,
-    SafetySettings,
     Sighting,
     State,
     initial_state,

@@ -26,6 +26,7 @@ from openjax.flying.controller import (
     wanted_acceleration,
     wanted_velocity,
 )
+from openjax.flying.limits import APART, SafetySettings, fence_velocity, resting_places
 from openjax.flying.set_point import ANGLES, RATES, SetPoint
 
 ATTITUDE_LAG = 0.12
@@ -37,8 +38,6 @@ BLIND_SPEED = 0.6
 BLIND_DEPTH = 0.15
 """A blind landing stops the motors this far below the floor by its reckoning (m)."""
 TRIM_GAIN, TRIM_LIMIT = 0.25, 0.15
-APART = 0.35
-"""Waiting vehicles keep this distance (m)."""
 
 
 class Mode(StrEnum):
@@ -66,43 +65,6 @@ class Request(StrEnum):
     HOLD = "hold"
     LAND = "land"
     STOP = "stop"
-
-
-@dataclass(frozen=True)
-class SafetySettings:
-    """Limits of a flight."""
-
-    arena_radius: float = 0.9
-    """No vehicle is let out of a cylinder of this radius (m)."""
-    arena_height: float = 1.2
-    """Nor above this (m)."""
-    floor: float = 0.12
-    """Nor, in pursuit, below this (m)."""
-    outside: float = 0.3
-    """Farther out than this (m) something is wrong: all land."""
-    speed_limit: float = 2.5
-    """Faster than this (m/s) something is wrong: all land."""
-    tilt_limit: float = 80.0
-    """More tilted than this (degrees) something is wrong: all land."""
-    braking: float = 5.0
-    """Deceleration that is counted on to stop within the arena (m/s^2)."""
-    reaction: float = 0.1
-    """Time until it acts (s)."""
-    pose_timeout: float = 0.06
-    """A pose older than this (s) is lost: blind landing."""
-    link_timeout: float = 0.3
-    """A link silent for longer (s) is gone."""
-    action_timeout: float = 0.035
-    """Without a new action of the policy for longer (s): all stop where they are."""
-    battery_low: float = 3.2
-    """Voltage under load, for `battery_time`, at which a vehicle lands (V)."""
-    battery_time: float = 0.5
-    hold_time: float = 1.0
-    """How long vehicles wait after a trouble before they land (s)."""
-    transfer_speed: float = 0.5
-    """On the way to the start (m/s)."""
-    landing_speed: float = 0.35
-    """m/s."""
 
 
 @dataclass(frozen=True)
@@ -235,13 +197,13 @@ def _requested(settings, state, drones, event):
     if request is Request.STOP:
         return [to(d, Mode.STOPPED, reason="stopped by hand") for d in drones]
     if request is Request.LAND:
-        anchors = resting_places(settings, state, drones)
+        anchors = _resting(settings, state, drones)
         return [
             to(d, Mode.LAND, a, "asked to land") if d.mode in (*_UNTROUBLED, Mode.HOLD) else d
             for d, a in zip(drones, anchors, strict=True)
         ]
     if request is Request.HOLD:
-        anchors = resting_places(settings, state, drones)
+        anchors = _resting(settings, state, drones)
         return [
             to(d, Mode.HOLD, a) if d.mode in _UNTROUBLED else d for d, a in zip(drones, anchors, strict=True)
         ]
@@ -286,7 +248,7 @@ def _react(settings, state, drones, troubles, now):
     """The drones after troubles: those in trouble as told; the others stop, wait, and land."""
     anchors = None
     if any(troubles):
-        anchors = resting_places(settings, state, drones)
+        anchors = _resting(settings, state, drones)
     team = any(d.reason for d in drones) or any(troubles)
     reacted = []
     for i, (drone, trouble) in enumerate(zip(drones, troubles, strict=True)):
@@ -296,7 +258,7 @@ def _react(settings, state, drones, troubles, now):
             anchor = drone.anchor if keep else anchors[i]
             drone = replace(drone, mode=mode, since=now, anchor=anchor, reason=reason)
         elif drone.mode in _UNTROUBLED and team:
-            anchor = (anchors or resting_places(settings, state, drones))[i]
+            anchor = (anchors or _resting(settings, state, drones))[i]
             drone = replace(drone, mode=Mode.HOLD, since=now, anchor=anchor, reason="another is in trouble")
         elif drone.mode is Mode.HOLD and drone.reason and now - drone.since > settings.hold_time:
             drone = replace(drone, mode=Mode.LAND, since=now)
@@ -371,6 +333,10 @@ def _wanted(settings, state, drone, i) -> Vector:
     return x, y, z
 
 
+def _resting(settings, state, drones):
+    return resting_places(settings, state.pillars, [drone.estimate for drone in drones])
+
+
 def _arrived(estimate, target) -> bool:
     return (
         math.dist(estimate.position, target) < 0.06 and math.dist(estimate.velocity, (0.0, 0.0, 0.0)) < 0.15
@@ -381,62 +347,3 @@ def _yaw_only(quaternion):
     w, _, _, z = quaternion
     size = math.hypot(w, z)
     return (w / size, 0.0, 0.0, z / size) if size > 1e-6 else (1.0, 0.0, 0.0, 0.0)
-
-
-def stopping_point(settings: SafetySettings, pose: Pose) -> Vector:
-    """Where a vehicle comes to rest that brakes now (m)."""
-    speed = math.dist(pose.velocity, (0.0, 0.0, 0.0))
-    time = settings.reaction + speed / (2.0 * settings.braking)
-    return tuple(p + time * v for p, v in zip(pose.position, pose.velocity, strict=True))
-
-
-def fence_velocity(settings: SafetySettings, pose: Pose) -> Vector | None:
-    """The velocity (m/s) that keeps a vehicle in the arena; None while it could still stop inside."""
-    x, y, z = stopping_point(settings, pose)
-    out = math.hypot(x, y)
-    outside, above, below = out > settings.arena_radius, z > settings.arena_height, z < settings.floor
-    if not (outside or above or below):
-        return None
-    vx, vy, _ = pose.velocity
-    if outside:
-        vx, vy = -0.5 * x / out, -0.5 * y / out
-    return vx, vy, -0.4 if above else 0.4 if below else 0.0
-
-
-def resting_places(settings: SafetySettings, state: State, drones: Sequence[Drone]) -> list[Vector]:
-    """Where the drones may wait or land: near where they would stop, inside, off the pillars, apart (m)."""
-    places = [
-        stopping_point(settings, d.estimate) if d.estimate is not None else (0.0, 0.0, 0.0) for d in drones
-    ]
-    reach = settings.arena_radius - 0.15
-    low, high = 0.3, settings.arena_height - 0.3
-    places = [(x, y, min(max(z, low), high)) for x, y, z in places]
-    for _ in range(20):
-        moved = []
-        for i, (x, y, z) in enumerate(places):
-            for px, py, radius in state.pillars:
-                x, y = _pushed(x, y, px, py, radius + 0.15)
-            for j, (ox, oy, _) in enumerate(places):
-                if j != i:
-                    x, y = _pushed(x, y, ox, oy, APART, 0.5)
-            out = math.hypot(x, y)
-            if out > reach:
-                x, y = x * reach / out, y * reach / out
-            moved.append((x, y, z))
-        if all(math.dist(a, b) < 1e-4 for a, b in zip(moved, places, strict=True)):
-            break
-        places = moved
-    return places
-
-
-def _pushed(x, y, from_x, from_y, distance, share=1.0):
-    """The point moved by a share of what it lacks of a distance from another."""
-    dx, dy = x - from_x, y - from_y
-    apart = math.hypot(dx, dy)
-    if apart >= distance:
-        return x, y
-    if apart < 1e-6:
-        dx, dy, apart = 1.0, 0.0, 1.0
-        return x + share * distance, y
-    lack = share * (distance - apart) / apart
-    return x + lack * dx, y + lack * dy

@@ -8,25 +8,28 @@ from __future__ import annotations
 
 import errno
 import struct
-import zlib
-from collections.abc import Callable
-from dataclasses import dataclass, field
 
 import numpy as np
 
 from openjax.flying.crtp import (
     FULL_SCALE,
-    LOG_FORMATS,
     LOG_TYPES,
-    MAX_LOG_DATA,
     PARAMETER_TYPES,
     PROTOCOL_VERSION,
     READ_ONLY,
-    Packet,
     Port,
-    compress_quaternion,
     decode,
     pack_number,
+)
+from openjax.flying.firmware_logs import MAX_BLOCKS, MAX_VARIABLES, LogBlocks
+from openjax.flying.firmware_tables import (
+    LOG_CRC,
+    LOG_NAMES,
+    LOG_VARIABLES,
+    PARAMETER_CRC,
+    PARAMETER_NAMES,
+    PARAMETERS,
+    READ_ONLY_GROUP,
 )
 from openjax.flying.set_point import ANGLES, OFF, RATES, SetPoint
 
@@ -36,93 +39,8 @@ STOP_AFTER = 2.0
 """Set-points older than this (s) stop the motors and disarm."""
 WATCHDOG = 1.0
 """Once an emergency-stop watchdog was started, it stops the motors unless it is repeated within this time (s)."""
-MAX_BLOCKS = 16
-MAX_VARIABLES = 128
 THRUST_CUT = 60000
 """The legacy commander cuts thrust here and takes less than 1000 as none (16 bit)."""
-
-
-@dataclass(frozen=True)
-class Sensors:
-    """What the firmware knows of its vehicle; SI units, frames as everywhere in openjax."""
-
-    position: np.ndarray  # (3,) m
-    velocity: np.ndarray  # (3,) m/s
-    quaternion: np.ndarray  # (4,) wxyz
-    body_rates: np.ndarray  # (3,) rad/s
-    specific_force: np.ndarray  # (3,) m/s^2, body
-    motor_command: np.ndarray  # (4,) 0..1
-    voltage: float = 4.1  # V
-
-
-def _roll_pitch_yaw(q):
-    """Degrees; pitch with the firmware's inverted sign."""
-    w, x, y, z = q
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return np.degrees(roll), -np.degrees(pitch), np.degrees(yaw)
-
-
-def _log_variables() -> dict[str, tuple[str, Callable]]:
-    """Name -> C type and value of (firmware, sensors): the variables that a flight needs, named as on board."""
-    table: dict[str, tuple[str, Callable]] = {}
-    for i, axis in enumerate("xyz"):
-        table[f"stateEstimate.{axis}"] = ("float", lambda f, s, i=i: s.position[i])
-        table[f"stateEstimate.v{axis}"] = ("float", lambda f, s, i=i: s.velocity[i])
-        table[f"stateEstimateZ.{axis}"] = ("int16_t", lambda f, s, i=i: 1000 * s.position[i])
-        table[f"stateEstimateZ.v{axis}"] = ("int16_t", lambda f, s, i=i: 1000 * s.velocity[i])
-        table[f"acc.{axis}"] = ("float", lambda f, s, i=i: s.specific_force[i] / 9.81)
-        table[f"gyro.{axis}"] = ("float", lambda f, s, i=i: np.degrees(s.body_rates[i]))
-        table[f"locSrv.{axis}"] = ("float", lambda f, s, i=i: f.external_pose[i])
-    for i, name in enumerate(("roll", "pitch", "yaw")):
-        table[f"stateEstimate.{name}"] = ("float", lambda f, s, i=i: _roll_pitch_yaw(s.quaternion)[i])
-    for i, name in enumerate(("qw", "qx", "qy", "qz")):
-        table[f"stateEstimate.{name}"] = ("float", lambda f, s, i=i: s.quaternion[i])
-        table[f"locSrv.{name}"] = ("float", lambda f, s, i=i: f.external_pose[3 + i])
-        table[f"motor.m{i + 1}"] = ("uint16_t", lambda f, s, i=i: FULL_SCALE * s.motor_command[i])
-    table["stateEstimateZ.quat"] = ("uint32_t", lambda f, s: compress_quaternion(s.quaternion))
-    table["pm.vbat"] = ("float", lambda f, s: s.voltage)
-    table["pm.vbatMV"] = ("uint16_t", lambda f, s: 1000 * s.voltage)
-    table["supervisor.info"] = ("uint16_t", lambda f, s: f.supervisor_info)
-    return dict(sorted(table.items()))
-
-
-LOG_VARIABLES = _log_variables()
-_LOG_NAMES = tuple(LOG_VARIABLES)
-PARAMETERS = {
-    "commander.enHighLevel": ("uint8_t", 0),
-    "firmware.modified": ("uint8_t", 1),
-    "firmware.revision0": ("uint16_t", 0),
-    "flightmode.stabModePitch": ("uint8_t", 1),
-    "flightmode.stabModeRoll": ("uint8_t", 1),
-    "flightmode.stabModeYaw": ("uint8_t", 0),
-    "kalman.resetEstimation": ("uint8_t", 0),
-    "locSrv.extPosStdDev": ("float", 0.01),
-    "locSrv.extQuatStdDev": ("float", 4.5e-3),
-    "stabilizer.controller": ("uint8_t", 1),
-    "stabilizer.estimator": ("uint8_t", 2),
-}
-"""Name -> C type and first value. Written values are kept and change nothing."""
-_PARAMETER_NAMES = tuple(PARAMETERS)
-_READ_ONLY_GROUP = "firmware"
-
-
-def _crc(table) -> int:
-    return zlib.crc32(repr([(name, table[name][0]) for name in table]).encode())
-
-
-LOG_CRC, PARAMETER_CRC = _crc(LOG_VARIABLES), _crc(PARAMETERS)
-
-
-@dataclass
-class _Block:
-    variables: list[tuple[str, str]] = field(default_factory=list)  # name, struct format
-    period: float = 0.0  # s; 0 while stopped
-    due: float = 0.0  # s
-
-    def size(self) -> int:
-        return sum(struct.calcsize(fmt) for _, fmt in self.variables)
 
 
 class VirtualFirmware:
@@ -138,7 +56,7 @@ class VirtualFirmware:
         self.external_pose = np.array([0, 0, 0, 1, 0, 0, 0], float)  # position, quaternion wxyz
         self.external_poses = 0
         self.parameters = {name: value for name, (_, value) in PARAMETERS.items()}
-        self._blocks: dict[int, _Block] = {}
+        self.logs = LogBlocks()
         self._set_point = SetPoint()
         self._set_point_time: float | None = None
         self._watchdog_time: float | None = None
@@ -169,10 +87,12 @@ class VirtualFirmware:
         if self._set_point_time is None or not self.armed or self.crashed or self.emergency:
             return SetPoint()
         age = now - self._set_point_time
+        if self._set_point.mode == OFF:  # nothing to time out: an armed vehicle waits for its first set-point
+            return SetPoint()
         if age > STOP_AFTER:
             self._disarm()
             return SetPoint()
-        if self._set_point.mode != OFF and age > LEVEL_AFTER:
+        if age > LEVEL_AFTER:
             return SetPoint(ANGLES, 0.0, 0.0, 0.0, self._set_point.thrust)
         return self._set_point
 
@@ -323,7 +243,7 @@ class VirtualFirmware:
         if packet.channel == 0:
             return self._contents(
                 packet,
-                _LOG_NAMES,
+                LOG_NAMES,
                 LOG_CRC,
                 bytes([MAX_BLOCKS, MAX_VARIABLES]),
                 lambda name: LOG_TYPES[LOG_VARIABLES[name][0]][0],
@@ -332,88 +252,26 @@ class VirtualFirmware:
             return []
         command = packet.data[0]
         ident = packet.data[1] if len(packet.data) > 1 else 0
-        return [packet._replace(data=bytes([command, ident, self._log_control(command, ident, packet, now)]))]
-
-    def _log_control(self, command, ident, packet, now) -> int:
-        """The status of a command on log blocks: 0 or an errno."""
-        if command == 5:
-            self._blocks.clear()
-            return 0
-        if command == 6:
-            if ident in self._blocks:
-                return errno.EEXIST
-            if len(self._blocks) >= MAX_BLOCKS:
-                return errno.ENOMEM
-            self._blocks[ident] = _Block()
-            return self._append(ident, packet.data[2:])
-        if command not in (2, 3, 4, 7, 8):
-            return errno.ENOEXEC
-        if ident not in self._blocks:
-            return errno.ENOENT
-        block = self._blocks[ident]
-        if command == 2:
-            del self._blocks[ident]
-        elif command == 4:
-            block.period = 0.0
-        elif command == 7:
-            return self._append(ident, packet.data[2:])
-        else:
-            block.period = packet.data[2] * 0.01
-            if command == 8:
-                block.period = struct.unpack("<H", packet.data[2:4])[0] * 1e-3
-            block.due = now + block.period
-        return 0
-
-    def _append(self, ident, data) -> int:
-        block = self._blocks[ident]
-        for kind, variable in struct.iter_unpack("<BH", data[: len(data) // 3 * 3]):
-            if variable >= len(_LOG_NAMES) or kind & 0x0F not in LOG_FORMATS:
-                return errno.ENOENT
-            fmt = LOG_FORMATS[kind & 0x0F]
-            if block.size() + struct.calcsize(fmt) > MAX_LOG_DATA:
-                return errno.E2BIG
-            if sum(len(b.variables) for b in self._blocks.values()) >= MAX_VARIABLES:
-                return errno.ENOMEM
-            block.variables.append((_LOG_NAMES[variable], fmt))
-        return 0
+        return [
+            packet._replace(data=bytes([command, ident, self.logs.control(command, ident, packet.data, now)]))
+        ]
 
     def _parameter(self, packet, now):
         if packet.channel == 0:
 
             def type_of(name):
-                read_only = name.split(".")[0] == _READ_ONLY_GROUP
+                read_only = name.split(".")[0] == READ_ONLY_GROUP
                 return PARAMETER_TYPES[PARAMETERS[name][0]][0] | (READ_ONLY if read_only else 0)
 
-            return self._contents(packet, _PARAMETER_NAMES, PARAMETER_CRC, b"", type_of)
+            return self._contents(packet, PARAMETER_NAMES, PARAMETER_CRC, b"", type_of)
         if packet.channel in (1, 2):
             (ident,) = struct.unpack("<H", packet.data[:2])
-            if ident >= len(_PARAMETER_NAMES):
+            if ident >= len(PARAMETER_NAMES):
                 return [packet._replace(data=packet.data[:2] + bytes([errno.ENOENT]))]
-            name = _PARAMETER_NAMES[ident]
+            name = PARAMETER_NAMES[ident]
             fmt = PARAMETER_TYPES[PARAMETERS[name][0]][1]
-            if packet.channel == 2 and name.split(".")[0] != _READ_ONLY_GROUP:
+            if packet.channel == 2 and name.split(".")[0] != READ_ONLY_GROUP:
                 (self.parameters[name],) = struct.unpack("<" + fmt, packet.data[2:])
             status = b"\0" if packet.channel == 1 else b""
             return [packet._replace(data=packet.data[:2] + status + pack_number(fmt, self.parameters[name]))]
         return [packet._replace(data=packet.data[:3] + bytes([errno.ENOENT]))]
-
-    # -- log data out
-
-    def next_log(self) -> float:
-        """When the next log packet is due (s); infinite if no block runs."""
-        return min((b.due for b in self._blocks.values() if b.period > 0), default=np.inf)
-
-    def log_packets(self, now: float, sensors: Sensors) -> list[bytes]:
-        """The log packets due at `now`, stamped with it in milliseconds."""
-        packets = []
-        for ident, block in self._blocks.items():
-            if block.period <= 0 or now < block.due:
-                continue
-            # in step with its start; what came due in between is left out
-            block.due += block.period * (1 + int((now - block.due) / block.period))
-            stamp = struct.pack("<I", int(now * 1000) & 0xFFFFFF)[:3]
-            values = b"".join(
-                pack_number(fmt, LOG_VARIABLES[name][1](self, sensors)) for name, fmt in block.variables
-            )
-            packets.append(Packet(Port.LOG, 2, bytes([ident]) + stamp + values).encode())
-        return packets

@@ -64,7 +64,7 @@ class VirtualCrazyflies:
         while not stop():
             due = min(
                 *(link.next_due() for link in self.links),
-                *(firmware.next_log() for firmware in self.firmware),
+                *(firmware.logs.next() for firmware in self.firmware),
                 self.time + LONGEST_WAIT,
             )
             wait = due - (time.perf_counter() - start)
@@ -84,8 +84,8 @@ class VirtualCrazyflies:
                 self.links[i].send(answer, now)
         self._advance(now)
         for i, (firmware, link) in enumerate(zip(self.firmware, self.links, strict=True)):
-            if firmware.next_log() <= self.time:
-                for packet in firmware.log_packets(self.time, self.vehicles.sensors(i)):
+            if firmware.logs.next() <= self.time:
+                for packet in firmware.logs.packets(firmware, self.time, self.vehicles.sensors(i)):
                     link.send(packet, now)
             link.flush(now)
 

@@ -11,8 +11,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from openjax.errors import UserError
+from openjax.flying.firmware_tables import Sensors
 from openjax.flying.set_point import ANGLES, OFF
-from openjax.flying.virtual_firmware import Sensors
 from openjax.vehicle import Vehicle, hover_state, make_drones_step, rate_controller, rotate, rotate_inverse
 from openjax.vehicle.effects import composition
 

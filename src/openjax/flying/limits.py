@@ -1,0 +1,114 @@
+"""The limits of a flight, and where within them a vehicle may stop, turn back, wait."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from openjax.flying.controller import Pose, Vector
+
+APART = 0.35
+"""Waiting vehicles keep this distance (m)."""
+
+
+@dataclass(frozen=True)
+class SafetySettings:
+    """Limits of a flight."""
+
+    arena_radius: float = 0.9
+    """No vehicle is let out of a cylinder of this radius (m)."""
+    arena_height: float = 1.2
+    """Nor above this (m)."""
+    floor: float = 0.12
+    """Nor, in pursuit, below this (m)."""
+    outside: float = 0.3
+    """Farther out than this (m) something is wrong: all land."""
+    speed_limit: float = 2.5
+    """Faster than this (m/s) something is wrong: all land."""
+    tilt_limit: float = 80.0
+    """More tilted than this (degrees) something is wrong: all land."""
+    braking: float = 5.0
+    """Deceleration that is counted on to stop within the arena (m/s^2)."""
+    reaction: float = 0.1
+    """Time until it acts (s)."""
+    pose_timeout: float = 0.06
+    """A pose older than this (s) is lost: blind landing."""
+    link_timeout: float = 0.3
+    """A link silent for longer (s) is gone."""
+    action_timeout: float = 0.035
+    """Without a new action of the policy for longer (s): all stop where they are."""
+    battery_low: float = 3.2
+    """Voltage under load, for `battery_time`, at which a vehicle lands (V)."""
+    battery_time: float = 0.5
+    hold_time: float = 1.0
+    """How long vehicles wait after a trouble before they land (s)."""
+    transfer_speed: float = 0.5
+    """On the way to the start (m/s)."""
+    landing_speed: float = 0.35
+    """m/s."""
+
+
+def stopping_point(settings: SafetySettings, pose: Pose) -> Vector:
+    """Where a vehicle comes to rest that brakes now (m)."""
+    speed = math.dist(pose.velocity, (0.0, 0.0, 0.0))
+    time = settings.reaction + speed / (2.0 * settings.braking)
+    return tuple(p + time * v for p, v in zip(pose.position, pose.velocity, strict=True))
+
+
+def fence_velocity(settings: SafetySettings, pose: Pose) -> Vector | None:
+    """The velocity (m/s) that keeps a vehicle in the arena; None while it could still stop inside."""
+    x, y, z = stopping_point(settings, pose)
+    out = math.hypot(x, y)
+    outside, above, below = out > settings.arena_radius, z > settings.arena_height, z < settings.floor
+    if not (outside or above or below):
+        return None
+    vx, vy, _ = pose.velocity
+    if outside:
+        vx, vy = -0.5 * x / out, -0.5 * y / out
+    return vx, vy, -0.4 if above else 0.4 if below else 0.0
+
+
+def resting_places(
+    settings: SafetySettings, pillars: Sequence[Vector], poses: Sequence[Pose | None]
+) -> list[Vector]:
+    """Where vehicles may wait or land: near where they would stop, inside, off the pillars, apart (m).
+
+    Args:
+      settings: limits.
+      pillars: x, y, radius (m).
+      poses: of the vehicles; None for one that was never seen.
+    """
+    places = [stopping_point(settings, pose) if pose is not None else (0.0, 0.0, 0.0) for pose in poses]
+    reach = settings.arena_radius - 0.15
+    low, high = 0.3, settings.arena_height - 0.3
+    places = [(x, y, min(max(z, low), high)) for x, y, z in places]
+    for _ in range(20):
+        moved = []
+        for i, (x, y, z) in enumerate(places):
+            for px, py, radius in pillars:
+                x, y = _pushed(x, y, px, py, radius + 0.15)
+            for j, (ox, oy, _) in enumerate(places):
+                if j != i:
+                    x, y = _pushed(x, y, ox, oy, APART, 0.5)
+            out = math.hypot(x, y)
+            if out > reach:
+                x, y = x * reach / out, y * reach / out
+            moved.append((x, y, z))
+        if all(math.dist(a, b) < 1e-4 for a, b in zip(moved, places, strict=True)):
+            break
+        places = moved
+    return places
+
+
+def _pushed(x, y, from_x, from_y, distance, share=1.0):
+    """The point moved by a share of what it lacks of a distance from another."""
+    dx, dy = x - from_x, y - from_y
+    apart = math.hypot(dx, dy)
+    if apart >= distance:
+        return x, y
+    if apart < 1e-6:
+        dx, dy, apart = 1.0, 0.0, 1.0
+        return x + share * distance, y
+    lack = share * (distance - apart) / apart
+    return x + lack * dx, y + lack * dy
