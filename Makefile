@@ -23,7 +23,7 @@ evaluate: $(READY)
 	$(BIN)/python -m openjax.evaluate --policy open open_seed_1 open_seed_2 --scenario all $(ARGS)
 
 tables: $(READY)
-	$(BIN)/python experiments/tables.py $(ARGS)
+	$(BIN)/python -m experiments.tables $(ARGS)
 
 exam: $(READY)
 	$(BIN)/python -m experiments.exam.run $(ARGS)

@@ -1,4 +1,4 @@
-"""Which part of OPEN carries the gain? `python experiments/ablations.py RUN ... [--commit HASH] [--note TEXT]`.
+"""Which part of OPEN carries the gain? `python -m experiments.ablations RUN ... [--commit HASH] [--note TEXT]`.
 
 RUN are directories of `openjax.train` that differ in seed, predictor and generator alone:
 
@@ -15,11 +15,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from headline import PAPER as PAPER_OPEN
-from headline import PAPER_PREDICTION
-from pages import RESULTS, spread, table
-from run_comparison import VARIANTS, band, by_variant, main_effects, read_run, savings, steps_to
 
+from experiments.headline import PAPER as PAPER_OPEN
+from experiments.headline import PAPER_PREDICTION
+from experiments.pages import RESULTS, spread, table, write_page
+from experiments.run_comparison import VARIANTS, band, by_variant, main_effects, read_run, savings, steps_to
 from openjax.commands.command_line import run_command
 from openjax.files import read_json
 from openjax.pursuit import SCENARIOS
@@ -258,15 +258,12 @@ def main(arguments: list[str]) -> int:
     if options.runs:
         records = [read_run(path, options.episodes) for path in options.runs]
         by_variant(records)  # complains before anything is written
-        command = "python experiments/ablations.py RUN ..."
+        command = "python -m experiments.ablations RUN ..."
         facts = {"command": command, "note": options.note, "commit": options.commit}
         write_json(data, {**facts, "runs": records})
     stored = read_json(data)
     runs = by_variant(stored["runs"])
-    lines = report(runs, stored)
-    options.out.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    draw(runs, options.out.with_suffix(".png"))
-    print("\n".join(lines))
+    write_page(options.out, report(runs, stored), runs, draw)
     return 0
 
 

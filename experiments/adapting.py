@@ -14,16 +14,13 @@ import dataclasses
 import functools
 import multiprocessing
 import os
-import sys
 import time
 from pathlib import Path
 
 import jax
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parent))
-from pages import page_parser, publish, table
-
+from experiments.pages import page_parser, publish, table, where
 from experiments.task_gap.flights import make_cases
 from experiments.task_gap.game import draw_tasks
 from experiments.worlds.game import play
@@ -153,11 +150,11 @@ def won_back(vehicles: dict, figure: str) -> tuple[float, float, float]:
 
 def report(results: dict) -> list[str]:
     """The page."""
-    machine, vehicles = results["machine"], results["vehicles"]
+    vehicles = results["vehicles"]
     lines = [
         "# What adapting wins back",
         "",
-        f"`{results['command']}`, JAX {machine['versions']['jax']}, commit {machine['commit']}: {results['seconds']:.0f} s. "
+        f"{where(results)} {results['seconds']:.0f} s. "
         f"{len(vehicles)} vehicles of the exam's plant with one cause each, {results['episodes']} uniform tasks each, no "
         "clamp, drawn starts. Loss: the difference to the same policy on the plant's nominal vehicle, summed over the vehicles "
         "with which it loses anything.",

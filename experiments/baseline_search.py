@@ -1,4 +1,4 @@
-"""Parameters of the heuristics: `python experiments/baseline_search.py [--sets 4096] [--tasks 64]`.
+"""Parameters of the heuristics: `python -m experiments.baseline_search [--sets 4096] [--tasks 64]`.
 
 Draws thousands of parameter sets of each method, flies all of them at once on the same training tasks, the best ones again
 on more of other tasks, and writes the winner to src/openjax/baselines/parameters.json (with `--ship`). What it says of the
@@ -14,8 +14,8 @@ import time
 import jax
 import jax.numpy as jnp
 import numpy as np
-from pages import page_parser, publish, table
 
+from experiments.pages import page_parser, publish, table
 from openjax.baselines import METHODS, Heuristic
 from openjax.baselines.parameters import FOUND, draw, ranges
 from openjax.commands.command_line import run_command
@@ -149,7 +149,7 @@ def study(options: argparse.Namespace) -> dict:
 def command_of(options: argparse.Namespace, name: str) -> str:
     """What makes the result of one method again."""
     return (
-        f"python experiments/baseline_search.py --methods {name} --sets {options.sets} --tasks {options.tasks} "
+        f"python -m experiments.baseline_search --methods {name} --sets {options.sets} --tasks {options.tasks} "
         f"--finalists {options.finalists} --final {options.final} --physics {options.physics}"
     )
 

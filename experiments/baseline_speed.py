@@ -1,4 +1,4 @@
-"""How fast the heuristics fly: `python experiments/baseline_speed.py [--envs 32768]`.
+"""How fast the heuristics fly: `python -m experiments.baseline_speed [--envs 32768]`.
 
 Environment steps per second of the whole loop: observation, method, velocity controller, physics, reward. Writes
 experiments/results/baseline_speed.json and .md.
@@ -7,8 +7,8 @@ experiments/results/baseline_speed.json and .md.
 import argparse
 
 import jax
-from pages import page_parser, publish, table
 
+from experiments.pages import page_parser, publish, table
 from openjax.baselines import METHODS, Heuristic
 from openjax.commands.command_line import run_command
 from openjax.commands.machine import describe_machine
@@ -48,7 +48,7 @@ def study(options: argparse.Namespace) -> dict:
         for physics in ("mjx", "rigid")
     ]
     return {
-        "command": f"python experiments/baseline_speed.py --envs {options.envs} --steps {options.steps}",
+        "command": f"python -m experiments.baseline_speed --envs {options.envs} --steps {options.steps}",
         "commit": options.commit,
         "machine": describe_machine(),
         "envs": options.envs,

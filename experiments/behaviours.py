@@ -1,17 +1,18 @@
-"""The paper's behaviours, measured and drawn: `python experiments/behaviours.py`, from what tables.py stored.
+"""The paper's behaviours, measured and drawn: `python -m experiments.behaviours`, from what tables.py stored.
 
 The paper shows four by pictures: surrounding from both sides (wall), a shortcut instead of following (narrow_gap), finding
 the evader behind pillars (random, and hidden, where nobody sees it at the start), blocking all three ways out (passage).
 Here each is a number for every method, beside one episode from above. Writes experiments/results/behaviours.md and .png.
 """
 
+import functools
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pages import page_from_tables, spread, table, where
-from roster import METHODS
 
+from experiments.pages import page_from_tables, spread, table, where
+from experiments.roster import METHODS
 from openjax.commands.command_line import run_command
 from openjax.pursuit import SCENARIOS, PursuitSettings
 from openjax.show.plots import draw_from_above
@@ -176,9 +177,7 @@ def trajectory_of(paths: dict, layout: str, title: str) -> Trajectory:
     )
 
 
-def main(arguments: list[str]) -> int:
-    """Write page and picture, print the page."""
-    return page_from_tables(__doc__, "behaviours", report, arguments, draw)
+main = functools.partial(page_from_tables, __doc__, "behaviours", report, draw=draw)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Does calibration recover known constants within its intervals? Simulated vehicles with drawn constants.
 
-    python experiments/calibration_recovery.py [--cases 40] [--out
+    python -m experiments.calibration_recovery [--cases 40] [--out
     experiments/results/calibration_recovery.json]
 
 Each case is three flights of 8 s of a vehicle whose constants differ from the nominal ones by up to 20 %

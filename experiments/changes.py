@@ -1,9 +1,9 @@
 """What changed, on real flights with known changes: CrazyPAD (github.com/AerialRoboticsUUST/CrazyPAD, commit 5448265, MIT;
 Masalimov et al., Data 2024, 9(6), 79), micro-SD logs of two Crazyflies without orientation.
 
-    python experiments/changes.py open FOLDER      # conditions in folders, labels.json: table with the truth beside
-    python experiments/changes.py answer FOLDER    # reference/ and case_*/: answers alone, as JSON
-    python experiments/changes.py figure FOLDER    # flies three days into an empty folder: the figure of docs/what_changed.md
+    python -m experiments.changes open FOLDER      # conditions in folders, labels.json: table with the truth beside
+    python -m experiments.changes answer FOLDER    # reference/ and case_*/: answers alone, as JSON
+    python -m experiments.changes figure FOLDER    # flies three days into an empty folder: the figure of docs/what_changed.md
 
 `open` compares every condition with all normal flights, and each day of normal flights with the other days; the table
 goes to experiments/results/changes_e8.md. `answer` writes experiments/results/changes_e9.json. Nothing is fitted to
@@ -132,7 +132,7 @@ def main() -> None:
     if what == "open":
         text = (
             "# What changed: real flights of one Crazyflie with known changes (CrazyPAD, vehicle E8)\n\n"
-            f"`python experiments/changes.py open FOLDER` at {commit()}; two cores. Every condition against all normal\n"
+            f"`python -m experiments.changes open FOLDER` at {commit()}; two cores. Every condition against all normal\n"
             "flights (twelve logs, three days by their trims), every day of normal flights against the others. Logs of the\n"
             "motors and of the controller together; no orientation, in motor logs no gyroscope.\n\n"
         )
@@ -142,7 +142,7 @@ def main() -> None:
     else:
         found = {
             "commit": commit(),
-            "command": "python experiments/changes.py answer FOLDER",
+            "command": "python -m experiments.changes answer FOLDER",
             "cases": answer(folder),
         }
         (RESULTS / "changes_e9.json").write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")

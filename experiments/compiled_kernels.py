@@ -1,4 +1,4 @@
-"""How many kernels does a program become on an H200? `python experiments/compiled_kernels.py [--drones 32768]`.
+"""How many kernels does a program become on an H200? `python -m experiments.compiled_kernels [--drones 32768]`.
 
 Compiles the rigid step of many drones (as XLA splits it and as one kernel) and the paper preset's training step for an H200,
 and counts what each loop starts per turn. Needs no GPU, but JAX's CUDA compiler: `pip install "jax[cuda13]"`. Nothing is
@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import topologies
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from pages import page_parser, publish, table
 
+from experiments.pages import page_parser, publish, table, where
 from openjax.commands.command_line import run_command
 from openjax.commands.machine import describe_machine
 from openjax.errors import UserError
@@ -118,7 +118,7 @@ def study(options: argparse.Namespace) -> dict:
             make_training_step(settings), abstract_carry(settings)
         )
     return {
-        "command": f"python experiments/compiled_kernels.py --drones {options.drones}",
+        "command": f"python -m experiments.compiled_kernels --drones {options.drones}",
         "machine": describe_machine(),
         "programs": {name: loops(program()) for name, program in programs.items()},
     }
@@ -126,11 +126,10 @@ def study(options: argparse.Namespace) -> dict:
 
 def report(results: dict) -> list[str]:
     """The page."""
-    machine = results["machine"]
     lines = [
         "# Kernels that a loop starts per turn, compiled for an H200",
         "",
-        f"`{results['command']}` on {machine['device']} (no GPU), JAX {machine['versions']['jax']}, commit {machine['commit']}. "
+        f"{where(results)} No GPU was there. "
         "Not tuned by measuring, as on a real GPU it would be. A turn of the training step's loops is a step of the rollout, "
         "a step of the predictor's update and a gradient step of the policy's update; the loop of two fusions sums advantages.",
         "",

@@ -1,4 +1,4 @@
-"""How many collisions do drawn starts force? `python experiments/drawn_starts.py [--episodes 100]`.
+"""How many collisions do drawn starts force? `python -m experiments.drawn_starts [--episodes 100]`.
 
 Drawn starts tilt each drone by up to 36 degrees in roll and in pitch, near pillars, neighbours and bounds. Here nothing is
 pursued: commands of the first two seconds are optimised for each episode, by gradients through the rigid physics and
@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from headline import GOAL_COLLISION
-from pages import page_parser, publish, table
-from prediction_flights import layout_tasks
 
+from experiments.headline import GOAL_COLLISION
+from experiments.pages import page_parser, publish, table, where
+from experiments.prediction_flights import layout_tasks
 from openjax.commands.command_line import run_command
 from openjax.commands.machine import describe_machine
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, Task, action_to_command
@@ -153,7 +153,7 @@ def study(options: argparse.Namespace) -> dict:
             for kind, part in zip(("held", "least"), parts, strict=True)
         }
     return {
-        "command": f"python experiments/drawn_starts.py --episodes {options.episodes} --iterations {options.iterations}",
+        "command": f"python -m experiments.drawn_starts --episodes {options.episodes} --iterations {options.iterations}",
         "machine": describe_machine(),
         "seconds": time.monotonic() - started,
         "episodes": options.episodes,
@@ -164,7 +164,6 @@ def study(options: argparse.Namespace) -> dict:
 
 def report(results: dict) -> list[str]:
     """The page."""
-    machine = results["machine"]
     rows = []
     for layout, kinds in results["layouts"].items():
         cells = []
@@ -179,7 +178,7 @@ def report(results: dict) -> list[str]:
     return [
         "# How many collisions drawn starts force",
         "",
-        f"`{results['command']}` on {machine['device']}, JAX {machine['versions']['jax']}, commit {machine['commit']}: "
+        f"{where(results)} "
         f"{results['seconds']:.0f} s. {results['episodes']} drawn starts per layout, rigid physics, speed clamp.",
         "",
         "Held: a controller levels each drone and holds its start. Least: commands of the first two seconds optimised for "

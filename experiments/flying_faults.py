@@ -1,4 +1,4 @@
-"""A thousand faults in simulated time: `python experiments/flying_faults.py [--faults 1000] [--processes 2]`.
+"""A thousand faults in simulated time: `python -m experiments.flying_faults [--faults 1000] [--processes 2]`.
 
 Three vehicles hunt in a layout; at a drawn moment something goes wrong with one of them, or with the computer. Counted
 is where every vehicle ends: landed inside the arena, or somewhere else. The vehicles are openjax's, with the firmware's

@@ -1,4 +1,4 @@
-"""Rare failures of policies, on tasks enough to count them: `python experiments/hard_tasks.py [--policy NAME ...]`.
+"""Rare failures of policies, on tasks enough to count them: `python -m experiments.hard_tasks [--policy NAME ...]`.
 
 The layouts' hundred episodes can't tell a crash in a hundred from one in a thousand, and nothing may be chosen by them.
 So policies are compared on three kinds of other tasks: uniform ones, uniform ones with their pillars in a row (which
@@ -9,9 +9,9 @@ starts close to a pillar or another pursuer. Writes experiments/results/hard_tas
 import time
 
 import jax
-from headline import evaluator_of, seeds_of_open
-from pages import page_parser, publish, table
 
+from experiments.headline import evaluator_of, seeds_of_open
+from experiments.pages import page_parser, publish, table, where
 from openjax.commands.command_line import run_command
 from openjax.commands.machine import describe_machine
 from openjax.commands.validation import uniform_tasks
@@ -67,7 +67,6 @@ def fly(policy: str, number: int) -> dict[str, dict]:
 
 def report(results: dict) -> list[str]:
     """The page."""
-    machine = results["machine"]
     rows = [
         [
             name,
@@ -83,7 +82,7 @@ def report(results: dict) -> list[str]:
     return [
         "# Rare failures, on many tasks",
         "",
-        f"`{results['command']}` on {machine['device']}, JAX {machine['versions']['jax']}, commit {machine['commit']}: "
+        f"{where(results)} "
         f"{results['seconds']:.0f} s. Uniform: validation uniform tasks; row: their pillars in a row; close: all pursuers "
         "that can be start close to a pillar or another pursuer. Each policy in the game that it was trained in; start "
         "attitudes drawn.",
@@ -99,7 +98,7 @@ def study(options) -> dict:
     chosen = f" --policy {' '.join(options.policy)}" if options.policy else ""
     policies = {name: fly(name, options.number) for name in names}
     return {
-        "command": f"python experiments/hard_tasks.py --number {options.number}{chosen}",
+        "command": f"python -m experiments.hard_tasks --number {options.number}{chosen}",
         "machine": describe_machine(),
         "seconds": time.monotonic() - started,
         "policies": policies,

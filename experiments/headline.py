@@ -1,4 +1,4 @@
-"""The headline table from the shipped policies: `python experiments/headline.py [--episodes 100] [--policy NAME ...]`.
+"""The headline table from the shipped policies: `python -m experiments.headline [--episodes 100] [--policy NAME ...]`.
 
 Evaluates all shipped seeds of OPEN (or other policies) on all six layouts, with the speed clamp from drawn and from level
 starts, and without the clamp, and holds them against this project's goals. Writes experiments/results/headline.json and
@@ -12,8 +12,8 @@ import time
 from pathlib import Path
 
 import numpy as np
-from pages import page_parser, publish, spread, table
 
+from experiments.pages import page_parser, publish, spread, table, where
 from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import Evaluator, evaluate_scenarios, layout_slots
 from openjax.commands.machine import describe_machine
@@ -114,7 +114,7 @@ def goals(by_layout: dict[str, list[dict]]) -> list[tuple[str, str, str, bool]]:
 
 def report(results: dict) -> list[str]:
     """The page."""
-    machine, records = results["machine"], results["records"]
+    records = results["records"]
     names = list(next(iter(records.values())))
     episodes = next(iter(records.values()))[names[0]][0]["episodes"]
     by_layout = {
@@ -125,7 +125,7 @@ def report(results: dict) -> list[str]:
     lines = [
         "# Headline: policies on the six layouts",
         "",
-        f"`{results['command']}` on {machine['device']}, JAX {machine['versions']['jax']}, commit {machine['commit']}. "
+        f"{where(results)} "
         f"{len(names)} training seeds ({', '.join(names)}), {episodes} episodes each per layout; mean (standard deviation "
         f"over seeds). The layouts were never trained on nor used to choose checkpoints. {results['note']}",
         "",
@@ -171,7 +171,7 @@ def study(options: argparse.Namespace) -> dict:
     }
     chosen = f" --policy {' '.join(options.policy)}" if options.policy else ""
     return {
-        "command": f"python experiments/headline.py --episodes {options.episodes}{chosen}",
+        "command": f"python -m experiments.headline --episodes {options.episodes}{chosen}",
         "note": options.note,
         "machine": describe_machine(),
         "seconds": time.monotonic() - started,

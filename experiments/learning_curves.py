@@ -1,4 +1,4 @@
-"""Learning curves from committed histories: `python experiments/learning_curves.py [RUN ...]`.
+"""Learning curves from committed histories: `python -m experiments.learning_curves [RUN ...]`.
 
 Capture rate, capture step and collision rate on the validation tasks against environment steps: OPEN (h200_runs.json) and
 the other methods as shipped, each trained under penalties with which it learns to catch (method_runs.json, in which a RUN of
@@ -8,10 +8,9 @@ the other methods as shipped, each trained under penalties with which it learns 
 import argparse
 from pathlib import Path
 
-from pages import RESULTS, table
-from roster import COLORS
-from run_comparison import band, read_run, steps_to
-
+from experiments.pages import RESULTS, table, write_page
+from experiments.roster import COLORS
+from experiments.run_comparison import band, read_run, steps_to
 from openjax.commands.command_line import run_command
 from openjax.files import read_json
 from openjax.store.settings_files import write_json
@@ -62,7 +61,7 @@ def report(groups: dict[str, list[dict]]) -> list[str]:
     return [
         "# Learning curves",
         "",
-        "`python experiments/learning_curves.py`, from the histories in h200_runs.json and method_runs.json. Each seed, on "
+        "`python -m experiments.learning_curves`, from the histories in h200_runs.json and method_runs.json. Each seed, on "
         "validation tasks (uniform, never a layout): environment steps until the capture rate first reaches a level, and "
         f"rates at the run's end. For comparison, {PAPER}. The commands are those of their commits: MAPPO and its variants flew "
         "under the preset `paper` as it was then, without a penalty of 5,000 for an episode's first crash (now preset `mappo`); "
@@ -113,10 +112,7 @@ def main(arguments: list[str]) -> int:
         runs += [run for run in stored if run["variant"] not in renewed]
         write_json(METHOD_RUNS, {"runs": runs})
     groups = histories()
-    lines = report(groups)
-    options.out.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    draw(groups, options.out.with_suffix(".png"))
-    print("\n".join(lines))
+    write_page(options.out, report(groups), groups, draw)
     return 0
 
 

@@ -32,10 +32,16 @@ def publish(
     if not options.report:
         write_json(data, study(options))
     results = read_json(data)
-    lines = report(results)
-    options.out.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_page(options.out, report(results), results, draw)
+
+
+def write_page(
+    out: Path, lines: list[str], results: Any = None, draw: Callable[[Any, Path], None] | None = None
+) -> None:
+    """Write and print the page, and draw its figure of `results` if there is one."""
+    out.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")
     if draw is not None:
-        draw(results, options.out.with_suffix(".png"))
+        draw(results, out.with_suffix(".png"))
     print("\n".join(lines))
 
 
@@ -61,11 +67,7 @@ def page_from_tables(
     parser.add_argument("--out", type=Path, default=RESULTS / name)
     options = parser.parse_args(arguments)
     results = read_json(options.flights)
-    lines = report(results)
-    options.out.with_suffix(".md").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    if draw is not None:
-        draw(results, options.out.with_suffix(".png"))
-    print("\n".join(lines))
+    write_page(options.out, report(results), results, draw)
     return 0
 
 

@@ -1,4 +1,4 @@
-"""What helps to predict the evader where it is hidden? `python experiments/prediction.py [--policy open]`.
+"""What helps to predict the evader where it is hidden? `python -m experiments.prediction [--policy open]`.
 
 Flies a fixed policy on training tasks, trains variants of the predictor on these flights, all for as many updates,
 and compares them on other training tasks and on the six layouts: 10 to 400 ms ahead, where the evader is seen and where it is
@@ -15,10 +15,11 @@ from concurrent.futures import ThreadPoolExecutor
 import jax
 import jax.numpy as jnp
 import numpy as np
-import prediction_flights as flying
-from pages import page_parser, publish
-from prediction_report import draw, report
-from predictors import (
+
+from experiments import prediction_flights as flying
+from experiments.pages import page_parser, publish
+from experiments.prediction_report import draw, report
+from experiments.predictors import (
     HORIZONS,
     VARIANTS,
     VISIBILITY,
@@ -31,7 +32,6 @@ from predictors import (
     train,
     visibility,
 )
-
 from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import layout_slots
 from openjax.commands.machine import describe_machine
@@ -94,7 +94,7 @@ def study(options: argparse.Namespace) -> dict:
     fewer = "" if options.variants >= len(VARIANTS) else f" --variants {options.variants}"
     outcome = np.asarray(outcome[number:]).reshape(sources, len(SCENARIOS), options.episodes, 3).mean(axis=2)
     return {
-        "command": f"python experiments/prediction.py --policy {options.policy} --worlds {options.worlds} "
+        "command": f"python -m experiments.prediction --policy {options.policy} --worlds {options.worlds} "
         f"--held-back {options.held_back} --episodes {options.episodes} --updates {options.updates} "
         f"--batch {options.batch} --seeds {options.seeds} --stride {options.stride}{fewer}",
         "note": options.note,

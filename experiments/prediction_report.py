@@ -1,10 +1,11 @@
-"""Page and picture of experiments/prediction.py."""
+"""Page and picture of `experiments.prediction`."""
 
 from pathlib import Path
 
 import numpy as np
-from headline import PAPER_PREDICTION
-from pages import table
+
+from experiments.headline import PAPER_PREDICTION
+from experiments.pages import table
 
 SEEN, LOST, NOT_YET, ALL = 0, 1, 2, 3
 PAPER = "paper: 1–5 ahead, absolute, step size 1e-4"

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from prediction_flights import Flights, inside, last_known
 
+from experiments.prediction_flights import Flights, inside, last_known
 from openjax.learning.predictor_update import make_predictor_optimiser, prediction_loss
 from openjax.policy import PredictorSettings
 from openjax.policy.predictor import EvaderPredictor

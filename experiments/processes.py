@@ -1,6 +1,6 @@
 """Two processes with one GPU each against one process with both: speed, the loss of one, and going on with one GPU.
 
-    python experiments/processes.py [--preset paper] [--seconds 25] [--out experiments/results/processes]
+    python -m experiments.processes [--preset paper] [--seconds 25] [--out experiments/results/processes]
 
 First all three programs (two devices of one process, two processes, one device) are compiled into a cache, side by
 side; then each is timed alone. Needs two devices; with `--cpu` they are two virtual ones, to try the script.
@@ -108,7 +108,7 @@ def main(command: ProcessesCommand) -> dict:
     """All measurements; returns what is written."""
     gpus = (os.environ.get("CUDA_VISIBLE_DEVICES") or "0,1").split(",")[:2]
     together, apart = [gpus], [[gpus[0]], [gpus[1]]]
-    results: dict = {"command": "python experiments/processes.py " + " ".join(sys.argv[1:])}
+    results: dict = {"command": "python -m experiments.processes " + " ".join(sys.argv[1:])}
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder)
         os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"

@@ -5,9 +5,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from headline import fly
 from scipy.stats import t as student
 
+from experiments.headline import fly
 from openjax.errors import UserError
 from openjax.files import read_json
 from openjax.pursuit import SCENARIOS

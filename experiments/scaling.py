@@ -1,4 +1,4 @@
-"""Scaling of the whole training step over the devices of a host: `python experiments/scaling.py [--commit HASH]`.
+"""Scaling of the whole training step over the devices of a host: `python -m experiments.scaling [--commit HASH]`.
 
 weak          as many worlds on every device as one has alone, minibatches as many and so larger: how one would train
 weak_batches  the same worlds, but as many more minibatches: each is as large as on one device
@@ -19,9 +19,9 @@ from typing import Annotated, Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pages
 import tyro
 
+from experiments import pages
 from openjax.cluster.devices import carry_shardings, check_devices, everywhere, make_device_step
 from openjax.commands.command_line import parse, peek, run_command
 from openjax.commands.loop import guarded
@@ -31,7 +31,7 @@ from openjax.learning import TrainCarry, TrainSettings, build, init_carry, prese
 from openjax.store.checkpoints import place
 from openjax.store.settings_files import write_json
 
-PROGRAM = "python experiments/scaling.py"
+PROGRAM = "python -m experiments.scaling"
 Kind = Literal["weak", "weak_batches", "strong"]
 
 

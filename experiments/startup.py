@@ -1,6 +1,6 @@
 """Seconds from the command to a training run's first update, with an empty and with a filled cache of compiled programs.
 
-python experiments/startup.py [--preset paper] [--repeats 2] [--out experiments/results/startup]
+python -m experiments.startup [--preset paper] [--repeats 2] [--out experiments/results/startup]
 """
 
 import dataclasses
@@ -61,7 +61,7 @@ def start_once(command: StartupCommand, scratch: Path, name: str) -> dict:
 
 def main(command: StartupCommand) -> dict:
     """All starts; returns what is written."""
-    results: dict = {"command": "python experiments/startup.py " + " ".join(sys.argv[1:])}
+    results: dict = {"command": "python -m experiments.startup " + " ".join(sys.argv[1:])}
     with tempfile.TemporaryDirectory() as folder:
         names = ["cold", *(f"warm {i + 1}" for i in range(command.repeats))]
         results["starts"] = [start_once(command, Path(folder), name.replace(" ", "_")) for name in names]

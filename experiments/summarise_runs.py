@@ -1,4 +1,4 @@
-"""Summary of training runs: `python experiments/summarise_runs.py OUT.json NAME=RUN ... [--note TEXT] [--commit HASH]`.
+"""Summary of training runs: `python -m experiments.summarise_runs OUT.json NAME=RUN ... [--note TEXT] [--commit HASH]`.
 
 Keeps what a run's directory says of itself: settings, evaluations on the validation tasks, the layouts before and after.
 Writes OUT.json and a table beside it.
@@ -9,8 +9,7 @@ import json
 import statistics
 from pathlib import Path
 
-from pages import table
-
+from experiments.pages import table
 from openjax.store.settings_files import write_json
 
 

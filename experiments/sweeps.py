@@ -1,16 +1,17 @@
-"""All methods over the capture radius and the evader's speed: `python experiments/sweeps.py`, from what tables.py stored.
+"""All methods over the capture radius and the evader's speed: `python -m experiments.sweeps`, from what tables.py stored.
 
 As in the paper's two figures: the radius in `empty`, the speed in `passage`; policies trained at one radius and one speed fly
 at others. Writes experiments/results/sweeps.md and .png.
 """
 
+import functools
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pages import page_from_tables, spread, table, where
-from roster import COLORS, METHODS
 
+from experiments.pages import page_from_tables, spread, table, where
+from experiments.roster import COLORS, METHODS
 from openjax.commands.command_line import run_command
 
 RADII = (0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5)
@@ -127,9 +128,7 @@ def draw(results: dict, path: Path) -> None:
     figure.savefig(path, dpi=100)
 
 
-def main(arguments: list[str]) -> int:
-    """Write page and picture, print the page."""
-    return page_from_tables(__doc__, "sweeps", report, arguments, draw)
+main = functools.partial(page_from_tables, __doc__, "sweeps", report, draw=draw)
 
 
 if __name__ == "__main__":

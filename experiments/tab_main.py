@@ -1,13 +1,15 @@
-"""The paper's main table (`tab:main`): `python experiments/tab_main.py`, from what tables.py stored.
+"""The paper's main table (`tab:main`): `python -m experiments.tab_main`, from what tables.py stored.
 
 Six methods on four layouts: capture rate, capture step, collision rate, and crash rate beside them; the paper's values
 beside ours. Writes experiments/results/tab_main.md.
 """
 
-import numpy as np
-from pages import page_from_tables, spread, table, where
-from roster import METHODS
+import functools
 
+import numpy as np
+
+from experiments.pages import page_from_tables, spread, table, where
+from experiments.roster import METHODS
 from openjax.commands.command_line import run_command
 
 FIGURES = {"capture_rate": 3, "capture_step": 0, "collision_rate": 4, "crash_rate": 3}
@@ -137,9 +139,7 @@ def report(results: dict) -> list[str]:
     return lines
 
 
-def main(arguments: list[str]) -> int:
-    """Write the page and print it."""
-    return page_from_tables(__doc__, "tab_main", report, arguments)
+main = functools.partial(page_from_tables, __doc__, "tab_main", report)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,13 @@
-"""The paper's table of its parts on layouts unlike its training (`tab:ood`): `python experiments/tab_ood.py`.
+"""The paper's table of its parts on layouts unlike its training (`tab:ood`): `python -m experiments.tab_ood`.
 
 OPEN, MAPPO with either part, and plain MAPPO in random and passage, from what tables.py stored; the paper's values beside
 ours. Writes experiments/results/tab_ood.md.
 """
 
-from pages import page_from_tables, spread, table, where
-from tab_main import FIGURES, rows_of
+import functools
 
+from experiments.pages import page_from_tables, spread, table, where
+from experiments.tab_main import FIGURES, rows_of
 from openjax.commands.command_line import run_command
 
 VARIANTS = ("OPEN", "MAPPO + predictor", "MAPPO + generator", "MAPPO")
@@ -46,9 +47,7 @@ def report(results: dict) -> list[str]:
     ]
 
 
-def main(arguments: list[str]) -> int:
-    """Write the page and print it."""
-    return page_from_tables(__doc__, "tab_ood", report, arguments)
+main = functools.partial(page_from_tables, __doc__, "tab_ood", report)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,14 @@
-"""The paper's table of prediction errors: `python experiments/tab_prediction.py`, from what tables.py stored.
+"""The paper's table of prediction errors: `python -m experiments.tab_prediction`, from what tables.py stored.
 
 Error of the evader's predicted next position over whole episodes of OPEN, beside that of keeping where it was last seen and
 the paper's. Writes experiments/results/tab_prediction.md.
 """
 
-from headline import PAPER_PREDICTION
-from pages import page_from_tables, spread, table, where
-from tab_main import rows_of
+import functools
 
+from experiments.headline import PAPER_PREDICTION
+from experiments.pages import page_from_tables, spread, table, where
+from experiments.tab_main import rows_of
 from openjax.commands.command_line import run_command
 
 
@@ -31,9 +32,7 @@ def report(results: dict) -> list[str]:
     ]
 
 
-def main(arguments: list[str]) -> int:
-    """Write the page and print it."""
-    return page_from_tables(__doc__, "tab_prediction", report, arguments)
+main = functools.partial(page_from_tables, __doc__, "tab_prediction", report)
 
 
 if __name__ == "__main__":

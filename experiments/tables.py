@@ -1,4 +1,4 @@
-"""The paper's tables and figures from the shipped weights: `python experiments/tables.py [--episodes 100]`, or `make tables`.
+"""The paper's tables and figures from the shipped weights: `python -m experiments.tables [--episodes 100]`, or `make tables`.
 
 Flies every method once, all its layouts, capture radii and evader speeds in one compiled call, and stores what came of it in
 experiments/results/tables.json; each script named in `PAGES` then writes its page from there. `--report` writes the pages
@@ -10,19 +10,14 @@ import dataclasses
 import time
 from pathlib import Path
 
-import behaviours
 import jax
 import jax.numpy as jnp
-import learning_curves
 import numpy as np
-import sweeps
-import tab_main
-import tab_ood
-import tab_prediction
-from flights import environment_of, fly
-from pages import RESULTS
-from roster import ABLATIONS, METHODS, seeds_of
 
+from experiments import behaviours, learning_curves, sweeps, tab_main, tab_ood, tab_prediction
+from experiments.flights import environment_of, fly
+from experiments.pages import RESULTS
+from experiments.roster import ABLATIONS, METHODS, seeds_of
 from openjax.baselines import METHODS as HEURISTICS
 from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import layout_slots, record_of, repeat_task
@@ -102,7 +97,7 @@ def study(options: argparse.Namespace) -> None:
                 )
                 print(f"{time.monotonic() - started:5.0f} s  {label}: {name}, {condition}", flush=True)
         # after each method, so that an interrupted study leaves what it has
-        command = f"python experiments/tables.py --episodes {options.episodes} --physics {options.physics}"
+        command = f"python -m experiments.tables --episodes {options.episodes} --physics {options.physics}"
         results = {"command": command, "commit": options.commit, "machine": describe_machine()}
         results |= {"seconds": time.monotonic() - started, **alike, "flights": flights}
         write_json(stored, results)

@@ -1,4 +1,4 @@
-"""Policies on vehicles that they weren't made for: `python experiments/vehicles.py [--policy NAME ...] [--number 1024]`.
+"""Policies on vehicles that they weren't made for: `python -m experiments.vehicles [--policy NAME ...] [--number 1024]`.
 
 No clamp, rate loop at 500 Hz, solid contacts. Vehicles: the nominal one; `table`, with motors 40 ms slower, commands 15 ms
 and poses 10 ms late, and drag; the family of the preset `flight`, ordinary and whole; and for each of its effects vehicles
@@ -14,9 +14,9 @@ import time
 import jax
 import jax.numpy as jnp
 import numpy as np
-from hard_tasks import close, drawn, row
-from pages import page_parser, publish, table
 
+from experiments.hard_tasks import close, drawn, row
+from experiments.pages import page_parser, publish, table, where
 from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import layout_slots, repeat_task
 from openjax.commands.machine import describe_machine
@@ -136,7 +136,7 @@ def study(options) -> dict:
     started = time.monotonic()
     policies = {name: fly(name, options.number, options.layouts, options.physics) for name in options.policy}
     return {
-        "command": f"python experiments/vehicles.py --policy {' '.join(options.policy)} --number {options.number} "
+        "command": f"python -m experiments.vehicles --policy {' '.join(options.policy)} --number {options.number} "
         f"--layouts {options.layouts} --physics {options.physics}",
         "machine": describe_machine(),
         "seconds": time.monotonic() - started,
@@ -148,7 +148,6 @@ def study(options) -> dict:
 
 def report(results: dict) -> list[str]:
     """The page."""
-    machine = results["machine"]
     rows = [
         [name, kind, tasks, *cells(summary)]
         for name, kinds in results["policies"].items()
@@ -158,8 +157,8 @@ def report(results: dict) -> list[str]:
     return [
         "# Policies on other vehicles",
         "",
-        f"`{results['command']}` on {machine['device']}, JAX {machine['versions']['jax']}, commit {machine['commit']}: "
-        f"{results['seconds']:.0f} s. No clamp, rate loop at 500 Hz, drawn starts; {results['number']} held-back tasks of each "
+        f"{where(results)} {results['seconds']:.0f} s. "
+        f"No clamp, rate loop at 500 Hz, drawn starts; {results['number']} held-back tasks of each "
         f"kind, {results['layouts']} episodes of each layout. Nominal: the nominal vehicle; table: motors 40 ms slower, "
         "commands 15 ms and poses 10 ms late, drag of .0125 N s/m; ordinary and family: the vehicles of the preset flight "
         "without and with the rare ones; a name: all vehicles out of the ordinary in that effect. "

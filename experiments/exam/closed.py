@@ -8,14 +8,13 @@ parameters that it gives, are put into the plant in place of the true ones and m
 truth brings. A report that names nothing closes 0; a name without a counterpart in the plant is left out.
 """
 
-import argparse
 import json
 import multiprocessing
 from pathlib import Path
 
 import numpy as np
 
-from experiments.exam import cases, generate, score
+from experiments.exam import cases, fleet, judge
 
 SKIPPED = ("packet_loss",)  # which packets were lost isn't a parameter
 
@@ -80,13 +79,12 @@ def close_chunk(job):
     for spec, answer, _ in rows:
         causes = [{k: x for k, x in c.items() if k != "magnitudes"} for c in answer["causes"]]
         variants.append((spec, causes))
-    fleet = generate.Fleet(
-        seed, column, variants, {s["name"]: generate.bodies(seed, column, s) for s, _ in variants}
-    )
-    p = fleet.model([[] for _ in variants])[0]
-    links, firmware = np.zeros((2, len(fleet.told)), bool)
-    for (_, answer, report), columns in zip(rows, fleet.columns, strict=True):
-        firmware[columns] = any(c["effect"] in generate.FIRMWARE for c in answer["causes"])
+    drawn = {s["name"]: fleet.bodies(seed, column, s) for s, _ in variants}
+    flown = fleet.Fleet(seed, column, variants, drawn)
+    p = flown.model([[] for _ in variants])[0]
+    links, firmware = np.zeros((2, len(flown.told)), bool)
+    for (_, answer, report), columns in zip(rows, flown.columns, strict=True):
+        firmware[columns] = any(c["effect"] in fleet.FIRMWARE for c in answer["causes"])
         for effect in report["effects"]:
             values = {
                 k: v["value"]
@@ -95,7 +93,7 @@ def close_chunk(job):
             }
             put(effect, values, p, columns)
             firmware[columns] |= effect in ("rate_gains", "command_latency")
-    said, squares = fleet.errors_of(p, firmware, links), fleet.energies()
+    said, squares = flown.errors_of(p, firmware, links), flown.energies()
     out = {}
     for i, (_, answer, _) in enumerate(rows):
         floor = np.array(
@@ -133,16 +131,12 @@ def close_all(answers, predictions, jobs=1, chunk=8):
 
 
 def main():
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("answers", type=Path)
-    parser.add_argument("diagnoses", type=Path)
+    parser = judge.reports_parser(__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--jobs", type=int, default=1)
     options = parser.parse_args()
     closed = close_all(
-        json.loads(options.answers.read_text()), score.collect(options.diagnoses), options.jobs
+        json.loads(options.answers.read_text()), judge.collect(options.diagnoses), options.jobs
     )
     options.out.write_text(json.dumps(dict(sorted(closed.items())), indent=1))
 

@@ -11,7 +11,6 @@ import contextlib
 import io
 import json
 import multiprocessing
-import os
 import sys
 import time
 import traceback
@@ -19,14 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-# one thread per process: the cases are the parallel part. Set before JAX is imported by a worker.
-SINGLE_THREAD = {
-    "JAX_PLATFORMS": "cpu",
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
-}
+from experiments.single_thread import use_single_thread
+
 _done = 0  # cases that this process has diagnosed
 
 
@@ -56,8 +49,7 @@ def diagnose_all(logs, out, jobs=1, seconds=None):
     work = [(folders[i], Path(out)) for i in np.random.default_rng(0).permutation(len(folders))]
     facts, start = {}, time.perf_counter()
     Path(out).mkdir(parents=True, exist_ok=True)
-    for key, value in SINGLE_THREAD.items():
-        os.environ.setdefault(key, value)
+    use_single_thread()  # before a worker imports JAX
 
     def keep(result):
         facts[result[0]] = result[1]

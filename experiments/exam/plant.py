@@ -184,6 +184,10 @@ def received(arrival, steps):
     return np.maximum.accumulate(table, axis=0)
 
 
+POSE = {"position": 3, "velocity": 3, "quaternion": 4}
+KEPT = {"rates": 3, "specific": 3, "gyro": 3, "rotor": 4, "motor": 4, "integral": 3, "applied": 4}
+
+
 class Flight:
     """B vehicles in the air, at rest at the start, 2 ms at a time.
 
@@ -221,8 +225,8 @@ class Flight:
         self.battery = Battery(air, hover)
         self.voltage = self.battery.step(np.tile(hover, (4, 1)), 0.0)
         self.commands = np.zeros((ticks, 4, count))
-        poses = (("position", 3), ("velocity", 3), ("quaternion", 4))
-        self.history = {n: np.zeros((PER_TICK * ticks, size, count), np.float32) for n, size in poses}
+        samples = PER_TICK * ticks
+        self.history = {n: np.zeros((samples, size, count), np.float32) for n, size in POSE.items()}
         self.columns = np.arange(count)
         far = np.array([[0.0], [0.0], [-10.0]])
         self.partners = [(partner, np.where(partner == self.columns, far, 0.0)) for partner in partners]
@@ -281,9 +285,6 @@ class Flight:
                 self.solids.stop(self.body.position, self.body.velocity)
         self.sample += 1
         return now, m
-
-
-KEPT = {"rates": 3, "specific": 3, "gyro": 3, "rotor": 4, "motor": 4, "integral": 3, "applied": 4}
 
 
 def fly(batch):

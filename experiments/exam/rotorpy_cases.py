@@ -15,9 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.exam import cases, generate, measure, sensors
+from experiments.exam import cases, fleet, measure, sensors
 from experiments.exam import vehicle as v
-from experiments.exam.plant import SAMPLE, Battery, Filter
+from experiments.exam.answer_key import accepted
+from experiments.exam.generate import write_answers
+from experiments.exam.plant import KEPT, POSE, SAMPLE, Battery, Filter
 
 SECONDS = 8.0
 QUIET, LAPS, TURNS, TURNING = ("hover",), ("circle", "eight"), ("eight", "rocking"), ("yawing", "rocking")
@@ -209,16 +211,7 @@ def fly(told, changed, wind, path, drawn, air):
     battery = Battery(
         {k: np.array([air[k]]) for k in ("open_voltage", "discharge", "resistance")}, np.array([told.hover])
     )
-    sizes = {
-        "position": 3,
-        "velocity": 3,
-        "quaternion": 4,
-        "rates": 3,
-        "specific": 3,
-        "gyro": 3,
-        "rotor": 4,
-        "motor": 4,
-    }
+    sizes = POSE | {k: size for k, size in KEPT.items() if k not in ("integral", "applied")}
     out = {name: np.zeros((samples, size, 1), np.float32) for name, size in sizes.items()}
     out |= {name: np.zeros((samples, 1), np.float32) for name in ("voltage", "load")}
     m, crashed = np.full((4, 1), told.hover), samples
@@ -295,7 +288,7 @@ def make_case(job):
     place = Path(folder) / f"case_{number:03d}"
     place.mkdir(parents=True, exist_ok=True)
     for letter, flight in zip("abc", flights, strict=True):
-        generate.write_flight(place / f"flight_{letter}.csv.gz", flight, drawn["channels"])
+        fleet.write_flight(place / f"flight_{letter}.csv.gz", flight, drawn["channels"])
     (place / "vehicle.toml").write_text(v.toml(told, "RotorPy 3", drawn["pose_rate"]))
     return _answer(place.name, kind, told, drawn, names, joined, flights, effects, form, said)
 
@@ -320,7 +313,7 @@ def _answer(name, kind, told, drawn, names, joined, flights, effects, form, said
         "category": category,
         "effects": truth,
         "expected": effects or ["none"],
-        "acceptable": {e: generate.accepted(e, told.weighed) for e in effects if e != "unknown"},
+        "acceptable": {e: accepted(e, told.weighed) for e in effects if e != "unknown"},
         "also_fine": ["wind", "rotor_drag"] if kind == "wind_tunnel" else [],
         "causes": [
             {"effect": e, "form": f, "size": _size(e, m), "magnitudes": m}
@@ -362,7 +355,7 @@ def main():
     jobs = [(options.seed, n, drawn[i], str(options.logs)) for n, i in enumerate(order, 1)]
     with multiprocessing.get_context("spawn").Pool(options.jobs) as pool:
         answers = sorted(pool.imap_unordered(make_case, jobs), key=lambda a: a["case"])
-    print("sha256", generate.write_answers(options.answers, answers, options.seed, "RotorPy"))
+    print("sha256", write_answers(options.answers, answers, options.seed, "RotorPy"))
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ import sys
 import time
 from pathlib import Path
 
-from experiments.exam import cases, score
+from experiments.exam import cases, judge, score
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "experiments" / "results"
@@ -89,7 +89,7 @@ def sit(column, options, count):
     if column in cases.COLUMN:
         step("closed", answers, out, "--out", work / "closed.json", "--jobs", options.jobs)
         closed = json.loads((work / "closed.json").read_text())
-    told, predictions = json.loads(answers.read_text())["cases"], score.collect(out)
+    told, predictions = json.loads(answers.read_text())["cases"], judge.collect(out)
     missing = sorted(set(told) - set(predictions))
     result = score.score({n: a for n, a in told.items() if n in predictions}, predictions, closed)
     result |= {

@@ -14,15 +14,9 @@ import os
 import time
 from pathlib import Path
 
-SINGLE_THREAD = {
-    "JAX_PLATFORMS": "cpu",
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
-}
-for _name, _value in SINGLE_THREAD.items():  # before JAX is imported, here and in the workers
-    os.environ.setdefault(_name, _value)
+from experiments.single_thread import use_single_thread
+
+use_single_thread()
 
 from experiments.task_gap.flights import SIZES, make_cases  # noqa: E402
 from experiments.task_gap.jobs import CONDITIONS, Job, do, read_flights  # noqa: E402

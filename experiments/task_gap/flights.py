@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.exam import cases, generate, vehicle
+from experiments.exam import cases, fleet, vehicle
 from experiments.exam.effects import EFFECTS, draw
 from experiments.worlds.plant import rng_of, sensors_of
 from openjax.vehicle.effects import load_effects
@@ -89,17 +89,17 @@ def write_flights(case: Case, folder: Path) -> dict:
     (`case.cause` is changed).
     """
     spec = case.spec()
-    drawn = {case.name: generate.bodies(case.seed, "known", spec)}
+    drawn = {case.name: fleet.bodies(case.seed, "known", spec)}
     for _ in range(6):
-        fleet = generate.Fleet(case.seed, "known", [(spec, [case.cause] if case.cause else [])], drawn)
-        if case.cause is None or fleet.lasts(0) >= SHORTEST:
+        flown = fleet.Fleet(case.seed, "known", [(spec, [case.cause] if case.cause else [])], drawn)
+        if case.cause is None or flown.lasts(0) >= SHORTEST:
             break
         case.cause["size"] *= 0.85
-    rows, _ = generate.write_case(fleet, 0, folder)
+    rows, _ = fleet.write_case(flown, 0, folder)
     return {
         "size": case.cause["size"] if case.cause else None,
         "form": case.cause["form"] if case.cause else None,
-        "magnitudes": _plain(fleet.magnitudes[0][0]) if case.cause else {},
+        "magnitudes": _plain(flown.magnitudes[0][0]) if case.cause else {},
         "missions": [list(m) for m in case.missions],
         "ticks": [len(flight[0]["t"]) for flight in rows],
     }

@@ -12,22 +12,17 @@ import dataclasses
 import functools
 import multiprocessing
 import os
-import sys
 import time
-from pathlib import Path
 
-for _name, _value in {
-    "JAX_PLATFORMS": "cpu",
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
-}.items():  # before JAX is imported, here and in the workers
-    os.environ.setdefault(_name, _value)
+from experiments.single_thread import use_single_thread
+
+use_single_thread()
 
 import jax  # noqa: E402
 import numpy as np  # noqa: E402
 
 from experiments.exam import effects  # noqa: E402
+from experiments.pages import page_parser, publish, table, where  # noqa: E402
 from experiments.task_gap.flights import SIZES  # noqa: E402
 from experiments.worlds.game import play  # noqa: E402
 from experiments.worlds.plant import PlantWorld, rng_of  # noqa: E402
@@ -37,9 +32,6 @@ from openjax.commands.evaluator import layout_slots  # noqa: E402
 from openjax.commands.machine import describe_machine  # noqa: E402
 from openjax.pursuit import SCENARIOS, scenario_task  # noqa: E402
 from openjax.store.policies import load_policy  # noqa: E402
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-from pages import page_parser, publish, table  # noqa: E402
 
 VEHICLE = {
     "motor_lag": {"extra_up": 0.04, "extra_down": 0.04},
@@ -179,11 +171,10 @@ def study(options: argparse.Namespace) -> dict:
 
 def report(results: dict) -> list[str]:
     """The page."""
-    machine = results["machine"]
     lines = [
         "# Policies in worlds that aren't the simulator",
         "",
-        f"`{results['command']}`, JAX {machine['versions']['jax']}, commit {machine['commit']}: {results['seconds']:.0f} s. "
+        f"{where(results)} {results['seconds']:.0f} s. "
         "No clamp, drawn starts. Nominal: the simulator with the rate loop at 500 Hz; table: the same with motors 40 ms "
         "slower, commands 15 ms and poses 10 ms late, and drag of .0125 N s/m; plant: the exam's plant (1 kHz, no shared "
         "code), also with each of its causes at three quarters of its range; rotorpy: RotorPy's own Crazyflie. Change: mean norm "

@@ -2,19 +2,13 @@
 
 import dataclasses
 import json
-import sys
-from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
-
-import ablations
-import run_comparison
-from run_comparison import VARIANTS, by_variant, main_effects, read_run, savings, steps_to
-
+from experiments import ablations, run_comparison
+from experiments.run_comparison import VARIANTS, by_variant, main_effects, read_run, savings, steps_to
 from openjax.errors import UserError
 from openjax.learning import GeneratorSettings, MappoSettings, TrainSettings, build, make_training_step
 from openjax.learning.training_step import _initial_carry

@@ -2,15 +2,12 @@
 
 import importlib
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from experiments.compare import report, stand_ins
 from experiments.compare.jaxmarl_mappo import MappoSettings, make_update

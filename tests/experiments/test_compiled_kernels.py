@@ -1,15 +1,11 @@
 """Counting what the loops of a compiled program start."""
 
 import sys
-from pathlib import Path
 
 import pytest
 
+from experiments.compiled_kernels import h200, loops, report
 from openjax.errors import UserError
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
-
-from compiled_kernels import h200, loops, report
 
 PROGRAM = """
 %inner (a: (s32[], f32[4])) -> (s32[], f32[4]) {

@@ -1,16 +1,11 @@
 """The study of drawn starts: its controller flies, and what it counts is what the game counts."""
 
-import sys
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "experiments"))
-import drawn_starts
-from prediction_flights import layout_tasks
-
+from experiments import drawn_starts
+from experiments.prediction_flights import layout_tasks
 from openjax.pursuit import Pursuit, PursuitSettings
 
 

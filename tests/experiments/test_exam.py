@@ -7,11 +7,14 @@ import pytest
 from scipy.signal import butter, lfilter
 
 from experiments.exam import (
+    answer_key,
     cases,
     closed,
     effects,
     garbage,
     generate,
+    judge,
+    magnitudes,
     measure,
     plant,
     score,
@@ -318,13 +321,13 @@ def test_rows_that_see_little_of_the_motors_hide_torque(hovering):
 def test_names_that_logs_cannot_tell_apart_are_right_and_no_others():
     seen, blind = np.full(12, 3.0), np.full(12, 3.0)
     blind[3:6] = 0.1  # no torque shows
-    assert generate.accepted("inertia", False, seen) == ["inertia"]
-    assert generate.accepted("blade_flapping", False, seen) == ["blade_flapping"]
-    assert "rotor_drag" in generate.accepted("blade_flapping", False, blind)
-    assert generate.accepted("motor_imbalance", True, seen) == ["motor_imbalance"]
-    assert "com_offset" in generate.accepted("motor_imbalance", True, blind)
-    assert generate.accepted("battery_sag", True, seen, scale=True) == ["battery_sag", "thrust_scale"]
-    assert set(generate.accepted("battery_sag", False, seen, scale=True)) == {
+    assert answer_key.accepted("inertia", False, seen) == ["inertia"]
+    assert answer_key.accepted("blade_flapping", False, seen) == ["blade_flapping"]
+    assert "rotor_drag" in answer_key.accepted("blade_flapping", False, blind)
+    assert answer_key.accepted("motor_imbalance", True, seen) == ["motor_imbalance"]
+    assert "com_offset" in answer_key.accepted("motor_imbalance", True, blind)
+    assert answer_key.accepted("battery_sag", True, seen, scale=True) == ["battery_sag", "thrust_scale"]
+    assert set(answer_key.accepted("battery_sag", False, seen, scale=True)) == {
         "battery_sag",
         "thrust_scale",
         "mass",
@@ -332,8 +335,8 @@ def test_names_that_logs_cannot_tell_apart_are_right_and_no_others():
     held = answer("none") | {"held_ms": 20.0}
     for late, right in ((0.012, True), (0.040, False)):
         report = said("state_latency", parameters={"state_latency": {"delay": {"value": late}}})
-        assert score.judge(held, report)["right"] == right
-        assert not score.judge(answer("none"), report)["right"]
+        assert judge.judge(held, report)["right"] == right
+        assert not judge.judge(answer("none"), report)["right"]
 
 
 def answer(category, effect=None, **more):
@@ -416,7 +419,7 @@ def test_the_scorer_counts_right():
     assert f["share_error"] == pytest.approx(4 / 6 - 0.5)
     assert f["traceback"] == pytest.approx(1 / 17)
     assert f["seconds"] == 1.0
-    assert score.gap_said(*rows["right"]) == pytest.approx(0.8)
+    assert magnitudes.gap_said(*rows["right"]) == pytest.approx(0.8)
     assert "| single cause: first name right |" in score.markdown("x", result)
     assert len(score.misses(answers, result, {k: p for k, (_, p) in rows.items()})) == 9
     json.dumps(result)
@@ -430,8 +433,8 @@ def test_intervals_and_calibration():
     fitted = {"scale": {"value": 0.09, "interval90": [0.06, 0.12]}}
     cause = {"effect": "thrust_scale", "form": "plain", "size": 0.1, "magnitudes": {"scale": 0.1}}
     case = answer("single", "thrust_scale") | {"causes": [cause]}
-    (row,) = score.parameters(case, said("thrust_scale", parameters={"thrust_scale": fitted}))
+    (row,) = magnitudes.parameters(case, said("thrust_scale", parameters={"thrust_scale": fitted}))
     assert row["covered"] == [True]
     assert row["error"] == pytest.approx(0.1)
     assert row["half_widths"] == pytest.approx([0.3])
-    assert score.before_thrust(case, said("thrust_scale", gap={"before": 4.0})) == 4.0
+    assert magnitudes.before_thrust(case, said("thrust_scale", gap={"before": 4.0})) == 4.0

@@ -1,16 +1,11 @@
 """The exam's plant against the simulator, and its cases against one another."""
 
-import sys
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
-
-from experiments.exam import cases, generate, sensors, vehicle
+from experiments.exam import cases, fleet, sensors, vehicle
 from openjax.vehicle import (
     load_vehicle,
     rate_controller,
@@ -40,8 +35,8 @@ def fly(*numbers):
         }
         for n in numbers
     ]
-    bodies = {s["name"]: generate.bodies(5, "known", s) for s in specs}
-    return generate.Fleet(5, "known", [(s, []) for s in specs], bodies)
+    bodies = {s["name"]: fleet.bodies(5, "known", s) for s in specs}
+    return fleet.Fleet(5, "known", [(s, []) for s in specs], bodies)
 
 
 @pytest.fixture(scope="module")

@@ -1,12 +1,8 @@
 """A few hundred hostile inputs and a few damaged checkpoints; `python -m experiments.fuzz` tries thousands."""
 
-import sys
 from collections import Counter
-from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from experiments.fuzz.cases import try_cases
 from experiments.fuzz.damages import make_checkpoints, try_damages

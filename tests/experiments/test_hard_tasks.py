@@ -1,14 +1,9 @@
 """The tasks on which rare failures are counted are as hard as their names say, and start clear."""
 
-import sys
-from pathlib import Path
-
 import jax
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "experiments"))
-import hard_tasks
-
+from experiments import hard_tasks
 from openjax.pursuit import PursuitSettings
 from openjax.pursuit.task import starts_clear
 

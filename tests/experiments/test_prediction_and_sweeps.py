@@ -1,22 +1,18 @@
 """The studies see the game as the game itself does: windows, predictions, errors; radii and speeds swept at once."""
 
 import dataclasses
-import sys
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments import predictors
+from experiments.flights import fly as fly_swept
+from experiments.prediction_flights import evader_rule, fly, layout_tasks, training_tasks
 from openjax.learning import make_evaluate
 from openjax.policy import NetworkSettings, Policy, PredictorSettings
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "experiments"))
-import predictors
-from flights import fly as fly_swept
-from prediction_flights import evader_rule, fly, layout_tasks, training_tasks
 
 SETTINGS = PursuitSettings(
     physics="rigid", episode_length=60, max_pillars=6, history_length=4, history_spacing=3

@@ -9,11 +9,7 @@ from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
-
-import scaling
-from scaling import cases, table
-
+from experiments.scaling import cases, table
 from openjax.learning import MappoSettings, TrainSettings
 
 TINY = """
@@ -49,7 +45,8 @@ def test_script_measures_one_device_and_two(tmp_path):
     out = tmp_path / "scaling.json"
     options = ["--json", str(out), "--kinds", "weak", "--calls", "2", "--seconds", "600", "--commit", "abc"]
     done = subprocess.run(
-        [sys.executable, scaling.__file__, *TINY, *options],
+        [sys.executable, "-m", "experiments.scaling", *TINY, *options],
+        cwd=Path(__file__).parents[2],
         env={**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"},
         capture_output=True,
         text=True,

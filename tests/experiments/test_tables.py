@@ -1,17 +1,12 @@
 """The tables' scripts: behaviours of flights made by hand, and verdicts of records made by hand."""
 
-import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "experiments"))
-import behaviours
-import sweeps
-import tab_main
-from roster import METHODS, seeds_of
+from experiments import behaviours, sweeps, tab_main
+from experiments.roster import METHODS, seeds_of
 
 
 def flight(pursuers, evader, capture, who=0, seen=None):

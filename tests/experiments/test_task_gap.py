@@ -1,13 +1,8 @@
 """The gap in the task: wakes and solid things of a team in the plant, the game around poses from outside, the flights."""
 
-import sys
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from experiments.exam import cases, vehicle
 from experiments.task_gap import flights

@@ -1,13 +1,8 @@
 """Worlds that aren't the simulator: the same start, one tick at a time, and how smooth commands are."""
 
-import sys
-from pathlib import Path
-
 import jax
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from experiments.worlds.__main__ import make_world, smoothness
 from openjax.pursuit import Pursuit, PursuitSettings

@@ -1,15 +1,11 @@
 """The state machine: rules one by one, properties under any events, and faults flown in simulated time."""
 
 import math
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from experiments.flying_faults import KINDS, fly, summary
 from openjax.flying.controller import Airframe, Pose

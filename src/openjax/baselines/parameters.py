@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from flax import struct
 
 FOUND = Path(__file__).with_name("parameters.json")
-"""Written by experiments/baseline_search.py: {method: {parameter: value}}."""
+"""Written by `experiments.baseline_search`: {method: {parameter: value}}."""
 
 Parameters = TypeVar("Parameters")
 
