@@ -119,7 +119,7 @@ def main(arguments: list[str]) -> int:
     if not options.report:
         study(options)
     for page in PAGES:
-        page.main(["--flights", str(flights), "--out", str(options.out / page.__name__)])
+        page.main(["--flights", str(flights), "--out", str(options.out / page.__name__.rpartition(".")[2])])
     learning_curves.main(["--out", str(options.out / "learning_curves")])
     return 0
 

@@ -5,7 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from experiments import behaviours, sweeps, tab_main
+from experiments import behaviours, sweeps, tab_main, tables
+from experiments.pages import RESULTS
 from experiments.roster import METHODS, seeds_of
 
 
@@ -91,3 +92,12 @@ def test_sweeps_say_where_open_is_not_above():
     text = sweeps.not_above(methods, "radius", (0.1, 0.3), "m")
     assert "APF at 0.1 m (0.50 / 700 against 0.40 / 700); APF at 0.3 m" in text
     assert "No method is above" in sweeps.not_above({"OPEN": methods["OPEN"]}, "radius", (0.1, 0.3), "m")
+
+
+def test_the_pages_are_those_of_the_stored_flights(tmp_path):
+    """A page written elsewhere, by hand, or before the code that writes it changed would differ."""
+    (tmp_path / "tables.json").write_bytes((RESULTS / "tables.json").read_bytes())
+    tables.main(["--report", "--out", str(tmp_path)])
+    for page in tables.PAGES:
+        name = page.__name__.split(".")[-1] + ".md"
+        assert (tmp_path / name).read_text() == (RESULTS / name).read_text(), name
