@@ -43,6 +43,7 @@ def try_damages(folder: Path, seeds: range) -> list[str]:
     """Damage the newest checkpoint (now and then either) and restore: `same`, `before`, `refused` or what went wrong."""
     from openjax.errors import UserError
     from openjax.learning import abstract_carry
+    from openjax.learning.train_state import policy_leaf
     from openjax.store.checkpoints import Checkpoints, abstract_like, named_leaves
 
     saved = {update: dict(np.load(folder / f"{update}.npz")) for update in (1, 2)}
@@ -64,7 +65,9 @@ def try_damages(folder: Path, seeds: range) -> list[str]:
             try:
                 found = Checkpoints(copy)
                 carry, record = found.restore_latest(abstract)
-                leaves, best = found.load_best("policy/", lambda text: None)
+                leaves, best = found.load_best(
+                    lambda name: name if policy_leaf(name) else None, lambda text: None
+                )
                 good = all(
                     _plain(leaf).tobytes() == saved[record.update][name].tobytes()
                     for name, leaf in named_leaves(carry).items()

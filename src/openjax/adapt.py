@@ -47,7 +47,7 @@ class AdaptCommand:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """The command; returns its exit status."""
+    """The command; returns its exit status. Raises UserError where there are no flights, or none that can be used."""
     command = parse(AdaptCommand, AdaptCommand(), arguments, PROGRAM)
     if not command.flights.exists():
         raise UserError(f"{command.flights}: no such folder of flights, nor effects.toml")

@@ -162,6 +162,7 @@ def _jax(act, inputs, seen):
 
 
 def main(arguments: Sequence[str]) -> None:
+    """The command. Raises UserError for an unusable policy or folder."""
     parsed = parse(Arguments, Arguments(), arguments, PROGRAM)
     report = export(parsed)
     output_console().print(

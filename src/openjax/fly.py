@@ -65,6 +65,7 @@ class Arguments:
 
 
 def main(arguments: Sequence[str]) -> int:
+    """The command; its exit status is 2 where nothing was flown."""
     parsed = parse(Arguments, Arguments(), arguments, PROGRAM)
     flight = fly(parsed)
     return 0 if flight is not None else 2

@@ -37,10 +37,12 @@ class Interval:
 
     @property
     def low(self) -> float:
+        """The lower end, whether it belongs to the interval or not."""
         return float(self._parts[2])
 
     @property
     def high(self) -> float:
+        """The upper end, whether it belongs to the interval or not."""
         return float(self._parts[3])
 
     def __contains__(self, value: float) -> bool:

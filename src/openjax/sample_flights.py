@@ -89,6 +89,7 @@ def make_case(arguments: Arguments) -> list[Path]:
 
 
 def main(arguments: Sequence[str]) -> None:
+    """The command. Raises UserError for an unknown effect or an unusable folder."""
     parsed = parse(Arguments, Arguments(out=tyro.MISSING), arguments, PROGRAM)
     files = make_case(parsed)
     console = output_console()

@@ -32,7 +32,7 @@ class ViewCommand:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """The command; returns its exit status."""
+    """The command; returns its exit status. Raises UserError without viser, or for an unusable policy or layout."""
     command = parse(ViewCommand, ViewCommand(), arguments, PROGRAM)
     if importlib.util.find_spec("viser") is None:
         raise UserError('the viewer needs viser: pip install "openjax[view]"')

@@ -80,6 +80,7 @@ def make(arguments: Arguments):
 
 
 def main(arguments: Sequence[str]) -> None:
+    """The command; it runs until it is stopped."""
     parsed = parse(Arguments, Arguments(), arguments, PROGRAM)
     from openjax.flying import real_time
 

@@ -5,11 +5,13 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from openjax.learning.mappo import initial_value_scale, make_optimiser, update_policy
 from openjax.learning.rollout import Rollout
 from openjax.learning.settings import MappoSettings
+from openjax.learning.train_state import Optimisers
 from openjax.policy import NetworkSettings, Policy, PredictorSettings, gaussian_log_prob
 from openjax.pursuit import Observation
 
@@ -56,15 +58,15 @@ def learn():
 
     The reward is constant + by_flag * flag + by_step * (second step) - by_action * (first action - 0.5 flag)^2.
     """
-    optimisers = make_optimiser(SETTINGS, UPDATES)
+    optimisers = Optimisers(*make_optimiser(SETTINGS, UPDATES), predictor=optax.identity())
     late = jnp.broadcast_to(jnp.arange(STEPS, dtype=jnp.float32)[:, None], (STEPS, WORLDS))
 
     def one_update(probe, carry, key):
-        actor, critic, states, scale = carry
+        actor, critic, scale = carry
         flag_key, noise_key, shuffle_key = jax.random.split(key, 3)
         flag = flags(flag_key, STEPS + 1)
         observation = observation_of(flag[:-1], late)
-        mean, log_std = POLICY.distribution(actor, observation, None)
+        mean, log_std = POLICY.distribution(actor.parameters, observation, None)
         action = mean + jnp.exp(log_std) * jax.random.normal(noise_key, mean.shape)
         miss = (POLICY.action(action[..., 0, 0]) - 0.5 * flag[:-1]) ** 2
         reward = (
@@ -84,12 +86,12 @@ def learn():
             evader=jnp.zeros((STEPS, WORLDS, 3)),
         )
         last = observation_of(flag[-1], jnp.ones(WORLDS))
-        (actor, critic), states, scale, _ = update_policy(
+        actor, critic, scale, _ = update_policy(
             SETTINGS,
             POLICY,
             optimisers,
-            (actor, critic),
-            states,
+            actor,
+            critic,
             scale,
             rollout,
             last,
@@ -97,22 +99,22 @@ def learn():
             shuffle_key,
             None,
         )
-        return (actor, critic, states, scale), None
+        return (actor, critic, scale), None
 
     @jax.jit
     def train(probe):
         corners = observation_of(jnp.array([[-1.0, -1.0], [1.0, 1.0]]), jnp.array([[0.0, 1.0], [0.0, 1.0]]))
         parameters = POLICY.init(jax.random.key(0), corners)
-        states = (optimisers[0].init(parameters.actor), optimisers[1].init(parameters.critic))
-        carry = (parameters.actor, parameters.critic, states, initial_value_scale())
-        (actor, critic, _, scale), _ = jax.lax.scan(
+        states = optimisers.start(parameters)
+        carry = (states["actor"], states["critic"], initial_value_scale())
+        (actor, critic, scale), _ = jax.lax.scan(
             lambda carry, key: one_update(probe, carry, key),
             carry,
             jax.random.split(jax.random.key(1), UPDATES),
         )
         mean, std = scale.moments
-        value = mean + std * POLICY.value(actor, critic, corners, None)[..., 0]
-        return value, POLICY.action(POLICY.distribution(actor, corners, None)[0])[..., 0, :]
+        value = mean + std * POLICY.value(actor.parameters, critic.parameters, corners, None)[..., 0]
+        return value, POLICY.action(POLICY.distribution(actor.parameters, corners, None)[0])[..., 0, :]
 
     def call(
         constant=0.0,

@@ -15,6 +15,7 @@ from openjax.learning.predictor_update import (
     windows_and_labels,
 )
 from openjax.learning.rollout import Rollout, collect
+from openjax.learning.train_state import TrainState
 from openjax.policy import NetworkSettings, Policy, PredictorSettings, gaussian_log_prob
 from openjax.pursuit import Observation, Pursuit, PursuitSettings
 
@@ -142,22 +143,19 @@ def test_learns_a_circling_evader():
         )
         return jnp.swapaxes(frames[1 : span + 1], 0, 1), rollout
 
-    def update(carry, key):
-        parameters, state = carry
+    def update(predictor, key):
         data_key, window_key = jax.random.split(key)
         earlier, rollout = rollout_of(data_key)
-        parameters, state, loss = update_predictor(
+        return update_predictor(
             policy,
             optimiser,
             PursuitSettings(),
-            parameters,
-            state,
+            predictor,
             earlier,
             rollout,
             jax.random.split(window_key, worlds),
             None,
         )
-        return (parameters, state), loss
 
     def errors(parameters, key):
         earlier, rollout = rollout_of(key)
@@ -173,10 +171,9 @@ def test_learns_a_circling_evader():
     def train(key):
         earlier, rollout = rollout_of(key)
         parameters = policy._predictor.init(key, earlier, rollout.observation.last_seen[0])
-        (parameters, _), loss = jax.lax.scan(
-            update, (parameters, optimiser.init(parameters)), jax.random.split(key, 150)
-        )
-        return loss, errors(parameters, jax.random.key(99))
+        predictor = TrainState(parameters, optimiser.init(parameters))
+        predictor, loss = jax.lax.scan(update, predictor, jax.random.split(key, 150))
+        return loss, errors(predictor.parameters, jax.random.key(99))
 
     loss, (learnt, kept) = train(jax.random.key(0))
     np.testing.assert_allclose(kept, [0.013, 0.065], rtol=0.02)

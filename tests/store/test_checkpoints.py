@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from openjax.errors import UserError
+from openjax.learning.train_state import policy_leaf
 from openjax.store.checkpoints import Checkpoints, abstract_like, load_arrays, load_state, place
 
 
@@ -17,6 +18,10 @@ def init():
         "key": jax.random.split(jax.random.key(3), 2),
         "n": jnp.int32(0),
     }
+
+
+def only_n(name):
+    return name if name == "n" else None
 
 
 def with_n(n):
@@ -74,7 +79,7 @@ def test_any_changed_byte_is_found(run):
         again = Checkpoints(run.directory)
         carry, record = again.restore_latest(abstract)
         assert record.update == 1 and int(carry["n"]) == 1, damaged
-        assert again.load_best("n", lambda text: None)[1].update == 1
+        assert again.load_best(only_n, lambda text: None)[1].update == 1
 
 
 def test_a_damaged_best_checkpoint_gives_way_to_the_next_best(run):
@@ -87,7 +92,7 @@ def test_a_damaged_best_checkpoint_gives_way_to_the_next_best(run):
     content[len(content) // 2] ^= 1
     file.write_bytes(content)
     warnings = []
-    leaves, record = run.load_best("n", warnings.append)
+    leaves, record = run.load_best(only_n, warnings.append)
     assert record.update == 4 and int(leaves["n"]) == 4
     assert len(warnings) == 1 and "000000003 is damaged" in warnings[0]
 
@@ -101,7 +106,7 @@ def test_scores_of_another_rule_are_not_compared(run):
     for update, score in ((4, 0.7), (5, 0.6), (6, 0.5), (7, 0.4)):
         again.save(update, with_n(update), score=score)
     again.wait()
-    assert again.best().update == 4 and again.load_best("n", print)[1].score == 0.7
+    assert again.best().update == 4 and again.load_best(only_n, print)[1].score == 0.7
     assert [record.update for record in again.records()] == [4, 6, 7]
 
 
@@ -122,6 +127,19 @@ def test_foreign_directory_is_no_checkpoint(tmp_path):
 
 
 def test_part_of_a_tree_can_be_read_without_knowing_it(run):
-    arrays = load_arrays(run.latest().path, "actor/")
-    assert list(arrays) == ["actor/kernel"]
-    np.testing.assert_array_equal(arrays["actor/kernel"], np.ones((3, 4)))
+    kernel = {"actor/kernel": "mine"}
+    arrays = load_arrays(run.latest().path, kernel.get)
+    assert list(arrays) == ["mine"]
+    np.testing.assert_array_equal(arrays["mine"], np.ones((3, 4)))
+
+
+def test_the_policy_is_found_in_carries_of_now_and_of_before():
+    names = {
+        "actor/parameters/params/x/kernel": "actor/params/x/kernel",
+        "predictor/parameters/y": "predictor/y",
+        "policy/critic/params/x": "critic/params/x",
+        "actor/optimiser/0/mu/params/x": None,
+        "actor_optimiser/0/mu": None,
+        "state/drones/position": None,
+    }
+    assert {name: policy_leaf(name) for name in names} == names

@@ -14,9 +14,8 @@ from rich.table import Table
 
 from openjax.learning import TrainSettings, build, init_carry, make_training_step
 from openjax.learning.collectives import own_keys
-from openjax.learning.mappo import update_policy
-from openjax.learning.predictor_update import update_predictor
 from openjax.learning.rollout import collect
+from openjax.learning.training_step import learn_policy, learn_predictor
 from openjax.pursuit.environment import action_to_command
 
 BANDWIDTH = 4.3e12
@@ -88,46 +87,24 @@ def measure(settings: TrainSettings, seconds_of: Callable[[Callable, tuple], flo
         parameters = carry.policy
         return jax.lax.scan(one, (carry.observation, jnp.zeros(())), None, length=steps)
 
-    def learn_predictor(carry, rollout):
-        keys = own_keys(jax.random.key(2), settings.num_envs, None)
-        return update_predictor(
-            policy,
-            parts.predictor_optimiser,
-            settings.environment,
-            carry.policy.predictor,
-            carry.predictor_optimiser,
-            carry.state.frames,
-            rollout,
-            keys,
-            None,
-        )
+    def predictor_update(carry, rollout):
+        return learn_predictor(parts, carry, rollout, own_keys(jax.random.key(2), settings.num_envs, None))
 
-    def learn_policy(carry, rollout, observation):
-        return update_policy(
-            settings.mappo,
-            policy,
-            parts.optimisers,
-            (carry.policy.actor, carry.policy.critic),
-            (carry.actor_optimiser, carry.critic_optimiser),
-            carry.value_scale,
-            rollout,
-            observation,
-            policy.predict(carry.policy, observation),
-            jax.random.key(3),
-            None,
-        )
+    def policy_update(carry, rollout, observation):
+        last = observation, policy.predict(carry.policy, observation)
+        return learn_policy(settings, parts, carry, rollout, last, jax.random.key(3))
 
     collected, observation, _ = jax.jit(rollout)(carry, noise)
     programs: dict[str, tuple[Callable, tuple]] = {
         "physics": (physics, (carry.state, noise)),
         "environment": (game, (carry.state, noise)),
         "rollout": (rollout, (carry, noise)),
-        "policy update": (learn_policy, (carry, collected, observation)),
+        "policy update": (policy_update, (carry, collected, observation)),
         "step": (make_training_step(settings), (carry,)),
     }
     if settings.predictor.enabled:
         programs["prediction"] = (prediction, (carry, noise))
-        programs["predictor update"] = (learn_predictor, (carry, collected))
+        programs["predictor update"] = (predictor_update, (carry, collected))
     seconds = {name: seconds_of(*program) for name, program in programs.items()}
     if None in seconds.values():
         return []

@@ -28,6 +28,7 @@ from openjax.commands.evaluator import (
 from openjax.commands.loop import NotFiniteError, Plan, StopRequest, guarded, run_updates
 from openjax.commands.validation import SCORE_RULE, Validation, flat_metrics, selection_score
 from openjax.learning import TrainSettings, build, make_start, summarise
+from openjax.learning.train_state import policy_leaf
 from openjax.policy import PolicyParameters
 from openjax.policy.growth import with_longer_history
 from openjax.pursuit import SCENARIOS, Pursuit
@@ -170,7 +171,7 @@ def _first_carry(job, start, abstract, directory, checkpoints, progress):
         return carry, record.update, float(record.notes.get("seconds", 0.0))
     carry = start(jax.random.key(settings.seed))
     if job.start_from is not None:
-        carry = carry.replace(policy=_start_parameters(job, carry.policy))
+        carry = carry.with_policy(_start_parameters(job, carry.policy))
     carry = place(carry, carry_shardings(job.devices))
     if job.processes.is_first:
         save_policy_file(directory.start_policy, carry.policy, settings, {"update": 0}, storage="float32")
@@ -209,9 +210,9 @@ def _validation(job):
 
 def _save_best(job, directory, checkpoints, outcome, warn):
     """Write the policy of the best checkpoint, or of the latest where none was evaluated."""
-    leaves, record = checkpoints.load_best("policy/", warn)
+    leaves, record = checkpoints.load_best(policy_leaf, warn)
     abstract = jax.eval_shape(lambda: outcome.carry.policy)
-    parameters = fill(abstract, leaves, str(record.path), "policy/")
+    parameters = fill(abstract, leaves, str(record.path))
     notes = {
         "update": record.update,
         "steps": record.update * job.settings.steps_per_update,

@@ -26,10 +26,7 @@ from openjax.vehicle import (
     rigid_step,
     rotate,
     rotate_inverse,
-    rotor_reaction,
     rotor_speed_step,
-    rotor_thrust,
-    total_wrench,
 )
 from openjax.vehicle.effects import composition, make_context
 
@@ -213,12 +210,7 @@ def _physics(vehicle, effects, parameters, drone: DroneState, motor_command, con
     """One physics step of one drone; its state, and the force without gravity in the body frame (3,) N."""
     motor_command = composition.change_motor_command(effects, parameters, motor_command, context)
     speed = rotor_speed_step(vehicle, drone.rotor_speed, motor_command, context.dt)
-    thrust, reaction = rotor_thrust(vehicle, speed), rotor_reaction(vehicle, speed)
-    context = context.replace(rotor_speed=speed, thrust=thrust)
-    thrust, reaction = composition.change_thrust(effects, parameters, thrust, reaction, context)
-    force, torque = total_wrench(vehicle, thrust, reaction)
-    more_force, more_torque = composition.added_wrench(effects, parameters, context.replace(thrust=thrust))
-    force, torque = force + more_force, torque + more_torque
+    force, torque = composition.wrench(effects, parameters, vehicle, speed, context)
     body = (drone.position, drone.quaternion, drone.velocity, drone.body_rates)
     position, quaternion, velocity, body_rates = rigid_step(
         vehicle, *body, rotate(drone.quaternion, force), torque, context.dt

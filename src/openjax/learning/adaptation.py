@@ -111,15 +111,15 @@ def fine_tune(
     bounds = jnp.asarray(bounds)
     carry = adaptation.start(key, bounds)
     learnt = carry.policy.replace(actor=parameters.actor, predictor=parameters.predictor)
-    fixed = jax.tree.map(jnp.copy, (learnt.actor, learnt.predictor, carry.actor_optimiser))
-    carry, history = carry.replace(policy=jax.tree.map(jnp.copy, learnt)), []
+    carry, history = carry.with_policy(jax.tree.map(jnp.copy, learnt)), []
+    fixed = jax.tree.map(jnp.copy, (carry.actor, learnt.predictor))
     for update in range(adaptation.settings.total_updates):
         carry, metrics = adaptation.step(carry, bounds)
         if update < warm_up:
-            actor, predictor, optimiser = jax.tree.map(jnp.copy, fixed)
+            actor, predictor = jax.tree.map(jnp.copy, fixed)
             carry = carry.replace(
-                policy=carry.policy.replace(actor=actor, predictor=predictor),
-                actor_optimiser=_at_step(optimiser, carry.actor_optimiser),
+                actor=actor.replace(optimiser=_at_step(actor.optimiser, carry.actor.optimiser)),
+                predictor=carry.predictor.replace(parameters=predictor),
             )
         metrics = {name: float(value) for name, value in metrics.items()}
         history.append(metrics)

@@ -77,6 +77,6 @@ def insert(
 
 
 def draw(archive: TaskArchive, key: jax.Array) -> Any:
-    """One used task, uniformly; slot 0 (all zeros) of an empty archive: check `size` first."""
+    """One used task (leaves without the archive's leading axis), uniformly; of an empty archive zeros: check `size` first."""
     slot = jax.random.randint(key, (), 0, jnp.maximum(archive.size, 1))
     return jax.tree.map(lambda leaf: leaf[slot], archive.tasks)

@@ -34,7 +34,7 @@ def gather_over_devices(tree, axis: str | None):
 
 
 def own_keys(key: jax.Array, number: int, axis: str | None) -> jax.Array:
-    """This device's `number` of keys out of one split for all devices: the same ones however many devices there are."""
+    """This device's (number,) keys out of one split for all devices: the same ones however many devices there are."""
     if axis is None:
         return jax.random.split(key, number)
     keys = jax.random.split(key, number * jax.lax.axis_size(axis))
@@ -42,7 +42,7 @@ def own_keys(key: jax.Array, number: int, axis: str | None) -> jax.Array:
 
 
 def joint_moments(x: jax.Array, axis: str | None) -> tuple[jax.Array, jax.Array]:
-    """Mean and standard deviation over all elements on all devices."""
+    """Mean () and standard deviation () over all elements on all devices."""
     mean = mean_over_devices(jnp.mean(x), axis)
     variance = mean_over_devices(jnp.mean((x - mean) ** 2), axis)
     return mean, jnp.sqrt(variance)

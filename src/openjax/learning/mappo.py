@@ -12,6 +12,7 @@ from openjax.learning.advantages import generalised_advantages
 from openjax.learning.collectives import joint_moments, mean_over_devices
 from openjax.learning.rollout import Rollout
 from openjax.learning.settings import MappoSettings
+from openjax.learning.train_state import Optimisers, TrainState
 from openjax.policy import Policy, gaussian_entropy, gaussian_log_prob
 from openjax.pursuit import Observation
 
@@ -26,7 +27,7 @@ class ValueScale:
 
     @property
     def moments(self) -> tuple[jax.Array, jax.Array]:
-        """Mean and standard deviation; 0 and 1 before the first update."""
+        """Mean () and standard deviation () of the returns; 0 and 1 before the first update."""
         weight = jnp.maximum(self.weight, 1e-6)
         mean = self.mean / weight
         variance = self.square / weight - mean**2
@@ -99,9 +100,9 @@ def loss(
 def update_policy(
     settings: MappoSettings,
     policy: Policy,
-    optimisers: tuple[optax.GradientTransformation, optax.GradientTransformation],
-    parameters: tuple[Any, Any],
-    optimiser_states: tuple[Any, Any],
+    optimisers: Optimisers,
+    actor: TrainState,
+    critic: TrainState,
     scale: ValueScale,
     rollout: Rollout,
     last: Observation,
@@ -109,15 +110,15 @@ def update_policy(
     key: jax.Array,
     axis: str | None,
     progress: jax.Array | float = 0.0,
-):
+) -> tuple[TrainState, TrainState, ValueScale, dict[str, jax.Array]]:
     """All epochs of the policy update on one rollout.
 
     Args:
         settings: MAPPO's.
         policy: the networks.
-        optimisers: of actor and critic.
-        parameters: of actor and critic.
-        optimiser_states: of actor and critic.
+        optimisers: the actor's and the critic's are used.
+        actor: before this update.
+        critic: before this update.
         scale: value normalisation before this rollout.
         rollout: T steps of E worlds.
         last: (E, ...) observation after the rollout, before any reset.
@@ -127,9 +128,10 @@ def update_policy(
         progress: () share of the run that is done, for the clip range.
 
     Returns:
-        (actor, critic), optimiser states, value scale, dict of () metrics.
+        actor, critic, value scale, {name: () metric}.
     """
     mean, std = scale.moments
+    parameters = actor.parameters, critic.parameters
     value = mean + std * policy.value(*parameters, rollout.observation, rollout.predicted)
     last_value = mean + std * policy.value(*parameters, last, last_predicted)
     next_value = jnp.concatenate([value[1:], last_value[None]])
@@ -167,29 +169,24 @@ def update_policy(
     clip = settings.clip_epsilon + (settings.clip_epsilon_end - settings.clip_epsilon) * progress
 
     def gradient_step(carry, index):
-        (actor, critic), (actor_state, critic_state) = carry
+        actor, critic = carry
         part = jax.tree.map(lambda x: x[index], batch)
         gradient, watch = jax.grad(lambda p: loss(settings, policy, p, part, clip), has_aux=True)(
-            (actor, critic)
+            (actor.parameters, critic.parameters)
         )
-        actor_gradient, critic_gradient = gradient
-        actor_gradient, critic_gradient, watch = mean_over_devices(
-            (actor_gradient, critic_gradient, watch), axis
-        )
+        (actor_gradient, critic_gradient), watch = mean_over_devices((gradient, watch), axis)
         # of one vector, like the optimiser's: a norm leaf by leaf is twenty kernels more
         watch |= {"actor_gradient": jnp.linalg.norm(ravel_pytree(actor_gradient)[0])}
-        actor_update, actor_state = optimisers[0].update(actor_gradient, actor_state, actor)
-        critic_update, critic_state = optimisers[1].update(critic_gradient, critic_state, critic)
-        actor = optax.apply_updates(actor, actor_update)
-        critic = optax.apply_updates(critic, critic_update)
-        return ((actor, critic), (actor_state, critic_state)), watch
+        actor = actor.updated(optimisers.actor, actor_gradient)
+        critic = critic.updated(optimisers.critic, critic_gradient)
+        return (actor, critic), watch
 
     order = jax.vmap(lambda k: jax.random.permutation(k, settings.minibatches))(
         jax.random.split(key, settings.epochs)
     ).ravel()
-    (parameters, optimiser_states), watch = jax.lax.scan(gradient_step, (parameters, optimiser_states), order)
+    (actor, critic), watch = jax.lax.scan(gradient_step, (actor, critic), order)
     metrics = jax.tree.map(jnp.mean, watch) | {"explained_variance": explained, "value_scale": std}
-    return parameters, optimiser_states, scale, metrics
+    return actor, critic, scale, metrics
 
 
 def _partition(batch: Batch, minibatches: int) -> Batch:

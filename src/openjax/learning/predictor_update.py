@@ -6,6 +6,7 @@ import optax
 
 from openjax.learning.collectives import mean_over_devices
 from openjax.learning.rollout import Rollout
+from openjax.learning.train_state import TrainState
 from openjax.policy import Policy, PredictorSettings
 from openjax.pursuit import PursuitSettings
 
@@ -73,17 +74,26 @@ def update_predictor(
     policy: Policy,
     optimiser: optax.GradientTransformation,
     game: PursuitSettings,
-    parameters,
-    optimiser_state,
+    predictor: TrainState,
     earlier: jax.Array,
     rollout: Rollout,
     keys: jax.Array,
     axis: str | None,
-):
-    """A few gradient steps on random windows of each environment; `keys` (E,).
+) -> tuple[TrainState, jax.Array]:
+    """A few gradient steps on random windows of each environment.
+
+    Args:
+        policy: for the predictor's network and settings.
+        optimiser: from `make_predictor_optimiser`.
+        game: the evader's speed and the history's spacing.
+        predictor: before this update.
+        earlier: (E, H, F), see `windows_and_labels`.
+        rollout: T steps of E worlds.
+        keys: (E,), draw the windows.
+        axis: name of the devices' axis.
 
     Returns:
-        parameters, optimiser state, mean loss ().
+        predictor, mean loss ().
     """
     settings = policy.predictor
     room = rollout.reward.shape[0] - settings.horizons[-1] + 1
@@ -98,15 +108,13 @@ def update_predictor(
         predicted = policy.predict_from(parameters, frames, last_seen)
         return prediction_loss(settings, game, predicted, last_seen, positions)
 
-    def one(carry, batch):
-        parameters, optimiser_state = carry
-        value, gradient = jax.value_and_grad(loss)(parameters, *batch)
+    def one(predictor, batch):
+        value, gradient = jax.value_and_grad(loss)(predictor.parameters, *batch)
         value, gradient = mean_over_devices((value, gradient), axis)
-        update, optimiser_state = optimiser.update(gradient, optimiser_state, parameters)
-        return (optax.apply_updates(parameters, update), optimiser_state), value
+        return predictor.updated(optimiser, gradient), value
 
-    (parameters, optimiser_state), values = jax.lax.scan(one, (parameters, optimiser_state), data)
-    return parameters, optimiser_state, jnp.mean(values)
+    predictor, values = jax.lax.scan(one, predictor, data)
+    return predictor, jnp.mean(values)
 
 
 def _take(values: jax.Array, index: jax.Array) -> jax.Array:

@@ -3,11 +3,9 @@
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
-import optax
 from flax import struct
 
 from openjax.baselines import make_policy
@@ -16,8 +14,9 @@ from openjax.learning.collectives import gather_over_devices, mean_over_devices,
 from openjax.learning.generator import generate_task, select, successes
 from openjax.learning.mappo import ValueScale, initial_value_scale, make_optimiser, update_policy
 from openjax.learning.predictor_update import make_predictor_optimiser, update_predictor
-from openjax.learning.rollout import collect
+from openjax.learning.rollout import Rollout, collect
 from openjax.learning.settings import TrainSettings
+from openjax.learning.train_state import Optimisers, TrainState
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Observation, Pursuit, PursuitState, empty_task
 from openjax.vehicle.family import narrowed_bounds
@@ -27,16 +26,30 @@ from openjax.vehicle.family import narrowed_bounds
 class TrainCarry:
     """Everything that a run is. Saved whole, it goes on as if nothing had happened."""
 
-    policy: PolicyParameters
-    actor_optimiser: Any
-    critic_optimiser: Any
-    predictor_optimiser: Any
+    actor: TrainState
+    critic: TrainState
+    predictor: TrainState
     value_scale: ValueScale
     observation: Observation  # (E, ...)
     state: PursuitState  # (E, ...)
     archive: TaskArchive
     key: jax.Array
     update: jax.Array  # () int32, training steps done
+
+    @property
+    def policy(self) -> PolicyParameters:
+        """The parameters that act."""
+        return PolicyParameters(
+            actor=self.actor.parameters, critic=self.critic.parameters, predictor=self.predictor.parameters
+        )
+
+    def with_policy(self, policy: PolicyParameters) -> "TrainCarry":
+        """The carry with other parameters, its optimisers as they are."""
+        return self.replace(
+            actor=self.actor.replace(parameters=policy.actor),
+            critic=self.critic.replace(parameters=policy.critic),
+            predictor=self.predictor.replace(parameters=policy.predictor),
+        )
 
 
 @dataclass(frozen=True)
@@ -45,8 +58,7 @@ class Building:
 
     environment: Pursuit
     policy: Policy
-    optimisers: tuple[optax.GradientTransformation, optax.GradientTransformation]
-    predictor_optimiser: optax.GradientTransformation
+    optimisers: Optimisers
 
 
 def build(settings: TrainSettings, environment: Pursuit | None = None) -> Building:
@@ -55,8 +67,10 @@ def build(settings: TrainSettings, environment: Pursuit | None = None) -> Buildi
     return Building(
         environment=environment,
         policy=make_policy(environment, settings.network, settings.predictor),
-        optimisers=make_optimiser(settings.mappo, settings.total_updates),
-        predictor_optimiser=make_predictor_optimiser(settings.predictor, settings.total_updates),
+        optimisers=Optimisers(
+            *make_optimiser(settings.mappo, settings.total_updates),
+            predictor=make_predictor_optimiser(settings.predictor, settings.total_updates),
+        ),
     )
 
 
@@ -94,16 +108,53 @@ def _initial_carry(settings, parts, key):
     observation = jax.vmap(environment.observe)(state)
     policy = parts.policy.init(policy_key, jax.tree.map(lambda x: x[0], observation))
     return TrainCarry(
-        policy=policy,
-        actor_optimiser=parts.optimisers[0].init(policy.actor),
-        critic_optimiser=parts.optimisers[1].init(policy.critic),
-        predictor_optimiser=parts.predictor_optimiser.init(policy.predictor),
+        **parts.optimisers.start(policy),
         value_scale=initial_value_scale(),
         observation=observation,
         state=state,
         archive=archive,
         key=key,
         update=jnp.zeros((), jnp.int32),
+    )
+
+
+def learn_predictor(
+    parts: Building, carry: TrainCarry, rollout: Rollout, keys: jax.Array, axis: str | None = None
+) -> tuple[TrainState, jax.Array]:
+    """The carry's predictor after an update on a rollout, and its () loss; `keys` (E,) draw the windows."""
+    game, optimiser = parts.environment.settings, parts.optimisers.predictor
+    return update_predictor(
+        parts.policy, optimiser, game, carry.predictor, carry.state.frames, rollout, keys, axis
+    )
+
+
+def learn_policy(
+    settings: TrainSettings,
+    parts: Building,
+    carry: TrainCarry,
+    rollout: Rollout,
+    last: tuple[Observation, jax.Array | None],
+    key: jax.Array,
+    axis: str | None = None,
+    progress: jax.Array | float = 0.0,
+) -> tuple[TrainState, TrainState, ValueScale, dict[str, jax.Array]]:
+    """Actor, critic and value scale of the carry after an update on a rollout, and () metrics; see `update_policy`.
+
+    `last` is the (E, ...) observation after the rollout and its (E, K, 3) prediction; `key` shuffles, `progress` () is the
+    share of the run that is done.
+    """
+    return update_policy(
+        settings.mappo,
+        parts.policy,
+        parts.optimisers,
+        carry.actor,
+        carry.critic,
+        carry.value_scale,
+        rollout,
+        *last,
+        key,
+        axis,
+        progress,
     )
 
 
@@ -140,37 +191,17 @@ def make_training_step(
         last_predicted = policy.predict(carry.policy, observation)
 
         # predictor update
-        predictor, predictor_optimiser = carry.policy.predictor, carry.predictor_optimiser
-        metrics = {}
+        predictor, metrics = carry.predictor, {}
         if settings.predictor.enabled:
-            predictor, predictor_optimiser, loss = update_predictor(
-                policy,
-                parts.predictor_optimiser,
-                settings.environment,
-                predictor,
-                predictor_optimiser,
-                carry.state.frames,
-                rollout,
-                own_keys(window_key, num_envs, axis),
-                axis,
+            predictor, loss = learn_predictor(
+                parts, carry, rollout, own_keys(window_key, num_envs, axis), axis
             )
             error = jnp.linalg.norm(rollout.predicted[:, :, 0] - rollout.evader, axis=-1)
             metrics |= {"predictor_loss": loss, "prediction_error": mean_over_devices(jnp.mean(error), axis)}
 
         # policy update
-        (actor, critic), optimiser_states, scale, watched = update_policy(
-            settings.mappo,
-            policy,
-            parts.optimisers,
-            (carry.policy.actor, carry.policy.critic),
-            (carry.actor_optimiser, carry.critic_optimiser),
-            carry.value_scale,
-            rollout,
-            observation,
-            last_predicted,
-            shuffle_key,
-            axis,
-            progress,
+        actor, critic, scale, watched = learn_policy(
+            settings, parts, carry, rollout, (observation, last_predicted), shuffle_key, axis, progress
         )
         metrics |= watched
 
@@ -189,10 +220,9 @@ def make_training_step(
         observation, state = worlds
 
         carry = TrainCarry(
-            policy=PolicyParameters(actor=actor, critic=critic, predictor=predictor),
-            actor_optimiser=optimiser_states[0],
-            critic_optimiser=optimiser_states[1],
-            predictor_optimiser=predictor_optimiser,
+            actor=actor,
+            critic=critic,
+            predictor=predictor,
             value_scale=scale,
             observation=observation,
             state=state,

@@ -107,12 +107,27 @@ class Pursuit:
         return jax.tree.map(lambda kind: Box(-jnp.inf, jnp.inf, kind.shape, kind.dtype), kinds)
 
     def reset(self, key: jax.Array) -> tuple[Observation, PursuitState]:
-        """Start an episode of a uniformly drawn task."""
+        """Start an episode of a uniformly drawn task.
+
+        Args:
+            key: () typed key; map over (B,) of them for B worlds.
+
+        Returns:
+            observation, state, both of one world.
+        """
         task_key, reset_key = jax.random.split(key)
         return self.reset_to(reset_key, uniform_task(self.settings, task_key))
 
     def reset_to(self, key: jax.Array, task: Task) -> tuple[Observation, PursuitState]:
-        """Start an episode of `task`; `key` draws the start attitudes and drives random effects."""
+        """Start an episode of `task`.
+
+        Args:
+            key: () typed key; draws start attitudes and vehicles and drives random effects.
+            task: with the settings' number of pursuers and pillar slots.
+
+        Returns:
+            observation, state, both of one world.
+        """
         settings = self.settings
         attitude_key, effect_key = jax.random.split(key)
         quaternion = start_attitude(settings, attitude_key)

@@ -86,7 +86,11 @@ def scenario_settings(settings: PursuitSettings, scenario: Scenario) -> PursuitS
 
 
 def scenario_task(settings: PursuitSettings, scenario: Scenario) -> Task:
-    """The scenario as a task with `settings.max_pillars` slots."""
+    """The scenario as a task with `settings.max_pillars` slots.
+
+    Raises:
+        UserError: it has more pillars than that, or not `settings.num_pursuers` pursuers.
+    """
     slots, used = settings.max_pillars, len(scenario.pillars)
     if used > slots:
         raise UserError(

@@ -29,12 +29,12 @@ class EpisodeStatistics:
 
     @property
     def collision_rate(self) -> jax.Array:
-        """Share of steps in which any pursuer breached any limit."""
+        """() share of steps in which any pursuer breached any limit."""
         return self.collision_steps / jnp.maximum(self.steps, 1)
 
     @property
     def over_speed_rate(self) -> jax.Array:
-        """Share of steps with any pursuer above 1.01 times the maximal speed."""
+        """() share of steps with any pursuer above 1.01 times the maximal speed."""
         return self.over_speed_steps / jnp.maximum(self.steps, 1)
 
 

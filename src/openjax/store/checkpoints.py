@@ -123,10 +123,14 @@ def load_state(path: Path, abstract: Any) -> Any:
     return jax.tree.unflatten(jax.tree.structure(abstract), leaves)
 
 
-def load_arrays(path: Path, prefix: str = "") -> dict[str, np.ndarray]:
-    """Leaves by path as host arrays, without knowing the tree; only those whose path starts with `prefix`.
+def load_arrays(
+    path: Path, name_of: Callable[[str], str | None] = lambda name: name
+) -> dict[str, np.ndarray]:
+    """Leaves as host arrays, without knowing the tree, read by this process alone.
 
-    Read by this process alone.
+    Args:
+      path: the checkpoint.
+      name_of: path in the tree -> name in what is returned; None: isn't read.
 
     Raises:
       UserError: not a checkpoint, or a damaged one.
@@ -134,17 +138,21 @@ def load_arrays(path: Path, prefix: str = "") -> dict[str, np.ndarray]:
     path = Path(path).absolute()
     _check(path)
     sharding = _default_sharding()
+    stored = load_orbax().metadata(path).metadata
+    names = {name: name_of(name) for name in stored}
     wanted = {
-        name: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
-        if name.startswith(prefix)
-        else load_orbax().PLACEHOLDER
-        for name, leaf in load_orbax().metadata(path).metadata.items()
+        name: load_orbax().PLACEHOLDER
+        if names[name] is None
+        else jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
+        for name, leaf in stored.items()
     }
     this = jax.process_index()
     alone = load_orbax().options.MultiprocessingOptions(primary_host=this, active_processes={this})
     with load_orbax().Context(multiprocessing_options=alone):
         loaded = {
-            name: leaf for name, leaf in load_orbax().load(path, wanted).items() if name.startswith(prefix)
+            names[name]: leaf
+            for name, leaf in load_orbax().load(path, wanted).items()
+            if names[name] is not None
         }
     is_key = {name: jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) for name, leaf in loaded.items()}
     return {
@@ -210,7 +218,7 @@ class Checkpoints:
         return any(is_checkpoint(path) for path in self.directory.glob("[0-9]" * _DIGITS))
 
     def load_best(
-        self, prefix: str, warn: Callable[[str], None]
+        self, name_of: Callable[[str], str | None], warn: Callable[[str], None]
     ) -> tuple[dict[str, np.ndarray], CheckpointRecord]:
         """Leaves (see `load_arrays`) of the best checkpoint, or of the latest where none has a score.
 
@@ -221,7 +229,7 @@ class Checkpoints:
         """
         while record := self.best() or self.latest():
             try:
-                return load_arrays(record.path, prefix), record
+                return load_arrays(record.path, name_of), record
             except DamagedError as error:
                 warn(f"{error}; using the next best")
                 self._damaged[record.path.name] = str(error)

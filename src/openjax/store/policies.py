@@ -8,6 +8,7 @@ import jax
 from openjax.baselines import METHODS, Heuristic, make_policy
 from openjax.errors import UserError
 from openjax.learning import TrainSettings
+from openjax.learning.train_state import policy_leaf
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Observation, Pursuit
 from openjax.store.checkpoints import Checkpoints, is_checkpoint, load_arrays
@@ -82,7 +83,7 @@ def load_policy(name_or_path: str | Path) -> LoadedPolicy:
         return _from_file(path, source)
     if is_checkpoint(path) and is_run(path.parent.parent):
         run = RunDirectory(path.parent.parent)
-        return _build(run.read_settings(), load_arrays(path, "policy/"), source, "policy/")
+        return _build(run.read_settings(), load_arrays(path, policy_leaf), source)
     if path.exists():
         raise UserError(
             f"{path} is no policy; expected a .npz file, a run of openjax.train or one of its checkpoints"
@@ -120,11 +121,11 @@ def _from_run(run, source):
     checkpoints = Checkpoints(run.checkpoints)
     if not checkpoints.any_finished():
         raise UserError(f"{run.path} holds no policy and no checkpoint yet")
-    leaves, _ = checkpoints.load_best("policy/", lambda text: None)
-    return _build(run.read_settings(), leaves, source, "policy/")
+    leaves, _ = checkpoints.load_best(policy_leaf, lambda text: None)
+    return _build(run.read_settings(), leaves, source)
 
 
-def _build(settings, leaves, source, prefix=""):
+def _build(settings, leaves, source):
     if jax.default_backend() == "cpu":  # CPUs emulate bfloat16, slowly
         settings = dataclasses.replace(
             settings, network=dataclasses.replace(settings.network, compute_type="float32")
@@ -132,8 +133,8 @@ def _build(settings, leaves, source, prefix=""):
     environment = Pursuit(settings.environment)
     policy = make_policy(environment, settings.network, settings.predictor)
     abstract = abstract_parameters(environment, policy)
-    if not any(name.startswith(f"{prefix}critic") for name in leaves):
+    if not any(name.startswith("critic/") for name in leaves):
         # Shipped without: flying needs no critic.
         abstract = abstract.replace(critic={})
-    parameters = fill(abstract, leaves, source, prefix)
+    parameters = fill(abstract, leaves, source)
     return LoadedPolicy(policy, parameters, settings, source)

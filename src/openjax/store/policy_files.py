@@ -113,15 +113,14 @@ def _dtype(name):
     return dtype
 
 
-def fill(abstract: Any, leaves: dict[str, np.ndarray], where: str, prefix: str = "") -> Any:
-    """The tree of `abstract` (shapes and dtypes) with its leaves taken by path, which starts with `prefix`.
+def fill(abstract: Any, leaves: dict[str, np.ndarray], where: str) -> Any:
+    """The tree of `abstract` (shapes and dtypes) with its leaves taken by path.
 
     Raises:
       UserError: a leaf is missing or has another shape; `where` names the source.
     """
     filled = []
-    for path, leaf in named_leaves(abstract).items():
-        name = prefix + path
+    for name, leaf in named_leaves(abstract).items():
         if name not in leaves:
             raise UserError(f"{where} lacks the parameters {name}; it was made by another network or version")
         if leaves[name].shape != leaf.shape:

@@ -51,18 +51,22 @@ class RunDirectory:
 
     @property
     def checkpoints(self) -> Path:
+        """Folder of the training states; see `openjax.store.checkpoints`."""
         return self.path / "checkpoints"
 
     @property
     def settings_file(self) -> Path:
+        """What determines the run, as JSON; a folder that has it is a run."""
         return self.path / SETTINGS_FILE
 
     @property
     def start_policy(self) -> Path:
+        """The policy before training."""
         return self.path / "policy_start.npz"
 
     @property
     def policy(self) -> Path:
+        """The best policy, once training has ended."""
         return self.path / "policy.npz"
 
     def optional(self, name: str) -> Path | None:

@@ -10,27 +10,43 @@ import jax.numpy as jnp
 
 from openjax.errors import UserError
 from openjax.vehicle.arena import Arena
+from openjax.vehicle.bodies import make_body, rigid_drone, vehicles_axis
 from openjax.vehicle.effects import composition
 from openjax.vehicle.effects.effect import Context, Effect, make_context
-from openjax.vehicle.mjx_body import make_world, mjx_step
+from openjax.vehicle.mjx_body import make_world
 from openjax.vehicle.parameters import Vehicle
 from openjax.vehicle.rate_controller import rate_controller
-from openjax.vehicle.rigid_body import rigid_step, rotate
+from openjax.vehicle.rigid_body import rotate
 from openjax.vehicle.rigid_kernel import FusedStep, step_many
-from openjax.vehicle.rotors import rotor_reaction, rotor_speed_step, rotor_thrust
-from openjax.vehicle.solids import (
-    Surroundings,
-    contact_acceleration,
-    encounters,
-    others,
-    place_solids,
-    surroundings,
-)
+from openjax.vehicle.rotors import rotor_speed_step
+from openjax.vehicle.solids import others
 from openjax.vehicle.state import DroneState
 from openjax.vehicle.stops import stop
-from openjax.vehicle.wrench import total_wrench
 
 PHYSICS = ("mjx", "rigid", "stops")
+
+
+def motors(effects, vehicle: Vehicle, parameters, drone: DroneState, command, context: Context | None, dt):
+    """One drone up to the wrench on its body, its controller and rotors dt seconds later.
+
+    Args:
+        effects: those that act, with their `parameters` {effect: {name: ()}}.
+        vehicle: that really flies.
+        drone: before the substep.
+        command: (4,) as for `rate_controller`.
+        context: of the effects; None without any.
+        dt: seconds.
+
+    Returns:
+        the drone with its new rotors and controller, force (3,) N in the world without gravity, torque (3,) N m about
+        the centre of mass, body frame.
+    """
+    motor_command, integral = rate_controller(vehicle, drone, command, dt)
+    motor_command = composition.change_motor_command(effects, parameters, motor_command, context)
+    speed = rotor_speed_step(vehicle, drone.rotor_speed, motor_command, dt)
+    force, torque = composition.wrench(effects, parameters, vehicle, speed, context)
+    drone = drone.replace(rotor_speed=speed, rate_integral=integral, previous_body_rates=drone.body_rates)
+    return drone, rotate(drone.quaternion, force), torque
 
 
 @dataclass(frozen=True)
@@ -58,39 +74,28 @@ class DronesStep:
         command (N, 4) as for `rate_controller`, pillar_position (P, 2) m, pillar_active (P,) bool,
         effect_parameters {effect: {parameter: () or (N,) array}} for the effects of this step, of all drones or of
         each; what is left out has no effect. The arithmetic is done in the precision of the drones' state.
+
+        Raises:
+            UserError: parameters of other effects than this step's, or drones without the memory of its effects.
         """
         dtype = drones.position.dtype
         vehicle = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), vehicle)
-        command = jnp.asarray(command, dtype)
-        if self.physics == "rigid" and not self.effects and dtype == jnp.float32:
+        command, pillars = jnp.asarray(command, dtype), (pillar_position, pillar_active)
+        if self.physics == "rigid" and not self.effects:
             memory = drones.effect_memory  # of other effects than this step's, if any
-            pillars = (pillar_position, pillar_active) if self.contacts else None
-            drones = step_many(self.fused, vehicle, drones.replace(effect_memory=()), command, pillars)
+            around = pillars if self.contacts else None
+            drones = step_many(self.fused, vehicle, drones.replace(effect_memory=()), command, around)
             return drones.replace(effect_memory=memory)
+
+        composition.check_memory(self.effects, drones.effect_memory)
         parameters = self._parameters(effect_parameters, drones)
         vehicle = self._body(vehicle, parameters)
-        if self.effects:
-            if not isinstance(drones.effect_memory, dict):
-                raise UserError(
-                    "drones without memory of the effects: pass them through the step's reset() first"
-                )
-            command, drones = self._receive(vehicle, parameters, drones, command)
-
-        def substep(drones, _):
-            return self._substep(vehicle, parameters, drones, command, pillar_position, pillar_active), None
-
-        if self.substeps == 1:
-            drones, _ = substep(drones, None)
-        else:
-            drones, _ = jax.lax.scan(substep, drones, None, length=self.substeps)
+        command, drones = self._receive(vehicle, parameters, drones, command)
+        substep = functools.partial(self._substep, vehicle, parameters, command, pillars)
+        drones = _repeated(substep, drones, self.substeps)
         if self.physics == "stops":
-            drones = stop(self.arena, drones, pillar_position, pillar_active)
-        if self.effects:
-            memory = jax.vmap(
-                lambda drone: composition.record(self.effects, drone.effect_memory, drone, self.dt)
-            )(drones)
-            drones = drones.replace(effect_memory=memory)
-        return drones
+            drones = stop(self.arena, drones, *pillars)
+        return self._remember(drones)
 
     @property
     def fused(self) -> FusedStep:
@@ -100,7 +105,8 @@ class DronesStep:
     def reset(self, vehicle: Vehicle, drones: DroneState, key=None) -> DroneState:
         """`drones` (leading axis N) with the effects' memory as at the start of an episode.
 
-        `key` is needed by random effects only (UserError without it).
+        Raises:
+            UserError: an effect is random and there is no `key`.
         """
         number = jnp.arange(drones.position.shape[0])
 
@@ -111,16 +117,12 @@ class DronesStep:
         return drones.replace(effect_memory=jax.vmap(memory)(drones, number))
 
     def seen(self, drones: DroneState, effect_parameters=None) -> DroneState:
-        """What the off-board controller sees of `drones` (leading axis N): they themselves without sensor
-        effects.
-        """
+        """What the off-board controller sees of `drones` (leading axis N): they themselves without sensor effects."""
         if not self.effects:
             return drones
         parameters = self._parameters(effect_parameters, drones)
-        axis = _drones_axis(parameters)
-        return jax.vmap(functools.partial(composition.seen_state, self.effects), (axis, 0))(
-            parameters, drones
-        )
+        see = functools.partial(composition.seen_state, self.effects)
+        return jax.vmap(see, (_drones_axis(parameters), 0))(parameters, drones)
 
     def _parameters(self, given, drones):
         """Parameters of every effect, all () where all drones share them, else all (N,)."""
@@ -144,12 +146,12 @@ class DronesStep:
                 vehicle,
                 drone,
                 others_position=neighbour,
-                air_time=drone.effect_memory[composition.AIR_TIME],
+                air_time=composition.air_time(self.effects, drone.effect_memory),
                 ceiling_height=self.arena.height,
                 dt=dt,
             )
 
-        return jax.vmap(context, (_vehicles_axis(vehicle), 0, 0))(vehicle, drones, neighbours)
+        return jax.vmap(context, (vehicles_axis(vehicle), 0, 0))(vehicle, drones, neighbours)
 
     def _receive(self, vehicle, parameters, drones, command):
         """The commands that reach the rate controllers, and the drones with the memory of it."""
@@ -159,78 +161,39 @@ class DronesStep:
         command, memory = jax.vmap(change, axes)(parameters, drones.effect_memory, command, contexts)
         return command, drones.replace(effect_memory=memory)
 
-    def _substep(self, vehicle, parameters, drones, command, pillar_position, pillar_active):
+    def _substep(self, vehicle, parameters, command, pillars, drones):
         dt = self.dt / self.substeps
-        contexts = self._contexts(vehicle, drones, dt) if self.effects else None
-        axes = (_vehicles_axis(vehicle), _drones_axis(parameters), 0, 0, 0)
-        around = None
-        if self.contacts and self.physics != "stops":
-            around = surroundings(drones.position, drones.velocity, pillar_position, pillar_active)
-        if self.physics != "mjx":
-            move = jax.vmap(self._rigid_substep, (*axes, None if around is None else 0))
-            return move(vehicle, parameters, drones, command, contexts, around)
-        motors = functools.partial(self._motors, dt=dt)
-        moved, force, torque = jax.vmap(motors, axes)(vehicle, parameters, drones, command, contexts)
-        body = (drones.position, drones.quaternion, drones.velocity, drones.body_rates, force, torque)
-        world, shapes = make_world(self.arena, 0, 0, dt, False), None
-        if self.contacts:
-            world = make_world(self.arena, pillar_position.shape[0], drones.position.shape[0] - 1, dt, True)
-            met = jax.vmap(functools.partial(encounters, self.arena, dt=dt))
-            shapes = jax.vmap(place_solids)(met(drones.position, drones.velocity, around))
-        axes = (axes[0], None if shapes is None else 0, *(0 for _ in body))
-        move = functools.partial(mjx_step, world, dt=dt)
-        return _with_body(moved, jax.vmap(move, axes)(vehicle, shapes, *body))
-
-    def _rigid_substep(self, vehicle, parameters, drone, command, context, around: Surroundings | None):
-        """One drone after a substep of `rigid`, in free flight if nothing is around."""
-        dt = self.dt / self.substeps
-        moved, force, torque = self._motors(vehicle, parameters, drone, command, context, dt)
-        body = (drone.position, drone.quaternion, drone.velocity, drone.body_rates, force, torque)
-        contact = None
-        if around is not None:
-
-            def contact(free):
-                return contact_acceleration(self.arena, drone.position, drone.velocity, free, around, dt)
-
-        return _with_body(moved, rigid_step(vehicle, *body, dt, contact))
+        contexts = self._contexts(vehicle, drones, dt)
+        turn = jax.vmap(
+            functools.partial(motors, self.effects, dt=dt),
+            (vehicles_axis(vehicle), _drones_axis(parameters), 0, 0, 0),
+        )
+        drones, force, torque = turn(vehicle, parameters, drones, command, contexts)
+        body = make_body(self.physics, self.contacts, self.arena, dt)
+        return body(vehicle, drones, force, torque, pillars)
 
     def _plain_substep(self, vehicle, drone, command, around):
         """One drone after a substep of `rigid` without effects."""
-        return self._rigid_substep(vehicle, {}, drone, command, None, around)
+        dt = self.dt / self.substeps
+        drone, force, torque = motors((), vehicle, {}, drone, command, None, dt)
+        return rigid_drone(self.arena, dt, vehicle, drone, force, torque, around)
 
-    def _motors(self, vehicle, parameters, drone, command, context, dt):
-        """One drone up to the wrench on its body: its new controller and rotors, force world, torque body."""
-        motor_command, integral = rate_controller(vehicle, drone, command, dt)
-        if self.effects:
-            motor_command = composition.change_motor_command(self.effects, parameters, motor_command, context)
-        speed = rotor_speed_step(vehicle, drone.rotor_speed, motor_command, dt)
-        thrust, reaction = rotor_thrust(vehicle, speed), rotor_reaction(vehicle, speed)
-        if self.effects:
-            context = context.replace(rotor_speed=speed, thrust=thrust)
-            thrust, reaction = composition.change_thrust(self.effects, parameters, thrust, reaction, context)
-            context = context.replace(thrust=thrust)
-        force, torque = total_wrench(vehicle, thrust, reaction)
-        if self.effects:
-            more_force, more_torque = composition.added_wrench(self.effects, parameters, context)
-            force, torque = force + more_force, torque + more_torque
-        drone = drone.replace(rotor_speed=speed, rate_integral=integral, previous_body_rates=drone.body_rates)
-        return drone, rotate(drone.quaternion, force), torque
+    def _remember(self, drones):
+        """The drones with the effects' memory at the end of a step."""
+        record = functools.partial(composition.record, self.effects, dt=self.dt)
+        return drones.replace(effect_memory=jax.vmap(record)(drones.effect_memory, drones))
+
+
+def _repeated(substep, drones, number):
+    """`drones` after so many substeps; a single one isn't worth a loop."""
+    if number == 1:
+        return substep(drones)
+    return jax.lax.scan(lambda drones, _: (substep(drones), None), drones, None, length=number)[0]
 
 
 def _drones_axis(parameters):
     """0 where the effects' parameters are those of each drone, None where all drones share them."""
     return 0 if any(leaf.ndim for leaf in jax.tree.leaves(parameters)) else None
-
-
-def _vehicles_axis(vehicle):
-    """0 where the leaves of `vehicle` are those of each drone, None where all drones are alike."""
-    return 0 if vehicle.mass.ndim else None
-
-
-def _with_body(drone, body):
-    """`drone` with the position, quaternion, velocity and body rates of `body`."""
-    position, quaternion, velocity, body_rates = body
-    return drone.replace(position=position, quaternion=quaternion, velocity=velocity, body_rates=body_rates)
 
 
 def make_drones_step(

@@ -41,7 +41,7 @@ class Vehicle:
 
 
 def assets_directory() -> Path:
-    """Where the MJCF files lie: inside the installed package, or at the top of the source tree."""
+    """Where the MJCF files lie: inside the installed package, or at the top of the source tree. UserError: nowhere."""
     here = Path(__file__).resolve()
     for candidate in (here.parents[1] / "assets", here.parents[3] / "assets"):
         if (candidate / "crazyflie.xml").is_file():
@@ -51,7 +51,11 @@ def assets_directory() -> Path:
 
 @lru_cache(maxsize=8)
 def read_mjcf(path: str) -> dict[str, np.ndarray]:
-    """Field of `Vehicle` -> float64 value, from the compiled model at `path`."""
+    """Field of `Vehicle` -> float64 value, from the compiled model at `path`.
+
+    Raises:
+        UserError: the file isn't MJCF, or lacks something that a vehicle needs.
+    """
     try:
         model = mujoco.MjModel.from_xml_path(path)
     except (ValueError, OSError) as error:

@@ -37,12 +37,15 @@ class FusedStep(NamedTuple):
 
 
 def step_many(step: FusedStep, vehicle: Vehicle, drones: DroneState, command, pillars=None) -> DroneState:
-    """The n drones (leading axis) of one world after a step, float32 throughout.
+    """The n drones (leading axis) of one world after a step.
 
     The drones are of one vehicle and have no effect memory. `pillars`: position (P, 2) m and active (P,) bool, or None
     for free flight, in which drones don't notice each other. On NVIDIA GPUs in one kernel, elsewhere mapped. May be
-    mapped further, over worlds (still one kernel) and vehicles (not); derivatives are those of `mapped_step`.
+    mapped further, over worlds (still one kernel) and vehicles (not); derivatives are those of `mapped_step`, and so is
+    whatever isn't float32.
     """
+    if drones.position.dtype != jnp.float32:
+        return mapped_step(step, vehicle, drones, command, pillars or ())
     if pillars is None:  # every drone is a world of its own
         alone = jax.tree.map(lambda leaf: leaf[:, None], (drones, command))
         return jax.tree.map(lambda leaf: leaf[:, 0], _many_worlds(step)(vehicle, *alone, ()))

@@ -13,7 +13,9 @@ from openjax.errors import UserError
 from openjax.vehicle.effects.effect import Context, Effect
 from openjax.vehicle.effects.registry import EFFECTS
 from openjax.vehicle.parameters import Vehicle
+from openjax.vehicle.rotors import rotor_reaction, rotor_thrust
 from openjax.vehicle.state import DroneState
+from openjax.vehicle.wrench import total_wrench
 
 AIR_TIME = "air_time"  # beside the effects' own memories
 
@@ -108,8 +110,36 @@ def added_wrench(effects, parameters, context: Context):
     return force, torque
 
 
+def wrench(effects, parameters, vehicle: Vehicle, rotor_speed, context: Context | None):
+    """Force (3,) N and torque (3,) N m about the centre of mass on the body, body frame, of rotors and effects.
+
+    rotor_speed (4,) rad/s; without effects there need be no `context`.
+    """
+    thrust, reaction = rotor_thrust(vehicle, rotor_speed), rotor_reaction(vehicle, rotor_speed)
+    if not effects:
+        return total_wrench(vehicle, thrust, reaction)
+    context = context.replace(rotor_speed=rotor_speed, thrust=thrust)
+    thrust, reaction = change_thrust(effects, parameters, thrust, reaction, context)
+    force, torque = total_wrench(vehicle, thrust, reaction)
+    more_force, more_torque = added_wrench(effects, parameters, context.replace(thrust=thrust))
+    return force + more_force, torque + more_torque
+
+
+def check_memory(effects, memory) -> None:
+    """Raises UserError where the drones have no memory of the effects."""
+    if effects and not isinstance(memory, dict):
+        raise UserError("drones without memory of the effects: pass them through the step's reset() first")
+
+
+def air_time(effects, memory):
+    """() s since the start of the episode; NaN, "not known", without effects."""
+    return memory[AIR_TIME] if effects else jnp.nan
+
+
 def record(effects, memory, state: DroneState, dt):
-    """Memory at the end of a step of dt seconds that led to `state`."""
+    """Memory at the end of a step of dt seconds that led to `state`; without effects it stays."""
+    if not effects:
+        return memory
     memory = {**memory, AIR_TIME: memory[AIR_TIME] + jnp.asarray(dt, memory[AIR_TIME].dtype)}
     for effect in effects:
         if effect.record is not None:

@@ -1,0 +1,53 @@
+"""A network while it learns: its parameters and its optimiser's state, side by side."""
+
+import re
+from typing import Any, NamedTuple
+
+import optax
+from flax import struct
+
+from openjax.policy import PolicyParameters
+
+
+@struct.dataclass
+class TrainState:
+    """One network. Flax's own would carry the optimiser itself, which would make every build a carry of another type."""
+
+    parameters: Any
+    optimiser: Any
+    """State of the `optax` transformation."""
+
+    def updated(self, optimiser: optax.GradientTransformation, gradient: Any) -> "TrainState":
+        """One step against `gradient`, a tree like the parameters."""
+        update, state = optimiser.update(gradient, self.optimiser, self.parameters)
+        return TrainState(optax.apply_updates(self.parameters, update), state)
+
+
+class Optimisers(NamedTuple):
+    """One for each network."""
+
+    actor: optax.GradientTransformation
+    critic: optax.GradientTransformation
+    predictor: optax.GradientTransformation
+
+    def start(self, parameters: PolicyParameters) -> dict[str, TrainState]:
+        """The networks before their first step, by name."""
+        return {
+            name: TrainState(getattr(parameters, name), optimiser.init(getattr(parameters, name)))
+            for name, optimiser in self._asdict().items()
+        }
+
+
+_NETWORK = "(actor|critic|predictor)"
+_OF_POLICY = re.compile(f"{_NETWORK}/parameters/(.+)"), re.compile(f"policy/{_NETWORK}/(.+)")
+
+
+def policy_leaf(name: str) -> str | None:
+    """The path in `PolicyParameters` of a leaf of a training carry: `actor/params/x` for `actor/parameters/params/x`.
+
+    None for one that isn't of the policy. In carries from before networks had a `TrainState` it is `policy/actor/params/x`.
+    """
+    for pattern in _OF_POLICY:
+        if found := pattern.fullmatch(name):
+            return "/".join(found.groups())
+    return None
