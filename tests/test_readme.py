@@ -35,6 +35,17 @@ def test_links_between_the_pages_lead_somewhere():
             assert (page.parent / path).exists(), f"{page.name}: {path}"
 
 
+def test_modules_that_the_pages_name_are_there():
+    modules = [
+        path.relative_to(ROOT).as_posix()
+        for part in ("src", "experiments", "examples", "tests")
+        for path in (ROOT / part).rglob("*.py")
+    ]
+    for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")):
+        for name in re.findall(r"`([\w/]+\.py)`", page.read_text(encoding="utf-8")):
+            assert any(f"/{module}".endswith(f"/{name}") for module in modules), f"{page.name}: {name}"
+
+
 def test_from_sample_flights_to_a_corrected_simulator(tmp_path):
     """sample_flights -> calibrate -> diagnose -> an environment that flies with what was found."""
     case, out = tmp_path / "drag", tmp_path / "diagnosis"
