@@ -153,13 +153,8 @@ def record_of(scenario: str, episodes: int, summary: dict, extra: tuple[str, ...
 
 def results_table(title: str, rows: Sequence[dict]) -> Table:
     """Records as a table."""
-    table = Table(title=title, title_justify="left", box=box.SIMPLE, pad_edge=False, padding=0)
-    table.add_column("scenario")
-    for name in ("epi-\nsodes", "capture\nrate", "capture\nstep", "colli-\nsions"):
-        table.add_column(name, justify="right")
-    table.add_column("pillar/drone/\nbounds", justify="right")
-    for name in ("crash\nrate", "over-\nspeed", "predicted\noff by [m]"):
-        table.add_column(name, justify="right")
+    heads = ("epi-\nsodes", "capture\nrate", "capture\nstep", "colli-\nsions", "pillar/drone/\nbounds")
+    table = _table(title, "scenario", *heads, "crash\nrate", "over-\nspeed", "predicted\noff by, m")
     for row in rows:
         parts = row["collision_parts"]
         table.add_row(
@@ -179,16 +174,13 @@ def results_table(title: str, rows: Sequence[dict]) -> Table:
 def spread_table(results: Sequence[Sequence[dict]]) -> Table:
     """Mean and standard deviation over several policies' records of the same scenarios."""
     title = f"Mean ± standard deviation of {len(results)} policies"
-    table = Table(title=title, title_justify="left", box=box.SIMPLE, pad_edge=False, padding=0)
-    table.add_column("scenario")
     columns = (
         ("capture_rate", "capture rate", ".3f"),
         ("capture_step", "capture step", ".0f"),
         ("collision_rate", "collision rate", ".4f"),
         ("crash_rate", "crash rate", ".3f"),
     )
-    for _, label, _ in columns:
-        table.add_column(label, justify="right")
+    table = _table(title, "scenario", *(label for _, label, _ in columns))
     for rows in zip(*results, strict=True):
         values = [(np.array([row[name] for row in rows]), style) for name, _, style in columns]
         cells = [f"{value.mean():{style}} ± {value.std(ddof=1):{style}}" for value, style in values]
@@ -198,10 +190,6 @@ def spread_table(results: Sequence[Sequence[dict]]) -> Table:
 
 def before_after_table(before: Sequence[dict], after: Sequence[dict]) -> Table:
     """Returns, captures and collisions per layout, before and after training."""
-    table = Table(
-        title="Before and after training", title_justify="left", box=box.SIMPLE, pad_edge=False, padding=0
-    )
-    table.add_column("layout")
     columns = (
         ("episode_return", "return", ".0f"),
         ("capture_rate", "capture rate", ".2f"),
@@ -209,9 +197,17 @@ def before_after_table(before: Sequence[dict], after: Sequence[dict]) -> Table:
         ("collision_rate", "collision rate", ".3f"),
         ("crash_rate", "crash rate", ".2f"),
     )
-    for _, label, _ in columns:
-        table.add_column(label, justify="right")
+    table = _table("Before and after training", "layout", *(label for _, label, _ in columns))
     for old, new in zip(before, after, strict=True):
         cells = [f"{old[name]:{style}} → {new[name]:{style}}" for name, _, style in columns]
         table.add_row(old["scenario"], *cells)
+    return table
+
+
+def _table(title, first, *heads):
+    """An empty table; the column `first` holds names, the others numbers."""
+    table = Table(title=title, title_justify="left", box=box.SIMPLE, pad_edge=False, padding=0)
+    table.add_column(first)
+    for head in heads:
+        table.add_column(head, justify="right")
     return table
