@@ -79,7 +79,6 @@ PARTS = {
     ("rotor_drag", "raised_hub"): ("blade_flapping",),
     ("motor_imbalance", "one_weak"): ("thrust_scale", "mass"),
     ("command_latency", "spikes"): ("packet_loss",),
-    ("rate_gains", "filtered_d"): ("motor_lag",),
 }
 
 

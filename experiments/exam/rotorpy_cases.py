@@ -17,7 +17,7 @@ import numpy as np
 
 from experiments.exam import cases, fleet, measure, sensors
 from experiments.exam import vehicle as v
-from experiments.exam.answer_key import accepted
+from experiments.exam.answer_key import HIDDEN, accepted
 from experiments.exam.generate import write_answers
 from experiments.exam.plant import KEPT, POSE, SAMPLE, Battery, Filter
 
@@ -299,12 +299,23 @@ def _answer(name, kind, told, drawn, names, joined, flights, effects, form, said
     p["rotor_gain"] *= 1 + drawn["thrust_offset"]
     seen = (measure.errors(joined, many, p, np.arange(3), none, none) ** 2).mean(axis=1)
     floor = [measure.sensor_floor(drawn, f[0], joined, j) for j, f in enumerate(flights)]
-    floor = np.sqrt((np.array(floor) ** 2).mean(axis=0))
+    rows, samples = [f[0] for f in flights], len(joined["motor"])
+    logged = np.stack([measure.motors_of_log(r, samples) for r in rows], axis=-1)
+    lasts = np.minimum(joined["crashed"], [round(r["t"][-1] / SAMPLE) for r in rows])
+    hidden = [
+        (
+            measure.errors(joined | {"motor": m, "crashed": lasts}, many, p, np.arange(3), none, none) ** 2
+        ).mean(axis=1)
+        for m in logged
+    ]
+    floor = np.sqrt((np.array(floor) ** 2).mean(axis=0) + np.maximum(np.min(hidden, axis=0) - seen, 0.0))
     known = np.isfinite(floor)
     energy = np.where(known, seen / floor**2, 0.0)
     severity, before = float(np.sqrt(energy.max())), float(np.sqrt(1 + energy[known].mean()))
     truth = [e if e != "unknown" else kind for e in effects]
     category = {0: "none", 1: "unknown" if effects == ["unknown"] else "single", 2: "pair"}[len(effects)]
+    if effects and severity < HIDDEN:
+        category = "not_testable"
     forms = [form, "slower"][: len(effects)]
     each = said if isinstance(said, list) else [said]
     gone = before if category == "none" else 1.0
@@ -312,9 +323,13 @@ def _answer(name, kind, told, drawn, names, joined, flights, effects, form, said
         "case": name,
         "category": category,
         "effects": truth,
-        "expected": effects or ["none"],
+        "expected": ["none"] if category in ("none", "not_testable") else effects,
         "acceptable": {e: accepted(e, told.weighed) for e in effects if e != "unknown"},
-        "also_fine": ["wind", "rotor_drag"] if kind == "wind_tunnel" else [],
+        "also_fine": truth
+        if category == "not_testable"
+        else ["wind", "rotor_drag"]
+        if kind == "wind_tunnel"
+        else [],
         "causes": [
             {"effect": e, "form": f, "size": _size(e, m), "magnitudes": m}
             for e, f, m in zip(truth, forms, each, strict=False)
