@@ -1,7 +1,8 @@
 """`python -m openjax.export --policy open --format onnx --out DIR`: a policy for programs that don't know openjax.
 
-Both formats hold the mean policy of a whole team, predictor included: from the observation's arrays to actions (N, 4) in
--1..1: collective thrust, roll, pitch and yaw rate. The result is compared with the policy itself before it is written.
+All formats hold the mean policy of a whole team, predictor included: from the observation's arrays to actions (N, 4) in
+-1..1: collective thrust, roll, pitch and yaw rate; with `--own`, that of one pursuer, as a vehicle computes it on board.
+The result is compared with the policy itself before it is written.
 """
 
 from __future__ import annotations
@@ -19,17 +20,21 @@ from openjax.errors import UserError
 PROGRAM = "python -m openjax.export"
 TOLERANCE = 2e-5
 """Largest difference of an action that is put down to the order of sums."""
-NAMES = {"onnx": "policy.onnx", "jax": "policy.jax_export"}
+NAMES = {"onnx": "policy.onnx", "jax": "policy.jax_export", "c": "policy.c"}
+EACH = ("self_state", "others", "pillars", "pillar_seen", "privileged", "position")
+"""What each pursuer sees for itself; the rest of an observation is the team's."""
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Write a policy as ONNX, or as a serialised JAX function."""
+    """Write a policy as ONNX, as a serialised JAX function, or as C."""
 
     policy: str = "open"
     """A run's directory, a policy file (.npz), or the name of a policy in the package."""
-    format: Literal["onnx", "jax"] = "onnx"
-    """onnx: for onnxruntime and its kin (pip install "openjax[export]"); jax: for jax.export.deserialize."""
+    format: Literal["onnx", "jax", "c"] = "onnx"
+    """onnx: for onnxruntime and its kin (pip install "openjax[export]"); jax: for jax.export.deserialize; c: C99."""
+    own: bool = False
+    """One pursuer's action instead of the whole team's."""
     out: Path = Path("exported")
     """Folder to write to."""
     observations: int = 10_000
@@ -71,7 +76,7 @@ def observations(policy, number: int, seed: int) -> dict:
 
 
 def export(arguments: Arguments) -> dict:
-    """Write the files; returns what `export.json` says. Raises UserError if it can't be, or differs."""
+    """Write the files; returns what FORMAT.json says. Raises UserError if it can't be, or differs."""
     import jax
     import numpy as np
 
@@ -91,12 +96,15 @@ def export(arguments: Arguments) -> dict:
     seen = observations(policy, arguments.observations, arguments.seed)
     number = len(next(iter(seen.values())))
     expected = np.asarray(jax.jit(jax.vmap(lambda fields: act(**fields)))(seen))
-    if arguments.format == "onnx":
-        data, found, extra = _onnx(act, inputs, seen, number)
-    else:
-        data, found, extra = _jax(act, inputs, seen)
-    difference = float(np.abs(found - expected).max())
-    if not difference <= TOLERANCE:
+    if arguments.own:
+        expected = expected[:, :1]
+        for name in EACH:
+            seen[name] = seen[name][:, :1]
+            inputs[name] = jax.ShapeDtypeStruct((1, *inputs[name].shape[1:]), inputs[name].dtype)
+    write = {"onnx": _onnx, "jax": _jax, "c": _c}[arguments.format]
+    files, found, extra = write(act, inputs, seen, policy.source)
+    difference = None if found is None else float(np.abs(found - expected).max())
+    if difference is not None and not difference <= TOLERANCE:
         raise UserError(
             f"the exported policy differs by {difference:.2g} from {policy.source}: nothing was written"
         )
@@ -104,18 +112,18 @@ def export(arguments: Arguments) -> dict:
         "policy": policy.source,
         "format": arguments.format,
         "file": NAMES[arguments.format],
-        "bytes": len(data),
+        "bytes": len(files[NAMES[arguments.format]]),
         "observations": number,
         "largest_difference": difference,
         "output": {"action": [int(n) for n in expected.shape[1:]]},
         **extra,
     }
+    files[f"{arguments.format}.json"] = (json.dumps(report, indent=1) + "\n").encode()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    partial = arguments.out / (NAMES[arguments.format] + ".partial")
-    partial.write_bytes(data)
-    partial.replace(arguments.out / NAMES[arguments.format])
-    text = json.dumps(report, indent=1) + "\n"
-    (arguments.out / f"{arguments.format}.json").write_text(text, encoding="utf-8")
+    for name, data in files.items():
+        partial = arguments.out / f"{name}.partial"
+        partial.write_bytes(data)
+        partial.replace(arguments.out / name)
     return report
 
 
@@ -123,8 +131,8 @@ def _described(inputs) -> dict:
     return {name: {"shape": list(kind.shape), "type": str(kind.dtype)} for name, kind in inputs.items()}
 
 
-def _onnx(act, inputs, seen, number):
-    """The file's bytes, its actions on `seen`, and what to say about it."""
+def _onnx(act, inputs, seen, source):
+    """The files, their actions on `seen`, and what to say about them."""
     import numpy as np
 
     from openjax.flying.onnx_graph import onnx_model, size
@@ -139,16 +147,17 @@ def _onnx(act, inputs, seen, number):
     options.intra_op_num_threads = 1
     session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     read = [value.name for value in session.get_inputs()]
+    number = len(seen["frames"])
     found = [session.run(None, {name: seen[name][i] for name in read})[0] for i in range(number)]
     extra = {
         "inputs": _described({n: inputs[n] for n in read}),
         "numbers": size(model),
         "nodes": len(model.graph.node),
     }
-    return data, np.stack(found), extra
+    return {NAMES["onnx"]: data}, np.stack(found), extra
 
 
-def _jax(act, inputs, seen):
+def _jax(act, inputs, seen, source):
     """See `_onnx`."""
     import jax
     import numpy as np
@@ -158,16 +167,44 @@ def _jax(act, inputs, seen):
     again = jax.export.deserialize(bytearray(data))
     call = jax.jit(again.call)
     found = [np.asarray(call({k: v[i] for k, v in seen.items()})) for i in range(len(seen["frames"]))]
-    return data, np.stack(found), {"inputs": _described(inputs), "platforms": list(exported.platforms)}
+    extra = {"inputs": _described(inputs), "platforms": list(exported.platforms)}
+    return {NAMES["jax"]: data}, np.stack(found), extra
+
+
+def _c(act, inputs, seen, source):
+    """See `_onnx`; nothing is compared where there is no C compiler."""
+    from openjax.flying.c_compiled import compiled
+    from openjax.flying.c_program import c_program
+
+    name = Path(NAMES["c"]).stem
+    program = c_program(act, inputs, "action", name, f"The policy {Path(source).name}")
+    extra = {
+        "inputs": _described({n: inputs[n] for n in program.inputs}),
+        "numbers": program.numbers,
+        "workspace_floats": program.workspace,
+        "multiply_adds": program.multiply_adds,
+        "functions": program.functions,
+    }
+    files = {f"{name}.c": program.source.encode(), f"{name}.h": program.header.encode()}
+    call = compiled(program, name)
+    if call is None:
+        return files, None, extra
+    extra["microseconds"] = round(1e6 * call.seconds(), 1)
+    return files, call(seen), extra
 
 
 def main(arguments: Sequence[str]) -> None:
     """The command. Raises UserError for an unusable policy or folder."""
     parsed = parse(Arguments, Arguments(), arguments, PROGRAM)
     report = export(parsed)
+    difference = report["largest_difference"]
+    compared = (
+        "compared with nothing, as there is no C compiler here"
+        if difference is None
+        else f"differs by at most {difference:.1e} on {report['observations']} observations"
+    )
     output_console().print(
-        f"{parsed.out / report['file']}: {report['bytes'] / 1e6:.2f} MB, differs by at most "
-        f"{report['largest_difference']:.1e} on {report['observations']} observations"
+        f"{parsed.out / report['file']}: {report['bytes'] / 1e6:.2f} MB, {compared}", soft_wrap=True
     )
 
 

@@ -1,6 +1,7 @@
 """Export: the file says what the policy says, for networks of both shapes, and refuses what it can't say."""
 
 import json
+import shutil
 
 import jax
 import jax.numpy as jnp
@@ -8,11 +9,13 @@ import numpy as np
 import pytest
 
 from openjax.errors import UserError
-from openjax.export import Arguments, export
+from openjax.export import EACH, Arguments, export, observations
+from openjax.flying.c_compiled import compiled
+from openjax.flying.c_program import c_program
 from openjax.learning import TrainSettings
 from openjax.policy import NetworkSettings, Policy, PredictorSettings
-from openjax.pursuit import Pursuit, PursuitSettings
-from openjax.store.policies import abstract_parameters
+from openjax.pursuit import Observation, Pursuit, PursuitSettings
+from openjax.store.policies import abstract_parameters, load_policy
 from openjax.store.policy_files import save_policy_file
 
 
@@ -34,11 +37,14 @@ def policy_file(tmp_path_factory):
     return path
 
 
-@pytest.mark.parametrize("kind", ["onnx", "jax"])
+NEEDS_CC = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler here")
+
+
+@pytest.mark.parametrize("kind", ["onnx", "jax", pytest.param("c", marks=NEEDS_CC)])
 def test_the_file_acts_as_the_policy_does(policy_file, tmp_path, kind):
     if kind == "onnx":
         pytest.importorskip("onnxruntime", reason='the extra "export" is not installed')
-    report = export(Arguments(str(policy_file), kind, tmp_path, observations=64))
+    report = export(Arguments(str(policy_file), kind, out=tmp_path, observations=64))
     assert report["observations"] == 64
     assert report["largest_difference"] < 1e-5
     assert json.loads((tmp_path / f"{kind}.json").read_text())["output"]["action"] == [3, 4]
@@ -46,27 +52,60 @@ def test_the_file_acts_as_the_policy_does(policy_file, tmp_path, kind):
     assert "privileged" not in report["inputs"] or kind == "jax"
 
 
-def test_operations_become_their_counterparts():
+@NEEDS_CC
+def test_the_c_program_is_one_vehicles_policy_for_any_observation(policy_file):
+    """Numbers that no game shows; a compiler that takes every warning for an error; a workspace full of NaN."""
+    policy = load_policy(str(policy_file))
+    rng = np.random.default_rng(1)
+    seen = observations(policy, 64, 0)
+    for name, values in seen.items():
+        noise = rng.normal(size=values.shape)
+        seen[name] = (noise > 0) if values.dtype == bool else noise.astype(np.float32)
+    expected = np.asarray(jax.jit(jax.vmap(lambda fields: policy(Observation(**fields))))(seen))[:, :1]
+    own = {name: values[:, :1] if name in EACH else values for name, values in seen.items()}
+    inputs = {name: jax.ShapeDtypeStruct(values.shape[1:], values.dtype) for name, values in own.items()}
+    program = c_program(lambda **fields: policy(Observation(**fields)), inputs, "action", "small", "A policy")
+    assert np.ptp(expected, axis=0).min() > 0.01  # a thousand times what may differ
+    np.testing.assert_allclose(compiled(program, "small")(own), expected, atol=1e-5)
+    assert "privileged" not in program.inputs
+    assert program.workspace < 2000 and program.numbers < sum(
+        leaf.size for leaf in jax.tree.leaves(policy.parameters)
+    )
+
+
+def everything(x, flag):
+    """Most of what the exports know."""
+    table = jnp.arange(12.0).reshape(3, 4)
+    y = jnp.einsum("ab,cb->ac", x, table) + jnp.pad(x[:, ::2], ((0, 0), (1, 0)))
+    y = jnp.where(flag, jnp.stack([y, -y], 1).sum(1) + y, jnp.clip(y, -1.0, 2.0)) ** 3
+    batched = jnp.einsum("ab,acd->abcd", y, jnp.stack([y.T @ y, 0.1 * table[:, :3]])).mean((1, 2))
+    return (
+        jax.lax.rsqrt(1.0 + jax.nn.softmax(y) ** 2)
+        + jnp.concatenate([y[:, 1:], y[:, :1]], 1).T.max(0)[:, None]
+        + jnp.tanh(batched)
+    )
+
+
+KINDS = {"x": jax.ShapeDtypeStruct((2, 4), jnp.float32), "flag": jax.ShapeDtypeStruct((2, 3), bool)}
+X = np.random.default_rng(0).normal(size=(2, 4)).astype(np.float32)
+FLAG = np.array([[True, False, True], [False, True, False]])
+
+
+def test_operations_become_their_counterparts_in_onnx():
     onnxruntime = pytest.importorskip("onnxruntime", reason='the extra "export" is not installed')
     from openjax.flying.onnx_graph import onnx_model
 
-    table = jnp.arange(12.0).reshape(3, 4)
-
-    def function(x, flag):
-        y = jnp.einsum("ab,cb->ac", x, table) + jnp.pad(x[:, ::2], ((0, 0), (1, 0)))
-        y = jnp.where(flag, jnp.stack([y, -y], 1).sum(1) + y, jnp.clip(y, -1.0, 2.0)) ** 3
-        return (
-            jax.lax.rsqrt(1.0 + jax.nn.softmax(y) ** 2)
-            + jnp.concatenate([y[:, 1:], y[:, :1]], 1).T.max(0)[:, None]
-        )
-
-    kinds = {"x": jax.ShapeDtypeStruct((2, 4), jnp.float32), "flag": jax.ShapeDtypeStruct((2, 3), bool)}
-    model = onnx_model(lambda x, flag: function(x, flag), kinds, "y")
+    model = onnx_model(everything, KINDS, "y")
     session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
-    x = np.random.default_rng(0).normal(size=(2, 4)).astype(np.float32)
-    flag = np.array([[True, False, True], [False, True, False]])
+    found = session.run(None, {"x": X, "flag": FLAG})[0]
+    np.testing.assert_allclose(found, everything(X, FLAG), rtol=2e-5, atol=2e-5)
+
+
+@NEEDS_CC
+def test_operations_become_their_counterparts_in_c():
+    found = compiled(c_program(everything, KINDS, "y", "everything", "A test"), "everything")
     np.testing.assert_allclose(
-        session.run(None, {"x": x, "flag": flag})[0], function(x, flag), rtol=2e-5, atol=2e-5
+        found({"x": X[None], "flag": FLAG[None]})[0], everything(X, FLAG), rtol=2e-5, atol=2e-5
     )
 
 
@@ -74,5 +113,8 @@ def test_what_has_no_counterpart_is_named():
     pytest.importorskip("onnx", reason='the extra "export" is not installed')
     from openjax.flying.onnx_graph import onnx_model
 
+    kinds = {"x": jax.ShapeDtypeStruct((3,), jnp.float32)}
     with pytest.raises(UserError, match="sort"):
-        onnx_model(lambda x: jnp.sort(x), {"x": jax.ShapeDtypeStruct((3,), jnp.float32)}, "y")
+        onnx_model(lambda x: jnp.sort(x), kinds, "y")
+    with pytest.raises(UserError, match="sort"):
+        c_program(lambda x: jnp.sort(x), kinds, "y", "sorted", "A test")

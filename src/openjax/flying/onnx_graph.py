@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from openjax.errors import UserError
+from openjax.flying.traced import Walk, trace
 
 OPSET = 18
 _LETTERS = "abcdefghijklmnopqrstuvwxyz"
@@ -23,18 +24,9 @@ _SAME = {
     "ge": "GreaterOrEqual", "eq": "Equal", "and": "And", "or": "Or", "not": "Not", "stop_gradient": "Identity",
     "copy": "Identity", "copy_p": "Identity", "optimization_barrier": "Identity",
 }  # fmt: skip
-_INLINE = (
-    "jit",
-    "pjit",
-    "closed_call",
-    "core_call",
-    "custom_jvp_call",
-    "custom_vjp_call",
-    "custom_vjp_call_jaxpr",
-)
 
 
-class _Graph:
+class _Graph(Walk):
     """Nodes and constants of a graph under construction. A value is a NumPy array or the name of a tensor."""
 
     def __init__(self):
@@ -63,38 +55,7 @@ class _Graph:
     def reshape(self, value, shape):
         return self.add("Reshape", value, np.array(shape, np.int64))
 
-    def run(self, jaxpr, consts, inputs) -> list:
-        """The outputs of a jaxpr for input values."""
-        values = dict(zip(jaxpr.constvars, map(np.asarray, consts), strict=True))
-        values |= dict(zip(jaxpr.invars, inputs, strict=True))
-
-        def read(atom):
-            return np.asarray(atom.val) if hasattr(atom, "val") else values[atom]
-
-        for equation in jaxpr.eqns:
-            found = self._equation(equation, [read(atom) for atom in equation.invars])
-            values |= dict(zip(equation.outvars, found, strict=True))
-        return [read(atom) for atom in jaxpr.outvars]
-
-    def _equation(self, equation, inputs) -> list:
-        name, parameters = equation.primitive.name, equation.params
-        if name == "platform_index":  # what is not for a platform of its own comes last
-            return [np.int32(len(parameters["platforms"]) - 1)]
-        if name == "cond" and not isinstance(inputs[0], str):
-            branch = parameters["branches"][int(inputs[0])]
-            return self.run(branch.jaxpr, branch.consts, inputs[1:])
-        if name in _INLINE:
-            inner = next(parameters[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in parameters)
-            consts = getattr(inner, "consts", ())
-            return self.run(getattr(inner, "jaxpr", inner), consts, inputs)
-        if not any(isinstance(value, str) for value in inputs):
-            found = equation.primitive.bind(*inputs, **parameters)
-            found = found if equation.primitive.multiple_results else [found]
-            return [np.asarray(value) for value in found]
-        found = self._node(name, parameters, inputs, equation)
-        return found if isinstance(found, list) else [found]
-
-    def _node(self, name, p, inputs, equation):
+    def node(self, name, p, inputs, equation):
         shape = equation.outvars[0].aval.shape
         first = inputs[0]
         if name in _SAME:
@@ -180,12 +141,9 @@ def onnx_model(function: Callable, inputs: dict[str, jax.ShapeDtypeStruct], outp
         from onnx import TensorProto, checker, helper
     except ImportError as error:
         raise UserError('onnx is missing: pip install "openjax[export]"') from error
-    names = list(inputs)
-    traced = jax.make_jaxpr(lambda *values: function(**dict(zip(names, values, strict=True))))(
-        *inputs.values()
-    )
+    traced = trace(function, inputs)
     graph = _Graph()
-    (result,) = graph.run(traced.jaxpr, traced.consts, names)
+    (result,) = graph.run(traced.jaxpr, traced.consts, list(inputs))
     graph.nodes.append(helper.make_node("Identity", [graph.name(result)], [output]))
     read = {name for node in graph.nodes for name in node.input}
 
