@@ -87,19 +87,27 @@ def study(options: argparse.Namespace) -> None:
             if condition != "clamp" and METHODS.get(label) not in HEURISTICS:
                 continue
             for name, seed in seeds_of(label):
-                changes = {"speed_limit": limit, "physics": options.physics}
+                changes, begun = {"speed_limit": limit, "physics": options.physics}, time.monotonic()
                 flown = of_policy(name, seed, changes, options.episodes)
                 if condition != "clamp" or (name, seed) != seeds_of(label)[0]:
                     for layout in flown["layouts"].values():  # one episode of each method is drawn
                         del layout["paths"]
                 flights.append(
-                    {"method": label, "policy": name, "seed": seed, "condition": condition, **flown}
+                    {
+                        "method": label,
+                        "policy": name,
+                        "seed": seed,
+                        "condition": condition,
+                        "seconds": time.monotonic() - begun,
+                        **flown,
+                    }
                 )
                 print(f"{time.monotonic() - started:5.0f} s  {label}: {name}, {condition}", flush=True)
         # after each method, so that an interrupted study leaves what it has
         command = f"python -m experiments.tables --episodes {options.episodes} --physics {options.physics}"
         results = {"command": command, "commit": options.commit, "machine": describe_machine()}
-        results |= {"seconds": time.monotonic() - started, **alike, "flights": flights}
+        seconds = [flight.get("seconds") for flight in flights]  # of those that are kept, too
+        results |= {"seconds": None if None in seconds else sum(seconds), **alike, "flights": flights}
         write_json(stored, results)
 
 
