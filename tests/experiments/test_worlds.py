@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.worlds.__main__ import make_world, smoothness
+from experiments.worlds.study import make_world, smoothness
 from openjax.pursuit import Pursuit, PursuitSettings
 
 

@@ -1,0 +1,247 @@
+"""Policies in worlds that aren't the simulator: six layouts, drawn starts, no clamp.
+
+    python -m experiments.worlds [--policy open flight] [--world nominal plant ...] [--episodes 100] [--jobs N]
+
+Worlds: the nominal simulator (rate loop at 500 Hz); `table`, the same with the slower vehicle of VEHICLE; `plant`,
+the exam's plant, and with `plant:motor_lag` and so on each of its causes at three quarters of its range; `rotorpy`,
+RotorPy's own Crazyflie. Writes experiments/results/worlds.json and .md (--out).
+"""
+
+import argparse
+import dataclasses
+import functools
+import math
+import multiprocessing
+import os
+import time
+
+from experiments.single_thread import use_single_thread
+
+use_single_thread()
+
+import jax  # noqa: E402
+import numpy as np  # noqa: E402
+
+from experiments.exam import effects  # noqa: E402
+from experiments.pages import page_parser, publish, table, where  # noqa: E402
+from experiments.task_gap.flights import SIZES  # noqa: E402
+from experiments.worlds.game import play  # noqa: E402
+from experiments.worlds.plant import PlantWorld, rng_of  # noqa: E402
+from experiments.worlds.rotorpy import RotorPyWorld  # noqa: E402
+from experiments.worlds.simulator import SimulatorWorld  # noqa: E402
+from openjax.commands.evaluator import layout_slots  # noqa: E402
+from openjax.commands.machine import describe_machine  # noqa: E402
+from openjax.pursuit import SCENARIOS, scenario_task  # noqa: E402
+from openjax.store.policies import load_policy  # noqa: E402
+
+VEHICLE = {
+    "motor_lag": {"extra_up": 0.04, "extra_down": 0.04},
+    "command_latency": {"delay": 0.015},
+    "state_latency": {"delay": 0.01},
+    "rotor_drag": {"d_xy": 0.0125, "d_z": 0.0125},
+}
+"""A Crazyflie with motors 40 ms slower than the nominal, commands 15 ms and poses 10 ms late, and drag."""
+SEED = 500  # of the plant's and RotorPy's sensors; used for nothing else
+PLAIN = ("nominal", "table", "plant", "rotorpy")
+CAUSES = tuple(f"plant:{effect}" for effect in SIZES)
+FAST = 10.0  # Hz
+FIGURES = ("captured", "capture_step", "collision_rate", "crashed", "over_speed_rate")
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """Episodes `start` to `start + number` of a policy in a layout of a world."""
+
+    policy: str
+    world: str
+    layout: str
+    start: int
+    number: int
+
+
+def make_world(world: str, ticks: int, start: int, drones, tasks):
+    """The world of that name for the drones (W, N, ...) of episodes `start` and on."""
+    name, _, effect = world.partition(":")
+    if name == "nominal":
+        return SimulatorWorld(drones, tasks)
+    if name == "table":
+        return SimulatorWorld(drones, tasks, VEHICLE)
+    if name == "rotorpy":
+        return RotorPyWorld(drones, tasks, ticks, SEED, first=start)
+    if name != "plant" or (effect and effect not in SIZES):
+        raise SystemExit(f"world {world!r} is unknown; known: {', '.join((*PLAIN, *CAUSES))}")
+    number = 0 if not effect else 1 + list(SIZES).index(effect)
+    cause = None
+    if effect:
+        form = effects.EFFECTS[effect].forms[0]
+        cause = effects.draw(rng_of(SEED, number, 5), effect, form) | {"size": SIZES[effect]}
+    return PlantWorld(drones, tasks, ticks, SEED, number, cause, first=start)
+
+
+@functools.cache
+def loaded_policy(name: str):
+    """A policy, and its game without clamp and family."""
+    loaded = load_policy(name)
+    settings = dataclasses.replace(
+        loaded.settings.environment,
+        speed_limit="none",
+        start_attitude="drawn",
+        physics="rigid",
+        vehicles=(),
+        rare_vehicles=0.0,
+        max_pillars=layout_slots(loaded.settings.environment),
+    )
+    return loaded, settings
+
+
+def do(job: Job) -> tuple[Job, dict[str, list[float]], float]:
+    """Figures of each episode of a job."""
+    begin = time.perf_counter()
+    loaded, settings = loaded_policy(job.policy)
+    task = scenario_task(settings, SCENARIOS[job.layout])
+    tasks = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], job.number, axis=0), task)
+    keys = jax.vmap(functools.partial(jax.random.fold_in, jax.random.key(SEED)))(
+        np.arange(job.start, job.start + job.number)
+    )
+    make = functools.partial(make_world, job.world, settings.episode_length, job.start)
+    statistics, actions = play(loaded, settings, tasks, keys, make, command_of)
+    figures = {name: np.asarray(getattr(statistics, name), float).tolist() for name in FIGURES}
+    figures |= smoothness(np.stack(actions), settings.time_step)
+    return job, figures, time.perf_counter() - begin
+
+
+def command_of(state, action):
+    """What `play` keeps of a step."""
+    del state
+    return action
+
+
+def smoothness(actions: np.ndarray, time_step: float) -> dict[str, list[float]]:
+    """How smooth commands (T, W, N, 4) in -1..1 are, of each world.
+
+    `change`: mean norm of a command's change; `fast`: share of the commands' variance above 10 Hz.
+    """
+    change = np.linalg.norm(np.diff(actions, axis=0), axis=-1).mean(axis=(0, 2))
+    power = np.abs(np.fft.rfft(actions - actions.mean(axis=0), axis=0)) ** 2
+    high = np.fft.rfftfreq(len(actions), time_step) > FAST
+    fast = power[high].sum(axis=(0, 2, 3)) / (power.sum(axis=(0, 2, 3)) + 1e-12)
+    return {"change": change.tolist(), "fast": fast.tolist()}
+
+
+def study(options: argparse.Namespace) -> dict:
+    """Fly all policies in all layouts of all worlds."""
+    started = time.monotonic()
+    jobs = [
+        Job(policy, world, layout, start, min(options.chunk, options.episodes - start))
+        for world in sorted(options.world, key=lambda name: name != "rotorpy")  # the slowest first
+        for policy in options.policy
+        for layout in options.layout
+        for start in range(0, options.episodes, options.chunk)
+    ]
+    found: dict[str, dict] = {}
+    with multiprocessing.get_context("spawn").Pool(min(options.jobs, len(jobs))) as pool:
+        for done, (job, figures, seconds) in enumerate(pool.imap_unordered(do, jobs), 1):
+            place = found.setdefault(job.policy, {}).setdefault(job.world, {}).setdefault(job.layout, {})
+            for name, values in figures.items():
+                place.setdefault(name, []).extend(values)
+            means = " ".join(f"{name} {np.mean(values):.3f}" for name, values in figures.items())
+            print(
+                f"{done}/{len(jobs)} {job.policy} {job.world} {job.layout} {job.start} {means} ({seconds:.0f} s, "
+                f"{time.monotonic() - started:.0f} s in all)",
+                flush=True,
+            )
+    records = {
+        policy: {
+            world: {
+                layout: {"episodes": len(figures["crashed"])}
+                | {name: float(np.mean(values)) for name, values in figures.items()}
+                for layout, figures in layouts.items()
+            }
+            for world, layouts in worlds.items()
+        }
+        for policy, worlds in found.items()
+    }
+    return {
+        "command": f"python -m experiments.worlds --policy {' '.join(options.policy)} --world {' '.join(options.world)} "
+        f"--episodes {options.episodes}",
+        "machine": describe_machine(),
+        "seconds": time.monotonic() - started,
+        "records": records,
+    }
+
+
+def report(results: dict) -> list[str]:
+    """The page."""
+    lines = [
+        "# Policies in worlds that aren't the simulator",
+        "",
+        f"{where(results)} {results['seconds']:.0f} s. "
+        "No clamp, drawn starts. Nominal: the simulator with the rate loop at 500 Hz; table: the same with motors 40 ms "
+        "slower, commands 15 ms and poses 10 ms late, and drag of .0125 N s/m; plant: the exam's plant (1 kHz, no shared "
+        "code), also with each of its causes at three quarters of its range; rotorpy: RotorPy's own Crazyflie. Change: mean norm "
+        "of a command's change in a step, commands in -1 to 1; above 10 Hz: that share of the commands' variance.",
+        "",
+    ]
+    rows = []
+    for world in next(iter(results["records"].values())):
+        for policy, worlds in results["records"].items():
+            for layout, record in worlds.get(world, {}).items():
+                rows.append([world, policy, layout, *_cells(record)])
+            if worlds.get(world):
+                mean = _mean(list(worlds[world].values()))
+                rows.append([world, policy, "**mean**", *_cells(mean)])
+                rows[-1][4] += " " + interval(mean["captured"], mean["episodes"])
+                rows[-1][7] += " " + interval(mean["crashed"], mean["episodes"])
+    heads = [
+        "world",
+        "policy",
+        "layout",
+        "episodes",
+        "capture",
+        "step",
+        "collision",
+        "crash",
+        "over speed",
+        "change",
+        "above 10 Hz",
+    ]
+    return lines + table(heads, rows)
+
+
+def interval(share: float, number: int, z: float = 1.96) -> str:
+    """The 95 % interval of a share of `number` episodes (Wilson, 1927)."""
+    middle = (share + z * z / (2 * number)) / (1 + z * z / number)
+    half = z / (1 + z * z / number) * math.sqrt(share * (1 - share) / number + (z / (2 * number)) ** 2)
+    return f"[{max(middle - half, 0.0):.2f}, {min(middle + half, 1.0):.2f}]"
+
+
+def _mean(records):
+    return {
+        name: (sum if name == "episodes" else np.mean)([record[name] for record in records])
+        for name in records[0]
+    }
+
+
+def _cells(record):
+    return [
+        str(record["episodes"]),
+        f"{record['captured']:.3f}",
+        f"{record['capture_step']:.0f}",
+        f"{record['collision_rate']:.4f}",
+        f"{record['crashed']:.3f}",
+        f"{record['over_speed_rate']:.3f}",
+        f"{record['change']:.3f}",
+        f"{record['fast']:.3f}",
+    ]
+
+
+def main() -> None:
+    """Fly, or read, and write the page."""
+    parser = page_parser(__doc__, "worlds")
+    parser.add_argument("--policy", nargs="+", default=["open", "flight"], help="names, runs or policy files")
+    parser.add_argument("--world", nargs="+", default=list(PLAIN), help=", ".join((*PLAIN, *CAUSES)))
+    parser.add_argument("--layout", nargs="+", default=list(SCENARIOS))
+    parser.add_argument("--episodes", type=int, default=100, help="per layout")
+    parser.add_argument("--chunk", type=int, default=50, help="episodes that one process flies at once")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    publish(parser.parse_args(), study, report)
