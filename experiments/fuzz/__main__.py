@@ -101,8 +101,10 @@ def run_damages(pool: ProcessPoolExecutor, scratch: Path, command: FuzzCommand, 
         pool.submit(try_damages, scratch, range(first, min(first + 20, command.damages)))
         for first in range(0, command.damages, 20)
     ]
-    outcomes = Counter(outcome for piece in pieces for outcome in piece.result())
-    results.put("damages", {"outcomes": dict(outcomes)})
+    outcomes: Counter = Counter()
+    for piece in as_completed(pieces):
+        outcomes.update(piece.result())
+        results.put("damages", {"outcomes": dict(outcomes)})
 
 
 def run_kills(pool: ProcessPoolExecutor, scratch: Path, command: FuzzCommand, results: Results) -> None:
