@@ -4,7 +4,9 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
+from openjax.policy import encoder
 from openjax.policy.attention import (
     BLOCK,
     ROWS,
@@ -57,7 +59,15 @@ def textbook(p, own, others, pillars, seen):
     return np.concatenate(mixed, axis=1) @ p["output"]
 
 
-def test_folded_attention_is_multi_head_attention_with_one_query():
+@pytest.fixture
+def on_machine(monkeypatch):
+    """Choose the program for machines with or without CUDA: kernels' formula, or one entity at a time."""
+    return lambda cuda: monkeypatch.setattr(encoder, "can_compile_for_cuda", lambda: cuda)
+
+
+@pytest.mark.parametrize("cuda", [True, False])
+def test_folded_attention_is_multi_head_attention_with_one_query(cuda, on_machine):
+    on_machine(cuda)
     draw = np.random.default_rng(0)
     own = draw.normal(size=(7, FEATURES))
     others, pillars = draw.normal(size=(7, 2, 3)), draw.normal(size=(7, 3, 5))
@@ -71,6 +81,29 @@ def test_folded_attention_is_multi_head_attention_with_one_query():
         folded = jax.jit(module.apply)(parameters, *arguments)
     expected = textbook(parameters["params"], own, others, pillars, seen)
     np.testing.assert_allclose(folded, expected, atol=2e-4 * np.abs(expected).max())
+
+
+def test_both_programs_have_the_same_gradients(on_machine):
+    keys = jax.random.split(jax.random.key(4), 4)
+    seen = jax.random.uniform(keys[3], (9, 3)) < 0.5
+    own, others, pillars = (
+        jax.random.normal(k, (9, *s)) for k, s in zip(keys[:3], [(20,), (2, 3), (3, 5)], strict=True)
+    )
+    module = encoder.Encoder(FEATURES, HEADS, jnp.float32)
+    parameters = shaken(jax.jit(module.init)(jax.random.key(0), own, others, pillars, seen), 1)
+
+    def gradient(cuda):
+        on_machine(cuda)
+
+        def loss(parameters, own):
+            return jnp.sum(jnp.sin(module.apply(parameters, own, others, pillars, seen)))
+
+        with jax.default_matmul_precision("highest"):
+            return jax.jit(jax.grad(loss, argnums=(0, 1)))(parameters, own)
+
+    one_by_one, fused = gradient(cuda=False), gradient(cuda=True)
+    for (path, a), b in zip(jax.tree.leaves_with_path(one_by_one), jax.tree.leaves(fused), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-4 * float(jnp.abs(b).max()) + 1e-5, err_msg=str(path))
 
 
 def test_normalised_linear_is_layer_norm_of_the_linear_layer():

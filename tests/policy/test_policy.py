@@ -117,6 +117,27 @@ def test_a_critic_of_observations_does_not_see_it():
     np.testing.assert_array_equal(value(observation), value(more))
 
 
+def test_a_critic_of_layers_sees_all_and_each_pursuer_its_own():
+    policy = Policy(
+        NetworkSettings(features=16, heads=2, critic_encoder="layers"), PredictorSettings(enabled=False)
+    )
+    observation = observation_of(4)
+    parameters = jax.jit(policy.init)(jax.random.key(0), observation)
+
+    @jax.jit
+    def slopes(observation):
+        def of_first(observation):
+            return jnp.sum(policy.value(parameters.actor, parameters.critic, observation, None)[:, 0])
+
+        return jax.grad(of_first, allow_int=True)(observation)
+
+    slopes = slopes(observation)
+    for name in ("self_state", "others", "pillars", "privileged"):
+        slope = getattr(slopes, name)
+        assert (slope[:, 0] != 0).all(), name
+        assert (slope[:, 1:] == 0).all(), name
+
+
 def test_one_pursuer_without_predictor_starts_near_hover():
     policy = Policy(
         NetworkSettings(features=16, heads=4, compute_type="bfloat16"),
@@ -188,6 +209,10 @@ def test_predictor_is_an_lstm_whose_range_is_the_arena(relative):
     ("make", "message"),
     [
         (lambda: NetworkSettings(features=10, heads=4), "features 10 must be a multiple of heads 4"),
+        (
+            lambda: NetworkSettings(shared_encoder=True, critic_encoder="layers"),
+            "critic_encoder layers has no effect",
+        ),
         (lambda: PredictorSettings(horizons=(2, 3)), "must start with 1"),
         (lambda: PredictorSettings(windows=5, steps=2), "windows 5 must be a multiple of steps 2"),
     ],

@@ -168,9 +168,10 @@ def update_policy(
     batch = _partition(batch, settings.minibatches)
     clip = settings.clip_epsilon + (settings.clip_epsilon_end - settings.clip_epsilon) * progress
 
-    def gradient_step(carry, index):
+    def gradient_step(carry, chosen):
         actor, critic = carry
-        part = jax.tree.map(lambda x: x[index], batch)
+        index, first = chosen
+        part = jax.tree.map(lambda x: _every(x[index], first, settings.sample_every), batch)
         gradient, watch = jax.grad(lambda p: loss(settings, policy, p, part, clip), has_aux=True)(
             (actor.parameters, critic.parameters)
         )
@@ -184,9 +185,20 @@ def update_policy(
     order = jax.vmap(lambda k: jax.random.permutation(k, settings.minibatches))(
         jax.random.split(key, settings.epochs)
     ).ravel()
-    (actor, critic), watch = jax.lax.scan(gradient_step, (actor, critic), order)
+    first = None
+    if settings.sample_every > 1:
+        first = jax.random.randint(jax.random.fold_in(key, 1), order.shape, 0, settings.sample_every)
+    (actor, critic), watch = jax.lax.scan(gradient_step, (actor, critic), (order, first))
     metrics = jax.tree.map(jnp.mean, watch) | {"explained_variance": explained, "value_scale": std}
     return actor, critic, scale, metrics
+
+
+def _every(x, first, number):
+    """(E, T, ...) to (E, T / number, ...): every `number`-th step from `first` on."""
+    if number == 1:
+        return x
+    x = x.reshape(x.shape[0], -1, number, *x.shape[2:])
+    return jax.lax.dynamic_index_in_dim(x, first, axis=2, keepdims=False)
 
 
 def _partition(batch: Batch, minibatches: int) -> Batch:

@@ -23,6 +23,9 @@ class MappoSettings:
     first."""
     epochs: Annotated[int, Interval("[1, 1000]")] = 4
     minibatches: Annotated[int, Interval("[1, 100000]")] = 16
+    sample_every: Annotated[int, Interval("[1, 100000]")] = 1
+    """A gradient step sees every n-th step of its trajectories, from a first one drawn each time: consecutive steps are so
+    alike that fewer of them teach nearly as much. Divides `rollout_length`."""
     clip_epsilon: Annotated[float, Interval("(0, 10]")] = 0.1
     """Clip range of the probability ratio at the start ..."""
     clip_epsilon_end: Annotated[float, Interval("(0, 10]")] = 0.1
@@ -143,6 +146,10 @@ class TrainSettings:
         need(
             self.num_envs % self.mappo.minibatches == 0,
             f"num_envs {self.num_envs} must be a multiple of mappo.minibatches {self.mappo.minibatches}",
+        )
+        need(
+            rollout % self.mappo.sample_every == 0,
+            f"mappo.sample_every {self.mappo.sample_every} must divide rollout_length {rollout}",
         )
         if self.predictor.enabled:
             room = rollout - self.predictor.horizons[-1] + 1

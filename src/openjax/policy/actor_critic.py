@@ -69,9 +69,7 @@ class Critic(nn.Module):
             own = own_features(observation, predicted)
             if sees_state:
                 own = jnp.concatenate([own, observation.privileged], axis=-1)
-            hidden = Encoder(settings.features, settings.heads, dtype, name="encoder")(
-                own, observation.others, observation.pillars, observation.pillar_seen
-            )
+            hidden = self._encoded(own, observation, dtype)
         leading = hidden.shape[:-1]
         hidden = HiddenLayer(settings.features, dtype, name="hidden")(
             hidden.reshape(math.prod(leading), hidden.shape[-1])
@@ -80,6 +78,22 @@ class Critic(nn.Module):
             hidden
         )
         return value.reshape(leading)
+
+    def _encoded(self, own, observation, dtype):
+        settings, leading = self.settings, own.shape[:-1]
+        if settings.critic_encoder == "attention":
+            return Encoder(settings.features, settings.heads, dtype, name="encoder")(
+                own, observation.others, observation.pillars, observation.pillar_seen
+            )
+        number = math.prod(leading)
+        parts = [
+            x.reshape(number, math.prod(x.shape[len(leading) :]))
+            for x in (own, observation.others, observation.pillars)
+        ]
+        hidden = padded(jnp.concatenate(parts, axis=-1))
+        for name in ("layer_1", "layer_2"):
+            hidden = HiddenLayer(2 * settings.features, dtype, name=name)(hidden)
+        return hidden.reshape(*leading, hidden.shape[-1])
 
 
 def own_features(observation: Observation, predicted: jax.Array | None) -> jax.Array:

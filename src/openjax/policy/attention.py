@@ -89,6 +89,35 @@ def attend(
     return _attend(query, own, inputs, inverse, weights, layout)
 
 
+def attend_one_by_one(
+    queries: list[jax.Array], entities: list[jax.Array], biases: list[jax.Array | float]
+) -> list[jax.Array]:
+    """The same mean from arrays of their own for every head and entity, as XLA's CPU compiler wants them.
+
+    Batches of tiny products are loops without vector instructions there, and so is whatever is fused with a slice or
+    a concatenation of entities; sums over features and (B, features) arrays alone run at full width.
+
+    Args:
+        queries: (B, features) of each head, scaled.
+        entities: (B, features) each, the pursuer itself included.
+        biases: (B, 1) or a number each, added to an entity's scores.
+
+    Returns:
+        (B, features) of each head.
+    """
+    means = []
+    for query in queries:
+        scores = [
+            jnp.sum(query * e, axis=-1, keepdims=True) + b for e, b in zip(entities, biases, strict=True)
+        ]
+        top = jax.lax.stop_gradient(functools.reduce(jnp.maximum, scores))
+        parts = [jnp.exp(score - top) for score in scores]
+        inverse = 1.0 / functools.reduce(jnp.add, parts)
+        weighted = [(part * inverse) * e for part, e in zip(parts, entities, strict=True)]
+        means.append(functools.reduce(jnp.add, weighted))
+    return means
+
+
 @functools.partial(jax.custom_vjp, nondiff_argnums=(5,))
 def _attend(query, own, inputs, inverse, weights, layout):
     return on_platform(_reference, _forward_kernel_call, layout)(query, own, inputs, inverse, weights)

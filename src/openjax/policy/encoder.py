@@ -6,8 +6,9 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from openjax.policy.attention import EntityKind, Layout, attend
-from openjax.policy.normalisation import normalise
+from openjax.platform import can_compile_for_cuda
+from openjax.policy.attention import EntityKind, Layout, attend, attend_one_by_one
+from openjax.policy.normalisation import normalise, normalised_layer
 
 MASKED = -1e4
 """Added to the score of an entity that isn't there."""
@@ -47,12 +48,12 @@ class SelfAttention(nn.Module):
             kernel("value", (f, f)).reshape(f, h, width),
             kernel("output", (f, f)).reshape(h, width, f),
         )
-        kinds, weights, inputs, inverses, bias = [], [], [], [], []
         embed = nn.initializers.orthogonal(2**0.5)
         seen = jnp.where(pillar_seen, 0.0, MASKED)
-        for name, x, b in (("others", others, jnp.zeros(others.shape[:-1])), ("pillars", pillars, seen)):
-            count, size = x.shape[-2:]
-            if count == 0:
+        entities = []
+        for name, x, bias in (("others", others, jnp.zeros(others.shape[:-1])), ("pillars", pillars, seen)):
+            size = x.shape[-1]
+            if x.shape[-2] == 0:
                 continue
             linear = jnp.concatenate(
                 [
@@ -60,19 +61,45 @@ class SelfAttention(nn.Module):
                     kernel(f"{name}_bias", (1, f), nn.initializers.zeros_init()),
                 ]
             )
+            scale = kernel(f"{name}_scale", (f,), nn.initializers.ones_init())
+            shift = kernel(f"{name}_shift", (1, f), nn.initializers.zeros_init())
+            entities.append((x, linear, scale, shift, bias))
+        if can_compile_for_cuda():
+            return self._fused(own, query, output, entities)
+        return self._one_by_one(own, query, output, entities)
+
+    def _one_by_one(self, own, query, output, kinds):
+        """Entity by entity and head by head: matrix products of whole batches, which a CPU is good at."""
+        embedded, biases = [own.astype(jnp.float32)], [0.0]
+        for x, linear, scale, shift, bias in kinds:
+            affine = jnp.stack([linear[-1], scale, shift[0]])
+            for m in range(x.shape[-2]):
+                embedded.append(normalised_layer(x[:, m], linear[:-1], affine))
+                biases.append(bias[:, m : m + 1])
+        own, scale = own.astype(self.dtype), (self.features // self.heads) ** -0.5
+        queries = [
+            scale * (own @ query[:, h].astype(self.dtype)).astype(jnp.float32) for h in range(self.heads)
+        ]
+        means = attend_one_by_one(queries, embedded, biases)
+        return sum(means[h].astype(self.dtype) @ output[h].astype(self.dtype) for h in range(self.heads))
+
+    def _fused(self, own, query, output, entities):
+        """By the kernels for GPUs, and the formula that stands for them elsewhere."""
+        f, h = self.features, self.heads
+        width = f // h
+        kinds, weights, inputs, inverses, biases = [], [], [], [], []
+        for x, linear, scale, shift, bias in entities:
+            count, size = x.shape[-2:]
             inverse, linear = normalised_linear(x, linear)
             kinds.append(EntityKind(count, size))
-            weights += [
-                linear * kernel(f"{name}_scale", (f,), nn.initializers.ones_init()),
-                kernel(f"{name}_shift", (1, f), nn.initializers.zeros_init()),
-            ]
+            weights += [linear * scale, shift]
             inputs.append(x.reshape(x.shape[0], count * size))
             inverses.append(inverse)
-            bias.append(b)
+            biases.append(bias)
         mean = attend(
             own.astype(self.dtype) @ query.reshape(f, h * f).astype(self.dtype),
             own,
-            jnp.concatenate(inputs + bias, axis=1).astype(jnp.float32).T,
+            jnp.concatenate(inputs + biases, axis=1).astype(jnp.float32).T,
             jnp.concatenate(inverses, axis=1).T,
             jnp.concatenate(weights),
             Layout(f, h, tuple(kinds), width**-0.5),
@@ -140,8 +167,10 @@ class HiddenLayer(nn.Module):
         """(B, inputs) -> (B, features)."""
         init = nn.initializers.orthogonal(2**0.5)
         kernel = self.param("kernel", init, (x.shape[-1], self.features), jnp.float32)
-        x = x.astype(self.dtype) @ kernel.astype(self.dtype)
-        return normalise(x, affine_parameters(self, "affine", self.features))
+        affine = affine_parameters(self, "affine", self.features)
+        if not can_compile_for_cuda():
+            return normalised_layer(x.astype(self.dtype), kernel, affine)
+        return normalise(x.astype(self.dtype) @ kernel.astype(self.dtype), affine)
 
 
 def padded(x: jax.Array) -> jax.Array:

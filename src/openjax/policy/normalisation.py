@@ -38,6 +38,24 @@ def normalise(x: jax.Array, affine: jax.Array, activate: bool = True) -> jax.Arr
     return _normalise(x, affine, activate)
 
 
+def normalised_layer(x: jax.Array, kernel: jax.Array, affine: jax.Array) -> jax.Array:
+    """`normalise(x @ kernel, affine)` with centred weights, whose output needs no centring: half the sums, forward and backward.
+
+    Args:
+        x: (B, inputs), whose type is that of the product.
+        kernel: (inputs, features) float32.
+        affine: (3, features) float32, the rows bias, scale, shift.
+
+    Returns:
+        (B, features) in the type of `x`.
+    """
+    kernel = kernel - jnp.mean(kernel, axis=-1, keepdims=True)
+    bias = affine[0] - jnp.mean(affine[0])
+    y = (x @ kernel.astype(x.dtype)).astype(jnp.float32) + bias
+    inverse = jax.lax.rsqrt(jnp.mean(y * y, axis=-1, keepdims=True) + EPSILON)
+    return activation(affine[1] * (y * inverse) + affine[2]).astype(x.dtype)
+
+
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
 def _normalise(x, affine, activate):
     return on_platform(_reference, _forward_kernel_call, activate)(x, affine)
