@@ -66,7 +66,7 @@ def main(arguments: Sequence[str]) -> int:
     on_cpu = jax.default_backend() == "cpu"
     default = BenchmarkCommand(
         envs=(64, 512) if on_cpu else (2048, 8192, 32768, 131072, 1048576),
-        training_envs=(160,) if on_cpu else (2048, 4096, 8192, 16384),
+        training_envs=(320,) if on_cpu else (2048, 4096, 8192, 16384),
         settings=preset(peek(arguments, "preset") or ("quick" if on_cpu else "paper")),
     )
     command = parse(BenchmarkCommand, default, arguments, PROGRAM)

@@ -22,6 +22,11 @@ def test_products_of_a_sample_are_those_of_the_folded_attention():
     assert _products(preset("paper"), {"params": {"encoder": encoder}}) == by_hand
 
 
+def test_a_critic_of_layers_attends_to_nothing():
+    layers = {"layer_1": {"kernel": jax.ShapeDtypeStruct((72, 2 * F), jnp.float32)}}
+    assert _products(preset("paper"), {"params": layers}) == 72 * 2 * F
+
+
 def test_the_limit_is_what_takes_longer():
     assert Share("x", 1.0, flops=ARITHMETIC, bytes=BANDWIDTH / 2).limit == pytest.approx(1.0)
     assert Share("x", 1.0, flops=0.0, bytes=2 * BANDWIDTH).limit == pytest.approx(2.0)

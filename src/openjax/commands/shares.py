@@ -118,7 +118,7 @@ def measure(settings: TrainSettings, seconds_of: Callable[[Callable, tuple], flo
         2 * settings.environment.history_length * sum(x.size for x in jax.tree.leaves(carry.policy.predictor))
     )
     observed = _bytes(carry.observation.replace(frames=())) * steps
-    update = settings.mappo.epochs
+    update = settings.mappo.epochs / settings.mappo.sample_every
     shares = [
         Share("physics", seconds["physics"], 0.0, 2 * _bytes(carry.state.drones) * steps),
         Share(
@@ -173,30 +173,32 @@ def _products(settings: TrainSettings, parameters: Any) -> int:
     uses = {"others_kernel": game.num_pursuers - 1, "pillars_kernel": game.observed_pillars}
     # query and output are as wide as an embedding for each head, keys and values are folded into them
     uses |= {"query": network.heads, "output": network.heads, "key": 0, "value": 0}
-    total = 0
+    total, attends = 0, False
     for path, leaf in jax.tree_util.tree_flatten_with_path(parameters)[0]:
         name = path[-1].key
+        attends |= name == "query"
         if leaf.ndim == 2 and (name == "kernel" or name in uses):
             total += math.prod(leaf.shape) * uses.get(name, 1)
     entities = game.num_pursuers + game.observed_pillars
-    return total + (2 * network.heads * entities * network.features if total else 0)
+    return total + (2 * network.heads * entities * network.features if attends else 0)
 
 
 def shares_table(shares: list[Share], settings: TrainSettings) -> Table:
-    """Parts of the step as a table."""
+    """Parts of the step as a table; the limit is an H200's, and a CPU is spared it."""
+    on_cpu = jax.default_backend() == "cpu"
     speed = settings.steps_per_update / shares[-1].seconds
     title = f"Where a training step's time goes: {settings.num_envs:,} worlds, {speed:,.0f} env steps/s"
     caption = f"limit: {BANDWIDTH / 1e12:.1f} TB/s, {ARITHMETIC / 1e12:.0f} TFLOP/s (H200) for what must be moved or multiplied"
     table = Table(
         title=title,
         title_justify="left",
-        caption=caption,
+        caption=None if on_cpu else caption,
         caption_justify="left",
         box=box.SIMPLE,
         pad_edge=False,
     )
     table.add_column("part")
-    for name in ("ms", "share", "GFLOP", "GB", "limit [ms]"):
+    for name in ("ms", "share", "GFLOP", "GB", *([] if on_cpu else ["limit [ms]"])):
         table.add_column(name, justify="right")
     for share in shares:
         table.add_row(
@@ -205,6 +207,6 @@ def shares_table(shares: list[Share], settings: TrainSettings) -> Table:
             f"{share.seconds / shares[-1].seconds:.0%}",
             f"{share.flops / 1e9:,.1f}",
             f"{share.bytes / 1e9:,.2f}",
-            f"{share.limit * 1e3:,.2f}",
+            *([] if on_cpu else [f"{share.limit * 1e3:,.2f}"]),
         )
     return table
