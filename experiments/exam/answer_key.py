@@ -57,18 +57,14 @@ def answer_of(fleet, i, squares, floor, wrong):
     names = [*seen, *(n for n in names if n not in seen)]
     total = max(float(excess.sum()), 1e-12)
     parts = [n for c in own for n in effects.PARTS.get((c["effect"], c["form"]), ())]
-    magnitudes = [
-        m
-        | (
-            {"logged_ms": sensors.pose_lag(m["delay_ms"], spec["sensors"])}
-            if c["effect"] == "state_latency"
-            else {}
-        )
-        for c, m in zip(own, fleet.magnitudes[i], strict=True)
-    ]
+    causes = [c | {"magnitudes": dict(m)} for c, m in zip(own, fleet.magnitudes[i], strict=True)]
+    for cause in causes:
+        if cause["effect"] == "state_latency":
+            said = cause["magnitudes"]
+            said["logged_ms"] = sensors.pose_lag(said["delay_ms"], spec["sensors"])
     gap = {k: float(np.sqrt(energy[k][np.isfinite(floor)].mean())) for k in ("nominal", "truth")}
     expected = {"none": ["none"], "not_testable": ["none"], "unknown": ["unknown"], "garbage": ["garbage"]}
-    told = {
+    acceptable = {
         n: accepted(n, spec["told"].weighed, shows[n], _scale_stands_in(fleet, i, n, squares, floor))
         for n in shows
     }
@@ -77,11 +73,11 @@ def answer_of(fleet, i, squares, floor, wrong):
         "category": category,
         "effects": names or ([spec["garbage"]] if spec["garbage"] else []),
         "expected": expected.get(category, seen),
-        "acceptable": told,
+        "acceptable": acceptable,
         "also_fine": spec["also_fine"] + parts + [n for n in names if n not in seen],
         "held_ms": 1e3 / spec["sensors"]["pose_rate"] if sensors.holds_poses(spec["sensors"]) else None,
         "in_sensors": bool(set(names) & set(unknowns.SENSOR_KINDS)),
-        "causes": [c | {"magnitudes": m} for c, m in zip(own, magnitudes, strict=True)],
+        "causes": causes,
         "severity": cases.label(severity) if own else None,
         "severity_ratio": round(severity, 3),
         "shares": {
