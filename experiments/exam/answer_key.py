@@ -65,7 +65,7 @@ def answer_of(fleet, i, squares, floor, wrong):
     gap = {k: float(np.sqrt(energy[k][np.isfinite(floor)].mean())) for k in ("nominal", "truth")}
     expected = {"none": ["none"], "not_testable": ["none"], "unknown": ["unknown"], "garbage": ["garbage"]}
     acceptable = {
-        n: accepted(n, spec["told"].weighed, shows[n], _scale_stands_in(fleet, i, n, squares, floor))
+        n: accepted(n, spec["told"].weighed, shows[n], scale_stands_in(fleet, i, n, squares, floor))
         for n in shows
     }
     return {
@@ -103,7 +103,7 @@ def answer_of(fleet, i, squares, floor, wrong):
     }
 
 
-def _scale_stands_in(fleet, i, name, squares, floor):
+def scale_stands_in(fleet, i, name, squares, floor):
     """Whether one constant factor on the thrust leaves less than `HIDDEN` floors of a cause in the map to thrust."""
     if name not in ("battery_sag", "thrust_curve"):
         return False
@@ -118,7 +118,8 @@ def _scale_stands_in(fleet, i, name, squares, floor):
         active = effects.Active(p, vehicle.nominal_parameters([fleet.told[j] for j in c]))
         demands.append([effects.motor_demand(p, active, *now) for now in zip(m, voltage, load, strict=True)])
     true, plain = np.array(demands)
-    without["rotor_gain"][:, c] *= (true * plain).sum() / (plain**2).sum()
+    # on the command, so that the rotors' speeds at the start of a window are those that flew
+    without["curve_map"][1, c] *= (true * plain).sum() / (plain**2).sum()
     left = fleet.replayed(i, without)[FORCE] - squares["truth"][FORCE]
     return bool(np.sqrt(np.maximum(left, 0.0) / floor[FORCE] ** 2).max() < HIDDEN)
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.exam import cases, fleet, sensors, vehicle
+from experiments.exam import answer_key, cases, effects, fleet, sensors, vehicle
 from openjax.vehicle import (
     load_vehicle,
     rate_controller,
@@ -17,13 +17,14 @@ from openjax.vehicle import (
 from openjax.vehicle.state import DroneState
 
 TICKS = 500
-FLIGHTS = {1: ("agile", "yaw", "fast"), 2: ("climb", "step", "agile")}
+FLIGHTS = {1: ("agile", "yaw", "fast"), 2: ("climb", "step", "agile"), 3: ("laps",)}
 
 
-def fly(*numbers):
-    """Nominal vehicles, told exactly, with hard manoeuvres in light turbulence."""
+def fly(*numbers, causes=(), **changes):
+    """Vehicles told exactly, with hard manoeuvres in light turbulence; `changes` of their sensors."""
     drawn = sensors.draw(np.random.default_rng(3), "white", "psgacmv", "light")
     drawn |= {"constants_off": [0.0] * 5, "thrust_offset": 0.0, "gyro_cut": 0.0, "derivative_cut": 0.0}
+    drawn |= changes
     specs = [
         {
             "name": f"case_{n}",
@@ -36,7 +37,7 @@ def fly(*numbers):
         for n in numbers
     ]
     bodies = {s["name"]: fleet.bodies(5, "known", s) for s in specs}
-    return fleet.Fleet(5, "known", [(s, []) for s in specs], bodies)
+    return fleet.Fleet(5, "known", [(s, list(causes)) for s in specs], bodies)
 
 
 @pytest.fixture(scope="module")
@@ -136,3 +137,14 @@ def test_a_case_does_not_depend_on_its_companions(nominal):
     np.testing.assert_array_equal(
         alone.flown["velocity"], nominal.flown["velocity"][:, :, nominal.columns[1]]
     )
+
+
+def test_a_factor_stands_in_for_a_battery_only_while_its_voltage_stays(monkeypatch):
+    """Else the key would want a name that no reader of one steady flight could know, or let any scale pass for a battery."""
+    monkeypatch.setattr(cases, "TICKS", 400)
+    sag = effects.draw(np.random.default_rng(1), "battery_sag", "linear") | {"size": 1.2}
+    for discharge, stands_in in ((0.0, True), (0.2, False)):
+        flown = fly(3, causes=[sag], discharge=discharge, resistance=0.0)
+        squares = {"truth": flown.replayed(0, flown.parameters)}
+        floor = np.sqrt(squares["truth"]) + 0.02
+        assert answer_key.scale_stands_in(flown, 0, "battery_sag", squares, floor) == stands_in
