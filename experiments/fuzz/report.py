@@ -7,8 +7,10 @@ from experiments.pages import table, where
 
 
 def page(parts: dict) -> str:
-    """The results as Markdown; parts are `cases`, `damages`, `kills`, any of which may be missing."""
+    """The results as Markdown; parts are `note`, `cases`, `damages`, `kills`, any of which may be missing."""
     lines = ["# Hostile input, damaged checkpoints, kills"]
+    if "note" in parts:  # written by hand, of what was measured elsewhere
+        lines += ["", parts["note"]]
     for name, section in (("cases", _cases), ("damages", _damages), ("kills", _kills)):
         if name in parts:
             part = parts[name]
@@ -46,7 +48,7 @@ def _row(kind, counts):
 
 
 MEANING = {
-    "same": "what was hit held nothing of the state",
+    "same": "the newest restored, bit for bit: the older one was hit, or nothing of the state",
     "before": "found, and the checkpoint before it restored, bit for bit",
     "refused": "both were hit, or the only undamaged one was gone, and one line says so",
 }
