@@ -2,43 +2,63 @@
 
 import dataclasses
 import math
+import typing
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from openjax import calibrate, diagnose, export, fly, sample_flights, virtual_crazyflie
+from openjax.adapt import AdaptCommand
 from openjax.benchmark import BenchmarkCommand
 from openjax.commands.command_line import parse
 from openjax.commands.training_command import TrainCommand
 from openjax.errors import UserError
 from openjax.evaluate import EvaluateCommand
+from openjax.flying.limits import SafetySettings
+from openjax.flying.virtual_link import LinkFaults
 from openjax.learning import GeneratorSettings, MappoSettings, TrainSettings
+from openjax.learning.adaptation import AdaptSettings
 from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import PursuitSettings, RewardSettings
 from openjax.ranges import Interval, check_intervals, ranged_fields
 from openjax.store.old_names import train_settings
 from openjax.store.settings_files import to_plain
+from openjax.view import ViewCommand
 
 SETTINGS = (
+    AdaptSettings,
     GeneratorSettings,
+    LinkFaults,
     MappoSettings,
     NetworkSettings,
     PredictorSettings,
     PursuitSettings,
     RewardSettings,
+    SafetySettings,
     TrainSettings,
 )
-COMMANDS = (BenchmarkCommand, EvaluateCommand, TrainCommand)
+COMMANDS = (
+    AdaptCommand,
+    BenchmarkCommand,
+    EvaluateCommand,
+    TrainCommand,
+    ViewCommand,
+    export.Arguments,
+    fly.Arguments,
+    virtual_crazyflie.Arguments,
+)
+OF_FLIGHTS = (calibrate.Arguments, diagnose.Options, sample_flights.Arguments)
+"""They can't be made without a folder."""
 FIELDS = [(kind, field) for kind in (*SETTINGS, *COMMANDS) for field in ranged_fields(kind)]
 
 
 def test_every_number_declares_a_range():
-    for kind in (*SETTINGS, *COMMANDS):
+    numbers = {int, float, int | None, float | None}
+    for kind in (*SETTINGS, *COMMANDS, *OF_FLIGHTS):
         ranged = {field.name for field in ranged_fields(kind)}
-        for field in dataclasses.fields(kind):
-            value = field.default
-            if isinstance(value, int | float) and not isinstance(value, bool):
-                assert field.name in ranged, f"{kind.__name__}.{field.name}"
+        for name, hint in typing.get_type_hints(kind).items():
+            assert name in ranged or hint not in numbers, f"{kind.__module__}.{kind.__name__}.{name}"
 
 
 def outside(interval: Interval):

@@ -12,10 +12,11 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from openjax.commands.command_line import output_console, parse, run_command
 from openjax.errors import UserError
+from openjax.ranges import Interval, Seed
 
 PROGRAM = "python -m openjax.export"
 TOLERANCE = 2e-5
@@ -37,9 +38,9 @@ class Arguments:
     """One pursuer's action instead of the whole team's."""
     out: Path = Path("exported")
     """Folder to write to."""
-    observations: int = 10_000
+    observations: Annotated[int, Interval("[1, 100000000]")] = 10_000
     """How many observations of its game it is compared on."""
-    seed: int = 0
+    seed: Seed = 0
     """Draws them."""
 
 

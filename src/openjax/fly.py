@@ -7,6 +7,7 @@ that `python -m openjax.diagnose` reads.
 from __future__ import annotations
 
 import dataclasses
+import math
 import select
 import shutil
 import sys
@@ -44,19 +45,19 @@ class Arguments:
     """Layout: a name or a TOML file. Pillars exist in the computer only, unless you put them up."""
     episodes: Annotated[int, Interval("[1, 100000]")] = 1
     """Games, one after the other. Between them all fly straight back: with real pillars leave it at 1."""
-    episode_seconds: float = float("inf")
+    episode_seconds: Annotated[float | None, Interval("(0, 1e9]")] = None
     """End each game after this time; otherwise it lasts as long as in training."""
     out: Path | None = None
     """Folder for the logs, a case for openjax.diagnose; must not exist or be empty."""
     vehicle: Path | None = None
     """What flies (vehicle.toml), for the hover thrust and the case."""
-    body_logs: int | None = None
+    body_logs: Annotated[int | None, Interval("[0, 5]")] = None
     """Log blocks of motors and accelerometer per vehicle, 0 to 5; default 5 over UDP, 1 over radio."""
     motion_capture: str | None = None
     """MODULE:FUNCTION that feeds poses; default: the vehicles' own estimates. See openjax.flying.motion_capture."""
     guard: bool = True
     """A second process lands the vehicles if this one stops."""
-    guard_after: float = 0.1
+    guard_after: Annotated[float, Interval("[0.01, 60]")] = 0.1
     """Silence of this one after which it does (s)."""
     watchdog: bool = False
     """Let the firmware stop the motors 1 s after the last set-point (otherwise 2 s); the vehicles must be restarted after
@@ -111,7 +112,7 @@ def fly(arguments: Arguments):
     vehicles = links = Links(uris, body_logs, arguments.watchdog)
     console.print(f"connecting to {', '.join(uris)} ...")
     links.connect()
-    plan = Plan(arguments.episodes, arguments.episode_seconds)
+    plan = Plan(arguments.episodes, arguments.episode_seconds or math.inf)
     guard = flight = None
     with _Keys() as keys:
         try:
@@ -166,10 +167,6 @@ def fly(arguments: Arguments):
 
 
 def _check(arguments):
-    if arguments.episodes < 1:
-        raise UserError(f"--episodes is {arguments.episodes}; it must be at least 1")
-    if arguments.body_logs is not None and not 0 <= arguments.body_logs <= 5:
-        raise UserError(f"--body_logs is {arguments.body_logs}; 0 to 5 are possible")
     if len(set(arguments.uri)) < len(arguments.uri):
         raise UserError("--uri names a vehicle twice")
     out = arguments.out

@@ -6,6 +6,7 @@ time, rate loop at 500 Hz, with any effects, and a link with latency and loss to
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +15,6 @@ from typing import Annotated
 import tyro
 
 from openjax.commands.command_line import output_console, parse, run_command
-from openjax.errors import UserError
 from openjax.flying.virtual_link import BASE_PORT, LinkFaults
 from openjax.ranges import Interval, Seed
 
@@ -25,7 +25,7 @@ PROGRAM = "python -m openjax.virtual_crazyflie"
 class Arguments:
     """Fly virtual Crazyflies until interrupted; each has a port of its own."""
 
-    number: Annotated[int, Interval("[1, 100]")] = 3
+    number: Annotated[int, Interval("[1, 10]")] = 3
     """How many."""
     host: str = "127.0.0.1"
     """Address to listen at."""
@@ -43,8 +43,8 @@ class Arguments:
     """Seconds of hover that a full battery lasts."""
     needs_arming: bool = True
     """Motors stay off until armed; False: armed from the start, as brushed Crazyflies are."""
-    seconds: float = float("inf")
-    """End after this time."""
+    seconds: Annotated[float | None, Interval("(0, 1e9]")] = None
+    """End after this time; by default only when interrupted."""
     seed: Seed = 0
     """Draws losses and jitter."""
     link: tyro.conf.OmitArgPrefixes[LinkFaults] = field(default_factory=LinkFaults)
@@ -58,10 +58,6 @@ def make(arguments: Arguments):
     from openjax.vehicle.effects import load_effects
     from openjax.vehicle.vehicle_file import load_vehicle_file
 
-    if not 1 <= arguments.number <= 10:
-        raise UserError(f"--number is {arguments.number}; 1 to 10 are possible")
-    if not 0.0 <= arguments.battery <= 1.0 or not arguments.endurance > 0.0:
-        raise UserError("--battery must lie between 0 and 1, --endurance above 0 s")
     scenario = find_scenario(arguments.scenario, PursuitSettings())
     stands = [start[:2] for start in scenario.pursuers][: arguments.number]
     stands += [(0.2 * i, -1.4) for i in range(arguments.number - len(stands))]
@@ -90,7 +86,7 @@ def main(arguments: Sequence[str]) -> None:
     try:
         real_time.hurry()
         console.print(f"listening: --uri {' '.join(virtual.uris)}")
-        virtual.run(lambda: virtual.time >= parsed.seconds)
+        virtual.run(lambda: virtual.time >= (parsed.seconds or math.inf))
     except KeyboardInterrupt:
         pass
     finally:

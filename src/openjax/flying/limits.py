@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 from openjax.flying.controller import Pose, Vector
+from openjax.ranges import Interval, check_intervals
 
 APART = 0.35
 """Waiting vehicles keep this distance (m)."""
@@ -16,37 +18,40 @@ APART = 0.35
 class SafetySettings:
     """Limits of a flight."""
 
-    arena_radius: float = 0.9
+    arena_radius: Annotated[float, Interval("(0, 1000]")] = 0.9
     """No vehicle is let out of a cylinder of this radius (m)."""
-    arena_height: float = 1.2
+    arena_height: Annotated[float, Interval("(0, 1000]")] = 1.2
     """Nor above this (m)."""
-    floor: float = 0.12
+    floor: Annotated[float, Interval("[0, 100]")] = 0.12
     """Nor, in pursuit, below this (m)."""
-    outside: float = 0.3
+    outside: Annotated[float, Interval("[0, 100]")] = 0.3
     """Farther out than this (m) something is wrong: all land."""
-    speed_limit: float = 2.5
+    speed_limit: Annotated[float, Interval("(0, 100]")] = 2.5
     """Faster than this (m/s) something is wrong: all land."""
-    tilt_limit: float = 80.0
+    tilt_limit: Annotated[float, Interval("(0, 180]")] = 80.0
     """More tilted than this (degrees) something is wrong: all land."""
-    braking: float = 5.0
+    braking: Annotated[float, Interval("(0, 100]")] = 5.0
     """Deceleration that is counted on to stop within the arena (m/s^2)."""
-    reaction: float = 0.1
+    reaction: Annotated[float, Interval("[0, 10]")] = 0.1
     """Time until it acts (s)."""
-    pose_timeout: float = 0.06
+    pose_timeout: Annotated[float, Interval("(0, 60]")] = 0.06
     """A pose older than this (s) is lost: blind landing."""
-    link_timeout: float = 0.3
+    link_timeout: Annotated[float, Interval("(0, 60]")] = 0.3
     """A link silent for longer (s) is gone."""
-    action_timeout: float = 0.035
+    action_timeout: Annotated[float, Interval("(0, 60]")] = 0.035
     """Without a new action of the policy for longer (s): all stop where they are."""
-    battery_low: float = 3.2
+    battery_low: Annotated[float, Interval("[0, 100]")] = 3.2
     """Voltage under load, for `battery_time`, at which a vehicle lands (V)."""
-    battery_time: float = 0.5
-    hold_time: float = 1.0
+    battery_time: Annotated[float, Interval("[0, 60]")] = 0.5
+    hold_time: Annotated[float, Interval("[0, 600]")] = 1.0
     """How long vehicles wait after a trouble before they land (s)."""
-    transfer_speed: float = 0.5
+    transfer_speed: Annotated[float, Interval("(0, 10]")] = 0.5
     """On the way to the start (m/s)."""
-    landing_speed: float = 0.35
+    landing_speed: Annotated[float, Interval("(0, 10]")] = 0.35
     """m/s."""
+
+    def __post_init__(self):
+        check_intervals(self, "safety.")
 
 
 def stopping_point(settings: SafetySettings, pose: Pose) -> Vector:

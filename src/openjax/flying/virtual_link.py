@@ -6,9 +6,11 @@ import heapq
 import random
 import socket
 from dataclasses import dataclass
+from typing import Annotated
 
 from openjax.errors import UserError
 from openjax.flying.crtp import Port
+from openjax.ranges import Interval, check_intervals
 
 BASE_PORT = 19850
 """`cflib` scans this port and the nine after it."""
@@ -18,24 +20,19 @@ BASE_PORT = 19850
 class LinkFaults:
     """What the link does to the two streams of a flight. Requests and their answers pass: a radio sends them again."""
 
-    latency_ms: float = 0.0
+    latency_ms: Annotated[float, Interval("[0, 1000]")] = 0.0
     """Set-points arrive this much later (ms)."""
-    jitter_ms: float = 0.0
+    jitter_ms: Annotated[float, Interval("[0, 1000]")] = 0.0
     """Up to this much more, drawn for each set-point (ms)."""
-    loss: float = 0.0
+    loss: Annotated[float, Interval("[0, 1]")] = 0.0
     """Share of the set-points that never arrive."""
-    pose_latency_ms: float = 0.0
+    pose_latency_ms: Annotated[float, Interval("[0, 1000]")] = 0.0
     """Log data arrive this much later (ms)."""
-    pose_loss: float = 0.0
+    pose_loss: Annotated[float, Interval("[0, 1]")] = 0.0
     """Share of the log data that never arrive."""
 
     def __post_init__(self):
-        for name in ("loss", "pose_loss"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise UserError(f"--{name} is {getattr(self, name)}; a share from 0 to 1 would be right")
-        for name in ("latency_ms", "jitter_ms", "pose_latency_ms"):
-            if not 0.0 <= getattr(self, name) <= 1000.0:
-                raise UserError(f"--{name} is {getattr(self, name)}; 0 to 1000 would be right")
+        check_intervals(self, "--")
 
 
 class VirtualLink:

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,7 @@ from openjax.learning.settings import TrainSettings
 from openjax.learning.training_step import TrainCarry, build, init_carry, make_training_step
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Pursuit, Task
+from openjax.ranges import Interval, check_intervals
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.family import adapted_family, family_bounds
 
@@ -21,14 +22,19 @@ from openjax.vehicle.family import adapted_family, family_bounds
 class AdaptSettings:
     """How a policy is fine-tuned."""
 
-    num_envs: int | None = None
+    num_envs: Annotated[int | None, Interval("[1, 16777216]")] = None
     """Worlds; by default 5,120 on an accelerator, 160 on a CPU, which is enough to see it work."""
-    updates: int = 60
+    updates: Annotated[int, Interval("[1, 1000000]")] = 60
     """Training steps of the policy, after ..."""
-    warm_up: int = 20
+    warm_up: Annotated[int, Interval("[0, 1000000]")] = 20
     """... those in which only the critic learns: shipped policies come without one, and a wrong one spoils the policy."""
-    learning_rate: float = 3e-4
-    clip_epsilon: float = 0.1
+    learning_rate: Annotated[float, Interval("(0, 1]")] = 3e-4
+    """Adam step size at the start."""
+    clip_epsilon: Annotated[float, Interval("(0, 10]")] = 0.1
+    """Clip range of the probability ratio."""
+
+    def __post_init__(self):
+        check_intervals(self, "training.")
 
 
 def adapting_settings(trained: TrainSettings, settings: AdaptSettings) -> TrainSettings:
