@@ -25,6 +25,8 @@ from openjax.flying.safety import Request
 from openjax.ranges import Interval
 
 PROGRAM = "python -m openjax.fly"
+FRESH = 0.05
+"""No flight begins with poses older than this (s)."""
 KEYS = {" ": Request.STOP, "q": Request.STOP, "l": Request.LAND, "h": Request.HOLD}
 
 
@@ -132,6 +134,7 @@ def fly(arguments: Arguments):
                 )
                 if not guard.wait():
                     raise UserError("the guard's process didn't start; --guard False flies without it")
+            _wait_for_poses(vehicles, uris)  # nobody looked meanwhile
             links.arm()
             vehicles.record()
             real_time.hurry()
@@ -181,11 +184,15 @@ def _hover_thrust(vehicle) -> float:
 
 def _wait_for_poses(vehicles, uris, timeout=5.0):
     deadline = time.monotonic() + timeout
-    while any(s.pose is None for s in vehicles.sightings()):
+    while True:
+        now = time.perf_counter()
+        old = [s.pose is None or now - s.pose.time > FRESH for s in vehicles.sightings()]
+        if not any(old):
+            return
         if time.monotonic() > deadline:
-            silent = [uri for uri, s in zip(uris, vehicles.sightings(), strict=True) if s.pose is None]
-            raise UserError(f"no pose from {', '.join(silent)} within {timeout:g} s; is its position known?")
-        time.sleep(0.02)
+            silent = ", ".join(uri for uri, missing in zip(uris, old, strict=True) if missing)
+            raise UserError(f"no pose from {silent} within {timeout:g} s; is its position known?")
+        vehicles.wait(now + 0.02)
 
 
 def _until_down(flight, keys):

@@ -65,16 +65,22 @@ def test_a_set_point_arrives_on_board_as_it_was_meant(mode, roll, pitch, yaw_rat
     assert abs(got.thrust - as_sent(wanted).thrust) < 3e-5
 
 
+@contextmanager
+def virtual(*options):
+    """Three virtual Crazyflies, by the command that a user gives; their URIs."""
+    command = [sys.executable, "-m", "openjax.virtual_crazyflie", "--port", "0", *options]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        yield process.stdout.readline().split("--uri ")[1].split()
+    finally:
+        process.terminate()
+        process.wait()
+
+
 @pytest.fixture(scope="module")
 def uris():
-    """Three virtual Crazyflies, by the command that a user gives."""
-    command = [sys.executable, "-m", "openjax.virtual_crazyflie", "--port", "0"]
-    virtual = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    try:
-        yield virtual.stdout.readline().split("--uri ")[1].split()
-    finally:
-        virtual.terminate()
-        virtual.wait()
+    with virtual() as found:
+        yield found
 
 
 @contextmanager
@@ -127,31 +133,57 @@ class Hovering:
         )  # fmt: skip
 
 
-def test_a_flight_from_the_floor_to_its_log(uris, tmp_path):
-    with connected(uris, body_logs=1) as links:
+def fly_hovering(uris, folder, body_logs, seconds):
+    """A short flight: the flight, what was recorded of the first vehicle, and the case as the diagnosis reads it."""
+    from openjax.flights.case import load_case
+
+    with connected(uris, body_logs) as links:
         links.arm()
         links.record()
-        flight = Flight(links, Hovering(links), PATIENT, Plan(episode_seconds=2.3))
-        record = flight.run()
+        flight = Flight(links, Hovering(links), PATIENT, Plan(episode_seconds=seconds))
+        flight.run()
         samples = links.samples()
+    write_case(folder, samples, flight.record, load_vehicle_file(), {})
+    return flight, samples[0], load_case(folder)
+
+
+def test_a_flight_from_the_floor_to_its_log(uris, tmp_path):
+    flight, samples, case = fly_hovering(uris, tmp_path, body_logs=1, seconds=2.3)
     assert flight.state.all_in(Mode.LANDED)
-    assert max(p.position[2] for _, p, _ in samples[0].poses) > 0.3
-    assert record.episodes[0]["capture_step"] == 11
-    timing = record.timing()
+    assert max(p.position[2] for _, p, _ in samples.poses) > 0.3
+    assert flight.record.episodes[0]["capture_step"] == 11
+    timing = flight.record.timing()
     assert timing["ticks"] > 200
     # a set-point leaves after the poses that it was made of, and those were measured before they arrived
     assert 0.0 < timing["command_age_ms"]["p50"] < timing["measured_to_sent_ms"]["p50"] < 10.0
-    write_case(tmp_path, samples, record, load_vehicle_file(), {})
-
-    from openjax.flights.case import load_case
-
-    case = load_case(tmp_path)
     assert {f.vehicle for f in case.flights} == {"0", "1", "2"}
     for flown in case.flights:
         assert flown.has_pose and flown.has_imu and flown.has_motors and flown.has_commands
         # what the motors were asked for follows the commanded thrust
         assert abs(np.nanmedian(flown.motor_command) - np.nanmedian(flown.command_thrust)) < 0.05
         assert abs(np.nanmedian(flown.specific_force[:, 2]) - 9.81) < 1.0
+
+
+@pytest.mark.parametrize(("latency", "loss"), [(0.0, 0.0), (6.0, 0.0), (12.0, 0.1)])
+def test_the_log_tells_the_links_latency_and_loss(tmp_path, latency, loss):
+    """By the motors, whose mean is the thrust that was asked for as long as none of them is at its limit."""
+    with virtual("--latency_ms", str(latency), "--loss", str(loss)) as uris:
+        _, _, case = fly_hovering(uris, tmp_path, body_logs=5, seconds=4.0)
+    delays, sent, arrived = [], 0, 0
+    for flown in case.flights:
+        motors = flown.motor_command.mean(1)
+        logged = np.isfinite(motors) & (flown.motor_command.max(1) < 0.999)
+        changes = np.flatnonzero(np.diff(flown.command_thrust) != 0.0)[2:-6] + 1
+        for change in changes:
+            since = flown.time - flown.time[change]
+            near = logged & (since > -0.005) & (since < latency * 1e-3 + 0.012)
+            same = np.flatnonzero(near & (np.abs(motors - flown.command_thrust[change]) < 4e-5))
+            sent += 1
+            arrived += len(same) > 0
+            delays += [1e3 * since[same[0]]] if len(same) else []
+    assert sent > 600
+    assert latency - 1.0 <= np.median(delays) <= latency + 2.0
+    assert abs(1.0 - arrived / sent - loss) < 0.03
 
 
 def test_the_guard_lands_what_hangs_in_the_air(uris):
