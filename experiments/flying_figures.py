@@ -79,7 +79,7 @@ def pair(arguments, number: int, out: Path, virtual: list[str], fly: list[str], 
             check=False,
         )
         print(out.name, " ".join((ran.stdout[-500:] + ran.stderr[-1500:]).split()), flush=True)
-        if not (out / "flight.json").exists():
+        if ran.returncode != 0 or not (out / "flight.json").exists():
             return {"error": ran.stdout[-600:] + ran.stderr[-1500:]}
         return json.loads((out / "flight.json").read_text(encoding="utf-8"))
     except subprocess.TimeoutExpired:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 
-PRIORITY = 10
-"""Of the real-time scheduler: above all ordinary processes, below the kernel's own threads (50)."""
+LOOP, LINKS, VEHICLES = 12, 11, 10
+"""Priorities of the real-time scheduler: above all ordinary processes, below the kernel's own threads (50). Whoever is
+asked for least and waited for most comes first; virtual vehicles come last, where they fly on the same machine."""
 NICE = -10
 
 
@@ -20,7 +21,7 @@ def prepare() -> None:
     jax.config.update("jax_cpu_enable_async_dispatch", False)
 
 
-def hurry() -> bool:
+def hurry(priority: int) -> bool:
     """Ask that this process's threads, and those they start, run before others; whether that was granted.
 
     Linux grants the real-time scheduler to root and to users with `rtprio` in /etc/security/limits.conf. All threads:
@@ -28,7 +29,7 @@ def hurry() -> bool:
     """
     try:
         for thread in os.listdir("/proc/self/task"):
-            os.sched_setscheduler(int(thread), os.SCHED_RR, os.sched_param(PRIORITY))
+            os.sched_setscheduler(int(thread), os.SCHED_RR, os.sched_param(priority))
         return True
     except (AttributeError, OSError):  # not on this system, or not ours to ask
         pass
