@@ -137,7 +137,7 @@ def fly(arguments: Arguments):
             _wait_for_poses(vehicles, uris)  # nobody looked meanwhile
             links.arm()
             vehicles.record()
-            real_time.hurry(real_time.LOOP)
+            real_time.hurry()
             console.print("flying: space or q stops all motors, l or Ctrl-C lands")
             record = _until_down(flight, keys)
             samples = vehicles.samples()

@@ -124,7 +124,7 @@ def watch(shared, uris, pose_blocks, safety, state, after, parent, links) -> Non
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the loop, which lands
     cflib.crtp.init_drivers()
-    real_time.hurry(real_time.LOOP)
+    real_time.hurry()
     own = {uri: _open(uri) for uri in uris if uri.startswith("udp:")}
     shared[2] = _READY
     while shared[2] == _READY:

@@ -198,7 +198,7 @@ def _serve(uris, body_logs, watchdog, timeout, heard, stream, commands, control)
     """The links' process. It leaves the vehicles alone when the loop's process is gone: they are the guard's then."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the loop, which lands
     sys.setswitchinterval(5e-4)  # cflib's threads and the one that passes on set-points
-    real_time.hurry(real_time.LINKS)
+    real_time.hurry()
     stream.setblocking(False)
     swarm, lock = Swarm(uris, body_logs, watchdog), threading.Lock()
 

@@ -31,7 +31,7 @@ PERIOD = 0.01
 """s"""
 MARGIN = 2.0e-3
 """A tick is due this long after the newest poses were measured (s), as far as the fastest packets tell."""
-PATIENCE = 3.0e-3
+EARLY, PATIENCE = 3.0e-3, 5.0e-3
 """It begins as soon as all poses are there, up to this much before or after it is due (s)."""
 GONE = 0.1
 """A vehicle whose newest pose is older (s) isn't waited for."""
@@ -134,9 +134,9 @@ def await_poses(vehicles: Vehicles, due: float, clock: Callable[[], float]) -> N
     while (now := clock()) < due + PATIENCE:
         measured = _measured(vehicles.sightings())
         complete = all(t > due - PERIOD or now - t > GONE for t in measured)
-        if complete and now >= due - PATIENCE:
+        if complete and now >= due - EARLY:
             return
-        vehicles.wait(due - PATIENCE if complete else due + PATIENCE)
+        vehicles.wait(due - EARLY if complete else due + PATIENCE)
 
 
 def _measured(sightings) -> tuple[float, ...]:
