@@ -182,7 +182,7 @@ def test_the_log_tells_the_links_latency_and_loss(tmp_path, latency, loss):
             arrived += len(same) > 0
             delays += [1e3 * since[same[0]]] if len(same) else []
     assert sent > 150
-    assert latency - 1.0 <= np.median(delays) <= latency + 2.0
+    assert latency - 1.0 <= np.median(delays) < latency + 3.0
     assert abs(1.0 - arrived / sent - loss) < 0.04 + 0.6 / np.sqrt(
         sent
     )  # a busy machine, and the draw of few set-points
