@@ -336,10 +336,12 @@ def log_rows(rng, sensors, flown, j, ticks, unknown=None):
 
     motor = flown["motor"][:, :, j].astype(float)
     if sensors["motor"] == "mean" and rate <= 500:
-        width = round(500 / rate)
+        # the mean over the row, whose end may lie within a sample
         total = np.concatenate([np.zeros((1, 4)), np.cumsum(motor, axis=0)])
+        width = min(500 / rate, samples)
         last = np.minimum(np.arange(samples) + width, samples)
-        motor = (total[last] - total[:samples]) / (last - np.arange(samples))[:, None]
+        total_then = np.stack([np.interp(last, np.arange(samples + 1), total[:, i]) for i in range(4)], 1)
+        motor = (total_then - total[:samples]) / (last - np.arange(samples))[:, None]
     place = np.minimum((t / SAMPLE + 1e-6).astype(int), samples - 1)
     motors = stream(motor, t, 1) if sensors["stream_rate"] else motor[place]
     command = flown["command"][:, :, j].astype(float)[

@@ -1,8 +1,11 @@
 """The flight container: slower channels, gaps and neighbours are handled once, for everyone behind it."""
 
 import numpy as np
+import pytest
 
 from openjax.flights.flight import Case, Flight
+from openjax.flights.track import flight_tracks
+from openjax.vehicle.vehicle_file import load_vehicle_file
 
 
 def flight(time, **channels):
@@ -41,3 +44,19 @@ def test_others_are_those_of_the_same_log():
     elsewhere = Flight("b.csv:1", "b.csv", "1", np.array([0.0, 1.0]))
     case = Case("case", (first, second, elsewhere), vehicle_file=None)
     assert case.others(first) == (second,) and case.others(elsewhere) == ()
+
+
+@pytest.mark.parametrize("rate", [100, 200, 250, 500])
+def test_faster_logs_become_means_over_the_rows_of_the_grid(rate):
+    """Motors hold until the next row; sensors are straight between rows and averaged around a grid point."""
+    time = np.arange(0.0, 4.0, 1 / rate)
+    jumps = np.floor(time / 0.004 + 1e-9) % 7 / 10.0
+    ramp = np.stack([time, 2 * time, -time], 1)
+    f = flight(time, motor_command=np.repeat(jumps[:, None], 4, 1), body_rates=ramp)
+    (track,) = flight_tracks(f, Case("case", (f,), load_vehicle_file()))
+    assert track.dt == pytest.approx(0.01)
+    held = np.repeat(jumps, 1000 // rate)  # every ms
+    expected = held[: len(held) // 10 * 10].reshape(-1, 10).mean(1) if rate > 100 else jumps
+    rows = slice(1, len(track) - 2)
+    np.testing.assert_allclose(track.motor[rows, 0], expected[: len(track)][rows], atol=1e-9)
+    np.testing.assert_allclose(track.body_rates[rows], np.outer(track.time, [1, 2, -1])[rows], atol=1e-9)

@@ -3,6 +3,7 @@
 import json
 import sys
 
+import numpy as np
 import pytest
 
 from openjax import diagnose
@@ -21,19 +22,30 @@ VEHICLE = '[vehicle]\nmass = 0.0321\nmass_weighed = {weighed}\n\n[motor]\ncomman
 NOTHING = {
     "mass": {"extra": 0.0},
     "rotor_drag": {"d_xy": 0.0, "d_z": 0.0},
+    "rate_gains": {"p": 1.0, "i": 1.0, "d": 1.0},
 }  # one compiled flight for all cases
 DRAG = {"d_xy": 0.015, "d_z": 0.006}
 
 
-def _case(folder, effects, weighed=False, flights=("flight_a", "flight_b", "flight_c"), seed=3):
-    """Fly and log a case; `flights` may repeat a reference."""
+def _case(
+    folder, effects, weighed=False, flights=("flight_a", "flight_b", "flight_c"), seed=3, logged=lambda c: c
+):
+    """Fly and log a case; `flights` may repeat a reference, `logged` changes the columns {name: (T,)}."""
     vehicle, found = load_vehicle(), references(seed=seed, duration=8.0)
     folder.mkdir(parents=True)
     (folder / "vehicle.toml").write_text(VEHICLE.format(weighed=str(weighed).lower()))
     for number, name in enumerate(flights):
         columns = fly(vehicle, vehicle, found[name], 10 * seed + number, NOTHING | effects)
+        columns = [logged(c) for c in columns]
         write_csv(folder / f"flight_{number}.csv.gz", log_of(columns, f"flight_{number}"))
     return folder
+
+
+def _held(columns):
+    """The pose comes every 20 ms, and each other row repeats the last one."""
+    pose = ("x", "y", "z", "qw", "qx", "qy", "qz", "vx", "vy", "vz")
+    rows = np.arange(len(columns["t"])) // 2 * 2
+    return {n: v[rows] if n in pose else v for n, v in columns.items()}
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +56,8 @@ def folders(tmp_path_factory):
         "drag": _case(root / "drag", {"rotor_drag": DRAG}),
         "mass": _case(root / "mass", {"mass": {"extra": 0.003}}),
         "weighed": _case(root / "weighed", {"thrust_scale": {"scale": -0.08}}, weighed=True),
+        "gains": _case(root / "gains", {"rate_gains": {"p": 1.5, "i": 1.0, "d": 1.0}}),
+        "held": _case(root / "held", {}, logged=_held),
         "doublets": _case(root / "doublets", {}, flights=("flight_c", "flight_c")),
     }
 
@@ -73,6 +87,17 @@ def test_nothing_is_named_where_nothing_is_wrong(reports):
     assert report.effects == () and report.verdict == "none"
     assert report.probabilities["none"] > 0.5
     assert abs(report.gap.reduction) < 0.05
+
+
+def test_a_pose_that_rows_repeat_is_no_late_pose(reports):
+    assert reports["held"].effects == ()
+    assert any("repeat the last sample" in q["issue"] for q in reports["held"].quality)
+
+
+def test_gains_of_the_rate_loop_are_read_from_what_commands_excite(reports):
+    report = reports["gains"]
+    assert report.effects == ("rate_gains",)
+    assert report.parameters["rate_gains"]["p"].value == pytest.approx(1.5, abs=0.15)
 
 
 def test_a_cause_outside_the_library_is_unknown_not_its_neighbour(folders):

@@ -15,6 +15,7 @@ from openjax.flights.reading import CHANNEL_COLUMNS
 SHORTEST = 2.0  # s airborne: windows of 0.5 s, and a few of them
 SLOWEST = 0.05  # s between rows
 FROZEN = 0.5  # s without a change of a sensor that has noise
+HELD = 0.1  # share of rows that repeat the one before, from which a sensor is slower than the rows
 GROUND_CLEARANCE = 0.02  # m above the floor
 SENSORS = ("position", "quaternion", "velocity", "body_rates", "specific_force")
 
@@ -40,7 +41,7 @@ def check_flight(
     try:
         _has_what_is_needed(flight, comparison)
         checked = _in_time(flight, note)
-        checked = _clean(checked, note)
+        checked = _without_repeats(_clean(checked, note), note)
         checked = _in_range(checked, note)
         checked = _derive_velocity(checked, note)
         checked = _derive_rates(checked, note)
@@ -159,6 +160,30 @@ def _clean(flight: Flight, note) -> Flight:
                     "gaps",
                     f"{', '.join(columns)}: not sampled for {steps[hole]:.2f} s after t = {at[hole]:.2f}",
                 )
+    return dataclasses.replace(flight, **changes) if changes else flight
+
+
+def _without_repeats(flight: Flight, note) -> Flight:
+    """A sensor that is slower than the rows and whose last sample was written again counts as sampled where it changed.
+    A sample that appears in a row may be older than it by up to a row."""
+    changes = {}
+    for group in (("position", "quaternion", "velocity"), ("body_rates", "specific_force")):
+        logged = [c for c in group if getattr(flight, c) is not None]
+        if not logged:
+            continue
+        together = np.concatenate([getattr(flight, c).reshape(len(flight), -1) for c in logged], 1)
+        repeated = np.r_[False, (np.diff(together, axis=0) == 0).all(1)]
+        if repeated.mean() < HELD:
+            continue
+        note(
+            "held",
+            f"{repeated.mean():.0%} of the rows repeat the last sample of {', '.join(logged)}: left out",
+        )
+        for channel in logged:
+            values = getattr(flight, channel)
+            changes[channel] = np.where(repeated.reshape((-1,) + (1,) * (values.ndim - 1)), np.nan, values)
+        if group[0] == "position":
+            changes["pose_age"] = flight.row_period
     return dataclasses.replace(flight, **changes) if changes else flight
 
 

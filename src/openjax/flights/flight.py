@@ -65,6 +65,7 @@ class Flight:
     vertical_force: Array | None = None  # (T,) m/s^2, body z, where the accelerometer's z alone was logged
     velocity_derived: bool = False  # True: differentiated from position by the reader, not logged
     body_rates_derived: bool = False  # True: differentiated from the attitude by the reader, no gyroscope
+    pose_age: float = 0.0  # s by which a pose may be older than its row, because the log held the last one
     fingerprint: str = ""  # hash of the whole log's values, the same for copies under other names
 
     def __len__(self) -> int:

@@ -35,6 +35,7 @@ class Track:
     motor: Array | None  # (T, 4) 0..1 thrust fraction
     voltage: Array | None  # (T,)
     neighbours: Array  # (K, T, 3) m, positions of the vehicles that flew along
+    pose_age: float = 0.0  # s by which the pose may be older than its row, see `Flight`
     motors_logged: bool = True  # False: made by the nominal rate controller from the commands
 
     def __len__(self) -> int:
@@ -63,19 +64,28 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
         period = GRID_PERIOD
     count = int((part.time[-1] - part.time[0]) / period + 1e-6) + 1
     grid = part.time[0] + period * np.arange(count)
-    per_row = round(period / part.row_period)
+    faster = period / part.row_period > 1.2
 
     def take(channel: str, ahead: bool = False) -> Array | None:
         if getattr(part, channel) is None:
             return None
-        if per_row <= 1 or channel in ("position", "quaternion"):
+        if not faster or channel in ("position", "quaternion"):
             return part.interpolated(channel, grid)
-        # Faster logs: the mean of the samples around a grid point (for commands: of those that follow it).
-        fine = grid[:, None] + period * (
-            np.arange(per_row) / per_row - (0.0 if ahead else 0.5 - 0.5 / per_row)
+        # Faster logs: the mean around a grid point; of commands, which hold until the next row, the mean that follows it.
+        at, values = part.sampled(channel)
+        flat = values.reshape(len(values), -1)
+        step = np.diff(at)[:, None] * (flat[:-1] if ahead else 0.5 * (flat[1:] + flat[:-1]))
+        whole = np.concatenate([np.zeros((1, flat.shape[1])), np.cumsum(step, 0)])
+        begin = np.clip(grid if ahead else grid - 0.5 * period, at[0], at[-1] - 0.5 * period)
+        end = np.clip(begin + period, at[0], at[-1])
+        means = np.stack(
+            [
+                (np.interp(end, at, column) - np.interp(begin, at, column)) / (end - begin)
+                for column in whole.T
+            ],
+            1,
         )
-        values = part.interpolated(channel, fine.reshape(-1))
-        return values.reshape((count, per_row, *values.shape[1:])).mean(1)
+        return means.reshape((count, *values.shape[1:]))
 
     quaternion = take("quaternion")
     motor = take("motor_command", ahead=True)
@@ -102,6 +112,7 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
         motor=motor,
         voltage=None if voltage is None else smooth(voltage, 0.3, period),
         neighbours=np.array(neighbours) if neighbours else np.zeros((0, count, 3)),
+        pose_age=part.pose_age,
     )
 
 

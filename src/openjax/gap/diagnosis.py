@@ -14,7 +14,6 @@ from openjax.gap import verdict as rules
 from openjax.gap.evidence import Evidence, gather
 from openjax.gap.hypotheses import SetFit
 from openjax.gap.library import CARDS, PLACE, Library, library, path_of
-from openjax.gap.linear_path import linear_score
 from openjax.gap.report import Estimate, Report
 from openjax.gap.rest import Rest, look
 from openjax.gap.selection import CLASS, Selection, select
@@ -63,6 +62,7 @@ def conclude(evidence: Evidence) -> Report:
     missing = rules.not_testable(evidence)
     found = rules.decide(evidence, selection, rest, parts, missing)
     named = [e for e in found.effects if e != "unknown"]
+    parts = replace(parts, effects={e: parts.effects[e] for e in named})
     equivalent = equivalents(evidence, selection, named)
     chances = found.probabilities
     ranked = sorted(chances, key=lambda e: -chances[e])
@@ -148,14 +148,7 @@ def _path_estimate(evidence: Evidence, effect: str, number: int) -> tuple[float,
         _, theta, covariance = evidence.pose.score()
         return float(theta[0]), float(np.sqrt(covariance[0, 0]))
     if effect == "rate_gains":
-        _, theta, covariance = evidence.rate_loop.score()
-        spread = np.sqrt(covariance[number, number])
-        per_flight = np.array(
-            [linear_score(g, evidence.rate_loop.spread)[1][number] for g in evidence.rate_loop.grams]
-        )
-        if len(per_flight) > 1:
-            spread = max(spread, per_flight.std(ddof=1) / np.sqrt(len(per_flight)))
-        return 1.0 + float(theta[number]), float(spread)
+        return 1.0 + float(evidence.gains.change[number]), float(evidence.gains.error[number])
     radio = evidence.radio
     if effect == "command_latency":
         return radio.delay, 0.0005
@@ -164,37 +157,26 @@ def _path_estimate(evidence: Evidence, effect: str, number: int) -> tuple[float,
 
 
 def _rest_in_words(rest: Rest) -> str:
+    words = [f"What is left isn't noise: {', '.join(rest.lines)}."] if rest.lines else []
     best = int(np.argmax(rest.predicted))
     if rest.predicted[best] <= rules.FOLLOWED or rest.nats < rules.LEAST_NATS:
-        return ""
+        return " ".join(words)
     return (
-        f"What is left in {ERROR_NAMES[best]} isn't noise: {100 * rest.predicted[best]:.0f} % of it follows "
-        f"{'; '.join(rest.followed)} on stretches left out."
+        " ".join(words)
+        + (" " if words else "")
+        + (
+            f"What is left in {ERROR_NAMES[best]} isn't noise: {100 * rest.predicted[best]:.0f} % of it follows "
+            f"{'; '.join(rest.followed)} on stretches left out."
+        )
     )
 
 
 def _nuisances(evidence: Evidence, selection: Selection) -> dict[str, str]:
     """What the vehicle's numbers and the sensors' mounting took, in usual sizes; a number at its bound says so."""
-    names = [" ".join(key[:2]) for key in evidence.replay.numbers] + SHARED
+    names = np.array(evidence.replay.nuisance_names)[evidence.replay.shared]
     taken = judge(selection.table, with_effects(selection.table)).taken.mean(0)
     at = lambda v: ", at its bound" if abs(v) > 0.99 * BOUND else ""  # noqa: E731
-    return {n: f"{v:+.2f} of its usual size{at(v)}" for n, v in zip(names, taken, strict=False)}
-
-
-# Shared nuisances beyond the vehicle's numbers, in the replay's order.
-SHARED = [
-    "feedback, roll and pitch",
-    "feedback, yaw",
-    "feedback's lag, roll and pitch",
-    "feedback's lag, yaw",
-    *(f"frame tilt {a}" for a in "xy"),
-    *(f"IMU tilt {a}" for a in "xyz"),
-    *(f"gyroscopic torque {a}" for a in "xyz"),
-    "roll and pitch damping",
-    "yaw damping",
-    "level of the world x",
-    "level of the world y",
-]
+    return {n: f"{v:+.2f} of its usual size{at(v)}" for n, v in zip(names, taken, strict=True)}
 
 
 __all__ = ["Library", "conclude", "diagnose", "diagnose_case", "library"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from dataclasses import dataclass, field
 
@@ -9,22 +10,23 @@ import numpy as np
 
 from openjax.errors import UserError
 from openjax.flights.flight import Case
-from openjax.flights.track import Track, tracks_of
+from openjax.flights.track import GRID_PERIOD, Track, tracks_of
 from openjax.gap import estimator, firmware
+from openjax.gap.feedback import AT_ONCE, ROW_DELAY, Gains, answers_noise, outputs_of, read_feedback
 from openjax.gap.firmware import Radio
 from openjax.gap.hypotheses import SetFit, model_noise, weigh_singles
 from openjax.gap.kinematics import Kinematics, corrected, read_kinematics
-from openjax.gap.library import ABSENT, CARDS, NUISANCES, PWM_NUISANCES, Library
+from openjax.gap.library import ABSENT, CARDS, NUISANCES, PWM_NUISANCES, SAMPLED_NUISANCES, Library
 from openjax.gap.linear_path import LinearPath
 from openjax.gap.observer import TICKS
 from openjax.gap.replay import Replay, make_replay
 
 CLEAR_DELAY = 0.002  # s of pose delay above which the pose is moved before the physics is read
 CLEAR_SCORE = 3.0  # nats, likewise
-CLEAR_GAINS = 20.0  # nats of the rate loop's path from which its gains are used to read it again
 LOOKS = 2  # at most
 WORTH_KNOWING = 15.0  # nats that an effect must add to be taken as known in the next look
 WORTH_A_SECOND_LOOK = 30.0  # nats of the best set above none
+LEAST_KICK = 0.1  # of the motors' outputs within a row: below, samples are as good as means
 RADIO_COST = 15.0  # nats that a radio effect must gain before the rate loop is read with it
 
 
@@ -44,6 +46,7 @@ class Evidence:
     floor: list[np.ndarray]  # (T, 9) residuals when all effects may act at once: sensors and gusts
     radio: Radio | None
     rate_loop: LinearPath | None
+    gains: Gains | None
     pose: LinearPath | None
     sensors: Kinematics
     seconds: dict[str, float] = field(default_factory=dict)
@@ -51,6 +54,27 @@ class Evidence:
     @property
     def nothing(self) -> SetFit:
         return self.sets[()]
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """How the rows of a case are read. `arrived`: the commands that the link let through, None without commands; `pwm`:
+    motors are duty cycles; `at_once`: a row's motors are one sample; `blind`: what motors do within a row isn't known;
+    `late` s: by how much they may be off against the gyroscope, None where that isn't known either."""
+
+    tracks: list[Track]
+    vehicles: list
+    arrived: list | None
+    flight_of: np.ndarray
+    sensors: Kinematics
+    pwm: bool
+    at_once: bool = False
+    blind: bool = False
+    late: float | None = None
+
+    @property
+    def numbers(self):
+        return PWM_NUISANCES if self.pwm else SAMPLED_NUISANCES if self.blind else NUISANCES
 
 
 def gather(case: Case, library: Library, progress=None) -> Evidence:
@@ -93,16 +117,20 @@ def gather(case: Case, library: Library, progress=None) -> Evidence:
         if not radio.readable:
             allowed = {(): 0.0}
         arrived = radio.arrived[max(allowed, key=lambda k: allowed[k] - RADIO_COST * len(k))]
+    # Faster logs are averaged anyway.
+    slow = min(f.row_period for f in case.flights) > 0.8 * GRID_PERIOD
+    derived = any(f.body_rates_derived for f in case.flights)
+    reading = Reading(tracks, vehicles, arrived, flight_of, sensors, case.vehicle_file.motor_command == "pwm")
+    reading = _sampled(reading, slow, derived)
     lap("paths")
     tell("replaying the flights")
-    numbers = PWM_NUISANCES if case.vehicle_file.motor_command == "pwm" else NUISANCES
-    found = _physics(tracks, vehicles, arrived, flight_of, library, numbers, sensors.one_clock)
+    found = _physics(reading, library)
     lap("first look")
     known = ()
     for _ in range(LOOKS - 1):
         fits = [f for f in found[1].values() if isinstance(f, SetFit)]
         best = max(fits, key=lambda f: f.score - WORTH_KNOWING * len(f.effects))
-        gains = _clear_gains(found[4], library)
+        gains = _clear_gains(found[5], library)
         surprising = best.effects and best.score - found[1][()].score > WORTH_A_SECOND_LOOK
         if found[4] is None or set(best.effects) == set(known) or not (surprising or gains is not None):
             break
@@ -115,11 +143,9 @@ def gather(case: Case, library: Library, progress=None) -> Evidence:
                 np.gradient((m - p)[0, :, :3], track.dt, axis=0)
                 for track, m, p in zip(tracks, moved, plain, strict=True)
             ]
-        found = _physics(
-            tracks, vehicles, arrived, flight_of, library, numbers, sensors.one_clock, pushes, gains, found[1]
-        )
+        found = _physics(reading, library, pushes, gains, found[1])
         lap("next look")
-    replay, sets, exposure, floor, rate_loop = found
+    replay, sets, exposure, floor, rate_loop, gains = found
     return Evidence(
         case,
         library,
@@ -131,6 +157,7 @@ def gather(case: Case, library: Library, progress=None) -> Evidence:
         floor,
         radio,
         rate_loop,
+        gains,
         pose,
         sensors,
         seconds,
@@ -152,29 +179,77 @@ def _late(pose: LinearPath) -> bool:
     return score > CLEAR_SCORE and abs(delay[0]) > CLEAR_DELAY
 
 
-def _clear_gains(rate_loop: LinearPath | None, library: Library):
+def _clear_gains(gains: Gains | None, library: Library):
     """Changes of the rate loop's gains where they are clear, else None."""
-    if rate_loop is None or "rate_gains" not in library.effects:
+    if gains is None or "rate_gains" not in library.effects or not gains.clear:
         return None
-    score, theta, _ = rate_loop.score()
-    return np.clip(theta[:3], -0.7, 1.5) if score > CLEAR_GAINS else None
+    return np.clip(gains.change[:3], -0.7, 1.5)
 
 
-def _physics(
-    tracks, vehicles, arrived, flight_of, library, numbers, one_clock, pushes=None, gains=None, before=None
-):
-    """Replay, scores of the sets, exposure, floor residuals and the rate loop's path."""
-    rate_loop, ticks = None, [np.repeat(t.motor[:, None], TICKS, 1) for t in tracks]
+def _sampled(reading: Reading, slow: bool, derived: bool) -> Reading:
+    """What rows of motor commands are: means over the row or single samples, and whether what happens within a row can be
+    told at all. Faster logs are averaged onto `slow` rows; rates may be `derived` from the attitude."""
+    tracks, drifts = reading.tracks, reading.sensors.wander > 0.0
+    answer = answers_noise(tracks, reading.vehicles) if all(t.motors_logged for t in tracks) and slow else 0.0
+    # Rows as slow as this hide every other command of a loop that sends one each 10 ms.
+    seldom = max(t.dt for t in tracks) > 1.2 * GRID_PERIOD
+    known = reading.arrived is not None and not seldom and not drifts
+    at_once = answer > AT_ONCE
+    if known and at_once:
+        # The log doesn't say which; the motion does.
+        own = Library(("inertia",))
+        mean, single = (_physics(dataclasses.replace(reading, at_once=m), own) for m in (False, True))
+        at_once = _looks_sampled(reading.vehicles, mean, single)
+    reading = dataclasses.replace(reading, at_once=at_once)
+    blind = (reading.at_once and not known) or drifts or derived
+    late = None if blind or seldom else ROW_DELAY[0 if slow else 1]
+    return dataclasses.replace(reading, blind=blind, late=late)
+
+
+def _looks_sampled(vehicles, mean, single) -> bool:
+    """Whether torques are off as single samples taken for means would have them, and right once they are taken for what
+    they are. Commands jump where rows begin, so the first motor command of a row is stronger than the row's mean, and a
+    vehicle flown by such samples seems heavier to turn."""
+    if any(("inertia",) not in look[1] for look in (mean, single)):
+        return False
+    paths = [
+        np.asarray(p.motor, float)[: len(t)] for p, t in zip(single[0].paths, single[0].tracks, strict=True)
+    ]
+    first, whole = (
+        np.concatenate(
+            [np.gradient(take(m) @ outputs_of(v), axis=0) for m, v in zip(paths, vehicles, strict=True)]
+        )
+        for take in (lambda m: m[:, 0], lambda m: m.mean(1))
+    )
+    kick = ((first * whole).sum(0) / np.maximum((whole**2).sum(0), 1e-12))[:2].mean() - 1.0
+    off = [
+        np.mean([v for v, _ in list(look[1]["inertia",].parameters()["inertia"].values())[:2]]) - 1.0
+        for look in (mean, single)
+    ]
+    return kick > LEAST_KICK and off[0] > kick and abs(off[1]) < 0.25 * off[0]
+
+
+def _physics(reading: Reading, library: Library, pushes=None, gains=None, before=None):
+    """Replay, scores of the sets, exposure, floor residuals, the rate loop's path and gains."""
+    tracks, vehicles, arrived, at_once = reading.tracks, reading.vehicles, reading.arrived, reading.at_once
+    rate_loop, found, ticks = None, None, [np.repeat(t.motor[:, None], TICKS, 1) for t in tracks]
+    links = arrived if arrived is not None else [None] * len(tracks)
     if arrived is not None:
         base = np.zeros(3) if gains is None else gains
-        loop = firmware.read_rate_loop(tracks, vehicles, arrived, flight_of, pushes, base)
-        rate_loop, ticks = loop.path, loop.ticks
-    links = arrived if arrived is not None else [None] * len(tracks)
-    back = [firmware.fed_back(t, v, link) for t, v, link in zip(tracks, vehicles, links, strict=True)]
-    replay = make_replay(tracks, vehicles, ticks, back, numbers, one_clock)
+        loop = firmware.read_rate_loop(
+            tracks, vehicles, arrived, reading.flight_of, pushes, base, at_once, reading.late
+        )
+        rate_loop, ticks, found = loop.path, loop.ticks, loop.gains
+        if at_once:
+            tracks = [dataclasses.replace(t, motor=m.mean(1)) for t, m in zip(tracks, ticks, strict=True)]
+    feedback, sensors = read_feedback(tracks, vehicles, links), reading.sensors
+    replay = make_replay(
+        tracks, vehicles, ticks, feedback, reading.numbers, sensors.one_clock, at_once, sensors.wander
+    )
     floor, exposure = model_noise(replay, library)
     for effect in library.physics:
-        needs = CARDS[effect].needs
-        if needs and any(getattr(t, needs) is None for t in tracks):
+        card = CARDS[effect]
+        unseen = card.needs and any(getattr(t, card.needs) is None for t in tracks)
+        if unseen or (card.within_row and reading.blind):
             exposure[effect] = 0.0
-    return replay, weigh_singles(replay, library, exposure, before), exposure, floor, rate_loop
+    return replay, weigh_singles(replay, library, exposure, before), exposure, floor, rate_loop, found

@@ -9,17 +9,15 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import lfilter
 
 from openjax.flights.track import Track, smooth
+from openjax.gap.feedback import Gains, in_force, outputs_of, read_gains
 from openjax.gap.linear_path import LinearPath, fit_linear_path
-from openjax.gap.observer import GYRO_GAIN, TICKS, commanded, observe
+from openjax.gap.observer import GYRO_GAIN, observe
 from openjax.gap.replay import bucket, padded
-from openjax.vehicle.rate_controller import mixer
 
 GAIN_STEP = 0.05
 GAIN_SPREAD = 0.4
-SLOW = 0.06  # s over which commands implied by motors and rates are smoothed
 # Share of a gain that a firmware's own filters and limits may imitate, for p, i, d.
 GAIN_TOLERANCE = (0.02, 0.4, 0.15)
 GYRO_TILT = 0.01  # rad, between the logged gyro and the one that the controller uses
@@ -28,6 +26,7 @@ LONGEST_DELAY = 0.1  # s
 DELAY_STEP = 0.0005  # s
 TOLERANCE = 3e-4  # of thrust: rounding of the logs and of the firmware's integers
 READABLE = 3e-3  # of thrust: mean misfit above which motors and commands aren't one stream
+EXPLAINED = 0.5  # of the misfit of a perfect link, above which the link isn't at fault
 INFORMATIVE = 1.5e-3  # smallest change of commanded thrust that shows whether a packet arrived
 
 
@@ -59,7 +58,9 @@ class Radio:
         lost = "packet_loss" in known and self.loss > least_loss and self.loss * self.informative > least
         if late and self.misfit["command_latency", "packet_loss"] > 3.0 * TOLERANCE:
             lost = False
-        return tuple(n for n, on in (("command_latency", late), ("packet_loss", lost)) if on)
+        key = tuple(n for n, on in (("command_latency", late), ("packet_loss", lost)) if on)
+        # What these don't explain isn't theirs: streams that were put onto the rows afterwards disagree everywhere.
+        return key if self.misfit[key] < EXPLAINED * self.misfit[()] else ()
 
 
 def read_radio(tracks: list[Track]) -> Radio:
@@ -161,16 +162,7 @@ def with_motors(track: Track, vehicle) -> Track:
     return track
 
 
-def in_force(track: Track, arrived) -> np.ndarray:
-    """Command (T, TICKS, 4) that rules at each tick of the rate loop."""
-    part, rows = arrived
-    out = np.repeat(track.command[rows[:, 0]][:, None], TICKS, 1)
-    older = round(part * TICKS)
-    out[:, :older] = track.command[rows[:, 1]][:, None]
-    return out
-
-
-def _observe_twice(track: Track, vehicle, link, gains, push=None):
+def _observe_twice(track: Track, vehicle, link, gains, push=None, at_once=False):
     """The observer's output: mean motor commands wanted (B, T, 4), the same knowing the past only, and the
     commands sent in the ticks (T, TICKS, 4) with the first gains.
 
@@ -180,41 +172,12 @@ def _observe_twice(track: Track, vehicle, link, gains, push=None):
     inputs = [padded(v, size) for v in (in_force(track, link), track.motor, track.body_rates)]
     push = padded(np.zeros((rows, 3)) if push is None else push, size)
     for _ in range(2):
-        wanted, sent, rates = observe(gains, vehicle, *inputs, push, np.float32(track.dt))
+        wanted, sent, rates = observe(gains, vehicle, *inputs, push, np.float32(track.dt), at_once)
         miss = track.body_rates[1:] - np.asarray(rates[0], float)[: rows - 1]
         step = miss.copy()  # undo the observer's own correction of what it missed before
         step[1:] -= (1.0 - GYRO_GAIN) * miss[:-1]
         push = push + padded(smooth(np.concatenate([step, step[-1:]]), 0.06, track.dt) / track.dt, size)
     return np.asarray(wanted, float)[:, :rows], np.asarray(sent[0])[:rows]
-
-
-def fed_back(track: Track, vehicle, link=None) -> np.ndarray:
-    """Angular acceleration (T, 3), rad/s^2, of the part of the motor commands that commands didn't cause: feedback of
-    gyroscope noise and gusts.
-
-    In closed loop the motors answer what pushes the body, so a model that makes them weak predicts better than the true
-    one; only what commands cause tells how strong they are. Where no commands were logged, the nominal controller's
-    law says which ones its motors and rates imply, slowly."""
-    rows, size = len(track), bucket(len(track))
-    outputs = np.linalg.pinv(np.asarray(mixer(vehicle), float)).T
-    if track.command is not None:
-        sent = track.command if link is None else in_force(track, link).mean(1)
-    else:
-        gain = np.asarray(vehicle.rate_kp, float) * 57.3 / 65536.0
-        implied = track.motor @ outputs / gain + track.body_rates
-        sent = np.concatenate(
-            [track.motor.mean(1)[:, None], smooth(implied - implied.mean(0), SLOW, track.dt)], 1
-        )
-    caused = np.asarray(commanded(vehicle, padded(sent, size), np.float32(track.dt)), float)[:rows]
-    rest = track.motor - caused
-    rest = rest - rest.mean(0)
-    blend = -np.expm1(-track.dt / float(vehicle.motor_time_constant))
-    pushed = lfilter([blend], [1.0, blend - 1.0], rest, axis=0)
-    thrust = pushed * float(vehicle.thrust_constant * vehicle.max_rotor_speed**2)
-    place, spin = np.asarray(vehicle.rotor_position, float), np.asarray(vehicle.rotor_spin, float)
-    ratio = float(vehicle.torque_constant / vehicle.thrust_constant)
-    torque = np.stack([thrust @ place[:, 1], -thrust @ place[:, 0], ratio * (thrust @ spin)], 1)
-    return torque / np.asarray(vehicle.inertia, float)
 
 
 def gyro_noise(rates: np.ndarray) -> float:
@@ -225,27 +188,28 @@ def gyro_noise(rates: np.ndarray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class RateLoop:
-    """The rate controller read from what the motors differ by: `path` for its gains; the motor commands
-    (T, TICKS, 4) of each track's ticks; and what the controller did beyond the observer's foresight,
-    (T, 3) roll, pitch, yaw, 0 where motors were at a limit: the controller sees the body's true rates,
-    so this is a sensor of theirs."""
+    """The rate controller read from what the motors differ by: `path` fits its outputs row by row; the motor commands
+    (T, TICKS, 4) of each track's `ticks`; `gains` from what commands alone excite."""
 
     path: LinearPath
     ticks: list[np.ndarray]
+    gains: Gains | None
 
 
-def read_rate_loop(tracks, vehicles, arrived, flight_of, pushes=None, base=(0.0, 0.0, 0.0)) -> RateLoop:
+def read_rate_loop(
+    tracks, vehicles, arrived, flight_of, pushes=None, base=(0.0, 0.0, 0.0), at_once=False, late=None
+) -> RateLoop:
     """Read the rate controllers of all tracks; `arrived` as in `Radio`. pushes [(T, 3)]: angular
     accelerations (rad/s^2) beyond the nominal that are already known; `base`: changes of the gains p, i, d
-    around which the loop is linearised."""
+    around which the loop is linearised. `late` s: see `read_gains`; None: clocks or rows tell nothing about gains."""
     base = np.asarray(base, float)
     gains = (1.0 + base + np.concatenate([np.zeros((1, 3)), GAIN_STEP * np.eye(3)])).astype(np.float32)
     y, columns, nuisances, masks, ticks, noise = [], [], [], [], [], []
     for number, (track, vehicle, link) in enumerate(zip(tracks, vehicles, arrived, strict=True)):
         push = None if pushes is None else pushes[number]
-        wanted, sent = _observe_twice(track, vehicle, link, gains, push)
+        wanted, sent = _observe_twice(track, vehicle, link, gains, push, at_once)
         ticks.append(sent)
-        outputs = np.linalg.pinv(np.asarray(mixer(vehicle), float)).T  # motors to roll, pitch, yaw
+        outputs = outputs_of(vehicle)
         demand, logged = wanted @ outputs, track.motor @ outputs
         tied = (demand[1:] - demand[0]) / GAIN_STEP
         # Yaw has gains of its own.
@@ -256,7 +220,7 @@ def read_rate_loop(tracks, vehicles, arrived, flight_of, pushes=None, base=(0.0,
             track.body_rates.shape
         )
         noisy = dataclasses.replace(track, body_rates=track.body_rates + dose)
-        loud = _observe_twice(noisy, vehicle, link, gains, push)[0] @ outputs
+        loud = _observe_twice(noisy, vehicle, link, gains, push, at_once)[0] @ outputs
         more = (loud[1:] - loud[0]) / GAIN_STEP - tied
         noise.append(np.concatenate([more * [1.0, 1.0, 0.0], more * [0.0, 0.0, 1.0]]))
         time = (track.time - track.time[0])[:, None]
@@ -277,4 +241,5 @@ def read_rate_loop(tracks, vehicles, arrived, flight_of, pushes=None, base=(0.0,
     groups = (((0, 1), False), ((2,), False))
     spread = (GAIN_SPREAD,) * 6
     path = fit_linear_path(y, columns, nuisances, flight_of, spread, groups, masks, 2 * GAIN_TOLERANCE, noise)
-    return RateLoop(path, ticks)
+    gains = None if late is None else read_gains(tracks, vehicles, arrived, at_once, late)
+    return RateLoop(path, ticks, gains)

@@ -26,6 +26,10 @@ LEAST_RATE = 0.1  # rad/s rms in the band: an axis that hardly turns shows no ga
 COHERENT = 0.97  # correlation below which the two streams don't fit well enough to compare gains
 ONE_CLOCK = 0.93  # below which they don't share a clock
 EDGE = 0.3  # s at either end that the filters spoil
+WINDOW = 1.0  # s over which a clock hardly moves
+WANDER_SCALE = 0.002  # s: windows that tell more than this aren't told apart
+WANDER_CLEAR = 2.0  # standard errors
+SEEN_WANDER, MOST_WANDER = 0.0015, 0.01  # s: below and above, it is noise
 GRANULE = 1.0  # s, unit of the jackknife
 
 
@@ -33,7 +37,8 @@ GRANULE = 1.0  # s, unit of the jackknife
 class Kinematics:
     """`gain` (3,) of the gyroscope with `gain_error` (3,), NaN where it couldn't be judged; `tilt` (2,) rad about the
     world's x and y axes with `tilt_error` (2,), None without path or accelerometer; `coherence` (3,) of attitude's
-    rate and gyroscope, `turning` (3,) whether the flights turn enough to tell; `findings`: what is off, in words, by name."""
+    rate and gyroscope, `turning` (3,) whether the flights turn enough to tell; `findings`: what is off, in words, by name;
+    `wander` s: by how much (rms) the clocks of gyroscope and pose drift apart and back within a flight."""
 
     gain: np.ndarray
     gain_error: np.ndarray
@@ -42,6 +47,7 @@ class Kinematics:
     coherence: np.ndarray
     turning: np.ndarray
     findings: dict[str, str]
+    wander: float = 0.0
 
     @property
     def upright(self) -> np.ndarray | None:
@@ -81,7 +87,7 @@ def read_kinematics(tracks: list[Track]) -> Kinematics:
                 f"motion capture's world leans by {np.degrees(size):.1f} degrees against gravity "
                 f"({np.degrees(tilt[0]):+.1f} about x, {np.degrees(tilt[1]):+.1f} about y)"
             )
-    return Kinematics(gain, error, tilt, tilt_error, coherence, turning, findings)
+    return Kinematics(gain, error, tilt, tilt_error, coherence, turning, findings, _wander(tracks))
 
 
 def corrected(track: Track, found: Kinematics) -> Track:
@@ -134,6 +140,43 @@ def _gyroscope(tracks) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     # The quieter of the two: noise alone is no motion.
     turning = np.sqrt(np.minimum(total[0], total[2]) / total[3]) > LEAST_RATE
     return np.where(turning & (coherence > COHERENT), gain, np.nan), error, coherence, turning
+
+
+def _wander(tracks) -> float:
+    """How far (s, rms) the delay between gyroscope and attitude's rate varies from window to window, beyond its errors."""
+    delays, errors = [], []
+    for track in tracks:
+        if track.quaternion is None or track.body_rates is None:
+            continue
+        turned = turn_increments(track.quaternion) / track.dt
+        gyro = 0.5 * (track.body_rates[1:] + track.body_rates[:-1])
+        band = butter(2, BAND, "bandpass", fs=1.0 / track.dt, output="sos")
+        edge, size = int(EDGE / track.dt), max(int(WINDOW / track.dt), 1)
+        if len(gyro) < 4 * edge + size:
+            continue
+        a, b = (sosfiltfilt(band, v, axis=0)[edge:-edge] for v in (turned, gyro))
+        slope = np.gradient(a, track.dt, axis=0)
+        of_track = []
+        for k in range(0, len(a) - size // 2, size):
+            x, y = slope[k : k + size].ravel(), (a - b)[k : k + size].ravel()
+            power = float(x @ x)
+            delay = float(x @ y) / max(power, 1e-12)
+            # Within the band some ten independent values a second and axis are left.
+            left = float(((y - delay * x) ** 2).mean()) * len(x) / (3 * WINDOW * 2.0 * BAND[1])
+            of_track.append((delay, left / max(power, 1e-12)))
+        of_track = np.array(of_track)
+        delays.append(of_track[:, 0] - np.average(of_track[:, 0], weights=1.0 / of_track[:, 1]))
+        errors.append(of_track[:, 1])
+    if not delays:
+        return 0.0
+    delays, errors = np.concatenate(delays), np.concatenate(errors)
+    weights = 1.0 / (errors + WANDER_SCALE**2)
+    each = weights * (delays**2 - errors) / weights.sum()
+    excess = float(each.sum())
+    if excess < WANDER_CLEAR * float(np.sqrt((each**2).sum())):
+        return 0.0
+    found = float(np.sqrt(max(excess, 0.0)))
+    return min(found, MOST_WANDER) if found > SEEN_WANDER else 0.0
 
 
 def _world(tracks) -> tuple[np.ndarray | None, np.ndarray | None]:

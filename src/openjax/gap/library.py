@@ -19,14 +19,15 @@ from openjax.vehicle.effects import EFFECTS, Card
 CARDS: dict[str, Card] = {name: effect.card for name, effect in EFFECTS.items() if effect.card is not None}
 
 # Small errors of the vehicle's numbers that no effect is blamed for - a thrust off by less than a per cent - and what the
-# replay's own step and the half-known motor commands inside a row leave.
+# replay's own step and the half-known motor commands inside a row leave: some per cent of a torque, a millisecond.
 NUISANCES = (
     ("thrust_scale", "scale", 0.004),
-    ("inertia", "xx", 0.01),
-    ("inertia", "yy", 0.01),
-    ("inertia", "zz", 0.01),
-    ("motor_lag", "extra_up", 3e-4),
-    ("motor_lag", "extra_down", 3e-4),
+    ("inertia", "xx", 0.025),
+    ("inertia", "yy", 0.025),
+    ("inertia", "zz", 0.025),
+    ("motor_lag", "extra_up", 0.001),
+    ("motor_lag", "extra_down", 0.001),
+    ("yaw_torque", "ratio", 0.02),
 )
 # With duty cycles for motor commands the map to thrust is a guess: scale, shape, lag and torques are free, and what they
 # can imitate isn't testable.
@@ -40,6 +41,17 @@ PWM_NUISANCES = (
     ("thrust_curve", "offset", 0.15),
     ("thrust_curve", "curvature", 0.3),
     ("yaw_torque", "ratio", 0.5),
+)
+# With single samples of the motors and no way to tell what they did between them, kicks at the rows' beginnings make
+# them look stronger than they are.
+SAMPLED_NUISANCES = (
+    ("thrust_scale", "scale", 0.004),
+    ("inertia", "xx", 0.3),
+    ("inertia", "yy", 0.3),
+    ("inertia", "zz", 0.3),
+    ("motor_lag", "extra_up", 0.005),
+    ("motor_lag", "extra_down", 0.005),
+    ("yaw_torque", "ratio", 0.2),
 )
 BALANCE = 0.99  # share of the common variance that `balanced` parameters go without
 MOTOR_SHIFT = 0.001  # s, standard deviation of the motors' clock offset

@@ -1,9 +1,9 @@
 """The nominal vehicle flown along a log: what the firmware did inside each row.
 
-A row of a log holds the mean of the motor commands over 10 ms, in which the 500 Hz rate loop ran five
-times. The observer runs that loop: the nominal rate controller on body rates that the logged motors drive
-and the gyroscope corrects after every row. It gives the motor command of every tick (its mean is the
-logged one), which the physics needs, and the mean that the controller would have sent, which shows whether
+A row of a log holds the mean of the motor commands over 10 ms (or the first of them), in which the 500 Hz rate loop ran
+five times: a jump of the command kicks the motors, and they are back before the next row. The observer runs that loop: the
+nominal rate controller on body rates that the logged motors drive and the gyroscope corrects after every row. It gives the
+motor command of every tick, which the physics needs, and the one that the controller would have sent, which shows whether
 the controller is the assumed one."""
 
 from __future__ import annotations
@@ -21,15 +21,20 @@ from openjax.vehicle.wrench import total_wrench
 
 TICKS = 5  # of the rate loop per row
 GYRO_GAIN = 0.3  # share of a gyro innovation that corrects the observer, near the optimum for usual noise
+FOLLOWED = (
+    0.2  # share of what single samples of the motors miss that corrects the next ones: their noise stays out
+)
 GAIN_NAMES = ("p", "i", "d")
 
 
-def _observe(gains, vehicle, command, motor, gyro, disturbance, dt):
+def _observe(gains, vehicle, command, motor, gyro, disturbance, dt, at_once):
     """One track. gains (3,) multiples of p, i, d; command (T, TICKS, 4), motor (T, 4), gyro (T, 3) rad/s,
     disturbance (T, 3) rad/s^2 of angular acceleration beyond the nominal; dt () s per row.
 
-    Returns the controller's mean motor command (T, 4), the motor commands of the ticks (T, TICKS, 4) with
-    the logged mean, and the rates at the end of each row as predicted (T, 3)."""
+    `at_once`: a row's motor is its first tick's, not the mean.
+
+    Returns the controller's motor command as it would be logged (T, 4), the motor commands of the ticks (T, TICKS, 4) that
+    suit the log, and the rates at the end of each row as predicted (T, 3)."""
     controller = EFFECTS["rate_gains"].body(dict(zip(GAIN_NAMES, gains, strict=True)), vehicle)
     h = dt / TICKS
     at_rest = jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0])
@@ -47,6 +52,14 @@ def _observe(gains, vehicle, command, motor, gyro, disturbance, dt):
 
     def row(carry, inputs):
         command, logged, gyro_next, push = inputs
+        *carry, missed = carry
+        if at_once:
+            (rates, previous, integral, speed, _, _), (wanted, sent) = jax.lax.scan(
+                tick, (*carry, missed, push), command, unroll=True
+            )
+            missed = missed + FOLLOWED * (logged - wanted[0] - missed)
+            step = GYRO_GAIN * (gyro_next - rates)
+            return (rates + step, previous + step, integral, speed, missed), (wanted[0], sent, rates)
         _, (wanted, _) = jax.lax.scan(tick, (*carry, jnp.zeros(4), push), command, unroll=True)
         # The second pass follows the motors as logged: the controller's pattern in the row, the log's mean.
         start = (*carry, logged - wanted.mean(0), push)
@@ -58,26 +71,26 @@ def _observe(gains, vehicle, command, motor, gyro, disturbance, dt):
         sent = given
         for _ in range(3):
             sent = jnp.clip(sent + (logged - sent.mean(0)), 0.0, 1.0)
-        return (rates + step, previous + step, integral, speed), (wanted.mean(0), sent, rates)
+        return (rates + step, previous + step, integral, speed, missed), (wanted.mean(0), sent, rates)
 
     speed = vehicle.max_rotor_speed * jnp.sqrt(jnp.clip(motor[0], 1e-4, 1.0))
     gyro_next = jnp.concatenate([gyro[1:], gyro[-1:]])
-    start = (gyro[0], gyro[0], jnp.zeros(3), speed)
+    start = (gyro[0], gyro[0], jnp.zeros(3), speed, jnp.zeros(4))
     return jax.lax.scan(row, start, (command, motor, gyro_next, disturbance))[1]
 
 
-@partial(jax.jit)
-def observe(gains, vehicle, command, motor, gyro, disturbance, dt):
+@partial(jax.jit, static_argnames="at_once")
+def observe(gains, vehicle, command, motor, gyro, disturbance, dt, at_once=False):
     """`_observe` for gains (B, 3); everything else is shared."""
-    return jax.vmap(_observe, in_axes=(0, None, None, None, None, None, None))(
+    return jax.vmap(partial(_observe, at_once=at_once), in_axes=(0, None, None, None, None, None, None))(
         gains, vehicle, command, motor, gyro, disturbance, dt
     )
 
 
 @jax.jit
 def commanded(vehicle, command, dt):
-    """Mean motor commands (T, 4) that the body-rate commands (T, 4) alone cause: the nominal loop around the nominal
-    vehicle, without gyroscope noise and air."""
+    """Mean motor commands (T, 4) and body rates (T, 3) amid the rows that the body-rate commands (T, 4) alone cause:
+    the nominal loop around the nominal vehicle, without gyroscope noise and air."""
     h = dt / TICKS
     at_rest = jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0])
 
@@ -92,8 +105,9 @@ def commanded(vehicle, command, dt):
         return (after, rates, integral, speed), given
 
     def row(carry, command):
+        start = carry[0]
         carry, given = jax.lax.scan(lambda c, _: tick(c, command), carry, None, length=TICKS)
-        return carry, given.mean(0)
+        return carry, (given.mean(0), 0.5 * (start + carry[0]))
 
     speed = vehicle.max_rotor_speed * jnp.sqrt(jnp.clip(jnp.full(4, command[0, 0]), 1e-4, 1.0))
     start = (command[0, 1:], command[0, 1:], jnp.zeros(3), speed)

@@ -34,11 +34,15 @@ GYROSCOPIC = 0.1  # relative to the moments of inertia
 DAMPING = 0.15  # 1/s, of the body rates by what the rotors do
 APART = 0.03  # s, the same of motor commands whose stream isn't on the pose's clock
 ACCELEROMETER_BIAS = 0.4  # m/s^2
+ACCELEROMETER_LAG = 0.004  # s, of a low-pass before the log: 30 Hz in the firmware of the Crazyflie
+GYROSCOPE_LAG = 0.0015  # s, likewise: 80 Hz
 POSE_SHIFT = 0.0015  # s between motion capture and the vehicle's clock
-FEEDBACK = 1.0  # of the strength of what feedback makes of the motor commands
-FEEDBACK_LAG = 0.015  # s of the same
-FEEDBACK_COLUMNS = 4
-WAKE_TORQUE = 15.0  # rad/s^2 at the edge of another vehicle's wake, which no simple form of it has right
+FEEDBACK = 1.0  # of the strength of what feedback makes of the motor commands, at each of
+FEEDBACK_ROWS = (0, 2)  # rows of delay
+QUICK_ROWS = (0, 1, 2)
+# Nuisances that belong to a track, not to the vehicle.
+OF_A_TRACK = ("clock of the motors", "accelerometer bias", "clock of the pose")
+WAKE_TORQUE = 5.0  # rad/s^2 at the edge of another vehicle's wake, which no simple form of it has right
 WAKE_WIDTHS = (0.05, 0.1)  # m
 
 
@@ -70,6 +74,10 @@ class Replay:
     whitened_nuisances: list | None = None
     projections: list | None = None  # (N, M) per track: whitened nuisances times (1 + n n')^(-1/2)
     numbers: tuple = NUISANCES  # the vehicle's numbers among the nuisances, which come first
+    nuisance_names: tuple[str, ...] = ()
+    shared: np.ndarray | None = (
+        None  # (N,) whether a nuisance belongs to the vehicle (all flights) or to a track
+    )
 
     def predict(self, theta: np.ndarray, track: int | None = None) -> list[np.ndarray]:
         """Channels (B, T, 9) of each track (or of one) for parameter vectors theta (B, P)."""
@@ -87,17 +95,6 @@ class Replay:
                 _integrated(np.concatenate(parts)[:count, : len(self.tracks[number])], self.tracks[number].dt)
             )
         return out
-
-    def shared_nuisances(self, count: int) -> np.ndarray:
-        """(count,) whether a nuisance belongs to the vehicle (and so to all flights) or to a track."""
-        own = len(self.numbers)
-        shared = np.ones(count, bool)
-        shared[own] = False  # the motors' clock
-        own += FEEDBACK_COLUMNS
-        shared[own + 3 : own + 6] = False  # accelerometer bias
-        if self.usable[3]:
-            shared[own + 16] = False  # pose clock
-        return shared
 
     def set_noise(self, noises) -> None:
         """Use these noise models; unlogged channels get none and count nothing."""
@@ -156,9 +153,12 @@ def _integrated(rows: np.ndarray, dt: float) -> np.ndarray:
     return np.concatenate([integral, specific], 2)
 
 
-def make_replay(tracks, vehicles, motor_ticks, fed_back, numbers=NUISANCES, one_clock=True) -> Replay:
-    """Replay of tracks with their nominal vehicles and motor commands (T, TICKS, 4) of the rate loop's ticks; fed_back
-    [(T, 3)]: angular acceleration of what feedback made of them, whose strength and lag are free. Without `one_clock`
+def make_replay(
+    tracks, vehicles, motor_ticks, feedback, numbers=NUISANCES, one_clock=True, at_once=False, wander=0.0
+) -> Replay:
+    """Replay of tracks with their nominal vehicles and motor commands (T, TICKS, 4) of the rate loop's ticks. `feedback` of
+    each track: what it made of the motors may be anything in strength and lag. `at_once`: motor commands are single
+    samples, whose quick part and time within a row aren't known. `wander` s: by how much clocks drift. Without `one_clock`
     the IMU's stream and the motors' are apart by unknown times: the IMU counts nothing, and the motors may be off by
     tens of milliseconds."""
     paths = [jax.device_put(_path(t, m)) for t, m in zip(tracks, motor_ticks, strict=True)]
@@ -184,17 +184,32 @@ def make_replay(tracks, vehicles, motor_ticks, fed_back, numbers=NUISANCES, one_
         numbers=numbers,
     )
     index = [PLACE[key[:2]] for key in numbers] + [len(ABSENT) - 1]
-    spread = np.array([key[2] for key in numbers] + [MOTOR_SHIFT if one_clock else APART])
+    shift = (
+        max(MOTOR_SHIFT, wander + (tracks[0].dt / 4 if at_once or wander else 0.0)) if one_clock else APART
+    )
     batch = np.repeat(ABSENT[None], 1 + len(index), 0)
     batch[np.arange(len(index)) + 1, index] += STEP[index]
+    named = []
     for number, track in enumerate(tracks):
         base, *moved = replay.predict(batch, number)[0]
         replay.nominal.append(base)
-        columns = [(m - base) * s for m, s in zip(moved, spread / STEP[index], strict=True)]
-        columns += _feedback_nuisances(track, fed_back[number]) + _sensor_nuisances(
-            track, paths[number], base
-        )
-        replay.nuisances.append(np.stack(columns))
+        columns = {
+            " ".join(key[:2]): (m - base) * key[2] / STEP[k]
+            for key, m, k in zip(numbers, moved, index, strict=False)
+        }
+        columns["clock of the motors"] = (moved[-1] - base) * shift / STEP[-1]
+        columns |= _late_torques("feedback", track, feedback[number].acceleration, FEEDBACK_ROWS)
+        if at_once:
+            columns |= _late_torques("motors within a row", track, feedback[number].quick, QUICK_ROWS)
+        columns |= _sensor_nuisances(track, paths[number], base, max(POSE_SHIFT, wander))
+        columns |= _wake_torques(track)
+        named.append(columns)
+    # A track without a neighbour has no wake: nothing there.
+    names = tuple(max(named, key=len))
+    for columns, base in zip(named, replay.nominal, strict=True):
+        replay.nuisances.append(np.stack([columns.get(n, np.zeros_like(base)) for n in names]))
+    replay.nuisance_names = names
+    replay.shared = np.array([not n.startswith(OF_A_TRACK) for n in names])
     replay.set_noise([first_noise(a, i, d) for (a, i), d in zip(GROUPS, FIRST_NOISE, strict=True)])
     return replay
 
@@ -238,59 +253,57 @@ def _measured(track: Track) -> np.ndarray:
     return out
 
 
-def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> list[np.ndarray]:
-    """Tilt of the tracked frame (2), accelerometer bias (3), tilt of the IMU (3), gyroscopic torques (3),
-    damping (2), levelling of the world (2), clock of the motion capture: columns (T, 9)."""
+def _sensor_nuisances(
+    track: Track, path: Path, nominal: np.ndarray, pose_shift: float
+) -> dict[str, np.ndarray]:
+    """Mounting, biases and clocks of the sensors, and what a rigid body with small errors does: columns (T, 9)."""
     rows = len(track)
     turn = rotation(np.asarray(path.quaternion, float)[:rows])
     specific = np.gradient(nominal[:, VELOCITY], track.dt, axis=0) + np.array([0.0, 0.0, 9.81])
     body = np.einsum("tji,tj->ti", turn, specific)
+    columns: dict[str, np.ndarray] = {}
+
+    def column(name: str, channel, values, size: float) -> None:
+        out = np.zeros((rows, 9))
+        out[:, channel] = values
+        columns[name] = columns.get(name, 0.0) + out * size
 
     def moved(acceleration):  # what a change of the body-frame acceleration does to the velocity
-        column = np.zeros((rows, 9))
-        column[:, VELOCITY] = np.cumsum(np.einsum("tij,tj->ti", turn, acceleration), 0) * track.dt
-        return column
+        return np.cumsum(np.einsum("tij,tj->ti", turn, acceleration), 0) * track.dt
 
-    columns = [moved(np.cross(axis, body)) * TILT for axis in np.eye(3)[:2]]
-    for axis in range(3):
-        column = np.zeros((rows, 9))
-        column[:, 6 + axis] = ACCELEROMETER_BIAS
-        columns.append(column)
     rates = smooth(track.body_rates, 0.03, track.dt)
     force = nominal[:, FORCE]
-    for axis in np.eye(3):  # the IMU's axes
-        column = np.zeros((rows, 9))
-        column[:, RATES] = -np.cross(axis, rates - rates[0])
-        column[:, FORCE] = -np.cross(axis, force)
-        columns.append(column * IMU_TILT)
-    for axis in range(3):  # gyroscopic torques, with the rates as the gyroscope has them
-        column = np.zeros((rows, 9))
-        column[:, axis] = np.cumsum(rates[:, axis - 2] * rates[:, axis - 1]) * track.dt
-        columns.append(column * GYROSCOPIC)
-    for axes in ((0, 1), (2,)):  # damping of the body rates
-        column = np.zeros((rows, 9))
-        column[:, axes] = -np.cumsum(rates, 0)[:, axes] * track.dt
-        columns.append(column * DAMPING)
-    for axis in range(2):  # motion capture's world against gravity
-        column = np.zeros((rows, 9))
-        column[:, 3 + axis] = 9.81 * LEVEL * track.dt * np.arange(rows)
-        columns.append(column)
+    for name, axis in zip("xy", np.eye(3), strict=False):
+        column(f"frame tilt {name}", VELOCITY, moved(np.cross(axis, body)), TILT)
+    for number, name in enumerate("xyz"):
+        column(f"accelerometer bias {name}", 6 + number, 1.0, ACCELEROMETER_BIAS)
+    for name, axis in zip("xyz", np.eye(3), strict=True):
+        column(f"IMU tilt {name}", RATES, -np.cross(axis, rates - rates[0]), IMU_TILT)
+        column(f"IMU tilt {name}", FORCE, -np.cross(axis, force), IMU_TILT)
+    for axis, name in enumerate("xyz"):
+        turning = np.cumsum(rates[:, axis - 2] * rates[:, axis - 1]) * track.dt
+        column(f"gyroscopic torque {name}", axis, turning, GYROSCOPIC)
+    for name, axes in (("roll and pitch damping", (0, 1)), ("yaw damping", (2,))):
+        column(name, axes, -np.cumsum(rates, 0)[:, axes] * track.dt, DAMPING)
+    for axis, name in enumerate("xy"):
+        column(f"level of the world {name}", 3 + axis, 9.81 * track.dt * np.arange(rows), LEVEL)
+    column("accelerometer's low-pass", FORCE, -np.gradient(force, track.dt, axis=0), ACCELEROMETER_LAG)
+    spinning = np.gradient(nominal[:, RATES], track.dt, axis=0)
+    column("gyroscope's low-pass", RATES, -(spinning - spinning[0]), GYROSCOPE_LAG)
     if track.velocity is not None:
-        column = -moved(np.cross(np.asarray(path.body_rates, float)[:rows], body))
-        column[:, VELOCITY] += smooth(np.gradient(track.velocity, track.dt, axis=0), 0.05, track.dt)
-        columns.append(column * POSE_SHIFT)
-    return columns + [torque_channels(t, track.dt) * WAKE_TORQUE for t in _wake_torques(track, turn)]
+        late = -moved(np.cross(np.asarray(path.body_rates, float)[:rows], body))
+        late += smooth(np.gradient(track.velocity, track.dt, axis=0), 0.05, track.dt)
+        column("clock of the pose", VELOCITY, late, pose_shift)
+    return columns
 
 
-def _feedback_nuisances(track: Track, acceleration: np.ndarray) -> list[np.ndarray]:
-    """Columns (T, 9): strength of the motors' feedback part by roll and pitch, yaw; then its lag."""
-    columns = []
-    for part, spread in (
-        (acceleration, FEEDBACK),
-        (-np.gradient(acceleration, track.dt, axis=0), FEEDBACK_LAG),
-    ):
-        for axes in ([1.0, 1.0, 0.0], [0.0, 0.0, 1.0]):
-            columns.append(torque_channels(part * axes, track.dt) * spread)
+def _late_torques(name: str, track: Track, acceleration: np.ndarray, delays) -> dict[str, np.ndarray]:
+    """Columns (T, 9) of angular accelerations by roll and pitch, yaw, at some delays: a filter of any shape."""
+    columns = {}
+    for rows in delays:
+        late = np.concatenate([np.zeros((rows, 3)), acceleration[: len(acceleration) - rows]])
+        for axes, mask in (("roll and pitch", [1.0, 1.0, 0.0]), ("yaw", [0.0, 0.0, 1.0])):
+            columns[f"{name}, {axes}, {rows} rows late"] = torque_channels(late * mask, track.dt) * FEEDBACK
     return columns
 
 
@@ -301,17 +314,18 @@ def torque_channels(acceleration: np.ndarray, dt: float) -> np.ndarray:
     return column
 
 
-def _wake_torques(track: Track, turn: np.ndarray) -> list[np.ndarray]:
-    """Directions (T, 3), body frame, in which the wakes of vehicles above turn this one, by wake width."""
-    if track.position is None or not len(track.neighbours):
-        return []
+def _wake_torques(track: Track) -> dict[str, np.ndarray]:
+    """How the wakes of vehicles above turn this one, by wake width: columns (T, 9)."""
+    if track.position is None or not len(track.neighbours) or track.quaternion is None:
+        return {}
     gap = track.neighbours - track.position
     height = np.maximum(gap[..., 2:], 0.0)
     square = (gap[..., :2] ** 2).sum(-1, keepdims=True)
-    out = []
+    out = {}
     for width in WAKE_WIDTHS:
         strength = (gap[..., 2:] > 0.02) * np.exp(-height / 0.5 - square / (2.0 * width**2)) / width
         # The side nearer to the wake is pushed down: (gap) x (-e_z).
         world = np.stack([-gap[..., 1], gap[..., 0], np.zeros_like(gap[..., 0])], -1) * strength
-        out.append(np.einsum("tji,tj->ti", turn, world.sum(0)))
+        turned = np.einsum("tji,tj->ti", rotation(track.quaternion), world.sum(0))
+        out[f"wake, {width:g} m"] = torque_channels(turned, track.dt) * WAKE_TORQUE
     return out

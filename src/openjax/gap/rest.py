@@ -16,6 +16,7 @@ from openjax.gap.evidence import Evidence
 from openjax.gap.hypotheses import SetFit, without_nuisances
 from openjax.gap.replay import FORCE, RATES, VELOCITY, Replay, torque_channels
 from openjax.gap.selection import Selection, testable
+from openjax.gap.spectral_lines import lines
 from openjax.gap.table import Model, build, judge, with_effects
 from openjax.vehicle.effects.effect import ARENA_CEILING
 
@@ -30,11 +31,12 @@ WIDTH = 0.25  # m of the radial functions of the place
 class Rest:
     """`predicted` (6,) share of each channel's squared error on stretches left out that the dictionary predicts
     (rates x, y, z, velocity x, y, z), `nats` of likelihood that it adds there, `followed` the regressors that carry
-    most, in words."""
+    most, in words; `lines`: what is local in frequency."""
 
     predicted: np.ndarray
     nats: float
     followed: tuple[str, ...]
+    lines: tuple[str, ...] = ()
 
 
 def look(evidence: Evidence, selection: Selection) -> Rest:
@@ -67,8 +69,14 @@ def look(evidence: Evidence, selection: Selection) -> Rest:
     white = table.white.sum(0)
     alone = white[0, extra] ** 2 / (white[extra, extra] + 1.0 / spread**2)
     order = np.argsort(-alone)[:3]
+    disturbed = [
+        disturbances(t, r) for t, r in zip(replay.tracks, residuals_of(replay, selection.fit), strict=True)
+    ]
     return Rest(
-        np.maximum(predicted, 0.0), float((then.nats - now.nats).sum()), tuple(names[k] for k in order)
+        np.maximum(predicted, 0.0),
+        float((then.nats - now.nats).sum()),
+        tuple(names[k] for k in order),
+        lines(replay.tracks, disturbed, replay.usable),
     )
 
 

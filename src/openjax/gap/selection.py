@@ -16,7 +16,7 @@ from openjax.gap.library import ABSENT, CARDS, places, prior, start_of
 from openjax.gap.table import Judged, Table, build, judge, level, with_effects
 
 # The decision's numbers. None was learned from a plant.
-LEAST_GAIN = 0.02  # floors by which an effect must shrink the gap on stretches left out
+LEAST_GAIN = 0.03  # floors by which an effect must shrink the gap on stretches left out
 LEAST_NATS = 5.0  # by which it must raise their likelihood even without the second of flight that gains most:
 # very strong evidence, in the usual words
 LEAST_SHARE = 0.01  # of the gap's rms above its floor: below, an effect is what the others' forms have wrong
@@ -79,11 +79,15 @@ def select(evidence: Evidence) -> Selection:
 
 def _widened(replay, fit, table, now, singles):
     """The set with everything that stays for what it adds."""
+    dropped: set[tuple] = set()  # (a set, what came in beside it and didn't stay)
     while len(fit.effects) < MOST:
+        base = frozenset(fit.effects)
+        left = {e: f for e, f in singles.items() if (base, e) not in dropped}
         if fit.effects:
-            tried = [_joined(replay, fit, singles, e) for e in _ranked(table, singles, now)]
+            ranked = [e for e in _ranked(table, singles, now) if e in left]
+            tried = [_joined(replay, fit, singles, e) for e in ranked]
         else:
-            tried = _openings(replay, fit, singles)
+            tried = _openings(replay, fit, left)
         better = [f for f in tried if is_itself(f) and f.score > fit.score + LEAST_NATS]
         for candidate in sorted(better, key=lambda f: -f.score):
             wider = build(replay, candidate, singles)
@@ -94,6 +98,7 @@ def _widened(replay, fit, table, now, singles):
         else:
             break
         fit, table, now = _pruned(replay, candidate, wider, whole, singles)
+        dropped |= {(base, e) for e in candidate.effects if e not in fit.effects}
     return fit, table, now
 
 
@@ -210,7 +215,7 @@ def _joined(replay, fit: SetFit, singles, effect: str, without: str | None = Non
 
 def _pruned(replay, fit, table, now, singles):
     """The set without what the others do as well."""
-    while len(fit.effects) > 1:
+    while fit.effects:
         gains = {e: gain_of(table, now, e) for e in fit.effects}
         weakest = min(gains, key=lambda e: gains[e].floors)
         if gains[weakest].accepted:
@@ -244,13 +249,19 @@ def _swapped(replay, fit, table, now, singles):
         for other in favoured:
             if CARDS[other].commoner == effect:
                 favoured[other] -= CLASS
-        best = max(favoured, key=favoured.get, default=None)
-        if best is not None and favoured[best] > LEAST_NATS:
+        for best in sorted(favoured, key=lambda o: -favoured[o]):
+            if favoured[best] <= LEAST_NATS:
+                continue
+            other = build(replay, tried[best], singles)
+            whole = judge(other, with_effects(other))
+            # What fits better without predicting more takes nobody's place.
+            if not gain_of(other, whole, best).accepted:
+                del gains[best]
+                continue
             ahead = gains.pop(best)
             swaps[best] = {o: v - ahead for o, v in (gains | {effect: 0.0}).items()}
-            fit = tried[best]
-            table = build(replay, fit, singles)
-            now = judge(table, with_effects(table))
+            fit, table, now = tried[best], other, whole
+            break
         else:
             swaps[effect] = gains
     return fit, table, now, swaps

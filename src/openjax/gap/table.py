@@ -106,14 +106,10 @@ def build(replay: Replay, fit: SetFit, singles: dict[str, SetFit], more=None) ->
     moved = replay.predict(np.array(points)) if points else [np.zeros((0, *y.shape)) for y in replay.measured]
     white, error, rows, track_of, fold_of = [], [], [], [], []
     added = [()] * len(replay.tracks) if more is None else [(m,) for m in more]
-    most = max(len(n) for n in replay.nuisances)
     for number, (c, m, track) in enumerate(zip(columns, moved, replay.tracks, strict=True)):
         now = replay.measured[number] - c[0]
         nuisances = replay.nuisances[number]
-        extra = np.zeros((most - len(nuisances), *now.shape))
-        x = np.concatenate(
-            [c, m[: len(others)] - now, now - m[len(others) :], *added[number], nuisances, extra]
-        )
+        x = np.concatenate([c, m[: len(others)] - now, now - m[len(others) :], *added[number], nuisances])
         skip, size = int(SKIP / track.dt), max(int(BLOCK / track.dt), 1)
         w = replay.whiten(x, number)
         e = _errors(x, track.dt)
@@ -134,7 +130,7 @@ def build(replay: Replay, fit: SetFit, singles: dict[str, SetFit], more=None) ->
         {e: at + k for k, e in enumerate(others)},
         {e: at + len(others) + k for k, e in enumerate(own)},
         at + len(others) + len(own) + np.arange(0 if more is None else len(more[0])),
-        replay.shared_nuisances(most),
+        replay.shared,
         replay.usable[:6],
     )  # fmt: skip
 

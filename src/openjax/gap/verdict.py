@@ -7,17 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from openjax.gap.evidence import Evidence
+from openjax.gap.library import path_of
 from openjax.gap.rest import Rest
-from openjax.gap.selection import LEAST_GAIN, LEAST_NATS, TESTABLE, Selection
+from openjax.gap.selection import LEAST_GAIN, LEAST_NATS, LEAST_SHARE, TESTABLE, Selection
 from openjax.gap.shares import Split
 from openjax.vehicle.effects import EFFECTS
 
 CLOCK = 0.003  # s by which the clocks of a log may differ
 CLEAR = 3.0  # standard errors
 LEAST_LOSS = 0.01  # of the packets
-LEAST_CHANGE = 0.1  # of a gain: filters of a firmware do less
-LOST = 0.2  # of a gain
 FOLLOWED = 0.2  # of a channel's rest that follows something in the log: something is left to explain
+BESIDE = 0.15  # floors by which an effect must shrink the gap to be named beside a stronger one
 UNKNOWN_SHARE = 0.2  # of the gap, from which an unexplained rest is named beside the effects
 TEMPERATURE = (
     4.0  # divides differences of log-likelihood: residuals are never quite as independent as they count
@@ -41,16 +41,12 @@ def other_paths(evidence: Evidence) -> list[str]:
     if radio is not None:
         key = radio.shown(known, CLOCK, LEAST_LOSS, LEAST_NATS)
         found += [n for n in key if radio.gain[key] - radio.gain[_less(key, n)] > LEAST_NATS * TEMPERATURE]
-    if evidence.rate_loop is not None and "rate_gains" in known:
-        _, theta, covariance = evidence.rate_loop.score()
-        # P tells. A D that is lost faster than P is a low-pass or noise: the loop saw other rates than the log.
-        for p, d in ((0, 2), (3, 5)):
-            clear = abs(theta[p]) > max(CLEAR * float(np.sqrt(covariance[p, p])), LEAST_CHANGE)
-            if clear and theta[d] > theta[p] - LOST and "rate_gains" not in found:
-                found.append("rate_gains")
+    if evidence.gains is not None and "rate_gains" in known and evidence.gains.clear:
+        found.append("rate_gains")
     if evidence.pose is not None and "state_latency" in known:
         nats, delay, covariance = evidence.pose.score()
-        if nats > LEAST_NATS and delay[0] > max(CLOCK, CLEAR * float(np.sqrt(covariance[0, 0]))):
+        unsure = CLOCK + max(t.pose_age for t in evidence.tracks) + evidence.sensors.wander
+        if nats > LEAST_NATS and delay[0] > max(unsure, CLEAR * float(np.sqrt(covariance[0, 0]))):
             found.append("state_latency")
     return found
 
@@ -64,7 +60,7 @@ def not_testable(evidence: Evidence) -> list[str]:
     missing = [e for e in evidence.library.physics if evidence.exposure.get(e, 0.0) < TESTABLE]
     if evidence.radio is None or evidence.radio.informative < 30 or not evidence.radio.readable:
         missing += [e for e in ("command_latency", "packet_loss") if e in evidence.library.effects]
-    if evidence.rate_loop is None:
+    if evidence.gains is None or not np.isfinite(evidence.gains.error).any():
         missing += [e for e in ("rate_gains",) if e in evidence.library.effects]
     if evidence.pose is None:
         missing += [e for e in ("state_latency",) if e in evidence.library.effects]
@@ -73,11 +69,10 @@ def not_testable(evidence: Evidence) -> list[str]:
 
 def decide(evidence: Evidence, selection: Selection, rest: Rest, parts: Split, missing) -> Verdict:
     """The words that the shares give, and how sure they are."""
-    named = sorted(parts.effects, key=lambda e: -parts.effects[e].value)
+    named = _material(selection, parts)
     left = rest.nats > LEAST_NATS and rest.predicted.max() > FOLLOWED
-    strange = bool(set(evidence.sensors.findings) - {"clocks"}) or (
-        left and (not named or parts.unexplained.value > UNKNOWN_SHARE)
-    )
+    strange = bool(set(evidence.sensors.findings) - {"clocks"}) or bool(rest.lines)
+    strange = strange or (left and (not named or parts.unexplained.value > UNKNOWN_SHARE))
     effects = list(named)
     if strange:
         sizes = [parts.effects[e].value for e in named]
@@ -90,6 +85,18 @@ def decide(evidence: Evidence, selection: Selection, rest: Rest, parts: Split, m
     if word == "none" and len(missing) >= len(evidence.library.effects) // 2:
         word = "not_testable"
     return Verdict(word, tuple(effects), _probabilities(evidence, selection, parts, rest, effects))
+
+
+def _material(selection: Selection, parts: Split) -> list[str]:
+    """The effects by their share, without those that are small beside the largest: they are what its form has wrong."""
+    order = sorted(parts.effects, key=lambda e: -parts.effects[e].value)
+
+    def stays(effect: str) -> bool:
+        if effect in selection.gains:
+            return selection.gains[effect].floors >= BESIDE
+        return path_of(effect) != "radio" or parts.effects[effect].value >= LEAST_SHARE
+
+    return [e for k, e in enumerate(order) if k == 0 or stays(e)]
 
 
 def _probabilities(evidence, selection, parts: Split, rest: Rest, effects) -> dict[str, float]:

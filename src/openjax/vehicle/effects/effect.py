@@ -117,6 +117,7 @@ class Card:
     needs: the channel without which it can't be told, though it leaves a trace in others.
     coordinate: the variable that it follows, for pictures.
     thrust_map: a map from duty cycles to thrust that isn't known can imitate it.
+    within_row: what motors do between two rows of the log can imitate it.
     commoner: an effect that is named instead where both do equally well.
     is_itself({parameter: value}, {parameter: deviation}): whether it isn't by its fitted value another effect.
     sample: a strength within its usual range to fly with, strong enough to see.
@@ -133,6 +134,7 @@ class Card:
     needs: str = ""
     coordinate: str = "thrust"
     thrust_map: bool = False
+    within_row: bool = False
     commoner: str = ""
     is_itself: Callable[[Mapping[str, float], Mapping[str, float]], bool] | None = None
     sample: Mapping[str, float] = field(default_factory=dict)

@@ -20,6 +20,7 @@ EFFECT = Effect(
     body=body,
     card=Card(
         path="physics",
+        within_row=True,
         fitted=(
             Fitted("xx", mean=1.0, spread=0.12, start=1.1, step=0.005),
             Fitted("yy", mean=1.0, spread=0.12, start=1.1, step=0.005),
