@@ -22,7 +22,6 @@ VEHICLE = '[vehicle]\nmass = 0.0321\nmass_weighed = {weighed}\n\n[motor]\ncomman
 NOTHING = {
     "mass": {"extra": 0.0},
     "rotor_drag": {"d_xy": 0.0, "d_z": 0.0},
-    "rate_gains": {"p": 1.0, "i": 1.0, "d": 1.0},
 }  # one compiled flight for all cases
 DRAG = {"d_xy": 0.015, "d_z": 0.006}
 
@@ -56,7 +55,6 @@ def folders(tmp_path_factory):
         "drag": _case(root / "drag", {"rotor_drag": DRAG}),
         "mass": _case(root / "mass", {"mass": {"extra": 0.003}}),
         "weighed": _case(root / "weighed", {"thrust_scale": {"scale": -0.08}}, weighed=True),
-        "gains": _case(root / "gains", {"rate_gains": {"p": 1.5, "i": 1.0, "d": 1.0}}),
         "held": _case(root / "held", {}, logged=_held),
         "doublets": _case(root / "doublets", {}, flights=("flight_c", "flight_c")),
     }
@@ -92,12 +90,6 @@ def test_nothing_is_named_where_nothing_is_wrong(reports):
 def test_a_pose_that_rows_repeat_is_no_late_pose(reports):
     assert reports["held"].effects == ()
     assert any("repeat the last sample" in q["issue"] for q in reports["held"].quality)
-
-
-def test_gains_of_the_rate_loop_are_read_from_what_commands_excite(reports):
-    report = reports["gains"]
-    assert report.effects == ("rate_gains",)
-    assert report.parameters["rate_gains"]["p"].value == pytest.approx(1.5, abs=0.15)
 
 
 def test_a_cause_outside_the_library_is_unknown_not_its_neighbour(folders):

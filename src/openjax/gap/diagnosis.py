@@ -23,6 +23,7 @@ from openjax.gap.where import locate
 from openjax.vehicle.effects import EFFECTS
 from openjax.vehicle.vehicle_file import VehicleFile, load_vehicle_file
 
+LEAST_ERROR = 0.01  # of a value, one standard deviation
 # Pairs that motion alone can't split, whatever their scores, unless something was measured beforehand.
 ALWAYS_EQUAL = (("mass", "thrust_scale"),)
 
@@ -118,6 +119,8 @@ def estimates(evidence: Evidence, fit: SetFit, named) -> dict[str, dict[str, Est
             if path == "physics":
                 place = PLACE[effect, fitted.name]
                 value, spread = float(fit.theta[place]), float(deviation[list(fit.index).index(place)])
+                # The replay itself is no better than that.
+                spread = float(np.hypot(spread, LEAST_ERROR * value))
             else:
                 value, spread = _path_estimate(evidence, effect, number)
             reach = 1.645 * spread

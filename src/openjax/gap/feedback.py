@@ -28,7 +28,7 @@ LEAST_CHANGE = 0.15  # of a gain: filters of a firmware do less
 CLEAR = 3.0  # standard errors
 LOST = 0.1  # of a gain
 ONE_SIDED = 0.00135  # chance of a normal number beyond three of them
-HELD = 0.3  # of a usual unit's information, by which a unit alone is held near the whole
+PRIOR = np.array([0.4, 0.4, 0.4, 1.0, 1.0])  # spreads of the gains and of the delays of P and D
 MARGIN = 0.05  # of a motor command: nearer to its limits some tick of the row was cut
 LEAST_SECONDS = 6  # without a motor at its limit
 GRANULE = 0.5  # s, unit of the errors
@@ -173,8 +173,10 @@ def read_gains(tracks, vehicles, links, at_once: bool, late: float) -> Gains:
         delayed = [times * np.gradient(v[[0, 2]], track.dt, axis=1) for v in (x, z)]
         both = np.concatenate([y[None], x, delayed[0], z, delayed[1]])
         both = sosfiltfilt(band, both, axis=1)[:, edge:-edge]
-        # A motor at its limit obeys no gains, and the filter carries that on.
-        limited = ((track.motor > 1.0 - MARGIN) | (track.motor < MARGIN)).any(1)
+        # A motor at its limit obeys no gains, be it for the first tick after a jump of the command; the filter carries that on.
+        kick = gain[0] * (sent - rates) - gain[2] * slope
+        asked = in_force(track, link)[:, -1, :1] + kick @ np.asarray(mixer(vehicle), float).T
+        limited = ((np.abs(track.motor - 0.5) > 0.5 - MARGIN) | (np.abs(asked - 0.5) > 0.5 - MARGIN)).any(1)
         limited = np.convolve(limited, np.ones(2 * edge // 3 + 1), "same")[edge:-edge] > 0
         for k in range(0, both.shape[1] - size // 2, size):
             if limited[k : k + size].any():
@@ -195,27 +197,32 @@ def read_gains(tracks, vehicles, links, at_once: bool, late: float) -> Gains:
 
 
 def _between(found: np.ndarray, units: np.ndarray, theta: np.ndarray) -> np.ndarray:
-    """Errors (5,) from how much flights and axes differ, widened where they are few."""
+    """Errors (5,) from how much flights and axes differ, widened where they are few. A unit alone is held near the whole
+    by the priors, so that what it can't tell doesn't count."""
+    each = found[:, :, 0] - found[:, :, 1:] @ theta
+    spread = each.T @ each / len(found)
+    spread += 1e-9 * np.trace(spread) * np.eye(5)
+    precision = np.diag(1.0 / PRIOR**2)
     alone, weights = [], []
     for unit in np.unique(units, axis=0):
-        own = found[(units == unit).all(1)].sum(0)
-        # Two-stage least squares of the unit, held near the whole by its own share of the information.
-        hold = HELD * np.diag(np.abs(np.diag(found.sum(0)[:, 1:]))) / len(np.unique(units, axis=0))
-        hold += 1e-6 * np.abs(np.diag(own[:, 1:])).max() * np.eye(5)
-        alone.append(theta + np.linalg.solve(own[:, 1:] + hold, own[:, 0] - own[:, 1:] @ theta))
-        weights.append(np.abs(np.diag(own[:, 1:])))
+        of_unit = (units == unit).all(1)
+        own = found[of_unit].sum(0)
+        weight = np.linalg.inv(spread * of_unit.sum())
+        hessian = own[:, 1:].T @ weight @ own[:, 1:]
+        push = own[:, 1:].T @ weight @ (own[:, 0] - own[:, 1:] @ theta)
+        alone.append(np.linalg.solve(hessian + precision, push))
+        weights.append(1.0 - np.diag(np.linalg.inv(hessian + precision)) / PRIOR**2)
     count = len(alone)
     if count < 2:
         return np.full(5, np.inf)
     alone, weights = np.array(alone), np.array(weights)
     weights = weights / np.maximum(weights.sum(0), 1e-30)
-    spread = np.sqrt(((weights * (alone - theta)) ** 2).sum(0) * count / (count - 1))
-    return spread * student.ppf(1.0 - ONE_SIDED, count - 1) / 3.0
+    return np.sqrt((weights * alone**2).sum(0) / (count - 1)) * student.ppf(1.0 - ONE_SIDED, count - 1) / 3.0
 
 
 def _moments(found: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients (5,) and errors (5,) that bring the moments (B, 5, 1 + 5) to zero, with weak priors."""
-    precision = np.diag(1.0 / np.array([0.4, 0.4, 0.4, 1.0, 1.0]) ** 2)
+    precision = np.diag(1.0 / PRIOR**2)
     total = found.sum(0)
     theta = np.zeros(5)
     for _ in range(4):

@@ -72,11 +72,14 @@ def look(evidence: Evidence, selection: Selection) -> Rest:
     disturbed = [
         disturbances(t, r) for t, r in zip(replay.tracks, residuals_of(replay, selection.fit), strict=True)
     ]
+    heard = replay.usable.copy()
+    if any(t.pose_age > 0.0 for t in replay.tracks):
+        heard[VELOCITY] = 0.0  # samples put onto faster rows beat with them
     return Rest(
         np.maximum(predicted, 0.0),
         float((then.nats - now.nats).sum()),
         tuple(names[k] for k in order),
-        lines(replay.tracks, disturbed, replay.usable),
+        lines(replay.tracks, disturbed, heard),
     )
 
 

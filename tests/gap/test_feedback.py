@@ -1,0 +1,86 @@
+"""The rate loop's gains and the motors' sampling, read from a loop written out in NumPy."""
+
+import numpy as np
+import pytest
+
+from openjax.flights.track import Track
+from openjax.gap.feedback import AT_ONCE, COUNT, answers_noise, outputs_of, read_feedback, read_gains
+from openjax.vehicle import load_vehicle
+from openjax.vehicle.rate_controller import mixer
+
+ROWS, DT, TICKS = 900, 0.01, 5
+
+
+def flown(seed, p=1.0, gust=0.0, noise=0.005, sampled=False):
+    """A flight in which commands step every .3 s: rigid body, motors' lag, and the firmware's loop at 500 Hz with a P of
+    `p` times the nominal one, gusts of `gust` rad/s^2 and `noise` rad/s in the gyroscope."""
+    vehicle, rng = load_vehicle(), np.random.default_rng(seed)
+    gains = [np.asarray(getattr(vehicle, n), float) * COUNT for n in ("rate_kp", "rate_ki", "rate_kd")]
+    mix, h = np.asarray(mixer(vehicle), float), DT / TICKS
+    reach = np.asarray(vehicle.rotor_position, float)
+    arms = np.stack([reach[:, 1], -reach[:, 0]])
+    arms = np.concatenate(
+        [
+            arms,
+            float(vehicle.torque_constant / vehicle.thrust_constant)
+            * np.asarray(vehicle.rotor_spin, float)[None],
+        ]
+    )
+    turning = (
+        arms
+        * float(vehicle.thrust_constant * vehicle.max_rotor_speed**2)
+        / np.asarray(vehicle.inertia, float)[:, None]
+    )
+    command = np.repeat(0.6 * rng.standard_normal((ROWS // 30, 3)), 30, axis=0)
+    command += 0.1 * rng.standard_normal((ROWS, 3))  # a position controller's own noise
+    rates, integral, thrust, before = np.zeros(3), np.zeros(3), np.full(4, 0.6), np.zeros(3)
+    push, out = np.zeros(3), {"rates": [], "motor": []}
+    for row in range(ROWS):
+        motors = []
+        for tick in range(TICKS):
+            seen = rates + noise * rng.standard_normal(3)
+            if tick == 0:
+                out["rates"].append(seen)
+            error = command[row] - seen
+            integral = integral + h * error
+            wanted = p * gains[0] * error + gains[1] * integral - gains[2] * (seen - before) / h
+            before = seen
+            motors.append(np.clip(0.6 + mix @ wanted, 0.0, 1.0))
+            thrust = thrust + (1.0 - np.exp(-h / float(vehicle.motor_time_constant))) * (motors[-1] - thrust)
+            push = 0.98 * push + 0.2 * gust * rng.standard_normal(3)
+            rates = rates + h * (turning @ thrust + push)
+        out["motor"].append(motors[0] if sampled else np.mean(motors, 0))
+    sent = np.concatenate([np.full((ROWS, 1), 0.6), command], 1)
+    track = Track(
+        name="flight", flight="flight", dt=DT, time=DT * np.arange(ROWS), position=None, quaternion=None,
+        velocity=None, body_rates=np.array(out["rates"]), specific_force=None, command=sent,
+        motor=np.array(out["motor"]), voltage=None, neighbours=np.zeros((0, ROWS, 3)),
+    )  # fmt: skip
+    rows = np.arange(ROWS)
+    return track, vehicle, (0.0, np.stack([rows, np.maximum(rows - 1, 0)], 1))
+
+
+@pytest.mark.parametrize(
+    ("p", "sampled"), [(1.0, False), (1.4, False), (0.7, False), (1.0, True), (1.4, True)]
+)
+def test_gains_are_what_the_loop_has_whatever_gusts_and_noise_do(p, sampled):
+    flights = [flown(seed, p, gust=5.0, sampled=sampled) for seed in range(3)]
+    gains = read_gains(*zip(*flights, strict=True), at_once=sampled, late=0.0005)
+    assert gains.change[0] == pytest.approx(p - 1.0, abs=0.12)
+    assert gains.clear == (p != 1.0)
+
+
+def test_single_samples_answer_the_gyroscopes_noise():
+    answer = [answers_noise(*([x] for x in flown(0, noise=0.02, sampled=s)[:2])) for s in (False, True)]
+    assert answer[0] < answer[1] and answer[1] > 4.0 * AT_ONCE
+
+
+def test_calm_flights_leave_all_of_the_motors_to_feedback():
+    """What commands caused is told apart: with gusts alone, the feedback part is nearly all that the motors did."""
+    track, vehicle, link = flown(1, gust=20.0)
+    (still,) = read_feedback([track], [vehicle], [link])
+    quiet, _, _ = flown(1)
+    (driven,) = read_feedback([quiet], [vehicle], [link])
+    assert still.acceleration.std() > 5.0 * driven.acceleration.std()
+    made = (quiet.motor - quiet.motor.mean(0)) @ outputs_of(vehicle)
+    assert made.std() > 0.01
