@@ -190,11 +190,12 @@ def _sampled(reading: Reading, slow: bool, derived: bool) -> Reading:
     """What rows of motor commands are: means over the row or single samples, and whether what happens within a row can be
     told at all. Faster logs are averaged onto `slow` rows; rates may be `derived` from the attitude."""
     tracks, drifts = reading.tracks, reading.sensors.wander > 0.0
-    answer = answers_noise(tracks, reading.vehicles) if all(t.motors_logged for t in tracks) and slow else 0.0
+    logged = slow and all(t.motors_logged for t in tracks)
     # Rows as slow as this hide every other command of a loop that sends one each 10 ms.
     seldom = max(t.dt for t in tracks) > 1.2 * GRID_PERIOD
     known = reading.arrived is not None and not seldom and not drifts
-    at_once = answer > AT_ONCE
+    # Without commands nothing tells samples from means.
+    at_once = logged and (reading.arrived is None or answers_noise(tracks, reading.vehicles) > AT_ONCE)
     if known and at_once:
         # The log doesn't say which; the motion does.
         own = Library(("inertia",))

@@ -43,14 +43,14 @@ PWM_NUISANCES = (
     ("yaw_torque", "ratio", 0.5),
 )
 # With single samples of the motors and no way to tell what they did between them, kicks at the rows' beginnings make
-# them look stronger than they are.
+# them look stronger than they are, and up to two rows earlier.
 SAMPLED_NUISANCES = (
     ("thrust_scale", "scale", 0.004),
     ("inertia", "xx", 0.3),
     ("inertia", "yy", 0.3),
     ("inertia", "zz", 0.3),
-    ("motor_lag", "extra_up", 0.005),
-    ("motor_lag", "extra_down", 0.005),
+    ("motor_lag", "extra_up", 0.01),
+    ("motor_lag", "extra_down", 0.01),
     ("yaw_torque", "ratio", 0.2),
 )
 BALANCE = 0.99  # share of the common variance that `balanced` parameters go without

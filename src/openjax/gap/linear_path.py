@@ -19,7 +19,7 @@ class LinearPath:
 
     grams: np.ndarray  # (F, 1 + P, 1 + P) whitened inner products per flight, nuisances marginalised
     spread: np.ndarray  # (P,)
-    before: list[np.ndarray]  # (T, A) residuals without the effect, nuisances taken off
+    before: list[np.ndarray]  # (T, A) residuals without the effect, all else as fitted
     residual: list[np.ndarray]  # (T, A) residuals after the fit
     noises: tuple[Noise, ...]
     rows: int  # residuals that counted
@@ -74,7 +74,8 @@ def fit_linear_path(
             grams[flight_of[number]] += marginal_gram(whitened[-1][:size], whitened[-1][size:])
         _, theta, _ = linear_score(grams.sum(0), spread)
         residual = [_left(d, w, theta) for d, w in zip(data, whitened, strict=True)]
-    before = [_left(d, w, 0.0 * theta) for d, w in zip(data, whitened, strict=True)]
+    # Nuisances stay as they are beside the effect: set free, a clock of a few ms would take any delay.
+    before = [r + np.tensordot(theta, d[1:size], 1) for r, d in zip(residual, data, strict=True)]
     return LinearPath(grams, spread, before, residual, noises, rows)
 
 

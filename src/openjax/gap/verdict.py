@@ -70,7 +70,8 @@ def not_testable(evidence: Evidence) -> list[str]:
 def decide(evidence: Evidence, selection: Selection, rest: Rest, parts: Split, missing) -> Verdict:
     """The words that the shares give, and how sure they are."""
     named = _material(selection, parts)
-    left = rest.nats > LEAST_NATS and rest.predicted.max() > FOLLOWED
+    material = parts.gap.after > 1.0 + LEAST_GAIN
+    left = material and rest.nats > LEAST_NATS and rest.predicted.max() > FOLLOWED
     strange = bool(set(evidence.sensors.findings) - {"clocks"}) or bool(rest.lines)
     strange = strange or (left and (not named or parts.unexplained.value > UNKNOWN_SHARE))
     effects = list(named)

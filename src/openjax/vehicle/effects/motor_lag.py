@@ -29,7 +29,6 @@ EFFECT = Effect(
     body=body,
     card=Card(
         path="physics",
-        within_row=True,
         fitted=(
             Fitted("extra_up", mean=0.0, spread=0.03, start=0.01, step=0.0005),
             Fitted("extra_down", mean=0.0, spread=0.03, start=0.01, step=0.0005),
