@@ -15,53 +15,26 @@ import jax
 import numpy as np
 
 from openjax.errors import UserError
+from openjax.flying.c_text import (
+    BINARY,
+    PRODUCT,
+    UNARY,
+    dims,
+    indented,
+    index_names,
+    literal,
+    loops,
+    number_rows,
+    offset_by,
+)
 from openjax.flying.traced import Walk, trace
 
-_BINARY = {
-    "add": "({} + {})", "sub": "({} - {})", "mul": "({} * {})", "div": "({} / {})", "add_any": "({} + {})",
-    "max": "fmaxf({}, {})", "min": "fminf({}, {})", "pow": "powf({}, {})",
-    "lt": "(float)({} < {})", "le": "(float)({} <= {})", "gt": "(float)({} > {})", "ge": "(float)({} >= {})",
-    "eq": "(float)({} == {})", "ne": "(float)({} != {})", "and": "(float)({} != 0.0f && {} != 0.0f)",
-    "or": "(float)({} != 0.0f || {} != 0.0f)",
-}  # fmt: skip
-_UNARY = {
-    "tanh": "tanhf({})", "exp": "expf({})", "log": "logf({})", "neg": "(-{})", "abs": "fabsf({})", "sqrt": "sqrtf({})",
-    "rsqrt": "(1.0f / sqrtf({}))", "logistic": "(1.0f / (1.0f + expf(-{})))", "sin": "sinf({})", "cos": "cosf({})",
-    "floor": "floorf({})", "erf": "erff({})", "not": "(float)({} == 0.0f)",
-}  # fmt: skip
 _SAME = ("stop_gradient", "copy", "copy_p", "optimization_barrier", "convert_element_type")
 _REDUCE = {
     "reduce_sum": ("0.0f", "{} + {}"),
     "reduce_max": ("-INFINITY", "fmaxf({}, {})"),
     "reduce_min": ("INFINITY", "fminf({}, {})"),
 }
-_PRODUCT = """
-/* out (rows, columns) = a (rows, inner) times b (inner, columns), all of them dense. Eight columns at a time: their sums
-   stay in registers, and both a compiler that vectorises and a processor without vectors do well by it. */
-static void product(const float *a, const float *b, float *out, int rows, int inner, int columns)
-{
-    for (int i = 0; i < rows; i++) {
-        int j = 0;
-        for (; j + 8 <= columns; j += 8) {
-            float sum[8] = {0.0f};
-            for (int k = 0; k < inner; k++) {
-                const float x = a[i * inner + k];
-                const float *w = b + k * columns + j;
-                for (int u = 0; u < 8; u++)
-                    sum[u] += x * w[u];
-            }
-            for (int u = 0; u < 8; u++)
-                out[i * columns + j + u] = sum[u];
-        }
-        for (; j < columns; j++) {
-            float sum = 0.0f;
-            for (int k = 0; k < inner; k++)
-                sum += a[i * inner + k] * b[k * columns + j];
-            out[i * columns + j] = sum;
-        }
-    }
-}
-"""
 
 
 @dataclass(frozen=True)
@@ -164,7 +137,7 @@ class _Writer(Walk):
                 value = one
                 same.append(axis)
         if value.size == 1:
-            number = _literal(value.item())
+            number = literal(value.item())
             return _Value(whole, lambda _: number, frozenset())
         key = np.ascontiguousarray(value).tobytes()
         if key not in self._names:
@@ -199,9 +172,9 @@ class _Writer(Walk):
         if value.dense is not None:
             return value
         number, stored = self.buffer(value.shape)
-        indices = _indices(value.shape)
+        indices = index_names(value.shape)
         body = f"{stored.at(indices)} = {value.at(indices)};"
-        self.emit(_loops(value.shape, indices, body), number, value.reads)
+        self.emit(loops(value.shape, indices, body), number, value.reads)
         return stored
 
     # -- operations
@@ -220,11 +193,11 @@ class _Writer(Walk):
             return self._product(inputs, p["dimension_numbers"], equation, shape)
         values = [self.value(value) for value in inputs]
         first = values[0]
-        if name in _BINARY:
-            return self._elementwise(_BINARY[name], values, shape)
-        if name in _UNARY:
+        if name in BINARY:
+            return self._elementwise(BINARY[name], values, shape)
+        if name in UNARY:
             self.functions += math.prod(shape) * (name not in ("neg", "abs", "not", "floor"))
-            return self._elementwise(_UNARY[name], values, shape)
+            return self._elementwise(UNARY[name], values, shape)
         if name == "integer_pow":
             return self._power(first, p["y"], shape)
         if name == "square":
@@ -244,7 +217,9 @@ class _Writer(Walk):
         if name == "slice":
             starts, steps = p["start_indices"], p["strides"] or [1] * len(shape)
             return self._view(
-                first, shape, lambda at: [_sum(i, k, s) for i, k, s in zip(at, starts, steps, strict=True)]
+                first,
+                shape,
+                lambda at: [offset_by(i, k, s) for i, k, s in zip(at, starts, steps, strict=True)],
             )
         if name == "concatenate":
             return self._join(values, shape, p["dimension"])
@@ -314,7 +289,9 @@ class _Writer(Walk):
                 self._view(
                     value,
                     shape,
-                    lambda at, start=start: [_sum(i, start if a == axis else 0, 1) for a, i in enumerate(at)],
+                    lambda at, start=start: [
+                        offset_by(i, start if a == axis else 0, 1) for a, i in enumerate(at)
+                    ],
                 )
             )
             start += size
@@ -324,36 +301,36 @@ class _Writer(Walk):
         number, joined = self.buffer(shape)
         start = 0
         for value in values:
-            indices = _indices(value.shape)
-            there = [_sum(i, start if a == axis else 0, 1) for a, i in enumerate(indices)]
+            indices = index_names(value.shape)
+            there = [offset_by(i, start if a == axis else 0, 1) for a, i in enumerate(indices)]
             body = f"{joined.at(there)} = {value.at(indices)};"
-            self.emit(_loops(value.shape, indices, body), number, value.reads)
+            self.emit(loops(value.shape, indices, body), number, value.reads)
             start += value.shape[axis]
         return joined
 
     def _pad(self, values, shape, padding):
         value, filling = values
         number, padded = self.buffer(shape)
-        indices = _indices(shape)
+        indices = index_names(shape)
         body = f"{padded.at(indices)} = {filling.at(())};"
-        self.emit(_loops(shape, indices, body), number, filling.reads)
-        indices = _indices(value.shape)
-        there = [_sum(i, low, 1) for i, (low, _, _) in zip(indices, padding, strict=True)]
+        self.emit(loops(shape, indices, body), number, filling.reads)
+        indices = index_names(value.shape)
+        there = [offset_by(i, low, 1) for i, (low, _, _) in zip(indices, padding, strict=True)]
         body = f"{padded.at(there)} = {value.at(indices)};"
-        self.emit(_loops(value.shape, indices, body), number, value.reads)
+        self.emit(loops(value.shape, indices, body), number, value.reads)
         return padded
 
     def _reduce(self, value, shape, axes, start, form):
         number, reduced = self.buffer(shape)
-        every = _indices(value.shape)
+        every = index_names(value.shape)
         outer = [i for a, i in enumerate(every) if a not in axes]
         inner = [i for a, i in enumerate(every) if a in axes]
         body = f"sum = {form.format('sum', value.at(every))};"
         body = (
-            f"float sum = {start};\n{_loops([value.shape[a] for a in axes], inner, body)}\n"
+            f"float sum = {start};\n{loops([value.shape[a] for a in axes], inner, body)}\n"
             f"{reduced.at(outer)} = sum;"
         )
-        self.emit(_loops(shape, outer, body), number, value.reads)
+        self.emit(loops(shape, outer, body), number, value.reads)
         return reduced
 
     def _product(self, inputs, numbers, equation, shape):
@@ -405,43 +382,6 @@ def _dense(name, shape, reads=frozenset()) -> _Value:
     return _Value(shape, at, reads, dense=name)
 
 
-def _indices(shape) -> list[str]:
-    return ["0" if size == 1 else f"i{axis}" for axis, size in enumerate(shape)]
-
-
-def _loops(sizes, indices, body: str) -> str:
-    """`body` for all values of the indices that vary."""
-    heads = [
-        f"for (int {i} = 0; {i} < {size}; {i}++)"
-        for i, size in zip(indices, sizes, strict=True)
-        if str(i) != "0"
-    ]
-    if "\n" in body:
-        body = "{\n" + _indented(body) + "\n}"
-    return "\n".join([*(4 * " " * k + head for k, head in enumerate(heads)), _indented(body, len(heads))])
-
-
-def _indented(text: str, times: int = 1) -> str:
-    return "\n".join(4 * " " * times + line for line in text.splitlines())
-
-
-def _sum(index, start, step) -> str:
-    moved = index if step == 1 or index == "0" else f"{index} * {step}"
-    if start == 0:
-        return moved
-    return str(start) if index == "0" else f"({moved} + {start})"
-
-
-def _literal(number: float) -> str:
-    if math.isinf(number):
-        return "INFINITY" if number > 0 else "-INFINITY"
-    if math.isnan(number):
-        return "NAN"
-    text = f"{np.float32(number):.9g}"
-    text = text if any(c in text for c in ".e") else text + ".0"
-    return f"({text}f)" if number < 0 else f"{text}f"
-
-
 def _placed(buffers: list[_Buffer]) -> int:
     """Give all buffers their offsets, so that two that live at once don't overlap; the floats needed."""
     placed: list[_Buffer] = []
@@ -480,9 +420,9 @@ def c_program(
     (result,) = writer.run(traced.jaxpr, traced.consts, given)
     result = writer.value(result)
     shape = tuple(traced.out_avals[0].shape)
-    indices = _indices(shape)
+    indices = index_names(shape)
     writer.statements.append(
-        _loops(shape, indices, f"{_dense(output, shape).at(indices)} = {result.at(indices)};")
+        loops(shape, indices, f"{_dense(output, shape).at(indices)} = {result.at(indices)};")
     )
     for buffer in result.reads:
         writer.buffers[buffer].read = len(writer.statements)
@@ -490,7 +430,7 @@ def c_program(
     text = "\n".join(writer.statements)
     read = {name: kind for name, kind in inputs.items() if f"in->{name}[" in text or f"in->{name}," in text}
     fields = "\n".join(
-        f"    {'unsigned char' if kind.dtype == bool else 'float'} {name}[{math.prod(kind.shape)}]; /* {_dims(kind.shape)} */"
+        f"    {'unsigned char' if kind.dtype == bool else 'float'} {name}[{math.prod(kind.shape)}]; /* {dims(kind.shape)} */"
         for name, kind in read.items()
     )
     upper = prefix.upper()
@@ -504,26 +444,26 @@ typedef struct {{ /* arrays row by row */
 {fields}
 }} {prefix}_observation;
 
-/* {output} {_dims(shape)}, row by row. Nothing is kept between calls; the workspace need not be cleared. */
+/* {output} {dims(shape)}, row by row. Nothing is kept between calls; the workspace need not be cleared. */
 void {prefix}(const {prefix}_observation *in, float workspace[{upper}_WORKSPACE], float {output}[{math.prod(shape)}]);
 
 #endif
 """
     arrays = "\n".join(
-        f"static const float c{k}[{value.size}] = {{\n{_numbers(value)}\n}};"
+        f"static const float c{k}[{value.size}] = {{\n{number_rows(value)}\n}};"
         for k, value in enumerate(writer.constants)
     )
     places = "\n".join(
         f"float *const t{k} = workspace + {buffer.offset};" for k, buffer in enumerate(writer.buffers)
     )
-    product = _PRODUCT if writer.multiply_adds else ""
+    product = PRODUCT if writer.multiply_adds else ""
     signature = (
         f"void {prefix}(const {prefix}_observation *in, float workspace[{upper}_WORKSPACE], "
         f"float {output}[{math.prod(shape)}])"
     )
     source = (
         f'/* {about}. Generated by python -m openjax.export. */\n#include <math.h>\n#include "{prefix}.h"\n{product}\n'
-        f"{arrays}\n\n{signature}\n{{\n{_indented(places)}\n\n{_indented(text)}\n}}\n"
+        f"{arrays}\n\n{signature}\n{{\n{indented(places)}\n\n{indented(text)}\n}}\n"
     )
     return CProgram(
         header,
@@ -536,12 +476,3 @@ void {prefix}(const {prefix}_observation *in, float workspace[{upper}_WORKSPACE]
         writer.multiply_adds,
         writer.functions,
     )
-
-
-def _dims(shape) -> str:
-    return "(" + ", ".join(map(str, shape)) + ")"
-
-
-def _numbers(value: np.ndarray) -> str:
-    literals = [_literal(number).strip("()") for number in value.tolist()]
-    return "\n".join(", ".join(literals[k : k + 8]) + "," for k in range(0, len(literals), 8))

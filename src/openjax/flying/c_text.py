@@ -1,0 +1,99 @@
+"""Pieces of C99 as text: operations, literals, loops and the product of matrices."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+BINARY = {
+    "add": "({} + {})", "sub": "({} - {})", "mul": "({} * {})", "div": "({} / {})", "add_any": "({} + {})",
+    "max": "fmaxf({}, {})", "min": "fminf({}, {})", "pow": "powf({}, {})",
+    "lt": "(float)({} < {})", "le": "(float)({} <= {})", "gt": "(float)({} > {})", "ge": "(float)({} >= {})",
+    "eq": "(float)({} == {})", "ne": "(float)({} != {})", "and": "(float)({} != 0.0f && {} != 0.0f)",
+    "or": "(float)({} != 0.0f || {} != 0.0f)",
+}  # fmt: skip
+UNARY = {
+    "tanh": "tanhf({})", "exp": "expf({})", "log": "logf({})", "neg": "(-{})", "abs": "fabsf({})", "sqrt": "sqrtf({})",
+    "rsqrt": "(1.0f / sqrtf({}))", "logistic": "(1.0f / (1.0f + expf(-{})))", "sin": "sinf({})", "cos": "cosf({})",
+    "floor": "floorf({})", "erf": "erff({})", "not": "(float)({} == 0.0f)",
+}  # fmt: skip
+PRODUCT = """
+/* out (rows, columns) = a (rows, inner) times b (inner, columns), all of them dense. Eight columns at a time: their sums
+   stay in registers, and both a compiler that vectorises and a processor without vectors do well by it. */
+static void product(const float *a, const float *b, float *out, int rows, int inner, int columns)
+{
+    for (int i = 0; i < rows; i++) {
+        int j = 0;
+        for (; j + 8 <= columns; j += 8) {
+            float sum[8] = {0.0f};
+            for (int k = 0; k < inner; k++) {
+                const float x = a[i * inner + k];
+                const float *w = b + k * columns + j;
+                for (int u = 0; u < 8; u++)
+                    sum[u] += x * w[u];
+            }
+            for (int u = 0; u < 8; u++)
+                out[i * columns + j + u] = sum[u];
+        }
+        for (; j < columns; j++) {
+            float sum = 0.0f;
+            for (int k = 0; k < inner; k++)
+                sum += a[i * inner + k] * b[k * columns + j];
+            out[i * columns + j] = sum;
+        }
+    }
+}
+"""
+
+
+def index_names(shape) -> list[str]:
+    """Names of the indices of an array, "0" along axes of one entry."""
+    return ["0" if size == 1 else f"i{axis}" for axis, size in enumerate(shape)]
+
+
+def loops(sizes, indices, body: str) -> str:
+    """`body` for all values of the indices that vary."""
+    heads = [
+        f"for (int {i} = 0; {i} < {size}; {i}++)"
+        for i, size in zip(indices, sizes, strict=True)
+        if str(i) != "0"
+    ]
+    if "\n" in body:
+        body = "{\n" + indented(body) + "\n}"
+    return "\n".join([*(4 * " " * k + head for k, head in enumerate(heads)), indented(body, len(heads))])
+
+
+def indented(text: str, times: int = 1) -> str:
+    """Lines moved in by four spaces, `times` over."""
+    return "\n".join(4 * " " * times + line for line in text.splitlines())
+
+
+def offset_by(index, start, step) -> str:
+    """The index of a slice as an index of the whole axis."""
+    moved = index if step == 1 or index == "0" else f"{index} * {step}"
+    if start == 0:
+        return moved
+    return str(start) if index == "0" else f"({moved} + {start})"
+
+
+def literal(number: float) -> str:
+    """A float32 constant; negative ones in brackets."""
+    if math.isinf(number):
+        return "INFINITY" if number > 0 else "-INFINITY"
+    if math.isnan(number):
+        return "NAN"
+    text = f"{np.float32(number):.9g}"
+    text = text if any(c in text for c in ".e") else text + ".0"
+    return f"({text}f)" if number < 0 else f"{text}f"
+
+
+def dims(shape) -> str:
+    """A shape for comments."""
+    return "(" + ", ".join(map(str, shape)) + ")"
+
+
+def number_rows(value: np.ndarray) -> str:
+    """Entries of a const array (N,), eight to a line."""
+    literals = [literal(number).strip("()") for number in value.tolist()]
+    return "\n".join(", ".join(literals[k : k + 8]) + "," for k in range(0, len(literals), 8))
