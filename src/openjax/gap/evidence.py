@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -54,6 +55,18 @@ class Evidence:
     @property
     def nothing(self) -> SetFit:
         return self.sets[()]
+
+
+class Look(NamedTuple):
+    """One look at the physics: the replay, what each set explains, what typical effects would show, the residuals that are
+    floor, and the rate loop's path and gains (None without commands)."""
+
+    replay: Replay
+    sets: dict[tuple[str, ...], SetFit]
+    exposure: dict[str, float]
+    floor: list[np.ndarray]
+    rate_loop: LinearPath | None
+    gains: Gains | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,44 +137,30 @@ def gather(case: Case, library: Library, progress=None) -> Evidence:
     reading = _sampled(reading, slow, derived)
     lap("paths")
     tell("replaying the flights")
-    found = _physics(reading, library)
+    look = _physics(reading, library)
     lap("first look")
     known = ()
     for _ in range(LOOKS - 1):
-        fits = [f for f in found[1].values() if isinstance(f, SetFit)]
+        fits = [f for f in look.sets.values() if isinstance(f, SetFit)]
         best = max(fits, key=lambda f: f.score - WORTH_KNOWING * len(f.effects))
-        gains = _clear_gains(found[5], library)
-        surprising = best.effects and best.score - found[1][()].score > WORTH_A_SECOND_LOOK
-        if found[4] is None or set(best.effects) == set(known) or not (surprising or gains is not None):
+        gains = _clear_gains(look.gains, library)
+        surprising = best.effects and best.score - look.sets[()].score > WORTH_A_SECOND_LOOK
+        if look.rate_loop is None or set(best.effects) == set(known) or not (surprising or gains is not None):
             break
         # The rate controller was read with the nominal physics and gains: once more with what was found.
         tell("looking again with what was found")
         known, pushes = best.effects, None
         if surprising:
-            moved, plain = found[0].predict(best.theta[None]), found[0].predict(ABSENT[None])
+            moved, plain = look.replay.predict(best.theta[None]), look.replay.predict(ABSENT[None])
             pushes = [
                 np.gradient((m - p)[0, :, :3], track.dt, axis=0)
                 for track, m, p in zip(tracks, moved, plain, strict=True)
             ]
-        found = _physics(reading, library, pushes, gains, found[1])
+        look = _physics(reading, library, pushes, gains, look.sets)
         lap("next look")
-    replay, sets, exposure, floor, rate_loop, gains = found
     return Evidence(
-        case,
-        library,
-        tracks,
-        vehicles,
-        replay,
-        sets,
-        exposure,
-        floor,
-        radio,
-        rate_loop,
-        gains,
-        pose,
-        sensors,
-        seconds,
-    )
+        case, library, tracks, vehicles, *look[:4], radio, look.rate_loop, look.gains, pose, sensors, seconds
+    )  # fmt: skip
 
 
 def _pose(tracks, flight_of, late: bool):
@@ -207,14 +206,15 @@ def _sampled(reading: Reading, slow: bool, derived: bool) -> Reading:
     return dataclasses.replace(reading, blind=blind, late=late)
 
 
-def _looks_sampled(vehicles, mean, single) -> bool:
+def _looks_sampled(vehicles, mean: Look, single: Look) -> bool:
     """Whether torques are off as single samples taken for means would have them, and right once they are taken for what
     they are. Commands jump where rows begin, so the first motor command of a row is stronger than the row's mean, and a
     vehicle flown by such samples seems heavier to turn."""
-    if any(("inertia",) not in look[1] for look in (mean, single)):
+    if any(("inertia",) not in look.sets for look in (mean, single)):
         return False
     paths = [
-        np.asarray(p.motor, float)[: len(t)] for p, t in zip(single[0].paths, single[0].tracks, strict=True)
+        np.asarray(p.motor, float)[: len(t)]
+        for p, t in zip(single.replay.paths, single.replay.tracks, strict=True)
     ]
     first, whole = (
         np.concatenate(
@@ -224,23 +224,23 @@ def _looks_sampled(vehicles, mean, single) -> bool:
     )
     kick = ((first * whole).sum(0) / np.maximum((whole**2).sum(0), 1e-12))[:2].mean() - 1.0
     off = [
-        np.mean([v for v, _ in list(look[1]["inertia",].parameters()["inertia"].values())[:2]]) - 1.0
+        np.mean([v for v, _ in list(look.sets["inertia",].parameters()["inertia"].values())[:2]]) - 1.0
         for look in (mean, single)
     ]
     return kick > LEAST_KICK and off[0] > kick and abs(off[1]) < 0.25 * off[0]
 
 
-def _physics(reading: Reading, library: Library, pushes=None, gains=None, before=None):
-    """Replay, scores of the sets, exposure, floor residuals, the rate loop's path and gains."""
+def _physics(reading: Reading, library: Library, pushes=None, gains=None, before=None) -> Look:
+    """Look at the physics. `pushes`, `gains`: what an earlier look found; `before`: its sets, to start from."""
     tracks, vehicles, arrived, at_once = reading.tracks, reading.vehicles, reading.arrived, reading.at_once
-    rate_loop, found, ticks = None, None, [np.repeat(t.motor[:, None], TICKS, 1) for t in tracks]
+    rate_loop, read, ticks = None, None, [np.repeat(t.motor[:, None], TICKS, 1) for t in tracks]
     links = arrived if arrived is not None else [None] * len(tracks)
     if arrived is not None:
         base = np.zeros(3) if gains is None else gains
         loop = firmware.read_rate_loop(
             tracks, vehicles, arrived, reading.flight_of, pushes, base, at_once, reading.late
         )
-        rate_loop, ticks, found = loop.path, loop.ticks, loop.gains
+        rate_loop, ticks, read = loop.path, loop.ticks, loop.gains
         if at_once:
             tracks = [dataclasses.replace(t, motor=m.mean(1)) for t, m in zip(tracks, ticks, strict=True)]
     feedback, sensors = read_feedback(tracks, vehicles, links), reading.sensors
@@ -253,4 +253,4 @@ def _physics(reading: Reading, library: Library, pushes=None, gains=None, before
         unseen = card.needs and any(getattr(t, card.needs) is None for t in tracks)
         if unseen or (card.within_row and reading.blind):
             exposure[effect] = 0.0
-    return replay, weigh_singles(replay, library, exposure, before), exposure, floor, rate_loop, found
+    return Look(replay, weigh_singles(replay, library, exposure, before), exposure, floor, rate_loop, read)

@@ -26,17 +26,15 @@ BAND = (0.5, 10.0)  # Hz in which the loop's gains are read: above trims, below 
 EDGE = 0.3  # s at either end that the filters spoil
 LEAST_CHANGE = 0.15  # of a gain: filters of a firmware do less
 CLEAR = 3.0  # standard errors
-LOST = 0.1  # of a gain
+LOST = 0.1  # of a gain, by which D may fall beyond P
 ONE_SIDED = 0.00135  # chance of a normal number beyond three of them
 PRIOR = np.array([0.4, 0.4, 0.4, 1.0, 1.0])  # spreads of the gains and of the delays of P and D
 MARGIN = 0.05  # of a motor command: nearer to its limits some tick of the row was cut
 LEAST_SECONDS = 6  # without a motor at its limit
 GRANULE = 0.5  # s, unit of the errors
 FILTER_DELAY = 0.004  # s, usual size of what low-passes do to the derivative
-ROW_DELAY = (
-    0.0005,
-    0.0025,
-)  # s by which motors may be off, where rows are the log's and where they are means of its rows
+# s by which motors may be off, where rows are the log's own and where they are means of its rows
+ROW_DELAY = (0.0005, 0.0025)
 COUNT = 57.29577951308232 / 65536.0  # motor command per count and rad/s
 
 
@@ -146,10 +144,10 @@ def read_gains(tracks, vehicles, links, at_once: bool, late: float) -> Gains:
     slope as the gyroscope has them, with what the nominal loop would have done under the same commands as instruments.
     `late` s: by how much the motors' rows may be off against the gyroscope's. Moments over short times, weighed by their
     own spread (generalised method of moments, Hansen 1982), so that neither colour nor clocks need a model."""
-    moments: dict[int, list] = {0: [], 1: [], 2: []}  # axis: (moments, unit) of every second
+    moments: dict[int, list] = {0: [], 1: [], 2: []}  # axis: [(moments, unit)] of every granule
     for unit, (track, vehicle, link) in enumerate(zip(tracks, vehicles, links, strict=True)):
-        sent = in_force(track, link)[:, 0 if at_once else slice(None), 1:]
-        sent = sent if at_once else sent.mean(1)
+        ruling = in_force(track, link)
+        sent = ruling[:, 0, 1:] if at_once else ruling[..., 1:].mean(1)
         _, drawn = _caused(track, vehicle, link)
         rates = track.body_rates
         after = np.concatenate([rates[1:], rates[-1:]])
@@ -175,7 +173,7 @@ def read_gains(tracks, vehicles, links, at_once: bool, late: float) -> Gains:
         both = sosfiltfilt(band, both, axis=1)[:, edge:-edge]
         # A motor at its limit obeys no gains, be it for the first tick after a jump of the command; the filter carries that on.
         kick = gain[0] * (sent - rates) - gain[2] * slope
-        asked = in_force(track, link)[:, -1, :1] + kick @ np.asarray(mixer(vehicle), float).T
+        asked = ruling[:, -1, :1] + kick @ np.asarray(mixer(vehicle), float).T
         limited = ((np.abs(track.motor - 0.5) > 0.5 - MARGIN) | (np.abs(asked - 0.5) > 0.5 - MARGIN)).any(1)
         limited = np.convolve(limited, np.ones(2 * edge // 3 + 1), "same")[edge:-edge] > 0
         for k in range(0, both.shape[1] - size // 2, size):

@@ -65,7 +65,8 @@ class Kinematics:
 
 def read_kinematics(tracks: list[Track]) -> Kinematics:
     """Compare the sensors of all tracks of one case."""
-    gain, error, coherence, turning = _gyroscope(tracks)
+    streams = _streams(tracks)
+    gain, error, coherence, turning = _gyroscope(streams)
     tilt, tilt_error = _world(tracks)
     findings = {}
     # Two axes alike are a sensor; one alone may be an axis that the flights hardly turn about.
@@ -87,7 +88,7 @@ def read_kinematics(tracks: list[Track]) -> Kinematics:
                 f"motion capture's world leans by {np.degrees(size):.1f} degrees against gravity "
                 f"({np.degrees(tilt[0]):+.1f} about x, {np.degrees(tilt[1]):+.1f} about y)"
             )
-    return Kinematics(gain, error, tilt, tilt_error, coherence, turning, findings, _wander(tracks))
+    return Kinematics(gain, error, tilt, tilt_error, coherence, turning, findings, _wander(streams))
 
 
 def corrected(track: Track, found: Kinematics) -> Track:
@@ -107,20 +108,29 @@ def corrected(track: Track, found: Kinematics) -> Track:
     return dataclasses.replace(track, **changes) if changes else track
 
 
-def _gyroscope(tracks) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Gain (3,), its error (3,) and the correlation (3,) of gyroscope and attitude's rate, axis by axis, in BAND; whether
-    an axis turns enough (3,)."""
-    sums = []  # per granule: (3, 3) sums of squares and products
+def _streams(tracks) -> list[tuple[float, np.ndarray, np.ndarray]]:
+    """Row period (s), rate of the attitude (T, 3) and gyroscope (T, 3), rad/s in BAND without the ends, of each track that
+    has both and is long enough to be filtered."""
+    out = []
     for track in tracks:
         if track.quaternion is None or track.body_rates is None:
             continue
         turned = turn_increments(track.quaternion) / track.dt
         gyro = 0.5 * (track.body_rates[1:] + track.body_rates[:-1])
         band = butter(2, BAND, "bandpass", fs=1.0 / track.dt, output="sos")
-        edge, size = int(EDGE / track.dt), max(int(GRANULE / track.dt), 1)
+        edge = int(EDGE / track.dt)
         if len(gyro) < 4 * edge:
             continue
-        a, b = (sosfiltfilt(band, v, axis=0)[edge:-edge] for v in (turned, gyro))
+        out.append((track.dt, *(sosfiltfilt(band, v, axis=0)[edge:-edge] for v in (turned, gyro))))
+    return out
+
+
+def _gyroscope(streams) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Gain (3,), its error (3,) and the correlation (3,) of gyroscope and attitude's rate, axis by axis, in BAND; whether
+    an axis turns enough (3,)."""
+    sums = []  # per granule: (3, 3) sums of squares and products
+    for dt, a, b in streams:
+        size = max(int(GRANULE / dt), 1)
         for k in range(0, len(a) - size // 2, size):
             p, q = a[k : k + size], b[k : k + size]
             sums.append(np.stack([(p * p).sum(0), (p * q).sum(0), (q * q).sum(0), np.full(3, len(p))]))
@@ -142,20 +152,14 @@ def _gyroscope(tracks) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     return np.where(turning & (coherence > COHERENT), gain, np.nan), error, coherence, turning
 
 
-def _wander(tracks) -> float:
+def _wander(streams) -> float:
     """How far (s, rms) the delay between gyroscope and attitude's rate varies from window to window, beyond its errors."""
     delays, errors = [], []
-    for track in tracks:
-        if track.quaternion is None or track.body_rates is None:
+    for dt, a, b in streams:
+        size = max(int(WINDOW / dt), 1)
+        if len(a) < 2 * int(EDGE / dt) + size:
             continue
-        turned = turn_increments(track.quaternion) / track.dt
-        gyro = 0.5 * (track.body_rates[1:] + track.body_rates[:-1])
-        band = butter(2, BAND, "bandpass", fs=1.0 / track.dt, output="sos")
-        edge, size = int(EDGE / track.dt), max(int(WINDOW / track.dt), 1)
-        if len(gyro) < 4 * edge + size:
-            continue
-        a, b = (sosfiltfilt(band, v, axis=0)[edge:-edge] for v in (turned, gyro))
-        slope = np.gradient(a, track.dt, axis=0)
+        slope = np.gradient(a, dt, axis=0)
         of_track = []
         for k in range(0, len(a) - size // 2, size):
             x, y = slope[k : k + size].ravel(), (a - b)[k : k + size].ravel()

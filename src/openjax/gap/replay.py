@@ -26,7 +26,7 @@ FIRST_NOISE = (0.03, 0.03, 0.006, 0.006, 0.25, 0.25)
 SKIP = 0.2  # s left out at the start of a track: rotor speeds are not known there
 BUCKETS = (256, 512, 1024, 2048, 4096, 8192, 16384, 32768)
 BATCH = 8
-# Nuisances and their standard deviations; see GAP: free in every hypothesis.
+# Nuisances and their standard deviations, free in every hypothesis.
 TILT = np.radians(0.5)  # between tracked frame and thrust axis
 LEVEL = np.radians(0.15)  # of motion capture's world
 IMU_TILT = 0.01  # rad, between the IMU's axes and the body's
