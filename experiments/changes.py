@@ -12,10 +12,11 @@ either: what the comparison assumes stands at the top of `openjax/gap/changes.py
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import json
+import os
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -128,24 +129,33 @@ def figure(folder: Path) -> list[str]:
 
 def main() -> None:
     """Run one of the three."""
-    what, folder = sys.argv[1], Path(sys.argv[2])
-    if what == "open":
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("what", choices=("open", "answer", "figure"))
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of the page or the answers")
+    parser.add_argument("--commit", help="said on the page where git isn't there")
+    options = parser.parse_args()
+    if options.what == "figure":
+        print("\n".join(figure(options.folder)))
+        return
+    made_at = options.commit or commit()
+    if options.what == "open":
         text = (
             "# What changed: real flights of one Crazyflie with known changes (CrazyPAD, vehicle E8)\n\n"
-            f"`python -m experiments.changes open FOLDER` at {commit()}; two cores. Every condition against all normal\n"
-            "flights (twelve logs, three days by their trims), every day of normal flights against the others. Logs of the\n"
-            "motors and of the controller together; no orientation, in motor logs no gyroscope.\n\n"
+            f"`python -m experiments.changes open FOLDER` at {made_at}; {os.cpu_count()} cores. Every condition against all\n"
+            "normal flights (twelve logs, three days by their trims), every day of normal flights against the others. Logs of\n"
+            "the motors and of the controller together; no orientation, in motor logs no gyroscope.\n\n"
         )
-        (RESULTS / "changes_e8.md").write_text(text + open_table(folder) + "\n", encoding="utf-8")
-    elif what == "figure":
-        print("\n".join(figure(folder)))
+        (options.out / "changes_e8.md").write_text(text + open_table(options.folder) + "\n", encoding="utf-8")
     else:
         found = {
-            "commit": commit(),
+            "commit": made_at,
             "command": "python -m experiments.changes answer FOLDER",
-            "cases": answer(folder),
+            "cases": answer(options.folder),
         }
-        (RESULTS / "changes_e9.json").write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+        (options.out / "changes_e9.json").write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

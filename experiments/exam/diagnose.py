@@ -1,9 +1,10 @@
 """Diagnose every case below a folder as a user would: `python -m openjax.diagnose CASE`, in parallel processes.
 
-    python -m experiments.exam.diagnose LOGS --out DIAGNOSES [--jobs 8] [--seconds 300]
+    python -m experiments.exam.diagnose LOGS --out DIAGNOSES [--jobs 8] [--seconds 300] [--study]
 
 The processes see the logs alone. Beside what the command writes, `runs.json` holds for each case its seconds, exit
-status, the one-line error or the traceback. The first case of a process compiles; `first` marks it.
+status, the one-line error or the traceback. The first case of a process compiles; `first` marks it. `--study` keeps what the
+engine weighed, too (see `study`).
 """
 
 import argparse
@@ -18,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments.exam import study
 from experiments.single_thread import use_single_thread
 
 _done = 0  # cases that this process has diagnosed
@@ -26,11 +28,14 @@ _done = 0  # cases that this process has diagnosed
 def diagnose_case(job):
     """(name, facts) of one case; its report lies in OUT/<name>/report.json if there is one."""
     global _done
-    folder, out = job
+    folder, out, keep_notes = job
     start, said, status, trace = time.perf_counter(), io.StringIO(), None, None
     try:
         from openjax import diagnose
+        from openjax.gap import report
 
+        if keep_notes and _done == 0:
+            report.write_report = study.with_notes(report.write_report)
         with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
             status = diagnose.main([str(folder), "--out", str(out), "--no-html", "--overwrite"])
     except SystemExit as stop:
@@ -43,10 +48,10 @@ def diagnose_case(job):
     return folder.name, facts
 
 
-def diagnose_all(logs, out, jobs=1, seconds=None):
+def diagnose_all(logs, out, jobs=1, seconds=None, keep_notes=False):
     """All cases below `logs` in a fixed random order, or those that `seconds` allow: {case: facts}."""
     folders = sorted(p.parent for p in Path(logs).glob("*/vehicle.toml"))
-    work = [(folders[i], Path(out)) for i in np.random.default_rng(0).permutation(len(folders))]
+    work = [(folders[i], Path(out), keep_notes) for i in np.random.default_rng(0).permutation(len(folders))]
     facts, start = {}, time.perf_counter()
     Path(out).mkdir(parents=True, exist_ok=True)
     use_single_thread()  # before a worker imports JAX
@@ -83,8 +88,9 @@ def main():
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--seconds", type=float, help="write what is done by then")
+    parser.add_argument("--study", action="store_true", help="also write what the engine weighed")
     options = parser.parse_args()
-    diagnose_all(options.logs, options.out, options.jobs, options.seconds)
+    diagnose_all(options.logs, options.out, options.jobs, options.seconds, options.study)
 
 
 if __name__ == "__main__":
