@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import openjax
-from openjax.baselines import DacoopPolicy, Heuristic, velocity_action
+from openjax.baselines import DacoopPolicy, Heuristic, VelocityPolicy, velocity_action
 from openjax.baselines.apf import apf
 from openjax.baselines.dacoop import START
 from openjax.baselines.surroundings import Craft, surroundings
@@ -86,6 +86,26 @@ def test_a_heuristic_says_what_it_cannot_fly(changes, complaint):
         environment = openjax.make(physics="rigid", **changes)
     with pytest.raises(UserError, match=complaint):
         Heuristic.for_environment("apf", environment)
+
+
+def test_a_velocity_policy_flies_the_velocity_that_its_network_puts_out():
+    """Where it asks for more than the drones may fly, their largest speed."""
+    network, predictor = NetworkSettings(output="velocity", squash="mean"), PredictorSettings(enabled=False)
+    policy = VelocityPolicy.for_environment(HONEST, network, predictor)
+    sample = jnp.array([[0.3, -0.4, 0.0], [2.0, 1.0, 0.0]])
+
+    def one(carry, _):
+        observation, state = carry
+        observation, state, *_ = HONEST.step(jax.random.key(0), state, policy.action(sample, observation))
+        return (observation, state), None
+
+    start = jax.jit(HONEST.reset_to)(jax.random.key(1), APART)
+    (_, state), _ = jax.jit(lambda start: jax.lax.scan(one, start, None, length=80))(start)
+    diagonal = policy.craft.speed / np.sqrt(2.0)
+    expected = [[0.3 * policy.craft.speed, -0.4 * policy.craft.speed, 0.0], [diagonal, diagonal, 0.0]]
+    np.testing.assert_allclose(state.drones.velocity, expected, atol=0.05)
+    with pytest.raises(UserError, match="control steps"):
+        VelocityPolicy.for_environment(openjax.make(physics="rigid", time_step=0.05), network, predictor)
 
 
 def test_dacoop_flies_the_field_that_its_network_sets():

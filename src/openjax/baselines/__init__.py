@@ -3,13 +3,14 @@
 from openjax.baselines.dacoop import DacoopPolicy
 from openjax.baselines.heuristic import METHODS, Heuristic
 from openjax.baselines.velocity_controller import velocity_action
+from openjax.baselines.velocity_policy import VelocityPolicy
 from openjax.policy import NetworkSettings, Policy, PredictorSettings
 from openjax.pursuit import Pursuit
 
-__all__ = ["METHODS", "DacoopPolicy", "Heuristic", "make_policy", "velocity_action"]
+__all__ = ["METHODS", "DacoopPolicy", "Heuristic", "VelocityPolicy", "make_policy", "velocity_action"]
 
 
 def make_policy(environment: Pursuit, network: NetworkSettings, predictor: PredictorSettings) -> Policy:
     """The policy for an environment, of the kind that `network.output` says."""
-    kind = DacoopPolicy if network.output == "field" else Policy
-    return kind.for_environment(environment, network, predictor)
+    kinds = {"commands": Policy, "velocity": VelocityPolicy, "field": DacoopPolicy}
+    return kinds[network.output].for_environment(environment, network, predictor)

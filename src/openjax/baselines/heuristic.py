@@ -12,13 +12,9 @@ from openjax.baselines.apf import ApfParameters, apf
 from openjax.baselines.janosov import JanosovParameters, janosov
 from openjax.baselines.parameters import best
 from openjax.baselines.surroundings import Craft, Surroundings, surroundings
-from openjax.baselines.velocity_controller import velocity_action
-from openjax.errors import UserError
+from openjax.baselines.velocity_controller import check_flyable, velocity_action
 from openjax.policy import PolicyParameters, PredictorSettings
 from openjax.pursuit import Observation, Pursuit
-
-SLOWEST_CONTROL = 0.03
-"""Control step (s) beyond which the velocity controller's attitude loop would ring."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,17 +47,8 @@ class Heuristic:
         Raises:
             UserError: the velocity controller can't fly there.
         """
-        craft, settings = Craft.of(environment), environment.settings
-        if settings.time_step > SLOWEST_CONTROL:
-            raise UserError(
-                f"{name}: its velocity controller can't fly control steps of {settings.time_step} s; "
-                f"at most {SLOWEST_CONTROL} s are possible"
-            )
-        if craft.hover_thrust > 0.8:
-            raise UserError(
-                f"{name}: a vehicle that hovers at {craft.hover_thrust:.2f} of its thrust leaves its velocity "
-                "controller no room; at most 0.8 is possible"
-            )
+        craft = Craft.of(environment)
+        check_flyable(name, craft, environment.settings.time_step)
         return cls(name, craft)
 
     def parameters(self) -> PolicyParameters:

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from openjax.baselines.surroundings import QUATERNION, VELOCITY, Craft, length, unit
+from openjax.errors import UserError
 from openjax.pursuit import Observation
 from openjax.pursuit.observation import rotation_axes
 
@@ -24,6 +25,24 @@ CLIMB_LIMITS = (-0.5, 0.3)
 """Vertical acceleration in units of gravity; thrust over weight is 1.44 with the commanded thrust cut at 0.9."""
 GRAVITY = 9.81
 """m/s^2"""
+SLOWEST_CONTROL = 0.03
+"""Control step (s) beyond which the attitude loop would ring."""
+HEAVIEST = 0.8
+"""Share of the thrust that hovers beyond which there is no room to climb and brake."""
+
+
+def check_flyable(name: str, craft: Craft, time_step: float) -> None:
+    """Raises UserError where the controller can't fly this craft with control steps of `time_step` (s) for `name`."""
+    if time_step > SLOWEST_CONTROL:
+        raise UserError(
+            f"{name}: its velocity controller can't fly control steps of {time_step} s; "
+            f"at most {SLOWEST_CONTROL} s are possible"
+        )
+    if craft.hover_thrust > HEAVIEST:
+        raise UserError(
+            f"{name}: a vehicle that hovers at {craft.hover_thrust:.2f} of its thrust leaves its velocity "
+            f"controller no room; at most {HEAVIEST} is possible"
+        )
 
 
 def velocity_action(craft: Craft, observation: Observation, desired: jax.Array) -> jax.Array:

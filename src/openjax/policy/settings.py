@@ -23,9 +23,9 @@ class NetworkSettings:
     squash: Literal["mean", "sample"] = "mean"
     """What the tanh bounds. "mean": exploration is added after it and cut at the bounds, so that the mean policy does
     what the exploring one does on average; "sample": exploration passes through the tanh, which shifts that average."""
-    output: Literal["commands", "field"] = "commands"
-    """What the actor puts out. "commands": thrust and body rates; "field": parameters of a potential field, whose force a
-    velocity controller flies (DACOOP)."""
+    output: Literal["commands", "velocity", "field"] = "commands"
+    """What the actor puts out. "commands": thrust and body rates; "velocity": a velocity, which a controller flies; "field":
+    parameters of a potential field, whose force that controller flies (DACOOP)."""
     critic_input: Literal["state", "observation"] = "state"
     """"state": the critic also sees the true evader, its velocity and the own position; "observation": what the actor sees."""
     critic_encoder: Literal["attention", "layers"] = "attention"
