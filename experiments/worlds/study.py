@@ -57,6 +57,8 @@ class Job:
     layout: str
     start: int
     number: int
+    latest: float = math.inf
+    """Time (s since the epoch) after which it isn't begun."""
 
 
 def make_world(world: str, ticks: int, start: int, drones, tasks):
@@ -94,8 +96,10 @@ def loaded_policy(name: str):
     return loaded, settings
 
 
-def do(job: Job) -> tuple[Job, dict[str, list[float]], float]:
-    """Figures of each episode of a job."""
+def do(job: Job) -> tuple[Job, dict[str, list[float]], float] | None:
+    """Figures of each episode of a job; None where it is too late to begin."""
+    if time.time() > job.latest:
+        return None
     begin = time.perf_counter()
     loaded, settings = loaded_policy(job.policy)
     task = scenario_task(settings, SCENARIOS[job.layout])
@@ -130,9 +134,9 @@ def smoothness(actions: np.ndarray, time_step: float) -> dict[str, list[float]]:
 
 def study(options: argparse.Namespace) -> dict:
     """Fly all policies in all layouts of all worlds."""
-    started = time.monotonic()
+    started, latest = time.monotonic(), time.time() + options.seconds
     jobs = [
-        Job(policy, world, layout, start, min(options.chunk, options.episodes - start))
+        Job(policy, world, layout, start, min(options.chunk, options.episodes - start), latest)
         for world in sorted(options.world, key=lambda name: name != "rotorpy")  # the slowest first
         for policy in options.policy
         for layout in options.layout
@@ -140,7 +144,10 @@ def study(options: argparse.Namespace) -> dict:
     ]
     found: dict[str, dict] = {}
     with multiprocessing.get_context("spawn").Pool(min(options.jobs, len(jobs))) as pool:
-        for done, (job, figures, seconds) in enumerate(pool.imap_unordered(do, jobs), 1):
+        for done, result in enumerate(pool.imap_unordered(do, jobs), 1):
+            if result is None:
+                continue
+            job, figures, seconds = result
             place = found.setdefault(job.policy, {}).setdefault(job.world, {}).setdefault(job.layout, {})
             for name, values in figures.items():
                 place.setdefault(name, []).extend(values)
@@ -244,4 +251,5 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=100, help="per layout")
     parser.add_argument("--chunk", type=int, default=50, help="episodes that one process flies at once")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--seconds", type=float, default=math.inf, help="begin nothing new after this long")
     publish(parser.parse_args(), study, report)
