@@ -251,6 +251,7 @@ def _physics(reading: Reading, library: Library, pushes=None, gains=None, before
     for effect in library.physics:
         card = CARDS[effect]
         unseen = card.needs and any(getattr(t, card.needs) is None for t in tracks)
+        unseen = unseen or (card.impossible is not None and any(card.impossible(t.position) for t in tracks))
         if unseen or (card.within_row and reading.blind):
             exposure[effect] = 0.0
     return Look(replay, weigh_singles(replay, library, exposure, before), exposure, floor, rate_loop, read)

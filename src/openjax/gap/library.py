@@ -53,7 +53,7 @@ SAMPLED_NUISANCES = (
     ("motor_lag", "extra_down", 0.01),
     ("yaw_torque", "ratio", 0.2),
 )
-BALANCE = 0.99  # share of the common variance that `balanced` parameters go without
+BALANCE = 0.9999  # share of the common variance that `balanced` parameters go without
 MOTOR_SHIFT = 0.001  # s, standard deviation of the motors' clock offset
 
 

@@ -85,16 +85,19 @@ class Replay:
         fill = -count % BATCH
         theta = np.concatenate([theta, np.repeat(theta[:1], fill, 0)]).astype(np.float32)
         physics = compiled_physics(PHYSICS_EFFECTS, THETA)
-        out = []
-        for number in range(len(self.tracks)) if track is None else (track,):
-            parts = [
-                np.asarray(physics(theta[i : i + BATCH], self.vehicles[number], self.paths[number]))
+        numbers = range(len(self.tracks)) if track is None else (track,)
+        # All of it is under way before any of it is waited for.
+        running = [
+            [
+                physics(theta[i : i + BATCH], self.vehicles[n], self.paths[n])
                 for i in range(0, len(theta), BATCH)
             ]
-            out.append(
-                _integrated(np.concatenate(parts)[:count, : len(self.tracks[number])], self.tracks[number].dt)
-            )
-        return out
+            for n in numbers
+        ]
+        return [
+            _integrated(np.concatenate(parts)[:count, : len(self.tracks[n])], self.tracks[n].dt)
+            for n, parts in zip(numbers, running, strict=True)
+        ]
 
     def set_noise(self, noises) -> None:
         """Use these noise models; unlogged channels get none and count nothing."""

@@ -17,7 +17,7 @@ from openjax.gap.hypotheses import SetFit, without_nuisances
 from openjax.gap.replay import FORCE, RATES, VELOCITY, Replay, torque_channels
 from openjax.gap.selection import Selection, testable
 from openjax.gap.spectral_lines import lines
-from openjax.gap.table import Model, build, judge, with_effects
+from openjax.gap.table import Model, build, judge, solve, with_effects
 from openjax.vehicle.effects.effect import ARENA_CEILING
 
 SPREAD = 0.3  # m/s^2 and, times TORQUE, rad/s^2: prior rms of a regressor's part of the motion
@@ -25,6 +25,8 @@ TORQUE = 10.0
 RADIUS = 0.023  # m, of a propeller
 RARE = 0.3  # of a regressor's usual size: one that happened less is not blown up
 WIDTH = 0.25  # m of the radial functions of the place
+# Regressors of the motion itself, by force along it.
+ALONG = ("force x by velocity", "force y by velocity", "force z by vertical speed")
 
 
 @dataclass(frozen=True)
@@ -57,13 +59,12 @@ def look(evidence: Evidence, selection: Selection) -> Rest:
     plain = with_effects(table)
     extra = table.more
     spread = np.array([SPREAD * (TORQUE if tables[0][n][0] == "torque" else 1.0) for n in names])
-    wide = Model(
-        plain.parts,
-        np.concatenate([plain.free, extra]).astype(int),
-        np.concatenate([plain.mean, np.zeros(len(extra))]),
-        _diagonal(plain.precision, 1.0 / spread**2),
-    )
-    now, then = judge(table, plain), judge(table, wide)
+    along = np.array([n in ALONG for n in names])
+    carried = _widened(plain, extra[along], spread[along])
+    # What pushes along the motion came before it: gusts carry the vehicle with them. What brakes it is an effect.
+    pushes = -solve(table, carried)[0, extra] > 0.0
+    base = _widened(plain, extra[along & pushes], spread[along & pushes])
+    now, then = judge(table, base), judge(table, _widened(plain, extra, spread))
     left = now.squares.sum(0)
     predicted = np.where(table.usable > 0, 1.0 - then.squares.sum(0) / np.maximum(left, 1e-30), 0.0)
     white = table.white.sum(0)
@@ -80,6 +81,16 @@ def look(evidence: Evidence, selection: Selection) -> Rest:
         float((then.nats - now.nats).sum()),
         tuple(names[k] for k in order),
         lines(replay.tracks, disturbed, heard),
+    )
+
+
+def _widened(model: Model, columns: np.ndarray, spread: np.ndarray) -> Model:
+    """The model with further columns free, whose coefficients are small in units of their `spread`."""
+    return Model(
+        model.parts,
+        np.concatenate([model.free, columns]).astype(int),
+        np.concatenate([model.mean, np.zeros(len(columns))]),
+        _diagonal(model.precision, 1.0 / spread**2),
     )
 
 

@@ -1,7 +1,7 @@
 """Rotors near the ceiling push more: they pull the vehicle up to it."""
 
 from openjax.vehicle.effects.airspeed import hub_height
-from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
+from openjax.vehicle.effects.effect import ARENA_CEILING, Card, Effect, Fitted, Parameter
 from openjax.vehicle.effects.ground_effect import gain
 
 
@@ -9,6 +9,11 @@ def thrust(parameters, thrust, reaction, context):
     """The ground effect mirrored at the ceiling, per rotor."""
     distance = context.ceiling_height - hub_height(context)
     return thrust * gain(parameters["strength"], distance + parameters["offset"]), reaction
+
+
+def above(position) -> bool:
+    """Whether a flight was where the ceiling should be: there is none."""
+    return bool((position[:, 2] > ARENA_CEILING).any())
 
 
 _SOURCE = "as strong as the ground effect or stronger (Hsiao, Chirarattananon 2019)"
@@ -31,6 +36,7 @@ EFFECT = Effect(
         others=((0.4, 0.0), (0.4, 0.025), (0.4, 0.05)),
         needs="position",
         coordinate="height",
+        impossible=above,
         sample={"strength": 0.6, "offset": 0.01},
         next_flight="slow passes just below the ceiling.",
     ),

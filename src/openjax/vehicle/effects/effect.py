@@ -121,6 +121,7 @@ class Card:
     commoner: an effect that is named instead where both do equally well.
     is_itself({parameter: value}, {parameter: deviation}): whether it isn't by its fitted value another effect.
     sample: a strength within its usual range to fly with, strong enough to see.
+    impossible(position): whether a flight along position (T, 3), m, rules it out.
     next_flight: what would show it, in words.
     """
 
@@ -137,6 +138,7 @@ class Card:
     within_row: bool = False
     commoner: str = ""
     is_itself: Callable[[Mapping[str, float], Mapping[str, float]], bool] | None = None
+    impossible: Callable[[Any], bool] | None = None
     sample: Mapping[str, float] = field(default_factory=dict)
     next_flight: str = ""
 
