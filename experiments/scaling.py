@@ -24,8 +24,8 @@ import tyro
 from experiments import pages
 from openjax.cluster.devices import carry_shardings, check_devices, everywhere, make_device_step
 from openjax.commands.command_line import parse, peek, run_command
-from openjax.commands.loop import guarded
 from openjax.commands.machine import describe_machine
+from openjax.commands.training_loop import guarded
 from openjax.errors import UserError
 from openjax.learning import TrainCarry, TrainSettings, build, init_carry, preset
 from openjax.store.checkpoints import place

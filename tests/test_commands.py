@@ -172,7 +172,7 @@ import sys, jax
 from openjax.learning import TrainSettings, init_carry, make_training_step
 from openjax.store.checkpoints import Checkpoints, abstract_like, place
 from openjax.store.environments import make_environment
-from openjax.commands.loop import guarded
+from openjax.commands.training_loop import guarded
 from openjax.store.run_directory import open_run
 
 run = open_run(sys.argv[1])

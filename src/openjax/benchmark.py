@@ -19,7 +19,7 @@ from rich.table import Table
 
 from openjax.commands.command_line import output_console, parse, peek, run_command
 from openjax.commands.machine import describe_machine
-from openjax.commands.shares import measure, shares_table
+from openjax.commands.step_shares import measure, shares_table
 from openjax.commands.timing import Timing, time_compiled
 from openjax.errors import UserError
 from openjax.files import check_output

@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -83,9 +84,8 @@ def run(options: Options) -> int:
         try:
             with console.status(f"{name}: reading") as status:
                 case = load_case(folder)
-                tell = lambda text, name=name: status.update(f"{name}: {text}")  # noqa: E731
-                report = diagnose_case(case, options.without, tell)
-                tell("writing the report")
+                report = diagnose_case(case, options.without, partial(_tell, status, name))
+                _tell(status, name, "writing the report")
                 _write(report, options.out / name, options.html)
         except UserError as error:
             failed += 1
@@ -129,6 +129,11 @@ def _compare(options: Options, names: list[str], console) -> int:
     if options.predictions is not None and predictions:
         write_json(options.predictions, predictions)
     return 2 if failed == len(names) else 0
+
+
+def _tell(status, name: str, text: str) -> None:
+    """Show what is being done to a case."""
+    status.update(f"{name}: {text}")
 
 
 def _write(report, folder: Path, pictures: bool) -> None:

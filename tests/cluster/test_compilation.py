@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import pytest
 
 from openjax.cluster.compilation import compile_ahead
-from openjax.commands.loop import guarded
+from openjax.commands.training_loop import guarded
 from openjax.store.checkpoints import abstract_like, place
 
 

@@ -39,7 +39,7 @@ from openjax.learning.training_step import _initial_carry
 from openjax.pursuit import Pursuit
 from openjax.store.checkpoints import Checkpoints, load_arrays, named_leaves, place
 from openjax.cluster.devices import carry_shardings, everywhere, make_device_step
-from openjax.commands.loop import guarded
+from openjax.commands.training_loop import guarded
 from openjax.store.run_directory import RunDirectory
 
 run, directory, UPDATES = RunDirectory(Path(sys.argv[1])), Path(sys.argv[2]), int(sys.argv[3])

@@ -25,7 +25,7 @@ from openjax.commands.evaluator import (
     layout_slots,
     record_of,
 )
-from openjax.commands.loop import NotFiniteError, Plan, StopRequest, guarded, run_updates
+from openjax.commands.training_loop import NotFiniteError, Plan, StopRequest, guarded, run_updates
 from openjax.commands.validation import SCORE_RULE, Validation, flat_metrics, selection_score
 from openjax.learning import TrainSettings, build, make_start, summarise
 from openjax.learning.train_state import policy_leaf

@@ -181,7 +181,10 @@ def _stand(drones):
     w, z = drones.quaternion[:, 0], drones.quaternion[:, 3]
     size = jnp.sqrt(w * w + z * z + 1e-12)
     level = jnp.stack([w / size, 0 * w, 0 * w, z / size], axis=-1)
-    keep = lambda fixed, free: jnp.where(below[:, None], fixed, free)  # noqa: E731
+
+    def keep(fixed, free):
+        return jnp.where(below[:, None], fixed, free)
+
     still = jnp.zeros_like(drones.velocity)
     drones = drones.replace(
         position=drones.position.at[:, 2].set(jnp.where(below, 0.0, drones.position[:, 2])),

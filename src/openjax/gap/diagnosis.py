@@ -178,7 +178,10 @@ def _nuisances(evidence: Evidence, selection: Selection) -> dict[str, str]:
     """What the vehicle's numbers and the sensors' mounting took, in usual sizes; a number at its bound says so."""
     names = np.array(evidence.replay.nuisance_names)[evidence.replay.shared]
     taken = judge(selection.table, with_effects(selection.table)).taken.mean(0)
-    at = lambda v: ", at its bound" if abs(v) > 0.99 * BOUND else ""  # noqa: E731
+
+    def at(v):
+        return ", at its bound" if abs(v) > 0.99 * BOUND else ""
+
     return {n: f"{v:+.2f} of its usual size{at(v)}" for n, v in zip(names, taken, strict=True)}
 
 

@@ -153,9 +153,10 @@ def _fly(plant: Vehicle, assumed: Vehicle, wanted, voltage, parameters, key, nam
         """Of every drone. The cell gives less with charge (0.02 V/s is a short, hard flight) and with
         load."""
         under_load = voltage - 0.004 * air_time - 0.5 * load
-        build = lambda d, near, v: make_context(  # noqa: E731
-            flown, d, others_position=near, battery_voltage=v, air_time=air_time, dt=dt
-        )
+
+        def build(d, near, v):
+            return make_context(flown, d, others_position=near, battery_voltage=v, air_time=air_time, dt=dt)
+
         return jax.vmap(build)(drones, drones.position[others], under_load), under_load
 
     def row(carry, inputs):
@@ -176,9 +177,10 @@ def _fly(plant: Vehicle, assumed: Vehicle, wanted, voltage, parameters, key, nam
         def rate_loop(inner, noise):
             drones, _ = inner
             gyro = drones.body_rates + gyro_bias + sensors.gyro_noise * noise
-            control = lambda d, g, c: rate_controller(  # noqa: E731
-                flown, d.replace(body_rates=g), c, PERIOD / RATE_LOOPS
-            )
+
+            def control(d, g, c):
+                return rate_controller(flown, d.replace(body_rates=g), c, PERIOD / RATE_LOOPS)
+
             motor, rate_integral = jax.vmap(control)(drones, gyro, command)
             drones = drones.replace(rate_integral=rate_integral, previous_body_rates=gyro)
             for _ in range(SUBSTEPS):
@@ -192,8 +194,8 @@ def _fly(plant: Vehicle, assumed: Vehicle, wanted, voltage, parameters, key, nam
         (after, force_after), motors = jax.lax.scan(rate_loop, (drones, force), noise)
         motors = motors.mean(0)
         if effects:
-            record = lambda d: composition.record(effects, d.effect_memory, d, PERIOD)  # noqa: E731
-            after = after.replace(effect_memory=jax.vmap(record)(after))
+            memory = jax.vmap(lambda d: composition.record(effects, d.effect_memory, d, PERIOD))(after)
+            after = after.replace(effect_memory=memory)
         # What motion capture and estimator deliver is what the controller sees; the IMU knows the moment
         # itself.
         pose = (seen.position, seen.quaternion, seen.velocity)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from openjax.commands.shares import ARITHMETIC, BANDWIDTH, Share, _products
+from openjax.commands.step_shares import ARITHMETIC, BANDWIDTH, Share, _products
 from openjax.learning import preset
 
 F, HEADS, OTHERS, PILLARS = 128, 2, 2, 3

@@ -11,7 +11,7 @@ import pytest
 from flax import struct
 from rich.console import Console
 
-from openjax.commands.loop import NotFiniteError, Plan, StopRequest, guarded, run_updates
+from openjax.commands.training_loop import NotFiniteError, Plan, StopRequest, guarded, run_updates
 from openjax.show.metrics import MetricsWriter, read_metrics
 from openjax.show.progress import Progress
 from openjax.store.checkpoints import Checkpoints, abstract_like, is_checkpoint, named_leaves, place

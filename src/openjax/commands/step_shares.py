@@ -50,27 +50,27 @@ def measure(settings: TrainSettings, seconds_of: Callable[[Callable, tuple], flo
     parts, carry = build(settings), init_carry(settings, jax.random.key(0))
     environment, policy, steps = parts.environment, parts.policy, settings.rollout_length
     agents = settings.num_envs * settings.environment.num_pursuers
-    noise = jax.random.normal(
-        jax.random.key(1), (steps, settings.num_envs, settings.environment.num_pursuers, policy.sample_size)
-    )
+    shape = (steps, settings.num_envs, settings.environment.num_pursuers)
+    noise = jax.random.normal(jax.random.key(1), (*shape, policy.sample_size))
+    actions = jnp.tanh(jax.random.normal(jax.random.key(1), (*shape, 4)))
 
-    def physics(state, noise):
-        def one(drones, noise):
-            command = action_to_command(jnp.tanh(noise[..., :4]))
+    def physics(state, actions):
+        def one(drones, action):
+            command = action_to_command(action)
             move = jax.vmap(environment.dynamics, (None, 0, 0, 0, 0, 0 if state.vehicles else None))
             pillars = (state.task.pillar_position, state.task.pillar_active)
             effects = {**state.vehicles, **environment.effect_parameters}
             return move(environment.vehicle, drones, command, *pillars, effects), None
 
-        return jax.lax.scan(one, state.drones, noise)[0]
+        return jax.lax.scan(one, state.drones, actions)[0]
 
-    def game(state, noise):
-        def one(state, noise):
+    def game(state, actions):
+        def one(state, action):
             step = jax.vmap(environment.step, (None, 0, 0))
-            observation, state, reward, *_ = step(jax.random.key(0), state, jnp.tanh(noise[..., :4]))
+            observation, state, reward, *_ = step(jax.random.key(0), state, action)
             return state, (observation.replace(frames=observation.frames[:, -1:]), reward)
 
-        return jax.lax.scan(one, state, noise)
+        return jax.lax.scan(one, state, actions)
 
     def rollout(carry, noise):
         return collect(environment, policy, carry.policy, carry.observation, carry.state, noise)
@@ -96,8 +96,8 @@ def measure(settings: TrainSettings, seconds_of: Callable[[Callable, tuple], flo
 
     collected, observation, _ = jax.jit(rollout)(carry, noise)
     programs: dict[str, tuple[Callable, tuple]] = {
-        "physics": (physics, (carry.state, noise)),
-        "environment": (game, (carry.state, noise)),
+        "physics": (physics, (carry.state, actions)),
+        "environment": (game, (carry.state, actions)),
         "rollout": (rollout, (carry, noise)),
         "policy update": (policy_update, (carry, collected, observation)),
         "step": (make_training_step(settings), (carry,)),
