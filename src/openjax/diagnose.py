@@ -103,7 +103,8 @@ def _compare(options: Options, names: list[str], console) -> int:
     from rich.panel import Panel
     from rich.text import Text
 
-    from openjax.gap import changes, changes_report
+    from openjax.gap import changes
+    from openjax.gap.changes import report as changes_report
 
     predictions, failed = {}, 0
     for folder, name in zip(options.cases, names, strict=True):

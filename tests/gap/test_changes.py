@@ -10,8 +10,8 @@ from openjax.diagnose import main
 from openjax.flights.case import load_case
 from openjax.flights.reading import LogTable, write_csv
 from openjax.gap import changes
-from openjax.gap.changes_report import in_words, prediction, to_dict
-from openjax.gap.flight_figures import FlightFigures, mixer_of
+from openjax.gap.changes.figures import FlightFigures, mixer_of
+from openjax.gap.changes.report import in_words, prediction, to_dict
 from openjax.gap.samples import fly, log_of, references
 from openjax.vehicle import load_vehicle
 

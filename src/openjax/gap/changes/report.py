@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from openjax.gap.changes import SHOWN, Change, Interval
-from openjax.gap.flight_figures import TRIMS
+from openjax.gap.changes.figures import TRIMS
+from openjax.gap.changes.result import SHOWN, Change, Interval
 
 _NAMES = {
     "drag_x": "drag along x", "drag_y": "drag along y", "lag": "delay from motors to angular acceleration",
