@@ -10,22 +10,24 @@ from experiments.exam.vehicle import GRAVITY, PROPELLER
 
 
 def share_errors(answer, prediction):
-    """[{"effect", "said", "true"}] of the true effects' shares of the gap's mean square over the floor, where the report
-    gives one; what the report leaves to the sensors is no part of the whole here.
+    """[{"effect", "said", "true"}] of the true effects' shares of the gap's mean square over the floor; said 0 where the report
+    doesn't name it. What the report leaves to the sensors is no part of the whole here, as the plant's measure reads none.
     """
-    said = (prediction["report"] or {}).get("shares") or {}
+    report = prediction["report"]
+    if report is None:
+        return []
+    said = report.get("shares") or {}
     rest = 1.0 - (said.get("sensors") or {}).get("value", 0.0)
-    shares, out, energy = said.get("effects", {}), [], answer.get("energy")
-    if not energy or rest <= 0.02:
-        return out
-    total, truth = sum(energy["nominal"]), sum(energy["truth"])
+    shares, out = said.get("effects", {}), []
     for effect in answer["effects"]:
-        entry = next(
-            (shares[n] for n in [effect, *answer["acceptable"].get(effect, [])] if n in shares), None
+        if effect not in answer["shares"]:
+            continue
+        names = [effect, *answer["acceptable"].get(effect, [])]
+        entry = next((shares[n] for n in names if n in shares), None)
+        value = 0.0 if entry is None else float(entry["value"]) / max(rest, 0.02)
+        out.append(
+            {"effect": effect, "said": value, "true": answer["shares"][effect], "named": entry is not None}
         )
-        if entry is not None and effect in energy:
-            true = (sum(energy[effect]) - truth) / total
-            out.append({"effect": effect, "said": float(entry["value"]) / rest, "true": true})
     return out
 
 
