@@ -86,6 +86,10 @@ def test_a_heuristic_says_what_it_cannot_fly(changes, complaint):
         environment = openjax.make(physics="rigid", **changes)
     with pytest.raises(UserError, match=complaint):
         Heuristic.for_environment("apf", environment)
+    with pytest.raises(UserError, match=complaint):
+        DacoopPolicy.for_environment(
+            environment, NetworkSettings(output="field"), PredictorSettings(enabled=False)
+        )
 
 
 def test_a_velocity_policy_flies_the_velocity_that_its_network_puts_out():
@@ -134,5 +138,7 @@ def test_evaluation_through_the_command(tmp_path, capsys):
     assert record["collision_rate"] < 0.2 and record["over_speed_rate"] == 0.0
     with pytest.raises(UserError, match="control steps"):
         main(["--policy", "janosov", "--scenario", "wall", "--environment.time_step", "0.05"])
+    with pytest.raises(UserError, match="control steps"):
+        main(["--policy", "dacoop_seed_0", "--scenario", "wall", "--environment.time_step", "0.05"])
     with pytest.raises(UserError, match="angelani"):
         main(["--policy", "angelany", "--scenario", "wall"])

@@ -15,7 +15,7 @@ import jax
 from openjax.baselines.apf import ApfParameters, apf
 from openjax.baselines.parameters import ranges
 from openjax.baselines.surroundings import Craft, surroundings
-from openjax.baselines.velocity_controller import velocity_action
+from openjax.baselines.velocity_controller import check_flyable, velocity_action
 from openjax.policy import NetworkSettings, Policy, PredictorSettings
 from openjax.pursuit import Observation, Pursuit
 
@@ -34,7 +34,13 @@ class DacoopPolicy(Policy):
     def for_environment(
         cls, environment: Pursuit, network: NetworkSettings, predictor: PredictorSettings
     ) -> "DacoopPolicy":
-        """The policy for an environment; its mean starts at `START`."""
+        """The policy for an environment; its mean starts at `START`.
+
+        Raises:
+            UserError: the velocity controller can't fly there.
+        """
+        craft = Craft.of(environment)
+        check_flyable("dacoop", craft, environment.settings.time_step)
         places = [_place(name, getattr(START, name)) for name in LEARNED]
         return cls(
             network=network,
@@ -42,7 +48,7 @@ class DacoopPolicy(Policy):
             arena_radius=environment.settings.arena_radius,
             arena_height=environment.settings.arena_height,
             initial_action=tuple(math.atanh(min(max(place, -0.95), 0.95)) for place in places),
-            craft=Craft.of(environment),
+            craft=craft,
         )
 
     def action(self, sample: jax.Array, observation: Observation) -> jax.Array:

@@ -5,7 +5,9 @@ from pathlib import Path
 
 import jax
 
-from openjax.baselines import METHODS, Heuristic, make_policy
+from openjax.baselines import METHODS, DacoopPolicy, Heuristic, VelocityPolicy, make_policy
+from openjax.baselines.surroundings import Craft
+from openjax.baselines.velocity_controller import check_flyable
 from openjax.errors import UserError
 from openjax.learning import TrainSettings
 from openjax.learning.train_state import policy_leaf
@@ -43,6 +45,12 @@ class LoadedPolicy:
                     f"the policy was trained with {name} {getattr(own, name)}, here it's "
                     f"{getattr(game, name)}: pursuers, observation and history must stay as in training"
                 )
+        if isinstance(
+            self.policy, DacoopPolicy | VelocityPolicy
+        ):  # its controller flies another arena, or vehicle
+            craft = Craft.of(environment)
+            check_flyable(f"the policy's output {self.settings.network.output}", craft, game.time_step)
+            return dataclasses.replace(self, policy=dataclasses.replace(self.policy, craft=craft))
         return self
 
     def __call__(self, observation: Observation) -> jax.Array:
