@@ -72,7 +72,7 @@ def train_arguments(tmp_path_factory):
     effects.write_text("[rotor_drag]\nd_xy = 0.01\n[command_latency]\ndelay = { value = 0.02, unit = 's' }\n")
     vehicle.write_text("[vehicle]\nmass = 0.034\n")
     files = ["--effects", str(effects), "--vehicle", str(vehicle)]
-    return ["openjax.train", *TINY, *STEPS, *files, "--devices", "all"]
+    return ["openjax.train", *TINY, *STEPS, *files, "--devices", "all", "--compare_with", "angelani"]
 
 
 @pytest.fixture(scope="session")
@@ -113,6 +113,7 @@ def test_train_shows_progress_and_leaves_what_the_readme_says(whole_run):
     layouts = json.loads((out / "layouts.json").read_text())
     scenarios = [row["scenario"] for row in layouts["after"]]
     assert scenarios[:3] == ["validation", "validation_far", "wall"]
+    assert [row["scenario"] for row in layouts["angelani"]] == [scenarios[0], *scenarios[2:]]
     assert layouts["machine"]["versions"]["jax"] == jax.__version__
 
 
@@ -310,6 +311,7 @@ def wrong_layout(change):
         (train, "--effects {folder}/nothing.toml", "nothing.toml"),
         (train, "--vehicle {folder}/nothing.toml", "nothing.toml"),
         (train, "--start_from {folder}", "is no policy"),
+        (train, "--compare_with opne", "policy opne: no such file"),
         (train, "--devices 1000", "expected all or a number up to"),
         (evaluate, "--policy {folder}", "is no policy"),
         (evaluate, "--policy {run} --scenario nowhere", "not one of wall"),

@@ -98,9 +98,15 @@ def trajectory():
 @pytest.mark.parametrize("renderer", ["auto", "matplotlib"])
 def test_animation_is_drawn_without_a_display(tmp_path, trajectory, renderer, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
-    animate(tmp_path / "chase.gif", trajectory, renderer)
+    animate(tmp_path / "chase.gif", trajectory, renderer=renderer)
     with Image.open(tmp_path / "chase.gif") as image:
         assert image.n_frames == 5
+    if renderer == "matplotlib":
+        animate(
+            tmp_path / "both.gif", trajectory, dataclasses.replace(trajectory, title="x"), renderer=renderer
+        )
+        with Image.open(tmp_path / "chase.gif") as one, Image.open(tmp_path / "both.gif") as both:
+            assert both.n_frames == 5 and both.size == (one.width, 2 * one.height)
 
 
 def test_pictures_are_drawn(tmp_path, trajectory):

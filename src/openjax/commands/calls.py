@@ -23,6 +23,7 @@ def train(
     *,
     minutes: float | None = None,
     start_from: str | None = None,
+    compare_with: str | None = None,
     devices: str = "1",
     vehicle: str | Path | None = None,
     effects: str | Path | None = None,
@@ -35,6 +36,7 @@ def train(
       out: directory of the run; None is runs/DATE.
       minutes: stop after this time.
       start_from: policy whose networks the run starts with.
+      compare_with: policy that the final table and the animation show beside the trained one.
       devices: how many, or "all".
       vehicle, effects: files to fly with, vehicle.toml and effects.toml.
       overwrite: replace a run that `out` already holds.
@@ -51,6 +53,7 @@ def train(
         out=out,
         minutes=minutes,
         start_from=start_from,
+        compare_with=compare_with or "none",
         devices=str(devices),
         vehicle=None if vehicle is None else Path(vehicle),
         effects=None if effects is None else Path(effects),

@@ -188,18 +188,30 @@ def spread_table(results: Sequence[Sequence[dict]]) -> Table:
     return table
 
 
-def before_after_table(before: Sequence[dict], after: Sequence[dict]) -> Table:
-    """Returns, captures and collisions per layout, before and after training."""
+def before_after_table(
+    before: Sequence[dict], after: Sequence[dict], other: str | None = None, others: Sequence[dict] = ()
+) -> Table:
+    """Returns, captures and collisions per layout, before and after training; last what the policy `other` does there."""
     columns = (
-        ("episode_return", "return", ".0f"),
+        *([("episode_return", "return", ".0f")] if other is None else []),
         ("capture_rate", "capture rate", ".2f"),
         ("capture_step", "capture step", ".0f"),
         ("collision_rate", "collision rate", ".3f"),
         ("crash_rate", "crash rate", ".2f"),
     )
-    table = _table("Before and after training", "layout", *(label for _, label, _ in columns))
+    last = [] if other is None else [f"{other}: rate,\nstep, crash"]
+    heads = [label if other is None else label.replace(" ", "\n") for _, label, _ in columns]
+    table = _table("Before and after training", "layout", *heads, *last)
+    theirs = {row["scenario"]: row for row in others}
     for old, new in zip(before, after, strict=True):
         cells = [f"{old[name]:{style}} → {new[name]:{style}}" for name, _, style in columns]
+        if other is not None:
+            row = theirs.get(old["scenario"])
+            cells.append(
+                f"{row['capture_rate']:.2f}, {row['capture_step']:.0f}, {row['crash_rate']:.2f}"
+                if row
+                else "–"
+            )
         table.add_row(old["scenario"], *cells)
     return table
 

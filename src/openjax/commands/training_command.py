@@ -70,7 +70,11 @@ class TrainCommand:
     compilation_cache: bool = True
     """Keep compiled programs in the user's cache folder, so that the next run starts sooner."""
     layout_episodes: Annotated[int | None, Interval("[1, 100000]")] = None
-    """Episodes per layout in the final table; by default 100 on an accelerator, 32 on a CPU."""
+    """Episodes per layout in the final table; by default 100 on an accelerator, 32 on a CPU, and 1 where all are alike, as
+    starts are level."""
+    compare_with: str | None = None
+    """Policy (a name, a file, a run) that the final table and the animation show beside the trained one, or none; by
+    default open after the preset quick."""
     settings: Annotated[tyro.conf.FlagConversionOff[TrainSettings], tyro.conf.arg(name="")] = (
         dataclasses.field(default_factory=TrainSettings)
     )
@@ -167,6 +171,7 @@ def prepare(
     effects = command.effects or (resumed.optional("effects.toml") if resumed else None)
     start_from = resumed.read_facts().get("start_from") if resumed else _lasting(command.start_from)
     environment = make_environment(command.settings.environment, vehicle, effects)
+    compare_with = _comparison(command, resumed)
     devices = _devices(command.devices)
     if resumed is None:
         name = command.preset or default_preset()
@@ -181,17 +186,37 @@ def prepare(
         devices=devices,
         processes=processes,
         time_limit=float("inf") if command.minutes is None else 60.0 * command.minutes,
-        layout_episodes=command.layout_episodes or (32 if jax.default_backend() == "cpu" else 100),
+        layout_episodes=command.layout_episodes or _layout_episodes(environment),
+        compare_with=compare_with,
         facts={
             "command": " ".join([PROGRAM, *arguments]),
             "machine": describe_machine(),
             "start_from": start_from,
+            "compare_with": compare_with,
         },
         started=started,
     )
     job.check()
     files = {"vehicle.toml": vehicle, "effects.toml": effects}
     return job, resumed or RunDirectory(out), {name: path for name, path in files.items() if path is not None}
+
+
+def _layout_episodes(environment):
+    """How often each layout is flown where nobody says."""
+    drawn = (
+        environment.settings.start_attitude == "drawn" or environment.settings.vehicles or environment.effects
+    )
+    return 1 if not drawn else 32 if jax.default_backend() == "cpu" else 100
+
+
+def _comparison(command, resumed):
+    """The policy to compare with; None for none."""
+    if command.compare_with is not None:
+        return None if command.compare_with == "none" else _lasting(command.compare_with)
+    if resumed is not None:
+        return resumed.read_facts().get("compare_with")
+    fits = command.settings.environment.num_pursuers == TrainSettings().environment.num_pursuers
+    return "open" if fits and (command.preset or default_preset()) == "quick" else None
 
 
 def _lasting(start_from):

@@ -19,6 +19,7 @@ from openjax.cluster.devices import (
     own_copy,
 )
 from openjax.cluster.processes import Processes
+from openjax.commands.comparison import compare, game_for
 from openjax.commands.evaluator import (
     before_after_table,
     evaluate_scenarios,
@@ -57,6 +58,8 @@ class TrainingJob:
     time_limit: float
     """Seconds of training after which to stop."""
     layout_episodes: int
+    compare_with: str | None
+    """Policy that the report shows beside the trained one."""
     facts: dict
     """Kept beside the settings: command line, machine."""
     started: float
@@ -68,6 +71,9 @@ class TrainingJob:
         check_memory(self.settings, self.devices)
         if self.start_from is not None:
             _start_parameters(self, _abstract_parameters(self))
+        if self.compare_with is not None:
+            other = load_policy(self.compare_with)
+            other.in_game(Pursuit(game_for(self.settings.environment, other)))
 
 
 def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
@@ -246,11 +252,23 @@ def _report(job, directory, validation, outcome, progress):
                 validation.evaluator, parameters, fitting, job.layout_episodes, seed=0, extra=_BESIDE_RECORD
             )
             rows[moment] += layouts
+    others, their_flights = [], []
+    if job.compare_with is not None:
+        progress.phase(f"evaluating {job.compare_with} in the same game")
+        # its networks may be large, and these are minutes on a small machine
+        others, their_flights = compare(
+            load_policy(job.compare_with),
+            job.environment,
+            fitting,
+            min(job.layout_episodes, 8),
+            min(validation.number, 32),
+        )
     progress.phase("drawing")
     write_json(
         directory.path / "layouts.json",
         {
             **rows,
+            **({job.compare_with: others} if others else {}),
             "updates": outcome.update,
             "steps": outcome.update * settings.steps_per_update,
             "seconds": round(outcome.seconds, 1),
@@ -260,9 +278,12 @@ def _report(job, directory, validation, outcome, progress):
     plot_training(directory.path / "training.png", directory.path / METRICS_FILE)
     plot_trajectories(directory.path / "trajectories.png", flights)
     captured = [flight for flight in flights if flight.capture_index is not None]
-    drawn_by = animate(directory.path / "chase.gif", (captured or flights)[0])
+    chosen = (captured or flights)[0]
+    shown = [flight for flight in their_flights if flight.title.startswith(f"{chosen.title}, ")]
+    shown.insert(0, dataclasses.replace(chosen, title=f"{chosen.title}, this run") if shown else chosen)
+    drawn_by = animate(directory.path / "chase.gif", *shown)
     progress.phase(f"done (animation by {drawn_by})")
-    return before_after_table(rows["before"], rows["after"])
+    return before_after_table(rows["before"], rows["after"], job.compare_with, others)
 
 
 def _flight(validation, records, episode):

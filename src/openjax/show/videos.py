@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from PIL import Image
+from PIL import Image, ImageDraw
 
 from openjax.files import replacing
 from openjax.show.plots import EVADER_COLOR, PURSUER_COLORS, draw_arena
@@ -24,18 +24,30 @@ _BACKENDS = ("egl", "osmesa", "glfw")
 _RENDER_LIMIT = 120  # s for one backend
 
 
-def animate(path: Path, trajectory: Trajectory, renderer: str = "auto") -> str:
+def animate(path: Path, *trajectories: Trajectory, renderer: str = "auto") -> str:
     """Write an animated GIF up to a second after the first capture.
 
     Args:
       path: the .gif file.
-      trajectory: the episode.
+      trajectories: the episode; of several, each is drawn below the one before.
       renderer: `mujoco`, `matplotlib` or `auto` (MuJoCo where an OpenGL backend works).
 
     Returns:
       The renderer that drew it: `mujoco` with the backend's name, or `matplotlib`.
     """
     path = Path(path)
+    if len(trajectories) == 1:
+        return _animate_one(path, trajectories[0], renderer)
+    with tempfile.TemporaryDirectory() as directory:
+        parts = [Path(directory) / f"{i}.gif" for i in range(len(trajectories))]
+        for part, trajectory in zip(parts, trajectories, strict=True):
+            drawn_by = _animate_one(part, trajectory, renderer)
+        titled = zip(parts, trajectories, strict=True)
+        write_gif(path, _stacked([_frames_of(part, trajectory.title) for part, trajectory in titled]))
+    return drawn_by
+
+
+def _animate_one(path, trajectory, renderer):
     if renderer != "matplotlib":
         backend = _animate_with_mujoco(path, trajectory)
         if backend is not None:
@@ -63,6 +75,28 @@ def write_gif(path: Path, frames: list[np.ndarray]) -> None:
         images[0].save(
             partial, save_all=True, append_images=images[1:], duration=round(1000 / FRAMES_PER_SECOND), loop=0
         )
+
+
+def _frames_of(path, title):
+    """The (H, W, 3) frames of a GIF, with a title in the corner."""
+    frames = []
+    with Image.open(path) as image:
+        for i in range(image.n_frames):
+            image.seek(i)
+            frame = image.convert("RGB")
+            ImageDraw.Draw(frame).text((6, 4), title, fill=(0, 0, 0))
+            frames.append(np.asarray(frame))
+    return frames
+
+
+def _stacked(films):
+    """Frames of films, each below the one before; those that end sooner keep their last frame."""
+    width, length = max(film[0].shape[1] for film in films), max(len(film) for film in films)
+
+    def wide(frame):
+        return np.pad(frame, ((0, 0), (0, width - frame.shape[1]), (0, 0)), constant_values=255)
+
+    return [np.concatenate([wide(film[min(i, len(film) - 1)]) for film in films]) for i in range(length)]
 
 
 def _animate_with_mujoco(path, trajectory):
