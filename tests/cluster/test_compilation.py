@@ -1,5 +1,6 @@
 """What was compiled ahead is found by the call, else every program would be compiled twice."""
 
+import threading
 from types import SimpleNamespace
 
 import jax
@@ -52,3 +53,11 @@ def test_what_goes_wrong_in_the_compiler_is_raised_when_waited_for():
     wait = compile_ahead(SimpleNamespace(lower=lambda *_: SimpleNamespace(compile=fail)))
     with pytest.raises(MemoryError, match="too large"):
         wait()
+
+
+def test_waits_no_longer_than_it_is_told():
+    go_on = threading.Event()
+    wait = compile_ahead(SimpleNamespace(lower=lambda *_: SimpleNamespace(compile=go_on.wait)))
+    assert not wait(0.01)
+    go_on.set()
+    assert wait(60.0) and wait()

@@ -41,6 +41,9 @@ from openjax.store.policy_files import fill, load_policy_file, save_policy_file
 from openjax.store.run_directory import RunDirectory
 from openjax.store.settings_files import write_json
 
+_SOON = 3.0
+"""Seconds after which a training step that isn't ready doesn't come from the cache."""
+
 _BESIDE_RECORD = ("episode_return", "last_seen_error")
 
 
@@ -114,10 +117,15 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
             metrics = MetricsWriter(directory.path, update or None, resumed_steps=steps)
         try:
             progress.phase("compiling the training step")
+            prepare_validation = functools.partial(_validation_ready, job, abstract)
+            # while an accelerator's compiler works for long, validation is made beside it; else its tracing would
+            # only hold up the first update, and on a CPU both would share the same cores
+            beside = processes.is_first and jax.default_backend() != "cpu" and not step_ready(_SOON)
+            if beside:
+                validation = in_background(prepare_validation)
             step_ready()
-            # not before: its tracing would hold up the training step's
-            if processes.is_first:
-                validation = in_background(functools.partial(_validation_ready, job, abstract))
+            if processes.is_first and not beside:
+                validation = in_background(prepare_validation)
             outcome = run_updates(
                 step,
                 carry,
