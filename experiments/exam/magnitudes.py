@@ -9,6 +9,9 @@ import numpy as np
 from experiments.exam.vehicle import GRAVITY, PROPELLER
 
 
+BRAKING = ("wind", "blade_flapping")  # with what they are, air brakes: see `judge.fine`
+
+
 def share_errors(answer, prediction):
     """[{"effect", "said", "true"}] of the true effects' shares of the gap's mean square over the floor; said 0 where the report
     doesn't name it. What the report leaves to the sensors is no part of the whole here, as the plant's measure reads none.
@@ -24,7 +27,15 @@ def share_errors(answer, prediction):
             continue
         names = [effect, *answer["acceptable"].get(effect, [])]
         entry = next((shares[n] for n in names if n in shares), None)
-        value = 0.0 if entry is None else float(entry["value"]) / max(rest, 0.02)
+        value = 0.0 if entry is None else float(entry["value"])
+        if (
+            entry is not None
+            and effect in BRAKING
+            and "rotor_drag" in shares
+            and entry is not shares["rotor_drag"]
+        ):
+            value += float(shares["rotor_drag"]["value"])
+        value /= max(rest, 0.02)
         out.append(
             {"effect": effect, "said": value, "true": answer["shares"][effect], "named": entry is not None}
         )

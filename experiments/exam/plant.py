@@ -17,6 +17,7 @@ from experiments.exam.unknowns import Unknowns
 DT = 0.001
 SAMPLE = 0.002  # s, at which the truth is kept and the rate loop runs
 PER_TICK = 5  # samples in a tick of the off-board controller, 10 ms
+CLEARANCE = 0.015  # m, between the body and the floor or the ceiling: less is a crash
 
 
 @dataclass
@@ -291,8 +292,8 @@ def fly(batch):
     """Fly the batch: dict of true signals every 2 ms, (S, n, B) float32, and commands (K, 4, B) as issued.
 
     `gyro` is the firmware's gyroscope (bias, noise, filter), `applied` the command in force, `motor` what the firmware
-    asks for in the 2 ms from that sample on; `voltage` (S, B); `crashed` (B,) sample of the first breach (floor, tilt
-    above 85 degrees, 2.5 m away), S if none.
+    asks for in the 2 ms from that sample on; `voltage` (S, B); `crashed` (B,) sample of the first breach (floor, ceiling,
+    tilt above 85 degrees, 2.5 m away), S if none.
     """
     p, reference = batch.parameters, batch.reference
     ticks, _, count = reference["position"].shape
@@ -319,7 +320,8 @@ def fly(batch):
     for s in range(samples):
         k, part = divmod(s, PER_TICK)
         if part == 0:
-            bad = (body.position[2] < 0.015) | (1 - 2 * (body.q[1] ** 2 + body.q[2] ** 2) < 0.087)
+            bad = (body.position[2] < CLEARANCE) | (1 - 2 * (body.q[1] ** 2 + body.q[2] ** 2) < 0.087)
+            bad |= body.position[2] > vehicle.CEILING - CLEARANCE
             bad |= ((body.position**2).sum(axis=0) > 2.5**2) | ~np.isfinite(body.position[0])
             crashed = np.where(bad & (crashed == samples), s, crashed)
             dead = crashed < samples

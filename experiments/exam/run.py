@@ -27,7 +27,7 @@ TITLES = {"stranger": "The stranger's column", "known": "The known column", "rot
 REPORTED = {
     101: {"stranger": 240, "known": 300},
     211: {"stranger": 240, "known": 300},
-}  # seed: cases; 211 is unopened
+}  # seed: cases; 101 and 211 are opened
 
 
 def plan_digest(seed, column, count):
