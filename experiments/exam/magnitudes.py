@@ -8,7 +8,6 @@ import numpy as np
 
 from experiments.exam.vehicle import GRAVITY, PROPELLER
 
-
 BRAKING = ("wind", "blade_flapping")  # with what they are, air brakes: see `judge.fine`
 
 
