@@ -29,7 +29,12 @@ LEAST_EXPLAINED = 0.75  # share of the rates' changes; below, no constant that t
 YAW_INERTIA_RANGE = (0.7, 1.6)  # of nominal; what it may be where it is assumed
 # Relative error (standard deviation) that remains however long one flies: commands and states are known every
 # 10 ms only, and thrust differs by up to a per cent from flight to flight.
-MODEL_ERROR = {"thrust_constant": 0.005, "torque_constant": 0.01, "motor_time_constant": 0.02, "inertia": 0.01}
+MODEL_ERROR = {
+    "thrust_constant": 0.005,
+    "torque_constant": 0.01,
+    "motor_time_constant": 0.02,
+    "inertia": 0.01,
+}
 
 # What flights can't tell, in words.
 _YAW_CLASS = (
