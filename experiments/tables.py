@@ -7,6 +7,7 @@ again.
 
 import argparse
 import dataclasses
+import json
 import time
 from pathlib import Path
 
@@ -22,11 +23,11 @@ from openjax.baselines import METHODS as HEURISTICS
 from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import layout_slots, record_of, repeat_task
 from openjax.commands.machine import describe_machine
-from openjax.files import read_json
+from openjax.files import read_json, write_text
 from openjax.learning import summarise
 from openjax.pursuit import SCENARIOS, RewardSettings, scenario_task
 from openjax.store.policies import load_policy
-from openjax.store.settings_files import write_json
+from openjax.store.settings_files import to_plain
 
 PAGES = (tab_main, tab_ood, tab_prediction, behaviours, sweeps)
 LAYOUTS = ("wall", "narrow_gap", "random", "passage", "hidden")
@@ -108,7 +109,8 @@ def study(options: argparse.Namespace) -> None:
         results = {"command": command, "commit": options.commit, "machine": describe_machine()}
         seconds = [flight.get("seconds") for flight in flights]  # of those that are kept, too
         results |= {"seconds": None if None in seconds else sum(seconds), **alike, "flights": flights}
-        write_json(stored, results)
+        # paths are long: no line for each number
+        write_text(stored, json.dumps(to_plain(results), allow_nan=False, separators=(",", ":")))
 
 
 def main(arguments: list[str]) -> int:
