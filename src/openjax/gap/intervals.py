@@ -1,4 +1,7 @@
-"""Parameters of the named effects with their 90 % intervals."""
+"""Parameters of the named effects with their 90 % intervals.
+
+An interval is the fit's, or what flights disagree by where that is more, and never narrower than what forms that aren't
+quite the library's and rows that show half of what happened leave: some per cent of the effect."""
 
 from __future__ import annotations
 
@@ -11,32 +14,53 @@ from openjax.gap.library import CARDS, PLACE, path_of
 from openjax.gap.report import Estimate
 from openjax.vehicle.effects import EFFECTS
 
-LEAST_ERROR = 0.01  # of a value, one standard deviation
+REACH = 1.645  # standard deviations of a 90 % interval
+FORM = 0.05  # of an effect's size, one standard deviation: real effects don't have the library's form
+LEAST_ERROR = 0.01  # of a value that isn't zero without the effect
+LAG_ERROR = 0.001  # s, of a motor's lag: what the half-known commands inside a row leave
+GRID_ERROR = 0.0005  # s, of a command's delay: it is read on a grid of a millisecond
+ROW_ERROR = (0.1, 0.29)  # of a row, likewise: rows that are means, rows that are single samples
+BURSTS = 3.0  # packets that are lost together
+GYROSCOPE_LATE = (
+    0.0028  # s by which a low-pass of second order at 80 Hz holds a gyroscope back: sqrt(2) / (2 pi 80 Hz)
+)
 
 
 def estimates(evidence: Evidence, fit: SetFit, named) -> dict[str, dict[str, Estimate]]:
-    """Parameters of the named effects with 90 % intervals, from the model or, where they disagree more, from the
-    flights' own spread."""
+    """{effect: {parameter: its estimate}} of the named effects."""
     out = {}
-    deviation = robust_deviation(fit)
+    deviation = dict(zip(fit.index.tolist(), robust_deviation(fit), strict=True))
     for effect in named:
-        path = path_of(effect)
-        values = {}
+        out[effect] = {}
+        physics = path_of(effect) == "physics"
+        sizes = _sizes(effect, fit.theta) if physics else {}
         for number, fitted in enumerate(CARDS[effect].fitted):
             parameter = EFFECTS[effect].parameters[fitted.name]
-            if path == "physics":
+            if physics:
                 place = PLACE[effect, fitted.name]
-                value, spread = float(fit.theta[place]), float(deviation[list(fit.index).index(place)])
-                # The replay itself is no better than that.
-                spread = float(np.hypot(spread, LEAST_ERROR * value))
+                value = float(fit.theta[place])
+                own = (deviation[place], FORM * sizes[fitted.name], LEAST_ERROR * value)
+                lag = LAG_ERROR if effect == "motor_lag" else 0.0
+                low = high = float(np.linalg.norm([*own, lag]))
             else:
-                value, spread = _path_estimate(evidence, effect, number)
-            reach = 1.645 * spread
-            values[fitted.name] = Estimate(
-                value, parameter.unit, (value - reach, value + reach), parameter.prior
+                value, low, high = _path_estimate(evidence, effect, number)
+            out[effect][fitted.name] = Estimate(
+                value, parameter.unit, (value - REACH * low, value + REACH * high), parameter.prior
             )
-        out[effect] = values
     return out
+
+
+def _sizes(effect: str, theta: np.ndarray) -> dict[str, float]:
+    """{parameter: how far the effect's parameters of its unit are from absent, the furthest of them}."""
+    parameters = EFFECTS[effect].parameters
+    away = {
+        f.name: abs(float(theta[PLACE[effect, f.name]]) - parameters[f.name].none)
+        for f in CARDS[effect].fitted
+    }
+    return {
+        name: max(v for other, v in away.items() if parameters[other].unit == parameters[name].unit)
+        for name in away
+    }
 
 
 def robust_deviation(fit: SetFit) -> np.ndarray:
@@ -50,18 +74,25 @@ def robust_deviation(fit: SetFit) -> np.ndarray:
     middle = pushes.T @ pushes * count / (count - 1)
     sandwich = np.sqrt(np.maximum(np.diag(fit.covariance @ middle @ fit.covariance), 0.0))
     # Few flights: Student's quantile instead of the normal one.
-    sandwich *= student.ppf(0.95, count - 1) / 1.645
+    sandwich *= student.ppf(0.95, count - 1) / REACH
     return np.clip(sandwich, model, 4.0 * model)
 
 
-def _path_estimate(evidence: Evidence, effect: str, number: int) -> tuple[float, float]:
+def _path_estimate(evidence: Evidence, effect: str, number: int) -> tuple[float, float, float]:
+    """Value and standard deviations below and above it."""
     if effect == "state_latency":
         _, theta, covariance = evidence.pose.score()
-        return float(theta[0]), float(np.sqrt(covariance[0, 0]))
+        spread = float(np.sqrt(covariance[0, 0]))
+        # The delay is against the gyroscope, and a gyroscope may be late itself.
+        return float(theta[0]), spread, spread + GYROSCOPE_LATE / REACH
     if effect == "rate_gains":
-        return 1.0 + float(evidence.gains.change[number]), float(evidence.gains.error[number])
+        spread = float(evidence.gains.error[number])
+        return 1.0 + float(evidence.gains.change[number]), spread, spread
     radio = evidence.radio
     if effect == "command_latency":
-        return radio.delay, 0.0005
-    n = max(radio.informative, 1)
-    return radio.loss, float(np.sqrt(radio.loss * (1 - radio.loss) / n) + 0.5 / n)
+        sampled = any(n.startswith("motors within a row") for n in evidence.replay.nuisance_names)
+        spread = float(np.hypot(GRID_ERROR, ROW_ERROR[sampled] * max(t.dt for t in evidence.tracks)))
+        return radio.delay, spread, spread
+    n = max(radio.informative / BURSTS, 1.0)
+    spread = float(np.sqrt(radio.loss * (1 - radio.loss) / n) + 0.5 / n)
+    return radio.loss, spread, spread
