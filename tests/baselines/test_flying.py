@@ -65,12 +65,20 @@ def test_surroundings_are_what_the_observation_says():
     (observation, state), _ = jax.jit(lambda start: jax.lax.scan(one, start, None, length=60))(start)
     known = surroundings(craft, observation)
     velocity = np.asarray(state.drones.velocity)
-    np.testing.assert_allclose(known.target[0], state.evader_position, atol=1e-6)
     np.testing.assert_allclose(known.target_velocity[1], state.evader_velocity, atol=1e-6)
     np.testing.assert_allclose(known.from_others_velocity[0, 0], velocity[0] - velocity[1], atol=0.1)
     np.testing.assert_allclose(known.team_velocity[0], velocity.mean(axis=0), atol=0.05)
-    radius = np.linalg.norm(np.asarray(state.drones.position)[:, :2], axis=-1)
-    np.testing.assert_allclose(known.obstacle_distance[:, -1], 0.9 - radius, atol=1e-5)
+    # where all will be after the vehicle's response, straight on
+    later = np.asarray(state.drones.position) + craft.response * velocity
+    np.testing.assert_allclose(known.position, later, atol=1e-5)
+    np.testing.assert_allclose(known.floor_distance, later[:, 2], atol=1e-5)
+    np.testing.assert_allclose(known.from_others[0, 0], later[0] - later[1], atol=0.02)
+    target = np.asarray(state.evader_position + craft.response * state.evader_velocity)
+    np.testing.assert_allclose(known.target[0], target, atol=1e-5)
+    place = np.asarray(state.drones.position)[:, :2]
+    outward = place / np.linalg.norm(place, axis=-1, keepdims=True)
+    to_wall = 0.9 - np.sum(outward * later[:, :2], axis=-1)
+    np.testing.assert_allclose(known.obstacle_distance[:, -1], to_wall, atol=1e-5)
     assert np.isinf(known.obstacle_distance[:, :-1]).all()
 
 
@@ -122,7 +130,7 @@ def test_dacoop_flies_the_field_that_its_network_sets():
     start = jnp.broadcast_to(jnp.tanh(jnp.array(policy.initial_action)), (3, policy.sample_size))
     fly = jax.jit(policy.action)
     action = fly(start, observation)
-    desired = apf(heuristic.craft, START, surroundings(heuristic.craft, observation), nearest=True)
+    desired = apf(heuristic.craft, START, surroundings(heuristic.craft, observation))
     expected = velocity_action(heuristic.craft, observation, desired)
     np.testing.assert_allclose(action, expected, atol=1e-3)
     # another balance, other commands: what the network puts out matters

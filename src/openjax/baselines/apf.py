@@ -42,8 +42,8 @@ class Forces:
     inside: jax.Array  # (..., N) bool, nearer to an obstacle than the margin
 
 
-def forces(parameters: ApfParameters, known: Surroundings, nearest: bool = False) -> Forces:
-    """The field at each pursuer; parameters () or (..., N). With `nearest` only the nearest pillar or wall repels."""
+def forces(parameters: ApfParameters, known: Surroundings) -> Forces:
+    """The field at each pursuer; parameters () or (..., N)."""
 
     def push(gap, eta, rho, margin):
         """eta (1/d - 1/rho) / d^2 of the distance beyond the margin."""
@@ -51,10 +51,7 @@ def forces(parameters: ApfParameters, known: Surroundings, nearest: bool = False
         return jnp.where(d < rho, eta * (1.0 / d - 1.0 / rho) / d**2, 0.0)
 
     scale = (parameters.repulsion, parameters.influence, parameters.margin)
-    distance = known.obstacle_distance
-    each = push(distance, *(jnp.asarray(x)[..., None] for x in scale))
-    if nearest:
-        each = jnp.where(distance == jnp.min(distance, axis=-1, keepdims=True), each, 0.0)
+    each = push(known.obstacle_distance, *(jnp.asarray(x)[..., None] for x in scale))
     vertical = push(known.floor_distance, *scale) - push(known.ceiling_distance, *scale)
     distance = length(known.from_others)
     beyond = jnp.maximum(distance - SAFE_PURSUER, NEAREST)
@@ -68,9 +65,9 @@ def forces(parameters: ApfParameters, known: Surroundings, nearest: bool = False
     )
 
 
-def apf(craft: Craft, parameters: ApfParameters, known: Surroundings, nearest: bool = False) -> jax.Array:
+def apf(craft: Craft, parameters: ApfParameters, known: Surroundings) -> jax.Array:
     """Desired velocities (..., N, 3), m/s, world: along the field, or along an obstacle that is in the way."""
-    field = forces(parameters, known, nearest)
+    field = forces(parameters, known)
     total = field.attraction + field.repulsion + field.individual
     blocked = jnp.sum((field.attraction + field.repulsion) * field.attraction, axis=-1, keepdims=True) < 0.0
     along = wall_following(field, known.velocity)

@@ -2,9 +2,8 @@
 
 A network turns the two main parameters of the potential field at every step and for each pursuer: the scale of the
 obstacles' repulsion and the balance of the force between pursuers. As in the paper, MAPPO learns them in place of D3QN,
-so they are continuous. Of obstacles only the nearest repels, as in Zhang et al.'s program. The network is the actor that
-plain MAPPO has; its two outputs, in -1..1, are positions between the ends of both ranges, on a logarithmic scale, and
-training starts from the field of `START`.
+so they are continuous. The network is the actor that plain MAPPO has; its two outputs, in -1..1, are positions between the
+ends of both ranges, on a logarithmic scale, and training starts from the field of `START`.
 """
 
 import dataclasses
@@ -20,7 +19,7 @@ from openjax.policy import NetworkSettings, Policy, PredictorSettings
 from openjax.pursuit import Observation, Pursuit
 
 LEARNED = ("repulsion", "balance")
-START = ApfParameters(repulsion=1e-3, influence=0.25, margin=0.14, balance=0.3)
+START = ApfParameters(repulsion=2e-3, influence=0.4, margin=0.08, balance=0.5)
 """The field at the start of training; what isn't learnt stays, also of shipped weights, whatever a search finds."""
 
 
@@ -53,9 +52,12 @@ class DacoopPolicy(Policy):
 
     def action(self, sample: jax.Array, observation: Observation) -> jax.Array:
         """The action (..., N, 4) in -1..1 that a sample (..., N, 2) of the Gaussian, or its mean, stands for."""
+        return velocity_action(self.craft, observation, self.desired(sample, observation))
+
+    def desired(self, sample: jax.Array, observation: Observation) -> jax.Array:
+        """Velocities (..., N, 3), m/s, world, that a sample stands for."""
         parameters = field_parameters(super().action(sample, observation))
-        desired = apf(self.craft, parameters, surroundings(self.craft, observation), nearest=True)
-        return velocity_action(self.craft, observation, desired)
+        return apf(self.craft, parameters, surroundings(self.craft, observation))
 
 
 def field_parameters(output: jax.Array) -> ApfParameters:

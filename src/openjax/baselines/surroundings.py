@@ -28,6 +28,9 @@ class Craft:
     """Collective thrust that carries the vehicle, as a share of the largest."""
     history_seconds: float = 0.09
     """Time between the first and the last frame of the observed history (s)."""
+    response: float = 0.15
+    """Time that the velocity controller takes to fly what it is told (s). A method is asked what it would do where all will
+    be by then: a point mass, which it takes itself for, would turn at once."""
 
     @classmethod
     def of(cls, environment: Pursuit) -> "Craft":
@@ -47,7 +50,8 @@ class Craft:
 
 @struct.dataclass
 class Surroundings:
-    """N pursuers' surroundings; leading axes as in the observation. World frame, m and m/s."""
+    """N pursuers' surroundings after their response time, all flying straight on; leading axes as in the observation. World
+    frame, m and m/s."""
 
     position: jax.Array  # (..., N, 3)
     velocity: jax.Array  # (..., N, 3)
@@ -69,11 +73,11 @@ def surroundings(craft: Craft, observation: Observation) -> Surroundings:
     The others' velocities are those of the observed history, mean over its length (0.09 s by default): a pursuer
     measures no velocity but its own.
     """
-    position = observation.position
-    number = position.shape[-2]
+    own, velocity = observation.position, observation.self_state[..., VELOCITY]
+    number = own.shape[-2]
     newest = observation.frames[..., -1, :]
     seen = newest[..., 1:2] > 0.9 * HIDDEN
-    per_pursuer = (*position.shape[:-2], number, 3)
+    per_pursuer = (*own.shape[:-2], number, 3)
 
     def for_all(vector):
         return jnp.broadcast_to(vector[..., None, :], per_pursuer)
@@ -82,24 +86,30 @@ def surroundings(craft: Craft, observation: Observation) -> Surroundings:
     velocities = moved.reshape(per_pursuer) / max(craft.history_seconds, 1e-6)
     index = jnp.array([[j for j in range(number) if j != i] for i in range(number)], jnp.int32)
     index = index.reshape(number, number - 1)
+    apart_velocity = velocities[..., :, None, :] - velocities[..., index, :]
+    target_velocity = for_all(jnp.where(seen, newest[..., 4:7], 0.0))
 
     pillar = observation.pillars
     across = jnp.sqrt(jnp.sum(pillar[..., :2] ** 2, axis=-1) + 1e-12)
     to_pillar = jnp.where(observation.pillar_seen, across - pillar[..., 4], jnp.inf)
-    radius = jnp.sqrt(jnp.sum(position[..., :2] ** 2, axis=-1, keepdims=True) + 1e-12)
+    radius = jnp.sqrt(jnp.sum(own[..., :2] ** 2, axis=-1, keepdims=True) + 1e-12)
     normal = jnp.concatenate(
-        [pillar[..., :2] / across[..., None], (-position[..., :2] / radius)[..., None, :]], axis=-2
+        [pillar[..., :2] / across[..., None], (-own[..., :2] / radius)[..., None, :]], axis=-2
     )
+    distance = jnp.concatenate([to_pillar, craft.arena_radius - radius], axis=-1)
+    # along today's normal: straight on, a drone might come out behind a pillar
+    receding = jnp.sum(normal * velocity[..., None, :2], axis=-1)
+    position = own + craft.response * velocity
     return Surroundings(
         position=position,
-        velocity=observation.self_state[..., VELOCITY],
-        target=for_all(observation.last_seen),
-        target_velocity=for_all(jnp.where(seen, newest[..., 4:7], 0.0)),
-        from_others=observation.others[..., :3],
-        from_others_velocity=velocities[..., :, None, :] - velocities[..., index, :],
+        velocity=velocity,
+        target=for_all(observation.last_seen) + craft.response * target_velocity,
+        target_velocity=target_velocity,
+        from_others=observation.others[..., :3] + craft.response * apart_velocity,
+        from_others_velocity=apart_velocity,
         team_velocity=for_all(jnp.mean(velocities, axis=-2)),
         obstacle_normal=normal,
-        obstacle_distance=jnp.concatenate([to_pillar, craft.arena_radius - radius], axis=-1),
+        obstacle_distance=distance + craft.response * receding,
         floor_distance=position[..., 2],
         ceiling_distance=craft.arena_height - position[..., 2],
     )
