@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from openjax.flights.track import Track
-from openjax.gap.feedback import AT_ONCE, COUNT, answers_noise, outputs_of, read_feedback, read_gains
+from openjax.gap.feedback import AT_ONCE, COUNT, Gains, answers_noise, outputs_of, read_feedback, read_gains
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.rate_controller import mixer
 
@@ -84,3 +84,16 @@ def test_calm_flights_leave_all_of_the_motors_to_feedback():
     assert still.acceleration.std() > 5.0 * driven.acceleration.std()
     made = (quiet.motor - quiet.motor.mean(0)) @ outputs_of(vehicle)
     assert made.std() > 0.01
+
+
+def test_yaw_tells_of_gains_where_rows_do_not_make_them_look_small():
+    def gains(p, error, yaw, yaw_error=0.015, by_commands=(0.0, 0.4)):
+        change = np.array([p, 0.0, p, by_commands[0], 0.0, 0.0])
+        return Gains(change, np.array([error, 0.1, 0.1, by_commands[1], 0.3, 0.4]), (yaw, yaw_error))
+
+    raised = gains(-0.25, 0.12, 0.4)
+    assert raised.clear and raised.found[0] == pytest.approx([0.4, 0.0, 0.0])
+    assert not gains(0.1, 0.1, -0.3).clear  # interpolated rows
+    assert gains(0.1, 0.1, -0.3, by_commands=(-0.28, 0.05)).clear
+    assert not gains(0.4, 0.09, 0.02).clear  # roll and pitch at their limits; yaw is as it should be
+    assert gains(0.4, 0.07, 0.02).clear

@@ -182,7 +182,7 @@ def _clear_gains(gains: Gains | None, library: Library):
     """Changes of the rate loop's gains where they are clear, else None."""
     if gains is None or "rate_gains" not in library.effects or not gains.clear:
         return None
-    return np.clip(gains.change[:3], -0.7, 1.5)
+    return np.clip(gains.found[0], -0.7, 1.5)
 
 
 def _sampled(reading: Reading, slow: bool, derived: bool) -> Reading:

@@ -26,6 +26,8 @@ BAND = (0.5, 10.0)  # Hz in which the loop's gains are read: above trims, below 
 EDGE = 0.3  # s at either end that the filters spoil
 LEAST_CHANGE = 0.15  # of a gain: filters of a firmware do less
 CLEAR = 3.0  # standard errors
+ALONE = 5.0  # likewise, where yaw says otherwise
+YAW_ERROR = 0.05  # of a gain, what rows leave
 LOST = 0.1  # of a gain, by which D may fall beyond P
 ONE_SIDED = 0.00135  # chance of a normal number beyond three of them
 PRIOR = np.array([0.4, 0.4, 0.4, 1.0, 1.0])  # spreads of the gains and of the delays of P and D
@@ -49,17 +51,47 @@ class Feedback:
 
 @dataclass(frozen=True, eq=False)
 class Gains:
-    """Changes of the rate loop's p, i, d as shares, roll and pitch first and then yaw: `change` (6,), `error` (6,)."""
+    """Changes of the rate loop's p, i, d as shares, roll and pitch first and then yaw: `change` (6,), `error` (6,), from what
+    commands excite; `yaw`: the change of yaw's P read row by row, and its error."""
 
     change: np.ndarray
     error: np.ndarray
+    yaw: tuple[float, float] = (0.0, np.inf)
 
     @property
     def clear(self) -> bool:
-        """Whether P, which tells, is changed by more than filters of a firmware do and beyond doubt. A D that is lost
-        faster than P is a low-pass, or noise that the loop didn't see."""
-        changed = np.abs(self.change[[0, 3]]) > np.maximum(LEAST_CHANGE, CLEAR * self.error[[0, 3]])
-        return bool(changed[0] and self.change[2] > self.change[0] - LOST) or bool(changed[1])
+        """Whether P, which tells, is changed by more than filters of a firmware do and beyond doubt."""
+        return self.by_yaw or self._by_commands
+
+    @property
+    def by_yaw(self) -> bool:
+        """Whether yaw's rows tell: yaw has no D that a filter could bend. Rows that see half of the motors make gains look
+        small, so a smaller one needs what commands excite to agree."""
+        change, error = self.yaw
+        if abs(change) < max(LEAST_CHANGE, CLEAR * error):
+            return False
+        apart, unsure = abs(self.change[3] - change), self.error[3]
+        return change > 0.0 or bool(unsure < LEAST_CHANGE and apart < 2.0 * unsure)
+
+    @property
+    def _by_commands(self) -> bool:
+        """A D that is lost faster than P is a low-pass, or noise that the loop didn't see. Roll and pitch alone, with a yaw
+        that is as it should be, need more."""
+        size, error = np.abs(self.change[[0, 3]]), self.error[[0, 3]]
+        as_usual = abs(self.yaw[0]) + CLEAR * self.yaw[1] < LEAST_CHANGE
+        sure = np.array([ALONE if as_usual else CLEAR, CLEAR])
+        changed = size > np.maximum(LEAST_CHANGE, sure * error)
+        return bool(changed[0] and self.change[2] > self.change[0] - LOST) or bool(
+            changed[1] and not as_usual
+        )
+
+    @property
+    def found(self) -> tuple[np.ndarray, np.ndarray]:
+        """Changes (3,) of p, i, d, and their errors (3,)."""
+        if self.by_yaw and not self._by_commands:
+            change, error = self.yaw
+            return np.array([change, 0.0, 0.0]), np.array([max(error, YAW_ERROR), PRIOR[1], PRIOR[2]])
+        return self.change[:3], self.error[:3]
 
 
 def outputs_of(vehicle) -> np.ndarray:

@@ -241,5 +241,9 @@ def read_rate_loop(
     groups = (((0, 1), False), ((2,), False))
     spread = (GAIN_SPREAD,) * 6
     path = fit_linear_path(y, columns, nuisances, flight_of, spread, groups, masks, 2 * GAIN_TOLERANCE, noise)
-    gains = None if late is None else read_gains(tracks, vehicles, arrived, at_once, late)
+    gains = None
+    if late is not None:
+        _, change, covariance = path.score()
+        yaw = float(change[3]), float(np.sqrt(covariance[3, 3]))
+        gains = dataclasses.replace(read_gains(tracks, vehicles, arrived, at_once, late), yaw=yaw)
     return RateLoop(path, ticks, gains)

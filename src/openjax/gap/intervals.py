@@ -86,8 +86,8 @@ def _path_estimate(evidence: Evidence, effect: str, number: int) -> tuple[float,
         # The delay is against the gyroscope, and a gyroscope may be late itself.
         return float(theta[0]), spread, spread + GYROSCOPE_LATE / REACH
     if effect == "rate_gains":
-        spread = float(evidence.gains.error[number])
-        return 1.0 + float(evidence.gains.change[number]), spread, spread
+        change, error = (float(v[number]) for v in evidence.gains.found)
+        return 1.0 + change, error, error
     radio = evidence.radio
     if effect == "command_latency":
         sampled = any(n.startswith("motors within a row") for n in evidence.replay.nuisance_names)
