@@ -25,6 +25,15 @@ METRIC = (
 )
 POSE_HORIZON = 0.1  # s
 THRUST_FLOOR = 2e-3  # of thrust: below, the link is perfect for every purpose
+# Nuisances that are the sensors' and the clocks': how they are mounted, biased, filtered and timed.
+SENSORS = (
+    "frame tilt",
+    "level of the world",
+    "IMU tilt",
+    "accelerometer",
+    "gyroscope's low-pass",
+    "clock of",
+)
 DRAWS = 400  # of the bootstrap over seconds of flight
 
 
@@ -129,12 +138,12 @@ ERROR_NAMES = tuple(n for n, _ in ERRORS)
 
 def _squares(evidence: Evidence, selection: Selection, physics, named, sensors=True) -> dict[str, np.ndarray]:
     """{channel: (B,) mean squared errors by second of flight} with the effects `physics` of the selection's and those
-    of `named` that act on other paths; `sensors`: nuisances within their bounds, or none."""
+    of `named` that act on other paths; `sensors`: with what sensors and clocks take within their bounds, or without."""
     table = selection.table
-    # How a duty cycle becomes thrust is no sensor's fault and no effect: the map that the flights ask for stays.
-    numbers = len(evidence.replay.numbers) if evidence.case.vehicle_file.motor_command == "pwm" else 0
+    # Numbers of the vehicle and what feedback makes of gusts are no sensor's fault and no effect: they stay.
+    off = None if sensors else np.array([n.startswith(SENSORS) for n in evidence.replay.nuisance_names])
     drop = tuple(e for e in selection.fit.effects if e not in physics)
-    squares = keep(table, with_effects(table), drop, sensors, numbers) / table.rows[:, None]
+    squares = keep(table, with_effects(table), drop, off) / table.rows[:, None]
     out = {n: squares[:, k] for k, (n, _) in enumerate(ERRORS) if table.usable[k] > 0}
     counts = [int((table.track_of == k).sum()) for k in range(len(evidence.tracks))]
 

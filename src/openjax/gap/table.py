@@ -241,9 +241,9 @@ def judge(table: Table, model: Model) -> Judged:
     return Judged(nats, squares, np.array(taken))
 
 
-def keep(table: Table, model: Model, drop=(), nuisances=True, numbers: int = 0) -> np.ndarray:
-    """Squared errors (B, 6) on each fold of a model fitted to all others, once the effects `drop` go and everything else
-    stays as fitted; without `nuisances` these go too, but for the first `numbers`."""
+def keep(table: Table, model: Model, drop=(), off: np.ndarray | None = None) -> np.ndarray:
+    """Squared errors (B, 6) on each fold of a model fitted to all others, once the effects `drop` and the nuisances `off`
+    (N,) go and everything else stays as fitted."""
     squares = np.zeros((len(table.white), 6))
     for fold in range(len(table.folds[0])):
         blocks = np.flatnonzero(table.fold_of == fold)
@@ -253,8 +253,8 @@ def keep(table: Table, model: Model, drop=(), nuisances=True, numbers: int = 0) 
             own = [table.derivative[int(i)] for i in prior((effect,))[0] if int(i) not in others]
             u[own] = 0.0
             u[table.part[effect]] = 1.0
-        if not nuisances:
-            u[table.nuisances[numbers:]] = 0.0
+        if off is not None:
+            u[table.nuisances[off]] = 0.0
         squares[blocks] = np.einsum("c,bkcd,d->bk", u, table.error[blocks], u)
     return squares
 
