@@ -24,6 +24,7 @@ from openjax.store.policy_files import shipped_policies
 UPDATES = 24
 TINY = (
     "--num_envs 16 --rollout_length 10 --environment.episode_length 20 --environment.physics rigid "
+    "--environment.time_step 0.01 --environment.substeps 1 "
     "--network.features 8 --network.heads 2 "
     "--predictor.units 4 --predictor.windows 4 --predictor.steps 2 --predictor.horizons 1 2 "
     "--mappo.minibatches 2 --mappo.epochs 1 --generator.capacity 8 "
@@ -32,27 +33,10 @@ TINY = (
 STEPS = ["--steps", str(UPDATES * 160), "--layout_episodes", "4"]
 
 
-@pytest.fixture(scope="session")
-def shared_cache(tmp_path_factory):
-    """One compilation cache for all processes of this module: the training step is compiled once."""
-    directory = str(tmp_path_factory.mktemp("compiled"))
-    options = {
-        "jax_compilation_cache_dir": directory,
-        "jax_persistent_cache_min_compile_time_secs": 0.3,
-        "jax_persistent_cache_min_entry_size_bytes": 0,
-    }
-    before = {name: getattr(jax.config, name) for name in options}
-    for name, value in options.items():
-        jax.config.update(name, value)
-    yield {name.upper(): str(value) for name, value in options.items()}
-    for name, value in before.items():
-        jax.config.update(name, value)
-
-
-def start(arguments, cache, **options):
-    """A command in a process of its own, compiled by the same flags as here, without waiting for a renderer."""
+def start(arguments, **options):
+    """A command in a process of its own, without waiting for a renderer; it says what it compiles."""
     command = [sys.executable, "-m", *arguments]
-    environment = {**os.environ, **cache, "MUJOCO_GL": "off"}
+    environment = {**os.environ, "MUJOCO_GL": "off", "JAX_LOG_COMPILES": "1"}
     return subprocess.Popen(
         command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **options
     )
@@ -76,10 +60,10 @@ def train_arguments(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def whole_run(tmp_path_factory, shared_cache, train_arguments):
+def whole_run(tmp_path_factory, train_arguments):
     """A run from start to end, and what it printed."""
     out = tmp_path_factory.mktemp("runs") / "whole"
-    return out, finish(start([*train_arguments, "--out", str(out)], shared_cache))
+    return out, finish(start([*train_arguments, "--out", str(out)]))
 
 
 def in_process(main, arguments, monkeypatch, capsys):
@@ -117,11 +101,9 @@ def test_train_shows_progress_and_leaves_what_the_readme_says(whole_run):
     assert layouts["machine"]["versions"]["jax"] == jax.__version__
 
 
-def test_killed_in_the_middle_of_a_checkpoint_and_resumed_equals_whole(
-    whole_run, tmp_path, shared_cache, train_arguments
-):
+def test_killed_in_the_middle_of_a_checkpoint_and_resumed_equals_whole(whole_run, tmp_path, train_arguments):
     out = tmp_path / "killed"
-    process = start([*train_arguments, "--out", str(out)], shared_cache)
+    process = start([*train_arguments, "--out", str(out)])
     checkpoints = Checkpoints(out / "checkpoints")
     deadline = time.monotonic() + 200
     while time.monotonic() < deadline and process.poll() is None:
@@ -136,8 +118,10 @@ def test_killed_in_the_middle_of_a_checkpoint_and_resumed_equals_whole(
     reached = checkpoints.latest().update
     assert 0 < reached < UPDATES
 
-    printed = finish(start(["openjax.train", "--resume", str(out), *STEPS[2:]], shared_cache))
+    printed = finish(start(["openjax.train", "--resume", str(out), *STEPS[2:]]))
     assert f"resumed at update {reached} of {UPDATES}" in printed
+    for said in (whole_run[1], printed):  # the step is compiled once, also for a restored carry
+        assert said.count("Finished XLA compilation of jit(step)") == 1
     whole = Checkpoints(whole_run[0] / "checkpoints").latest()
     again = checkpoints.latest()
     assert whole.update == again.update == UPDATES
@@ -152,9 +136,9 @@ def test_killed_in_the_middle_of_a_checkpoint_and_resumed_equals_whole(
     assert losses[0] == losses[1]
 
 
-def test_signal_saves_and_exits_cleanly(whole_run, tmp_path, shared_cache, train_arguments):
+def test_signal_saves_and_exits_cleanly(whole_run, tmp_path, train_arguments):
     out = tmp_path / "stopped"
-    process = start([*train_arguments, "--out", str(out)], shared_cache)
+    process = start([*train_arguments, "--out", str(out)])
     deadline = time.monotonic() + 200
     while time.monotonic() < deadline and process.poll() is None:
         if (out / "metrics.jsonl").exists() and (out / "metrics.jsonl").stat().st_size > 0:
@@ -168,37 +152,7 @@ def test_signal_saves_and_exits_cleanly(whole_run, tmp_path, shared_cache, train
     assert (out / "policy.npz").exists()
 
 
-COMPILES_ONCE = """
-import sys, jax
-from openjax.learning import TrainSettings, init_carry, make_training_step
-from openjax.store.checkpoints import Checkpoints, abstract_like, place
-from openjax.store.environments import make_environment
-from openjax.commands.training_loop import guarded
-from openjax.store.run_directory import open_run
-
-run = open_run(sys.argv[1])
-settings = run.read_settings()
-environment = make_environment(
-    settings.environment, run.optional("vehicle.toml"), run.optional("effects.toml")
-)
-step = guarded(make_training_step(settings, environment))
-carry = place(init_carry(settings, jax.random.key(0), environment))
-abstract = abstract_like(carry)
-for _ in range(10):
-    carry, _, _ = step(carry)
-carry, _ = Checkpoints(run.checkpoints).restore_latest(abstract)
-step(carry)
-print("compiled", step._cache_size())
-"""
-
-
-def test_training_step_compiles_once_also_after_a_resume(whole_run, tmp_path, shared_cache):
-    (tmp_path / "compiles_once.py").write_text(COMPILES_ONCE)
-    process = start(["compiles_once", str(whole_run[0])], shared_cache, cwd=tmp_path)
-    assert "compiled 1\n" in finish(process)
-
-
-def test_nan_stops_the_run_and_leaves_the_state(tmp_path, monkeypatch, capsys, shared_cache):
+def test_nan_stops_the_run_and_leaves_the_state(tmp_path, monkeypatch, capsys):
     def make_broken_step(settings, environment, devices):
         def step(carry):
             update = carry.update + 1
@@ -210,7 +164,8 @@ def test_nan_stops_the_run_and_leaves_the_state(tmp_path, monkeypatch, capsys, s
 
     monkeypatch.setattr(training_job, "make_device_step", make_broken_step)
     out = tmp_path / "broken"
-    status, _ = in_process(train.main, [*TINY, *STEPS, "--out", out], monkeypatch, capsys)
+    options = [*TINY, *STEPS, "--compare_with", "none", "--out", out]
+    status, _ = in_process(train.main, options, monkeypatch, capsys)
     assert status == 1
     report = json.loads((out / "not_finite" / "report.json").read_text())
     assert report["update"] == 4 and all(name.startswith("actor/parameters/") for name in report["leaves"])
@@ -225,7 +180,7 @@ evader = [-0.6, 0.0, 0.5]
 """
 
 
-def test_evaluate_prints_and_writes_the_records(whole_run, tmp_path, monkeypatch, capsys, shared_cache):
+def test_evaluate_prints_and_writes_the_records(whole_run, tmp_path, monkeypatch, capsys):
     records = tmp_path / "records.json"
     arguments = ["--policy", whole_run[0], "--episodes", "4", "--json", records]
     assert in_process(evaluate.main, [*arguments, "--scenario", "all"], monkeypatch, capsys)[0] == 0
@@ -254,10 +209,13 @@ def test_evaluate_prints_and_writes_the_records(whole_run, tmp_path, monkeypatch
 
 def test_shipped_policies_act_in_their_game_and_refuse_another():
     assert "open" in shipped_policies()
+    observed = {}
     for name in shipped_policies():
         policy = openjax.load_policy(name)
         environment = openjax.make(policy.settings.environment, speed_limit="none")
-        observation, _ = jax.jit(environment.reset)(jax.random.key(0))
+        if environment.settings not in observed:
+            observed[environment.settings] = jax.jit(environment.reset)(jax.random.key(0))[0]
+        observation = observed[environment.settings]
         action = policy(observation)
         assert action.shape == (3, 4) and bool((abs(action) <= 1).all()), name
     for changes in ({"history_length": 3}, {"observe_time": False}):
@@ -266,11 +224,11 @@ def test_shipped_policies_act_in_their_game_and_refuse_another():
             policy(jax.eval_shape(other.reset, jax.random.key(0))[0])
 
 
-def test_benchmark_writes_table_and_file(tmp_path, shared_cache):
+def test_benchmark_writes_table_and_file(tmp_path):
     file = tmp_path / "speed.json"
     arguments = [*TINY, "--parts", "rigid", "training", "--envs", "8", "--training_envs", "16"]
     arguments += ["--steps", "5", "--seconds", "0.1", "--json", str(file)]
-    printed = finish(start(["openjax.benchmark", *arguments], shared_cache))
+    printed = finish(start(["openjax.benchmark", *arguments]))
     assert "env steps/s" in printed and "compile" in printed
     result = json.loads(file.read_text())
     assert [row["part"] for row in result["rows"]] == ["rigid", "training"]
@@ -323,7 +281,7 @@ def wrong_layout(change):
     ],
 )
 def test_bad_input_is_one_line_and_status_2(
-    main, arguments, message, whole_run, tmp_path, monkeypatch, capsys, shared_cache
+    main, arguments, message, whole_run, tmp_path, monkeypatch, capsys
 ):
     folder = tmp_path / "folder"
     folder.mkdir()

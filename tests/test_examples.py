@@ -35,7 +35,7 @@ def test_training_from_python_gives_a_policy(tmp_path, monkeypatch, capsys):
     tiny = openjax.preset("quick")
     tiny = dataclasses.replace(
         tiny,
-        environment=dataclasses.replace(tiny.environment, physics="rigid", episode_length=40),
+        environment=dataclasses.replace(tiny.environment, time_step=0.01, substeps=1, episode_length=40),
         network=dataclasses.replace(tiny.network, features=8, heads=2),
         predictor=dataclasses.replace(tiny.predictor, units=4, horizons=(1, 5), windows=4),
         rollout_length=20,
@@ -46,6 +46,7 @@ def test_training_from_python_gives_a_policy(tmp_path, monkeypatch, capsys):
     )
     monkeypatch.setattr(openjax, "preset", lambda name: tiny, raising=False)
     monkeypatch.setattr(sys, "argv", ["train_from_python.py"])
+    monkeypatch.setenv("MUJOCO_GL", "off")  # a renderer to wait for
     monkeypatch.chdir(tmp_path)
     runpy.run_path(str(EXAMPLES / "train_from_python.py"))
     assert "distances to the evader" in capsys.readouterr().out

@@ -35,6 +35,16 @@ def test_links_between_the_pages_lead_somewhere():
             assert (page.parent / path).exists(), f"{page.name}: {path}"
 
 
+def test_the_table_of_experiments_names_them_all():
+    page = (ROOT / "experiments" / "README.md").read_text(encoding="utf-8")
+    named = {name.split(".")[0] for name in re.findall(r"`(\w+(?:\.run)?)`", page)}
+    folders = {path.parent for path in (ROOT / "experiments").glob("*/__init__.py")}
+    there = {path.stem for path in {*(ROOT / "experiments").glob("*.py"), *folders}} - {"__init__"}
+    assert there <= named, there - named
+    for path in re.findall(r"\]\(([^)#]+)\)", page):
+        assert (ROOT / "experiments" / path).exists(), path
+
+
 def test_modules_that_the_pages_name_are_there():
     modules = [
         path.relative_to(ROOT).as_posix()

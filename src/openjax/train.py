@@ -25,7 +25,9 @@ def main(arguments: Sequence[str]) -> int:
     from openjax.commands.training_command import membership, read_command, start
 
     with joined(membership(arguments)) as processes:
-        return start(read_command(arguments), arguments, started, processes)
+        return start(
+            read_command(arguments), arguments, started, processes, keep_traced=__name__ == "__main__"
+        )
 
 
 if __name__ == "__main__":

@@ -22,7 +22,8 @@ from openjax.store.checkpoints import is_checkpoint
 
 UPDATES = 3
 OPTIONS = """
-    --preset quick --environment.physics mjx --environment.episode_length 20 --environment.capture_radius 1.0
+    --preset quick --environment.time_step 0.01 --environment.substeps 1
+    --environment.physics mjx --environment.episode_length 20 --environment.capture_radius 1.0
     --network.features 8 --network.heads 2 --predictor.units 4 --predictor.windows 2 --predictor.steps 1
     --predictor.horizons 1 2 --mappo.minibatches 2 --mappo.epochs 1 --generator.capacity 8
     --generator.success_low 0.0 --generator.success_high 1.0 --generator.episodes_per_task 2
@@ -128,6 +129,7 @@ with _connected(membership) as (connections, _):
 def environment_with(devices):
     """Few optimisations, since compiling is what these tests wait for."""
     flags = f"--xla_force_host_platform_device_count={devices} --xla_backend_optimization_level=0"
+    flags += " --xla_llvm_disable_expensive_passes=true"
     if version("jaxlib").startswith("0.10."):
         flags += " --xla_cpu_use_fusion_emitters=false"  # a third of the time to compile
     return {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "OPENBLAS_NUM_THREADS": "1"}

@@ -176,4 +176,4 @@ def test_a_gradient_step_may_see_every_third_step_of_all_worlds():
     np.testing.assert_array_equal(np.sort(thirds[:, 2, :, 1], axis=None), np.arange(12))  # none left out
     assert _every(steps, None, 1) is steps
     with pytest.raises(UserError, match="sample_every 3 must divide rollout_length 80"):
-        preset("quick", mappo=MappoSettings(minibatches=4, sample_every=3))
+        preset("paper", mappo=MappoSettings(minibatches=16, sample_every=3))

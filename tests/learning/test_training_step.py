@@ -19,6 +19,7 @@ from openjax.learning import (
     make_training_step,
     preset,
     summarise,
+    training_step,
 )
 from openjax.learning.training_step import _initial_carry, _penalty_share
 from openjax.policy import NetworkSettings, PredictorSettings
@@ -259,8 +260,17 @@ def test_presets():
 
 
 @pytest.mark.parametrize("rollouts", [1, 2])
-def test_the_worlds_of_every_second_task_start_anew_within_the_episode(rollouts):
-    settings = dataclasses.replace(SETTINGS, restart_every=2, restart_steps=rollouts * ROLLOUT)
+def test_the_worlds_of_every_second_task_start_anew_within_the_episode(rollouts, monkeypatch):
+    def learn_nothing(settings, parts, carry, *_):
+        return carry.actor, carry.critic, carry.value_scale, {}
+
+    monkeypatch.setattr(training_step, "learn_policy", learn_nothing)  # it takes most of the compiler's time
+    settings = dataclasses.replace(
+        SETTINGS,
+        restart_every=2,
+        restart_steps=rollouts * ROLLOUT,
+        predictor=dataclasses.replace(SETTINGS.predictor, enabled=False),
+    )
     carry = init_carry(settings, jax.random.key(0))
     step = jax.jit(make_training_step(settings))
     world = np.arange(settings.num_envs)

@@ -143,9 +143,8 @@ def test_motor_lag_is_exact(vehicle):
 
 
 def test_gradients_are_right_and_finite(vehicle):
-    """By MJX among solids as by the written-out equations; finite on the floor, where a contact acts, and at
-    full stop
-    of a rotor, where the square root of the command has no slope."""
+    """By MJX among solids as by the written-out equations; finite on the floor, where a contact acts, and at full stop of
+    a rotor, where the square root of the command has no slope."""
     pillars = jnp.array([[0.5, 0.0]]), jnp.ones(1, bool)
 
     def slopes(physics):

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import time
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +20,7 @@ from openjax.cluster.devices import (
     own_copy,
 )
 from openjax.cluster.processes import Processes
+from openjax.cluster.tracing import recalled
 from openjax.commands.comparison import compare, game_for
 from openjax.commands.evaluator import (
     before_after_table,
@@ -67,6 +69,18 @@ class TrainingJob:
     """Kept beside the settings: command line, machine."""
     started: float
     """`time.monotonic()` when the command started."""
+    traced: Path | None = None
+    """Folder in which traced programs are kept; None: they aren't."""
+
+    @property
+    def made_from(self) -> str:
+        """What the run's programs depend on, beside the package's sources."""
+        game = self.environment
+        arrays = [
+            np.asarray(leaf).tolist() for leaf in jax.tree.leaves((game.vehicle, game.effect_parameters))
+        ]
+        names = jax.tree.structure(game.effect_parameters)
+        return repr((self.settings, game.settings, game.effects, str(names), arrays))
 
     def check(self) -> None:
         """Raises UserError for what doesn't fit together, before any directory is touched."""
@@ -99,6 +113,10 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
         step = guarded(
             make_device_step(settings, job.environment, job.devices), shardings, everywhere(job.devices)
         )
+        if job.traced is not None and job.devices == 1:
+            keep = functools.partial(recalled, carry=abstract, made_from=job.made_from, folder=job.traced)
+            start = jax.jit(keep("start", start, (jax.random.key(settings.seed),)), out_shardings=shardings)
+            step = jax.jit(keep("step", step, (abstract,)), donate_argnums=0, out_shardings=shardings)
         step_ready = compile_ahead(step, abstract)  # takes longest, so it comes first
         carry, update, seconds = _first_carry(job, start, abstract, directory, checkpoints, progress)
         if processes.is_first:

@@ -1,0 +1,165 @@
+"""The quick preset as a user with two cores meets it: the whole command, installed but nothing compiled, for several seeds.
+
+    python -m experiments.quick [--seeds 0 1 2] [--at_once 1] [--options "..."] [--out experiments/results/quick_runs]
+
+Each run has two cores of its own and an empty cache. Its policy is then flown on the validation tasks once more, with
+captures and crashes looked for in every physics step, and not only at those at which the policy steers.
+"""
+
+import argparse
+import dataclasses
+import os
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+
+from experiments.pages import RESULTS, publish, table, where
+from openjax.commands.machine import describe_machine
+from openjax.commands.validation import uniform_tasks
+from openjax.files import read_json
+from openjax.learning import preset
+from openjax.pursuit import Pursuit
+from openjax.store.policies import LoadedPolicy, load_policy
+
+CORES = 2
+
+
+def train(options: argparse.Namespace, seed: int, cores: list[int]) -> dict:
+    """One run on those cores: what its table says, and the seconds of the whole command."""
+    run = options.runs / f"seed_{seed}"
+    command = [sys.executable, "-m", "openjax.train", "--preset", "quick", "--seed", str(seed)]
+    command += ["--out", str(run), "--overwrite", "--no-compilation_cache", *options.options.split()]
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+    started = time.monotonic()
+    with open(f"{run}.txt", "w") as log:
+        subprocess.run(
+            ["taskset", "-c", ",".join(map(str, cores)), *command],
+            env=environment,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            check=True,
+        )
+    seconds = round(time.monotonic() - started)
+    layouts, loaded = read_json(run / "layouts.json"), load_policy(run)
+    kept = {name: layouts[name] for name in ("after", "open", "seconds", "steps") if name in layouts}
+    return {
+        "seed": seed,
+        "whole_command": seconds,
+        "time_step": loaded.settings.environment.time_step,
+        **kept,
+        "every_physics_step": fly_finely(loaded),
+    }
+
+
+def fly_finely(loaded: LoadedPolicy) -> dict[str, float]:
+    """Rates on the validation tasks in an environment whose step is one physics step, the policy's action held between."""
+    own = loaded.settings.environment
+    held = own.substeps
+    game = Pursuit(
+        dataclasses.replace(
+            own,
+            time_step=own.time_step / held,
+            substeps=1,
+            episode_length=own.episode_length * held,
+            history_spacing=own.history_spacing * held,
+            observe_history_spacing=own.observe_history_spacing * held,
+        )
+    )
+    tasks = uniform_tasks(own, loaded.settings.validation_episodes, own.max_pillars)
+    keys = jax.random.split(jax.random.key(0), loaded.settings.validation_episodes)
+
+    @jax.jit
+    def episodes(keys, tasks):
+        def one(carry, _):
+            observation, state = carry
+            action = loaded(observation)
+            for _ in range(held):
+                observation, state, *_ = jax.vmap(game.step, (None, 0, 0))(jax.random.key(0), state, action)
+            return (observation, state), None
+
+        start = jax.vmap(game.reset_to)(keys, tasks)
+        return jax.lax.scan(one, start, None, length=own.episode_length)[0][1].statistics
+
+    statistics = episodes(keys, tasks)
+    return {
+        "capture_rate": float(jnp.mean(statistics.captured)),
+        "crash_rate": float(jnp.mean(statistics.crashed)),
+        "capture_seconds": float(jnp.mean(statistics.capture_step)) * own.time_step / held,
+    }
+
+
+def study(options: argparse.Namespace) -> dict:
+    """All runs."""
+    options.runs.mkdir(parents=True, exist_ok=True)
+    available = sorted(os.sched_getaffinity(0))
+    places = [available[CORES * i : CORES * (i + 1)] for i in range(options.at_once)]
+    with ThreadPoolExecutor(options.at_once) as pool:
+        runs = list(
+            pool.map(
+                lambda i: train(options, options.seeds[i], places[i % options.at_once]),
+                range(len(options.seeds)),
+            )
+        )
+    return {
+        "command": "python -m experiments.quick " + " ".join(sys.argv[1:]),
+        "machine": describe_machine(),
+        "preset": " ".join(preset("quick").__doc__.split()),
+        "runs": runs,
+    }
+
+
+def report(results: dict) -> list[str]:
+    """The page."""
+    heads = ["seed", "whole command, s", "steps, M", "every physics step", "validation", "empty"]
+    heads += [f"{name}, `open`" for name in ("validation", "empty")]
+    rows = []
+    for run in results["runs"]:
+        own, other = ({row["scenario"]: row for row in run.get(kind, [])} for kind in ("after", "open"))
+        fine = run["every_physics_step"]
+        cells = [f"{fine['capture_rate']:.2f}, {fine['capture_seconds']:.2f}, {fine['crash_rate']:.2f}"]
+        for records in (own, other):
+            cells += [_three(records.get(name), run["time_step"]) for name in ("validation", "empty")]
+        rows.append([str(run["seed"]), str(run["whole_command"]), f"{run['steps'] / 1e6:.1f}", *cells])
+    return [
+        "# Runs of the quick preset",
+        "",
+        where(results),
+        "",
+        results["preset"] + " Each cell: capture rate, seconds to the capture, crash rate.",
+        "",
+        *table(heads, rows),
+    ]
+
+
+def _three(record, time_step):
+    if record is None:
+        return "–"
+    return (
+        f"{record['capture_rate']:.2f}, {record['capture_step'] * time_step:.2f}, {record['crash_rate']:.2f}"
+    )
+
+
+def main() -> None:
+    """The command."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument(
+        "--at_once", type=int, default=1, help="runs side by side, each on two cores of its own"
+    )
+    parser.add_argument("--options", default="", help="more options of openjax.train")
+    parser.add_argument("--runs", type=Path, default=Path("runs/quick"), help="folder of the runs")
+    parser.add_argument("--report", action="store_true", help="from the stored results")
+    parser.add_argument("--out", type=Path, default=RESULTS / "quick_runs")
+    publish(parser.parse_args(), study, report)
+
+
+if __name__ == "__main__":
+    main()
