@@ -74,13 +74,15 @@ class TrainingJob:
 
     @property
     def made_from(self) -> str:
-        """What the run's programs depend on, beside the package's sources."""
+        """What the run's programs depend on, beside the package's sources; the seed comes in as a key."""
         game = self.environment
         arrays = [
             np.asarray(leaf).tolist() for leaf in jax.tree.leaves((game.vehicle, game.effect_parameters))
         ]
         names = jax.tree.structure(game.effect_parameters)
-        return repr((self.settings, game.settings, game.effects, str(names), arrays))
+        return repr(
+            (dataclasses.replace(self.settings, seed=0), game.settings, game.effects, str(names), arrays)
+        )
 
     def check(self) -> None:
         """Raises UserError for what doesn't fit together, before any directory is touched."""
@@ -107,16 +109,7 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
         checkpoints = Checkpoints(directory.checkpoints, processes=processes, score_rule=SCORE_RULE)
         processes.advice = f"go on with python -m openjax.train --resume {directory.path} --devices all"
         progress.phase("compiling the start: networks, first tasks")
-        shardings = carry_shardings(job.devices)
-        start = make_start(settings, job.environment)
-        abstract = abstract_like(jax.eval_shape(start, jax.random.key(settings.seed)), shardings)
-        step = guarded(
-            make_device_step(settings, job.environment, job.devices), shardings, everywhere(job.devices)
-        )
-        if job.traced is not None and job.devices == 1:
-            keep = functools.partial(recalled, carry=abstract, made_from=job.made_from, folder=job.traced)
-            start = jax.jit(keep("start", start, (jax.random.key(settings.seed),)), out_shardings=shardings)
-            step = jax.jit(keep("step", step, (abstract,)), donate_argnums=0, out_shardings=shardings)
+        start, step, abstract = _programs(job)
         step_ready = compile_ahead(step, abstract)  # takes longest, so it comes first
         carry, update, seconds = _first_carry(job, start, abstract, directory, checkpoints, progress)
         if processes.is_first:
@@ -182,6 +175,25 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
     console.print(table)
     console.print(f"run, policy and pictures are in {directory.path}", soft_wrap=True)
     return 0
+
+
+def _programs(job):
+    """The run's start and its step, from earlier runs' traces where they're kept, and the kind of the carry."""
+    settings, shardings = job.settings, carry_shardings(job.devices)
+    start = make_start(settings, job.environment)
+    abstract = abstract_like(jax.eval_shape(start, jax.random.key(settings.seed)), shardings)
+    step = guarded(
+        make_device_step(settings, job.environment, job.devices), shardings, everywhere(job.devices)
+    )
+    if job.traced is None or job.devices > 1:
+        return start, step, abstract
+    keep = functools.partial(recalled, carry=abstract, made_from=job.made_from, folder=job.traced)
+
+    def kept_start(key):
+        return jax.jit(keep("start", start, (key,)), out_shardings=shardings)(key)
+
+    kept_step = jax.jit(keep("step", step, (abstract,)), donate_argnums=0, out_shardings=shardings)
+    return kept_start, kept_step, abstract
 
 
 def _validation_ready(job, abstract):
