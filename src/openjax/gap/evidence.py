@@ -28,6 +28,7 @@ LOOKS = 2  # at most
 WORTH_KNOWING = 15.0  # nats that an effect must add to be taken as known in the next look
 WORTH_A_SECOND_LOOK = 30.0  # nats of the best set above none
 LEAST_KICK = 0.1  # of the motors' outputs within a row: below, samples are as good as means
+HEAVY = 0.1  # of the moments of inertia, that single samples taken for means may feign
 RADIO_COST = 15.0  # nats that a radio effect must gain before the rate loop is read with it
 
 
@@ -195,23 +196,24 @@ def _sampled(reading: Reading, slow: bool, derived: bool) -> Reading:
     known = reading.arrived is not None and not seldom and not drifts
     # Without commands nothing tells samples from means.
     at_once = logged and (reading.arrived is None or answers_noise(tracks, reading.vehicles) > AT_ONCE)
+    sure = True
     if known and at_once:
         # The log doesn't say which; the motion does.
         own = Library(("inertia",))
         mean, single = (_physics(dataclasses.replace(reading, at_once=m), own) for m in (False, True))
-        at_once = _looks_sampled(reading.vehicles, mean, single)
+        at_once, sure = _looks_sampled(reading.vehicles, mean, single)
     reading = dataclasses.replace(reading, at_once=at_once)
-    blind = (reading.at_once and not known) or drifts or derived
+    blind = (reading.at_once and not known) or not sure or drifts or derived
     late = None if blind or seldom else ROW_DELAY[0 if slow else 1]
     return dataclasses.replace(reading, blind=blind, late=late)
 
 
-def _looks_sampled(vehicles, mean: Look, single: Look) -> bool:
+def _looks_sampled(vehicles, mean: Look, single: Look) -> tuple[bool, bool]:
     """Whether torques are off as single samples taken for means would have them, and right once they are taken for what
-    they are. Commands jump where rows begin, so the first motor command of a row is stronger than the row's mean, and a
-    vehicle flown by such samples seems heavier to turn."""
+    they are; and whether that is sure. Commands jump where rows begin, so the first motor command of a row is stronger
+    than the row's mean, and a vehicle flown by such samples seems heavier to turn."""
     if any(("inertia",) not in look.sets for look in (mean, single)):
-        return False
+        return False, True
     paths = [
         np.asarray(p.motor, float)[: len(t)]
         for p, t in zip(single.replay.paths, single.replay.tracks, strict=True)
@@ -227,7 +229,10 @@ def _looks_sampled(vehicles, mean: Look, single: Look) -> bool:
         np.mean([v for v, _ in list(look.sets["inertia",].parameters()["inertia"].values())[:2]]) - 1.0
         for look in (mean, single)
     ]
-    return kick > LEAST_KICK and off[0] > kick and abs(off[1]) < 0.25 * off[0]
+    if kick > LEAST_KICK and off[0] > kick and abs(off[1]) < 0.25 * off[0]:
+        return True, True
+    doubtful = off[0] > HEAVY and abs(off[1]) < 0.5 * off[0]
+    return doubtful, not doubtful
 
 
 def _physics(reading: Reading, library: Library, pushes=None, gains=None, before=None) -> Look:

@@ -39,14 +39,7 @@ class SetFit:
 
     def parameters(self) -> dict[str, dict[str, tuple[float, float]]]:
         """{effect: {parameter: (value, standard deviation)}} of the set's own effects."""
-        deviation = dict(zip(self.index.tolist(), np.sqrt(np.diag(self.covariance)), strict=True))
-        return {
-            e: {
-                p.name: (float(self.theta[PLACE[e, p.name]]), float(deviation[PLACE[e, p.name]]))
-                for p in CARDS[e].fitted
-            }
-            for e in self.effects
-        }
+        return _named(self.effects, self.theta, self.index, self.covariance)
 
 
 def fit_set(replay: Replay, effects, start: np.ndarray | None = None, iterations: int = ITERATIONS) -> SetFit:
@@ -90,6 +83,28 @@ def fit_set(replay: Replay, effects, start: np.ndarray | None = None, iterations
     score = -objective - 0.5 * volume + _sign_term(effects, index, theta, covariance)
     score -= _free_ride(grams.sum(0), theta[index] - mean, precision, len(places(effects)))
     return SetFit(effects, theta, index, grams, columns, covariance, float(score), float(objective))
+
+
+def step_with(replay: Replay, fit: SetFit, more) -> dict[str, dict[str, tuple[float, float]]]:
+    """{effect: {parameter: (value, standard deviation)}} of a fitted set and `more` effects, by one step from the fit."""
+    effects = (*fit.effects, *more)
+    index, mean, precision = prior(effects)
+    gram = replay.grams(replay.linearised(fit.theta, index)).sum(0)
+    hessian = gram[1:, 1:] + precision
+    theta = fit.theta.copy()
+    theta[index] += np.linalg.solve(hessian, gram[1:, 0] - precision @ (theta[index] - mean))
+    return _named(effects, theta, index, np.linalg.inv(hessian))
+
+
+def _named(effects, theta, index, covariance) -> dict[str, dict[str, tuple[float, float]]]:
+    deviation = dict(zip(index.tolist(), np.sqrt(np.diag(covariance)), strict=True))
+    return {
+        e: {
+            p.name: (float(theta[PLACE[e, p.name]]), float(deviation[PLACE[e, p.name]]))
+            for p in CARDS[e].fitted
+        }
+        for e in effects
+    }
 
 
 def _sign_term(effects, index, theta, covariance) -> float:

@@ -24,10 +24,10 @@ NUISANCES = (
     ("thrust_scale", "scale", 0.004),
     ("inertia", "xx", 0.025),
     ("inertia", "yy", 0.025),
-    ("inertia", "zz", 0.025),
+    ("inertia", "zz", 0.01),
     ("motor_lag", "extra_up", 0.001),
     ("motor_lag", "extra_down", 0.001),
-    ("yaw_torque", "ratio", 0.02),
+    ("yaw_torque", "ratio", 0.01),
 )
 # With duty cycles for motor commands the map to thrust is a guess: scale, shape, lag and torques are free, and what they
 # can imitate isn't testable.

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from openjax.gap.evidence import Evidence
-from openjax.gap.hypotheses import SetFit, fit_set
+from openjax.gap.hypotheses import SetFit, fit_set, step_with
 from openjax.gap.library import ABSENT, CARDS, places, prior, start_of
 from openjax.gap.table import Judged, Table, build, judge, level, with_effects
 
@@ -88,7 +88,7 @@ def _widened(replay, fit, table, now, singles):
             tried = [_joined(replay, fit, singles, e) for e in ranked]
         else:
             tried = _openings(replay, fit, left)
-        better = [f for f in tried if is_itself(f) and f.score > fit.score + LEAST_NATS]
+        better = [f for f in tried if is_itself(replay, f) and f.score > fit.score + LEAST_NATS]
         for candidate in sorted(better, key=lambda f: -f.score):
             wider = build(replay, candidate, singles)
             whole = judge(wider, with_effects(wider))
@@ -105,7 +105,7 @@ def _widened(replay, fit, table, now, singles):
 def _openings(replay, nothing: SetFit, singles) -> list[SetFit]:
     """What to begin with: the best effects alone and, where they leave much, the best with one more each, so that what
     two effects do together isn't given to a third that looks like both."""
-    alone = sorted((f for f in singles.values() if is_itself(f)), key=lambda f: -f.score)
+    alone = sorted((f for f in singles.values() if is_itself(replay, f)), key=lambda f: -f.score)
     if not alone:
         return []
     best = alone[0].score - nothing.score
@@ -178,15 +178,17 @@ def _ranked(table: Table, singles, now: Judged) -> list[str]:
     return list(dict.fromkeys([*best, *(e for e in alone[:TRIED] if line[e] > 0.0)]))
 
 
-def is_itself(fit: SetFit) -> bool:
+def is_itself(replay, fit: SetFit) -> bool:
     """Whether no effect of a set is by its fitted value another one."""
-    found = fit.parameters()
-    for effect in fit.effects:
-        test = CARDS[effect].is_itself
-        if test is not None:
-            value, deviation = ({k: v[n] for k, v in found[effect].items()} for n in (0, 1))
-            if not test(value, deviation):
-                return False
+    tests = [e for e in fit.effects if CARDS[e].is_itself is not None]
+    more = {o for e in tests for o in CARDS[e].beside if o not in fit.effects}
+    found = step_with(replay, fit, more) if more else fit.parameters()
+    for effect in tests:
+        named = {p: v for p, v in found[effect].items()}
+        named |= {f"{o}.{p}": v for o in CARDS[effect].beside for p, v in found[o].items()}
+        value, deviation = ({k: v[n] for k, v in named.items()} for n in (0, 1))
+        if not CARDS[effect].is_itself(value, deviation):
+            return False
     return True
 
 
@@ -239,7 +241,7 @@ def _swapped(replay, fit, table, now, singles):
         alone = sorted(lines, key=lambda o: -singles[o].score)[:TRIED]
         for other in dict.fromkeys([*sorted(lines, key=lambda o: -lines[o])[:TRIED], *alone]):
             found = _joined(replay, fit, singles, other, without=effect)
-            if is_itself(found):
+            if is_itself(replay, found):
                 tried[other] = found
         gains = {o: f.score - fit.score for o, f in tried.items()}
         favoured = dict(gains)

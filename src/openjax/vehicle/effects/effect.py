@@ -119,7 +119,8 @@ class Card:
     thrust_map: a map from duty cycles to thrust that isn't known can imitate it.
     within_row: what motors do between two rows of the log can imitate it.
     commoner: an effect that is named instead where both do equally well.
-    is_itself({parameter: value}, {parameter: deviation}): whether it isn't by its fitted value another effect.
+    is_itself({parameter: value}, {parameter: deviation}): whether it isn't by its fitted value another effect; `beside`:
+        effects that are fitted with it for that, whose parameters follow as "effect.parameter".
     sample: a strength within its usual range to fly with, strong enough to see.
     impossible(position): whether a flight along position (T, 3), m, rules it out.
     next_flight: what would show it, in words.
@@ -137,6 +138,7 @@ class Card:
     thrust_map: bool = False
     within_row: bool = False
     commoner: str = ""
+    beside: tuple[str, ...] = ()
     is_itself: Callable[[Mapping[str, float], Mapping[str, float]], bool] | None = None
     impossible: Callable[[Any], bool] | None = None
     sample: Mapping[str, float] = field(default_factory=dict)

@@ -11,6 +11,17 @@ def body(parameters, vehicle):
     )
 
 
+_EARLY = 0.0025  # s
+
+
+def resists(value, deviation):
+    """Whether the body resists the motors. One that seems heavy to turn and yet turns before its motors act is pushed by
+    what its rate controller answers: in closed loop, gusts look like weak and early motors."""
+    early = max(value["motor_lag.extra_up"], value["motor_lag.extra_down"]) < -_EARLY
+    sure = value["motor_lag.extra_up"] < -3.0 * deviation["motor_lag.extra_up"]
+    return not (early and sure and max(value["xx"], value["yy"], value["zz"]) > 1.0)
+
+
 _SOURCE = "published values for the Crazyflie, with and without decks: 0.7-1.6 of nominal"
 
 EFFECT = Effect(
@@ -27,6 +38,8 @@ EFFECT = Effect(
             Fitted("zz", mean=1.0, spread=0.12, start=1.1, step=0.005),
         ),
         common=0.3,
+        beside=("motor_lag",),
+        is_itself=resists,
         sample={"xx": 1.4, "yy": 1.4, "zz": 1.4},
         next_flight="roll, pitch and yaw doublets with the motor commands logged.",
     ),

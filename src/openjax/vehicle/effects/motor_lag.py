@@ -5,12 +5,20 @@ import jax.numpy as jnp
 from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
 _SHORTEST = 1e-3  # s
+_EARLY = 0.0025  # s
 
 
 def body(parameters, vehicle):
     up = jnp.maximum(vehicle.motor_time_constant + parameters["extra_up"], _SHORTEST)
     down = vehicle.motor_time_constant * vehicle.motor_slowdown_ratio + parameters["extra_down"]
     return vehicle.replace(motor_time_constant=up, motor_slowdown_ratio=jnp.maximum(down, _SHORTEST) / up)
+
+
+def lags(value, deviation):
+    """Whether motors lag. That they are early is what gusts look like, which the rate controller answers, and single
+    samples of the motors; a motor's time constant is known better than that."""
+    del deviation
+    return max(value["extra_up"], value["extra_down"]) > -_EARLY
 
 
 _SOURCE = "coreless motors of this size: time constants of 0.02-0.12 s, against a nominal 0.025 s"
@@ -34,6 +42,7 @@ EFFECT = Effect(
             Fitted("extra_down", mean=0.0, spread=0.03, start=0.01, step=0.0005),
         ),
         common=0.03,
+        is_itself=lags,
         sample={"extra_up": 0.02, "extra_down": 0.03},
         next_flight="roll, pitch and thrust doublets, as short as the vehicle allows.",
     ),
