@@ -17,6 +17,7 @@ from openjax.flights.track import Track, rotation, smooth
 from openjax.gap.library import ABSENT, MOTOR_SHIFT, NUISANCES, PHYSICS_EFFECTS, PLACE, STEP, THETA
 from openjax.gap.physics import Path, compiled_physics
 from openjax.gap.whitening import Noise, first_noise, whiten
+from openjax.vehicle.effects.airspeed import PROPELLER_RADIUS
 from openjax.vehicle.effects.effect import ARENA_CEILING
 
 RATES, VELOCITY, FORCE = slice(0, 3), slice(3, 6), slice(6, 9)
@@ -44,6 +45,8 @@ QUICK_ROWS = (0, 1, 2)
 OF_A_TRACK = ("clock of the motors", "accelerometer bias", "clock of the pose")
 WAKE_TORQUE = 5.0  # rad/s^2 at the edge of another vehicle's wake, which no simple form of it has right
 WAKE_WIDTHS = (0.05, 0.1)  # m
+NEAR_TORQUE = 500.0  # 1/s^2 per rad of tilt a propeller's radius from floor or ceiling: what half of a usual ground effect does
+NEAR_OFFSET = 0.02  # m
 
 
 def bucket(length: int) -> int:
@@ -205,7 +208,7 @@ def make_replay(
         if at_once:
             columns |= _late_torques("motors within a row", track, feedback[number].quick, QUICK_ROWS)
         columns |= _sensor_nuisances(track, paths[number], base, max(POSE_SHIFT, wander))
-        columns |= _wake_torques(track)
+        columns |= _wake_torques(track) | _near_torques(track)
         named.append(columns)
     # A track without a neighbour has no wake: nothing there.
     names = tuple(max(named, key=len))
@@ -315,6 +318,19 @@ def torque_channels(acceleration: np.ndarray, dt: float) -> np.ndarray:
     column = np.zeros((len(acceleration), 9))
     column[1:, RATES] = np.cumsum(acceleration[:-1], 0) * dt
     return column
+
+
+def _near_torques(track: Track) -> dict[str, np.ndarray]:
+    """How floor and ceiling right a tilted vehicle or turn it over, which depends on more than its height: columns (T, 9)."""
+    if track.position is None or track.quaternion is None:
+        return {}
+    height, up = track.position[:, 2], rotation(track.quaternion)[:, 2]
+    tilt = np.stack([-up[:, 1], up[:, 0], np.zeros(len(track))], 1)
+    out = {}
+    for name, distance in (("floor", height), ("ceiling", ARENA_CEILING - height)):
+        near = (PROPELLER_RADIUS / (np.maximum(distance, 0.0) + NEAR_OFFSET)) ** 3
+        out[f"torque near the {name}"] = torque_channels(tilt * near[:, None], track.dt) * NEAR_TORQUE
+    return out
 
 
 def _wake_torques(track: Track) -> dict[str, np.ndarray]:
