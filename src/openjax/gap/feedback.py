@@ -19,6 +19,7 @@ from openjax.gap.replay import bucket, padded
 from openjax.vehicle.rate_controller import mixer
 
 SLOW = 0.06  # s over which commands implied by motors and rates are smoothed
+TRIM = 0.5  # s: what is slower is no answer to a gust, but what the vehicle needs
 QUICK = 0.1  # s: within it, single samples say little about what motors did between them
 LOOP_PERIOD = 0.002  # s, of the firmware's rate loop
 AT_ONCE = 0.12  # of the answer to one sample: above, motors may be single samples
@@ -124,7 +125,7 @@ def read_feedback(tracks, vehicles, links) -> list[Feedback]:
     rest = [m - share * c for c, m in zip(caused, made, strict=True)]
     return [
         Feedback(
-            _turning(r @ np.asarray(mixer(v), float).T, t, v),
+            _turning((r - smooth(r, TRIM, t.dt)) @ np.asarray(mixer(v), float).T, t, v),
             _turning(t.motor - smooth(t.motor, QUICK, t.dt), t, v),
         )
         for r, t, v in zip(rest, tracks, vehicles, strict=True)
