@@ -6,7 +6,7 @@
 Seeds below 100 are for development; the stranger's column is for reported runs. What a seed draws (categories, causes,
 sensors, vehicles, missions; before anything is flown) has a digest in `exam_plans.json`, committed before the run; the
 digest of the answers is on disk before the first diagnosis. A column whose `answers.json` lies in the work folder is taken as
-it is: `generate --cases` makes a part of a plan. Needs no network and no GPU.
+it is, and so are diagnoses that are there whole: `generate --cases` makes a part of a plan. Needs no network and no GPU.
 """
 
 import argparse
@@ -85,7 +85,10 @@ def sit(column, options, count):
     digest = answers.with_suffix(".sha256").read_text().strip()
     print(f"{column}: answers {digest}", flush=True)
     limit = ["--seconds", options.seconds] if options.seconds else []
-    step("diagnose", logs, "--out", out, "--jobs", options.jobs, *limit)
+    if (out / "runs.json").exists():
+        print(f"{column}: the diagnoses in {out}", flush=True)
+    else:
+        step("diagnose", logs, "--out", out, "--jobs", options.jobs, *limit)
     closed = None
     if column in cases.COLUMN:
         step("closed", answers, out, "--out", work / "closed.json", "--jobs", options.jobs)
@@ -196,8 +199,6 @@ def main():
     wanted = {"stranger": options.stranger, "rotorpy": options.rotorpy, "known": options.known}
     if not any(wanted.values()):
         parser.error("say how many cases: --known, --stranger or --rotorpy")
-    if any((options.work / column / "diagnoses").exists() for column in wanted):
-        parser.error(f"{options.work} already holds a run: remove it or give another --work")
     data = {"facts": facts(options), "columns": {}}
     results = options.results or options.work / "exam"
     results.parent.mkdir(parents=True, exist_ok=True)
