@@ -1,6 +1,6 @@
 """The exam from end to end: cases are drawn and flown, their answers sealed, the logs diagnosed, the answers opened.
 
-    python -m experiments.exam.run --known 60 --stranger 240 --rotorpy 3 --seed 307 --jobs 30 --work DIR [--results PATH]
+    python -m experiments.exam.run --known 60 --stranger 240 --rotorpy 3 --seed 401 --jobs 30 --work DIR [--results PATH]
     python -m experiments.exam.run --plans            # writes experiments/results/exam_plans.json
 
 Seeds below 100 are for development; the stranger's column is for reported runs. What a seed draws (categories, causes,
@@ -27,7 +27,7 @@ TITLES = {"stranger": "The stranger's column", "known": "The known column", "rot
 REPORTED = {
     101: {"stranger": 240, "known": 300},
     211: {"stranger": 240, "known": 300},
-    307: {"stranger": 240, "known": 60},
+    401: {"stranger": 240, "known": 60},
 }  # seed: cases; 101 and 211 are opened
 
 
