@@ -1,11 +1,13 @@
 """How much of a method's collisions is the vehicle's: `python -m experiments.point_mass [--tasks 512]`.
 
 The methods that put out a velocity, flown as what they take a drone for: a point whose velocity is the commanded one at once,
-or follows it with a lag. Beside them the vehicle behind its velocity controller, on the same tasks, which are such as the
-trainers draw. Writes experiments/results/point_mass.json and .md.
+or follows it with a lag. Beside them the vehicle behind its velocity controller, with the methods asked what they would do here
+and now, and where all will be after the vehicle's response; on the same tasks, which are such as the trainers draw. Writes
+experiments/results/point_mass.json and .md.
 """
 
 import argparse
+import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -22,9 +24,15 @@ from openjax.learning import make_evaluate
 from openjax.pursuit import EpisodeStatistics, Pursuit, PursuitSettings
 from openjax.store.policies import LoadedPolicy, load_policy
 
-LAGS = (0.0, 0.05, 0.1, 0.2)
+LAGS = (0.0, 0.1, 0.2)
 """Time constants (s) of the points."""
 POLICIES = (*METHODS, "dacoop_seed_0")
+
+
+def without_response(loaded: LoadedPolicy) -> LoadedPolicy:
+    """The method asked about here and now."""
+    craft = dataclasses.replace(loaded.policy.craft, response=0.0)
+    return dataclasses.replace(loaded, policy=dataclasses.replace(loaded.policy, craft=craft))
 
 
 def velocity_of(loaded: LoadedPolicy):
@@ -74,16 +82,21 @@ def means(counted: EpisodeStatistics, groups: int) -> list[list[float]]:
 
 def study(options: argparse.Namespace) -> dict:
     """All methods."""
-    settings = PursuitSettings(physics="rigid", start_attitude="level")
-    tasks = training_tasks(settings, jax.random.key(10), options.tasks)
+    tasks = training_tasks(PursuitSettings(), jax.random.key(10), options.tasks)
     repeated = jax.tree.map(lambda leaf: jnp.concatenate([leaf] * len(LAGS)), tasks)
     lags, rows = jnp.repeat(jnp.array(LAGS), options.tasks), {}
     for name in POLICIES:
+        loaded = load_policy(name)
+        settings = dataclasses.replace(
+            loaded.settings.environment, physics="rigid", start_attitude="level", speed_limit="clamp"
+        )
         environment = Pursuit(settings)
-        loaded = load_policy(name).in_game(environment)
-        evaluate = jax.jit(make_evaluate(environment, loaded.policy))
-        vehicle = evaluate(loaded.parameters, tasks, jax.random.key(0)).statistics
-        rows[name] = means(as_points(loaded, settings, repeated, lags), len(LAGS)) + means(vehicle, 1)
+        loaded = loaded.in_game(environment)
+        now = without_response(loaded)
+        rows[name] = means(as_points(now, settings, repeated, lags), len(LAGS))
+        for each in (now, loaded):
+            evaluate = jax.jit(make_evaluate(environment, each.policy))
+            rows[name] += means(evaluate(each.parameters, tasks, jax.random.key(0)).statistics, 1)
         print(name, rows[name], flush=True)
     return {
         "command": f"python -m experiments.point_mass --tasks {options.tasks}",
@@ -96,7 +109,7 @@ def study(options: argparse.Namespace) -> dict:
 
 def report(results: dict) -> list[str]:
     """The page."""
-    heads = [*(f"point, lag {lag:g} s" for lag in LAGS), "vehicle"]
+    heads = [*(f"point, lag {lag:g} s" for lag in LAGS), "vehicle, asked about now", "vehicle"]
     return [
         "# The methods that put out a velocity, as points and as vehicles",
         "",
