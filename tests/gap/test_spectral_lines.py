@@ -33,6 +33,14 @@ def test_a_line_of_the_motion_is_found_at_its_frequency(channels):
     assert "5.0 Hz" in found
 
 
+def test_who_flies_circles_has_no_line_at_their_rhythm():
+    tracks, disturbed, usable = rest((VELOCITY,), frequency=2.0)
+    time = DT * np.arange(ROWS)
+    circle = np.stack([np.cos(2 * np.pi * time), np.sin(2 * np.pi * time), 0.0 * time], 1)
+    assert lines(tracks, disturbed, usable)
+    assert lines([SimpleNamespace(dt=DT, velocity=circle)] * 2, disturbed, usable) == ()
+
+
 def test_a_sensor_that_shakes_by_itself_is_no_motion():
     assert lines(*rest((FORCE,), size=3.0)) == ()
     assert lines(*rest((RATES,), size=0.5)) == ()

@@ -2,6 +2,7 @@
 
 The rest is compared with the same flights' own spectrum, never with a plant's. Turbulence and sensors make smooth spectra; a
 loose part, a pendulum or a beat makes a line. A vibrating sensor makes lines, too: what two sensors see at once is motion.
+So does whoever flies circles: what any model has wrong comes back with each of them, and with its multiples.
 
 What is local in time (knocks, switches) was tried by the kurtosis of the rest's increments: drifting clocks, wakes of
 another form and interpolated poses make as much of it."""
@@ -22,6 +23,8 @@ SEGMENT = 4.0  # s of a spectrum
 AROUND = 3.0  # Hz whose median is the spectrum around
 LOWEST, HIGHEST = 0.8, 25.0  # Hz
 POSE_HIGHEST = 8.0  # Hz: above, what tracks the pose and puts it onto rows makes lines of its own
+LAPS = 0.4  # of the velocity's power, near one frequency: the flights go round and round
+LONGEST_LAP, MULTIPLES = 1.6, (1, 2, 3)  # Hz; of it
 NAMES = {"torque": RATES, "velocity": VELOCITY, "force": FORCE}
 
 
@@ -31,9 +34,12 @@ def lines(tracks: list[Track], disturbed: list[np.ndarray], usable: np.ndarray) 
     if len({round(t.dt, 5) for t in tracks}) > 1 or not seen:
         return ()
     spectra = {name: _ratio(tracks, [d[:, axes] for d in disturbed]) for name, axes in seen.items()}
-    best = {}
+    best, laps = {}, _laps(tracks)
     for name, (frequency, ratio) in spectra.items():
         inside = (frequency > LOWEST) & (frequency < (POSE_HIGHEST if name == "velocity" else HIGHEST))
+        for lap in laps:
+            for times in MULTIPLES:
+                inside &= np.abs(frequency - times * lap) > 1.5 / SEGMENT
         place = np.unravel_index(np.argmax(np.where(inside[:, None], ratio, 0.0)), ratio.shape)
         best[name] = float(frequency[place[0]]), float(ratio[place]), "xyz"[place[1]]
     for name, (at, size, axis) in best.items():
@@ -46,6 +52,21 @@ def lines(tracks: list[Track], disturbed: list[np.ndarray], usable: np.ndarray) 
         if (size > alone and (name != "force" or "velocity" not in seen)) or (size > LINE and others):
             return (f"a line at {at:.1f} Hz in {name} {axis}, {size:.0f} times the spectrum around it",)
     return ()
+
+
+def _laps(tracks: list[Track]) -> list[float]:
+    """Frequencies, Hz, at which the flights go round: of each track those that hold much of the velocity's power."""
+    found = []
+    for track in tracks:
+        velocity = getattr(track, "velocity", None)
+        if velocity is None:
+            continue
+        frequency, power = welch(velocity, 1.0 / track.dt, nperseg=len(velocity), axis=0, detrend="linear")
+        power = power.sum(1)
+        near = np.convolve(power, np.ones(3), "same") / power.sum()
+        peaks = (power >= np.maximum(np.roll(power, 1), np.roll(power, -1))) & (near > LAPS)
+        found += [float(f) for f in frequency[peaks & (frequency > 0.0) & (frequency < LONGEST_LAP)]]
+    return found
 
 
 def _ratio(tracks, parts) -> tuple[np.ndarray, np.ndarray]:
