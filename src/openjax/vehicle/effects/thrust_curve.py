@@ -15,12 +15,15 @@ def motor(parameters, motor_command, context):
 _SOURCE = "spread of quadratic thrust maps published for the Crazyflie, as shares of the largest thrust"
 
 
+_BEND = 0.03  # of the thrust over the usual commands
+
+
 def bends(value, deviation):
     """Whether a fitted curve bends over the usual commands; if not, it is another thrust or mass."""
     del deviation
     commands = np.linspace(0.45, 0.85, 9)
     change = value["offset"] / commands + value["slope"] + value["curvature"] * commands - 1.0
-    return bool(np.ptp(change) > 0.5 * abs(change.mean()))
+    return bool(np.ptp(change) > min(0.5 * abs(change.mean()), _BEND))
 
 
 EFFECT = Effect(
