@@ -13,7 +13,15 @@ from openjax.errors import UserError
 from openjax.flights.flight import Case
 from openjax.flights.track import GRID_PERIOD, Track, tracks_of
 from openjax.gap import estimator, firmware
-from openjax.gap.feedback import AT_ONCE, ROW_DELAY, Gains, answers_noise, outputs_of, read_feedback
+from openjax.gap.feedback import (
+    AT_ONCE,
+    ROW_DELAY,
+    Gains,
+    answers_noise,
+    gustiness,
+    outputs_of,
+    read_feedback,
+)
 from openjax.gap.firmware import Radio
 from openjax.gap.hypotheses import SetFit, model_noise, weigh_singles
 from openjax.gap.kinematics import Kinematics, corrected, read_kinematics
@@ -28,6 +36,8 @@ LOOKS = 2  # at most
 WORTH_KNOWING = 15.0  # nats that an effect must add to be taken as known in the next look
 WORTH_A_SECOND_LOOK = 30.0  # nats of the best set above none
 LEAST_KICK = 0.1  # of the motors' outputs within a row: below, samples are as good as means
+GUSTY = 0.3  # of the gusts' share in the torques: by so much moments of inertia may look wrong,
+GUSTY_LAG = 0.01  # s: and motors late or early
 HEAVY = 0.1  # of the moments of inertia, that single samples taken for means may feign
 RADIO_COST = 15.0  # nats that a radio effect must gain before the rate loop is read with it
 
@@ -253,6 +263,12 @@ def _physics(reading: Reading, library: Library, pushes=None, gains=None, before
         tracks, vehicles, ticks, feedback, reading.numbers, sensors.one_clock, at_once, sensors.wander
     )
     floor, exposure = model_noise(replay, library)
+    gusts = np.minimum(gustiness(tracks, feedback, floor), 1.0)
+    wrong = {"inertia": dict(zip(("xx", "yy", "zz"), GUSTY * gusts, strict=True))}
+    wrong["motor_lag"] = dict.fromkeys(("extra_up", "extra_down"), GUSTY_LAG * gusts[:2].mean())
+    replay.loosen(
+        {f"{e} {p}": float(np.hypot(1.0, wrong.get(e, {}).get(p, 0.0) / sd)) for e, p, sd in replay.numbers}
+    )
     for effect in library.physics:
         card = CARDS[effect]
         unseen = card.needs and any(getattr(t, card.needs) is None for t in tracks)

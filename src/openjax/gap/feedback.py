@@ -44,10 +44,12 @@ COUNT = 57.29577951308232 / 65536.0  # motor command per count and rad/s
 @dataclass(frozen=True, eq=False)
 class Feedback:
     """Of one track: `acceleration` (T, 3) rad/s^2 that the feedback part of the motors makes, through their lag;
-    `quick` (T, 3) the same of what motors do within QUICK s, whoever caused it."""
+    `quick` (T, 3) the same of what motors do within QUICK s, whoever caused it; `caused` (T, 3) the same of what the
+    commands caused."""
 
     acceleration: np.ndarray
     quick: np.ndarray
+    caused: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,15 +113,16 @@ def in_force(track: Track, arrived) -> np.ndarray:
 
 def read_feedback(tracks, vehicles, links) -> list[Feedback]:
     """The feedback part of every track's motors. `links`: what arrived of the commands, None where that wasn't read."""
-    caused, made = [], []
+    given, caused, made = [], [], []
     for track, vehicle, link in zip(tracks, vehicles, links, strict=True):
-        given, _ = _caused(track, vehicle, link)
+        motors, _ = _caused(track, vehicle, link)
         outputs = outputs_of(vehicle)
-        caused.append(given @ outputs)
+        given.append(motors - motors.mean(0))
+        caused.append(given[-1] @ outputs)
         made.append(track.motor @ outputs)
     # First stage: as much of the outputs as is proportional to what commands would have caused, axis by axis. More freedom
     # (a filter) would let the outer loop's answers to gusts in.
-    caused, made = ([v - v.mean(0) for v in values] for values in (caused, made))
+    made = [m - m.mean(0) for m in made]
     power = sum((c * c).sum(0) for c in caused)
     share = sum((c * m).sum(0) for c, m in zip(caused, made, strict=True)) / np.maximum(power, 1e-12)
     rest = [m - share * c for c, m in zip(caused, made, strict=True)]
@@ -127,9 +130,25 @@ def read_feedback(tracks, vehicles, links) -> list[Feedback]:
         Feedback(
             _turning((r - smooth(r, TRIM, t.dt)) @ np.asarray(mixer(v), float).T, t, v),
             _turning(t.motor - smooth(t.motor, QUICK, t.dt), t, v),
+            _turning(g, t, v),
         )
-        for r, t, v in zip(rest, tracks, vehicles, strict=True)
+        for r, g, t, v in zip(rest, given, tracks, vehicles, strict=True)
     ]
+
+
+def gustiness(tracks, feedback: list[Feedback], floor) -> np.ndarray:
+    """(3,) rms of the angular accelerations that nothing explains over those that commands caused, in BAND. Commands
+    answer gusts too, by way of the attitude, so this bounds how wrong torques may look. `floor` [(T, 9)]: residuals when
+    all effects may act."""
+    left, caused = np.zeros(3), np.full(3, 1e-12)
+    for track, part, rest in zip(tracks, feedback, floor, strict=True):
+        band = butter(2, BAND, "bandpass", fs=1.0 / track.dt, output="sos")
+        edge = int(EDGE / track.dt)
+        both = np.stack([np.gradient(rest[:, :3], track.dt, axis=0), part.caused])
+        both = sosfiltfilt(band, both, axis=1)[:, edge:-edge]
+        left += (both[0] ** 2).sum(0)
+        caused += (both[1] ** 2).sum(0)
+    return np.sqrt(left / caused)
 
 
 def _caused(track: Track, vehicle, link) -> tuple[np.ndarray, np.ndarray]:

@@ -108,6 +108,12 @@ class Replay:
         self.whitened_nuisances = [self.whiten(n, k) for k, n in enumerate(self.nuisances)]
         self.projections = [projection(n.reshape(len(n), -1)) for n in self.whitened_nuisances]
 
+    def loosen(self, usual: dict[str, float]) -> None:
+        """Let nuisances be `usual` {name: times} as large as they usually are."""
+        times = np.array([usual.get(n, 1.0) for n in self.nuisance_names])
+        self.nuisances = [n * times[:, None, None] for n in self.nuisances]
+        self.set_noise(self.noises)
+
     def whiten(self, x: np.ndarray, track: int) -> np.ndarray:
         """x (..., T, 9) of a track -> (..., T', 9) in units of the noise, without the first moments."""
         out = whiten(self.noises, x) * self.usable
