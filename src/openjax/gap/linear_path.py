@@ -12,7 +12,7 @@ from openjax.gap.whitening import Noise, fit_noise, whiten
 PASSES = 3  # of fitting the noise model and the coefficients in turn
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class LinearPath:
     """y (T, A) = columns x theta + nuisances + noise, for each track; theta has a zero-mean prior of
     `spread` (P,)."""
