@@ -7,6 +7,7 @@ again.
 
 import argparse
 import dataclasses
+import functools
 import json
 import time
 from pathlib import Path
@@ -20,13 +21,14 @@ from experiments.flights import environment_of, fly
 from experiments.pages import RESULTS
 from experiments.roster import ABLATIONS, METHODS, seeds_of
 from openjax.baselines import METHODS as HEURISTICS
+from openjax.cluster.compilation import compile_ahead
 from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import layout_slots, record_of, repeat_task
 from openjax.commands.machine import describe_machine
 from openjax.files import read_json, write_text
 from openjax.learning import summarise
-from openjax.pursuit import SCENARIOS, RewardSettings, scenario_task
-from openjax.store.policies import load_policy
+from openjax.pursuit import SCENARIOS, Pursuit, RewardSettings, scenario_task
+from openjax.store.policies import LoadedPolicy, load_policy
 from openjax.store.settings_files import to_plain
 
 PAGES = (tab_main, tab_ood, tab_prediction, behaviours, sweeps)
@@ -35,26 +37,48 @@ LABELS = (*METHODS, *ABLATIONS)
 LIMITS = {"clamp": "clamp", "no clamp": "none"}
 
 
-def of_policy(name: str, seed: int, changes: dict, episodes: int) -> dict:
-    """By layout: the record of a policy, what it did there, the paths of one episode; and its two sweeps."""
+@functools.cache
+def game_of(name: str, limit: str, physics: str) -> tuple[LoadedPolicy, Pursuit]:
+    """A policy, and the game that it flies."""
     loaded = load_policy(name)
     game = loaded.settings.environment
     # the reward changes nothing that is counted here; one for all saves compilations
-    game = dataclasses.replace(game, max_pillars=layout_slots(game), reward=RewardSettings(), **changes)
-    # layout, evader speed, episodes
-    cells = [(layout, game.evader_speed, episodes) for layout in LAYOUTS]
-    cells += [(layout, speed, max(1, episodes // 2)) for layout, speed in sweeps.CELLS]
-    tasks = [repeat_task(scenario_task(game, SCENARIOS[layout]), number) for layout, _, number in cells]
+    game = dataclasses.replace(
+        game, max_pillars=layout_slots(game), reward=RewardSettings(), speed_limit=limit, physics=physics
+    )
     environment = environment_of(game)
-    flown = fly(
+    return loaded.in_game(environment), environment
+
+
+def cells_of(evader_speed: float, episodes: int) -> list[tuple[str, float, int]]:
+    """Layout, evader speed (m/s) and number of what a policy flies in one call."""
+    cells = [(layout, evader_speed, episodes) for layout in LAYOUTS]
+    return cells + [(layout, speed, max(1, episodes // 2)) for layout, speed in sweeps.CELLS]
+
+
+def call_of(name: str, seed: int, limit: str, physics: str, episodes: int) -> tuple:
+    """The arguments of `fly`."""
+    loaded, environment = game_of(name, limit, physics)
+    game = environment.settings
+    cells = cells_of(game.evader_speed, episodes)
+    tasks = [repeat_task(scenario_task(game, SCENARIOS[layout]), number) for layout, _, number in cells]
+    return (
         environment,
-        loaded.in_game(environment).policy,
+        loaded.policy,
         sweeps.RADII,
         loaded.parameters,
         jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *tasks),
         jnp.concatenate([jnp.full(number, speed, jnp.float32) for _, speed, number in cells]),
         jax.random.key(seed),
     )
+
+
+def of_policy(name: str, seed: int, limit: str, physics: str, episodes: int) -> dict:
+    """By layout: the record of a policy, what it did there, the paths of one episode; and its two sweeps."""
+    call = call_of(name, seed, limit, physics, episodes)
+    game = call[0].settings
+    cells = cells_of(game.evader_speed, episodes)
+    flown = fly(*call)
     flown = jax.tree.map(np.asarray, flown)
     ends = np.cumsum([number for *_, number in cells])
     parts = [
@@ -83,13 +107,25 @@ def study(options: argparse.Namespace) -> None:
     kept = read_json(stored) if stored.exists() and len(options.methods) < len(LABELS) else {}
     kept = kept.get("flights", []) if {name: kept.get(name) for name in alike} == alike else []
     flights = [flight for flight in kept if flight["method"] not in options.methods]
+    wanted = [
+        (label, condition)
+        for label in options.methods
+        for condition in LIMITS
+        if condition == "clamp" or METHODS.get(label) in HEURISTICS
+    ]
+    rest = (options.physics, options.episodes)
+    compiled = {}
+    for label, condition in wanted:  # all programs are compiled side by side, and while others fly
+        for name, seed in seeds_of(label)[:1]:
+            compiled[label, condition] = compile_ahead(fly, *call_of(name, seed, LIMITS[condition], *rest))
     for label in options.methods:
         for condition, limit in LIMITS.items():
-            if condition != "clamp" and METHODS.get(label) not in HEURISTICS:
+            if (label, condition) not in compiled:
                 continue
+            compiled[label, condition]()
             for name, seed in seeds_of(label):
-                changes, begun = {"speed_limit": limit, "physics": options.physics}, time.monotonic()
-                flown = of_policy(name, seed, changes, options.episodes)
+                begun = time.monotonic()
+                flown = of_policy(name, seed, limit, *rest)
                 if condition != "clamp" or (name, seed) != seeds_of(label)[0]:
                     for layout in flown["layouts"].values():  # one episode of each method is drawn
                         del layout["paths"]
@@ -107,8 +143,7 @@ def study(options: argparse.Namespace) -> None:
         # after each method, so that an interrupted study leaves what it has
         command = f"python -m experiments.tables --episodes {options.episodes} --physics {options.physics}"
         results = {"command": command, "commit": options.commit, "machine": describe_machine()}
-        seconds = [flight.get("seconds") for flight in flights]  # of those that are kept, too
-        results |= {"seconds": None if None in seconds else sum(seconds), **alike, "flights": flights}
+        results |= {"seconds": time.monotonic() - started, **alike, "flights": flights}
         # paths are long: no line for each number
         write_text(stored, json.dumps(to_plain(results), allow_nan=False, separators=(",", ":")))
 
