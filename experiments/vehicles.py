@@ -67,8 +67,10 @@ def program(settings, policy):
     return jax.jit(run)
 
 
-def fly(name: str, number: int, layouts: int, physics: str) -> dict[str, dict[str, dict]]:
-    """Summaries by vehicle and kind of task."""
+def fly(
+    name: str, number: int, layouts: int, physics: str, chosen: list[str] | None = None
+) -> dict[str, dict[str, dict]]:
+    """Summaries by vehicle (all kinds, or those `chosen`) and kind of task."""
     loaded = load_policy(name)
     game = dataclasses.replace(
         loaded.settings.environment,
@@ -92,6 +94,8 @@ def fly(name: str, number: int, layouts: int, physics: str) -> dict[str, dict[st
     found: dict[str, dict[str, dict]] = {}
     run = program(game, loaded.policy)
     for kind, bounds in vehicles().items():
+        if chosen and kind not in chosen:
+            continue
         shown = tasks if kind in ("nominal", "table", "ordinary", WHOLE) else {"uniform": tasks["uniform"]}
         own = found.setdefault(kind, {})
         for task_kind, drawn_tasks in shown.items():
@@ -134,10 +138,14 @@ def cells(summary: dict) -> list[str]:
 def study(options) -> dict:
     """Fly the policies."""
     started = time.monotonic()
-    policies = {name: fly(name, options.number, options.layouts, options.physics) for name in options.policy}
+    policies = {
+        name: fly(name, options.number, options.layouts, options.physics, options.vehicles)
+        for name in options.policy
+    }
+    chosen = f" --vehicles {' '.join(options.vehicles)}" if options.vehicles else ""
     return {
         "command": f"python -m experiments.vehicles --policy {' '.join(options.policy)} --number {options.number} "
-        f"--layouts {options.layouts} --physics {options.physics}",
+        f"--layouts {options.layouts} --physics {options.physics}{chosen}",
         "machine": describe_machine(),
         "seconds": time.monotonic() - started,
         "number": options.number,
@@ -178,6 +186,9 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--number", type=int, default=1024, help="tasks of each kind")
     parser.add_argument("--layouts", type=int, default=0, help="episodes of each layout; 0: none")
     parser.add_argument("--physics", default="rigid")
+    parser.add_argument(
+        "--vehicles", nargs="+", choices=list(vehicles()), help="kinds of vehicles; default: all"
+    )
     publish(parser.parse_args(arguments), study, report)
     return 0
 
