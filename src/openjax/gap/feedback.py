@@ -15,11 +15,10 @@ from scipy.stats import t as student
 
 from openjax.flights.track import Track, smooth
 from openjax.gap.observer import TICKS, commanded
-from openjax.gap.replay import bucket, padded
+from openjax.gap.replay import TRIM, bucket, padded
 from openjax.vehicle.rate_controller import mixer
 
 SLOW = 0.06  # s over which commands implied by motors and rates are smoothed
-TRIM = 0.5  # s: what is slower is no answer to a gust, but what the vehicle needs
 QUICK = 0.1  # s: within it, single samples say little about what motors did between them
 LOOP_PERIOD = 0.002  # s, of the firmware's rate loop
 AT_ONCE = 0.12  # of the answer to one sample: above, motors may be single samples

@@ -24,6 +24,7 @@ RATES, VELOCITY, FORCE = slice(0, 3), slice(3, 6), slice(6, 9)
 # Groups of channels that share a noise model: axes, whether integrated.
 GROUPS = (((0, 1), True), ((2,), True), ((3, 4), True), ((5,), True), ((6, 7), False), ((8,), False))
 FIRST_NOISE = (0.03, 0.03, 0.006, 0.006, 0.25, 0.25)
+TRIM = 0.5  # s: what motors do more slowly is no answer to a gust, but what the vehicle needs
 SKIP = 0.2  # s left out at the start of a track: rotor speeds are not known there
 BUCKETS = (256, 512, 1024, 2048, 4096, 8192, 16384, 32768)
 BATCH = 8
@@ -209,6 +210,9 @@ def make_replay(
             " ".join(key[:2]): (m - base) * key[2] / STEP[k]
             for key, m, k in zip(numbers, moved, index, strict=False)
         }
+        for name in columns:
+            if name.startswith("inertia "):
+                _without_trim(columns[name], track)
         columns["clock of the motors"] = (moved[-1] - base) * shift / STEP[-1]
         columns |= _late_torques("feedback", track, feedback[number].acceleration, FEEDBACK_ROWS)
         if at_once:
@@ -307,6 +311,13 @@ def _sensor_nuisances(
         late += smooth(np.gradient(track.velocity, track.dt, axis=0), 0.05, track.dt)
         column("clock of the pose", VELOCITY, late, pose_shift)
     return columns
+
+
+def _without_trim(column: np.ndarray, track: Track) -> None:
+    """Take the slow part off the torques of a column (T, 9). Motors that hold a trim hold it against something, and the two
+    together turn a heavier body no less: inertia must not take what an offset or a weak rotor does."""
+    turning = np.diff(column[:, RATES], axis=0, prepend=column[:1, RATES])
+    column[:, RATES] = np.cumsum(turning - smooth(turning, TRIM, track.dt), 0)
 
 
 def _late_torques(name: str, track: Track, acceleration: np.ndarray, delays) -> dict[str, np.ndarray]:
