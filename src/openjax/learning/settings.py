@@ -293,6 +293,52 @@ def flight() -> TrainSettings:
     )
 
 
+def flight_second() -> TrainSettings:
+    """Second stage of `flight`, from a policy of the first (`--start_from`): ways round rows of pillars, the whole family."""
+    base = flight()
+    return dataclasses.replace(
+        base,
+        environment=dataclasses.replace(
+            base.environment,
+            reward=dataclasses.replace(base.environment.reward, collision=20.0, margin=0.02),
+        ),
+        mappo=dataclasses.replace(
+            base.mappo,
+            learning_rate=6e-4,
+            clip_epsilon=0.15,
+            actor_start=0.06,
+            discount=0.998,
+            gae_lambda=0.97,
+            penalty_start=0.3,
+            penalty_ramp=0.4,
+        ),
+        # Starts force collisions. If they counted against success, the archive would hold such starts instead of the
+        # tasks whose evader nobody reaches
+        generator=dataclasses.replace(
+            base.generator, row_share=0.5, success_low=0.25, collision_tolerance=1.0
+        ),
+        vehicles_start=0.0,
+        vehicles_ramp=0.0,
+        total_steps=230_000_000,
+    )
+
+
+def flight_last() -> TrainSettings:
+    """Last stage of `flight`, from a policy of the second (`--start_from`): fewer collisions and crashes."""
+    base = flight_second()
+    return dataclasses.replace(
+        base,
+        environment=dataclasses.replace(
+            base.environment,
+            reward=dataclasses.replace(
+                base.environment.reward, collision=40.0, margin=0.03, first_crash=3000.0
+            ),
+        ),
+        mappo=dataclasses.replace(base.mappo, learning_rate=5e-4, clip_epsilon=0.12, penalty_start=1.0),
+        total_steps=95_000_000,
+    )
+
+
 def mappo() -> TrainSettings:
     """The paper's plain MAPPO, without predictor and generator, with penalties under which it learns to catch: where a
     first crash costs 5,000, only the generator's tasks lead past hovering."""
@@ -315,7 +361,15 @@ def dacoop() -> TrainSettings:
     )
 
 
-PRESETS = {"quick": quick, "paper": paper, "flight": flight, "mappo": mappo, "dacoop": dacoop}
+PRESETS = {
+    "quick": quick,
+    "paper": paper,
+    "flight": flight,
+    "flight_second": flight_second,
+    "flight_last": flight_last,
+    "mappo": mappo,
+    "dacoop": dacoop,
+}
 
 
 def preset(name: str, **changes) -> TrainSettings:
