@@ -20,10 +20,12 @@ FOLLOWED = 0.2  # of a channel's rest that follows something in the log: somethi
 TEMPERATURE = (
     4.0  # divides differences of log-likelihood: residuals are never quite as independent as they count
 )
-SURE = 0.92  # no name is more certain than this
-HALF = 0.1  # floors that a name takes off the gap if it is half as certain
-SEEN = 0.75  # certainty of "unknown" where a sensor is off or the rest has a rhythm
-NOTHING = 0.6  # certainty of "none"
+SURE = 0.92  # no name by its gain is more certain than this
+HALF = 0.07  # floors that a name takes off the gap if it is half as certain
+READ = 0.97  # certainty of what radio, rate loop and pose say: they have bounds of their own
+SEEN = 0.9  # certainty of "unknown" where a sensor is off or the rest has a rhythm
+LEFT = 0.6  # the most where something is left that follows the log
+NOTHING = 0.68  # certainty of "none"
 BROAD = 3.0  # by which a share's power makes the largest the strongest
 
 
@@ -56,13 +58,15 @@ def _certainty(evidence: Evidence, selection: Selection, parts: Split, rest: Res
     if effect == "unknown":
         if rest.lines or set(evidence.sensors.findings) - {"clocks"}:
             return SEEN
-        floors = parts.gap.after - 1.0
-    elif effect in selection.gains:
-        floors = selection.gains[effect].floors
-    else:
-        return SURE  # radio, rate loop and pose have bounds of their own
-    floors = max(floors, 0.0)
-    return SURE * floors / (floors + HALF)
+        return LEFT * _by_size(parts.gap.after - 1.0)
+    if effect in selection.gains:
+        return SURE * _by_size(selection.gains[effect].floors)
+    return READ
+
+
+def _by_size(floors: float) -> float:
+    square = max(floors, 0.0) ** 2
+    return square / (square + HALF**2)
 
 
 def _alternatives(selection: Selection, parts: Split, rest: Rest, effects) -> dict[str, float]:
