@@ -24,7 +24,7 @@ AROUND = 3.0  # Hz whose median is the spectrum around
 LOWEST, HIGHEST = 0.8, 25.0  # Hz
 POSE_HIGHEST = 8.0  # Hz: above, what tracks the pose and puts it onto rows makes lines of its own
 LAPS = 0.4  # of the velocity's power, near one frequency: the flights go round and round
-LONGEST_LAP, MULTIPLES = 1.6, (1, 2, 3)  # Hz; of it
+LONGEST_LAP, MULTIPLES = 1.6, (1, 2)  # Hz; of it
 NAMES = {"torque": RATES, "velocity": VELOCITY, "force": FORCE}
 
 
@@ -39,7 +39,7 @@ def lines(tracks: list[Track], disturbed: list[np.ndarray], usable: np.ndarray) 
         inside = (frequency > LOWEST) & (frequency < (POSE_HIGHEST if name == "velocity" else HIGHEST))
         for lap in laps:
             for times in MULTIPLES:
-                inside &= np.abs(frequency - times * lap) > 1.5 / SEGMENT
+                inside &= np.abs(frequency - times * lap) > 1.0 / SEGMENT
         place = np.unravel_index(np.argmax(np.where(inside[:, None], ratio, 0.0)), ratio.shape)
         best[name] = float(frequency[place[0]]), float(ratio[place]), "xyz"[place[1]]
     for name, (at, size, axis) in best.items():
