@@ -46,6 +46,7 @@ def train(options: argparse.Namespace, seed: int, cores: list[int]) -> dict:
             check=True,
         )
     seconds = round(time.monotonic() - started)
+    print(f"seed {seed}: {seconds} s", flush=True)
     layouts, loaded = read_json(run / "layouts.json"), load_policy(run)
     kept = {name: layouts[name] for name in ("after", "open", "seconds", "steps") if name in layouts}
     return {
