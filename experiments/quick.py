@@ -22,7 +22,7 @@ from experiments.pages import RESULTS, publish, table, where
 from openjax.commands.machine import describe_machine
 from openjax.commands.validation import uniform_tasks
 from openjax.files import read_json
-from openjax.learning import preset
+from openjax.learning.settings import PRESETS
 from openjax.pursuit import Pursuit
 from openjax.store.policies import LoadedPolicy, load_policy
 
@@ -110,7 +110,8 @@ def study(options: argparse.Namespace) -> dict:
     return {
         "command": "python -m experiments.quick " + " ".join(sys.argv[1:]),
         "machine": describe_machine(),
-        "preset": " ".join(preset("quick").__doc__.split()),
+        "commit": options.commit,
+        "preset": " ".join(PRESETS["quick"].__doc__.split()),
         "runs": runs,
     }
 
@@ -157,6 +158,7 @@ def main() -> None:
     )
     parser.add_argument("--options", default="", help="more options of openjax.train")
     parser.add_argument("--runs", type=Path, default=Path("runs/quick"), help="folder of the runs")
+    parser.add_argument("--commit", help="of these sources, where git doesn't tell")
     parser.add_argument("--report", action="store_true", help="from the stored results")
     parser.add_argument("--out", type=Path, default=RESULTS / "quick_runs")
     publish(parser.parse_args(), study, report)
