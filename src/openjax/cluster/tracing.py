@@ -43,7 +43,7 @@ def recalled(
     if program is None:
         try:
             _write(file, _export(function, arguments, type(carry)))
-        except (ValueError, NotImplementedError, OSError):
+        except (ValueError, NotImplementedError, OSError):  # a call that can't be kept, a full disk
             return function
         program = _read(file)  # also now, so that it's the same program the first time
         if program is None:

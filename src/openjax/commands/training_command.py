@@ -69,6 +69,8 @@ class TrainCommand:
     """Which of them this one is, from 0. Slurm and Open MPI tell it."""
     compilation_cache: bool = True
     """Keep compiled programs in the user's cache folder, so that the next run starts sooner."""
+    traced_programs: bool | None = None
+    """Keep traced programs there, too, so that the next run traces nothing; by default on a CPU."""
     layout_episodes: Annotated[int | None, Interval("[1, 100000]")] = None
     """Episodes per layout in the final table; by default 100 on an accelerator, 32 on a CPU, and 1 where all are alike, as
     starts are level."""
@@ -139,13 +141,16 @@ def start(
 ) -> int:
     """Make the run's directory, or open it, and train. Returns the exit status.
 
-    With `keep_traced` the cache holds traced programs, too: only where nobody can have changed a function of the package
+    With `keep_traced` the cache may hold traced programs, too: only where nobody can have changed a function of the package
     since it was loaded.
     """
     _check_same(command, processes)
     cache = cache_programs() if command.compilation_cache else None
     job, directory, files = prepare(command, arguments, started, processes)
-    if keep_traced and cache is not None:
+    wanted = command.traced_programs
+    if wanted is None:
+        wanted = jax.default_backend() == "cpu"
+    if keep_traced and wanted and cache is not None:
         job = dataclasses.replace(job, traced=cache / "traced")
     processes.everyone()  # a mistake shows before any process changes a file
     with locked(directory.path) if processes.is_first else contextlib.nullcontext():
