@@ -36,7 +36,8 @@ LOOKS = 2  # at most
 WORTH_KNOWING = 15.0  # nats that an effect must add to be taken as known in the next look
 WORTH_A_SECOND_LOOK = 30.0  # nats of the best set above none
 LEAST_KICK = 0.1  # of the motors' outputs within a row: below, samples are as good as means
-GUSTY = 0.3  # of the gusts' share in the torques: by so much moments of inertia may look wrong,
+GUSTY = (0.3, 0.3, 0.1)  # of the gusts' share in the torques: by so much moments of inertia may look wrong,
+MOST_GUSTS = 0.5  # of the torques that commands cause: from then on feedback is all that is seen of them
 GUSTY_LAG = 0.01  # s: and motors late or early
 HEAVY = 0.1  # of the moments of inertia, that single samples taken for means may feign
 RADIO_COST = 15.0  # nats that a radio effect must gain before the rate loop is read with it
@@ -263,8 +264,8 @@ def _physics(reading: Reading, library: Library, pushes=None, gains=None, before
         tracks, vehicles, ticks, feedback, reading.numbers, sensors.one_clock, at_once, sensors.wander
     )
     floor, exposure = model_noise(replay, library)
-    gusts = np.minimum(gustiness(tracks, feedback, floor), 1.0)
-    wrong = {"inertia": dict(zip(("xx", "yy", "zz"), GUSTY * gusts, strict=True))}
+    gusts = gustiness(tracks, feedback, floor)
+    wrong = {"inertia": dict(zip(("xx", "yy", "zz"), np.multiply(GUSTY, gusts), strict=True))}
     wrong["motor_lag"] = dict.fromkeys(("extra_up", "extra_down"), GUSTY_LAG * gusts[:2].mean())
     replay.loosen(
         {f"{e} {p}": float(np.hypot(1.0, wrong.get(e, {}).get(p, 0.0) / sd)) for e, p, sd in replay.numbers}
@@ -273,6 +274,7 @@ def _physics(reading: Reading, library: Library, pushes=None, gains=None, before
         card = CARDS[effect]
         unseen = card.needs and any(getattr(t, card.needs) is None for t in tracks)
         unseen = unseen or (card.impossible is not None and any(card.impossible(t.position) for t in tracks))
-        if unseen or (card.within_row and reading.blind):
+        axes = list(card.torque_axes)
+        if unseen or (axes and (reading.blind or gusts[axes].mean() > MOST_GUSTS)):
             exposure[effect] = 0.0
     return Look(replay, weigh_singles(replay, library, exposure, before), exposure, floor, rate_loop, read)

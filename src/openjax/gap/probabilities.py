@@ -33,7 +33,7 @@ def probabilities_of(
     evidence: Evidence, selection: Selection, parts: Split, rest: Rest, effects
 ) -> dict[str, float]:
     """{cause, "none", "unknown": probability}, whose sum is one and whose largest is the first word."""
-    names = dict.fromkeys((*EFFECTS, *evidence.library.effects, "none", "unknown"), 0.0)
+    names = dict.fromkeys((*evidence.library.effects, "none", "unknown"), 0.0)
     if not effects:
         chance = {"none": NOTHING}
     else:
@@ -43,11 +43,11 @@ def probabilities_of(
         chance = {e: sure[e] * power[e] / total for e in effects}
     doubt = 1.0 - sum(chance.values())
     chance = names | chance
-    others = _alternatives(selection, parts, rest, effects)
+    others = _alternatives(evidence, selection, rest, effects)
     total = sum(others.values())
     for name, weight in others.items():
         chance[name] += doubt * weight / total
-    return _first_on_top(chance, effects[0] if effects else "none")
+    return dict.fromkeys(EFFECTS, 0.0) | _first_on_top(chance, effects[0] if effects else "none")
 
 
 def _share(parts: Split, effect: str) -> float:
@@ -69,10 +69,10 @@ def _by_size(floors: float) -> float:
     return square / (square + HALF**2)
 
 
-def _alternatives(selection: Selection, parts: Split, rest: Rest, effects) -> dict[str, float]:
+def _alternatives(evidence: Evidence, selection: Selection, rest: Rest, effects) -> dict[str, float]:
     """Weights of what it may be instead: what does nearly as well in a name's place or was nearly accepted, nothing at
     all, something unknown."""
-    weights = dict.fromkeys(EFFECTS, 0.01)
+    weights = dict.fromkeys(evidence.library.effects, 0.01)
     for effect in effects:
         for other, nats in selection.swaps.get(effect, {}).items():
             weights[other] += float(np.exp(min(nats / TEMPERATURE, 0.0)))

@@ -25,6 +25,10 @@ TORQUE = 10.0
 RADIUS = 0.023  # m, of a propeller
 RARE = 0.3  # of a regressor's usual size: one that happened less is not blown up
 WIDTH = 0.25  # m of the radial functions of the place
+STEADY = (
+    "force by wind along world x",
+    "force by wind along world y",
+)  # what a frame that leans does as well
 # Regressors of the motion itself, by force along it.
 ALONG = ("force x by velocity", "force y by velocity", "force z by vertical speed")
 
@@ -63,7 +67,8 @@ def look(evidence: Evidence, selection: Selection) -> Rest:
     carried = _widened(plain, extra[along], spread[along])
     # What pushes along the motion came before it: gusts carry the vehicle with them. What brakes it is an effect.
     pushes = -solve(table, carried)[0, extra] > 0.0
-    base = _widened(plain, extra[along & pushes], spread[along & pushes])
+    allowed = (along & pushes) | np.array([n in STEADY for n in names])
+    base = _widened(plain, extra[allowed], spread[allowed])
     now, then = judge(table, base), judge(table, _widened(plain, extra, spread))
     left = now.squares.sum(0)
     predicted = np.where(table.usable > 0, 1.0 - then.squares.sum(0) / np.maximum(left, 1e-30), 0.0)
@@ -126,7 +131,8 @@ def dictionary(track: Track) -> dict[str, tuple[str, np.ndarray, float]]:
     thrust = smooth(track.motor.mean(1), 0.05, track.dt)
     over = thrust - 0.62
     mix = np.array([[-1, -1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]]) / 4.0
-    square = smooth((track.motor - 0.62) ** 2 @ mix.T, 0.05, track.dt)
+    # About their own mean: what is in proportion to the motors is feedback's answer to gusts as well.
+    square = smooth((track.motor - track.motor.mean(0)) ** 2 @ mix.T, 0.05, track.dt)
     heading = np.arctan2(turn[:, 1, 0], turn[:, 0, 0])
     time = (track.time - track.time[0]) / 10.0 - 0.5
     out: dict[str, tuple[str, np.ndarray, float]] = {}
@@ -181,6 +187,9 @@ def dictionary(track: Track) -> dict[str, tuple[str, np.ndarray, float]]:
             for y in (-0.5, 0.0, 0.5):
                 bump = np.exp(-((place[:, 0] - x) ** 2 + (place[:, 1] - y) ** 2) / (2 * WIDTH**2))
                 add("force", f"the place ({x:g}, {y:g})", 2, bump, 0.3)
+                for axis in (0, 1):
+                    name = f"the place ({x:g}, {y:g}) along world {'xy'[axis]}"
+                    add("force", name, None, bump[:, None] * turn[:, axis], 0.3)
         for k, other in enumerate(track.neighbours):
             gap = other - track.position
             below = (gap[:, 2] > 0.02) * np.exp(-np.maximum(gap[:, 2], 0.0) / 0.5)

@@ -10,13 +10,14 @@ from openjax.gap.evidence import Evidence
 from openjax.gap.library import path_of
 from openjax.gap.probabilities import FOLLOWED, TEMPERATURE, probabilities_of
 from openjax.gap.rest import Rest
-from openjax.gap.selection import LEAST_GAIN, LEAST_NATS, LEAST_SHARE, TESTABLE, Selection
+from openjax.gap.selection import LEAST_NATS, LEAST_SHARE, TESTABLE, Selection
 from openjax.gap.shares import Split
 
 CLOCK = 0.003  # s by which the clocks of a log may differ
 CLEAR = 3.0  # standard errors
 LEAST_LOSS = 0.01  # of the packets
 BESIDE = 0.15  # floors by which an effect must shrink the gap to be named beside a stronger one
+LEAST_LEFT = 0.05  # floors of the gap that an unexplained rest must hold to be named
 UNKNOWN_SHARE = 0.2  # of the gap, from which an unexplained rest is named beside the effects
 
 
@@ -65,7 +66,7 @@ def not_testable(evidence: Evidence) -> list[str]:
 def decide(evidence: Evidence, selection: Selection, rest: Rest, parts: Split, missing) -> Verdict:
     """The words that the shares give, and how sure they are."""
     named = _material(selection, parts)
-    material = parts.gap.after > 1.0 + LEAST_GAIN
+    material = parts.gap.after > 1.0 + LEAST_LEFT
     left = material and rest.nats > LEAST_NATS and rest.predicted.max() > FOLLOWED
     strange = bool(set(evidence.sensors.findings) - {"clocks"}) or bool(rest.lines)
     strange = strange or (left and (not named or parts.unexplained.value > UNKNOWN_SHARE))

@@ -14,6 +14,16 @@ def wrench(parameters, context):
     return force, torque + parameters["stiffness"] * jnp.stack([vy, -vx, jnp.zeros_like(vx)])
 
 
+_LEVER = 0.003  # N m: one centimetre of a weight of 0.3 N
+
+
+def pitches(value, deviation):
+    """Whether blades flap: thrust tilts back, and the body is pitched by more than drag a centimetre above its centre of
+    mass would do. If not, it is drag."""
+    sure = value["tilt"] > 3.0 * deviation["tilt"]
+    return bool(sure and value["stiffness"] > _LEVER * value["tilt"])
+
+
 EFFECT = Effect(
     name="blade_flapping",
     description="thrust tilts back with airspeed, and the hubs pass on a torque",
@@ -41,6 +51,7 @@ EFFECT = Effect(
         needs="velocity",
         coordinate="body velocity",
         commoner="rotor_drag",
+        is_itself=pitches,
         sample={"tilt": 0.02, "stiffness": 0.0002},
         next_flight="fast straight passes with sudden stops, to load roll and pitch.",
     ),

@@ -117,7 +117,7 @@ class Card:
     needs: the channel without which it can't be told, though it leaves a trace in others.
     coordinate: the variable that it follows, for pictures.
     thrust_map: a map from duty cycles to thrust that isn't known can imitate it.
-    within_row: what motors do between two rows of the log can imitate it.
+    torque_axes: those of the torques by which it is told, which gusts can imitate, and what motors do between two rows.
     commoner: an effect that is named instead where both do equally well.
     is_itself({parameter: value}, {parameter: deviation}): whether it isn't by its fitted value another effect; `beside`:
         effects that are fitted with it for that, whose parameters follow as "effect.parameter".
@@ -136,7 +136,7 @@ class Card:
     needs: str = ""
     coordinate: str = "thrust"
     thrust_map: bool = False
-    within_row: bool = False
+    torque_axes: tuple[int, ...] = ()
     commoner: str = ""
     beside: tuple[str, ...] = ()
     is_itself: Callable[[Mapping[str, float], Mapping[str, float]], bool] | None = None

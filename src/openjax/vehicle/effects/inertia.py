@@ -31,7 +31,7 @@ EFFECT = Effect(
     body=body,
     card=Card(
         path="physics",
-        within_row=True,
+        torque_axes=(0, 1),
         fitted=(
             Fitted("xx", mean=1.0, spread=0.12, start=1.1, step=0.005),
             Fitted("yy", mean=1.0, spread=0.12, start=1.1, step=0.005),

@@ -21,7 +21,7 @@ EFFECT = Effect(
     body=body,
     card=Card(
         path="physics",
-        within_row=True,
+        torque_axes=(2,),
         fitted=(Fitted("ratio", mean=1.0, spread=0.5, start=0.9, step=0.005),),
         sample={"ratio": 0.4},
         next_flight="yaw doublets and steps.",
