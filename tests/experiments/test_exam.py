@@ -369,12 +369,7 @@ def said(*names, verdict="effect", **report):
 def test_the_scorer_counts_right():
     refused = said() | {"report": None, "status": 2, "error": "error: no"}
     broken = said() | {"report": None, "traceback": "Traceback"}
-    energy = {
-        "nominal": [5.0, 1.0],
-        "truth": [1.0, 1.0],
-        "rotor_drag": [5.0, 1.0],
-    }  # 4 of 6 come back without it
-    drag = answer("single", "rotor_drag", energy=energy)
+    drag = answer("single", "rotor_drag", shares={"rotor_drag": 0.8})
     mass = answer("single", "mass", acceptable={"mass": ["mass", "thrust_scale"]})
     two = answer("pair", "wind", effects=["wind", "inertia"], expected=["wind", "inertia"])
     rows = {
@@ -416,7 +411,7 @@ def test_the_scorer_counts_right():
     assert f["false_garbage"] == pytest.approx(1 / 14)
     assert f["pair_exact"] == 0.5
     assert f["pair_f1"] == pytest.approx((1 + 2 / 3) / 2)
-    assert f["share_error"] == pytest.approx(4 / 6 - 0.5)
+    assert f["share_error"] == pytest.approx(0.8 - 0.45 / 0.9)
     assert f["traceback"] == pytest.approx(1 / 17)
     assert f["seconds"] == 1.0
     assert magnitudes.gap_said(*rows["right"]) == pytest.approx(0.8)
