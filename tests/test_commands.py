@@ -253,7 +253,7 @@ def wrong_layout(change):
         (train, "--network.heads 0", "network.heads is 0; it must be a whole number in"),
         (train, "--mappo.learning_rate nan", "mappo.learning_rate is nan; it must be in (0, 1]"),
         (train, "--restart_close 0.5", "restart_close 0.5 needs restart_every"),
-        (train, "--num_envs 16000000", "worlds of 40 steps need at least"),
+        (train, "--num_envs 16000000", "worlds of 20 steps need at least"),
         (train, "--out /proc/run", "can't be written there"),
         (evaluate, "--policy {run} --json {folder}", "is a folder; a file is needed"),
         (train, "--preset huge", "preset huge: unknown; possible are quick, paper"),
