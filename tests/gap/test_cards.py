@@ -44,3 +44,38 @@ def test_nuisances_stay_within_their_bounds():
         assert (
             cost(found) - best <= 0.15 * (best - free) + 1e-6
         )  # fixing what leaves the box comes close to the best
+
+
+def seems(effect, deviation=1e-6, **value):
+    """Whether an effect fitted with these values is itself."""
+    return CARDS[effect].is_itself(value, dict.fromkeys(value, deviation))
+
+
+def test_a_heavy_body_that_turns_before_its_motors_act_is_a_gust():
+    heavy = {"xx": 1.3, "yy": 1.3, "zz": 1.2}
+    late, early = ({f"motor_lag.{k}": v for k in ("extra_up", "extra_down")} for v in (0.001, -0.008))
+    assert seems("inertia", **heavy, **late) and not seems("inertia", **heavy, **early)
+    assert seems("inertia", deviation=0.01, **heavy, **early)  # so unsure a lag says nothing
+    assert seems("inertia", xx=0.8, yy=0.8, zz=0.9, **early)
+    assert seems("motor_lag", extra_up=0.01, extra_down=0.02)
+    assert not seems("motor_lag", extra_up=-0.008, extra_down=-0.007)
+    assert not seems("motor_lag", extra_up=0.5, extra_down=0.4)
+
+
+def test_what_pitches_the_body_like_drag_is_drag():
+    # Drag 0.5 cm above the centre of mass of a 30 g vehicle whose thrust tilts 0.01 rad per m/s, and flapping 3 cm above.
+    weight, tilt = 0.03 * 9.81, 0.01
+    assert not seems("blade_flapping", tilt=tilt, stiffness=0.005 * weight * tilt)
+    assert seems("blade_flapping", tilt=tilt, stiffness=0.03 * weight * tilt)
+    assert not seems("blade_flapping", tilt=-tilt, stiffness=0.03 * weight * tilt)
+
+
+def test_a_curve_that_hardly_bends_is_a_scale():
+    assert not seems("thrust_curve", offset=0.0, slope=0.95, curvature=0.005)
+    assert seems("thrust_curve", offset=0.0, slope=0.9, curvature=0.15)
+
+
+def test_above_the_ceiling_there_is_none():
+    low, high = np.zeros((5, 3)), np.zeros((5, 3))
+    high[2, 2] = 1.3
+    assert CARDS["ceiling_effect"].impossible(high) and not CARDS["ceiling_effect"].impossible(low)

@@ -25,6 +25,7 @@ MOST = 6  # effects at once
 OPENINGS = 3  # effects from which a search begins
 LEFT_MUCH = 1.2  # of the squares that noise alone leaves: a search from several beginnings is worth its time
 ROUNDS = 2  # of widening and swapping
+ALIKE = 0.98  # correlation of two effects' parameters beyond which one of them is enough
 CLASS = 10.0  # nats within which two effects do equally well
 TRIED = 2  # candidates of each kind fitted in full at each step
 
@@ -179,7 +180,9 @@ def _ranked(table: Table, singles, now: Judged) -> list[str]:
 
 
 def is_itself(replay, fit: SetFit) -> bool:
-    """Whether no effect of a set is by its fitted value another one."""
+    """Whether no effect of a set is by its fitted value another one, and none of two that undo each other."""
+    if _entangled(fit):
+        return False
     tests = [e for e in fit.effects if CARDS[e].is_itself is not None]
     more = {o for e in tests for o in CARDS[e].beside if o not in fit.effects}
     found = step_with(replay, fit, more) if more else fit.parameters()
@@ -190,6 +193,15 @@ def is_itself(replay, fit: SetFit) -> bool:
         if not CARDS[effect].is_itself(value, deviation):
             return False
     return True
+
+
+def _entangled(fit: SetFit) -> bool:
+    """Whether two effects of a set can hardly be told apart in these flights: either would do."""
+    deviation = np.sqrt(np.diag(fit.covariance))
+    alike = np.abs(fit.covariance / np.outer(deviation, deviation))
+    owner = np.array([next((e for e in fit.effects if i in places((e,))), "") for i in fit.index])
+    apart = (owner[:, None] != owner[None]) & (owner[:, None] != "") & (owner[None] != "")
+    return bool((alike[apart] > ALIKE).any())
 
 
 def _joined(replay, fit: SetFit, singles, effect: str, without: str | None = None) -> SetFit:
