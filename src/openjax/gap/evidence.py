@@ -25,7 +25,7 @@ from openjax.gap.feedback import (
 from openjax.gap.firmware import Radio
 from openjax.gap.hypotheses import SetFit, model_noise, weigh_singles
 from openjax.gap.kinematics import Kinematics, corrected, read_kinematics
-from openjax.gap.library import ABSENT, CARDS, NUISANCES, PWM_NUISANCES, SAMPLED_NUISANCES, Library
+from openjax.gap.library import ABSENT, CARDS, GUSTY, NUISANCES, PWM_NUISANCES, SAMPLED_NUISANCES, Library
 from openjax.gap.linear_path import LinearPath
 from openjax.gap.observer import TICKS
 from openjax.gap.replay import Replay, make_replay
@@ -36,9 +36,7 @@ LOOKS = 2  # at most
 WORTH_KNOWING = 15.0  # nats that an effect must add to be taken as known in the next look
 WORTH_A_SECOND_LOOK = 30.0  # nats of the best set above none
 LEAST_KICK = 0.1  # of the motors' outputs within a row: below, samples are as good as means
-GUSTY = (0.3, 0.3, 0.1)  # of the gusts' share in the torques: by so much moments of inertia may look wrong,
 MOST_GUSTS = 0.5  # of the torques that commands cause: from then on feedback is all that is seen of them
-GUSTY_LAG = 0.01  # s: and motors late or early
 HEAVY = 0.1  # of the moments of inertia, that single samples taken for means may feign
 RADIO_COST = 15.0  # nats that a radio effect must gain before the rate loop is read with it
 
@@ -246,6 +244,16 @@ def _looks_sampled(vehicles, mean: Look, single: Look) -> tuple[bool, bool]:
     return doubtful, not doubtful
 
 
+def _hidden(card, tracks, blind: bool, gusts: np.ndarray) -> bool:
+    """Whether an effect can't be told from these logs, however large it is."""
+    if card.needs and any(getattr(t, card.needs) is None for t in tracks):
+        return True
+    if card.impossible is not None and any(card.impossible(t.position) for t in tracks):
+        return True
+    axes = list(card.torque_axes)
+    return bool(axes) and bool(blind or gusts[axes].mean() > MOST_GUSTS)
+
+
 def _physics(reading: Reading, library: Library, pushes=None, gains=None, before=None) -> Look:
     """Look at the physics. `pushes`, `gains`: what an earlier look found; `before`: its sets, to start from."""
     tracks, vehicles, arrived, at_once = reading.tracks, reading.vehicles, reading.arrived, reading.at_once
@@ -265,16 +273,14 @@ def _physics(reading: Reading, library: Library, pushes=None, gains=None, before
     )
     floor, exposure = model_noise(replay, library)
     gusts = gustiness(tracks, feedback, floor)
-    wrong = {"inertia": dict(zip(("xx", "yy", "zz"), np.multiply(GUSTY, gusts), strict=True))}
-    wrong["motor_lag"] = dict.fromkeys(("extra_up", "extra_down"), GUSTY_LAG * gusts[:2].mean())
     replay.loosen(
-        {f"{e} {p}": float(np.hypot(1.0, wrong.get(e, {}).get(p, 0.0) / sd)) for e, p, sd in replay.numbers}
+        {
+            f"{e} {p}": float(np.hypot(1.0, GUSTY[e, p][0] * gusts[list(GUSTY[e, p][1])].mean() / usual))
+            for e, p, usual in replay.numbers
+            if (e, p) in GUSTY
+        }
     )
     for effect in library.physics:
-        card = CARDS[effect]
-        unseen = card.needs and any(getattr(t, card.needs) is None for t in tracks)
-        unseen = unseen or (card.impossible is not None and any(card.impossible(t.position) for t in tracks))
-        axes = list(card.torque_axes)
-        if unseen or (axes and (reading.blind or gusts[axes].mean() > MOST_GUSTS)):
+        if _hidden(CARDS[effect], tracks, reading.blind, gusts):
             exposure[effect] = 0.0
     return Look(replay, weigh_singles(replay, library, exposure, before), exposure, floor, rate_loop, read)

@@ -53,6 +53,15 @@ SAMPLED_NUISANCES = (
     ("motor_lag", "extra_down", 0.01),
     ("yaw_torque", "ratio", 0.2),
 )
+# By how much more these may seem wrong, per share of gusts in the torques (`feedback.gustiness`), about which axes:
+# commands answer gusts by way of the attitude, so that in closed loop motors look weak and early.
+GUSTY = {
+    ("inertia", "xx"): (0.3, (0,)),
+    ("inertia", "yy"): (0.3, (1,)),
+    ("inertia", "zz"): (0.1, (2,)),
+    ("motor_lag", "extra_up"): (0.01, (0, 1)),
+    ("motor_lag", "extra_down"): (0.01, (0, 1)),
+}
 BALANCE = 0.9999  # share of the common variance that `balanced` parameters go without
 MOTOR_SHIFT = 0.001  # s, standard deviation of the motors' clock offset
 

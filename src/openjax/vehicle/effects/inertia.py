@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 
 from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
+from openjax.vehicle.effects.motor_lag import EARLY
 
 
 def body(parameters, vehicle):
@@ -11,13 +12,10 @@ def body(parameters, vehicle):
     )
 
 
-_EARLY = 0.0025  # s
-
-
 def resists(value, deviation):
     """Whether the body resists the motors. One that seems heavy to turn and yet turns before its motors act is pushed by
     what its rate controller answers: in closed loop, gusts look like weak and early motors."""
-    early = max(value["motor_lag.extra_up"], value["motor_lag.extra_down"]) < -_EARLY
+    early = max(value["motor_lag.extra_up"], value["motor_lag.extra_down"]) < -EARLY
     sure = value["motor_lag.extra_up"] < -3.0 * deviation["motor_lag.extra_up"]
     return not (early and sure and max(value["xx"], value["yy"], value["zz"]) > 1.0)
 

@@ -6,7 +6,7 @@ from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
 _SHORTEST = 1e-3  # s
 _SLOWEST = 0.2  # s: no motor of this size is slower
-_EARLY = 0.0025  # s
+EARLY = 0.0025  # s: motors that seem earlier than this are not what they seem
 
 
 def body(parameters, vehicle):
@@ -19,7 +19,7 @@ def lags(value, deviation):
     """Whether motors lag. That they are early is what gusts look like, which the rate controller answers, and single
     samples of the motors; a motor's time constant is known better than that."""
     del deviation
-    return -_EARLY < max(value["extra_up"], value["extra_down"]) < _SLOWEST
+    return -EARLY < max(value["extra_up"], value["extra_down"]) < _SLOWEST
 
 
 _SOURCE = "coreless motors of this size: time constants of 0.02-0.12 s, against a nominal 0.025 s"
