@@ -1,5 +1,6 @@
 """The methods that the paper compares with: Angelani, Janosov, potential field, DACOOP; see docs/methods.md."""
 
+from openjax.baselines.craft_policy import CraftPolicy
 from openjax.baselines.dacoop import DacoopPolicy
 from openjax.baselines.heuristic import METHODS, Heuristic
 from openjax.baselines.velocity_controller import velocity_action
@@ -7,7 +8,15 @@ from openjax.baselines.velocity_policy import VelocityPolicy
 from openjax.policy import NetworkSettings, Policy, PredictorSettings
 from openjax.pursuit import Pursuit
 
-__all__ = ["METHODS", "DacoopPolicy", "Heuristic", "VelocityPolicy", "make_policy", "velocity_action"]
+__all__ = [
+    "METHODS",
+    "CraftPolicy",
+    "DacoopPolicy",
+    "Heuristic",
+    "VelocityPolicy",
+    "make_policy",
+    "velocity_action",
+]
 
 
 def make_policy(environment: Pursuit, network: NetworkSettings, predictor: PredictorSettings) -> Policy:

@@ -12,11 +12,11 @@ import math
 import jax
 
 from openjax.baselines.apf import ApfParameters, apf
+from openjax.baselines.craft_policy import CraftPolicy
 from openjax.baselines.parameters import ranges
-from openjax.baselines.surroundings import Craft, surroundings
-from openjax.baselines.velocity_controller import check_flyable, velocity_action
-from openjax.policy import NetworkSettings, Policy, PredictorSettings
-from openjax.pursuit import Observation, Pursuit
+from openjax.baselines.surroundings import surroundings
+from openjax.baselines.velocity_controller import velocity_action
+from openjax.pursuit import Observation
 
 LEARNED = ("repulsion", "balance")
 START = ApfParameters(repulsion=2e-3, influence=0.4, margin=0.08, balance=0.5)
@@ -24,31 +24,16 @@ START = ApfParameters(repulsion=2e-3, influence=0.4, margin=0.08, balance=0.5)
 
 
 @dataclasses.dataclass(frozen=True)
-class DacoopPolicy(Policy):
+class DacoopPolicy(CraftPolicy):
     """A policy whose samples are parameters of the field instead of commands."""
 
-    craft: Craft = dataclasses.field(default_factory=Craft)
+    NAME = "dacoop"
 
-    @classmethod
-    def for_environment(
-        cls, environment: Pursuit, network: NetworkSettings, predictor: PredictorSettings
-    ) -> "DacoopPolicy":
-        """The policy for an environment; its mean starts at `START`.
-
-        Raises:
-            UserError: the velocity controller can't fly there.
-        """
-        craft = Craft.of(environment)
-        check_flyable("dacoop", craft, environment.settings.time_step)
+    @staticmethod
+    def start() -> tuple[float, ...]:
+        """The field of `START`."""
         places = [_place(name, getattr(START, name)) for name in LEARNED]
-        return cls(
-            network=network,
-            predictor=predictor,
-            arena_radius=environment.settings.arena_radius,
-            arena_height=environment.settings.arena_height,
-            initial_action=tuple(math.atanh(min(max(place, -0.95), 0.95)) for place in places),
-            craft=craft,
-        )
+        return tuple(math.atanh(min(max(place, -0.95), 0.95)) for place in places)
 
     def action(self, sample: jax.Array, observation: Observation) -> jax.Array:
         """The action (..., N, 4) in -1..1 that a sample (..., N, 2) of the Gaussian, or its mean, stands for."""

@@ -9,37 +9,22 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from openjax.baselines.surroundings import Craft, length
-from openjax.baselines.velocity_controller import check_flyable, velocity_action
-from openjax.policy import NetworkSettings, Policy, PredictorSettings
-from openjax.pursuit import Observation, Pursuit
+from openjax.baselines.craft_policy import CraftPolicy
+from openjax.baselines.surroundings import length
+from openjax.baselines.velocity_controller import velocity_action
+from openjax.pursuit import Observation
 
 
 @dataclasses.dataclass(frozen=True)
-class VelocityPolicy(Policy):
+class VelocityPolicy(CraftPolicy):
     """A policy whose samples are velocities instead of commands."""
 
-    craft: Craft = dataclasses.field(default_factory=Craft)
+    NAME = "output velocity"
 
-    @classmethod
-    def for_environment(
-        cls, environment: Pursuit, network: NetworkSettings, predictor: PredictorSettings
-    ) -> "VelocityPolicy":
-        """The policy for an environment; its mean starts at standing still.
-
-        Raises:
-            UserError: the velocity controller can't fly there.
-        """
-        craft = Craft.of(environment)
-        check_flyable("output velocity", craft, environment.settings.time_step)
-        return cls(
-            network=network,
-            predictor=predictor,
-            arena_radius=environment.settings.arena_radius,
-            arena_height=environment.settings.arena_height,
-            initial_action=(0.0, 0.0, 0.0),
-            craft=craft,
-        )
+    @staticmethod
+    def start() -> tuple[float, ...]:
+        """Standing still."""
+        return 0.0, 0.0, 0.0
 
     def action(self, sample: jax.Array, observation: Observation) -> jax.Array:
         """The action (..., N, 4) in -1..1 that a sample (..., N, 3) of the Gaussian, or its mean, stands for."""

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import jax
 
-from openjax.baselines import METHODS, DacoopPolicy, Heuristic, VelocityPolicy, make_policy
+from openjax.baselines import METHODS, CraftPolicy, Heuristic, make_policy
 from openjax.baselines.surroundings import Craft
 from openjax.baselines.velocity_controller import check_flyable
 from openjax.errors import UserError
@@ -45,9 +45,7 @@ class LoadedPolicy:
                     f"the policy was trained with {name} {getattr(own, name)}, here it's "
                     f"{getattr(game, name)}: pursuers, observation and history must stay as in training"
                 )
-        if isinstance(
-            self.policy, DacoopPolicy | VelocityPolicy
-        ):  # its controller flies another arena, or vehicle
+        if isinstance(self.policy, CraftPolicy):  # its controller flies another arena, or vehicle
             craft = Craft.of(environment)
             check_flyable(f"the policy's output {self.settings.network.output}", craft, game.time_step)
             return dataclasses.replace(self, policy=dataclasses.replace(self.policy, craft=craft))
