@@ -80,18 +80,16 @@ class Results:
 def run_cases(pool: ProcessPoolExecutor, command: FuzzCommand, results: Results) -> None:
     """Changed inputs, in pieces that one process does at a time."""
     pieces = [pool.submit(try_cases, *piece) for piece in plan(command.cases, command.seed)]
-    found = [case for piece in as_completed(pieces) for case in piece.result()]
     counts: dict[str, Counter] = {}
-    for kind, _, outcome, _ in sorted(found):
-        counts.setdefault(kind, Counter())[outcome] += 1
-    failures = [
-        {"kind": kind, "seed": seed, "text": text}
-        for kind, seed, outcome, text in sorted(found)
-        if outcome == "failed"
-    ]
-    results.put(
-        "cases", {"counts": {kind: dict(count) for kind, count in counts.items()}, "failures": failures}
-    )
+    failures = []
+    for done, piece in enumerate(as_completed(pieces), 1):
+        for kind, seed, outcome, text in piece.result():
+            counts.setdefault(kind, Counter())[outcome] += 1
+            if outcome == "failed":
+                failures.append({"kind": kind, "seed": seed, "text": text})
+        if done % 50 == 0 or done == len(pieces):
+            found = {kind: dict(count) for kind, count in sorted(counts.items())}
+            results.put("cases", {"counts": found, "failures": failures})
 
 
 def run_damages(pool: ProcessPoolExecutor, scratch: Path, command: FuzzCommand, results: Results) -> None:
