@@ -7,7 +7,8 @@ __getattr__, __dir__, __all__ = lazy_names(
     {
         **dict.fromkeys(("EpisodeRecord", "Evaluation", "make_evaluate", "summarise"), "evaluation"),
         **dict.fromkeys(
-            ("PRESETS", "GeneratorSettings", "MappoSettings", "TrainSettings", "preset"), "settings"
+            ("PRESETS", "GeneratorSettings", "MappoSettings", "TrainSettings", "changed", "preset"),
+            "settings",
         ),
         **dict.fromkeys(
             ("TrainCarry", "abstract_carry", "build", "init_carry", "make_start", "make_training_step"),

@@ -200,6 +200,18 @@ class TrainSettings:
         return max(1, -(-self.total_steps // self.steps_per_update))
 
 
+def changed(settings, **changes):
+    """`dataclasses.replace` for settings within settings: a dict stands for changes of the settings under that name.
+
+    `changed(preset("paper"), seed=1, environment=dict(reward=dict(crash=40.0)))`
+    """
+    given = {
+        name: changed(getattr(settings, name), **value) if isinstance(value, dict) else value
+        for name, value in changes.items()
+    }
+    return dataclasses.replace(settings, **given)
+
+
 def quick() -> TrainSettings:
     """Minutes on two CPU cores, and an easier game than the paper's: the evader is slower than the pursuers may be, two or
     three pillars, level starts; and the policy commands 25 times a second instead of 100."""
@@ -276,11 +288,9 @@ def paper() -> TrainSettings:
 
 def flight() -> TrainSettings:
     """Policies to be flown: no clamp on the speed, the rate loop at 500 Hz, every pursuer its own vehicle."""
-    base = paper()
-    return dataclasses.replace(
-        base,
-        environment=dataclasses.replace(
-            base.environment,
+    return changed(
+        paper(),
+        environment=dict(
             speed_limit="none",
             substeps=5,
             physics="stops",
@@ -288,7 +298,7 @@ def flight() -> TrainSettings:
             rare_vehicles=0.5,
             observe_history=12,
             # without the clamp, a first crash at 5,000 teaches to stay away from rows of pillars
-            reward=dataclasses.replace(base.environment.reward, crash=40.0, first_crash=1000.0),
+            reward=dict(crash=40.0, first_crash=1000.0),
         ),
         # flown from the start, the whole family teaches to hover out of harm's way and nothing else
         vehicles_start=0.35,
@@ -299,15 +309,10 @@ def flight() -> TrainSettings:
 
 def flight_second() -> TrainSettings:
     """Second stage of `flight`, from a policy of the first (`--start_from`): ways round rows of pillars, the whole family."""
-    base = flight()
-    return dataclasses.replace(
-        base,
-        environment=dataclasses.replace(
-            base.environment,
-            reward=dataclasses.replace(base.environment.reward, collision=20.0, margin=0.02),
-        ),
-        mappo=dataclasses.replace(
-            base.mappo,
+    return changed(
+        flight(),
+        environment=dict(reward=dict(collision=20.0, margin=0.02)),
+        mappo=dict(
             learning_rate=6e-4,
             clip_epsilon=0.15,
             actor_start=0.06,
@@ -318,9 +323,7 @@ def flight_second() -> TrainSettings:
         ),
         # Starts force collisions. If they counted against success, the archive would hold such starts instead of the
         # tasks whose evader nobody reaches
-        generator=dataclasses.replace(
-            base.generator, row_share=0.5, success_low=0.25, collision_tolerance=1.0
-        ),
+        generator=dict(row_share=0.5, success_low=0.25, collision_tolerance=1.0),
         vehicles_start=0.0,
         vehicles_ramp=0.0,
         total_steps=230_000_000,
@@ -329,16 +332,10 @@ def flight_second() -> TrainSettings:
 
 def flight_last() -> TrainSettings:
     """Last stage of `flight`, from a policy of the second (`--start_from`): fewer collisions and crashes."""
-    base = flight_second()
-    return dataclasses.replace(
-        base,
-        environment=dataclasses.replace(
-            base.environment,
-            reward=dataclasses.replace(
-                base.environment.reward, collision=40.0, margin=0.03, first_crash=3000.0
-            ),
-        ),
-        mappo=dataclasses.replace(base.mappo, learning_rate=5e-4, clip_epsilon=0.12, penalty_start=1.0),
+    return changed(
+        flight_second(),
+        environment=dict(reward=dict(collision=40.0, margin=0.03, first_crash=3000.0)),
+        mappo=dict(learning_rate=5e-4, clip_epsilon=0.12, penalty_start=1.0),
         total_steps=95_000_000,
     )
 
@@ -346,23 +343,18 @@ def flight_last() -> TrainSettings:
 def mappo() -> TrainSettings:
     """The paper's plain MAPPO, without predictor and generator, with penalties under which it learns to catch: where a
     first crash costs 5,000, only the generator's tasks lead past hovering."""
-    base = paper()
-    reward = dataclasses.replace(base.environment.reward, first_crash=0.0)
-    return dataclasses.replace(
-        base,
-        environment=dataclasses.replace(base.environment, reward=reward),
-        predictor=dataclasses.replace(base.predictor, enabled=False),
-        generator=dataclasses.replace(base.generator, enabled=False),
+    return changed(
+        paper(),
+        environment=dict(reward=dict(first_crash=0.0)),
+        predictor=dict(enabled=False),
+        generator=dict(enabled=False),
         restart_close=0.0,
     )
 
 
 def dacoop() -> TrainSettings:
     """DACOOP: plain MAPPO puts out the parameters of a potential field (`openjax.baselines.dacoop`)."""
-    base = mappo()
-    return dataclasses.replace(
-        base, network=dataclasses.replace(base.network, output="field"), total_steps=100_000_000
-    )
+    return changed(mappo(), network=dict(output="field"), total_steps=100_000_000)
 
 
 PRESETS = {
@@ -377,11 +369,11 @@ PRESETS = {
 
 
 def preset(name: str, **changes) -> TrainSettings:
-    """A preset's settings, with top-level fields changed.
+    """A preset's settings, with fields changed; those of settings within them by a dict, as in `changed`.
 
     Raises:
         UserError: no such preset.
     """
     if name not in PRESETS:
         raise UserError(f"preset {name}: unknown; possible are {', '.join(PRESETS)}")
-    return dataclasses.replace(PRESETS[name](), **changes)
+    return changed(PRESETS[name](), **changes)
