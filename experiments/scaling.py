@@ -28,7 +28,7 @@ from openjax.commands.machine import describe_machine
 from openjax.commands.training_loop import guarded
 from openjax.errors import UserError
 from openjax.learning import TrainCarry, TrainSettings, build, init_carry, preset
-from openjax.store.checkpoints import place
+from openjax.store.leaves import place
 from openjax.store.settings_files import write_json
 
 PROGRAM = "python -m experiments.scaling"

@@ -18,7 +18,8 @@ from openjax.commands import training_job
 from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import FIELDS
 from openjax.show.metrics import read_metrics
-from openjax.store.checkpoints import Checkpoints, is_checkpoint, load_arrays
+from openjax.store.checkpoint_files import is_checkpoint, load_arrays
+from openjax.store.checkpoints import Checkpoints
 from openjax.store.policy_files import shipped_policies
 
 UPDATES = 24

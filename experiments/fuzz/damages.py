@@ -22,7 +22,8 @@ def make_checkpoints(folder: Path) -> None:
     import jax
 
     from openjax.learning import init_carry
-    from openjax.store.checkpoints import Checkpoints, named_leaves, place
+    from openjax.store.checkpoints import Checkpoints
+    from openjax.store.leaves import named_leaves, place
 
     checkpoints = Checkpoints(folder / "checkpoints")
     for update in (1, 2):
@@ -45,7 +46,8 @@ def try_damages(folder: Path, seeds: range) -> list[str]:
     from openjax.errors import UserError
     from openjax.learning import abstract_carry
     from openjax.learning.train_state import policy_leaf
-    from openjax.store.checkpoints import Checkpoints, abstract_like, named_leaves
+    from openjax.store.checkpoints import Checkpoints
+    from openjax.store.leaves import abstract_like, named_leaves
 
     saved = {update: dict(np.load(folder / f"{update}.npz")) for update in (1, 2)}
     abstract = abstract_like(abstract_carry(_tiny_settings()))

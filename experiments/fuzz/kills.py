@@ -52,7 +52,8 @@ def train(
 
 def result_of(run: Path) -> dict[str, bytes]:
     """All bits of the last training state and of the policy of a run."""
-    from openjax.store.checkpoints import Checkpoints, load_arrays
+    from openjax.store.checkpoint_files import load_arrays
+    from openjax.store.checkpoints import Checkpoints
     from openjax.store.policy_files import load_policy_file
 
     record = Checkpoints(run / "checkpoints").latest()

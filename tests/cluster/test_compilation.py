@@ -9,7 +9,7 @@ import pytest
 
 from openjax.cluster.compilation import compile_ahead
 from openjax.commands.training_loop import guarded
-from openjax.store.checkpoints import abstract_like, place
+from openjax.store.leaves import abstract_like, place
 
 
 def start():

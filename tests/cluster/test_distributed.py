@@ -18,7 +18,7 @@ from openjax.cluster.relay import __file__ as RELAY
 from openjax.commands.training_command import membership
 from openjax.errors import UserError
 from openjax.show.metrics import read_metrics
-from openjax.store.checkpoints import is_checkpoint
+from openjax.store.checkpoint_files import is_checkpoint
 
 UPDATES = 3
 OPTIONS = """
@@ -38,7 +38,9 @@ import jax, numpy as np
 from openjax.learning import TrainSettings, build, init_carry
 from openjax.learning.training_step import _initial_carry
 from openjax.pursuit import Pursuit
-from openjax.store.checkpoints import Checkpoints, load_arrays, named_leaves, place
+from openjax.store.checkpoint_files import load_arrays
+from openjax.store.checkpoints import Checkpoints
+from openjax.store.leaves import named_leaves, place
 from openjax.cluster.devices import carry_shardings, everywhere, make_device_step
 from openjax.commands.training_loop import guarded
 from openjax.store.run_directory import RunDirectory

@@ -14,7 +14,9 @@ from rich.console import Console
 from openjax.commands.training_loop import NotFiniteError, Plan, StopRequest, guarded, run_updates
 from openjax.show.metrics import MetricsWriter, read_metrics
 from openjax.show.progress import Progress
-from openjax.store.checkpoints import Checkpoints, abstract_like, is_checkpoint, named_leaves, place
+from openjax.store.checkpoint_files import is_checkpoint
+from openjax.store.checkpoints import Checkpoints
+from openjax.store.leaves import abstract_like, named_leaves, place
 
 
 @struct.dataclass

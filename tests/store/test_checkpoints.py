@@ -9,7 +9,9 @@ import pytest
 
 from openjax.errors import UserError
 from openjax.learning.train_state import policy_leaf
-from openjax.store.checkpoints import Checkpoints, abstract_like, load_arrays, load_state, place
+from openjax.store.checkpoint_files import load_arrays, load_state
+from openjax.store.checkpoints import Checkpoints
+from openjax.store.leaves import abstract_like, place
 
 
 def init():

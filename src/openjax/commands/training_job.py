@@ -37,7 +37,9 @@ from openjax.policy.growth import with_longer_history
 from openjax.pursuit import SCENARIOS, Pursuit
 from openjax.show.metrics import METRICS_FILE, MetricsWriter, NoMetrics
 from openjax.show.progress import Progress
-from openjax.store.checkpoints import Checkpoints, abstract_like, load_orbax, named_leaves, place
+from openjax.store.checkpoint_files import load_orbax
+from openjax.store.checkpoints import Checkpoints
+from openjax.store.leaves import abstract_like, named_leaves, place
 from openjax.store.policies import abstract_parameters, load_policy
 from openjax.store.policy_files import fill, load_policy_file, save_policy_file
 from openjax.store.run_directory import RunDirectory

@@ -16,7 +16,9 @@ import numpy as np
 
 from openjax.show.metrics import MetricsWriter
 from openjax.show.progress import Progress
-from openjax.store.checkpoints import Checkpoints, named_leaves, save_state
+from openjax.store.checkpoint_files import save_state
+from openjax.store.checkpoints import Checkpoints
+from openjax.store.leaves import named_leaves
 from openjax.store.settings_files import write_json
 
 NOT_FINITE = "not_finite"

@@ -1,32 +1,30 @@
-"""Checkpoints of a whole training carry: atomic, exact, the last good one found again after any kill or damage.
-
-A checkpoint NAME is a folder of orbax's and, written after it, NAME.sha256 with the checksums of all its files: it
-counts once that is there, and only while they agree. Orbax stands behind this module only.
-
-A carry is any pytree of arrays; optimiser states, typed random keys and counters are leaves like all others, so nothing
-can be forgotten. Leaves are stored under their path in the tree, which makes a carry of another shape a readable error
-instead of a wrong run.
-"""
+"""Checkpoints of a run: the last few and the best are kept, the last good one is found again after any kill or damage."""
 
 import dataclasses
-import functools
-import hashlib
 import shutil
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from openjax.cluster.processes import Processes
 from openjax.errors import UserError
-from openjax.files import WRITING, write_text
+from openjax.files import WRITING
+from openjax.store.checkpoint_files import (
+    DamagedError,
+    check_state,
+    commit,
+    is_checkpoint,
+    load_arrays,
+    load_orbax,
+    load_state,
+    remove_state,
+    start_save,
+)
 
 _DIGITS = 9
-_CHECKSUMS = ".sha256"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,132 +40,6 @@ class CheckpointRecord:
     """Host-side facts that a resumed run goes on from (seconds so far and the like)."""
     score_rule: int = 1
     """How the score was made; only scores of one rule can be compared."""
-
-
-def named_leaves(tree: Any) -> dict[str, Any]:
-    """Leaves by their path, for example `actor/params/Dense_0/kernel`."""
-    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
-    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
-
-
-def place(carry: Any, shardings: Any = None) -> Any:
-    """Commit every leaf to its devices, so that a fresh and a restored carry hit the same compiled step.
-
-    Args:
-      carry: pytree of arrays.
-      shardings: None (the first device) or a sharding or a pytree prefix of them.
-    """
-    shardings = _default_sharding() if shardings is None else shardings
-    if all(sharding.is_fully_addressable for sharding in jax.tree.leaves(shardings)):
-        return jax.device_put(carry, shardings)
-    # Devices of other processes: each process has the whole carry and hands in its own devices' share.
-    is_key = jax.tree.map(lambda leaf: jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key), carry)
-    arrays = jax.tree.map(
-        lambda leaf, key: np.asarray(jax.random.key_data(leaf) if key else leaf), carry, is_key
-    )
-    implementations = jax.tree.map(
-        lambda leaf, key: jax.random.key_impl(leaf) if key else None, carry, is_key
-    )
-
-    def whole(arrays):
-        return jax.tree.map(
-            lambda leaf, key, kind: jax.random.wrap_key_data(leaf, impl=kind) if key else leaf,
-            arrays,
-            is_key,
-            implementations,
-        )
-
-    return jax.jit(whole, out_shardings=shardings)(arrays)
-
-
-def abstract_like(carry: Any, shardings: Any = None) -> Any:
-    """Shapes, dtypes and shardings of a carry that `place` put, or would put, on its devices.
-
-    Args:
-      carry: pytree of arrays, or of their shapes and dtypes.
-      shardings: as for `place`.
-    """
-    shardings = _default_sharding() if shardings is None else shardings
-    return jax.tree.map(
-        lambda leaf, sharding: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding),
-        carry,
-        jax.tree.broadcast(shardings, carry),
-    )
-
-
-def save_state(path: Path, carry: Any, notes: dict | None = None) -> None:
-    """Write one carry to the directory `path`, in place of what is there; it appears whole or not at all."""
-    path = Path(path)
-    if jax.process_index() == 0:
-        _remove(path)
-    _commit(path, _start_save(path, carry, notes or {}))
-
-
-def load_state(path: Path, abstract: Any) -> Any:
-    """Read a carry whose shapes, dtypes and shardings are those of `abstract` (from `abstract_like`).
-
-    Raises:
-      UserError: not a checkpoint, a damaged one (`DamagedError`), or one of another shape.
-    """
-    path = Path(path).absolute()
-    _check(path)
-    stored = load_orbax().metadata(path).metadata
-    wanted = {name: leaf for name, leaf in named_leaves(abstract).items() if leaf.size}
-    _check_same_shapes(path, stored, wanted)
-    arrays = load_orbax().load(path, wanted)
-    # Orbax can't write arrays without elements; they hold nothing, so they are made anew.
-    leaves = [
-        arrays[name] if leaf.size else jnp.zeros(leaf.shape, leaf.dtype, device=leaf.sharding)
-        for name, leaf in named_leaves(abstract).items()
-    ]
-    return jax.tree.unflatten(jax.tree.structure(abstract), leaves)
-
-
-def load_arrays(
-    path: Path, name_of: Callable[[str], str | None] = lambda name: name
-) -> dict[str, np.ndarray]:
-    """Leaves as host arrays, without knowing the tree, read by this process alone.
-
-    Args:
-      path: the checkpoint.
-      name_of: path in the tree -> name in what is returned; None: isn't read.
-
-    Raises:
-      UserError: not a checkpoint, or a damaged one.
-    """
-    path = Path(path).absolute()
-    _check(path)
-    sharding = _default_sharding()
-    stored = load_orbax().metadata(path).metadata
-    names = {name: name_of(name) for name in stored}
-    wanted = {
-        name: load_orbax().PLACEHOLDER
-        if names[name] is None
-        else jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
-        for name, leaf in stored.items()
-    }
-    this = jax.process_index()
-    alone = load_orbax().options.MultiprocessingOptions(primary_host=this, active_processes={this})
-    with load_orbax().Context(multiprocessing_options=alone):
-        loaded = {
-            names[name]: leaf
-            for name, leaf in load_orbax().load(path, wanted).items()
-            if names[name] is not None
-        }
-    is_key = {name: jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) for name, leaf in loaded.items()}
-    return {
-        name: np.asarray(jax.random.key_data(leaf) if is_key[name] else leaf) for name, leaf in loaded.items()
-    }
-
-
-def is_checkpoint(path: Path) -> bool:
-    """True for a finished checkpoint, whether its files are still as they were written or not."""
-    path = Path(path)
-    return path.is_dir() and _checksums_file(path).is_file()
-
-
-class DamagedError(UserError):
-    """A checkpoint's files aren't as they were written."""
 
 
 class Checkpoints:
@@ -259,11 +131,11 @@ class Checkpoints:
         if self._processes.of_first(is_checkpoint(path) and path.name not in self._damaged):
             return
         if self._processes.is_first:
-            _remove(path)
+            remove_state(path)
             self._known.pop(path.name, None), self._damaged.pop(path.name, None)
         scored = {"score": score, "score_rule": self.score_rule}
-        started = _start_save(path, carry, {**(notes or {}), **scored})
-        self._pending = self._pool.submit(_commit, path, started)
+        started = start_save(path, carry, {**(notes or {}), **scored})
+        self._pending = self._pool.submit(commit, path, started)
 
     def wait(self) -> None:
         """Block until the checkpoint under way is on disk, then drop the ones that are no longer kept."""
@@ -276,7 +148,7 @@ class Checkpoints:
         records, best = self.records(), self.best()
         for record in records[: -self.keep_last]:
             if best is None or record.path != best.path:
-                _remove(record.path)
+                remove_state(record.path)
 
     def restore_latest(self, abstract: Any, warn=lambda text: None) -> tuple[Any, CheckpointRecord]:
         """The newest checkpoint that can be read; damaged ones are passed over with a warning.
@@ -315,96 +187,12 @@ class Checkpoints:
                 path.unlink(missing_ok=True)
 
 
-@functools.cache
-def load_orbax():
-    """Loaded late: it takes a second or two, which pass while a run's programs are compiled."""
-    from orbax.checkpoint.experimental import v1
-
-    return v1
-
-
 def _record(path):
     """What is known of a checkpoint. Raises DamagedError."""
-    _check(path)
+    check_state(path)
     try:
         notes = dict(load_orbax().metadata(path.absolute()).custom_metadata or {})
     except Exception as error:  # orbax and tensorstore raise many kinds
         raise DamagedError(f"checkpoint {path} can't be read ({type(error).__name__})") from error
     score, rule = notes.pop("score", None), notes.pop("score_rule", 1)
     return CheckpointRecord(path, int(path.name), score, notes, rule)
-
-
-def _commit(path, started):
-    """Wait until orbax has written a checkpoint, and seal it by its checksums."""
-    started.result()
-    if jax.process_index() == 0:
-        lines = [f"{_checksum(file)}  {file.relative_to(path).as_posix()}" for file in _files(path)]
-        write_text(_checksums_file(path), "\n".join(lines) + "\n")
-
-
-def _check(path):
-    """Raises UserError where no checkpoint is, and DamagedError where its files aren't as they were written."""
-    if not is_checkpoint(path):
-        raise UserError(f"{path} is no checkpoint; expected a directory written by openjax.train")
-    try:
-        lines = _checksums_file(path).read_text(encoding="utf-8").splitlines()
-        expected = {name: checksum for checksum, _, name in (line.partition("  ") for line in lines)}
-        found = {file.relative_to(path).as_posix(): file for file in _files(path)}
-        different = sorted(expected.keys() ^ found.keys())
-        different += [
-            name
-            for name in sorted(expected.keys() & found.keys())
-            if _checksum(found[name]) != expected[name]
-        ]
-    except (OSError, UnicodeDecodeError) as error:
-        raise DamagedError(f"checkpoint {path} is damaged ({error})") from error
-    if different or not expected:
-        where = different[0] if different else _CHECKSUMS
-        raise DamagedError(f"checkpoint {path} is damaged: {where[:80]} isn't as it was written")
-
-
-def _files(path):
-    return sorted(file for file in path.rglob("*") if file.is_file())
-
-
-def _checksum(file):
-    with open(file, "rb") as content:
-        return hashlib.file_digest(content, "sha256").hexdigest()
-
-
-def _checksums_file(path):
-    return path.with_name(path.name + _CHECKSUMS)
-
-
-def _remove(path):
-    """Delete a checkpoint; its checksums go first, so that a half-deleted one is none."""
-    _checksums_file(path).unlink(missing_ok=True)
-    shutil.rmtree(path, ignore_errors=True)
-
-
-def _default_sharding():
-    return jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
-
-
-def _start_save(path, carry, notes):
-    arrays = {name: leaf for name, leaf in named_leaves(carry).items() if leaf.size}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return load_orbax().save_async(path.absolute(), arrays, custom_metadata=notes)
-
-
-def _check_same_shapes(path, stored, wanted):
-    reason = "it was written by other settings or another version"
-    for name, leaf in wanted.items():
-        if name not in stored:
-            raise UserError(f"checkpoint {path} lacks {name}; {reason}")
-        is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-        expected = jax.eval_shape(jax.random.key_data, leaf) if is_key else leaf
-        shape = tuple(stored[name].shape)
-        if shape != tuple(expected.shape) or stored[name].dtype != expected.dtype:
-            raise UserError(
-                f"checkpoint {path} is of another shape: {name} is {stored[name].dtype}{list(shape)} there, "
-                f"the settings make it {expected.dtype}{list(expected.shape)}"
-            )
-    for name in stored:
-        if name not in wanted:
-            raise UserError(f"checkpoint {path} also holds {name}; {reason}")

@@ -13,7 +13,8 @@ from openjax.learning import TrainSettings
 from openjax.learning.train_state import policy_leaf
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Observation, Pursuit
-from openjax.store.checkpoints import Checkpoints, is_checkpoint, load_arrays
+from openjax.store.checkpoint_files import is_checkpoint, load_arrays
+from openjax.store.checkpoints import Checkpoints
 from openjax.store.old_names import train_settings
 from openjax.store.policy_files import WEIGHTS, fill, load_policy_file, shipped_policies
 from openjax.store.run_directory import RunDirectory, is_run

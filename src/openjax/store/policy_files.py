@@ -18,7 +18,7 @@ import numpy as np
 
 from openjax.errors import UserError
 from openjax.files import replacing
-from openjax.store.checkpoints import named_leaves
+from openjax.store.leaves import named_leaves
 from openjax.store.settings_files import to_plain
 
 _FORMAT = "openjax policy 1"
