@@ -6,8 +6,9 @@
 The vehicles are those of `experiments.task_gap`: the exam's plant with one cause each, their flights diagnosed by
 `openjax.gap`. `--cases` holds, of each, its NAME.json and NAME.toml (the effects that were found) as task_gap writes them.
 `tune` fine-tunes the policy to each; `fly` plays the same tasks in the plant with the vehicle that flew: the policy as it
-was, the adapted one, and the policy as it was on the plant's nominal vehicle. Loss is the difference to the latter. Writes
-experiments/results/adapting.json and .md (--out).
+was, the adapted one, and the policy as it was on the plant's nominal vehicle. Loss is the difference to the latter. Without
+--work it flies the policy as it was alone, which tells how much there is to win. Writes experiments/results/adapting.json
+and .md (--out).
 """
 
 import dataclasses
@@ -86,9 +87,14 @@ def game_of(policy: str):
     return loaded, settings
 
 
-def fly_one(job) -> tuple[str, str, dict[str, list[float]]]:
-    """Episodes of a policy in the plant with a vehicle: (case, which policy, figures of each episode)."""
-    cases, name, which, policy, episodes = job
+def fly_one(job) -> tuple[str, str, dict[str, list[float]] | None]:
+    """Episodes of a policy in the plant with a vehicle: (case, which policy, figures of each episode).
+
+    No figures where it is too late to begin.
+    """
+    cases, name, which, policy, episodes, latest = job
+    if time.time() > latest:
+        return name, which, None
     loaded, settings = game_of(policy)
     case = next(case for case in make_cases(1, 2, 2) if case.name == name)
     cause = None
@@ -110,21 +116,28 @@ def fly_one(job) -> tuple[str, str, dict[str, list[float]]]:
 def study(options) -> dict:
     """Fly the adapted policies, and the policy as it was, in the plant."""
     started = time.monotonic()
-    names = [name for name in found_cases(options) if (options.work / f"{name}.npz").exists()]
+    names = found_cases(options)
+    tuned = {} if options.work is None else {path.stem: str(path) for path in options.work.glob("*.npz")}
+    if tuned:
+        names = [name for name in names if name in tuned]
+    latest = time.time() + options.seconds
     jobs = [
-        (options.cases, name, which, policy, options.episodes)
+        (options.cases, name, which, policy, options.episodes, latest)
         for name in names
         for which, policy in (
             (NOMINAL, options.policy),
             ("before", options.policy),
-            ("after", str(options.work / f"{name}.npz")),
+            ("after", tuned.get(name)),
         )
+        if policy is not None
     ]
     found: dict[str, dict] = {}
     with multiprocessing.get_context("spawn").Pool(min(options.jobs, len(jobs))) as pool:
         for name, which, figures in pool.imap_unordered(fly_one, jobs):
+            if figures is None:
+                continue
+            found.setdefault(name, {})[which] = figures
             means = {figure: float(np.mean(values)) for figure, values in figures.items()}
-            found.setdefault(name, {})[which] = means
             print(name, which, means, f"{time.monotonic() - started:.0f} s", flush=True)
     return {
         "command": f"python -m experiments.adapting fly --policy {options.policy} --episodes {options.episodes}",
@@ -132,58 +145,82 @@ def study(options) -> dict:
         "seconds": time.monotonic() - started,
         "episodes": options.episodes,
         "vehicles": {
-            name: found[name] | {"found": load_effects(options.cases / f"{name}.toml")[0]} for name in names
+            name: found[name] | {"found": load_effects(options.cases / f"{name}.toml")[0]}
+            for name in names
+            if len(found.get(name, ())) == (3 if tuned else 2)
         },
     }
 
 
-def won_back(vehicles: dict, figure: str) -> tuple[float, float, float]:
-    """Sum of losses before and after adapting, where the policy loses anything, and the share won back."""
+def losses(vehicles: dict, figure: str, which: str) -> np.ndarray:
+    """(V, E) what each episode of a figure costs more than the same episode on the nominal vehicle."""
     sign = -1.0 if figure == "captured" else 1.0
-    losses = [
-        [sign * (row[which][figure] - row[NOMINAL][figure]) for which in ("before", "after")]
-        for row in vehicles.values()
-    ]
-    before, after = np.sum([loss for loss in losses if loss[0] > 0] or [[0.0, 0.0]], axis=0)
-    return float(before), float(after), float(1 - after / before) if before > 0 else float("nan")
+    return sign * np.array(
+        [np.subtract(row[which][figure], row[NOMINAL][figure]) for row in vehicles.values()]
+    )
+
+
+def won_back(before: np.ndarray, after: np.ndarray, draws: int = 2000) -> tuple[float, float, float]:
+    """The share of the mean loss that is won back, and its 90 % interval by drawing episodes anew.
+
+    Losses (V, E) before and after of the same episodes. All vehicles count: to leave out those that seem to lose nothing
+    would choose by chance, and count its return to the mean as won.
+    """
+    rng = np.random.default_rng(0)
+    episodes = rng.integers(0, before.shape[1], (draws, before.shape[1]))
+    one, two = before.mean(axis=0)[episodes].mean(axis=1), after.mean(axis=0)[episodes].mean(axis=1)
+    low, high = np.percentile(1 - two / np.where(np.abs(one) > 1e-12, one, np.nan), [5, 95])
+    return float(1 - after.mean() / before.mean()), float(low), float(high)
 
 
 def report(results: dict) -> list[str]:
     """The page."""
     vehicles = results["vehicles"]
+    steps = [step for step in (NOMINAL, "before", "after") if step in next(iter(vehicles.values()))]
     lines = [
         "# What adapting wins back",
         "",
         f"{where(results)} {results['seconds']:.0f} s. "
         f"{len(vehicles)} vehicles of the exam's plant with one cause each, {results['episodes']} uniform tasks each, no "
-        "clamp, drawn starts. Loss: the difference to the same policy on the plant's nominal vehicle, summed over the vehicles "
-        "with which it loses anything.",
+        "clamp, drawn starts. Loss: the difference to the same policy on the plant's nominal vehicle, mean over all vehicles; "
+        "the share won back has a 90 % interval by drawing episodes anew.",
         "",
-        *table(
-            ["figure", "loss before", "loss after", "won back"],
-            [
-                [figure, f"{before:.3f}", f"{after:.3f}", f"{share:.2f}"]
-                for figure in FIGURES
-                for before, after, share in [won_back(vehicles, figure)]
-            ],
-        ),
-        "",
-        *table(
-            ["vehicle", "found", *(f"{figure}: nominal, before → after" for figure in FIGURES)],
-            [
-                [
-                    name,
-                    ", ".join(row["found"]) or "none",
-                    *(
-                        f"{row[NOMINAL][figure]:.4g}, {row['before'][figure]:.4g} → {row['after'][figure]:.4g}"
-                        for figure in FIGURES
-                    ),
-                ]
-                for name, row in vehicles.items()
-            ],
-        ),
     ]
-    return lines
+    if "after" in steps:
+        rows = []
+        for figure in FIGURES:
+            before, after = (losses(vehicles, figure, which) for which in ("before", "after"))
+            share, low, high = won_back(before, after)
+            rows.append(
+                [
+                    figure,
+                    f"{before.mean():.4f}",
+                    f"{after.mean():.4f}",
+                    f"{share:.2f} [{low:.2f}, {high:.2f}]",
+                ]
+            )
+        crashes = {
+            which: np.array([row[which]["crashed"] for row in vehicles.values()]) > 0
+            for which in ("before", "after")
+        }
+        lines += [
+            *table(["figure", "loss before", "loss after", "won back"], rows),
+            "",
+            f"Episodes that crashed after adapting and not before: {int((crashes['after'] & ~crashes['before']).sum())}; "
+            f"before and not after: {int((crashes['before'] & ~crashes['after']).sum())}; of {crashes['after'].size}.",
+            "",
+        ]
+    return lines + table(
+        ["vehicle", "found", *(f"{figure}: {' → '.join(steps)}" for figure in FIGURES)],
+        [
+            [
+                name,
+                ", ".join(row["found"]) or "none",
+                *(" → ".join(f"{np.mean(row[step][figure]):.4g}" for step in steps) for figure in FIGURES),
+            ]
+            for name, row in vehicles.items()
+        ],
+    )
 
 
 def main() -> None:
@@ -191,11 +228,11 @@ def main() -> None:
     parser = page_parser(__doc__, "adapting")
     parser.add_argument("what", choices=("tune", "fly"))
     parser.add_argument("--cases", type=Path, required=True)
-    parser.add_argument("--work", type=Path, required=True, help="where the adapted policies are")
+    parser.add_argument("--work", type=Path, help="where the adapted policies are")
     parser.add_argument("--policy", default="flight")
     parser.add_argument("--updates", type=int, default=AdaptSettings.updates)
     parser.add_argument("--limit", type=int, default=0, help="vehicles at most; 0: all")
-    parser.add_argument("--seconds", type=float, default=1e9, help="tune nothing new after this long")
+    parser.add_argument("--seconds", type=float, default=1e9, help="begin nothing new after this long")
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     options = parser.parse_args()

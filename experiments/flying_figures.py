@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -40,7 +41,7 @@ class Arguments:
     out: Annotated[Path, tyro.conf.Positional]
     """Folder for logs and figures."""
     part: Literal["all", "long", "layouts", "links", "simulator", "diagnose"] = "all"
-    policy: str = "no_clamp_seed_0"
+    policy: str = "flight"
     minutes: float = 10.0
     """Of the long flight."""
     at_once: int = 4
@@ -53,8 +54,15 @@ class Arguments:
     """Further options of the virtual Crazyflies, as NAME=VALUE."""
 
 
+LANDING = 60.0
+"""Seconds that a flight has for its landing and its files, once it was asked to end."""
+
+
 def pair(arguments, number: int, out: Path, virtual: list[str], fly: list[str], seconds: float) -> dict:
-    """Fly with virtual Crazyflies of their own; what flight.json says, or why there is none."""
+    """Fly with virtual Crazyflies of their own, landing after `seconds` if the games aren't over before.
+
+    Returns what flight.json says, or why there is none.
+    """
     port = PORTS + 10 * number
     environment = {**os.environ, "JAX_PLATFORMS": "cpu", "OMP_NUM_THREADS": "1"}
     own = [f"--{option}" for option in arguments.virtual]
@@ -70,32 +78,36 @@ def pair(arguments, number: int, out: Path, virtual: list[str], fly: list[str], 
         command = [sys.executable, "-m", "openjax.fly", "--policy", arguments.policy, "--out", str(out), *fly]
         command += ["--body_logs", str(arguments.body_logs)]
         command += ["--guard_after", "1.0"]  # a stall is to be measured, not to end the measurement
-        ran = subprocess.run(
+        flying = subprocess.Popen(
             [*command, "--uri", *uris],
             env=environment,
-            capture_output=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
             text=True,
-            timeout=seconds,
-            check=False,
         )
-        print(out.name, " ".join((ran.stdout[-500:] + ran.stderr[-1500:]).split()), flush=True)
-        if ran.returncode != 0 or not (out / "flight.json").exists():
-            return {"error": ran.stdout[-600:] + ran.stderr[-1500:]}
+        try:
+            said, complaint = flying.communicate(timeout=seconds)
+        except subprocess.TimeoutExpired:
+            flying.send_signal(signal.SIGINT)  # Ctrl-C: all land, and the log is written
+            try:
+                said, complaint = flying.communicate(timeout=LANDING)
+            except subprocess.TimeoutExpired:
+                flying.kill()
+                return {"error": f"not over {LANDING:g} s after it was asked to land"}
+        print(out.name, " ".join((said[-500:] + complaint[-1500:]).split()), flush=True)
+        if flying.returncode != 0 or not (out / "flight.json").exists():
+            return {"error": said[-600:] + complaint[-1500:]}
         return json.loads((out / "flight.json").read_text(encoding="utf-8"))
-    except subprocess.TimeoutExpired:
-        return {"error": f"not over after {seconds:g} s"}
     finally:
         vehicles.terminate()
         vehicles.wait()
 
 
 def long(arguments) -> dict:
-    """One flight, game after game, until the minutes are over."""
-    games = max(1, int(60 * arguments.minutes / 10.8))
-    options = ["--scenario", "wall", "--episodes", str(games)]
-    return pair(
-        arguments, 0, arguments.out / "long", ["--endurance", "7200"], options, 90 * arguments.minutes + 120
-    )
+    """One flight, game after game, until the minutes are over: then it's asked to land."""
+    options = ["--scenario", "wall", "--episodes", str(max(1, int(20 * arguments.minutes)))]
+    place = arguments.out / "long"
+    return pair(arguments, 0, place, ["--endurance", "7200"], options, 60 * arguments.minutes)
 
 
 def layouts(arguments) -> dict:
