@@ -26,7 +26,6 @@ from experiments.task_gap.flights import make_cases
 from experiments.task_gap.game import draw_tasks
 from experiments.worlds.game import play
 from experiments.worlds.plant import PlantWorld
-from openjax.commands.machine import describe_machine
 from openjax.files import read_json
 from openjax.learning.adaptation import (
     AdaptSettings,
@@ -140,9 +139,6 @@ def study(options) -> dict:
             means = {figure: float(np.mean(values)) for figure, values in figures.items()}
             print(name, which, means, f"{time.monotonic() - started:.0f} s", flush=True)
     return {
-        "command": f"python -m experiments.adapting fly --policy {options.policy} --episodes {options.episodes}",
-        "machine": describe_machine(),
-        "seconds": time.monotonic() - started,
         "episodes": options.episodes,
         "vehicles": {
             name: found[name] | {"found": load_effects(options.cases / f"{name}.toml")[0]}

@@ -221,7 +221,6 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--physics", choices=("mjx", "rigid"), default="mjx")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--ship", action="store_true", help="also write the package's parameters")
-    parser.add_argument("--commit", default="", help="where the machine has no repository")
     publish(parser.parse_args(arguments), study, report)
     return 0
 

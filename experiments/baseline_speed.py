@@ -8,10 +8,9 @@ import argparse
 
 import jax
 
-from experiments.pages import page_parser, publish, table
+from experiments.pages import page_parser, publish, table, where
 from openjax.baselines import METHODS, Heuristic
 from openjax.commands.command_line import run_command
-from openjax.commands.machine import describe_machine
 from openjax.commands.timing import time_compiled
 from openjax.pursuit import Pursuit, PursuitSettings
 
@@ -48,9 +47,6 @@ def study(options: argparse.Namespace) -> dict:
         for physics in ("mjx", "rigid")
     ]
     return {
-        "command": f"python -m experiments.baseline_speed --envs {options.envs} --steps {options.steps}",
-        "commit": options.commit,
-        "machine": describe_machine(),
         "envs": options.envs,
         "rows": rows,
     }
@@ -58,13 +54,11 @@ def study(options: argparse.Namespace) -> dict:
 
 def report(results: dict) -> list[str]:
     """The page."""
-    machine = results["machine"]
-    commit = results["commit"] or machine.get("commit") or "unknown"
     lines = [
         "# Speed of the heuristics",
         "",
-        f"`{results['command']}` on {machine['device']}, JAX {machine['versions']['jax']}, commit {commit}; "
-        f"{results['envs']:,} worlds of three pursuers, million environment steps per second. Goal: 5 with MJX on one H200.",
+        f"{where(results)} {results['envs']:,} worlds of three pursuers, million environment steps per second. Goal: 5 with "
+        "MJX on one H200.",
         "",
     ]
     speeds = {(row["method"], row["physics"]): row["speed"] for row in results["rows"]}
@@ -87,7 +81,6 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=list(METHODS))
     parser.add_argument("--envs", type=int, default=32768)
     parser.add_argument("--steps", type=int, default=50, help="control steps per call")
-    parser.add_argument("--commit", default="", help="where the machine has no repository")
     publish(parser.parse_args(arguments), study, report)
     return 0
 

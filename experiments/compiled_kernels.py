@@ -19,7 +19,6 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from experiments.pages import page_parser, publish, table, where
 from openjax.commands.command_line import run_command
-from openjax.commands.machine import describe_machine
 from openjax.errors import UserError
 from openjax.learning import abstract_carry, make_training_step, preset
 from openjax.vehicle import hover_state, load_vehicle, make_drones_step
@@ -118,8 +117,6 @@ def study(options: argparse.Namespace) -> dict:
             make_training_step(settings), abstract_carry(settings)
         )
     return {
-        "command": f"python -m experiments.compiled_kernels --drones {options.drones}",
-        "machine": describe_machine(),
         "programs": {name: loops(program()) for name, program in programs.items()},
     }
 

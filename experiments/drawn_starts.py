@@ -8,7 +8,6 @@ Writes experiments/results/drawn_starts.json and .md.
 
 import argparse
 import functools
-import time
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +18,6 @@ from experiments.headline import GOAL_COLLISION
 from experiments.pages import page_parser, publish, table, where
 from experiments.prediction_flights import layout_tasks
 from openjax.commands.command_line import run_command
-from openjax.commands.machine import describe_machine
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, Task, action_to_command
 from openjax.pursuit.collisions import breaches, crashed, drone_distance, pillar_distance
 from openjax.pursuit.observation import rotation_axes
@@ -132,7 +130,6 @@ def least(environment: Pursuit, tasks: Task, drones: DroneState, iterations: int
 
 def study(options: argparse.Namespace) -> dict:
     """Figures by layout."""
-    started = time.monotonic()
     settings = PursuitSettings(
         physics="rigid", max_pillars=max(len(scenario.pillars) for scenario in SCENARIOS.values())
     )
@@ -153,9 +150,6 @@ def study(options: argparse.Namespace) -> dict:
             for kind, part in zip(("held", "least"), parts, strict=True)
         }
     return {
-        "command": f"python -m experiments.drawn_starts --episodes {options.episodes} --iterations {options.iterations}",
-        "machine": describe_machine(),
-        "seconds": time.monotonic() - started,
         "episodes": options.episodes,
         "episode_length": settings.episode_length,
         "layouts": rows,

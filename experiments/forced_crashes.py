@@ -9,7 +9,6 @@ loop at 500 Hz, solid contacts. Writes experiments/results/forced_crashes.json a
 """
 
 import dataclasses
-import time
 from typing import NamedTuple
 
 import jax
@@ -21,7 +20,6 @@ from experiments.pages import page_parser, publish, table, where
 from experiments.vehicles import WHOLE, program, vehicles, widened
 from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import layout_slots, repeat_task
-from openjax.commands.machine import describe_machine
 from openjax.commands.validation import uniform_tasks
 from openjax.learning import preset
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, RewardSettings, scenario_task
@@ -160,7 +158,6 @@ def searched(settings: PursuitSettings, chosen: np.ndarray, tasks, keys, bounds,
 
 def study(options) -> dict:
     """Fly the policies, then search where all of them crash."""
-    started = time.monotonic()
     policies = {name: load_policy(name) for name in options.policy}
     drawn_from = preset("flight").environment
     tasks = all_tasks(drawn_from, options.number, options.layouts)
@@ -195,10 +192,6 @@ def study(options) -> dict:
         for kind, row in figures[vehicle].items():
             print(vehicle, kind, row, flush=True)
     return {
-        "command": f"python -m experiments.forced_crashes --policy {' '.join(options.policy)} --number {options.number} "
-        f"--layouts {options.layouts} --samples {options.samples} --rounds {options.rounds}",
-        "machine": describe_machine(),
-        "seconds": time.monotonic() - started,
         "figures": figures,
     }
 

@@ -6,14 +6,11 @@ hide the evader and have to be flown round), and uniform ones turned about the a
 starts close to a pillar or another pursuer. Writes experiments/results/hard_tasks.json and .md.
 """
 
-import time
-
 import jax
 
 from experiments.headline import evaluator_of, seeds_of_open
 from experiments.pages import page_parser, publish, table, where
 from openjax.commands.command_line import run_command
-from openjax.commands.machine import describe_machine
 from openjax.commands.validation import uniform_tasks
 from openjax.learning import summarise
 from openjax.pursuit import PursuitSettings, close_starts, line_up_pillars, turn_task, uniform_task
@@ -93,14 +90,9 @@ def report(results: dict) -> list[str]:
 
 def study(options) -> dict:
     """Fly the policies."""
-    started = time.monotonic()
     names = options.policy or seeds_of_open()
-    chosen = f" --policy {' '.join(options.policy)}" if options.policy else ""
     policies = {name: fly(name, options.number) for name in names}
     return {
-        "command": f"python -m experiments.hard_tasks --number {options.number}{chosen}",
-        "machine": describe_machine(),
-        "seconds": time.monotonic() - started,
         "policies": policies,
     }
 

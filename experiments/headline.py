@@ -8,7 +8,6 @@ starts, and without the clamp, and holds them against this project's goals. Writ
 import argparse
 import dataclasses
 import functools
-import time
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,6 @@ import numpy as np
 from experiments.pages import page_parser, publish, spread, table, where
 from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import Evaluator, evaluate_scenarios, layout_slots
-from openjax.commands.machine import describe_machine
 from openjax.learning import TrainSettings
 from openjax.policy import Policy
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings
@@ -163,18 +161,13 @@ def report(results: dict) -> list[str]:
 
 def study(options: argparse.Namespace) -> dict:
     """Fly the policies under all conditions."""
-    started = time.monotonic()
     names = options.policy or seeds_of_open()
     records = {
         condition: {name: fly(name, changes, options.episodes) for name in names}
         for condition, changes in CONDITIONS.items()
     }
-    chosen = f" --policy {' '.join(options.policy)}" if options.policy else ""
     return {
-        "command": f"python -m experiments.headline --episodes {options.episodes}{chosen}",
         "note": options.note,
-        "machine": describe_machine(),
-        "seconds": time.monotonic() - started,
         "records": records,
     }
 

@@ -1,12 +1,16 @@
 """What the scripts that make a page have in common: measure or read what was stored, write both files and a figure."""
 
 import argparse
+import shlex
+import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from openjax.commands.machine import describe_machine
 from openjax.files import read_json
 from openjax.store.settings_files import write_json
 
@@ -14,11 +18,31 @@ RESULTS = Path(__file__).parent / "results"
 
 
 def page_parser(doc: str, name: str) -> argparse.ArgumentParser:
-    """A parser with `--report` and, by default for the page `name`, `--out`."""
+    """A parser with `--report`, `--commit` and, by default for the page `name`, `--out`."""
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--report", action="store_true", help="from the stored results")
+    parser.add_argument("--commit", default="", help="where the machine has no repository")
     parser.add_argument("--out", type=Path, default=RESULTS / name)
     return parser
+
+
+def typed_command() -> str:
+    """The command that runs, as one types it, without the places of its results."""
+    spec = getattr(sys.modules["__main__"], "__spec__", None)
+    name = spec.name.removesuffix(".__main__") if spec else Path(sys.argv[0]).name
+    words, kept = iter(sys.argv[1:]), []
+    for word in words:
+        if word in ("--out", "--commit"):
+            next(words, None)
+        elif not word.startswith(("--out=", "--commit=")):
+            kept.append(word)
+    return shlex.join(["python", "-m", name, *kept])
+
+
+def facts(commit: str | None = None) -> dict:
+    """What stands beside all results: the command, the machine, and the commit, where the source tree can't tell."""
+    machine = describe_machine()
+    return {"command": typed_command(), "machine": machine | ({"commit": commit} if commit else {})}
 
 
 def publish(
@@ -27,10 +51,15 @@ def publish(
     report: Callable[[Any], list[str]],
     draw: Callable[[Any, Path], None] | None = None,
 ) -> None:
-    """Store what `study` finds (unless told to read it), then write and print the page made from what is stored."""
+    """Store what `study` finds (unless told to read it), then write and print the page made from what is stored.
+
+    Command, machine and seconds stand beside it.
+    """
     data = options.out.with_suffix(".json")
     if not options.report:
-        write_json(data, study(options))
+        started = time.monotonic()
+        found = study(options)
+        write_json(data, {**facts(options.commit), "seconds": time.monotonic() - started, **found})
     results = read_json(data)
     write_page(options.out, report(results), results, draw)
 

@@ -19,7 +19,6 @@ from experiments.worlds.game import flown_pursuit, remember
 from openjax.baselines import METHODS, DacoopPolicy
 from openjax.baselines.surroundings import surroundings
 from openjax.commands.command_line import run_command
-from openjax.commands.machine import describe_machine
 from openjax.learning import make_evaluate
 from openjax.pursuit import EpisodeStatistics, Pursuit, PursuitSettings
 from openjax.store.policies import LoadedPolicy, load_policy
@@ -99,9 +98,6 @@ def study(options: argparse.Namespace) -> dict:
             rows[name] += means(evaluate(each.parameters, tasks, jax.random.key(0)).statistics, 1)
         print(name, rows[name], flush=True)
     return {
-        "command": f"python -m experiments.point_mass --tasks {options.tasks}",
-        "commit": options.commit,
-        "machine": describe_machine(),
         "tasks": options.tasks,
         "rows": rows,
     }
@@ -130,7 +126,6 @@ def main(arguments: list[str]) -> int:
     """Measure or read it, write both files, print the page."""
     parser = page_parser(__doc__, "point_mass")
     parser.add_argument("--tasks", type=int, default=512)
-    parser.add_argument("--commit", default="", help="where the machine has no repository")
     publish(parser.parse_args(arguments), study, report)
     return 0
 

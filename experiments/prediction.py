@@ -34,7 +34,6 @@ from experiments.predictors import (
 )
 from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import layout_slots
-from openjax.commands.machine import describe_machine
 from openjax.pursuit import SCENARIOS, Pursuit
 from openjax.store.policies import load_policy
 
@@ -98,8 +97,6 @@ def study(options: argparse.Namespace) -> dict:
         f"--held-back {options.held_back} --episodes {options.episodes} --updates {options.updates} "
         f"--batch {options.batch} --seeds {options.seeds} --stride {options.stride}{fewer}",
         "note": options.note,
-        "commit": options.commit,
-        "machine": describe_machine(),
         "seconds": {**seconds, "whole": time.monotonic() - started},
         "time_step": settings.time_step,
         "horizons": HORIZONS,
@@ -134,7 +131,6 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--stride", type=int, default=4, help="compare at every so manyth step")
     parser.add_argument("--variants", type=int, default=len(VARIANTS), help="only the first so many")
     parser.add_argument("--episode-length", type=int, default=0, help="shorter episodes, to try the command")
-    parser.add_argument("--commit", default="", help="where the machine has no repository")
     parser.add_argument("--note", default="")
     publish(parser.parse_args(arguments), study, report, draw)
     return 0

@@ -1,9 +1,11 @@
-"""Two processes with one GPU each against one process with both: speed, the loss of one, and going on with one GPU.
+"""Two processes with one GPU each against one process with both and one GPU alone: speed, the loss of one, going on alone.
 
-    python -m experiments.processes [--preset paper] [--seconds 25] [--out experiments/results/processes]
+    python -m experiments.processes [--preset paper] [--seconds 15] [--out experiments/results/processes]
 
-First all three programs (two devices of one process, two processes, one device) are compiled into a cache, side by
-side; then each is timed alone. Needs two devices; with `--cpu` they are two virtual ones, to try the script.
+Two GPUs fly twice the preset's worlds. First all programs are compiled into a cache, side by side, which the two
+processes do until their first checkpoint; then one of them is killed, its run is gone on with on one GPU beside one GPU
+alone, and both kinds of two are timed, one after the other. Needs two devices; with `--cpu` they are two virtual ones, to
+try the script.
 """
 
 import dataclasses
@@ -16,10 +18,12 @@ import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import tyro
 
+from experiments.pages import table, typed_command, where
 from openjax.show.metrics import METRICS_FILE, read_metrics
 from openjax.store.settings_files import write_json
 
@@ -29,9 +33,11 @@ class ProcessesCommand:
     """Train on two devices of one host, by one process and by two."""
 
     preset: str = "paper"
+    num_envs: int = 5120
+    """Worlds per device."""
     options: str = ""
     """More options of openjax.train."""
-    seconds: float = 25.0
+    seconds: float = 15.0
     """Time each is measured for, after its first update."""
     compilation: float = 240.0
     """Longest time to wait for a first update."""
@@ -54,7 +60,8 @@ class Job:
             environment["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
             if command.cpu:
                 environment |= {"JAX_PLATFORMS": "cpu"}
-                environment["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={len(own)}"
+                flags = os.environ.get("XLA_FLAGS", "")
+                environment["XLA_FLAGS"] = f"{flags} --xla_force_host_platform_device_count={len(own)}"
             else:
                 environment["CUDA_VISIBLE_DEVICES"] = ",".join(own)
             arguments = [sys.executable, "-m", "openjax.train", *options]
@@ -104,67 +111,98 @@ def speed(records: list[dict]) -> int:
     return round((last["steps"] - first["steps"]) / (last["seconds"] - first["seconds"]))
 
 
+def timed(command: ProcessesCommand, job: Job) -> dict:
+    """Wait for a job's first update, time those that follow, and end it."""
+    job.wait_for(command.compilation, job.updates)
+    first = job.updates()[0]["seconds"]
+    time.sleep(command.seconds)
+    statuses = job.end(signal.SIGTERM)
+    records = job.updates()
+    return {
+        "first_update_seconds": first,
+        "updates": len(records),
+        "env_steps_per_second": speed(records),
+        "statuses": statuses,
+        "last_reward": records[-1]["reward"],
+    }
+
+
+def lose_one(job: Job) -> dict:
+    """Kill the second process; how the first one ends."""
+    job.processes[1].kill()
+    started = time.monotonic()
+    status = job.processes[0].wait(120)
+    text = job.texts[0].read_text()
+    return {
+        "status": status,
+        "seconds": round(time.monotonic() - started, 1),
+        "said": [line for line in text.splitlines() if line.startswith("error")][-1:],
+        "trace": "Traceback" in text,
+    }
+
+
+def go_on(command: ProcessesCommand, job: Job) -> dict:
+    """Time a resumed run, and end it."""
+
+    def restored():
+        found = re.search(r"resumed at update (\d+)", job.texts[0].read_text())
+        return found and len(job.updates(int(found[1]))) > 4 and int(found[1])
+
+    job.wait_for(command.compilation, restored)
+    at = restored()
+    time.sleep(command.seconds)
+    statuses = job.end(signal.SIGTERM)
+    records = job.updates(at)
+    return {
+        "at_update": at,
+        "updates": len(records),
+        "env_steps_per_second": speed(records),
+        "statuses": statuses,
+    }
+
+
 def main(command: ProcessesCommand) -> dict:
     """All measurements; returns what is written."""
     gpus = (os.environ.get("CUDA_VISIBLE_DEVICES") or "0,1").split(",")[:2]
-    together, apart = [gpus], [[gpus[0]], [gpus[1]]]
-    results: dict = {"command": "python -m experiments.processes " + " ".join(sys.argv[1:])}
+    together, apart, alone, other = [gpus], [[gpus[0]], [gpus[1]]], [gpus[:1]], [gpus[1:]]
+    twice = ("--num_envs", str(2 * command.num_envs))
+    unwatched = ("--validation_interval", "100000")
+    results: dict = {"command": typed_command()}
+
+    def tell(name, found):
+        results[name] = found
+        print(name, found, flush=True)
+
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder)
         os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
         started = time.monotonic()
-        jobs = [
-            Job(command, scratch, f"compiling_{i}", d) for i, d in enumerate((together, apart, [gpus[:1]]))
+        lost = Job(command, scratch, "lost", apart, *twice, "--validation_interval", "10")
+        compiling = [
+            Job(command, scratch, "compiling_together", together, *twice, *unwatched),
+            Job(command, scratch, "compiling_alone", alone, *unwatched, "--num_envs", str(command.num_envs)),
+            Job(command, scratch, "compiling_resumed", other, *twice, *unwatched),
         ]
-        for job in jobs:
-            job.wait_for(command.compilation, lambda job=job: job.updates())
-        for job in jobs:
-            job.end(signal.SIGKILL)
-        results["compilation_seconds"] = round(time.monotonic() - started)
-        print(f"compiled in {results['compilation_seconds']} s", flush=True)
-        os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "true"
-        for name, devices in (("one process", together), ("two processes", apart)):
-            job = Job(command, scratch, name.replace(" ", "_"), devices, "--validation_interval", "100000")
+        for job in compiling:
             job.wait_for(command.compilation, job.updates)
-            first = job.updates()[0]["seconds"]
-            time.sleep(command.seconds)
-            statuses = job.end(signal.SIGTERM)
-            records = job.updates()
-            results[name] = {
-                "first_update_seconds": first, "updates": len(records), "env_steps_per_second": speed(records),
-                "statuses": statuses, "last_reward": records[-1]["reward"],
-            }  # fmt: skip
-            settings = json.loads((job.run / "settings.json").read_text(encoding="utf-8"))
-            results["machine"] = settings["machine"]
-            print(name, results[name], flush=True)
+            job.end(signal.SIGKILL)
+        lost.wait_for(command.compilation, lambda: list((lost.run / "checkpoints").glob("*.sha256")))
+        tell("compilation_seconds", round(time.monotonic() - started))
+        tell("process 1 killed", lose_one(lost))
 
-        job = Job(command, scratch, "lost", apart, "--validation_interval", "10")
-        job.wait_for(command.compilation, lambda: list((job.run / "checkpoints").glob("*.sha256")))
-        job.processes[1].kill()
-        started = time.monotonic()
-        status = job.processes[0].wait(120)
-        said = [line for line in job.texts[0].read_text().splitlines() if line.startswith("error")]
-        results["process 1 killed"] = {
-            "status": status, "seconds": round(time.monotonic() - started, 1), "said": said[-1:],
-            "trace": "Traceback" in job.texts[0].read_text(),
-        }  # fmt: skip
-        print(results["process 1 killed"], flush=True)
-
-        resumed = Job(command, scratch, "lost", [gpus[:1]], "--resume", str(job.run))
-
-        def restored():
-            found = re.search(r"resumed at update (\d+)", resumed.texts[0].read_text())
-            return found and resumed.updates(int(found[1])) and int(found[1])
-
-        resumed.wait_for(command.compilation, restored)
-        at = restored()
-        time.sleep(command.seconds / 2)
-        statuses = resumed.end(signal.SIGTERM)
-        records = resumed.updates(at)
-        results["resumed on one GPU"] = {
-            "at_update": at, "updates": len(records), "env_steps_per_second": speed(records), "statuses": statuses,
-        }  # fmt: skip
-        print(results["resumed on one GPU"], flush=True)
+        beside = ThreadPoolExecutor(2)
+        one = Job(command, scratch, "one_device", alone, *unwatched, "--num_envs", str(command.num_envs))
+        resumed = Job(command, scratch, "lost", other, "--resume", str(lost.run))
+        futures = beside.submit(timed, command, one), beside.submit(go_on, command, resumed)
+        tell("one device", futures[0].result())
+        tell("resumed on one device", futures[1].result())
+        for name, devices in (("one process", together), ("two processes", apart)):
+            tell(
+                name,
+                timed(command, Job(command, scratch, name.replace(" ", "_"), devices, *twice, *unwatched)),
+            )
+        settings = json.loads((one.run / "settings.json").read_text(encoding="utf-8"))
+        results["machine"] = settings["machine"]
     write_json(command.out.with_suffix(".json"), results)
     command.out.with_suffix(".md").write_text(page(results, command))
     return results
@@ -173,27 +211,42 @@ def main(command: ProcessesCommand) -> dict:
 def page(results: dict, command: ProcessesCommand) -> str:
     """The results as Markdown."""
     machine = results["machine"]
-    lost, resumed = results["process 1 killed"], results["resumed on one GPU"]
+    lost, resumed = results["process 1 killed"], results["resumed on one device"]
+    alone = results["one device"]["env_steps_per_second"]
+    rows = [
+        [
+            name,
+            f"{worlds * command.num_envs:,}",
+            f"{row['first_update_seconds']:.0f}",
+            f"{speed:,}",
+            f"{speed / alone:.2f}",
+        ]
+        for name, worlds in (("one device", 1), ("one process", 2), ("two processes", 2))
+        for row in [results[name]]
+        for speed in [row["env_steps_per_second"]]
+    ]
+    heads = [
+        "training",
+        "worlds",
+        "first update, s",
+        "environment steps/s, without validations",
+        "against one device",
+    ]
     lines = [
         "# Two processes",
         "",
-        f"`{results['command']}`, commit {machine['commit']}, {machine['device']}, {machine['cpu_cores']} CPU cores, JAX "
-        f"{machine['versions']['jax']}, {machine['date']}. Preset `{command.preset}`, programs compiled before.",
+        f"{where(results)} {machine['cpu_cores']} CPU cores, {machine['date']}. Preset `{command.preset}`, programs compiled "
+        f"before, side by side, in {results['compilation_seconds']} s.",
         "",
-        "| training on two devices | first update, s | environment steps/s, without validations |",
-        "|---|---|---|",
-    ]
-    for name in ("one process", "two processes"):
-        row = results[name]
-        lines.append(f"| {name} | {row['first_update_seconds']:.0f} | {row['env_steps_per_second']:,} |")
-    lines += [
+        *table(heads, rows),
         "",
         f"Process 1 killed (SIGKILL) after a checkpoint: process 0 ended {lost['seconds']} s later with status "
-        f"{lost['status']} and the line",
+        f"{lost['status']}, {'a' if lost['trace'] else 'no'} stack trace, and the line",
         "",
         *(f"    {line}" for line in lost["said"]),
         "",
-        f"Resumed on one device at update {resumed['at_update']}: {resumed['env_steps_per_second']:,} environment steps/s.",
+        f"Resumed on one device at update {resumed['at_update']}, with all worlds: "
+        f"{resumed['env_steps_per_second']:,} environment steps/s.",
     ]
     return "\n".join(lines) + "\n"
 

@@ -19,7 +19,6 @@ import jax
 import jax.numpy as jnp
 
 from experiments.pages import RESULTS, publish, table, where
-from openjax.commands.machine import describe_machine
 from openjax.commands.validation import uniform_tasks
 from openjax.files import read_json
 from openjax.learning.settings import PRESETS
@@ -108,9 +107,6 @@ def study(options: argparse.Namespace) -> dict:
             )
         )
     return {
-        "command": "python -m experiments.quick " + " ".join(sys.argv[1:]),
-        "machine": describe_machine(),
-        "commit": options.commit,
         "preset": " ".join(PRESETS["quick"].__doc__.split()),
         "runs": runs,
     }

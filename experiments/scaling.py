@@ -209,7 +209,7 @@ def main(arguments: Sequence[str]) -> int:
     machine = describe_machine()
     if command.commit is not None:
         machine |= {"commit": command.commit, "commit_clean": None}
-    facts = {"command": " ".join([PROGRAM, *arguments]), "machine": machine}
+    facts = {"command": pages.typed_command(), "machine": machine}
     print(f"{machine['device']} × {available}: compiling {len(found)} programs ...", flush=True)
     start = init_carry(command.settings, jax.random.key(0))
     programs = compiled_cases(found, start)

@@ -15,8 +15,7 @@ from pathlib import Path
 
 import tyro
 
-from experiments.pages import table
-from openjax.commands.machine import describe_machine
+from experiments.pages import facts, table
 from openjax.show.metrics import METRICS_FILE, read_metrics
 from openjax.store.settings_files import write_json
 
@@ -76,13 +75,12 @@ def start_once(command: StartupCommand, scratch: Path, name: str) -> dict:
 
 def main(command: StartupCommand) -> dict:
     """All starts; returns what is written."""
-    results: dict = {"command": "python -m experiments.startup " + " ".join(sys.argv[1:])}
+    results: dict = facts()
     with tempfile.TemporaryDirectory() as folder:
         names = ["cold", *(f"warm {i + 1}" for i in range(command.repeats))]
         results["starts"] = [start_once(command, Path(folder), name.replace(" ", "_")) for name in names]
         cache = [path.stat().st_size for path in Path(folder, "cache").rglob("*") if path.is_file()]
         results["cache_megabytes"] = round(sum(cache) / 2**20, 1)
-    results["machine"] = describe_machine()
     write_json(command.out.with_suffix(".json"), results)
     command.out.with_suffix(".md").write_text(page(results, command))
     return results

@@ -9,7 +9,6 @@ experiments/results/vehicles.json and .md (`--out`: others).
 
 import dataclasses
 import functools
-import time
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +18,6 @@ from experiments.hard_tasks import close, drawn, row
 from experiments.pages import page_parser, publish, table, where
 from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import layout_slots, repeat_task
-from openjax.commands.machine import describe_machine
 from openjax.commands.validation import uniform_tasks
 from openjax.learning import make_evaluate, summarise
 from openjax.pursuit import SCENARIOS, Pursuit, RewardSettings, scenario_task
@@ -137,17 +135,11 @@ def cells(summary: dict) -> list[str]:
 
 def study(options) -> dict:
     """Fly the policies."""
-    started = time.monotonic()
     policies = {
         name: fly(name, options.number, options.layouts, options.physics, options.vehicles)
         for name in options.policy
     }
-    chosen = f" --vehicles {' '.join(options.vehicles)}" if options.vehicles else ""
     return {
-        "command": f"python -m experiments.vehicles --policy {' '.join(options.policy)} --number {options.number} "
-        f"--layouts {options.layouts} --physics {options.physics}{chosen}",
-        "machine": describe_machine(),
-        "seconds": time.monotonic() - started,
         "number": options.number,
         "layouts": options.layouts,
         "policies": policies,

@@ -15,7 +15,6 @@ from experiments.pages import page_parser, publish, table, where
 from openjax.baselines.surroundings import Craft
 from openjax.baselines.velocity_controller import Gains, velocity_action
 from openjax.commands.command_line import run_command
-from openjax.commands.machine import describe_machine
 from openjax.pursuit import Pursuit, PursuitSettings, Task
 
 VELOCITY, ATTITUDE, TILT = (6.0, 8.0, 10.0, 12.0, 15.0), (15.0, 20.0, 25.0, 30.0), (0.7, 1.0, 1.2)
@@ -73,9 +72,6 @@ def study(options: argparse.Namespace) -> dict:
             }
         )
     return {
-        "command": "python -m experiments.velocity_gains",
-        "commit": options.commit,
-        "machine": describe_machine(),
         "rows": rows,
     }
 
@@ -126,7 +122,6 @@ DIGITS = {"turned": 2, "beyond": 3, "drift": 3, "fastest": 2, "height": 3}
 def main(arguments: list[str]) -> int:
     """Measure or read it, write both files, print the page."""
     parser = page_parser(__doc__, "velocity_gains")
-    parser.add_argument("--commit", default="", help="where the machine has no repository")
     publish(parser.parse_args(arguments), study, report)
     return 0
 

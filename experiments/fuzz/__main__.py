@@ -16,7 +16,6 @@ A part whose number is 0 is left out; what an earlier call found of it stays in 
 import dataclasses
 import json
 import os
-import sys
 import tempfile
 import time
 from collections import Counter
@@ -30,8 +29,8 @@ from experiments.fuzz.cases import plan, try_cases
 from experiments.fuzz.damages import make_checkpoints, try_damages
 from experiments.fuzz.kills import instants, try_kill, undisturbed
 from experiments.fuzz.report import page
+from experiments.pages import facts
 from openjax.commands.command_line import quiet_libraries
-from openjax.commands.machine import describe_machine
 from openjax.files import read_json
 from openjax.store.settings_files import write_json
 
@@ -63,10 +62,7 @@ class Results:
         if out.with_suffix(".json").exists():
             self.parts = read_json(out.with_suffix(".json"))
         self.started = time.monotonic()
-        self.facts = {
-            "command": "python -m experiments.fuzz " + " ".join(sys.argv[1:]),
-            "machine": describe_machine(),
-        }
+        self.facts = facts()
 
     def put(self, part: str, found: dict) -> None:
         """What this call found of a part, in place of what an earlier one did."""

@@ -1,6 +1,9 @@
-"""`python -m experiments.worlds`: see `experiments.worlds.study`. Workers can't import what stands in a `__main__`."""
+"""`python -m experiments.worlds`: see `experiments.worlds.study`."""
 
-from experiments.worlds.study import main
+from experiments.single_thread import use_single_thread
 
 if __name__ == "__main__":
+    use_single_thread()  # before JAX is imported
+    from experiments.worlds.study import main
+
     main()

@@ -15,24 +15,19 @@ import multiprocessing
 import os
 import time
 
-from experiments.single_thread import use_single_thread
+import jax
+import numpy as np
 
-use_single_thread()
-
-import jax  # noqa: E402
-import numpy as np  # noqa: E402
-
-from experiments.exam import effects  # noqa: E402
-from experiments.pages import page_parser, publish, table, where  # noqa: E402
-from experiments.task_gap.flights import SIZES  # noqa: E402
-from experiments.worlds.game import play  # noqa: E402
-from experiments.worlds.plant import PlantWorld, rng_of  # noqa: E402
-from experiments.worlds.rotorpy import RotorPyWorld  # noqa: E402
-from experiments.worlds.simulator import SimulatorWorld  # noqa: E402
-from openjax.commands.evaluator import layout_slots  # noqa: E402
-from openjax.commands.machine import describe_machine  # noqa: E402
-from openjax.pursuit import SCENARIOS, scenario_task  # noqa: E402
-from openjax.store.policies import load_policy  # noqa: E402
+from experiments.exam import effects
+from experiments.pages import page_parser, publish, table, where
+from experiments.task_gap.flights import SIZES
+from experiments.worlds.game import play
+from experiments.worlds.plant import PlantWorld, rng_of
+from experiments.worlds.rotorpy import RotorPyWorld
+from experiments.worlds.simulator import SimulatorWorld
+from openjax.commands.evaluator import layout_slots
+from openjax.pursuit import SCENARIOS, scenario_task
+from openjax.store.policies import load_policy
 
 VEHICLE = {
     "motor_lag": {"extra_up": 0.04, "extra_down": 0.04},
@@ -169,10 +164,6 @@ def study(options: argparse.Namespace) -> dict:
         for policy, worlds in found.items()
     }
     return {
-        "command": f"python -m experiments.worlds --policy {' '.join(options.policy)} --world {' '.join(options.world)} "
-        f"--episodes {options.episodes}",
-        "machine": describe_machine(),
-        "seconds": time.monotonic() - started,
         "records": records,
     }
 
