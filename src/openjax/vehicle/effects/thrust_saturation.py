@@ -15,13 +15,19 @@ def motor(parameters, motor_command, context):
     return jnp.minimum(motor_command, limit)
 
 
+def tops_out(value, deviation):
+    """Whether the limit is one that full commands reach; above 1 it is a thrust curve's form."""
+    del deviation
+    return value["limit"] < 1.0
+
+
 EFFECT = Effect(
     name="thrust_saturation",
     description="no rotor gives more than a share of the nominal largest thrust",
     parameters={
         "limit": Parameter(
             unit="1",
-            none=1.0,
+            none=1.5,  # out of reach: what a curve or a full battery gives beyond the nominal largest thrust stays
             prior=(0.6, 0.95),
             source="brushed motors on a worn battery top out 10-30 % early",
             meaning="largest thrust as a share of the nominal one, at 3.9 V",
@@ -43,6 +49,7 @@ EFFECT = Effect(
         ),
         others=((0.95, 0.0), (0.92, 0.0), (0.89, 0.0), (0.865, 0.0), (0.84, 0.0), (0.76, 0.0), (0.7, 0.0)),
         thrust_map=True,
+        is_itself=tops_out,
         sample={"limit": 0.82},
         next_flight="short full-thrust climbs.",
     ),
