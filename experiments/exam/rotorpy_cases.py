@@ -124,7 +124,7 @@ KINDS = {
     "com_offset": (_offset, ["com_offset"], "torque", ()),
     "translational_lift": (_lift, ["unknown"], "outside", LAPS),
     "wind_tunnel": (_tunnel, ["unknown"], "outside", LAPS),
-    "drag_and_lag": (_drag_and_lag, ["rotor_drag", "motor_lag"], "rotor_speed", LAPS + TURNS),
+    "drag_and_lag": (_drag_and_lag, ["rotor_drag", "motor_lag"], ("rotor_speed", "slower"), LAPS + TURNS),
 }
 
 
@@ -290,13 +290,26 @@ def make_case(job):
     for letter, flight in zip("abc", flights, strict=True):
         fleet.write_flight(place / f"flight_{letter}.csv.gz", flight, drawn["channels"])
     (place / "vehicle.toml").write_text(v.toml(told, "RotorPy 3", drawn["pose_rate"]))
-    return _answer(place.name, kind, told, drawn, names, joined, flights, effects, form, said)
+    fine = ["wind", "rotor_drag"] if kind == "wind_tunnel" else []
+    return answer(
+        place.name, kind, told, drawn, names, joined, flights, effects, form, said, "SE3Control", fine
+    )
 
 
-def _answer(name, kind, told, drawn, names, joined, flights, effects, form, said):
+def answer(
+    name, kind, told, drawn, names, joined, flights, effects, form, said, controller, fine, gusts=0.0, off=()
+):
+    """The answer of one case that was flown in RotorPy. `form`, `said`: of each effect where there are several; `fine`: names
+    that are no mistake; `gusts` (12,): mean squares that the air adds to the channels of `measure`, part of the
+    floor; `off` (5,): by how much motor time (a third of it), yaw torque and moments are off untold."""
     many, none = [told] * 3, np.zeros(3, bool)
     p = v.nominal_parameters(many)
     p["rotor_gain"] *= 1 + drawn["thrust_offset"]
+    if len(off):
+        for name in ("tau_up", "tau_down"):
+            p[name] *= 1 + 3 * off[0]
+        p["torque_ratio"] *= 1 + off[1]
+        p["inertia"] *= 1 + np.diag(off[2:])[..., None]
     seen = (measure.errors(joined, many, p, np.arange(3), none, none) ** 2).mean(axis=1)
     floor = [measure.sensor_floor(drawn, f[0], joined, j) for j, f in enumerate(flights)]
     rows, samples = [f[0] for f in flights], len(joined["motor"])
@@ -308,15 +321,16 @@ def _answer(name, kind, told, drawn, names, joined, flights, effects, form, said
         ).mean(axis=1)
         for m in logged
     ]
-    floor = np.sqrt((np.array(floor) ** 2).mean(axis=0) + np.maximum(np.min(hidden, axis=0) - seen, 0.0))
+    sensed = (np.array(floor) ** 2).mean(axis=0)
+    floor = np.sqrt(sensed + gusts + np.maximum(np.min(hidden, axis=0) - seen, 0.0))
     known = np.isfinite(floor)
-    energy = np.where(known, seen / floor**2, 0.0)
+    energy = np.where(known, np.maximum(seen - gusts, 0.0) / floor**2, 0.0)
     severity, before = float(np.sqrt(energy.max())), float(np.sqrt(1 + energy[known].mean()))
     truth = [e if e != "unknown" else kind for e in effects]
     category = {0: "none", 1: "unknown" if effects == ["unknown"] else "single", 2: "pair"}[len(effects)]
     if effects and severity < HIDDEN:
         category = "not_testable"
-    forms = [form, "slower"][: len(effects)]
+    forms = [form] if isinstance(form, str) else list(form)
     each = said if isinstance(said, list) else [said]
     gone = before if category == "none" else 1.0
     return {
@@ -325,11 +339,7 @@ def _answer(name, kind, told, drawn, names, joined, flights, effects, form, said
         "effects": truth,
         "expected": ["none"] if category in ("none", "not_testable") else effects,
         "acceptable": {e: accepted(e, told.weighed) for e in effects if e != "unknown"},
-        "also_fine": truth
-        if category == "not_testable"
-        else ["wind", "rotor_drag"]
-        if kind == "wind_tunnel"
-        else [],
+        "also_fine": truth if category == "not_testable" else fine,
         "causes": [
             {"effect": e, "form": f, "size": _size(e, m), "magnitudes": m}
             for e, f, m in zip(truth, forms, each, strict=False)
@@ -340,7 +350,7 @@ def _answer(name, kind, told, drawn, names, joined, flights, effects, form, said
         "gap": {"before": before, "floor": gone, "closed_by_truth": 1 - gone / before},
         "mass_weighed": told.weighed,
         "told": told.__dict__,
-        "controller": "SE3Control",
+        "controller": controller,
         "sensors": drawn,
         "missions": [[n] for n in names],
         "rotorpy": kind,
