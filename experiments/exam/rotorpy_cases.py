@@ -306,8 +306,8 @@ def answer(
     p = v.nominal_parameters(many)
     p["rotor_gain"] *= 1 + drawn["thrust_offset"]
     if len(off):
-        for name in ("tau_up", "tau_down"):
-            p[name] *= 1 + 3 * off[0]
+        for time in ("tau_up", "tau_down"):
+            p[time] *= 1 + 3 * off[0]
         p["torque_ratio"] *= 1 + off[1]
         p["inertia"] *= 1 + np.diag(off[2:])[..., None]
     seen = (measure.errors(joined, many, p, np.arange(3), none, none) ** 2).mean(axis=1)
