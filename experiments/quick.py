@@ -18,7 +18,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from experiments.pages import RESULTS, publish, table, where
+from experiments.pages import page_parser, publish, table, where
 from openjax.commands.validation import uniform_tasks
 from openjax.files import read_json
 from openjax.learning.settings import PRESETS
@@ -145,18 +145,13 @@ def _three(record, time_step):
 
 def main() -> None:
     """The command."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = page_parser(__doc__, "quick_runs")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument(
         "--at_once", type=int, default=1, help="runs side by side, each on two cores of its own"
     )
     parser.add_argument("--options", default="", help="more options of openjax.train")
     parser.add_argument("--runs", type=Path, default=Path("runs/quick"), help="folder of the runs")
-    parser.add_argument("--commit", help="of these sources, where git doesn't tell")
-    parser.add_argument("--report", action="store_true", help="from the stored results")
-    parser.add_argument("--out", type=Path, default=RESULTS / "quick_runs")
     publish(parser.parse_args(), study, report)
 
 
