@@ -10,7 +10,7 @@ train: $(READY)
 	$(BIN)/python -m openjax.train --out runs/train --overwrite $(ARGS)
 
 test: $(READY)
-	$(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 lint: $(READY)
 	$(BIN)/ruff check src tests experiments

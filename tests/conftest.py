@@ -19,6 +19,19 @@ os.environ.setdefault(
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
 
+LONGEST = """
+    gap/test_diagnosis cluster/test_distributed test_commands learning/test_training_step test_examples test_readme
+    experiments/test_exam vehicle/test_effects vehicle/test_flight_dynamics experiments/test_scaling test_adapt
+    commands/test_validation experiments/test_fuzz
+""".split()
+"""The files that take longest: they come first, so that no worker is left with one of them when all else is done."""
+
+
+def pytest_collection_modifyitems(items):
+    place = {f"tests/{name}.py": i for i, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.location[0], len(place)))
+
+
 VEHICLE_TOML = """
 [vehicle]
 name = "crazyflie-2.1"
