@@ -408,7 +408,8 @@ def make_case(job):
     untold |= dict(zip(("Ixx", "Iyy", "Izz"), np.array(told.inertia) * off[2:], strict=True))
     names = [str(rng.choice(exposing))] if exposing else []
     names += [
-        str(n) for n in rng.choice(("circle", "eight", "rocking", "yawing"), 3 - len(names), replace=False)
+        str(n)
+        for n in rng.choice(("circle", "eight", "rocking", "yawing", "hover"), 3 - len(names), replace=False)
     ]
     seconds = SHORT if drawn["rate"] >= 500 else SECONDS
     flights, flown = [], []
