@@ -16,6 +16,7 @@ SHORTEST = 2.0  # s airborne: windows of 0.5 s, and a few of them
 SLOWEST = 0.05  # s between rows
 FROZEN = 0.5  # s without a change of a sensor that has noise
 HELD = 0.1  # share of rows that repeat the one before, from which a sensor is slower than the rows
+RATE_NOISE = 0.04  # rad/s of body rates that are derived: what gyroscopes of such vehicles have at most
 GROUND_CLEARANCE = 0.02  # m above the floor
 SENSORS = ("position", "quaternion", "velocity", "body_rates", "specific_force")
 
@@ -309,9 +310,11 @@ def _derive_rates(flight: Flight, note) -> Flight:
     if flight.body_rates is not None or flight.quaternion is None:
         return flight
     time, attitude = flight.sampled("quaternion")
-    half = max(2, round(0.025 / max(float(np.median(np.diff(time))), 1e-4)))
+    step = max(float(np.median(np.diff(time))), 1e-4)
+    half = max(2, round(0.025 / step))
     if len(time) < 2 * half + 1:
         return flight
+    half = min(half, _enough(attitude, step))
     slope, reach = _slopes(time, attitude, half)
     w, x, y, z = attitude.T
     dw, dx, dy, dz = slope.T
@@ -325,6 +328,19 @@ def _derive_rates(flight: Flight, note) -> Flight:
     derived[np.isfinite(flight.quaternion).all(1)] = rates
     note("columns", "no gyroscope was logged: body rates are derived from the attitude")
     return dataclasses.replace(flight, body_rates=derived, body_rates_derived=True)
+
+
+def _enough(attitude: np.ndarray, step: float) -> int:
+    """Rows to either side over which the slope of attitudes (R, 4) is no noisier than RATE_NOISE: a wide fit takes the
+    edge off every turn, and an estimator's attitude, which is smooth, doesn't need it."""
+    # Third differences hold little motion; of white noise s they are sqrt(20) s, and their median size .6745 of that.
+    noise = float(np.median(np.abs(np.diff(attitude, 3, axis=0)))) / (0.6745 * np.sqrt(20.0))
+    half = 1
+    while half < len(attitude) // 2 and 2.0 * noise / step > RATE_NOISE * np.sqrt(
+        half * (half + 1) * (2 * half + 1) / 3.0
+    ):
+        half += 1
+    return half
 
 
 def _airborne(flight: Flight, floor_z: float | None, note, every: bool = False) -> Flight:
