@@ -71,8 +71,9 @@ def test_what_pitches_the_body_like_drag_is_drag():
 
 
 def test_a_curve_that_hardly_bends_is_a_scale():
-    assert not seems("thrust_curve", offset=0.0, slope=0.95, curvature=0.005, cubic=0.0)
-    assert seems("thrust_curve", offset=0.0, slope=0.9, curvature=0.15, cubic=0.0)
+    assert not seems("thrust_curve", offset=0.0, slope=0.95, curvature=0.005)
+    assert seems("thrust_curve", offset=0.0, slope=0.9, curvature=0.15)
+    assert not seems("thrust_curve", offset=0.5, slope=0.2, curvature=0.0)  # hardly the motors' doing
 
 
 def test_above_the_ceiling_there_is_none():

@@ -131,8 +131,6 @@ def test_saturation_is_one_sided_and_the_curve_is_not(vehicle):
     np.testing.assert_allclose(EFFECTS["thrust_saturation"].motor(sagging, command, low)[3], 0.56, rtol=1e-5)
     bent = EFFECTS["thrust_curve"].motor(given("thrust_curve", offset=0.01, curvature=0.1), command, context)
     np.testing.assert_allclose(bent, 0.01 + command + 0.1 * command**2, rtol=1e-6)
-    cubic = EFFECTS["thrust_curve"].motor(given("thrust_curve", cubic=0.1), command, context)
-    np.testing.assert_allclose(cubic, command + 0.1 * (command - 0.65) ** 3, rtol=1e-6)
     # Absent, it leaves what a curve, or a battery fuller than its reference, gives beyond the nominal largest thrust.
     absent = EFFECTS["thrust_saturation"].motor(given("thrust_saturation"), 1.2 * command, low)
     np.testing.assert_allclose(absent, 1.2 * command, rtol=1e-6)
