@@ -71,6 +71,7 @@ def _damages(part):
 def _kills(part):
     tries = part["tries"]
     good = sum(kill["outcome"] == "the same bits" for kill in tries)
+    late = sum(kill["went_on_by"] == "had ended" for kill in tries)
     rows = [
         [str(kill["seconds"]), kill["moment"], str(kill["checkpoints"]), kill["went_on_by"], kill["outcome"]]
         for kill in tries
@@ -79,7 +80,8 @@ def _kills(part):
         "## Kills",
         "",
         f"A run of {part['whole_run']} s was killed (SIGKILL) at {len(tries)} instants, then gone on with. "
-        f"{good} of {len(tries)} ended with the last training state and the policy of the run that nobody killed, bit for bit.",
+        f"{good} of {len(tries)} ended with the last training state and the policy of the run that nobody killed, bit for bit."
+        + (f" {late} had ended by then: runs beside others' took less than the one alone." if late else ""),
         "",
         *table(["killed after, s", "while", "checkpoints then", "went on by", "result"], rows),
     ]
