@@ -209,7 +209,9 @@ def _sampled(reading: Reading, slow: bool, derived: bool) -> Reading:
     if known and at_once:
         # The log doesn't say which; the motion does.
         own = Library(("inertia",))
-        mean, single = (_physics(dataclasses.replace(reading, at_once=m), own) for m in (False, True))
+        mean, single = (
+            _physics(dataclasses.replace(reading, at_once=m), own, hide=False) for m in (False, True)
+        )
         at_once, sure = _looks_sampled(reading.vehicles, mean, single)
     reading = dataclasses.replace(reading, at_once=at_once)
     blind = (reading.at_once and not known) or not sure or drifts or derived
@@ -254,8 +256,11 @@ def _hidden(card, tracks, blind: bool, gusts: np.ndarray) -> bool:
     return bool(axes) and bool(blind or gusts[axes].mean() > MOST_GUSTS)
 
 
-def _physics(reading: Reading, library: Library, pushes=None, gains=None, before=None) -> Look:
-    """Look at the physics. `pushes`, `gains`: what an earlier look found; `before`: its sets, to start from."""
+def _physics(
+    reading: Reading, library: Library, pushes=None, gains=None, before=None, hide: bool = True
+) -> Look:
+    """Look at the physics. `pushes`, `gains`: what an earlier look found; `before`: its sets, to start from; `hide`: leave
+    out what can't be told from these logs."""
     tracks, vehicles, arrived, at_once = reading.tracks, reading.vehicles, reading.arrived, reading.at_once
     rate_loop, read, ticks = None, None, [np.repeat(t.motor[:, None], TICKS, 1) for t in tracks]
     links = arrived if arrived is not None else [None] * len(tracks)
@@ -281,6 +286,6 @@ def _physics(reading: Reading, library: Library, pushes=None, gains=None, before
         }
     )
     for effect in library.physics:
-        if _hidden(CARDS[effect], tracks, reading.blind, gusts):
+        if hide and _hidden(CARDS[effect], tracks, reading.blind, gusts):
             exposure[effect] = 0.0
     return Look(replay, weigh_singles(replay, library, exposure, before), exposure, floor, rate_loop, read)
