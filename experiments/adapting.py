@@ -26,6 +26,8 @@ from experiments.task_gap.flights import make_cases
 from experiments.task_gap.game import draw_tasks
 from experiments.worlds.game import play
 from experiments.worlds.plant import PlantWorld
+from openjax.adapt import scores_on
+from openjax.commands.validation import uniform_tasks
 from openjax.files import read_json
 from openjax.learning.adaptation import (
     AdaptSettings,
@@ -56,6 +58,8 @@ def tune(options) -> None:
     training = AdaptSettings(updates=options.updates)
     adaptation = make_adaptation(adapting_settings(loaded.settings, training))
     parameters = loaded.parameters.replace(critic={})
+    environment = adaptation.settings.environment
+    tasks = uniform_tasks(environment, options.look_at, environment.max_pillars)
     for number, name in enumerate(found_cases(options)):
         if time.monotonic() - started > options.seconds:
             print("time is up before", name)
@@ -64,16 +68,21 @@ def tune(options) -> None:
         file = options.cases / f"{name}.toml"
         effects, values = load_effects(file)
         bounds = bounds_of(values, load_intervals(file))
-        tuned, history = fine_tune(adaptation, parameters, bounds, training.warm_up, jax.random.key(number))
-        notes = {"effects": list(effects), "seconds": time.monotonic() - begin}
+        key = jax.random.key(number)
+        score = scores_on(adaptation, tasks, key, bounds)
+        tuned = fine_tune(adaptation, parameters, bounds, training, key, score)
+        notes = {"effects": list(effects), "seconds": time.monotonic() - begin, "update": tuned.update}
         # the game without its family: flown elsewhere, it isn't needed, and all policies share one program
         settings = dataclasses.replace(
             adaptation.settings,
-            environment=dataclasses.replace(adaptation.settings.environment, vehicles=()),
+            environment=dataclasses.replace(environment, vehicles=()),
         )
-        save_policy_file(options.work / f"{name}.npz", tuned.replace(critic={}), settings, notes, "float32")
-        said = {key: round(history[-1][key], 4) for key in ("capture_rate", "crash_rate", "collision_rate")}
-        print(f"{name}: {', '.join(effects) or 'none'}; {notes['seconds']:.0f} s {said}", flush=True)
+        save_policy_file(options.work / f"{name}.npz", tuned.parameters, settings, notes, "float32")
+        looks = {update: round(value, 4) for update, value in tuned.looks.items()}
+        print(
+            f"{name}: {', '.join(effects) or 'none'}; {notes['seconds']:.0f} s, kept {tuned.update} of {looks}",
+            flush=True,
+        )
 
 
 @functools.cache
@@ -227,6 +236,7 @@ def main() -> None:
     parser.add_argument("--work", type=Path, help="where the adapted policies are")
     parser.add_argument("--policy", default="flight")
     parser.add_argument("--updates", type=int, default=AdaptSettings.updates)
+    parser.add_argument("--look_at", type=int, default=1024, help="episodes by which the best step is chosen")
     parser.add_argument("--limit", type=int, default=0, help="vehicles at most; 0: all")
     parser.add_argument("--seconds", type=float, default=1e9, help="begin nothing new after this long")
     parser.add_argument("--episodes", type=int, default=100)

@@ -1,17 +1,27 @@
 """From flights to a fine-tuned policy, at a tiny size: what is drawn, what is written, what is refused."""
 
+import dataclasses
 import json
+from types import SimpleNamespace
+from typing import Any
 
 import jax
 import numpy as np
 import pytest
+from flax import struct
 
 from openjax import adapt
 from openjax.errors import UserError
 from openjax.learning import TrainSettings, build
-from openjax.learning.adaptation import AdaptSettings, adapting_settings, bounds_of
+from openjax.learning.adaptation import (
+    AdaptSettings,
+    adapting_settings,
+    bounds_of,
+    clearly_better,
+    fine_tune,
+)
 from openjax.learning.settings import GeneratorSettings, MappoSettings
-from openjax.policy import NetworkSettings, PredictorSettings
+from openjax.policy import NetworkSettings, PolicyParameters, PredictorSettings
 from openjax.pursuit import PursuitSettings
 from openjax.store.policies import load_policy
 from openjax.store.policy_files import save_policy_file
@@ -30,6 +40,28 @@ TINY = TrainSettings(
     num_envs=8,
     rollout_length=4,
 )
+
+
+@struct.dataclass
+class Network:
+    parameters: Any
+    optimiser: Any = ()
+
+
+class Counting:
+    """A carry whose networks are numbers."""
+
+    def __init__(self, actor, predictor):
+        self.actor, self.predictor = Network(actor), Network(predictor)
+        self.policy = PolicyParameters(actor=actor, critic={}, predictor=predictor)
+
+    def with_policy(self, policy):
+        return Counting(policy.actor, policy.predictor)
+
+    def replace(self, actor, predictor):
+        return Counting(actor.parameters, predictor.parameters)
+
+
 VALUES = {"motor_lag": {"extra_up": 0.04, "extra_down": 0.03}}
 INTERVALS = {"motor_lag": {"extra_up": (0.035, 0.045)}}
 
@@ -56,6 +88,35 @@ def test_vehicles_are_drawn_from_the_intervals_and_a_share_of_all_else():
 def test_settings_for_fine_tuning_fit_together():
     settings = adapting_settings(TINY, AdaptSettings(num_envs=30, updates=3, warm_up=2))
     assert settings.num_envs == 28 and settings.total_updates == 5 and settings.mappo.penalty_start == 1.0
+    strict = dataclasses.replace(
+        TINY, generator=dataclasses.replace(TINY.generator, collision_tolerance=0.002)
+    )
+    assert adapting_settings(strict, AdaptSettings()).generator.collision_tolerance == 1.0
+
+
+def test_only_what_is_clearly_better_is_kept():
+    rng = np.random.default_rng(0)
+    before = rng.normal(0.9, 0.3, 1000)  # episodes differ far more than policies do
+    assert clearly_better(before, before + rng.normal(0.02, 0.1, 1000))
+    assert not clearly_better(before, before + rng.normal(0.0, 0.1, 1000))
+    assert not clearly_better(before, before - 0.02)
+    assert not clearly_better(before, before)
+
+
+def test_the_best_step_on_the_way_is_kept():
+    """A stand-in for training whose policy is its own step, and which is worth most after the third."""
+    policy = PolicyParameters(actor=np.zeros(1), critic={}, predictor=np.zeros(1))
+    training = AdaptSettings(updates=6, warm_up=1, look_every=1)
+    adaptation = SimpleNamespace(
+        settings=SimpleNamespace(total_updates=7),
+        start=lambda key, bounds: Counting(policy.actor, policy.predictor),
+        step=lambda carry, bounds: (Counting(carry.actor.parameters + 1.0, carry.predictor.parameters), {}),
+    )
+    worth = lambda parameters: np.full(4, -((float(parameters.actor[0]) - 3.0) ** 2))  # noqa: E731
+    tuned = fine_tune(adaptation, policy, np.zeros((1, 4)), training, None, worth)
+    assert tuned.update == 4 and tuned.parameters.actor[0] == 3.0 and len(tuned.looks) == 7
+    worse = fine_tune(adaptation, policy, np.zeros((1, 4)), training, None, lambda p: -p.actor[:1])
+    assert worse.update == 0 and worse.parameters.actor[0] == 0.0
 
 
 def test_a_policy_is_fine_tuned_measured_and_written(policy_file, tmp_path, monkeypatch):
@@ -77,7 +138,8 @@ def test_a_policy_is_fine_tuned_measured_and_written(policy_file, tmp_path, monk
     changed = not np.allclose(
         *(jax.tree.leaves(loaded.parameters.actor)[0] for loaded in (before, after)), atol=1e-5
     )
-    assert changed == (results["kept"] == "fine-tuned")
+    assert changed == results["kept"].startswith("fine-tuned")
+    assert len(results["looks"]) == 2  # before and after its one step
     with pytest.raises(UserError, match="already exists"):
         adapt.main([str(effects), "--policy", str(policy_file), "--out", str(command.out)])
 

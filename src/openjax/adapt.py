@@ -71,7 +71,7 @@ def adapt(command: AdaptCommand) -> dict:
         import jax
 
         from openjax.commands.machine import describe_machine
-        from openjax.commands.validation import selection_score, uniform_tasks
+        from openjax.commands.validation import uniform_tasks
         from openjax.learning import summarise
         from openjax.learning.adaptation import adapting_settings, bounds_of, fine_tune, make_adaptation
         from openjax.store.policies import load_policy
@@ -97,17 +97,13 @@ def adapt(command: AdaptCommand) -> dict:
         bounds = bounds_of(values, intervals)
         ready()
         seconds["compiled"] = time.monotonic() - started
-        tuned, history = fine_tune(adaptation, parameters, bounds, command.training.warm_up, key)
-        tuned = tuned.replace(critic={})
+        score = scores_on(adaptation, chosen_by, jax.random.fold_in(key, 1), bounds)
+        tuned = fine_tune(adaptation, parameters, bounds, command.training, key, score)
         seconds["fine-tuned"] = time.monotonic() - started
-
-        def figures(parameters, tasks, number):
-            return summarise(adaptation.evaluate(parameters, tasks, jax.random.fold_in(key, number), bounds))
-
-        length = settings.environment.episode_length
-        scores = [selection_score(figures(p, chosen_by, 1), length) for p in (parameters, tuned)]
-        better = scores[1] >= scores[0]
-        before, after = (figures(p, measured_on, 2) for p in (parameters, tuned))
+        before, after = (
+            summarise(adaptation.evaluate(p, measured_on, jax.random.fold_in(key, 2), bounds))
+            for p in (parameters, tuned.parameters)
+        )
         seconds["measured"] = time.monotonic() - started
     finally:
         diagnosis.stop()
@@ -126,8 +122,11 @@ def adapt(command: AdaptCommand) -> dict:
         "episodes": command.episodes,
         "before": {name: before[name] for name in FIGURES},
         "after": {name: after[name] for name in FIGURES},
-        "kept": "fine-tuned" if better else "the policy as it was",
-        "history": [{name: row[name] for name in FIGURES} for row in history],
+        "kept": f"fine-tuned, as it was after step {tuned.update}"
+        if tuned.update
+        else "the policy as it was",
+        "history": [{name: row[name] for name in FIGURES} for row in tuned.history],
+        "looks": tuned.looks,
         "warm_up": command.training.warm_up,
         "seconds": seconds,
     }
@@ -135,12 +134,32 @@ def adapt(command: AdaptCommand) -> dict:
         settings, environment=dataclasses.replace(settings.environment, vehicles=family)
     )
     command.out.mkdir(parents=True, exist_ok=True)
-    kept = tuned if better else parameters
     notes = {"adapted_from": command.policy, "effects": values, "machine": results["machine"]}
-    save_policy_file(command.out / "policy.npz", kept, own, notes, storage="float32")
+    save_policy_file(command.out / "policy.npz", tuned.parameters, own, notes, storage="float32")
     write_json(command.out / "adapt.json", results)
     (command.out / "adapt.html").write_text(page(results), encoding="utf-8")
     return results
+
+
+def scores_on(adaptation, tasks, key, bounds):
+    """Scores (B,) of a policy's episodes on tasks (B, ...), parameters -> scores, by which checkpoints are chosen, too."""
+    import numpy as np
+
+    from openjax.commands.validation import selection_score
+
+    def scores(parameters):
+        of = adaptation.evaluate(parameters, tasks, key, bounds).statistics
+        episodes = {
+            "capture_rate": of.captured,
+            "collision_rate": of.collision_rate,
+            "crash_rate": of.crashed,
+            "over_speed_rate": of.over_speed_rate,
+            "capture_step": of.capture_step,
+        }
+        episodes = {name: np.asarray(value, float) for name, value in episodes.items()}
+        return selection_score(episodes, adaptation.settings.environment.episode_length)
+
+    return scores
 
 
 class _Diagnosis:
@@ -177,7 +196,7 @@ class _Diagnosis:
 
 
 def _compile(adaptation, parameters, tasks, bounds):
-    """Start to compile the training step and the evaluation; a function that waits for both."""
+    """Start to compile the start, the training step and the evaluation; a function that waits for all."""
     import jax
 
     from openjax.cluster.compilation import compile_ahead
@@ -186,6 +205,7 @@ def _compile(adaptation, parameters, tasks, bounds):
     carry = jax.eval_shape(adaptation.start, key, bounds)
     waits = [
         compile_ahead(adaptation.step, carry, bounds),
+        compile_ahead(adaptation.start, key, bounds),
         compile_ahead(adaptation.evaluate, parameters, tasks, key, bounds),
     ]
     return lambda: [wait() for wait in waits]

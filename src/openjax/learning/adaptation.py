@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from openjax.learning.evaluation import Evaluation, make_evaluate
 from openjax.learning.settings import TrainSettings
@@ -24,10 +25,12 @@ class AdaptSettings:
 
     num_envs: Annotated[int | None, Interval("[1, 16777216]")] = None
     """Worlds; by default 5,120 on an accelerator, 160 on a CPU, which is enough to see it work."""
-    updates: Annotated[int, Interval("[1, 1000000]")] = 60
+    updates: Annotated[int, Interval("[1, 1000000]")] = 40
     """Training steps of the policy, after ..."""
     warm_up: Annotated[int, Interval("[0, 1000000]")] = 20
     """... those in which only the critic learns: shipped policies come without one, and a wrong one spoils the policy."""
+    look_every: Annotated[int, Interval("[1, 1000000]")] = 8
+    """Steps of the policy between looks at what it has become; the best of all looks is kept."""
     learning_rate: Annotated[float, Interval("(0, 1]")] = 3e-4
     """Adam step size at the start."""
     clip_epsilon: Annotated[float, Interval("(0, 10]")] = 0.1
@@ -56,6 +59,9 @@ def adapting_settings(trained: TrainSettings, settings: AdaptSettings) -> TrainS
             actor_start=0.0,
             minibatches=minibatches,
         ),
+        # A good policy solves nearly all but starts that force a collision. If those counted as unsolved, they would fill the
+        # archive, and all that is left to learn from them is to keep away from everything
+        generator=dataclasses.replace(trained.generator, collision_tolerance=1.0),
         vehicles_start=0.0,
         vehicles_ramp=0.0,
         num_envs=num_envs,
@@ -89,7 +95,7 @@ def make_adaptation(settings: TrainSettings) -> Adaptation:
     return Adaptation(
         settings=settings,
         policy=policy,
-        start=lambda key, bounds: init_carry(settings, key, environment(bounds)),
+        start=jax.jit(lambda key, bounds: init_carry(settings, key, environment(bounds))),
         step=jax.jit(
             lambda carry, bounds: make_training_step(settings, environment(bounds))(carry), donate_argnums=0
         ),
@@ -101,36 +107,69 @@ def make_adaptation(settings: TrainSettings) -> Adaptation:
     )
 
 
+@dataclass(frozen=True)
+class Tuned:
+    """What fine-tuning led to."""
+
+    parameters: PolicyParameters
+    """The best of those looked at, the first ones among them; without a critic."""
+    update: int
+    """After which training step they were found; 0: they are the first ones."""
+    history: list[dict[str, float]]
+    """Metrics of each training step."""
+    looks: dict[int, float]
+    """{training step: mean score}."""
+
+
 def fine_tune(
     adaptation: Adaptation,
     parameters: PolicyParameters,
     bounds: jax.Array,
-    warm_up: int,
+    training: AdaptSettings,
     key: jax.Array,
-    tell: Callable[[int, dict[str, float]], Any] = lambda update, metrics: None,
-) -> tuple[PolicyParameters, list[dict[str, float]]]:
-    """Train `parameters` (critic left aside) on vehicles within `bounds` (R, 4).
+    score: Callable[[PolicyParameters], np.ndarray],
+    tell: Callable[[int, dict[str, jax.Array]], Any] = lambda update, metrics: None,
+) -> Tuned:
+    """Train `parameters` (critic left aside) on vehicles within `bounds` (R, 4), and keep the best on the way.
 
-    In the first `warm_up` steps actor and predictor are put back after each step. `tell` hears of every training step.
-    Returns the parameters after it and the metrics of each step.
+    In the first `training.warm_up` steps actor and predictor are put back after each step. `score` gives the scores of
+    episodes (B,), of the same tasks and vehicles each time; what isn't clearly better than the first parameters, by the
+    differences of single episodes, isn't kept. `tell` hears of every training step.
     """
     bounds = jnp.asarray(bounds)
     carry = adaptation.start(key, bounds)
     learnt = carry.policy.replace(actor=parameters.actor, predictor=parameters.predictor)
     carry, history = carry.with_policy(jax.tree.map(jnp.copy, learnt)), []
     fixed = jax.tree.map(jnp.copy, (carry.actor, learnt.predictor))
-    for update in range(adaptation.settings.total_updates):
+    first = np.asarray(score(parameters.replace(critic={})))
+    best, looks = (parameters.replace(critic={}), 0), {0: float(first.mean())}
+    for update in range(1, adaptation.settings.total_updates + 1):
         carry, metrics = adaptation.step(carry, bounds)
-        if update < warm_up:
+        if update <= training.warm_up:
             actor, predictor = jax.tree.map(jnp.copy, fixed)
             carry = carry.replace(
                 actor=actor.replace(optimiser=_at_step(actor.optimiser, carry.actor.optimiser)),
                 predictor=carry.predictor.replace(parameters=predictor),
             )
-        metrics = {name: float(value) for name, value in metrics.items()}
         history.append(metrics)
-        tell(update + 1, metrics)
-    return carry.policy, history
+        tell(update, metrics)
+        trained = update - training.warm_up
+        if trained > 0 and (
+            trained % training.look_every == 0 or update == adaptation.settings.total_updates
+        ):
+            now = jax.tree.map(jnp.copy, carry.policy.replace(critic={}))
+            scores = np.asarray(score(now))
+            looks[update] = float(scores.mean())
+            if looks[update] > looks[best[1]] and clearly_better(first, scores):
+                best = now, update
+    history = [{name: float(value) for name, value in row.items()} for row in jax.device_get(history)]
+    return Tuned(*best, history, looks)
+
+
+def clearly_better(before: np.ndarray, after: np.ndarray, errors: float = 2.0) -> bool:
+    """Whether the scores (B,) of the same episodes rose by more than so many standard errors of their differences."""
+    gain = np.asarray(after, float) - np.asarray(before, float)
+    return bool(gain.mean() > errors * gain.std() / np.sqrt(len(gain)))
 
 
 def _at_step(fresh, used):
