@@ -66,7 +66,12 @@ def program(settings, policy):
 
 
 def fly(
-    name: str, number: int, layouts: int, physics: str, chosen: list[str] | None = None
+    name: str,
+    number: int,
+    layouts: int,
+    physics: str,
+    chosen: list[str] | None = None,
+    attitude: str = "drawn",
 ) -> dict[str, dict[str, dict]]:
     """Summaries by vehicle (all kinds, or those `chosen`) and kind of task."""
     loaded = load_policy(name)
@@ -75,6 +80,7 @@ def fly(
         speed_limit="none",
         substeps=5,
         physics=physics,
+        start_attitude=attitude,
         vehicles=FLIGHT_FAMILY,
         rare_vehicles=0.5,
         max_pillars=layout_slots(loaded.settings.environment),
@@ -136,12 +142,13 @@ def cells(summary: dict) -> list[str]:
 def study(options) -> dict:
     """Fly the policies."""
     policies = {
-        name: fly(name, options.number, options.layouts, options.physics, options.vehicles)
+        name: fly(name, options.number, options.layouts, options.physics, options.vehicles, options.attitude)
         for name in options.policy
     }
     return {
         "number": options.number,
         "layouts": options.layouts,
+        "attitude": options.attitude,
         "policies": policies,
     }
 
@@ -158,7 +165,7 @@ def report(results: dict) -> list[str]:
         "# Policies on other vehicles",
         "",
         f"{where(results)} {results['seconds']:.0f} s. "
-        f"No clamp, rate loop at 500 Hz, drawn starts; {results['number']} held-back tasks of each "
+        f"No clamp, rate loop at 500 Hz, {results.get('attitude', 'drawn')} starts; {results['number']} held-back tasks of each "
         f"kind, {results['layouts']} episodes of each layout. Nominal: the nominal vehicle; table: motors 40 ms slower, "
         "commands 15 ms and poses 10 ms late, drag of .0125 N s/m; ordinary and family: the vehicles of the preset flight "
         "without and with the rare ones; a name: all vehicles out of the ordinary in that effect. "
@@ -178,6 +185,9 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--number", type=int, default=1024, help="tasks of each kind")
     parser.add_argument("--layouts", type=int, default=0, help="episodes of each layout; 0: none")
     parser.add_argument("--physics", default="rigid")
+    parser.add_argument(
+        "--attitude", choices=("drawn", "level"), default="drawn", help="how pursuers are tilted at the start"
+    )
     parser.add_argument(
         "--vehicles", nargs="+", choices=list(vehicles()), help="kinds of vehicles; default: all"
     )
