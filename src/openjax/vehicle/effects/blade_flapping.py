@@ -18,10 +18,11 @@ _LEVER = 0.003  # N m: one centimetre of a weight of 0.3 N
 
 
 def pitches(value, deviation):
-    """Whether blades flap: thrust tilts back, and the body is pitched by more than drag a centimetre above its centre of
-    mass would do. If not, it is drag."""
-    sure = value["tilt"] > 3.0 * deviation["tilt"]
-    return bool(sure and value["stiffness"] > _LEVER * value["tilt"])
+    """Whether blades flap: they pitch the body by more than drag a centimetre above its centre of mass would do. If not, it
+    is drag. Blades on stiff hubs may do that without tilting the thrust, but then beyond doubt."""
+    tilts = value["tilt"] > 3.0 * deviation["tilt"]
+    pitches_alone = value["stiffness"] > 5.0 * deviation["stiffness"]
+    return bool((tilts or pitches_alone) and value["stiffness"] > _LEVER * max(value["tilt"], 0.0))
 
 
 EFFECT = Effect(
