@@ -28,7 +28,8 @@ REPORTED = {
     101: {"stranger": 240, "known": 300},
     211: {"stranger": 240, "known": 300},
     401: {"stranger": 240, "known": 60},
-}  # seed: cases; 101 and 211 are opened
+    503: {"stranger": 240, "known": 60},
+}  # seed: cases; all but the last are opened
 
 
 def plan_digest(seed, column, count):
