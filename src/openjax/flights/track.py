@@ -15,6 +15,9 @@ Array = np.ndarray
 GRID_PERIOD = 0.01  # s, the step of the simulator
 MIN_DURATION = 2.0  # s, shorter stretches say next to nothing and are left out
 MAX_GAP = 0.05  # s, a longer step between rows splits the flight
+RHYTHM = 50  # new commands from which their rhythm is looked for
+RHYTHMIC = 0.5  # concentration of their phases (0 to 1) from which they have one
+EARLY = 25.0  # per cent of them that may come before the rows that are made for them
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +40,9 @@ class Track:
     neighbours: Array  # (K, T, 3) m, positions of the vehicles that flew along
     pose_age: float = 0.0  # s by which the pose may be older than its row, see `Flight`
     motors_logged: bool = True  # False: made by the nominal rate controller from the commands
+    fast_thrust: tuple[Array, Array] | None = (
+        None  # of logs faster than the grid: times (S,) s, mean of the motors (S,)
+    )
 
     def __len__(self) -> int:
         return len(self.time)
@@ -62,9 +68,10 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
     period = max(part.row_period, GRID_PERIOD)
     if abs(period - GRID_PERIOD) < 0.15 * GRID_PERIOD:
         period = GRID_PERIOD
-    count = int((part.time[-1] - part.time[0]) / period + 1e-6) + 1
-    grid = part.time[0] + period * np.arange(count)
     faster = period / part.row_period > 1.2
+    begin = part.time[0] + (_command_phase(part, period) if faster else 0.0)
+    count = int((part.time[-1] - begin) / period + 1e-6) + 1
+    grid = begin + period * np.arange(count)
 
     def take(channel: str, ahead: bool = False) -> Array | None:
         if getattr(part, channel) is None:
@@ -74,24 +81,18 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
         # Faster logs: the mean around a grid point; of commands, which hold until the next row, the mean that follows it.
         at, values = part.sampled(channel)
         flat = values.reshape(len(values), -1)
-        step = np.diff(at)[:, None] * (flat[:-1] if ahead else 0.5 * (flat[1:] + flat[:-1]))
-        whole = np.concatenate([np.zeros((1, flat.shape[1])), np.cumsum(step, 0)])
-        begin = np.clip(grid if ahead else grid - 0.5 * period, at[0], at[-1] - 0.5 * period)
-        end = np.clip(begin + period, at[0], at[-1])
-        means = np.stack(
-            [
-                (np.interp(end, at, column) - np.interp(begin, at, column)) / (end - begin)
-                for column in whole.T
-            ],
-            1,
-        )
+        means = _means(at, flat, grid if ahead else grid - 0.5 * period, period, ahead)
         return means.reshape((count, *values.shape[1:]))
 
     quaternion = take("quaternion")
     motor = take("motor_command", ahead=True)
     voltage = take("battery_voltage")
+    fast_thrust = None
     if motor is not None and case.vehicle_file.motor_command == "pwm":
         motor = pwm_thrust(motor, voltage, case.vehicle_of(flight))
+    elif motor is not None and faster:
+        at, values = part.sampled("motor_command")
+        fast_thrust = at, values.mean(1)
     command = None
     if part.has_commands:
         command = np.concatenate([take("command_thrust", True)[:, None], take("command_body_rates", True)], 1)
@@ -113,7 +114,45 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
         voltage=None if voltage is None else smooth(voltage, 0.3, period),
         neighbours=np.array(neighbours) if neighbours else np.zeros((0, count, 3)),
         pose_age=part.pose_age,
+        fast_thrust=fast_thrust,
     )
+
+
+def held_means(at: Array, values: Array, begin: Array, period: float) -> Array:
+    """Means (G,) of values (S,) at times `at` (S,) s, each held until the next, over `period` s from `begin` (G,) s on."""
+    return _means(at, values[:, None], begin, period, True)[:, 0]
+
+
+def _means(at, values, begin, period, held):
+    """Means (G, C) of samples (S, C) over periods, of samples that are `held` until the next or of lines between them."""
+    step = np.diff(at)[:, None] * (values[:-1] if held else 0.5 * (values[1:] + values[:-1]))
+    whole = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(step, 0)])
+    begin = np.clip(begin, at[0], at[-1] - 0.5 * period)
+    end = np.clip(begin + period, at[0], at[-1])
+    means = [
+        (np.interp(end, at, column) - np.interp(begin, at, column)) / (end - begin) for column in whole.T
+    ]
+    return np.stack(means, 1)
+
+
+def _command_phase(part: Flight, period: float) -> float:
+    """When within a period (s, from the first row on) new commands begin: rows of the grid that begin there hold one each.
+
+    A row that mixed two could not tell which of them had arrived.
+    """
+    if not part.has_commands:
+        return 0.0
+    at, values = part.sampled("command_thrust")
+    new = at[1:][np.diff(values) != 0.0] - part.time[0]
+    if len(new) < RHYTHM:
+        return 0.0
+    turns = np.exp(2j * np.pi * new / period)
+    if abs(turns.mean()) < RHYTHMIC:
+        return 0.0
+    # late ones belong to the row that began before them: the begin is before the middle
+    late = np.angle(turns / turns.mean()) / (2 * np.pi) * period
+    middle = np.angle(turns.mean()) / (2 * np.pi) * period
+    return float((middle + np.percentile(late, EARLY)) % period)
 
 
 def pwm_thrust(duty: Array, voltage: Array | None, vehicle) -> Array:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from openjax.flights.track import Track, smooth
+from openjax.flights.track import Track, held_means, smooth
 from openjax.gap.feedback import Gains, in_force, outputs_of, read_gains
 from openjax.gap.linear_path import LinearPath, fit_linear_path
 from openjax.gap.observer import GYRO_GAIN, observe
@@ -26,8 +26,13 @@ LONGEST_DELAY = 0.1  # s
 DELAY_STEP = 0.0005  # s
 TOLERANCE = 3e-4  # of thrust: rounding of the logs and of the firmware's integers
 READABLE = 3e-3  # of thrust: mean misfit above which motors and commands aren't one stream
-EXPLAINED = 0.5  # of the misfit of a perfect link, above which the link isn't at fault
-INFORMATIVE = 1.5e-3  # smallest change of commanded thrust that shows whether a packet arrived
+EXPLAINED = 0.5  # of the misfit without a delay, above which the link isn't late
+INFORMATIVE = 1.5e-3  # smallest change of commanded thrust that shows what the link does at all
+HELD = (
+    0.2  # of the way from the command that was due to the one held: nearer to the latter, the packet was lost
+)
+BETWEEN = 0.6  # of that way: rows up to here that don't hold it are neither; a lost packet leaves none
+MOST_BETWEEN = 0.5  # of them per lost packet; where rows lie anywhere between two commands, it is one
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,14 +40,18 @@ class Radio:
     """What the link did. `gain` maps a set of its effects to its log-likelihood gain over a perfect link;
     `arrived` [(fraction, (T, 2) rows)]: the command in force at the end and at the start of each row,
     and the share of the row that the older one rules; `misfit` is the mean error of the collective
-    thrust per set."""
+    thrust per set. `informative` rows have a new command; `told` ones are so clear that they tell whether it arrived, and
+    `loss` is the share of them in which it didn't; `between` counts those that neither hold the old command nor follow the
+    new one, per lost packet."""
 
     delay: float
     loss: float
+    between: float
     gain: dict
     arrived: dict
     misfit: dict
     informative: int
+    told: int
 
     @property
     def readable(self) -> bool:
@@ -51,16 +60,19 @@ class Radio:
 
     def shown(self, known, clock: float, least_loss: float, least: float) -> tuple[str, ...]:
         """Of the effects `known` those that the link shows: a delay beyond what clocks may differ by, more lost packets
-        than a share `least_loss` and a number `least`. A delay that jitters looks like lost packets."""
+        than a share `least_loss` and a number `least`.
+
+        What a delay doesn't explain isn't late: streams that were put onto the rows afterwards disagree everywhere. Nor are
+        packets lost where as many rows lie between two commands: a delay that jitters, or clocks that do, leave those.
+        """
         if not self.readable:
             return ()
-        late = "command_latency" in known and self.delay > clock
-        lost = "packet_loss" in known and self.loss > least_loss and self.loss * self.informative > least
-        if late and self.misfit["command_latency", "packet_loss"] > 3.0 * TOLERANCE:
-            lost = False
-        key = tuple(n for n, on in (("command_latency", late), ("packet_loss", lost)) if on)
-        # What these don't explain isn't theirs: streams that were put onto the rows afterwards disagree everywhere.
-        return key if self.misfit[key] < EXPLAINED * self.misfit[()] else ()
+        at_once = min(self.misfit[()], self.misfit["packet_loss",])
+        later = min(self.misfit["command_latency",], self.misfit["command_latency", "packet_loss"])
+        late = "command_latency" in known and self.delay > clock and later < EXPLAINED * at_once
+        lost = "packet_loss" in known and self.loss > least_loss and self.loss * self.told > least
+        lost = lost and self.between < MOST_BETWEEN
+        return tuple(n for n, on in (("command_latency", late), ("packet_loss", lost)) if on)
 
 
 def read_radio(tracks: list[Track]) -> Radio:
@@ -80,7 +92,8 @@ def read_radio(tracks: list[Track]) -> Radio:
     used = both if delay > 0 else straight
     return Radio(
         delay,
-        used["lost"] / max(used["informative"], 1),
+        used["lost"] / max(used["told"], 1),
+        used["between"] / max(used["lost"], 1),
         {name: level[name] - level[()] for name in names},
         {name: found["arrived"] for name, found in names.items()},
         {
@@ -88,6 +101,7 @@ def read_radio(tracks: list[Track]) -> Radio:
             for name, found in names.items()
         },
         used["informative"],
+        used["told"],
     )
 
 
@@ -105,46 +119,85 @@ def _clean_rows(track: Track) -> np.ndarray:
 
 
 def _delay_misfit(track: Track, delays: np.ndarray) -> np.ndarray:
-    thrust, given, clean = track.command[:, 0], track.motor.mean(1), _clean_rows(track)
+    thrust, clean = track.command[:, 0], _clean_rows(track)
     cap = 0.3 * np.std(np.diff(thrust)) + 1e-9  # a lost packet must not pull at the delay
-    misfit = np.zeros(len(delays))
-    for number, delay in enumerate(delays):
-        whole = int(delay / track.dt + 1e-9)
-        part = delay / track.dt - whole
-        newer, older = _late(thrust, whole), _late(thrust, whole + 1)
-        error = np.abs(given - (1 - part) * newer - part * older)[clean]
-        misfit[number] = np.minimum(error, cap).sum()
-    return misfit
+    return np.array([np.minimum(np.abs(_late_error(track, d)[clean]), cap).sum() for d in delays])
+
+
+def _late_error(track: Track, delay: float) -> np.ndarray:
+    """(T,) mean of the motors less the commanded thrust of `delay` s ago."""
+    whole, part, given, clean = _link_rows(track, delay)
+    del clean
+    thrust = track.command[:, 0]
+    return given - (1 - part) * _late(thrust, whole) - part * _late(thrust, whole + 1)
 
 
 def _late(values: np.ndarray, rows: int) -> np.ndarray:
     return np.concatenate([np.repeat(values[:1], rows, 0), values[: len(values) - rows]])
 
 
+def _rows_late(track: Track, delay: float) -> tuple[int, float]:
+    """A delay (s) in rows: whole ones and the rest."""
+    whole = int(delay / track.dt + 1e-9)
+    return whole, delay / track.dt - whole
+
+
+def _link_rows(track: Track, delay: float) -> tuple[int, float, np.ndarray, np.ndarray]:
+    """Rows in which commands of `delay` s ago are in force: whole rows late, the share of a row that the one before still
+    rules, the motors' mean (T,), whether it can be read (T,). Logs faster than the rows are cut anew where the commands
+    arrive, so that a row holds one command."""
+    clean = _clean_rows(track)
+    if track.fast_thrust is None:
+        return *_rows_late(track, delay), track.motor.mean(1), clean
+    given = held_means(*track.fast_thrust, track.time + delay, track.dt)
+    rows = int(np.ceil(delay / track.dt - 1e-9))
+    for later in range(1, rows + 1):  # what a row holds then is in these
+        clean = clean & np.concatenate([clean[later:], np.zeros(min(later, len(clean)), bool)])
+    return 0, 0.0, given, clean
+
+
 def _decode(tracks, delay: float, may_lose: bool) -> dict:
     """Row by row: did the command due in this row arrive, or is the one before still held?"""
-    errors, arrived, lost, informative = [], [], 0, 0
+    errors, arrived, informative, told, lost, between = [], [], 0, 0, 0, 0
     for track in tracks:
-        thrust, given, clean = track.command[:, 0].tolist(), track.motor.mean(1).tolist(), _clean_rows(track)
-        whole = int(delay / track.dt + 1e-9)
-        part = delay / track.dt - whole
-        held, rows, error = 0, np.zeros((len(track), 2), int), np.zeros(len(track))
-        flags = clean.tolist()
+        whole, part, given, clean = _link_rows(track, delay)
+        error = np.abs(_late_error(track, delay)[clean])
+        noise = float(np.median(error)) if len(error) else 0.0
+        telling = (
+            TOLERANCE + 2.0 * noise
+        ) / HELD  # smallest change of thrust that shows whether a packet arrived
+        thrust, given, flags = track.command[:, 0].tolist(), given.tolist(), clean.tolist()
+        held, in_force, error = 0, np.zeros(len(track), int), np.zeros(len(track))
         for row in range(len(track)):
             due = max(row - whole, 0)
             expected = (1 - part) * thrust[due] + part * thrust[held]
             missed = False
-            if flags[row] and abs(thrust[due] - thrust[held]) * (1 - part) > INFORMATIVE:
+            change = abs(thrust[held] - expected)
+            if flags[row] and change > INFORMATIVE:
                 informative += 1
-                missed = may_lose and abs(given[row] - thrust[held]) < abs(given[row] - expected)
-                lost += missed
+                way = abs(given[row] - thrust[held]) / change
+                missed = may_lose and way < abs(given[row] - expected) / change
+                if change > telling:
+                    told += 1
+                    lost += way < HELD
+                    between += HELD <= way < BETWEEN
             error[row] = given[row] - (thrust[held] if missed else expected)
-            rows[row] = (held if missed else due), held
             if not missed:
                 held = due
+            in_force[row] = held
         errors.append(error[clean])
-        arrived.append((part, rows))
-    return {"error": np.concatenate(errors), "arrived": arrived, "lost": lost, "informative": informative}
+        if track.fast_thrust is not None:
+            whole, part = _rows_late(track, delay)
+            in_force = _late(in_force, whole)
+        arrived.append((part, np.stack([in_force, _late(in_force, 1)], 1)))
+    return {
+        "error": np.concatenate(errors),
+        "arrived": arrived,
+        "informative": informative,
+        "told": told,
+        "lost": lost,
+        "between": between,
+    }
 
 
 def with_motors(track: Track, vehicle) -> Track:

@@ -93,6 +93,6 @@ def _path_estimate(evidence: Evidence, effect: str, number: int) -> tuple[float,
         sampled = any(n.startswith("motors within a row") for n in evidence.replay.nuisance_names)
         spread = float(np.hypot(GRID_ERROR, ROW_ERROR[sampled] * max(t.dt for t in evidence.tracks)))
         return radio.delay, spread, spread
-    n = max(radio.informative / BURSTS, 1.0)
+    n = max(radio.told / BURSTS, 1.0)
     spread = float(np.sqrt(radio.loss * (1 - radio.loss) / n) + 0.5 / n)
     return radio.loss, spread, spread
