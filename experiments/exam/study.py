@@ -54,7 +54,7 @@ def notes(report):
             "predicted": found.predicted,
             "nats": found.nats,
             "followed": found.followed,
-            "lines": found.lines,
+            "lines": found.local,
         }
 
     def radio():

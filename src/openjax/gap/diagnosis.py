@@ -10,6 +10,7 @@ import numpy as np
 
 from openjax.flights.flight import Case, Flight, Issue
 from openjax.gap import verdict as rules
+from openjax.gap.bounds import BOUND
 from openjax.gap.evidence import Evidence, gather
 from openjax.gap.intervals import estimates
 from openjax.gap.library import CARDS, Library, library
@@ -17,7 +18,7 @@ from openjax.gap.report import Report
 from openjax.gap.rest import Rest, look
 from openjax.gap.selection import CLASS, Selection, select
 from openjax.gap.shares import ERROR_NAMES, split
-from openjax.gap.table import BOUND, judge, with_effects
+from openjax.gap.table import judge, with_effects
 from openjax.gap.where import locate
 from openjax.vehicle.vehicle_file import VehicleFile, load_vehicle_file
 
@@ -104,7 +105,7 @@ def equivalents(evidence: Evidence, selection: Selection, named) -> dict[str, li
 
 
 def _rest_in_words(rest: Rest) -> str:
-    words = [f"What is left isn't noise: {', '.join(rest.lines)}."] if rest.lines else []
+    words = [f"What is left isn't noise: {', '.join(rest.local)}."] if rest.local else []
     best = int(np.argmax(rest.predicted))
     if rest.predicted[best] <= rules.FOLLOWED or rest.nats < rules.LEAST_NATS:
         return " ".join(words)

@@ -36,7 +36,7 @@ LOOKS = 2  # at most
 WORTH_KNOWING = 15.0  # nats that an effect must add to be taken as known in the next look
 WORTH_A_SECOND_LOOK = 30.0  # nats of the best set above none
 LEAST_KICK = 0.1  # of the motors' outputs within a row: below, samples are as good as means
-MOST_GUSTS = 0.5  # of the torques that commands cause: from then on feedback is all that is seen of them
+MOST_GUSTS = 0.25  # of the torques that commands cause: from then on feedback is all that is seen of them
 HEAVY = 0.1  # of the moments of inertia, that single samples taken for means may feign
 RADIO_COST = 15.0  # nats that a radio effect must gain before the rate loop is read with it
 

@@ -143,7 +143,7 @@ def gustiness(tracks, feedback: list[Feedback], floor) -> np.ndarray:
     for track, part, rest in zip(tracks, feedback, floor, strict=True):
         band = butter(2, BAND, "bandpass", fs=1.0 / track.dt, output="sos")
         edge = int(EDGE / track.dt)
-        both = np.stack([np.gradient(rest[:, :3], track.dt, axis=0), part.caused])
+        both = np.stack([np.gradient(rest[:, :3], track.dt, axis=0), part.caused])[:, edge:]
         both = sosfiltfilt(band, both, axis=1)[:, edge:-edge]
         left += (both[0] ** 2).sum(0)
         caused += (both[1] ** 2).sum(0)

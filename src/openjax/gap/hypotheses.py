@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import norm
 
+from openjax.gap.bounds import held_objective
 from openjax.gap.library import ABSENT, CARDS, PLACE, Library, places, prior, start_of
 from openjax.gap.replay import GROUPS, SKIP, Replay
 from openjax.gap.whitening import Noise, fit_noise
@@ -82,6 +83,16 @@ def fit_set(replay: Replay, effects, start: np.ndarray | None = None, iterations
     volume = np.linalg.slogdet(hessian)[1] - np.linalg.slogdet(precision)[1] if len(index) else 0.0
     score = -objective - 0.5 * volume + _sign_term(effects, index, theta, covariance)
     score -= _free_ride(grams.sum(0), theta[index] - mean, precision, len(places(effects)))
+    # What counts is how well a set does with nuisances within their bounds, and the vehicle's alike in all flights.
+    white = [replay.whiten(c, k).reshape(len(c), -1) for k, c in enumerate(columns)]
+    score += objective - held_objective(
+        [w[0] for w in white],
+        [w[1:] for w in white],
+        [n.reshape(len(n), -1) for n in replay.whitened_nuisances],
+        replay.shared,
+        theta[index] - mean,
+        precision,
+    )
     return SetFit(effects, theta, index, grams, columns, covariance, float(score), float(objective))
 
 
@@ -119,7 +130,8 @@ def _sign_term(effects, index, theta, covariance) -> float:
 
 
 def _free_ride(gram, off, precision, own: int) -> float:
-    """What the companions alone would gain over no effect (nats): a set must not live off them."""
+    """What the companions alone would gain over no effect (nats), or beside the set's own effects where that is less: a
+    set must not live off them."""
     if len(off) == own:
         return 0.0
     # Seen from no effect: the residual there is the present one plus what the whole set explains.
@@ -127,7 +139,12 @@ def _free_ride(gram, off, precision, own: int) -> float:
     prior_part = precision[own:, own:]
     hessian = gram[1 + own :, 1 + own :] + prior_part
     volume = np.linalg.slogdet(hessian)[1] - np.linalg.slogdet(prior_part)[1]
-    return max(0.0, float(0.5 * push @ np.linalg.solve(hessian, push) - 0.5 * volume))
+    alone = max(0.0, float(0.5 * push @ np.linalg.solve(hessian, push) - 0.5 * volume))
+    # Beside the others the companions' curvature is what the others can't follow.
+    whole = gram[1:, 1:] + precision
+    follow = np.linalg.solve(whole[:own, :own], whole[:own, own:])
+    moved = off[own:]
+    return min(alone, float(0.5 * moved @ (whole[own:, own:] - whole[own:, :own] @ follow) @ moved))
 
 
 def model_noise(replay: Replay, library: Library) -> tuple[list[np.ndarray], dict[str, float]]:

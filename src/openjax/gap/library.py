@@ -22,11 +22,11 @@ CARDS: dict[str, Card] = {name: effect.card for name, effect in EFFECTS.items() 
 # replay's own step and the half-known motor commands inside a row leave: some per cent of a torque, a millisecond.
 NUISANCES = (
     ("thrust_scale", "scale", 0.004),
-    ("inertia", "xx", 0.025),
-    ("inertia", "yy", 0.025),
-    ("inertia", "zz", 0.01),
-    ("motor_lag", "extra_up", 0.001),
-    ("motor_lag", "extra_down", 0.001),
+    ("inertia", "xx", 0.04),
+    ("inertia", "yy", 0.04),
+    ("inertia", "zz", 0.015),
+    ("motor_lag", "extra_up", 0.0015),
+    ("motor_lag", "extra_down", 0.0015),
     ("yaw_torque", "ratio", 0.01),
 )
 # With duty cycles for motor commands the map to thrust is a guess: scale, shape, lag and torques are free, and what they
@@ -56,9 +56,9 @@ SAMPLED_NUISANCES = (
 # By how much more these may seem wrong, per share of gusts in the torques (`feedback.gustiness`), about which axes:
 # commands answer gusts by way of the attitude, so that in closed loop motors look weak and early.
 GUSTY = {
-    ("inertia", "xx"): (0.3, (0,)),
-    ("inertia", "yy"): (0.3, (1,)),
-    ("inertia", "zz"): (0.1, (2,)),
+    ("inertia", "xx"): (1.0, (0,)),
+    ("inertia", "yy"): (1.0, (1,)),
+    ("inertia", "zz"): (0.3, (2,)),
     ("motor_lag", "extra_up"): (0.01, (0, 1)),
     ("motor_lag", "extra_down"): (0.01, (0, 1)),
 }

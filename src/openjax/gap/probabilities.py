@@ -56,7 +56,7 @@ def _share(parts: Split, effect: str) -> float:
 
 def _certainty(evidence: Evidence, selection: Selection, parts: Split, rest: Rest, effect: str) -> float:
     if effect == "unknown":
-        if rest.lines or set(evidence.sensors.findings) - {"clocks"}:
+        if rest.local or set(evidence.sensors.findings) - {"clocks"}:
             return SEEN
         return LEFT * _by_size(parts.gap.after - 1.0)
     if effect in selection.gains:

@@ -14,14 +14,16 @@ import numpy as np
 from openjax.flights.track import Track, rotation, smooth
 from openjax.gap.evidence import Evidence
 from openjax.gap.hypotheses import SetFit, without_nuisances
+from openjax.gap.knocks import knocks
 from openjax.gap.replay import FORCE, RATES, VELOCITY, Replay, torque_channels
-from openjax.gap.selection import Selection, testable
+from openjax.gap.selection import LEAST_NATS, Selection, testable
 from openjax.gap.spectral_lines import lines
-from openjax.gap.table import Model, build, judge, solve, with_effects
+from openjax.gap.table import build, judge, offers, solve, widened, with_effects
 from openjax.vehicle.effects.effect import ARENA_CEILING
 
 SPREAD = 0.3  # m/s^2 and, times TORQUE, rad/s^2: prior rms of a regressor's part of the motion
 TORQUE = 10.0
+MOST = 6  # regressors at once
 RADIUS = 0.023  # m, of a propeller
 RARE = 0.3  # of a regressor's usual size: one that happened less is not blown up
 WIDTH = 0.25  # m of the radial functions of the place
@@ -36,13 +38,13 @@ ALONG = ("force x by velocity", "force y by velocity", "force z by vertical spee
 @dataclass(frozen=True)
 class Rest:
     """`predicted` (6,) share of each channel's squared error on stretches left out that the dictionary predicts
-    (rates x, y, z, velocity x, y, z), `nats` of likelihood that it adds there, `followed` the regressors that carry
-    most, in words; `lines`: what is local in frequency."""
+    (rates x, y, z, velocity x, y, z), `nats` of likelihood that it adds there, `followed` the regressors that do, in
+    words, the most telling first; `local`: what is local in frequency or in time."""
 
     predicted: np.ndarray
     nats: float
     followed: tuple[str, ...]
-    lines: tuple[str, ...] = ()
+    local: tuple[str, ...] = ()
 
 
 def look(evidence: Evidence, selection: Selection) -> Rest:
@@ -64,17 +66,25 @@ def look(evidence: Evidence, selection: Selection) -> Rest:
     extra = table.more
     spread = np.array([SPREAD * (TORQUE if tables[0][n][0] == "torque" else 1.0) for n in names])
     along = np.array([n in ALONG for n in names])
-    carried = _widened(plain, extra[along], spread[along])
+    carried = widened(plain, extra[along], spread[along] ** -2.0)
     # What pushes along the motion came before it: gusts carry the vehicle with them. What brakes it is an effect.
     pushes = -solve(table, carried)[0, extra] > 0.0
     allowed = (along & pushes) | np.array([n in STEADY for n in names])
-    base = _widened(plain, extra[allowed], spread[allowed])
-    now, then = judge(table, base), judge(table, _widened(plain, extra, spread))
+    base = widened(plain, extra[allowed], spread[allowed] ** -2.0)
+    now = judge(table, base)
+    model, then, chosen = base, now, []
+    for _ in range(MOST):
+        open_ = np.flatnonzero(~allowed & ~np.isin(np.arange(len(names)), chosen))
+        nats = offers(table, model, extra[open_], spread[open_] ** -2.0) - then.nats
+        best = open_[int(np.argmax(nats.sum(1) - np.maximum(nats.max(1), 0.0)))]
+        wider = widened(model, extra[[best]], spread[[best]] ** -2.0)
+        whole = judge(table, wider)
+        gained = whole.nats - then.nats
+        if gained.sum() - max(gained.max(), 0.0) < LEAST_NATS + np.log(len(names)):  # the best of so many
+            break
+        model, then, chosen = wider, whole, [*chosen, int(best)]
     left = now.squares.sum(0)
     predicted = np.where(table.usable > 0, 1.0 - then.squares.sum(0) / np.maximum(left, 1e-30), 0.0)
-    white = table.white.sum(0)
-    alone = white[0, extra] ** 2 / (white[extra, extra] + 1.0 / spread**2)
-    order = np.argsort(-alone)[:3]
     disturbed = [
         disturbances(t, r) for t, r in zip(replay.tracks, residuals_of(replay, selection.fit), strict=True)
     ]
@@ -84,27 +94,9 @@ def look(evidence: Evidence, selection: Selection) -> Rest:
     return Rest(
         np.maximum(predicted, 0.0),
         float((then.nats - now.nats).sum()),
-        tuple(names[k] for k in order),
-        lines(replay.tracks, disturbed, heard),
+        tuple(names[k] for k in chosen),
+        (*lines(replay.tracks, disturbed, heard), *knocks(replay.tracks, disturbed, replay.usable)),
     )
-
-
-def _widened(model: Model, columns: np.ndarray, spread: np.ndarray) -> Model:
-    """The model with further columns free, whose coefficients are small in units of their `spread`."""
-    return Model(
-        model.parts,
-        np.concatenate([model.free, columns]).astype(int),
-        np.concatenate([model.mean, np.zeros(len(columns))]),
-        _diagonal(model.precision, 1.0 / spread**2),
-    )
-
-
-def _diagonal(block: np.ndarray, more: np.ndarray) -> np.ndarray:
-    size = len(block) + len(more)
-    out = np.zeros((size, size))
-    out[: len(block), : len(block)] = block
-    out[np.arange(len(block), size), np.arange(len(block), size)] = more
-    return out
 
 
 def channels(track: Track, kind: str, values: np.ndarray) -> np.ndarray:
@@ -164,6 +156,8 @@ def dictionary(track: Track) -> dict[str, tuple[str, np.ndarray, float]]:
         ("time", time, 0.3),
     ):
         add("force", name, 2, values, usual)
+    for axis in range(3):
+        add("torque", "time", axis, time, 0.3)
     add("torque", "rates x", 2, w[:, 0])
     add("torque", "rates y", 2, w[:, 1])
     add("torque", "thrust", 2, thrust)

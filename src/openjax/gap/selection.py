@@ -257,11 +257,11 @@ def _swapped(replay, fit, table, now, singles):
                 tried[other] = found
         gains = {o: f.score - fit.score for o, f in tried.items()}
         favoured = dict(gains)
-        commoner = CARDS[effect].commoner
-        if gains.get(commoner, -np.inf) > -CLASS:
-            favoured[commoner] += CLASS + LEAST_NATS
+        for other in CARDS[effect].commoner:
+            if gains.get(other, -np.inf) > -CLASS:
+                favoured[other] += CLASS + LEAST_NATS
         for other in favoured:
-            if CARDS[other].commoner == effect:
+            if effect in CARDS[other].commoner:
                 favoured[other] -= CLASS
         for best in sorted(favoured, key=lambda o: -favoured[o]):
             if favoured[best] <= LEAST_NATS:

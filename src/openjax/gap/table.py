@@ -15,12 +15,12 @@ from functools import cached_property
 
 import numpy as np
 
+from openjax.gap.bounds import BOUND, bounded
 from openjax.gap.hypotheses import SetFit
 from openjax.gap.library import ABSENT, CARDS, PLACE, places, prior
 from openjax.gap.replay import SKIP, Replay
 
 BLOCK = 1.0  # s: gusts and sensors forget within less
-BOUND = 2.0  # usual sizes that a nuisance may take
 HORIZONS = {"velocity": 0.25, "rates": 0.05}  # s of the predictions whose errors are the gap
 ERRORS = tuple((f"{kind} {axis}", 3 * number + k) for number, kind in enumerate(("rates", "velocity"))
                for k, axis in enumerate("xyz"))  # fmt: skip
@@ -178,12 +178,23 @@ def with_effects(table: Table, add=(), drop=()) -> Model:
 
 def solve(table: Table, model: Model, left_out: int | None = None) -> np.ndarray:
     """Coefficients (tracks, C) of every column, fitted to all folds but one."""
+    hessian, push = _equations(table, model, left_out)
+    found, _ = bounded(hessian, push, len(model.free), model.bound)
+    return np.stack([_spread(table, model, found, k) for k in range(len(np.unique(table.track_of)))])
+
+
+def _nuisances(table: Table, model: Model) -> tuple[np.ndarray, np.ndarray]:
+    """Columns of the nuisances that the model uses: the case's and a track's."""
+    if model.bound == 0.0:
+        return table.nuisances[:0], table.nuisances[:0]
+    return table.nuisances[table.shared], table.nuisances[~table.shared]
+
+
+def _equations(table: Table, model: Model, left_out: int | None) -> tuple[np.ndarray, np.ndarray]:
+    """Normal equations of the model's free columns, the case's nuisances and each track's, over all folds but one."""
     sums, tracks = table.folds
     names = np.unique(table.track_of)
-    shared = table.nuisances[table.shared]
-    own = table.nuisances[~table.shared]
-    if model.bound == 0.0:
-        shared, own = shared[:0], own[:0]
+    shared, own = _nuisances(table, model)
     p, s, n = len(model.free), len(shared), len(own)
     size = p + s + n * len(names)
     hessian, push = np.zeros((size, size)), np.zeros(size)
@@ -200,31 +211,56 @@ def solve(table: Table, model: Model, left_out: int | None = None) -> np.ndarray
         target = gram[:, 0] + gram[:, list(model.parts)].sum(1)
         hessian[np.ix_(here, here)] += gram[np.ix_(columns, columns)]
         push[here] += target[columns]
-    found = _bounded(hessian, push, p, model.bound)
-    out = np.zeros((len(names), table.size))
-    out[:, 0] = 1.0
-    out[:, list(model.parts)] = 1.0
-    for k in range(len(names)):
-        out[k, model.free] -= found[:p]
-        out[k, shared] = -found[p : p + s]
-        out[k, own] = -found[p + s + n * k : p + s + n * (k + 1)]
+    return hessian, push
+
+
+def _spread(table: Table, model: Model, found: np.ndarray, track: int) -> np.ndarray:
+    """Coefficients (..., C) of every column on one track, from solutions (..., size) of the equations."""
+    shared, own = _nuisances(table, model)
+    p, s, n = len(model.free), len(shared), len(own)
+    out = np.zeros((*found.shape[:-1], table.size))
+    out[..., 0] = 1.0
+    out[..., list(model.parts)] = 1.0
+    out[..., model.free] -= found[..., :p]
+    out[..., shared] = -found[..., p : p + s]
+    out[..., own] = -found[..., p + s + n * track : p + s + n * (track + 1)]
     return out
 
 
-def _bounded(hessian, push, free: int, bound: float) -> np.ndarray:
-    """Minimum of x'Hx/2 - push'x with |x| <= bound beyond the first `free` entries, by fixing what leaves the box."""
-    found = np.zeros(len(push))
-    open_ = np.ones(len(push), bool)
-    for _ in range(len(push)):
-        inside = np.flatnonzero(open_)
-        rest = push[inside] - hessian[np.ix_(inside, np.flatnonzero(~open_))] @ found[~open_]
-        found[inside] = np.linalg.solve(hessian[np.ix_(inside, inside)], rest)
-        beyond = open_ & (np.abs(found) > bound) & (np.arange(len(push)) >= free)
-        if not beyond.any():
-            break
-        found[beyond] = np.sign(found[beyond]) * bound
-        open_ &= ~beyond
-    return found
+def offers(table: Table, model: Model, columns: np.ndarray, precision: np.ndarray) -> np.ndarray:
+    """Nats (K, B) on each fold of the model with one more of `columns` (K,) free, whose coefficient has `precision` (K,) about
+    none: `judge` for each, with the nuisances that are at their bounds left there."""
+    wide = widened(model, columns, precision)
+    added = len(model.free) + np.arange(len(columns))
+    nats = np.zeros((len(columns), len(table.white)))
+    tracks = np.unique(table.track_of)
+    for fold in range(len(table.folds[0])):
+        hessian, push = _equations(table, wide, fold)
+        kept = np.setdiff1d(np.arange(len(push)), added)
+        found, open_ = bounded(hessian[np.ix_(kept, kept)], push[kept], len(model.free), model.bound)
+        inside = kept[open_]
+        follow = np.linalg.solve(hessian[np.ix_(inside, inside)], hessian[np.ix_(inside, added)])
+        stiff = hessian[added, added] - (hessian[np.ix_(inside, added)] * follow).sum(0)
+        size = (push[added] - hessian[np.ix_(added, kept)] @ found) / stiff
+        whole = np.zeros((len(columns), len(push)))
+        whole[:, kept] = found
+        whole[:, inside] -= (follow * size).T
+        whole[np.arange(len(columns)), added] = size
+        blocks = np.flatnonzero(table.fold_of == fold)
+        u = _spread(table, wide, whole, int(np.searchsorted(tracks, table.track_of[blocks[0]])))
+        for b in blocks:
+            nats[:, b] = -0.5 * ((u @ table.white[b]) * u).sum(1)
+    return nats
+
+
+def widened(model: Model, columns: np.ndarray, precision: np.ndarray) -> Model:
+    """The model with further columns free, whose coefficients have `precision` about none."""
+    size, more = len(model.free), len(columns)
+    block = np.zeros((size + more, size + more))
+    block[:size, :size] = model.precision
+    block[np.arange(size, size + more), np.arange(size, size + more)] = precision
+    free = np.concatenate([model.free, columns]).astype(int)
+    return Model(model.parts, free, np.concatenate([model.mean, np.zeros(more)]), block, model.bound)
 
 
 def judge(table: Table, model: Model) -> Judged:
@@ -274,6 +310,8 @@ __all__ = [
     "build",
     "judge",
     "level",
+    "offers",
     "solve",
+    "widened",
     "with_effects",
 ]

@@ -68,7 +68,7 @@ def decide(evidence: Evidence, selection: Selection, rest: Rest, parts: Split, m
     named = _material(selection, parts)
     material = parts.gap.after > 1.0 + LEAST_LEFT
     left = material and rest.nats > LEAST_NATS and rest.predicted.max() > FOLLOWED
-    strange = bool(set(evidence.sensors.findings) - {"clocks"}) or bool(rest.lines)
+    strange = bool(set(evidence.sensors.findings) - {"clocks"}) or bool(rest.local)
     strange = strange or (left and (not named or parts.unexplained.value > UNKNOWN_SHARE))
     effects = list(named)
     if strange:

@@ -44,7 +44,7 @@ EFFECT = Effect(
         needs="voltage",
         coordinate="voltage",
         thrust_map=True,
-        commoner="thrust_scale",
+        commoner=("thrust_scale",),
         sample={"exponent": 1.0},
         next_flight="the same hover on a full and on a nearly empty battery.",
     ),

@@ -118,7 +118,7 @@ class Card:
     coordinate: the variable that it follows, for pictures.
     thrust_map: a map from duty cycles to thrust that isn't known can imitate it.
     torque_axes: those of the torques by which it is told, which gusts can imitate, and what motors do between two rows.
-    commoner: an effect that is named instead where both do equally well.
+    commoner: effects one of which is named instead where it does equally well.
     is_itself({parameter: value}, {parameter: deviation}): whether it isn't by its fitted value another effect; `beside`:
         effects that are fitted with it for that, whose parameters follow as "effect.parameter".
     sample: a strength within its usual range to fly with, strong enough to see.
@@ -137,7 +137,7 @@ class Card:
     coordinate: str = "thrust"
     thrust_map: bool = False
     torque_axes: tuple[int, ...] = ()
-    commoner: str = ""
+    commoner: tuple[str, ...] = ()
     beside: tuple[str, ...] = ()
     is_itself: Callable[[Mapping[str, float], Mapping[str, float]], bool] | None = None
     impossible: Callable[[Any], bool] | None = None

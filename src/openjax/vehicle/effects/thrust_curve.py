@@ -48,6 +48,7 @@ EFFECT = Effect(
             Fitted("curvature", mean=0.0, spread=0.25, start=0.02, step=0.001),
         ),
         thrust_map=True,
+        commoner=("thrust_scale", "mass"),
         is_itself=bends,
         sample={"curvature": 0.25},
         next_flight="steps of collective thrust between 40 and 90 %.",

@@ -2,15 +2,16 @@
 
 import jax.numpy as jnp
 
+from openjax.vehicle.effects.airspeed import hub_velocity, hub_wrench
 from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 from openjax.vehicle.rigid_body import rotate_inverse
 
 
 def wrench(parameters, context):
-    """-drag (v - w), at the centre of mass."""
-    wind = jnp.stack([parameters["x"], parameters["y"], parameters["z"]])
-    force = -parameters["drag"] * (context.velocity - wind)
-    return rotate_inverse(context.quaternion, force), jnp.zeros_like(force)
+    """-drag (v - w) at the hubs, of which a share along the rotors' axes: rotor drag in air that moves."""
+    wind = rotate_inverse(context.quaternion, jnp.stack([parameters["x"], parameters["y"], parameters["z"]]))
+    drag = parameters["drag"] * jnp.stack([1.0, 1.0, parameters["along"]])
+    return hub_wrench(context, -0.25 * drag * (hub_velocity(context) - wind))
 
 
 _SOURCE = "indoor draughts and fans, 0.3-3 m/s"
@@ -31,7 +32,10 @@ EFFECT = Effect(
         "x": Parameter("m/s", 0.0, (-3.0, 3.0), _SOURCE, "velocity of the air"),
         "y": Parameter("m/s", 0.0, (-3.0, 3.0), _SOURCE, "velocity of the air"),
         "z": Parameter("m/s", 0.0, (-1.0, 1.0), _SOURCE, "velocity of the air"),
-        "drag": Parameter("N s/m", 0.0, (0.005, 0.03), "as for rotor_drag, isotropic"),
+        "drag": Parameter("N s/m", 0.0, (0.005, 0.03), "as for rotor_drag"),
+        "along": Parameter(
+            "1", 1.0, (0.3, 1.0), "as for rotor_drag", "share of the drag along the rotors' axes"
+        ),
     },
     wrench=wrench,
     card=Card(
@@ -41,10 +45,11 @@ EFFECT = Effect(
             Fitted("y", mean=0.0, spread=1.5, start=0.3, step=0.01),
             Fitted("z", mean=0.0, spread=0.5, start=0.0, step=0.01),
             Fitted("drag", mean=0.013, spread=0.006, start=0.013, step=0.0001, positive=True),
+            Fitted("along", mean=0.8, spread=0.4, start=1.0, step=0.01),
         ),
         needs="velocity",
         coordinate="body velocity",
-        commoner="rotor_drag",
+        commoner=("rotor_drag",),
         is_itself=blows,
         sample={"x": 1.2, "y": -0.8, "drag": 0.015},
         next_flight="hover, turning slowly through a full circle of yaw.",
