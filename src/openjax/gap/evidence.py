@@ -55,6 +55,9 @@ class Evidence:
     sets: dict[tuple[str, ...], SetFit]
     exposure: dict[str, float]
     floor: list[np.ndarray]  # (T, 9) residuals when all effects may act at once: sensors and gusts
+    feigned: frozenset[
+        str
+    ]  # effects that gusts or samples look like: they take what they can, and aren't named
     radio: Radio | None
     rate_loop: LinearPath | None
     gains: Gains | None
@@ -69,12 +72,13 @@ class Evidence:
 
 class Look(NamedTuple):
     """One look at the physics: the replay, what each set explains, what typical effects would show, the residuals that are
-    floor, and the rate loop's path and gains (None without commands)."""
+    floor, the effects that gusts or samples feign, and the rate loop's path and gains (None without commands)."""
 
     replay: Replay
     sets: dict[tuple[str, ...], SetFit]
     exposure: dict[str, float]
     floor: list[np.ndarray]
+    feigned: frozenset[str]
     rate_loop: LinearPath | None
     gains: Gains | None
 
@@ -151,7 +155,7 @@ def gather(case: Case, library: Library, progress=None) -> Evidence:
     lap("first look")
     known = ()
     for _ in range(LOOKS - 1):
-        fits = [f for f in look.sets.values() if isinstance(f, SetFit)]
+        fits = [f for k, f in look.sets.items() if isinstance(f, SetFit) and not look.feigned & set(k)]
         best = max(fits, key=lambda f: f.score - WORTH_KNOWING * len(f.effects))
         gains = _clear_gains(look.gains, library)
         surprising = best.effects and best.score - look.sets[()].score > WORTH_A_SECOND_LOOK
@@ -169,7 +173,7 @@ def gather(case: Case, library: Library, progress=None) -> Evidence:
         look = _physics(reading, library, pushes, gains, look.sets)
         lap("next look")
     return Evidence(
-        case, library, tracks, vehicles, *look[:4], radio, look.rate_loop, look.gains, pose, sensors, seconds
+        case, library, tracks, vehicles, *look[:5], radio, look.rate_loop, look.gains, pose, sensors, seconds
     )  # fmt: skip
 
 
@@ -246,12 +250,17 @@ def _looks_sampled(vehicles, mean: Look, single: Look) -> tuple[bool, bool]:
     return doubtful, not doubtful
 
 
-def _hidden(card, tracks, blind: bool, gusts: np.ndarray) -> bool:
+def _hidden(card, tracks) -> bool:
     """Whether an effect can't be told from these logs, however large it is."""
     if card.needs and any(getattr(t, card.needs) is None for t in tracks):
         return True
     if card.impossible is not None and any(card.impossible(t.position) for t in tracks):
         return True
+    return False
+
+
+def _feigned(card, blind: bool, gusts: np.ndarray) -> bool:
+    """Whether gusts, or what motors do between two rows, look like an effect."""
     axes = list(card.torque_axes)
     return bool(axes) and bool(blind or gusts[axes].mean() > MOST_GUSTS)
 
@@ -259,8 +268,8 @@ def _hidden(card, tracks, blind: bool, gusts: np.ndarray) -> bool:
 def _physics(
     reading: Reading, library: Library, pushes=None, gains=None, before=None, hide: bool = True
 ) -> Look:
-    """Look at the physics. `pushes`, `gains`: what an earlier look found; `before`: its sets, to start from; `hide`: leave
-    out what can't be told from these logs."""
+    """Look at the physics. `pushes`, `gains`: what an earlier look found; `before`: its sets, to start from; `hide`: tell
+    what gusts and samples feign."""
     tracks, vehicles, arrived, at_once = reading.tracks, reading.vehicles, reading.arrived, reading.at_once
     rate_loop, read, ticks = None, None, [np.repeat(t.motor[:, None], TICKS, 1) for t in tracks]
     links = arrived if arrived is not None else [None] * len(tracks)
@@ -285,7 +294,9 @@ def _physics(
             if (e, p) in GUSTY
         }
     )
+    feigned = frozenset(e for e in library.physics if hide and _feigned(CARDS[e], reading.blind, gusts))
     for effect in library.physics:
-        if hide and _hidden(CARDS[effect], tracks, reading.blind, gusts):
+        if _hidden(CARDS[effect], tracks):
             exposure[effect] = 0.0
-    return Look(replay, weigh_singles(replay, library, exposure, before), exposure, floor, rate_loop, read)
+    sets = weigh_singles(replay, library, exposure, before)
+    return Look(replay, sets, exposure, floor, feigned, rate_loop, read)

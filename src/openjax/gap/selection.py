@@ -22,6 +22,7 @@ LEAST_NATS = 5.0  # by which it must raise their likelihood even without the sec
 LEAST_SHARE = 0.01  # of the gap's rms above its floor: below, an effect is what the others' forms have wrong
 TESTABLE = 6.0  # nats that an effect of usual size must leave in these flights
 MOST = 6  # effects at once
+VERTICAL = 5  # of the errors: velocity z
 OPENINGS = 3  # effects from which a search begins
 LEFT_MUCH = 1.2  # of the squares that noise alone leaves: a search from several beginnings is worth its time
 ROUNDS = 2  # of widening and swapping
@@ -33,23 +34,26 @@ TRIED = 2  # candidates of each kind fitted in full at each step
 @dataclass(frozen=True)
 class Gain:
     """What an effect adds on stretches left out, all others refitted: `nats`, and `steady` ones without the best second
-    of flight, `floors` of the gap, `share` of its rms above what all together leave."""
+    of flight, `floors` of the gap, `share` of its rms above what all together leave; `seen`: whether it does so in the
+    channel where it must show."""
 
     nats: float
     steady: float
     floors: float
     share: float
+    seen: bool = True
 
     @property
     def accepted(self) -> bool:
-        return self.steady > LEAST_NATS and self.floors > LEAST_GAIN and self.share > LEAST_SHARE
+        enough = self.steady > LEAST_NATS and self.floors > LEAST_GAIN and self.share > LEAST_SHARE
+        return enough and self.seen
 
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """`fit` of the accepted effects, strongest first in `effects`; `table` around it; `gains` {effect: Gain} of the
-    accepted, `offered` {effect: Gain} of the others beside them; `swaps` {effect: {other: nats that the other explains
-    more in its place}}."""
+    """`fit` of the accepted effects and of those that are feigned, the former in `effects`, strongest first; `table` around
+    it; `gains` {effect: Gain} of the accepted, `offered` {effect: Gain} of the others beside them; `swaps` {effect: {other:
+    nats that the other explains more in its place}}."""
 
     effects: tuple[str, ...]
     fit: SetFit
@@ -73,7 +77,7 @@ def select(evidence: Evidence) -> Selection:
         if fit is before:
             break
         fit, table, now = _pruned(replay, fit, table, now, singles)
-    gains = {e: gain_of(table, now, e) for e in fit.effects}
+    gains = {e: gain_of(table, now, e) for e in fit.effects if e not in evidence.feigned}
     offered = {e: _offer(table, now, e) for e in table.step}
     return Selection(tuple(sorted(gains, key=lambda e: -gains[e].floors)), fit, table, gains, offered, swaps)
 
@@ -145,16 +149,16 @@ def gain_of(table: Table, whole: Judged, effect: str) -> Gain:
     nothing = (
         judge(table, with_effects(table, drop=table.fit.effects)) if len(table.fit.effects) > 1 else without
     )
-    return _gain(table, without, whole, nothing)
+    return _gain(table, effect, without, whole, nothing)
 
 
 def _offer(table: Table, now: Judged, effect: str) -> Gain:
     more = judge(table, with_effects(table, add=(effect,)))
     nothing = judge(table, with_effects(table, drop=table.fit.effects))
-    return _gain(table, now, more, nothing)
+    return _gain(table, effect, now, more, nothing)
 
 
-def _gain(table: Table, without: Judged, whole: Judged, nothing: Judged) -> Gain:
+def _gain(table: Table, effect: str, without: Judged, whole: Judged, nothing: Judged) -> Gain:
     floor = floor_of(table, whole)
     nats = whole.nats - without.nats
     less = level(without.squares, floor) - 1.0
@@ -163,7 +167,16 @@ def _gain(table: Table, without: Judged, whole: Judged, nothing: Judged) -> Gain
         float(nats.sum() - max(nats.max(), 0.0)),
         less,
         less / max(level(nothing.squares, floor) - 1.0, 1e-9),
+        not CARDS[effect].thrust_map or _lifts(table, without, whole),
     )
+
+
+def _lifts(table: Table, without: Judged, whole: Judged) -> bool:
+    """Whether an effect on the thrust shows where thrust does, along the vertical: torques alone are something else's."""
+    if table.usable[VERTICAL] <= 0:
+        return True
+    before, after = (j.squares[:, VERTICAL].sum() for j in (without, whole))
+    return bool(np.sqrt(before / max(after, 1e-30)) - 1.0 > LEAST_GAIN)
 
 
 def floor_of(table: Table, whole: Judged) -> np.ndarray:

@@ -142,7 +142,7 @@ def _squares(evidence: Evidence, selection: Selection, physics, named, sensors=T
     table = selection.table
     # Numbers of the vehicle and what feedback makes of gusts are no sensor's fault and no effect: they stay.
     off = None if sensors else np.array([n.startswith(SENSORS) for n in evidence.replay.nuisance_names])
-    drop = tuple(e for e in selection.fit.effects if e not in physics)
+    drop = tuple(e for e in selection.fit.effects if e not in physics and e not in evidence.feigned)
     squares = keep(table, with_effects(table), drop, off) / table.rows[:, None]
     out = {n: squares[:, k] for k, (n, _) in enumerate(ERRORS) if table.usable[k] > 0}
     counts = [int((table.track_of == k).sum()) for k in range(len(evidence.tracks))]

@@ -53,7 +53,8 @@ def _less(key: tuple[str, ...], name: str) -> tuple[str, ...]:
 
 def not_testable(evidence: Evidence) -> list[str]:
     """Effects of the library that, at a usual size, these flights would not show."""
-    missing = [e for e in evidence.library.physics if evidence.exposure.get(e, 0.0) < TESTABLE]
+    physics, exposure = evidence.library.physics, evidence.exposure
+    missing = [e for e in physics if e in evidence.feigned or exposure.get(e, 0.0) < TESTABLE]
     if evidence.radio is None or evidence.radio.informative < 30 or not evidence.radio.readable:
         missing += [e for e in ("command_latency", "packet_loss") if e in evidence.library.effects]
     if evidence.gains is None or not np.isfinite(evidence.gains.error).any():

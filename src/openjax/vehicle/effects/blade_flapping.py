@@ -51,7 +51,7 @@ EFFECT = Effect(
         ),
         needs="velocity",
         coordinate="body velocity",
-        commoner="rotor_drag",
+        commoner=("rotor_drag",),
         is_itself=pitches,
         sample={"tilt": 0.02, "stiffness": 0.0002},
         next_flight="fast straight passes with sudden stops, to load roll and pitch.",
