@@ -33,15 +33,18 @@ CUT = -0.5
 
 
 def program(settings, policy):
-    """The compiled flight: (parameters, tasks, key, bounds (R, 4), held ()) -> (B,) step of the first crash, 0 for none."""
+    """The compiled flights: (parameters, tasks, key, bounds (R, 4), held (H,)) -> (H, B) step of the first crash, or 0."""
     vehicle = load_vehicle()
 
     def run(parameters, tasks, key, bounds, held):
         environment = Pursuit(settings, vehicle, vehicle_bounds=bounds)
-        number = tasks.evader_position.shape[0]
-        # as `make_evaluate` draws the starts
-        reset_keys = jax.random.split(jax.random.split(key)[0], number)
-        observation, state = jax.vmap(environment.reset_to)(reset_keys, tasks)
+        # as `make_evaluate` draws the starts; the same for each time of holding
+        keys = jax.random.split(jax.random.split(key)[0], tasks.evader_position.shape[0])
+        shape = held.shape[0], keys.shape[0]
+        number = shape[0] * shape[1]
+        worlds = jax.tree.map(lambda x: jnp.tile(x, (shape[0],) + (1,) * (x.ndim - 1)), (keys, tasks))
+        held = jnp.repeat(held, shape[1])[:, None]
+        observation, state = jax.vmap(environment.reset_to)(*worlds)
         step = jax.vmap(environment.step, in_axes=(None, 0, 0))
 
         def one(carry, i):
@@ -61,7 +64,7 @@ def program(settings, policy):
             jnp.zeros((number, settings.num_pursuers), bool),
             jnp.zeros(number, jnp.int32),
         )
-        return jax.lax.scan(one, start, jnp.arange(settings.episode_length))[0][3]
+        return jax.lax.scan(one, start, jnp.arange(settings.episode_length))[0][3].reshape(shape)
 
     return jax.jit(run)
 
@@ -88,17 +91,16 @@ def fly(name: str, number: int) -> dict[str, dict[str, dict]]:
     found: dict[str, dict[str, dict]] = {}
     for kind in KINDS:
         for task_kind, chosen in tasks.items():
-
-            def crash(held, kind=kind, chosen=chosen):
-                return np.asarray(
-                    run(loaded.parameters, chosen, jax.random.key(0), vehicles()[kind], jnp.asarray(held))
-                )
-
-            own = crash(0)
+            first = np.asarray(
+                run(loaded.parameters, chosen, jax.random.key(0), vehicles()[kind], jnp.array((0, *HELD)))
+            )
+            own = first[0]
             found.setdefault(kind, {})[task_kind] = {
                 "early": float(((own > 0) & (own <= EARLY)).mean()),
                 "later": float((own > EARLY).mean()),
-                "held": {str(held): float((crash(held) > 0).mean()) for held in HELD},
+                "held": {
+                    str(held): float((then > 0).mean()) for held, then in zip(HELD, first[1:], strict=True)
+                },
             }
             print(name, kind, task_kind, found[kind][task_kind], flush=True)
     return found
