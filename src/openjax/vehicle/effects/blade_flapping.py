@@ -21,7 +21,9 @@ def pitches(value, deviation):
     """Whether blades flap: they pitch the body by more than drag a centimetre above its centre of mass would do. If not, it
     is drag. Blades on stiff hubs may do that without tilting the thrust, but then beyond doubt."""
     tilts = value["tilt"] > 3.0 * deviation["tilt"]
-    pitches_alone = value["stiffness"] > 5.0 * deviation["stiffness"]
+    pitches_alone = (
+        value["stiffness"] > 5.0 * deviation["stiffness"] and value["tilt"] > -3.0 * deviation["tilt"]
+    )
     return bool((tilts or pitches_alone) and value["stiffness"] > _LEVER * max(value["tilt"], 0.0))
 
 
