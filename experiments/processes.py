@@ -172,6 +172,7 @@ def main(command: ProcessesCommand) -> dict:
     def tell(name, found):
         results[name] = found
         print(name, found, flush=True)
+        write_json(command.out.with_suffix(".json"), results)
 
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder)
@@ -190,6 +191,7 @@ def main(command: ProcessesCommand) -> dict:
         tell("compilation_seconds", round(time.monotonic() - started))
         tell("process 1 killed", lose_one(lost))
 
+        os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "true"
         beside = ThreadPoolExecutor(2)
         one = Job(command, scratch, "one_device", alone, *unwatched, "--num_envs", str(command.num_envs))
         resumed = Job(command, scratch, "lost", other, "--resume", str(lost.run))

@@ -37,7 +37,7 @@ def test_training_from_python_gives_a_policy(tmp_path, monkeypatch, capsys):
         tiny,
         environment=dataclasses.replace(tiny.environment, time_step=0.01, substeps=1, episode_length=40),
         network=dataclasses.replace(tiny.network, features=8, heads=2),
-        predictor=dataclasses.replace(tiny.predictor, units=4, horizons=(1, 5), windows=4),
+        predictor=dataclasses.replace(tiny.predictor, enabled=False),  # less to compile
         rollout_length=20,
         restart_every=0,
         num_envs=16,

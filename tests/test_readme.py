@@ -79,7 +79,7 @@ def test_from_sample_flights_to_a_corrected_simulator(tmp_path):
 
     def speed_after_a_second(environment):
         step = jax.jit(environment.step)
-        _, state = environment.reset(jax.random.key(0))
+        _, state = jax.jit(environment.reset)(jax.random.key(0))
         for _ in range(100):
             _, state, *_ = step(jax.random.key(0), state, action)
         return float(jnp.mean(jnp.linalg.norm(state.drones.velocity, axis=-1)))

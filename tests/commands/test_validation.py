@@ -52,7 +52,8 @@ def test_uniform_tasks_fly_as_they_would_alone():
     policy = Policy.for_environment(
         environment, NetworkSettings(features=8, heads=2), PredictorSettings(units=4)
     )
-    parameters = policy.init(jax.random.key(1), environment.reset(jax.random.key(0))[0])
+    key = jax.random.key(1)
+    parameters = jax.jit(lambda key: policy.init(key, environment.reset(key)[0]))(key)
     validation = Validation(environment, game, policy, 4)
     uniform, far, _ = validation(parameters)
     rewarded = dataclasses.replace(

@@ -28,7 +28,8 @@ def game():
     policy = Policy.for_environment(
         environment, NetworkSettings(features=8, heads=2), PredictorSettings(units=4, horizons=HORIZONS)
     )
-    parameters = policy.init(jax.random.key(3), environment.reset(jax.random.key(0))[0])
+    key = jax.random.key(3)
+    parameters = jax.jit(lambda key: policy.init(key, environment.reset(key)[0]))(key)
     drawn = training_tasks(SETTINGS, jax.random.key(1), WORLDS - len(SCENARIOS), 10)
     tasks = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), drawn, layout_tasks(SETTINGS, 1))
     return environment, policy, parameters, tasks

@@ -15,8 +15,8 @@ from openjax.learning import MappoSettings, TrainSettings
 TINY = """
     --preset quick --environment.time_step 0.01 --environment.substeps 1
     --environment.episode_length 10 --network.features 8 --network.heads 2
-    --predictor.enabled False --mappo.minibatches 2 --mappo.epochs 1 --generator.episodes_per_task 2
-    --generator.capacity 8 --num_envs 8 --rollout_length 10
+    --predictor.enabled False --generator.enabled False --mappo.minibatches 2 --mappo.epochs 1
+    --num_envs 8 --rollout_length 10
 """.split()
 
 

@@ -55,8 +55,8 @@ def test_game_around_outside_poses_is_the_game():
     settings = PursuitSettings(physics="rigid", episode_length=20)
     inside, outside = Pursuit(settings), game.flown_pursuit(settings)
     key = jax.random.key(5)
-    _, state = inside.reset(key)
-    _, other = outside.reset(key)
+    _, state = jax.jit(inside.reset)(key)
+    _, other = jax.jit(outside.reset)(key)
     action = jnp.array([[0.1, 0.2, 0.0, 0.3], [1.0, -1.0, 0.1, 0.0], [-1.0, 0.0, 0.4, 0.0]])
 
     @jax.jit

@@ -161,12 +161,13 @@ def test_mean_and_samples_are_actions_within_bounds(squash):
     )
     observation = observation_of(5)
     parameters = jax.jit(policy.init)(jax.random.key(0), observation)
-    mean, log_std = policy.distribution(parameters.actor, observation, None)
+    mean, log_std = jax.jit(policy.distribution)(parameters.actor, observation, None)
     np.testing.assert_allclose(mean, np.tanh(3.0) if squash == "mean" else 3.0, atol=0.1)
     sample = mean + jnp.exp(log_std) * jax.random.normal(jax.random.key(1), mean.shape)
     expected = np.clip(sample, -1, 1) if squash == "mean" else np.tanh(sample)
     np.testing.assert_allclose(policy.action(sample), expected, atol=1e-6)
-    np.testing.assert_allclose(policy.act(parameters, observation), policy.action(mean), atol=1e-6)
+    action = jax.jit(policy.act)(parameters, observation)
+    np.testing.assert_allclose(action, policy.action(mean), atol=1e-6)
 
 
 def test_density_and_entropy():

@@ -188,7 +188,7 @@ def test_gradients_of_free_flight_are_finite_and_right(tiny):
 
     actions = 0.5 * jax.random.uniform(KEY, (8, 3, 4), minval=-1.0)
     with jax.enable_x64(False):
-        _, state = tiny.reset(jax.random.key(3))
+        _, state = jax.jit(tiny.reset)(jax.random.key(3))
         value_and_gradient = jax.jit(jax.value_and_grad(loss))
         _, gradient = value_and_gradient(actions, state)
         assert np.isfinite(gradient).all() and np.abs(gradient).max() > 1e-5
@@ -262,8 +262,9 @@ def test_physical_effects_act_in_the_game():
     np.testing.assert_allclose(first.position, state.task.pursuer_position, atol=1e-6)
 
 
-@pytest.mark.parametrize("physics", ["mjx", "rigid", "stops"])
-@pytest.mark.parametrize("effects", [(), ("rotor_drag",)])
+@pytest.mark.parametrize(
+    ("physics", "effects"), [("mjx", ()), ("rigid", ()), ("stops", ()), ("rigid", ("rotor_drag",))]
+)
 def test_pillars_are_as_wide_and_as_high_as_the_settings_say(physics, effects):
     """Thrown at a pillar of 0.3 m and over one that ends below: stopped at the surface, and not stopped."""
     settings = PursuitSettings(
@@ -276,7 +277,6 @@ def test_pillars_are_as_wide_and_as_high_as_the_settings_say(physics, effects):
         speed_limit="none",
         start_attitude="level",
     )
-    environment = make(settings)
     task = Task(
         pursuer_position=jnp.array([[-0.6, 0.0, 0.5], [0.6, 0.0, 1.6]]),
         evader_position=jnp.array([0.0, 0.8, 0.5]),
@@ -290,7 +290,7 @@ def test_pillars_are_as_wide_and_as_high_as_the_settings_say(physics, effects):
         return state, state.drones.position
 
     environment = Pursuit(settings, effects=effects)
-    _, state = environment.reset_to(KEY, task)
+    _, state = jax.jit(environment.reset_to)(KEY, task)
     velocity = jnp.array([[2.0, 0.0, 0.0], [-2.0, 0.0, 0.0]])
     state = state.replace(drones=state.drones.replace(velocity=velocity))
     _, position = jax.jit(lambda state: jax.lax.scan(fly, state, None, length=50))(state)

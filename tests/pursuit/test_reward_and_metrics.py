@@ -168,7 +168,7 @@ def test_lookahead_counts_in_the_reward_what_comes_at_the_present_velocity():
     reward = dataclasses.replace(SETTINGS.reward, lookahead=0.5)
     environment = Pursuit(dataclasses.replace(SETTINGS, reward=reward))
     plain = Pursuit(SETTINGS)
-    _, state = environment.reset(jax.random.key(0))
+    _, state = jax.jit(environment.reset)(jax.random.key(0))
     position = jnp.array([[0.55, 0.0, 0.6], [-0.5, 0.0, 0.6], [0.0, 0.5, 0.3]])
     velocity = jnp.array(
         [[0.8, 0.0, 0.0], [0.8, 0.0, 0.0], [0.0, 0.0, 0.0]]
@@ -177,6 +177,6 @@ def test_lookahead_counts_in_the_reward_what_comes_at_the_present_velocity():
     pillar_active = jnp.zeros_like(state.task.pillar_active)
     state = state.replace(drones=drones, task=state.task.replace(pillar_active=pillar_active))
     action = state.previous_action
-    with_it, without = (game.step(jax.random.key(0), state, action) for game in (environment, plain))
+    with_it, without = (jax.jit(game.step)(jax.random.key(0), state, action) for game in (environment, plain))
     np.testing.assert_allclose(with_it[2] - without[2], [-10.0, 0.0, 0.0], atol=1e-4)
     assert not with_it[1].statistics.collision_steps.any()

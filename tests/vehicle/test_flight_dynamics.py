@@ -151,8 +151,8 @@ def test_gradients_are_right_and_finite(vehicle):
         step = make_drones_step(physics)
 
         def end(thrust, mass, height):
-            start = hover_state(vehicle, jnp.array([[0.0, 0, 0], [0.2, 0, 0]]).at[:, 2].set(height))
-            command = jnp.zeros((2, 4)).at[:, 0].set(thrust).at[:, 1].set(3.0)
+            start = hover_state(vehicle, jnp.zeros((1, 3)).at[:, 2].set(height))
+            command = jnp.zeros((1, 4)).at[:, 0].set(thrust).at[:, 1].set(3.0)
             drones = step(vehicle.replace(mass=mass), start, command, *pillars)
             return jnp.sum(drones.position[:, 2]) + jnp.sum(drones.body_rates[:, 0])
 

@@ -55,25 +55,36 @@ def fly_plainly(vehicle, drones, command):
     return mapped_step(FREE.fused, vehicle, drones, command, ())
 
 
+def by_kernel(fused, drones, command, pillars=()):
+    return jax.jit(lambda *given: kernel_call(fused, VEHICLE, *given, interpret=True))(
+        drones, command, pillars
+    )
+
+
+@jax.jit
+def freely(drones, command):
+    return jax.vmap(lambda d, c: fly_plainly(VEHICLE, d, c))(drones, command)
+
+
 def test_kernel_computes_the_step_of_each_drone():
     drones, command = drawn(WORLDS + 5, 1)  # the last block is only partly filled
-    stepped = kernel_call(FREE.fused, VEHICLE, drones, command, (), interpret=True)
-    assert_close(stepped, jax.vmap(lambda d, c: fly_plainly(VEHICLE, d, c))(drones, command))
+    assert_close(by_kernel(FREE.fused, drones, command), freely(drones, command))
 
 
 def test_kernel_computes_contacts():
     drones, command, pillars = crowded(WORLDS + 5)
     among = AMONG_SOLIDS.fused
-    stepped = kernel_call(among, VEHICLE, drones, command, pillars, interpret=True)
-    expected = jax.vmap(lambda *world: mapped_step(among, VEHICLE, *world))(drones, command, pillars)
+    stepped = by_kernel(among, drones, command, pillars)
+    plainly = jax.jit(jax.vmap(lambda *world: mapped_step(among, VEHICLE, *world)))
+    expected = plainly(drones, command, pillars)
     assert_close(stepped, expected, 1e-4)
-    free = jax.vmap(lambda d, c: fly_plainly(VEHICLE, d, c))(drones, command)
+    free = freely(drones, command)
     assert (np.abs(free.velocity - expected.velocity).max(-1) > 0.1).mean() > 0.5, "most must touch something"
 
 
 def test_mapped_over_worlds_and_over_vehicles():
     drones, command = drawn(5, 3)
-    expected = jax.jit(jax.vmap(lambda d, c: fly_plainly(VEHICLE, d, c)))(drones, command)
+    expected = freely(drones, command)
     assert_close(jax.jit(jax.vmap(lambda d, c: fly(VEHICLE, d, c)))(drones, command), expected)
     one_command = jax.jit(jax.vmap(lambda d: fly(VEHICLE, d, command[0])))(drones)
     assert_close(one_command, jax.jit(jax.vmap(lambda d: fly_plainly(VEHICLE, d, command[0])))(drones))
@@ -89,9 +100,10 @@ def test_mapped_over_worlds_and_over_vehicles():
 def test_memory_of_effects_that_the_step_does_not_have_is_left_alone():
     drones, command = drawn(3)
     memory = {"delay": jnp.arange(30.0).reshape(3, 5, 2), "age": jnp.arange(3)}
-    stepped = fly(VEHICLE, drones.replace(effect_memory=memory), command)
+    step = jax.jit(fly)
+    stepped = step(VEHICLE, drones.replace(effect_memory=memory), command)
     jax.tree.map(np.testing.assert_array_equal, stepped.effect_memory, memory)
-    assert_close(stepped.replace(effect_memory=()), fly(VEHICLE, drones, command))
+    assert_close(stepped.replace(effect_memory=()), step(VEHICLE, drones, command))
 
 
 def test_worlds_become_more_worlds_of_one_call(monkeypatch):

@@ -1,6 +1,7 @@
 """Policies from wherever they lie: a policy file, a run, a checkpoint, or one shipped with the package."""
 
 import dataclasses
+import functools
 from pathlib import Path
 
 import jax
@@ -11,8 +12,8 @@ from openjax.baselines.velocity_controller import check_flyable
 from openjax.errors import UserError
 from openjax.learning import TrainSettings
 from openjax.learning.train_state import policy_leaf
-from openjax.policy import Policy, PolicyParameters
-from openjax.pursuit import Observation, Pursuit
+from openjax.policy import NetworkSettings, Policy, PolicyParameters, PredictorSettings
+from openjax.pursuit import Observation, Pursuit, PursuitSettings
 from openjax.store.checkpoint_files import is_checkpoint, load_arrays
 from openjax.store.checkpoints import Checkpoints
 from openjax.store.old_names import train_settings
@@ -137,11 +138,17 @@ def _build(settings, leaves, source):
         settings = dataclasses.replace(
             settings, network=dataclasses.replace(settings.network, compute_type="float32")
         )
-    environment = Pursuit(settings.environment)
-    policy = make_policy(environment, settings.network, settings.predictor)
-    abstract = abstract_parameters(environment, policy)
+    policy, abstract = _untrained(settings.environment, settings.network, settings.predictor)
     if not any(name.startswith("critic/") for name in leaves):
         # Shipped without: flying needs no critic.
         abstract = abstract.replace(critic={})
     parameters = fill(abstract, leaves, source)
     return LoadedPolicy(policy, parameters, settings, source)
+
+
+@functools.lru_cache(maxsize=8)
+def _untrained(game: PursuitSettings, network: NetworkSettings, predictor: PredictorSettings):
+    """The networks of these settings and the kinds of their parameters, which take a second to trace."""
+    environment = Pursuit(game)
+    policy = make_policy(environment, network, predictor)
+    return policy, abstract_parameters(environment, policy)
