@@ -33,6 +33,8 @@ BODY_BLOCK = (
 )
 WATCHDOG_PERIOD = 0.1
 """s between two words to the firmware's watchdog."""
+TRIES = 5
+"""To have the log blocks sampled at different moments."""
 DRIFT = 5e-5
 """How fast two clocks may part (s/s)."""
 _WRAP = 1 << 24
@@ -80,6 +82,7 @@ class Member:
         self.listener: Callable[[bool], None] = lambda new_pose: None
         self.crazyflie = None
         self.blocks: list = []
+        self.phases: dict = {}  # when in the period each block of motors was sampled last (ms)
 
     def pose_arrived(self, stamp: int, data: dict, _block=None) -> None:
         """A pose block, called by cflib's thread."""
@@ -102,6 +105,7 @@ class Member:
         """A block of motors and accelerometer."""
         now = self._now()
         self.heard = now
+        self.phases[_block] = stamp % PERIOD_MS
         if self.recording:
             motors = tuple(data[name] / 65536 for name, _ in BODY_BLOCK[:4])
             force = tuple(9.81 * data[name] for name, _ in BODY_BLOCK[4:])
@@ -197,10 +201,19 @@ class Swarm:
             if self._now() > deadline:
                 raise UserError(f"the log blocks didn't start within {timeout:g} s")
             time.sleep(0.01)
-        # Once more, in step: all poses at the same moment, the other blocks spread over the 10 ms.
+        # Once more, in step. A vehicle samples every 1 or 2 ms: blocks that share a sample leave a gap elsewhere.
+        for _ in range(TRIES):
+            self._start_in_step()
+            time.sleep(5e-3 * PERIOD_MS)
+            if all(len(set(m.phases.values())) == self._body_logs for m in self.members):
+                break
+
+    def _start_in_step(self):
+        """All poses at the same moment, the blocks of motors spread evenly over the 10 ms."""
         begin = self._now() + 0.01
-        for number in range(len(kinds)):
-            while self._now() < begin + number * 1e-3 * PERIOD_MS / len(kinds):
+        for number in range(1 + self._body_logs):
+            due = begin + 1e-3 * PERIOD_MS * (number - 0.5) / self._body_logs if number else begin
+            while self._now() < due:
                 time.sleep(1e-4)
             for member in self.members:
                 member.blocks[number].start()
