@@ -23,7 +23,12 @@ from experiments.exam import cases, judge, score
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "experiments" / "results"
-TITLES = {"stranger": "The stranger's column", "known": "The known column", "rotorpy": "RotorPy 3"}
+TITLES = {
+    "stranger": "The stranger's column",
+    "known": "The known column",
+    "rotorpy": "RotorPy 3",
+    "onboard": "On-board estimates",
+}
 REPORTED = {
     101: {"stranger": 240, "known": 300},
     211: {"stranger": 240, "known": 300},
@@ -79,8 +84,8 @@ def sit(column, options, count):
     made = ["--seed", options.seed, "--logs", logs, "--answers", answers, "--jobs", options.jobs]
     if answers.exists():
         print(f"{column}: the cases in {work}", flush=True)
-    elif column == "rotorpy":
-        step("rotorpy_cases", "--each", count, *made)
+    elif column in ("rotorpy", "onboard"):
+        step(f"{column}_cases", "--each", count, *made)
     else:
         step("generate", "--column", column, "--count", count, *made)
     digest = answers.with_suffix(".sha256").read_text().strip()
@@ -166,6 +171,7 @@ def main():
     parser.add_argument("--known", type=int, default=0, help="cases of the known column")
     parser.add_argument("--stranger", type=int, default=0, help="cases of the stranger's column")
     parser.add_argument("--rotorpy", type=int, default=0, help="cases of each kind in RotorPy")
+    parser.add_argument("--onboard", type=int, default=0, help="cases of each kind on on-board estimates")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument(
         "--seconds", type=float, help="time for the diagnoses of a column; what is done by then counts"
@@ -197,9 +203,9 @@ def main():
         path.with_suffix(".md").write_text(page(data, reading.read_text() if reading.exists() else ""))
         draw(data, path.with_suffix(".png"))
         return
-    wanted = {"stranger": options.stranger, "rotorpy": options.rotorpy, "known": options.known}
+    wanted = {c: getattr(options, c) for c in TITLES}
     if not any(wanted.values()):
-        parser.error("say how many cases: --known, --stranger or --rotorpy")
+        parser.error("say how many cases: --known, --stranger, --rotorpy or --onboard")
     data = {"facts": facts(options), "columns": {}}
     results = options.results or options.work / "exam"
     results.parent.mkdir(parents=True, exist_ok=True)
