@@ -3,6 +3,7 @@ flights pass is tested with the other checks."""
 
 import numpy as np
 import pytest
+from scipy.signal import butter, sosfilt
 
 from openjax.errors import UserError
 from openjax.flights.case import load_case
@@ -70,6 +71,31 @@ def test_clocks_apart_filters_and_noise_are_no_contradiction(sample_columns):
         late[name] = columns[name] + 0.003 * rng.standard_normal(len(columns[name]))
     kept, found = refusals(late)
     assert found == [] and kept is not None
+
+
+def test_an_estimates_wandering_position_is_no_contradiction_while_hovering():
+    rng, t = np.random.default_rng(5), np.arange(0.0, 8.0, 0.01)
+    low = butter(2, 1.5, fs=100.0, output="sos")
+    slow = {n: sosfilt(low, rng.standard_normal((len(t) + 500, 3)), axis=0)[500:] for n in ("place", "lean")}
+    slow = {n: v / v.std(0) for n, v in slow.items()}
+    place = [0.0, 0.0, 0.6] + 0.003 * slow["place"]  # m: what ultra-wideband ranges leave
+    lean = 0.01 * slow["lean"]
+    rates = np.gradient(lean, t, axis=0) + 0.01 * rng.standard_normal((len(t), 3))
+    force = [0.0, 0.0, 9.81] + 0.05 * rng.standard_normal((len(t), 3))
+    quaternion = np.concatenate([np.ones((len(t), 1)), 0.5 * lean], 1)
+    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+    motors = 0.6 + 0.02 * rng.standard_normal((len(t), 4))
+    columns = {"t": t}
+    for channel, values in {
+        "position": place,
+        "quaternion": quaternion,
+        "body_rates": rates,
+        "specific_force": force,
+        "motor_command": motors,
+    }.items():
+        columns |= dict(zip(CHANNEL_COLUMNS[channel], values.T, strict=True))
+    kept, found = refusals(columns)
+    assert kept is not None, found
 
 
 def test_what_most_flights_contradict_the_calm_ones_must_show_to_be_right(case_folder, sample_columns):
