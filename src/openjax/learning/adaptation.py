@@ -31,7 +31,7 @@ class AdaptSettings:
     """... those in which only the critic learns: shipped policies come without one, and a wrong one spoils the policy."""
     look_every: Annotated[int, Interval("[1, 1000000]")] = 8
     """Steps of the policy between looks at what it has become; the best of all looks is kept."""
-    learning_rate: Annotated[float, Interval("(0, 1]")] = 3e-4
+    learning_rate: Annotated[float, Interval("(0, 1]")] = 6e-4
     """Adam step size at the start."""
     clip_epsilon: Annotated[float, Interval("(0, 10]")] = 0.1
     """Clip range of the probability ratio."""
@@ -56,12 +56,13 @@ def adapting_settings(trained: TrainSettings, settings: AdaptSettings) -> TrainS
             clip_epsilon=settings.clip_epsilon,
             clip_epsilon_end=settings.clip_epsilon,
             penalty_start=1.0,
-            actor_start=0.0,
+            # the optimiser learns the gradients' size meanwhile: with moments of zero, its first steps are ten times too long
+            actor_start=settings.warm_up / (settings.warm_up + settings.updates),
             minibatches=minibatches,
         ),
-        # A good policy solves nearly all but starts that force a collision. If those counted as unsolved, they would fill the
-        # archive, and all that is left to learn from them is to keep away from everything
-        generator=dataclasses.replace(trained.generator, collision_tolerance=1.0),
+        # What a good policy doesn't solve is hardly to be solved. Drawn again and again, it is all that the policy gets better
+        # at, and it gets worse at the rest
+        generator=dataclasses.replace(trained.generator, expansion=0.0),
         vehicles_start=0.0,
         vehicles_ramp=0.0,
         num_envs=num_envs,
@@ -132,25 +133,20 @@ def fine_tune(
 ) -> Tuned:
     """Train `parameters` (critic left aside) on vehicles within `bounds` (R, 4), and keep the best on the way.
 
-    In the first `training.warm_up` steps actor and predictor are put back after each step. `score` gives the scores of
-    episodes (B,), of the same tasks and vehicles each time; what isn't clearly better than the first parameters, by the
-    differences of single episodes, isn't kept. `tell` hears of every training step.
+    The predictor stays as it is: the evader flies no vehicle. `score` gives the scores of episodes (B,), of the same tasks
+    and vehicles each time; what isn't clearly better than the first parameters, by the differences of single episodes,
+    isn't kept. `tell` hears of every training step.
     """
     bounds = jnp.asarray(bounds)
     carry = adaptation.start(key, bounds)
     learnt = carry.policy.replace(actor=parameters.actor, predictor=parameters.predictor)
     carry, history = carry.with_policy(jax.tree.map(jnp.copy, learnt)), []
-    fixed = jax.tree.map(jnp.copy, (carry.actor, learnt.predictor))
     first = np.asarray(score(parameters.replace(critic={})))
     best, looks = (parameters.replace(critic={}), 0), {0: float(first.mean())}
     for update in range(1, adaptation.settings.total_updates + 1):
         carry, metrics = adaptation.step(carry, bounds)
-        if update <= training.warm_up:
-            actor, predictor = jax.tree.map(jnp.copy, fixed)
-            carry = carry.replace(
-                actor=actor.replace(optimiser=_at_step(actor.optimiser, carry.actor.optimiser)),
-                predictor=carry.predictor.replace(parameters=predictor),
-            )
+        predictor = jax.tree.map(jnp.copy, learnt.predictor)
+        carry = carry.replace(predictor=carry.predictor.replace(parameters=predictor))
         history.append(metrics)
         tell(update, metrics)
         trained = update - training.warm_up
@@ -170,11 +166,6 @@ def clearly_better(before: np.ndarray, after: np.ndarray, errors: float = 2.0) -
     """Whether the scores (B,) of the same episodes rose by more than so many standard errors of their differences."""
     gain = np.asarray(after, float) - np.asarray(before, float)
     return bool(gain.mean() > errors * gain.std() / np.sqrt(len(gain)))
-
-
-def _at_step(fresh, used):
-    """Optimiser state `fresh`, with the counts of steps of `used`, so that the step size goes on falling."""
-    return jax.tree.map(lambda new, old: old if jnp.issubdtype(old.dtype, jnp.integer) else new, fresh, used)
 
 
 def bounds_of(values, intervals) -> jax.Array:
