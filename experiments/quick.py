@@ -131,6 +131,7 @@ def report(results: dict) -> list[str]:
         "",
         results["preset"] + " Each cell: capture rate, seconds to the capture, crash rate.",
         "",
+        *([results["note"], ""] if "note" in results else []),
         *table(heads, rows),
     ]
 
