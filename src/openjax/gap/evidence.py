@@ -23,7 +23,7 @@ from openjax.gap.feedback import (
     read_feedback,
 )
 from openjax.gap.firmware import Radio
-from openjax.gap.hypotheses import SetFit, model_noise, weigh_singles
+from openjax.gap.hypotheses import SetFit, model_noise, weigh_singles, without_nuisances
 from openjax.gap.kinematics import Kinematics, corrected, read_kinematics
 from openjax.gap.library import ABSENT, CARDS, GUSTY, NUISANCES, PWM_NUISANCES, SAMPLED_NUISANCES, Library
 from openjax.gap.linear_path import LinearPath
@@ -299,4 +299,12 @@ def _physics(
         if _hidden(CARDS[effect], tracks):
             exposure[effect] = 0.0
     sets = weigh_singles(replay, library, exposure, before)
+    if feigned and not reading.blind:
+        # A large change leaves more than a straight line takes, which looked like gusts: what is left of its own fit tells.
+        for effect in sorted(feigned):
+            fit = sets.get((effect,))
+            if isinstance(fit, SetFit):
+                left = [without_nuisances(replay, c[0], k) for k, c in enumerate(fit.columns)]
+                if not _feigned(CARDS[effect], False, gustiness(tracks, feedback, left)):
+                    feigned -= {effect}
     return Look(replay, sets, exposure, floor, feigned, rate_loop, read)
