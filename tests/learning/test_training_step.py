@@ -21,7 +21,6 @@ from openjax.learning import (
     summarise,
     training_step,
 )
-from openjax.learning.rollout import correlated
 from openjax.learning.training_step import _initial_carry, _penalty_share
 from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import SCENARIOS, PursuitSettings, hover_action, scenario_task
@@ -294,14 +293,3 @@ def test_the_worlds_of_every_second_task_start_anew_within_the_episode(no_learni
         # of the group that ended only the other task was flown to its end, unless it began late
         entered += int(update >= 2)
         assert int(carry.archive.size) == min(entered, settings.generator.capacity)
-
-
-def test_correlated_noise():
-    noise = jax.random.normal(jax.random.key(1), (4000, 12, 2))
-    assert correlated(noise, 0.0) is noise
-    made = np.asarray(correlated(noise, 0.8))
-    np.testing.assert_allclose(made.std(axis=0), 1.0, atol=0.05)
-    for apart in (1, 3):
-        product = (made[:, apart:] * made[:, :-apart]).mean(axis=0)
-        np.testing.assert_allclose(product, 0.8**apart, atol=0.06)
-    np.testing.assert_array_equal(made[:, 0], noise[:, 0])

@@ -15,7 +15,7 @@ from openjax.pursuit import (
     turn_task,
     uniform_task,
 )
-from openjax.pursuit.task import start_attitude, starts_clear, together_starts
+from openjax.pursuit.task import start_attitude, starts_clear
 
 SETTINGS = PursuitSettings()
 DRAWS = 2000
@@ -198,18 +198,6 @@ def test_close_starts_leave_little_room_beside_a_pillar_or_another_pursuer(unifo
     moved = np.asarray(close.pursuer_position != uniform.pursuer_position).any(axis=-1)
     assert not moved[:, 0].any() and moved[:, 1:].mean() > 0.9
     assert (distances(close)[0].reshape(DRAWS, 3, 2).min(axis=-1) < 0.14 + 0.05 + 1e-5)[moved].all()
-
-
-def test_pursuers_that_start_together_stand_side_by_side(uniform):
-    together = jax.jit(jax.vmap(lambda key, task: together_starts(SETTINGS, key, task)))(keys(35), uniform)
-    assert_clear(together)
-    position = np.asarray(together.pursuer_position)
-    np.testing.assert_array_equal(position[:, 0], uniform.pursuer_position[:, 0])
-    assert np.abs(position[..., 2] - 0.6).max() <= 0.1 + 1e-6
-    moved = (position != np.asarray(uniform.pursuer_position))[:, 1:].any(axis=(1, 2))
-    assert moved.mean() > 0.9
-    nearest = distances(together)[0].reshape(DRAWS, 3, 2).min(axis=-1)[moved]
-    assert nearest.max() < 0.14 + 0.1 + 1e-5 and nearest.max() > 0.14 + 0.09
 
 
 def test_start_attitudes():

@@ -17,7 +17,6 @@ from openjax.pursuit import (
     turn_task,
     uniform_task,
 )
-from openjax.pursuit.task import together_starts
 
 
 def generate_task(
@@ -26,21 +25,13 @@ def generate_task(
     archive: TaskArchive,
     key: jax.Array,
     close: float = 0.0,
-    together: float = 0.0,
 ) -> Task:
     """Draw one task: with probability p an archived one, expanded, else a uniform one.
 
-    A share `close` of its pursuers is put close to a pillar or to another one; or, with probability `together`, all of
-    them side by side (neither is in the paper).
+    A share `close` of its pursuers is put close to a pillar or to another one (not in the paper).
     """
     task = _archived_or_uniform(settings, environment, archive, key)
-    drawn = close_starts(environment, jax.random.fold_in(key, 1), task, close) if close else task
-    if not together:
-        return drawn
-    choice_key, start_key = jax.random.split(jax.random.fold_in(key, 2))
-    side_by_side = together_starts(environment, start_key, task)
-    chosen = jax.random.uniform(choice_key) < together
-    return jax.tree.map(lambda a, b: jnp.where(chosen, a, b), side_by_side, drawn)
+    return close_starts(environment, jax.random.fold_in(key, 1), task, close) if close else task
 
 
 def _archived_or_uniform(settings, environment, archive, key):

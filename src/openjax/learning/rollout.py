@@ -2,7 +2,6 @@
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 
 from openjax.policy import Policy, PolicyParameters, gaussian_log_prob
@@ -26,21 +25,6 @@ class Rollout:
 def newest_frame(observation: Observation) -> Observation:
     """The observation with the newest frame only: the others are the frames of earlier steps."""
     return observation.replace(frames=observation.frames[..., -1:, :])
-
-
-def correlated(noise: jax.Array, correlation: float) -> jax.Array:
-    """Standard normal noise (E, T, ...) as noise whose consecutive steps correlate by `correlation` (0 to below 1).
-
-    Autoregressive of first order, each step still standard normal; made by one matrix product over the steps.
-    """
-    if not correlation:
-        return noise
-    step = np.arange(noise.shape[1])
-    weights = np.tril(correlation ** np.maximum(step[:, None] - step[None], 0).astype(np.float64))
-    weights[:, 1:] *= np.sqrt(1.0 - correlation**2)
-    return jnp.einsum(
-        "ts,es...->et...", weights.astype(np.float32), noise, precision=jax.lax.Precision.HIGHEST
-    )
 
 
 def collect(

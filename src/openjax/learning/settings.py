@@ -32,9 +32,6 @@ class MappoSettings:
     """... which changes linearly to this over `total_steps`."""
     entropy_coefficient: Annotated[float, Interval("[0, 10]")] = 1e-3
     """Weight of the entropy."""
-    noise_correlation: Annotated[float, Interval("[0, 1)")] = 0.0
-    """Correlation of the noise of consecutive actions. Independent noise at 100 Hz averages out in the motors, so little is
-    tried; the surrogate treats correlated noise as if it were independent (Hollenstein et al. 2024, colored noise in PPO)."""
     discount: Annotated[float, Interval("[0, 1]")] = 0.995
     gae_lambda: Annotated[float, Interval("[0, 1]")] = 0.95
     """Lambda of the generalised advantage estimate."""
@@ -113,8 +110,6 @@ class TrainSettings:
     """Multiple of `rollout_length`; the value of what would have come is estimated, as after every rollout."""
     restart_close: Annotated[float, Interval("[0, 1]")] = 0.0
     """Share of the pursuers in worlds that are started anew which start close to a pillar or another pursuer."""
-    restart_together: Annotated[float, Interval("[0, 1]")] = 0.0
-    """Share of these worlds in which all pursuers start side by side instead."""
     vehicles_start: Annotated[float, Interval("[0, 1]")] = 0.0
     """Share of the run in which all vehicles are nominal; after it, the family `environment.vehicles` grows about them ..."""
     vehicles_ramp: Annotated[float, Interval("[0, 1]")] = 0.0

@@ -14,7 +14,7 @@ from openjax.learning.collectives import gather_over_devices, mean_over_devices,
 from openjax.learning.generator import generate_task, select, successes
 from openjax.learning.mappo import ValueScale, initial_value_scale, make_optimiser, update_policy
 from openjax.learning.predictor_update import make_predictor_optimiser, update_predictor
-from openjax.learning.rollout import Rollout, collect, correlated
+from openjax.learning.rollout import Rollout, collect
 from openjax.learning.settings import TrainSettings
 from openjax.learning.train_state import Optimisers, TrainState
 from openjax.policy import Policy, PolicyParameters
@@ -179,7 +179,6 @@ def make_training_step(
         starting = _with_vehicles_of(settings, environment, progress)
         shape = (settings.rollout_length, settings.environment.num_pursuers, policy.sample_size)
         noise = jax.vmap(lambda k: jax.random.normal(k, shape))(own_keys(noise_key, num_envs, axis))
-        noise = correlated(noise, settings.mappo.noise_correlation)
         rollout, observation, state = collect(
             environment,
             policy,
@@ -255,10 +254,7 @@ def _with_vehicles_of(settings, environment, progress):
 def _tasks(settings, archive, keys, close=0.0):
     """One task per key, repeated for the environments that share it; a share of pursuers starts close to something."""
 
-    together = settings.restart_together if close else 0.0
-    draw = functools.partial(
-        generate_task, settings.generator, settings.environment, archive, close=close, together=together
-    )
+    draw = functools.partial(generate_task, settings.generator, settings.environment, archive, close=close)
     return jax.tree.map(lambda x: jnp.repeat(x, settings.episodes_per_task, axis=0), jax.vmap(draw)(keys))
 
 

@@ -175,28 +175,6 @@ def close_starts(settings: PursuitSettings, key: jax.Array, task: Task, share: f
     return _first_clear(settings, draw, key, task)
 
 
-def together_starts(settings: PursuitSettings, key: jax.Array, task: Task) -> Task:
-    """Put all pursuers side by side: each after the first 0 to 0.1 m outside the safety distance of one before it.
-
-    Mostly beside, hardly above one another, within 0.1 m of half the arena's height. Among a few draws the first that
-    starts clear is taken, else the task itself.
-    """
-    n = task.pursuer_position.shape[0]
-
-    def draw(key):
-        position = task.pursuer_position
-        for i, own_key in enumerate(jax.random.split(key, n - 1), start=1):
-            which_key, direction_key, gap_key = jax.random.split(own_key, 3)
-            beside = position[jax.random.randint(which_key, (), 0, i)]
-            away = jax.random.normal(direction_key, (3,)) * jnp.array([1.0, 1.0, 0.3])
-            gap = settings.drone_clearance + jax.random.uniform(gap_key, (), jnp.float32, 0.0, 2 * CLOSE)
-            place = beside + gap * away / jnp.linalg.norm(away)
-            position = position.at[i].set(place.at[2].set(_start_height(settings, place[2])))
-        return task.replace(pursuer_position=position)
-
-    return _first_clear(settings, draw, key, task)
-
-
 def _start_height(settings, z):
     """Heights z (m), cut to those at which a vehicle may start."""
     middle = settings.arena_height / 2
