@@ -286,7 +286,7 @@ def _physics(
         tracks, vehicles, ticks, feedback, reading.numbers, sensors.one_clock, at_once, sensors.wander
     )
     floor, exposure = model_noise(replay, library)
-    gusts = gustiness(tracks, feedback, floor)
+    gusts = replay.gusts = gustiness(tracks, feedback, floor)
     replay.loosen(
         {
             f"{e} {p}": float(np.hypot(1.0, GUSTY[e, p][0] * gusts[list(GUSTY[e, p][1])].mean() / usual))

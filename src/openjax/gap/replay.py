@@ -79,6 +79,9 @@ class Replay:
     projections: list | None = None  # (N, M) per track: whitened nuisances times (1 + n n')^(-1/2)
     numbers: tuple = NUISANCES  # the vehicle's numbers among the nuisances, which come first
     nuisance_names: tuple[str, ...] = ()
+    gusts: np.ndarray | None = (
+        None  # (3,) how gusty the torques are, see `feedback.gustiness`; None: not read
+    )
     shared: np.ndarray | None = (
         None  # (N,) whether a nuisance belongs to the vehicle (all flights) or to a track
     )

@@ -202,6 +202,11 @@ def is_itself(replay, fit: SetFit) -> bool:
     for effect in tests:
         named = {p: v for p, v in found[effect].items()}
         named |= {f"{o}.{p}": v for o in CARDS[effect].beside for p, v in found[o].items()}
+        axes = list(CARDS[effect].torque_axes)
+        named["gusts"] = (
+            float(np.mean(replay.gusts[axes])) if axes and replay.gusts is not None else 0.0,
+            0.0,
+        )
         value, deviation = ({k: v[n] for k, v in named.items()} for n in (0, 1))
         if not CARDS[effect].is_itself(value, deviation):
             return False

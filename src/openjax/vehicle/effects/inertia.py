@@ -14,12 +14,16 @@ def body(parameters, vehicle):
 
 def resists(value, deviation):
     """Whether the body resists the motors. One that seems heavy to turn and yet turns before its motors act is pushed by
-    what its rate controller answers: in closed loop, gusts look like weak and early motors."""
+    what its rate controller answers: in closed loop, gusts look like weak and early motors, though by no more than there are
+    gusts."""
+    if max(value["xx"], value["yy"]) - 1.0 > _FEIGNED * value["gusts"] > 0.0:
+        return True
     early = max(value["motor_lag.extra_up"], value["motor_lag.extra_down"]) < -EARLY
     sure = value["motor_lag.extra_up"] < -3.0 * deviation["motor_lag.extra_up"]
     return not (early and sure and max(value["xx"], value["yy"], value["zz"]) > 1.0)
 
 
+_FEIGNED = 4.0  # heavier than so many times the gusts' share of the torques, a body is heavy
 _SOURCE = "published values for the Crazyflie, with and without decks: 0.7-1.6 of nominal"
 
 EFFECT = Effect(
