@@ -207,8 +207,7 @@ def _sampled(reading: Reading, slow: bool, derived: bool) -> Reading:
     # Rows as slow as this hide every other command of a loop that sends one each 10 ms.
     seldom = max(t.dt for t in tracks) > 1.2 * GRID_PERIOD
     known = reading.arrived is not None and not seldom and not drifts
-    # Without commands nothing tells samples from means.
-    at_once = logged and (reading.arrived is None or answers_noise(tracks, reading.vehicles) > AT_ONCE)
+    at_once = logged and answers_noise(tracks, reading.vehicles) > AT_ONCE
     sure = True
     if known and at_once:
         # The log doesn't say which; the motion does.

@@ -81,18 +81,8 @@ def fit_set(replay: Replay, effects, start: np.ndarray | None = None, iterations
     hessian = grams.sum(0)[1:, 1:] + precision
     covariance = np.linalg.inv(hessian) if len(index) else np.zeros((0, 0))
     volume = np.linalg.slogdet(hessian)[1] - np.linalg.slogdet(precision)[1] if len(index) else 0.0
-    score = -objective - 0.5 * volume + _sign_term(effects, index, theta, covariance)
-    score -= _free_ride(grams.sum(0), theta[index] - mean, precision, len(places(effects)))
-    # What counts is how well a set does with nuisances within their bounds, and the vehicle's alike in all flights.
-    white = [replay.whiten(c, k).reshape(len(c), -1) for k, c in enumerate(columns)]
-    score += objective - held_objective(
-        [w[0] for w in white],
-        [w[1:] for w in white],
-        [n.reshape(len(n), -1) for n in replay.whitened_nuisances],
-        replay.shared,
-        theta[index] - mean,
-        precision,
-    )
+    least, free_ride = _held(replay, columns, theta, index, mean, precision, len(places(effects)))
+    score = -least - 0.5 * volume + _sign_term(effects, index, theta, covariance) - free_ride
     return SetFit(effects, theta, index, grams, columns, covariance, float(score), float(objective))
 
 
@@ -129,22 +119,33 @@ def _sign_term(effects, index, theta, covariance) -> float:
     return float(total)
 
 
-def _free_ride(gram, off, precision, own: int) -> float:
-    """What the companions alone would gain over no effect (nats), or beside the set's own effects where that is less: a
-    set must not live off them."""
-    if len(off) == own:
-        return 0.0
-    # Seen from no effect: the residual there is the present one plus what the whole set explains.
-    push = gram[1 + own :, 0] + gram[1 + own :, 1:] @ off
-    prior_part = precision[own:, own:]
-    hessian = gram[1 + own :, 1 + own :] + prior_part
-    volume = np.linalg.slogdet(hessian)[1] - np.linalg.slogdet(prior_part)[1]
-    alone = max(0.0, float(0.5 * push @ np.linalg.solve(hessian, push) - 0.5 * volume))
-    # Beside the others the companions' curvature is what the others can't follow.
-    whole = gram[1:, 1:] + precision
-    follow = np.linalg.solve(whole[:own, :own], whole[:own, own:])
-    moved = off[own:]
-    return min(alone, float(0.5 * moved @ (whole[own:, own:] - whole[own:, :own] @ follow) @ moved))
+def _held(replay: Replay, columns, theta, index, mean, precision, own: int) -> tuple[float, float]:
+    """Least objective of a set with nuisances within their bounds, and the vehicle's alike in all flights; and what its
+    companions, beyond the first `own` columns, alone gain over no effect (nats), or beside the set's own effects where that
+    is less: a set must not live off them."""
+    white = [replay.whiten(c, k).reshape(len(c), -1) for k, c in enumerate(columns)]
+    nuisances = [n.reshape(len(n), -1) for n in replay.whitened_nuisances]
+    off, away = theta[index] - mean, theta[index] - ABSENT[index]
+
+    def least(free, back):
+        """With the columns `free`, and those of `back` as if they were absent."""
+        return held_objective(
+            [w[0] + away[back] @ w[1 + back] for w in white],
+            [w[1 + free] for w in white],
+            nuisances,
+            replay.shared,
+            off[free],
+            precision[np.ix_(free, free)],
+        )
+
+    every, none = np.arange(len(index)), np.arange(0)
+    best = least(every, none)
+    if len(index) == own:
+        return best, 0.0
+    effects, companions = every[:own], every[own:]
+    alone = least(none, every) - least(companions, effects)
+    beside = least(effects, companions) - best
+    return best, max(0.0, min(alone, beside))
 
 
 def model_noise(replay: Replay, library: Library) -> tuple[list[np.ndarray], dict[str, float]]:

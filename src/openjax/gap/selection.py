@@ -19,6 +19,7 @@ from openjax.gap.table import Judged, Table, build, judge, level, with_effects
 LEAST_GAIN = 0.03  # floors by which an effect must shrink the gap on stretches left out
 LEAST_NATS = 5.0  # by which it must raise their likelihood even without the second of flight that gains most:
 # very strong evidence, in the usual words
+LEAST_STEADY = 0.1  # of the nats must be left without that second: an effect that acts once isn't known
 LEAST_SHARE = 0.01  # of the gap's rms above its floor: below, an effect is what the others' forms have wrong
 TESTABLE = 6.0  # nats that an effect of usual size must leave in these flights
 MOST = 6  # effects at once
@@ -45,8 +46,8 @@ class Gain:
 
     @property
     def accepted(self) -> bool:
-        enough = self.steady > LEAST_NATS and self.floors > LEAST_GAIN and self.share > LEAST_SHARE
-        return enough and self.seen
+        often = self.steady > max(LEAST_NATS, LEAST_STEADY * self.nats)
+        return often and self.floors > LEAST_GAIN and self.share > LEAST_SHARE and self.seen
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,12 +195,17 @@ def _ranked(table: Table, singles, now: Judged) -> list[str]:
 
 def is_itself(replay, fit: SetFit) -> bool:
     """Whether no effect of a set is by its fitted value another one, and none of two that undo each other."""
-    if _entangled(fit):
-        return False
+    return not _entangled(fit) and not _others(replay, fit)
+
+
+def _others(replay, fit: SetFit) -> list[str]:
+    """Effects of a set that are by their fitted values others."""
     tests = [e for e in fit.effects if CARDS[e].is_itself is not None]
     more = {o for e in tests for o in CARDS[e].beside if o not in fit.effects}
-    found = step_with(replay, fit, more) if more else fit.parameters()
+    alone, beside = fit.parameters(), step_with(replay, fit, more) if more else fit.parameters()
+    wrong = []
     for effect in tests:
+        found = beside if CARDS[effect].beside else alone
         named = {p: v for p, v in found[effect].items()}
         named |= {f"{o}.{p}": v for o in CARDS[effect].beside for p, v in found[o].items()}
         axes = list(CARDS[effect].torque_axes)
@@ -209,8 +215,8 @@ def is_itself(replay, fit: SetFit) -> bool:
         )
         value, deviation = ({k: v[n] for k, v in named.items()} for n in (0, 1))
         if not CARDS[effect].is_itself(value, deviation):
-            return False
-    return True
+            wrong.append(effect)
+    return wrong
 
 
 def _entangled(fit: SetFit) -> bool:
@@ -246,11 +252,12 @@ def _joined(replay, fit: SetFit, singles, effect: str, without: str | None = Non
 
 
 def _pruned(replay, fit, table, now, singles):
-    """The set without what the others do as well."""
+    """The set without what the others do as well, and without what isn't itself once they are gone."""
     while fit.effects:
         gains = {e: gain_of(table, now, e) for e in fit.effects}
-        weakest = min(gains, key=lambda e: gains[e].floors)
-        if gains[weakest].accepted:
+        others = _others(replay, fit)
+        weakest = min(others or gains, key=lambda e: gains[e].floors)
+        if gains[weakest].accepted and not others:
             break
         fit = fit_set(replay, [e for e in fit.effects if e != weakest], fit.theta)
         table = build(replay, fit, singles)

@@ -16,7 +16,7 @@ from openjax.gap.shares import Split
 CLOCK = 0.003  # s by which the clocks of a log may differ
 CLEAR = 3.0  # standard errors
 LEAST_LOSS = 0.01  # of the packets
-BESIDE = 0.15  # floors by which an effect must shrink the gap to be named beside a stronger one
+BESIDE = 0.13  # floors by which an effect must shrink the gap to be named beside a stronger one
 LEAST_LEFT = 0.05  # floors of the gap that an unexplained rest must hold to be named
 UNKNOWN_SHARE = 0.2  # of the gap, from which an unexplained rest is named beside the effects
 

@@ -15,7 +15,7 @@ def motor(parameters, motor_command, context):
 _SOURCE = "spread of quadratic thrust maps published for the Crazyflie, as shares of the largest thrust"
 
 
-_BEND = 0.03  # of the thrust over the usual commands
+_BEND = 0.02, 0.03  # of the thrust over the usual commands: least of all, and beside a change of all thrust
 _STEEPNESS = 0.4, 2.2  # of the curve, where a straight line has 1: powers of the command from 0.6 to 1.9
 
 
@@ -28,7 +28,7 @@ def bends(value, deviation):
     if steepness.min() < _STEEPNESS[0] or steepness.max() > _STEEPNESS[1]:
         return False
     change = value["offset"] / commands + value["slope"] + value["curvature"] * commands - 1.0
-    return bool(np.ptp(change) > min(0.5 * abs(change.mean()), _BEND))
+    return bool(np.ptp(change) > np.clip(0.5 * abs(change.mean()), *_BEND))
 
 
 EFFECT = Effect(

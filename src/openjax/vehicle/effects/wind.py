@@ -16,7 +16,7 @@ def wrench(parameters, context):
 
 _SOURCE = "indoor draughts and fans, 0.3-3 m/s"
 
-_CALM = 0.1  # m/s: air that moves less is calm
+_CALM = 0.2  # m/s: air that moves less is calm
 
 
 def blows(value, deviation):
@@ -47,6 +47,7 @@ EFFECT = Effect(
             Fitted("drag", mean=0.013, spread=0.006, start=0.013, step=0.0001, positive=True),
             Fitted("along", mean=0.8, spread=0.4, start=1.0, step=0.01),
         ),
+        companions=(("blade_flapping", "stiffness", 4e-05),),  # as for rotor_drag
         needs="velocity",
         coordinate="body velocity",
         commoner=("rotor_drag",),
