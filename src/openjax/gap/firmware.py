@@ -126,8 +126,7 @@ def _delay_misfit(track: Track, delays: np.ndarray) -> np.ndarray:
 
 def _late_error(track: Track, delay: float) -> np.ndarray:
     """(T,) mean of the motors less the commanded thrust of `delay` s ago."""
-    whole, part, given, clean = _link_rows(track, delay)
-    del clean
+    whole, part, given, _ = _link_rows(track, delay)
     thrust = track.command[:, 0]
     return given - (1 - part) * _late(thrust, whole) - part * _late(thrust, whole + 1)
 
@@ -163,9 +162,8 @@ def _decode(tracks, delay: float, may_lose: bool) -> dict:
         whole, part, given, clean = _link_rows(track, delay)
         error = np.abs(_late_error(track, delay)[clean])
         noise = float(np.median(error)) if len(error) else 0.0
-        telling = (
-            TOLERANCE + 2.0 * noise
-        ) / HELD  # smallest change of thrust that shows whether a packet arrived
+        # the smallest change of thrust that shows whether a packet arrived
+        telling = (TOLERANCE + 2.0 * noise) / HELD
         thrust, given, flags = track.command[:, 0].tolist(), given.tolist(), clean.tolist()
         held, in_force, error = 0, np.zeros(len(track), int), np.zeros(len(track))
         for row in range(len(track)):
