@@ -54,9 +54,11 @@ def seems(effect, deviation=1e-6, **value):
 def test_a_heavy_body_that_turns_before_its_motors_act_is_a_gust():
     heavy = {"xx": 1.3, "yy": 1.3, "zz": 1.2}
     late, early = ({f"motor_lag.{k}": v for k in ("extra_up", "extra_down")} for v in (0.001, -0.008))
-    assert seems("inertia", **heavy, **late) and not seems("inertia", **heavy, **early)
-    assert seems("inertia", deviation=0.01, **heavy, **early)  # so unsure a lag says nothing
-    assert seems("inertia", xx=0.8, yy=0.8, zz=0.9, **early)
+    gusty, calm = {"gusts": 0.2}, {"gusts": 0.05}
+    assert seems("inertia", **heavy, **late, **gusty) and not seems("inertia", **heavy, **early, **gusty)
+    assert seems("inertia", deviation=0.01, **heavy, **early, **gusty)  # so unsure a lag says nothing
+    assert seems("inertia", xx=0.8, yy=0.8, zz=0.9, **early, **gusty)
+    assert seems("inertia", **heavy, **early, **calm)  # more than these gusts can feign
     assert seems("motor_lag", extra_up=0.01, extra_down=0.02)
     assert not seems("motor_lag", extra_up=-0.008, extra_down=-0.007)
     assert not seems("motor_lag", extra_up=0.5, extra_down=0.4)
