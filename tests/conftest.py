@@ -7,11 +7,12 @@ from pathlib import Path
 import pytest
 
 _flags = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+# workers are the parallel part: more threads would only wait for each other's cores
+_flags += " --xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 if version("jaxlib").startswith("0.10."):
     # its way of fusing compiles three times as long; later versions know no such flag
     _flags += " --xla_cpu_use_fusion_emitters=false"
 os.environ.setdefault("XLA_FLAGS", _flags)
-# workers are the parallel part: a linear algebra's own threads would only wait for each other's cores
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
