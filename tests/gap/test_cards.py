@@ -59,6 +59,7 @@ def test_a_heavy_body_that_turns_before_its_motors_act_is_a_gust():
     assert seems("inertia", deviation=0.01, **heavy, **early, **gusty)  # so unsure a lag says nothing
     assert seems("inertia", xx=0.8, yy=0.8, zz=0.9, **early, **gusty)
     assert seems("inertia", **heavy, **early, **calm)  # more than these gusts can feign
+    assert not seems("inertia", xx=0.97, yy=0.97, zz=1.0, **late, **calm)
     assert seems("motor_lag", extra_up=0.01, extra_down=0.02)
     assert not seems("motor_lag", extra_up=-0.008, extra_down=-0.007)
     assert not seems("motor_lag", extra_up=0.5, extra_down=0.4)
