@@ -1,0 +1,67 @@
+"""The algebra of decisions against plain least squares."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from openjax.gap.bounds import BOUND, held_objective
+from openjax.gap.table import Model, Table, judge, offers
+
+SHARED = np.array([True, True, False])
+
+
+@pytest.fixture
+def columns():
+    """Whitened columns of two tracks: what is left, four candidates, three nuisances that explain a part of it."""
+    rng = np.random.default_rng(0)
+    out = []
+    for _ in range(2):
+        x = rng.standard_normal((8, 400))
+        x[0] += 0.5 * x[2] + 0.1 * x[3] + 0.3 * x[5] - 0.4 * x[7]
+        out.append(x)
+    return out
+
+
+def table_of(columns) -> Table:
+    blocks = [b for x in columns for b in np.array_split(x, 4, axis=1)]
+    white = np.array([b @ b.T for b in blocks])
+    return Table(
+        SimpleNamespace(effects=(), theta=np.zeros(0)), white, np.repeat(white[:, None], 6, 1), np.full(8, 100),
+        np.repeat([0, 1], 4), np.repeat([0, 1], 4), np.repeat([0, 1, 2, 3], 2), {}, {}, {}, np.arange(1, 5), SHARED,
+        np.ones(6),
+    )  # fmt: skip
+
+
+def test_an_offer_is_what_judging_each_column_finds(columns):
+    table = table_of(columns)
+    model = Model((), np.array([3]), np.zeros(1), np.eye(1))
+    precision = np.array([1.0, 25.0, 4.0])
+    offered = offers(table, model, np.array([1, 2, 4]), precision)
+    for column, sure, nats in zip((1, 2, 4), precision, offered, strict=True):
+        wider = Model((), np.array([3, column]), np.zeros(2), np.diag([1.0, sure]))
+        np.testing.assert_allclose(nats, judge(table, wider).nats, rtol=1e-9)
+    gains = offered.sum(1) - judge(table, model).nats.sum()
+    assert gains[1] > 50.0 and max(gains[0], gains[2]) < 5.0  # column 2 is part of what is left
+
+
+def test_nuisances_of_the_vehicle_are_alike_on_all_tracks_and_bounded(columns):
+    left = [
+        x[0] + s * 5.0 * x[6] for x, s in zip(columns, (1.0, -1.0), strict=True)
+    ]  # the second would differ in sign
+    left = [r + 3.0 * x[5] for r, x in zip(left, columns, strict=True)]  # and the first be beyond its bound
+    off, precision = np.array([0.2]), np.array([[4.0]])
+    found = held_objective(left, [x[2:3] for x in columns], [x[5:] for x in columns], SHARED, off, precision)
+
+    def objective(z):
+        step, common, own = z[:1], z[1:3], z[3:]
+        value = 0.5 * 4.0 * (off[0] + step[0]) ** 2 + 0.5 * (common @ common + own @ own)
+        for k, (r, x) in enumerate(zip(left, columns, strict=True)):
+            value += 0.5 * ((r - step @ x[2:3] - common @ x[5:7] - own[k] * x[7]) ** 2).sum()
+        return value
+
+    bounds = [(None, None)] + [(-BOUND, BOUND)] * 4
+    best = minimize(objective, np.zeros(5), bounds=bounds, options={"ftol": 1e-14}).fun
+    np.testing.assert_allclose(found, best, rtol=1e-3)
+    assert found >= best - 1e-6 * best
