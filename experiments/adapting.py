@@ -174,8 +174,9 @@ def won_back(before: np.ndarray, after: np.ndarray, draws: int = 2000) -> tuple[
     rng = np.random.default_rng(0)
     episodes = rng.integers(0, before.shape[1], (draws, before.shape[1]))
     one, two = before.mean(axis=0)[episodes].mean(axis=1), after.mean(axis=0)[episodes].mean(axis=1)
-    low, high = np.percentile(1 - two / np.where(np.abs(one) > 1e-12, one, np.nan), [5, 95])
-    return float(1 - after.mean() / before.mean()), float(low), float(high)
+    low, high = np.nanpercentile(1 - two / np.where(np.abs(one) > 1e-12, one, np.nan), [5, 95])
+    share = 1 - after.mean() / before.mean() if before.mean() else float("nan")
+    return float(share), float(low), float(high)
 
 
 def report(results: dict) -> list[str]:

@@ -56,12 +56,11 @@ def adapting_settings(trained: TrainSettings, settings: AdaptSettings) -> TrainS
             clip_epsilon=settings.clip_epsilon,
             clip_epsilon_end=settings.clip_epsilon,
             penalty_start=1.0,
-            # the optimiser learns the gradients' size meanwhile: with moments of zero, its first steps are ten times too long
+            # the optimiser learns the gradients' size meanwhile; with moments of zero its first steps would be ten times as long
             actor_start=settings.warm_up / (settings.warm_up + settings.updates),
             minibatches=minibatches,
         ),
-        # What a good policy doesn't solve is hardly to be solved. Drawn again and again, it is all that the policy gets better
-        # at, and it gets worse at the rest
+        # uniform tasks: by them the best step is chosen, and with tasks from the archive it came out no better
         generator=dataclasses.replace(trained.generator, expansion=0.0),
         vehicles_start=0.0,
         vehicles_ramp=0.0,
