@@ -164,6 +164,13 @@ def test_wind_persists_at_rest_and_turns_with_yaw(vehicle):
         wrench(vehicle, "wind", values, quaternion=yawed(np.pi / 2))[0], [0, -0.02, 0], atol=1e-7
     )
     np.testing.assert_allclose(wrench(vehicle, "wind", values, velocity=(2, 0, 0))[0], [0, 0, 0], atol=1e-8)
+    # In still air it is rotor drag: along the axes by its share, and against the body's rates.
+    still = {"x": 0.0, "y": 0.0, "z": 0.0, "drag": 0.02, "along": 0.4}
+    moving = dict(velocity=(0.5, -1.0, 2.0), body_rates=(1.0, 2.0, 3.0))
+    drag = wrench(vehicle, "rotor_drag", {"d_xy": 0.02, "d_z": 0.008}, **moving)
+    np.testing.assert_allclose(
+        np.concatenate(wrench(vehicle, "wind", still, **moving)), np.concatenate(drag), rtol=1e-5
+    )
 
 
 @pytest.mark.parametrize(("name", "plane", "side"), [("ground_effect", 0.0, 1), ("ceiling_effect", 1.2, -1)])

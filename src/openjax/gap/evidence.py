@@ -55,9 +55,7 @@ class Evidence:
     sets: dict[tuple[str, ...], SetFit]
     exposure: dict[str, float]
     floor: list[np.ndarray]  # (T, 9) residuals when all effects may act at once: sensors and gusts
-    feigned: frozenset[
-        str
-    ]  # effects that gusts or samples look like: they take what they can, and aren't named
+    feigned: frozenset[str]  # what gusts or samples look like: it takes what it can, and isn't named
     radio: Radio | None
     rate_loop: LinearPath | None
     gains: Gains | None
@@ -213,7 +211,7 @@ def _sampled(reading: Reading, slow: bool, derived: bool) -> Reading:
         # The log doesn't say which; the motion does.
         own = Library(("inertia",))
         mean, single = (
-            _physics(dataclasses.replace(reading, at_once=m), own, hide=False) for m in (False, True)
+            _physics(dataclasses.replace(reading, at_once=m), own, tell=False) for m in (False, True)
         )
         at_once, sure = _looks_sampled(reading.vehicles, mean, single)
     reading = dataclasses.replace(reading, at_once=at_once)
@@ -265,10 +263,10 @@ def _feigned(card, blind: bool, gusts: np.ndarray) -> bool:
 
 
 def _physics(
-    reading: Reading, library: Library, pushes=None, gains=None, before=None, hide: bool = True
+    reading: Reading, library: Library, pushes=None, gains=None, before=None, tell: bool = True
 ) -> Look:
-    """Look at the physics. `pushes`, `gains`: what an earlier look found; `before`: its sets, to start from; `hide`: tell
-    what gusts and samples feign."""
+    """Look at the physics. `pushes`, `gains`: what an earlier look found; `before`: its sets, to start from; `tell`: apart what
+    gusts and samples feign."""
     tracks, vehicles, arrived, at_once = reading.tracks, reading.vehicles, reading.arrived, reading.at_once
     rate_loop, read, ticks = None, None, [np.repeat(t.motor[:, None], TICKS, 1) for t in tracks]
     links = arrived if arrived is not None else [None] * len(tracks)
@@ -293,7 +291,7 @@ def _physics(
             if (e, p) in GUSTY
         }
     )
-    feigned = frozenset(e for e in library.physics if hide and _feigned(CARDS[e], reading.blind, gusts))
+    feigned = frozenset(e for e in library.physics if tell and _feigned(CARDS[e], reading.blind, gusts))
     for effect in library.physics:
         if _hidden(CARDS[effect], tracks):
             exposure[effect] = 0.0

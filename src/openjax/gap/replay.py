@@ -80,7 +80,7 @@ class Replay:
     numbers: tuple = NUISANCES  # the vehicle's numbers among the nuisances, which come first
     nuisance_names: tuple[str, ...] = ()
     gusts: np.ndarray | None = (
-        None  # (3,) how gusty the torques are, see `feedback.gustiness`; None: not read
+        None  # (3,) their share in the torques about each axis, see `feedback.gustiness`
     )
     shared: np.ndarray | None = (
         None  # (N,) whether a nuisance belongs to the vehicle (all flights) or to a track

@@ -120,7 +120,8 @@ class Card:
     torque_axes: those of the torques by which it is told, which gusts can imitate, and what motors do between two rows.
     commoner: effects one of which is named instead where it does equally well.
     is_itself({parameter: value}, {parameter: deviation}): whether it isn't by its fitted value another effect; `beside`:
-        effects that are fitted with it for that, whose parameters follow as "effect.parameter".
+        effects that are fitted with it for that, whose parameters follow as "effect.parameter"; "gusts" is their share in
+        the torques.
     sample: a strength within its usual range to fly with, strong enough to see.
     impossible(position): whether a flight along position (T, 3), m, rules it out.
     next_flight: what would show it, in words.
