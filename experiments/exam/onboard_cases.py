@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import butter, lfilter
 
-from experiments.exam import fleet, measure, onboard
+from experiments.exam import fleet, measure, onboard, sensors
 from experiments.exam import rotorpy_cases as rp
 from experiments.exam import vehicle as v
 from experiments.exam.generate import write_answers
@@ -375,7 +375,7 @@ def log_rows(rng, drawn, flown, seconds):
     ]
     groups += [flown["command"][place // 5, :, 0], motors, voltage[:, None]]
     values = np.concatenate([g.astype(float) for g in groups], axis=1)
-    return {"t": STEP * place} | dict(zip(fleet.sensors.COLUMNS[2:], values.T, strict=True))
+    return {"t": STEP * place} | dict(zip(sensors.COLUMNS[2:], values.T, strict=True))
 
 
 def air_errors(joined):
