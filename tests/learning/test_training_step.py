@@ -14,6 +14,7 @@ from openjax.learning import (
     MappoSettings,
     TrainSettings,
     build,
+    changed,
     init_carry,
     make_evaluate,
     make_training_step,
@@ -266,6 +267,11 @@ def test_impossible_settings(changes, message):
 def test_presets():
     for name in ("quick", "paper"):
         assert preset(name, seed=3).seed == 3
+    paper = preset("paper")
+    dear = preset("paper", environment=dict(reward=dict(crash=55.0)))  # all else stays
+    assert dear != paper and changed(dear, environment=dict(reward=dict(crash=20.0))) == paper
+    with pytest.raises(UserError, match="crash"):
+        preset("paper", environment=dict(reward=dict(crash=float("nan"))))
     with pytest.raises(UserError, match="possible are quick, paper"):
         preset("papers")
 
