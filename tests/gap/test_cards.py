@@ -65,6 +65,12 @@ def test_a_heavy_body_that_turns_before_its_motors_act_is_a_gust():
     assert not seems("motor_lag", extra_up=0.5, extra_down=0.4)
 
 
+def test_what_pushes_along_the_motion_is_no_drag():
+    assert seems("rotor_drag", d_xy=0.004, d_z=0.0) and not seems("rotor_drag", d_xy=-0.01, d_z=0.004)
+    assert seems("wind", x=0.5, y=0.0, z=0.0, drag=0.004, along=1.0)
+    assert not seems("wind", x=0.5, y=0.0, z=0.0, drag=-0.004, along=1.0)
+
+
 def test_what_pitches_the_body_like_drag_is_drag():
     # Drag 0.5 cm above the centre of mass of a 30 g vehicle whose thrust tilts 0.01 rad per m/s, and flapping 3 cm above.
     weight, tilt = 0.03 * 9.81, 0.01

@@ -35,6 +35,8 @@ def test_knocks_and_jets_that_switch_are_found():
     assert knocks(*flights(3.0 * (time % 0.9 < 0.07)))
     assert knocks(*flights(2.0 * (time % 3.0 < 1.5)))
     assert not knocks(*flights(2.0 * np.sin(2 * np.pi * time / 3.0)))  # as strong, but slow
+    tracks, disturbed, usable = flights(3.0 * (time % 0.9 < 0.07))
+    assert not knocks(tracks, [0.01 * x for x in disturbed], usable)  # too weak to matter
 
 
 def test_only_sideways_force_counts_and_only_where_it_was_logged():

@@ -15,6 +15,7 @@ from openjax.gap.replay import FORCE, SKIP
 WIDTHS = (0.05, 0.1)  # s of the means whose differences are looked at
 CLEAR = 5.5  # standard errors of the kurtosis of as many normal numbers
 LEAST = 1.0  # of the kurtosis above three: below, it is a matter of how steady turbulence was
+PUSH = 0.1  # m/s^2, a hundredth of the weight: the largest must be more to matter
 
 
 def knocks(tracks: list[Track], disturbed: list[np.ndarray], usable: np.ndarray) -> tuple[str, ...]:
@@ -32,8 +33,8 @@ def knocks(tracks: list[Track], disturbed: list[np.ndarray], usable: np.ndarray)
             continue
         # Axes differ in what acts along them, and flights in their air.
         kurtosis = float(np.mean((changes / np.sqrt(np.mean(changes**2, 0) + 1e-30)) ** 4))
-        if kurtosis > 3.0 + max(LEAST, CLEAR * np.sqrt(24.0 / number)):
-            size = np.sqrt((changes**2).sum(1).max())
+        size = float(np.sqrt((changes**2).sum(1).max()))
+        if size > PUSH and kurtosis > 3.0 + max(LEAST, CLEAR * np.sqrt(24.0 / number)):
             return (
                 f"sudden pushes to the side, up to {size:.1f} m/s^2 within {width:g} s (kurtosis {kurtosis:.1f})",
             )

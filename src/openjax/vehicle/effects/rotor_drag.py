@@ -16,6 +16,12 @@ _SOURCE = (
     "induced drag of small quadrotors (Foerster 2015 for the Crazyflie; Faessler, Franchi, Scaramuzza 2018)"
 )
 
+
+def brakes(value, deviation):
+    """Whether a fitted drag isn't clearly a push along the motion."""
+    return bool(value["d_xy"] > -3.0 * deviation["d_xy"])
+
+
 EFFECT = Effect(
     name="rotor_drag",
     description="force against the hubs' velocity in the body frame",
@@ -33,6 +39,7 @@ EFFECT = Effect(
         companions=(("blade_flapping", "stiffness", 4e-05),),
         needs="velocity",
         coordinate="body velocity",
+        is_itself=brakes,
         sample={"d_xy": 0.015, "d_z": 0.005},
         next_flight="fast straight passes in two headings, nose and side first.",
     ),

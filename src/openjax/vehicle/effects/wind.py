@@ -20,9 +20,9 @@ _CALM = 0.2  # m/s: air that moves less is calm
 
 
 def blows(value, deviation):
-    """Whether a fitted wind moves; if not, it is drag."""
+    """Whether a fitted wind drags and moves; if not, it is drag, or nothing."""
     speed = (value["x"] ** 2 + value["y"] ** 2) ** 0.5
-    return speed > max(_CALM, 3.0 * deviation["x"], 3.0 * deviation["y"])
+    return bool(value["drag"] > 0.0 and speed > max(_CALM, 3.0 * deviation["x"], 3.0 * deviation["y"]))
 
 
 EFFECT = Effect(
