@@ -29,6 +29,7 @@ LEFT_MUCH = 1.2  # of the squares that noise alone leaves: a search from several
 ROUNDS = 2  # of widening and swapping
 ALIKE = 0.98  # correlation of two effects' parameters beyond which one of them is enough
 CLASS = 10.0  # nats within which two effects do equally well
+COMMONER = 20.0  # nats by which an effect must do better than a commoner one
 TRIED = 2  # candidates of each kind fitted in full at each step
 
 
@@ -283,11 +284,11 @@ def _swapped(replay, fit, table, now, singles):
         gains = {o: f.score - fit.score for o, f in tried.items()}
         favoured = dict(gains)
         for other in CARDS[effect].commoner:
-            if gains.get(other, -np.inf) > -CLASS:
-                favoured[other] += CLASS + LEAST_NATS
+            if gains.get(other, -np.inf) > -COMMONER:
+                favoured[other] += COMMONER + LEAST_NATS
         for other in favoured:
             if effect in CARDS[other].commoner:
-                favoured[other] -= CLASS
+                favoured[other] -= COMMONER
         for best in sorted(favoured, key=lambda o: -favoured[o]):
             if favoured[best] <= LEAST_NATS:
                 continue
