@@ -15,6 +15,8 @@ from openjax.files import read_json
 from openjax.store.settings_files import write_json
 
 RESULTS = Path(__file__).parent / "results"
+PLACES = ("--out", "--work", "--results", "--commit")
+"""Options that say where files lie, or what git would say."""
 
 
 def page_parser(doc: str, name: str) -> argparse.ArgumentParser:
@@ -27,14 +29,14 @@ def page_parser(doc: str, name: str) -> argparse.ArgumentParser:
 
 
 def typed_command() -> str:
-    """The command that runs, as one types it, without the places of its results."""
+    """The command that runs, as one types it, without the places of its work and its results."""
     spec = getattr(sys.modules["__main__"], "__spec__", None)
     name = spec.name.removesuffix(".__main__") if spec else Path(sys.argv[0]).name
     words, kept = iter(sys.argv[1:]), []
     for word in words:
-        if word in ("--out", "--commit"):
+        if word in PLACES:
             next(words, None)
-        elif not word.startswith(("--out=", "--commit=")):
+        elif word.partition("=")[0] not in PLACES:
             kept.append(word)
     return shlex.join(["python", "-m", name, *kept])
 

@@ -20,6 +20,7 @@ import time
 from pathlib import Path
 
 from experiments.exam import cases, judge, score
+from experiments.pages import typed_command
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "experiments" / "results"
@@ -70,7 +71,7 @@ def facts(options):
         or subprocess.check_output(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, text=True).strip()
     )
     return {
-        "command": "python -m experiments.exam.run " + " ".join(sys.argv[1:]),
+        "command": typed_command(),
         "commit": commit,
         "machine": f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}",
         "seed": options.seed,

@@ -8,6 +8,7 @@ prints the table; `score` and `collect` give the figures as plain data. Every sh
 
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -236,6 +237,7 @@ def misses(answers, result, predictions):
         a, p = answers[name], predictions.get(name, {})
         s = a["sensors"]
         why = (p.get("traceback") or p.get("error") or "").strip().splitlines()[-1:] or [""]
+        why = re.sub(r"\S*/", "", why[0])[:160]  # without the folders
         truth = (
             "+".join(f"{c['effect']}({c['form']})" for c in a["causes"]) or "+".join(a["effects"]) or "none"
         )
@@ -243,7 +245,7 @@ def misses(answers, result, predictions):
         flown = "/".join("+".join(m) for m in a["missions"])
         log = f"{s['kind']} {s['rate']} Hz {s['channels']} turbulence {s['turbulence']} {a['controller']} {flown}"
         size = f"{a['severity'] or ''} {a['severity_ratio']:.1f}"
-        out.append(f"{name} {a['category']} {size}: {truth} -> {said} | {log} {why[0][:160]}")
+        out.append(f"{name} {a['category']} {size}: {truth} -> {said} | {log} {why}")
     return out
 
 

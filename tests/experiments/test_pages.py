@@ -7,7 +7,7 @@ from experiments.pages import page_parser, publish
 
 
 def test_results_name_the_command_without_their_own_places_and_the_commit(tmp_path, monkeypatch, capsys):
-    arguments = ["--number", "3", "--name", "two words", "--commit", "abc", "--out", str(tmp_path / "page")]
+    arguments = ["--number", "3", "--name", "two words", "--commit=abc", "--out", str(tmp_path / "page")]
     monkeypatch.setattr(sys, "argv", ["study", *arguments])
     parser = page_parser("A study.", "page")
     parser.add_argument("--number", type=int)
