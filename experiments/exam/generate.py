@@ -141,18 +141,23 @@ def write_answers(path, answers, seed, column, count=None):
     return digest
 
 
-def main():
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def add_case_arguments(parser):
+    """What all that fly cases are told: which, and where to."""
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--column", choices=list(cases.COLUMN), default="known")
-    parser.add_argument("--count", type=int, default=60)
-    parser.add_argument("--only", help="categories, comma-separated: " + ", ".join(cases.SHARES))
     parser.add_argument("--cases", help="these cases of the plan alone, comma-separated: case_003,case_017")
     parser.add_argument("--logs", type=Path, required=True)
     parser.add_argument("--answers", type=Path, required=True)
     parser.add_argument("--jobs", type=int, default=1)
+
+
+def main():
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add_case_arguments(parser)
+    parser.add_argument("--column", choices=list(cases.COLUMN), default="known")
+    parser.add_argument("--count", type=int, default=60)
+    parser.add_argument("--only", help="categories, comma-separated: " + ", ".join(cases.SHARES))
     options = parser.parse_args()
     use_single_thread()
     if options.answers.resolve().is_relative_to(options.logs.resolve()):

@@ -10,18 +10,17 @@ what flapping does.
 """
 
 import argparse
-import multiprocessing
-from pathlib import Path
 
 import numpy as np
 
-from experiments.exam import cases, fleet, measure, sensors
+from experiments.exam import sensors
 from experiments.exam import vehicle as v
-from experiments.exam.answer_key import HIDDEN, accepted
-from experiments.exam.generate import write_answers
+from experiments.exam.flown_cases import answer, choose_paths, fly_plan, slow_enough, told_for, write_case
+from experiments.exam.generate import add_case_arguments
 from experiments.exam.plant import KEPT, POSE, SAMPLE, Battery, Filter
 
 SECONDS = 8.0
+LEAST = 4.0 / SAMPLE + 1  # samples that a flight must last
 QUIET, LAPS, TURNS, TURNING = ("hover",), ("circle", "eight"), ("eight", "rocking"), ("yawing", "rocking")
 
 
@@ -256,10 +255,8 @@ def make_case(job):
     """Fly and write one case; returns its answer."""
     seed, number, kind, folder = job
     rng = np.random.default_rng(np.random.SeedSequence([17, seed, number]))
-    told = v.draw_told(rng)
     draw, effects, form, exposing = KINDS[kind]
-    if "mass" in effects:
-        told = v.Told(**(told.__dict__ | {"weighed": False}))
+    told = told_for(rng, effects)
     changed, wind, said = draw(rng, told, v.MAX_SPEED * np.sqrt(told.hover))
     np.random.seed(seed * 1000 + number)  # noqa: NPY002  RotorPy draws its motor noise from the global state
     needed = "pgm" if effects else "m"
@@ -270,117 +267,35 @@ def make_case(job):
     if drawn["rate"] > 500:
         drawn["rate"] = 500
     nuisance = {"k_eta": told.thrust_constant * (1 + drawn["thrust_offset"])}
-    names = [str(rng.choice(exposing))] if exposing else []
-    names += [
-        str(n) for n in rng.choice(("circle", "eight", "rocking", "yawing"), 3 - len(names), replace=False)
-    ]
+    names = choose_paths(rng, exposing, ("circle", "eight", "rocking", "yawing"))
     ticks, flights, flown = int(SECONDS * 100), [], []
     for name in names:
-        for slower in (1.0, 0.7, 0.5, 0.35):  # some vehicles can't follow the fast ones
+
+        def attempt(slower, name=name):
             air = sensors.draw_air(rng, drawn, ticks, drawn["voltage"] + rng.uniform(-0.15, 0.1))
-            flight = fly(told, nuisance | changed, wind, trajectory(name, rng, slower), drawn, air)
-            if flight["crashed"][0] > 4.0 / SAMPLE:
-                break
-        flown.append(flight)
+            return fly(told, nuisance | changed, wind, trajectory(name, rng, slower), drawn, air)
+
+        flown.append(slow_enough(attempt, LEAST))
         length = min(ticks, int(flown[-1]["crashed"][0]) // 5 - 5)
         flights.append([sensors.log_rows(rng, drawn, flown[-1], 0, length)])
     joined = {k: np.concatenate([f[k] for f in flown], axis=-1) for k in flown[0]}
-    place = Path(folder) / f"case_{number:03d}"
-    place.mkdir(parents=True, exist_ok=True)
-    for letter, flight in zip("abc", flights, strict=True):
-        fleet.write_flight(place / f"flight_{letter}.csv.gz", flight, drawn["channels"])
-    (place / "vehicle.toml").write_text(v.toml(told, "RotorPy 3", drawn["pose_rate"]))
+    place = write_case(folder, number, flights, drawn, v.toml(told, "RotorPy 3", drawn["pose_rate"]))
     fine = ["wind", "rotor_drag"] if kind == "wind_tunnel" else []
     return answer(
         place.name, kind, told, drawn, names, joined, flights, effects, form, said, "SE3Control", fine
     )
 
 
-def answer(
-    name, kind, told, drawn, names, joined, flights, effects, form, said, controller, fine, gusts=0.0, off=()
-):
-    """The answer of one case that was flown in RotorPy. `form`, `said`: of each effect where there are several; `fine`: names
-    that are no mistake; `gusts` (12,): mean squares that the air adds to the channels of `measure`, part of the
-    floor; `off` (5,): by how much motor time (a third of it), yaw torque and moments are off untold."""
-    many, none = [told] * 3, np.zeros(3, bool)
-    p = v.nominal_parameters(many)
-    p["rotor_gain"] *= 1 + drawn["thrust_offset"]
-    if len(off):
-        for time in ("tau_up", "tau_down"):
-            p[time] *= 1 + 3 * off[0]
-        p["torque_ratio"] *= 1 + off[1]
-        p["inertia"] *= 1 + np.diag(off[2:])[..., None]
-    seen = (measure.errors(joined, many, p, np.arange(3), none, none) ** 2).mean(axis=1)
-    floor = [measure.sensor_floor(drawn, f[0], joined, j) for j, f in enumerate(flights)]
-    rows, samples = [f[0] for f in flights], len(joined["motor"])
-    logged = np.stack([measure.motors_of_log(r, samples) for r in rows], axis=-1)
-    lasts = np.minimum(joined["crashed"], [round(r["t"][-1] / SAMPLE) for r in rows])
-    hidden = [
-        (
-            measure.errors(joined | {"motor": m, "crashed": lasts}, many, p, np.arange(3), none, none) ** 2
-        ).mean(axis=1)
-        for m in logged
-    ]
-    sensed = (np.array(floor) ** 2).mean(axis=0)
-    floor = np.sqrt(sensed + gusts + np.maximum(np.min(hidden, axis=0) - seen, 0.0))
-    known = np.isfinite(floor)
-    energy = np.where(known, np.maximum(seen - gusts, 0.0) / floor**2, 0.0)
-    severity, before = float(np.sqrt(energy.max())), float(np.sqrt(1 + energy[known].mean()))
-    truth = [e if e != "unknown" else kind for e in effects]
-    category = {0: "none", 1: "unknown" if effects == ["unknown"] else "single", 2: "pair"}[len(effects)]
-    if effects and severity < HIDDEN:
-        category = "not_testable"
-    forms = [form] if isinstance(form, str) else list(form)
-    each = said if isinstance(said, list) else [said]
-    gone = before if category == "none" else 1.0
-    return {
-        "case": name,
-        "category": category,
-        "effects": truth,
-        "expected": ["none"] if category in ("none", "not_testable") else effects,
-        "acceptable": {e: accepted(e, told.weighed) for e in effects if e != "unknown"},
-        "also_fine": truth if category == "not_testable" else fine,
-        "causes": [
-            {"effect": e, "form": f, "size": _size(e, m), "magnitudes": m}
-            for e, f, m in zip(truth, forms, each, strict=False)
-        ],
-        "severity": cases.label(severity) if effects else None,
-        "severity_ratio": round(severity, 3),
-        "shares": {e: 1.0 for e in truth if len(truth) == 1 and category == "single"},
-        "gap": {"before": before, "floor": gone, "closed_by_truth": 1 - gone / before},
-        "mass_weighed": told.weighed,
-        "told": told.__dict__,
-        "controller": controller,
-        "sensors": drawn,
-        "missions": [[n] for n in names],
-        "rotorpy": kind,
-    }
-
-
-def _size(effect, magnitudes):
-    """How far a mass or thrust is off; the other causes need no size."""
-    if effect == "mass":
-        return abs(magnitudes["ratio"] - 1)
-    return abs(magnitudes["scale"]) if effect == "thrust_scale" else 0.0
-
-
 def main():
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--seed", type=int, default=1)
+    add_case_arguments(parser)
     parser.add_argument("--each", type=int, default=4, help="cases of each kind")
     parser.add_argument("--kinds", default=",".join(KINDS))
-    parser.add_argument("--logs", type=Path, required=True)
-    parser.add_argument("--answers", type=Path, required=True)
-    parser.add_argument("--jobs", type=int, default=1)
     options = parser.parse_args()
-    drawn = [kind for kind in options.kinds.split(",") for _ in range(options.each)]
-    order = np.random.default_rng(options.seed).permutation(len(drawn))
-    jobs = [(options.seed, n, drawn[i], str(options.logs)) for n, i in enumerate(order, 1)]
-    with multiprocessing.get_context("spawn").Pool(options.jobs) as pool:
-        answers = sorted(pool.imap_unordered(make_case, jobs), key=lambda a: a["case"])
-    print("sha256", write_answers(options.answers, answers, options.seed, "RotorPy"))
+    kinds = [kind for kind in options.kinds.split(",") for _ in range(options.each)]
+    fly_plan(options, kinds, make_case, "RotorPy")
 
 
 if __name__ == "__main__":
