@@ -24,22 +24,31 @@ def bounded(hessian, push, free: int = 0, bound: float = BOUND) -> tuple[np.ndar
     return found, open_
 
 
+def normal_equations(precision: np.ndarray, push: np.ndarray, common: int, own: int, parts) -> tuple:
+    """Hessian and right side of least squares over tracks: of columns with a prior (`precision` (p, p), `push` (p,)), of
+    `common` nuisances that all tracks share and of `own` ones that each track has for itself, all of unit prior variance.
+    `parts` [(gram, target)] of each track's p + common + own columns in that order; None: nothing is known of it."""
+    free, shared = len(push), len(push) + common
+    size = shared + own * len(parts)
+    hessian, right = np.eye(size), np.zeros(size)
+    hessian[:free, :free], right[:free] = precision, push
+    for k, part in enumerate(parts):
+        if part is not None:
+            here = np.concatenate([np.arange(shared), shared + own * k + np.arange(own)])
+            hessian[np.ix_(here, here)] += part[0]
+            right[here] += part[1]
+    return hessian, right
+
+
 def held_objective(residuals, columns, nuisances, shared, off: np.ndarray, precision: np.ndarray) -> float:
     """Least half square of whitened residuals [(M,)] of every track, once columns [(p, M)] may move from where they are -
     `off` (p,) from a prior of `precision` - and nuisances [(N, M)] of unit prior variance may take what their bounds allow:
     those of `shared` (N,) the same on every track."""
-    free, common, own = len(off), int(shared.sum()), int((~shared).sum())
-    size = free + common + own * len(residuals)
-    hessian, push, square = np.eye(size), np.zeros(size), 0.0
-    hessian[:free, :free] = precision
-    push[:free] = -precision @ off
-    for k, (r, c, n) in enumerate(zip(residuals, columns, nuisances, strict=True)):
-        x = np.concatenate([c, n[shared], n[~shared]])
-        here = np.concatenate([np.arange(free + common), free + common + own * k + np.arange(own)])
-        hessian[np.ix_(here, here)] += x @ x.T
-        push[here] += x @ r
-        square += float(r @ r)
-    found, _ = bounded(hessian, push, free)
+    whole = [np.concatenate([c, n[shared], n[~shared]]) for c, n in zip(columns, nuisances, strict=True)]
+    parts = [(x @ x.T, x @ r) for x, r in zip(whole, residuals, strict=True)]
+    hessian, push = normal_equations(precision, -precision @ off, shared.sum(), (~shared).sum(), parts)
+    found, _ = bounded(hessian, push, len(off))
+    square = sum(float(r @ r) for r in residuals)
     return (
         0.5 * square
         + 0.5 * float(off @ precision @ off)

@@ -210,9 +210,7 @@ def _sampled(reading: Reading, slow: bool, derived: bool) -> Reading:
     if known and at_once:
         # The log doesn't say which; the motion does.
         own = Library(("inertia",))
-        mean, single = (
-            _physics(dataclasses.replace(reading, at_once=m), own, tell=False) for m in (False, True)
-        )
+        mean, single = (_physics(dataclasses.replace(reading, at_once=m), own) for m in (False, True))
         at_once, sure = _looks_sampled(reading.vehicles, mean, single)
     reading = dataclasses.replace(reading, at_once=at_once)
     blind = (reading.at_once and not known) or not sure or drifts or derived
@@ -251,9 +249,7 @@ def _hidden(card, tracks) -> bool:
     """Whether an effect can't be told from these logs, however large it is."""
     if card.needs and any(getattr(t, card.needs) is None for t in tracks):
         return True
-    if card.impossible is not None and any(card.impossible(t.position) for t in tracks):
-        return True
-    return False
+    return card.impossible is not None and any(card.impossible(t.position) for t in tracks)
 
 
 def _feigned(card, blind: bool, gusts: np.ndarray) -> bool:
@@ -262,11 +258,8 @@ def _feigned(card, blind: bool, gusts: np.ndarray) -> bool:
     return bool(axes) and bool(blind or gusts[axes].mean() > MOST_GUSTS)
 
 
-def _physics(
-    reading: Reading, library: Library, pushes=None, gains=None, before=None, tell: bool = True
-) -> Look:
-    """Look at the physics. `pushes`, `gains`: what an earlier look found; `before`: its sets, to start from; `tell`: apart what
-    gusts and samples feign."""
+def _physics(reading: Reading, library: Library, pushes=None, gains=None, before=None) -> Look:
+    """Look at the physics. `pushes`, `gains`: what an earlier look found; `before`: its sets, to start from."""
     tracks, vehicles, arrived, at_once = reading.tracks, reading.vehicles, reading.arrived, reading.at_once
     rate_loop, read, ticks = None, None, [np.repeat(t.motor[:, None], TICKS, 1) for t in tracks]
     links = arrived if arrived is not None else [None] * len(tracks)
@@ -291,7 +284,7 @@ def _physics(
             if (e, p) in GUSTY
         }
     )
-    feigned = frozenset(e for e in library.physics if tell and _feigned(CARDS[e], reading.blind, gusts))
+    feigned = frozenset(e for e in library.physics if _feigned(CARDS[e], reading.blind, gusts))
     for effect in library.physics:
         if _hidden(CARDS[effect], tracks):
             exposure[effect] = 0.0

@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from openjax.gap.bounds import BOUND, bounded
+from openjax.gap.bounds import BOUND, bounded, normal_equations
 from openjax.gap.hypotheses import SetFit
 from openjax.gap.library import ABSENT, CARDS, PLACE, places, prior
 from openjax.gap.replay import SKIP, Replay
@@ -195,23 +195,14 @@ def _equations(table: Table, model: Model, left_out: int | None) -> tuple[np.nda
     sums, tracks = table.folds
     names = np.unique(table.track_of)
     shared, own = _nuisances(table, model)
-    p, s, n = len(model.free), len(shared), len(own)
-    size = p + s + n * len(names)
-    hessian, push = np.zeros((size, size)), np.zeros(size)
-    hessian[:p, :p] = model.precision
-    push[:p] = model.precision @ model.mean
-    hessian[np.arange(p, size), np.arange(p, size)] = 1.0
-    for k, track in enumerate(names):
+    columns = np.concatenate([model.free, shared, own])
+    parts = []
+    for track in names:
         used = [f for f in np.flatnonzero(tracks == track) if f != left_out]
-        if not used:
-            continue
         gram = sums[used].sum(0)
-        columns = np.concatenate([model.free, shared, own])
-        here = np.concatenate([np.arange(p + s), p + s + n * k + np.arange(n)])
         target = gram[:, 0] + gram[:, list(model.parts)].sum(1)
-        hessian[np.ix_(here, here)] += gram[np.ix_(columns, columns)]
-        push[here] += target[columns]
-    return hessian, push
+        parts.append((gram[np.ix_(columns, columns)], target[columns]) if used else None)
+    return normal_equations(model.precision, model.precision @ model.mean, len(shared), len(own), parts)
 
 
 def _spread(table: Table, model: Model, found: np.ndarray, track: int) -> np.ndarray:
