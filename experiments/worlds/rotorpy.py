@@ -1,7 +1,8 @@
 """RotorPy 3 as a world (Folk, Paulos, Kumar 2023; the `dev` extra): its `Multirotor` and its own Crazyflie.
 
 Rigid body, rotors, drag at the hubs and motor lag are RotorPy's, with its identified Crazyflie: 30 g, motors of 72 ms,
-other thrust and torque constants. The firmware's rate loop at 500 Hz and the sensors' noise are those of the exam's
+other thrust and torque constants. RotorPy integrates one vehicle at a time; `Bodies` evaluates the same equations for all
+vehicles at once, and a test holds it against `Multirotor.step`. The firmware's rate loop at 500 Hz and the sensors' noise are those of the exam's
 plant, since RotorPy's Crazyflie has no motor commands; commanded thrust is in units of the nominal vehicle's.
 """
 
@@ -25,8 +26,100 @@ def crazyflie() -> dict:
     return quad_params | {"rotor_pos": hubs, "rotor_directions": v.SPIN}
 
 
+class Bodies:
+    """What `Multirotor.step` does, for B vehicles at once: its equations with its numbers, by a Runge-Kutta step.
+
+    Args:
+      model: RotorPy's `Multirotor`, with or without aerodynamics; wind and ground aren't known here.
+      state: {"x": (3, B), "v": (3, B), "q": (4, B) as xyzw, "w": (3, B), "rotor_speeds": (4, B)}.
+    """
+
+    def __init__(self, model, state: dict[str, np.ndarray]):
+        self.model = model
+        self.state = np.concatenate([state[name] for name in ("x", "v", "q", "w", "rotor_speeds")])
+
+    @property
+    def position(self) -> np.ndarray:
+        """(3, B) m, a view."""
+        return self.state[0:3]
+
+    @property
+    def velocity(self) -> np.ndarray:
+        """(3, B) m/s, a view."""
+        return self.state[3:6]
+
+    @property
+    def quaternion(self) -> np.ndarray:
+        """(4, B) wxyz."""
+        return np.roll(self.state[6:10], 1, axis=0)
+
+    @property
+    def rates(self) -> np.ndarray:
+        """(3, B) rad/s, a view."""
+        return self.state[10:13]
+
+    def step(self, speeds: np.ndarray, time: float) -> None:
+        """`time` s under commanded motor speeds (4, B) in rad/s."""
+        least, most = self.model.rotor_speed_min, self.model.rotor_speed_max
+        speeds, s = np.clip(speeds, least, most), self.state
+        one = self._slope(s, speeds)
+        two = self._slope(s + 0.5 * time * one, speeds)
+        three = self._slope(s + 0.5 * time * two, speeds)
+        four = self._slope(s + time * three, speeds)
+        s = s + time / 6.0 * (one + 2.0 * (two + three) + four)
+        s[6:10] /= np.sqrt((s[6:10] ** 2).sum(axis=0))
+        s[13:] = np.clip(s[13:], least, most)
+        self.state = s
+
+    def _slope(self, s, speeds):
+        model, q, rates, rotor = self.model, s[6:10], s[10:13], s[13:]
+        rotation = _rotation(q / np.sqrt((q * q).sum(axis=0)))
+        hubs = model.rotor_geometry  # (4, 3)
+        force = np.zeros((3, 4, s.shape[1]))  # of each rotor, in the body frame
+        force[2] = model.k_eta * rotor**2
+        torque = np.zeros((3, s.shape[1]))
+        torque[2] = model.k_m * (model.rotor_dir @ rotor**2)
+        drag = 0.0
+        if model.aero:
+            air = np.einsum("jib,jb->ib", rotation, s[3:6])
+            at_hubs = air[:, None] + np.cross(rates[:, None], hubs.T[:, :, None], axis=0)
+            drag = -np.sqrt((air * air).sum(axis=0)) * (model.drag_matrix @ air)
+            force -= rotor * np.einsum("ij,jrb->irb", model.rotor_drag_matrix, at_hubs)
+            force[2] += model.k_h * (at_hubs[0] ** 2 + at_hubs[1] ** 2)
+            torque += -model.k_flap * (rotor * np.stack([at_hubs[1], -at_hubs[0], 0.0 * rotor])).sum(axis=1)
+        torque += np.cross(hubs.T[:, :, None], force, axis=0).sum(axis=1)
+        total = np.einsum("ijb,jb->ib", rotation, force.sum(axis=1) + drag)
+        total[2] -= model.mass * model.g
+        spin = np.cross(rates, model.inertia @ rates, axis=0)
+        x, y, z, w = q
+        p, q_, r = rates
+        turn = 0.5 * np.stack(
+            [
+                w * p - z * q_ + y * r,
+                z * p + w * q_ - x * r,
+                -y * p + x * q_ + w * r,
+                -x * p - y * q_ - z * r,
+            ]
+        )
+        return np.concatenate(
+            [s[3:6], total / model.mass, turn, model.inv_inertia @ (torque - spin), (speeds - rotor) / model.tau_m]
+        )
+
+
+def _rotation(q):
+    """(3, 3, B) rotations body to world of unit quaternions (4, B) xyzw."""
+    x, y, z, w = q
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
 class RotorPyWorld:
-    """Vehicles of RotorPy, one `Multirotor` each.
+    """Vehicles of RotorPy.
 
     Args:
       drones: (W, N, ...) at the start.
@@ -51,30 +144,18 @@ class RotorPyWorld:
         worlds, self.team = drones.position.shape[:2]
         count = worlds * self.team
         self.parameters = crazyflie() | (changed or {})
-        self.position = np.asarray(drones.position, float).reshape(count, 3).T.copy()
-        self.q = np.asarray(drones.quaternion, float).reshape(count, 4).T.copy()
-        self.velocity, self.rates = np.zeros((3, count)), np.zeros((3, count))
         hover = np.sqrt(self.parameters["mass"] * v.GRAVITY / (4 * self.parameters["k_eta"]))
-        self.states, self.models = [], []
-        for i in range(count):
-            state = {
-                "x": self.position[:, i].copy(),
-                "v": np.zeros(3),
-                "q": np.roll(self.q[:, i], -1),
-                "w": np.zeros(3),
-                "wind": np.zeros(3),
-                "rotor_speeds": np.full(4, hover),
-            }
-            self.states.append(state)
-            self.models.append(
-                Multirotor(
-                    self.parameters,
-                    state,
-                    control_abstraction="cmd_motor_speeds",
-                    aero=True,
-                    integrator_kwargs={"method": "RK23", "first_step": SAMPLE, "rtol": 1e-3, "atol": 1e-5},
-                )
-            )
+        quaternion = np.asarray(drones.quaternion, float).reshape(count, 4).T
+        self.bodies = Bodies(
+            Multirotor(self.parameters, control_abstraction="cmd_motor_speeds", aero=True),
+            {
+                "x": np.asarray(drones.position, float).reshape(count, 3).T,
+                "v": np.zeros((3, count)),
+                "q": np.roll(quaternion, -1, axis=0),
+                "w": np.zeros((3, count)),
+                "rotor_speeds": np.full((4, count), hover),
+            },
+        )
         drawn = sensors_of(seed, 0)
         self.air = air_of(drawn, seed, 0, ticks + 1, range(first, first + worlds), self.team)
         nominal = v.nominal_parameters([v.Told()] * count)
@@ -83,35 +164,24 @@ class RotorPyWorld:
 
     def poses(self) -> Poses:
         """Where the vehicles are."""
-        return per_world(self.team, self.position, self.q, self.velocity)
+        return per_world(self.team, self.bodies.position, self.bodies.quaternion, self.bodies.velocity)
 
     def measure(self) -> Poses:
-        """Poses as they were a few milliseconds ago, with the motion capture's noise."""
-        air, k = self.air, self.tick
+        """Where the motion capture sees them."""
+        air, k, bodies = self.air, self.tick, self.bodies
         late = 1e-3 * air["pose_delay"]
-        quaternion = v.multiply(v.turn(self.q, -self.rates, late), air["seen_attitude"][k])
+        quaternion = v.multiply(v.turn(bodies.quaternion, -bodies.rates, late), air["seen_attitude"][k])
         quaternion /= np.sqrt((quaternion * quaternion).sum(axis=0))
-        position = self.position - late * self.velocity + air["seen_position"][k]
-        return per_world(self.team, position, quaternion, self.velocity + air["seen_velocity"][k])
+        position = bodies.position - late * bodies.velocity + air["seen_position"][k]
+        return per_world(self.team, position, quaternion, bodies.velocity + air["seen_velocity"][k])
 
     def fly(self, command, max_speed=None) -> None:
-        """One tick: five times the rate loop and RotorPy's step, then solid things."""
+        """One tick: five times the rate loop and RotorPy's equations, then solid things."""
         command = command.reshape(-1, 4).T
         for part in range(PER_TICK):
             noise = self.air["gyro_bias"] + self.air["gyro"][PER_TICK * self.tick + part]
-            motors = self.firmware(command, self.rates + noise)
-            speeds = np.sqrt(motors * MOST_THRUST / self.parameters["k_eta"])
-            for i, model in enumerate(self.models):
-                self.states[i] = model.step(self.states[i], {"cmd_motor_speeds": speeds[:, i]}, SAMPLE)
-            self._read()
-        self.solids.stop(self.position, self.velocity)
-        limit_speed(self.velocity, max_speed)
-        for i, state in enumerate(self.states):
-            state["x"], state["v"] = self.position[:, i].copy(), self.velocity[:, i].copy()
+            motors = self.firmware(command, self.bodies.rates + noise)
+            self.bodies.step(np.sqrt(motors * MOST_THRUST / self.parameters["k_eta"]), SAMPLE)
+        self.solids.stop(self.bodies.position, self.bodies.velocity)
+        limit_speed(self.bodies.velocity, max_speed)
         self.tick += 1
-
-    def _read(self):
-        self.position = np.stack([state["x"] for state in self.states], axis=-1)
-        self.velocity = np.stack([state["v"] for state in self.states], axis=-1)
-        self.rates = np.stack([state["w"] for state in self.states], axis=-1)
-        self.q = np.stack([np.roll(state["q"], 1) for state in self.states], axis=-1)

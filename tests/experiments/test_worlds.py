@@ -4,6 +4,7 @@ import jax
 import numpy as np
 import pytest
 
+from experiments.worlds.rotorpy import Bodies, crazyflie
 from experiments.worlds.study import make_world, smoothness
 from openjax.pursuit import Pursuit, PursuitSettings
 
@@ -35,6 +36,33 @@ def test_worlds_fly_alike_for_a_moment(start, name):
     np.testing.assert_allclose(world.measure()["position"], after["position"], atol=5e-3)
     world.fly(100 * command, max_speed=0.01)
     assert np.linalg.norm(world.poses()["velocity"], axis=-1).max() < 0.01 + 1e-4
+
+
+def test_rotorpy_at_once_is_rotorpy_one_by_one():
+    """`Bodies` against `Multirotor.step` with a tight solver: vehicles that tumble, with every aerodynamic term."""
+    multirotor = pytest.importorskip("rotorpy.vehicles.multirotor")
+    rng = np.random.default_rng(0)
+    terms = {"c_Dx": 0.01, "c_Dz": 0.02, "k_h": 1e-4, "k_flap": 2e-7, "Ixy": 1e-6, "Ixz": -1.5e-6}
+    exact = {"method": "DOP853", "rtol": 1e-10, "atol": 1e-12}
+    model = multirotor.Multirotor(crazyflie() | terms, integrator_kwargs=exact)
+    attitude = rng.normal(size=(4, 3))
+    states = {
+        "x": rng.normal(size=(3, 3)),
+        "v": rng.normal(size=(3, 3)),
+        "q": attitude / np.linalg.norm(attitude, axis=0),
+        "w": 4 * rng.normal(size=(3, 3)),
+        "rotor_speeds": rng.uniform(500, 2400, (4, 3)),
+    }
+    bodies, alone = Bodies(model, states), [{n: x[:, i] for n, x in states.items()} for i in range(3)]
+    for _ in range(50):
+        speeds = rng.uniform(0, 2600, (4, 3))  # some beyond what motors can
+        bodies.step(speeds, 0.002)
+        alone = [
+            model.step(state | {"wind": np.zeros(3)}, {"cmd_motor_speeds": speeds[:, i]}, 0.002)
+            for i, state in enumerate(alone)
+        ]
+    expected = [np.concatenate([state[name] for name in states]) for state in alone]
+    np.testing.assert_allclose(bodies.state.T, expected, rtol=2e-6, atol=2e-6)
 
 
 def test_smoothness_of_known_commands():
