@@ -48,7 +48,7 @@ class Arguments:
     """Fly a thousand faults."""
 
     faults: int = 1000
-    policy: str = "no_clamp_seed_0"
+    policy: str = "flight"
     layouts: tuple[str, ...] = ("wall", "random", "passage")
     seed: int = 0
     batch: int = 50
@@ -116,7 +116,7 @@ def fly(
     n, worlds = len(starts), len(seeds)
     faults = [draw_fault(seed, latest) for seed in seeds]
     swarm = SimulatedSwarm(
-        VirtualVehicles(load_vehicle(), np.tile(starts, (worlds, 1)), flying=True), seeds[0]
+        VirtualVehicles(load_vehicle(), np.tile(starts, (worlds, 1)), flying=True), seeds[0], watchdog
     )
     safety = SafetySettings()
     pillars = [(x, y, settings.pillar_radius) for x, y in scenario.pillars]

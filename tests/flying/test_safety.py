@@ -61,6 +61,24 @@ def test_a_lost_pose_lands_that_one_blindly_and_stops_the_others():
     assert state.modes[0] is Mode.LAND and state.modes[2] is Mode.LAND
 
 
+@pytest.mark.parametrize(("ticks", "mode"), [(4, Mode.PURSUIT), (40, Mode.BLIND)])
+def test_a_pose_that_jumps_is_not_followed(ticks, mode):
+    """Motion capture takes the vehicle for another: for a moment nothing happens, for longer it lands where it is."""
+    state, away = pursuing(), (0.1, 0.0, 0.5)
+    for k in range(1, 3):
+        state, _ = step(LIMITS, state, event(0.01 * k))
+    for k in range(3, 3 + ticks):
+        time = 0.01 * k
+        state, _ = step(LIMITS, state, event(time, _1=Sighting(Pose(time, away, (0.0,) * 3, LEVEL), time, 4.0)))
+    assert math.dist(state.drones[1].estimate.position[:2], PLACES[1][:2]) < 0.02
+    assert state.modes[1] is mode
+    assert state.drones[1].reason == ("pose jumped" if mode is Mode.BLIND else "")
+    time = state.time + 0.01
+    back = Sighting(Pose(time, PLACES[1], (0.0,) * 3, LEVEL), time, 4.0)
+    state, _ = step(LIMITS, state, event(time, _1=back))
+    assert state.modes[1] is (Mode.LAND if mode is Mode.BLIND else Mode.PURSUIT)
+
+
 @pytest.mark.parametrize(
     ("sighting", "reason"),
     [

@@ -36,6 +36,8 @@ class SafetySettings:
     """Time until it acts (s)."""
     pose_timeout: Annotated[float, Interval("(0, 60]")] = 0.06
     """A pose older than this (s) is lost: blind landing."""
+    pose_jump: Annotated[float, Interval("(0, 100]")] = 0.15
+    """A pose farther than this (m) from where its vehicle must be isn't believed."""
     link_timeout: Annotated[float, Interval("(0, 60]")] = 0.3
     """A link silent for longer (s) is gone."""
     action_timeout: Annotated[float, Interval("(0, 60]")] = 0.035

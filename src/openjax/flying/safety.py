@@ -37,6 +37,8 @@ BLIND_SPEED = 0.6
 """It sinks faster than a landing with poses (m/s): what it doesn't know grows with the square of the time."""
 BLIND_DEPTH = 0.15
 """A blind landing stops the motors this far below the floor by its reckoning (m)."""
+DRIFT = 0.25
+"""What dead reckoning may be wrong by after a second without poses (m): so far from it is a pose believed that returns."""
 TRIM_GAIN, TRIM_LIMIT = 0.25, 0.15
 
 
@@ -96,6 +98,7 @@ class Drone:
     mode: Mode = Mode.GROUND
     since: float = 0.0  # s, when the mode began
     estimate: Pose | None = None  # now; reckoned on where no pose is fresh
+    seen: float = -math.inf  # s, when the last pose that was believed was measured
     acceleration: Vector = (0.0, 0.0, 0.0)  # m/s^2, what dead reckoning takes it to be
     anchor: Vector = (0.0, 0.0, 0.0)  # where it waits or lands
     trim: float = 0.0  # of the hover thrust
@@ -172,18 +175,26 @@ def usable(pose: Pose | None) -> bool:
 def _sense(settings, drone, sighting, now, dt):
     """The drone with its estimate brought to `now`: the newest pose moved on, or reckoned from the last estimate."""
     pose = sighting.pose
-    if usable(pose) and now - pose.time <= settings.pose_timeout:
+    if usable(pose) and now - pose.time <= settings.pose_timeout and _believable(settings, drone, pose):
         estimate = moved_on(pose, max(now, pose.time))
         w, x, y, z = estimate.quaternion
         lift = max(up(estimate.quaternion), 0.3)
         tilt = (2 * (x * z + w * y) / lift * GRAVITY, 2 * (y * z - w * x) / lift * GRAVITY, 0.0)
-        return replace(drone, estimate=estimate, acceleration=tilt)
+        return replace(drone, estimate=estimate, seen=pose.time, acceleration=tilt)
     if drone.estimate is None:
         return drone
     old = drone.estimate
     velocity = tuple(v + dt * a for v, a in zip(old.velocity, drone.acceleration, strict=True))
     position = tuple(p + dt * v for p, v in zip(old.position, velocity, strict=True))
     return replace(drone, estimate=old._replace(time=now, position=position, velocity=velocity))
+
+
+def _believable(settings, drone, pose) -> bool:
+    """Whether a flying vehicle can have got to where a pose says it is: motion capture takes one for another at times."""
+    if drone.mode not in FLYING or drone.estimate is None:
+        return True
+    room = settings.pose_jump + DRIFT * max(pose.time - drone.seen, 0.0)
+    return math.dist(pose.position, moved_on(drone.estimate, pose.time).position) <= room
 
 
 def _requested(settings, state, drones, event):
@@ -221,13 +232,14 @@ def _trouble(settings, drone, sighting, now) -> tuple[Mode, str] | None:
     if drone.mode not in FLYING:
         return None
     silent = now - sighting.heard > settings.link_timeout
-    lost = not usable(sighting.pose) or now - sighting.pose.time > settings.pose_timeout
+    lost = now - drone.seen > settings.pose_timeout
     if drone.mode is Mode.BLIND:
         return None if silent or lost else (Mode.LAND, drone.reason)
     if silent:
         return Mode.BLIND, "link gone"
     if lost:
-        return Mode.BLIND, "pose lost"
+        jumped = usable(sighting.pose) and now - sighting.pose.time <= settings.pose_timeout
+        return Mode.BLIND, "pose jumped" if jumped else "pose lost"
     if drone.mode is Mode.LAND:
         return None
     if drone.low_since is not None and now - drone.low_since > settings.battery_time:
