@@ -2,8 +2,9 @@
 
 Rigid body, rotors, drag at the hubs and motor lag are RotorPy's, with its identified Crazyflie: 30 g, motors of 72 ms,
 other thrust and torque constants. RotorPy integrates one vehicle at a time; `Bodies` evaluates the same equations for all
-vehicles at once, and a test holds it against `Multirotor.step`. The firmware's rate loop at 500 Hz and the sensors' noise are those of the exam's
-plant, since RotorPy's Crazyflie has no motor commands; commanded thrust is in units of the nominal vehicle's.
+at once, and a test holds it against `Multirotor.step`. The firmware's rate loop at 500 Hz and the sensors' noise are
+those of the exam's plant, since RotorPy's Crazyflie has no motor commands; commanded thrust is in units of the nominal
+vehicle's.
 """
 
 import numpy as np
@@ -102,7 +103,13 @@ class Bodies:
             ]
         )
         return np.concatenate(
-            [s[3:6], total / model.mass, turn, model.inv_inertia @ (torque - spin), (speeds - rotor) / model.tau_m]
+            [
+                s[3:6],
+                total / model.mass,
+                turn,
+                model.inv_inertia @ (torque - spin),
+                (speeds - rotor) / model.tau_m,
+            ]
         )
 
 

@@ -69,7 +69,9 @@ def test_a_pose_that_jumps_is_not_followed(ticks, mode):
         state, _ = step(LIMITS, state, event(0.01 * k))
     for k in range(3, 3 + ticks):
         time = 0.01 * k
-        state, _ = step(LIMITS, state, event(time, _1=Sighting(Pose(time, away, (0.0,) * 3, LEVEL), time, 4.0)))
+        state, _ = step(
+            LIMITS, state, event(time, _1=Sighting(Pose(time, away, (0.0,) * 3, LEVEL), time, 4.0))
+        )
     assert math.dist(state.drones[1].estimate.position[:2], PLACES[1][:2]) < 0.02
     assert state.modes[1] is mode
     assert state.drones[1].reason == ("pose jumped" if mode is Mode.BLIND else "")
