@@ -137,7 +137,11 @@ def fly(arguments: Arguments):
             _wait_for_poses(vehicles, uris)  # nobody looked meanwhile
             links.arm()
             vehicles.record()
-            real_time.hurry()
+            scheduler = real_time.hurry()
+            if scheduler != "real time":
+                console.print(
+                    "no real-time scheduler: on a busy machine deadlines will be missed (docs/flying.md)"
+                )
             console.print("flying: space or q stops all motors, l or Ctrl-C lands")
             record = _until_down(flight, keys)
             samples = vehicles.samples()
@@ -157,6 +161,7 @@ def fly(arguments: Arguments):
         "policy": policy.source,
         "scenario": scenario.name,
         "uris": uris,
+        "scheduler": scheduler,
         "reasons": [d.reason for d in flight.state.drones],
     }
     _show(console, record, flight)

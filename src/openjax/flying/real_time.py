@@ -21,8 +21,10 @@ def prepare() -> None:
     jax.config.update("jax_cpu_enable_async_dispatch", False)
 
 
-def hurry() -> bool:
-    """Ask that this process's threads, and those they start, run before others; whether that was granted.
+def hurry() -> str:
+    """Ask that this process's threads, and those they start, run before others; what was granted.
+
+    "real time": Linux's real-time scheduler; "nice": before others, as far as they are ordinary; "ordinary": nothing.
 
     Linux grants the real-time scheduler to root and to users with `rtprio` in /etc/security/limits.conf. All threads:
     JAX computes in several, and the loop would wait for one that waits for its turn.
@@ -30,11 +32,11 @@ def hurry() -> bool:
     try:
         for thread in os.listdir("/proc/self/task"):
             os.sched_setscheduler(int(thread), os.SCHED_RR, os.sched_param(PRIORITY))
-        return True
+        return "real time"
     except (AttributeError, OSError):  # not on this system, or not ours to ask
         pass
     try:
         os.setpriority(os.PRIO_PROCESS, 0, NICE)
-        return True
+        return "nice"
     except (AttributeError, OSError):
-        return False
+        return "ordinary"

@@ -19,6 +19,10 @@ from openjax.vehicle import load_vehicle
 from openjax.vehicle.family import adapted_family, family_bounds
 
 
+RATE_LOOP = 0.002
+"""Period of a Crazyflie's rate loop (s)."""
+
+
 @dataclass(frozen=True)
 class AdaptSettings:
     """How a policy is fine-tuned."""
@@ -42,13 +46,20 @@ class AdaptSettings:
 
 def adapting_settings(trained: TrainSettings, settings: AdaptSettings) -> TrainSettings:
     """The training's settings for fine-tuning: penalties in full, small steps, vehicles of every kind of effect."""
+    game = trained.environment
     num_envs = settings.num_envs or (160 if jax.default_backend() == "cpu" else 5120)
     num_envs = max(num_envs // trained.world_unit, 1) * trained.world_unit
     minibatches = max(n for n in range(1, trained.mappo.minibatches + 1) if num_envs % n == 0)
     return dataclasses.replace(
         trained,
+        # as vehicles fly: no clamp, the rate loop at 500 Hz, solid pillars; whatever the policy was trained in
         environment=dataclasses.replace(
-            trained.environment, vehicles=adapted_family({}, {}), rare_vehicles=0.0
+            game,
+            vehicles=adapted_family({}, {}),
+            rare_vehicles=0.0,
+            speed_limit="none",
+            physics="stops",
+            substeps=max(game.substeps, round(game.time_step / RATE_LOOP)),
         ),
         mappo=dataclasses.replace(
             trained.mappo,
@@ -97,7 +108,9 @@ def make_adaptation(settings: TrainSettings) -> Adaptation:
         policy=policy,
         start=jax.jit(lambda key, bounds: init_carry(settings, key, environment(bounds))),
         step=jax.jit(
-            lambda carry, bounds: make_training_step(settings, environment(bounds))(carry), donate_argnums=0
+            # the predictor stays as it is: the evader flies no vehicle
+            lambda carry, bounds: make_training_step(settings, environment(bounds), train_predictor=False)(carry),
+            donate_argnums=0,
         ),
         evaluate=jax.jit(
             lambda parameters, tasks, key, bounds: make_evaluate(environment(bounds), policy)(
@@ -132,7 +145,7 @@ def fine_tune(
 ) -> Tuned:
     """Train `parameters` (critic left aside) on vehicles within `bounds` (R, 4), and keep the best on the way.
 
-    The predictor stays as it is: the evader flies no vehicle. `score` gives the scores of episodes (B,), of the same tasks
+    `score` gives the scores of episodes (B,), of the same tasks
     and vehicles each time; what isn't clearly better than the first parameters, by the differences of single episodes,
     isn't kept. `tell` hears of every training step.
     """
@@ -144,8 +157,6 @@ def fine_tune(
     best, looks = (parameters.replace(critic={}), 0), {0: float(first.mean())}
     for update in range(1, adaptation.settings.total_updates + 1):
         carry, metrics = adaptation.step(carry, bounds)
-        predictor = jax.tree.map(jnp.copy, learnt.predictor)
-        carry = carry.replace(predictor=carry.predictor.replace(parameters=predictor))
         history.append(metrics)
         tell(update, metrics)
         trained = update - training.warm_up
