@@ -18,7 +18,6 @@ from openjax.ranges import Interval, check_intervals
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.family import adapted_family, family_bounds
 
-
 RATE_LOOP = 0.002
 """Period of a Crazyflie's rate loop (s)."""
 
@@ -109,7 +108,9 @@ def make_adaptation(settings: TrainSettings) -> Adaptation:
         start=jax.jit(lambda key, bounds: init_carry(settings, key, environment(bounds))),
         step=jax.jit(
             # the predictor stays as it is: the evader flies no vehicle
-            lambda carry, bounds: make_training_step(settings, environment(bounds), train_predictor=False)(carry),
+            lambda carry, bounds: make_training_step(settings, environment(bounds), train_predictor=False)(
+                carry
+            ),
             donate_argnums=0,
         ),
         evaluate=jax.jit(
