@@ -14,10 +14,16 @@ PROGRAM = """
   ROOT %t = (s32[], /*index=1*/f32[4]{0}) tuple(%i, %c)
 }
 
+%graph (a: f32[4]) -> f32[4] {
+  %g = f32[4]{0} fusion(%a), kind=kLoop, calls=%add
+  ROOT %h = f32[4]{0} fusion(%g), kind=kLoop, calls=%add
+}
+
 %outer (a: (s32[], f32[4])) -> (s32[], f32[4]) {
   %k = (f32[4]{0}, /*index=5*/f32[4]{0}) custom-call(%a), custom_call_target="kernel"
   %d = f32[4]{0} fusion(%k), kind=kLoop, calls=%add
-  %w = (s32[], f32[4]{0}) while(%d), condition=%less, body=%inner, backend_config={"known_trip_count":{"n":"3"}}
+  %e = f32[4]{0} call(%d), to_apply=%graph
+  %w = (s32[], f32[4]{0}) while(%e), condition=%less, body=%inner, backend_config={"known_trip_count":{"n":"3"}}
   ROOT %t = (s32[], f32[4]{0}) tuple(%i, %w)
 }
 
@@ -30,7 +36,7 @@ ENTRY %main (x: f32[4]) -> f32[4] {
 
 def test_each_loop_counts_its_own():
     assert sorted(loops(PROGRAM), key=lambda loop: loop["turns"] or 0) == [
-        {"turns": None, "custom-call": 1, "fusion": 1},
+        {"turns": None, "custom-call": 1, "fusion": 3},
         {"turns": 3, "fusion": 1, "copy": 1},
     ]
 
@@ -38,7 +44,7 @@ def test_each_loop_counts_its_own():
 def test_page_adds_them_up():
     machine = {"device": "here", "versions": {"jax": "0"}, "commit": "abc"}
     lines = report({"command": "c", "machine": machine, "programs": {"p": loops(PROGRAM)}})
-    assert {"| p | 3 | 1 | 0 | 1 | 2 |", "| p | None | 1 | 1 | 0 | 2 |"} <= set(lines)
+    assert {"| p | 3 | 1 | 0 | 1 | 2 |", "| p | None | 3 | 1 | 0 | 4 |"} <= set(lines)
 
 
 def test_missing_compiler_is_named(monkeypatch):
