@@ -35,6 +35,7 @@ from openjax.learning.adaptation import (
     bounds_of,
     fine_tune,
     make_adaptation,
+    starting_parameters,
 )
 from openjax.store.policies import load_policy
 from openjax.store.policy_files import save_policy_file
@@ -57,7 +58,7 @@ def tune(options) -> None:
     loaded = load_policy(options.policy)
     training = AdaptSettings(updates=options.updates)
     adaptation = make_adaptation(adapting_settings(loaded.settings, training))
-    parameters = loaded.parameters.replace(critic={})
+    parameters = starting_parameters(loaded.parameters, loaded.settings, adaptation.settings)
     environment = adaptation.settings.environment
     tasks = uniform_tasks(environment, options.look_at, environment.max_pillars)
     for number, name in enumerate(found_cases(options)):

@@ -35,7 +35,7 @@ class AdaptCommand:
     flights: Annotated[Path, tyro.conf.Positional] = Path("flights")
     """Folder of flight logs with a vehicle.toml, or an effects.toml of a diagnosis made before."""
     policy: str = "flight"
-    """A run, a policy file or the name of a policy in the package; it should know a history of its own flight."""
+    """A run, a policy file or the name of a policy in the package."""
     out: Path = Path("adapted")
     """Directory for what is found."""
     episodes: Annotated[int, Interval("[1, 1000000]")] = 1024
@@ -73,7 +73,13 @@ def adapt(command: AdaptCommand) -> dict:
         from openjax.commands.machine import describe_machine
         from openjax.commands.validation import uniform_tasks
         from openjax.learning import summarise
-        from openjax.learning.adaptation import adapting_settings, bounds_of, fine_tune, make_adaptation
+        from openjax.learning.adaptation import (
+            adapting_settings,
+            bounds_of,
+            fine_tune,
+            make_adaptation,
+            starting_parameters,
+        )
         from openjax.store.policies import load_policy
         from openjax.store.policy_files import save_policy_file
         from openjax.store.settings_files import write_json
@@ -87,7 +93,7 @@ def adapt(command: AdaptCommand) -> dict:
         tasks = uniform_tasks(settings.environment, 2 * command.episodes, settings.environment.max_pillars)
         chosen_by = jax.tree.map(lambda leaf: leaf[: command.episodes], tasks)
         measured_on = jax.tree.map(lambda leaf: leaf[command.episodes :], tasks)
-        parameters = loaded.parameters.replace(critic={})
+        parameters = starting_parameters(loaded.parameters, loaded.settings, settings)
         ready = _compile(adaptation, parameters, chosen_by, bounds_of({}, {}))
 
         effects = diagnosis()

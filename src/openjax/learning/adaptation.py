@@ -13,6 +13,7 @@ from openjax.learning.evaluation import Evaluation, make_evaluate
 from openjax.learning.settings import TrainSettings
 from openjax.learning.training_step import TrainCarry, build, init_carry, make_training_step
 from openjax.policy import Policy, PolicyParameters
+from openjax.policy.growth import with_longer_history
 from openjax.pursuit import Pursuit, Task
 from openjax.ranges import Interval, check_intervals
 from openjax.vehicle import load_vehicle
@@ -20,6 +21,8 @@ from openjax.vehicle.family import adapted_family, family_bounds
 
 RATE_LOOP = 0.002
 """Period of a Crazyflie's rate loop (s)."""
+HISTORY = 12
+"""Frames of its own flight that an adapted policy sees at least: with late commands and slow motors one isn't enough."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,7 @@ def adapting_settings(trained: TrainSettings, settings: AdaptSettings) -> TrainS
             game,
             vehicles=adapted_family({}, {}),
             rare_vehicles=0.0,
+            observe_history=max(game.observe_history, HISTORY),
             speed_limit="none",
             physics="stops",
             substeps=max(game.substeps, round(game.time_step / RATE_LOOP)),
@@ -77,6 +81,16 @@ def adapting_settings(trained: TrainSettings, settings: AdaptSettings) -> TrainS
         num_envs=num_envs,
         total_steps=(settings.updates + settings.warm_up) * num_envs * trained.rollout_length,
     )
+
+
+def starting_parameters(
+    parameters: PolicyParameters, trained: TrainSettings, settings: TrainSettings
+) -> PolicyParameters:
+    """The policy trained with `trained` as it begins in `settings`, without its critic; it acts as before."""
+    grown = with_longer_history(
+        parameters.replace(critic={}), settings.predictor, trained.environment, settings.environment
+    )
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), grown)
 
 
 @dataclass(frozen=True)
@@ -146,9 +160,8 @@ def fine_tune(
 ) -> Tuned:
     """Train `parameters` (critic left aside) on vehicles within `bounds` (R, 4), and keep the best on the way.
 
-    `score` gives the scores of episodes (B,), of the same tasks
-    and vehicles each time; what isn't clearly better than the first parameters, by the differences of single episodes,
-    isn't kept. `tell` hears of every training step.
+    `score` gives the scores of episodes (B,), of the same tasks and vehicles each time; what isn't clearly better than the
+    first parameters, by the differences of single episodes, isn't kept. `tell` hears of every training step.
     """
     bounds = jnp.asarray(bounds)
     carry = adaptation.start(key, bounds)
