@@ -3,9 +3,9 @@
     python -m experiments.processes [--preset paper] [--seconds 15] [--out experiments/results/processes]
 
 Two GPUs fly twice the preset's worlds. First all programs are compiled into a cache, side by side, which the two
-processes do until their first checkpoint; then one of them is killed, its run is gone on with on one GPU beside one GPU
-alone, and both kinds of two are timed, one after the other. Needs two devices; with `--cpu` they are two virtual ones, to
-try the script.
+processes do until their first checkpoint; then one of them is killed, both kinds of two are timed, one after the other,
+and the lost run is gone on with on one GPU beside one GPU alone. With `--speed_only` nothing but both kinds of two; the
+rest stays as an earlier call left it. Needs two devices; with `--cpu` they are two virtual ones, to try the script.
 """
 
 import dataclasses
@@ -24,6 +24,7 @@ from pathlib import Path
 import tyro
 
 from experiments.pages import table, typed_command, where
+from openjax.files import read_json
 from openjax.show.metrics import METRICS_FILE, read_metrics
 from openjax.store.settings_files import write_json
 
@@ -41,6 +42,8 @@ class ProcessesCommand:
     """Time each is measured for, after its first update."""
     compilation: float = 240.0
     """Longest time to wait for a first update."""
+    speed_only: bool = False
+    """Time the two kinds of two alone."""
     cpu: bool = False
     """Two virtual CPU devices instead of GPUs."""
     out: Path = Path(__file__).parent / "results" / "processes"
@@ -167,23 +170,34 @@ def main(command: ProcessesCommand) -> dict:
     together, apart, alone, other = [gpus], [[gpus[0]], [gpus[1]]], [gpus[:1]], [gpus[1:]]
     twice = ("--num_envs", str(2 * command.num_envs))
     unwatched = ("--validation_interval", "100000")
-    results: dict = {"command": typed_command()}
+    data = command.out.with_suffix(".json")
+    results: dict = read_json(data) if command.speed_only and data.exists() else {}
+    results["speed_command" if command.speed_only else "command"] = typed_command()
 
     def tell(name, found):
         results[name] = found
         print(name, found, flush=True)
-        write_json(command.out.with_suffix(".json"), results)
+        write_json(data, results)
 
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder)
         os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
         started = time.monotonic()
         lost = Job(command, scratch, "lost", apart, *twice, "--validation_interval", "10")
-        compiling = [
-            Job(command, scratch, "compiling_together", together, *twice, *unwatched),
-            Job(command, scratch, "compiling_alone", alone, *unwatched, "--num_envs", str(command.num_envs)),
-            Job(command, scratch, "compiling_resumed", other, *twice, *unwatched),
-        ]
+        compiling = [Job(command, scratch, "compiling_together", together, *twice, *unwatched)]
+        if not command.speed_only:
+            compiling += [
+                Job(
+                    command,
+                    scratch,
+                    "compiling_alone",
+                    alone,
+                    *unwatched,
+                    "--num_envs",
+                    str(command.num_envs),
+                ),
+                Job(command, scratch, "compiling_resumed", other, *twice, *unwatched),
+            ]
         for job in compiling:
             job.wait_for(command.compilation, job.updates)
             job.end(signal.SIGKILL)
@@ -192,20 +206,17 @@ def main(command: ProcessesCommand) -> dict:
         tell("process 1 killed", lose_one(lost))
 
         os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "true"
-        beside = ThreadPoolExecutor(2)
-        one = Job(command, scratch, "one_device", alone, *unwatched, "--num_envs", str(command.num_envs))
-        resumed = Job(command, scratch, "lost", other, "--resume", str(lost.run))
-        futures = beside.submit(timed, command, one), beside.submit(go_on, command, resumed)
-        tell("one device", futures[0].result())
-        tell("resumed on one device", futures[1].result())
-        for name, devices in (("one process", together), ("two processes", apart)):
-            tell(
-                name,
-                timed(command, Job(command, scratch, name.replace(" ", "_"), devices, *twice, *unwatched)),
-            )
-        settings = json.loads((one.run / "settings.json").read_text(encoding="utf-8"))
-        results["machine"] = settings["machine"]
-    write_json(command.out.with_suffix(".json"), results)
+        for name, devices in (("two processes", apart), ("one process", together)):
+            two = Job(command, scratch, name.replace(" ", "_"), devices, *twice, *unwatched)
+            tell(name, timed(command, two))
+        tell("machine", json.loads((two.run / "settings.json").read_text(encoding="utf-8"))["machine"])
+        if not command.speed_only:
+            one = Job(command, scratch, "one_device", alone, *unwatched, "--num_envs", str(command.num_envs))
+            resumed = Job(command, scratch, "lost", other, "--resume", str(lost.run))
+            with ThreadPoolExecutor(2) as beside:
+                futures = beside.submit(timed, command, one), beside.submit(go_on, command, resumed)
+                tell("one device", futures[0].result())
+                tell("resumed on one device", futures[1].result())
     command.out.with_suffix(".md").write_text(page(results, command))
     return results
 
@@ -224,6 +235,7 @@ def page(results: dict, command: ProcessesCommand) -> str:
             f"{speed / alone:.2f}",
         ]
         for name, worlds in (("one device", 1), ("one process", 2), ("two processes", 2))
+        if name in results
         for row in [results[name]]
         for speed in [row["env_steps_per_second"]]
     ]
@@ -239,6 +251,7 @@ def page(results: dict, command: ProcessesCommand) -> str:
         "",
         f"{where(results)} {machine['cpu_cores']} CPU cores, {machine['date']}. Preset `{command.preset}`, programs compiled "
         f"before, side by side, in {results['compilation_seconds']} s.",
+        *([f"Both kinds of two: `{results['speed_command']}`."] if "speed_command" in results else []),
         "",
         *table(heads, rows),
         "",
