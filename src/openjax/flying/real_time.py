@@ -30,13 +30,22 @@ def hurry() -> str:
     JAX computes in several, and the loop would wait for one that waits for its turn.
     """
     try:
-        for thread in os.listdir("/proc/self/task"):
-            os.sched_setscheduler(int(thread), os.SCHED_RR, os.sched_param(PRIORITY))
+        for thread in _threads():
+            os.sched_setscheduler(thread, os.SCHED_RR, os.sched_param(PRIORITY))
         return "real time"
     except (AttributeError, OSError):  # not on this system, or not ours to ask
         pass
     try:
-        os.setpriority(os.PRIO_PROCESS, 0, NICE)
+        for thread in _threads():  # Linux's nice values are threads', too
+            os.setpriority(os.PRIO_PROCESS, thread, NICE)
         return "nice"
     except (AttributeError, OSError):
         return "ordinary"
+
+
+def _threads() -> list[int]:
+    """The threads of this process; 0, which means it, where they can't be told."""
+    try:
+        return [int(name) for name in os.listdir("/proc/self/task")]
+    except OSError:
+        return [0]
