@@ -71,6 +71,7 @@ def adapting_settings(trained: TrainSettings, settings: AdaptSettings) -> TrainS
             clip_epsilon_end=settings.clip_epsilon,
             penalty_start=1.0,
             # the optimiser learns the gradients' size meanwhile; with moments of zero its first steps would be ten times as long
+            critic_lambda=1.0,
             actor_start=settings.warm_up / (settings.warm_up + settings.updates),
             minibatches=minibatches,
         ),
