@@ -51,8 +51,9 @@ def notes(report):
 
         found = look(evidence, selection)
         return {
-            "predicted": found.predicted,
-            "nats": found.nats,
+            "everything": found.everything._asdict(),
+            "strange": found.strange._asdict(),
+            "plain": found.plain._asdict(),
             "followed": found.followed,
             "lines": found.local,
         }

@@ -106,14 +106,15 @@ def equivalents(evidence: Evidence, selection: Selection, named) -> dict[str, li
 
 def _rest_in_words(rest: Rest) -> str:
     words = [f"What is left isn't noise: {', '.join(rest.local)}."] if rest.local else []
-    best = int(np.argmax(rest.predicted))
-    if rest.predicted[best] <= rules.FOLLOWED or rest.nats < rules.LEAST_NATS:
+    predicted = rest.everything.predicted
+    best = int(np.argmax(predicted))
+    if predicted[best] <= rules.FOLLOWED or rest.everything.nats < rules.LEAST_NATS:
         return " ".join(words)
     return (
         " ".join(words)
         + (" " if words else "")
         + (
-            f"What is left in {ERROR_NAMES[best]} isn't noise: {100 * rest.predicted[best]:.0f} % of it follows "
+            f"What is left in {ERROR_NAMES[best]} isn't noise: {100 * predicted[best]:.0f} % of it follows "
             f"{'; '.join(rest.followed)} on stretches left out."
         )
     )

@@ -79,7 +79,9 @@ def _alternatives(evidence: Evidence, selection: Selection, rest: Rest, effects)
     for effect, gain in selection.offered.items():
         nearly = min(max(gain.floors / LEAST_GAIN, 0.0), 1.0) ** 2
         weights[effect] += nearly * float(np.exp(min((gain.nats - 2 * LEAST_NATS) / TEMPERATURE, 0.0)))
-    weights["unknown"] = 0.5 if effects else 0.5 + min(float(rest.predicted.max()) / FOLLOWED, 1.0) ** 2
+    weights["unknown"] = (
+        0.5 if effects else 0.5 + min(float(rest.strange.predicted.max()) / FOLLOWED, 1.0) ** 2
+    )
     weights["none"] = 0.5
     return {e: w for e, w in weights.items() if e not in effects and (effects or e != "none")}
 

@@ -3,11 +3,16 @@
 A dictionary of plain regressors - place, motion, motor commands, voltage, the vehicle above - pushes and turns the
 vehicle along each axis, without any effect's form. Its columns go through the same replay, noise models, nuisances and
 folds as the effects do. Angular accelerations, which share the gyroscope's noise with what is to be explained, are not
-among them, and what hardly happened in the flights is kept small."""
+among them, and what hardly happened in the flights is kept small.
+
+Not everything that the rest follows says that something unknown acts. What follows thrust, motors, voltage, speed, floor or
+ceiling is what an effect of the list has wrong, or feedback's answer to gusts, which drives the motors just as a thrust curve
+would: strange is what none of them does."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,7 +30,7 @@ SPREAD = 0.3  # m/s^2 and, times TORQUE, rad/s^2: prior rms of a regressor's par
 TORQUE = 10.0
 MOST = 6  # regressors at once
 RADIUS = 0.023  # m, of a propeller
-RARE = 0.3  # of a regressor's usual size: one that happened less is not blown up
+RARE = 0.3  # of a regressor's usual size: what happened less isn't blown up, nor called strange
 WIDTH = 0.25  # m of the radial functions of the place
 STEADY = (
     "force by wind along world x",
@@ -35,14 +40,42 @@ STEADY = (
 ALONG = ("force x by velocity", "force y by velocity", "force z by vertical speed")
 
 
-@dataclass(frozen=True)
-class Rest:
-    """`predicted` (6,) share of each channel's squared error on stretches left out that the dictionary predicts
-    (rates x, y, z, velocity x, y, z), `nats` of likelihood that it adds there, `followed` the regressors that do, in
-    words, the most telling first; `local`: what is local in frequency or in time."""
+# What an effect of the list would do as well, or feedback.
+LIKE_AN_EFFECT, STRANGE, PLAIN = range(3)
+
+
+class Regressor(NamedTuple):
+    """`values` (T, 3): acceleration in the body frame, "force" m/s^2 or "torque" rad/s^2; `usual`: its usual size; `rank`:
+    whether an effect of the list does the like, or else whether it is one of many (places, headings) or as plain as
+    physics goes."""
+
+    kind: str
+    values: np.ndarray
+    usual: float
+    rank: int
+
+    @property
+    def size(self) -> float:
+        return float(np.sqrt(np.mean(self.values**2)))
+
+
+class Followed(NamedTuple):
+    """`predicted` (6,) share of each channel's squared error on stretches left out (rates x, y, z, velocity x, y, z), `nats` of
+    likelihood that it adds there."""
 
     predicted: np.ndarray
     nats: float
+
+
+@dataclass(frozen=True)
+class Rest:
+    """What the dictionary predicts of the rest: `everything` with all regressors that it took, `strange` what those add that
+    are like no effect of the list, `plain` the plainest of these; `followed` the regressors, in words, the most telling
+    first; `local`: what is local in frequency or in time."""
+
+    everything: Followed
+    strange: Followed
+    plain: Followed
     followed: tuple[str, ...]
     local: tuple[str, ...] = ()
 
@@ -51,12 +84,17 @@ def look(evidence: Evidence, selection: Selection) -> Rest:
     """What the dictionary predicts of what the selection leaves."""
     replay = evidence.replay
     tables = [dictionary(t) for t in replay.tracks]
-    names = [n for n in tables[0] if all(n in t for t in tables)]
-    usual = {n: tables[0][n][2] for n in names}
-    size = {n: np.sqrt(np.mean(np.concatenate([t[n][1] for t in tables]) ** 2)) for n in names}
-    names = [n for n in names if size[n] > 1e-3 * usual[n]]
+    sizes = {
+        n: np.sqrt(np.mean([t[n].size ** 2 for t in tables]))
+        for n in tables[0]
+        if all(n in t for t in tables)
+    }
+    usual = {n: tables[0][n].usual for n in sizes}
+    names = [
+        n for n in sizes if sizes[n] > (1e-3 if tables[0][n].rank == LIKE_AN_EFFECT else RARE) * usual[n]
+    ]
     more = [
-        np.stack([channels(track, t[n][0], t[n][1] / max(size[n], RARE * usual[n])) for n in names])
+        np.stack([channels(track, t[n].kind, t[n].values / max(sizes[n], RARE * usual[n])) for n in names])
         for track, t in zip(replay.tracks, tables, strict=True)
     ]
     table = build(
@@ -64,7 +102,7 @@ def look(evidence: Evidence, selection: Selection) -> Rest:
     )
     plain = with_effects(table)
     extra = table.more
-    spread = np.array([SPREAD * (TORQUE if tables[0][n][0] == "torque" else 1.0) for n in names])
+    spread = np.array([SPREAD * (TORQUE if tables[0][n].kind == "torque" else 1.0) for n in names])
     along = np.array([n in ALONG for n in names])
     carried = widened(plain, extra[along], spread[along] ** -2.0)
     # What pushes along the motion came before it: gusts carry the vehicle with them. What brakes it is an effect.
@@ -83,8 +121,19 @@ def look(evidence: Evidence, selection: Selection) -> Rest:
         if gained.sum() - max(gained.max(), 0.0) < LEAST_NATS + np.log(len(names)):  # the best of so many
             break
         model, then, chosen = wider, whole, [*chosen, int(best)]
-    left = now.squares.sum(0)
-    predicted = np.where(table.usable > 0, 1.0 - then.squares.sum(0) / np.maximum(left, 1e-30), 0.0)
+    rank = np.array([tables[0][n].rank for n in names])
+    taken = np.array(chosen, int)
+
+    def judged(ranks):
+        columns = taken[np.isin(rank[taken], ranks)]
+        return judge(table, widened(base, extra[columns], spread[columns] ** -2.0)) if len(columns) else now
+
+    def followed(fewer, more):
+        left = fewer.squares.sum(0)
+        predicted = np.where(table.usable > 0, 1.0 - more.squares.sum(0) / np.maximum(left, 1e-30), 0.0)
+        return Followed(np.maximum(predicted, 0.0), float((more.nats - fewer.nats).sum()))
+
+    known = judged((LIKE_AN_EFFECT,))
     disturbed = [
         disturbances(t, r) for t, r in zip(replay.tracks, residuals_of(replay, selection.fit), strict=True)
     ]
@@ -92,8 +141,9 @@ def look(evidence: Evidence, selection: Selection) -> Rest:
     if any(t.pose_age > 0.0 for t in replay.tracks):
         heard[VELOCITY] = 0.0  # samples put onto faster rows beat with them
     return Rest(
-        np.maximum(predicted, 0.0),
-        float((then.nats - now.nats).sum()),
+        followed(now, then),
+        followed(known, then),
+        followed(known, judged((LIKE_AN_EFFECT, PLAIN))),
         tuple(names[k] for k in chosen),
         (*lines(replay.tracks, disturbed, heard), *knocks(replay.tracks, disturbed, replay.usable)),
     )
@@ -112,8 +162,8 @@ def channels(track: Track, kind: str, values: np.ndarray) -> np.ndarray:
     return out
 
 
-def dictionary(track: Track) -> dict[str, tuple[str, np.ndarray, float]]:
-    """{name: (kind, acceleration (T, 3) of the body frame, usual size)}."""
+def dictionary(track: Track) -> dict[str, Regressor]:
+    """{name: regressor} of one track."""
     rows = len(track)
     turn = rotation(track.quaternion) if track.quaternion is not None else np.tile(np.eye(3), (rows, 1, 1))
     velocity = track.velocity if track.velocity is not None else np.zeros((rows, 3))
@@ -127,11 +177,15 @@ def dictionary(track: Track) -> dict[str, tuple[str, np.ndarray, float]]:
     square = smooth((track.motor - track.motor.mean(0)) ** 2 @ mix.T, 0.05, track.dt)
     heading = np.arctan2(turn[:, 1, 0], turn[:, 0, 0])
     time = (track.time - track.time[0]) / 10.0 - 0.5
-    out: dict[str, tuple[str, np.ndarray, float]] = {}
+    out: dict[str, Regressor] = {}
 
-    def add(kind, name, axis, values, usual=1.0):
+    def add(kind, name, axis, values, usual=1.0, rank=LIKE_AN_EFFECT):
+        if kind == "force" and axis == 2:
+            values = values - values.mean()  # what is the same all the time is thrust's
         vector = values if axis is None else values[:, None] * np.eye(3)[axis]
-        out[f"{kind} {'' if axis is None else 'xyz'[axis] + ' '}by {name}"] = (kind, vector, usual)
+        out[f"{kind} {'' if axis is None else 'xyz'[axis] + ' '}by {name}"] = Regressor(
+            kind, vector, usual, rank
+        )
 
     for axis in (0, 1):
         add("force", "velocity", axis, v[:, axis])
@@ -145,25 +199,25 @@ def dictionary(track: Track) -> dict[str, tuple[str, np.ndarray, float]]:
         add("torque", "rates across", axis, w[:, 1 - axis])
         add("torque", "motor commands squared", axis, square[:, axis], 0.01)
         add("torque", "tilt", axis, turn[:, 2, axis], 0.1)
-    for name, values, usual in (
-        ("vertical speed", v[:, 2], 0.3),
-        ("vertical speed times speed", v[:, 2] * speed, 0.3),
-        ("horizontal speed", (v[:, :2] ** 2).sum(1), 1.0),
-        ("sinking", np.minimum(v[:, 2], 0.0), 0.3),
-        ("thrust", over, 0.1),
-        ("thrust squared", over**2, 0.02),
-        ("high motor commands", np.maximum(track.motor - 0.75, 0.0).mean(1), 0.03),
-        ("time", time, 0.3),
+    for name, values, usual, rank in (
+        ("vertical speed", v[:, 2], 0.3, LIKE_AN_EFFECT),
+        ("vertical speed times speed", v[:, 2] * speed, 0.3, LIKE_AN_EFFECT),
+        ("horizontal speed", (v[:, :2] ** 2).sum(1), 1.0, PLAIN),
+        ("sinking", np.minimum(v[:, 2], 0.0), 0.3, PLAIN),
+        ("thrust", over, 0.1, LIKE_AN_EFFECT),
+        ("thrust squared", over**2, 0.02, LIKE_AN_EFFECT),
+        ("high motor commands", np.maximum(track.motor - 0.75, 0.0).mean(1), 0.03, LIKE_AN_EFFECT),
+        ("time", time, 0.3, PLAIN),
     ):
-        add("force", name, 2, values, usual)
+        add("force", name, 2, values, usual, rank)
     for axis in range(3):
-        add("torque", "time", axis, time, 0.3)
-    add("torque", "rates x", 2, w[:, 0])
-    add("torque", "rates y", 2, w[:, 1])
+        add("torque", "time", axis, time, 0.3, PLAIN)
+    add("torque", "rates x", 2, w[:, 0], 1.0, STRANGE)
+    add("torque", "rates y", 2, w[:, 1], 1.0, STRANGE)
     add("torque", "thrust", 2, thrust)
     add("torque", "motor commands squared", 2, square[:, 2], 0.01)
-    add("torque", "heading, sine", 2, np.sin(heading))
-    add("torque", "heading, cosine", 2, np.cos(heading))
+    add("torque", "heading, sine", 2, np.sin(heading), 1.0, STRANGE)
+    add("torque", "heading, cosine", 2, np.cos(heading), 1.0, STRANGE)
     add("torque", "change of thrust", 2, np.gradient(thrust, track.dt))
     if track.voltage is not None:
         add("force", "voltage", 2, track.voltage - 3.8, 0.1)
@@ -173,17 +227,19 @@ def dictionary(track: Track) -> dict[str, tuple[str, np.ndarray, float]]:
         for axis in range(3):
             for own in range(3):
                 pull = place[:, own : own + 1] * turn[:, axis]
-                add("force", f"place {'xyz'[own]} along world {'xyz'[axis]}", None, pull, 0.3)
+                # Wind may change with height; a spring pulls back along each axis.
+                rank = PLAIN if own == axis else LIKE_AN_EFFECT if own == 2 else STRANGE
+                add("force", f"place {'xyz'[own]} along world {'xyz'[axis]}", None, pull, 0.3, rank)
         add("force", "the floor near", 2, (RADIUS / (height + 0.03)) ** 2, 0.1)
         ceiling = np.maximum(ARENA_CEILING - height, 0.0)
         add("force", "the ceiling near", 2, (RADIUS / (ceiling + 0.05)) ** 2, 0.1)
         for x in (-0.5, 0.0, 0.5):
             for y in (-0.5, 0.0, 0.5):
                 bump = np.exp(-((place[:, 0] - x) ** 2 + (place[:, 1] - y) ** 2) / (2 * WIDTH**2))
-                add("force", f"the place ({x:g}, {y:g})", 2, bump, 0.3)
+                add("force", f"the place ({x:g}, {y:g})", 2, bump, 0.3, STRANGE)
                 for axis in (0, 1):
                     name = f"the place ({x:g}, {y:g}) along world {'xy'[axis]}"
-                    add("force", name, None, bump[:, None] * turn[:, axis], 0.3)
+                    add("force", name, None, bump[:, None] * turn[:, axis], 0.3, STRANGE)
         for k, other in enumerate(track.neighbours):
             gap = other - track.position
             below = (gap[:, 2] > 0.02) * np.exp(-np.maximum(gap[:, 2], 0.0) / 0.5)

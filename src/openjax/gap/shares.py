@@ -84,7 +84,9 @@ def split(evidence: Evidence, selection: Selection, rest: Rest, named) -> Split:
         states[effect] = _squares(evidence, selection, [e for e in physics if e != effect], others)
     names = list(states["all"])
     left = {k: np.stack([v[n] for n in names], 1) for k, v in states.items()}
-    predicted = np.array([rest.predicted[ERROR_NAMES.index(n)] if n in ERROR_NAMES else 0.0 for n in names])
+    predicted = np.array(
+        [rest.everything.predicted[ERROR_NAMES.index(n)] if n in ERROR_NAMES else 0.0 for n in names]
+    )
     rows = left["all"].shape[0]
 
     def power(kind, pick, floor):

@@ -4,8 +4,7 @@ The rest is compared with the same flights' own spectrum, never with a plant's. 
 loose part, a pendulum or a beat makes a line. A vibrating sensor makes lines, too: what two sensors see at once is motion.
 So does whoever flies circles: what any model has wrong comes back with each of them, and with its multiples.
 
-What is local in time (knocks, switches) was tried by the kurtosis of the rest's increments: drifting clocks, wakes of
-another form and interpolated poses make as much of it."""
+Torques of a few hertz are how one flies; above, they are smooth, and whole flights tell weaker lines."""
 
 from __future__ import annotations
 
@@ -19,7 +18,8 @@ from openjax.gap.replay import FORCE, RATES, SKIP, VELOCITY
 LINE = 10.0  # times the spectrum around it
 ALONE = 30.0  # the same for a line that one sensor alone sees
 PARTLY = 3.0  # of a line in a second sensor
-SEGMENT = 4.0  # s of a spectrum
+QUICK, FAINT = 3.0, 20.0  # Hz above which torques of whole flights are looked at; times the spectrum around
+SEGMENT, WHOLE = 4.0, 10.0  # s of a spectrum
 AROUND = 3.0  # Hz whose median is the spectrum around
 LOWEST, HIGHEST = 0.8, 25.0  # Hz
 POSE_HIGHEST = 8.0  # Hz: above, what tracks the pose and puts it onto rows makes lines of its own
@@ -50,8 +50,18 @@ def lines(tracks: list[Track], disturbed: list[np.ndarray], usable: np.ndarray) 
         # The pose is nobody's vibration; an accelerometer's or a gyroscope's line may be its own.
         alone = LINE if name == "velocity" else ALONE
         if (size > alone and (name != "force" or "velocity" not in seen)) or (size > LINE and others):
-            return (f"a line at {at:.1f} Hz in {name} {axis}, {size:.0f} times the spectrum around it",)
+            return (_words(at, name, axis, size),)
+    if "torque" in seen:
+        frequency, ratio = _ratio(tracks, [d[:, RATES] for d in disturbed], WHOLE)
+        ratio = np.where(((frequency > QUICK) & (frequency < HIGHEST))[:, None], ratio, 0.0)
+        place = np.unravel_index(np.argmax(ratio), ratio.shape)
+        if ratio[place] > FAINT:
+            return (_words(frequency[place[0]], "torque", "xyz"[place[1]], ratio[place]),)
     return ()
+
+
+def _words(at: float, name: str, axis: str, size: float) -> str:
+    return f"a line at {at:.1f} Hz in {name} {axis}, {size:.0f} times the spectrum around it"
 
 
 def _laps(tracks: list[Track]) -> list[float]:
@@ -69,11 +79,11 @@ def _laps(tracks: list[Track]) -> list[float]:
     return found
 
 
-def _ratio(tracks, parts) -> tuple[np.ndarray, np.ndarray]:
+def _ratio(tracks, parts, seconds: float = SEGMENT) -> tuple[np.ndarray, np.ndarray]:
     """Frequencies (K,) Hz and the spectrum (K, 3) over its own median around."""
     total, weight = 0.0, 0.0
     kept = [part[int(SKIP / track.dt) :] for track, part in zip(tracks, parts, strict=True)]
-    rows = min(round(SEGMENT / tracks[0].dt), *(len(x) for x in kept)) // 2 * 2
+    rows = min(round(seconds / tracks[0].dt), *(len(x) for x in kept)) // 2 * 2
     for track, x in zip(tracks, kept, strict=True):
         frequency, power = welch(
             x, 1.0 / track.dt, nperseg=rows, noverlap=rows // 2, axis=0, detrend="linear"

@@ -9,7 +9,7 @@ import numpy as np
 from openjax.gap.evidence import Evidence
 from openjax.gap.library import path_of
 from openjax.gap.probabilities import FOLLOWED, TEMPERATURE, probabilities_of
-from openjax.gap.rest import Rest
+from openjax.gap.rest import Followed, Rest
 from openjax.gap.selection import LEAST_NATS, LEAST_SHARE, TESTABLE, Selection
 from openjax.gap.shares import Split
 
@@ -17,8 +17,9 @@ CLOCK = 0.003  # s by which the clocks of a log may differ
 CLEAR = 3.0  # standard errors
 LEAST_LOSS = 0.01  # of the packets
 BESIDE = 0.13  # floors by which an effect must shrink the gap to be named beside a stronger one
-LEAST_LEFT = 0.05  # floors of the gap that an unexplained rest must hold to be named
-UNKNOWN_SHARE = 0.2  # of the gap, from which an unexplained rest is named beside the effects
+LEAST_LEFT = 0.05  # floors of the gap that a strange rest must hold to be named: the best of many regressors
+LEAST_PLAIN = 0.01  # the same where plain ones tell it
+UNKNOWN_SHARE = 0.12  # of the gap, from which a strange rest is named beside the effects
 
 
 @dataclass(frozen=True)
@@ -67,10 +68,11 @@ def not_testable(evidence: Evidence) -> list[str]:
 def decide(evidence: Evidence, selection: Selection, rest: Rest, parts: Split, missing) -> Verdict:
     """The words that the shares give, and how sure they are."""
     named = _material(selection, parts)
-    material = parts.gap.after > 1.0 + LEAST_LEFT
-    left = material and rest.nats > LEAST_NATS and rest.predicted.max() > FOLLOWED
     strange = bool(set(evidence.sensors.findings) - {"clocks"}) or bool(rest.local)
-    strange = strange or (left and (not named or parts.unexplained.value > UNKNOWN_SHARE))
+    strange = strange or any(
+        found.nats > LEAST_NATS and found.predicted.max() > FOLLOWED and _left(parts, found, least, named)
+        for found, least in ((rest.strange, LEAST_LEFT), (rest.plain, LEAST_PLAIN))
+    )
     effects = list(named)
     if strange:
         sizes = [parts.effects[e].value for e in named]
@@ -83,6 +85,13 @@ def decide(evidence: Evidence, selection: Selection, rest: Rest, parts: Split, m
     if word == "none" and len(missing) >= len(evidence.library.effects) // 2:
         word = "not_testable"
     return Verdict(word, tuple(effects), probabilities_of(evidence, selection, parts, rest, effects))
+
+
+def _left(parts: Split, found: Followed, least: float, named) -> bool:
+    """Whether what is found is material: of the gap by itself and, beside names, as a share of it."""
+    more = float(np.sum(1.0 / (1.0 - found.predicted) - 1.0)) / len(parts.channels)  # of the gap's square
+    share = parts.unexplained.value * min(more / max(parts.gap.after**2 - 1.0, 1e-9), 1.0)
+    return np.sqrt(1.0 + more) > 1.0 + least and (not named or share > UNKNOWN_SHARE)
 
 
 def _material(selection: Selection, parts: Split) -> list[str]:
