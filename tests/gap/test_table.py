@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import minimize
 
 from openjax.gap.bounds import BOUND, held_objective
-from openjax.gap.table import Model, Table, judge, offers
+from openjax.gap.table import Model, Table, _errors, judge, offers
 
 SHARED = np.array([True, True, False])
 
@@ -44,6 +44,26 @@ def test_an_offer_is_what_judging_each_column_finds(columns):
         np.testing.assert_allclose(nats, judge(table, wider).nats, rtol=1e-9)
     gains = offered.sum(1) - judge(table, model).nats.sum()
     assert gains[1] > 50.0 and max(gains[0], gains[2]) < 5.0  # column 2 is part of what is left
+
+
+def test_what_half_a_track_cannot_show_of_its_clock_is_not_foretold(columns):
+    # The track's own nuisance is silent in the first half and rules the second: the first knows nothing of it.
+    for x in columns:
+        x[0] -= 0.3 * x[5] - 0.4 * x[7]
+        x[7, :200] *= 1e-3
+        x[0, 200:] += 1.5 * x[7, 200:]
+    model = Model((), np.array([3]), np.zeros(1), np.eye(1))
+    nats = judge(table_of(columns), model).nats
+    assert abs(nats.reshape(4, 2).sum(1).min() / nats.reshape(4, 2).sum(1).max() - 1.0) < 0.5
+
+
+def test_without_a_pose_the_accelerometer_says_what_the_velocity_became():
+    rng = np.random.default_rng(1)
+    specific = rng.standard_normal((1, 200, 3))
+    x = np.concatenate([np.zeros((1, 200, 6)), specific], 2)
+    blind = _errors(x, 0.01, np.array([1, 1, 1, 0, 0, 0, 1, 1, 1]))
+    np.testing.assert_allclose(blind[0, 60, 3:], 0.01 * specific[0, 36:61].sum(0), rtol=1e-9)
+    assert not _errors(x, 0.01, np.ones(9)).any()
 
 
 def test_nuisances_of_the_vehicle_are_alike_on_all_tracks_and_bounded(columns):

@@ -15,6 +15,7 @@ from openjax.flights.track import GRID_PERIOD, Track, tracks_of
 from openjax.gap import estimator, firmware
 from openjax.gap.feedback import (
     AT_ONCE,
+    AT_ONCE_SELDOM,
     ROW_DELAY,
     Gains,
     answers_noise,
@@ -205,7 +206,7 @@ def _sampled(reading: Reading, slow: bool, derived: bool) -> Reading:
     # Rows as slow as this hide every other command of a loop that sends one each 10 ms.
     seldom = max(t.dt for t in tracks) > 1.2 * GRID_PERIOD
     known = reading.arrived is not None and not seldom and not drifts
-    at_once = logged and answers_noise(tracks, reading.vehicles) > AT_ONCE
+    at_once = logged and answers_noise(tracks, reading.vehicles) > (AT_ONCE_SELDOM if seldom else AT_ONCE)
     sure = True
     if known and at_once:
         # The log doesn't say which; the motion does.

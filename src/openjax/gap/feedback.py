@@ -22,6 +22,7 @@ SLOW = 0.06  # s over which commands implied by motors and rates are smoothed
 QUICK = 0.1  # s: within it, single samples say little about what motors did between them
 LOOP_PERIOD = 0.002  # s, of the firmware's rate loop
 AT_ONCE = 0.12  # of the answer to one sample: above, motors may be single samples
+AT_ONCE_SELDOM = 0.22  # likewise in rows of over 12 ms, whose differences hold as much motion as noise
 BAND = (0.5, 10.0)  # Hz in which the loop's gains are read: above trims, below filters and single samples
 EDGE = 0.3  # s at either end that the filters spoil
 LEAST_CHANGE = 0.15  # of a gain: filters of a firmware do less

@@ -92,10 +92,10 @@ def _widened(replay, fit, table, now, singles):
         left = {e: f for e, f in singles.items() if (base, e) not in dropped}
         if fit.effects:
             ranked = [e for e in _ranked(table, singles, now) if e in left]
-            tried = [_joined(replay, fit, singles, e) for e in ranked]
+            tried = [_mended(replay, _joined(replay, fit, singles, e), singles, e) for e in ranked]
         else:
             tried = _openings(replay, fit, left)
-        better = [f for f in tried if is_itself(replay, f) and f.score > fit.score + LEAST_NATS]
+        better = [f for f in tried if f and is_itself(replay, f) and f.score > fit.score + LEAST_NATS]
         for candidate in sorted(better, key=lambda f: -f.score):
             wider = build(replay, candidate, singles)
             whole = judge(wider, with_effects(wider))
@@ -187,16 +187,38 @@ def floor_of(table: Table, whole: Judged) -> np.ndarray:
 
 
 def _ranked(table: Table, singles, now: Judged) -> list[str]:
-    """Effects outside the table's set that promise most: by a straight line beside the set, and alone."""
+    """Effects outside the table's set that promise most: by a straight line beside the set (nats, and nats of those that
+    shrink the gap, too), and alone."""
     alone = sorted(table.step, key=lambda e: -singles[e].score)
-    line = {e: (judge(table, with_effects(table, add=(e,))).nats - now.nats).sum() for e in table.step}
-    best = [e for e in sorted(line, key=lambda e: -line[e]) if line[e] > 0.0][: TRIED + 1]
-    return list(dict.fromkeys([*best, *(e for e in alone[:TRIED] if line[e] > 0.0)]))
+    judged = {e: judge(table, with_effects(table, add=(e,))) for e in table.step}
+    line = {e: (j.nats - now.nats).sum() for e, j in judged.items()}
+    best = [e for e in sorted(line, key=lambda e: -line[e]) if line[e] > 0.0]
+    wide = [e for e in best if level(now.squares, floor_of(table, judged[e])) - 1.0 > LEAST_GAIN]
+    ranked = [*best[: TRIED + 1], *wide[:TRIED], *(e for e in alone[:TRIED] if line[e] > 0.0)]
+    return list(dict.fromkeys(ranked))
 
 
 def is_itself(replay, fit: SetFit) -> bool:
     """Whether no effect of a set is by its fitted value another one, and none of two that undo each other."""
     return not _entangled(fit) and not _others(replay, fit)
+
+
+def _mended(replay, fit: SetFit, singles, newest: str) -> SetFit | None:
+    """The set without what isn't itself beside its `newest` effect, and with what promises most once that is gone; None where
+    it is the newest that isn't itself. What explained two causes at once makes way for them so."""
+    gone: set[str] = set()
+    while wrong := {*_entangled(fit), *_others(replay, fit)} - ({newest} if _entangled(fit) else set()):
+        if newest in wrong:
+            return None
+        gone |= wrong
+        fit = fit_set(replay, [e for e in fit.effects if e not in wrong], fit.theta)
+    if not gone:
+        return fit
+    table = build(replay, fit, singles)
+    ranked = [e for e in _ranked(table, singles, judge(table, with_effects(table))) if e not in gone]
+    more = [f for f in (_joined(replay, fit, singles, e) for e in ranked[:TRIED]) if is_itself(replay, f)]
+    best = max(more, key=lambda f: f.score, default=fit)
+    return best if best.score > fit.score + LEAST_NATS else fit
 
 
 def _others(replay, fit: SetFit) -> list[str]:
@@ -220,13 +242,13 @@ def _others(replay, fit: SetFit) -> list[str]:
     return wrong
 
 
-def _entangled(fit: SetFit) -> bool:
-    """Whether two effects of a set can hardly be told apart in these flights: either would do."""
+def _entangled(fit: SetFit) -> set[str]:
+    """Effects of a set that can hardly be told apart in these flights: either would do."""
     deviation = np.sqrt(np.diag(fit.covariance))
     alike = np.abs(fit.covariance / np.outer(deviation, deviation))
     owner = np.array([next((e for e in fit.effects if i in places((e,))), "") for i in fit.index])
     apart = (owner[:, None] != owner[None]) & (owner[:, None] != "") & (owner[None] != "")
-    return bool((alike[apart] > ALIKE).any())
+    return set(owner[(apart & (alike > ALIKE)).any(1)])
 
 
 def _joined(replay, fit: SetFit, singles, effect: str, without: str | None = None) -> SetFit:
@@ -278,8 +300,8 @@ def _swapped(replay, fit, table, now, singles):
         tried = {}
         alone = sorted(lines, key=lambda o: -singles[o].score)[:TRIED]
         for other in dict.fromkeys([*sorted(lines, key=lambda o: -lines[o])[:TRIED], *alone]):
-            found = _joined(replay, fit, singles, other, without=effect)
-            if is_itself(replay, found):
+            found = _mended(replay, _joined(replay, fit, singles, other, without=effect), singles, other)
+            if found is not None:
                 tried[other] = found
         gains = {o: f.score - fit.score for o, f in tried.items()}
         favoured = dict(gains)

@@ -112,7 +112,7 @@ def build(replay: Replay, fit: SetFit, singles: dict[str, SetFit], more=None) ->
         x = np.concatenate([c, m[: len(others)] - now, now - m[len(others) :], *added[number], nuisances])
         skip, size = int(SKIP / track.dt), max(int(BLOCK / track.dt), 1)
         w = replay.whiten(x, number)
-        e = _errors(x, track.dt)
+        e = _errors(x, track.dt, replay.usable)
         count = max(w.shape[1] // size, 1)
         for k, (a, b) in enumerate(zip(np.array_split(w, count, 1), _split(e, skip, count), strict=True)):
             flat = a.reshape(len(x), -1)
@@ -131,16 +131,20 @@ def build(replay: Replay, fit: SetFit, singles: dict[str, SetFit], more=None) ->
         {e: at + len(others) + k for k, e in enumerate(own)},
         at + len(others) + len(own) + np.arange(0 if more is None else len(more[0])),
         replay.shared,
-        replay.usable[:6],
+        np.concatenate([replay.usable[:3], replay.usable[3:6] if replay.usable[3] else replay.usable[6:9]]),
     )  # fmt: skip
 
 
-def _errors(x: np.ndarray, dt: float) -> np.ndarray:
-    """Errors (C, T, 6) of predictions over HORIZONS that end at each row."""
+def _errors(x: np.ndarray, dt: float, usable: np.ndarray) -> np.ndarray:
+    """Errors (C, T, 6) of predictions over HORIZONS that end at each row. Without a pose the accelerometer says what the
+    velocity became, in axes of the body."""
     out = np.zeros((*x.shape[:2], 6))
     for k, kind in enumerate(("rates", "velocity")):
         step = max(round(HORIZONS[kind] / dt), 1)
-        out[:, step:, 3 * k : 3 * k + 3] = (x[:, step:] - x[:, :-step])[..., 3 * k : 3 * k + 3]
+        whole = x[..., 3 * k : 3 * k + 3]
+        if kind == "velocity" and not usable[3]:
+            whole = np.cumsum(x[..., 6:9], axis=1) * dt
+        out[:, step:, 3 * k : 3 * k + 3] = whole[:, step:] - whole[:, :-step]
     return out
 
 
@@ -180,7 +184,22 @@ def solve(table: Table, model: Model, left_out: int | None = None) -> np.ndarray
     """Coefficients (tracks, C) of every column, fitted to all folds but one."""
     hessian, push = _equations(table, model, left_out)
     found, _ = bounded(hessian, push, len(model.free), model.bound)
+    if left_out is not None:
+        _own_again(table, model, found, table.folds[1][left_out])
     return np.stack([_spread(table, model, found, k) for k in range(len(np.unique(table.track_of)))])
+
+
+def _own_again(table: Table, model: Model, found: np.ndarray, track: int) -> None:
+    """Fit a track's own nuisances to all of it, everything else as it was `found`: they are of its sensors and clocks, and
+    what the rest of the track can't show of them isn't to be foretold."""
+    sums, tracks = table.folds
+    shared, own = _nuisances(table, model)
+    fixed = np.concatenate([model.free, shared])
+    gram = sums[tracks == track].sum(0)
+    target = gram[:, 0] + gram[:, list(model.parts)].sum(1) - gram[:, fixed] @ found[: len(fixed)]
+    place = len(fixed) + len(own) * int(np.searchsorted(np.unique(table.track_of), track))
+    hessian = np.eye(len(own)) + gram[np.ix_(own, own)]
+    found[place : place + len(own)] = bounded(hessian, target[own], 0, model.bound)[0]
 
 
 def _nuisances(table: Table, model: Model) -> tuple[np.ndarray, np.ndarray]:
@@ -237,6 +256,8 @@ def offers(table: Table, model: Model, columns: np.ndarray, precision: np.ndarra
         whole[:, kept] = found
         whole[:, inside] -= (follow * size).T
         whole[np.arange(len(columns)), added] = size
+        for each in whole:
+            _own_again(table, wide, each, table.folds[1][fold])
         blocks = np.flatnonzero(table.fold_of == fold)
         u = _spread(table, wide, whole, int(np.searchsorted(tracks, table.track_of[blocks[0]])))
         for b in blocks:
