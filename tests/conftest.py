@@ -1,5 +1,6 @@
 """Settings and fixtures of the whole suite: it compiles much and computes little, so the compiler may leave out costly passes."""
 
+import gc
 import os
 from importlib.metadata import version
 from pathlib import Path
@@ -7,6 +8,8 @@ from pathlib import Path
 import pytest
 
 _flags = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+# what isn't fused needs no compiler of fusions, which takes longer than the rest of an operation
+_flags += " --xla_disable_hlo_passes=fusion-wrapper"
 # workers are the parallel part: more threads would only wait for each other's cores
 _flags += " --xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 if version("jaxlib").startswith("0.10."):
@@ -22,6 +25,9 @@ os.environ.setdefault(
 )
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
+
+# tracing leaves many objects and little garbage
+gc.set_threshold(100_000, 50, 50)
 
 LONGEST = """
     gap/test_diagnosis cluster/test_distributed test_commands learning/test_training_step test_examples test_readme
