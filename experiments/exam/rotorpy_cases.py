@@ -20,6 +20,7 @@ from experiments.exam.generate import add_case_arguments
 from experiments.exam.plant import KEPT, POSE, SAMPLE, Battery, Filter
 
 SECONDS = 8.0
+TUNNEL_HEIGHT = 0.65  # m
 LEAST = 4.0 / SAMPLE + 1  # samples that a flight must last
 QUIET, LAPS, TURNS, TURNING = ("hover",), ("circle", "eight"), ("eight", "rocking"), ("yawing", "rocking")
 
@@ -162,7 +163,9 @@ def _air(kind):
     name, mean = kind
     mean = np.array(mean)
     if name == "tunnel":
-        return WindTunnel(np.linalg.norm(mean), mean / np.linalg.norm(mean), 0.25).update
+        # Its axis goes through the origin, which is on the floor: it is lifted to where the flights are.
+        tunnel = WindTunnel(np.linalg.norm(mean), mean / np.linalg.norm(mean), 0.25)
+        return lambda t, x: tunnel.update(t, x - [0.0, 0.0, TUNNEL_HEIGHT])
     steady = ConstantWind(*mean)
     sway = SinusoidWind(0.25 * mean, np.array([0.4, 0.55, 0.3]), np.array([0.0, 0.7, 0.3]))
     return steady.update if name == "steady" else lambda t, x: steady.update(t, x) + sway.update(t, x)
