@@ -81,9 +81,10 @@ def load_arrays(
         else jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
         for name, leaf in stored.items()
     }
-    this = jax.process_index()
-    alone = load_orbax().options.MultiprocessingOptions(primary_host=this, active_processes={this})
-    with load_orbax().Context(multiprocessing_options=alone):
+    alone = load_orbax().Context()
+    alone.multiprocessing.primary_host = jax.process_index()
+    alone.multiprocessing.active_processes = {jax.process_index()}
+    with alone:
         loaded = {
             names[name]: leaf
             for name, leaf in load_orbax().load(path, wanted).items()
