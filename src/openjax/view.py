@@ -46,7 +46,7 @@ def open_viewer(command: ViewCommand):
     """Fly the episodes and serve the page; returns the `openjax.show.viewer.Viewer`.
 
     Raises:
-        UserError: an unusable policy, layout or port.
+      UserError: an unusable policy, layout or port.
     """
     from openjax.store.policies import load_policy
 

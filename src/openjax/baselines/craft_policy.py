@@ -30,7 +30,7 @@ class CraftPolicy(Policy):
         """The policy for an environment; its mean starts at `start`.
 
         Raises:
-            UserError: the velocity controller can't fly there.
+          UserError: the velocity controller can't fly there.
         """
         craft = Craft.of(environment)
         check_flyable(cls.NAME, craft, environment.settings.time_step)

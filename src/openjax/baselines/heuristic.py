@@ -45,7 +45,7 @@ class Heuristic:
         """A method for an environment's arena and vehicle.
 
         Raises:
-            UserError: the velocity controller can't fly there.
+          UserError: the velocity controller can't fly there.
         """
         craft = Craft.of(environment)
         check_flyable(name, craft, environment.settings.time_step)

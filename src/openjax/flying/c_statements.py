@@ -83,7 +83,7 @@ class Writer(Walk):
     """Statements and constants of a program under construction.
 
     Args:
-        readers: how often the result of each operation is read.
+      readers: how often the result of each operation is read.
     """
 
     def __init__(self, readers: list[int]):

@@ -83,8 +83,8 @@ class Game:
     """A policy's game with measured pursuers.
 
     Args:
-        policy: what `openjax.load_policy` gives; only its settings and its call are used.
-        task: pursuers' starts, evader's start, pillars.
+      policy: what `openjax.load_policy` gives; only its settings and its call are used.
+      task: pursuers' starts, evader's start, pillars.
     """
 
     def __init__(self, policy, task: Task):

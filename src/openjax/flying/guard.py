@@ -60,12 +60,12 @@ class Guard:
     """The loop's end of it: start it before take-off, call it at every tick, close it at the end.
 
     Args:
-        uris: of the vehicles.
-        pose_blocks: ids of their pose blocks, as the log set them up.
-        safety: limits.
-        state: of the loop's state machine; starts, pillars and airframe are taken from it.
-        after: silence of the loop after which it flies (s).
-        links: the links' process, which it ends with the loop's.
+      uris: of the vehicles.
+      pose_blocks: ids of their pose blocks, as the log set them up.
+      safety: limits.
+      state: of the loop's state machine; starts, pillars and airframe are taken from it.
+      after: silence of the loop after which it flies (s).
+      links: the links' process, which it ends with the loop's.
     """
 
     def __init__(

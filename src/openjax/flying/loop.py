@@ -161,13 +161,13 @@ class Flight:
     """One flight: take-off, games, landing.
 
     Args:
-        vehicles: links to them; the pursuers first, then, where it's a vehicle, the evader.
-        game: the policy and its game.
-        safety: limits.
-        plan: what to fly.
-        requests: asked at every tick for what the operator wants.
-        beat: called at every tick with time and state, see `openjax.flying.guard`.
-        clock: host time (s).
+      vehicles: links to them; the pursuers first, then, where it's a vehicle, the evader.
+      game: the policy and its game.
+      safety: limits.
+      plan: what to fly.
+      requests: asked at every tick for what the operator wants.
+      beat: called at every tick with time and state, see `openjax.flying.guard`.
+      clock: host time (s).
     """
 
     def __init__(

@@ -48,8 +48,8 @@ class MotionCaptured:
     """Vehicles whose poses come from outside; to the loop what `Links` is.
 
     Args:
-        links: to the vehicles.
-        clock: host time (s).
+      links: to the vehicles.
+      clock: host time (s).
     """
 
     def __init__(self, links: Links, clock: Callable[[], float] = time.perf_counter):

@@ -117,12 +117,12 @@ class Swarm:
     """Crazyflies, real or virtual, in one process. `openjax.flying.links` runs it in one of its own.
 
     Args:
-        uris: as `cflib` writes them: `radio://0/80/2M/E7E7E7E7E7`, `udp://127.0.0.1:19850`.
-        body_logs: log blocks of motors and accelerometer for each vehicle, spread over the 10 ms; more of them tell
-            the diagnosis more exactly when a command arrived, and take more of the link. 0 to 5.
-        watchdog: feed the firmware's emergency-stop watchdog: motors stop 1 s after the last set-point, instead of 2 s.
-            Once it was fed and has bitten, also after a normal flight, the vehicle must be restarted.
-        clock: host time (s).
+      uris: as `cflib` writes them: `radio://0/80/2M/E7E7E7E7E7`, `udp://127.0.0.1:19850`.
+      body_logs: log blocks of motors and accelerometer for each vehicle, spread over the 10 ms; more of them tell
+          the diagnosis more exactly when a command arrived, and take more of the link. 0 to 5.
+      watchdog: feed the firmware's emergency-stop watchdog: motors stop 1 s after the last set-point, instead of 2 s.
+          Once it was fed and has bitten, also after a normal flight, the vehicle must be restarted.
+      clock: host time (s).
     """
 
     def __init__(

@@ -22,12 +22,12 @@ class VirtualCrazyflies:
     """N virtual Crazyflies on consecutive ports, in one air.
 
     Args:
-        vehicles: what flies.
-        host: address to listen at.
-        port: first port; 0 takes any free ones.
-        faults: what the links do.
-        seed: draws losses and jitter.
-        needs_arming: see `VirtualFirmware`.
+      vehicles: what flies.
+      host: address to listen at.
+      port: first port; 0 takes any free ones.
+      faults: what the links do.
+      seed: draws losses and jitter.
+      needs_arming: see `VirtualFirmware`.
     """
 
     def __init__(

@@ -45,16 +45,16 @@ class VirtualVehicles:
     """N vehicles in one air. They start on the floor, level, and each step takes 2 ms.
 
     Args:
-        vehicle: their parameters.
-        position: (N, 2) m, where they stand; (N, 3) where they hover if `flying`.
-        effects: names of effects; those that delay or lose commands belong to the link instead.
-        effect_parameters: {effect: {parameter: value}}.
-        battery: charge at the start, 0..1.
-        endurance: s of hover that empty a full battery.
-        flying: they begin hovering in the air instead.
+      vehicle: their parameters.
+      position: (N, 2) m, where they stand; (N, 3) where they hover if `flying`.
+      effects: names of effects; those that delay or lose commands belong to the link instead.
+      effect_parameters: {effect: {parameter: value}}.
+      battery: charge at the start, 0..1.
+      endurance: s of hover that empty a full battery.
+      flying: they begin hovering in the air instead.
 
     Raises:
-        UserError: an unknown effect, or one that acts on commands.
+      UserError: an unknown effect, or one that acts on commands.
     """
 
     def __init__(

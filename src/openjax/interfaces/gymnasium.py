@@ -19,8 +19,8 @@ class PursuitVectorEnv(VectorEnv):
     observation of the episode is in `infos["final_obs"]`.
 
     Args:
-        num_envs: worlds E.
-        environment: the game; None is the nominal one.
+      num_envs: worlds E.
+      environment: the game; None is the nominal one.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012

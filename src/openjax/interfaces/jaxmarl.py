@@ -18,7 +18,7 @@ class PursuitMultiAgentEnv:
     """Agents `pursuer_0` ...; each observes (D,) float32 (`flat_observation`) and acts with (4,) in -1..1.
 
     Args:
-        environment: the game; None is the nominal one.
+      environment: the game; None is the nominal one.
     """
 
     def __init__(self, environment: Pursuit | None = None):

@@ -16,7 +16,7 @@ class PursuitParallelEnv(ParallelEnv):
     Every pursuer gets its own reward. An episode ends for all at once, after `settings.episode_length` steps.
 
     Args:
-        environment: the game; None is the nominal one.
+      environment: the game; None is the nominal one.
     """
 
     metadata = {"name": "openjax_pursuit_v0", "render_modes": [], "is_parallelizable": True}  # noqa: RUF012

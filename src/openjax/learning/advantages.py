@@ -16,13 +16,13 @@ def generalised_advantages(
     """Advantages (T, ...) of T consecutive steps.
 
     Args:
-        reward: (T, ...) of each step.
-        value: (T, ...) of the state in which the step was taken.
-        next_value: (T, ...) of the state it led to, before any reset; ignored where terminated.
-        terminated: (T, ...) bool, the episode ended for good: nothing comes after.
-        truncated: (T, ...) bool, the episode was cut: the value of the state it led to stands for the rest.
-        discount: gamma.
-        trace: lambda.
+      reward: (T, ...) of each step.
+      value: (T, ...) of the state in which the step was taken.
+      next_value: (T, ...) of the state it led to, before any reset; ignored where terminated.
+      terminated: (T, ...) bool, the episode ended for good: nothing comes after.
+      truncated: (T, ...) bool, the episode was cut: the value of the state it led to stands for the rest.
+      discount: gamma.
+      trace: lambda.
     """
     goes_on = 1.0 - terminated.astype(reward.dtype)
     error = reward + discount * goes_on * next_value - value

@@ -45,11 +45,11 @@ def insert(
     sampling, which the paper's code runs on the host, has the same aim.
 
     Args:
-        archive: C slots.
-        tasks: leading axis M, newest last.
-        success: (M,) success rates.
-        accepted: (M,) bool, which of them enter.
-        descriptor: of tasks (M, ...) the (M, D) numbers by whose distance they are told apart.
+      archive: C slots.
+      tasks: leading axis M, newest last.
+      success: (M,) success rates.
+      accepted: (M,) bool, which of them enter.
+      descriptor: of tasks (M, ...) the (M, D) numbers by whose distance they are told apart.
     """
     capacity = archive.success.shape[0]
     m = success.shape[0]

@@ -64,11 +64,11 @@ def select(
     """Keep the tasks that are neither solved nor hopeless.
 
     Args:
-        settings: bounds of the success rate.
-        archive: the archive so far.
-        tasks: leading axis M.
-        success: (M,) success rate of each.
-        complete: (M,) bool, its episodes ran their full length (the first ones start late).
+      settings: bounds of the success rate.
+      archive: the archive so far.
+      tasks: leading axis M.
+      success: (M,) success rate of each.
+      complete: (M,) bool, its episodes ran their full length (the first ones start late).
     """
     unsolved = (success >= settings.success_low) & (success <= settings.success_high)
     return insert(archive, tasks, success, unsolved & complete, task_descriptor)

@@ -114,21 +114,21 @@ def update_policy(
     """All epochs of the policy update on one rollout.
 
     Args:
-        settings: MAPPO's.
-        policy: the networks.
-        optimisers: the actor's and the critic's are used.
-        actor: before this update.
-        critic: before this update.
-        scale: value normalisation before this rollout.
-        rollout: T steps of E worlds.
-        last: (E, ...) observation after the rollout, before any reset.
-        last_predicted: (E, K, 3) its prediction.
-        key: shuffles, the same on all devices.
-        axis: name of the devices' axis.
-        progress: () share of the run that is done, for the clip range.
+      settings: MAPPO's.
+      policy: the networks.
+      optimisers: the actor's and the critic's are used.
+      actor: before this update.
+      critic: before this update.
+      scale: value normalisation before this rollout.
+      rollout: T steps of E worlds.
+      last: (E, ...) observation after the rollout, before any reset.
+      last_predicted: (E, K, 3) its prediction.
+      key: shuffles, the same on all devices.
+      axis: name of the devices' axis.
+      progress: () share of the run that is done, for the clip range.
 
     Returns:
-        actor, critic, value scale, {name: () metric}.
+      actor, critic, value scale, {name: () metric}.
     """
     mean, std = scale.moments
     parameters = actor.parameters, critic.parameters

@@ -28,15 +28,15 @@ def windows_and_labels(
     crosses the boundary of an episode.
 
     Args:
-        policy: for the predictor's horizons.
-        history_spacing: steps between two frames of a window.
-        earlier: (E, H, F) frames before the rollout's second step, oldest first (H = window's span); its last one
-            is the rollout's first.
-        rollout: T steps.
-        times: (E, W) steps of the rollout, at most T - largest horizon.
+      policy: for the predictor's horizons.
+      history_spacing: steps between two frames of a window.
+      earlier: (E, H, F) frames before the rollout's second step, oldest first (H = window's span); its last one
+          is the rollout's first.
+      rollout: T steps.
+      times: (E, W) steps of the rollout, at most T - largest horizon.
 
     Returns:
-        frames (E, W, n, F), last_seen (E, W, 3), positions (E, W, K, 3).
+      frames (E, W, n, F), last_seen (E, W, 3), positions (E, W, K, 3).
     """
     span = earlier.shape[1]
     new = jnp.swapaxes(rollout.observation.frames[1:, :, 0], 0, 1)
@@ -83,17 +83,17 @@ def update_predictor(
     """A few gradient steps on random windows of each environment.
 
     Args:
-        policy: for the predictor's network and settings.
-        optimiser: from `make_predictor_optimiser`.
-        game: the evader's speed and the history's spacing.
-        predictor: before this update.
-        earlier: (E, H, F), see `windows_and_labels`.
-        rollout: T steps of E worlds.
-        keys: (E,), draw the windows.
-        axis: name of the devices' axis.
+      policy: for the predictor's network and settings.
+      optimiser: from `make_predictor_optimiser`.
+      game: the evader's speed and the history's spacing.
+      predictor: before this update.
+      earlier: (E, H, F), see `windows_and_labels`.
+      rollout: T steps of E worlds.
+      keys: (E,), draw the windows.
+      axis: name of the devices' axis.
 
     Returns:
-        predictor, mean loss ().
+      predictor, mean loss ().
     """
     settings = policy.predictor
     room = rollout.reward.shape[0] - settings.horizons[-1] + 1

@@ -39,16 +39,16 @@ def collect(
     """Act with exploration for T steps in E worlds.
 
     Args:
-        environment: the game.
-        policy: the networks.
-        parameters: theirs.
-        observation: (E, ...) of `state`.
-        state: (E, ...).
-        noise: (T, E, N, A) standard normal, drawn ahead in one go.
-        penalty_share: () share of the reward's penalties that counts.
+      environment: the game.
+      policy: the networks.
+      parameters: theirs.
+      observation: (E, ...) of `state`.
+      state: (E, ...).
+      noise: (T, E, N, A) standard normal, drawn ahead in one go.
+      penalty_share: () share of the reward's penalties that counts.
 
     Returns:
-        the rollout, and observation and state after it.
+      the rollout, and observation and state after it.
     """
     step = jax.vmap(environment.step, in_axes=(None, 0, 0))
     unused_key = jax.random.key(0)

@@ -375,7 +375,7 @@ def preset(name: str, **changes) -> TrainSettings:
     """A preset's settings, with fields changed; those of settings within them by a dict, as in `changed`.
 
     Raises:
-        UserError: no such preset.
+      UserError: no such preset.
     """
     if name not in PRESETS:
         raise UserError(f"preset {name}: unknown; possible are {', '.join(PRESETS)}")

@@ -74,17 +74,17 @@ def attend(
     s_hm = scale * query_h . e_m + bias_m, the result of head h is sum_m softmax(s_h)_m e_m.
 
     Args:
-        query: (B, heads * features), one query per head in the space of the embeddings.
-        own: (B, features).
-        inputs: (input_rows + entities, B) float32: all entities' numbers, then the biases (a large negative one masks).
-        inverse: (entities, B) float32, by which the linear layer's output is scaled.
-        weights: (sum of size + 2 over kinds, features) float32: per kind its matrix W, then b and c.
-        layout: sizes.
+      query: (B, heads * features), one query per head in the space of the embeddings.
+      own: (B, features).
+      inputs: (input_rows + entities, B) float32: all entities' numbers, then the biases (a large negative one masks).
+      inverse: (entities, B) float32, by which the linear layer's output is scaled.
+      weights: (sum of size + 2 over kinds, features) float32: per kind its matrix W, then b and c.
+      layout: sizes.
 
     All but `inputs` are differentiable.
 
     Returns:
-        (B, heads * features) in the type of `query`.
+      (B, heads * features) in the type of `query`.
     """
     return _attend(query, own, inputs, inverse, weights, layout)
 
@@ -98,12 +98,12 @@ def attend_one_by_one(
     a concatenation of entities; sums over features and (B, features) arrays alone run at full width.
 
     Args:
-        queries: (B, features) of each head, scaled.
-        entities: (B, features) each, the pursuer itself included.
-        biases: (B, 1) or a number each, added to an entity's scores.
+      queries: (B, features) of each head, scaled.
+      entities: (B, features) each, the pursuer itself included.
+      biases: (B, 1) or a number each, added to an entity's scores.
 
     Returns:
-        (B, features) of each head.
+      (B, features) of each head.
     """
     means = []
     for query in queries:

@@ -114,12 +114,12 @@ def normalised_linear(x: jax.Array, linear: jax.Array) -> tuple[jax.Array, jax.A
     weights and the inverse standard deviation give the normalised output.
 
     Args:
-        x: (..., size).
-        linear: (size + 1, F), the bias last.
+      x: (..., size).
+      linear: (size + 1, F), the bias last.
 
     Returns:
-        inverse standard deviations (...) and weights (size + 1, F): their product with [x, 1] is
-        LayerNorm(linear' [x, 1]).
+      inverse standard deviations (...) and weights (size + 1, F): their product with [x, 1] is
+      LayerNorm(linear' [x, 1]).
     """
     x = jnp.concatenate([x, jnp.ones_like(x[..., :1])], axis=-1)
     centred = linear - jnp.mean(linear, axis=1, keepdims=True)

@@ -28,12 +28,12 @@ def normalise(x: jax.Array, affine: jax.Array, activate: bool = True) -> jax.Arr
     """activation(scale * LayerNorm(x + bias) + shift), or without the activation.
 
     Args:
-        x: (B, features); the arithmetic is float32 whatever its type.
-        affine: (3, features) float32, the rows bias, scale, shift.
-        activate: apply the activation.
+      x: (B, features); the arithmetic is float32 whatever its type.
+      affine: (3, features) float32, the rows bias, scale, shift.
+      activate: apply the activation.
 
     Returns:
-        (B, features) in the type of `x`.
+      (B, features) in the type of `x`.
     """
     return _normalise(x, affine, activate)
 
@@ -42,12 +42,12 @@ def normalised_layer(x: jax.Array, kernel: jax.Array, affine: jax.Array) -> jax.
     """`normalise(x @ kernel, affine)` with centred weights, whose output needs no centring: half the sums, forward and backward.
 
     Args:
-        x: (B, inputs), whose type is that of the product.
-        kernel: (inputs, features) float32.
-        affine: (3, features) float32, the rows bias, scale, shift.
+      x: (B, inputs), whose type is that of the product.
+      kernel: (inputs, features) float32.
+      affine: (3, features) float32, the rows bias, scale, shift.
 
     Returns:
-        (B, features) in the type of `x`.
+      (B, features) in the type of `x`.
     """
     kernel = kernel - jnp.mean(kernel, axis=-1, keepdims=True)
     bias = affine[0] - jnp.mean(affine[0])

@@ -110,10 +110,10 @@ class Pursuit:
         """Start an episode of a uniformly drawn task.
 
         Args:
-            key: () typed key; map over (B,) of them for B worlds.
+          key: () typed key; map over (B,) of them for B worlds.
 
         Returns:
-            observation, state, both of one world.
+          observation, state, both of one world.
         """
         task_key, reset_key = jax.random.split(key)
         return self.reset_to(reset_key, uniform_task(self.settings, task_key))
@@ -122,11 +122,11 @@ class Pursuit:
         """Start an episode of `task`.
 
         Args:
-            key: () typed key; draws start attitudes and vehicles and drives random effects.
-            task: with the settings' number of pursuers and pillar slots.
+          key: () typed key; draws start attitudes and vehicles and drives random effects.
+          task: with the settings' number of pursuers and pillar slots.
 
         Returns:
-            observation, state, both of one world.
+          observation, state, both of one world.
         """
         settings = self.settings
         attitude_key, effect_key = jax.random.split(key)
@@ -194,12 +194,12 @@ class Pursuit:
         """One control step.
 
         Args:
-            key: for an interface like other environments'; the game itself draws nothing after its reset.
-            state: of this step's start.
-            action: (N, 4) in -1..1: collective thrust, roll, pitch and yaw rate; see `action_to_command`.
+          key: for an interface like other environments'; the game itself draws nothing after its reset.
+          state: of this step's start.
+          action: (N, 4) in -1..1: collective thrust, roll, pitch and yaw rate; see `action_to_command`.
 
         Returns:
-            observation, state, reward (N,), terminated (), truncated (), info.
+          observation, state, reward (N,), terminated (), truncated (), info.
         """
         del key
         settings, task = self.settings, state.task

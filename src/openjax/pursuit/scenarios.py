@@ -89,7 +89,7 @@ def scenario_task(settings: PursuitSettings, scenario: Scenario) -> Task:
     """The scenario as a task with `settings.max_pillars` slots.
 
     Raises:
-        UserError: it has more pillars than that, or not `settings.num_pursuers` pursuers.
+      UserError: it has more pillars than that, or not `settings.num_pursuers` pursuers.
     """
     slots, used = settings.max_pillars, len(scenario.pillars)
     if used > slots:
@@ -117,7 +117,7 @@ def find_scenario(name_or_path: str, settings: PursuitSettings) -> Scenario:
     optionally a `name`.
 
     Raises:
-        UserError: no such name or file, a wrong entry, a pillar outside the arena or over a start, a start outside.
+      UserError: no such name or file, a wrong entry, a pillar outside the arena or over a start, a start outside.
     """
     if name_or_path in SCENARIOS:
         return SCENARIOS[name_or_path]

@@ -18,8 +18,8 @@ class Viewer:
     """A scene that plays episodes: choose a layout, play or drag the time.
 
     Args:
-        server: where browsers look; `viser.ViserServer(port=...)`.
-        flights: at least one episode.
+      server: where browsers look; `viser.ViserServer(port=...)`.
+      flights: at least one episode.
     """
 
     def __init__(self, server: viser.ViserServer, flights: Sequence[Trajectory]):

@@ -44,7 +44,7 @@ def evaluate(traced: ClosedJaxpr, arguments: Sequence[np.ndarray]) -> list[np.nd
     A component is a number, a scalar or a block (all of one shape) of the input's type; so are the results'.
 
     Raises:
-        NotImplementedError: the function holds an operation that mixes components in a way not known here.
+      NotImplementedError: the function holds an operation that mixes components in a way not known here.
     """
     return _evaluate(traced.jaxpr, traced.consts, arguments)
 

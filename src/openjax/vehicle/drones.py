@@ -30,16 +30,16 @@ def motors(effects, vehicle: Vehicle, parameters, drone: DroneState, command, co
     """One drone up to the wrench on its body, its controller and rotors dt seconds later.
 
     Args:
-        effects: those that act, with their `parameters` {effect: {name: ()}}.
-        vehicle: that really flies.
-        drone: before the substep.
-        command: (4,) as for `rate_controller`.
-        context: of the effects; None without any.
-        dt: seconds.
+      effects: those that act, with their `parameters` {effect: {name: ()}}.
+      vehicle: that really flies.
+      drone: before the substep.
+      command: (4,) as for `rate_controller`.
+      context: of the effects; None without any.
+      dt: seconds.
 
     Returns:
-        the drone with its new rotors and controller, force (3,) N in the world without gravity, torque (3,) N m about
-        the centre of mass, body frame.
+      the drone with its new rotors and controller, force (3,) N in the world without gravity, torque (3,) N m about
+      the centre of mass, body frame.
     """
     motor_command, integral = rate_controller(vehicle, drone, command, dt)
     motor_command = composition.change_motor_command(effects, parameters, motor_command, context)
@@ -76,7 +76,7 @@ class DronesStep:
         each; what is left out has no effect. The arithmetic is done in the precision of the drones' state.
 
         Raises:
-            UserError: parameters of other effects than this step's, or drones without the memory of its effects.
+          UserError: parameters of other effects than this step's, or drones without the memory of its effects.
         """
         dtype = drones.position.dtype
         vehicle = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), vehicle)
@@ -106,7 +106,7 @@ class DronesStep:
         """`drones` (leading axis N) with the effects' memory as at the start of an episode.
 
         Raises:
-            UserError: an effect is random and there is no `key`.
+          UserError: an effect is random and there is no `key`.
         """
         number = jnp.arange(drones.position.shape[0])
 

@@ -54,7 +54,7 @@ def read_mjcf(path: str) -> dict[str, np.ndarray]:
     """Field of `Vehicle` -> float64 value, from the compiled model at `path`.
 
     Raises:
-        UserError: the file isn't MJCF, or lacks something that a vehicle needs.
+      UserError: the file isn't MJCF, or lacks something that a vehicle needs.
     """
     try:
         model = mujoco.MjModel.from_xml_path(path)
