@@ -9,6 +9,8 @@ import argparse
 import json
 from pathlib import Path
 
+from experiments.exam.effects import EFFECTS
+
 GARBAGE_VERDICTS = ("garbage", "contradictory", "contradiction", "inconsistent", "refused")
 GARBAGE = "garbage"
 CAPTURE = 2.5  # ms that a motion capture may be late by itself
@@ -102,7 +104,11 @@ def judge(answer, prediction):
         out["right"] = "unknown" in said or (GARBAGE in said and answer.get("in_sensors", False))
         out["wrong_name"] = bool([n for n in names if n not in allowed])
     elif category in ("none", "not_testable"):
-        out["right"] = not lost and "unknown" not in said and not [n for n in names if n not in allowed]
+        strange = set(answer["effects"]) - set(
+            EFFECTS
+        )  # acts, but less than is asked for: naming it is no mistake
+        wrong = "unknown" in said and not strange
+        out["right"] = not lost and not wrong and not [n for n in names if n not in allowed]
     elif category == "single":
         out["right"] = not lost and _first_right(answer, names, allowed)
         out["extra"] = _extra(answer, names, allowed)

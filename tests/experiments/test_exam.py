@@ -337,6 +337,11 @@ def test_names_that_logs_cannot_tell_apart_are_right_and_no_others():
         report = said("state_latency", parameters={"state_latency": {"delay": {"value": late}}})
         assert judge.judge(held, report)["right"] == right
         assert not judge.judge(answer("none"), report)["right"]
+    for hidden, right in (
+        ("loose_propeller", True),
+        ("inertia", False),
+    ):  # too small to be asked for, and yet there
+        assert judge.judge(answer("not_testable", hidden), said("unknown"))["right"] == right
 
 
 def answer(category, effect=None, **more):
