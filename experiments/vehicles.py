@@ -2,7 +2,7 @@
 
 No clamp, rate loop at 500 Hz, solid contacts. Vehicles: the nominal one; `table`, with motors 40 ms slower, commands 15 ms
 and poses 10 ms late, and drag; the family of the preset `flight`, ordinary and whole; and for each of its effects vehicles
-that are out of the ordinary in it alone. Tasks: held-back uniform ones, with rows of pillars, with close starts, and at the
+that are out of the ordinary in it alone. Tasks: uniform validation ones, with rows of pillars, with close starts, and at the
 end the six layouts, for the first three kinds of vehicles. Nothing is chosen by the layouts. Writes
 experiments/results/vehicles.json and .md (`--out`: others).
 """
@@ -165,7 +165,7 @@ def report(results: dict) -> list[str]:
         "# Policies on other vehicles",
         "",
         f"{where(results)} {results['seconds']:.0f} s. "
-        f"No clamp, rate loop at 500 Hz, {results.get('attitude', 'drawn')} starts; {results['number']} held-back tasks of each "
+        f"No clamp, rate loop at 500 Hz, {results.get('attitude', 'drawn')} starts; {results['number']} validation tasks of each "
         f"kind, {results['layouts']} episodes of each layout. Nominal: the nominal vehicle; table: motors 40 ms slower, "
         "commands 15 ms and poses 10 ms late, drag of .0125 N s/m; ordinary and family: the vehicles of the preset flight "
         "without and with the rare ones; a name: all vehicles out of the ordinary in that effect. "
