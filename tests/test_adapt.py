@@ -143,6 +143,10 @@ def test_a_policy_is_fine_tuned_measured_and_written(policy_file, tmp_path, monk
 def test_what_is_not_there_is_refused_before_anything_is_written(tmp_path):
     with pytest.raises(UserError, match="no such folder"):
         adapt.main([str(tmp_path / "nothing"), "--out", str(tmp_path / "out")])
+    with pytest.raises(UserError, match="holds no flight log"):
+        adapt.main([str(tmp_path), "--out", str(tmp_path / "out")])
+    with pytest.raises(UserError, match="can't be written there"):
+        adapt.main([str(tmp_path), "--out", "/proc/out"])
     with pytest.raises(UserError, match="episodes is 0; it must be a whole number in"):
         adapt.main([str(tmp_path), "--out", str(tmp_path / "out"), "--episodes", "0"])
     assert not (tmp_path / "out").exists()

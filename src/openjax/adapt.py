@@ -21,6 +21,7 @@ import tyro
 
 from openjax.commands.command_line import output_console, parse, run_command
 from openjax.errors import UserError
+from openjax.files import check_output_folder, write_text
 from openjax.learning.adaptation import AdaptSettings
 from openjax.ranges import Interval, Seed
 
@@ -53,8 +54,7 @@ def main(arguments: Sequence[str]) -> int:
         raise UserError(f"{command.flights}: no such folder of flights, nor effects.toml")
     if command.out.exists() and not command.overwrite:
         raise UserError(f"{command.out} already exists: choose another --out or give --overwrite")
-    if command.episodes < 1 or command.training.updates < 1 or command.training.warm_up < 0:
-        raise UserError("--episodes and --training.updates must be positive, --training.warm_up not negative")
+    check_output_folder(command.out, "--out")
     results = adapt(command)
     console = output_console()
     for line in in_words(results):
@@ -66,10 +66,12 @@ def main(arguments: Sequence[str]) -> int:
 def adapt(command: AdaptCommand) -> dict:
     """Do all of it and write it down. Raises UserError for flights that can't be diagnosed or an unusable policy."""
     started = time.monotonic()
+    _check_flights(command.flights)
     diagnosis = _Diagnosis(command)
     try:
         import jax
 
+        from openjax.cluster.devices import check_memory
         from openjax.commands.machine import describe_machine
         from openjax.commands.validation import uniform_tasks
         from openjax.learning import summarise
@@ -88,6 +90,7 @@ def adapt(command: AdaptCommand) -> dict:
 
         loaded = load_policy(command.policy)
         settings = adapting_settings(loaded.settings, command.training)
+        check_memory(settings, 1)
         adaptation = make_adaptation(settings)
         key = jax.random.key(command.seed)
         tasks = uniform_tasks(settings.environment, 2 * command.episodes, settings.environment.max_pillars)
@@ -143,7 +146,7 @@ def adapt(command: AdaptCommand) -> dict:
     notes = {"adapted_from": command.policy, "effects": values, "machine": results["machine"]}
     save_policy_file(command.out / "policy.npz", tuned.parameters, own, notes, storage="float32")
     write_json(command.out / "adapt.json", results)
-    (command.out / "adapt.html").write_text(page(results), encoding="utf-8")
+    write_text(command.out / "adapt.html", page(results))
     return results
 
 
@@ -166,6 +169,14 @@ def scores_on(adaptation, tasks, key, bounds):
         return selection_score(episodes, adaptation.settings.environment.episode_length)
 
     return scores
+
+
+def _check_flights(path):
+    """What can be wrong with them is told before anything is compiled. Raises UserError."""
+    from openjax.flights.case import load_case
+    from openjax.vehicle.effects.effects_file import load_effects
+
+    (load_case if path.is_dir() else load_effects)(path)
 
 
 class _Diagnosis:

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import openjax
 from openjax.policy import NetworkSettings, Policy, PredictorSettings
 from openjax.policy.growth import with_longer_history
 from openjax.pursuit import Pursuit, PursuitSettings
@@ -44,3 +45,10 @@ def test_the_grown_policy_acts_alike(frames, predicts):
 def test_a_policy_of_the_same_history_is_left_alone():
     settings = PursuitSettings()
     assert with_longer_history("anything", PredictorSettings(), settings, settings) == "anything"
+
+
+def test_a_policy_without_networks_is_refused():
+    heuristic = openjax.load_policy("apf")
+    longer = dataclasses.replace(heuristic.settings.environment, observe_history=12)
+    with pytest.raises(openjax.UserError, match="no networks"):
+        with_longer_history(heuristic.parameters, PredictorSettings(), heuristic.settings.environment, longer)

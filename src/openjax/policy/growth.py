@@ -1,9 +1,11 @@
 """A policy for a game in which it observes more of its own history: the same policy until it learns to use it."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax.numpy as jnp
 
+from openjax.errors import UserError
 from openjax.policy.policy import PolicyParameters
 from openjax.policy.settings import PredictorSettings
 from openjax.pursuit.settings import OWN_FRAME, PursuitSettings
@@ -16,10 +18,15 @@ def with_longer_history(
 
     The first layer's weights for the additional, older frames are zero. The critic, which may see other privileged
     numbers as well, is left out where the history grows.
+
+    Raises:
+      UserError: the policy isn't made of networks.
     """
     more = (new.observe_history - old.observe_history) * OWN_FRAME
     if more <= 0:
         return parameters
+    if not (isinstance(parameters.actor, Mapping) and "params" in parameters.actor):
+        raise UserError("the policy has no networks that could learn")
     before = old.self_size - old.observe_history * OWN_FRAME
     inputs = old.self_size + (3 * len(predictor.horizons) if predictor.enabled else 0)
 
