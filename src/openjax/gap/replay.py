@@ -186,6 +186,8 @@ def make_replay(
         usable[FORCE] = 0.0
     if not one_clock and usable[3]:
         usable[RATES] = usable[FORCE] = 0.0
+    if usable[3:].any() and not all(t.motors_logged for t in tracks):
+        usable[RATES] = 0.0  # motors made from commands tell the thrust, not how a real loop shares it out
     flights = tuple(dict.fromkeys(t.flight for t in tracks))
     replay = Replay(
         list(tracks),

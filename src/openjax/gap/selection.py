@@ -292,6 +292,8 @@ def _swapped(replay, fit, table, now, singles):
     """Each effect against every other in its place: the better one stays, and what comes near is told."""
     swaps: dict[str, dict[str, float]] = {}
     for effect in list(fit.effects):
+        if effect not in fit.effects:  # made way for what came in another's place
+            continue
         rest = [e for e in fit.effects if e != effect]
         lines = {}
         for other in table.step:
