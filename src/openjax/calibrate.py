@@ -16,6 +16,7 @@ from rich.table import Table
 
 from openjax.commands.command_line import output_console, parse, run_command
 from openjax.errors import UserError
+from openjax.files import check_output
 
 PROGRAM = "python -m openjax.calibrate"
 
@@ -41,10 +42,9 @@ def run(arguments: Arguments, console: Console):
     out = arguments.case / "vehicle_calibrated.toml" if arguments.out is None else arguments.out
     if out.exists() and not arguments.overwrite:
         raise UserError(f"{out}: exists already; use --overwrite to replace it or --out for another file")
-    if not out.parent.is_dir():
-        raise UserError(f"{out}: no such folder {out.parent}")
     start = time.perf_counter()
     case = load_case(arguments.case)
+    check_output(out, "--out")
     for issue in case.quality:
         console.print(
             f"[yellow]{'left out' if issue.refused else 'noted'}[/] {issue.flight}: {issue.issue}",

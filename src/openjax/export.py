@@ -16,6 +16,7 @@ from typing import Annotated, Literal
 
 from openjax.commands.command_line import output_console, parse, run_command
 from openjax.errors import UserError
+from openjax.files import check_output_folder, replacing
 from openjax.ranges import Interval, Seed
 
 PROGRAM = "python -m openjax.export"
@@ -84,8 +85,7 @@ def export(arguments: Arguments) -> dict:
     from openjax.pursuit import Observation, Pursuit
     from openjax.store.policies import load_policy
 
-    if arguments.observations < 1:
-        raise UserError(f"--observations is {arguments.observations}; it must be at least 1")
+    check_output_folder(arguments.out, "--out")
     policy = load_policy(arguments.policy)
     environment = Pursuit(dataclasses.replace(policy.settings.environment, vehicles=()))
     kinds = jax.eval_shape(lambda key: environment.reset(key)[0], jax.random.key(0))
@@ -122,9 +122,8 @@ def export(arguments: Arguments) -> dict:
     files[f"{arguments.format}.json"] = (json.dumps(report, indent=1) + "\n").encode()
     arguments.out.mkdir(parents=True, exist_ok=True)
     for name, data in files.items():
-        partial = arguments.out / f"{name}.partial"
-        partial.write_bytes(data)
-        partial.replace(arguments.out / name)
+        with replacing(arguments.out / name) as partial:
+            partial.write_bytes(data)
     return report
 
 

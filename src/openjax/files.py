@@ -152,6 +152,14 @@ def check_output_folder(path: str | Path, option: str) -> None:
         raise UserError(f"{option} {path}: can't be written there ({error.strerror or error})") from None
 
 
+def check_new_folder(path: str | Path, option: str) -> None:
+    """Whether a folder can be made there, or is there and empty; changes nothing. Raises UserError."""
+    path = Path(path)
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise UserError(f"{option} {path}: exists and isn't an empty folder; name another one")
+    check_output_folder(path, option)
+
+
 def remove_unfinished(folder: Path) -> None:
     """Delete what killed processes left of files they were writing."""
     for path in folder.glob(f"{WRITING}*"):

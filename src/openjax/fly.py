@@ -9,9 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import select
-import shutil
 import sys
-import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -20,6 +18,7 @@ from typing import Annotated
 
 from openjax.commands.command_line import output_console, parse, run_command
 from openjax.errors import UserError
+from openjax.files import check_new_folder, replacing
 from openjax.flying.limits import SafetySettings
 from openjax.flying.safety import Request
 from openjax.ranges import Interval
@@ -103,14 +102,14 @@ def fly(arguments: Arguments):
             f"--scenario {scenario.name} has {len(scenario.pursuers)} pursuers, the policy {settings.num_pursuers}"
         )
     slots = max(settings.max_pillars, len(scenario.pillars))
-    game = Game(policy, scenario_task(dataclasses.replace(settings, max_pillars=slots), scenario))
     vehicle = load_vehicle_file(arguments.vehicle)
+    feed = find_feed(arguments.motion_capture) if arguments.motion_capture else None
+    game = Game(policy, scenario_task(dataclasses.replace(settings, max_pillars=slots), scenario))
     game.hover_thrust = _hover_thrust(vehicle.vehicle)
     uris = [*arguments.uri, *([arguments.evader_uri] if arguments.evader_uri else [])]
     body_logs = arguments.body_logs
     if body_logs is None:
         body_logs = 5 if all(uri.startswith("udp:") for uri in uris) else 1
-    feed = find_feed(arguments.motion_capture) if arguments.motion_capture else None
     vehicles = links = Links(uris, body_logs, arguments.watchdog)
     console.print(f"connecting to {', '.join(uris)} ...")
     links.connect()
@@ -169,7 +168,9 @@ def fly(arguments: Arguments):
         described = dataclasses.replace(
             vehicle, path=None, log={"source": f"openjax.fly, policy {policy.source}", "floor_z": 0.0}
         )
-        _write(arguments.out, lambda folder: write_case(folder, samples, record, described, about))
+        with replacing(arguments.out) as folder:
+            folder.mkdir()
+            write_case(folder, samples, record, described, about)
         console.print(f"{arguments.out}: next, python -m openjax.diagnose {arguments.out}")
     return record
 
@@ -177,9 +178,8 @@ def fly(arguments: Arguments):
 def _check(arguments):
     if len(set(arguments.uri)) < len(arguments.uri):
         raise UserError("--uri names a vehicle twice")
-    out = arguments.out
-    if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise UserError(f"{out}: exists and isn't an empty folder; name another one")
+    if arguments.out is not None:
+        check_new_folder(arguments.out, "--out")
 
 
 def _hover_thrust(vehicle) -> float:
@@ -207,18 +207,6 @@ def _until_down(flight, keys):
     except KeyboardInterrupt:
         keys.pressed = Request.LAND
         return flight.run()
-
-
-def _write(out: Path, write) -> None:
-    """Written beside the place and moved there at the end: an interrupted write leaves no half case."""
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as scratch:
-        folder = Path(scratch) / "case"
-        folder.mkdir()
-        write(folder)
-        if out.exists():
-            out.rmdir()
-        shutil.move(folder, out)
 
 
 def _show(console, record, flight):

@@ -3,8 +3,6 @@ diagnosis on."""
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +12,7 @@ import tyro
 
 from openjax.commands.command_line import output_console, parse, run_command
 from openjax.errors import UserError
+from openjax.files import check_new_folder, replacing
 from openjax.ranges import Interval, Seed
 
 PROGRAM = "python -m openjax.sample_flights"
@@ -65,27 +64,19 @@ def make_case(arguments: Arguments) -> list[Path]:
     if arguments.effect not in ("none", *EFFECTS):
         known = ", ".join(("none", *EFFECTS))
         raise UserError(f"--effect {arguments.effect}: no such effect; known are {known}")
-    out = arguments.out
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise UserError(f"{out}: exists and isn't an empty folder; name another one")
+    check_new_folder(arguments.out, "OUT")
     effects = {} if arguments.effect == "none" else {arguments.effect: EFFECTS[arguments.effect].card.sample}
     vehicle = load_vehicle()
     decimals = {c: DECIMALS.get(c, _REST) for c in LOG_COLUMNS}
     flights = references(arguments.seed, arguments.duration, neighbour=arguments.effect == "downwash")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    # Written beside and moved at the end: an interrupted run leaves no half case.
-    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as scratch:
-        folder = Path(scratch) / "case"
+    with replacing(arguments.out) as folder:
         folder.mkdir()
         for number, (name, reference) in enumerate(flights.items()):
             columns = fly(vehicle, vehicle, reference, 1000 * arguments.seed + number, effects)
             write_csv(folder / f"{name}.csv.gz", log_of(columns, name), decimals)
         text = VEHICLE_TOML.format(mass=float(vehicle.mass), seed=arguments.seed, effect=arguments.effect)
         (folder / "vehicle.toml").write_text(text, encoding="utf-8")
-        if out.exists():
-            out.rmdir()
-        shutil.move(folder, out)
-    return sorted(out.iterdir())
+    return sorted(arguments.out.iterdir())
 
 
 def main(arguments: Sequence[str]) -> None:
