@@ -26,7 +26,7 @@ def flights(push=0.0, forgets=0.5, seed=0, twist=0.0):
         x[:, 6] += push
         x[:, 1] += twist
         out.append(x)
-    return [SimpleNamespace(dt=DT, name="flight")] * 3, out, np.ones(9)
+    return [SimpleNamespace(dt=DT, name="flight", motors_logged=True)] * 3, out, np.ones(9)
 
 
 @pytest.mark.parametrize("forgets", [0.1, 0.5, 2.0])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from openjax.flights.track import Track
-from openjax.gap.rest import LIKE_AN_EFFECT, PLAIN, Followed, dictionary
+from openjax.gap.rest import LIKE_AN_EFFECT, PLAIN, Followed, _happened, dictionary
 from openjax.gap.verdict import LEAST_LEFT, LEAST_PLAIN, UNKNOWN_SHARE, _left
 
 
@@ -24,14 +24,16 @@ def regressors():
     )  # fmt: skip
 
 
-def test_what_pulls_up_all_the_time_is_no_regressors(regressors):
-    up = [r for n, r in regressors.items() if n.startswith("force z")]
-    assert up and all(abs(r.values[:, 2].mean()) < 1e-9 for r in up)
+def test_a_place_where_one_stays_says_nothing(regressors):
+    place = regressors["force by place x along world x"]
+    there = place._replace(values=np.tile([0.5, 0.0, 0.0], (800, 1)))
+    assert _happened([place], place.size)
+    assert not _happened([there], there.size)
 
 
 def test_what_effects_of_the_list_do_is_not_strange(regressors):
     known = {n for n, r in regressors.items() if r.rank == LIKE_AN_EFFECT}
-    for word in ("thrust", "motor commands", "voltage", "the floor near", "wind along"):
+    for word in ("force z by thrust", "motor commands", "voltage", "the floor near", "wind along"):
         assert {n for n in regressors if word in n} <= known
     plain = {n for n, r in regressors.items() if r.rank == PLAIN}
     assert {"force z by sinking", "torque x by time", "force by place x along world x"} <= plain

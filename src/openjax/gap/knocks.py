@@ -27,7 +27,7 @@ ALONG = 0.3  # s of the means that tell the direction of the pushes
 PUSH = 0.1  # m/s^2, a hundredth of the weight: the largest must be more to matter
 
 STEADY = 0.25  # s of the means that a change for good is looked for in
-LASTING = 3  # of them at least before and after
+LASTING = 6  # of them at least before and after
 EDGE = 0.1  # s left out at the end of a track
 TURN = 1.0  # rad/s^2: the least change of torque that matters
 MOST = 0.4  # of a track's torque that one change must explain
@@ -69,13 +69,13 @@ def _pushes(tracks, disturbed, usable, generator) -> tuple[str, ...]:
 
 def _changed(tracks, disturbed, usable, generator) -> tuple[str, ...]:
     """A torque that changes once in a flight and stays."""
-    if usable[RATES].min() <= 0.0:
+    if usable[RATES].min() <= 0.0 or not all(t.motors_logged for t in tracks):
         return ()
     scores, best = [], (0.0, "")
     for track, d in zip(tracks, disturbed, strict=True):
         size = max(round(STEADY / track.dt), 1)
         part = d[int(2 * STEADY / track.dt) : len(d) - max(int(EDGE / track.dt), 1), RATES]
-        if len(part) < max(4 * LASTING * size, SHORTEST / track.dt):
+        if len(part) < 2 * LASTING * size:
             continue
         means = _means(_with_surrogates(part, generator), size)
         score, place, explained, jump = _split(means)

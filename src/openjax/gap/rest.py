@@ -30,7 +30,8 @@ SPREAD = 0.3  # m/s^2 and, times TORQUE, rad/s^2: prior rms of a regressor's par
 TORQUE = 10.0
 MOST = 6  # regressors at once
 RADIUS = 0.023  # m, of a propeller
-RARE = 0.3  # of a regressor's usual size: what happened less isn't blown up, nor called strange
+RARE = 0.3  # of a regressor's usual size: what happened less isn't blown up
+LEAST_CHANGE = 0.15  # of it: what changed less isn't called strange
 WIDTH = 0.25  # m of the radial functions of the place
 STEADY = (
     "force by wind along world x",
@@ -58,6 +59,11 @@ class Regressor(NamedTuple):
     def size(self) -> float:
         return float(np.sqrt(np.mean(self.values**2)))
 
+    @property
+    def change(self) -> float:
+        """Its size about its own mean."""
+        return float(np.sqrt(np.mean(np.var(self.values, axis=0))))
+
 
 class Followed(NamedTuple):
     """`predicted` (6,) share of each channel's squared error on stretches left out (rates x, y, z, velocity x, y, z), `nats` of
@@ -84,15 +90,9 @@ def look(evidence: Evidence, selection: Selection) -> Rest:
     """What the dictionary predicts of what the selection leaves."""
     replay = evidence.replay
     tables = [dictionary(t) for t in replay.tracks]
-    sizes = {
-        n: np.sqrt(np.mean([t[n].size ** 2 for t in tables]))
-        for n in tables[0]
-        if all(n in t for t in tables)
-    }
-    usual = {n: tables[0][n].usual for n in sizes}
-    names = [
-        n for n in sizes if sizes[n] > (1e-3 if tables[0][n].rank == LIKE_AN_EFFECT else RARE) * usual[n]
-    ]
+    usual = {n: r.usual for n, r in tables[0].items() if all(n in t for t in tables)}
+    sizes = {n: np.sqrt(np.mean([t[n].size ** 2 for t in tables])) for n in usual}
+    names = [n for n in usual if _happened([t[n] for t in tables], sizes[n])]
     more = [
         np.stack([channels(track, t[n].kind, t[n].values / max(sizes[n], RARE * usual[n])) for n in names])
         for track, t in zip(replay.tracks, tables, strict=True)
@@ -149,6 +149,15 @@ def look(evidence: Evidence, selection: Selection) -> Rest:
     )
 
 
+def _happened(regressors: list[Regressor], size: float) -> bool:
+    """Whether a regressor can be looked at: one that would be strange must come and go, as what is there all the time may be
+    the thrust's, the mass's or a trim's."""
+    _, _, usual, rank = regressors[0]
+    if rank == LIKE_AN_EFFECT:
+        return size > 1e-3 * usual
+    return float(np.sqrt(np.mean([r.change**2 for r in regressors]))) > LEAST_CHANGE * usual
+
+
 def channels(track: Track, kind: str, values: np.ndarray) -> np.ndarray:
     """Channels (T, 9) of an acceleration (T, 3) of the body frame: "force" m/s^2 or "torque" rad/s^2."""
     if kind == "torque":
@@ -180,8 +189,6 @@ def dictionary(track: Track) -> dict[str, Regressor]:
     out: dict[str, Regressor] = {}
 
     def add(kind, name, axis, values, usual=1.0, rank=LIKE_AN_EFFECT):
-        if kind == "force" and axis == 2:
-            values = values - values.mean()  # what is the same all the time is thrust's
         vector = values if axis is None else values[:, None] * np.eye(3)[axis]
         out[f"{kind} {'' if axis is None else 'xyz'[axis] + ' '}by {name}"] = Regressor(
             kind, vector, usual, rank
@@ -192,7 +199,7 @@ def dictionary(track: Track) -> dict[str, Regressor]:
         add("force", "velocity squared", axis, v[:, axis] * speed)
         add("force", "velocity times thrust", axis, v[:, axis] * over, 0.1)
         add("force", "velocity across", axis, v[:, 1 - axis])
-        add("force", "thrust", axis, thrust)
+        add("force", "thrust", axis, thrust, 0.5, STRANGE)
         add("force", f"wind along world {'xy'[axis]}", None, turn[:, axis])
         add("torque", "velocity", axis, v[:, 1 - axis])
         add("torque", "thrust", axis, thrust)
