@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from openjax.flights.track import Track
-from openjax.gap.rest import LIKE_AN_EFFECT, PLAIN, Followed, _happened, dictionary
+from openjax.gap.rest import LIKE_AN_EFFECT, PLAIN, Followed, _happened, _rank, dictionary
 from openjax.gap.verdict import LEAST_LEFT, LEAST_PLAIN, UNKNOWN_SHARE, _left
 
 
@@ -35,6 +35,8 @@ def test_what_effects_of_the_list_do_is_not_strange(regressors):
     known = {n for n, r in regressors.items() if r.rank == LIKE_AN_EFFECT}
     for word in ("force z by thrust", "motor commands", "voltage", "the floor near", "wind along"):
         assert {n for n in regressors if word in n} <= known
+    drag = regressors["force x by velocity"]
+    assert _rank(drag, ("rotor_drag", "mass")) == LIKE_AN_EFFECT and _rank(drag, ("mass",)) == PLAIN
     plain = {n for n, r in regressors.items() if r.rank == PLAIN}
     assert {"force z by sinking", "torque x by time", "force by place x along world x"} <= plain
 
@@ -46,7 +48,9 @@ def test_a_rest_counts_by_what_it_holds_of_the_gap():
             gap=SimpleNamespace(after=np.sqrt(1.0 + (1.0 / (1.0 - share) - 1.0) / 9.0)),
             unexplained=SimpleNamespace(value=unexplained),
         )
-        return _left(parts, Followed(np.array([0.0, 0.0, 0.0, 0.0, 0.0, share]), 30.0), least, named)
+        return _left(
+            parts, Followed(np.array([0.0, 0.0, 0.0, 0.0, 0.0, share]), 30.0), least, UNKNOWN_SHARE, named
+        )
 
     assert left(0.3, LEAST_PLAIN) and not left(0.3, LEAST_LEFT)
     assert left(0.8, LEAST_LEFT) and not left(0.1, LEAST_PLAIN)

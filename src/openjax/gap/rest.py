@@ -47,13 +47,14 @@ LIKE_AN_EFFECT, STRANGE, PLAIN = range(3)
 
 class Regressor(NamedTuple):
     """`values` (T, 3): acceleration in the body frame, "force" m/s^2 or "torque" rad/s^2; `usual`: its usual size; `rank`:
-    whether an effect of the list does the like, or else whether it is one of many (places, headings) or as plain as
-    physics goes."""
+    whether an effect of the list does the like (`like`: which; none: feedback does), or else whether it is one of many (places,
+    headings) or as plain as physics goes."""
 
     kind: str
     values: np.ndarray
     usual: float
     rank: int
+    like: tuple[str, ...] = ()
 
     @property
     def size(self) -> float:
@@ -121,7 +122,7 @@ def look(evidence: Evidence, selection: Selection) -> Rest:
         if gained.sum() - max(gained.max(), 0.0) < LEAST_NATS + np.log(len(names)):  # the best of so many
             break
         model, then, chosen = wider, whole, [*chosen, int(best)]
-    rank = np.array([tables[0][n].rank for n in names])
+    rank = np.array([_rank(tables[0][n], evidence.library.effects) for n in names])
     taken = np.array(chosen, int)
 
     def judged(ranks):
@@ -149,11 +150,16 @@ def look(evidence: Evidence, selection: Selection) -> Rest:
     )
 
 
+def _rank(regressor: Regressor, library: tuple[str, ...]) -> int:
+    """A regressor's rank where the list is this one: what is like effects that aren't on it is as plain as any."""
+    return PLAIN if regressor.like and not set(regressor.like) & set(library) else regressor.rank
+
+
 def _happened(regressors: list[Regressor], size: float) -> bool:
     """Whether a regressor can be looked at: one that would be strange must come and go, as what is there all the time may be
     the thrust's, the mass's or a trim's."""
-    _, _, usual, rank = regressors[0]
-    if rank == LIKE_AN_EFFECT:
+    usual = regressors[0].usual
+    if regressors[0].rank == LIKE_AN_EFFECT:
         return size > 1e-3 * usual
     return float(np.sqrt(np.mean([r.change**2 for r in regressors]))) > LEAST_CHANGE * usual
 
@@ -188,35 +194,39 @@ def dictionary(track: Track) -> dict[str, Regressor]:
     time = (track.time - track.time[0]) / 10.0 - 0.5
     out: dict[str, Regressor] = {}
 
-    def add(kind, name, axis, values, usual=1.0, rank=LIKE_AN_EFFECT):
+    def add(kind, name, axis, values, usual=1.0, rank=LIKE_AN_EFFECT, like=()):
         vector = values if axis is None else values[:, None] * np.eye(3)[axis]
         out[f"{kind} {'' if axis is None else 'xyz'[axis] + ' '}by {name}"] = Regressor(
-            kind, vector, usual, rank
+            kind, vector, usual, rank, like
         )
 
+    lift, pull = (
+        ("thrust_scale", "mass", "thrust_curve", "thrust_saturation", "battery_sag"),
+        ("rotor_drag", "blade_flapping", "wind"),
+    )
     for axis in (0, 1):
-        add("force", "velocity", axis, v[:, axis])
-        add("force", "velocity squared", axis, v[:, axis] * speed)
-        add("force", "velocity times thrust", axis, v[:, axis] * over, 0.1)
-        add("force", "velocity across", axis, v[:, 1 - axis])
-        add("force", "thrust", axis, thrust, 0.5, STRANGE)
-        add("force", f"wind along world {'xy'[axis]}", None, turn[:, axis])
-        add("torque", "velocity", axis, v[:, 1 - axis])
-        add("torque", "thrust", axis, thrust)
+        add("force", "velocity", axis, v[:, axis], like=pull)
+        add("force", "velocity squared", axis, v[:, axis] * speed, like=pull)
+        add("force", "velocity times thrust", axis, v[:, axis] * over, 0.1, like=pull)
+        add("force", "velocity across", axis, v[:, 1 - axis], like=pull)
+        add("force", "thrust", axis, thrust, 0.1, STRANGE)
+        add("force", f"wind along world {'xy'[axis]}", None, turn[:, axis], like=("wind",))
+        add("torque", "velocity", axis, v[:, 1 - axis], like=pull)
+        add("torque", "thrust", axis, thrust, like=("com_offset", "motor_imbalance"))
         add("torque", "rates across", axis, w[:, 1 - axis])
         add("torque", "motor commands squared", axis, square[:, axis], 0.01)
         add("torque", "tilt", axis, turn[:, 2, axis], 0.1)
-    for name, values, usual, rank in (
-        ("vertical speed", v[:, 2], 0.3, LIKE_AN_EFFECT),
-        ("vertical speed times speed", v[:, 2] * speed, 0.3, LIKE_AN_EFFECT),
-        ("horizontal speed", (v[:, :2] ** 2).sum(1), 1.0, PLAIN),
-        ("sinking", np.minimum(v[:, 2], 0.0), 0.3, PLAIN),
-        ("thrust", over, 0.1, LIKE_AN_EFFECT),
-        ("thrust squared", over**2, 0.02, LIKE_AN_EFFECT),
-        ("high motor commands", np.maximum(track.motor - 0.75, 0.0).mean(1), 0.03, LIKE_AN_EFFECT),
-        ("time", time, 0.3, PLAIN),
+    for name, values, usual, rank, like in (
+        ("vertical speed", v[:, 2], 0.3, LIKE_AN_EFFECT, pull),
+        ("vertical speed times speed", v[:, 2] * speed, 0.3, LIKE_AN_EFFECT, pull),
+        ("horizontal speed", (v[:, :2] ** 2).sum(1), 1.0, PLAIN, ()),
+        ("sinking", np.minimum(v[:, 2], 0.0), 0.3, PLAIN, ()),
+        ("thrust", over, 0.1, LIKE_AN_EFFECT, lift),
+        ("thrust squared", over**2, 0.02, LIKE_AN_EFFECT, lift),
+        ("high motor commands", np.maximum(track.motor - 0.75, 0.0).mean(1), 0.03, LIKE_AN_EFFECT, lift),
+        ("time", time, 0.3, PLAIN, ()),
     ):
-        add("force", name, 2, values, usual, rank)
+        add("force", name, 2, values, usual, rank, like)
     for axis in range(3):
         add("torque", "time", axis, time, 0.3, PLAIN)
     add("torque", "rates x", 2, w[:, 0], 1.0, STRANGE)
@@ -227,7 +237,7 @@ def dictionary(track: Track) -> dict[str, Regressor]:
     add("torque", "heading, cosine", 2, np.cos(heading), 1.0, STRANGE)
     add("torque", "change of thrust", 2, np.gradient(thrust, track.dt))
     if track.voltage is not None:
-        add("force", "voltage", 2, track.voltage - 3.8, 0.1)
+        add("force", "voltage", 2, track.voltage - 3.8, 0.1, like=("battery_sag",))
     if track.position is not None:
         place = track.position - [0.0, 0.0, 0.6]
         height = np.maximum(track.position[:, 2], 0.0)
@@ -237,9 +247,9 @@ def dictionary(track: Track) -> dict[str, Regressor]:
                 # Wind may change with height; a spring pulls back along each axis.
                 rank = PLAIN if own == axis else LIKE_AN_EFFECT if own == 2 else STRANGE
                 add("force", f"place {'xyz'[own]} along world {'xyz'[axis]}", None, pull, 0.3, rank)
-        add("force", "the floor near", 2, (RADIUS / (height + 0.03)) ** 2, 0.1)
+        add("force", "the floor near", 2, (RADIUS / (height + 0.03)) ** 2, 0.1, like=("ground_effect",))
         ceiling = np.maximum(ARENA_CEILING - height, 0.0)
-        add("force", "the ceiling near", 2, (RADIUS / (ceiling + 0.05)) ** 2, 0.1)
+        add("force", "the ceiling near", 2, (RADIUS / (ceiling + 0.05)) ** 2, 0.1, like=("ceiling_effect",))
         for x in (-0.5, 0.0, 0.5):
             for y in (-0.5, 0.0, 0.5):
                 bump = np.exp(-((place[:, 0] - x) ** 2 + (place[:, 1] - y) ** 2) / (2 * WIDTH**2))
@@ -252,7 +262,7 @@ def dictionary(track: Track) -> dict[str, Regressor]:
             below = (gap[:, 2] > 0.02) * np.exp(-np.maximum(gap[:, 2], 0.0) / 0.5)
             for width in (0.05, 0.15):
                 near = below * np.exp(-(gap[:, 0] ** 2 + gap[:, 1] ** 2) / (2 * width**2))
-                add("force", f"vehicle {k} above, {width:g} m", 2, near, 0.1)
+                add("force", f"vehicle {k} above, {width:g} m", 2, near, 0.1, like=("downwash",))
     return out
 
 

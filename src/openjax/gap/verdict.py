@@ -19,7 +19,9 @@ LEAST_LOSS = 0.01  # of the packets
 BESIDE = 0.13  # floors by which an effect must shrink the gap to be named beside a stronger one
 LEAST_LEFT = 0.05  # floors of the gap that a strange rest must hold to be named: the best of many regressors
 LEAST_PLAIN = 0.01  # the same where plain ones tell it
+LEAST_LARGE = 0.25  # the same of a rest that an effect of the list could make, and none was named
 UNKNOWN_SHARE = 0.12  # of the gap, from which a strange rest is named beside the effects
+LARGE_SHARE = 0.2  # the same of any rest
 
 
 @dataclass(frozen=True)
@@ -69,9 +71,16 @@ def decide(evidence: Evidence, selection: Selection, rest: Rest, parts: Split, m
     """The words that the shares give, and how sure they are."""
     named = _material(selection, parts)
     strange = bool(set(evidence.sensors.findings) - {"clocks"}) or bool(rest.local)
+    routes = (
+        (rest.everything, LEAST_LEFT if named else LEAST_LARGE, LARGE_SHARE),
+        (rest.strange, LEAST_LEFT, UNKNOWN_SHARE),
+        (rest.plain, LEAST_PLAIN, UNKNOWN_SHARE),
+    )
     strange = strange or any(
-        found.nats > LEAST_NATS and found.predicted.max() > FOLLOWED and _left(parts, found, least, named)
-        for found, least in ((rest.strange, LEAST_LEFT), (rest.plain, LEAST_PLAIN))
+        found.nats > LEAST_NATS
+        and found.predicted.max() > FOLLOWED
+        and _left(parts, found, least, share, named)
+        for found, least, share in routes
     )
     effects = list(named)
     if strange:
@@ -87,11 +96,11 @@ def decide(evidence: Evidence, selection: Selection, rest: Rest, parts: Split, m
     return Verdict(word, tuple(effects), probabilities_of(evidence, selection, parts, rest, effects))
 
 
-def _left(parts: Split, found: Followed, least: float, named) -> bool:
+def _left(parts: Split, found: Followed, least: float, least_share: float, named) -> bool:
     """Whether what is found is material: of the gap by itself and, beside names, as a share of it."""
     more = float(np.sum(1.0 / (1.0 - found.predicted) - 1.0)) / len(parts.channels)  # of the gap's square
     share = parts.unexplained.value * min(more / max(parts.gap.after**2 - 1.0, 1e-9), 1.0)
-    return np.sqrt(1.0 + more) > 1.0 + least and (not named or share > UNKNOWN_SHARE)
+    return np.sqrt(1.0 + more) > 1.0 + least and (not named or share > least_share)
 
 
 def _material(selection: Selection, parts: Split) -> list[str]:
