@@ -4,8 +4,8 @@
 
 Two GPUs fly twice the preset's worlds. First all programs are compiled into a cache, side by side, which the two
 processes do until their first checkpoint; then one of them is killed, both kinds of two are timed, one after the other,
-and the lost run is gone on with on one GPU beside one GPU alone. With `--speed_only` nothing but both kinds of two; the
-rest stays as an earlier call left it. Needs two devices; with `--cpu` they are two virtual ones, to try the script.
+and the lost run is gone on with on one GPU beside one GPU alone. With `--apart_only` nothing but the two processes;
+the rest stays as an earlier call left it. Needs two devices; with `--cpu` they are two virtual ones, to try the script.
 """
 
 import dataclasses
@@ -42,8 +42,8 @@ class ProcessesCommand:
     """Time each is measured for, after its first update."""
     compilation: float = 240.0
     """Longest time to wait for a first update."""
-    speed_only: bool = False
-    """Time the two kinds of two alone."""
+    apart_only: bool = False
+    """Time the two processes alone."""
     cpu: bool = False
     """Two virtual CPU devices instead of GPUs."""
     out: Path = Path(__file__).parent / "results" / "processes"
@@ -171,8 +171,8 @@ def main(command: ProcessesCommand) -> dict:
     twice = ("--num_envs", str(2 * command.num_envs))
     unwatched = ("--validation_interval", "100000")
     data = command.out.with_suffix(".json")
-    results: dict = read_json(data) if command.speed_only and data.exists() else {}
-    results["speed_command" if command.speed_only else "command"] = typed_command()
+    results: dict = read_json(data) if command.apart_only and data.exists() else {}
+    results["apart_command" if command.apart_only else "command"] = typed_command()
 
     def tell(name, found):
         results[name] = found
@@ -184,9 +184,10 @@ def main(command: ProcessesCommand) -> dict:
         os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
         started = time.monotonic()
         lost = Job(command, scratch, "lost", apart, *twice, "--validation_interval", "10")
-        compiling = [Job(command, scratch, "compiling_together", together, *twice, *unwatched)]
-        if not command.speed_only:
-            compiling += [
+        compiling = []
+        if not command.apart_only:
+            compiling = [
+                Job(command, scratch, "compiling_together", together, *twice, *unwatched),
                 Job(
                     command,
                     scratch,
@@ -206,11 +207,15 @@ def main(command: ProcessesCommand) -> dict:
         tell("process 1 killed", lose_one(lost))
 
         os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "true"
-        for name, devices in (("two processes", apart), ("one process", together)):
-            two = Job(command, scratch, name.replace(" ", "_"), devices, *twice, *unwatched)
-            tell(name, timed(command, two))
-        tell("machine", json.loads((two.run / "settings.json").read_text(encoding="utf-8"))["machine"])
-        if not command.speed_only:
+        two = Job(command, scratch, "two_processes", apart, *twice, *unwatched)
+        tell("two processes", timed(command, two))
+        machine = json.loads((two.run / "settings.json").read_text(encoding="utf-8"))["machine"]
+        tell("apart_machine" if command.apart_only else "machine", machine)
+        if not command.apart_only:
+            tell(
+                "one process",
+                timed(command, Job(command, scratch, "one_process", together, *twice, *unwatched)),
+            )
             one = Job(command, scratch, "one_device", alone, *unwatched, "--num_envs", str(command.num_envs))
             resumed = Job(command, scratch, "lost", other, "--resume", str(lost.run))
             with ThreadPoolExecutor(2) as beside:
@@ -251,7 +256,11 @@ def page(results: dict, command: ProcessesCommand) -> str:
         "",
         f"{where(results)} {machine['cpu_cores']} CPU cores, {machine['date']}. Preset `{command.preset}`, programs compiled "
         f"before, side by side, in {results['compilation_seconds']} s.",
-        *([f"Both kinds of two: `{results['speed_command']}`."] if "speed_command" in results else []),
+        *(
+            [f"The two processes: `{results['apart_command']}`, commit {results['apart_machine']['commit']}."]
+            if "apart_command" in results
+            else []
+        ),
         "",
         *table(heads, rows),
         "",
