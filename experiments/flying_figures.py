@@ -155,8 +155,9 @@ def simulator(arguments) -> dict:
     """Capture steps of 10 games per layout in the simulator."""
     out = arguments.out / "simulator.json"
     command = [sys.executable, "-m", "openjax.evaluate", "--policy", arguments.policy, "--episodes", "10"]
-    game = {"speed_limit": "none", "substeps": "5", "start_attitude": "level"}
+    game = {"speed_limit": "none", "substeps": "5", "start_attitude": "level", "rare_vehicles": "0.0"}
     command += [f"--environment.{name}={value}" for name, value in game.items()]
+    command += ["--environment.vehicles"]  # none but the nominal one, as the virtual ones are
     subprocess.run([*command, "--json", str(out)], check=True, env={**os.environ, "JAX_PLATFORMS": "cpu"})
     return {row["scenario"]: row for row in json.loads(out.read_text(encoding="utf-8"))}
 
