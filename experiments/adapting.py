@@ -31,7 +31,6 @@ from openjax.commands.validation import uniform_tasks
 from openjax.files import read_json
 from openjax.learning.adaptation import (
     AdaptSettings,
-    adapting_settings,
     bounds_of,
     fine_tune,
     make_adaptation,
@@ -57,10 +56,10 @@ def tune(options) -> None:
     started = time.monotonic()
     loaded = load_policy(options.policy)
     training = AdaptSettings(updates=options.updates)
-    adaptation = make_adaptation(adapting_settings(loaded.settings, training))
-    parameters = starting_parameters(loaded.parameters, loaded.settings, adaptation.settings)
-    environment = adaptation.settings.environment
-    tasks = uniform_tasks(environment, options.look_at, environment.max_pillars)
+    adaptation = make_adaptation(loaded.settings, training)
+    parameters = starting_parameters(loaded.parameters, loaded.settings)
+    game = adaptation.game
+    tasks = uniform_tasks(game, options.look_at, game.max_pillars)
     for number, name in enumerate(found_cases(options)):
         if time.monotonic() - started > options.seconds:
             print("time is up before", name)
@@ -74,10 +73,7 @@ def tune(options) -> None:
         tuned = fine_tune(adaptation, parameters, bounds, training, key, score)
         notes = {"effects": list(effects), "seconds": time.monotonic() - begin, "update": tuned.update}
         # the game without its family: flown elsewhere, it isn't needed, and all policies share one program
-        settings = dataclasses.replace(
-            adaptation.settings,
-            environment=dataclasses.replace(environment, vehicles=()),
-        )
+        settings = dataclasses.replace(loaded.settings, environment=dataclasses.replace(game, vehicles=()))
         save_policy_file(options.work / f"{name}.npz", tuned.parameters, settings, notes, "float32")
         looks = {update: round(value, 4) for update, value in tuned.looks.items()}
         print(

@@ -2,19 +2,17 @@
 
 import json
 from types import SimpleNamespace
-from typing import Any
 
 import jax
 import numpy as np
 import pytest
-from flax import struct
 
 from openjax import adapt
 from openjax.errors import UserError
 from openjax.learning import TrainSettings, build
 from openjax.learning.adaptation import (
     AdaptSettings,
-    adapting_settings,
+    adapting_game,
     bounds_of,
     clearly_better,
     fine_tune,
@@ -41,26 +39,6 @@ TINY = TrainSettings(
 )
 
 
-@struct.dataclass
-class Network:
-    parameters: Any
-    optimiser: Any = ()
-
-
-class Counting:
-    """A carry whose networks are numbers."""
-
-    def __init__(self, actor, predictor):
-        self.actor, self.predictor = Network(actor), Network(predictor)
-        self.policy = PolicyParameters(actor=actor, critic={}, predictor=predictor)
-
-    def with_policy(self, policy):
-        return Counting(policy.actor, policy.predictor)
-
-    def replace(self, predictor):
-        return Counting(self.actor.parameters, predictor.parameters)
-
-
 VALUES = {"motor_lag": {"extra_up": 0.04, "extra_down": 0.03}}
 INTERVALS = {"motor_lag": {"extra_up": (0.035, 0.045)}}
 
@@ -84,10 +62,10 @@ def test_vehicles_are_drawn_from_the_intervals_and_a_share_of_all_else():
     assert bounds_of(VALUES, INTERVALS).shape == bounds_of({}, {}).shape
 
 
-def test_settings_for_fine_tuning_fit_together():
-    settings = adapting_settings(TINY, AdaptSettings(num_envs=30, updates=3, warm_up=2))
-    assert settings.num_envs == 28 and settings.total_updates == 5 and settings.mappo.penalty_start == 1.0
-    assert settings.mappo.actor_start == pytest.approx(0.4) and settings.generator.expansion == 0.0
+def test_the_game_is_as_vehicles_fly_whatever_the_policy_knew():
+    game = adapting_game(PursuitSettings())
+    assert (game.speed_limit, game.substeps, game.start_attitude) == ("none", 5, "drawn")
+    assert game.observe_history == 12 and adapting_game(PursuitSettings(time_step=0.04)).substeps == 20
 
 
 def test_only_what_is_clearly_better_is_kept():
@@ -102,16 +80,17 @@ def test_only_what_is_clearly_better_is_kept():
 def test_the_best_step_on_the_way_is_kept():
     """A stand-in for training whose policy is its own step, and which is worth most after the third."""
     policy = PolicyParameters(actor=np.zeros(1), critic={}, predictor=np.zeros(1))
-    training = AdaptSettings(updates=6, warm_up=1, look_every=1)
+    training = AdaptSettings(updates=6, look_every=1)
     adaptation = SimpleNamespace(
-        settings=SimpleNamespace(total_updates=7),
-        start=lambda key, bounds: Counting(policy.actor, policy.predictor),
-        step=lambda carry, bounds: (Counting(carry.actor.parameters + 1.0, carry.predictor.parameters), {}),
+        fly=lambda parameters, key: None,
+        optimiser=SimpleNamespace(init=lambda actor: None),
+        update=lambda actor, state, *_: (actor + 1.0, state, {}),
     )
     worth = lambda parameters: np.full(4, -((float(parameters.actor[0]) - 3.0) ** 2))  # noqa: E731
-    tuned = fine_tune(adaptation, policy, np.zeros((1, 4)), training, None, worth)
+    key = jax.random.key(0)
+    tuned = fine_tune(adaptation, policy, np.zeros((1, 4)), training, key, worth)
     assert tuned.update == 3 and tuned.parameters.actor[0] == 3.0 and len(tuned.looks) == 7
-    worse = fine_tune(adaptation, policy, np.zeros((1, 4)), training, None, lambda p: -p.actor[:1])
+    worse = fine_tune(adaptation, policy, np.zeros((1, 4)), training, key, lambda p: -p.actor[:1])
     assert worse.update == 0 and worse.parameters.actor[0] == 0.0
 
 
@@ -122,7 +101,7 @@ def test_a_policy_is_fine_tuned_measured_and_written(policy_file, tmp_path, monk
     monkeypatch.setattr(family, "known_effects", lambda: few)
     effects = tmp_path / "effects.toml"
     save_effects(effects, VALUES, INTERVALS)
-    training = AdaptSettings(num_envs=8, updates=1, warm_up=1)
+    training = AdaptSettings(worlds=2, updates=1)
     command = adapt.AdaptCommand(effects, str(policy_file), tmp_path / "out", episodes=2, training=training)
     results = adapt.adapt(command)
     assert json.loads((command.out / "adapt.json").read_text())["effects"] == ["motor_lag"]

@@ -1,7 +1,8 @@
 """From flights to a better policy: `python -m openjax.adapt FLIGHTS --policy NAME --out DIR`.
 
-Diagnoses the flights, draws vehicles from the intervals of what was found, fine-tunes the policy on them, and measures
-both policies on tasks and vehicles that neither was trained on. Writes DIR/policy.npz, adapt.json and adapt.html.
+Diagnoses the flights, draws vehicles from the intervals of what was found, fine-tunes the policy on them by the gradient
+through the simulation, and measures both policies on tasks and vehicles that neither was trained on. Writes DIR/policy.npz,
+adapt.json and adapt.html.
 """
 
 import base64
@@ -71,12 +72,10 @@ def adapt(command: AdaptCommand) -> dict:
     try:
         import jax
 
-        from openjax.cluster.devices import check_memory
         from openjax.commands.machine import describe_machine
         from openjax.commands.validation import uniform_tasks
         from openjax.learning import summarise
         from openjax.learning.adaptation import (
-            adapting_settings,
             bounds_of,
             fine_tune,
             make_adaptation,
@@ -89,14 +88,12 @@ def adapt(command: AdaptCommand) -> dict:
         from openjax.vehicle.family import adapted_family
 
         loaded = load_policy(command.policy)
-        settings = adapting_settings(loaded.settings, command.training)
-        check_memory(settings, 1)
-        adaptation = make_adaptation(settings)
-        key = jax.random.key(command.seed)
-        tasks = uniform_tasks(settings.environment, 2 * command.episodes, settings.environment.max_pillars)
+        adaptation = make_adaptation(loaded.settings, command.training)
+        game, key = adaptation.game, jax.random.key(command.seed)
+        tasks = uniform_tasks(game, 2 * command.episodes, game.max_pillars)
         chosen_by = jax.tree.map(lambda leaf: leaf[: command.episodes], tasks)
         measured_on = jax.tree.map(lambda leaf: leaf[command.episodes :], tasks)
-        parameters = starting_parameters(loaded.parameters, loaded.settings, settings)
+        parameters = starting_parameters(loaded.parameters, loaded.settings)
         ready = _compile(adaptation, parameters, chosen_by, bounds_of({}, {}))
 
         effects = diagnosis()
@@ -134,14 +131,11 @@ def adapt(command: AdaptCommand) -> dict:
         "kept": f"fine-tuned, as it was after step {tuned.update}"
         if tuned.update
         else "the policy as it was",
-        "history": [{name: row[name] for name in FIGURES} for row in tuned.history],
+        "history": tuned.history,
         "looks": tuned.looks,
-        "warm_up": command.training.warm_up,
         "seconds": seconds,
     }
-    own = dataclasses.replace(
-        settings, environment=dataclasses.replace(settings.environment, vehicles=family)
-    )
+    own = dataclasses.replace(loaded.settings, environment=dataclasses.replace(game, vehicles=family))
     command.out.mkdir(parents=True, exist_ok=True)
     notes = {"adapted_from": command.policy, "effects": values, "machine": results["machine"]}
     save_policy_file(command.out / "policy.npz", tuned.parameters, own, notes, storage="float32")
@@ -166,7 +160,7 @@ def scores_on(adaptation, tasks, key, bounds):
             "capture_step": of.capture_step,
         }
         episodes = {name: np.asarray(value, float) for name, value in episodes.items()}
-        return selection_score(episodes, adaptation.settings.environment.episode_length)
+        return selection_score(episodes, adaptation.game.episode_length)
 
     return scores
 
@@ -213,17 +207,18 @@ class _Diagnosis:
 
 
 def _compile(adaptation, parameters, tasks, bounds):
-    """Start to compile the start, the training step and the evaluation; a function that waits for all."""
+    """Start to compile flights, update and evaluation; a function that waits for all."""
     import jax
 
     from openjax.cluster.compilation import compile_ahead
 
     key = jax.random.key(0)
-    carry = jax.eval_shape(adaptation.start, key, bounds)
+    flights = jax.eval_shape(adaptation.fly, parameters, key)
+    state = jax.eval_shape(adaptation.optimiser.init, parameters.actor)
     waits = [
-        compile_ahead(adaptation.step, carry, bounds),
-        compile_ahead(adaptation.start, key, bounds),
+        compile_ahead(adaptation.update, parameters.actor, state, parameters, flights, key, bounds),
         compile_ahead(adaptation.evaluate, parameters, tasks, key, bounds),
+        compile_ahead(adaptation.fly, parameters, key),
     ]
     return lambda: [wait() for wait in waits]
 
@@ -263,7 +258,7 @@ def page(results: dict) -> str:
         "img{max-width:100%}</style>"
         f"<h1>From flights to a better policy</h1>{words}"
         f"<h2>What it gained</h2><table><tr><th></th><th>before</th><th>after</th></tr>{figures}</table>"
-        f"<img alt='before, after and on the way' src='data:image/png;base64,{_picture(results)}'>"
+        f"<img alt='what is learnt, update by update' src='data:image/png;base64,{_picture(results)}'>"
         f"<h2>The vehicle</h2><table><tr><th>parameter</th><th>found</th><th>drawn from</th></tr>{rows}</table>"
         "<p>Of effects that weren't found, a third of the ranges that real flights justify was drawn as well: "
         "flights can't rule them out.</p>"
@@ -277,15 +272,15 @@ def _picture(results):
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 3.2), layout="constrained")
-    shown = ("capture_step", "collision_rate", "crash_rate")
-    for axes, name in zip(figure.subplots(1, len(shown)), shown, strict=True):
+    shown = {
+        "crashes_from_starts": "crashes from leaning starts (smooth)",
+        "crashes_in_flight": "crashes within flights (smooth)",
+        "off_the_nominal_flight": "distance from the nominal vehicle's flight",
+    }
+    for axes, (name, title) in zip(figure.subplots(1, len(shown)), shown.items(), strict=True):
         course = [row[name] for row in results["history"]]
-        axes.plot(range(1, len(course) + 1), course, color="0.6", label="with exploration, while training")
-        axes.axvspan(0, results["warm_up"], color="0.93", label="critic alone")
-        axes.axhline(results["before"][name], color="tab:red", label="before")
-        axes.axhline(results["after"][name], color="tab:blue", label="after")
-        axes.set(title=name.replace("_", " "), xlabel="training step", ylim=(0, None))
-    figure.axes[0].legend(fontsize="x-small")
+        axes.plot(range(1, len(course) + 1), course)
+        axes.set(title=title, xlabel="update", ylim=(0, None))
     FigureCanvasAgg(figure)
     data = io.BytesIO()
     figure.savefig(data, dpi=110)

@@ -177,39 +177,3 @@ def test_a_gradient_step_may_see_every_third_step_of_all_worlds():
     assert _every(steps, None, 1) is steps
     with pytest.raises(UserError, match="sample_every 3 must divide rollout_length 80"):
         preset("paper", mappo=MappoSettings(minibatches=16, sample_every=3))
-
-
-def test_a_critic_that_learns_alone_hears_of_the_whole_rollout():
-    """A reward in the last of two steps: with lambda 0 the first step's return is the critic's guess, with 1 the truth."""
-    settings = dataclasses.replace(
-        SETTINGS, epochs=1, minibatches=1, gae_lambda=0.0, critic_lambda=1.0, actor_start=0.5
-    )
-    optimisers = Optimisers(*make_optimiser(settings, 4), predictor=optax.identity())
-    late = jnp.broadcast_to(jnp.arange(STEPS, dtype=jnp.float32)[:, None], (STEPS, WORLDS))
-    observation = observation_of(flags(jax.random.key(0), STEPS), late)
-    states = optimisers.start(POLICY.init(jax.random.key(1), observation))
-    mean, log_std = POLICY.distribution(states["actor"].parameters, observation, None)
-    rollout = Rollout(
-        observation=observation,
-        predicted=None,
-        action=mean,
-        log_prob=gaussian_log_prob(mean, mean, log_std),
-        reward=4.0 * late[..., None],
-        terminated=late > 0,
-        truncated=jnp.zeros((STEPS, WORLDS), bool),
-        evader=jnp.zeros((STEPS, WORLDS, 3)),
-    )
-
-    @jax.jit
-    def mean_return(progress):
-        last = jax.tree.map(lambda leaf: leaf[-1], observation)
-        networks = states["actor"], states["critic"], initial_value_scale()
-        key = jax.random.key(2)
-        update = update_policy(
-            settings, POLICY, optimisers, *networks, rollout, last, None, key, None, progress
-        )
-        return update[2].moments[0]
-
-    truth = 0.5 * (4.0 + DISCOUNT * 4.0)
-    assert mean_return(0.25) == pytest.approx(truth, abs=1e-5)
-    assert mean_return(0.75) != pytest.approx(truth, abs=1e-2)

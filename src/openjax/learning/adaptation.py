@@ -1,4 +1,9 @@
-"""Fine-tuning a policy to one diagnosed vehicle, by programs that are compiled before the diagnosis is known."""
+"""Adapting a policy to one diagnosed vehicle by the gradient through the simulation, compiled before the diagnosis is known.
+
+Two things are learnt at once, from flights of half a second. From drawn starts, leaning and close to things: to touch
+nothing. From moments of the policy's flights with the nominal vehicle: to fly the diagnosed vehicle where and as fast as the
+policy flew the nominal one. The simulator's derivative says in one update what MAPPO has to find by trying.
+"""
 
 import dataclasses
 from collections.abc import Callable
@@ -8,132 +13,237 @@ from typing import Annotated, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
+from flax import struct
 
+from openjax.baselines import make_policy
 from openjax.learning.evaluation import Evaluation, make_evaluate
 from openjax.learning.settings import TrainSettings
-from openjax.learning.training_step import TrainCarry, build, init_carry, make_training_step
 from openjax.policy import Policy, PolicyParameters
 from openjax.policy.growth import with_longer_history
-from openjax.pursuit import Pursuit, Task
+from openjax.pursuit import (
+    Pursuit,
+    PursuitSettings,
+    PursuitState,
+    RewardSettings,
+    Task,
+    close_starts,
+    turn_task,
+    uniform_task,
+)
+from openjax.pursuit.collisions import TOUCH, drone_distance, pillar_distance
 from openjax.ranges import Interval, check_intervals
 from openjax.vehicle import load_vehicle
-from openjax.vehicle.family import adapted_family, family_bounds
+from openjax.vehicle.family import adapted_family, draw_vehicles, family_bounds
+from openjax.vehicle.solids import DRONE_RADIUS
 
 RATE_LOOP = 0.002
 """Period of a Crazyflie's rate loop (s)."""
 HISTORY = 12
 """Frames of its own flight that an adapted policy sees at least: with late commands and slow motors one isn't enough."""
+STEPS = 50
+"""Control steps of the flights that are learnt from."""
+FLIGHT = 400
+"""Control steps of the flights with the nominal vehicle that these begin in, ..."""
+FIRST = 25
+"""... from this one on."""
+SMOOTH = 0.012
+"""Gap (m) over which a crash goes from sure to none in what is learnt."""
+NEAR, ALIKE = 0.02, 0.1
+"""Distance (m) and difference in velocity (m/s) from the nominal vehicle's flight that count as one."""
 
 
 @dataclass(frozen=True)
 class AdaptSettings:
     """How a policy is fine-tuned."""
 
-    num_envs: Annotated[int | None, Interval("[1, 16777216]")] = None
-    """Worlds; by default 5,120 on an accelerator, 160 on a CPU, which is enough to see it work."""
-    updates: Annotated[int, Interval("[1, 1000000]")] = 40
-    """Training steps of the policy, after ..."""
-    warm_up: Annotated[int, Interval("[0, 1000000]")] = 20
-    """... those in which only the critic learns: shipped policies come without one, and a wrong one spoils the policy."""
-    look_every: Annotated[int, Interval("[1, 1000000]")] = 8
-    """Steps of the policy between looks at what it has become; the best of all looks is kept."""
-    learning_rate: Annotated[float, Interval("(0, 1]")] = 6e-4
-    """Adam step size at the start."""
-    clip_epsilon: Annotated[float, Interval("(0, 10]")] = 0.1
-    """Clip range of the probability ratio."""
+    worlds: Annotated[int | None, Interval("[1, 16777216]")] = None
+    """Worlds of each kind of flight in an update; by default 320 on an accelerator, 8 on a CPU: enough to see it work."""
+    updates: Annotated[int, Interval("[1, 1000000]")] = 80
+    look_every: Annotated[int, Interval("[1, 1000000]")] = 20
+    """Updates between looks at what the policy has become; the best of all looks is kept."""
+    learning_rate: Annotated[float, Interval("(0, 1]")] = 3e-4
+    """Adam step size at the start; falls linearly to a twentieth."""
+    follow: Annotated[float, Interval("[0, 1000]")] = 0.1
+    """Weight of flying where the nominal vehicle would, beside the share of pursuers that touch something."""
 
     def __post_init__(self):
         check_intervals(self, "training.")
 
 
-def adapting_settings(trained: TrainSettings, settings: AdaptSettings) -> TrainSettings:
-    """The training's settings for fine-tuning: penalties in full, small steps, vehicles of every kind of effect."""
-    game = trained.environment
-    num_envs = settings.num_envs or (160 if jax.default_backend() == "cpu" else 5120)
-    num_envs = max(num_envs // trained.world_unit, 1) * trained.world_unit
-    minibatches = max(n for n in range(1, trained.mappo.minibatches + 1) if num_envs % n == 0)
+def adapting_game(game: PursuitSettings) -> PursuitSettings:
+    """The game as vehicles fly it, whatever a policy was trained in: no clamp, the rate loop at 500 Hz, solid pillars."""
     return dataclasses.replace(
-        trained,
-        # as vehicles fly: no clamp, the rate loop at 500 Hz, solid pillars; whatever the policy was trained in
-        environment=dataclasses.replace(
-            game,
-            vehicles=adapted_family({}, {}),
-            rare_vehicles=0.0,
-            observe_history=max(game.observe_history, HISTORY),
-            speed_limit="none",
-            physics="stops",
-            substeps=max(game.substeps, round(game.time_step / RATE_LOOP)),
-        ),
-        mappo=dataclasses.replace(
-            trained.mappo,
-            learning_rate=settings.learning_rate,
-            clip_epsilon=settings.clip_epsilon,
-            clip_epsilon_end=settings.clip_epsilon,
-            penalty_start=1.0,
-            # the optimiser learns the gradients' size meanwhile; with moments of zero its first steps would be ten times as long
-            critic_lambda=1.0,
-            actor_start=settings.warm_up / (settings.warm_up + settings.updates),
-            minibatches=minibatches,
-        ),
-        # uniform tasks: by them the best step is chosen, and with tasks from the archive it came out no better
-        generator=dataclasses.replace(trained.generator, expansion=0.0),
-        vehicles_start=0.0,
-        vehicles_ramp=0.0,
-        num_envs=num_envs,
-        total_steps=(settings.updates + settings.warm_up) * num_envs * trained.rollout_length,
+        game,
+        vehicles=adapted_family({}, {}),
+        rare_vehicles=0.0,
+        observe_history=max(game.observe_history, HISTORY),
+        speed_limit="none",
+        physics="stops",
+        substeps=max(game.substeps, round(game.time_step / RATE_LOOP)),
+        start_attitude="drawn",
+        reward=RewardSettings(),
     )
 
 
-def starting_parameters(
-    parameters: PolicyParameters, trained: TrainSettings, settings: TrainSettings
-) -> PolicyParameters:
-    """The policy trained with `trained` as it begins in `settings`, without its critic; it acts as before."""
-    grown = with_longer_history(
-        parameters.replace(critic={}), settings.predictor, trained.environment, settings.environment
-    )
+def starting_parameters(parameters: PolicyParameters, trained: TrainSettings) -> PolicyParameters:
+    """A policy as it begins in `adapting_game`, without its critic; it acts as before."""
+    game = trained.environment
+    grown = with_longer_history(parameters.replace(critic={}), trained.predictor, game, adapting_game(game))
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), grown)
+
+
+@struct.dataclass
+class Flights:
+    """Moments of flights with the nominal vehicle, and what came after each."""
+
+    state: PursuitState  # (W, ...)
+    position: jax.Array  # (T, W, N, 3) m, after the steps that followed
+    velocity: jax.Array  # (T, W, N, 3) m/s
 
 
 @dataclass(frozen=True)
 class Adaptation:
-    """The compiled programs: the training step and the evaluation, both for vehicles whose bounds are an argument."""
+    """The programs, not compiled yet; all but the first for vehicles whose bounds (R, 4) are an argument."""
 
-    settings: TrainSettings
+    game: PursuitSettings
     policy: Policy
-    start: Callable[[jax.Array, jax.Array], TrainCarry]
-    """(key, bounds) -> carry."""
-    step: Callable[[TrainCarry, jax.Array], tuple[TrainCarry, dict[str, jax.Array]]]
-    """(carry, bounds) -> carry, metrics; the carry is donated."""
+    optimiser: optax.GradientTransformation
+    fly: Callable[[PolicyParameters, jax.Array], Flights]
+    """(parameters, key) -> moments of flights with the nominal vehicle."""
+    update: Callable[..., tuple[Any, Any, dict[str, jax.Array]]]
+    """(actor, optimiser's state, parameters, flights, key, bounds) -> actor, state, metrics."""
     evaluate: Callable[[PolicyParameters, Task, jax.Array, jax.Array], Evaluation]
     """(parameters, tasks, key, bounds) -> one episode per task."""
 
 
-def make_adaptation(settings: TrainSettings) -> Adaptation:
-    """The programs for `adapting_settings`, not compiled yet."""
+def make_adaptation(trained: TrainSettings, settings: AdaptSettings) -> Adaptation:
+    """The programs for a policy that was trained with `trained`."""
+    game, vehicle = adapting_game(trained.environment), load_vehicle()
+    # nothing is solid while the gradient is taken: a crash is told by the gap
+    free = dataclasses.replace(game, physics="rigid", contacts=False)
+    policy = make_policy(Pursuit(game), trained.network, trained.predictor)
+    worlds = settings.worlds or (8 if jax.default_backend() == "cpu" else 320)
+    nominal = jnp.asarray(family_bounds(adapted_family({}, {}, rest=0.0)))
+    step_size = optax.linear_schedule(settings.learning_rate, 0.05 * settings.learning_rate, settings.updates)
+    optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(step_size))
 
-    vehicle = load_vehicle()
+    def environment(settings, bounds):
+        return Pursuit(settings, vehicle, vehicle_bounds=bounds)
 
-    def environment(bounds):
-        return Pursuit(settings.environment, vehicle, vehicle_bounds=bounds)
+    def fly(parameters, key):
+        pursuit = environment(free, nominal)
+        task_key, reset_key, moment_key = jax.random.split(key, 3)
+        tasks = jax.vmap(lambda key: _task(free, key))(jax.random.split(task_key, 4 * worlds))
+        _, state = jax.vmap(pursuit.reset_to)(jax.random.split(reset_key, 4 * worlds), tasks)
+        moment = jax.random.randint(moment_key, (4 * worlds,), FIRST, FLIGHT - STEPS)
+        fly_on = _stepper(pursuit, policy, parameters)
 
-    policy = build(settings).policy
-    return Adaptation(
-        settings=settings,
-        policy=policy,
-        start=jax.jit(lambda key, bounds: init_carry(settings, key, environment(bounds))),
-        step=jax.jit(
-            # the predictor stays as it is: the evader flies no vehicle
-            lambda carry, bounds: make_training_step(settings, environment(bounds), train_predictor=False)(
-                carry
-            ),
-            donate_argnums=0,
-        ),
-        evaluate=jax.jit(
-            lambda parameters, tasks, key, bounds: make_evaluate(environment(bounds), policy)(
-                parameters, tasks, key
+        def one(carry, step):
+            observation, state, kept = carry
+            kept = jax.vmap(lambda now, a, b: jax.tree.map(lambda x, y: jnp.where(now, x, y), a, b))(
+                moment == step, state, kept
             )
-        ),
-    )
+            observation, state = fly_on(parameters.actor, observation, state)
+            return (observation, state, kept), (state.drones.position, state.drones.velocity)
+
+        first = jax.vmap(pursuit.observe)(state), state, state
+        (_, _, kept), flown = jax.lax.scan(one, first, jnp.arange(FLIGHT))
+        after = moment + jnp.arange(STEPS)[:, None]  # (T, W)
+        position, velocity = (track[after, jnp.arange(4 * worlds)] for track in flown)
+        return Flights(kept, position, velocity)
+
+    def begin(flights, key, bounds):
+        """Half of the worlds at starts, half in the flights, all with vehicles of the bounds; and the flights to follow."""
+        pursuit = environment(free, bounds)
+        task_key, reset_key, moment_key, vehicle_key = jax.random.split(key, 4)
+        tasks = jax.vmap(lambda key: _start(free, key))(jax.random.split(task_key, worlds))
+        _, starts = jax.vmap(pursuit.reset_to)(jax.random.split(reset_key, worlds), tasks)
+        chosen = jax.random.choice(moment_key, flights.position.shape[1], (worlds,), replace=False)
+        drawn = jax.vmap(lambda key: draw_vehicles(free.vehicles, key, free.num_pursuers, 0.0, bounds))(
+            jax.random.split(vehicle_key, worlds)
+        )
+        moments = jax.tree.map(lambda leaf: leaf[chosen], flights.state).replace(vehicles=drawn)
+        state = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), starts, moments)
+        return pursuit, state, flights.position[:, chosen], flights.velocity[:, chosen]
+
+    def loss(actor, parameters, flights, key, bounds):
+        pursuit, state, position, velocity = begin(flights, key, bounds)
+        fly_on = jax.checkpoint(_stepper(pursuit, policy, parameters))
+
+        def one(carry, _):
+            observation, state, least = carry
+            observation, state = fly_on(actor, observation, state)
+            least = jnp.minimum(least, _gap(free, state))
+            return (observation, state, least), (state.drones.position, state.drones.velocity)
+
+        first = jax.vmap(pursuit.observe)(state), state, jnp.full(state.drones.position.shape[:2], jnp.inf)
+        (_, end, least), (flown, speed) = jax.lax.scan(one, first, None, length=STEPS)
+        crash = jnp.mean(jax.nn.sigmoid((3 * TOUCH - least) / SMOOTH), axis=-1)
+        fast = jnp.sqrt(jnp.sum(end.drones.velocity[:worlds] ** 2, axis=-1) + 1e-9) - 1.0
+        low = 0.35 - end.drones.position[:worlds, :, 2]
+        off = jnp.sum(((flown[:, worlds:] - position) / NEAR) ** 2, axis=-1)
+        off = off + jnp.sum(((speed[:, worlds:] - velocity) / ALIKE) ** 2, axis=-1)
+        off = jnp.sqrt(1.0 + off) - 1.0
+        watch = {
+            "crashes_from_starts": jnp.mean(crash[:worlds]),
+            "crashes_in_flight": jnp.mean(crash[worlds:]),
+            "ends": jnp.mean(jax.nn.relu(fast)) + jnp.mean(jax.nn.relu(low)),
+            "off_the_nominal_flight": jnp.mean(off),
+        }
+        whole = watch["crashes_from_starts"] + watch["crashes_in_flight"] + 0.2 * watch["ends"]
+        return whole + settings.follow * watch["off_the_nominal_flight"], watch
+
+    def update(actor, state, parameters, flights, key, bounds):
+        gradient, watch = jax.grad(loss, has_aux=True)(actor, parameters, flights, key, bounds)
+        whole = jnp.isfinite(optax.global_norm(gradient))
+        gradient = jax.tree.map(lambda leaf: jnp.where(whole, leaf, 0.0), gradient)
+        change, state = optimiser.update(gradient, state, actor)
+        return optax.apply_updates(actor, change), state, watch
+
+    def evaluate(parameters, tasks, key, bounds):
+        return make_evaluate(environment(game, bounds), policy)(parameters, tasks, key)
+
+    return Adaptation(game, policy, optimiser, jax.jit(fly), jax.jit(update), jax.jit(evaluate))
+
+
+def _stepper(pursuit, policy, parameters):
+    """A control step of worlds (W, ...): (actor, observation, state) -> observation, state; the prediction has no gradient."""
+    step = jax.vmap(pursuit.step, in_axes=(None, 0, 0))
+
+    def fly_on(actor, observation, state):
+        predicted = jax.lax.stop_gradient(policy.predict(parameters, observation))
+        action = policy.action(policy.distribution(actor, observation, predicted)[0], observation)
+        observation, state, *_ = step(jax.random.key(0), state, action)
+        return observation, state
+
+    return fly_on
+
+
+def _task(game, key):
+    """A uniform task, turned about the arena's axis."""
+    task_key, turn_key = jax.random.split(key)
+    return turn_task(turn_key, uniform_task(game, task_key))
+
+
+def _start(game, key):
+    """A task to start from: half of them with pursuers close to something."""
+    task_key, close_key = jax.random.split(key)
+    task = _task(game, task_key)
+    near = close_starts(game, close_key, task, 0.7)
+    half = jax.random.bernoulli(jax.random.fold_in(key, 2))
+    return jax.tree.map(lambda a, b: jnp.where(half, a, b), near, task)
+
+
+def _gap(game, state):
+    """(W, N) m, from each pursuer to the nearest solid thing: pillar, pursuer or floor."""
+    position, task = state.drones.position, state.task
+    to_pillar = jax.vmap(lambda p, q: pillar_distance(game, p, q))(position, task.pillar_position)
+    gap = jnp.min(jnp.where(task.pillar_active[:, None], to_pillar, jnp.inf), axis=-1) - DRONE_RADIUS
+    if game.num_pursuers > 1:
+        others = jnp.min(jax.vmap(drone_distance)(position), axis=-1)
+        gap = jnp.minimum(gap, others - 2 * DRONE_RADIUS)
+    return jnp.minimum(gap, position[..., 2] - DRONE_RADIUS)
 
 
 @dataclass(frozen=True)
@@ -143,11 +253,11 @@ class Tuned:
     parameters: PolicyParameters
     """The best of those looked at, the first ones among them; without a critic."""
     update: int
-    """After which training step they were found; 0: they are the first ones."""
+    """After which update they were found; 0: they are the first ones."""
     history: list[dict[str, float]]
-    """Metrics of each training step."""
+    """Metrics of each update."""
     looks: dict[int, float]
-    """{training step: mean score}."""
+    """{update: mean score}."""
 
 
 def fine_tune(
@@ -159,26 +269,24 @@ def fine_tune(
     score: Callable[[PolicyParameters], np.ndarray],
     tell: Callable[[int, dict[str, jax.Array]], Any] = lambda update, metrics: None,
 ) -> Tuned:
-    """Train `parameters` (critic left aside) on vehicles within `bounds` (R, 4), and keep the best on the way.
+    """Train `parameters` (from `starting_parameters`) on vehicles within `bounds` (R, 4), and keep the best on the way.
 
     `score` gives the scores of episodes (B,), of the same tasks and vehicles each time; what isn't clearly better than the
-    first parameters, by the differences of single episodes, isn't kept. `tell` hears of every training step.
+    first parameters, by the differences of single episodes, isn't kept. `tell` hears of every update.
     """
     bounds = jnp.asarray(bounds)
-    carry = adaptation.start(key, bounds)
-    learnt = carry.policy.replace(actor=parameters.actor, predictor=parameters.predictor)
-    carry, history = carry.with_policy(jax.tree.map(jnp.copy, learnt)), []
-    first = np.asarray(score(parameters.replace(critic={})))
-    best, looks = (parameters.replace(critic={}), 0), {0: float(first.mean())}
-    for update in range(1, adaptation.settings.total_updates + 1):
-        carry, metrics = adaptation.step(carry, bounds)
+    fly_key, update_key = jax.random.split(key)
+    flights = adaptation.fly(parameters, fly_key)
+    actor, state, history = parameters.actor, adaptation.optimiser.init(parameters.actor), []
+    first = np.asarray(score(parameters))
+    best, looks = (parameters, 0), {0: float(first.mean())}
+    for update in range(1, training.updates + 1):
+        own_key = jax.random.fold_in(update_key, update)
+        actor, state, metrics = adaptation.update(actor, state, parameters, flights, own_key, bounds)
         history.append(metrics)
         tell(update, metrics)
-        trained = update - training.warm_up
-        if trained > 0 and (
-            trained % training.look_every == 0 or update == adaptation.settings.total_updates
-        ):
-            now = jax.tree.map(jnp.copy, carry.policy.replace(critic={}))
+        if update % training.look_every == 0 or update == training.updates:
+            now = parameters.replace(actor=actor)
             scores = np.asarray(score(now))
             looks[update] = float(scores.mean())
             if looks[update] > looks[best[1]] and clearly_better(first, scores):

@@ -136,9 +136,6 @@ def update_policy(
     last_value = mean + std * policy.value(*parameters, last, last_predicted)
     next_value = jnp.concatenate([value[1:], last_value[None]])
     per_pursuer = value.shape
-    trace = settings.gae_lambda
-    if settings.actor_start and settings.critic_lambda is not None:
-        trace = jnp.where(progress < settings.actor_start, settings.critic_lambda, trace)
     advantage = generalised_advantages(
         settings.reward_scale * rollout.reward,
         value,
@@ -146,7 +143,7 @@ def update_policy(
         jnp.broadcast_to(rollout.terminated[..., None], per_pursuer),
         jnp.broadcast_to(rollout.truncated[..., None], per_pursuer),
         settings.discount,
-        trace,
+        settings.gae_lambda,
     )
     returns = advantage + value
     explained = 1.0 - joint_moments(advantage, axis)[1] ** 2 / (joint_moments(returns, axis)[1] ** 2 + 1e-8)

@@ -35,9 +35,6 @@ class MappoSettings:
     discount: Annotated[float, Interval("[0, 1]")] = 0.995
     gae_lambda: Annotated[float, Interval("[0, 1]")] = 0.95
     """Lambda of the generalised advantage estimate."""
-    critic_lambda: Annotated[float | None, Interval("[0, 1]")] = None
-    """Lambda while the actor waits (`actor_start`); None: `gae_lambda`. At 1 a fresh critic hears of what comes hundreds of steps
-    later within a few iterations: each looks as far as its rollout, and not 1 / (1 - discount * lambda) steps."""
     max_grad_norm: Annotated[float, Interval("(0, 1e6]")] = 10.0
     """Global norm to which gradients are cut, actor and critic each."""
     huber: Annotated[float, Interval("(0, 1e6]")] = 10.0

@@ -159,15 +159,11 @@ def learn_policy(
 
 
 def make_training_step(
-    settings: TrainSettings,
-    environment: Pursuit | None = None,
-    axis: str | None = None,
-    train_predictor: bool = True,
+    settings: TrainSettings, environment: Pursuit | None = None, axis: str | None = None
 ) -> Callable[[TrainCarry], tuple[TrainCarry, dict[str, jax.Array]]]:
     """The training step `carry -> (carry, metrics)`; compile it with `jax.jit(step, donate_argnums=0)`.
 
-    `axis` names the axis of devices when it runs under `shard_map` (see `openjax.cluster.devices`). Without
-    `train_predictor` the predictor stays as it is.
+    `axis` names the axis of devices when it runs under `shard_map` (see `openjax.cluster.devices`).
     Metrics are () float32, counted over the rollout or over the episodes that ended with it.
     """
     parts = build(settings, environment)
@@ -196,7 +192,7 @@ def make_training_step(
 
         # predictor update
         predictor, metrics = carry.predictor, {}
-        if settings.predictor.enabled and train_predictor:
+        if settings.predictor.enabled:
             predictor, loss = learn_predictor(
                 parts, carry, rollout, own_keys(window_key, num_envs, axis), axis
             )
