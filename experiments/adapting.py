@@ -26,7 +26,7 @@ from experiments.task_gap.flights import make_cases
 from experiments.task_gap.game import draw_tasks
 from experiments.worlds.game import play
 from experiments.worlds.plant import PlantWorld
-from openjax.adapt import scores_on
+from openjax.adapt import compile_programs, scores_on
 from openjax.commands.validation import uniform_tasks
 from openjax.files import read_json
 from openjax.learning.adaptation import (
@@ -60,6 +60,8 @@ def tune(options) -> None:
     parameters = starting_parameters(loaded.parameters, loaded.settings)
     game = adaptation.game
     tasks = uniform_tasks(game, options.look_at, game.max_pillars)
+    compile_programs(adaptation, parameters, tasks, bounds_of({}, {}))()
+    print(f"compiled in {time.monotonic() - started:.0f} s", flush=True)
     for number, name in enumerate(found_cases(options)):
         if time.monotonic() - started > options.seconds:
             print("time is up before", name)
@@ -77,7 +79,8 @@ def tune(options) -> None:
         save_policy_file(options.work / f"{name}.npz", tuned.parameters, settings, notes, "float32")
         looks = {update: round(value, 4) for update, value in tuned.looks.items()}
         print(
-            f"{name}: {', '.join(effects) or 'none'}; {notes['seconds']:.0f} s, kept {tuned.update} of {looks}",
+            f"{name}: {', '.join(effects) or 'none'}; {notes['seconds']:.0f} s, kept {tuned.update} of {looks}; "
+            + "; ".join(f"{n} {tuned.history[0][n]:.4f} → {x:.4f}" for n, x in tuned.history[-1].items()),
             flush=True,
         )
 

@@ -94,7 +94,7 @@ def adapt(command: AdaptCommand) -> dict:
         chosen_by = jax.tree.map(lambda leaf: leaf[: command.episodes], tasks)
         measured_on = jax.tree.map(lambda leaf: leaf[command.episodes :], tasks)
         parameters = starting_parameters(loaded.parameters, loaded.settings)
-        ready = _compile(adaptation, parameters, chosen_by, bounds_of({}, {}))
+        ready = compile_programs(adaptation, parameters, chosen_by, bounds_of({}, {}))
 
         effects = diagnosis()
         names, values = load_effects(effects)
@@ -206,7 +206,7 @@ class _Diagnosis:
             self.process.wait()
 
 
-def _compile(adaptation, parameters, tasks, bounds):
+def compile_programs(adaptation, parameters, tasks, bounds):
     """Start to compile flights, update and evaluation; a function that waits for all."""
     import jax
 
