@@ -59,7 +59,7 @@ class AdaptSettings:
 
     worlds: Annotated[int | None, Interval("[1, 65536]")] = None
     """Worlds of each kind of flight in an update; by default 320 on an accelerator, 8 on a CPU: enough to see it work."""
-    updates: Annotated[int, Interval("[1, 1000000]")] = 60
+    updates: Annotated[int, Interval("[1, 1000000]")] = 40
     look_every: Annotated[int, Interval("[1, 1000000]")] = 20
     """Updates between looks at what the policy has become; the best of all looks is kept."""
     learning_rate: Annotated[float, Interval("(0, 1]")] = 3e-4
