@@ -7,8 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from openjax.errors import UserError
 from openjax.flying.crtp import Packet, Port, compress_quaternion, decode, expand_quaternion, pack_number
 from openjax.flying.firmware_tables import LOG_VARIABLES, Sensors
+from openjax.flying.motion_capture import find_feed
 from openjax.flying.set_point import ANGLES, OFF, RATES, SetPoint
 from openjax.flying.virtual_firmware import (
     LEVEL_AFTER,
@@ -16,6 +18,7 @@ from openjax.flying.virtual_firmware import (
     WATCHDOG,
     VirtualFirmware,
 )
+from openjax.flying.virtual_link import LinkFaults, VirtualLink
 
 SENSORS = Sensors(
     np.array([0.5, -0.25, 1.0]),
@@ -116,3 +119,15 @@ def test_no_packet_breaks_it(data, header):
         for answer in firmware.receive(raw, 1.0):
             assert 1 <= len(answer) <= 31
     assert np.isfinite(firmware.set_point(1.0).array()).all()
+
+
+@pytest.mark.parametrize("host, port", [("127.0.0.1", 65536), ("nohost.invalid", 1), ("x" * 80, 1)])
+def test_an_address_that_cannot_be_had_is_named(host, port):
+    with pytest.raises(UserError, match=f"UDP port {port} of {host} can't be had"):
+        VirtualLink(host, port, LinkFaults(), 0)
+
+
+@pytest.mark.parametrize("name", ["nomodule:feed", "os:nothing", "os:sep", "nonsense"])
+def test_a_feed_that_is_none_is_named(name):
+    with pytest.raises(UserError, match=f"--motion_capture {name}"):
+        find_feed(name)

@@ -37,11 +37,14 @@ def find_feed(name: str) -> Callable:
     module, _, function = name.partition(":")
     sys.path.insert(0, str(Path.cwd()))
     try:
-        return getattr(importlib.import_module(module), function)
+        found = getattr(importlib.import_module(module), function)
     except (ImportError, AttributeError, ValueError) as error:
         raise UserError(f"--motion_capture {name}: no such MODULE:FUNCTION ({error})") from error
     finally:
         sys.path.pop(0)
+    if not callable(found):
+        raise UserError(f"--motion_capture {name}: is no function")
+    return found
 
 
 class MotionCaptured:

@@ -42,10 +42,11 @@ class VirtualLink:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self.socket.bind((host, port))
-        except OSError as error:
+        except (OSError, OverflowError, UnicodeError) as error:  # taken, beyond 65535, no name of a host
             self.socket.close()
+            reason = getattr(error, "strerror", None) or error
             raise UserError(
-                f"UDP port {port} of {host} can't be had ({error.strerror}); choose another --port"
+                f"UDP port {port} of {host} can't be had ({reason}); choose another --port"
             ) from error
         self.socket.setblocking(False)
         self.faults, self._random, self._peer = faults, random.Random(seed), None
