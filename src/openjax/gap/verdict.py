@@ -20,6 +20,7 @@ BESIDE = 0.13  # floors by which an effect must shrink the gap to be named besid
 LEAST_LEFT = 0.05  # floors of the gap that a strange rest must hold to be named: the best of many regressors
 LEAST_PLAIN = 0.01  # the same where plain ones tell it
 LEAST_LARGE = 0.25  # the same of a rest that an effect of the list could make, and none was named
+UNDONE = 1.5  # sum of the shares beyond which effects undo each other
 UNKNOWN_SHARE = 0.12  # of the gap, from which a strange rest is named beside the effects
 LARGE_SHARE = 0.2  # the same of any rest
 
@@ -106,6 +107,9 @@ def _left(parts: Split, found: Followed, least: float, least_share: float, named
 def _material(selection: Selection, parts: Split) -> list[str]:
     """The effects by their share, without those that are small beside the largest: they are what its form has wrong."""
     order = sorted(parts.effects, key=lambda e: -parts.effects[e].value)
+    if sum(part.value for part in parts.effects.values()) > UNDONE:
+        # What each adds where the others may follow orders them then.
+        order.sort(key=lambda e: -selection.gains[e].floors if e in selection.gains else -np.inf)
 
     def stays(effect: str) -> bool:
         if effect in selection.gains:
