@@ -8,8 +8,6 @@ from pathlib import Path
 import pytest
 
 _flags = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
-# what isn't fused needs no compiler of fusions, which takes longer than the rest of an operation
-_flags += " --xla_disable_hlo_passes=fusion-wrapper"
 # workers are the parallel part: more threads would only wait for each other's cores
 _flags += " --xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 if version("jaxlib").startswith("0.10."):

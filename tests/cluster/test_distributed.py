@@ -140,7 +140,7 @@ def free_address():
         return f"127.0.0.1:{server.getsockname()[1]}"
 
 
-def wait_for(happened, processes, seconds=240.0):
+def wait_for(happened, processes, seconds=480.0):
     deadline = time.monotonic() + seconds
     while not happened():
         assert time.monotonic() < deadline and all(process.poll() is None for process in processes)
