@@ -73,8 +73,8 @@ def observe(settings: PursuitSettings, state: PursuitState, seen_drones: DroneSt
         spacing = settings.observe_history_spacing
         parts.append(jnp.moveaxis(state.own_history[spacing - 1 :: spacing], 0, 1).reshape(n, -1))
 
-    index = jnp.array([[j for j in range(n) if j != i] for i in range(n)], jnp.int32).reshape(n, n - 1)
-    others = position[:, None] - position[index]
+    # slices and no index: the gradient of an index is a scatter
+    others = jnp.stack([position[i] - jnp.concatenate([position[:i], position[i + 1 :]]) for i in range(n)])
 
     pillars, pillar_seen = _nearest_pillars(settings, position, task.pillar_position, task.pillar_active)
     true_parts = [
