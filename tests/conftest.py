@@ -9,7 +9,7 @@ import pytest
 
 _flags = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 # workers are the parallel part: more threads would only wait for each other's cores
-_flags += " --xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+_flags += " --xla_cpu_multi_thread_eigen=false"
 if version("jaxlib").startswith("0.10."):
     # its way of fusing compiles three times as long; later versions know no such flag
     _flags += " --xla_cpu_use_fusion_emitters=false"

@@ -267,8 +267,8 @@ def wrong_layout(change):
         (train, "--restart_close 0.5", "restart_close 0.5 needs restart_every"),
         (
             train,
-            "--num_envs 16000000 --rollout_length 10000 --environment.episode_length 10000",
-            "worlds of 10000 steps need at least",
+            "--num_envs 16000000 --rollout_length 9600 --environment.episode_length 9600 --restart_steps 9600",
+            "worlds of 9600 steps need at least",
         ),  # more than any machine has
         (train, "--out /proc/run", "can't be written there"),
         (evaluate, "--policy {run} --json {folder}", "is a folder; a file is needed"),
