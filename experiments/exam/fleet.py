@@ -44,7 +44,7 @@ class Fleet:
     def __init__(self, seed, column, variants, drawn):
         """variants: list of (spec, causes); drawn: {case name: `bodies`}."""
         self.seed, self.column, self.variants = seed, column, variants
-        told, references, airs, partner, kinds, self.columns = [], [], [], [], [], []
+        told, references, airs, partner, kinds, logged, self.columns = [], [], [], [], [], [], []
         for spec, _ in variants:
             start = len(told)
             for reference, air, other in drawn[spec["name"]]:
@@ -53,6 +53,8 @@ class Fleet:
                 airs.append(air)
                 partner.append(start + other)
                 kinds.append(spec["controller"])
+            for mission, ticks in zip(spec["missions"], spec["ticks"], strict=True):
+                logged += [plant.PER_TICK * ticks] * (2 if len(mission) == 2 else 1)
             self.columns.append(np.arange(start, len(told)))
         self.told, self.partner = told, np.array(partner)
         arrival = np.repeat(10 * np.arange(cases.TICKS)[:, None], len(told), axis=1)
@@ -63,6 +65,8 @@ class Fleet:
                 told, self.parameters, reference, kinds, self.partner, arrival, sensors.stack(airs), strangers
             )
         )
+        # What is measured is what the logs cover: a fault that comes after their end shows nothing.
+        self.seen = self.flown | {"crashed": np.minimum(self.flown["crashed"], logged)}
 
     def model(self, causes_of, arrival=None):
         """Parameters with the nuisances and these causes; unknown causes and magnitudes beside."""
@@ -88,7 +92,7 @@ class Fleet:
 
     def errors_of(self, parameters, firmware, links):
         """Mean squares (12, variants) of a model; see `measure.errors`."""
-        rms = measure.errors(self.flown, self.told, parameters, self.partner, firmware, links)
+        rms = measure.errors(self.seen, self.told, parameters, self.partner, firmware, links)
         return np.stack([(rms[:, c] ** 2).mean(axis=1) for c in self.columns], axis=1)
 
     def replayed(self, i, parameters, motors=None, lasts=None):
