@@ -135,7 +135,7 @@ def lose_one(job: Job) -> dict:
     job.processes[1].kill()
     started = time.monotonic()
     status = job.processes[0].wait(120)
-    text = job.texts[0].read_text()
+    text = job.texts[0].read_text().replace(str(job.run), "RUN")
     return {
         "status": status,
         "seconds": round(time.monotonic() - started, 1),
