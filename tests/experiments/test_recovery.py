@@ -5,8 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 
-from openjax.learning import recovery as module
-from openjax.learning.recovery import side_by_side
+from experiments.recovery import SIDE_BY_SIDE, side_by_side
 from openjax.pursuit import PursuitSettings, uniform_task
 from openjax.pursuit.task import starts_clear
 
@@ -21,7 +20,7 @@ def test_all_stand_side_by_side():
     apart = np.linalg.norm(position[:, :, None] - position[:, None], axis=-1) + 9 * np.eye(3)
     moved = (position != np.asarray(before.pursuer_position)).any((1, 2))
     assert moved.mean() > 0.5
-    assert (apart[moved].min(2) < GAME.drone_clearance + module.APART + 1e-4).all()
+    assert (apart[moved].min(2) < GAME.drone_clearance + SIDE_BY_SIDE + 1e-4).all()
     near = dataclasses.replace(
         GAME, drone_clearance=GAME.drone_clearance - 0.01
     )  # outside the arena counts, too
