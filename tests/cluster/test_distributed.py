@@ -129,8 +129,9 @@ with _connected(membership) as (connections, _):
 
 
 def environment_with(devices):
-    """The suite's own, with virtual devices."""
-    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={devices}"
+    """The suite's own, with virtual devices, which may have threads as in a user's run."""
+    flags = os.environ["XLA_FLAGS"].replace("--xla_cpu_multi_thread_eigen=false", "")
+    flags += f" --xla_force_host_platform_device_count={devices}"
     return {**os.environ, "XLA_FLAGS": flags}
 
 

@@ -39,7 +39,8 @@ def test_worlds_or_minibatches_grow_with_the_devices_and_what_cannot_be_shared_o
 
 
 def test_script_measures_one_device_and_two(tmp_path):
-    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=2"
+    flags = os.environ["XLA_FLAGS"].replace("--xla_cpu_multi_thread_eigen=false", "")
+    flags += " --xla_force_host_platform_device_count=2"
     out = tmp_path / "scaling.json"
     options = ["--json", str(out), "--kinds", "weak", "--calls", "2", "--seconds", "600", "--commit", "abc"]
     done = subprocess.run(
