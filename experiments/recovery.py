@@ -22,6 +22,7 @@ from experiments.vehicles import WHOLE, vehicles
 from openjax.commands.command_line import run_command
 from openjax.commands.validation import uniform_tasks
 from openjax.files import read_json
+from openjax.learning.adaptation import crash_share, nearest_gap
 from openjax.pursuit import (
     Pursuit,
     PursuitSettings,
@@ -31,20 +32,17 @@ from openjax.pursuit import (
     turn_task,
     uniform_task,
 )
-from openjax.pursuit.collisions import TOUCH, drone_distance, pillar_distance
+from openjax.pursuit.collisions import TOUCH, drone_distance
 from openjax.pursuit.observation import rotation_axes
 from openjax.pursuit.settings import OWN_FRAME
 from openjax.store.policies import LoadedPolicy, load_policy
 from openjax.store.policy_files import WEIGHTS, load_policy_file, save_policy_file
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.family import FLIGHT_FAMILY, standard_parameters
-from openjax.vehicle.solids import DRONE_RADIUS
 
 KINDS = ("nominal", "table", WHOLE)
 STEPS, COUNTED = 50, 60
 """Control steps that are learnt, and in which crashes are counted."""
-SMOOTH = 0.012
-"""Gap (m) over which a pursuer's crash goes from sure to none in what is learnt."""
 SIDE_BY_SIDE = 0.1
 """Farthest gap beyond the safety distance of pursuers side by side (m)."""
 FLIGHT, MOMENTS = 400, 12
@@ -133,7 +131,6 @@ class Starts:
         seen = jax.vmap(lambda observation, state: self._seen(environment, observation, state))
         observation, state = jax.vmap(environment.reset_to)(keys, tasks)
         step = jax.vmap(environment.step, in_axes=(None, 0, 0))
-        pillars, active = tasks.pillar_position, tasks.pillar_active[:, None]
 
         def one(carry, _):
             observation, state, least = carry
@@ -141,12 +138,8 @@ class Starts:
             predicted = jax.lax.stop_gradient(self.policy.predict(self.loaded.parameters, observation))
             action = self.policy.action(self.policy.distribution(actor, shown, predicted)[0])
             observation, state, *_ = step(jax.random.key(0), state, action)
-            position = state.drones.position
-            to_pillar = jax.vmap(lambda p, q: pillar_distance(self.settings, p, q))(position, pillars)
-            gap = jnp.min(jnp.where(active, to_pillar, jnp.inf), axis=-1) - DRONE_RADIUS
-            gap = jnp.minimum(gap, jnp.min(jax.vmap(drone_distance)(position), axis=-1) - 2 * DRONE_RADIUS)
-            gap = jnp.minimum(gap, position[..., 2] - DRONE_RADIUS)
-            return (observation, state, jnp.minimum(least, gap)), ((shown, predicted) if record else None)
+            least = jnp.minimum(least, nearest_gap(self.settings, state))
+            return (observation, state, least), ((shown, predicted) if record else None)
 
         first = observation, state, jnp.full(tasks.pursuer_position.shape[:2], 9.0)
         (_, state, least), moments = jax.lax.scan(jax.checkpoint(one), first, None, length=steps)
@@ -162,7 +155,7 @@ class Starts:
     def loss(self, actor, before, tasks, keys, bounds, moments, hold: float):
         """What is learnt (): a smooth share of crashes, not to end fast or low, and to fly as `before` in the `moments`."""
         least, drones, _ = self.fly(actor, tasks, keys, bounds, STEPS)
-        crash = jnp.mean(jax.nn.sigmoid((3 * TOUCH - least) / SMOOTH))
+        crash = jnp.mean(crash_share(least))
         speed = jnp.sqrt(jnp.sum(drones.velocity**2, axis=-1) + 1e-9)
         end = jnp.mean(jax.nn.relu(speed - 1.0)) + jnp.mean(jax.nn.relu(0.35 - drones.position[..., 2]))
         mean, log_std = self.policy.distribution(before, *moments)

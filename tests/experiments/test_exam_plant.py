@@ -30,6 +30,7 @@ def fly(*numbers, causes=(), **changes):
             "name": f"case_{n}",
             "number": n,
             "missions": [(m,) for m in FLIGHTS[n]],
+            "ticks": [cases.TICKS] * len(FLIGHTS[n]),
             "sensors": drawn,
             "told": vehicle.Told(),
             "controller": "geometric",

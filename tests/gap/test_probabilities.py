@@ -11,7 +11,7 @@ from openjax.gap.selection import Gain
 from openjax.gap.shares import Share
 
 SENSORS = SimpleNamespace(findings={})
-QUIET = SimpleNamespace(predicted=np.zeros(6), local=())
+QUIET = SimpleNamespace(strange=SimpleNamespace(predicted=np.zeros(6)), local=())
 
 
 def said(effects, floors=None, offered=None, swaps=None, rest=QUIET, shares=None):

@@ -174,12 +174,12 @@ def make_adaptation(trained: TrainSettings, settings: AdaptSettings) -> Adaptati
         def one(carry, _):
             observation, state, least = carry
             observation, state = fly_on(actor, observation, state)
-            least = jnp.minimum(least, _gap(free, state))
+            least = jnp.minimum(least, nearest_gap(free, state))
             return (observation, state, least), (state.drones.position, state.drones.velocity)
 
         first = jax.vmap(pursuit.observe)(state), state, jnp.full(state.drones.position.shape[:2], jnp.inf)
         (_, end, least), (flown, speed) = jax.lax.scan(one, first, None, length=STEPS)
-        crash = jnp.mean(jax.nn.sigmoid((3 * TOUCH - least) / SMOOTH), axis=-1)
+        crash = jnp.mean(crash_share(least), axis=-1)
         fast = jnp.sqrt(jnp.sum(end.drones.velocity[:worlds] ** 2, axis=-1) + 1e-9) - 1.0
         low = 0.35 - end.drones.position[:worlds, :, 2]
         off = jnp.sum(((flown[:, worlds:] - position) / NEAR) ** 2, axis=-1)
@@ -235,8 +235,8 @@ def _start(game, key):
     return jax.tree.map(lambda a, b: jnp.where(half, a, b), near, task)
 
 
-def _gap(game, state):
-    """(W, N) m, from each pursuer to the nearest solid thing: pillar, pursuer or floor."""
+def nearest_gap(game: PursuitSettings, state: PursuitState) -> jax.Array:
+    """(W, N) m, from each pursuer of worlds (W, ...) to the nearest solid thing: pillar, pursuer or floor."""
     position, task = state.drones.position, state.task
     to_pillar = jax.vmap(lambda p, q: pillar_distance(game, p, q))(position, task.pillar_position)
     gap = jnp.min(jnp.where(task.pillar_active[:, None], to_pillar, jnp.inf), axis=-1) - DRONE_RADIUS
@@ -244,6 +244,11 @@ def _gap(game, state):
         others = jnp.min(jax.vmap(drone_distance)(position), axis=-1)
         gap = jnp.minimum(gap, others - 2 * DRONE_RADIUS)
     return jnp.minimum(gap, position[..., 2] - DRONE_RADIUS)
+
+
+def crash_share(gap: jax.Array) -> jax.Array:
+    """How much of a crash a least gap (m) counts as, from 0 to 1: what has a gradient before anything is touched."""
+    return jax.nn.sigmoid((3 * TOUCH - gap) / SMOOTH)
 
 
 @dataclass(frozen=True)
