@@ -116,6 +116,6 @@ def _material(selection: Selection, parts: Split) -> list[str]:
             return selection.gains[effect].floors >= BESIDE
         return path_of(effect) != "radio" or parts.effects[effect].value >= LEAST_SHARE
 
-    if order and parts.effects[order[0]].value < LEAST_SHARE:
+    if order and parts.effects[order[0]].value < LEAST_SHARE and parts.unexplained.value > UNKNOWN_SHARE:
         return []
     return [e for k, e in enumerate(order) if k == 0 or stays(e)]
