@@ -95,7 +95,7 @@ def _widened(replay, fit, table, now, singles):
             tried = [_mended(replay, _joined(replay, fit, singles, e), singles, e) for e in ranked]
         else:
             tried = _openings(replay, fit, left)
-        better = [f for f in tried if f and is_itself(replay, f) and f.score > fit.score + LEAST_NATS]
+        better = [f for f in tried if f is not None and f.score > fit.score + LEAST_NATS]
         for candidate in sorted(better, key=lambda f: -f.score):
             wider = build(replay, candidate, singles)
             whole = judge(wider, with_effects(wider))
@@ -128,7 +128,7 @@ def _openings(replay, nothing: SetFit, singles) -> list[SetFit]:
             key = frozenset((*fit.effects, effect))
             if key not in pairs:
                 pairs[key] = _joined(replay, fit, singles, effect)
-    return [*alone[: TRIED + 1], *pairs.values()]
+    return [*alone[: TRIED + 1], *(f for f in pairs.values() if is_itself(replay, f))]
 
 
 def testable(evidence: Evidence) -> dict[str, SetFit]:
@@ -207,7 +207,13 @@ def _mended(replay, fit: SetFit, singles, newest: str) -> SetFit | None:
     """The set without what isn't itself beside its `newest` effect, and with what promises most once that is gone; None where
     it is the newest that isn't itself. What explained two causes at once makes way for them so."""
     gone: set[str] = set()
-    while wrong := {*_entangled(fit), *_others(replay, fit)} - ({newest} if _entangled(fit) else set()):
+    while True:
+        entangled = _entangled(fit)
+        wrong = {*entangled, *_others(replay, fit)}
+        if not wrong:
+            break
+        if entangled:
+            wrong -= {newest}
         if newest in wrong:
             return None
         gone |= wrong

@@ -196,10 +196,15 @@ def _own_again(table: Table, model: Model, found: np.ndarray, track: int) -> Non
     shared, own = _nuisances(table, model)
     fixed = np.concatenate([model.free, shared])
     gram = sums[tracks == track].sum(0)
-    target = gram[:, 0] + gram[:, list(model.parts)].sum(1) - gram[:, fixed] @ found[: len(fixed)]
+    target = _target(gram, model) - gram[:, fixed] @ found[: len(fixed)]
     place = len(fixed) + len(own) * int(np.searchsorted(np.unique(table.track_of), track))
     hessian = np.eye(len(own)) + gram[np.ix_(own, own)]
     found[place : place + len(own)] = bounded(hessian, target[own], 0, model.bound)[0]
+
+
+def _target(gram: np.ndarray, model: Model) -> np.ndarray:
+    """(C,) products of every column with what the model has to explain."""
+    return gram[:, 0] + gram[:, list(model.parts)].sum(1)
 
 
 def _nuisances(table: Table, model: Model) -> tuple[np.ndarray, np.ndarray]:
@@ -219,7 +224,7 @@ def _equations(table: Table, model: Model, left_out: int | None) -> tuple[np.nda
     for track in names:
         used = [f for f in np.flatnonzero(tracks == track) if f != left_out]
         gram = sums[used].sum(0)
-        target = gram[:, 0] + gram[:, list(model.parts)].sum(1)
+        target = _target(gram, model)
         parts.append((gram[np.ix_(columns, columns)], target[columns]) if used else None)
     return normal_equations(model.precision, model.precision @ model.mean, len(shared), len(own), parts)
 
