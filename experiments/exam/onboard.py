@@ -18,7 +18,7 @@ def cross_matrix(a):
 
 
 def matrix_of(q):
-    """Rotation (3, 3), body to world."""
+    """Rotations (3, 3, ...), body to world, of unit quaternions (4, ...)."""
     w, x, y, z = q
     return np.array(
         [

@@ -10,6 +10,7 @@ vehicle's.
 import numpy as np
 
 from experiments.exam import vehicle as v
+from experiments.exam.onboard import matrix_of
 from experiments.exam.plant import PER_TICK, SAMPLE, Firmware
 from experiments.worlds.plant import air_of, limit_speed, sensors_of, solids_of
 from experiments.worlds.world import Poses, per_world
@@ -74,7 +75,7 @@ class Bodies:
 
     def _slope(self, s, speeds):
         model, q, rates, rotor = self.model, s[6:10], s[10:13], s[13:]
-        rotation = _rotation(q / np.sqrt((q * q).sum(axis=0)))
+        rotation = matrix_of((q / np.sqrt((q * q).sum(axis=0)))[[3, 0, 1, 2]])
         hubs = model.rotor_geometry  # (4, 3)
         force = np.zeros((3, 4, s.shape[1]))  # of each rotor, in the body frame
         force[2] = model.k_eta * rotor**2
@@ -111,18 +112,6 @@ class Bodies:
                 (speeds - rotor) / model.tau_m,
             ]
         )
-
-
-def _rotation(q):
-    """(3, 3, B) rotations body to world of unit quaternions (4, B) xyzw."""
-    x, y, z, w = q
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 class RotorPyWorld:
