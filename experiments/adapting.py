@@ -1,14 +1,16 @@
 """What adapting a policy to a diagnosed vehicle wins back, in that vehicle's own world.
 
     python -m experiments.adapting tune --cases DIR --policy flight --work DIR     (a GPU)
-    python -m experiments.adapting fly --cases DIR --policy flight --work DIR [--jobs N] [--episodes 100]     (CPU cores)
+    python -m experiments.adapting tune --cases DIR --policy flight --work OWN --long     (a GPU)
+    python -m experiments.adapting fly --cases DIR --policy flight --work DIR [--own OWN] [--jobs N] [--episodes 100]
 
 The vehicles are those of `experiments.task_gap`: the exam's plant with one cause each, their flights diagnosed by
 `openjax.gap`. `--cases` holds, of each, its NAME.json and NAME.toml (the effects that were found) as task_gap writes them.
-`tune` fine-tunes the policy to each; `fly` plays the same tasks in the plant with the vehicle that flew: the policy as it
-was, the adapted one, and the policy as it was on the plant's nominal vehicle. Loss is the difference to the latter. Without
---work it flies the policy as it was alone, which tells how much there is to win. Writes experiments/results/adapting.json
-and .md (--out).
+`tune` fine-tunes the policy to each as `openjax.adapt` does; with --long four times as long, and to that one vehicle without
+anything else that it might be: what training for it can reach. `fly` (CPU cores) plays the same tasks in the plant with the
+vehicle that flew: the policy as it was, the adapted ones, and the policy as it was on the plant's nominal vehicle. Loss is
+the difference to the latter. Without --work it flies the policy as it was alone, which tells how much there is to win. Writes
+experiments/results/adapting.json and .md (--out).
 """
 
 import dataclasses
@@ -26,7 +28,7 @@ from experiments.task_gap.flights import make_cases
 from experiments.task_gap.game import draw_tasks
 from experiments.worlds.game import play
 from experiments.worlds.plant import PlantWorld
-from openjax.adapt import compile_programs, scores_on
+from openjax.adapt import LOSSES, compile_programs, episodes, scores_on
 from openjax.commands.validation import uniform_tasks
 from openjax.files import read_json
 from openjax.learning.adaptation import (
@@ -43,6 +45,10 @@ from openjax.vehicle.effects.effects_file import load_intervals
 
 FIGURES = ("crashed", "collision_rate", "capture_step", "captured")
 NOMINAL = "nominal"
+WHICH = (NOMINAL, "before", "after", "own")
+ENDS = slice(None, 10), slice(-10, None)
+LONG = 4
+"""Times the updates of `openjax.adapt` for a vehicle's own policy."""
 
 
 def found_cases(options) -> list[str]:
@@ -55,12 +61,16 @@ def tune(options) -> None:
     """Fine-tune the policy to each vehicle; one compilation for all."""
     started = time.monotonic()
     loaded = load_policy(options.policy)
-    training = AdaptSettings(updates=options.updates)
+    training = AdaptSettings(
+        updates=options.updates * (LONG if options.long else 1),
+        learning_rate=options.learning_rate,
+        follow=options.follow,
+    )
     adaptation = make_adaptation(loaded.settings, training)
     parameters = starting_parameters(loaded.parameters, loaded.settings)
     game = adaptation.game
     tasks = uniform_tasks(game, options.look_at, game.max_pillars)
-    compile_programs(adaptation, parameters, tasks, bounds_of({}, {}))()
+    compile_programs(adaptation, parameters, tasks, bounds_of({}, {}, rest=0.0))()
     print(f"compiled in {time.monotonic() - started:.0f} s", flush=True)
     for number, name in enumerate(found_cases(options)):
         if time.monotonic() - started > options.seconds:
@@ -70,17 +80,36 @@ def tune(options) -> None:
         file = options.cases / f"{name}.toml"
         effects, values = load_effects(file)
         bounds = bounds_of(values, load_intervals(file))
+        if options.long:
+            exact = {
+                effect: {key: (value, value) for key, value in own.items()} for effect, own in values.items()
+            }
+            bounds = bounds_of(values, exact, rest=0.0)
         key = jax.random.key(number)
-        score = scores_on(adaptation, tasks, key, bounds)
+        score = scores_on(adaptation, parameters, tasks, key, bounds)
         tuned = fine_tune(adaptation, parameters, bounds, training, key, score)
         notes = {"effects": list(effects), "seconds": time.monotonic() - begin, "update": tuned.update}
         # the game without its family: flown elsewhere, it isn't needed, and all policies share one program
         settings = dataclasses.replace(loaded.settings, environment=dataclasses.replace(game, vehicles=()))
         save_policy_file(options.work / f"{name}.npz", tuned.parameters, settings, notes, "float32")
         looks = {update: round(value, 4) for update, value in tuned.looks.items()}
+        means = [np.mean([row[n] for row in tuned.history[part]]) for n in tuned.history[0] for part in ENDS]
+        learnt = "; ".join(
+            f"{n} {one:.4f} → {two:.4f}"
+            for n, one, two in zip(tuned.history[0], means[::2], means[1::2], strict=True)
+        )
+        flown = [
+            episodes(adaptation.evaluate(p, tasks, key, vehicles))
+            for p, vehicles in (
+                (parameters, bounds_of({}, {}, rest=0.0)),
+                (parameters, bounds),
+                (tuned.parameters, bounds),
+            )
+        ]
+        came = "; ".join(f"{n} " + " → ".join(f"{own[n].mean():.4f}" for own in flown) for n in LOSSES)
         print(
-            f"{name}: {', '.join(effects) or 'none'}; {notes['seconds']:.0f} s, kept {tuned.update} of {looks}; "
-            + "; ".join(f"{n} {tuned.history[0][n]:.4f} → {x:.4f}" for n, x in tuned.history[-1].items()),
+            f"{name}: {', '.join(effects) or 'none'}; {notes['seconds']:.0f} s, kept {tuned.update} of {looks}; {learnt}; "
+            f"here: {came}",
             flush=True,
         )
 
@@ -125,17 +154,18 @@ def study(options) -> dict:
     """Fly the adapted policies, and the policy as it was, in the plant."""
     started = time.monotonic()
     names = found_cases(options)
-    tuned = {} if options.work is None else {path.stem: str(path) for path in options.work.glob("*.npz")}
+    tuned, own = (
+        {} if folder is None else {path.stem: str(path) for path in folder.glob("*.npz")}
+        for folder in (options.work, options.own)
+    )
     if tuned:
         names = [name for name in names if name in tuned]
     latest = time.time() + options.seconds
     jobs = [
         (options.cases, name, which, policy, options.episodes, latest)
         for name in names
-        for which, policy in (
-            (NOMINAL, options.policy),
-            ("before", options.policy),
-            ("after", tuned.get(name)),
+        for which, policy in zip(
+            WHICH, (options.policy, options.policy, tuned.get(name), own.get(name)), strict=True
         )
         if policy is not None
     ]
@@ -152,7 +182,7 @@ def study(options) -> dict:
         "vehicles": {
             name: found[name] | {"found": load_effects(options.cases / f"{name}.toml")[0]}
             for name in names
-            if len(found.get(name, ())) == (3 if tuned else 2)
+            if {NOMINAL, "before", *(["after"] if tuned else [])} <= set(found.get(name, ()))
         },
     }
 
@@ -171,22 +201,33 @@ def drawn_anew(loss: np.ndarray, draws: int = 2000) -> np.ndarray:
     return loss.mean(axis=0)[episodes].mean(axis=1)
 
 
-def won_back(before: np.ndarray, after: np.ndarray, draws: int = 2000) -> tuple[float, float, float]:
-    """The share of the mean loss that is won back, and its 90 % interval by drawing episodes anew.
+def losing(loss: np.ndarray, errors: float = 2.0) -> np.ndarray:
+    """(V,) which vehicles lose by more than so many standard errors in every other one of their episodes (V, E).
 
-    Losses (V, E) before and after of the same episodes. All vehicles count: to leave out those that seem to lose nothing
-    would choose by chance, and count its return to the mean as won.
+    The others' losses aren't touched by that choice: to choose and to measure by the same episodes would count the return
+    to the mean as won.
     """
-    one, two = drawn_anew(before, draws), drawn_anew(after, draws)
-    low, high = np.nanpercentile(1 - two / np.where(np.abs(one) > 1e-12, one, np.nan), [5, 95])
-    share = 1 - after.mean() / before.mean() if before.mean() else float("nan")
-    return float(share), float(low), float(high)
+    half = loss[:, ::2]
+    return half.mean(axis=1) > errors * half.std(axis=1) / np.sqrt(half.shape[1])
+
+
+def share_won(before: np.ndarray, after: np.ndarray, floor: np.ndarray | float = 0.0) -> str:
+    """The share of the mean loss above the `floor` that is won back, and its 90 % interval by drawing episodes anew.
+
+    Losses (V, E) before and after, and of the vehicles' own policies, of the same episodes.
+    """
+    floor = np.broadcast_to(floor, before.shape)
+    whole, left = drawn_anew(before - floor), drawn_anew(after - floor)
+    low, high = np.nanpercentile(1 - left / np.where(np.abs(whole) > 1e-12, whole, np.nan), [5, 95])
+    if np.percentile(whole, 5) <= 0:
+        return "–"
+    return f"{1 - (after - floor).mean() / (before - floor).mean():.2f} [{low:.2f}, {high:.2f}]"
 
 
 def report(results: dict) -> list[str]:
     """The page."""
     vehicles = results["vehicles"]
-    steps = [step for step in (NOMINAL, "before", "after") if step in next(iter(vehicles.values()))]
+    steps = [step for step in WHICH if all(step in row for row in vehicles.values())]
     lines = [
         "# What adapting wins back",
         "",
@@ -222,22 +263,38 @@ def report(results: dict) -> list[str]:
     if "after" in steps:
         rows = []
         for figure in FIGURES:
-            before, after = (losses(vehicles, figure, which) for which in ("before", "after"))
-            share, low, high = won_back(before, after)
-            rows.append(
-                [
-                    figure,
-                    f"{before.mean():.4f}",
-                    f"{after.mean():.4f}",
-                    f"{share:.2f} [{low:.2f}, {high:.2f}]",
-                ]
-            )
+            found = {which: losses(vehicles, figure, which) for which in steps if which != NOMINAL}
+            chosen = losing(found["before"])
+            cells = [figure, f"{found['before'].mean():.4f}", f"{int(chosen.sum())} of {len(chosen)}"]
+            if chosen.any():
+                found = {which: loss[chosen, 1::2] for which, loss in found.items()}
+                own = found.get("own")
+                cells += [f"{found[which].mean():.4f}" if which in found else "" for which in WHICH[1:]]
+                cells.append(share_won(found["before"], found["after"]))
+                cells.append("" if own is None else share_won(found["before"], found["after"], own))
+            rows.append(cells + [""] * (8 - len(cells)))
         crashes = {
             which: np.array([row[which]["crashed"] for row in vehicles.values()]) > 0
             for which in ("before", "after")
         }
         lines += [
-            *table(["figure", "loss before", "loss after", "won back"], rows),
+            "Vehicles that lose are chosen by every other episode, and measured by the rest. Own: trained for that vehicle "
+            f"alone, {LONG} times as long; the last column is what is won back of what that wins. –: no difference beyond "
+            "chance.",
+            "",
+            *table(
+                [
+                    "figure",
+                    "mean loss, all vehicles",
+                    "vehicles that lose",
+                    "their loss before",
+                    "after",
+                    "own",
+                    "won back",
+                    "won back of what the own policy wins",
+                ],
+                rows,
+            ),
             "",
             f"Episodes that crashed after adapting and not before: {int((crashes['after'] & ~crashes['before']).sum())}; "
             f"before and not after: {int((crashes['before'] & ~crashes['after']).sum())}; of {crashes['after'].size}.",
@@ -249,7 +306,10 @@ def report(results: dict) -> list[str]:
             [
                 name,
                 ", ".join(row["found"]) or "none",
-                *(" → ".join(f"{np.mean(row[step][figure]):.4g}" for step in steps) for figure in FIGURES),
+                *(
+                    " → ".join(f"{np.mean(row[step][figure]):.4g}" for step in WHICH if step in row)
+                    for figure in FIGURES
+                ),
             ]
             for name, row in vehicles.items()
         ],
@@ -262,8 +322,12 @@ def main() -> None:
     parser.add_argument("what", choices=("tune", "fly"))
     parser.add_argument("--cases", type=Path, required=True)
     parser.add_argument("--work", type=Path, help="where the adapted policies are")
+    parser.add_argument("--own", type=Path, help="where the vehicles' own policies are")
+    parser.add_argument("--long", action="store_true", help="tune the vehicles' own policies")
     parser.add_argument("--policy", default="flight")
     parser.add_argument("--updates", type=int, default=AdaptSettings.updates)
+    parser.add_argument("--learning_rate", type=float, default=AdaptSettings.learning_rate)
+    parser.add_argument("--follow", type=float, default=AdaptSettings.follow)
     parser.add_argument("--look_at", type=int, default=1024, help="episodes by which the best step is chosen")
     parser.add_argument("--limit", type=int, default=0, help="vehicles at most; 0: all")
     parser.add_argument("--seconds", type=float, default=1e9, help="begin nothing new after this long")

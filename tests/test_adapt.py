@@ -16,6 +16,8 @@ from openjax.learning.adaptation import (
     bounds_of,
     clearly_better,
     fine_tune,
+    make_adaptation,
+    starting_parameters,
 )
 from openjax.learning.settings import GeneratorSettings, MappoSettings
 from openjax.policy import NetworkSettings, PolicyParameters, PredictorSettings
@@ -82,7 +84,7 @@ def test_the_best_step_on_the_way_is_kept():
     policy = PolicyParameters(actor=np.zeros(1), critic={}, predictor=np.zeros(1))
     training = AdaptSettings(updates=6, look_every=1)
     adaptation = SimpleNamespace(
-        fly=lambda parameters, key: None,
+        fly=lambda parameters, key, bounds: None,
         optimiser=SimpleNamespace(init=lambda actor: None),
         update=lambda actor, state, *_: (actor + 1.0, state, {}),
     )
@@ -92,6 +94,41 @@ def test_the_best_step_on_the_way_is_kept():
     assert tuned.update == 3 and tuned.parameters.actor[0] == 3.0 and len(tuned.looks) == 7
     worse = fine_tune(adaptation, policy, np.zeros((1, 4)), training, key, lambda p: -p.actor[:1])
     assert worse.update == 0 and worse.parameters.actor[0] == 0.0
+
+
+def test_what_is_won_back_is_the_share_of_a_loss_beyond_chance():
+    chance = np.random.default_rng(0).normal(0.0, 0.1, 400)
+    nominal = {name: np.ones(400) for name in adapt.LOSSES}
+    before = nominal | {"crash_rate": 1.5 + chance, "capture_step": 1.0 + chance - chance.mean()}
+    after = nominal | {"crash_rate": 1.1 + chance}
+    shares = adapt.won_back({"nominal": nominal, "before": before, "after": after})
+    assert shares["crash_rate"] == pytest.approx(0.8, abs=0.01)
+    assert shares["capture_step"] is None and shares["collision_rate"] is None
+
+
+def test_moments_in_flight_are_the_nominal_vehicles_with_a_settled_other_one(policy_file, monkeypatch):
+    """A heavy vehicle at a moment of the light one's flight: where that is, with rotors that carry its own weight."""
+    few = {name: family.known_effects()[name] for name in ("mass", "state_latency")}
+    monkeypatch.setattr(family, "known_effects", lambda: few)
+    loaded = load_policy(policy_file)
+    adaptation = make_adaptation(loaded.settings, AdaptSettings(worlds=2))
+    parameters = starting_parameters(loaded.parameters, loaded.settings)
+    bounds = bounds_of({"mass": {"extra": 0.008}}, {}, rest=0.0)
+    flights = adaptation.fly(parameters, jax.random.key(0), bounds)
+    nominal = adaptation.fly(parameters, jax.random.key(0), bounds_of({}, {}, rest=0.0))
+    own, other = flights.state.drones, nominal.state.drones
+    np.testing.assert_array_equal(own.position, other.position)
+    np.testing.assert_array_equal(
+        own.effect_memory["state_latency"]["pose"], other.effect_memory["state_latency"]["pose"]
+    )
+    np.testing.assert_array_equal(flights.position, nominal.position)
+    np.testing.assert_allclose(flights.state.vehicles["mass"]["extra"], 0.008, atol=1e-3)
+    np.testing.assert_array_equal(nominal.state.vehicles["mass"]["extra"], 0.0)
+    assert not np.allclose(own.rotor_speed, other.rotor_speed)
+    step = np.asarray(nominal.position)[0] - np.asarray(other.position)
+    np.testing.assert_allclose(
+        step, 0.01 * np.asarray(other.velocity), atol=2e-3
+    )  # the flight that goes on from there
 
 
 def test_a_policy_is_fine_tuned_measured_and_written(policy_file, tmp_path, monkeypatch):
@@ -115,6 +152,7 @@ def test_a_policy_is_fine_tuned_measured_and_written(policy_file, tmp_path, monk
     )
     assert changed == results["kept"].startswith("fine-tuned")
     assert len(results["looks"]) == 2  # before and after its one step
+    assert set(results["nominal"]) == set(adapt.FIGURES) and set(results["won_back"]) == set(adapt.LOSSES)
     with pytest.raises(UserError, match="already exists"):
         adapt.main([str(effects), "--policy", str(policy_file), "--out", str(command.out)])
 

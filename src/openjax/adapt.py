@@ -28,6 +28,11 @@ from openjax.ranges import Interval, Seed
 
 PROGRAM = "python -m openjax.adapt"
 FIGURES = ("capture_rate", "capture_step", "collision_rate", "crash_rate", "over_speed_rate")
+WHICH = ("nominal", "before", "after")
+LOSSES = ("crash_rate", "collision_rate", "capture_step")
+"""Figures that a vehicle can make worse, of which adapting is to win back what it can."""
+ERRORS = 2.0
+"""A loss is one that is larger than so many standard errors of the differences of single episodes."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +79,6 @@ def adapt(command: AdaptCommand) -> dict:
 
         from openjax.commands.machine import describe_machine
         from openjax.commands.validation import uniform_tasks
-        from openjax.learning import summarise
         from openjax.learning.adaptation import (
             bounds_of,
             fine_tune,
@@ -94,7 +98,8 @@ def adapt(command: AdaptCommand) -> dict:
         chosen_by = jax.tree.map(lambda leaf: leaf[: command.episodes], tasks)
         measured_on = jax.tree.map(lambda leaf: leaf[command.episodes :], tasks)
         parameters = starting_parameters(loaded.parameters, loaded.settings)
-        ready = compile_programs(adaptation, parameters, chosen_by, bounds_of({}, {}))
+        nominal = bounds_of({}, {}, rest=0.0)
+        ready = compile_programs(adaptation, parameters, chosen_by, nominal)
 
         effects = diagnosis()
         names, values = load_effects(effects)
@@ -103,13 +108,17 @@ def adapt(command: AdaptCommand) -> dict:
         bounds = bounds_of(values, intervals)
         ready()
         seconds["compiled"] = time.monotonic() - started
-        score = scores_on(adaptation, chosen_by, jax.random.fold_in(key, 1), bounds)
+        score = scores_on(adaptation, parameters, chosen_by, jax.random.fold_in(key, 1), bounds)
         tuned = fine_tune(adaptation, parameters, bounds, command.training, key, score)
         seconds["fine-tuned"] = time.monotonic() - started
-        before, after = (
-            summarise(adaptation.evaluate(p, measured_on, jax.random.fold_in(key, 2), bounds))
-            for p in (parameters, tuned.parameters)
-        )
+        flown = {
+            which: episodes(adaptation.evaluate(p, measured_on, jax.random.fold_in(key, 2), vehicles))
+            for which, p, vehicles in (
+                ("nominal", parameters, nominal),
+                ("before", parameters, bounds),
+                ("after", tuned.parameters, bounds),
+            )
+        }
         seconds["measured"] = time.monotonic() - started
     finally:
         diagnosis.stop()
@@ -126,8 +135,8 @@ def adapt(command: AdaptCommand) -> dict:
             if effect in values
         ],
         "episodes": command.episodes,
-        "before": {name: before[name] for name in FIGURES},
-        "after": {name: after[name] for name in FIGURES},
+        **{which: {name: float(own[name].mean()) for name in FIGURES} for which, own in flown.items()},
+        "won_back": won_back(flown),
         "kept": f"fine-tuned, as it was after step {tuned.update}"
         if tuned.update
         else "the policy as it was",
@@ -144,25 +153,49 @@ def adapt(command: AdaptCommand) -> dict:
     return results
 
 
-def scores_on(adaptation, tasks, key, bounds):
-    """Scores (B,) of a policy's episodes on tasks (B, ...), parameters -> scores, by which checkpoints are chosen, too."""
+def episodes(evaluation) -> dict:
+    """Figures (B,) of single episodes."""
+    import numpy as np
+
+    of = evaluation.statistics
+    names = {"capture_rate": of.captured, "crash_rate": of.crashed}
+    names |= {name: getattr(of, name) for name in ("collision_rate", "over_speed_rate", "capture_step")}
+    return {name: np.asarray(value, float) for name, value in names.items()}
+
+
+def scores_on(adaptation, parameters, tasks, key, bounds):
+    """Scores (B,) of a policy's episodes on tasks (B, ...), policy -> scores, by which checkpoints are chosen, too.
+
+    Speeds over the limit count as far as they are more than in the same episode of `parameters` with the nominal vehicle:
+    to fly as fast with the diagnosed one is what is wanted, and a vehicle that made a policy slower did nothing good by it.
+    """
     import numpy as np
 
     from openjax.commands.validation import selection_score
+    from openjax.learning.adaptation import bounds_of
 
-    def scores(parameters):
-        of = adaptation.evaluate(parameters, tasks, key, bounds).statistics
-        episodes = {
-            "capture_rate": of.captured,
-            "collision_rate": of.collision_rate,
-            "crash_rate": of.crashed,
-            "over_speed_rate": of.over_speed_rate,
-            "capture_step": of.capture_step,
-        }
-        episodes = {name: np.asarray(value, float) for name, value in episodes.items()}
-        return selection_score(episodes, adaptation.game.episode_length)
+    usual = episodes(adaptation.evaluate(parameters, tasks, key, bounds_of({}, {}, rest=0.0)))
+
+    def scores(policy):
+        found = episodes(adaptation.evaluate(policy, tasks, key, bounds))
+        found["over_speed_rate"] = np.maximum(found["over_speed_rate"], usual["over_speed_rate"])
+        return selection_score(found, adaptation.game.episode_length)
 
     return scores
+
+
+def won_back(flown: dict) -> dict[str, float | None]:
+    """Of each loss, before against nominal, the share that is none any more after; None where there was none beyond chance.
+
+    Args:
+      flown: {"nominal", "before", "after": figures (B,) of the same episodes}.
+    """
+    shares = {}
+    for name in LOSSES:
+        loss, left = (flown[which][name] - flown["nominal"][name] for which in ("before", "after"))
+        seen = loss.mean() > ERRORS * loss.std() / len(loss) ** 0.5
+        shares[name] = float(1.0 - left.mean() / loss.mean()) if seen else None
+    return shares
 
 
 def _check_flights(path):
@@ -213,12 +246,12 @@ def compile_programs(adaptation, parameters, tasks, bounds):
     from openjax.cluster.compilation import compile_ahead
 
     key = jax.random.key(0)
-    flights = jax.eval_shape(adaptation.fly, parameters, key)
+    flights = jax.eval_shape(adaptation.fly, parameters, key, bounds)
     state = jax.eval_shape(adaptation.optimiser.init, parameters.actor)
     waits = [
         compile_ahead(adaptation.update, parameters.actor, state, parameters, flights, key, bounds),
         compile_ahead(adaptation.evaluate, parameters, tasks, key, bounds),
-        compile_ahead(adaptation.fly, parameters, key),
+        compile_ahead(adaptation.fly, parameters, key, bounds),
     ]
     return lambda: [wait() for wait in waits]
 
@@ -226,13 +259,17 @@ def compile_programs(adaptation, parameters, tasks, bounds):
 def in_words(results: dict) -> list[str]:
     """What was found and gained."""
     effects = ", ".join(results["effects"]) or "no effect: the simulator is right to within the noise"
-    before, after = results["before"], results["after"]
     changes = "; ".join(
-        f"{name.replace('_', ' ')} {before[name]:.4g} → {after[name]:.4g}" for name in FIGURES
+        f"{name.replace('_', ' ')} " + " → ".join(f"{results[which][name]:.4g}" for which in WHICH)
+        for name in FIGURES
     )
+    shares = {name: share for name, share in results["won_back"].items() if share is not None}
+    won = ", ".join(f"{name.replace('_', ' ')} {share:.0%}" for name, share in shares.items())
     return [
         f"Found: {effects}.",
-        f"On {results['episodes']} tasks that neither was trained on, vehicles drawn from what was found: {changes}.",
+        f"On {results['episodes']} tasks that neither was trained on, with the nominal vehicle → with vehicles drawn from what "
+        f"was found, before → after: {changes}.",
+        f"Won back of what the vehicle costs: {won}." if won else "The vehicle costs nothing beyond chance.",
         f"Kept: {results['kept']}. {results['seconds']['measured']:.0f} s.",
     ]
 
@@ -246,7 +283,9 @@ def page(results: dict) -> str:
         if row["value"] is not None
     )
     figures = "".join(
-        f"<tr><td>{name.replace('_', ' ')}</td><td>{results['before'][name]:.4f}</td><td>{results['after'][name]:.4f}</td></tr>"
+        f"<tr><td>{name.replace('_', ' ')}</td>"
+        + "".join(f"<td>{results[which][name]:.4f}</td>" for which in WHICH)
+        + "</tr>"
         for name in FIGURES
     )
     words = "".join(f"<p>{html.escape(line)}</p>" for line in in_words(results))
@@ -257,7 +296,8 @@ def page(results: dict) -> str:
         "table{border-collapse:collapse;margin:1em 0}td,th{border-bottom:1px solid #ccc;padding:.2em 1em;text-align:left}"
         "img{max-width:100%}</style>"
         f"<h1>From flights to a better policy</h1>{words}"
-        f"<h2>What it gained</h2><table><tr><th></th><th>before</th><th>after</th></tr>{figures}</table>"
+        f"<h2>What it gained</h2><table><tr><th></th><th>nominal vehicle</th><th>before</th><th>after</th></tr>"
+        f"{figures}</table>"
         f"<img alt='what is learnt, update by update' src='data:image/png;base64,{_picture(results)}'>"
         f"<h2>The vehicle</h2><table><tr><th>parameter</th><th>found</th><th>drawn from</th></tr>{rows}</table>"
         "<p>Of effects that weren't found, a third of the ranges that real flights justify was drawn as well: "

@@ -1,8 +1,8 @@
 """Adapting a policy to one diagnosed vehicle by the gradient through the simulation, compiled before the diagnosis is known.
 
 Two things are learnt at once, from flights of half a second. From drawn starts, leaning and close to things: to touch
-nothing. From moments of the policy's flights with the nominal vehicle: to fly the diagnosed vehicle where and as fast as the
-policy flew the nominal one. The simulator's derivative says in one update what MAPPO has to find by trying.
+nothing. From moments of the policy's flights with the nominal vehicle: to fly the diagnosed vehicle, settled in flight, where
+and as fast as the policy flew the nominal one. The simulator's derivative says in one update what MAPPO has to find by trying.
 """
 
 import dataclasses
@@ -34,7 +34,7 @@ from openjax.pursuit import (
 from openjax.pursuit.collisions import TOUCH, drone_distance, pillar_distance
 from openjax.ranges import Interval, check_intervals
 from openjax.vehicle import load_vehicle
-from openjax.vehicle.family import adapted_family, draw_vehicles, family_bounds
+from openjax.vehicle.family import REST, adapted_family, draw_vehicles, family_bounds, known_effects
 from openjax.vehicle.solids import DRONE_RADIUS
 
 RATE_LOOP = 0.002
@@ -44,9 +44,10 @@ HISTORY = 12
 STEPS = 50
 """Control steps of the flights that are learnt from."""
 FLIGHT = 400
-"""Control steps of the flights with the nominal vehicle that these begin in, ..."""
-FIRST = 25
-"""... from this one on."""
+"""Control steps of the flights with the nominal vehicle that these begin in."""
+SETTLE = 40
+"""Control steps that the diagnosed vehicle flies up to such a moment, so that its controllers, rotors and the policy's
+memories are those of that vehicle, and not of one that has just been changed in flight."""
 SMOOTH = 0.012
 """Gap (m) over which a crash goes from sure to none in what is learnt."""
 NEAR, ALIKE = 0.02, 0.1
@@ -59,8 +60,8 @@ class AdaptSettings:
 
     worlds: Annotated[int | None, Interval("[1, 65536]")] = None
     """Worlds of each kind of flight in an update; by default 320 on an accelerator, 8 on a CPU: enough to see it work."""
-    updates: Annotated[int, Interval("[1, 1000000]")] = 40
-    look_every: Annotated[int, Interval("[1, 1000000]")] = 20
+    updates: Annotated[int, Interval("[1, 1000000]")] = 120
+    look_every: Annotated[int, Interval("[1, 1000000]")] = 40
     """Updates between looks at what the policy has become; the best of all looks is kept."""
     learning_rate: Annotated[float, Interval("(0, 1]")] = 3e-4
     """Adam step size at the start; falls linearly to a twentieth."""
@@ -95,22 +96,22 @@ def starting_parameters(parameters: PolicyParameters, trained: TrainSettings) ->
 
 @struct.dataclass
 class Flights:
-    """Moments of flights with the nominal vehicle, and what came after each."""
+    """Moments of flights with the nominal vehicle, and how that flew on from each."""
 
-    state: PursuitState  # (W, ...)
+    state: PursuitState  # (W, ...) where the nominal vehicle was; with vehicles of the bounds that are adapted to
     position: jax.Array  # (T, W, N, 3) m, after the steps that followed
     velocity: jax.Array  # (T, W, N, 3) m/s
 
 
 @dataclass(frozen=True)
 class Adaptation:
-    """The programs, not compiled yet; all but the first for vehicles whose bounds (R, 4) are an argument."""
+    """The programs, not compiled yet; vehicles' bounds (R, 4) are an argument."""
 
     game: PursuitSettings
     policy: Policy
     optimiser: optax.GradientTransformation
-    fly: Callable[[PolicyParameters, jax.Array], Flights]
-    """(parameters, key) -> moments of flights with the nominal vehicle."""
+    fly: Callable[[PolicyParameters, jax.Array, jax.Array], Flights]
+    """(parameters, key, bounds) -> moments of flights."""
     update: Callable[..., tuple[Any, Any, dict[str, jax.Array]]]
     """(actor, optimiser's state, parameters, flights, key, bounds) -> actor, state, metrics."""
     evaluate: Callable[[PolicyParameters, Task, jax.Array, jax.Array], Evaluation]
@@ -124,46 +125,53 @@ def make_adaptation(trained: TrainSettings, settings: AdaptSettings) -> Adaptati
     free = dataclasses.replace(game, physics="rigid", contacts=False)
     policy = make_policy(Pursuit(game), trained.network, trained.predictor)
     worlds = settings.worlds or (8 if jax.default_backend() == "cpu" else 320)
-    nominal = jnp.asarray(family_bounds(adapted_family({}, {}, rest=0.0)))
+    nominal = bounds_of({}, {}, rest=0.0)
     step_size = optax.linear_schedule(settings.learning_rate, 0.05 * settings.learning_rate, settings.updates)
     optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(step_size))
 
     def environment(settings, bounds):
         return Pursuit(settings, vehicle, vehicle_bounds=bounds)
 
-    def fly(parameters, key):
-        pursuit = environment(free, nominal)
-        task_key, reset_key, moment_key = jax.random.split(key, 3)
-        tasks = jax.vmap(lambda key: _task(free, key))(jax.random.split(task_key, 4 * worlds))
-        _, state = jax.vmap(pursuit.reset_to)(jax.random.split(reset_key, 4 * worlds), tasks)
-        moment = jax.random.randint(moment_key, (4 * worlds,), FIRST, FLIGHT - STEPS)
+    def fly(parameters, key, bounds):
+        pursuit, number = environment(free, nominal), 4 * worlds
+        task_key, reset_key, moment_key, vehicle_key = jax.random.split(key, 4)
+        tasks = jax.vmap(lambda key: _task(free, key))(jax.random.split(task_key, number))
+        _, state = jax.vmap(pursuit.reset_to)(jax.random.split(reset_key, number), tasks)
+        moment = jax.random.randint(moment_key, (number,), SETTLE, FLIGHT - STEPS)
         fly_on = _stepper(pursuit, policy, parameters)
 
         def one(carry, step):
-            observation, state, kept = carry
-            kept = jax.vmap(lambda now, a, b: jax.tree.map(lambda x, y: jnp.where(now, x, y), a, b))(
-                moment == step, state, kept
-            )
+            observation, state, before, kept = carry
+            before, kept = _kept(moment - SETTLE == step, state, before), _kept(moment == step, state, kept)
             observation, state = fly_on(parameters.actor, observation, state)
-            return (observation, state, kept), (state.drones.position, state.drones.velocity)
+            return (observation, state, before, kept), (state.drones.position, state.drones.velocity)
 
-        first = jax.vmap(pursuit.observe)(state), state, state
-        (_, _, kept), flown = jax.lax.scan(one, first, jnp.arange(FLIGHT))
+        first = jax.vmap(pursuit.observe)(state), state, state, state
+        (_, _, before, kept), flown = jax.lax.scan(one, first, jnp.arange(FLIGHT))
         after = moment + jnp.arange(STEPS)[:, None]  # (T, W)
-        position, velocity = (track[after, jnp.arange(4 * worlds)] for track in flown)
-        return Flights(kept, position, velocity)
+        position, velocity = (track[after, jnp.arange(number)] for track in flown)
+
+        drawn = jax.vmap(lambda key: draw_vehicles(free.vehicles, key, free.num_pursuers, 0.0, bounds))(
+            jax.random.split(vehicle_key, number)
+        )
+        pursuit, settled = environment(free, bounds), before.replace(vehicles=drawn)
+        fly_on = _stepper(pursuit, policy, parameters)
+        settled, _ = jax.lax.scan(
+            lambda carry, _: (fly_on(parameters.actor, *carry), None),
+            (jax.vmap(pursuit.observe)(settled), settled),
+            None,
+            length=SETTLE,
+        )
+        return Flights(_in_its_place(settled[1], kept), position, velocity)
 
     def begin(flights, key, bounds):
-        """Half of the worlds at starts, half in the flights, all with vehicles of the bounds; and the flights to follow."""
+        """Half of the worlds at starts, half in flight, all with vehicles of the bounds; and the flights to follow."""
         pursuit = environment(free, bounds)
-        task_key, reset_key, moment_key, vehicle_key = jax.random.split(key, 4)
+        task_key, reset_key, moment_key = jax.random.split(key, 3)
         tasks = jax.vmap(lambda key: _start(free, key))(jax.random.split(task_key, worlds))
         _, starts = jax.vmap(pursuit.reset_to)(jax.random.split(reset_key, worlds), tasks)
         chosen = jax.random.choice(moment_key, flights.position.shape[1], (worlds,), replace=False)
-        drawn = jax.vmap(lambda key: draw_vehicles(free.vehicles, key, free.num_pursuers, 0.0, bounds))(
-            jax.random.split(vehicle_key, worlds)
-        )
-        moments = jax.tree.map(lambda leaf: leaf[chosen], flights.state).replace(vehicles=drawn)
+        moments = jax.tree.map(lambda leaf: leaf[chosen], flights.state)
         state = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), starts, moments)
         return pursuit, state, flights.position[:, chosen], flights.velocity[:, chosen]
 
@@ -218,6 +226,34 @@ def _stepper(pursuit, policy, parameters):
         return observation, state
 
     return fly_on
+
+
+def _kept(now, state, kept):
+    """States (W, ...) of which those whose moment is `now` (W,) take the place of what was kept."""
+    return jax.vmap(lambda now, a, b: jax.tree.map(lambda x, y: jnp.where(now, x, y), a, b))(now, state, kept)
+
+
+def _in_its_place(settled: PursuitState, there: PursuitState) -> PursuitState:
+    """States `there` whose vehicles, as one would find them in flight, are those of `settled`.
+
+    Where they are and how they move, and what their sensors still show of that, is from `there`; rotors, controllers,
+    commands on the way, effects, and what the policy remembers of the vehicle from `settled`.
+    """
+    kinematic = ("position", "quaternion", "velocity", "body_rates", "previous_body_rates")
+    sensors = {name for name, effect in known_effects().items() if effect.sensor is not None}
+    memory = {
+        name: there.drones.effect_memory[name] if name in sensors else own
+        for name, own in settled.drones.effect_memory.items()
+    }
+    drones = settled.drones.replace(
+        **{name: getattr(there.drones, name) for name in kinematic}, effect_memory=memory
+    )
+    return there.replace(
+        vehicles=settled.vehicles,
+        drones=drones,
+        own_history=settled.own_history,
+        previous_action=settled.previous_action,
+    )
 
 
 def _task(game, key):
@@ -281,7 +317,7 @@ def fine_tune(
     """
     bounds = jnp.asarray(bounds)
     fly_key, update_key = jax.random.split(key)
-    flights = adaptation.fly(parameters, fly_key)
+    flights = adaptation.fly(parameters, fly_key, bounds)
     actor, state, history = parameters.actor, adaptation.optimiser.init(parameters.actor), []
     first = np.asarray(score(parameters))
     best, looks = (parameters, 0), {0: float(first.mean())}
@@ -306,6 +342,6 @@ def clearly_better(before: np.ndarray, after: np.ndarray, errors: float = 2.0) -
     return bool(gain.mean() > errors * gain.std() / np.sqrt(len(gain)))
 
 
-def bounds_of(values, intervals) -> jax.Array:
-    """(R, 4) bounds of the family of a diagnosed vehicle; see `adapted_family`."""
-    return jnp.asarray(family_bounds(adapted_family(values, intervals)))
+def bounds_of(values, intervals, rest: float = REST) -> jax.Array:
+    """(R, 4) bounds of the family of a diagnosed vehicle; see `adapted_family`. Of nothing found and no rest: nominal."""
+    return jnp.asarray(family_bounds(adapted_family(values, intervals, rest)))

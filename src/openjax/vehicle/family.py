@@ -208,10 +208,14 @@ FLIGHT_FAMILY: tuple[VehicleRange, ...] = tuple(
 )
 
 
+REST = 0.35
+"""The part of `FLIGHT_FAMILY`'s ranges that remains for what a diagnosis didn't find."""
+
+
 def adapted_family(
     values: dict[str, dict[str, float]],
     intervals: dict[str, dict[str, tuple[float, float]]],
-    rest: float = 0.35,
+    rest: float = REST,
 ) -> tuple[VehicleRange, ...]:
     """The family of one vehicle that was diagnosed: what was found, within its intervals, and a share of all else.
 
