@@ -31,6 +31,7 @@ from openjax.commands.evaluator import (
 from openjax.commands.training_loop import NotFiniteError, Plan, StopRequest, guarded, run_updates
 from openjax.commands.validation import SCORE_RULE, Validation, flat_metrics, selection_score
 from openjax.learning import TrainSettings, build, make_start, summarise
+from openjax.learning.analytic_gradient import AnalyticGradient, compile_analytic, free_flight
 from openjax.learning.train_state import policy_leaf
 from openjax.policy import PolicyParameters
 from openjax.policy.growth import with_longer_history
@@ -139,6 +140,8 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
             step_ready()
             if processes.is_first and not beside:
                 validation = in_background(prepare_validation)
+            if processes.is_first and settings.analytic.updates:
+                learn = in_background(functools.partial(_analytic_ready, job, abstract))
             outcome = run_updates(
                 step,
                 carry,
@@ -173,6 +176,9 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
                 f"go on with python -m openjax.train --resume {directory.path}"
             )
             return 0
+        if settings.analytic.updates:
+            progress.phase("learning by the gradient through the simulation")
+            progress.message(_learn_analytic(job, directory, learn(), validation()))
         table = _report(job, directory, validation(), outcome, progress)
     console.print(table)
     console.print(f"run, policy and pictures are in {directory.path}", soft_wrap=True)
@@ -202,9 +208,19 @@ def _validation_ready(job, abstract):
     """The validation, compiled; and what else is needed soon after the first update is loaded."""
     load_orbax()
     validation = _validation(job)
-    policy = abstract_like(abstract.policy, jax.sharding.SingleDeviceSharding(jax.local_devices()[0]))
-    validation.evaluator.compile_ahead(policy, validation.tasks)()
+    validation.evaluator.compile_ahead(_on_one_device(abstract.policy), validation.tasks)()
     return validation
+
+
+def _on_one_device(abstract):
+    return abstract_like(abstract, jax.sharding.SingleDeviceSharding(jax.local_devices()[0]))
+
+
+def _analytic_ready(job, abstract):
+    """The stage after MAPPO, being compiled while that learns."""
+    policy = build(job.settings, job.environment).policy
+    stage = AnalyticGradient(job.settings.analytic, free_flight(job.environment), policy)
+    return compile_analytic(stage, _on_one_device(abstract.policy))
 
 
 def _first_carry(job, start, abstract, directory, checkpoints, progress):
@@ -267,6 +283,26 @@ def _save_best(job, directory, checkpoints, outcome, warn):
         **job.facts,
     }
     save_policy_file(directory.policy, parameters, job.settings, notes, storage="float32")
+
+
+def _learn_analytic(job, directory, learn, validation):
+    """Take the run's policy through the last stage, and keep what it becomes if that validates better; a message."""
+    began, settings = time.monotonic(), job.settings
+    leaves, _, notes = load_policy_file(directory.policy)
+    before = fill(_abstract_parameters(job), leaves, str(directory.policy))
+    after, history = learn(before, jax.random.key(settings.seed))
+    summaries = [summarise(validation(parameters)[0]) for parameters in (before, after)]
+    scores = [selection_score(summary, settings.environment.episode_length) for summary in summaries]
+    kept = scores[1] > scores[0]
+    facts = {"seconds": round(time.monotonic() - began, 1), "kept": kept, "validation_scores": scores}
+    if kept:
+        notes = {**notes, "validation_score": scores[1], "analytic_updates": len(history)}
+        save_policy_file(directory.policy, after, settings, notes, storage="float32")
+    write_json(directory.path / "analytic.json", {**facts, "validation": summaries, "history": history})
+    return (
+        f"by the gradient through the simulation: validation score {scores[0]:.4f} -> {scores[1]:.4f}"
+        f"{'' if kept else ', not kept'}, {facts['seconds']:.0f} s"
+    )
 
 
 def _report(job, directory, validation, outcome, progress):

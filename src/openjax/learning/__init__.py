@@ -7,7 +7,15 @@ __getattr__, __dir__, __all__ = lazy_names(
     {
         **dict.fromkeys(("EpisodeRecord", "Evaluation", "make_evaluate", "summarise"), "evaluation"),
         **dict.fromkeys(
-            ("PRESETS", "GeneratorSettings", "MappoSettings", "TrainSettings", "changed", "preset"),
+            (
+                "PRESETS",
+                "AnalyticSettings",
+                "GeneratorSettings",
+                "MappoSettings",
+                "TrainSettings",
+                "changed",
+                "preset",
+            ),
             "settings",
         ),
         **dict.fromkeys(

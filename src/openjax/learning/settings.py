@@ -89,6 +89,31 @@ class GeneratorSettings:
 
 
 @dataclass(frozen=True)
+class AnalyticSettings:
+    """The stage after MAPPO by the gradient through the simulation; see `openjax.learning.analytic_gradient`."""
+
+    updates: Annotated[int, Interval("[0, 1000000]")] = 0
+    """Updates of the actor; 0: there is no such stage."""
+    worlds: Annotated[int, Interval("[1, 65536]")] = 320
+    """Starts in an update, and as many moments of flights."""
+    learning_rate: Annotated[float, Interval("(0, 1]")] = 3e-4
+    """Adam step size at the start; falls linearly to a twentieth."""
+    hold: Annotated[float, Interval("[0, 1000]")] = 0.05
+    """Weight of the squared change of the actions in flight, in standard deviations of the policy's."""
+    breach: Annotated[float, Interval("[0, 1000]")] = 1.0
+    """Weight of the breaches per step, beside the share of pursuers that touch something."""
+    speed: Annotated[float, Interval("[0, 1000]")] = 0.3
+    """Weight of speeds over the limit."""
+    speed_from: Annotated[float, Interval("[0, 10]")] = 0.97
+    """Share of the maximal speed from which the speed costs."""
+    nominal: Annotated[float, Interval("[0, 1]")] = 0.25
+    """Share of the worlds whose vehicles are nominal ones instead of the family's."""
+
+    def __post_init__(self):
+        check_intervals(self, "analytic.")
+
+
+@dataclass(frozen=True)
 class TrainSettings:
     """Everything that determines a run. A run's result depends on nothing else but the machine's arithmetic."""
 
@@ -97,6 +122,7 @@ class TrainSettings:
     predictor: PredictorSettings = field(default_factory=PredictorSettings)
     mappo: MappoSettings = field(default_factory=MappoSettings)
     generator: GeneratorSettings = field(default_factory=GeneratorSettings)
+    analytic: AnalyticSettings = field(default_factory=AnalyticSettings)
     num_envs: Annotated[int, Interval("[1, 16777216]")] = 2560
     """Worlds that are simulated at once."""
     rollout_length: Annotated[int, Interval("[1, 100000]")] = 80

@@ -1,0 +1,275 @@
+"""The last stage of a policy that is to be flown: the gradient through the simulation (analytic policy gradient).
+
+MAPPO is a poor teacher of what is decided within tenths of a second. Starts lean by up to 36 degrees, some beside a pillar or
+another pursuer; its noise averages out in the motors, and a crash says little of what would have avoided it. The equations of
+motion know. Here the actor follows the gradient of smooth shares of crashes, breaches and speeds over the limit through half
+seconds of free flight, from leaning starts and from moments of its own flights (Xu et al. 2022, short-horizon actor-critic,
+without the critic). All else is held to what it did.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from openjax.cluster.compilation import in_background
+from openjax.learning.adaptation import crash_share, nearest_gap
+from openjax.learning.settings import AnalyticSettings
+from openjax.policy import Policy, PolicyParameters
+from openjax.pursuit import (
+    Pursuit,
+    PursuitSettings,
+    PursuitState,
+    RewardSettings,
+    Task,
+    close_starts,
+    turn_task,
+    uniform_task,
+)
+from openjax.pursuit.collisions import drone_distance, pillar_distance
+from openjax.vehicle.family import family_bounds, narrowed_bounds
+
+STEPS = 50
+"""Control steps that are learnt at once."""
+SEGMENTS = 8
+"""A flight is looked at after each of so many times `STEPS`."""
+SMOOTH = 0.012
+"""Distance (m) over which a breach goes from sure to none in what is learnt."""
+FAST = 0.05
+"""Speed (m/s) above where the speed begins to cost that costs as much as a crash in every step would."""
+LOWEST, FASTEST = 0.35, 1.0
+"""Height (m) below, and speed (m/s) above which the end of a start costs."""
+CLOSE, SIDE_BY_SIDE = 0.45, 0.35
+"""Shares of the starts close to something (70 % of the pursuers), and of those in which all stand side by side."""
+APART = 0.1
+"""Farthest gap beyond the safety distance of pursuers side by side (m)."""
+
+
+def side_by_side(settings: PursuitSettings, key: jax.Array, task: Task) -> Task:
+    """A task whose pursuers all start beside one before them; as it was where that would breach something."""
+    position = task.pursuer_position
+    for i, own_key in enumerate(jax.random.split(key, position.shape[0] - 1), start=1):
+        which_key, direction_key, gap_key = jax.random.split(own_key, 3)
+        away = jax.random.normal(direction_key, (3,)) * jnp.array([1.0, 1.0, 0.3])
+        gap = settings.drone_clearance + jax.random.uniform(gap_key, (), maxval=APART)
+        beside = position[jax.random.randint(which_key, (), 0, i)] + gap * away / jnp.linalg.norm(away)
+        position = position.at[i].set(beside)
+    pillars = jnp.linalg.norm(position[:, None, :2] - task.pillar_position[None], axis=-1)
+    room = settings.pillar_radius + settings.pillar_clearance
+    clear = ~jnp.any(task.pillar_active & (pillars < room)) & jnp.all(
+        drone_distance(position) >= settings.drone_clearance - 1e-4
+    )
+    return task.replace(pursuer_position=jnp.where(clear, position, task.pursuer_position))
+
+
+def draw_start(settings: PursuitSettings, key: jax.Array) -> Task:
+    """A task to learn from: close to something, side by side, or any."""
+    task_key, turn_key, start_key, choice_key = jax.random.split(key, 4)
+    task = turn_task(turn_key, uniform_task(settings, task_key))
+    near = close_starts(settings, start_key, task, 0.7)
+    beside = side_by_side(settings, start_key, task) if settings.num_pursuers > 1 else near
+    kind = jax.random.uniform(choice_key)
+    return jax.tree.map(
+        lambda a, b, c: jnp.where(kind < CLOSE, a, jnp.where(kind < CLOSE + SIDE_BY_SIDE, b, c)),
+        near,
+        beside,
+        task,
+    )
+
+
+@dataclass(frozen=True)
+class AnalyticGradient:
+    """A policy's game in free flight, and what is learnt in it. `World`s are observations and states (B, ...)."""
+
+    how: AnalyticSettings
+    environment: Pursuit
+    """See `free_flight`."""
+    policy: Policy
+
+    @property
+    def game(self) -> PursuitSettings:
+        """The environment's settings."""
+        return self.environment.settings
+
+    def shown(self, observation, state):
+        """What the actor is shown of worlds (B, ...): their observations."""
+        del state
+        return observation
+
+    def begin(self, tasks: Task, keys: jax.Array, bounds: jax.Array):
+        """Worlds of tasks (B, ...) whose vehicles have bounds (B, R, 4)."""
+
+        def one(key, task, bounds):
+            return self.environment.with_bounds(bounds).reset_to(key, task)
+
+        return jax.vmap(one)(keys, tasks, bounds)
+
+    def inputs(self, parameters: PolicyParameters, observation, state):
+        """What the actor acts on: observations and predictions, without a gradient through the predictor."""
+        predicted = jax.lax.stop_gradient(self.policy.predict(parameters, observation))
+        return self.shown(observation, state), predicted
+
+    def fly(self, actor: Any, parameters: PolicyParameters, world, steps: int):
+        """Worlds some steps later.
+
+        Returns:
+          the worlds; (B, N) least gaps to anything solid (m), mean number of breaches and mean excess of speed, all smooth.
+        """
+        step = jax.vmap(self.environment.step, in_axes=(None, 0, 0))
+        limit = self.how.speed_from * self.game.max_speed
+
+        def one(carry, _):
+            (observation, state), least, breach, excess = carry
+            inputs = self.inputs(parameters, observation, state)
+            action = self.policy.action(self.policy.distribution(actor, *inputs)[0], observation)
+            observation, state, *_ = step(jax.random.key(0), state, action)
+            least = jnp.minimum(least, nearest_gap(self.game, state))
+            breach = breach + breach_share(self.game, state)
+            excess = excess + jax.nn.relu(_speed(state.drones) - limit) / FAST
+            return ((observation, state), least, breach, excess), None
+
+        shape = world[1].drones.position.shape[:2]
+        first = world, jnp.full(shape, jnp.inf), jnp.zeros(shape), jnp.zeros(shape)
+        (world, least, breach, excess), _ = jax.lax.scan(jax.checkpoint(one), first, None, length=steps)
+        return world, least, breach / steps, excess / steps
+
+    def starts(self, key: jax.Array, bounds: jax.Array):
+        """Worlds to learn from, at their starts; bounds (B, R, 4)."""
+        task_key, reset_key = jax.random.split(key)
+        number = bounds.shape[0]
+        tasks = jax.vmap(lambda key: draw_start(self.game, key))(jax.random.split(task_key, number))
+        return self.begin(tasks, jax.random.split(reset_key, number), bounds)
+
+    def flights(self, parameters: PolicyParameters, key: jax.Array, bounds: jax.Array):
+        """Worlds (SEGMENTS * B, ...) at moments of the policy's flights."""
+
+        def segment(world, _):
+            world = self.fly(parameters.actor, parameters, world, STEPS)[0]
+            return world, world
+
+        worlds = jax.lax.scan(segment, self.starts(key, bounds), None, length=SEGMENTS)[1]
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), worlds)
+
+    def loss(self, actor: Any, parameters: PolicyParameters, starts, flying):
+        """What is learnt (), and its parts. `parameters` are the policy's before."""
+        how, number = self.how, starts[1].step.shape[0]
+        inputs = self.inputs(parameters, *flying)
+        mean, log_std = self.policy.distribution(parameters.actor, *inputs)
+        change = (self.policy.distribution(actor, *inputs)[0] - mean) * jnp.exp(-log_std)
+        worlds = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), starts, flying)
+        (_, end), least, breach, excess = self.fly(actor, parameters, worlds, STEPS)
+        crash, drones = crash_share(least), jax.tree.map(lambda leaf: leaf[:number], end.drones)
+        fast, low = _speed(drones) - FASTEST, LOWEST - drones.position[..., 2]
+        parts = {
+            "crashes_from_starts": jnp.mean(crash[:number]),
+            "crashes_in_flight": jnp.mean(crash[number:]),
+            "breaches": jnp.mean(breach),
+            "speed": jnp.mean(excess),
+            "ends": jnp.mean(jax.nn.relu(fast)) + jnp.mean(jax.nn.relu(low)),
+            "change": jnp.mean(jnp.sum(change**2, axis=-1)),
+        }
+        weights = (1.0, 1.0, how.breach, how.speed, 0.2, how.hold)
+        return sum(weight * part for weight, part in zip(weights, parts.values(), strict=True)), parts
+
+    def update(self, actor: Any, state: Any, parameters: PolicyParameters, flights, key: jax.Array):
+        """The actor and its optimiser's state after an update, and the loss's parts."""
+        start_key, choice_key = jax.random.split(key)
+        bounds = self.bounds()
+        moments = flights[1].step.shape[0]
+        chosen = jax.random.randint(choice_key, (self.how.worlds,), 0, moments)
+        flying = jax.tree.map(lambda leaf: leaf[chosen], flights)
+        starts = self.starts(start_key, bounds)
+        gradient, parts = jax.grad(self.loss, has_aux=True)(actor, parameters, starts, flying)
+        # a world that tumbles may have no gradient
+        finite = jnp.isfinite(optax.global_norm(gradient))
+        gradient = jax.tree.map(lambda leaf: jnp.where(finite, leaf, 0.0), gradient)
+        change, state = self.optimiser.update(gradient, state)
+        return optax.apply_updates(actor, change), state, parts
+
+    def bounds(self) -> jax.Array:
+        """(B, R, 4) of each world's vehicles: the game's family, and a share of nominal ones."""
+        family, worlds = self.game.vehicles, self.how.worlds
+        if not family:
+            return jnp.zeros((worlds, 0, 4))
+        plain = jnp.arange(worlds)[:, None, None] < self.how.nominal * worlds
+        return jnp.where(plain, narrowed_bounds(family, 0.0), jnp.asarray(family_bounds(family)))
+
+    @functools.cached_property
+    def optimiser(self) -> optax.GradientTransformation:
+        """Adam with clipped gradients; its step size falls linearly to a twentieth."""
+        rate = self.how.learning_rate
+        schedule = optax.linear_schedule(rate, 0.05 * rate, max(self.how.updates, 1))
+        return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
+
+
+def free_flight(environment: Pursuit, game: PursuitSettings | None = None) -> Pursuit:
+    """`environment` as it is learnt in: nothing is solid while the gradient is taken, a crash is told by the gap."""
+    free = dataclasses.replace(
+        game or environment.settings,
+        physics="rigid",
+        contacts=False,
+        speed_limit="none",
+        reward=RewardSettings(),
+    )
+    return Pursuit(free, environment.vehicle, environment.effects, environment.effect_parameters)
+
+
+def breach_share(game: PursuitSettings, state: PursuitState) -> jax.Array:
+    """(W, N) smooth number of breaches of each pursuer in worlds (W, ...); `openjax.pursuit.collisions.breaches`."""
+    position, task = state.drones.position, state.task
+    to_pillar = jax.vmap(lambda p, q: pillar_distance(game, p, q))(position, task.pillar_position)
+    to_pillar = jnp.where(task.pillar_active[:, None], to_pillar, jnp.inf) - game.pillar_clearance
+    to_drone = jax.vmap(drone_distance)(position) - game.drone_clearance
+    to_wall = game.arena_radius - jnp.sqrt(jnp.sum(position[..., :2] ** 2, axis=-1) + 1e-12)
+    to_ceiling = game.arena_height - position[..., 2]
+
+    def near(distance):
+        return jax.nn.sigmoid((SMOOTH - distance) / SMOOTH)
+
+    total = jnp.sum(near(to_pillar), axis=-1) + jnp.sum(near(to_drone), axis=-1)
+    return total + near(to_wall) + near(to_ceiling)
+
+
+def _speed(drones):
+    return jnp.sqrt(jnp.sum(drones.velocity**2, axis=-1) + 1e-9)
+
+
+def compile_analytic(
+    gradient: AnalyticGradient, parameters: PolicyParameters
+) -> Callable[[PolicyParameters, jax.Array], tuple[PolicyParameters, list[dict[str, float]]]]:
+    """Start to compile the stage for parameters of these shapes (or abstract ones), in the background.
+
+    Returns:
+      the stage, which waits for the compiler: (parameters, key) -> parameters, metrics of each update.
+    """
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    record = jax.jit(lambda parameters, key: gradient.flights(parameters, key, gradient.bounds()))
+    actor, flights = parameters.actor, jax.eval_shape(record, parameters, key)
+    state = jax.eval_shape(gradient.optimiser.init, actor)
+    update = jax.jit(gradient.update)
+    lowered = record.lower(parameters, key), update.lower(actor, state, parameters, flights, key)
+    ready = [in_background(program.compile) for program in lowered]
+
+    def learn(parameters, key, look=None):
+        record, update = (wait() for wait in ready)
+        flight_key, update_key = jax.random.split(key)
+        actor, state = parameters.actor, gradient.optimiser.init(parameters.actor)
+        flights, history = record(parameters, flight_key), []
+        for number in range(gradient.how.updates):
+            if look is not None:
+                look(number, actor)
+            actor, state, parts = update(
+                actor, state, parameters, flights, jax.random.fold_in(update_key, number)
+            )
+            history.append(parts)
+        if look is not None:
+            look(gradient.how.updates, actor)
+        history = [{name: float(value) for name, value in parts.items()} for parts in jax.device_get(history)]
+        return parameters.replace(actor=actor), history
+
+    return learn

@@ -1,0 +1,94 @@
+"""The stage by the gradient through the simulation: its starts, what it counts, and that it learns it."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from openjax.learning import AnalyticSettings
+from openjax.learning.analytic_gradient import (
+    APART,
+    AnalyticGradient,
+    breach_share,
+    compile_analytic,
+    free_flight,
+    side_by_side,
+)
+from openjax.policy import NetworkSettings, Policy, PredictorSettings
+from openjax.pursuit import Pursuit, PursuitSettings, uniform_task
+from openjax.pursuit.collisions import breaches
+from openjax.pursuit.task import starts_clear
+
+GAME = PursuitSettings(min_pillars=0, max_pillars=1)
+
+
+def test_all_stand_side_by_side():
+    keys = jax.random.split(jax.random.key(0), 64)
+    before = jax.vmap(lambda key: uniform_task(GAME, key))(keys)
+    tasks = jax.vmap(lambda key, task: side_by_side(GAME, key, task))(keys, before)
+    position = np.asarray(tasks.pursuer_position)
+    apart = np.linalg.norm(position[:, :, None] - position[:, None], axis=-1) + 9 * np.eye(3)
+    moved = (position != np.asarray(before.pursuer_position)).any((1, 2))
+    assert moved.mean() > 0.5
+    assert (apart[moved].min(2) < GAME.drone_clearance + APART + 1e-4).all()
+    near = dataclasses.replace(
+        GAME, drone_clearance=GAME.drone_clearance - 0.01
+    )  # outside the arena counts, too
+    clear = jax.vmap(
+        lambda task: starts_clear(dataclasses.replace(near, arena_radius=9.0, arena_height=9.0), task)
+    )
+    assert np.asarray(clear(tasks))[moved].all()
+
+
+@pytest.fixture(scope="module")
+def stage():
+    """A stage of a small network on a family of one effect, and its parameters."""
+    game = PursuitSettings(
+        physics="rigid", max_pillars=4, vehicles=(("rotor_drag.d_xy", 0.0, 0.01, 0.0, 0.02),)
+    )
+    policy = Policy.for_environment(
+        Pursuit(game), NetworkSettings(features=8, heads=1), PredictorSettings(enabled=False)
+    )
+    how = AnalyticSettings(updates=6, worlds=4, learning_rate=3e-3, hold=0.0)
+    environment = free_flight(Pursuit(game))
+    observation, _ = environment.reset(jax.random.key(0))
+    return AnalyticGradient(how, environment, policy), policy.init(jax.random.key(1), observation)
+
+
+def test_smooth_breaches_are_those_of_the_game(stage):
+    game = stage[0].game
+    key = jax.random.split(jax.random.key(2), 3)
+    tasks = jax.vmap(lambda key: uniform_task(game, key))(jax.random.split(key[0], 256))
+    _, state = jax.vmap(stage[0].environment.reset_to)(jax.random.split(key[1], 256), tasks)
+    position = jax.random.uniform(key[2], (256, 3, 3), minval=-0.6, maxval=0.6) * jnp.array([2.0, 2.0, 2.2])
+    state = state.replace(drones=state.drones.replace(position=position))
+    counted = jax.vmap(lambda p, t: breaches(game, p, t.pillar_position, t.pillar_active).total)
+    hard, smooth = np.asarray(counted(position, tasks)), np.asarray(breach_share(game, state))
+    assert 0.2 < (hard > 0).mean() < 0.9
+    assert (smooth > 0.7 * hard).all()
+    assert np.abs(smooth - hard).mean() < 0.1
+
+
+def test_gradient_is_that_of_the_loss_and_learning_follows_it(stage):
+    gradient, parameters = stage
+    starts = gradient.starts(jax.random.key(3), gradient.bounds())
+
+    @jax.jit
+    def loss(actor):
+        return gradient.loss(actor, parameters, starts, starts)[0]
+
+    value, slope = jax.jit(jax.value_and_grad(loss))(parameters.actor)
+    steepness, step = float(optax.global_norm(slope)), 1e-3
+    direction = jax.tree.map(lambda leaf: leaf / steepness, slope)
+
+    def moved(size):
+        return loss(jax.tree.map(lambda leaf, along: leaf + size * along, parameters.actor, direction))
+
+    assert moved(step) - moved(-step) == pytest.approx(2 * step * steepness, rel=0.1)
+    learnt, history = compile_analytic(gradient, parameters)(parameters, jax.random.key(4))
+    assert len(history) == gradient.how.updates
+    assert all(np.isfinite(list(parts.values())).all() for parts in history)
+    assert loss(learnt.actor) < value
