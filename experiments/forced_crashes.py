@@ -17,7 +17,7 @@ import numpy as np
 
 from experiments.hard_tasks import close, drawn
 from experiments.pages import page_parser, publish, table, where
-from experiments.vehicles import WHOLE, program, vehicles, widened
+from experiments.vehicles import NAMES, WHOLE, program, vehicles, widened
 from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import layout_slots, repeat_task
 from openjax.commands.validation import uniform_tasks
@@ -123,6 +123,14 @@ def game(settings: PursuitSettings) -> PursuitSettings:
     )
 
 
+def one_vehicle(values: dict[str, str]) -> np.ndarray:
+    """Bounds (R, 4) of the vehicle that has these parameters beside the nominal ones."""
+    bounds = vehicles()["nominal"].copy()
+    for name, value in values.items():
+        bounds[NAMES.index(name)] = float(value)
+    return bounds
+
+
 def all_tasks(settings: PursuitSettings, number: int, layouts: int):
     """Tasks by kind, with as many pillar slots as the layouts need."""
     slots = layout_slots(settings)
@@ -167,8 +175,10 @@ def study(options) -> dict:
     key = jax.random.key(0)
     keys = jax.random.split(jax.random.split(key)[0], int(ends[-1]))  # as `make_evaluate` draws the starts
     figures: dict[str, dict[str, dict]] = {}
-    for vehicle in KINDS:
-        bounds = vehicles()[vehicle]
+    kinds = {name: vehicles()[name] for name in options.vehicles}
+    if options.own:
+        kinds[" ".join(options.own)] = one_vehicle(dict(word.split("=") for word in options.own))
+    for vehicle, bounds in kinds.items():
         crashes = {}
         for name, loaded in policies.items():
             run = program(game(loaded.settings.environment), loaded.policy)
@@ -229,6 +239,8 @@ def main(arguments: list[str]) -> int:
     parser.add_argument(
         "--policy", nargs="+", default=["flight", "no_clamp_seed_0"], help="names, runs or policy files"
     )
+    parser.add_argument("--vehicles", nargs="*", choices=list(vehicles()), default=KINDS)
+    parser.add_argument("--own", nargs="*", metavar="PARAMETER=VALUE", help="one more vehicle")
     parser.add_argument("--number", type=int, default=1024, help="tasks of each kind")
     parser.add_argument("--layouts", type=int, default=100, help="episodes of each layout; 0: none")
     parser.add_argument("--samples", type=int, default=Search().samples, help="plans of a round")
