@@ -20,7 +20,7 @@ from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import layout_slots, repeat_task
 from openjax.commands.validation import uniform_tasks
 from openjax.learning import make_evaluate, summarise
-from openjax.pursuit import SCENARIOS, Pursuit, RewardSettings, scenario_task
+from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, RewardSettings, scenario_task
 from openjax.store.policies import load_policy
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.family import FLIGHT_FAMILY, family_bounds, find_parameter
@@ -86,7 +86,11 @@ def fly(
         max_pillars=layout_slots(loaded.settings.environment),
         reward=RewardSettings(),  # counts for nothing here: the same program for policies that differ in it
     )
-    drawn_from = loaded.settings.environment
+    # the same tasks for policies that were trained with fewer pillars
+    paper = PursuitSettings()
+    drawn_from = dataclasses.replace(
+        loaded.settings.environment, min_pillars=paper.min_pillars, max_pillars=paper.max_pillars
+    )
     slots = game.max_pillars
     tasks = {
         "uniform": uniform_tasks(drawn_from, number, slots),
