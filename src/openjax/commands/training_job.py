@@ -219,6 +219,8 @@ def _on_one_device(abstract):
 def _analytic_ready(job, abstract):
     """The stage after MAPPO, being compiled while that learns."""
     policy = build(job.settings, job.environment).policy
+    # fifty steps of the simulation follow each action: too far for the gradient of rough arithmetic
+    policy = dataclasses.replace(policy, network=dataclasses.replace(policy.network, compute_type="float32"))
     stage = AnalyticGradient(job.settings.analytic, free_flight(job.environment), policy)
     return compile_analytic(stage, _on_one_device(abstract.policy))
 
