@@ -143,6 +143,23 @@ def test_velocity_is_derived_where_it_is_missing(sample_columns):
     assert np.sqrt(np.mean((kept.velocity - logged) ** 2)) < 0.02  # m/s; the logged one has 0.005 of noise
 
 
+def test_a_velocity_that_missing_rows_have_spoilt_is_taken_from_the_position(sample_columns):
+    columns = {k: v for k, v in sample_columns["flight_b"].items()}
+    position = np.stack([columns[n] for n in "xyz"], 1)
+    kept = np.random.default_rng(0).random(len(position)) > 0.02
+    half, step = 3, columns["t"][1] - columns["t"][0]
+    rows = np.flatnonzero(kept)
+    ahead, behind = np.clip([np.arange(len(rows)) + half, np.arange(len(rows)) - half], 0, len(rows) - 1)
+    # as if all rows were a step apart
+    spoilt = (position[rows[ahead]] - position[rows[behind]]) / (2 * half * step)
+    true = np.stack([columns[n] for n in ("vx", "vy", "vz")], 1)[rows]
+    columns = {k: v[rows] for k, v in columns.items()} | dict(zip(("vx", "vy", "vz"), spoilt.T, strict=True))
+    flight, issues = check(columns)
+    inside = slice(half, -half)
+    before, after = (np.sqrt(np.mean((v - true)[inside] ** 2)) for v in (spoilt, flight.velocity))
+    assert any("velocity in" in i.issue for i in issues) and after < 0.6 * before
+
+
 def test_slips_that_can_be_mended_are_mended_and_named(sample_columns):
     columns = {k: np.array(v) for k, v in sample_columns["flight_b"].items()}
     order = np.arange(len(columns["t"]))

@@ -17,6 +17,7 @@ SLOWEST = 0.05  # s between rows
 FROZEN = 0.5  # s without a change of a sensor that has noise
 HELD = 0.1  # share of rows that repeat the one before, from which a sensor is slower than the rows
 RATE_NOISE = 0.04  # rad/s of body rates that are derived: what gyroscopes of such vehicles have at most
+BESIDE_GAP, GAP, OUTSIDE = 4, 1.5, 6.0  # rows, usual steps, deviations: of a velocity that a gap has spoilt
 GROUND_CLEARANCE = 0.02  # m above the floor
 SENSORS = ("position", "quaternion", "velocity", "body_rates", "specific_force")
 
@@ -44,7 +45,7 @@ def check_flight(
         checked = _in_time(flight, note)
         checked = _without_repeats(_clean(checked, note), note)
         checked = _in_range(checked, note)
-        checked = _derive_velocity(checked, note)
+        checked = _derive_velocity(_velocity_at_gaps(checked, note), note)
         checked = _derive_rates(checked, note)
         checked = _airborne(checked, (log or {}).get("floor_z"), note, comparison)
         _has_what_is_needed(checked, comparison)
@@ -290,6 +291,37 @@ def _derive_velocity(flight: Flight, note) -> Flight:
     velocity[rows[jump]] = np.nan
     note("columns", "no velocity was logged: it is derived from position")
     return dataclasses.replace(flight, velocity=velocity, velocity_derived=True)
+
+
+def _velocity_at_gaps(flight: Flight, note) -> Flight:
+    """A velocity that somebody differentiated row by row is wrong beside rows that are missing: there it is taken from the
+    position, where it is far off its slope for such rows alone."""
+    if flight.velocity is None or flight.position is None:
+        return flight
+    rows = np.flatnonzero(np.isfinite(flight.position).all(1) & np.isfinite(flight.velocity).all(1))
+    if len(rows) < 10 * BESIDE_GAP:
+        return flight
+    time = flight.time[rows]
+    steps = np.diff(time)
+    gaps = np.flatnonzero(steps > GAP * np.median(steps))
+    beside = np.zeros(len(rows), bool)
+    for shift in range(-BESIDE_GAP, BESIDE_GAP):
+        beside[np.clip(gaps + 1 + shift, 0, len(rows) - 1)] = True
+    if not beside.any() or beside.mean() > 0.5:
+        return flight
+    slope, reach = _slopes(time, flight.position[rows], BESIDE_GAP - 1)
+    off = flight.velocity[rows] - slope
+    usual = 1.4826 * np.median(np.abs(off[~beside]), axis=0) + 1e-6
+    wrong = beside & (np.abs(off) > OUTSIDE * usual).any(1) & (reach < 0.25)
+    if not wrong.any():
+        return flight
+    velocity = flight.velocity.copy()
+    velocity[rows[wrong]] = slope[wrong]
+    note(
+        "gaps",
+        f"velocity in {wrong.sum()} rows beside missing ones contradicts the position: taken from it there",
+    )
+    return dataclasses.replace(flight, velocity=velocity)
 
 
 def _slopes(time: np.ndarray, values: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:

@@ -217,10 +217,14 @@ def noise_of(replay: Replay, residuals: list[np.ndarray]) -> list[Noise]:
     ]
 
 
-def without_nuisances(replay: Replay, residual: np.ndarray, track: int) -> np.ndarray:
-    """A residual (T, 9) less the nuisances' most likely part."""
+def without_nuisances(
+    replay: Replay, residual: np.ndarray, track: int, stay: np.ndarray | None = None
+) -> np.ndarray:
+    """A residual (T, 9) less the nuisances' most likely part, but that of those (N,) that `stay`."""
     n = replay.whitened_nuisances[track].reshape(len(replay.nuisances[track]), -1)
     taken = np.linalg.solve(np.eye(len(n)) + n @ n.T, n @ replay.whiten(residual, track).ravel())
+    if stay is not None:
+        taken = np.where(stay, 0.0, taken)
     return residual - np.tensordot(taken, replay.nuisances[track], 1)
 
 

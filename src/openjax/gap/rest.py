@@ -20,6 +20,7 @@ from openjax.flights.track import Track, rotation, smooth
 from openjax.gap.evidence import Evidence
 from openjax.gap.hypotheses import SetFit, without_nuisances
 from openjax.gap.knocks import knocks
+from openjax.gap.levers import torques
 from openjax.gap.replay import FORCE, RATES, VELOCITY, Replay, torque_channels
 from openjax.gap.selection import LEAST_NATS, Selection, testable
 from openjax.gap.spectral_lines import lines
@@ -138,6 +139,12 @@ def look(evidence: Evidence, selection: Selection) -> Rest:
     disturbed = [
         disturbances(t, r) for t, r in zip(replay.tracks, residuals_of(replay, selection.fit), strict=True)
     ]
+    # Feedback answers what isn't known, too: what it did stays in.
+    answered = [
+        disturbances(t, r)
+        for t, r in zip(replay.tracks, residuals_of(replay, selection.fit, ("feedback,",)), strict=True)
+    ]
+    turned = [np.gradient(t.body_rates, t.dt, axis=0) for t in replay.tracks]
     heard = replay.usable.copy()
     if any(t.pose_age > 0.0 for t in replay.tracks):
         heard[VELOCITY] = 0.0  # samples put onto faster rows beat with them
@@ -146,7 +153,11 @@ def look(evidence: Evidence, selection: Selection) -> Rest:
         followed(known, then),
         followed(known, judged((LIKE_AN_EFFECT, PLAIN))),
         tuple(names[k] for k in chosen),
-        (*lines(replay.tracks, disturbed, heard), *knocks(replay.tracks, disturbed, replay.usable)),
+        (
+            *lines(replay.tracks, disturbed, heard),
+            *knocks(replay.tracks, disturbed, replay.usable),
+            *torques(replay.tracks, answered, turned, replay.usable, evidence.vehicles),
+        ),
     )
 
 
@@ -266,9 +277,10 @@ def dictionary(track: Track) -> dict[str, Regressor]:
     return out
 
 
-def residuals_of(replay: Replay, fit: SetFit) -> list[np.ndarray]:
-    """Residual (T, 9) of each track under a fit, nuisances taken off."""
-    return [without_nuisances(replay, column[0], number) for number, column in enumerate(fit.columns)]
+def residuals_of(replay: Replay, fit: SetFit, kept=()) -> list[np.ndarray]:
+    """Residual (T, 9) of each track under a fit, nuisances taken off but those whose names begin like `kept`."""
+    stay = np.array([n.startswith(tuple(kept)) for n in replay.nuisance_names])
+    return [without_nuisances(replay, column[0], number, stay) for number, column in enumerate(fit.columns)]
 
 
 def disturbances(track: Track, residual: np.ndarray) -> np.ndarray:
