@@ -15,8 +15,8 @@ VEHICLES = [SimpleNamespace(inertia=np.array([2e-5, 2e-5, 3e-5]), mass=0.035)]
 
 
 def flights(torque=0.0, turned=None, push=0.05, lever=0.008, noise=0.01, axis=2, seed=0):
-    """Three tracks: turbulence of `push` (m/s^2) with a `lever` (m), noise (rad/s) of the gyroscope, a `torque` (ROWS,) rad/s^2 about
-    an axis; `turned` (ROWS,): what the vehicle did there, by default what a loop lets a disturbance do."""
+    """Three tracks: turbulence of `push` (m/s^2) with a `lever` (m), noise (rad/s) of the gyroscope, a `torque` (ROWS,) rad/s^2
+    about an axis; `turned` (ROWS,): what the vehicle did there, by default what a loop lets a disturbance do."""
     rng, disturbed, whole = np.random.default_rng(seed), [], []
     for _ in range(3):
         gust = push * lfilter([0.3], [1.0, -0.95], rng.standard_normal((ROWS, 3)), axis=0)
