@@ -152,12 +152,18 @@ def links(arguments) -> dict:
 
 
 def simulator(arguments) -> dict:
-    """Capture steps of 10 games per layout in the simulator."""
+    """Capture steps of 20 games per layout in the simulator.
+
+    Poses have the noise of their packets' last digits: without it all games of a layout, which begin alike, are one game.
+    """
     out = arguments.out / "simulator.json"
-    command = [sys.executable, "-m", "openjax.evaluate", "--policy", arguments.policy, "--episodes", "10"]
+    command = [sys.executable, "-m", "openjax.evaluate", "--policy", arguments.policy, "--episodes", "20"]
     game = {"speed_limit": "none", "substeps": "5", "start_attitude": "level", "rare_vehicles": "0.0"}
     command += [f"--environment.{name}={value}" for name, value in game.items()]
-    command += ["--environment.vehicles"]  # none but the nominal one, as the virtual ones are
+    # the nominal vehicle, as the virtual ones are
+    command += ["--environment.vehicles"]
+    for name, size in (("position", "0.0003"), ("velocity", "0.0003"), ("attitude", "0.001")):
+        command += [f"view_noise.{name}", size, size, size, size]
     subprocess.run([*command, "--json", str(out)], check=True, env={**os.environ, "JAX_PLATFORMS": "cpu"})
     return {row["scenario"]: row for row in json.loads(out.read_text(encoding="utf-8"))}
 
