@@ -29,6 +29,8 @@ LEAST_CHANGE = 0.15  # of a gain: filters of a firmware do less
 CLEAR = 3.0  # standard errors
 ALONE = 5.0  # likewise, where yaw says otherwise
 YAW_ERROR = 0.05  # of a gain, what rows leave
+LEAST_YAW = 0.09  # of yaw's P where rows show all that the loop does
+MOST_LEFT = 0.06  # of the power of yaw's outputs that a read loop leaves there
 LOST = 0.1  # of a gain, by which D may fall beyond P
 ONE_SIDED = 0.00135  # chance of a normal number beyond three of them
 PRIOR = np.array([0.4, 0.4, 0.4, 1.0, 1.0])  # spreads of the gains and of the delays of P and D
@@ -55,11 +57,13 @@ class Feedback:
 @dataclass(frozen=True, eq=False)
 class Gains:
     """Changes of the rate loop's p, i, d as shares, roll and pitch first and then yaw: `change` (6,), `error` (6,), from what
-    commands excite; `yaw`: the change of yaw's P read row by row, and its error."""
+    commands excite; `yaw`: the change of yaw's P read row by row, and its error; `yaw_left`: the share of the power of yaw's
+    outputs that rows leave then."""
 
     change: np.ndarray
     error: np.ndarray
     yaw: tuple[float, float] = (0.0, np.inf)
+    yaw_left: float = 1.0
 
     @property
     def clear(self) -> bool:
@@ -67,10 +71,17 @@ class Gains:
         return self.by_yaw or self._by_commands
 
     @property
+    def readable(self) -> bool:
+        """Whether either reading could tell."""
+        return bool(np.isfinite(self.error).any() or self.yaw_left < MOST_LEFT)
+
+    @property
     def by_yaw(self) -> bool:
-        """Whether yaw's rows tell: yaw has no D that a filter could bend. Rows that see half of the motors make gains look
-        small, so a smaller one needs what commands excite to agree."""
+        """Whether yaw's rows tell: yaw has no D that a filter could bend. Rows that see half of the motors, or another clock,
+        make gains look small and leave much, so a smaller one needs what commands excite to agree then."""
         change, error = self.yaw
+        if self.yaw_left < MOST_LEFT:
+            return abs(change) > max(LEAST_YAW, CLEAR * float(np.hypot(error, self.yaw_left)))
         if abs(change) < max(LEAST_CHANGE, CLEAR * error):
             return False
         apart, unsure = abs(self.change[3] - change), self.error[3]
@@ -84,8 +95,9 @@ class Gains:
         as_usual = abs(self.yaw[0]) + CLEAR * self.yaw[1] < LEAST_CHANGE
         sure = np.array([ALONE if as_usual else CLEAR, CLEAR])
         changed = size > np.maximum(LEAST_CHANGE, sure * error)
+        alike = self.change[3] * self.yaw[0] > 0.0
         return bool(changed[0] and self.change[2] > self.change[0] - LOST) or bool(
-            changed[1] and not as_usual
+            changed[1] and alike and not as_usual
         )
 
     @property

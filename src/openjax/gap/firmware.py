@@ -292,9 +292,9 @@ def read_rate_loop(
     groups = (((0, 1), False), ((2,), False))
     spread = (GAIN_SPREAD,) * 6
     path = fit_linear_path(y, columns, nuisances, flight_of, spread, groups, masks, 2 * GAIN_TOLERANCE, noise)
-    gains = None
-    if late is not None:
-        _, change, covariance = path.score()
-        yaw = float(change[3]), float(np.sqrt(covariance[3, 3]))
-        gains = dataclasses.replace(read_gains(tracks, vehicles, arrived, at_once, late), yaw=yaw)
+    _, change, covariance = path.score()
+    outputs = np.concatenate([(t.motor @ outputs_of(v))[:, 2] for t, v in zip(tracks, vehicles, strict=True)])
+    left = float(np.concatenate(path.residual)[:, 2].var() / max(outputs.var(), 1e-12))
+    gains = Gains(np.zeros(6), np.full(6, np.inf)) if late is None else read_gains(tracks, vehicles, arrived, at_once, late)
+    gains = dataclasses.replace(gains, yaw=(float(change[3]), float(np.sqrt(covariance[3, 3]))), yaw_left=left)
     return RateLoop(path, ticks, gains)

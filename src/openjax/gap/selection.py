@@ -21,7 +21,8 @@ LEAST_NATS = 5.0  # by which it must raise their likelihood even without the sec
 # very strong evidence, in the usual words
 LEAST_STEADY = 0.1  # of the nats must be left without that second: an effect that acts once isn't known
 LEAST_SHARE = 0.01  # of the gap's rms above its floor: below, an effect is what the others' forms have wrong
-TESTABLE = 6.0  # nats that an effect of usual size must leave in these flights
+TESTABLE = 6.0  # nats that an effect of usual size must leave in these flights,
+EVIDENT = 20.0  # or that it explains as it is
 MOST = 6  # effects at once
 VERTICAL = 5  # of the errors: velocity z
 OPENINGS = 3  # effects from which a search begins
@@ -141,7 +142,7 @@ def testable(evidence: Evidence) -> dict[str, SetFit]:
         if len(k) == 1
         and (known or not CARDS[k[0]].thrust_map)
         and isinstance(f, SetFit)
-        and evidence.exposure.get(k[0], 0.0) >= TESTABLE
+        and (evidence.exposure.get(k[0], 0.0) >= TESTABLE or f.score - evidence.nothing.score > EVIDENT)
     }
 
 

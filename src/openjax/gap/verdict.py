@@ -15,7 +15,7 @@ from openjax.gap.shares import Split
 
 CLOCK = 0.003  # s by which the clocks of a log may differ
 CLEAR = 3.0  # standard errors
-LEAST_LOSS = 0.01  # of the packets
+LEAST_LOSS = 0.005  # of the packets
 BESIDE = 0.13  # floors by which an effect must shrink the gap to be named beside a stronger one
 LEAST_LEFT = 0.05  # floors of the gap that a strange rest must hold to be named: the best of many regressors
 LEAST_PLAIN = 0.01  # the same where plain ones tell it
@@ -61,7 +61,7 @@ def not_testable(evidence: Evidence) -> list[str]:
     missing = [e for e in physics if e in evidence.feigned or exposure.get(e, 0.0) < TESTABLE]
     if evidence.radio is None or evidence.radio.informative < 30 or not evidence.radio.readable:
         missing += [e for e in ("command_latency", "packet_loss") if e in evidence.library.effects]
-    if evidence.gains is None or not np.isfinite(evidence.gains.error).any():
+    if evidence.gains is None or not evidence.gains.readable:
         missing += [e for e in ("rate_gains",) if e in evidence.library.effects]
     if evidence.pose is None:
         missing += [e for e in ("state_latency",) if e in evidence.library.effects]
