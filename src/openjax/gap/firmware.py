@@ -295,6 +295,12 @@ def read_rate_loop(
     _, change, covariance = path.score()
     outputs = np.concatenate([(t.motor @ outputs_of(v))[:, 2] for t, v in zip(tracks, vehicles, strict=True)])
     left = float(np.concatenate(path.residual)[:, 2].var() / max(outputs.var(), 1e-12))
-    gains = Gains(np.zeros(6), np.full(6, np.inf)) if late is None else read_gains(tracks, vehicles, arrived, at_once, late)
-    gains = dataclasses.replace(gains, yaw=(float(change[3]), float(np.sqrt(covariance[3, 3]))), yaw_left=left)
+    gains = (
+        Gains(np.zeros(6), np.full(6, np.inf))
+        if late is None
+        else read_gains(tracks, vehicles, arrived, at_once, late)
+    )
+    gains = dataclasses.replace(
+        gains, yaw=(float(change[3]), float(np.sqrt(covariance[3, 3]))), yaw_left=left
+    )
     return RateLoop(path, ticks, gains)

@@ -15,6 +15,7 @@ from openjax.gap.shares import Split
 
 CLOCK = 0.003  # s by which the clocks of a log may differ
 CLEAR = 3.0  # standard errors
+LEAST_COUNTED = 100.0  # nats of the link alone that need no share
 LEAST_LOSS = 0.005  # of the packets
 BESIDE = 0.13  # floors by which an effect must shrink the gap to be named beside a stronger one
 LEAST_LEFT = 0.05  # floors of the gap that a strange rest must hold to be named: the best of many regressors
@@ -70,7 +71,7 @@ def not_testable(evidence: Evidence) -> list[str]:
 
 def decide(evidence: Evidence, selection: Selection, rest: Rest, parts: Split, missing) -> Verdict:
     """The words that the shares give, and how sure they are."""
-    named = _material(selection, parts)
+    named = _material(evidence, selection, parts)
     strange = bool(set(evidence.sensors.findings) - {"clocks"}) or bool(rest.local)
     routes = (
         (rest.everything, LEAST_LEFT if named else LEAST_LARGE, LARGE_SHARE),
@@ -104,7 +105,7 @@ def _left(parts: Split, found: Followed, least: float, least_share: float, named
     return np.sqrt(1.0 + more) > 1.0 + least and (not named or share > least_share)
 
 
-def _material(selection: Selection, parts: Split) -> list[str]:
+def _material(evidence: Evidence, selection: Selection, parts: Split) -> list[str]:
     """The effects by their share, without those that are small beside the largest: they are what its form has wrong."""
     order = sorted(parts.effects, key=lambda e: -parts.effects[e].value)
     if sum(part.value for part in parts.effects.values()) > UNDONE:
@@ -114,7 +115,11 @@ def _material(selection: Selection, parts: Split) -> list[str]:
     def stays(effect: str) -> bool:
         if effect in selection.gains:
             return selection.gains[effect].floors >= BESIDE
-        return path_of(effect) != "radio" or parts.effects[effect].value >= LEAST_SHARE
+        if path_of(effect) != "radio" or parts.effects[effect].value >= LEAST_SHARE:
+            return True
+        # Lost packets that hold the old command are counted, however little they did to the thrust.
+        gain = evidence.radio.gain
+        return gain[effect,] > LEAST_COUNTED
 
     if order and parts.effects[order[0]].value < LEAST_SHARE and parts.unexplained.value > UNKNOWN_SHARE:
         return []
