@@ -95,7 +95,7 @@ class Gains:
         as_usual = abs(self.yaw[0]) + CLEAR * self.yaw[1] < LEAST_CHANGE
         sure = np.array([ALONE if as_usual else CLEAR, CLEAR])
         changed = size > np.maximum(LEAST_CHANGE, sure * error)
-        alike = self.change[3] * self.yaw[0] > 0.0
+        alike = self.change[3] * self.yaw[0] > 0.0 or not np.isfinite(self.yaw[1])
         return bool(changed[0] and self.change[2] > self.change[0] - LOST) or bool(
             changed[1] and alike and not as_usual
         )
