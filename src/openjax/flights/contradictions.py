@@ -243,7 +243,7 @@ def _pairs(flight: Flight, vehicle, grid: np.ndarray, shown: set[str] | None = N
             shows=("velocity",),
         )
         path = path if velocity is None else velocity
-    along = None
+    along, order = None, 0
     if path is not None and up is not None:
         order = 1 if path is velocity else 2
         acceleration = np.gradient(path, 1 / RATE, axis=0)
@@ -262,12 +262,12 @@ def _pairs(flight: Flight, vehicle, grid: np.ndarray, shown: set[str] | None = N
             least = max(MOVED["acceleration"], CLEARLY * float(off))
             compare(("az",), force[:, 2], along, low, least, about, "m/s^2", (0, order), shows=shows)
     motor, thrust = on_clock(flight, "motor_command", grid), on_clock(flight, "command_thrust", grid)
-    felt = along if force is None else force[:, 2]
+    felt = along if force is None or _feels_itself(force, along, low, order) else force[:, 2]
     collective = None if motor is None else motor.mean(1)
     together = ("m1 + m2 + m3 + m4",)
     if motor is not None and felt is not None:
         scaled = collective * np.median(felt) / max(float(np.median(collective)), 1e-3)
-        order = order if force is None else 0
+        order = order if felt is along else 0
         compare(together, scaled, felt, low, 0.12, "the force felt", "m/s^2", (0, order))
     if motor is not None and thrust is not None:
         compare(("cmd_thrust",), 100 * thrust, 100 * collective, wide, 1.0, "m1 + m2 + m3 + m4", "%")
@@ -284,6 +284,15 @@ def _pairs(flight: Flight, vehicle, grid: np.ndarray, shown: set[str] | None = N
         if motor is not None:
             found += _torques(motor, rates, vehicle, shown)
     return found
+
+
+def _feels_itself(force: np.ndarray, along: np.ndarray | None, band, order: int) -> bool:
+    """Whether what the accelerometer feels along the vertical isn't there in a path that would show it: its own vibration, which
+    slow rows fold down into the band."""
+    if along is None:
+        return False
+    seen = agreement(_columns(along), _columns(force[:, 2]), band, (order, 0))
+    return bool(seen.expected[0] > TELLS and seen.correlation[0] < AGREE * seen.expected[0])
 
 
 def _columns(values: np.ndarray) -> np.ndarray:
