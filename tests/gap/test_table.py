@@ -72,7 +72,8 @@ def test_nuisances_of_the_vehicle_are_alike_on_all_tracks_and_bounded(columns):
     ]  # the second would differ in sign
     left = [r + 3.0 * x[5] for r, x in zip(left, columns, strict=True)]  # and the first be beyond its bound
     off, precision = np.array([0.2]), np.array([[4.0]])
-    found = held_objective(left, [x[2:3] for x in columns], [x[5:] for x in columns], SHARED, off, precision)
+    rows = [np.concatenate([[r], x[2:3], x[5:]]) for r, x in zip(left, columns, strict=True)]
+    found = held_objective([x @ x.T for x in rows], SHARED, off, precision)
 
     def objective(z):
         step, common, own = z[:1], z[1:3], z[3:]

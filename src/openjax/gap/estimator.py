@@ -9,7 +9,7 @@ import numpy as np
 
 from openjax.flights.track import Track, smooth
 from openjax.gap.linear_path import LinearPath, fit_linear_path
-from openjax.gap.replay import POSE_SHIFT
+from openjax.gap.nuisances import POSE_SHIFT
 
 DELAY_SPREAD = 0.02  # s
 LONGEST = 0.15  # s

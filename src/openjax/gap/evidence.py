@@ -42,7 +42,7 @@ HEAVY = 0.1  # of the moments of inertia, that single samples taken for means ma
 RADIO_COST = 15.0  # nats that a radio effect must gain before the rate loop is read with it
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class Evidence:
     """Scores are log marginal likelihoods above that of no effect (nats). `sets` holds physics sets: a
     full fit or a linearised score; `exposure` what a typical effect would show. None: that path wasn't
@@ -227,7 +227,7 @@ def _looks_sampled(vehicles, mean: Look, single: Look) -> tuple[bool, bool]:
         return False, True
     paths = [
         np.asarray(p.motor, float)[: len(t)]
-        for p, t in zip(single.replay.paths, single.replay.tracks, strict=True)
+        for p, t in zip(single.replay.physics.paths, single.replay.tracks, strict=True)
     ]
     first, whole = (
         np.concatenate(
@@ -276,9 +276,9 @@ def _physics(reading: Reading, library: Library, pushes=None, gains=None, before
     replay = make_replay(
         tracks, vehicles, ticks, feedback, reading.numbers, sensors.one_clock, at_once, sensors.wander
     )
-    floor, exposure = model_noise(replay, library)
-    gusts = replay.gusts = gustiness(tracks, feedback, floor)
-    replay.loosen(
+    replay, floor, exposure = model_noise(replay, library)
+    gusts = gustiness(tracks, feedback, floor)
+    replay = dataclasses.replace(replay, gusts=gusts).loosened(
         {
             f"{e} {p}": float(np.hypot(1.0, GUSTY[e, p][0] * gusts[list(GUSTY[e, p][1])].mean() / usual))
             for e, p, usual in replay.numbers

@@ -14,8 +14,9 @@ from scipy.signal import butter, lfilter, sosfiltfilt
 from scipy.stats import t as student
 
 from openjax.flights.track import Track, smooth
+from openjax.gap.nuisances import TRIM
 from openjax.gap.observer import TICKS, commanded
-from openjax.gap.replay import TRIM, bucket, padded
+from openjax.gap.prediction import bucket, padded
 from openjax.vehicle.rate_controller import mixer
 
 SLOW = 0.06  # s over which commands implied by motors and rates are smoothed

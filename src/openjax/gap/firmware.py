@@ -14,7 +14,7 @@ from openjax.flights.track import Track, held_means, smooth
 from openjax.gap.feedback import Gains, in_force, outputs_of, read_gains
 from openjax.gap.linear_path import LinearPath, fit_linear_path
 from openjax.gap.observer import GYRO_GAIN, observe
-from openjax.gap.replay import bucket, padded
+from openjax.gap.prediction import bucket, padded
 
 GAIN_STEP = 0.05
 GAIN_SPREAD = 0.4

@@ -13,8 +13,8 @@ import numpy as np
 from scipy.stats import norm
 
 from openjax.gap.bounds import held_objective
-from openjax.gap.library import ABSENT, CARDS, PLACE, Library, places, prior, start_of
-from openjax.gap.replay import GROUPS, SKIP, Replay
+from openjax.gap.library import ABSENT, CARDS, PLACE, STEP, Library, places, prior, start_of
+from openjax.gap.replay import GROUPS, SKIP, Replay, stepped
 from openjax.gap.whitening import Noise, fit_noise
 
 ITERATIONS = 6
@@ -24,7 +24,7 @@ SIZES = (0.05, 4.0)  # of a start that is scaled
 UNEXPOSED = 0.5  # nats that a typical effect would leave: below, the effect isn't fitted at all
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class SetFit:
     """A fitted set of effects. `grams` (F, 1 + p, 1 + p) of residual and derivatives at the optimum, by
     flight; `score` the log marginal likelihood; `index` (p,) places in `theta` (P,), companions last."""
@@ -56,19 +56,20 @@ def fit_set(replay: Replay, effects, start: np.ndarray | None = None, iterations
     reach = 3.0 / np.sqrt(np.diag(precision)) if len(index) else np.zeros(0)
     for iteration in range(iterations + 1):
         columns = replay.linearised(theta, index)
-        grams = replay.grams(columns)
+        products = replay.products(columns)
+        grams = replay.marginal(products)
         gram, off = grams.sum(0), theta[index] - mean
         objective = 0.5 * gram[0, 0] + 0.5 * off @ precision @ off
         if best is not None and not objective < best[0] - SMALL_STEP:
             if objective < best[0]:
-                best = (objective, theta.copy(), grams, columns)
+                best = (objective, theta.copy(), grams, columns, products)
                 break
             if not np.isfinite(objective) or objective > best[0] + 1.0:
                 if iteration < iterations:  # overshot: half way back
                     theta = 0.5 * (theta + best[1])
                     continue
             break
-        best = (objective, theta.copy(), grams, columns)
+        best = (objective, theta.copy(), grams, columns, products)
         if not len(index):
             break
         push = gram[1:, 0] - precision @ off
@@ -77,20 +78,39 @@ def fit_set(replay: Replay, effects, start: np.ndarray | None = None, iterations
             break
         theta = theta.copy()
         theta[index] += np.clip(step, -reach, reach)
-    objective, theta, grams, columns = best
+    objective, theta, grams, columns, products = best
     hessian = grams.sum(0)[1:, 1:] + precision
     covariance = np.linalg.inv(hessian) if len(index) else np.zeros((0, 0))
     volume = np.linalg.slogdet(hessian)[1] - np.linalg.slogdet(precision)[1] if len(index) else 0.0
-    least, free_ride = _held(replay, columns, theta, index, mean, precision, len(places(effects)))
+    least, free_ride = _held(replay, products, theta, index, mean, precision, len(places(effects)))
     score = -least - 0.5 * volume + _sign_term(effects, index, theta, covariance) - free_ride
     return SetFit(effects, theta, index, grams, columns, covariance, float(score), float(objective))
+
+
+def linearised_at(replay: Replay, fit: SetFit, index) -> list[np.ndarray]:
+    """`Replay.linearised` at a fit; what the fit was made of isn't worked out again."""
+    own = {int(i): 1 + k for k, i in enumerate(fit.index)}
+    new = [int(i) for i in index if int(i) not in own]
+    moved = (
+        replay.predict(stepped(fit.theta, new)[1:])
+        if new
+        else [np.zeros((0, *y.shape)) for y in replay.measured]
+    )
+    steps = STEP[new][:, None, None]
+    out = []
+    for column, y, m in zip(fit.columns, replay.measured, moved, strict=True):
+        further = dict(zip(new, (m - (y - column[0])) / steps, strict=True))
+        out.append(
+            np.stack([column[0], *(column[own[int(i)]] if int(i) in own else further[int(i)] for i in index)])
+        )
+    return out
 
 
 def step_with(replay: Replay, fit: SetFit, more) -> dict[str, dict[str, tuple[float, float]]]:
     """{effect: {parameter: (value, standard deviation)}} of a fitted set and `more` effects, by one step from the fit."""
     effects = (*fit.effects, *more)
     index, mean, precision = prior(effects)
-    gram = replay.grams(replay.linearised(fit.theta, index)).sum(0)
+    gram = replay.grams(linearised_at(replay, fit, index)).sum(0)
     hessian = gram[1:, 1:] + precision
     theta = fit.theta.copy()
     theta[index] += np.linalg.solve(hessian, gram[1:, 0] - precision @ (theta[index] - mean))
@@ -119,23 +139,23 @@ def _sign_term(effects, index, theta, covariance) -> float:
     return float(total)
 
 
-def _held(replay: Replay, columns, theta, index, mean, precision, own: int) -> tuple[float, float]:
+def _held(replay: Replay, products, theta, index, mean, precision, own: int) -> tuple[float, float]:
     """Least objective of a set with nuisances within their bounds, and the vehicle's alike in all flights; and what its
     companions, beyond the first `own` columns, alone gain over no effect (nats), or beside the set's own effects where that
     is less: a set must not live off them."""
-    white = [replay.whiten(c, k).reshape(len(c), -1) for k, c in enumerate(columns)]
-    nuisances = [n.reshape(len(n), -1) for n in replay.whitened_nuisances]
+    grams = [
+        np.block([[gram, cross], [cross.T, inner]])
+        for (gram, cross), inner in zip(products, replay.nuisance_grams, strict=True)
+    ]
     off, away = theta[index] - mean, theta[index] - ABSENT[index]
 
     def least(free, back):
         """With the columns `free`, and those of `back` as if they were absent."""
+        taken = np.concatenate([[0], 1 + free, np.arange(1 + len(index), len(grams[0]))])
+        mixed = np.eye(len(grams[0]))[taken]
+        mixed[0, 1 + back] = away[back]
         return held_objective(
-            [w[0] + away[back] @ w[1 + back] for w in white],
-            [w[1 + free] for w in white],
-            nuisances,
-            replay.shared,
-            off[free],
-            precision[np.ix_(free, free)],
+            [mixed @ g @ mixed.T for g in grams], replay.shared, off[free], precision[np.ix_(free, free)]
         )
 
     every, none = np.arange(len(index)), np.arange(0)
@@ -148,10 +168,9 @@ def _held(replay: Replay, columns, theta, index, mean, precision, own: int) -> t
     return best, max(0.0, min(alone, beside))
 
 
-def model_noise(replay: Replay, library: Library) -> tuple[list[np.ndarray], dict[str, float]]:
-    """Fit the noise models to what is left when all effects of the library may act at once: residuals [(T,
-    9)], and what each effect would show if it acted as at its start (nats, nuisances marginalised): its
-    exposure."""
+def model_noise(replay: Replay, library: Library) -> tuple[Replay, list[np.ndarray], dict[str, float]]:
+    """The replay with noise models that fit what is left when all effects of the library may act at once; the residuals
+    [(T, 9)], and what each effect would show if it acted as at its start (nats, nuisances marginalised): its exposure."""
     theta = ABSENT.copy()
     ahead, firsts = [], []
     for effect in library.physics:
@@ -169,14 +188,15 @@ def model_noise(replay: Replay, library: Library) -> tuple[list[np.ndarray], dic
     size = len(index)
     penalty = np.eye(size + len(ahead))
     penalty[:size, :size] = precision
-    nothing, _ = _settle(replay, columns, lambda: None)
+    replay, nothing = _settle(replay, columns, lambda _: np.zeros(len(penalty)))
     alone = replay.noises
 
-    def weights():
+    def weights(replay):
         gram = replay.grams(columns).sum(0)
         return np.linalg.solve(gram[1:, 1:] + penalty, gram[1:, 0])
 
-    residuals, together = _settle(replay, columns, weights)
+    replay, residuals = _settle(replay, columns, weights)
+    together = replay.noises
     # Where all effects together explain no more than so many parameters must, the noise is that of no effect:
     # in calm flights feedback makes disturbances look like weak motors, and a noise model made under that
     # would confirm it.
@@ -188,24 +208,24 @@ def model_noise(replay: Replay, library: Library) -> tuple[list[np.ndarray], dic
         if gained <= WORTH_ALL:
             for left, calm in zip(residuals, nothing, strict=True):
                 left[:, axes] = calm[:, axes]
-    replay.set_noise(chosen)
+    replay = replay.with_noise(chosen)
     shown = np.diag(replay.grams(columns).sum(0))[1 + size :]
     exposure = {e: 0.0 for e in library.physics}
     for effect, square in zip(firsts, shown, strict=True):
         exposure[effect] = max(exposure[effect], 0.5 * float(square))
-    return residuals, exposure
+    return replay, residuals, exposure
 
 
-def _settle(replay: Replay, columns, weights) -> tuple[list[np.ndarray], tuple]:
-    """Residuals [(T, 9)] and noise models that suit each other, with `weights()` of the columns."""
+def _settle(replay: Replay, columns, weights) -> tuple[Replay, list[np.ndarray]]:
+    """The replay with noise models that suit its residuals [(T, 9)] with `weights(replay)` of the columns, and these."""
     for _ in range(2):
-        taken = weights()
-        residuals = []
-        for number, column in enumerate(columns):
-            left = column[0] if taken is None else column[0] - np.tensordot(taken, column[1:], 1)
-            residuals.append(without_nuisances(replay, left, number))
-        replay.set_noise(noise_of(replay, residuals))
-    return residuals, replay.noises
+        taken = weights(replay)
+        residuals = [
+            without_nuisances(replay, c[0] - np.tensordot(taken, c[1:], 1), number)
+            for number, c in enumerate(columns)
+        ]
+        replay = replay.with_noise(noise_of(replay, residuals))
+    return replay, residuals
 
 
 def noise_of(replay: Replay, residuals: list[np.ndarray]) -> list[Noise]:
@@ -221,8 +241,7 @@ def without_nuisances(
     replay: Replay, residual: np.ndarray, track: int, stay: np.ndarray | None = None
 ) -> np.ndarray:
     """A residual (T, 9) less the nuisances' most likely part, but that of those (N,) that `stay`."""
-    n = replay.whitened_nuisances[track].reshape(len(replay.nuisances[track]), -1)
-    taken = np.linalg.solve(np.eye(len(n)) + n @ n.T, n @ replay.whiten(residual, track).ravel())
+    taken = replay.taken(residual, track)
     if stay is not None:
         taken = np.where(stay, 0.0, taken)
     return residual - np.tensordot(taken, replay.nuisances[track], 1)

@@ -17,7 +17,7 @@ from openjax.vehicle import DroneState
 from openjax.vehicle.effects import make_context, resolve
 from openjax.vehicle.effects.composition import added_wrench, change_body, change_motor_command, change_thrust
 from openjax.vehicle.rigid_body import rotate
-from openjax.vehicle.rotors import rotor_reaction, rotor_speed_step, rotor_thrust
+from openjax.vehicle.rotors import commanded_rotor_speed, rotor_reaction, rotor_thrust
 from openjax.vehicle.wrench import total_wrench
 
 CHANNELS = 9  # angular acceleration (body), acceleration (world), specific force (body)
@@ -39,7 +39,8 @@ class Path:
 
 @lru_cache(maxsize=16)
 def compiled_physics(names: tuple[str, ...], parameters: tuple[tuple[str, str], ...]):
-    """The batched physics with the effects `names`: theta (B, P), vehicle, path -> (B, T, 9).
+    """The batched physics with the effects `names`: theta (B, P), and of each its vehicle and path (leaves (B, ...)) ->
+    (B, T, 9).
 
     `parameters` says which (effect, parameter) each entry of theta is; parameters not named stay without
     effect. A last entry of theta beyond them shifts the motors in time (s, later is positive)."""
@@ -64,17 +65,23 @@ def compiled_physics(names: tuple[str, ...], parameters: tuple[tuple[str, str], 
 
         given = jax.vmap(demanded)(path.motor, still)
 
-        def row(speed, commands):
+        wanted = commanded_rotor_speed(flown, given)
+        # As `rotor_speed_step`, with what doesn't change outside the loop.
+        faster = -jnp.expm1(-step / flown.motor_time_constant)
+        slower = -jnp.expm1(-step / (flown.motor_time_constant * flown.motor_slowdown_ratio))
+
+        def row(speed, targets):
             total = 0.0
-            for tick in range(path.motor.shape[1]):
-                after = rotor_speed_step(flown, speed, commands[tick], step)
+            for tick in range(len(targets)):
+                target = targets[tick]
+                after = speed + (target - speed) * jnp.where(target < speed, slower, faster)
                 # Mean of the square over a tick, in which the speed is nearly straight.
                 total = total + (speed * speed + speed * after + after * after) / 3.0
                 speed = after
-            return speed, total / path.motor.shape[1]
+            return speed, total / len(targets)
 
         start = jnp.sqrt(jnp.clip(given[0, 0], 1e-6, None)) * flown.max_rotor_speed
-        _, square = jax.lax.scan(row, start, given)
+        _, square = jax.lax.scan(row, start, wanted)
         square = square - theta[-1] * jnp.gradient(square, path.dt, axis=0)
         speed = jnp.sqrt(jnp.maximum(square, 0.0))
 
@@ -93,4 +100,4 @@ def compiled_physics(names: tuple[str, ...], parameters: tuple[tuple[str, str], 
 
         return jax.vmap(wrench)(*along, speed)
 
-    return jax.jit(jax.vmap(one, in_axes=(0, None, None)))
+    return jax.jit(jax.vmap(one))

@@ -21,7 +21,8 @@ from openjax.gap.evidence import Evidence
 from openjax.gap.hypotheses import SetFit, without_nuisances
 from openjax.gap.knocks import knocks
 from openjax.gap.levers import torques
-from openjax.gap.replay import FORCE, RATES, VELOCITY, Replay, torque_channels
+from openjax.gap.nuisances import torque_channels
+from openjax.gap.replay import FORCE, RATES, VELOCITY, Replay
 from openjax.gap.selection import LEAST_NATS, Selection, testable
 from openjax.gap.spectral_lines import lines
 from openjax.gap.table import build, judge, offers, solve, widened, with_effects

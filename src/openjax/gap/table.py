@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from openjax.gap.bounds import BOUND, bounded, normal_equations
-from openjax.gap.hypotheses import SetFit
+from openjax.gap.hypotheses import SetFit, linearised_at
 from openjax.gap.library import ABSENT, CARDS, PLACE, places, prior
 from openjax.gap.replay import SKIP, Replay
 
@@ -102,7 +102,7 @@ def build(replay: Replay, fit: SetFit, singles: dict[str, SetFit], more=None) ->
         point = fit.theta.copy()
         point[places((effect,))] = ABSENT[places((effect,))]
         points.append(point)
-    columns = replay.linearised(fit.theta, index)
+    columns = linearised_at(replay, fit, index)
     moved = replay.predict(np.array(points)) if points else [np.zeros((0, *y.shape)) for y in replay.measured]
     white, error, rows, track_of, fold_of = [], [], [], [], []
     added = [()] * len(replay.tracks) if more is None else [(m,) for m in more]
@@ -111,7 +111,7 @@ def build(replay: Replay, fit: SetFit, singles: dict[str, SetFit], more=None) ->
         nuisances = replay.nuisances[number]
         x = np.concatenate([c, m[: len(others)] - now, now - m[len(others) :], *added[number], nuisances])
         skip, size = int(SKIP / track.dt), max(int(BLOCK / track.dt), 1)
-        w = replay.whiten(x, number)
+        w = np.concatenate([replay.whiten(x[: -len(nuisances)], number), replay.whitened_nuisances[number]])
         e = _errors(x, track.dt, replay.usable)
         count = max(w.shape[1] // size, 1)
         for k, (a, b) in enumerate(zip(np.array_split(w, count, 1), _split(e, skip, count), strict=True)):

@@ -1,0 +1,116 @@
+"""What a vehicle with given effects does along each track: the physics on logged states, in lanes of one size.
+
+Channels: body rates (3), velocity (3, world) - both integrated from the first row - and specific force (3, body)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+
+from openjax.flights.track import Track, smooth
+from openjax.gap.library import PHYSICS_EFFECTS, THETA
+from openjax.gap.physics import Path, compiled_physics
+from openjax.vehicle.effects.effect import ARENA_CEILING
+
+RATES, VELOCITY, FORCE = slice(0, 3), slice(3, 6), slice(6, 9)
+BUCKETS = (256, 512, 1024, 2048, 4096, 8192, 16384, 32768)
+LANES = 8  # parameter vectors along tracks that one call of the physics takes
+
+
+def bucket(length: int) -> int:
+    """The padded length of a track: a few fixed sizes, so that nothing is compiled twice."""
+    return next((b for b in BUCKETS if b >= length), length)
+
+
+def padded(values: np.ndarray, length: int) -> np.ndarray:
+    """float32, the last row repeated up to `length`."""
+    values = np.asarray(values, np.float32)
+    return np.concatenate([values, np.repeat(values[-1:], length - len(values), 0)])
+
+
+@dataclass(frozen=True, eq=False)
+class Physics:
+    """Tracks of a case, their nominal vehicles and their paths."""
+
+    tracks: tuple[Track, ...]
+    vehicles: tuple
+    paths: tuple[Path, ...]
+
+    def predict(self, theta: np.ndarray) -> list[np.ndarray]:
+        """Channels (B, T, 9) of each track for parameter vectors theta (B, P)."""
+        theta = np.asarray(theta, np.float32)
+        run = compiled_physics(PHYSICS_EFFECTS, THETA)
+        parts = [[] for _ in self.tracks]
+        # All of it is under way before any of it is waited for.
+        running = []
+        for alike in self._alike():
+            lanes = [(number, k) for number in alike for k in range(len(theta))]
+            for begin in range(0, len(lanes), LANES):
+                own = lanes[begin : begin + LANES]
+                filled = own + own[:1] * (LANES - len(own))
+                vehicles, paths = (
+                    jax.tree.map(lambda *leaves: np.stack(leaves), *(of[number] for number, _ in filled))
+                    for of in (self.vehicles, self.paths)
+                )
+                running.append((own, run(theta[[k for _, k in filled]], vehicles, paths)))
+        for own, rows in running:
+            for (number, _), lane in zip(own, np.asarray(rows), strict=False):
+                parts[number].append(lane[: len(self.tracks[number])])
+        return [_integrated(np.stack(p), t.dt) for p, t in zip(parts, self.tracks, strict=True)]
+
+    def _alike(self) -> list[list[int]]:
+        """Numbers of the tracks by the shape of their paths."""
+        shapes: dict[tuple, list[int]] = {}
+        for number, path in enumerate(self.paths):
+            shapes.setdefault(path.others.shape, []).append(number)
+        return list(shapes.values())
+
+
+def make_physics(tracks, vehicles, motor_ticks) -> Physics:
+    """Physics of tracks with their nominal vehicles and motor commands (T, TICKS, 4) of the rate loop's ticks."""
+    return Physics(
+        tuple(tracks),
+        tuple(jax.tree.map(np.float32, v) for v in vehicles),
+        tuple(_path(t, m) for t, m in zip(tracks, motor_ticks, strict=True)),
+    )
+
+
+def _path(track: Track, ticks: np.ndarray) -> Path:
+    rows, size = len(track), bucket(len(track))
+
+    def middle(values):
+        return padded(0.5 * (values + np.concatenate([values[1:], values[-1:]])), size)
+
+    unknown = np.zeros((rows, 3))
+    quaternion = track.quaternion if track.quaternion is not None else np.tile([1.0, 0, 0, 0], (rows, 1))
+    quaternion = middle(quaternion)
+    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+    # Without a pose the vehicle is taken to be in mid-air, far from everything.
+    position = track.position if track.position is not None else unknown + np.array([0.0, 0.0, 0.6])
+    # Neither floor nor ceiling can be entered: a log that says so has an offset in height.
+    position = np.concatenate([position[:, :2], np.clip(position[:, 2:], 0.0, ARENA_CEILING)], 1)
+    velocity = track.velocity if track.velocity is not None else unknown
+    others = [middle(p) for p in track.neighbours] or [np.tile(np.float32([50.0, 50.0, -50.0]), (size, 1))]
+    voltage = np.full(size, np.nan, np.float32) if track.voltage is None else middle(track.voltage)
+    return Path(
+        middle(position),
+        quaternion,
+        middle(velocity),
+        middle(smooth(track.body_rates, 0.05, track.dt)),
+        padded(ticks, size),
+        voltage,
+        np.stack(others, 1),
+        np.float32(track.dt),
+    )
+
+
+def _integrated(rows: np.ndarray, dt: float) -> np.ndarray:
+    """Channels (B, T, 9) from accelerations and specific force (B, T, 9) of the rows' intervals."""
+    rows = rows.astype(float)
+    integral = np.zeros_like(rows[:, :, :6])
+    np.cumsum(rows[:, :-1, :6] * dt, axis=1, out=integral[:, 1:])
+    specific = rows[:, :, 6:].copy()
+    specific[:, 1:] = 0.5 * (rows[:, 1:, 6:] + rows[:, :-1, 6:])
+    return np.concatenate([integral, specific], 2)
