@@ -42,7 +42,7 @@ class Radio:
     and the share of the row that the older one rules; `misfit` is the mean error of the collective
     thrust per set. `informative` rows have a new command; `told` ones are so clear that they tell whether it arrived, and
     `loss` is the share of them in which it didn't; `between` counts those that neither hold the old command nor follow the
-    new one, per lost packet."""
+    new one, per lost packet. `single` says whether the motors were sampled so often that a row holds one command only."""
 
     delay: float
     loss: float
@@ -52,6 +52,7 @@ class Radio:
     misfit: dict
     informative: int
     told: int
+    single: bool = False
 
     @property
     def readable(self) -> bool:
@@ -102,6 +103,7 @@ def read_radio(tracks: list[Track]) -> Radio:
         },
         used["informative"],
         used["told"],
+        all(track.fast_thrust is not None for track in tracks),
     )
 
 

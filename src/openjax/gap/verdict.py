@@ -117,9 +117,10 @@ def _material(evidence: Evidence, selection: Selection, parts: Split) -> list[st
             return selection.gains[effect].floors >= BESIDE
         if path_of(effect) != "radio" or parts.effects[effect].value >= LEAST_SHARE:
             return True
-        # Lost packets that hold the old command are counted, however little they did to the thrust.
-        gain = evidence.radio.gain
-        return gain[effect,] > LEAST_COUNTED
+        # Lost packets that hold the old command are counted, however little they did to the thrust. Beside a latency late
+        # rows look like them, unless a row holds one command only.
+        radio = evidence.radio
+        return radio.gain[effect,] > LEAST_COUNTED and (radio.single or radio.delay <= CLOCK)
 
     if order and parts.effects[order[0]].value < LEAST_SHARE and parts.unexplained.value > UNKNOWN_SHARE:
         return []
