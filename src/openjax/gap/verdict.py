@@ -120,7 +120,8 @@ def _material(evidence: Evidence, selection: Selection, parts: Split) -> list[st
         # Lost packets that hold the old command are counted, however little they did to the thrust. Beside a latency late
         # rows look like them, unless a row holds one command only.
         radio = evidence.radio
-        return radio.gain[effect,] > LEAST_COUNTED and (radio.single or radio.delay <= CLOCK)
+        feigned = effect == "packet_loss" and radio.delay > CLOCK and not radio.single
+        return radio.gain[effect,] > LEAST_COUNTED and not feigned
 
     if order and parts.effects[order[0]].value < LEAST_SHARE and parts.unexplained.value > UNKNOWN_SHARE:
         return []
