@@ -52,6 +52,7 @@ def notes(report):
         found = look(evidence, selection)
         return {
             "everything": found.everything._asdict(),
+            "others": found.others._asdict(),
             "strange": found.strange._asdict(),
             "plain": found.plain._asdict(),
             "followed": found.followed,

@@ -78,11 +78,13 @@ class Followed(NamedTuple):
 
 @dataclass(frozen=True)
 class Rest:
-    """What the dictionary predicts of the rest: `everything` with all regressors that it took, `strange` what those add that
-    are like no effect of the list, `plain` the plainest of these; `followed` the regressors, in words, the most telling
-    first; `local`: what is local in frequency or in time."""
+    """What the dictionary predicts of the rest: `everything` with all regressors that it took, `others` what those add that
+    are like no effect of the selection, whose form may be a little off, `strange` those that are like none of the list, `plain`
+    the plainest of these; `followed` the regressors, in words, the most telling first; `local`: what is local in frequency or
+    in time."""
 
     everything: Followed
+    others: Followed
     strange: Followed
     plain: Followed
     followed: tuple[str, ...]
@@ -127,8 +129,10 @@ def look(evidence: Evidence, selection: Selection) -> Rest:
     rank = np.array([_rank(tables[0][n], evidence.library.effects) for n in names])
     taken = np.array(chosen, int)
 
-    def judged(ranks):
-        columns = taken[np.isin(rank[taken], ranks)]
+    own = np.array([bool(set(tables[0][n].like) & set(selection.effects)) for n in names])
+
+    def judged(which):
+        columns = taken[which[taken]]
         return judge(table, widened(base, extra[columns], spread[columns] ** -2.0)) if len(columns) else now
 
     def followed(fewer, more):
@@ -136,7 +140,7 @@ def look(evidence: Evidence, selection: Selection) -> Rest:
         predicted = np.where(table.usable > 0, 1.0 - more.squares.sum(0) / np.maximum(left, 1e-30), 0.0)
         return Followed(np.maximum(predicted, 0.0), float((more.nats - fewer.nats).sum()))
 
-    known = judged((LIKE_AN_EFFECT,))
+    known = judged(rank == LIKE_AN_EFFECT)
     disturbed = [
         disturbances(t, r) for t, r in zip(replay.tracks, residuals_of(replay, selection.fit), strict=True)
     ]
@@ -151,8 +155,9 @@ def look(evidence: Evidence, selection: Selection) -> Rest:
         heard[VELOCITY] = 0.0  # samples put onto faster rows beat with them
     return Rest(
         followed(now, then),
+        followed(judged(own & (rank == LIKE_AN_EFFECT)), then),
         followed(known, then),
-        followed(known, judged((LIKE_AN_EFFECT, PLAIN))),
+        followed(known, judged(np.isin(rank, (LIKE_AN_EFFECT, PLAIN)))),
         tuple(names[k] for k in chosen),
         (
             *lines(replay.tracks, disturbed, heard),

@@ -22,7 +22,7 @@ LEAST_LEFT = 0.05  # floors of the gap that a strange rest must hold to be named
 LEAST_PLAIN = 0.01  # the same where plain ones tell it
 LEAST_LARGE = 0.25  # the same of a rest that an effect of the list could make, and none was named
 UNDONE = 1.5  # sum of the shares beyond which effects undo each other
-UNKNOWN_SHARE = 0.12  # of the gap, from which a strange rest is named beside the effects
+UNKNOWN_SHARE = 0.08  # of the gap, from which a strange rest is named beside the effects
 LARGE_SHARE = 0.2  # the same of any rest
 
 
@@ -73,8 +73,11 @@ def decide(evidence: Evidence, selection: Selection, rest: Rest, parts: Split, m
     """The words that the shares give, and how sure they are."""
     named = _material(evidence, selection, parts)
     strange = bool(set(evidence.sensors.findings) - {"clocks"}) or bool(rest.local)
+    largest = max((parts.effects[e].value for e in named), default=0.0)
     routes = (
-        (rest.everything, LEAST_LEFT if named else LEAST_LARGE, LARGE_SHARE),
+        (rest.others, LEAST_LEFT if named else LEAST_LARGE, LARGE_SHARE),
+        # What is larger than all that is named isn't what its form has wrong.
+        (rest.everything, LEAST_LEFT if named else LEAST_LARGE, max(LARGE_SHARE, largest)),
         (rest.strange, LEAST_LEFT, UNKNOWN_SHARE),
         (rest.plain, LEAST_PLAIN, UNKNOWN_SHARE),
     )
