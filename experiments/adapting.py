@@ -86,7 +86,8 @@ def tune(options) -> None:
             }
             bounds = bounds_of(values, exact, rest=0.0)
         key = jax.random.key(number)
-        score = scores_on(adaptation, parameters, tasks, key, bounds)
+        seen: list[dict[str, float]] = []
+        score = scores_on(adaptation, parameters, tasks, key, bounds, seen.append)
         tuned = fine_tune(adaptation, parameters, bounds, training, key, score)
         notes = {"effects": list(effects), "seconds": time.monotonic() - begin, "update": tuned.update}
         # the game without its family: flown elsewhere, it isn't needed, and all policies share one program
@@ -98,18 +99,14 @@ def tune(options) -> None:
             f"{n} {one:.4f} → {two:.4f}"
             for n, one, two in zip(tuned.history[0], means[::2], means[1::2], strict=True)
         )
-        flown = [
-            episodes(adaptation.evaluate(p, tasks, key, vehicles))
-            for p, vehicles in (
-                (parameters, bounds_of({}, {}, rest=0.0)),
-                (parameters, bounds),
-                (tuned.parameters, bounds),
-            )
-        ]
-        came = "; ".join(f"{n} " + " → ".join(f"{own[n].mean():.4f}" for own in flown) for n in LOSSES)
+        usual = episodes(adaptation.evaluate(parameters, tasks, key, bounds_of({}, {}, rest=0.0)))
+        came = "; ".join(
+            f"{n} {usual[n].mean():.4f} → " + ", ".join(f"{figures[n]:.4f}" for figures in seen)
+            for n in LOSSES
+        )
         print(
             f"{name}: {', '.join(effects) or 'none'}; {notes['seconds']:.0f} s, kept {tuned.update} of {looks}; {learnt}; "
-            f"here: {came}",
+            f"nominal → looks: {came}",
             flush=True,
         )
 

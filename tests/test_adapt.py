@@ -11,12 +11,14 @@ from openjax import adapt
 from openjax.errors import UserError
 from openjax.learning import TrainSettings, build
 from openjax.learning.adaptation import (
+    LAG,
     AdaptSettings,
     adapting_game,
     bounds_of,
     clearly_better,
     fine_tune,
     make_adaptation,
+    off_the_flight,
     starting_parameters,
 )
 from openjax.learning.settings import GeneratorSettings, MappoSettings
@@ -125,10 +127,18 @@ def test_moments_in_flight_are_the_nominal_vehicles_with_a_settled_other_one(pol
     np.testing.assert_allclose(flights.state.vehicles["mass"]["extra"], 0.008, atol=1e-3)
     np.testing.assert_array_equal(nominal.state.vehicles["mass"]["extra"], 0.0)
     assert not np.allclose(own.rotor_speed, other.rotor_speed)
-    step = np.asarray(nominal.position)[0] - np.asarray(other.position)
+    step = np.asarray(nominal.position)[LAG] - np.asarray(other.position)
     np.testing.assert_allclose(
         step, 0.01 * np.asarray(other.velocity), atol=2e-3
     )  # the flight that goes on from there
+
+
+def test_a_flight_may_come_late_but_not_elsewhere():
+    flown = np.cumsum(np.random.default_rng(0).normal(0.0, 0.05, (LAG + 12, 1, 2, 3)), axis=0)
+    late = off_the_flight(flown[LAG - 4 : -4], flown[LAG - 4 : -4], flown, flown)
+    np.testing.assert_allclose(late, 0.0, atol=1e-6)
+    away = off_the_flight(flown[LAG:] + 0.1, flown[LAG:], flown, flown)
+    assert (np.asarray(away) > 1.0).mean() > 0.9
 
 
 def test_a_policy_is_fine_tuned_measured_and_written(policy_file, tmp_path, monkeypatch):

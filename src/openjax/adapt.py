@@ -163,11 +163,12 @@ def episodes(evaluation) -> dict:
     return {name: np.asarray(value, float) for name, value in names.items()}
 
 
-def scores_on(adaptation, parameters, tasks, key, bounds):
+def scores_on(adaptation, parameters, tasks, key, bounds, hear=lambda figures: None):
     """Scores (B,) of a policy's episodes on tasks (B, ...), policy -> scores, by which checkpoints are chosen, too.
 
     Speeds over the limit count as far as they are more than in the same episode of `parameters` with the nominal vehicle:
     to fly as fast with the diagnosed one is what is wanted, and a vehicle that made a policy slower did nothing good by it.
+    `hear` is told the mean of each figure, each time.
     """
     import numpy as np
 
@@ -178,6 +179,7 @@ def scores_on(adaptation, parameters, tasks, key, bounds):
 
     def scores(policy):
         found = episodes(adaptation.evaluate(policy, tasks, key, bounds))
+        hear({name: float(values.mean()) for name, values in found.items()})
         found["over_speed_rate"] = np.maximum(found["over_speed_rate"], usual["over_speed_rate"])
         return selection_score(found, adaptation.game.episode_length)
 

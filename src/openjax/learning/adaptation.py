@@ -6,6 +6,7 @@ and as fast as the policy flew the nominal one. The simulator's derivative says 
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -17,6 +18,7 @@ import optax
 from flax import struct
 
 from openjax.baselines import make_policy
+from openjax.learning.analytic_gradient import breach_share, crash_share, draw_start, nearest_gap
 from openjax.learning.evaluation import Evaluation, make_evaluate
 from openjax.learning.settings import TrainSettings
 from openjax.policy import Policy, PolicyParameters
@@ -27,15 +29,12 @@ from openjax.pursuit import (
     PursuitState,
     RewardSettings,
     Task,
-    close_starts,
     turn_task,
     uniform_task,
 )
-from openjax.pursuit.collisions import TOUCH, drone_distance, pillar_distance
 from openjax.ranges import Interval, check_intervals
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.family import REST, adapted_family, draw_vehicles, family_bounds, known_effects
-from openjax.vehicle.solids import DRONE_RADIUS
 
 RATE_LOOP = 0.002
 """Period of a Crazyflie's rate loop (s)."""
@@ -48,8 +47,9 @@ FLIGHT = 400
 SETTLE = 40
 """Control steps that the diagnosed vehicle flies up to such a moment, so that its controllers, rotors and the policy's
 memories are those of that vehicle, and not of one that has just been changed in flight."""
-SMOOTH = 0.012
-"""Gap (m) over which a crash goes from sure to none in what is learnt."""
+LAG = 6
+"""Control steps by which the diagnosed vehicle may follow late: one that hears late can't help it, and would learn to overdo
+what it does if it were to catch up."""
 NEAR, ALIKE = 0.02, 0.1
 """Distance (m) and difference in velocity (m/s) from the nominal vehicle's flight that count as one."""
 
@@ -99,8 +99,10 @@ class Flights:
     """Moments of flights with the nominal vehicle, and how that flew on from each."""
 
     state: PursuitState  # (W, ...) where the nominal vehicle was; with vehicles of the bounds that are adapted to
-    position: jax.Array  # (T, W, N, 3) m, after the steps that followed
-    velocity: jax.Array  # (T, W, N, 3) m/s
+    position: (
+        jax.Array
+    )  # (LAG + T, W, N, 3) m, after the LAG steps before the moment and the steps that followed
+    velocity: jax.Array  # (LAG + T, W, N, 3) m/s
 
 
 @dataclass(frozen=True)
@@ -148,7 +150,7 @@ def make_adaptation(trained: TrainSettings, settings: AdaptSettings) -> Adaptati
 
         first = jax.vmap(pursuit.observe)(state), state, state, state
         (_, _, before, kept), flown = jax.lax.scan(one, first, jnp.arange(FLIGHT))
-        after = moment + jnp.arange(STEPS)[:, None]  # (T, W)
+        after = moment + jnp.arange(-LAG, STEPS)[:, None]
         position, velocity = (track[after, jnp.arange(number)] for track in flown)
 
         drawn = jax.vmap(lambda key: draw_vehicles(free.vehicles, key, free.num_pursuers, 0.0, bounds))(
@@ -168,7 +170,7 @@ def make_adaptation(trained: TrainSettings, settings: AdaptSettings) -> Adaptati
         """Half of the worlds at starts, half in flight, all with vehicles of the bounds; and the flights to follow."""
         pursuit = environment(free, bounds)
         task_key, reset_key, moment_key = jax.random.split(key, 3)
-        tasks = jax.vmap(lambda key: _start(free, key))(jax.random.split(task_key, worlds))
+        tasks = jax.vmap(lambda key: draw_start(free, key))(jax.random.split(task_key, worlds))
         _, starts = jax.vmap(pursuit.reset_to)(jax.random.split(reset_key, worlds), tasks)
         chosen = jax.random.choice(moment_key, flights.position.shape[1], (worlds,), replace=False)
         moments = jax.tree.map(lambda leaf: leaf[chosen], flights.state)
@@ -180,26 +182,32 @@ def make_adaptation(trained: TrainSettings, settings: AdaptSettings) -> Adaptati
         fly_on = jax.checkpoint(_stepper(pursuit, policy, parameters))
 
         def one(carry, _):
-            observation, state, least = carry
+            observation, state, least, breach = carry
             observation, state = fly_on(actor, observation, state)
             least = jnp.minimum(least, nearest_gap(free, state))
-            return (observation, state, least), (state.drones.position, state.drones.velocity)
+            breach = breach + breach_share(free, state) / STEPS
+            return (observation, state, least, breach), (state.drones.position, state.drones.velocity)
 
-        first = jax.vmap(pursuit.observe)(state), state, jnp.full(state.drones.position.shape[:2], jnp.inf)
-        (_, end, least), (flown, speed) = jax.lax.scan(one, first, None, length=STEPS)
+        number = state.drones.position.shape[:2]
+        first = jax.vmap(pursuit.observe)(state), state, jnp.full(number, jnp.inf), jnp.zeros(number)
+        (_, end, least, breach), (flown, speed) = jax.lax.scan(one, first, None, length=STEPS)
         crash = jnp.mean(crash_share(least), axis=-1)
         fast = jnp.sqrt(jnp.sum(end.drones.velocity[:worlds] ** 2, axis=-1) + 1e-9) - 1.0
         low = 0.35 - end.drones.position[:worlds, :, 2]
-        off = jnp.sum(((flown[:, worlds:] - position) / NEAR) ** 2, axis=-1)
-        off = off + jnp.sum(((speed[:, worlds:] - velocity) / ALIKE) ** 2, axis=-1)
-        off = jnp.sqrt(1.0 + off) - 1.0
+        off = off_the_flight(flown[:, worlds:], speed[:, worlds:], position, velocity)
         watch = {
             "crashes_from_starts": jnp.mean(crash[:worlds]),
             "crashes_in_flight": jnp.mean(crash[worlds:]),
+            "breaches": jnp.mean(breach),
             "ends": jnp.mean(jax.nn.relu(fast)) + jnp.mean(jax.nn.relu(low)),
             "off_the_nominal_flight": jnp.mean(off),
         }
-        whole = watch["crashes_from_starts"] + watch["crashes_in_flight"] + 0.2 * watch["ends"]
+        whole = (
+            watch["crashes_from_starts"]
+            + watch["crashes_in_flight"]
+            + watch["breaches"]
+            + 0.2 * watch["ends"]
+        )
         return whole + settings.follow * watch["off_the_nominal_flight"], watch
 
     def update(actor, state, parameters, flights, key, bounds):
@@ -226,6 +234,21 @@ def _stepper(pursuit, policy, parameters):
         return observation, state
 
     return fly_on
+
+
+def off_the_flight(position, velocity, wanted, wanted_velocity) -> jax.Array:
+    """(T, W, N) how far flights (T, W, N, 3) are from those that are wanted (LAG + T, W, N, 3), at the lag that suits best.
+
+    In multiples of `NEAR` and `ALIKE`, less one where it is large and half the square where it is small.
+    """
+
+    def at(lag):
+        part = slice(LAG - lag, LAG - lag + position.shape[0])
+        off = jnp.sum(((position - wanted[part]) / NEAR) ** 2, axis=-1)
+        off = off + jnp.sum(((velocity - wanted_velocity[part]) / ALIKE) ** 2, axis=-1)
+        return jnp.sqrt(1.0 + off) - 1.0
+
+    return functools.reduce(jnp.minimum, [at(lag) for lag in range(0, LAG + 1, 2)])
 
 
 def _kept(now, state, kept):
@@ -260,31 +283,6 @@ def _task(game, key):
     """A uniform task, turned about the arena's axis."""
     task_key, turn_key = jax.random.split(key)
     return turn_task(turn_key, uniform_task(game, task_key))
-
-
-def _start(game, key):
-    """A task to start from: half of them with pursuers close to something."""
-    task_key, close_key = jax.random.split(key)
-    task = _task(game, task_key)
-    near = close_starts(game, close_key, task, 0.7)
-    half = jax.random.bernoulli(jax.random.fold_in(key, 2))
-    return jax.tree.map(lambda a, b: jnp.where(half, a, b), near, task)
-
-
-def nearest_gap(game: PursuitSettings, state: PursuitState) -> jax.Array:
-    """(W, N) m, from each pursuer of worlds (W, ...) to the nearest solid thing: pillar, pursuer or floor."""
-    position, task = state.drones.position, state.task
-    to_pillar = jax.vmap(lambda p, q: pillar_distance(game, p, q))(position, task.pillar_position)
-    gap = jnp.min(jnp.where(task.pillar_active[:, None], to_pillar, jnp.inf), axis=-1) - DRONE_RADIUS
-    if game.num_pursuers > 1:
-        others = jnp.min(jax.vmap(drone_distance)(position), axis=-1)
-        gap = jnp.minimum(gap, others - 2 * DRONE_RADIUS)
-    return jnp.minimum(gap, position[..., 2] - DRONE_RADIUS)
-
-
-def crash_share(gap: jax.Array) -> jax.Array:
-    """How much of a crash a least gap (m) counts as, from 0 to 1: what has a gradient before anything is touched."""
-    return jax.nn.sigmoid((3 * TOUCH - gap) / SMOOTH)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,6 @@ import jax.numpy as jnp
 import optax
 
 from openjax.cluster.compilation import in_background
-from openjax.learning.adaptation import crash_share, nearest_gap
 from openjax.learning.settings import AnalyticSettings
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import (
@@ -31,15 +30,16 @@ from openjax.pursuit import (
     turn_task,
     uniform_task,
 )
-from openjax.pursuit.collisions import drone_distance, pillar_distance
+from openjax.pursuit.collisions import TOUCH, drone_distance, pillar_distance
 from openjax.vehicle.family import family_bounds, narrowed_bounds
+from openjax.vehicle.solids import DRONE_RADIUS
 
 STEPS = 50
 """Control steps that are learnt at once."""
 SEGMENTS = 8
 """A flight is looked at after each of so many times `STEPS`."""
 SMOOTH = 0.012
-"""Distance (m) over which a breach goes from sure to none in what is learnt."""
+"""Distance (m) over which a breach or a crash goes from sure to none in what is learnt."""
 FAST = 0.05
 """Speed (m/s) above where the speed begins to cost that costs as much as a crash in every step would."""
 LOWEST, FASTEST = 0.35, 1.0
@@ -217,6 +217,22 @@ def free_flight(environment: Pursuit, game: PursuitSettings | None = None) -> Pu
         reward=RewardSettings(),
     )
     return Pursuit(free, environment.vehicle, environment.effects, environment.effect_parameters)
+
+
+def nearest_gap(game: PursuitSettings, state: PursuitState) -> jax.Array:
+    """(W, N) m, from each pursuer of worlds (W, ...) to the nearest solid thing: pillar, pursuer or floor."""
+    position, task = state.drones.position, state.task
+    to_pillar = jax.vmap(lambda p, q: pillar_distance(game, p, q))(position, task.pillar_position)
+    gap = jnp.min(jnp.where(task.pillar_active[:, None], to_pillar, jnp.inf), axis=-1) - DRONE_RADIUS
+    if game.num_pursuers > 1:
+        others = jnp.min(jax.vmap(drone_distance)(position), axis=-1)
+        gap = jnp.minimum(gap, others - 2 * DRONE_RADIUS)
+    return jnp.minimum(gap, position[..., 2] - DRONE_RADIUS)
+
+
+def crash_share(gap: jax.Array) -> jax.Array:
+    """How much of a crash a least gap (m) counts as, from 0 to 1: what has a gradient before anything is touched."""
+    return jax.nn.sigmoid((3 * TOUCH - gap) / SMOOTH)
 
 
 def breach_share(game: PursuitSettings, state: PursuitState) -> jax.Array:
