@@ -7,7 +7,8 @@ import pytest
 from scipy.optimize import minimize
 
 from openjax.gap.bounds import BOUND, held_objective
-from openjax.gap.table import Model, Table, _errors, judge, offers
+from openjax.gap.judging import judge, offers
+from openjax.gap.table import Model, Table, _errors
 
 SHARED = np.array([True, True, False])
 

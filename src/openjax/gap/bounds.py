@@ -10,18 +10,18 @@ BOUND = 2.0  # usual sizes that a nuisance may take
 def bounded(hessian, push, free: int = 0, bound: float = BOUND) -> tuple[np.ndarray, np.ndarray]:
     """Minimum of x'Hx/2 - push'x with |x| <= bound beyond the first `free` entries, by fixing what leaves the box; and
     which entries are inside it."""
-    found = np.zeros(len(push))
     open_ = np.ones(len(push), bool)
-    for _ in range(len(push)):
-        inside = np.flatnonzero(open_)
-        rest = push[inside] - hessian[np.ix_(inside, np.flatnonzero(~open_))] @ found[~open_]
-        found[inside] = np.linalg.solve(hessian[np.ix_(inside, inside)], rest)
-        beyond = open_ & (np.abs(found) > bound) & (np.arange(len(push)) >= free)
+    found = np.linalg.solve(hessian, push)
+    while True:
+        beyond = open_ & (np.abs(found) > bound)
+        beyond[:free] = False
         if not beyond.any():
-            break
+            return found, open_
         found[beyond] = np.sign(found[beyond]) * bound
         open_ &= ~beyond
-    return found, open_
+        inside, fixed = np.flatnonzero(open_), np.flatnonzero(~open_)
+        rest = push[inside] - hessian[np.ix_(inside, fixed)] @ found[fixed]
+        found[inside] = np.linalg.solve(hessian[np.ix_(inside, inside)], rest)
 
 
 def normal_equations(precision: np.ndarray, push: np.ndarray, common: int, own: int, parts) -> tuple:
@@ -34,9 +34,14 @@ def normal_equations(precision: np.ndarray, push: np.ndarray, common: int, own: 
     hessian[:free, :free], right[:free] = precision, push
     for k, part in enumerate(parts):
         if part is not None:
-            here = np.concatenate([np.arange(shared), shared + own * k + np.arange(own)])
-            hessian[np.ix_(here, here)] += part[0]
-            right[here] += part[1]
+            gram, target = part
+            mine = slice(shared + own * k, shared + own * (k + 1))
+            hessian[:shared, :shared] += gram[:shared, :shared]
+            hessian[:shared, mine] += gram[:shared, shared:]
+            hessian[mine, :shared] += gram[shared:, :shared]
+            hessian[mine, mine] += gram[shared:, shared:]
+            right[:shared] += target[:shared]
+            right[mine] += target[shared:]
     return hessian, right
 
 

@@ -13,12 +13,13 @@ from openjax.gap import verdict as rules
 from openjax.gap.bounds import BOUND
 from openjax.gap.evidence import Evidence, gather
 from openjax.gap.intervals import estimates
+from openjax.gap.judging import judge
 from openjax.gap.library import CARDS, Library, library
 from openjax.gap.report import Report
 from openjax.gap.rest import Rest, look
 from openjax.gap.selection import CLASS, Selection, select
 from openjax.gap.shares import ERROR_NAMES, split
-from openjax.gap.table import judge, with_effects
+from openjax.gap.table import with_effects
 from openjax.gap.where import locate
 from openjax.vehicle.vehicle_file import VehicleFile, load_vehicle_file
 

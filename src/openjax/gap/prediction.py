@@ -5,6 +5,7 @@ Channels: body rates (3), velocity (3, world) - both integrated from the first r
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import jax
 import numpy as np
@@ -45,27 +46,33 @@ class Physics:
         parts = [[] for _ in self.tracks]
         # All of it is under way before any of it is waited for.
         running = []
-        for alike in self._alike():
-            lanes = [(number, k) for number in alike for k in range(len(theta))]
+        for alike, nominal in self._alike:
+            lanes = [(place, k) for place in range(len(alike)) for k in range(len(theta))]
             for begin in range(0, len(lanes), LANES):
-                own = lanes[begin : begin + LANES]
-                filled = own + own[:1] * (LANES - len(own))
-                vehicles, paths = (
-                    jax.tree.map(lambda *leaves: np.stack(leaves), *(of[number] for number, _ in filled))
-                    for of in (self.vehicles, self.paths)
-                )
-                running.append((own, run(theta[[k for _, k in filled]], vehicles, paths)))
-        for own, rows in running:
-            for (number, _), lane in zip(own, np.asarray(rows), strict=False):
+                places, vectors = np.array(lanes[begin : begin + LANES]).T
+                fill = np.minimum(np.arange(LANES), len(places) - 1)
+                vehicles, paths = jax.tree.map(lambda leaf, which=places[fill]: leaf[which], nominal)
+                running.append((alike[places], run(theta[vectors[fill]], vehicles, paths)))
+        for numbers, rows in running:
+            for number, lane in zip(numbers, np.asarray(rows), strict=False):
                 parts[number].append(lane[: len(self.tracks[number])])
         return [_integrated(np.stack(p), t.dt) for p, t in zip(parts, self.tracks, strict=True)]
 
-    def _alike(self) -> list[list[int]]:
-        """Numbers of the tracks by the shape of their paths."""
+    @cached_property
+    def _alike(self) -> list[tuple[np.ndarray, tuple]]:
+        """Tracks by the shape of their paths: their numbers, vehicles and paths (leaves (tracks, ...))."""
         shapes: dict[tuple, list[int]] = {}
         for number, path in enumerate(self.paths):
             shapes.setdefault(path.others.shape, []).append(number)
-        return list(shapes.values())
+        return [
+            (
+                np.array(own),
+                jax.tree.map(
+                    lambda *leaves: np.stack(leaves), *((self.vehicles[n], self.paths[n]) for n in own)
+                ),
+            )
+            for own in shapes.values()
+        ]
 
 
 def make_physics(tracks, vehicles, motor_ticks) -> Physics:

@@ -19,13 +19,14 @@ import numpy as np
 from openjax.flights.track import Track, rotation, smooth
 from openjax.gap.evidence import Evidence
 from openjax.gap.hypotheses import SetFit, without_nuisances
+from openjax.gap.judging import judge, offers, solve
 from openjax.gap.knocks import knocks
 from openjax.gap.levers import torques
 from openjax.gap.nuisances import torque_channels
 from openjax.gap.replay import FORCE, RATES, VELOCITY, Replay
 from openjax.gap.selection import LEAST_NATS, Selection, testable
 from openjax.gap.spectral_lines import lines
-from openjax.gap.table import build, judge, offers, solve, widened, with_effects
+from openjax.gap.table import build, widened, with_effects
 from openjax.vehicle.effects.effect import ARENA_CEILING
 
 SPREAD = 0.3  # m/s^2 and, times TORQUE, rad/s^2: prior rms of a regressor's part of the motion

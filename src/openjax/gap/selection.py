@@ -7,13 +7,15 @@ that stays is set against every effect that could stand in its place."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 
 from openjax.gap.evidence import Evidence
 from openjax.gap.hypotheses import SetFit, fit_set, step_with
+from openjax.gap.judging import Judged, judge, level
 from openjax.gap.library import ABSENT, CARDS, places, prior, start_of
-from openjax.gap.table import Judged, Table, build, judge, level, with_effects
+from openjax.gap.table import Table, build, with_effects
 
 # The decision's numbers. None was learned from a plant.
 LEAST_GAIN = 0.03  # floors by which an effect must shrink the gap on stretches left out
@@ -148,21 +150,21 @@ def testable(evidence: Evidence) -> dict[str, SetFit]:
 
 def gain_of(table: Table, whole: Judged, effect: str) -> Gain:
     """What an effect of the table's set adds."""
-    without = judge(table, with_effects(table, drop=(effect,)))
-    nothing = (
-        judge(table, with_effects(table, drop=table.fit.effects)) if len(table.fit.effects) > 1 else without
-    )
-    return _gain(table, effect, without, whole, nothing)
+    return _gain(table, effect, judge(table, with_effects(table, drop=(effect,))), whole)
 
 
 def _offer(table: Table, now: Judged, effect: str) -> Gain:
-    more = judge(table, with_effects(table, add=(effect,)))
-    nothing = judge(table, with_effects(table, drop=table.fit.effects))
-    return _gain(table, effect, now, more, nothing)
+    return _gain(table, effect, now, judge(table, with_effects(table, add=(effect,))))
 
 
-def _gain(table: Table, effect: str, without: Judged, whole: Judged, nothing: Judged) -> Gain:
-    floor = floor_of(table, whole)
+@lru_cache(maxsize=1)
+def _of_nothing(table: Table) -> Judged:
+    """The table without any effect of its set."""
+    return judge(table, with_effects(table, drop=table.fit.effects))
+
+
+def _gain(table: Table, effect: str, without: Judged, whole: Judged) -> Gain:
+    floor, nothing = floor_of(table, whole), _of_nothing(table)
     nats = whole.nats - without.nats
     less = level(without.squares, floor) - 1.0
     return Gain(

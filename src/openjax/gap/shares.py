@@ -14,10 +14,11 @@ import numpy as np
 
 from openjax.flights.track import smooth
 from openjax.gap.evidence import Evidence
+from openjax.gap.judging import keep
 from openjax.gap.replay import SKIP
 from openjax.gap.rest import Rest
 from openjax.gap.selection import LEAST_GAIN, Selection
-from openjax.gap.table import ERRORS, keep, with_effects
+from openjax.gap.table import ERRORS, with_effects
 
 METRIC = (
     "rms over channels of prediction error / noise floor on stretches left out (velocity over 0.25 s, body rates over "

@@ -15,9 +15,9 @@ from functools import cached_property
 
 import numpy as np
 
-from openjax.gap.bounds import BOUND, bounded, normal_equations
+from openjax.gap.bounds import BOUND
 from openjax.gap.hypotheses import SetFit, linearised_at
-from openjax.gap.library import ABSENT, CARDS, PLACE, places, prior
+from openjax.gap.library import ABSENT, CARDS, places, prior
 from openjax.gap.replay import SKIP, Replay
 
 BLOCK = 1.0  # s: gusts and sensors forget within less
@@ -58,9 +58,13 @@ class Table:
     @cached_property
     def folds(self) -> tuple[np.ndarray, np.ndarray]:
         """Whitened sums (folds, C, C), and the track (folds,) that each belongs to."""
-        count = int(self.fold_of.max()) + 1
-        sums = np.stack([self.white[self.fold_of == k].sum(0) for k in range(count)])
-        return sums, np.array([self.track_of[np.argmax(self.fold_of == k)] for k in range(count)])
+        own = [self.blocks_of(k) for k in range(int(self.fold_of.max()) + 1)]
+        return np.stack([self.white[b].sum(0) for b in own]), np.array([self.track_of[b.start] for b in own])
+
+    def blocks_of(self, fold: int) -> slice:
+        """The blocks of a fold, which follow one another."""
+        own = np.flatnonzero(self.fold_of == fold)
+        return slice(int(own[0]), int(own[-1]) + 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,16 +77,6 @@ class Model:
     mean: np.ndarray
     precision: np.ndarray
     bound: float = BOUND
-
-
-@dataclass(frozen=True, eq=False)
-class Judged:
-    """A model on stretches left out: `nats` (B,) minus half the whitened sum of squares, `squares` (B, 6) of the
-    errors, `taken` (folds, N) of the shared nuisances."""
-
-    nats: np.ndarray
-    squares: np.ndarray
-    taken: np.ndarray
 
 
 def build(replay: Replay, fit: SetFit, singles: dict[str, SetFit], more=None) -> Table:
@@ -180,96 +174,6 @@ def with_effects(table: Table, add=(), drop=()) -> Model:
     return Model(tuple(table.part[e] for e in drop), free.astype(int), np.concatenate(means), out)
 
 
-def solve(table: Table, model: Model, left_out: int | None = None) -> np.ndarray:
-    """Coefficients (tracks, C) of every column, fitted to all folds but one."""
-    hessian, push = _equations(table, model, left_out)
-    found, _ = bounded(hessian, push, len(model.free), model.bound)
-    if left_out is not None:
-        _own_again(table, model, found, table.folds[1][left_out])
-    return np.stack([_spread(table, model, found, k) for k in range(len(np.unique(table.track_of)))])
-
-
-def _own_again(table: Table, model: Model, found: np.ndarray, track: int) -> None:
-    """Fit a track's own nuisances to all of it, everything else as it was `found`: they are of its sensors and clocks, and
-    what the rest of the track can't show of them isn't to be foretold."""
-    sums, tracks = table.folds
-    shared, own = _nuisances(table, model)
-    fixed = np.concatenate([model.free, shared])
-    gram = sums[tracks == track].sum(0)
-    target = _target(gram, model) - gram[:, fixed] @ found[: len(fixed)]
-    place = len(fixed) + len(own) * int(np.searchsorted(np.unique(table.track_of), track))
-    hessian = np.eye(len(own)) + gram[np.ix_(own, own)]
-    found[place : place + len(own)] = bounded(hessian, target[own], 0, model.bound)[0]
-
-
-def _target(gram: np.ndarray, model: Model) -> np.ndarray:
-    """(C,) products of every column with what the model has to explain."""
-    return gram[:, 0] + gram[:, list(model.parts)].sum(1)
-
-
-def _nuisances(table: Table, model: Model) -> tuple[np.ndarray, np.ndarray]:
-    """Columns of the nuisances that the model uses: the case's and a track's."""
-    if model.bound == 0.0:
-        return table.nuisances[:0], table.nuisances[:0]
-    return table.nuisances[table.shared], table.nuisances[~table.shared]
-
-
-def _equations(table: Table, model: Model, left_out: int | None) -> tuple[np.ndarray, np.ndarray]:
-    """Normal equations of the model's free columns, the case's nuisances and each track's, over all folds but one."""
-    sums, tracks = table.folds
-    names = np.unique(table.track_of)
-    shared, own = _nuisances(table, model)
-    columns = np.concatenate([model.free, shared, own])
-    parts = []
-    for track in names:
-        used = [f for f in np.flatnonzero(tracks == track) if f != left_out]
-        gram = sums[used].sum(0)
-        target = _target(gram, model)
-        parts.append((gram[np.ix_(columns, columns)], target[columns]) if used else None)
-    return normal_equations(model.precision, model.precision @ model.mean, len(shared), len(own), parts)
-
-
-def _spread(table: Table, model: Model, found: np.ndarray, track: int) -> np.ndarray:
-    """Coefficients (..., C) of every column on one track, from solutions (..., size) of the equations."""
-    shared, own = _nuisances(table, model)
-    p, s, n = len(model.free), len(shared), len(own)
-    out = np.zeros((*found.shape[:-1], table.size))
-    out[..., 0] = 1.0
-    out[..., list(model.parts)] = 1.0
-    out[..., model.free] -= found[..., :p]
-    out[..., shared] = -found[..., p : p + s]
-    out[..., own] = -found[..., p + s + n * track : p + s + n * (track + 1)]
-    return out
-
-
-def offers(table: Table, model: Model, columns: np.ndarray, precision: np.ndarray) -> np.ndarray:
-    """Nats (K, B) on each fold of the model with one more of `columns` (K,) free, whose coefficient has `precision` (K,) about
-    none: `judge` for each, with the nuisances that are at their bounds left there."""
-    wide = widened(model, columns, precision)
-    added = len(model.free) + np.arange(len(columns))
-    nats = np.zeros((len(columns), len(table.white)))
-    tracks = np.unique(table.track_of)
-    for fold in range(len(table.folds[0])):
-        hessian, push = _equations(table, wide, fold)
-        kept = np.setdiff1d(np.arange(len(push)), added)
-        found, open_ = bounded(hessian[np.ix_(kept, kept)], push[kept], len(model.free), model.bound)
-        inside = kept[open_]
-        follow = np.linalg.solve(hessian[np.ix_(inside, inside)], hessian[np.ix_(inside, added)])
-        stiff = hessian[added, added] - (hessian[np.ix_(inside, added)] * follow).sum(0)
-        size = (push[added] - hessian[np.ix_(added, kept)] @ found) / stiff
-        whole = np.zeros((len(columns), len(push)))
-        whole[:, kept] = found
-        whole[:, inside] -= (follow * size).T
-        whole[np.arange(len(columns)), added] = size
-        for each in whole:
-            _own_again(table, wide, each, table.folds[1][fold])
-        blocks = np.flatnonzero(table.fold_of == fold)
-        u = _spread(table, wide, whole, int(np.searchsorted(tracks, table.track_of[blocks[0]])))
-        for b in blocks:
-            nats[:, b] = -0.5 * ((u @ table.white[b]) * u).sum(1)
-    return nats
-
-
 def widened(model: Model, columns: np.ndarray, precision: np.ndarray) -> Model:
     """The model with further columns free, whose coefficients have `precision` about none."""
     size, more = len(model.free), len(columns)
@@ -278,57 +182,3 @@ def widened(model: Model, columns: np.ndarray, precision: np.ndarray) -> Model:
     block[np.arange(size, size + more), np.arange(size, size + more)] = precision
     free = np.concatenate([model.free, columns]).astype(int)
     return Model(model.parts, free, np.concatenate([model.mean, np.zeros(more)]), block, model.bound)
-
-
-def judge(table: Table, model: Model) -> Judged:
-    """The model on each fold, fitted to all others."""
-    nats, squares = np.zeros(len(table.white)), np.zeros((len(table.white), 6))
-    taken = []
-    for fold in range(len(table.folds[0])):
-        coefficients = solve(table, model, fold)
-        blocks = np.flatnonzero(table.fold_of == fold)
-        u = coefficients[table.track_of[blocks[0]]]
-        nats[blocks] = -0.5 * np.einsum("c,bcd,d->b", u, table.white[blocks], u)
-        squares[blocks] = np.einsum("c,bkcd,d->bk", u, table.error[blocks], u)
-        taken.append(-u[table.nuisances[table.shared]])
-    return Judged(nats, squares, np.array(taken))
-
-
-def keep(table: Table, model: Model, drop=(), off: np.ndarray | None = None) -> np.ndarray:
-    """Squared errors (B, 6) on each fold of a model fitted to all others, once the effects `drop` and the nuisances `off`
-    (N,) go and everything else stays as fitted."""
-    squares = np.zeros((len(table.white), 6))
-    for fold in range(len(table.folds[0])):
-        blocks = np.flatnonzero(table.fold_of == fold)
-        u = solve(table, model, fold)[table.track_of[blocks[0]]]
-        for effect in drop:
-            others = {int(i) for e in table.fit.effects if e not in drop for i in prior((e,))[0]}
-            own = [table.derivative[int(i)] for i in prior((effect,))[0] if int(i) not in others]
-            u[own] = 0.0
-            u[table.part[effect]] = 1.0
-        if off is not None:
-            u[table.nuisances[off]] = 0.0
-        squares[blocks] = np.einsum("c,bkcd,d->bk", u, table.error[blocks], u)
-    return squares
-
-
-def level(squares: np.ndarray, floor: np.ndarray) -> float:
-    """The gap: rms over channels of each channel's error over its floor (6,), both sums over the same rows."""
-    use = floor > 0
-    return float(np.sqrt(np.mean(squares.sum(0)[use] / floor[use])))
-
-
-__all__ = [
-    "ERRORS",
-    "PLACE",
-    "Judged",
-    "Model",
-    "Table",
-    "build",
-    "judge",
-    "level",
-    "offers",
-    "solve",
-    "widened",
-    "with_effects",
-]
