@@ -292,6 +292,8 @@ def _learn_analytic(job, directory, learn, validation):
     began, settings = time.monotonic(), job.settings
     leaves, _, notes = load_policy_file(directory.policy)
     before = fill(_abstract_parameters(job), leaves, str(directory.policy))
+    # where the validation, too, was compiled for
+    before = jax.device_put(before, jax.sharding.SingleDeviceSharding(jax.local_devices()[0]))
     after, history = learn(before, jax.random.key(settings.seed))
     summaries = [summarise(validation(parameters)[0]) for parameters in (before, after)]
     scores = [selection_score(summary, settings.environment.episode_length) for summary in summaries]

@@ -94,16 +94,16 @@ class AnalyticSettings:
 
     updates: Annotated[int, Interval("[0, 1000000]")] = 0
     """Updates of the actor; 0: there is no such stage."""
-    worlds: Annotated[int, Interval("[1, 65536]")] = 320
+    worlds: Annotated[int, Interval("[1, 65536]")] = 640
     """Starts in an update, and as many moments of flights."""
     learning_rate: Annotated[float, Interval("(0, 1]")] = 3e-4
     """Adam step size at the start; falls linearly to a twentieth."""
-    hold: Annotated[float, Interval("[0, 1000]")] = 0.05
+    hold: Annotated[float, Interval("[0, 1000]")] = 0.04
     """Weight of the squared change of the actions in flight, in standard deviations of the policy's."""
-    breach: Annotated[float, Interval("[0, 1000]")] = 1.0
-    """Weight of the breaches per step, beside the share of pursuers that touch something."""
-    speed: Annotated[float, Interval("[0, 1000]")] = 0.3
-    """Weight of speeds over the limit."""
+    breach: Annotated[float, Interval("[0, 1000]")] = 2.0
+    """Weight of the breaches per step in flight, beside the share of pursuers that touch something from a start."""
+    speed: Annotated[float, Interval("[0, 1000]")] = 0.6
+    """Weight of speeds over the limit in flight."""
     speed_from: Annotated[float, Interval("[0, 10]")] = 0.97
     """Share of the maximal speed from which the speed costs."""
     nominal: Annotated[float, Interval("[0, 1]")] = 0.25
