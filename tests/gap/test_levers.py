@@ -30,7 +30,7 @@ def flights(torque=0.0, turned=None, push=0.05, lever=0.008, noise=0.01, axis=2,
             did[:, axis] = turned + x[:, axis]
         disturbed.append(x)
         whole.append(did)
-    tracks = [SimpleNamespace(dt=DT, motors_logged=True, __len__=lambda self: ROWS)] * 3
+    tracks = [SimpleNamespace(dt=DT, motors_logged=True, missing=None)] * 3
     return tracks, disturbed, whole, np.ones(9), VEHICLES
 
 
@@ -69,5 +69,13 @@ def test_a_torque_counts_by_the_push_beside_it():
 def test_nothing_is_said_without_gyroscope_or_motors():
     tracks, disturbed, turned, usable, vehicles = flights(4.0 * np.sin(TIME))
     assert not torques(tracks, disturbed, turned, np.r_[np.zeros(3), np.ones(6)], vehicles)
-    made = [SimpleNamespace(dt=DT, motors_logged=False)] * 3
+    made = [SimpleNamespace(dt=DT, motors_logged=False, missing=None)] * 3
     assert not torques(made, disturbed, turned, usable, vehicles)
+
+
+def test_rows_that_are_missing_tell_nothing():
+    glitch = 40.0 * np.isin(np.arange(ROWS) // 10, (20, 45, 70))
+    tracks, *more = flights(glitch)
+    assert torques(tracks, *more)
+    tracks = [SimpleNamespace(dt=DT, motors_logged=True, missing=glitch > 0.0)] * 3
+    assert not torques(tracks, *more)

@@ -43,6 +43,7 @@ class Track:
     fast_thrust: tuple[Array, Array] | None = (
         None  # of logs faster than the grid: times (S,) s, mean of the motors (S,)
     )
+    missing: Array | None = None  # (T,) rows that weren't logged: lines between their neighbours
 
     def __len__(self) -> int:
         return len(self.time)
@@ -115,7 +116,14 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
         neighbours=np.array(neighbours) if neighbours else np.zeros((0, count, 3)),
         pose_age=part.pose_age,
         fast_thrust=fast_thrust,
+        missing=_missing(part.time, grid, period),
     )
+
+
+def _missing(logged: Array, grid: Array, period: float) -> Array:
+    """(T,) the rows of a grid with no logged row within half a period and a bit."""
+    after = np.clip(np.searchsorted(logged, grid), 1, len(logged) - 1)
+    return np.minimum(np.abs(grid - logged[after - 1]), np.abs(logged[after] - grid)) > 0.6 * period
 
 
 def held_means(at: Array, values: Array, begin: Array, period: float) -> Array:

@@ -5,8 +5,7 @@ colour, are linear and normal; a surrogate of a signal - its spectrum, with phas
 Physica D 58, 77-94) - is what such a process of the same flights would give. What levels and jumps explain of the signal,
 they would then explain of its surrogates as well.
 
-Pushes are looked for in the sideways specific force (or, without an accelerometer, in what the velocity became): no motor
-makes it, and turbulence changes it slowly. Vertical force and
+Pushes are looked for in the sideways specific force: no motor makes it, and turbulence changes it slowly. Vertical force and
 quick torques don't serve: what late clocks, single samples of motors and interpolated poses have wrong is largest where the
 motors work most. A torque that changes once, for good, is another matter: a fault, a loose battery."""
 
@@ -22,10 +21,7 @@ CLEAR = 5.0  # standard deviations of the surrogates' statistic
 PIECE = 10.0  # s: longer tracks are cut
 SHORTEST = 3.0  # s
 
-WIDTHS = (0.05, 0.1)  # s of the means whose jumps are looked at; levels are looked for in those of LEVEL
-LEVEL = 0.1  # s
-POSED = (0.1, 0.2)  # s, the same of the velocity, where no accelerometer was logged
-CLEAR_POSED = 8.0  # of it: poses that come late, seldom or interpolated are no noise either
+WIDTHS = (0.05, 0.1)  # s of the means whose jumps are looked at; levels are looked for in the last
 CHANGES = (6, 9, 12)  # between levels, in a piece
 ALONG = 0.3  # s of the means that tell the direction of the pushes
 PUSH = 0.1  # m/s^2, a hundredth of the weight: the largest must be more to matter
@@ -45,36 +41,30 @@ def knocks(tracks: list[Track], disturbed: list[np.ndarray], usable: np.ndarray)
 
 def _pushes(tracks, disturbed, usable, generator) -> tuple[str, ...]:
     """Levels and jumps in the sideways specific force, along the direction that it varies most in and across."""
-    posed = bool(usable[VELOCITY].min() > 0.0)
-    if usable[FORCE][:2].min() > 0.0:
-        felt, widths, clear = FORCE, WIDTHS, CLEAR
-    elif posed:
-        felt, widths, clear = VELOCITY, POSED, CLEAR_POSED
-    else:
+    if usable[FORCE][:2].min() <= 0.0:
         return ()
     parts = [(d[int(SKIP / t.dt) :], t.dt) for t, d in zip(tracks, disturbed, strict=True)]
-    turn = _directions(parts, felt, VELOCITY if posed else felt)
+    turn = _directions(parts, bool(usable[VELOCITY].min() > 0.0))
     levels, jumps, largest = 0.0, 0.0, 0.0
     for part, dt in parts:
-        for piece in _pieces(part[:, felt][:, :2] @ turn, dt):
+        for piece in _pieces(part[:, FORCE][:, :2] @ turn, dt):
             drawn, moments = _with_surrogates(piece, generator), []
-            for width in widths:
+            for width in WIDTHS:
                 means = _means(drawn, max(round(width / dt), 1))
                 steps = np.diff(means, axis=1)[..., 0]
                 moments.append(
                     [(steps**4).sum(1), (steps**2).sum(1), np.full(len(steps), float(steps.shape[1]))]
                 )
                 largest = max(largest, float(np.abs(steps[0]).max()))
-            means = _means(drawn, max(round(LEVEL / dt), 1))
             left = _levels(means, max(CHANGES))[..., np.array(CHANGES) - 1]
             levels, jumps = levels - means.shape[1] * np.log(left).sum(2), jumps + np.array(moments)
     if largest < PUSH:
         return ()
     fourth, second, number = np.moveaxis(jumps, 1, 0)
     kurtosis = np.log(fourth / second**2 * number)
-    if max(map(_above, (levels[:, 0], levels.sum(1), *kurtosis))) < clear:
+    if max(map(_above, (levels[:, 0], levels.sum(1), *kurtosis))) < CLEAR:
         return ()
-    return (f"pushes to the side that come and go, by up to {largest:.1f} m/s^2 within {widths[-1]:g} s",)
+    return (f"pushes to the side that come and go, by up to {largest:.1f} m/s^2 within {WIDTHS[-1]:g} s",)
 
 
 def _changed(tracks, disturbed, usable, generator) -> tuple[str, ...]:
@@ -100,14 +90,16 @@ def _changed(tracks, disturbed, usable, generator) -> tuple[str, ...]:
     return (best[1],)
 
 
-def _directions(parts, first: slice, second: slice) -> np.ndarray:
+def _directions(parts, posed: bool) -> np.ndarray:
     """(2, 2) sideways directions as columns, the one of the largest pushes first; noise of two sensors isn't shared."""
     shared = np.zeros((2, 2))
     for part, dt in parts:
         size = max(round(ALONG / dt), 1)
         if len(part) < 2 * size:
             continue
-        felt, moved = (_means(part[None, :, axes][..., :2], size)[0] for axes in (first, second))
+        felt, moved = (
+            _means(part[None, :, axes][..., :2], size)[0] for axes in (FORCE, VELOCITY if posed else FORCE)
+        )
         shared += (felt - felt.mean(0)).T @ (moved - moved.mean(0))
     return np.linalg.eigh(shared + shared.T)[1][:, ::-1]
 

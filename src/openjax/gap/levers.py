@@ -18,7 +18,9 @@ WRONG = 0.5  # of what motors do that a model may have wrong
 LEVER = 0.02  # m: half an arm
 TURNING = 2.0  # times the lever about x and y, that one about z must have: gusts turn more about these
 SHORT = 0.008  # m: the least lever of such a one
+BLIND = 2.0  # times as long where it isn't known what motors do within a row
 STILL = 0.03  # m/s^2 of push below which sensors can't tell one
+FEWEST = 10  # means of a track
 TURN = 0.7  # rad/s^2: less doesn't matter
 
 
@@ -36,20 +38,22 @@ def levers(
     for track, d, a in zip(tracks, disturbed, turned, strict=True):
         size = max(round(WIDTH / track.dt), 1)
         inside = slice(int(2 * SKIP / track.dt), len(d) - max(int(SKIP / 2 / track.dt), 1))
-        left = _means(d[inside, RATES], size)
-        if len(left) < 10:
+        left, whole = _means(d[inside, RATES], size), _means(a[inside], size)
+        # What motors did in rows that are missing isn't known.
+        gaps = np.zeros(len(d)) if track.missing is None else track.missing.astype(float)
+        known = _around(_means(gaps[inside, None], size), (-1, 0, 1))[:, 0] == 0.0
+        if known.sum() < FEWEST:
             continue
-        left = left - left.mean(0)
-        whole = _means(a[inside], size)
+        left = left - left[known].mean(0)
         # Late motors are wrong by what they did before.
         worked = np.minimum(_around(whole, (-1, 0, 1)), _around(whole - left, (0, 1)))
-        torque += (np.maximum(np.abs(left) - WRONG * worked, 0.0) ** 2).sum(0)
-        count += len(left)
+        torque += (np.maximum(np.abs(left) - WRONG * worked, 0.0)[known] ** 2).sum(0)
+        count += int(known.sum())
         # White noise of the gyroscope: three differences leave little else. A central one came before.
         rough = (np.diff(np.cumsum(d[inside, RATES], 0) * track.dt, 3, axis=0) ** 2).mean(0) / 2.5
-        noise += len(left) * rough / (size * track.dt) ** 2
+        noise += known.sum() * rough / (size * track.dt) ** 2
         for k, axes in enumerate(sensors):
-            force = _means(d[inside, axes], size)
+            force = _means(d[inside, axes], size)[known]
             push[k] += ((force - force.mean(0)) ** 2).mean(1).sum()
     if not count:
         return None
@@ -61,14 +65,15 @@ def levers(
     return torque * inertia / (mass * pushed), torque
 
 
-def torques(tracks, disturbed, turned, usable, vehicles) -> tuple[str, ...]:
-    """Findings in words; arguments as of `levers`."""
+def torques(tracks, disturbed, turned, usable, vehicles, blind: bool = False) -> tuple[str, ...]:
+    """Findings in words; arguments as of `levers`. `blind`: what motors do within a row isn't known."""
     found = levers(tracks, disturbed, turned, usable, vehicles)
     if found is None:
         return ()
     lever, torque = found
-    long = lever > LEVER
-    long[2] |= lever[2] > max(TURNING * lever[:2].max(), SHORT)
+    least = BLIND if blind else 1.0
+    long = lever > least * LEVER
+    long[2] |= lever[2] > max(TURNING * lever[:2].max(), least * SHORT)
     long &= torque > TURN
     if not long.any():
         return ()

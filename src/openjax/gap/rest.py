@@ -22,6 +22,7 @@ from openjax.gap.hypotheses import SetFit, without_nuisances
 from openjax.gap.judging import judge, offers, solve
 from openjax.gap.knocks import knocks
 from openjax.gap.levers import torques
+from openjax.gap.library import SAMPLED_NUISANCES
 from openjax.gap.nuisances import torque_channels
 from openjax.gap.replay import FORCE, RATES, VELOCITY, Replay
 from openjax.gap.selection import LEAST_NATS, Selection, testable
@@ -151,6 +152,7 @@ def look(evidence: Evidence, selection: Selection) -> Rest:
         for t, r in zip(replay.tracks, residuals_of(replay, selection.fit, ("feedback,",)), strict=True)
     ]
     turned = [np.gradient(t.body_rates, t.dt, axis=0) for t in replay.tracks]
+    blind = replay.numbers is SAMPLED_NUISANCES
     heard = replay.usable.copy()
     if any(t.pose_age > 0.0 for t in replay.tracks):
         heard[VELOCITY] = 0.0  # samples put onto faster rows beat with them
@@ -163,7 +165,7 @@ def look(evidence: Evidence, selection: Selection) -> Rest:
         (
             *lines(replay.tracks, disturbed, heard),
             *knocks(replay.tracks, disturbed, replay.usable),
-            *torques(replay.tracks, answered, turned, replay.usable, evidence.vehicles),
+            *torques(replay.tracks, answered, turned, replay.usable, evidence.vehicles, blind),
         ),
     )
 
