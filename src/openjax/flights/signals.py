@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.signal import butter, lfilter, sosfiltfilt
@@ -43,11 +45,20 @@ def on_clock(flight: Flight, channel: str, grid: np.ndarray) -> np.ndarray | Non
 
 def in_band(values: np.ndarray, band: tuple[float, float]) -> np.ndarray:
     """`values` (T, C) between two frequencies, without delay, and without the ends where that isn't right."""
-    sos = butter(2, band, "bandpass", fs=RATE, output="sos")
     edge = min(20, len(values) // 8)  # rows at the ends where filter and differences aren't trustworthy
     # Faded in and out: a filter this slow would carry the last row's noise far into the flight.
-    fade = tukey(len(values), min(1.0, 2 * FADE * RATE / len(values)))[:, None]
-    return sosfiltfilt(sos, fade * (values - values.mean(0)), axis=0)[edge:-edge]
+    fade = _fade(len(values))[:, None]
+    return sosfiltfilt(_bandpass(band), fade * (values - values.mean(0)), axis=0)[edge:-edge]
+
+
+@lru_cache(maxsize=32)
+def _bandpass(band: tuple[float, float]) -> np.ndarray:
+    return butter(2, band, "bandpass", fs=RATE, output="sos")
+
+
+@lru_cache(maxsize=32)
+def _fade(rows: int) -> np.ndarray:
+    return tukey(rows, min(1.0, 2 * FADE * RATE / rows))
 
 
 def rates_of(quaternion: np.ndarray) -> np.ndarray:

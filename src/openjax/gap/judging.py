@@ -83,9 +83,11 @@ class Equations:
             np.eye(own) + gram[common:, common:],
             target[common:] - found[:, :common] @ gram[:common, common:],
         )
-        found = found.copy()
-        for each, right in zip(found, push, strict=True):
-            each[common + own * track :][:own] = bounded(hessian, right, 0, self.model.bound)[0]
+        free = np.linalg.solve(hessian, push.T).T
+        found, mine = found.copy(), slice(common + own * track, common + own * (track + 1))
+        for each, alone, right in zip(found, free, push, strict=True):
+            inside = (np.abs(alone) <= self.model.bound).all()
+            each[mine] = alone if inside else bounded(hessian, right, 0, self.model.bound)[0]
         return found
 
     def coefficients(self, found: np.ndarray, track: int) -> np.ndarray:

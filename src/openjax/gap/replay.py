@@ -86,7 +86,8 @@ class Replay:
 
     def whiten(self, x: np.ndarray, track: int) -> np.ndarray:
         """x (..., T, 9) of a track -> (..., T', 9) in units of the noise, without the first moments."""
-        out = whiten(self.noises, x) * self.usable
+        out = whiten(self.noises, x)
+        out *= self.usable
         return out[..., int(SKIP / self.tracks[track].dt) :, :]
 
     def products(self, columns: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -100,14 +100,13 @@ def _widened(replay, fit, table, now, singles):
             tried = _openings(replay, fit, left)
         better = [f for f in tried if f is not None and f.score > fit.score + LEAST_NATS]
         for candidate in sorted(better, key=lambda f: -f.score):
-            wider = build(replay, candidate, singles)
-            whole = judge(wider, with_effects(wider))
             added = [e for e in candidate.effects if e not in fit.effects]
-            if any(gain_of(wider, whole, e).accepted for e in added):
+            if _stays(replay, candidate, added):
                 break
         else:
             break
-        fit, table, now = _pruned(replay, candidate, wider, whole, singles)
+        table = build(replay, candidate, singles)
+        fit, table, now = _pruned(replay, candidate, table, judge(table, with_effects(table)), singles)
         dropped |= {(base, e) for e in candidate.effects if e not in fit.effects}
     return fit, table, now
 
@@ -146,6 +145,13 @@ def testable(evidence: Evidence) -> dict[str, SetFit]:
         and isinstance(f, SetFit)
         and (evidence.exposure.get(k[0], 0.0) >= TESTABLE or f.score - evidence.nothing.score > EVIDENT)
     }
+
+
+def _stays(replay, fit: SetFit, added) -> bool:
+    """Whether one of the effects `added` to a set stays for what it adds."""
+    table = build(replay, fit, {})
+    whole = judge(table, with_effects(table))
+    return any(gain_of(table, whole, e).accepted for e in added)
 
 
 def gain_of(table: Table, whole: Judged, effect: str) -> Gain:
@@ -325,15 +331,14 @@ def _swapped(replay, fit, table, now, singles):
         for best in sorted(favoured, key=lambda o: -favoured[o]):
             if favoured[best] <= LEAST_NATS:
                 continue
-            other = build(replay, tried[best], singles)
-            whole = judge(other, with_effects(other))
             # What fits better without predicting more takes nobody's place.
-            if not gain_of(other, whole, best).accepted:
+            if not _stays(replay, tried[best], [best]):
                 del gains[best]
                 continue
             ahead = gains.pop(best)
             swaps[best] = {o: v - ahead for o, v in (gains | {effect: 0.0}).items()}
-            fit, table, now = tried[best], other, whole
+            fit, table = tried[best], build(replay, tried[best], singles)
+            now = judge(table, with_effects(table))
             break
         else:
             swaps[effect] = gains

@@ -40,10 +40,10 @@ class Noise:
 
 
 def whiten(noises, x: np.ndarray) -> np.ndarray:
-    """x (..., T, C) channel by channel, each group of axes by its own noise model."""
+    """x (..., T, C) channel by channel, each group of axes, which lie side by side, by its own noise model."""
     out = np.empty_like(x)
     for noise in noises:
-        axes = list(noise.axes)
+        axes = slice(noise.axes[0], noise.axes[-1] + 1)
         out[..., axes] = noise.whiten(x[..., axes])
     return out
 
