@@ -8,6 +8,7 @@ import numpy as np
 from openjax import load_policy
 from openjax.flying.controller import Pose
 from openjax.flying.game import Game, game_functions, pose_array
+from openjax.flying.real_time import compile_in_line
 from openjax.pursuit import find_scenario, scenario_task
 
 
@@ -40,3 +41,15 @@ def test_the_packed_tick_plays_as_the_games_own_functions():
             np.testing.assert_allclose(np.asarray(mine, float), np.asarray(expected, float), atol=1e-5)
         caught |= play.captured
     assert caught
+
+
+def test_a_compiler_without_the_option_compiles_as_it_does():
+    class Lowered:
+        def compile(self, compiler_options=None):
+            if compiler_options:
+                raise RuntimeError(f"no such compile option: {next(iter(compiler_options))}")
+            return "compiled"
+
+    assert compile_in_line(Lowered()) == "compiled"
+    double = compile_in_line(jax.jit(lambda x: 2 * x).lower(np.ones(3, np.float32)))
+    np.testing.assert_array_equal(double(np.arange(3, dtype=np.float32)), [0.0, 2.0, 4.0])

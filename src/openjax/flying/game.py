@@ -16,6 +16,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from openjax.flying.controller import Pose
+from openjax.flying.real_time import compile_in_line
 from openjax.pursuit import Pursuit, Task, hover_action
 
 FIELDS = (("position", 3), ("quaternion", 4), ("velocity", 3), ("body_rates", 3))
@@ -115,8 +116,8 @@ class Game:
             together = jnp.concatenate([jnp.ravel(leaf).astype(jnp.float32) for leaf in results])
             return ravel_pytree((state, results[0]))[0], together
 
-        self._first = jax.jit(begin).lower(example).compile()
-        self._tick = jax.jit(move).lower(flat, example, *nowhere).compile()
+        self._first = compile_in_line(jax.jit(begin).lower(example))
+        self._tick = compile_in_line(jax.jit(move).lower(flat, example, *nowhere))
         self._flat = flat
         self.start(poses)  # the first calls take tens of milliseconds: not in flight
         self.step(poses)

@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 
 from openjax.errors import UserError
 from openjax.flying.firmware_tables import Sensors
+from openjax.flying.real_time import compile_in_line
 from openjax.flying.set_point import ANGLES, OFF
 from openjax.vehicle import Vehicle, hover_state, make_drones_step, rate_controller, rotate, rotate_inverse
 from openjax.vehicle.effects import composition
@@ -81,10 +82,9 @@ class VirtualVehicles:
         drones = self._step.reset(vehicle, drones, jax.random.key(0))
         flat, unflatten = ravel_pytree(drones)
         self._state = np.asarray(flat)
-        self._advance = jax.jit(
-            partial(_advance, self._step, vehicle, effect_parameters or {}, unflatten)
-        ).lower(flat, np.zeros((self.number, 5), np.float32), np.int32(1))
-        self._advance = self._advance.compile()
+        advance = jax.jit(partial(_advance, self._step, vehicle, effect_parameters or {}, unflatten))
+        nothing = np.zeros((self.number, 5), np.float32)
+        self._advance = compile_in_line(advance.lower(flat, nothing, np.int32(1)))
         self.battery, self._endurance = np.full(self.number, float(battery)), float(endurance)
         self._hover = float(vehicle.mass * vehicle.gravity) / float(
             4 * vehicle.thrust_constant * vehicle.max_rotor_speed**2
