@@ -231,7 +231,7 @@ def report(results: dict) -> list[str]:
         f"{where(results)} {results['seconds']:.0f} s. "
         f"{len(vehicles)} vehicles of the exam's plant with one cause each, {results['episodes']} uniform tasks each, no "
         "clamp, drawn starts. Loss: the difference to the same policy on the plant's nominal vehicle, mean over all vehicles; "
-        "intervals of 90 % by drawing episodes anew.",
+        "intervals of 90 % by drawing episodes anew. " + results.get("note", ""),
         "",
     ]
     if "after" not in steps:
@@ -265,31 +265,23 @@ def report(results: dict) -> list[str]:
             cells = [figure, f"{found['before'].mean():.4f}", f"{int(chosen.sum())} of {len(chosen)}"]
             if chosen.any():
                 found = {which: loss[chosen, 1::2] for which, loss in found.items()}
-                own = found.get("own")
-                cells += [f"{found[which].mean():.4f}" if which in found else "" for which in WHICH[1:]]
-                cells.append(share_won(found["before"], found["after"]))
-                cells.append("" if own is None else share_won(found["before"], found["after"], own))
-            rows.append(cells + [""] * (8 - len(cells)))
+                cells += [f"{loss.mean():.4f}" for loss in found.values()]
+                floors = [0.0, found["own"]] if "own" in found else [0.0]
+                cells += [share_won(found["before"], found["after"], floor) for floor in floors]
+            rows.append(cells + [""] * (2 * len(steps) - len(cells)))
         crashes = {
             which: np.array([row[which]["crashed"] for row in vehicles.values()]) > 0
             for which in ("before", "after")
         }
         lines += [
-            "Vehicles that lose are chosen by every other episode, and measured by the rest. Own: trained for that vehicle "
-            f"alone, {LONG} times as long; the last column is what is won back of what that wins. –: no difference beyond "
-            "chance.",
+            "Vehicles that lose are chosen by every other episode, and measured by the rest. –: no difference beyond chance."
+            + f" Own: trained for that vehicle alone, {LONG} times as long." * ("own" in steps),
             "",
             *table(
-                [
-                    "figure",
-                    "mean loss, all vehicles",
-                    "vehicles that lose",
-                    "their loss before",
-                    "after",
-                    "own",
-                    "won back",
-                    "won back of what the own policy wins",
-                ],
+                ["figure", "mean loss, all vehicles", "vehicles that lose", "their loss before", "after"]
+                + ["own"] * ("own" in steps)
+                + ["won back"]
+                + ["won back of what the own policy wins"] * ("own" in steps),
                 rows,
             ),
             "",
