@@ -36,6 +36,7 @@ CLEAR_SCORE = 3.0  # nats, likewise
 LOOKS = 2  # at most
 WORTH_KNOWING = 15.0  # nats that an effect must add to be taken as known in the next look
 WORTH_A_SECOND_LOOK = 30.0  # nats of the best set above none
+FEW_ROWS = 2.4  # of a log in one of the grid's: if they are samples, their mean isn't what five ticks of the loop did
 LEAST_KICK = 0.1  # of the motors' outputs within a row: below, samples are as good as means
 MOST_GUSTS = 0.25  # of the torques that commands cause: from then on feedback is all that is seen of them
 HEAVY = 0.1  # of the moments of inertia, that single samples taken for means may feign
@@ -144,10 +145,12 @@ def gather(case: Case, library: Library, progress=None) -> Evidence:
             allowed = {(): 0.0}
         arrived = radio.arrived[max(allowed, key=lambda k: allowed[k] - RADIO_COST * len(k))]
     # Faster logs are averaged anyway.
-    slow = min(f.row_period for f in case.flights) > 0.8 * GRID_PERIOD
+    shortest = min(f.row_period for f in case.flights)
+    slow = shortest > 0.8 * GRID_PERIOD
+    few = not slow and GRID_PERIOD / shortest < FEW_ROWS
     derived = any(f.body_rates_derived for f in case.flights)
     reading = Reading(tracks, vehicles, arrived, flight_of, sensors, case.vehicle_file.motor_command == "pwm")
-    reading = _sampled(reading, slow, derived)
+    reading = _sampled(reading, slow, derived or few)
     lap("paths")
     tell("replaying the flights")
     look = _physics(reading, library)
@@ -198,9 +201,10 @@ def _clear_gains(gains: Gains | None, library: Library):
     return np.clip(gains.found[0], -0.7, 1.5)
 
 
-def _sampled(reading: Reading, slow: bool, derived: bool) -> Reading:
+def _sampled(reading: Reading, slow: bool, hidden: bool) -> Reading:
     """What rows of motor commands are: means over the row or single samples, and whether what happens within a row can be
-    told at all. Faster logs are averaged onto `slow` rows; rates may be `derived` from the attitude."""
+    told at all. Faster logs are averaged onto `slow` rows; what happens is `hidden` where two samples may make a
+    row, or where rates are derived from the attitude."""
     tracks, drifts = reading.tracks, reading.sensors.wander > 0.0
     logged = slow and all(t.motors_logged for t in tracks)
     # Rows as slow as this hide every other command of a loop that sends one each 10 ms.
@@ -214,7 +218,7 @@ def _sampled(reading: Reading, slow: bool, derived: bool) -> Reading:
         mean, single = (_physics(dataclasses.replace(reading, at_once=m), own) for m in (False, True))
         at_once, sure = _looks_sampled(reading.vehicles, mean, single)
     reading = dataclasses.replace(reading, at_once=at_once)
-    blind = (reading.at_once and not known) or not sure or drifts or derived
+    blind = (reading.at_once and not known) or not sure or drifts or hidden
     late = None if blind or seldom else ROW_DELAY[0 if slow else 1]
     return dataclasses.replace(reading, blind=blind, late=late)
 

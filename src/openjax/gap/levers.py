@@ -15,10 +15,12 @@ from openjax.gap.replay import FORCE, RATES, SKIP, VELOCITY
 
 WIDTH = 0.1  # s of the means: shorter ones are the gyroscope's noise
 WRONG = 0.5  # of what motors do that a model may have wrong
-LEVER = 0.02  # m: half an arm
+LEVER = 0.025  # m: half an arm
 TURNING = 2.0  # times the lever about x and y, that one about z must have: gusts turn more about these
 SHORT = 0.008  # m: the least lever of such a one
-BLIND = 2.0  # times as long where it isn't known what motors do within a row
+BLIND = (
+    2.0  # times as long where clocks drift or it isn't known what motors do within a row; nothing of z then
+)
 STILL = 0.03  # m/s^2 of push below which sensors can't tell one
 FEWEST = 10  # means of a track
 TURN = 0.7  # rad/s^2: less doesn't matter
@@ -71,9 +73,8 @@ def torques(tracks, disturbed, turned, usable, vehicles, blind: bool = False) ->
     if found is None:
         return ()
     lever, torque = found
-    least = BLIND if blind else 1.0
-    long = lever > least * LEVER
-    long[2] |= lever[2] > max(TURNING * lever[:2].max(), least * SHORT)
+    long = lever > LEVER * (BLIND if blind else 1.0)
+    long[2] |= not blind and lever[2] > max(TURNING * lever[:2].max(), SHORT)
     long &= torque > TURN
     if not long.any():
         return ()
