@@ -75,24 +75,35 @@ def select(evidence: Evidence) -> Selection:
     table = build(replay, fit, singles)
     now = judge(table, with_effects(table))
     swaps: dict[str, dict[str, float]] = {}
+    trail = _Trail()
     for _ in range(ROUNDS):
-        fit, table, now = _widened(replay, fit, table, now, singles)
+        fit, table, now = _widened(replay, fit, table, now, singles, trail)
         before = fit
         fit, table, now, swaps = _swapped(replay, fit, table, now, singles)
         if fit is before:
             break
+        trail.left.add(frozenset(before.effects))
         fit, table, now = _pruned(replay, fit, table, now, singles)
     gains = {e: gain_of(table, now, e) for e in fit.effects if e not in evidence.feigned}
     offered = {e: _offer(table, now, e) for e in table.step}
     return Selection(tuple(sorted(gains, key=lambda e: -gains[e].floors)), fit, table, gains, offered, swaps)
 
 
-def _widened(replay, fit, table, now, singles):
-    """The set with everything that stays for what it adds."""
-    dropped: set[tuple] = set()  # (a set, what came in beside it and didn't stay)
-    while len(fit.effects) < MOST:
-        base = frozenset(fit.effects)
-        left = {e: f for e, f in singles.items() if (base, e) not in dropped}
+@dataclass(frozen=True)
+class _Trail:
+    """What a search has been through: sets that it `left` for others, those that nothing widens (`whole`), and what came in
+    beside a set and didn't stay (`dropped`)."""
+
+    left: set[frozenset] = field(default_factory=set)
+    whole: set[frozenset] = field(default_factory=set)
+    dropped: set[tuple[frozenset, str]] = field(default_factory=set)
+
+
+def _widened(replay, fit, table, now, singles, trail: _Trail):
+    """The set with everything that stays for what it adds. Pruning may take the search to a worse set than it came from: none
+    that it left is come back to, or it would go round for ever."""
+    while len(fit.effects) < MOST and (base := frozenset(fit.effects)) not in trail.whole:
+        left = {e: f for e, f in singles.items() if (base, e) not in trail.dropped}
         if fit.effects:
             ranked = [e for e in _ranked(table, singles, now) if e in left]
             tried = [_mended(replay, _joined(replay, fit, singles, e), singles, e) for e in ranked]
@@ -104,10 +115,17 @@ def _widened(replay, fit, table, now, singles):
             if _stays(replay, candidate, added):
                 break
         else:
+            trail.whole.add(base)
             break
-        table = build(replay, candidate, singles)
-        fit, table, now = _pruned(replay, candidate, table, judge(table, with_effects(table)), singles)
-        dropped |= {(base, e) for e in candidate.effects if e not in fit.effects}
+        wider = build(replay, candidate, singles)
+        pruned = _pruned(replay, candidate, wider, judge(wider, with_effects(wider)), singles)
+        if frozenset(pruned[0].effects) in trail.left:
+            trail.dropped.update((base, e) for e in added)
+            continue
+        fit, table, now = pruned
+        trail.dropped.update((base, e) for e in candidate.effects if e not in fit.effects)
+        if base != frozenset(fit.effects):
+            trail.left.add(base)
     return fit, table, now
 
 
