@@ -4,8 +4,7 @@
 
 Every folder below LOGS with a vehicle.toml is a case: `experiments.exam.generate` and `experiments.exam.rotorpy_cases` make
 some, and recorded flights do as well. The process starts with no compiled programs, so the first case compiles, and so do
-later ones whose flights are of another length. Pictures are drawn as a user's are. What else kept the cores busy meanwhile is told by the share of
-the time that this process was given of what it asked for, and by the machine's load.
+later ones whose flights are of another length. Pictures are drawn as a user's are.
 """
 
 import os
@@ -14,10 +13,12 @@ import tempfile
 import time
 from pathlib import Path
 
-from experiments.pages import RESULTS, facts, page_parser, table
+# Read when NumPy and JAX are loaded: as the command does, and nothing compiled before.
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
+os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)
+
+from experiments.pages import page_parser, publish, table, where
 from openjax.errors import UserError
-from openjax.files import read_json
-from openjax.store.settings_files import write_json
 
 GOALS = {"median": 5.0, "slowest": 15.0, "first": 30.0}  # s; the first case apart
 
@@ -49,36 +50,70 @@ def time_case(folder: Path, out: Path) -> dict:
         result |= {"effects": list(report.effects), "rows": sum(len(t) for t in evidence.tracks)}
     except UserError as error:  # garbage is told as such
         result["error"] = str(error)[:100]
-    total = {"seconds": round(time.perf_counter() - clock, 2), "processor": round(time.process_time() - processor, 2)}
+    total = {
+        "seconds": round(time.perf_counter() - clock, 2),
+        "processor": round(time.process_time() - processor, 2),
+    }
     return result | {"steps": seconds} | total
 
 
 def summary(cases: list[dict]) -> dict:
-    """The figures with a goal; garbage, which is refused early, apart."""
-    whole = [c["seconds"] for c in cases[1:] if "error" not in c]
-    return {"first": cases[0]["seconds"], "median": round(statistics.median(whole), 2), "slowest": max(whole), "cases": len(cases)}
+    """The figures with a goal; garbage, which is refused early, doesn't count."""
+    whole = [c["seconds"] for c in cases if "error" not in c]
+    first, others = whole[0], whole[1:]
+    return {"first": first, "median": round(statistics.median(others), 2), "slowest": max(others)}
 
 
-def page(result: dict) -> str:
+def study(options) -> dict:
+    """All cases in one process on a few cores."""
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: options.cores])
+    folders = sorted(p.parent for logs in options.logs for p in logs.glob("*/vehicle.toml"))
+    if not folders:
+        raise SystemExit("no case: name folders of which each holds folders with a vehicle.toml")
+    load, cases = [os.getloadavg()[0]], []
+    with tempfile.TemporaryDirectory() as out:
+        for number, folder in enumerate(folders):
+            cases.append(time_case(folder, Path(out) / str(number)))
+            print(cases[-1], flush=True)
+    load.append(os.getloadavg()[0])
+    return {"cores": options.cores, "load": load, "summary": summary(cases), "cases": cases}
+
+
+def page(result: dict) -> list[str]:
     """The results page."""
-    names = {"first": "first case (compiles)", "median": "median of the others", "slowest": "slowest of the others"}
-    rows = [[names[k], result["summary"][k], f"≤ {goal:g}"] for k, goal in GOALS.items()]
-    steps = list(max((c["steps"] for c in result["cases"]), key=len))
+    names = {
+        "first": "first case (compiles)",
+        "median": "median of the others",
+        "slowest": "slowest of the others",
+    }
+    rows = [[names[k], f"{result['summary'][k]:.1f}", f"≤ {goal:g}"] for k, goal in GOALS.items()]
+    steps = ("reading", "evidence", "decision", "pages")
     each = [
-        [c["case"], c["rows"], *(c["steps"].get(s, "") for s in steps), c["seconds"], c["processor"],
-         ", ".join(c["effects"]) or "none" if c["effects"] is not None else "refused"]
+        [c["case"], str(c["rows"]), *(str(c["steps"].get(s, "")) for s in steps), str(c["seconds"]), str(c["processor"]),
+         "refused" if c["effects"] is None else ", ".join(c["effects"]) or "none"]
         for c in result["cases"]
     ]  # fmt: skip
-    return "\n".join(
-        [
-            "# Seconds of a diagnosis",
-            "",
-            f"`{result['command']}`, commit {result['commit']}, {result['machine']}, {result['date']}. "
-            f"{result['cores']} cores, load of the machine {result['load'][0]:.1f} before and {result['load'][1]:.1f} after "
-            "(averages of a minute; this process alone makes 1 to 2).",
-            "",
-            *table(["s", "", "goal"], rows),
-            "",
-            *table(["case", "rows", *(f"{s}, s" for s in steps), "all, s", "of processor, s", "named"], each),
-        ]
-    ) + "\n"
+    return [
+        "# Seconds of a diagnosis",
+        "",
+        where(result),
+        "",
+        f"One process on {result['cores']} cores, pictures drawn. Load of the machine (mean of a minute; this process "
+        f"alone makes 1 to 2): {result['load'][0]:.1f} before, {result['load'][1]:.1f} after.",
+        "",
+        *table(["", "s", "goal"], rows),
+        "",
+        *table(["case", "rows", *(f"{s}, s" for s in steps), "all, s", "of processor, s", "named"], each),
+    ]
+
+
+def main() -> None:
+    """Measure, and write the page."""
+    parser = page_parser(__doc__, "diagnosis_time")
+    parser.add_argument("logs", type=Path, nargs="*")
+    parser.add_argument("--cores", type=int, default=2)
+    publish(parser.parse_args(), study, page)
+
+
+if __name__ == "__main__":
+    main()
