@@ -16,6 +16,7 @@ from openjax.gap import estimator, firmware
 from openjax.gap.feedback import (
     AT_ONCE,
     AT_ONCE_SELDOM,
+    MOST_LEFT,
     ROW_DELAY,
     Gains,
     answers_noise,
@@ -37,6 +38,8 @@ LOOKS = 2  # at most
 WORTH_KNOWING = 15.0  # nats that an effect must add to be taken as known in the next look
 WORTH_A_SECOND_LOOK = 30.0  # nats of the best set above none
 FEW_ROWS = 2.4  # of a log in one of the grid's: if they are samples, their mean isn't what five ticks of the loop did
+ALIKE_LEFT = 0.8  # of what yaw's outputs leave as means: by so much less, they are single samples,
+APART_LEFT = 0.4  # and by so much less as means, they are means
 LEAST_KICK = 0.1  # of the motors' outputs within a row: below, samples are as good as means
 MOST_GUSTS = 0.25  # of the torques that commands cause: from then on feedback is all that is seen of them
 HEAVY = 0.1  # of the moments of inertia, that single samples taken for means may feign
@@ -213,14 +216,34 @@ def _sampled(reading: Reading, slow: bool, hidden: bool) -> Reading:
     at_once = logged and answers_noise(tracks, reading.vehicles) > (AT_ONCE_SELDOM if seldom else AT_ONCE)
     sure = True
     if known and at_once:
-        # The log doesn't say which; the motion does.
-        own = Library(("inertia",))
-        mean, single = (_physics(dataclasses.replace(reading, at_once=m), own) for m in (False, True))
-        at_once, sure = _looks_sampled(reading.vehicles, mean, single)
+        # The log doesn't say which; yaw's loop or the motion does.
+        told = _obeys_as_sampled(reading)
+        if told is not None:
+            at_once = told
+        else:
+            own = Library(("inertia",))
+            mean, single = (_physics(dataclasses.replace(reading, at_once=m), own) for m in (False, True))
+            at_once, sure = _looks_sampled(reading.vehicles, mean, single)
     reading = dataclasses.replace(reading, at_once=at_once)
     blind = (reading.at_once and not known) or not sure or drifts or hidden
     late = None if blind or seldom else ROW_DELAY[0 if slow else 1]
     return dataclasses.replace(reading, blind=blind, late=late)
+
+
+def _obeys_as_sampled(reading: Reading) -> bool | None:
+    """Whether yaw's outputs obey the rate loop better as single samples than as means of their rows; None where neither is
+    clear, or gains are changed."""
+    mean, single = (
+        firmware.read_rate_loop(
+            reading.tracks, reading.vehicles, reading.arrived, reading.flight_of, at_once=once
+        ).gains
+        for once in (False, True)
+    )
+    if min(mean.yaw_left, single.yaw_left) > MOST_LEFT or mean.by_yaw or single.by_yaw:
+        return None
+    if single.yaw_left < ALIKE_LEFT * mean.yaw_left:
+        return True
+    return False if mean.yaw_left < APART_LEFT * single.yaw_left else None
 
 
 def _looks_sampled(vehicles, mean: Look, single: Look) -> tuple[bool, bool]:

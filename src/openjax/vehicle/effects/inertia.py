@@ -20,8 +20,8 @@ def resists(value, deviation):
         return False
     if max(value["xx"], value["yy"]) - 1.0 > _FEIGNED * value["gusts"] > 0.0:
         return True
-    early = max(value["motor_lag.extra_up"], value["motor_lag.extra_down"]) < -EARLY
-    sure = value["motor_lag.extra_up"] < -3.0 * deviation["motor_lag.extra_up"]
+    lag = 0.5 * (value["motor_lag.extra_up"] + value["motor_lag.extra_down"])
+    early, sure = lag < -EARLY, lag < -3.0 * deviation["motor_lag.extra_up"]
     return not (early and sure and max(value["xx"], value["yy"], value["zz"]) > 1.0)
 
 
