@@ -104,8 +104,12 @@ def pair(arguments, number: int, out: Path, virtual: list[str], fly: list[str], 
 
 
 def long(arguments) -> dict:
-    """One flight, game after game, until the minutes are over: then it's asked to land."""
+    """One flight, game after game, until the minutes are over: then it's asked to land.
+
+    A machine that stops for a moment would end it in a landing, as it should any flight but one that measures such stops.
+    """
     options = ["--scenario", "wall", "--episodes", str(max(1, int(20 * arguments.minutes)))]
+    options += [f"--safety.{name}=0.5" for name in ("pose_timeout", "link_timeout", "action_timeout")]
     place = arguments.out / "long"
     return pair(arguments, 0, place, ["--endurance", "7200"], options, 60 * arguments.minutes)
 
