@@ -82,7 +82,6 @@ def select(evidence: Evidence) -> Selection:
         fit, table, now, swaps = _swapped(replay, fit, table, now, singles)
         if fit is before:
             break
-        trail.left.add(frozenset(before.effects))
         fit, table, now = _pruned(replay, fit, table, now, singles)
     gains = {e: gain_of(table, now, e) for e in fit.effects if e not in evidence.feigned}
     offered = {e: _offer(table, now, e) for e in table.step}
@@ -91,10 +90,9 @@ def select(evidence: Evidence) -> Selection:
 
 @dataclass(frozen=True)
 class _Trail:
-    """What a search has been through: sets that it `left` for others, those that nothing widens (`whole`), and what came in
-    beside a set and didn't stay (`dropped`)."""
+    """What a search has been through: sets that nothing widens (`whole`), and what came in beside a set and didn't stay
+    (`dropped`)."""
 
-    left: set[frozenset] = field(default_factory=set)
     whole: set[frozenset] = field(default_factory=set)
     dropped: set[tuple[frozenset, str]] = field(default_factory=set)
 
@@ -102,6 +100,7 @@ class _Trail:
 def _widened(replay, fit, table, now, singles, trail: _Trail):
     """The set with everything that stays for what it adds. Pruning may take the search to a worse set than it came from: none
     that it left is come back to, or it would go round for ever."""
+    behind: set[frozenset] = set()
     while len(fit.effects) < MOST and (base := frozenset(fit.effects)) not in trail.whole:
         left = {e: f for e, f in singles.items() if (base, e) not in trail.dropped}
         if fit.effects:
@@ -119,13 +118,13 @@ def _widened(replay, fit, table, now, singles, trail: _Trail):
             break
         wider = build(replay, candidate, singles)
         pruned = _pruned(replay, candidate, wider, judge(wider, with_effects(wider)), singles)
-        if frozenset(pruned[0].effects) in trail.left:
+        if frozenset(pruned[0].effects) in behind:
             trail.dropped.update((base, e) for e in added)
             continue
         fit, table, now = pruned
         trail.dropped.update((base, e) for e in candidate.effects if e not in fit.effects)
         if base != frozenset(fit.effects):
-            trail.left.add(base)
+            behind.add(base)
     return fit, table, now
 
 
