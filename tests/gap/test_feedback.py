@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 
 from openjax.flights.track import Track
-from openjax.gap.feedback import AT_ONCE, COUNT, Gains, answers_noise, outputs_of, read_feedback, read_gains
+from openjax.gap.feedback import (
+    AT_ONCE,
+    COUNT,
+    Gains,
+    answers_noise,
+    caused_by_commands,
+    outputs_of,
+    read_feedback,
+    read_gains,
+)
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.rate_controller import mixer
 
@@ -65,7 +74,8 @@ def flown(seed, p=1.0, gust=0.0, noise=0.005, sampled=False):
 )
 def test_gains_are_what_the_loop_has_whatever_gusts_and_noise_do(p, sampled):
     flights = [flown(seed, p, gust=5.0, sampled=sampled) for seed in range(3)]
-    gains = read_gains(*zip(*flights, strict=True), at_once=sampled, late=0.0005)
+    commanded = [caused_by_commands(*f) for f in flights]
+    gains = read_gains(*zip(*flights, strict=True), commanded, at_once=sampled, late=0.0005)
     assert gains.change[0] == pytest.approx(p - 1.0, abs=0.12)
     assert gains.clear == (p != 1.0)
 
@@ -78,9 +88,9 @@ def test_single_samples_answer_the_gyroscopes_noise():
 def test_calm_flights_leave_all_of_the_motors_to_feedback():
     """What commands caused is told apart: with gusts alone, the feedback part is nearly all that the motors did."""
     track, vehicle, link = flown(1, gust=20.0)
-    (still,) = read_feedback([track], [vehicle], [link])
+    (still,) = read_feedback([track], [vehicle], [caused_by_commands(track, vehicle, link)])
     quiet, _, _ = flown(1)
-    (driven,) = read_feedback([quiet], [vehicle], [link])
+    (driven,) = read_feedback([quiet], [vehicle], [caused_by_commands(quiet, vehicle, link)])
     assert still.acceleration.std() > 5.0 * driven.acceleration.std()
     made = (quiet.motor - quiet.motor.mean(0)) @ outputs_of(vehicle)
     assert made.std() > 0.01

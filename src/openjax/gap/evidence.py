@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from openjax.gap.feedback import (
     ROW_DELAY,
     Gains,
     answers_noise,
+    caused_by_commands,
     gustiness,
     outputs_of,
     read_feedback,
@@ -105,6 +107,12 @@ class Reading:
     @property
     def numbers(self):
         return PWM_NUISANCES if self.pwm else SAMPLED_NUISANCES if self.blind else NUISANCES
+
+    @cached_property
+    def by_commands(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """`caused_by_commands` of each track."""
+        links = self.arrived if self.arrived is not None else [None] * len(self.tracks)
+        return [caused_by_commands(*of) for of in zip(self.tracks, self.vehicles, links, strict=True)]
 
 
 def gather(case: Case, library: Library, progress=None) -> Evidence:
@@ -235,7 +243,12 @@ def _obeys_as_sampled(reading: Reading) -> bool | None:
     clear, or gains are changed."""
     mean, single = (
         firmware.read_rate_loop(
-            reading.tracks, reading.vehicles, reading.arrived, reading.flight_of, at_once=once
+            reading.tracks,
+            reading.vehicles,
+            reading.arrived,
+            reading.by_commands,
+            reading.flight_of,
+            at_once=once,
         ).gains
         for once in (False, True)
     )
@@ -290,16 +303,23 @@ def _physics(reading: Reading, library: Library, pushes=None, gains=None, before
     """Look at the physics. `pushes`, `gains`: what an earlier look found; `before`: its sets, to start from."""
     tracks, vehicles, arrived, at_once = reading.tracks, reading.vehicles, reading.arrived, reading.at_once
     rate_loop, read, ticks = None, None, [np.repeat(t.motor[:, None], TICKS, 1) for t in tracks]
-    links = arrived if arrived is not None else [None] * len(tracks)
     if arrived is not None:
         base = np.zeros(3) if gains is None else gains
         loop = firmware.read_rate_loop(
-            tracks, vehicles, arrived, reading.flight_of, pushes, base, at_once, reading.late
+            tracks,
+            vehicles,
+            arrived,
+            reading.by_commands,
+            reading.flight_of,
+            pushes,
+            base,
+            at_once,
+            reading.late,
         )
         rate_loop, ticks, read = loop.path, loop.ticks, loop.gains
         if at_once:
             tracks = [dataclasses.replace(t, motor=m.mean(1)) for t, m in zip(tracks, ticks, strict=True)]
-    feedback, sensors = read_feedback(tracks, vehicles, links), reading.sensors
+    feedback, sensors = read_feedback(tracks, vehicles, reading.by_commands), reading.sensors
     replay = make_replay(
         tracks, vehicles, ticks, feedback, reading.numbers, sensors.one_clock, at_once, sensors.wander
     )

@@ -124,11 +124,10 @@ def in_force(track: Track, arrived) -> np.ndarray:
     return out
 
 
-def read_feedback(tracks, vehicles, links) -> list[Feedback]:
-    """The feedback part of every track's motors. `links`: what arrived of the commands, None where that wasn't read."""
+def read_feedback(tracks, vehicles, by_commands) -> list[Feedback]:
+    """The feedback part of every track's motors. `by_commands`: `caused_by_commands` of each."""
     given, caused, made = [], [], []
-    for track, vehicle, link in zip(tracks, vehicles, links, strict=True):
-        motors, _ = _caused(track, vehicle, link)
+    for track, vehicle, (motors, _) in zip(tracks, vehicles, by_commands, strict=True):
         outputs = outputs_of(vehicle)
         given.append(motors - motors.mean(0))
         caused.append(given[-1] @ outputs)
@@ -164,9 +163,9 @@ def gustiness(tracks, feedback: list[Feedback], floor) -> np.ndarray:
     return np.sqrt(left / caused)
 
 
-def _caused(track: Track, vehicle, link) -> tuple[np.ndarray, np.ndarray]:
-    """Motor commands (T, 4) and rates (T, 3) that the body-rate commands alone cause. Where none were logged, the
-    nominal controller's law says which ones the motors and rates imply, slowly."""
+def caused_by_commands(track: Track, vehicle, link) -> tuple[np.ndarray, np.ndarray]:
+    """Motor commands (T, 4) and rates (T, 3) that the body-rate commands alone cause; `link`: what arrived of them, None where
+    that wasn't read. Where none were logged, the nominal controller's law says which ones the motors and rates imply, slowly."""
     if track.command is not None:
         sent = track.command if link is None else in_force(track, link).mean(1)
     else:
@@ -204,16 +203,16 @@ def answers_noise(tracks, vehicles) -> float:
     return product / square / expected if square > 0.0 else 0.0
 
 
-def read_gains(tracks, vehicles, links, at_once: bool, late: float) -> Gains:
+def read_gains(tracks, vehicles, links, by_commands, at_once: bool, late: float) -> Gains:
     """The rate loop's gains from what commands excite: the motors' outputs against error, its integral and the rates'
     slope as the gyroscope has them, with what the nominal loop would have done under the same commands as instruments.
     `late` s: by how much the motors' rows may be off against the gyroscope's. Moments over short times, weighed by their
     own spread (generalised method of moments, Hansen 1982), so that neither colour nor clocks need a model."""
     moments: dict[int, list] = {0: [], 1: [], 2: []}  # axis: [(moments, unit)] of every granule
-    for unit, (track, vehicle, link) in enumerate(zip(tracks, vehicles, links, strict=True)):
+    flights = zip(tracks, vehicles, links, by_commands, strict=True)
+    for unit, (track, vehicle, link, (_, drawn)) in enumerate(flights):
         ruling = in_force(track, link)
         sent = ruling[:, 0, 1:] if at_once else ruling[..., 1:].mean(1)
-        _, drawn = _caused(track, vehicle, link)
         rates = track.body_rates
         after = np.concatenate([rates[1:], rates[-1:]])
         slope = (after - rates) / track.dt

@@ -250,10 +250,18 @@ class RateLoop:
 
 
 def read_rate_loop(
-    tracks, vehicles, arrived, flight_of, pushes=None, base=(0.0, 0.0, 0.0), at_once=False, late=None
+    tracks,
+    vehicles,
+    arrived,
+    by_commands,
+    flight_of,
+    pushes=None,
+    base=(0.0, 0.0, 0.0),
+    at_once=False,
+    late=None,
 ) -> RateLoop:
-    """Read the rate controllers of all tracks; `arrived` as in `Radio`. pushes [(T, 3)]: angular
-    accelerations (rad/s^2) beyond the nominal that are already known; `base`: changes of the gains p, i, d
+    """Read the rate controllers of all tracks; `arrived` as in `Radio`, `by_commands` as for `read_gains`. pushes [(T, 3)]:
+    angular accelerations (rad/s^2) beyond the nominal that are already known; `base`: changes of the gains p, i, d
     around which the loop is linearised. `late` s: see `read_gains`; None: clocks or rows tell nothing about gains."""
     base = np.asarray(base, float)
     gains = (1.0 + base + np.concatenate([np.zeros((1, 3)), GAIN_STEP * np.eye(3)])).astype(np.float32)
@@ -300,7 +308,7 @@ def read_rate_loop(
     gains = (
         Gains(np.zeros(6), np.full(6, np.inf))
         if late is None
-        else read_gains(tracks, vehicles, arrived, at_once, late)
+        else read_gains(tracks, vehicles, arrived, by_commands, at_once, late)
     )
     gains = dataclasses.replace(
         gains, yaw=(float(change[3]), float(np.sqrt(covariance[3, 3]))), yaw_left=left

@@ -72,8 +72,7 @@ def fit_set(replay: Replay, effects, start: np.ndarray | None = None, iterations
         best = (objective, theta.copy(), grams, columns, products)
         if not len(index):
             break
-        push = gram[1:, 0] - precision @ off
-        step = np.linalg.solve(gram[1:, 1:] + precision, push)
+        push, step, _ = _newton(gram, precision, off)
         if 0.5 * push @ step < SMALL_STEP:
             break
         theta = theta.copy()
@@ -85,6 +84,13 @@ def fit_set(replay: Replay, effects, start: np.ndarray | None = None, iterations
     least, free_ride = _held(replay, products, theta, index, mean, precision, len(places(effects)))
     score = -least - 0.5 * volume + _sign_term(effects, index, theta, covariance) - free_ride
     return SetFit(effects, theta, index, grams, columns, covariance, float(score), float(objective))
+
+
+def _newton(gram, precision, off) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Right side, step and Hessian of Gauss and Newton, from inner products of residual and derivatives (1 + p, 1 + p) and how
+    far parameters are `off` their prior's mean."""
+    push, hessian = gram[1:, 0] - precision @ off, gram[1:, 1:] + precision
+    return push, np.linalg.solve(hessian, push), hessian
 
 
 def linearised_at(replay: Replay, fit: SetFit, index) -> list[np.ndarray]:
@@ -111,9 +117,9 @@ def step_with(replay: Replay, fit: SetFit, more) -> dict[str, dict[str, tuple[fl
     effects = (*fit.effects, *more)
     index, mean, precision = prior(effects)
     gram = replay.grams(linearised_at(replay, fit, index)).sum(0)
-    hessian = gram[1:, 1:] + precision
+    _, step, hessian = _newton(gram, precision, fit.theta[index] - mean)
     theta = fit.theta.copy()
-    theta[index] += np.linalg.solve(hessian, gram[1:, 0] - precision @ (theta[index] - mean))
+    theta[index] += step
     return _named(effects, theta, index, np.linalg.inv(hessian))
 
 
