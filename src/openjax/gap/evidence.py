@@ -25,6 +25,7 @@ from openjax.gap.feedback import (
     gustiness,
     outputs_of,
     read_feedback,
+    read_gains,
 )
 from openjax.gap.firmware import Radio
 from openjax.gap.hypotheses import SetFit, model_noise, weigh_singles, without_nuisances
@@ -92,7 +93,8 @@ class Look(NamedTuple):
 class Reading:
     """How the rows of a case are read. `arrived`: the commands that the link let through, None without commands; `pwm`:
     motors are duty cycles; `at_once`: a row's motors are one sample; `blind`: what motors do within a row isn't known;
-    `late` s: by how much they may be off against the gyroscope, None where that isn't known either."""
+    `late` s: by how much they may be off against the gyroscope, None where that isn't known either; `loops` {at_once: the rate
+    loop read so, of the nominal vehicle}, where they were read."""
 
     tracks: list[Track]
     vehicles: list
@@ -103,6 +105,7 @@ class Reading:
     at_once: bool = False
     blind: bool = False
     late: float | None = None
+    loops: dict[bool, firmware.RateLoop] = field(default_factory=dict)
 
     @property
     def numbers(self):
@@ -225,7 +228,10 @@ def _sampled(reading: Reading, slow: bool, hidden: bool) -> Reading:
     sure = True
     if known and at_once:
         # The log doesn't say which; yaw's loop or the motion does.
-        told = _obeys_as_sampled(reading)
+        of_all = reading.tracks, reading.vehicles, reading.arrived, reading.flight_of
+        loops = {once: firmware.read_rate_loop(*of_all, at_once=once) for once in (False, True)}
+        reading = dataclasses.replace(reading, loops=loops)
+        told = _obeys_as_sampled(loops[False].gains, loops[True].gains)
         if told is not None:
             at_once = told
         else:
@@ -238,20 +244,9 @@ def _sampled(reading: Reading, slow: bool, hidden: bool) -> Reading:
     return dataclasses.replace(reading, blind=blind, late=late)
 
 
-def _obeys_as_sampled(reading: Reading) -> bool | None:
+def _obeys_as_sampled(mean: Gains, single: Gains) -> bool | None:
     """Whether yaw's outputs obey the rate loop better as single samples than as means of their rows; None where neither is
     clear, or gains are changed."""
-    mean, single = (
-        firmware.read_rate_loop(
-            reading.tracks,
-            reading.vehicles,
-            reading.arrived,
-            reading.by_commands,
-            reading.flight_of,
-            at_once=once,
-        ).gains
-        for once in (False, True)
-    )
     if min(mean.yaw_left, single.yaw_left) > MOST_LEFT or mean.by_yaw or single.by_yaw:
         return None
     if single.yaw_left < ALIKE_LEFT * mean.yaw_left:
@@ -305,17 +300,14 @@ def _physics(reading: Reading, library: Library, pushes=None, gains=None, before
     rate_loop, read, ticks = None, None, [np.repeat(t.motor[:, None], TICKS, 1) for t in tracks]
     if arrived is not None:
         base = np.zeros(3) if gains is None else gains
-        loop = firmware.read_rate_loop(
-            tracks,
-            vehicles,
-            arrived,
-            reading.by_commands,
-            reading.flight_of,
-            pushes,
-            base,
-            at_once,
-            reading.late,
-        )
+        loop = reading.loops.get(at_once) if pushes is None and gains is None else None
+        if loop is None:
+            loop = firmware.read_rate_loop(
+                tracks, vehicles, arrived, reading.flight_of, pushes, base, at_once
+            )
+        if reading.late is not None:
+            found = read_gains(tracks, vehicles, arrived, reading.by_commands, at_once, reading.late)
+            loop = firmware.with_gains(loop, found)
         rate_loop, ticks, read = loop.path, loop.ticks, loop.gains
         if at_once:
             tracks = [dataclasses.replace(t, motor=m.mean(1)) for t, m in zip(tracks, ticks, strict=True)]

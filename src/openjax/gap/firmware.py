@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from openjax.flights.track import Track, held_means, smooth
-from openjax.gap.feedback import Gains, in_force, outputs_of, read_gains
+from openjax.gap.feedback import Gains, in_force, outputs_of
 from openjax.gap.linear_path import LinearPath, fit_linear_path
 from openjax.gap.observer import GYRO_GAIN, observe
 from openjax.gap.prediction import bucket, padded
@@ -242,27 +242,19 @@ def gyro_noise(rates: np.ndarray) -> float:
 @dataclass(frozen=True, eq=False)
 class RateLoop:
     """The rate controller read from what the motors differ by: `path` fits its outputs row by row; the motor commands
-    (T, TICKS, 4) of each track's `ticks`; `gains` from what commands alone excite."""
+    (T, TICKS, 4) of each track's `ticks`; `gains` of yaw, row by row, and what `with_gains` adds."""
 
     path: LinearPath
     ticks: list[np.ndarray]
-    gains: Gains | None
+    gains: Gains
 
 
 def read_rate_loop(
-    tracks,
-    vehicles,
-    arrived,
-    by_commands,
-    flight_of,
-    pushes=None,
-    base=(0.0, 0.0, 0.0),
-    at_once=False,
-    late=None,
+    tracks, vehicles, arrived, flight_of, pushes=None, base=(0.0, 0.0, 0.0), at_once=False
 ) -> RateLoop:
-    """Read the rate controllers of all tracks; `arrived` as in `Radio`, `by_commands` as for `read_gains`. pushes [(T, 3)]:
-    angular accelerations (rad/s^2) beyond the nominal that are already known; `base`: changes of the gains p, i, d
-    around which the loop is linearised. `late` s: see `read_gains`; None: clocks or rows tell nothing about gains."""
+    """Read the rate controllers of all tracks; `arrived` as in `Radio`. pushes [(T, 3)]: angular
+    accelerations (rad/s^2) beyond the nominal that are already known; `base`: changes of the gains p, i, d
+    around which the loop is linearised."""
     base = np.asarray(base, float)
     gains = (1.0 + base + np.concatenate([np.zeros((1, 3)), GAIN_STEP * np.eye(3)])).astype(np.float32)
     y, columns, nuisances, masks, ticks, noise = [], [], [], [], [], []
@@ -305,12 +297,12 @@ def read_rate_loop(
     _, change, covariance = path.score()
     outputs = np.concatenate([(t.motor @ outputs_of(v))[:, 2] for t, v in zip(tracks, vehicles, strict=True)])
     left = float(np.concatenate(path.residual)[:, 2].var() / max(outputs.var(), 1e-12))
-    gains = (
-        Gains(np.zeros(6), np.full(6, np.inf))
-        if late is None
-        else read_gains(tracks, vehicles, arrived, by_commands, at_once, late)
+    yaw = float(change[3]), float(np.sqrt(covariance[3, 3]))
+    return RateLoop(path, ticks, Gains(np.zeros(6), np.full(6, np.inf), yaw=yaw, yaw_left=left))
+
+
+def with_gains(loop: RateLoop, gains: Gains) -> RateLoop:
+    """The loop with `gains` read from what commands excite; yaw's stay those read row by row."""
+    return dataclasses.replace(
+        loop, gains=dataclasses.replace(gains, yaw=loop.gains.yaw, yaw_left=loop.gains.yaw_left)
     )
-    gains = dataclasses.replace(
-        gains, yaw=(float(change[3]), float(np.sqrt(covariance[3, 3]))), yaw_left=left
-    )
-    return RateLoop(path, ticks, gains)
