@@ -54,7 +54,7 @@ class Arguments:
     """Further options of the virtual Crazyflies, as NAME=VALUE."""
 
 
-LANDING = 60.0
+LANDING = 150.0
 """Seconds that a flight has for its landing and its files, once it was asked to end."""
 
 

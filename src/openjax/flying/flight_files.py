@@ -57,22 +57,25 @@ def _table(name, samples, record, ticks) -> LogTable:
     begin, end = record.sent[ticks[0]], record.sent[ticks[-1]]
     sent = [record.sent[k] for k in ticks]
     rows, ids = [], []
+
+    def within(samples, time_of):
+        """(time, sample) of those in this game."""
+        times = ((round(time_of(sample), 4), sample) for sample in samples)
+        return [(at, sample) for at, sample in times if begin <= at <= end]
+
     for i, vehicle in enumerate(samples):
         at_time: dict[float, dict] = {}
-        for _, pose, voltage in vehicle.poses:
+        for at, (_, pose, voltage) in within(vehicle.poses, lambda sample: sample[1].time):
             values = dict(zip(_POSE, measured_numbers(pose), strict=True))
             if vehicle.seen:
                 values = {name: values[name] for name in _POSE[10:]}
-            at_time.setdefault(round(pose.time, 4), {}).update(values, vbat=voltage)
-        for pose in vehicle.seen:  # motion capture in place of the estimate on board
-            at_time.setdefault(round(pose.time, 4), {}).update(
-                zip(_POSE[:10], measured_numbers(pose)[:10], strict=True)
-            )
-        for at, values in vehicle.bodies:
-            at_time.setdefault(round(at, 4), {}).update(zip(_BODY, values, strict=True))
+            at_time.setdefault(at, {}).update(values, vbat=voltage)
+        # motion capture in place of the estimate on board
+        for at, pose in within(vehicle.seen, lambda pose: pose.time):
+            at_time.setdefault(at, {}).update(zip(_POSE[:10], measured_numbers(pose)[:10], strict=True))
+        for at, (_, values) in within(vehicle.bodies, lambda sample: sample[0]):
+            at_time.setdefault(at, {}).update(zip(_BODY, values, strict=True))
         for at in sorted(at_time):
-            if not begin <= at <= end:
-                continue
             command = record.set_points[ticks[max(bisect.bisect_right(sent, at) - 1, 0)]][i]
             row = at_time[at]
             if command.mode == RATES:
