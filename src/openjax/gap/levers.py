@@ -18,9 +18,8 @@ WRONG = 0.5  # of what motors do that a model may have wrong
 LEVER = 0.025  # m: half an arm
 TURNING = 2.0  # times the lever about x and y, that one about z must have: gusts turn more about these
 SHORT = 0.008  # m: the least lever of such a one
-BLIND = (
-    2.0  # times as long where clocks drift or it isn't known what motors do within a row; nothing of z then
-)
+# Times as long where clocks drift or it isn't known what motors do within a row; z has no lever of its own then.
+BLIND = 2.0
 STILL = 0.03  # m/s^2 of push below which sensors can't tell one
 FEWEST = 10  # means of a track
 TURN = 0.7  # rad/s^2: less doesn't matter
@@ -28,7 +27,7 @@ TURN = 0.7  # rad/s^2: less doesn't matter
 
 def levers(
     tracks: list[Track], disturbed: list[np.ndarray], turned: list[np.ndarray], usable: np.ndarray, vehicles
-):
+) -> tuple[np.ndarray, np.ndarray] | None:
     """Levers (3,) m about each axis, and torques (3,) rad/s^2 of which they are; None where the log doesn't tell them.
 
     disturbed [(T, 9)]: what is left as accelerations, see `rest.disturbances`, with what feedback made of it; turned [(T, 3)]:
