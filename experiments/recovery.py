@@ -181,7 +181,7 @@ def report(results: dict) -> list[str]:
 def main(arguments: list[str]) -> int:
     """Learn and write the files."""
     parser = page_parser(__doc__, "recovery")
-    usual = dataclasses.replace(preset("flight").analytic, updates=200)
+    usual = preset("flight").analytic
     parser.add_argument("--policy", default="flight", help="name or policy file")
     parser.add_argument("--sees", nargs="*", choices=("others", "vehicle"), default=[])
     parser.add_argument("--vehicles", choices=KINDS, default=WHOLE, help="kind that is learnt on")
