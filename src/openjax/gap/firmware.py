@@ -33,6 +33,7 @@ HELD = (
 )
 BETWEEN = 0.6  # of that way: rows up to here that don't hold it are neither; a lost packet leaves none
 MOST_BETWEEN = 0.5  # of them per lost packet; where rows lie anywhere between two commands, it is one
+MOST_BETWEEN_SINGLE = 1.0  # the same where a row holds one command: a busy sender's leave some, and over three where none is lost
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +73,7 @@ class Radio:
         later = min(self.misfit["command_latency",], self.misfit["command_latency", "packet_loss"])
         late = "command_latency" in known and self.delay > clock and later < EXPLAINED * at_once
         lost = "packet_loss" in known and self.loss > least_loss and self.loss * self.told > least
-        lost = lost and self.between < MOST_BETWEEN
+        lost = lost and self.between < (MOST_BETWEEN_SINGLE if self.single else MOST_BETWEEN)
         return tuple(n for n, on in (("command_latency", late), ("packet_loss", lost)) if on)
 
 
