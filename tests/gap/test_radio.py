@@ -1,5 +1,6 @@
 """What a link did to the commands, read from logs whose motors are sampled every 2 ms, as `openjax.fly` writes them."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,7 +10,7 @@ from openjax.flights.flight import Flight
 from openjax.flights.track import flight_tracks
 from openjax.gap.firmware import read_radio
 from openjax.gap.selection import LEAST_NATS
-from openjax.gap.verdict import CLOCK, LEAST_LOSS
+from openjax.gap.verdict import CLOCK, LEAST_LOSS, _material
 
 BOTH = ("command_latency", "packet_loss")
 CASE = SimpleNamespace(vehicle_file=SimpleNamespace(motor_command="thrust"), others=lambda flight: ())
@@ -67,3 +68,15 @@ def test_rows_begin_where_commands_do():
     changed = np.diff(track.command[:, 0]) != 0.0
     assert changed.mean() > 0.98
     assert np.abs(track.motor.mean(1) - track.command[:, 0]).max() < 1e-4  # no row mixes two commands
+
+
+def test_a_small_loss_stays_beside_a_latency_only_where_rows_hold_one_command():
+    shares = {"command_latency": SimpleNamespace(value=0.8), "packet_loss": SimpleNamespace(value=0.001)}
+    parts = SimpleNamespace(effects=shares, unexplained=SimpleNamespace(value=0.0))
+    radio = read_radio(flown(0.02, 0.1)[0])
+    assert radio.single and radio.delay == pytest.approx(0.02, abs=0.002)
+    named = {}
+    for single in (True, False):
+        evidence = SimpleNamespace(radio=dataclasses.replace(radio, single=single))
+        named[single] = _material(evidence, SimpleNamespace(gains={}), parts)
+    assert named == {True: ["command_latency", "packet_loss"], False: ["command_latency"]}
