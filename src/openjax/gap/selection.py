@@ -320,6 +320,15 @@ def _pruned(replay, fit, table, now, singles):
     return fit, table, now
 
 
+def _same_gap(replay, one: SetFit, other: SetFit) -> bool:
+    """Whether the first set leaves no larger gap on stretches left out than the other."""
+    squares = []
+    for fit in (one, other):
+        table = build(replay, fit, {})
+        squares.append(judge(table, with_effects(table)))
+    return level(squares[0].squares, floor_of(table, squares[1])) - 1.0 < LEAST_GAIN
+
+
 def _swapped(replay, fit, table, now, singles):
     """Each effect against every other in its place: the better one stays, and what comes near is told."""
     swaps: dict[str, dict[str, float]] = {}
@@ -340,16 +349,17 @@ def _swapped(replay, fit, table, now, singles):
         gains = {o: f.score - fit.score for o, f in tried.items()}
         favoured = dict(gains)
         for other in CARDS[effect].commoner:
-            if gains.get(other, -np.inf) > -COMMONER:
-                favoured[other] += COMMONER + LEAST_NATS
+            if other in gains and (gains[other] > -COMMONER or _same_gap(replay, tried[other], fit)):
+                favoured[other] = max(gains[other], 0.0) + COMMONER + LEAST_NATS
         for other in favoured:
             if effect in CARDS[other].commoner:
                 favoured[other] -= COMMONER
         for best in sorted(favoured, key=lambda o: -favoured[o]):
             if favoured[best] <= LEAST_NATS:
                 continue
-            # What fits better without predicting more takes nobody's place.
-            if not _stays(replay, tried[best], [best]):
+            # What fits better without predicting more takes nobody's place, nor what is rarer and leaves the same gap.
+            same = effect in CARDS[best].commoner and _same_gap(replay, fit, tried[best])
+            if same or not _stays(replay, tried[best], [best]):
                 del gains[best]
                 continue
             ahead = gains.pop(best)
