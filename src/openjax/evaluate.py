@@ -33,7 +33,7 @@ class EvaluateCommand:
     --environment.speed_limit none or --environment.start_attitude level.
     """
 
-    policy: tuple[str, ...] = ("open",)
+    policy: tuple[str, ...] = ("flight",)
     """A run's directory, a policy file (.npz), a checkpoint, or the name of a policy in the package or of a heuristic:
     angelani, janosov, apf.
 

@@ -59,6 +59,9 @@ def conclude(evidence: Evidence) -> Report:
     rest = look(evidence, selection)
     named = [*selection.effects, *rules.other_paths(evidence)]
     parts = split(evidence, selection, rest, named)
+    material = [e for e in named if rules.shrinks(parts, e)]
+    if material != named:
+        parts = split(evidence, selection, rest, material)
     missing = rules.not_testable(evidence)
     found = rules.decide(evidence, selection, rest, parts, missing)
     named = [e for e in found.effects if e != "unknown"]

@@ -10,7 +10,7 @@ from openjax.gap.evidence import Evidence
 from openjax.gap.library import path_of
 from openjax.gap.probabilities import FOLLOWED, TEMPERATURE, probabilities_of
 from openjax.gap.rest import Followed, Rest
-from openjax.gap.selection import LEAST_NATS, LEAST_SHARE, TESTABLE, Selection
+from openjax.gap.selection import LEAST_GAIN, LEAST_NATS, LEAST_SHARE, TESTABLE, Selection
 from openjax.gap.shares import Split
 
 CLOCK = 0.003  # s by which the clocks of a log may differ
@@ -50,6 +50,14 @@ def other_paths(evidence: Evidence) -> list[str]:
         if nats > LEAST_NATS and delay[0] > max(unsure, CLEAR * float(np.sqrt(covariance[0, 0]))):
             found.append("state_latency")
     return found
+
+
+def shrinks(parts: Split, effect: str) -> bool:
+    """Whether an effect of the rate loop shrinks the gap: its gains may be read more finely than it matters."""
+    if path_of(effect) != "rate_loop":
+        return True
+    whole = max(parts.gap.before**2 - 1.0, 0.0)
+    return parts.effects[effect].value * whole > (1.0 + LEAST_GAIN) ** 2 - 1.0
 
 
 def _less(key: tuple[str, ...], name: str) -> tuple[str, ...]:

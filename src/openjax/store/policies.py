@@ -70,11 +70,11 @@ class LoadedPolicy:
         return self.policy.act(self.parameters, observation)
 
 
-def load_policy(name_or_path: str | Path) -> LoadedPolicy:
+def load_policy(name_or_path: str | Path = "flight") -> LoadedPolicy:
     """Load a policy.
 
     Args:
-      name_or_path: a name from `known_policies()`, a policy file (.npz), a run's directory (its best
+      name_or_path: a name from `known_policies()` (`flight` if none is given), a policy file (.npz), a run's directory (its best
         policy) or a checkpoint's directory inside a run.
 
     Raises:
