@@ -29,7 +29,7 @@ def search(monkeypatch):
         "_ranked": lambda table, singles, now: ["b" if now.effects == ("a",) else "a"],
         "_joined": lambda replay, fit, singles, effect: fit_of(effect, *fit.effects),
         "_mended": mended,
-        "_stays": lambda replay, fit, added: True,
+        "_stays": lambda table, whole, added: True,
         "build": lambda replay, fit, singles: fit,
         "with_effects": lambda fit: fit,
         "judge": lambda table, fit: fit,

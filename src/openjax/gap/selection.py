@@ -111,7 +111,7 @@ def _widened(replay, fit, table, now, singles, trail: _Trail):
         better = [f for f in tried if f is not None and f.score > fit.score + LEAST_NATS]
         for candidate in sorted(better, key=lambda f: -f.score):
             added = [e for e in candidate.effects if e not in fit.effects]
-            if _stays(replay, candidate, added):
+            if _stays(*_alone(replay, candidate), added):
                 break
         else:
             trail.whole.add(base)
@@ -164,10 +164,14 @@ def testable(evidence: Evidence) -> dict[str, SetFit]:
     }
 
 
-def _stays(replay, fit: SetFit, added) -> bool:
-    """Whether one of the effects `added` to a set stays for what it adds."""
+def _alone(replay, fit: SetFit) -> tuple[Table, Judged]:
+    """The table of a set that nothing may widen, and the set judged."""
     table = build(replay, fit, {})
-    whole = judge(table, with_effects(table))
+    return table, judge(table, with_effects(table))
+
+
+def _stays(table: Table, whole: Judged, added) -> bool:
+    """Whether one of the effects `added` to a set stays for what it adds."""
     return any(gain_of(table, whole, e).accepted for e in added)
 
 
@@ -320,13 +324,9 @@ def _pruned(replay, fit, table, now, singles):
     return fit, table, now
 
 
-def _same_gap(replay, one: SetFit, other: SetFit) -> bool:
-    """Whether the first set leaves no larger gap on stretches left out than the other."""
-    squares = []
-    for fit in (one, other):
-        table = build(replay, fit, {})
-        squares.append(judge(table, with_effects(table)))
-    return level(squares[0].squares, floor_of(table, squares[1])) - 1.0 < LEAST_GAIN
+def _same_gap(table: Table, one: Judged, other: Judged) -> bool:
+    """Whether the first of two sets leaves no larger gap on stretches left out than the other; `table` of either."""
+    return level(one.squares, floor_of(table, other)) - 1.0 < LEAST_GAIN
 
 
 def _swapped(replay, fit, table, now, singles):
@@ -349,7 +349,9 @@ def _swapped(replay, fit, table, now, singles):
         gains = {o: f.score - fit.score for o, f in tried.items()}
         favoured = dict(gains)
         for other in CARDS[effect].commoner:
-            if other in gains and (gains[other] > -COMMONER or _same_gap(replay, tried[other], fit)):
+            if other not in gains:
+                continue
+            if gains[other] > -COMMONER or _same_gap(table, _alone(replay, tried[other])[1], now):
                 favoured[other] = max(gains[other], 0.0) + COMMONER + LEAST_NATS
         for other in favoured:
             if effect in CARDS[other].commoner:
@@ -358,8 +360,9 @@ def _swapped(replay, fit, table, now, singles):
             if favoured[best] <= LEAST_NATS:
                 continue
             # What fits better without predicting more takes nobody's place, nor what is rarer and leaves the same gap.
-            same = effect in CARDS[best].commoner and _same_gap(replay, fit, tried[best])
-            if same or not _stays(replay, tried[best], [best]):
+            narrow, whole = _alone(replay, tried[best])
+            same = effect in CARDS[best].commoner and _same_gap(narrow, now, whole)
+            if same or not _stays(narrow, whole, [best]):
                 del gains[best]
                 continue
             ahead = gains.pop(best)
