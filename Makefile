@@ -26,7 +26,7 @@ tables: $(READY)
 	$(BIN)/python -m experiments.tables $(ARGS)
 
 exam: $(READY)
-	$(BIN)/python -m experiments.exam.run $(ARGS)
+	$(BIN)/python -m experiments.diagnosis.run $(ARGS)
 
 # One install for everything; again only when pyproject.toml changes. A GPU is used where nvidia-smi finds one.
 $(READY): pyproject.toml

@@ -28,7 +28,7 @@ from experiments.task_gap.flights import make_cases
 from experiments.task_gap.game import draw_tasks
 from experiments.worlds.game import play
 from experiments.worlds.plant import PlantWorld
-from openjax.adapt import LOSSES, compile_programs, episodes, scores_on
+from openjax.commands.adapt import LOSSES, compile_programs, episodes, scores_on
 from openjax.commands.validation import uniform_tasks
 from openjax.files import read_json
 from openjax.learning.adaptation import (

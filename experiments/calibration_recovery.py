@@ -21,11 +21,11 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from openjax.calibration.calibration import calibrate
 from openjax.commands.machine import describe_machine
 from openjax.flights.checks import check_flight
 from openjax.flights.flight import Case
 from openjax.flights.reading import flights_of
-from openjax.gap.calibration import calibrate
 from openjax.gap.samples import fly, log_of, references
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.vehicle_file import VehicleFile

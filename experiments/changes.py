@@ -7,7 +7,7 @@ Masalimov et al., Data 2024, 9(6), 79), micro-SD logs of two Crazyflies without 
 
 `open` compares every condition with all normal flights, and each day of normal flights with the other days; the table
 goes to experiments/results/changes_e8.md. `answer` writes experiments/results/changes_e9.json. Nothing is fitted to
-either: what the comparison assumes stands at the top of the modules of `openjax.gap.changes`.
+either: what the comparison assumes stands at the top of the modules of `openjax.comparison`.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import spearmanr
 
+from openjax.comparison.report import draw, in_words, prediction
 from openjax.flights.reading import write_csv
 from openjax.gap import changes
-from openjax.gap.changes.report import draw, in_words, prediction
 from openjax.gap.samples import fly, log_of, references
 from openjax.vehicle import load_vehicle
 

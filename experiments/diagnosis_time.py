@@ -2,7 +2,7 @@
 
     python -m experiments.diagnosis_time LOGS [MORE ...] [--cores 2] [--out experiments/results/diagnosis_time]
 
-Every folder below LOGS with a vehicle.toml is a case: `experiments.exam.generate` and `experiments.exam.rotorpy_cases` make
+Every folder below LOGS with a vehicle.toml is a case: `experiments.diagnosis.generate` and `.rotorpy_cases` make
 some, and recorded flights do as well. The process starts with no compiled programs, so the first case compiles, and so do
 later ones whose flights are of another length. Pictures are drawn as a user's are.
 """

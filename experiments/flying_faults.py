@@ -99,11 +99,11 @@ def fly(
     from openjax.flying.limits import SafetySettings
     from openjax.flying.safety import Drone, Event, Mode, Request, initial_state, step
     from openjax.flying.set_point import from_action
-    from openjax.flying.simulated import SimulatedSwarm
-    from openjax.flying.virtual_vehicles import VirtualVehicles
     from openjax.pursuit import find_scenario, scenario_task
     from openjax.pursuit.environment import THRUST_LIMIT
     from openjax.vehicle import load_vehicle
+    from openjax.virtual_crazyflie.simulated import SimulatedSwarm
+    from openjax.virtual_crazyflie.vehicles import VirtualVehicles
 
     policy = openjax.load_policy(policy_name)
     game = policy.settings.environment

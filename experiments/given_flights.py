@@ -3,7 +3,7 @@
     python -m experiments.given_flights second_plant DIAGNOSES --answers ANSWERS.json    # experiments/results/second_plant.*
     python -m experiments.given_flights nanobench DIAGNOSES                              # experiments/results/real/
 
-DIAGNOSES is what `python -m openjax.diagnose CASE ... --no-html --out DIAGNOSES` or `experiments.exam.diagnose` wrote. Both
+DIAGNOSES is what `python -m openjax.diagnose CASE ... --no-html --out DIAGNOSES` or `experiments.diagnosis.diagnose` wrote. Both
 sets are for development; what the pages say in words stands in NAME_reading.md beside them.
 """
 

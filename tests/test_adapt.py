@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from openjax import adapt
+from openjax.commands import adapt
 from openjax.errors import UserError
 from openjax.learning import TrainSettings, build
 from openjax.learning.adaptation import (

@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 import openjax
-from openjax import benchmark, evaluate, train
-from openjax.commands import training_job
+from openjax.commands import benchmark, evaluate, train, training_job
 from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import FIELDS
 from openjax.learning import training_step

@@ -10,7 +10,7 @@ import pytest
     ("modules", "unwanted"),
     [
         (("openjax.learning.advantages", "openjax.learning.archive", "openjax.learning.schedule"), "mujoco flax.linen"),
-        (("openjax.policy.predictor", "openjax.policy.attention"), "mujoco openjax.pursuit"),
+        (("openjax.policy.predictor", "openjax.kernels.attention"), "mujoco openjax.pursuit"),
         (("openjax.files", "openjax.ranges", "openjax.errors"), "jax numpy"),
         (("openjax.commands.training_job",), "orbax matplotlib tensorboardX torch PIL"),
     ],

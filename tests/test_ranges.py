@@ -8,15 +8,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from openjax import calibrate, diagnose, export, fly, sample_flights, virtual_crazyflie
-from openjax.adapt import AdaptCommand
-from openjax.benchmark import BenchmarkCommand
+from openjax.commands import calibrate, diagnose, export, fly, sample_flights, virtual_crazyflie
+from openjax.commands.adapt import AdaptCommand
+from openjax.commands.benchmark import BenchmarkCommand
 from openjax.commands.command_line import parse
+from openjax.commands.evaluate import EvaluateCommand
 from openjax.commands.training_command import TrainCommand
+from openjax.commands.view import ViewCommand
 from openjax.errors import UserError
-from openjax.evaluate import EvaluateCommand
 from openjax.flying.limits import SafetySettings
-from openjax.flying.virtual_link import LinkFaults
 from openjax.learning import GeneratorSettings, MappoSettings, TrainSettings
 from openjax.learning.adaptation import AdaptSettings
 from openjax.policy import NetworkSettings, PredictorSettings
@@ -24,7 +24,7 @@ from openjax.pursuit import PursuitSettings, RewardSettings
 from openjax.ranges import Interval, check_intervals, ranged_fields
 from openjax.store.old_names import train_settings
 from openjax.store.settings_files import to_plain
-from openjax.view import ViewCommand
+from openjax.virtual_crazyflie.link import LinkFaults
 
 SETTINGS = (
     AdaptSettings,

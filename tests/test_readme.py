@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 import openjax
-from openjax import calibrate, diagnose, sample_flights
+from openjax.commands import calibrate, diagnose, sample_flights
 from openjax.store.environments import make_environment
 from openjax.vehicle.vehicle_file import load_vehicle_file
 

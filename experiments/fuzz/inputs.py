@@ -40,7 +40,7 @@ def fuzz_train(rng: random.Random, folder: Path):
 
 def fuzz_evaluate(rng: random.Random, folder: Path):
     from openjax.commands.command_line import option_names, parse
-    from openjax.evaluate import PROGRAM, EvaluateCommand, prepare
+    from openjax.commands.evaluate import PROGRAM, EvaluateCommand, prepare
 
     names = _cached("evaluate options", lambda: option_names(EvaluateCommand()))
     arguments = _hostile_options(rng, rng.choices(names, k=rng.randint(1, 3)), names)
@@ -50,7 +50,7 @@ def fuzz_evaluate(rng: random.Random, folder: Path):
 
 
 def fuzz_benchmark(rng: random.Random, folder: Path):
-    from openjax.benchmark import PROGRAM, BenchmarkCommand
+    from openjax.commands.benchmark import PROGRAM, BenchmarkCommand
     from openjax.commands.command_line import option_names, parse
 
     names = _cached("benchmark options", lambda: option_names(BenchmarkCommand()))
@@ -252,7 +252,7 @@ def _hostile_options(rng, chosen, names):
 
 
 def _sample_case():
-    from openjax.sample_flights import main
+    from openjax.commands.sample_flights import main
 
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
         main([f"{folder}/case", "--duration", "4", "--seed", "0"])

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.exam import cases, fleet, vehicle
-from experiments.exam.effects import EFFECTS, draw
+from experiments.diagnosis import cases, fleet, vehicle
+from experiments.diagnosis.effects import EFFECTS, draw
 from experiments.worlds.plant import rng_of, sensors_of
 from openjax.vehicle.effects import load_effects
 

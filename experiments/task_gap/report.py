@@ -183,7 +183,7 @@ def markdown(cases, options, measured, machine) -> str:
     return "\n".join(lines) + "\n"
 
 
-METHOD = """Flights of the exam's plant (`experiments/exam`, no code shared with openjax) with one cause each, at
+METHOD = """Flights of the exam's plant (`experiments/diagnosis`, no code shared with openjax) with one cause each, at
 three quarters of its usual range, are diagnosed; then the policy plays the same uniform tasks from the same starts in three
 worlds: *nominal* (the simulator), *flights* (that plant with that cause, its gusts and sensor noise, at 1 kHz; only the game
 around it is openjax's), *corrected* (the simulator with the diagnosed effects.toml). Differences are paired by episode; ± is

@@ -18,7 +18,7 @@ import time
 import jax
 import numpy as np
 
-from experiments.exam import effects
+from experiments.diagnosis import effects
 from experiments.pages import page_parser, publish, table, where
 from experiments.task_gap.flights import SIZES
 from experiments.worlds.game import play

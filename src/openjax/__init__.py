@@ -17,21 +17,20 @@ _PUBLIC = {
     "SCENARIOS": "openjax.pursuit",
     "Task": "openjax.pursuit",
     "UserError": "openjax.errors",
+    "evaluate": "openjax.commands.calls",
     "load_policy": "openjax.store.policies",
     "make": "openjax.pursuit",
     "preset": "openjax.learning",
+    "train": "openjax.commands.calls",
 }
-_COMMANDS = ("evaluate", "train")  # modules that can be called
 
-__all__ = sorted([*_PUBLIC, *_COMMANDS])
+__all__ = sorted(_PUBLIC)
 
 
 def __getattr__(name: str):
     # imported on first use: `python -m openjax.diagnose --help` needn't wait for MuJoCo
     if name in _PUBLIC:
         return getattr(importlib.import_module(_PUBLIC[name]), name)
-    if name in _COMMANDS:
-        return importlib.import_module(f"openjax.{name}")
     raise AttributeError(f"module 'openjax' has no attribute {name!r}")
 
 

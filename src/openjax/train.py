@@ -1,34 +1,9 @@
-"""Train pursuers: `python -m openjax.train [--preset NAME] [--out DIR] [--any.setting value]`.
+"""`python -m openjax.train`: the command is `openjax.commands.train`."""
 
-Writes a run directory (see `openjax.store.run_directory`) with logs, checkpoints, the best policy and
-pictures. Ctrl-C or SIGTERM saves and exits; `--resume DIR` goes on exactly where it stopped.
-From Python: `openjax.train(settings, out)`, see `openjax.commands.calls.train`.
-"""
+import functools
 
-import sys
-import time
-from collections.abc import Sequence
-
-from openjax.commands.callable_module import make_callable
-from openjax.commands.command_line import peek, run_command
-
-CALL = "train"
-make_callable(__name__)
-
-
-def main(arguments: Sequence[str]) -> int:
-    """The command; returns its exit status."""
-    started = time.monotonic()
-    if not {"-h", "--help"} & set(arguments) and peek(arguments, "process_id") in (None, "0"):
-        print("openjax.train: loading JAX and MuJoCo ...", flush=True)  # takes seconds; nobody should wonder
-    from openjax.cluster.joining import joined
-    from openjax.commands.training_command import membership, read_command, start
-
-    with joined(membership(arguments)) as processes:
-        return start(
-            read_command(arguments), arguments, started, processes, keep_traced=__name__ == "__main__"
-        )
-
+from openjax.commands.command_line import run_command
+from openjax.commands.train import main
 
 if __name__ == "__main__":
-    sys.exit(run_command(main))
+    run_command(functools.partial(main, keep_traced=True))

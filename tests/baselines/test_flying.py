@@ -12,8 +12,8 @@ from openjax.baselines import DacoopPolicy, Heuristic, VelocityPolicy, velocity_
 from openjax.baselines.apf import apf
 from openjax.baselines.dacoop import START
 from openjax.baselines.surroundings import Craft, surroundings
+from openjax.commands.evaluate import main
 from openjax.errors import UserError
-from openjax.evaluate import main
 from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import Pursuit, PursuitSettings, Task
 

@@ -34,12 +34,12 @@ from openjax.flying.set_point import (
     as_sent,
     manual_arguments,
 )
-from openjax.flying.virtual_firmware import VirtualFirmware
-from openjax.flying.virtual_link import LinkFaults
-from openjax.flying.virtual_process import VirtualCrazyflies
-from openjax.flying.virtual_vehicles import VirtualVehicles
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.vehicle_file import load_vehicle_file
+from openjax.virtual_crazyflie.firmware import VirtualFirmware
+from openjax.virtual_crazyflie.link import LinkFaults
+from openjax.virtual_crazyflie.process import VirtualCrazyflies
+from openjax.virtual_crazyflie.vehicles import VirtualVehicles
 
 PATIENT = SafetySettings(pose_timeout=2.0, link_timeout=3.0, action_timeout=2.0)
 """A busy machine is no reason to land."""

@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from openjax import diagnose
+from openjax.commands import diagnose
 from openjax.commands.command_line import one_line
 from openjax.errors import UserError
 from openjax.flights.case import load_case

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from openjax.commands.sample_flights import main
 from openjax.errors import UserError
 from openjax.flights.case import load_case
 from openjax.gap.samples import fly, references
-from openjax.sample_flights import main
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.effects import EFFECTS
 

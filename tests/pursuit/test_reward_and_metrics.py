@@ -12,8 +12,8 @@ import pytest
 
 from openjax.pursuit import Pursuit, PursuitSettings, RewardSettings, Task, hover_action
 from openjax.pursuit.collisions import Breaches, breaches, crashed
+from openjax.pursuit.info import StepInfo
 from openjax.pursuit.reward import reward as reward_of
-from openjax.pursuit.state import StepInfo
 
 SETTINGS = PursuitSettings(
     max_pillars=1,

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from openjax.kernels.componentwise import evaluate, split
 from openjax.vehicle import hover_state, load_vehicle, make_drones_step
-from openjax.vehicle.componentwise import evaluate, split
 from openjax.vehicle.rigid_kernel import WORLDS, kernel_call, mapped_step
 
 VEHICLE = load_vehicle()

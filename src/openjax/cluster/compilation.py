@@ -5,9 +5,9 @@ import os
 import platform
 import sys
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+
+from openjax.background import in_background
 
 CACHE_SIZE = 2 * 2**30
 """Bytes that the cache of compiled programs may take; what was used longest ago goes first."""
@@ -75,14 +75,6 @@ def _bound(folder, size):
             return
         path.unlink(missing_ok=True)
         total -= bytes_
-
-
-def in_background(make: Callable[[], Any]) -> Callable[[], Any]:
-    """Start to make something in a thread of its own; a function that waits for it and returns it, or raises its error."""
-    pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="background")
-    future = pool.submit(make)
-    pool.shutdown(wait=False)
-    return future.result
 
 
 def compile_ahead(function: Callable, *arguments) -> Callable[..., bool]:

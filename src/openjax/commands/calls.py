@@ -93,7 +93,7 @@ def evaluate(
     Raises:
       UserError: an unusable layout, or a game that the policy can't play.
     """
-    from openjax.evaluate import EvaluateCommand, fly_scenarios
+    from openjax.commands.evaluate import EvaluateCommand, fly_scenarios
 
     if isinstance(policy, str | Path):
         policy = load_policy(policy)

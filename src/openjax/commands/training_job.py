@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-from openjax.cluster.compilation import compile_ahead, in_background
+from openjax.background import in_background
+from openjax.cluster.compilation import compile_ahead
 from openjax.cluster.devices import (
     carry_shardings,
     check_devices,
@@ -21,7 +22,7 @@ from openjax.cluster.devices import (
 )
 from openjax.cluster.processes import Processes
 from openjax.cluster.tracing import recalled
-from openjax.commands.comparison import compare, game_for
+from openjax.commands.before_and_after import compare, game_for
 from openjax.commands.evaluator import (
     before_after_table,
     evaluate_scenarios,

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from openjax.cluster.compilation import in_background
+from openjax.background import in_background
 from openjax.learning.settings import AnalyticSettings
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import (

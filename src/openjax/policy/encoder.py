@@ -6,9 +6,9 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from openjax.kernels.attention import EntityKind, Layout, attend, attend_one_by_one
+from openjax.kernels.normalisation import normalise, normalised_layer
 from openjax.platform import can_compile_for_cuda
-from openjax.policy.attention import EntityKind, Layout, attend, attend_one_by_one
-from openjax.policy.normalisation import normalise, normalised_layer
 
 MASKED = -1e4
 """Added to the score of an entity that isn't there."""

@@ -1,10 +1,11 @@
 """The game: tasks, evader, sensing, observation, reward, test layouts, and the environment made of them."""
 
 from openjax.pursuit.environment import Dynamics, Pursuit, action_to_command, hover_action, make
+from openjax.pursuit.info import StepInfo
 from openjax.pursuit.observation import Observation
 from openjax.pursuit.scenarios import SCENARIOS, Scenario, find_scenario, scenario_settings, scenario_task
 from openjax.pursuit.settings import PursuitSettings, RewardSettings
-from openjax.pursuit.state import PursuitState, StepInfo
+from openjax.pursuit.state import PursuitState
 from openjax.pursuit.statistics import EpisodeStatistics
 from openjax.pursuit.task import (
     Task,

@@ -9,12 +9,13 @@ import jax.numpy as jnp
 
 from openjax.pursuit.collisions import breaches, crashed
 from openjax.pursuit.evader import evader_velocity
+from openjax.pursuit.info import StepInfo
 from openjax.pursuit.observation import Observation, frame, observe, own_frame, rotation_axes
 from openjax.pursuit.reward import captures, over_speed, reward
 from openjax.pursuit.sensing import line_of_sight
 from openjax.pursuit.settings import PursuitSettings
 from openjax.pursuit.spaces import Box
-from openjax.pursuit.state import PursuitState, StepInfo
+from openjax.pursuit.state import PursuitState
 from openjax.pursuit.statistics import count, empty_statistics
 from openjax.pursuit.task import Task, start_attitude, uniform_task
 from openjax.vehicle import DroneState, Vehicle, hover_state, load_vehicle, make_drones_step

@@ -4,9 +4,10 @@ import jax
 import jax.numpy as jnp
 
 from openjax.pursuit.collisions import breaches, crashed
+from openjax.pursuit.info import StepInfo
 from openjax.pursuit.observation import rotation_axes
 from openjax.pursuit.settings import PursuitSettings
-from openjax.pursuit.state import PursuitState, StepInfo
+from openjax.pursuit.state import PursuitState
 
 OVER_SPEED = 1.01
 """Share of the maximal speed above which a step counts as over speed."""

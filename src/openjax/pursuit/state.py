@@ -1,10 +1,9 @@
-"""The state of one world, and what happened in a step of it."""
+"""The state of one world."""
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from openjax.pursuit.collisions import Breaches
 from openjax.pursuit.statistics import EpisodeStatistics
 from openjax.pursuit.task import Task
 from openjax.vehicle import DroneState
@@ -33,15 +32,3 @@ class PursuitState:
     def seen(self) -> jax.Array:
         """() bool, some pursuer sees the evader."""
         return jnp.any(self.in_sight, axis=-1)
-
-
-@struct.dataclass
-class StepInfo:
-    """What happened in one step, beside the reward."""
-
-    captured: jax.Array  # (N,) bool
-    seen: jax.Array  # () bool, some pursuer sees the evader
-    breaches: Breaches
-    over_speed: jax.Array  # (N,) bool
-    crashed: jax.Array  # (N,) bool
-    penalty: jax.Array  # (N,) the reward's penalties, at most 0

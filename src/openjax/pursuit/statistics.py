@@ -1,15 +1,10 @@
 """What is counted over an episode: the paper's metrics and ours."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-if TYPE_CHECKING:
-    from openjax.pursuit.state import StepInfo
+from openjax.pursuit.info import StepInfo
 
 
 @struct.dataclass

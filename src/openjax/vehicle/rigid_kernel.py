@@ -17,8 +17,8 @@ import numpy as np
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as pallas_triton
 
+from openjax.kernels.componentwise import evaluate, split
 from openjax.platform import on_platform, whole_blocks
-from openjax.vehicle.componentwise import evaluate, split
 from openjax.vehicle.parameters import Vehicle
 from openjax.vehicle.solids import Surroundings, others, surroundings
 from openjax.vehicle.state import DroneState

@@ -1,0 +1,79 @@
+"""Settings and fixtures of the whole suite: it compiles much and computes little, so the compiler may leave out costly passes."""
+
+import gc
+import os
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+_flags = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+# workers are the parallel part: more threads would only wait for each other's cores
+_flags += " --xla_cpu_multi_thread_eigen=false"
+if version("jaxlib").startswith("0.10."):
+    # its way of fusing compiles three times as long; later versions know no such flag
+    _flags += " --xla_cpu_use_fusion_emitters=false"
+os.environ.setdefault("XLA_FLAGS", _flags)
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+# what one test compiled, its other processes, other workers and the next session needn't compile again
+os.environ.setdefault(
+    "JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parent / ".pytest_cache" / "compiled")
+)
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
+
+# tracing leaves many objects and little garbage
+gc.set_threshold(100_000, 50, 50)
+
+LONGEST = """
+    tests/gap/test_diagnosis tests/cluster/test_distributed tests/test_commands tests/learning/test_training_step
+    tests/test_examples tests/test_readme experiments/tests/test_exam tests/vehicle/test_effects
+    tests/vehicle/test_flight_dynamics experiments/tests/test_scaling tests/test_adapt tests/commands/test_validation
+    experiments/tests/test_fuzz
+""".split()
+"""The files that take longest: they come first, so that no worker is left with one of them when all else is done."""
+
+
+def pytest_collection_modifyitems(items):
+    place = {f"{name}.py": i for i, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.location[0], len(place)))
+
+
+VEHICLE_TOML = """
+[vehicle]
+name = "crazyflie-2.1"
+mass = 0.0321
+mass_weighed = true
+
+[motor]
+command = "thrust"
+"""
+
+
+@pytest.fixture(scope="session")
+def sample_columns():
+    """Columns of three sample flights of the nominal vehicle: {"flight_a": {"t": ..., ...}, ...}."""
+    from openjax.gap.samples import fly, references
+    from openjax.vehicle import load_vehicle
+
+    vehicle = load_vehicle()
+    return {
+        name: fly(vehicle, vehicle, reference, seed)[0]
+        for seed, (name, reference) in enumerate(references(seed=1, duration=8.0).items())
+    }
+
+
+@pytest.fixture
+def case_folder(tmp_path, sample_columns):
+    """A case folder with the three sample flights."""
+    from openjax.flights.reading import write_csv
+    from openjax.gap.samples import log_of
+
+    folder = tmp_path / "case"
+    folder.mkdir()
+    (folder / "vehicle.toml").write_text(VEHICLE_TOML)
+    for name, columns in sample_columns.items():
+        write_csv(folder / f"{name}.csv.gz", log_of([columns], name))
+    return folder

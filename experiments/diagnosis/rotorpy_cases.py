@@ -1,0 +1,312 @@
+"""Cases flown in somebody else's simulator: RotorPy 3 (Folk, Paulos, Kumar 2023), the `dev` extra.
+
+    python -m experiments.diagnosis.rotorpy_cases --seed 101 --each 4 --logs LOGS --answers ANSWERS.json [--jobs 8]
+
+Rigid body, rotors, hub drag, parasitic drag, flapping moment, translational lift, motor lag, wind, the controller
+(SE3Control, motor speeds at 250 Hz from the measured state) and the trajectories are RotorPy's; the told vehicles, the
+sensors of the known column and the measure of severity are the exam's. There are no body-rate commands. RotorPy's flapping
+coefficient is taken negative: with its sign convention a positive one pitches the nose down in forward flight, against
+what flapping does.
+"""
+
+import argparse
+
+import numpy as np
+
+from experiments.diagnosis import sensors
+from experiments.diagnosis import vehicle as v
+from experiments.diagnosis.flown_cases import (
+    answer,
+    choose_paths,
+    fly_plan,
+    slow_enough,
+    told_for,
+    write_case,
+)
+from experiments.diagnosis.generate import add_case_arguments
+from experiments.diagnosis.plant import KEPT, POSE, SAMPLE, Battery, Filter
+
+SECONDS = 8.0
+TUNNEL_HEIGHT = 0.65  # m
+LEAST = 4.0 / SAMPLE + 1  # samples that a flight must last
+QUIET, LAPS, TURNS, TURNING = ("hover",), ("circle", "eight"), ("eight", "rocking"), ("yawing", "rocking")
+
+
+def _drag(rng, told, hover):
+    d = rng.uniform(0.005, 0.025)
+    return {"k_d": d / (4 * hover), "k_z": 0.7 * d / (4 * hover)}, None, {"d_xy": d, "d_z": 0.7 * d}
+
+
+def _parasitic(rng, told, hover):
+    c = rng.uniform(0.006, 0.02)
+    return {"c_Dx": c, "c_Dy": c, "c_Dz": c}, None, {"quadratic": c}
+
+
+def _flapping(rng, told, hover):
+    k = rng.uniform(0.6e-4, 3e-4)
+    return {"k_flap": -k / (4 * hover)}, None, {"torque_N_m_per_m_s": k, "tilt_rad_per_m_s": 0.0}
+
+
+def _wind(rng, told, hover):
+    speed, angle = rng.uniform(0.4, 1.6), rng.uniform(0, 2 * np.pi)
+    drag, _, said = _drag(rng, told, hover)
+    wind = [speed * np.cos(angle), speed * np.sin(angle), 0.0]
+    return drag, ("steady", wind), {"w_x": wind[0], "w_y": wind[1], "speed": speed, "drag": said["d_xy"]}
+
+
+def _swaying(rng, told, hover):
+    drag, (_, wind), said = _wind(rng, told, hover)
+    return drag, ("swaying", wind), said
+
+
+def _tunnel(rng, told, hover):
+    drag, (_, wind), said = _wind(rng, told, hover)
+    return drag, ("tunnel", [2 * w for w in wind]), said
+
+
+def _lag(rng, told, hover):
+    tau = told.motor_time * rng.uniform(1.4, 3.5)
+    return {"tau_m": tau}, None, {"tau_up": tau, "tau_down": tau}
+
+
+def _mass(rng, told, hover):
+    ratio = 1 + rng.choice([-1, 1]) * rng.uniform(0.03, 0.2)
+    return {"mass": told.mass * ratio}, None, {"mass_kg": told.mass * ratio, "ratio": ratio}
+
+
+def _thrust(rng, told, hover):
+    scale = rng.choice([-1, 1]) * rng.uniform(0.03, 0.15)
+    changed = {
+        "k_eta": told.thrust_constant * (1 + scale),
+        "k_m": told.torque_ratio * told.thrust_constant * (1 + scale),
+    }
+    return changed, None, {"scale": scale}
+
+
+def _inertia(rng, told, hover):
+    ratio = rng.uniform(1.15, 1.5, 3)
+    moments = dict(zip(("Ixx", "Iyy", "Izz"), np.array(told.inertia) * ratio, strict=True))
+    return moments, None, {"ratio": ratio.tolist()}
+
+
+def _yaw(rng, told, hover):
+    ratio = rng.uniform(0.3, 0.8)
+    return {"k_m": told.torque_ratio * told.thrust_constant * ratio}, None, {"ratio": ratio}
+
+
+def _offset(rng, told, hover):
+    angle, size = rng.uniform(0, 2 * np.pi), rng.uniform(0.2, 2.0)
+    x, y = size * np.cos(angle), size * np.sin(angle)
+    return {"rotor_pos": _hubs(1e-3 * x, 1e-3 * y)}, None, {"x_mm": x, "y_mm": y}
+
+
+def _lift(rng, told, hover):
+    k = rng.uniform(0.0006, 0.003)
+    return {"k_h": k}, None, {"strength": k}
+
+
+def _noisy(rng, told, hover):
+    return {"motor_noise_std": rng.uniform(0.5, 2.0)}, None, {}  # process noise, no cause
+
+
+def _drag_and_lag(rng, told, hover):
+    (one, _, said_one), (two, _, said_two) = _drag(rng, told, hover), _lag(rng, told, hover)
+    return one | two, None, [said_one, said_two]
+
+
+# kind: (draw, effects, form as the scorer knows it, trajectories that expose it)
+KINDS = {
+    "none": (lambda *_: ({}, None, {}), [], "", ()),
+    "noisy_motors": (_noisy, [], "", ()),
+    "rotor_drag": (_drag, ["rotor_drag"], "rotor_speed", LAPS),
+    "parasitic_drag": (_parasitic, ["rotor_drag"], "parasitic", LAPS),
+    "blade_flapping": (_flapping, ["blade_flapping"], "linear", LAPS),
+    "wind": (_wind, ["wind"], "steady", ("circle", "yawing", "hover")),
+    "swaying_wind": (_swaying, ["wind"], "swaying", ("circle", "yawing", "hover")),
+    "motor_lag": (_lag, ["motor_lag"], "slower", TURNS),
+    "mass": (_mass, ["mass"], "plain", ()),
+    "thrust_scale": (_thrust, ["thrust_scale"], "plain", ()),
+    "inertia": (_inertia, ["inertia"], "diagonal", TURNING),
+    "yaw_torque": (_yaw, ["yaw_torque"], "scale", ("yawing",)),
+    "com_offset": (_offset, ["com_offset"], "torque", ()),
+    "translational_lift": (_lift, ["unknown"], "outside", LAPS),
+    "wind_tunnel": (_tunnel, ["unknown"], "outside", LAPS),
+    "drag_and_lag": (_drag_and_lag, ["rotor_drag", "motor_lag"], ("rotor_speed", "slower"), LAPS + TURNS),
+}
+
+
+def _hubs(x=0.0, y=0.0):
+    return {f"r{i + 1}": np.array([v.ROTOR_X[i] - x, v.ROTOR_Y[i] - y, 0.0]) for i in range(4)}
+
+
+def rotorpy_vehicle(told, changed):
+    """RotorPy's parameter dict of the told vehicle without aerodynamics, with some entries changed."""
+    out = {
+        "mass": told.mass,
+        "num_rotors": 4,
+        "rotor_pos": _hubs(),
+        "rotor_directions": v.SPIN,
+        "rI": np.zeros(3),
+    }
+    out |= dict(zip(("Ixx", "Iyy", "Izz"), told.inertia, strict=True))
+    out |= dict.fromkeys(("Ixy", "Iyz", "Ixz", "c_Dx", "c_Dy", "c_Dz", "k_d", "k_z", "k_h", "k_flap"), 0.0)
+    out |= {
+        "k_eta": told.thrust_constant,
+        "k_m": told.torque_ratio * told.thrust_constant,
+        "tau_m": told.motor_time,
+    }
+    out |= {"rotor_speed_min": 0.0, "rotor_speed_max": v.MAX_SPEED, "motor_noise_std": 0.0}
+    if set(changed) - set(out):
+        raise ValueError(f"not parameters of RotorPy's multirotor: {sorted(set(changed) - set(out))}")
+    return out | changed
+
+
+def _air(kind):
+    from rotorpy.wind.default_winds import ConstantWind, NoWind, SinusoidWind
+    from rotorpy.wind.spatial_winds import WindTunnel
+
+    if kind is None:
+        return NoWind().update
+    name, mean = kind
+    mean = np.array(mean)
+    if name == "tunnel":
+        # Its axis goes through the origin, which is on the floor: it is lifted to where the flights are.
+        tunnel = WindTunnel(np.linalg.norm(mean), mean / np.linalg.norm(mean), 0.25)
+        return lambda t, x: tunnel.update(t, x - [0.0, 0.0, TUNNEL_HEIGHT])
+    steady = ConstantWind(*mean)
+    sway = SinusoidWind(0.25 * mean, np.array([0.4, 0.55, 0.3]), np.array([0.0, 0.7, 0.3]))
+    return steady.update if name == "steady" else lambda t, x: steady.update(t, x) + sway.update(t, x)
+
+
+def trajectory(name, rng, slower=1.0):
+    """One of RotorPy's trajectories within the arena."""
+    from rotorpy.trajectories.circular_traj import ThreeDCircularTraj
+    from rotorpy.trajectories.hover_traj import HoverTraj
+    from rotorpy.trajectories.lissajous_traj import TwoDLissajous
+
+    height, speed = rng.uniform(0.5, 0.8), rng.uniform(0.8, 1.3) * slower
+    if name == "hover":
+        return HoverTraj(x0=np.array([0.0, 0.0, height]))
+    if name == "eight":
+        a = speed
+        return TwoDLissajous(A=0.55, B=0.5, a=a, b=2 * a, height=height, yaw_bool=bool(rng.random() < 0.5))
+    radius, rate = rng.uniform(0.4, 0.6), speed / 0.5 / (2 * np.pi)
+    if name == "rocking":  # short swings on every axis
+        size, rates = np.array([0.06, 0.07, 0.03]), slower * rng.uniform(0.7, 1.2, 3)
+        return ThreeDCircularTraj(np.array([0, 0, height]), size, rates, yaw_bool=bool(rng.random() < 0.5))
+    sizes = np.array([radius, radius, rng.uniform(0.05, 0.25)])
+    return ThreeDCircularTraj(
+        np.array([0, 0, height]), sizes, np.array([rate, rate, 0.6 * rate]), yaw_bool=name == "yawing"
+    )
+
+
+def fly(told, changed, wind, path, drawn, air):
+    """One flight in RotorPy as `plant.fly` would give it: dict of (S, n, 1) arrays every 2 ms."""
+    from rotorpy.controllers.quadrotor_control import SE3Control
+    from rotorpy.vehicles.multirotor import Multirotor
+
+    samples = int(SECONDS / SAMPLE)
+    goal = path.update(0.0)
+    hover = v.MAX_SPEED * np.sqrt(told.hover)
+    state = {"x": goal["x"].astype(float), "v": goal["x_dot"].astype(float), "q": np.array([0, 0, 0, 1.0])}
+    state |= {"w": np.zeros(3), "wind": np.zeros(3), "rotor_speeds": np.full(4, hover)}
+    tight = {"method": "RK23", "rtol": 1e-5, "atol": 1e-7}
+    model = Multirotor(
+        rotorpy_vehicle(told, changed), state, "cmd_motor_speeds", aero=True, integrator_kwargs=tight
+    )
+    control = SE3Control(rotorpy_vehicle(told, {}))
+    wind_at = _air(wind)
+    low = Filter(np.array([drawn["gyro_cut"]]), 3, air["gyro_bias"][:, None])
+    battery = Battery(
+        {k: np.array([air[k]]) for k in ("open_voltage", "discharge", "resistance")}, np.array([told.hover])
+    )
+    sizes = POSE | {k: size for k, size in KEPT.items() if k not in ("integral", "applied")}
+    out = {name: np.zeros((samples, size, 1), np.float32) for name, size in sizes.items()}
+    out |= {name: np.zeros((samples, 1), np.float32) for name in ("voltage", "load")}
+    m, crashed = np.full((4, 1), told.hover), samples
+    voltage = battery.step(m, 0.0)
+    for s in range(samples):
+        t = SAMPLE * s
+        state["wind"] = wind_at(t, state["x"])
+        gyro = low(state["w"][:, None] + air["gyro_bias"][:, None] + air["gyro"][s][:, None])
+        if s % 2 == 0:
+            k = s // 5
+            q = state["q"] + 0.5 * np.append(air["seen_attitude"][k][1:] * 2, 0.0) * state["q"][3]
+            seen = {"x": state["x"] + air["seen_position"][k], "v": state["v"] + air["seen_velocity"][k]}
+            seen |= {"q": q / np.linalg.norm(q), "w": gyro[:, 0]}
+            speeds = np.clip(control.update(t, seen, path.update(t))["cmd_motor_speeds"], 0.0, v.MAX_SPEED)
+            m = (speeds[:, None] / v.MAX_SPEED) ** 2
+        rotation = np.roll(state["q"], 1)[:, None]
+        accel = model.statedot(state, {"cmd_motor_speeds": speeds}, SAMPLE)["vdot"][:, None]
+        accel[2] += v.GRAVITY
+        for name, value in (
+            ("position", state["x"][:, None]),
+            ("velocity", state["v"][:, None]),
+            ("quaternion", rotation),
+            ("rates", state["w"][:, None]),
+            ("specific", v.rotate_back(rotation, accel)),
+            ("gyro", gyro),
+            ("rotor", state["rotor_speeds"][:, None]),
+            ("motor", m),
+            ("voltage", voltage),
+            ("load", battery.load),
+        ):
+            out[name][s] = value
+        if state["x"][2] < 0.02 or np.linalg.norm(state["x"]) > 2.5:
+            crashed = s
+            break
+        state = model.step(state, {"cmd_motor_speeds": speeds}, SAMPLE)
+        voltage = battery.step(m, SAMPLE)
+    out |= {"command": np.zeros((samples // 5, 4, 1), np.float32), "crashed": np.array([crashed])}
+    return out | {"pose_delay": np.zeros(1), "pose_jitter": np.zeros(1)}
+
+
+def make_case(job):
+    """Fly and write one case; returns its answer."""
+    seed, number, kind, folder = job
+    rng = np.random.default_rng(np.random.SeedSequence([17, seed, number]))
+    draw, effects, form, exposing = KINDS[kind]
+    told = told_for(rng, effects)
+    changed, wind, said = draw(rng, told, v.MAX_SPEED * np.sqrt(told.hover))
+    np.random.seed(seed * 1000 + number)  # noqa: NPY002  RotorPy draws its motor noise from the global state
+    needed = "pgm" if effects else "m"
+    drawn = sensors.draw(rng, str(rng.choice(sensors.KINDS)), needed, "none")
+    drawn["channels"] = drawn["channels"].replace("c", "")
+    if "m" not in drawn["channels"]:
+        drawn["channels"] += "m"
+    if drawn["rate"] > 500:
+        drawn["rate"] = 500
+    nuisance = {"k_eta": told.thrust_constant * (1 + drawn["thrust_offset"])}
+    names = choose_paths(rng, exposing, ("circle", "eight", "rocking", "yawing"))
+    ticks, flights, flown = int(SECONDS * 100), [], []
+    for name in names:
+
+        def attempt(slower, name=name):
+            air = sensors.draw_air(rng, drawn, ticks, drawn["voltage"] + rng.uniform(-0.15, 0.1))
+            return fly(told, nuisance | changed, wind, trajectory(name, rng, slower), drawn, air)
+
+        flown.append(slow_enough(attempt, LEAST))
+        length = min(ticks, int(flown[-1]["crashed"][0]) // 5 - 5)
+        flights.append([sensors.log_rows(rng, drawn, flown[-1], 0, length)])
+    joined = {k: np.concatenate([f[k] for f in flown], axis=-1) for k in flown[0]}
+    place = write_case(folder, number, flights, drawn, v.toml(told, "RotorPy 3", drawn["pose_rate"]))
+    fine = ["wind", "rotor_drag"] if kind == "wind_tunnel" else []
+    return answer(
+        place.name, kind, told, drawn, names, joined, flights, effects, form, said, "SE3Control", fine
+    )
+
+
+def main():
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add_case_arguments(parser)
+    parser.add_argument("--each", type=int, default=4, help="cases of each kind")
+    parser.add_argument("--kinds", default=",".join(KINDS))
+    options = parser.parse_args()
+    kinds = [kind for kind in options.kinds.split(",") for _ in range(options.each)]
+    fly_plan(options, kinds, make_case, "RotorPy")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,361 @@
+"""The family of sensors and logs: what a case's vehicle carries, the air that it flies in, and the rows of its logs.
+
+`draw` makes a case's set-up; eight kinds of sensors, two of which (`STRANGERS`) are drawn for reported runs only.
+Every case, "none" included, has biases, a tilt up to 1 degree between IMU and tracked frame, a thrust offset up to
+0.8 % and constants off by up to 1 % beside what is told.
+"""
+
+import numpy as np
+from scipy.signal import butter, lfilter, lfilter_zi
+
+from experiments.diagnosis import vehicle
+from experiments.diagnosis.plant import SAMPLE
+
+KINDS = ("white", "coloured", "filtered", "vibrating", "quantised", "radio")
+STRANGERS = ("estimator", "stale")
+RATES = {50: 0.15, 100: 0.5, 200: 0.1, 250: 0.08, 500: 0.12, 1000: 0.05}
+COLUMNS = (
+    "t,vehicle,x,y,z,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz,ax,ay,az,cmd_thrust,cmd_wx,cmd_wy,cmd_wz,m1,m2,m3,m4,vbat"
+)
+COLUMNS = COLUMNS.split(",")
+# letter of a channel group -> its columns
+GROUPS = {
+    "p": COLUMNS[2:9],
+    "s": COLUMNS[9:12],
+    "g": COLUMNS[12:15],
+    "a": COLUMNS[15:18],
+    "c": COLUMNS[18:22],
+}
+GROUPS |= {"m": COLUMNS[22:26], "v": COLUMNS[26:27]}
+DIGITS = (4,) * 3 + (5,) * 4 + (4,) * 3 + (4,) * 3 + (3,) * 3 + (4,) + (3,) * 3 + (4,) * 4 + (3,)
+DECIMALS = dict(zip(COLUMNS[2:], DIGITS, strict=True))
+TURBULENCE = {"none": (0.0, 0.05), "light": (0.3, 1.2), "strong": (2.0, 4.0)}  # mN rms per axis
+
+
+def coloured(rng, count, axes, time, rms, step):
+    """First-order noise (count, axes) of correlation time `time` (s) and the given rms, sampled every `step` (s)."""
+    keep = np.exp(-step / time)
+    white = rng.standard_normal((count, axes)) * np.sqrt(1 - keep**2)
+    white[0] /= np.sqrt(1 - keep**2)
+    return rms * lfilter([1.0], [1.0, -keep], white, axis=0)
+
+
+def narrow(rng, count, axes, frequency, quality, rms, step):
+    """Narrow-band noise (count, axes) around `frequency` (Hz): white noise through a resonance of the given quality."""
+    pole = np.exp(-np.pi * frequency / quality * step)
+    a = [1.0, -2 * pole * np.cos(2 * np.pi * frequency * step), pole * pole]
+    signal = lfilter([1.0], a, rng.standard_normal((count + 500, axes)), axis=0)[500:]
+    return rms * signal / np.sqrt((signal**2).mean())
+
+
+def _channels(rng, needed):
+    """Letters of the logged groups: what an effect needs is there, the rest is drawn; always a legal log."""
+    have = set(needed)
+    for letter, chance in (
+        ("p", 0.88),
+        ("g", 0.9),
+        ("a", 0.85),
+        ("s", 0.6),
+        ("c", 0.75),
+        ("m", 0.92),
+        ("v", 0.8),
+    ):
+        if rng.random() < chance:
+            have.add(letter)
+    if "p" not in have:
+        have -= {"s"}
+        have |= {"a", "g"}
+    if "g" not in have:
+        have |= {"p"}
+    if not have & {"c", "m"}:
+        have.add("m")
+    return have
+
+
+def draw(rng, kind, needed="", turbulence=None):
+    """Sensors and air of a case: a dict of plain numbers, see the keys below. `needed`: letters of `GROUPS`."""
+    size = float(np.exp(rng.uniform(np.log(0.5), np.log(2.0))))  # good and bad instruments
+    tilt = rng.standard_normal(3)
+    tilt *= np.deg2rad(rng.uniform(0, 1.0)) / np.linalg.norm(tilt)
+    filtered = kind == "filtered" or rng.random() < 0.5
+    turbulence = turbulence or str(rng.choice(list(TURBULENCE), p=[0.35, 0.45, 0.2]))
+    rate = int(rng.choice(list(RATES), p=list(RATES.values()))) if kind not in ("radio", "stale") else 100
+    out = {
+        "kind": kind,
+        "rate": rate,
+        "channels": "".join(sorted(_channels(rng, needed))),
+        "size": size,
+        "tilt": tilt.tolist(),
+        "accel_bias": rng.uniform(-0.35, 0.35, 3).tolist(),
+        "gyro_bias": rng.uniform(-0.02, 0.02, 3).tolist(),
+        "thrust_offset": float(rng.uniform(-0.008, 0.008)),
+        "constants_off": rng.uniform(-0.01, 0.01, 5).tolist(),  # motor time, yaw torque, three moments
+        "turbulence": turbulence,
+        "gust": float(rng.uniform(*TURBULENCE[turbulence])),
+        "pose_delay": float(rng.uniform(0.0, 2.5)),  # ms
+        "pose_rate": int(rng.choice([60, 100, 120, 240])) if rate > 100 else min(rate, 100),
+        "position": 2.0e-4 * size,  # m, white
+        "angle": 1.8e-3 * size,  # rad, white
+        "accel": 0.16 * size,
+        "gyro": 0.008 * size,
+        "colour": 0.0,  # rms of the coloured part, in units of the white one
+        "colour_time": float(np.exp(rng.uniform(np.log(0.02), np.log(0.3)))),
+        "accel_cut": 30.0 if filtered else 0.0,
+        "gyro_cut": 80.0 if filtered else 0.0,
+        "derivative_cut": float(rng.choice([0.0, 0.0, 30.0, 60.0])),
+        "vibration": 0.0,  # m/s^2 rms; the gyroscope gets 0.04 rad/s of it per m/s^2
+        "vibration_frequency": float(rng.uniform(12.0, 90.0)),
+        "vibration_quality": float(rng.uniform(5.0, 25.0)),
+        "quantum": 1.0,  # 1: as many digits as the log has
+        "velocity": str(rng.choice(["smooth", "derived"])),
+        "motor": "mean" if rng.random() < 0.7 else "snapshot",
+        "wander": 0.0,  # ms rms of the clocks of IMU and motors against the pose
+        "stream_rate": 0.0,  # Hz of the streams that were interpolated onto the rows; 0: sampled at the rows
+        "dropped": float(rng.choice([0.0, 0.0, 0.01, 0.04])),
+        "voltage": float(rng.uniform(3.6, 4.05)),
+        "resistance": float(rng.uniform(0.12, 0.3)),
+        "discharge": float(rng.uniform(0.01, 0.03)),
+    }
+    if kind == "coloured":
+        out |= {"colour": float(rng.uniform(1.0, 3.0)), "velocity": "smooth"}
+    elif kind == "vibrating":
+        out |= {"vibration": float(rng.uniform(0.3, 2.0))}
+    elif kind == "quantised":
+        out |= {"quantum": float(rng.choice([4.0, 10.0, 20.0]))}
+    elif kind == "radio":
+        out |= {"wander": float(rng.uniform(2.0, 10.0)), "stream_rate": float(rng.uniform(70, 90))}
+    elif kind == "estimator":
+        out |= {
+            "colour": float(rng.uniform(1.5, 4.0)),
+            "colour_time": float(rng.uniform(0.15, 0.5)),
+            "velocity": "smooth",
+        }
+    elif kind == "stale":
+        out |= {"pose_rate": int(rng.choice([45, 60, 72]))}
+    return out
+
+
+def draw_air(rng, sensors, ticks, voltage, strong=1.0):
+    """Air, gyroscope and pose of one body in one flight as `plant.fly` wants them (no body axis yet)."""
+    samples, size, gust = 5 * ticks, sensors["size"], 1e-3 * sensors["gust"] * strong
+    force = coloured(rng, ticks, 3, 0.35, gust, 0.01) + coloured(rng, ticks, 3, 0.05, 0.4 * gust, 0.01)
+    torque = coloured(rng, ticks, 3, 0.08, 0.013 * gust, 0.01) * np.array([1.0, 1.0, 0.5])
+    gyro = sensors["gyro"] * rng.standard_normal((samples, 3))
+    if sensors["colour"]:
+        gyro += coloured(rng, samples, 3, 0.02, 0.4 * sensors["gyro"] * sensors["colour"], SAMPLE)
+    if sensors["vibration"]:
+        gyro += _vibration(rng, sensors, samples, 0.04 * sensors["vibration"])
+    angle = 1.5e-3 * size * rng.standard_normal((ticks, 3))
+    return {
+        "gust_force": force.astype(np.float32),
+        "gust_torque": torque.astype(np.float32),
+        "slow": coloured(rng, ticks, 1, 1.2, 1.0, 0.01)[:, 0],
+        "gyro": gyro.astype(np.float32),
+        "gyro_bias": np.array(sensors["gyro_bias"]) + 0.003 * rng.standard_normal(3),
+        "seen_position": 2e-4 * size * rng.standard_normal((ticks, 3)),
+        "seen_velocity": 4e-3 * size * rng.standard_normal((ticks, 3)),
+        "seen_attitude": np.concatenate([np.ones((ticks, 1)), 0.5 * angle], axis=1),
+        "pose_delay": np.float64(sensors["pose_delay"]),
+        "pose_jitter": rng.uniform(-1, 1, ticks),
+        "open_voltage": np.float64(voltage),
+        "resistance": np.float64(sensors["resistance"]),
+        "discharge": np.float64(sensors["discharge"]),
+    }
+
+
+def holds_poses(sensors):
+    """Whether rows repeat the last pose, which makes them late by half the hold on average, whatever flies."""
+    return sensors["kind"] == "stale" and "p" in sensors["channels"]
+
+
+def pose_lag(delay_ms, sensors):
+    """By how much poses in the log are late, ms: the cause together with the motion capture's own; None if they are held."""
+    return None if holds_poses(sensors) else delay_ms + sensors["pose_delay"]
+
+
+def stack(flights):
+    """List of `draw_air` dicts to one with the body index last."""
+    return {key: np.stack([np.asarray(f[key]) for f in flights], axis=-1) for key in flights[0]}
+
+
+def _vibration(rng, sensors, samples, rms):
+    return narrow(
+        rng, samples, 3, sensors["vibration_frequency"], sensors["vibration_quality"], rms, SAMPLE
+    ) * np.array([1.0, 1.0, 0.6])
+
+
+def apply_nuisances(p, columns, sensors):
+    """What is off in every case: thrust, motor time, yaw torque, moments of inertia, and the firmware's filters."""
+    lag, yaw, *moments = sensors["constants_off"]
+    p["rotor_gain"][:, columns] *= 1 + sensors["thrust_offset"]
+    p["tau_up"][columns] *= 1 + 3 * lag
+    p["tau_down"][columns] *= 1 + 3 * lag
+    p["torque_ratio"][columns] *= 1 + yaw
+    for i, off in enumerate(moments):
+        p["inertia"][i, i, columns] *= 1 + off
+    p["gyro_cut"][columns], p["derivative_cut"][columns] = sensors["gyro_cut"], sensors["derivative_cut"]
+
+
+def at(signal, times):
+    """(S, n) or (S,) truth every 2 ms, at `times` (s), linearly."""
+    place = np.clip(np.asarray(times) / SAMPLE, 0, len(signal) - 1.001)
+    whole = place.astype(int)
+    rest = place - whole
+    rest = rest[:, None] if signal.ndim == 2 else rest
+    return signal[whole] + rest * (signal[whole + 1] - signal[whole])
+
+
+def _normal(q):
+    return q / np.sqrt((q * q).sum(axis=1, keepdims=True))
+
+
+def _through(cut, signal):
+    """A (S, n) signal through the second-order low-pass of `cut` Hz, started in rest."""
+    if not cut:
+        return signal
+    low = butter(2, cut, fs=1 / SAMPLE)
+    return lfilter(*low, signal, axis=0, zi=lfilter_zi(*low)[:, None] * signal[:1])[0]
+
+
+def _pose(rng, sensors, flown, j, times, delay):
+    """Position, orientation, velocity (n, 10) of the motion capture at its own `times`."""
+    size, n = sensors["size"], len(times)
+    step = float(np.median(np.diff(times)))
+    when = times - delay
+    position = at(flown["position"][:, :, j].astype(float), when)
+    position += sensors["position"] * rng.standard_normal((n, 3)) + coloured(
+        rng, n, 3, 1.0, 1.5e-4 * size, step
+    )
+    angle = sensors["angle"] * rng.standard_normal((n, 3)) + coloured(rng, n, 3, 1.5, 8e-4 * size, step)
+    velocity = at(flown["velocity"][:, :, j].astype(float), when)
+    if sensors["kind"] == "estimator":  # smoothed: hardly any white noise, slow errors instead
+        slow, time = sensors["colour"], sensors["colour_time"]
+        wander = coloured(rng, n, 3, time, slow * 6e-4 * size, step)
+        position += wander - sensors["position"] * 0.8 * rng.standard_normal((n, 3))
+        angle = coloured(rng, n, 3, time, slow * 2.5e-3 * size, step)
+        velocity += coloured(rng, n, 3, time, slow * 5e-3 * size, step)
+    elif sensors["velocity"] == "derived":
+        velocity = smooth_derivative(position, step)
+    else:
+        velocity += 3e-3 * size * rng.standard_normal((n, 3)) + coloured(rng, n, 3, 0.3, 1e-3 * size, step)
+    if sensors["kind"] == "coloured":
+        velocity += coloured(rng, n, 3, sensors["colour_time"], 3e-3 * size * sensors["colour"], step)
+    q = at(flown["quaternion"][:, :, j].astype(float), when)
+    q = vehicle.multiply(q.T, np.concatenate([np.ones((1, n)), 0.5 * angle.T]))
+    return np.concatenate([position, _normal(q.T), velocity], axis=1)
+
+
+def smooth_derivative(position, step):
+    """Least-squares slope over seven samples."""
+    half = np.arange(-3, 4)
+    padded = np.concatenate([np.repeat(position[:1], 3, 0), position, np.repeat(position[-1:], 3, 0)])
+    out = sum(h * padded[3 + h : 3 + h + len(position)] for h in half) / (28.0 * step)
+    out[:3], out[-3:] = out[3], out[-4]
+    return out
+
+
+def log_rows(rng, sensors, flown, j, ticks, unknown=None):
+    """Rows of body j: dict column -> (n,) with NaN where a channel was not sampled; `t` first. All groups are made,
+    the caller leaves out what was not logged. `unknown`: {name: (strength, shape)} of the kinds that sit in sensors.
+    """
+    unknown = unknown or {}
+    seconds, rate = 0.01 * ticks, sensors["rate"]
+    t = np.arange(int(seconds * rate)) / rate
+    if sensors["dropped"]:
+        keep = rng.random(len(t)) >= sensors["dropped"]
+        keep[:3] = True
+        t = t[keep]
+    n = len(t)
+    wander = (
+        coloured(rng, len(flown["rates"]), 2, 2.0, 1e-3 * sensors["wander"], SAMPLE)
+        if sensors["wander"]
+        else None
+    )
+
+    def stream(signal, times, clock=None):
+        """A 500 Hz signal as its stream delivers it at `times`."""
+        late = 0.0 if wander is None or clock is None else at(wander[:, clock], times)
+        if not sensors["stream_rate"]:
+            return at(signal, times + late)
+        own = np.arange(0, seconds, 1 / sensors["stream_rate"])
+        late = 0.0 if np.ndim(late) == 0 else at(wander[:, clock], own)
+        values = at(signal, own + late)
+        return np.stack([np.interp(times, own, values[:, i]) for i in range(values.shape[1])], axis=1)
+
+    out = {"t": t}
+    # pose: at its own rate, empty cells between, held (stale) or interpolated
+    own = np.arange(0, seconds, 1 / sensors["pose_rate"]) if sensors["pose_rate"] < rate else t
+    delay = 1e-3 * sensors["pose_delay"] + flown["pose_delay"][j]
+    if flown["pose_jitter"][j]:
+        delay = delay + flown["pose_jitter"][j] * rng.uniform(-1, 1, len(own))
+    pose = _pose(rng, sensors, flown, j, own, delay)
+    if len(own) != n and sensors["kind"] == "stale":
+        pose = pose[np.searchsorted(own, t + 1e-9) - 1]
+    elif len(own) != n:
+        row = np.searchsorted(t, own - 0.5 / rate)
+        ok = row < n
+        empty = np.full((n, 10), np.nan)
+        empty[row[ok]] = pose[ok]
+        pose = empty
+    if "world_tilt" in unknown:
+        s, shape = unknown["world_tilt"]
+        half = 0.5 * np.deg2rad(s)
+        turn = np.array(
+            [np.cos(half), np.sin(half) * np.cos(6.28 * shape[0]), np.sin(half) * np.sin(6.28 * shape[0]), 0]
+        )
+        turn = np.repeat(turn[:, None], n, axis=1)
+        pose = np.concatenate(
+            [
+                vehicle.rotate(turn, pose[:, :3].T).T,
+                vehicle.multiply(turn, pose[:, 3:7].T).T,
+                vehicle.rotate(turn, pose[:, 7:].T).T,
+            ],
+            axis=1,
+        )
+    if "marker_jumps" in unknown:
+        s, shape = unknown["marker_jumps"]
+        slot = np.floor(t / (0.5 + shape[0])).astype(int)
+        jumps = np.random.default_rng(int(1e6 * shape[1])).uniform(-1, 1, (slot[-1] + 1, 3))
+        pose[:, :3] += s * jumps[slot]
+
+    # IMU: the firmware's gyroscope, and the accelerometer with its own noise, vibration and filter
+    tilt = np.array(sensors["tilt"])
+    gyro = flown["gyro"][:, :, j].astype(float)
+    accel = flown["specific"][:, :, j].astype(float)
+    samples = len(accel)
+    accel = accel - np.cross(np.broadcast_to(tilt, accel.shape), accel) + np.array(sensors["accel_bias"])
+    noise = sensors["accel"] * rng.standard_normal((samples, 3)) + coloured(
+        rng, samples, 3, 3.0, 0.02, SAMPLE
+    )
+    if sensors["colour"]:
+        noise += coloured(rng, samples, 3, 0.02, 0.4 * sensors["accel"] * sensors["colour"], SAMPLE)
+    if sensors["vibration"]:
+        noise += _vibration(rng, sensors, samples, sensors["vibration"])
+    accel = _through(sensors["accel_cut"], accel + noise)
+    gyro = gyro - np.cross(np.broadcast_to(tilt, gyro.shape), gyro)
+
+    motor = flown["motor"][:, :, j].astype(float)
+    if sensors["motor"] == "mean" and rate <= 500:
+        # the mean over the row, whose end may lie within a sample
+        total = np.concatenate([np.zeros((1, 4)), np.cumsum(motor, axis=0)])
+        width = min(500 / rate, samples)
+        last = np.minimum(np.arange(samples) + width, samples)
+        total_then = np.stack([np.interp(last, np.arange(samples + 1), total[:, i]) for i in range(4)], 1)
+        motor = (total_then - total[:samples]) / (last - np.arange(samples))[:, None]
+    place = np.minimum((t / SAMPLE + 1e-6).astype(int), samples - 1)
+    motors = stream(motor, t, 1) if sensors["stream_rate"] else motor[place]
+    command = flown["command"][:, :, j].astype(float)[
+        np.minimum((t / 0.01 + 1e-6).astype(int), len(flown["command"]) - 1)
+    ]
+    voltage = flown["voltage"][place, j] + 0.012 * rng.standard_normal(n)
+    seldom = np.floor(t * 10 + 1e-6)
+    voltage[np.concatenate([[False], seldom[1:] == seldom[:-1]])] = np.nan
+    values = np.concatenate(
+        [pose, stream(gyro, t, 0), stream(accel, t, 0), command, motors, voltage[:, None]], axis=1
+    )
+    for i, column in enumerate(COLUMNS[2:]):
+        step = 10.0 ** -DECIMALS[column]
+        if sensors["quantum"] > 1 and column not in GROUPS["c"]:
+            step *= sensors["quantum"]
+        out[column] = step * np.rint(values[:, i] / step)
+    return out

@@ -1,0 +1,1 @@
+"""The fit of the nominal vehicle to flights: thrust and torque constants, motor lag, inertia."""

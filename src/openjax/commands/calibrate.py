@@ -1,0 +1,101 @@
+"""`python -m openjax.calibrate CASE_DIR`: fit the nominal vehicle's own constants to flights, with intervals
+and with what the flights can't tell, and write a `vehicle.toml` that trainer and diagnosis load."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from openjax.commands.command_line import output_console, parse
+from openjax.errors import UserError
+from openjax.files import check_output
+
+PROGRAM = "python -m openjax.calibrate"
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Fit thrust and torque constants, motor lag and inertia to a case's flights."""
+
+    case: Annotated[Path, tyro.conf.Positional]
+    """Folder with flight logs and a vehicle.toml."""
+    out: Path | None = None
+    """File to write; vehicle_calibrated.toml in the case folder if left out."""
+    overwrite: bool = False
+    """Replace the file if it exists."""
+
+
+def run(arguments: Arguments, console: Console):
+    """Calibrate, print and write; returns the Calibration. Raises UserError; writes nothing then."""
+    from openjax.calibration.calibration import calibrate
+    from openjax.flights.case import load_case
+    from openjax.vehicle.vehicle_file import load_vehicle_file, save_vehicle_file
+
+    out = arguments.case / "vehicle_calibrated.toml" if arguments.out is None else arguments.out
+    if out.exists() and not arguments.overwrite:
+        raise UserError(f"{out}: exists already; use --overwrite to replace it or --out for another file")
+    start = time.perf_counter()
+    case = load_case(arguments.case)
+    check_output(out, "--out")
+    for issue in case.quality:
+        console.print(
+            f"[yellow]{'left out' if issue.refused else 'noted'}[/] {issue.flight}: {issue.issue}",
+            highlight=False,
+        )
+    result = calibrate(case)
+    _print(result, console)
+    if not result.calibrated():
+        raise UserError(
+            f"{arguments.case}: these flights determine none of the vehicle's constants; nothing is written"
+        )
+    calibrated = dataclasses.replace(load_vehicle_file(arguments.case), calibrated=result.calibrated())
+    save_vehicle_file(out, calibrated)
+    console.print(f"{time.perf_counter() - start:.1f} s; written to [bold]{out}[/]", highlight=False)
+    return result
+
+
+def _print(result, console: Console) -> None:
+    table = Table(title=f"Calibrated on {len(result.flights)} flights, {result.seconds:.0f} s")
+    for name, justify in (
+        ("quantity", "left"),
+        ("value", "right"),
+        ("90 % interval", "right"),
+        ("of nominal", "right"),
+    ):
+        table.add_column(name, justify=justify)
+    table.add_column("")
+    for name, quantity in result.quantities.items():
+        for i, value in enumerate(quantity.value):
+            label = name.replace("_", " ") + (f" {('xx', 'yy', 'zz')[i]}" if len(quantity.value) > 1 else "")
+            assumed = name == "inertia" and i == 2
+            low, high = quantity.interval90[i]
+            remark = "assumed" if assumed else "" if quantity.determined else "not determined: nominal kept"
+            table.add_row(
+                f"{label} [dim]{quantity.unit}[/]",
+                f"{value:.4g}",
+                "" if assumed else f"{low:.4g} … {high:.4g}",
+                f"{value / quantity.nominal[i]:.3f}",
+                remark,
+            )
+    console.print(table)
+    for channel, (before, after) in result.explained.items():
+        given = f"{before:.1%}" if before > 0 else "none"
+        fitted = f"{max(after, 0.0):.1%}"
+        console.print(f"{channel}: the fitted vehicle explains {fitted} of what changed, the given {given}")
+    console.print("[bold]What these flights can't tell[/]")
+    for text in result.cannot_tell:
+        console.print(f"• {text}", highlight=False)
+
+
+def main(arguments: Sequence[str]) -> None:
+    """The command. Raises UserError for a case that can't be read or calibrated."""
+    parsed = parse(Arguments, Arguments(case=tyro.MISSING), arguments, PROGRAM)
+    run(parsed, output_console())

@@ -1,0 +1,155 @@
+"""Diagnose the sim-to-real gap of flights: `python -m openjax.diagnose CASE_DIR [CASE_DIR ...]`."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from openjax.commands.command_line import one_line, output_console, parse
+from openjax.errors import UserError
+from openjax.files import check_output_folder, replacing, write_json
+
+PROGRAM = "python -m openjax.diagnose"
+
+
+@dataclass(frozen=True)
+class Options:
+    """Diagnose the sim-to-real gap: where the simulator differs from flights, which effect causes it, how far
+    it shrinks.
+
+    Writes OUT/<case>/report.html, report.json and effects.toml (which `python -m openjax.train --effects`
+    flies with)."""
+
+    cases: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Folders of flight logs, each with a vehicle.toml."""
+    reference: tuple[Path, ...] = ()
+    """Folders of earlier flights of the same vehicle: report what changed since instead (changes.html and
+    changes.json); one folder per day tells how far days differ. Motor commands alone are enough."""
+    out: Path = Path("diagnosis")
+    """Where the reports go, one folder per case."""
+    predictions: Path | None = None
+    """Also write all cases' answers into this one JSON file."""
+    without: tuple[str, ...] = ()
+    """Effects that the library must do without."""
+    html: bool = True
+    """Write report.html (pictures take about a second per case)."""
+    overwrite: bool = False
+    """Replace reports that are already in OUT."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the command; the exit status is 0, or 2 if nothing could be diagnosed."""
+    return run(parse(Options, Options(cases=tyro.MISSING), arguments, PROGRAM))
+
+
+def run(options: Options) -> int:
+    """Diagnose every case; a case that can't be used is named and the rest goes on. Raises UserError for
+    bad options."""
+    # Small matrices: more threads than one only wait for each other. Read when NumPy is loaded, below.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    console = output_console()
+    if not options.cases:
+        raise UserError("no case given: name at least one folder of flight logs with a vehicle.toml")
+    names = [c.resolve().name for c in options.cases]
+    twice = next((n for n in names if names.count(n) > 1), None)
+    if twice is not None:
+        raise UserError(f"two cases are called {twice!r}: their reports would overwrite each other")
+    for name in names:
+        if (options.out / name).exists() and not options.overwrite:
+            raise UserError(f"{options.out / name} already exists: choose another --out or give --overwrite")
+
+    check_output_folder(options.out, "--out")
+    if options.predictions is not None:
+        check_output_folder(options.predictions.absolute().parent, "--predictions")
+        if options.predictions.is_dir():
+            raise UserError(f"--predictions {options.predictions}: is a folder; a file is needed")
+
+    if options.reference:
+        return _compare(options, names, console)
+
+    from openjax.flights.case import load_case
+    from openjax.gap.diagnosis import diagnose_case
+    from openjax.gap.library import library
+
+    library(options.without)
+    predictions, failed = {}, 0
+    for folder, name in zip(options.cases, names, strict=True):
+        try:
+            with console.status(f"{name}: reading") as status:
+                case = load_case(folder)
+                report = diagnose_case(case, options.without, partial(_tell, status, name))
+                _tell(status, name, "writing the report")
+                _write(report, options.out / name, options.html)
+        except UserError as error:
+            failed += 1
+            print(f"error: {one_line(error)}", file=sys.stderr)
+            continue
+        predictions[name] = report.prediction()
+        _show(console, report, options.out / name)
+    if options.predictions is not None and predictions:
+        write_json(options.predictions, predictions)
+    return 2 if failed == len(names) else 0
+
+
+def _compare(options: Options, names: list[str], console) -> int:
+    """What changed in each case since the reference."""
+    from rich.panel import Panel
+    from rich.text import Text
+
+    from openjax.comparison import report as changes_report
+    from openjax.gap import changes
+
+    predictions, failed = {}, 0
+    for folder, name in zip(options.cases, names, strict=True):
+        try:
+            with console.status(f"{name}: comparing"):
+                change = changes.compare(folder, options.reference)
+                with replacing(options.out / name) as partial:
+                    partial.mkdir()
+                    changes_report.write(change, partial, options.html)
+        except UserError as error:
+            failed += 1
+            print(f"error: {one_line(error)}", file=sys.stderr)
+            continue
+        predictions[name] = changes_report.prediction(change)
+        body = "\n".join(
+            [
+                *changes_report.in_words(change),
+                f"({options.out / name}/changes.{'html' if options.html else 'json'})",
+            ]
+        )
+        title = f"{name}: {'changed' if change.changed else 'no change'}"
+        console.print(Panel(Text(body), title=title, title_align="left"))
+    if options.predictions is not None and predictions:
+        write_json(options.predictions, predictions)
+    return 2 if failed == len(names) else 0
+
+
+def _tell(status, name: str, text: str) -> None:
+    """Show what is being done to a case."""
+    status.update(f"{name}: {text}")
+
+
+def _write(report, folder: Path, pictures: bool) -> None:
+    """All files of a report, or none: written beside the place and moved there at the end."""
+    from openjax.gap.report import write_report
+
+    with replacing(folder) as partial:
+        partial.mkdir()
+        write_report(report, partial, pictures)
+
+
+def _show(console, report, folder: Path) -> None:
+    from rich.panel import Panel
+    from rich.text import Text
+
+    title = f"{report.case}: {', '.join(report.effects) or report.verdict}"
+    body = "\n".join([*report.in_words(), f"({report.seconds:.1f} s; {folder}/report.html)"])
+    console.print(Panel(Text(body), title=title, title_align="left"))

@@ -1,0 +1,138 @@
+"""Evaluate a policy: `python -m openjax.evaluate --policy PATH --scenario NAME|FILE.toml`.
+
+Prints, and with `--json` writes, for each scenario: scenario, episodes, capture_rate, capture_step,
+collision_rate, collision_parts, crash_rate, over_speed_rate, prediction_error.
+From Python: `openjax.evaluate(policy, scenario)`, see `openjax.commands.calls.evaluate`.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from openjax.commands.command_line import output_console, parse
+from openjax.errors import UserError
+from openjax.files import check_output
+from openjax.pursuit import SCENARIOS, PursuitSettings, find_scenario
+from openjax.ranges import Interval, Seed
+
+PROGRAM = "python -m openjax.evaluate"
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluateCommand:
+    """Fly a policy's mean on a layout and count captures, collisions and crashes.
+
+    The game is the one that the policy was trained in; any --environment.setting can be changed, for example
+    --environment.speed_limit none or --environment.start_attitude level.
+    """
+
+    policy: tuple[str, ...] = ("flight",)
+    """A run's directory, a policy file (.npz), a checkpoint, or the name of a policy in the package or of a heuristic:
+    angelani, janosov, apf.
+
+    Of several, for example one per training seed, mean and standard deviation are shown too."""
+    scenario: str = "all"
+    """wall, narrow_gap, random, passage, empty, hidden, a TOML file with an own layout, or all six."""
+    episodes: Annotated[int, Interval("[1, 1000000]")] = 100
+    """Episodes per scenario."""
+    seed: Seed = 0
+    """Draws the start attitudes."""
+    compilation_cache: bool = True
+    """Keep compiled programs in the user's cache folder."""
+    json: Path | None = None
+    """File to write the records to: an object for one scenario, a list for all."""
+    vehicle: Path | None = None
+    """Vehicle to fly (vehicle.toml); by default the nominal Crazyflie."""
+    effects: Path | None = None
+    """Physical effects to fly with (effects.toml)."""
+    environment: tyro.conf.FlagConversionOff[PursuitSettings] = dataclasses.field(
+        default_factory=PursuitSettings
+    )
+
+
+def main(arguments: Sequence[str]) -> int:
+    """The command; returns its exit status."""
+    command = parse(EvaluateCommand, EvaluateCommand(), arguments, PROGRAM)
+    if command.compilation_cache:
+        from openjax.cluster.compilation import cache_programs
+
+        cache_programs()
+    evaluators: dict = {}
+    policies = prepare(command, arguments)
+    _show(command, [(loaded.source, fly_scenarios(own, loaded, evaluators)[0]) for own, loaded in policies])
+    return 0
+
+
+def prepare(command: EvaluateCommand, arguments: Sequence[str]) -> list[tuple]:
+    """Each policy, and the command with that policy's own game as the default; all that can be wrong was looked at.
+
+    Raises:
+      UserError: an unusable file or layout, or a game that a policy can't play.
+    """
+    from openjax.store.policies import load_policy
+
+    if not command.policy:
+        raise UserError("--policy needs at least one policy")
+    check_output(command.json, "--json")
+    policies = []
+    for loaded in [load_policy(name) for name in command.policy]:
+        default = dataclasses.replace(EvaluateCommand(), environment=loaded.settings.environment)
+        own = parse(EvaluateCommand, default, arguments, PROGRAM)
+        _game(own, loaded)
+        policies.append((own, loaded))
+    return policies
+
+
+def fly_scenarios(command: EvaluateCommand, loaded, evaluators: dict) -> tuple[list[dict], list]:
+    """A record (see `openjax.commands.evaluator.FIELDS`) and the first episode's `Trajectory` per scenario.
+
+    Args:
+      command: what to fly, with the game's settings.
+      loaded: the policy.
+      evaluators: those already compiled, to be used again for policies of the same kind.
+
+    Raises:
+      UserError: an unusable layout, or a game that the policy can't play.
+    """
+    from openjax.commands.evaluator import Evaluator, evaluate_scenarios
+
+    game, loaded, scenarios = _game(command, loaded)
+    kind = (game.settings, loaded.policy)
+    if kind not in evaluators:
+        evaluators[kind] = Evaluator(game, loaded.policy, command.episodes)
+    return evaluate_scenarios(evaluators[kind], loaded.parameters, scenarios, command.episodes, command.seed)
+
+
+def _game(command, loaded):
+    """The game of a command, the policy in it, and the scenarios."""
+    from openjax.commands.evaluator import layout_slots
+    from openjax.store.environments import make_environment
+
+    settings = command.environment
+    if command.scenario == "all":
+        scenarios = list(SCENARIOS.values())
+    else:
+        scenarios = [find_scenario(command.scenario, settings)]
+    slots = max(layout_slots(settings), *(len(scenario.pillars) for scenario in scenarios))
+    settings = dataclasses.replace(settings, max_pillars=slots, num_pursuers=len(scenarios[0].pursuers))
+    environment = make_environment(settings, command.vehicle, command.effects)
+    return environment, loaded.in_game(environment), scenarios
+
+
+def _show(command, results):
+    """Print the tables and write the file: a record, a list of them, or such a list by policy."""
+    from openjax.commands.evaluator import results_table, spread_table
+    from openjax.store.settings_files import write_json
+
+    console = output_console()
+    for source, rows in results:
+        console.print(results_table(f"{source}, mean policy, seed {command.seed}", rows))
+    if len(results) > 1:
+        console.print(spread_table([rows for _, rows in results]))
+    if command.json is not None:
+        plain = [rows if command.scenario == "all" else rows[0] for _, rows in results]
+        sources = [source for source, _ in results]
+        write_json(command.json, plain[0] if len(plain) == 1 else dict(zip(sources, plain, strict=True)))

@@ -1,0 +1,208 @@
+"""`python -m openjax.export --policy open --format onnx --out DIR`: a policy for programs that don't know openjax.
+
+All formats hold the mean policy of a whole team, predictor included: from the observation's arrays to actions (N, 4) in
+-1..1: collective thrust, roll, pitch and yaw rate; with `--own`, that of one pursuer, as a vehicle computes it on board.
+The result is compared with the policy itself before it is written.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from openjax.commands.command_line import output_console, parse
+from openjax.errors import UserError
+from openjax.files import check_output_folder, replacing
+from openjax.ranges import Interval, Seed
+
+PROGRAM = "python -m openjax.export"
+TOLERANCE = 2e-5
+"""Largest difference of an action that is put down to the order of sums."""
+NAMES = {"onnx": "policy.onnx", "jax": "policy.jax_export", "c": "policy.c"}
+EACH = ("self_state", "others", "pillars", "pillar_seen", "privileged", "position")
+"""What each pursuer sees for itself; the rest of an observation is the team's."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Write a policy as ONNX, as a serialised JAX function, or as C."""
+
+    policy: str = "open"
+    """A run's directory, a policy file (.npz), or the name of a policy in the package."""
+    format: Literal["onnx", "jax", "c"] = "onnx"
+    """onnx: for onnxruntime and its kin (pip install "openjax[export]"); jax: for jax.export.deserialize; c: C99."""
+    own: bool = False
+    """One pursuer's action instead of the whole team's."""
+    out: Path = Path("exported")
+    """Folder to write to."""
+    observations: Annotated[int, Interval("[1, 100000000]")] = 10_000
+    """How many observations of its game it is compared on."""
+    seed: Seed = 0
+    """Draws them."""
+
+
+def observations(policy, number: int, seed: int) -> dict:
+    """{field: array (number or more, ...)} of observations from games that the policy plays, NumPy."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from openjax.pursuit import Pursuit
+
+    settings = dataclasses.replace(policy.settings.environment, physics="rigid", vehicles=())
+    environment = Pursuit(settings)
+    worlds, steps = 64, -(-number // 64)
+    observation, state = jax.vmap(environment.reset)(jax.random.split(jax.random.key(seed), worlds))
+
+    @jax.jit
+    def play(observation, state, key):
+        def step(carry, key):
+            observation, state = carry
+            # some noise, or all worlds would soon look alike
+            noise = 0.3 * jax.random.normal(key, state.previous_action.shape)
+            action = jnp.clip(policy(observation) + noise, -1.0, 1.0)
+            after, state, *_ = jax.vmap(environment.step, in_axes=(None, 0, 0))(key, state, action)
+            return (after, state), observation
+
+        return jax.lax.scan(step, (observation, state), jax.random.split(key, steps))[1]
+
+    seen = play(observation, state, jax.random.key(seed + 1))
+    return {
+        field.name: np.asarray(getattr(seen, field.name)).reshape(-1, *getattr(seen, field.name).shape[2:])
+        for field in dataclasses.fields(seen)
+    }
+
+
+def export(arguments: Arguments) -> dict:
+    """Write the files; returns what FORMAT.json says. Raises UserError if it can't be, or differs."""
+    import jax
+    import numpy as np
+
+    from openjax.pursuit import Observation, Pursuit
+    from openjax.store.policies import load_policy
+
+    check_output_folder(arguments.out, "--out")
+    policy = load_policy(arguments.policy)
+    environment = Pursuit(dataclasses.replace(policy.settings.environment, vehicles=()))
+    kinds = jax.eval_shape(lambda key: environment.reset(key)[0], jax.random.key(0))
+    inputs = {field.name: getattr(kinds, field.name) for field in dataclasses.fields(kinds)}
+
+    def act(**fields):
+        return policy(Observation(**fields))
+
+    seen = observations(policy, arguments.observations, arguments.seed)
+    number = len(next(iter(seen.values())))
+    expected = np.asarray(jax.jit(jax.vmap(lambda fields: act(**fields)))(seen))
+    if arguments.own:
+        expected = expected[:, :1]
+        for name in EACH:
+            seen[name] = seen[name][:, :1]
+            inputs[name] = jax.ShapeDtypeStruct((1, *inputs[name].shape[1:]), inputs[name].dtype)
+    write = {"onnx": _onnx, "jax": _jax, "c": _c}[arguments.format]
+    files, found, extra = write(act, inputs, seen, policy.source)
+    difference = None if found is None else float(np.abs(found - expected).max())
+    if difference is not None and not difference <= TOLERANCE:
+        raise UserError(
+            f"the exported policy differs by {difference:.2g} from {policy.source}: nothing was written"
+        )
+    report = {
+        "policy": policy.source,
+        "format": arguments.format,
+        "file": NAMES[arguments.format],
+        "bytes": len(files[NAMES[arguments.format]]),
+        "observations": number,
+        "largest_difference": difference,
+        "output": {"action": [int(n) for n in expected.shape[1:]]},
+        **extra,
+    }
+    files[f"{arguments.format}.json"] = (json.dumps(report, indent=1) + "\n").encode()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    for name, data in files.items():
+        with replacing(arguments.out / name) as partial:
+            partial.write_bytes(data)
+    return report
+
+
+def _described(inputs) -> dict:
+    return {name: {"shape": list(kind.shape), "type": str(kind.dtype)} for name, kind in inputs.items()}
+
+
+def _onnx(act, inputs, seen, source):
+    """The files, their actions on `seen`, and what to say about them."""
+    import numpy as np
+
+    from openjax.export.onnx_graph import onnx_model, size
+
+    model = onnx_model(act, inputs, "action")
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise UserError('onnxruntime is missing: pip install "openjax[export]"') from error
+    data = model.SerializeToString()
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+    read = [value.name for value in session.get_inputs()]
+    number = len(seen["frames"])
+    found = [session.run(None, {name: seen[name][i] for name in read})[0] for i in range(number)]
+    extra = {
+        "inputs": _described({n: inputs[n] for n in read}),
+        "numbers": size(model),
+        "nodes": len(model.graph.node),
+    }
+    return {NAMES["onnx"]: data}, np.stack(found), extra
+
+
+def _jax(act, inputs, seen, source):
+    """See `_onnx`."""
+    import jax
+    import numpy as np
+
+    exported = jax.export.export(jax.jit(lambda fields: act(**fields)))(inputs)
+    data = bytes(exported.serialize())
+    again = jax.export.deserialize(bytearray(data))
+    call = jax.jit(again.call)
+    found = [np.asarray(call({k: v[i] for k, v in seen.items()})) for i in range(len(seen["frames"]))]
+    extra = {"inputs": _described(inputs), "platforms": list(exported.platforms)}
+    return {NAMES["jax"]: data}, np.stack(found), extra
+
+
+def _c(act, inputs, seen, source):
+    """See `_onnx`; nothing is compared where there is no C compiler."""
+    from openjax.export.c_compiled import compiled
+    from openjax.export.c_program import c_program
+
+    name = Path(NAMES["c"]).stem
+    program = c_program(act, inputs, "action", name, f"The policy {Path(source).name}")
+    extra = {
+        "inputs": _described({n: inputs[n] for n in program.inputs}),
+        "numbers": program.numbers,
+        "workspace_floats": program.workspace,
+        "multiply_adds": program.multiply_adds,
+        "functions": program.functions,
+    }
+    files = {f"{name}.c": program.source.encode(), f"{name}.h": program.header.encode()}
+    call = compiled(program, name)
+    if call is None:
+        return files, None, extra
+    extra["microseconds"] = round(1e6 * call.seconds(), 1)
+    return files, call(seen), extra
+
+
+def main(arguments: Sequence[str]) -> None:
+    """The command. Raises UserError for an unusable policy or folder."""
+    parsed = parse(Arguments, Arguments(), arguments, PROGRAM)
+    report = export(parsed)
+    difference = report["largest_difference"]
+    compared = (
+        "compared with nothing, as there is no C compiler here"
+        if difference is None
+        else f"differs by at most {difference:.1e} on {report['observations']} observations"
+    )
+    output_console().print(
+        f"{parsed.out / report['file']}: {report['bytes'] / 1e6:.2f} MB, {compared}", soft_wrap=True
+    )

@@ -1,0 +1,89 @@
+"""`python -m openjax.sample_flights OUT`: make a case of three sample flights, to try calibration and
+diagnosis on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from openjax.commands.command_line import output_console, parse
+from openjax.errors import UserError
+from openjax.files import check_new_folder, replacing
+from openjax.ranges import Interval, Seed
+
+PROGRAM = "python -m openjax.sample_flights"
+
+VEHICLE_TOML = """\
+[vehicle]
+name = "crazyflie-2.1"
+mass = {mass:.4f}            # kg, what the simulator should assume
+mass_weighed = true
+
+[motor]
+command = "thrust"       # m = 1 asks for the maximal rotor thrust
+order = ["front_right", "rear_right", "rear_left", "front_left"]
+spin = ["ccw", "cw", "ccw", "cw"]
+
+[log]
+source = "simulated: openjax.sample_flights, seed {seed}, effect: {effect}"
+motion_capture_rate = 100   # Hz
+floor_z = 0.0            # m
+"""
+DECIMALS = {"t": 2, "vbat": 3} | {
+    c: 5 for c in ("x", "y", "z", "qw", "qx", "qy", "qz", "m1", "m2", "m3", "m4")
+}
+_REST = 4
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Fly openjax's own vehicle through three manoeuvres and write the logs as a case."""
+
+    out: Annotated[Path, tyro.conf.Positional]
+    """Folder to write the case to; must not exist or be empty."""
+    effect: str = "none"
+    """What the vehicle suffers from that the simulator doesn't know: an effect's name, or "none"."""
+    duration: Annotated[float, Interval("[3, 120]")] = 10.0
+    """Seconds per flight."""
+    seed: Seed = 0
+    """Random numbers: trajectories, noise, biases."""
+
+
+def make_case(arguments: Arguments) -> list[Path]:
+    """Write the case; returns its files. Raises UserError for an unknown effect or a folder that isn't
+    empty."""
+    from openjax.flights.reading import LOG_COLUMNS, write_csv
+    from openjax.gap.samples import fly, log_of, references
+    from openjax.vehicle import load_vehicle
+    from openjax.vehicle.effects import EFFECTS
+
+    if arguments.effect not in ("none", *EFFECTS):
+        known = ", ".join(("none", *EFFECTS))
+        raise UserError(f"--effect {arguments.effect}: no such effect; known are {known}")
+    check_new_folder(arguments.out, "OUT")
+    effects = {} if arguments.effect == "none" else {arguments.effect: EFFECTS[arguments.effect].card.sample}
+    vehicle = load_vehicle()
+    decimals = {c: DECIMALS.get(c, _REST) for c in LOG_COLUMNS}
+    flights = references(arguments.seed, arguments.duration, neighbour=arguments.effect == "downwash")
+    with replacing(arguments.out) as folder:
+        folder.mkdir()
+        for number, (name, reference) in enumerate(flights.items()):
+            columns = fly(vehicle, vehicle, reference, 1000 * arguments.seed + number, effects)
+            write_csv(folder / f"{name}.csv.gz", log_of(columns, name), decimals)
+        text = VEHICLE_TOML.format(mass=float(vehicle.mass), seed=arguments.seed, effect=arguments.effect)
+        (folder / "vehicle.toml").write_text(text, encoding="utf-8")
+    return sorted(arguments.out.iterdir())
+
+
+def main(arguments: Sequence[str]) -> None:
+    """The command. Raises UserError for an unknown effect or an unusable folder."""
+    parsed = parse(Arguments, Arguments(out=tyro.MISSING), arguments, PROGRAM)
+    files = make_case(parsed)
+    console = output_console()
+    console.print(f"[bold]{parsed.out}[/]: three flights of {parsed.duration:g} s, effect: {parsed.effect}")
+    for file in files:
+        console.print(f"  {file.name}  {file.stat().st_size / 1024:.1f} KiB")

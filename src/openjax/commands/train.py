@@ -1,0 +1,23 @@
+"""Train pursuers: `python -m openjax.train [--preset NAME] [--out DIR] [--any.setting value]`.
+
+Writes a run directory (see `openjax.store.run_directory`) with logs, checkpoints, the best policy and
+pictures. Ctrl-C or SIGTERM saves and exits; `--resume DIR` goes on exactly where it stopped.
+From Python: `openjax.train(settings, out)`, see `openjax.commands.calls.train`.
+"""
+
+import time
+from collections.abc import Sequence
+
+from openjax.commands.command_line import peek
+
+
+def main(arguments: Sequence[str], *, keep_traced: bool = False) -> int:
+    """The command; returns its exit status. `keep_traced`: keep traced programs, too, in a process of their own."""
+    started = time.monotonic()
+    if not {"-h", "--help"} & set(arguments) and peek(arguments, "process_id") in (None, "0"):
+        print("openjax.train: loading JAX and MuJoCo ...", flush=True)  # takes seconds; nobody should wonder
+    from openjax.cluster.joining import joined
+    from openjax.commands.training_command import membership, read_command, start
+
+    with joined(membership(arguments)) as processes:
+        return start(read_command(arguments), arguments, started, processes, keep_traced=keep_traced)

@@ -1,0 +1,94 @@
+"""`python -m openjax.virtual_crazyflie`: Crazyflies that are simulated, for everything that speaks to real ones.
+
+They answer CRTP over UDP as `cflib` expects (`udp://127.0.0.1:19850` and on); inside fly openjax's vehicles in real
+time, rate loop at 500 Hz, with any effects, and a link with latency and loss to order.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from openjax.commands.command_line import output_console, parse
+from openjax.ranges import Interval, Seed
+from openjax.virtual_crazyflie.link import BASE_PORT, LinkFaults
+
+PROGRAM = "python -m openjax.virtual_crazyflie"
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Fly virtual Crazyflies until interrupted; each has a port of its own."""
+
+    number: Annotated[int, Interval("[1, 10]")] = 3
+    """How many."""
+    host: str = "127.0.0.1"
+    """Address to listen at."""
+    port: Annotated[int, Interval("[0, 65535]")] = BASE_PORT
+    """UDP port of the first; cflib's scan looks at 19850 to 19859."""
+    scenario: str = "wall"
+    """They stand below the pursuers' starts of this layout (a name or a TOML file); more of them in a row behind."""
+    vehicle: Path | None = None
+    """The vehicle inside (vehicle.toml); by default the nominal Crazyflie."""
+    effects: Path | None = None
+    """Physical effects that it suffers from (effects.toml)."""
+    battery: Annotated[float, Interval("(0, 1]")] = 1.0
+    """Charge at the start, 0 to 1."""
+    endurance: Annotated[float, Interval("(0, 100000]")] = 420.0
+    """Seconds of hover that a full battery lasts."""
+    needs_arming: bool = True
+    """Motors stay off until armed; False: armed from the start, as brushed Crazyflies are."""
+    seconds: Annotated[float | None, Interval("(0, 1e9]")] = None
+    """End after this time; by default only when interrupted."""
+    seed: Seed = 0
+    """Draws losses and jitter."""
+    link: tyro.conf.OmitArgPrefixes[LinkFaults] = field(default_factory=LinkFaults)
+
+
+def make(arguments: Arguments):
+    """The virtual Crazyflies, listening. Raises UserError for what can't be."""
+    from openjax.pursuit import PursuitSettings, find_scenario
+    from openjax.vehicle.effects import load_effects
+    from openjax.vehicle.vehicle_file import load_vehicle_file
+    from openjax.virtual_crazyflie.process import VirtualCrazyflies
+    from openjax.virtual_crazyflie.vehicles import VirtualVehicles
+
+    scenario = find_scenario(arguments.scenario, PursuitSettings())
+    stands = [start[:2] for start in scenario.pursuers][: arguments.number]
+    stands += [(0.2 * i, -1.4) for i in range(arguments.number - len(stands))]
+    effects, parameters = load_effects(arguments.effects) if arguments.effects else ((), {})
+    vehicles = VirtualVehicles(
+        load_vehicle_file(arguments.vehicle).vehicle,
+        stands,
+        effects,
+        parameters,
+        arguments.battery,
+        arguments.endurance,
+    )
+    return VirtualCrazyflies(
+        vehicles, arguments.host, arguments.port, arguments.link, arguments.seed, arguments.needs_arming
+    )
+
+
+def main(arguments: Sequence[str]) -> None:
+    """The command; it runs until it is stopped."""
+    parsed = parse(Arguments, Arguments(), arguments, PROGRAM)
+    from openjax.flying import real_time
+
+    real_time.prepare()
+    virtual = make(parsed)
+    console = output_console()
+    try:
+        real_time.hurry()
+        console.print(f"listening: --uri {' '.join(virtual.uris)}")
+        virtual.run(lambda: virtual.time >= (parsed.seconds or math.inf))
+    except KeyboardInterrupt:
+        pass
+    finally:
+        virtual.close()
+    console.print(f"{virtual.time:.0f} s; {virtual.late} steps late by more than 20 ms")

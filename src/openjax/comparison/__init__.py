@@ -1,0 +1,107 @@
+"""What changed since last week: two sets of flights of one vehicle, compared with each other instead of with the
+simulator, so that what model and sensors share cancels.
+
+`figures` reads what each flight says about its vehicle; `days` takes a day as a random effect; `causes` says what each
+cause would do, `weigh` how well each explains what differs, `others` what is compared besides the trims; `result` is what
+comes out, `report` tells it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from openjax.comparison.causes import ROTOR_PLACES, SIDES, hypotheses_of
+from openjax.comparison.days import battery_of, by_day, days_told_apart, spread_of_days
+from openjax.comparison.figures import TRIMS, FlightFigures, figures_of, mixer_of
+from openjax.comparison.others import compare_others, support_of
+from openjax.comparison.result import SHOWN, Change, Interval, OtherFigure
+from openjax.comparison.weigh import least_shown, weigh
+from openjax.errors import UserError
+from openjax.flights.case import load_case
+from openjax.flights.flight import Case, Issue
+
+
+def compare(flights: Path, references: Sequence[Path]) -> Change:
+    """What changed in the flights of a folder against those of one or more reference folders (days).
+
+    Raises UserError for a folder without a usable flight and for flights of several vehicles."""
+    new_case, new, quality = read(Path(flights))
+    old: list[FlightFigures] = []
+    for folder in references:
+        case, figures, found = read(Path(folder))
+        if {f.vehicle for f in case.flights} != {f.vehicle for f in new_case.flights}:
+            raise UserError(f"{folder}: holds flights of another vehicle than {flights}")
+        old += figures
+        quality += found
+    return change_between(Path(flights).resolve().name, new, old, new_case, tuple(quality))
+
+
+def read(folder: Path) -> tuple[Case, list[FlightFigures], list[Issue]]:
+    case = load_case(folder, comparison=True)
+    if len({f.vehicle for f in case.flights}) > 1:
+        raise UserError(f"{folder}: holds several vehicles; a comparison is of one vehicle with itself")
+    quality, figures = list(case.quality), []
+    for flight in case.flights:
+        found = figures_of(flight, case, str(folder))
+        if isinstance(found, str):
+            quality.append(Issue(flight.name, found, refused=True, kind="comparison"))
+        else:
+            figures.append(found)
+    if not figures:
+        reasons = "; ".join(dict.fromkeys(i.issue for i in quality if i.refused))
+        raise UserError(f"{folder}: no flight can be compared: {reasons}")
+    return case, days_told_apart(figures), quality
+
+
+def change_between(
+    name: str,
+    new: Sequence[FlightFigures],
+    old: Sequence[FlightFigures],
+    case: Case,
+    quality: tuple[Issue, ...] = (),
+) -> Change:
+    """`compare` for figures that are there already; `case` gives the vehicle's geometry and motor order."""
+    mixer = mixer_of(case.vehicle_of(case.flights[0]))
+    battery = battery_of([*new, *old])
+    before, after = (by_day(f, battery) for f in (old, new))
+    spread, freedom = spread_of_days(before, after)
+    difference = after.mean - before.mean
+    scale = np.sqrt(
+        spread**2 * (1 / len(before.days) + 1 / len(after.days)) + before.error**2 + after.error**2
+    )
+    hypotheses = hypotheses_of(mixer, before.mean)
+    others = compare_others(new, old)
+    evidence = weigh(hypotheses, difference, scale, freedom, support_of(others))
+    logged = [case.vehicle_file.motor_permutation[j] + 1 for j in range(4)]
+    place, within = evidence.place()
+    unchanged = 1.0 - evidence.changed
+    for other in others:
+        unchanged *= 1.0 - other.probability if not other.name.endswith("noise") else 1.0
+    reach = 1.645 * scale
+    return Change(
+        name=name,
+        changed=unchanged < 1.0 - SHOWN,
+        probability=1.0 - unchanged,
+        trims_changed=evidence.changed > SHOWN,
+        rotors=tuple(sorted(logged[j] for j in place)),
+        side=ROTOR_PLACES[place[0]] if len(place) == 1 else SIDES.get(place, ""),
+        causes=evidence.causes,
+        causes_here=evidence.causes_at(within),
+        places={tuple(sorted(logged[j] for j in p)): share for p, share in evidence.places.items()},
+        size=evidence.size(within),
+        trims={
+            n: Interval(float(d), float(d - r), float(d + r))
+            for n, d, r in zip(TRIMS, difference, reach, strict=True)
+        },
+        others=others,
+        least=least_shown(hypotheses, mixer, before.mean, scale, freedom),
+        reference=tuple(old),
+        flights=tuple(new),
+        quality=quality,
+        spread=dict(zip(TRIMS, spread.tolist(), strict=True)),
+    )
+
+
+__all__ = ["SHOWN", "Change", "Interval", "OtherFigure", "change_between", "compare", "read"]

@@ -1,0 +1,207 @@
+"""What changed, told: a few sentences, `changes.json`, a page with one figure."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+
+from openjax.comparison.figures import TRIMS
+from openjax.comparison.result import SHOWN, Change, Interval
+
+_NAMES = {
+    "drag_x": "drag along x", "drag_y": "drag along y", "lag": "delay from motors to angular acceleration",
+    "torque_gain": "angular acceleration per motor command", "gyroscope_noise": "gyroscope noise above 20 Hz",
+    "accelerometer_noise": "accelerometer noise above 20 Hz", "motor_noise": "motor command noise above 20 Hz",
+}  # fmt: skip
+_LOGARITHMS = {"torque_gain", "gyroscope_noise", "accelerometer_noise", "motor_noise"}
+STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:62rem;margin:2rem auto;padding:0 1rem;color:#222}
+h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2rem}table{border-collapse:collapse;margin:.6rem 0}
+td,th{border-bottom:1px solid #ddd;padding:.2rem .7rem;text-align:left}img{max-width:100%}
+.verdict{background:#f3f6fa;padding:.8rem 1.2rem;border-left:4px solid #2b6cb0}"""
+
+
+def prediction(change: Change) -> dict:
+    """The case's entry in a predictions file: `probabilities` of no change and of each cause add up to one."""
+    causes = {c.replace(" ", "_"): round(change.probability * p, 5) for c, p in change.causes.items()}
+    return {
+        "changed": change.changed,
+        "effects": list(change.effects),
+        "rotors": list(change.rotors) if change.trims_changed else [],
+        "side": change.side if change.trims_changed else "",
+        "size": round(change.size.value, 4),
+        "probabilities": {"no_change": round(1.0 - change.probability, 5)} | causes,
+    }
+
+
+def to_dict(change: Change) -> dict:
+    """`changes.json`."""
+
+    def interval(one: Interval) -> dict:
+        return {"value": round(one.value, 5), "interval90": [round(one.low, 5), round(one.high, 5)]}
+
+    return prediction(change) | {
+        "case": change.name,
+        "in_words": in_words(change),
+        "least_shown": round(change.least, 4),
+        "size90": [round(change.size.low, 4), round(change.size.high, 4)],
+        "places": {
+            "+".join(map(str, p)) or "unclear": round(v, 4) for p, v in change.places.items() if v > 5e-4
+        },
+        "trims": {n: interval(v) for n, v in change.trims.items()},
+        "others": {
+            o.name: interval(o.difference) | {"unit": o.unit, "probability": round(o.probability, 4)}
+            for o in change.others
+        },
+        "days": {"reference": change.days, "spread": {n: round(v, 4) for n, v in change.spread.items()}},
+        "flights": [
+            {"flight": f.name, "set": name, "day": f.day.rpartition("/")[2], "voltage": f.voltage}
+            | {n: round(v[0], 5) for n, v in f.values.items()}
+            for name, figures in (("reference", change.reference), ("new", change.flights))
+            for f in figures
+        ],
+        "quality": [{"flight": i.flight, "issue": i.issue} for i in change.quality],
+    }
+
+
+def in_words(change: Change) -> list[str]:
+    """The answer in a few plain sentences."""
+    lines = []
+    if change.trims_changed:
+        told = list(dict.fromkeys(_cause_in_words(change, cause) for cause in change.likely_causes))
+        what = " or ".join(told)
+        lines.append(f"The vehicle changed (probability {change.probability:.2f}): {what}.")
+        low, high = change.size.low, change.size.high
+        lines.append(
+            f"Size: {100 * change.size.value:.0f} % [{100 * low:.0f}, {100 * high:.0f}] of a rotor's thrust"
+            + (" lost." if change.size.value > 0 else " (negative: it got stronger or lighter).")
+        )
+        if len(told) > 1:
+            lines.append(
+                "These flights can't split the causes named; a weighed vehicle or another propeller would."
+            )
+    elif change.changed:
+        lines.append(f"The vehicle changed (probability {change.probability:.2f}), though its trims didn't.")
+    else:
+        lines.append(f"No change that these flights can show (probability of one: {change.probability:.2f}).")
+        if change.probability > 0.2:
+            likely = _cause_in_words(change, change.likely_causes[0])
+            lines.append(
+                f"Below the spread of days; if anything, {likely} by {100 * change.size.value:.0f} %."
+            )
+    for other in change.others:
+        if other.probability > SHOWN:
+            lines.append(
+                f"{_NAMES[other.name].capitalize()}: {_difference(other)} (probability {other.probability:.2f})."
+            )
+    differences = ", ".join(
+        f"{n} {100 * v.value:+.1f} % [{100 * v.low:+.1f}, {100 * v.high:+.1f}]"
+        for n, v in change.trims.items()
+    )
+    lines.append(f"Trims against the reference, as shares of hover, with the spread of days: {differences}.")
+    days = f"{change.days} day{'s' * (change.days > 1)}"
+    spread = (
+        "estimated from them and a prior" if change.days > 1 else "a prior: fly the reference on several days"
+    )
+    lines.append(
+        f"The reference holds {len(change.reference)} flights of {days} (their spread is {spread}). A single rotor that "
+        f"lost less than {100 * change.least:.0f} % of its thrust would not show."
+    )
+    return lines
+
+
+def _cause_in_words(change: Change, cause: str) -> str:
+    rotors = " and ".join(str(r) for r in change.rotors)
+    weaker = "weaker" if change.size.value > 0 else "stronger"
+    if len(change.rotors) == 1 and cause.endswith("weaker"):
+        return f"rotor {rotors} ({change.side}) is {weaker}"
+    if cause == "one rotor weaker":
+        return f"one of rotors {rotors} ({change.side}) is {weaker}"
+    if cause == "two rotors weaker":
+        return f"rotors {rotors} ({change.side}) are {weaker}"
+    if cause == "weight":
+        beside = f" at the {change.side}" if change.side and change.side != "diagonal" else ""
+        return f"a weight was {'added' if change.size.value > 0 else 'taken off'}{beside}"
+    if cause == "whole vehicle":
+        return (
+            "the whole vehicle is heavier or its thrust weaker"
+            if change.size.value > 0
+            else "it is lighter or stronger"
+        )
+    return "something without a known pattern"
+
+
+def _difference(other) -> str:
+    d = other.difference
+    if other.name in _LOGARITHMS:
+        return (
+            f"{100 * np.expm1(d.value):+.0f} % [{100 * np.expm1(d.low):+.0f}, {100 * np.expm1(d.high):+.0f}]"
+        )
+    scale, unit = (1e3, "ms") if other.unit == "s" else (1.0, other.unit)
+    return f"{scale * d.value:+.3g} {unit} [{scale * d.low:+.3g}, {scale * d.high:+.3g}]"
+
+
+def write(change: Change, folder: Path, pictures: bool = True) -> None:
+    """`changes.json` and (with `pictures`) `changes.html` into an existing folder."""
+    (folder / "changes.json").write_text(json.dumps(to_dict(change), indent=1) + "\n", encoding="utf-8")
+    if pictures:
+        (folder / "changes.html").write_text(html_of(change), encoding="utf-8")
+
+
+def html_of(change: Change) -> str:
+    """One page, nothing to fetch from elsewhere."""
+    buffer = io.BytesIO()
+    figure = draw(change)
+    figure.savefig(buffer, format="png", dpi=110)
+    image = base64.b64encode(buffer.getvalue()).decode()
+    lines = "".join(f"<p>{html.escape(line)}</p>" for line in in_words(change))
+    rows = [["figure", "difference", "probability of a change"]]
+    rows += [[_NAMES[o.name], _difference(o), f"{o.probability:.2f}"] for o in change.others]
+    table = "".join("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in row) + "</tr>" for row in rows)
+    notes = "".join(
+        f"<tr><td>{html.escape(i.flight)}</td><td>{html.escape(i.issue)}</td></tr>" for i in change.quality
+    )
+    title = html.escape(f"What changed: {change.name}")
+    return (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>{STYLE}</style></head>'
+        f'<body><h1>{title}</h1><div class="verdict">{lines}</div><h2>Flights</h2>'
+        f'<img alt="trims of every flight" src="data:image/png;base64,{image}"><h2>Besides the trims</h2>'
+        f"<table>{table}</table>"
+        + (f"<h2>Data</h2><table>{notes}</table>" if notes else "")
+        + "</body></html>\n"
+    )
+
+
+def draw(change: Change):
+    """Trims of every flight, day by day, beside what days differ by; and where the change would sit."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 3.6), layout="constrained")
+    axes = figure.subplots(1, 5, width_ratios=(1, 1, 1, 1, 1.3))
+    level = np.mean([f.values["hover"][0] for f in change.reference])
+    for axis, name in zip(axes, TRIMS, strict=False):
+        for k, figures in enumerate((change.reference, change.flights)):
+            days = list(dict.fromkeys(f.day for f in figures))
+            for j, day in enumerate(days):
+                own = [f.values[name][0] for f in figures if f.day == day]
+                values = 100 * (np.array(own) / level - 1.0 if name == "hover" else np.array(own))
+                place = k + 0.6 * ((j + 0.5) / len(days) - 0.5)
+                axis.plot(
+                    np.full(len(values), place), values, "o", ms=5, color=("#777", "#c53030")[k], alpha=0.8
+                )
+        middle = 100 * np.mean([f.values[name][0] / level - 1 if name == "hover" else f.values[name][0]
+                                for f in change.reference])  # fmt: skip
+        spread = 100 * change.spread[name]
+        axis.axhspan(middle - 1.645 * spread, middle + 1.645 * spread, color="#2b6cb0", alpha=0.12, lw=0)
+        axis.set(title=name, xticks=(0, 1), xticklabels=("reference", "new"), xlim=(-0.6, 1.6))
+    axes[0].set_ylabel("% of hover (band: 90 % of normal days)")
+    places = sorted(change.places.items(), key=lambda item: -item[1])[:6]
+    names = ["all" if len(p) == 4 else "+".join(f"m{i}" for i in p) or "unclear" for p, _ in places]
+    shares = [change.probability * share for _, share in places]
+    axes[4].barh(["no change", *names][::-1], [1 - change.probability, *shares][::-1], color="#2b6cb0")
+    axes[4].set(title="probability", xlim=(0, 1))
+    return figure

@@ -1,0 +1,94 @@
+"""What a comparison says, as plain data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from openjax.comparison.figures import FlightFigures
+from openjax.flights.flight import Issue
+
+SHOWN = 0.5  # probability from which on something is said to have changed
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A value with its 90 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class OtherFigure:
+    """A figure besides the trims: how it differs, and the probability that this is more than a day's."""
+
+    name: str
+    unit: str
+    difference: Interval
+    probability: float
+
+
+@dataclass(frozen=True)
+class Change:
+    """What differs between two sets of flights.
+
+    `probability` that the vehicle changed, and whether its trims did (`trims_changed`). `places` {rotors: p} and
+    `causes` {cause: p} say how probable each is if the trims changed (`causes_here`: at the most probable place);
+    rotors count 1 to 4 as logged (m1..m4).
+    `size` is the thrust that was lost, as a share of one rotor's, at the most probable place (for a weight: its share
+    of a rotor's load); `trims` are the differences, their intervals with the spread of a day in them; `least` is
+    the loss of a single rotor that these flights would have shown.
+    """
+
+    name: str
+    changed: bool
+    probability: float
+    trims_changed: bool
+    rotors: tuple[int, ...]
+    side: str
+    causes: dict[str, float]
+    causes_here: dict[str, float]
+    places: dict[tuple[int, ...], float]
+    size: Interval
+    trims: dict[str, Interval]
+    others: tuple[OtherFigure, ...]
+    least: float
+    reference: tuple[FlightFigures, ...]
+    flights: tuple[FlightFigures, ...]
+    quality: tuple[Issue, ...]
+    spread: dict[str, float]  # of normal days, as estimated
+
+    @property
+    def days(self) -> int:
+        """Days that the reference holds."""
+        return len({f.day for f in self.reference})
+
+    @property
+    def likely_causes(self) -> tuple[str, ...]:
+        """The most probable cause at the most probable place, and those that these flights can't split from it."""
+        top = max(self.causes_here.values())
+        likely = [c for c, p in self.causes_here.items() if p > 0.25 * top]
+        return tuple(sorted(likely, key=lambda c: -self.causes_here[c]))
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """What changed by the names of the effect library, the most probable first."""
+        names: list[str] = []
+        if self.trims_changed:
+            names += [effect for cause in self.likely_causes for effect in _EFFECTS[cause]]
+        names += [_EFFECTS[o.name][0] for o in self.others if o.probability > SHOWN and o.name in _EFFECTS]
+        return tuple(dict.fromkeys(names))
+
+
+_EFFECTS = {
+    "one rotor weaker": ("motor_imbalance",),
+    "two rotors weaker": ("motor_imbalance",),
+    "weight": ("mass", "com_offset"),
+    "whole vehicle": ("mass", "thrust_scale"),
+    "something else": (),
+    "drag_x": ("rotor_drag",),
+    "drag_y": ("rotor_drag",),
+    "lag": ("motor_lag",),
+    "torque_gain": ("inertia",),
+}

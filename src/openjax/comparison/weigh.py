@@ -1,0 +1,89 @@
+"""Causes weighed against each other and against no change, by how well each, with the spread of a day, predicts the
+difference of the four trims."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from openjax.comparison.causes import CAUSES, SIDES, Hypotheses
+from openjax.comparison.result import SHOWN, Interval
+
+PRIOR_CHANGED = 0.5
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """`changed`: probability that the trims changed; the rest holds if they did: `posterior` (N,) of the hypotheses."""
+
+    changed: float
+    causes: dict[str, float]
+    places: dict[tuple[int, ...], float]
+    posterior: np.ndarray
+    hypotheses: Hypotheses
+
+    def place(self) -> tuple[tuple[int, ...], list[tuple[int, ...]]]:
+        """The smallest place that holds more than half of the probability, and the places within it: a rotor, two
+        rotors, a side (one or both of its rotors), else what is most probable."""
+        best = max(self.places, key=lambda p: self.places[p])
+        if self.places[best] > 0.5:
+            return best, [best]
+        sides = {side: [side, side[:1], side[1:]] for side, name in SIDES.items() if name != "diagonal"}
+        shares = {side: sum(self.places[p] for p in within) for side, within in sides.items()}
+        side = max(shares, key=lambda p: shares[p])
+        return (side, sides[side]) if shares[side] > 0.5 else (best, [best])
+
+    def _within(self, places: list[tuple[int, ...]]) -> np.ndarray:
+        return np.isin(self.hypotheses.place, [self.hypotheses.places.index(p) for p in places])
+
+    def causes_at(self, places: list[tuple[int, ...]]) -> dict[str, float]:
+        """Probability of each cause at some places."""
+        here = self._within(places)
+        each = np.bincount(self.hypotheses.cause[here], self.posterior[here], len(CAUSES))
+        return dict(zip(CAUSES, (each / each.sum()).tolist(), strict=True))
+
+    def size(self, places: list[tuple[int, ...]]) -> Interval:
+        """Median and 90 % interval of the size at some places."""
+        here = self._within(places)
+        order = np.argsort(self.hypotheses.size[here])
+        share = np.cumsum(self.posterior[here][order])
+        values = self.hypotheses.size[here][order]
+        low, middle, high = (float(values[np.searchsorted(share, q * share[-1])]) for q in (0.05, 0.5, 0.95))
+        return Interval(middle, low, high)
+
+
+def weigh(hypotheses: Hypotheses, difference, scale, freedom: float, support: float = 1.0) -> Weighed:
+    """Posterior of every cause, place and size: Student's distribution around the change that each predicts."""
+
+    def log_density(rest: np.ndarray) -> np.ndarray:
+        return -0.5 * (freedom + 1.0) * np.log1p((rest / scale) ** 2 / freedom).sum(-1)
+
+    none = log_density(difference)
+    each = np.log(hypotheses.weight) + log_density(difference - hypotheses.change)
+    top = max(each.max(), none)
+    posterior = support * PRIOR_CHANGED * np.exp(each - top)
+    total = posterior.sum() + (1.0 - PRIOR_CHANGED) * np.exp(none - top)
+    changed = float(posterior.sum() / total)
+    posterior /= posterior.sum()
+    causes = {c: float(posterior[hypotheses.cause == k].sum()) for k, c in enumerate(CAUSES)}
+    places = {p: float(posterior[hypotheses.place == k].sum()) for k, p in enumerate(hypotheses.places)}
+    return Weighed(changed, causes, places, posterior, hypotheses)
+
+
+def least_shown(hypotheses, mixer, trims, scale, freedom) -> float:
+    """The loss of a single rotor that would just be said to be a change, whichever rotor it is."""
+    level = np.linalg.solve(mixer, np.r_[1.0, trims[1:]])
+    worst = 0.0
+    for rotor in range(4):
+        low, high = 0.0, 1.0
+        for _ in range(8):
+            middle = 0.5 * (low + high)
+            command = level.copy()
+            command[rotor] *= 1.0 + middle
+            mixed = mixer @ command
+            change = np.r_[np.log(mixed[0]), mixed[1:] / mixed[0] - trims[1:]]
+            shown = weigh(hypotheses, change, scale, freedom).changed > SHOWN
+            low, high = (low, middle) if shown else (middle, high)
+        worst = max(worst, high / (1.0 + high))
+    return worst

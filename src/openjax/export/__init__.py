@@ -1,0 +1,1 @@
+"""A policy for programs that don't know openjax: ONNX, a serialised JAX function, or C99."""

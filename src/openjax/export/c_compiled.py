@@ -1,0 +1,80 @@
+"""A generated C program, compiled here and called from Python: to compare it with what it was made of."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import shutil
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from openjax.errors import UserError
+from openjax.export.c_program import CProgram
+
+FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-shared", "-fPIC")
+
+
+class Compiled:
+    """A compiled program. Raises UserError if the compiler refuses it."""
+
+    def __init__(self, program: CProgram, name: str, compiler: str):
+        with tempfile.TemporaryDirectory() as scratch:
+            folder = Path(scratch)
+            (folder / f"{name}.h").write_text(program.header, encoding="utf-8")
+            (folder / f"{name}.c").write_text(program.source, encoding="utf-8")
+            library = folder / f"{name}.so"
+            command = [compiler, *FLAGS, "-o", str(library), str(folder / f"{name}.c"), "-lm"]
+            ran = subprocess.run(command, capture_output=True, text=True, check=False)
+            if ran.returncode != 0:
+                complaint = next((line for line in ran.stderr.splitlines() if "error" in line), "no word")
+                raise UserError(f"{compiler} refuses the exported program: {complaint}")
+            self._function = getattr(ctypes.CDLL(str(library)), name)
+        self._function.restype = None
+        self._inputs = tuple(program.inputs)
+        self._observation = np.zeros((), np.dtype({"names": list(program.inputs), **_layout(program)}))
+        workspace = np.full(program.workspace, np.nan, np.float32)  # nobody clears it
+        self._output = np.zeros(program.shape, np.float32)
+        self._arrays = (self._observation, workspace, self._output)
+        self._pointers = [ctypes.c_void_p(array.ctypes.data) for array in self._arrays]
+
+    def __call__(self, seen: dict) -> np.ndarray:
+        """Outputs (number, ...) for {input: array (number, ...)}."""
+        found = []
+        for i in range(len(seen[self._inputs[0]])):
+            for name in self._inputs:
+                self._observation[name] = seen[name][i].reshape(-1)
+            self._function(*self._pointers)
+            found.append(self._output.copy())
+        return np.stack(found)
+
+    def seconds(self, repeats: int = 500) -> float:
+        """Of one call; the best of five batches."""
+        best = math.inf
+        for _ in range(5):
+            begin = time.perf_counter()
+            for _ in range(repeats):
+                self._function(*self._pointers)
+            best = min(best, (time.perf_counter() - begin) / repeats)
+        return best
+
+
+def compiled(program: CProgram, name: str) -> Compiled | None:
+    """The program, compiled; None where there is no C compiler."""
+    compiler = shutil.which("cc")
+    return None if compiler is None else Compiled(program, name, compiler)
+
+
+def _layout(program: CProgram) -> dict:
+    """Formats, offsets and size of the observation's struct: floats and flags, each aligned to itself."""
+    formats, offsets, end = [], [], 0
+    for name, shape in program.inputs.items():
+        size = 1 if program.flags[name] else 4
+        end = -(-end // size) * size
+        formats.append(((np.uint8 if size == 1 else np.float32), (math.prod(shape),)))
+        offsets.append(end)
+        end += size * math.prod(shape)
+    return {"formats": formats, "offsets": offsets, "itemsize": -(-end // 4) * 4}

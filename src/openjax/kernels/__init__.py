@@ -1,0 +1,1 @@
+"""GPU kernels, each beside the plain formula that it must agree with."""

@@ -1,0 +1,1 @@
+"""Crazyflies that answer as real ones do: firmware, CRTP, radio link, vehicles; `cflib` flies them."""

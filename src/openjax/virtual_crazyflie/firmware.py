@@ -1,0 +1,277 @@
+"""What a Crazyflie's firmware answers over CRTP: parameters, log blocks, set-points, arming, external pose.
+
+One vehicle, without sockets or clock: packets in, packets out. Set-points of body rates or angles with thrust are
+flown; position set-points, trajectories and memories are not there.
+"""
+
+from __future__ import annotations
+
+import errno
+import struct
+
+import numpy as np
+
+from openjax.flying.crtp import (
+    FULL_SCALE,
+    LOG_TYPES,
+    PARAMETER_TYPES,
+    PROTOCOL_VERSION,
+    READ_ONLY,
+    Port,
+    decode,
+    pack_number,
+)
+from openjax.flying.set_point import ANGLES, OFF, RATES, SetPoint
+from openjax.virtual_crazyflie.logs import MAX_BLOCKS, MAX_VARIABLES, LogBlocks
+from openjax.virtual_crazyflie.tables import (
+    LOG_CRC,
+    LOG_NAMES,
+    LOG_VARIABLES,
+    PARAMETER_CRC,
+    PARAMETER_NAMES,
+    PARAMETERS,
+    READ_ONLY_GROUP,
+)
+
+LEVEL_AFTER = 0.5
+"""Set-points older than this (s) are replaced by a level attitude at the same thrust (firmware: supervisor.c)."""
+STOP_AFTER = 2.0
+"""Set-points older than this (s) stop the motors and disarm."""
+WATCHDOG = 1.0
+"""Once an emergency-stop watchdog was started, it stops the motors unless it is repeated within this time (s)."""
+THRUST_CUT = 60000
+"""The legacy commander cuts thrust here and takes less than 1000 as none (16 bit)."""
+
+
+class VirtualFirmware:
+    """One virtual Crazyflie's firmware. Times are seconds of one clock that the caller owns."""
+
+    def __init__(self, needs_arming: bool = True):
+        """`needs_arming`: motors stay off until armed; otherwise armed from the start, as on brushed Crazyflies."""
+        self.auto_arm = not needs_arming
+        self.armed = self.auto_arm
+        self.crashed = False
+        self.emergency = False
+        self.flying = False
+        self.external_pose = np.array([0, 0, 0, 1, 0, 0, 0], float)  # position, quaternion wxyz
+        self.external_poses = 0
+        self.parameters = {name: value for name, (_, value) in PARAMETERS.items()}
+        self.logs = LogBlocks()
+        self._set_point = SetPoint()
+        self._set_point_time: float | None = None
+        self._watchdog_time: float | None = None
+        self.set_points = 0
+
+    # -- set-points and supervision
+
+    @property
+    def supervisor_info(self) -> int:
+        """The supervisor's bits: can be armed, is armed, auto arming, can fly, is flying, tumbled, locked, crashed."""
+        ready = not (self.crashed or self.emergency)
+        bits = (
+            ready and not self.armed,
+            self.armed,
+            self.auto_arm,
+            ready and self.armed,
+            self.flying,
+            self.crashed,
+            self.emergency,
+            self.crashed,
+        )
+        return sum(int(bit) << i for i, bit in enumerate(bits))
+
+    def set_point(self, now: float) -> SetPoint:
+        """What the stabiliser is asked for at `now`, watchdogs and supervision included."""
+        if self._watchdog_time is not None and now - self._watchdog_time > WATCHDOG:
+            self.emergency = True
+        if self._set_point_time is None or not self.armed or self.crashed or self.emergency:
+            return SetPoint()
+        age = now - self._set_point_time
+        if self._set_point.mode == OFF:  # nothing to time out: an armed vehicle waits for its first set-point
+            return SetPoint()
+        if age > STOP_AFTER:
+            self._disarm()
+            return SetPoint()
+        if age > LEVEL_AFTER:
+            return SetPoint(ANGLES, 0.0, 0.0, 0.0, self._set_point.thrust)
+        return self._set_point
+
+    def feed_watchdog(self, now: float) -> None:
+        """Start or restart the emergency-stop watchdog."""
+        self._watchdog_time = now
+
+    def crash(self) -> None:
+        """The vehicle hit something: motors off until a recovery is asked for."""
+        self.crashed = True
+        self._disarm()
+
+    def _disarm(self):
+        self.armed, self._set_point, self._set_point_time = self.auto_arm, SetPoint(), None
+
+    # -- packets in
+
+    def receive(self, raw: bytes, now: float) -> list[bytes]:
+        """Answers to one packet. What can't be understood is left without one, as on board."""
+        if not raw:
+            return []
+        if raw == b"\xff":  # the null packet of a scan
+            return [raw]
+        packet = decode(raw)
+        handler = {
+            Port.LINK: self._link,
+            Port.PLATFORM: self._platform,
+            Port.SUPERVISOR: self._supervisor,
+            Port.LOG: self._log,
+            Port.PARAMETERS: self._parameter,
+            Port.MEMORY: self._memory,
+            Port.LOCALIZATION: self._localization,
+            Port.COMMANDER: self._commander,
+            Port.COMMANDER_GENERIC: self._generic,
+        }.get(packet.port)
+        if handler is None:
+            return []
+        try:
+            answers = handler(packet, now)
+        except (struct.error, IndexError):  # shorter than its kind
+            return []
+        return [answer.encode() for answer in answers]
+
+    def _link(self, packet, now):
+        if packet.channel == 0:  # echo
+            return [packet]
+        return [packet._replace(data=b"Bitcraze Crazyflie\0")] if packet.channel == 1 else []
+
+    def _platform(self, packet, now):
+        command = packet.data[0]
+        if packet.channel == 1:
+            answer = {0: bytes([PROTOCOL_VERSION]), 1: b"openjax virtual", 2: b"CF21"}.get(command, b"")
+            return [packet._replace(data=bytes([command]) + answer)]
+        if packet.channel == 0 and command == 1:
+            return [packet._replace(data=bytes([command, *self._arm(bool(packet.data[1]))]))]
+        return []
+
+    def _arm(self, do_arm):
+        """Success, and whether it's armed now."""
+        if do_arm:
+            success = not (self.crashed or self.emergency)
+            self.armed = success or self.auto_arm
+        else:
+            success = True
+            self._disarm()
+        return int(success), int(self.armed)
+
+    def _supervisor(self, packet, now):
+        command = packet.data[0]
+        answer = None
+        if packet.channel == 0 and command == 0x0C:
+            answer = struct.pack("<H", self.supervisor_info)
+        elif packet.channel == 1 and command == 0x01:
+            answer = bytes(self._arm(bool(packet.data[1])))
+        elif packet.channel == 1 and command == 0x02:
+            self.crashed = False
+            answer = bytes([1, 1])
+        elif packet.channel == 1 and command == 0x03:
+            self.emergency = True
+            answer = b""
+        elif packet.channel == 1 and command == 0x04:
+            self.feed_watchdog(now)
+            answer = b""
+        return [] if answer is None else [packet._replace(data=bytes([command | 0x80]) + answer)]
+
+    def _memory(self, packet, now):
+        return [packet._replace(data=b"\x01\x00")] if packet.channel == 0 and packet.data[0] == 1 else []
+
+    def _localization(self, packet, now):
+        if packet.channel == 0:
+            self.external_pose[:3] = struct.unpack("<3f", packet.data[:12])
+            self.external_poses += 1
+        elif packet.data[0] == 8:
+            x, y, z, qx, qy, qz, qw = struct.unpack("<7f", packet.data[1:29])
+            self.external_pose[:] = x, y, z, qw, qx, qy, qz
+            self.external_poses += 1
+        elif packet.data[0] == 3:
+            self.emergency = True
+        elif packet.data[0] == 4:
+            self.feed_watchdog(now)
+        return []
+
+    def _commander(self, packet, now):
+        roll, pitch, yaw_rate, thrust = struct.unpack("<fffH", packet.data[:14])
+        thrust = 0 if thrust < 1000 else min(thrust, THRUST_CUT)
+        rates = self.parameters["flightmode.stabModeRoll"] == 0
+        self._accept(RATES if rates else ANGLES, roll, pitch, yaw_rate, thrust, now)
+        return []
+
+    def _generic(self, packet, now):
+        if packet.channel != 0:
+            return []
+        if packet.data[0] == 0:
+            self._set_point, self._set_point_time = SetPoint(), now
+            self.set_points += 1
+        elif packet.data[0] == 11:
+            roll, pitch, yaw_rate, thrust, rate = struct.unpack("<fffHB", packet.data[1:16])
+            self._accept(RATES if rate else ANGLES, roll, pitch, yaw_rate, thrust, now)
+        return []
+
+    def _accept(self, mode, roll, pitch, yaw_rate, thrust, now):
+        """Degrees in the firmware's frame, where pitch points the other way."""
+        if all(map(np.isfinite, (roll, pitch, yaw_rate))):
+            angles = np.radians((roll, -pitch, yaw_rate)).tolist()
+            self.accept(SetPoint(mode, *angles, thrust / (FULL_SCALE + 1)), now)
+
+    def accept(self, set_point: SetPoint, now: float) -> None:
+        """Take a set-point as it comes out of a packet: no thrust means motors off."""
+        self.set_points += 1
+        self._set_point_time = now
+        self._set_point = SetPoint() if set_point.thrust == 0.0 else set_point
+
+    # -- tables of contents
+
+    def _contents(self, packet, names, crc, limits, type_of):
+        command = packet.data[0]
+        if command == 3:
+            return [packet._replace(data=struct.pack("<BHI", 3, len(names), crc) + limits)]
+        if command == 2:
+            (ident,) = struct.unpack("<H", packet.data[1:3])
+            if ident >= len(names):
+                return [packet._replace(data=b"\x02")]
+            name = names[ident].replace(".", "\0").encode() + b"\0"
+            return [packet._replace(data=packet.data[:3] + bytes([type_of(names[ident])]) + name)]
+        return []
+
+    def _log(self, packet, now):
+        if packet.channel == 0:
+            return self._contents(
+                packet,
+                LOG_NAMES,
+                LOG_CRC,
+                bytes([MAX_BLOCKS, MAX_VARIABLES]),
+                lambda name: LOG_TYPES[LOG_VARIABLES[name][0]][0],
+            )
+        if packet.channel != 1:
+            return []
+        command = packet.data[0]
+        ident = packet.data[1] if len(packet.data) > 1 else 0
+        return [
+            packet._replace(data=bytes([command, ident, self.logs.control(command, ident, packet.data, now)]))
+        ]
+
+    def _parameter(self, packet, now):
+        if packet.channel == 0:
+
+            def type_of(name):
+                read_only = name.split(".")[0] == READ_ONLY_GROUP
+                return PARAMETER_TYPES[PARAMETERS[name][0]][0] | (READ_ONLY if read_only else 0)
+
+            return self._contents(packet, PARAMETER_NAMES, PARAMETER_CRC, b"", type_of)
+        if packet.channel in (1, 2):
+            (ident,) = struct.unpack("<H", packet.data[:2])
+            if ident >= len(PARAMETER_NAMES):
+                return [packet._replace(data=packet.data[:2] + bytes([errno.ENOENT]))]
+            name = PARAMETER_NAMES[ident]
+            fmt = PARAMETER_TYPES[PARAMETERS[name][0]][1]
+            if packet.channel == 2 and name.split(".")[0] != READ_ONLY_GROUP:
+                (self.parameters[name],) = struct.unpack("<" + fmt, packet.data[2:])
+            status = b"\0" if packet.channel == 1 else b""
+            return [packet._replace(data=packet.data[:2] + status + pack_number(fmt, self.parameters[name]))]
+        return [packet._replace(data=packet.data[:3] + bytes([errno.ENOENT]))]

@@ -1,0 +1,94 @@
+"""The log blocks of a virtual Crazyflie's firmware: set up by packets, sent when they are due."""
+
+from __future__ import annotations
+
+import errno
+import struct
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from openjax.flying.crtp import LOG_FORMATS, MAX_LOG_DATA, Packet, Port, pack_number
+from openjax.virtual_crazyflie.tables import LOG_NAMES, LOG_VARIABLES, Sensors
+
+MAX_BLOCKS = 16
+MAX_VARIABLES = 128
+
+
+@dataclass
+class _Block:
+    variables: list[tuple[str, str]] = field(default_factory=list)  # name, struct format
+    period: float = 0.0  # s; 0 while stopped
+    due: float = 0.0  # s
+
+    def size(self) -> int:
+        return sum(struct.calcsize(fmt) for _, fmt in self.variables)
+
+
+class LogBlocks:
+    """The blocks of one vehicle. Times are seconds of one clock that the caller owns."""
+
+    def __init__(self):
+        self._blocks: dict[int, _Block] = {}
+
+    def control(self, command: int, ident: int, data: bytes, now: float) -> int:
+        """The status of a command on log blocks: 0 or an errno."""
+        if command == 5:
+            self._blocks.clear()
+            return 0
+        if command == 6:
+            if ident in self._blocks:
+                return errno.EEXIST
+            if len(self._blocks) >= MAX_BLOCKS:
+                return errno.ENOMEM
+            self._blocks[ident] = _Block()
+            return self._append(ident, data[2:])
+        if command not in (2, 3, 4, 7, 8):
+            return errno.ENOEXEC
+        if ident not in self._blocks:
+            return errno.ENOENT
+        block = self._blocks[ident]
+        if command == 2:
+            del self._blocks[ident]
+        elif command == 4:
+            block.period = 0.0
+        elif command == 7:
+            return self._append(ident, data[2:])
+        else:
+            block.period = data[2] * 0.01
+            if command == 8:
+                block.period = struct.unpack("<H", data[2:4])[0] * 1e-3
+            block.due = now + block.period
+        return 0
+
+    def _append(self, ident, data) -> int:
+        block = self._blocks[ident]
+        for kind, variable in struct.iter_unpack("<BH", data[: len(data) // 3 * 3]):
+            if variable >= len(LOG_NAMES) or kind & 0x0F not in LOG_FORMATS:
+                return errno.ENOENT
+            fmt = LOG_FORMATS[kind & 0x0F]
+            if block.size() + struct.calcsize(fmt) > MAX_LOG_DATA:
+                return errno.E2BIG
+            if sum(len(b.variables) for b in self._blocks.values()) >= MAX_VARIABLES:
+                return errno.ENOMEM
+            block.variables.append((LOG_NAMES[variable], fmt))
+        return 0
+
+    def next(self) -> float:
+        """When the next log packet is due (s); infinite if no block runs."""
+        return min((b.due for b in self._blocks.values() if b.period > 0), default=np.inf)
+
+    def packets(self, firmware, now: float, sensors: Sensors) -> list[bytes]:
+        """The log packets due at `now`, stamped with it in milliseconds."""
+        packets = []
+        for ident, block in self._blocks.items():
+            if block.period <= 0 or now < block.due:
+                continue
+            # in step with its start; what came due in between is left out
+            block.due += block.period * (1 + int((now - block.due) / block.period))
+            stamp = struct.pack("<I", int(now * 1000) & 0xFFFFFF)[:3]
+            values = b"".join(
+                pack_number(fmt, LOG_VARIABLES[name][1](firmware, sensors)) for name, fmt in block.variables
+            )
+            packets.append(Packet(Port.LOG, 2, bytes([ident]) + stamp + values).encode())
+        return packets

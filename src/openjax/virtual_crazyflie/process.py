@@ -1,0 +1,108 @@
+"""Virtual Crazyflies in real time: links, firmware and vehicles of one process."""
+
+from __future__ import annotations
+
+import select
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from openjax.virtual_crazyflie.firmware import VirtualFirmware
+from openjax.virtual_crazyflie.link import LinkFaults, VirtualLink
+from openjax.virtual_crazyflie.vehicles import STEP, VirtualVehicles
+
+LONGEST_WAIT = 0.02
+"""The vehicles are advanced at least this often (s)."""
+LATE = 0.02
+"""An advance of more than this (s) says that the machine is too slow, or was busy."""
+
+
+class VirtualCrazyflies:
+    """N virtual Crazyflies on consecutive ports, in one air.
+
+    Args:
+      vehicles: what flies.
+      host: address to listen at.
+      port: first port; 0 takes any free ones.
+      faults: what the links do.
+      seed: draws losses and jitter.
+      needs_arming: see `VirtualFirmware`.
+    """
+
+    def __init__(
+        self,
+        vehicles: VirtualVehicles,
+        host: str = "127.0.0.1",
+        port: int = 19850,
+        faults: LinkFaults | None = None,
+        seed: int = 0,
+        needs_arming: bool = True,
+    ):
+        self.vehicles, self.late = vehicles, 0
+        self.firmware = [VirtualFirmware(needs_arming) for _ in range(vehicles.number)]
+        self.links: list[VirtualLink] = []
+        try:
+            for i in range(vehicles.number):
+                link = VirtualLink(host, port + i if port else 0, faults or LinkFaults(), 1000 * seed + i)
+                self.links.append(link)
+        except BaseException:
+            self.close()
+            raise
+        self.uris = [f"udp://{host}:{link.port}" for link in self.links]
+        self._steps = 0
+
+    @property
+    def time(self) -> float:
+        """s that the vehicles have flown."""
+        return self._steps * STEP
+
+    def run(self, stop: Callable[[], bool] = lambda: False) -> None:
+        """Fly in real time until `stop()`, which is asked some hundred times a second."""
+        start = time.perf_counter() - self.time
+        sockets = [link.socket for link in self.links]
+        while not stop():
+            due = min(
+                *(link.next_due() for link in self.links),
+                *(firmware.logs.next() for firmware in self.firmware),
+                self.time + LONGEST_WAIT,
+            )
+            wait = due - (time.perf_counter() - start)
+            if wait > 0:
+                select.select(sockets, [], [], wait)
+            self.catch_up(time.perf_counter() - start)
+
+    def catch_up(self, now: float) -> None:
+        """Take in what has arrived, advance everything to `now` (s), send what is due."""
+        packets = []
+        for i, link in enumerate(self.links):
+            link.poll(now)
+            packets += [(due, i, raw) for due, raw in link.received(now)]
+        for due, i, raw in sorted(packets, key=lambda packet: packet[0]):
+            self._advance(due)
+            for answer in self.firmware[i].receive(raw, max(due, self.time)):
+                self.links[i].send(answer, now)
+        self._advance(now)
+        for i, (firmware, link) in enumerate(zip(self.firmware, self.links, strict=True)):
+            if firmware.logs.next() <= self.time:
+                for packet in firmware.logs.packets(firmware, self.time, self.vehicles.sensors(i)):
+                    link.send(packet, now)
+            link.flush(now)
+
+    def _advance(self, until: float) -> None:
+        steps = int(until / STEP + 1e-6) - self._steps
+        if steps < 1:
+            return
+        self.late += steps * STEP > LATE + LONGEST_WAIT
+        set_points = np.stack([firmware.set_point(self.time).array() for firmware in self.firmware])
+        report = self.vehicles.advance(set_points, steps)
+        self._steps += steps
+        for i, firmware in enumerate(self.firmware):
+            firmware.flying = bool(report.motor_command[i].max() > 0.05)
+            if report.crashed[i]:
+                firmware.crash()
+
+    def close(self) -> None:
+        """Give the ports back."""
+        for link in self.links:
+            link.close()

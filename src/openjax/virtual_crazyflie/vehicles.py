@@ -1,0 +1,197 @@
+"""The vehicles inside virtual Crazyflies: openjax's own, with any of its effects, advanced between packets."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from openjax.errors import UserError
+from openjax.flying.real_time import compile_in_line
+from openjax.flying.set_point import ANGLES, OFF
+from openjax.vehicle import Vehicle, hover_state, make_drones_step, rate_controller, rotate, rotate_inverse
+from openjax.vehicle.effects import composition
+from openjax.virtual_crazyflie.tables import Sensors
+
+STEP = 0.002
+"""Seconds of a step: the firmware's rate loop runs at 500 Hz."""
+ANGLE_GAIN = 6.0
+"""Body rate asked for per angle error (1/s): proportional part of the firmware's attitude controller."""
+CRASH_SPEED, CRASH_TILT = 1.5, 0.5
+"""Touching the floor faster (m/s) or with body z lower (cosine) than this is a crash."""
+_NO_THRUST = -10.0
+"""As a thrust set-point: whatever the rate controller adds, all motors stay off."""
+FULL_VOLTAGE, SAG, SPENT = 4.15, 0.35, 0.9
+"""Battery: open circuit when full, drop at full thrust, fall from full to empty (V); empty is about 3.25 V."""
+
+
+class Report(NamedTuple):
+    """Arrays (N, ...) of what the firmware senses."""
+
+    position: np.ndarray
+    velocity: np.ndarray
+    quaternion: np.ndarray
+    body_rates: np.ndarray
+    specific_force: np.ndarray
+    motor_command: np.ndarray
+    on_floor: np.ndarray
+    crashed: np.ndarray
+
+
+class VirtualVehicles:
+    """N vehicles in one air. They start on the floor, level, and each step takes 2 ms.
+
+    Args:
+      vehicle: their parameters.
+      position: (N, 2) m, where they stand; (N, 3) where they hover if `flying`.
+      effects: names of effects; those that delay or lose commands belong to the link instead.
+      effect_parameters: {effect: {parameter: value}}.
+      battery: charge at the start, 0..1.
+      endurance: s of hover that empty a full battery.
+      flying: they begin hovering in the air instead.
+
+    Raises:
+      UserError: an unknown effect, or one that acts on commands.
+    """
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        position,
+        effects=(),
+        effect_parameters=None,
+        battery: float = 1.0,
+        endurance: float = 420.0,
+        flying: bool = False,
+    ):
+        self._step = make_drones_step("rigid", dt=STEP, effects=effects, contacts=False)
+        for effect in self._step.effects:
+            if effect.command is not None:
+                raise UserError(
+                    f"effect {effect.name} acts on commands: order it from the link, with --latency_ms or --loss"
+                )
+        position = np.atleast_2d(np.asarray(position, np.float32))
+        self.number = len(position)
+        height = position[:, 2:] if flying else np.zeros((self.number, 1), np.float32)
+        drones = hover_state(vehicle, np.concatenate([position[:, :2], height], 1))
+        drones = drones.replace(rotor_speed=drones.rotor_speed * flying)
+        drones = self._step.reset(vehicle, drones, jax.random.key(0))
+        flat, unflatten = ravel_pytree(drones)
+        self._state = np.asarray(flat)
+        advance = jax.jit(partial(_advance, self._step, vehicle, effect_parameters or {}, unflatten))
+        nothing = np.zeros((self.number, 5), np.float32)
+        self._advance = compile_in_line(advance.lower(flat, nothing, np.int32(1)))
+        self.battery, self._endurance = np.full(self.number, float(battery)), float(endurance)
+        self._hover = float(vehicle.mass * vehicle.gravity) / float(
+            4 * vehicle.thrust_constant * vehicle.max_rotor_speed**2
+        )
+        self.report = self.advance(np.zeros((self.number, 5), np.float32), 0)
+
+    def advance(self, set_points: np.ndarray, steps: int) -> Report:
+        """What is sensed after `steps` steps under constant set-points (N, 5), see `SetPoint.array`."""
+        self._state, report = self._advance(self._state, set_points, np.int32(steps))
+        self.report = Report(*(np.asarray(leaf, np.float64) for leaf in report))
+        share = self.report.motor_command.mean(1) / self._hover
+        self.battery = np.maximum(self.battery - steps * STEP * share / self._endurance, 0.0)
+        return self.report
+
+    def sensors(self, i: int) -> Sensors:
+        """What vehicle i senses."""
+        r = self.report
+        motor = r.motor_command[i]
+        voltage = FULL_VOLTAGE - SPENT * (1.0 - self.battery[i]) - SAG * motor.mean()
+        return Sensors(
+            r.position[i],
+            r.velocity[i],
+            r.quaternion[i],
+            r.body_rates[i],
+            r.specific_force[i],
+            motor,
+            voltage,
+        )
+
+
+def commands(quaternion, set_points):
+    """(N, 4) thrust and body rates (rad/s) for the rate controller from set-points (N, 5) at attitudes (N, 4).
+
+    Angles are tracked by the proportional attitude loop of the firmware, whose yaw is a rate.
+    """
+    mode, roll, pitch, yaw_rate, thrust = set_points.T
+    w, x, y, z = quaternion.T
+    roll_error = roll - jnp.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch_error = pitch - jnp.arcsin(jnp.clip(2 * (w * y - z * x), -1.0, 1.0))
+    angles = mode == ANGLES
+    return jnp.stack(
+        [
+            jnp.where(mode == OFF, _NO_THRUST, thrust),
+            jnp.where(angles, ANGLE_GAIN * roll_error, roll),
+            jnp.where(angles, ANGLE_GAIN * pitch_error, pitch),
+            yaw_rate,
+        ],
+        axis=-1,
+    )
+
+
+def _advance(drones_step, vehicle, parameters, unflatten, flat, set_points, steps):
+    """The flat state after `steps` steps, and what is sensed then."""
+    no_pillars = (jnp.zeros((1, 2)), jnp.zeros(1, bool))
+    complete = composition.complete_parameters(drones_step.effects, parameters, jnp.float32)
+    flown = composition.change_body(drones_step.effects, complete, vehicle)
+
+    def step(_, carry):
+        drones, _, crashed = carry
+        command = commands(drones.quaternion, set_points)
+        motor, _ = jax.vmap(lambda d, c: rate_controller(flown, d, c, STEP))(drones, command)
+        moved = drones_step(vehicle, drones, command, *no_pillars, parameters)
+        acceleration = (moved.velocity - drones.velocity) / STEP
+        moved, on_floor, hit = _stand(moved)
+        gravity = vehicle.gravity * jnp.array([0.0, 0.0, 1.0])
+        acceleration = jnp.where(on_floor[:, None], 0.0, acceleration)
+        force = jax.vmap(rotate_inverse)(moved.quaternion, acceleration + gravity)
+        return moved, (motor, force, on_floor), crashed | hit
+
+    drones = unflatten(flat)
+    number = drones.position.shape[0]
+    gravity = jnp.zeros((number, 3)).at[:, 2].set(vehicle.gravity)
+    nothing = (jnp.zeros((number, 4)), gravity, jnp.zeros(number, bool))
+    drones, (motor, force, on_floor), crashed = jax.lax.fori_loop(
+        0, steps, step, (drones, nothing, jnp.zeros(number, bool))
+    )
+    return ravel_pytree(drones)[0], Report(
+        drones.position,
+        drones.velocity,
+        drones.quaternion,
+        drones.body_rates,
+        force,
+        motor,
+        on_floor,
+        crashed,
+    )
+
+
+def _stand(drones):
+    """The floor: a vehicle on it stands still and level, and leaves it as soon as it is lifted."""
+    below = (drones.position[:, 2] <= 0.0) & (drones.velocity[:, 2] <= 0.0)
+    up = jax.vmap(lambda q: rotate(q, jnp.array([0.0, 0.0, 1.0])))(drones.quaternion)[:, 2]
+    hit = below & ((drones.velocity[:, 2] < -CRASH_SPEED) | (up < CRASH_TILT))
+    w, z = drones.quaternion[:, 0], drones.quaternion[:, 3]
+    size = jnp.sqrt(w * w + z * z + 1e-12)
+    level = jnp.stack([w / size, 0 * w, 0 * w, z / size], axis=-1)
+
+    def keep(fixed, free):
+        return jnp.where(below[:, None], fixed, free)
+
+    still = jnp.zeros_like(drones.velocity)
+    drones = drones.replace(
+        position=drones.position.at[:, 2].set(jnp.where(below, 0.0, drones.position[:, 2])),
+        velocity=keep(still, drones.velocity),
+        quaternion=keep(level, drones.quaternion),
+        body_rates=keep(still, drones.body_rates),
+        rate_integral=keep(still, drones.rate_integral),
+        previous_body_rates=keep(still, drones.previous_body_rates),
+    )
+    return drones, below, hit

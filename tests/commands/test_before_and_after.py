@@ -1,0 +1,33 @@
+"""Another policy in a run's game."""
+
+import dataclasses
+
+import numpy as np
+
+import openjax
+from openjax.commands.before_and_after import compare, game_for
+from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings
+
+
+def test_it_plays_the_runs_game_and_steers_as_it_was_trained_to():
+    """In steps and episodes of its own length, which the record counts in the run's."""
+    run = PursuitSettings(
+        physics="rigid",
+        time_step=0.02,
+        substeps=2,
+        episode_length=60,
+        evader_speed=0.5,
+        start_attitude="level",
+    )
+    policy = openjax.load_policy("apf")
+    rows, flights = compare(policy, Pursuit(run), [SCENARIOS["empty"]], 1, 2)
+    assert [(row["scenario"], row["episodes"]) for row in rows] == [("validation", 2), ("empty", 1)]
+    flight = flights[1]
+    assert flight.title == "empty, apf" and flight.time_step == 0.01 and len(flight.evader_position) == 120
+    speed = np.linalg.norm(np.diff(flight.evader_position, axis=0), axis=-1) / flight.time_step
+    np.testing.assert_allclose(speed, run.evader_speed, rtol=1e-2)
+
+    game = dataclasses.replace(game_for(run, policy), max_pillars=run.max_pillars)
+    record = openjax.evaluate(policy, "empty", episodes=1, **vars(game))
+    assert record["capture_rate"] == rows[1]["capture_rate"]
+    assert record["capture_step"] == 2 * rows[1]["capture_step"]
