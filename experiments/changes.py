@@ -22,9 +22,9 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import spearmanr
 
+from openjax import comparison
 from openjax.comparison.report import draw, in_words, prediction
 from openjax.flights.reading import write_csv
-from openjax.gap import changes
 from openjax.gap.samples import fly, log_of, references
 from openjax.vehicle import load_vehicle
 
@@ -42,7 +42,7 @@ def answer(folder: Path) -> dict:
     """{case: prediction} of every case_* against reference/."""
     out = {}
     for case in sorted(folder.glob("case_*")):
-        change = changes.compare(case, [folder / "reference"])
+        change = comparison.compare(case, [folder / "reference"])
         out[case.name] = prediction(change) | {"least_shown": round(change.least, 4)}
         print(case.name, out[case.name], flush=True)
     return out
@@ -51,13 +51,13 @@ def answer(folder: Path) -> dict:
 def open_table(folder: Path) -> str:
     """The table of an open vehicle, as Markdown."""
     labels = json.loads((folder / "labels.json").read_text())
-    read = {name: changes.read(folder / name) for name in labels}
+    read = {name: comparison.read(folder / name) for name in labels}
     (normal,) = [name for name, label in labels.items() if label["cause"] == "none"]
     case, reference, _ = read[normal]
     rows, cuts = [], []
 
     def compare(name, truth, new, old):
-        change = changes.change_between(name, new, old, case)
+        change = comparison.change_between(name, new, old, case)
         answer = prediction(change)
         rotors = "+".join(f"m{r}" for r in answer["rotors"]) or "–"
         low, high = change.size.low, change.size.high
@@ -75,7 +75,7 @@ def open_table(folder: Path) -> str:
         for k, day in enumerate(days)
     ]  # fmt: skip
     single = [
-        changes.change_between(
+        comparison.change_between(
             "one", [dataclasses.replace(f, day="one")], [g for g in reference if g.day != f.day], case
         )
         for f in reference
@@ -122,7 +122,7 @@ def figure(folder: Path) -> list[str]:
         for k, (flight, reference) in enumerate(references(seed=seed, duration=8.0).items()):
             columns = fly(vehicle, vehicle, reference, 10 * seed + k, effects)
             write_csv(folder / name / f"{flight}.csv.gz", log_of(columns, flight))
-    change = changes.compare(folder / "tuesday", [folder / "friday", folder / "monday"])
+    change = comparison.compare(folder / "tuesday", [folder / "friday", folder / "monday"])
     draw(change).savefig(Path(__file__).parents[1] / "docs" / "what_changed.png", dpi=90)
     return in_words(change)
 

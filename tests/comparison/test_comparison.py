@@ -6,12 +6,12 @@ import json
 import numpy as np
 import pytest
 
+from openjax import comparison
 from openjax.commands.diagnose import main
 from openjax.comparison.figures import FlightFigures, mixer_of
 from openjax.comparison.report import in_words, prediction, to_dict
 from openjax.flights.case import load_case
 from openjax.flights.reading import LogTable, write_csv
-from openjax.gap import changes
 from openjax.gap.samples import fly, log_of, references
 from openjax.vehicle import load_vehicle
 
@@ -39,7 +39,7 @@ def folders(tmp_path_factory):
 
 
 def compared(folders, name):
-    return changes.compare(folders / name, [folders / "monday", folders / "tuesday"])
+    return comparison.compare(folders / name, [folders / "monday", folders / "tuesday"])
 
 
 def test_the_same_vehicle_has_not_changed(folders):
@@ -87,7 +87,7 @@ def test_poor_logs_tell_as_much_about_trims(folders, tmp_path, kept):
                 columns |= {f"w{a}": v for a, v in zip("xyz", flight.body_rates.T, strict=True)}
                 columns |= {f"a{a}": v for a, v in zip("xyz", flight.specific_force.T, strict=True)}
             write_csv(tmp_path / name / flight.log, LogTable(flight.log, columns, np.full(len(flight), "0")))
-    change = changes.compare(tmp_path / "rotor", [tmp_path / "monday"])
+    change = comparison.compare(tmp_path / "rotor", [tmp_path / "monday"])
     assert change.changed and change.rotors == (3,)
 
 
@@ -121,8 +121,8 @@ def test_the_spread_of_days_is_learnt_and_hides_what_is_smaller(case):
     ]
     calm = [f for k in range(8) for f in trims(f"d{k}", seed=k)]
     new = trims("new", factors=(1, 1, 1.095, 1), seed=9)
-    in_wild = changes.change_between("new", new, wild, case)
-    in_calm = changes.change_between("new", new, calm, case)
+    in_wild = comparison.change_between("new", new, wild, case)
+    in_calm = comparison.change_between("new", new, calm, case)
     assert in_wild.spread["roll"] > 2 * in_calm.spread["roll"]
     assert in_calm.changed and in_calm.rotors == (3,)
     assert not in_wild.changed and in_wild.least > in_calm.least
@@ -132,7 +132,9 @@ def test_sizes_grow_with_the_change_and_intervals_hold_it(case):
     old = [f for k in range(3) for f in trims(f"d{k}", offset=(0, 0.01 * k, 0, 0), seed=k)]
     sizes = []
     for rise in (0.05, 0.1, 0.2, 0.3):
-        change = changes.change_between("new", trims("new", factors=(1, 1 + rise, 1, 1), seed=5), old, case)
+        change = comparison.change_between(
+            "new", trims("new", factors=(1, 1 + rise, 1, 1), seed=5), old, case
+        )
         sizes.append(change.size.value)
         assert change.size.low < rise / (1 + rise) < change.size.high
     assert sizes == sorted(sizes) and change.rotors == (2,)
@@ -140,7 +142,7 @@ def test_sizes_grow_with_the_change_and_intervals_hold_it(case):
 
 def test_two_rotors_of_a_side_are_a_class_with_a_weight_there(case):
     old = [f for k in range(3) for f in trims(f"d{k}", seed=k)]
-    change = changes.change_between("new", trims("new", factors=(1.15, 1.15, 1, 1), seed=5), old, case)
+    change = comparison.change_between("new", trims("new", factors=(1.15, 1.15, 1, 1), seed=5), old, case)
     assert change.changed and change.rotors == (1, 2) and change.side == "right"
     assert {"motor_imbalance", "com_offset"} <= set(change.effects)
     chances = prediction(change)["probabilities"]
@@ -158,7 +160,7 @@ def test_rotors_are_counted_as_logged(case, folders, tmp_path):
                 f"m{i + 1}": flight.motor_command[:, (i + 2) % 4] for i in range(4)
             }
             write_csv(tmp_path / name / flight.log, LogTable(flight.log, columns, np.full(len(flight), "0")))
-    change = changes.compare(tmp_path / "rotor", [tmp_path / "monday"])
+    change = comparison.compare(tmp_path / "rotor", [tmp_path / "monday"])
     assert change.rotors == (1,) and change.side == "rear left"
 
 
@@ -179,4 +181,4 @@ def test_the_command_writes_page_and_numbers_and_spares_the_others(folders, tmp_
     page = (out / "rotor" / "changes.html").read_text()
     assert "data:image/png" in page and "http" not in page
     assert "holds no flight log" in capsys.readouterr().err and not (out / "empty").exists()
-    assert json.dumps(to_dict(changes.compare(folders / "rotor", [folders / "monday"])))
+    assert json.dumps(to_dict(comparison.compare(folders / "rotor", [folders / "monday"])))

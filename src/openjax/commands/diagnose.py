@@ -103,14 +103,14 @@ def _compare(options: Options, names: list[str], console) -> int:
     from rich.panel import Panel
     from rich.text import Text
 
+    from openjax import comparison
     from openjax.comparison import report as changes_report
-    from openjax.gap import changes
 
     predictions, failed = {}, 0
     for folder, name in zip(options.cases, names, strict=True):
         try:
             with console.status(f"{name}: comparing"):
-                change = changes.compare(folder, options.reference)
+                change = comparison.compare(folder, options.reference)
                 with replacing(options.out / name) as partial:
                     partial.mkdir()
                     changes_report.write(change, partial, options.html)
