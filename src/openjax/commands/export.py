@@ -34,7 +34,7 @@ class Arguments:
     policy: str = "open"
     """A run's directory, a policy file (.npz), or the name of a policy in the package."""
     format: Literal["onnx", "jax", "c"] = "onnx"
-    """onnx: for onnxruntime and its kin (pip install "openjax[export]"); jax: for jax.export.deserialize; c: C99."""
+    """onnx: for onnxruntime and its kin (pip install onnx onnxruntime); jax: for jax.export.deserialize; c: C99."""
     own: bool = False
     """One pursuer's action instead of the whole team's."""
     out: Path = Path("exported")
@@ -141,7 +141,7 @@ def _onnx(act, inputs, seen, source):
     try:
         import onnxruntime
     except ImportError as error:
-        raise UserError('onnxruntime is missing: pip install "openjax[export]"') from error
+        raise UserError('onnxruntime is missing: pip install onnx onnxruntime') from error
     data = model.SerializeToString()
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1

@@ -1,4 +1,4 @@
-"""Many worlds as a Gymnasium `VectorEnv` in which one agent flies the whole team (`pip install "openjax[interfaces]"`)."""
+"""Many worlds as a Gymnasium `VectorEnv` in which one agent flies the whole team (`pip install gymnasium pettingzoo`)."""
 
 import jax
 import jax.numpy as jnp

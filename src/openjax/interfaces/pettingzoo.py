@@ -1,4 +1,4 @@
-"""One world as a PettingZoo `ParallelEnv` (`pip install "openjax[interfaces]"`)."""
+"""One world as a PettingZoo `ParallelEnv` (`pip install gymnasium pettingzoo`)."""
 
 import jax
 import jax.numpy as jnp

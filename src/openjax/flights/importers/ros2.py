@@ -64,7 +64,7 @@ def read_bag(path: str | Path, mapping: ColumnMapping | None = None) -> LogTable
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise UserError(
-            f"{path}: reading ROS 2 bags needs the rosbags library: pip install openjax[ros]"
+            f"{path}: reading ROS 2 bags needs the rosbags library: pip install rosbags"
         ) from error
     path = Path(path)
     try:

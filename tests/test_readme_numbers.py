@@ -1,0 +1,95 @@
+"""Every result in the README is what a committed result file says."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.headline import PAPER
+from openjax.pursuit import SCENARIOS
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def read(name):
+    return json.loads((ROOT / "experiments" / "results" / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def short(value, digits):
+    """A rate as the README writes it: .013, 1.00."""
+    return f"{value:.{digits}f}".removeprefix("0")
+
+
+def cells(label):
+    """The cells of the README's only table row that begins with `label`."""
+    rows = [line for line in README.splitlines() if line.startswith(f"| {label} |")]
+    assert len(rows) == 1, (label, rows)
+    return [cell.strip() for cell in rows[0].strip("|").split("|")][1:]
+
+
+@pytest.mark.parametrize("layout", list(SCENARIOS))
+def test_layouts(layout):
+    """Mean over the shipped seeds, in the game that they were trained in."""
+    seeds = read("headline")["records"]["clamp, drawn starts"].values()
+    records = [next(r for r in records if r["scenario"] == layout) for records in seeds]
+    assert len(records) == 3 and all(record["episodes"] == 100 for record in records)
+
+    def mean(field):
+        return float(np.mean([record[field] for record in records]))
+
+    paper = "–"
+    if layout in PAPER:
+        rate, step, collisions = PAPER[layout]
+        paper = f"{short(rate, 3)}, {step}, {short(collisions, 3)}"
+    assert cells(layout) == [
+        short(mean("capture_rate"), 2),
+        f"{mean('capture_step'):.0f}",
+        short(mean("collision_rate"), 4),
+        short(mean("crash_rate"), 3),
+        paper,
+    ]
+
+
+def test_training_runs():
+    """Seconds of the three runs and their steps per second, at the preset's default settings."""
+    runs = list(read("h200_runs")["runs"].values())
+    seconds = [f"{run['layouts']['seconds']:.0f} s" for run in runs]
+    value = cells("a whole training run on one H200, compilation included")[0]
+    assert value == f"{', '.join(sorted(seconds[:2]))} (and {seconds[2]} on a GPU shared with another run)"
+    speeds = sorted(run["steps_per_second"] / 1e6 for run in runs[:2])
+    speed = cells("environment steps per second in such a run")[0]
+    assert speed == f"{speeds[0]:.1f} to {speeds[1]:.1f} million"
+
+
+def test_training_step():
+    """The default network, the preset's number of worlds."""
+    rows = read("faster_step")["rows"]
+    (row,) = [r for r in rows if r["run"] == "new" and r["label"] == "training" and r["worlds"] == 5120]
+    assert cells("the training step alone")[0] == f"{row['sps'] / 1e6:.1f} million"
+
+
+def test_slower_vehicle():
+    """Mean crash rate over the six layouts."""
+    policies = read("vehicles")["policies"]
+    crashes = [
+        np.mean([policies[name]["table"][layout]["crash_rate"] for layout in SCENARIOS])
+        for name in ("flight", "open")
+    ]
+    value = cells("a slower Crazyflie without clamp: crash rate of `flight`, of `open`")[0]
+    assert value == f"{short(crashes[0], 3)}, {short(crashes[1], 2)}"
+
+
+@pytest.mark.parametrize(
+    ("label", "figure"),
+    [
+        ("diagnosis of 240 simulated cases that no tuning saw: first cause named is right", "top1"),
+        ("... nothing else is named", "nothing_extra"),
+        ("... a cause that no model covers is called unknown", "unknown_recall"),
+    ],
+)
+def test_diagnosis(label, figure):
+    figures = read("exam")["columns"]["stranger"]["figures"]
+    assert figures["traceback"]["n"] == 240
+    assert cells(label)[0] == short(figures[figure]["value"], 2)
