@@ -1,0 +1,44 @@
+"""The page of a study: what stands beside stored results, and what a table shows of a record."""
+
+import json
+import sys
+
+from experiments.table import Page, Table, page_parser, publish
+
+
+def test_results_name_the_command_without_their_own_places_and_the_commit(tmp_path, monkeypatch):
+    arguments = ["--number", "3", "--name", "two words", "--commit=abc", "--out", str(tmp_path / "page")]
+    monkeypatch.setattr(sys, "argv", ["study", *arguments])
+    parser = page_parser("A study.", "page")
+    parser.add_argument("--number", type=int)
+    parser.add_argument("--name")
+
+    def study(options):
+        return {"number": options.number}
+
+    def page(results):
+        return Page("Things", f"{results['number']} of them.", Table({"number": "number"}, [results]))
+
+    publish(parser.parse_args(arguments), study, page)
+    results = json.loads((tmp_path / "page.json").read_text())
+    assert results["number"] == 3 and results["seconds"] >= 0
+    assert results["command"].endswith(" --number 3 --name 'two words'")
+    assert results["machine"]["commit"] == "abc" and results["machine"]["versions"]["jax"]
+    written = (tmp_path / "page.md").read_text()
+    assert written.startswith("# Things\n\n3 of them.\n\n| number |\n| --- |\n| 3 |\n\nMade with ")
+    assert f"(abc) by `{results['command']}` on " in written
+
+
+def test_cells_of_records():
+    record = {"name": "one", "rates": {"crash": 0.25}, "seeds": [1.0, 3.0], "nan": float("nan"), "done": True}
+    columns = {
+        "name": "name",
+        "crash": "rates.crash:.3f",
+        "seeds": "seeds:.1f",
+        "nan": "nan:.1f",
+        "none": "rates.none:.1f",
+        "done": "done",
+        "twice": lambda row: f"{2 * row['rates']['crash']:.1f}",
+    }
+    row = Table(columns, [record]).lines()[-1]
+    assert row == "| one | 0.250 | 2.0 (1.4) | – | – | yes | 0.5 |"
