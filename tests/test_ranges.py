@@ -18,7 +18,7 @@ from openjax.commands.view import ViewCommand
 from openjax.errors import UserError
 from openjax.flying.limits import SafetySettings
 from openjax.learning import GeneratorSettings, MappoSettings, TrainSettings
-from openjax.learning.adaptation import AdaptSettings
+from openjax.learning.settings import AdaptSettings
 from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import PursuitSettings, RewardSettings
 from openjax.ranges import Interval, check_intervals, ranged_fields

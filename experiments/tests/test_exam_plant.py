@@ -8,12 +8,12 @@ import pytest
 from experiments.diagnosis import answer_key, cases, effects, fleet, sensors, vehicle
 from openjax.vehicle import (
     load_vehicle,
-    rate_controller,
     rigid_step,
     rotor_speed_step,
     rotor_thrust,
     rotor_wrench,
 )
+from openjax.vehicle.rate_controller import rate_controller
 from openjax.vehicle.state import DroneState
 
 TICKS = 500

@@ -11,7 +11,6 @@ from openjax.vehicle import (
     load_vehicle,
     make_drones_step,
     max_rotor_thrust,
-    rate_controller,
     rotor_reaction,
     rotor_speed_step,
     rotor_thrust,
@@ -19,6 +18,7 @@ from openjax.vehicle import (
     total_wrench,
 )
 from openjax.vehicle.effects import EFFECTS, Effect, Parameter, make_context
+from openjax.vehicle.rate_controller import rate_controller
 
 NO_PILLARS = jnp.zeros((0, 2)), jnp.zeros(0, bool)
 NONE = {name: effect.none() for name, effect in EFFECTS.items()}

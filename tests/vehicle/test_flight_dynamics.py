@@ -11,11 +11,11 @@ from openjax.vehicle import (
     load_vehicle,
     make_drones_step,
     max_rotor_thrust,
-    rate_controller,
     rigid_step,
     rotate,
     rotor_speed_step,
 )
+from openjax.vehicle.rate_controller import rate_controller
 
 NO_PILLARS = jnp.zeros((0, 2)), jnp.zeros(0, bool)
 

@@ -23,7 +23,7 @@ import tyro
 from openjax.commands.command_line import output_console, parse
 from openjax.errors import UserError
 from openjax.files import check_output_folder, write_text
-from openjax.learning.adaptation import AdaptSettings
+from openjax.learning.settings import AdaptSettings
 from openjax.ranges import Interval, Seed
 
 PROGRAM = "python -m openjax.adapt"

@@ -22,13 +22,13 @@ from openjax.vehicle import (
     Vehicle,
     hover_state,
     max_rotor_thrust,
-    rate_controller,
     rigid_step,
     rotate,
     rotate_inverse,
     rotor_speed_step,
 )
 from openjax.vehicle.effects import composition, make_context
+from openjax.vehicle.rate_controller import rate_controller
 
 PERIOD = 0.01  # s, rows and off-board commands
 RATE_LOOPS = 5  # per row: 500 Hz

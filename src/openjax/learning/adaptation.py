@@ -9,7 +9,7 @@ import dataclasses
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ from flax import struct
 from openjax.baselines import make_policy
 from openjax.learning.analytic_gradient import breach_share, crash_share, draw_start, nearest_gap
 from openjax.learning.evaluation import Evaluation, make_evaluate
-from openjax.learning.settings import TrainSettings
+from openjax.learning.settings import AdaptSettings, TrainSettings
 from openjax.policy import Policy, PolicyParameters
 from openjax.policy.growth import with_longer_history
 from openjax.pursuit import (
@@ -32,7 +32,6 @@ from openjax.pursuit import (
     turn_task,
     uniform_task,
 )
-from openjax.ranges import Interval, check_intervals
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.family import REST, adapted_family, draw_vehicles, family_bounds, known_effects
 
@@ -52,24 +51,6 @@ LAG = 6
 what it does if it were to catch up."""
 NEAR, ALIKE = 0.02, 0.1
 """Distance (m) and difference in velocity (m/s) from the nominal vehicle's flight that count as one."""
-
-
-@dataclass(frozen=True)
-class AdaptSettings:
-    """How a policy is fine-tuned."""
-
-    worlds: Annotated[int | None, Interval("[1, 65536]")] = None
-    """Worlds of each kind of flight in an update; by default 320 on an accelerator, 8 on a CPU: enough to see it work."""
-    updates: Annotated[int, Interval("[1, 1000000]")] = 120
-    look_every: Annotated[int, Interval("[1, 1000000]")] = 40
-    """Updates between looks at what the policy has become; the best of all looks is kept."""
-    learning_rate: Annotated[float, Interval("(0, 1]")] = 3e-4
-    """Adam step size at the start; falls linearly to a twentieth."""
-    follow: Annotated[float, Interval("[0, 1000]")] = 0.1
-    """Weight of flying where the nominal vehicle would, beside the share of pursuers that touch something."""
-
-    def __post_init__(self):
-        check_intervals(self, "training.")
 
 
 def adapting_game(game: PursuitSettings) -> PursuitSettings:

@@ -2,14 +2,15 @@
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from openjax.errors import UserError
-from openjax.learning.schedule import Schedule
 from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import PursuitSettings, RewardSettings
 from openjax.ranges import Interval, Seed, check_intervals
-from openjax.vehicle.family import FLIGHT_FAMILY
+
+if TYPE_CHECKING:
+    from openjax.learning.schedule import Schedule  # written in JAX, which a command's help needn't wait for
 
 
 @dataclass(frozen=True)
@@ -114,6 +115,24 @@ class AnalyticSettings:
 
 
 @dataclass(frozen=True)
+class AdaptSettings:
+    """How a policy is fine-tuned."""
+
+    worlds: Annotated[int | None, Interval("[1, 65536]")] = None
+    """Worlds of each kind of flight in an update; by default 320 on an accelerator, 8 on a CPU: enough to see it work."""
+    updates: Annotated[int, Interval("[1, 1000000]")] = 120
+    look_every: Annotated[int, Interval("[1, 1000000]")] = 40
+    """Updates between looks at what the policy has become; the best of all looks is kept."""
+    learning_rate: Annotated[float, Interval("(0, 1]")] = 3e-4
+    """Adam step size at the start; falls linearly to a twentieth."""
+    follow: Annotated[float, Interval("[0, 1000]")] = 0.1
+    """Weight of flying where the nominal vehicle would, beside the share of pursuers that touch something."""
+
+    def __post_init__(self):
+        check_intervals(self, "training.")
+
+
+@dataclass(frozen=True)
 class TrainSettings:
     """Everything that determines a run. A run's result depends on nothing else but the machine's arithmetic."""
 
@@ -209,8 +228,10 @@ class TrainSettings:
         return self.start_groups * self.episodes_per_task * max(1, self.restart_every)
 
     @property
-    def schedule(self) -> Schedule:
+    def schedule(self) -> "Schedule":
         """Which worlds start when."""
+        from openjax.learning.schedule import Schedule
+
         every = self.restart_steps // self.rollout_length
         ages = tuple(range(every, self.start_groups, every))
         return Schedule(self.start_groups, self.episodes_per_task, self.restart_every, ages)
@@ -315,6 +336,8 @@ def paper() -> TrainSettings:
 def flight() -> TrainSettings:
     """Policies to be flown: no clamp on the speed, the rate loop at 500 Hz, every pursuer its own vehicle; at last half seconds
     by the gradient through the simulation. Five minutes on one large accelerator."""
+    from openjax.vehicle.family import FLIGHT_FAMILY
+
     return changed(
         paper(),
         environment=dict(

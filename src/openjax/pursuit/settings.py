@@ -6,7 +6,6 @@ from typing import Annotated, Literal
 from openjax.errors import UserError
 from openjax.ranges import Interval, check_intervals
 from openjax.vehicle.arena import Arena
-from openjax.vehicle.family import check_ranges
 
 HIDDEN = -5.0
 """What stands in an observation for something that isn't seen (the paper's marker value)."""
@@ -113,7 +112,10 @@ class PursuitSettings:
             raise UserError(
                 f"environment.min_pillars {self.min_pillars} is more than environment.max_pillars {self.max_pillars}"
             )
-        check_ranges(self.vehicles)
+        if self.vehicles:
+            from openjax.vehicle.family import check_ranges  # knows the effects, which are written in JAX
+
+            check_ranges(self.vehicles)
 
     @property
     def arena(self) -> Arena:

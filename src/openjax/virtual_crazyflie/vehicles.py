@@ -13,8 +13,9 @@ from jax.flatten_util import ravel_pytree
 from openjax.errors import UserError
 from openjax.flying.real_time import compile_in_line
 from openjax.flying.set_point import ANGLES, OFF
-from openjax.vehicle import Vehicle, hover_state, make_drones_step, rate_controller, rotate, rotate_inverse
+from openjax.vehicle import Vehicle, hover_state, make_drones_step, rotate, rotate_inverse
 from openjax.vehicle.effects import composition
+from openjax.vehicle.rate_controller import rate_controller
 from openjax.virtual_crazyflie.tables import Sensors
 
 STEP = 0.002
