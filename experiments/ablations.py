@@ -2,7 +2,7 @@
 
 RUN are directories of `openjax.train` that differ in seed, predictor and generator alone:
 
-    python -m openjax.train --preset paper --seed S --validation_interval 12
+    openjax train --preset paper --seed S --validation_interval 12
         [--predictor.enabled False] [--generator.enabled False] [--generator.turn False]
 
 Writes experiments/results/ablations.json, .md and .png: the layouts per variant, the error of the predicted next

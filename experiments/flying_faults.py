@@ -2,7 +2,7 @@
 
 Three vehicles hunt in a layout; at a drawn moment something goes wrong with one of them, or with the computer. Counted
 is where every vehicle ends: landed inside the arena, or somewhere else. The vehicles are openjax's, with the firmware's
-watchdogs; policy, game and state machine are those of `python -m openjax.fly`.
+watchdogs; policy, game and state machine are those of `openjax fly`.
 
 Kinds of faults:
 * pose lost: no more poses of one vehicle, for good or for a while; its link still takes set-points

@@ -1,4 +1,4 @@
-"""`python -m openjax.adapt`: the command is `openjax.commands.adapt`."""
+"""`openjax adapt`: the command is `openjax.commands.adapt`."""
 
 from openjax.commands.adapt import main
 from openjax.commands.command_line import run_command

@@ -1,4 +1,4 @@
-"""`python -m openjax.benchmark`: the command is `openjax.commands.benchmark`."""
+"""`openjax benchmark`: the command is `openjax.commands.benchmark`."""
 
 from openjax.commands.benchmark import main
 from openjax.commands.command_line import run_command

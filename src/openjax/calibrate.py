@@ -1,4 +1,4 @@
-"""`python -m openjax.calibrate`: the command is `openjax.commands.calibrate`."""
+"""`openjax calibrate`: the command is `openjax.commands.calibrate`."""
 
 from openjax.commands.calibrate import main
 from openjax.commands.command_line import run_command

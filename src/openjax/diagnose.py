@@ -1,4 +1,4 @@
-"""`python -m openjax.diagnose`: the command is `openjax.commands.diagnose`."""
+"""`openjax diagnose`: the command is `openjax.commands.diagnose`."""
 
 from openjax.commands.command_line import run_command
 from openjax.commands.diagnose import main

@@ -1,4 +1,4 @@
-"""`python -m openjax.evaluate`: the command is `openjax.commands.evaluate`."""
+"""`openjax evaluate`: the command is `openjax.commands.evaluate`."""
 
 from openjax.commands.command_line import run_command
 from openjax.commands.evaluate import main

@@ -1,4 +1,4 @@
-"""`python -m openjax.fly`: the command is `openjax.commands.fly`."""
+"""`openjax fly`: the command is `openjax.commands.fly`."""
 
 from openjax.commands.command_line import run_command
 from openjax.commands.fly import main

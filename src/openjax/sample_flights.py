@@ -1,4 +1,4 @@
-"""`python -m openjax.sample_flights`: the command is `openjax.commands.sample_flights`."""
+"""`openjax sample_flights`: the command is `openjax.commands.sample_flights`."""
 
 from openjax.commands.command_line import run_command
 from openjax.commands.sample_flights import main

@@ -1,4 +1,4 @@
-"""`python -m openjax.train`: the command is `openjax.commands.train`."""
+"""`openjax train`: the command is `openjax.commands.train`."""
 
 import functools
 

@@ -1,4 +1,4 @@
-"""`python -m openjax.view`: the command is `openjax.commands.view`."""
+"""`openjax view`: the command is `openjax.commands.view`."""
 
 from openjax.commands.command_line import run_command
 from openjax.commands.view import main

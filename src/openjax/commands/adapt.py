@@ -1,4 +1,4 @@
-"""From flights to a better policy: `python -m openjax.adapt FLIGHTS --policy NAME --out DIR`.
+"""From flights to a better policy: `openjax adapt FLIGHTS --policy NAME --out DIR`.
 
 Diagnoses the flights, draws vehicles from the intervals of what was found, fine-tunes the policy on them by the gradient
 through the simulation, and measures both policies on tasks and vehicles that neither was trained on. Writes DIR/policy.npz,
@@ -26,7 +26,7 @@ from openjax.files import check_output_folder, write_text
 from openjax.learning.settings import AdaptSettings
 from openjax.ranges import Interval, Seed
 
-PROGRAM = "python -m openjax.adapt"
+PROGRAM = "openjax adapt"
 FIGURES = ("capture_rate", "capture_step", "collision_rate", "crash_rate", "over_speed_rate")
 WHICH = ("nominal", "before", "after")
 LOSSES = ("crash_rate", "collision_rate", "capture_step")

@@ -1,4 +1,4 @@
-"""Speed on this machine: `python -m openjax.benchmark [--envs 1024 4096] [--json FILE]`.
+"""Speed on this machine: `openjax benchmark [--envs 1024 4096] [--json FILE]`.
 
 Steps per second of the physics (rigid and MJX, each with and without solids), of the environment, of rollouts with the
 policy and of the whole training step, over a sweep of environment counts; and where a training step's time goes, beside
@@ -6,31 +6,20 @@ what a limit would be. Same command on CPU and GPU.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
-import jax
-import jax.numpy as jnp
 import tyro
 from rich import box
 from rich.table import Table
 
 from openjax.commands.command_line import output_console, parse, peek
-from openjax.commands.machine import describe_machine
-from openjax.commands.step_shares import measure, shares_table
-from openjax.commands.timing import Timing, time_compiled
-from openjax.errors import UserError
 from openjax.files import check_output
-from openjax.learning import TrainSettings, build, init_carry, make_training_step, preset
-from openjax.learning.rollout import collect
-from openjax.pursuit import Pursuit, hover_action, uniform_task
-from openjax.pursuit.environment import action_to_command
+from openjax.learning.settings import TrainSettings, preset
 from openjax.ranges import Interval
-from openjax.store.settings_files import write_json
-from openjax.vehicle import hover_state, load_vehicle, make_drones_step
 
-PROGRAM = "python -m openjax.benchmark"
+PROGRAM = "openjax benchmark"
 PHYSICS = ("rigid_free", "rigid", "mjx_free", "mjx")
 PARTS = (*PHYSICS, "environment", "rollout", "training", "shares")
 
@@ -62,7 +51,7 @@ class BenchmarkCommand:
 
 def main(arguments: Sequence[str]) -> int:
     """The command; returns its exit status."""
-    on_cpu = jax.default_backend() == "cpu"
+    on_cpu = bool({"-h", "--help"} & set(arguments)) or _on_cpu()
     default = BenchmarkCommand(
         envs=(64, 512) if on_cpu else (2048, 8192, 32768, 131072, 1048576),
         training_envs=(320,) if on_cpu else (2048, 4096, 8192, 16384),
@@ -70,6 +59,14 @@ def main(arguments: Sequence[str]) -> int:
     )
     command = parse(BenchmarkCommand, default, arguments, PROGRAM)
     check_output(command.json, "--json")
+    import jax
+
+    from openjax.commands.benchmark_cases import cases, fitting_settings
+    from openjax.commands.machine import describe_machine
+    from openjax.commands.step_shares import measure, shares_table
+    from openjax.commands.timing import time_compiled
+    from openjax.store.settings_files import write_json
+
     machine = describe_machine()
     print(f"{machine['device']}, JAX {machine['versions']['jax']}, commit {machine['commit']}", flush=True)
     rows, shares = [], []
@@ -81,7 +78,9 @@ def main(arguments: Sequence[str]) -> int:
         write_json(command.json, {**facts, "settings": command.settings, "rows": rows, "shares": shares})
 
     console = output_console()
-    for part, num_envs, steps, function, inputs in _cases(command):
+    for part, num_envs, steps, function, inputs in cases(
+        command.settings, command.parts, command.envs, command.training_envs, command.steps
+    ):
         timing = time_compiled(function, inputs, command.seconds)
         rows.append(_row(part, num_envs, steps, command.settings, timing))
         print(_line(rows[-1]), flush=True)
@@ -89,7 +88,7 @@ def main(arguments: Sequence[str]) -> int:
     if rows:
         console.print(results_table(rows))
     for num_envs in command.training_envs if "shares" in command.parts else ():
-        fitting = _fitting(command.settings, num_envs)
+        fitting = fitting_settings(command.settings, num_envs)
         found = measure(fitting, lambda *program: time_compiled(*program, command.seconds).seconds)
         if not found:
             console.print(f"shares of {fitting.num_envs:,} environments: out of memory")
@@ -102,108 +101,14 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
-def _cases(command: BenchmarkCommand) -> Iterator[tuple[str, int, int, Callable, tuple]]:
-    """(part, environments, control steps per call, function, its arguments), made one at a time."""
-    settings = command.settings
-    for part in command.parts:
-        if part == "shares":
-            continue
-        for num_envs in command.training_envs if part == "training" else command.envs:
-            if part == "training":
-                fitting = _fitting(settings, num_envs)
-                step = make_training_step(fitting)
-                yield (
-                    part,
-                    fitting.num_envs,
-                    fitting.rollout_length,
-                    step,
-                    (init_carry(fitting, jax.random.key(0)),),
-                )
-            elif part == "rollout":
-                yield part, num_envs, command.steps, *_rollout(settings, num_envs, command.steps)
-            elif part == "environment":
-                yield part, num_envs, command.steps, *_environment(settings, num_envs, command.steps)
-            else:
-                yield part, num_envs, command.steps, *_physics(part, settings, num_envs, command.steps)
+def _on_cpu():
+    import jax
+
+    return jax.default_backend() == "cpu"
 
 
-def _fitting(settings, num_envs):
-    """The settings with the nearest number of environments from above that they allow."""
-    for number in range(num_envs, num_envs + 10_000):
-        try:
-            return dataclasses.replace(settings, num_envs=number)
-        except UserError:
-            continue
-    raise UserError(f"training_envs {num_envs}: no number of environments from there on fits the settings")
-
-
-def _physics(part, settings, num_envs, steps):
-    """Drones of each world hover among a task's pillars and turn slowly."""
-    game, vehicle = settings.environment, load_vehicle()
-    drones_step = make_drones_step(
-        physics=part.removesuffix("_free"),
-        dt=game.time_step,
-        substeps=game.substeps,
-        contacts=not part.endswith("_free"),
-    )
-    tasks = _tasks(game, num_envs)
-    drones = jax.jit(jax.vmap(lambda task: hover_state(vehicle, task.pursuer_position)))(tasks)
-    command = action_to_command(jnp.broadcast_to(hover_action(vehicle), (game.num_pursuers, 4)))
-    command = command.at[:, 1:].add(0.1)
-
-    def run(drones, tasks):
-        def one(drones, _):
-            step = jax.vmap(lambda d, p, a: drones_step(vehicle, d, command, p, a, {}))
-            return step(drones, tasks.pillar_position, tasks.pillar_active), None
-
-        return jax.lax.scan(one, drones, None, length=steps)[0]
-
-    return run, (drones, tasks)
-
-
-def _environment(settings, num_envs, steps):
-    environment = Pursuit(settings.environment)
-    state = jax.jit(jax.vmap(environment.reset))(jax.random.split(jax.random.key(0), num_envs))[1]
-    key = jax.random.key(1)
-    action = 0.1 * jax.random.normal(key, (num_envs, settings.environment.num_pursuers, 4))
-    action = jnp.tanh(action + hover_action(environment.vehicle))
-
-    def run(state, action):
-        def one(state, _):
-            observation, state, reward, *_ = jax.vmap(environment.step, (None, 0, 0))(key, state, action)
-            # Observation and reward are used, else the compiler would leave them out.
-            used = sum(jnp.sum(leaf) for leaf in jax.tree.leaves(observation)) + jnp.sum(reward)
-            return state, used
-
-        return jax.lax.scan(one, state, None, length=steps)
-
-    return run, (state, action)
-
-
-def _rollout(settings, num_envs, steps):
-    parts = build(settings)
-    environment = parts.environment
-    keys = jax.random.split(jax.random.key(0), num_envs)
-    observation, state = jax.jit(jax.vmap(environment.reset))(keys)
-    first = jax.tree.map(lambda leaf: leaf[0], observation)
-    parameters = jax.jit(parts.policy.init)(jax.random.key(1), first)
-
-    def run(parameters, observation, state, key):
-        shape = (steps, num_envs, settings.environment.num_pursuers, parts.policy.sample_size)
-        return collect(
-            environment, parts.policy, parameters, observation, state, jax.random.normal(key, shape)
-        )
-
-    return run, (parameters, observation, state, jax.random.key(2))
-
-
-def _tasks(settings, num_envs):
-    keys = jax.random.split(jax.random.key(0), num_envs)
-    return jax.jit(jax.vmap(lambda key: uniform_task(settings, key)))(keys)
-
-
-def _row(part, num_envs, steps, settings, timing: Timing) -> dict:
-    """One measurement; an environment step moves one world by one control step, all its drones."""
+def _row(part, num_envs, steps, settings, timing) -> dict:
+    """One measurement (a `Timing`); an environment step moves one world by one control step, all its drones."""
     speed = None if timing.seconds is None else num_envs * steps / timing.seconds
     return {
         "part": part,

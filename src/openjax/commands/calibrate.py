@@ -1,4 +1,4 @@
-"""`python -m openjax.calibrate CASE_DIR`: fit the nominal vehicle's own constants to flights, with intervals
+"""`openjax calibrate CASE_DIR`: fit the nominal vehicle's own constants to flights, with intervals
 and with what the flights can't tell, and write a `vehicle.toml` that trainer and diagnosis load."""
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from openjax.commands.command_line import output_console, parse
 from openjax.errors import UserError
 from openjax.files import check_output
 
-PROGRAM = "python -m openjax.calibrate"
+PROGRAM = "openjax calibrate"
 
 
 @dataclass(frozen=True)

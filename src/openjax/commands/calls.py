@@ -29,7 +29,7 @@ def train(
     effects: str | Path | None = None,
     overwrite: bool = False,
 ) -> LoadedPolicy:
-    """Train as `python -m openjax.train` does, with its progress, checkpoints and pictures.
+    """Train as `openjax train` does, with its progress, checkpoints and pictures.
 
     Args:
       settings: of the run; None is the preset for this machine (`openjax.preset`).
@@ -75,7 +75,7 @@ def evaluate(
     effects: str | Path | None = None,
     **changes,
 ) -> dict | list[dict]:
-    """Fly a policy's mean on layouts as `python -m openjax.evaluate` does.
+    """Fly a policy's mean on layouts as `openjax evaluate` does.
 
     Args:
       policy: a loaded policy, what `openjax.load_policy` takes, or a pure function from the `Observation` of one world

@@ -1,4 +1,4 @@
-"""Diagnose the sim-to-real gap of flights: `python -m openjax.diagnose CASE_DIR [CASE_DIR ...]`."""
+"""Diagnose the sim-to-real gap of flights: `openjax diagnose CASE_DIR [CASE_DIR ...]`."""
 
 from __future__ import annotations
 
@@ -15,8 +15,10 @@ import tyro
 from openjax.commands.command_line import one_line, output_console, parse
 from openjax.errors import UserError
 from openjax.files import check_output_folder, replacing, write_json
+from openjax.vehicle.effect_names import effect_names
 
-PROGRAM = "python -m openjax.diagnose"
+PROGRAM = "openjax diagnose"
+_WITHOUT_HELP = f"Effects that the library must do without, of {', '.join(effect_names())}."
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,7 @@ class Options:
     """Diagnose the sim-to-real gap: where the simulator differs from flights, which effect causes it, how far
     it shrinks.
 
-    Writes OUT/<case>/report.html, report.json and effects.toml (which `python -m openjax.train --effects`
+    Writes OUT/<case>/report.html, report.json and effects.toml (which `openjax train --effects`
     flies with)."""
 
     cases: Annotated[tuple[Path, ...], tyro.conf.Positional]
@@ -36,8 +38,7 @@ class Options:
     """Where the reports go, one folder per case."""
     predictions: Path | None = None
     """Also write all cases' answers into this one JSON file."""
-    without: tuple[str, ...] = ()
-    """Effects that the library must do without."""
+    without: Annotated[tuple[str, ...], tyro.conf.arg(help=_WITHOUT_HELP)] = ()
     html: bool = True
     """Write report.html (pictures take about a second per case)."""
     overwrite: bool = False

@@ -1,4 +1,4 @@
-"""Evaluate a policy: `python -m openjax.evaluate --policy PATH --scenario NAME|FILE.toml`.
+"""Evaluate a policy: `openjax evaluate --policy PATH --scenario NAME|FILE.toml`.
 
 Prints, and with `--json` writes, for each scenario: scenario, episodes, capture_rate, capture_step,
 collision_rate, collision_parts, crash_rate, over_speed_rate, prediction_error.
@@ -15,10 +15,10 @@ import tyro
 from openjax.commands.command_line import output_console, parse
 from openjax.errors import UserError
 from openjax.files import check_output
-from openjax.pursuit import SCENARIOS, PursuitSettings, find_scenario
+from openjax.pursuit.settings import PursuitSettings
 from openjax.ranges import Interval, Seed
 
-PROGRAM = "python -m openjax.evaluate"
+PROGRAM = "openjax evaluate"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,6 +109,7 @@ def fly_scenarios(command: EvaluateCommand, loaded, evaluators: dict) -> tuple[l
 def _game(command, loaded):
     """The game of a command, the policy in it, and the scenarios."""
     from openjax.commands.evaluator import layout_slots
+    from openjax.pursuit.scenarios import SCENARIOS, find_scenario
     from openjax.store.environments import make_environment
 
     settings = command.environment

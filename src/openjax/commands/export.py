@@ -1,4 +1,4 @@
-"""`python -m openjax.export --policy open --format onnx --out DIR`: a policy for programs that don't know openjax.
+"""`openjax export --policy open --format onnx --out DIR`: a policy for programs that don't know openjax.
 
 All formats hold the mean policy of a whole team, predictor included: from the observation's arrays to actions (N, 4) in
 -1..1: collective thrust, roll, pitch and yaw rate; with `--own`, that of one pursuer, as a vehicle computes it on board.
@@ -19,7 +19,7 @@ from openjax.errors import UserError
 from openjax.files import check_output_folder, replacing
 from openjax.ranges import Interval, Seed
 
-PROGRAM = "python -m openjax.export"
+PROGRAM = "openjax export"
 TOLERANCE = 2e-5
 """Largest difference of an action that is put down to the order of sums."""
 NAMES = {"onnx": "policy.onnx", "jax": "policy.jax_export", "c": "policy.c"}

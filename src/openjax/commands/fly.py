@@ -1,7 +1,7 @@
-"""`python -m openjax.fly --policy PATH --uri URI [URI ...]`: fly a policy on Crazyflies, real or virtual.
+"""`openjax fly --policy PATH --uri URI [URI ...]`: fly a policy on Crazyflies, real or virtual.
 
 A hundred times a second from poses to body rates and thrust, through the real `cflib`. The flight is written as a case
-that `python -m openjax.diagnose` reads.
+that `openjax diagnose` reads.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from openjax.flying.limits import SafetySettings
 from openjax.flying.safety import Request
 from openjax.ranges import Interval
 
-PROGRAM = "python -m openjax.fly"
+PROGRAM = "openjax fly"
 FRESH = 0.05
 """No flight begins with poses older than this (s)."""
 KEYS = {" ": Request.STOP, "q": Request.STOP, "l": Request.LAND, "h": Request.HOLD}
@@ -171,7 +171,7 @@ def fly(arguments: Arguments):
         with replacing(arguments.out) as folder:
             folder.mkdir()
             write_case(folder, samples, record, described, about)
-        console.print(f"{arguments.out}: next, python -m openjax.diagnose {arguments.out}")
+        console.print(f"{arguments.out}: next, openjax diagnose {arguments.out}")
     return record
 
 

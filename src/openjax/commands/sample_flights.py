@@ -1,4 +1,4 @@
-"""`python -m openjax.sample_flights OUT`: make a case of three sample flights, to try calibration and
+"""`openjax sample_flights OUT`: make a case of three sample flights, to try calibration and
 diagnosis on."""
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ from openjax.commands.command_line import output_console, parse
 from openjax.errors import UserError
 from openjax.files import check_new_folder, replacing
 from openjax.ranges import Interval, Seed
+from openjax.vehicle.effect_names import effect_names
 
-PROGRAM = "python -m openjax.sample_flights"
+PROGRAM = "openjax sample_flights"
 
 VEHICLE_TOML = """\
 [vehicle]
@@ -37,6 +38,9 @@ DECIMALS = {"t": 2, "vbat": 3} | {
     c: 5 for c in ("x", "y", "z", "qw", "qx", "qy", "qz", "m1", "m2", "m3", "m4")
 }
 _REST = 4
+_EFFECT_HELP = (
+    f"What the vehicle suffers from that the simulator doesn't know: none, {', '.join(effect_names())}."
+)
 
 
 @dataclass(frozen=True)
@@ -45,8 +49,7 @@ class Arguments:
 
     out: Annotated[Path, tyro.conf.Positional]
     """Folder to write the case to; must not exist or be empty."""
-    effect: str = "none"
-    """What the vehicle suffers from that the simulator doesn't know: an effect's name, or "none"."""
+    effect: Annotated[str, tyro.conf.arg(help=_EFFECT_HELP)] = "none"
     duration: Annotated[float, Interval("[3, 120]")] = 10.0
     """Seconds per flight."""
     seed: Seed = 0

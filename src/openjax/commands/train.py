@@ -1,4 +1,4 @@
-"""Train pursuers: `python -m openjax.train [--preset NAME] [--out DIR] [--any.setting value]`.
+"""Train pursuers: `openjax train [--preset NAME] [--out DIR] [--any.setting value]`.
 
 Writes a run directory (see `openjax.store.run_directory`) with logs, checkpoints, the best policy and
 pictures. Ctrl-C or SIGTERM saves and exits; `--resume DIR` goes on exactly where it stopped.
@@ -8,16 +8,27 @@ From Python: `openjax.train(settings, out)`, see `openjax.commands.calls.train`.
 import time
 from collections.abc import Sequence
 
-from openjax.commands.command_line import peek
+from openjax.commands.command_line import parse, peek
 
 
 def main(arguments: Sequence[str], *, keep_traced: bool = False) -> int:
     """The command; returns its exit status. `keep_traced`: keep traced programs, too, in a process of their own."""
     started = time.monotonic()
-    if not {"-h", "--help"} & set(arguments) and peek(arguments, "process_id") in (None, "0"):
+    if {"-h", "--help"} & set(arguments):
+        return _help(arguments)
+    if peek(arguments, "process_id") in (None, "0"):
         print("openjax.train: loading JAX and MuJoCo ...", flush=True)  # takes seconds; nobody should wonder
     from openjax.cluster.joining import joined
     from openjax.commands.training_command import membership, read_command, start
 
     with joined(membership(arguments)) as processes:
         return start(read_command(arguments), arguments, started, processes, keep_traced=keep_traced)
+
+
+def _help(arguments):
+    """The options and a preset's defaults, without waiting for JAX to find its devices."""
+    from openjax.commands.training_options import PROGRAM, TrainCommand
+    from openjax.learning.settings import preset
+
+    default = TrainCommand(settings=preset(peek(arguments, "preset") or "quick"))
+    parse(TrainCommand, default, ["--help"], PROGRAM)  # prints and exits

@@ -1,4 +1,4 @@
-"""Options of `openjax.train`, their checks, and the start of a run: everything before the first array."""
+"""What `openjax train` was asked for, checked, and the start of a run: everything before the first array."""
 
 import contextlib
 import dataclasses
@@ -6,10 +6,8 @@ import shutil
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
 
 import jax
-import tyro
 
 from openjax.cluster.compilation import cache_programs
 from openjax.cluster.joining import Membership, find_membership
@@ -17,69 +15,15 @@ from openjax.cluster.processes import Processes
 from openjax.commands.command_line import output_console, parse, peek
 from openjax.commands.machine import describe_machine
 from openjax.commands.training_job import TrainingJob, run_job
+from openjax.commands.training_options import MAY_CHANGE, PROGRAM, TrainCommand
 from openjax.errors import UserError
 from openjax.learning import TrainSettings, preset
 from openjax.learning.settings import PRESETS
-from openjax.ranges import Interval
 from openjax.store.checkpoints import Checkpoints
 from openjax.store.environments import make_environment
 from openjax.store.policies import known_policies
 from openjax.store.run_directory import RunDirectory, check_free, create_run, locked, open_run
 from openjax.store.settings_files import to_plain
-
-PROGRAM = "python -m openjax.train"
-
-MAY_CHANGE = ("total_steps", "validation_interval", "validation_episodes")
-"""Settings that a resumed run may have otherwise; all else goes on as it was."""
-
-
-@dataclasses.dataclass(frozen=True)
-class TrainCommand:
-    """Train pursuers to capture a faster evader.
-
-    Every setting of the run can be given, for example --environment.capture_radius 0.2 or --mappo.epochs 2;
-    the defaults shown are those of the preset.
-    """
-
-    preset: str | None = None
-    """quick: minutes on two CPU cores, an easier game; paper: the paper's task on an accelerator; by default what fits."""
-    out: Path | None = None
-    """Directory of the run; by default runs/DATE-PRESET."""
-    steps: Annotated[int | None, Interval("[1, 1e15]")] = None
-    """Environment steps of the whole run, short for --total_steps."""
-    minutes: Annotated[float | None, Interval("(0, 1000000]")] = None
-    """Stop after this time, compilation included; a resumed run has it anew."""
-    resume: Path | None = None
-    """Go on with the run in this directory, exactly where it stopped."""
-    start_from: str | None = None
-    """Start with the networks of this policy (a run, a policy file or a name) instead of fresh ones."""
-    overwrite: bool = False
-    """Replace the run that --out already holds."""
-    effects: Path | None = None
-    """Physical effects to fly with (effects.toml, as the diagnosis writes it)."""
-    vehicle: Path | None = None
-    """Vehicle to fly (vehicle.toml, as the calibration writes it); by default the nominal Crazyflie."""
-    devices: str = "1"
-    """Number of devices to train on, or all (of all processes)."""
-    coordinator_address: str | None = None
-    """With several processes: host:port of process 0. Slurm and Open MPI tell it."""
-    num_processes: Annotated[int | None, Interval("[1, 100000]")] = None
-    """How many processes train together, for example one per host. Slurm and Open MPI tell it."""
-    process_id: Annotated[int | None, Interval("[0, 99999]")] = None
-    """Which of them this one is, from 0. Slurm and Open MPI tell it."""
-    compilation_cache: bool = True
-    """Keep compiled programs in the user's cache folder, so that the next run starts sooner."""
-    traced_programs: bool | None = None
-    """Keep traced programs there, too, so that the next run traces nothing; by default on a CPU."""
-    layout_episodes: Annotated[int | None, Interval("[1, 100000]")] = None
-    """Episodes per layout in the final table; by default 100 on an accelerator, 32 on a CPU, and 1 where all are alike, as
-    starts are level."""
-    compare_with: str | None = None
-    """Policy (a name, a file, a run) that the final table and the animation show beside the trained one, or none; by
-    default open after the preset quick."""
-    settings: Annotated[tyro.conf.FlagConversionOff[TrainSettings], tyro.conf.arg(name="")] = (
-        dataclasses.field(default_factory=TrainSettings)
-    )
 
 
 def read_command(arguments: Sequence[str]) -> TrainCommand:

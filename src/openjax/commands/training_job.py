@@ -111,7 +111,7 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
     title = f"openjax.train → {directory.path}"
     with StopRequest() as stop, Progress(title, settings.total_steps, console) as progress:
         checkpoints = Checkpoints(directory.checkpoints, processes=processes, score_rule=SCORE_RULE)
-        processes.advice = f"go on with python -m openjax.train --resume {directory.path} --devices all"
+        processes.advice = f"go on with openjax train --resume {directory.path} --devices all"
         progress.phase("compiling the start: networks, first tasks")
         start, step, abstract = _programs(job)
         step_ready = compile_ahead(step, abstract)  # takes longest, so it comes first
@@ -174,7 +174,7 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
         if signals:
             progress.message(
                 f"{signals[0]}: saved at update {outcome.update}; "
-                f"go on with python -m openjax.train --resume {directory.path}"
+                f"go on with openjax train --resume {directory.path}"
             )
             return 0
         if settings.analytic.updates:

@@ -1,4 +1,4 @@
-"""Watch a policy in three dimensions in a browser: `python -m openjax.view --policy open --scenario wall`.
+"""Watch a policy in three dimensions in a browser: `openjax view --policy open --scenario wall`.
 
 Needs `pip install viser`.
 """
@@ -13,7 +13,7 @@ from openjax.commands.evaluate import EvaluateCommand, fly_scenarios
 from openjax.errors import UserError
 from openjax.ranges import Interval, Seed
 
-PROGRAM = "python -m openjax.view"
+PROGRAM = "openjax view"
 
 
 @dataclasses.dataclass(frozen=True)

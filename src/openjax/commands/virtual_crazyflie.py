@@ -1,4 +1,4 @@
-"""`python -m openjax.virtual_crazyflie`: Crazyflies that are simulated, for everything that speaks to real ones.
+"""`openjax virtual_crazyflie`: Crazyflies that are simulated, for everything that speaks to real ones.
 
 They answer CRTP over UDP as `cflib` expects (`udp://127.0.0.1:19850` and on); inside fly openjax's vehicles in real
 time, rate loop at 500 Hz, with any effects, and a link with latency and loss to order.
@@ -18,7 +18,7 @@ from openjax.commands.command_line import output_console, parse
 from openjax.ranges import Interval, Seed
 from openjax.virtual_crazyflie.link import BASE_PORT, LinkFaults
 
-PROGRAM = "python -m openjax.virtual_crazyflie"
+PROGRAM = "openjax virtual_crazyflie"
 
 
 @dataclass(frozen=True)

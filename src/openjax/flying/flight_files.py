@@ -1,4 +1,4 @@
-"""What a flight leaves behind: a case that `python -m openjax.diagnose` reads, and `flight.json` about the flight.
+"""What a flight leaves behind: a case that `openjax diagnose` reads, and `flight.json` about the flight.
 
 One log per game, with all vehicles in it: a row for each moment at which something was sampled on board. Commands are
 those in force at that moment, as sent: body rates and thrust.

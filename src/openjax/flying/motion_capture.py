@@ -7,7 +7,7 @@ The adapter of a laboratory is one function that runs for as long as there are p
             for vehicle, body in enumerate(frame.bodies):
                 update(vehicle, body.position, body.quaternion)      # metres, wxyz, body to world
 
-and `python -m openjax.fly --motion_capture my_lab:poses`. Velocities are differences, smoothed; body rates come from the
+and `openjax fly --motion_capture my_lab:poses`. Velocities are differences, smoothed; body rates come from the
 gyroscope on board. Each pose is also sent to its vehicle, for the estimator on board and for the guard, which flies by it.
 """
 

@@ -1,0 +1,68 @@
+"""Every command of the package: `openjax NAME ...`, or `python -m openjax NAME ...`."""
+
+import difflib
+import functools
+import importlib
+import sys
+from collections.abc import Sequence
+
+from openjax import __version__
+from openjax.commands.command_line import run_command
+from openjax.errors import UserError
+
+COMMANDS = {
+    "train": "train pursuers, or go on with a run",
+    "evaluate": "fly policies on layouts: captures, collisions, crashes",
+    "view": "watch episodes in three dimensions, in a browser or as an HTML file",
+    "sample_flights": "write logs of a simulated vehicle with an effect, to try the diagnosis on",
+    "diagnose": "say from flight logs what causes the sim-to-real gap, or what changed",
+    "calibrate": "fit thrust, torque, motor lag and inertia of the nominal vehicle to flights",
+    "adapt": "diagnose flights and fine-tune a policy to the vehicle that flew them",
+    "fly": "fly a policy on Crazyflies, virtual or real",
+    "virtual_crazyflie": "simulate Crazyflies that answer as real ones do",
+    "export": "write a policy as ONNX, jax.export or C99",
+    "benchmark": "measure steps per second on this machine",
+}
+"""What each does; the module of the same name in `openjax.commands` holds its `main(arguments)`."""
+
+
+def usage() -> str:
+    """The help text."""
+    width = max(map(len, COMMANDS))
+    rows = "\n".join(f"  {name:{width}}  {text}" for name, text in COMMANDS.items())
+    return (
+        "usage: openjax COMMAND [OPTIONS]      (openjax COMMAND --help says more)\n\n"
+        f"{rows}\n\n"
+        "Pursuit-evasion of quadrotors in JAX, and a diagnosis of the sim-to-real gap.\n"
+        "First: openjax view, openjax train, openjax sample_flights my_flights --effect rotor_drag"
+    )
+
+
+def main(arguments: Sequence[str]) -> int | None:
+    """Run the command that the first argument names; returns its exit status. Raises UserError for an unknown one."""
+    name = arguments[0] if arguments else "--help"
+    if name in ("-h", "--help", "help"):
+        print(usage())
+        return 0
+    if name in ("-V", "--version"):
+        print(f"openjax {__version__}")
+        return 0
+    command = name.replace("-", "_")
+    if command not in COMMANDS:
+        close = difflib.get_close_matches(command, COMMANDS, n=1, cutoff=0.5)
+        hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(COMMANDS)}"
+        raise UserError(f"{name}: no such command; {hint}")
+    run = importlib.import_module(f"openjax.commands.{command}").main
+    if command == "train":  # a process of its own: nobody can have changed a function of the package
+        run = functools.partial(run, keep_traced=True)
+    return run(arguments[1:])
+
+
+def entry() -> None:
+    """What the installed script `openjax` calls."""
+    run_command(main)
+
+
+if __name__ == "__main__":
+    sys.argv[0] = "openjax"
+    entry()

@@ -1,0 +1,119 @@
+"""What `openjax benchmark` times: physics, environment, rollout and the training step, each as one function."""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+
+import jax
+import jax.numpy as jnp
+
+from openjax.errors import UserError
+from openjax.learning import TrainSettings, build, init_carry, make_training_step
+from openjax.learning.rollout import collect
+from openjax.pursuit import Pursuit, hover_action, uniform_task
+from openjax.pursuit.environment import action_to_command
+from openjax.vehicle import hover_state, load_vehicle, make_drones_step
+
+
+def cases(
+    settings: TrainSettings,
+    parts: Sequence[str],
+    envs: Sequence[int],
+    training_envs: Sequence[int],
+    steps: int,
+) -> Iterator[tuple[str, int, int, Callable, tuple]]:
+    """(part, environments, control steps per call, function, its arguments), made one at a time."""
+    for part in parts:
+        if part == "shares":
+            continue
+        for num_envs in training_envs if part == "training" else envs:
+            if part == "training":
+                fitting = fitting_settings(settings, num_envs)
+                step = make_training_step(fitting)
+                yield (
+                    part,
+                    fitting.num_envs,
+                    fitting.rollout_length,
+                    step,
+                    (init_carry(fitting, jax.random.key(0)),),
+                )
+            elif part == "rollout":
+                yield part, num_envs, steps, *_rollout(settings, num_envs, steps)
+            elif part == "environment":
+                yield part, num_envs, steps, *_environment(settings, num_envs, steps)
+            else:
+                yield part, num_envs, steps, *_physics(part, settings, num_envs, steps)
+
+
+def fitting_settings(settings: TrainSettings, num_envs: int) -> TrainSettings:
+    """The settings with the nearest number of environments from above that they allow."""
+    for number in range(num_envs, num_envs + 10_000):
+        try:
+            return dataclasses.replace(settings, num_envs=number)
+        except UserError:
+            continue
+    raise UserError(f"training_envs {num_envs}: no number of environments from there on fits the settings")
+
+
+def _physics(part, settings, num_envs, steps):
+    """Drones of each world hover among a task's pillars and turn slowly."""
+    game, vehicle = settings.environment, load_vehicle()
+    drones_step = make_drones_step(
+        physics=part.removesuffix("_free"),
+        dt=game.time_step,
+        substeps=game.substeps,
+        contacts=not part.endswith("_free"),
+    )
+    tasks = _tasks(game, num_envs)
+    drones = jax.jit(jax.vmap(lambda task: hover_state(vehicle, task.pursuer_position)))(tasks)
+    command = action_to_command(jnp.broadcast_to(hover_action(vehicle), (game.num_pursuers, 4)))
+    command = command.at[:, 1:].add(0.1)
+
+    def run(drones, tasks):
+        def one(drones, _):
+            step = jax.vmap(lambda d, p, a: drones_step(vehicle, d, command, p, a, {}))
+            return step(drones, tasks.pillar_position, tasks.pillar_active), None
+
+        return jax.lax.scan(one, drones, None, length=steps)[0]
+
+    return run, (drones, tasks)
+
+
+def _environment(settings, num_envs, steps):
+    environment = Pursuit(settings.environment)
+    state = jax.jit(jax.vmap(environment.reset))(jax.random.split(jax.random.key(0), num_envs))[1]
+    key = jax.random.key(1)
+    action = 0.1 * jax.random.normal(key, (num_envs, settings.environment.num_pursuers, 4))
+    action = jnp.tanh(action + hover_action(environment.vehicle))
+
+    def run(state, action):
+        def one(state, _):
+            observation, state, reward, *_ = jax.vmap(environment.step, (None, 0, 0))(key, state, action)
+            # Observation and reward are used, else the compiler would leave them out.
+            used = sum(jnp.sum(leaf) for leaf in jax.tree.leaves(observation)) + jnp.sum(reward)
+            return state, used
+
+        return jax.lax.scan(one, state, None, length=steps)
+
+    return run, (state, action)
+
+
+def _rollout(settings, num_envs, steps):
+    parts = build(settings)
+    environment = parts.environment
+    keys = jax.random.split(jax.random.key(0), num_envs)
+    observation, state = jax.jit(jax.vmap(environment.reset))(keys)
+    first = jax.tree.map(lambda leaf: leaf[0], observation)
+    parameters = jax.jit(parts.policy.init)(jax.random.key(1), first)
+
+    def run(parameters, observation, state, key):
+        shape = (steps, num_envs, settings.environment.num_pursuers, parts.policy.sample_size)
+        return collect(
+            environment, parts.policy, parameters, observation, state, jax.random.normal(key, shape)
+        )
+
+    return run, (parameters, observation, state, jax.random.key(2))
+
+
+def _tasks(settings, num_envs):
+    keys = jax.random.split(jax.random.key(0), num_envs)
+    return jax.jit(jax.vmap(lambda key: uniform_task(settings, key)))(keys)
