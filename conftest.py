@@ -31,7 +31,7 @@ LONGEST = """
     tests/gap/test_diagnosis tests/cluster/test_distributed tests/test_commands tests/learning/test_training_step
     tests/test_examples tests/test_readme experiments/tests/test_exam tests/vehicle/test_effects
     tests/vehicle/test_flight_dynamics experiments/tests/test_scaling tests/test_adapt tests/commands/test_validation
-    experiments/tests/test_fuzz
+    tests/fuzz/test_fuzz
 """.split()
 """The files that take longest: they come first, so that no worker is left with one of them when all else is done."""
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from flax import struct
 
 FOUND = Path(__file__).with_name("parameters.json")
-"""Written by `experiments.baseline_search`: {method: {parameter: value}}."""
+"""{method: {parameter: value}}: the best of 512 sets each on training tasks, by capture rate, step and collisions."""
 
 Parameters = TypeVar("Parameters")
 

@@ -18,7 +18,7 @@ from openjax.pursuit.observation import rotation_axes
 
 @dataclasses.dataclass(frozen=True)
 class Gains:
-    """Of the controller. What others do is measured by `experiments.velocity_gains`."""
+    """Of the controller."""
 
     velocity: float | jax.Array = 6.0
     """1/s, velocity error to acceleration: slower than the attitude, whose lag is that of the motors (25 ms) and of the

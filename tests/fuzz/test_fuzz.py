@@ -1,12 +1,12 @@
-"""A few hundred hostile inputs and a few damaged checkpoints; `python -m experiments.fuzz` tries thousands."""
+"""A few hundred hostile inputs, changed at random from fixed seeds, and a few damaged checkpoints."""
 
 from collections import Counter
 
 import pytest
 
-from experiments.fuzz.cases import try_cases
-from experiments.fuzz.damages import make_checkpoints, try_damages
-from experiments.fuzz.inputs import KINDS
+from tests.fuzz.cases import try_cases
+from tests.fuzz.damages import make_checkpoints, try_damages
+from tests.fuzz.inputs import KINDS
 
 NUMBER = {"settings files": 60, "layouts": 60, "effects files": 60, "vehicle files": 60}
 

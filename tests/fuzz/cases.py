@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.fuzz.inputs import KINDS
 from openjax.commands.command_line import LONGEST, one_line
+from tests.fuzz.inputs import KINDS
 
 SECONDS, MEGABYTES = 30.0, 1000.0
 
@@ -38,7 +38,7 @@ def finite(tree) -> bool:
 
 def try_case(kind: str, seed: int) -> tuple[str, str]:
     """One case: `refused`, `accepted` or `failed`, and what is to be told of it."""
-    function = KINDS[kind][0]
+    function = KINDS[kind]
     rng = random.Random(f"{kind} {seed}")
     memory, started = _megabytes(), time.process_time()
     with tempfile.TemporaryDirectory() as folder:
@@ -77,16 +77,3 @@ def try_cases(kind: str, seeds: range) -> list[tuple[str, int, str, str]]:
         try_case(kind, -1)
         _warm.add(kind)
     return [(kind, seed, *try_case(kind, seed)) for seed in seeds]
-
-
-def plan(cases: int, seed: int, piece: int = 20) -> list[tuple[str, range]]:
-    """The cases, in pieces that one process does at a time."""
-    total = sum(share for _, share in KINDS.values())
-    pieces = []
-    for kind, (_, share) in KINDS.items():
-        number = max(1, round(cases * share / total))
-        first = seed * 1_000_000
-        pieces += [
-            (kind, range(i, min(i + piece, first + number))) for i in range(first, first + number, piece)
-        ]
-    return pieces

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.fuzz.mutations import changed_bytes
+from tests.fuzz.mutations import changed_bytes
 
 TINY = """--preset quick --environment.time_step 0.01 --environment.substeps 1
     --environment.episode_length 20 --environment.physics rigid --environment.capture_radius 1.0

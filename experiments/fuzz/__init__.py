@@ -1,1 +1,0 @@
-"""Hostile input, damaged checkpoints, kills at any instant, and what openjax makes of them."""
