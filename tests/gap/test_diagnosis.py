@@ -1,6 +1,8 @@
 """The diagnosis on flights whose cause is known: the right name, honest parameters, and honest refusals."""
 
+import gzip
 import json
+import shutil
 import sys
 
 import numpy as np
@@ -163,6 +165,32 @@ def test_the_command_writes_everything_or_nothing(folders, reports, tmp_path, ca
     capsys.readouterr()
     assert main([str(folders["drag"]), "--out", str(out)]) == 2
     assert "already exists" in capsys.readouterr().err
+
+
+def test_a_fault_in_one_case_does_not_cost_the_others(folders, reports, tmp_path, capsys, monkeypatch):
+    def diagnosed(case, *_):
+        return {"drag": reports["drag"]}[case.name]  # KeyError: what no check has foreseen
+
+    monkeypatch.setattr("openjax.gap.diagnosis.diagnose_case", diagnosed)
+    out = tmp_path / "out"
+    assert main([str(folders["none"]), str(folders["drag"]), "--out", str(out), "--no-html"]) == 0
+    said = capsys.readouterr()
+    assert said.err.startswith("error: none: KeyError") and said.err.count("\n") == 1
+    assert sorted(p.name for p in out.iterdir()) == ["drag"] and "report.html" not in said.out
+
+
+def test_a_log_without_a_whole_attitude_is_diagnosed_and_one_left_out_is_named(folders, tmp_path, capsys):
+    folder = tmp_path / "case"
+    shutil.copytree(folders["drag"], folder)
+    for path in folder.glob("*.csv.gz"):
+        rows = [line.split(",") for line in gzip.decompress(path.read_bytes()).decode().splitlines()]
+        keep = [k for k, name in enumerate(rows[0]) if name != "qz"]
+        text = "\n".join(",".join(row[k] for k in keep) for row in rows) + "\n"
+        path.write_bytes(gzip.compress(text.encode()))
+    (folder / "torn.csv").write_text("t,wx\n1,2\n")
+    assert main([str(folder), "--out", str(tmp_path / "out")]) == 0
+    assert "Left out: torn.csv" in capsys.readouterr().out
+    assert "Left out: torn.csv" in (tmp_path / "out" / "case" / "report.html").read_text()
 
 
 @pytest.mark.parametrize("kind", ["missing", "empty", "no_commands", "unknown_effect"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -92,11 +93,23 @@ def run(options: Options) -> int:
             failed += 1
             print(f"error: {one_line(error)}", file=sys.stderr)
             continue
+        except Exception as error:  # a fault of the program in one case must not cost the others
+            failed += 1
+            print(f"error: {_unforeseen(name, error)}", file=sys.stderr)
+            continue
         predictions[name] = report.prediction()
-        _show(console, report, options.out / name)
+        _show(console, report, options)
     if options.predictions is not None and predictions:
         write_json(options.predictions, predictions)
     return 2 if failed == len(names) else 0
+
+
+def _unforeseen(name: str, error: Exception) -> str:
+    """One line on a fault of the program: the case, what was raised, and where."""
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    where = f"{Path(place.filename).name}:{place.lineno}"
+    text = " ".join(str(error).split())
+    return f"{name}: {type(error).__name__} in {where} ({text}): a fault of the program, please report it"
 
 
 def _compare(options: Options, names: list[str], console) -> int:
@@ -118,6 +131,10 @@ def _compare(options: Options, names: list[str], console) -> int:
         except UserError as error:
             failed += 1
             print(f"error: {one_line(error)}", file=sys.stderr)
+            continue
+        except Exception as error:  # as above
+            failed += 1
+            print(f"error: {_unforeseen(name, error)}", file=sys.stderr)
             continue
         predictions[name] = changes_report.prediction(change)
         body = "\n".join(
@@ -147,10 +164,11 @@ def _write(report, folder: Path, pictures: bool) -> None:
         write_report(report, partial, pictures)
 
 
-def _show(console, report, folder: Path) -> None:
+def _show(console, report, options: Options) -> None:
     from rich.panel import Panel
     from rich.text import Text
 
     title = f"{report.case}: {', '.join(report.effects) or report.verdict}"
-    body = "\n".join([*report.in_words(), f"({report.seconds:.1f} s; {folder}/report.html)"])
+    written = options.out / report.case / ("report.html" if options.html else "report.json")
+    body = "\n".join([*report.in_words(), f"({report.seconds:.1f} s; {written})"])
     console.print(Panel(Text(body), title=title, title_align="left"))

@@ -85,7 +85,9 @@ def conclude(evidence: Evidence) -> Report:
         gap=parts.gap,
         not_testable=missing,
         next_flight=CARDS[splitter].next_flight if splitter in CARDS else "",
-        quality=[{"flight": i.flight, "issue": i.issue} for i in evidence.case.quality],
+        quality=[
+            {"flight": i.flight, "issue": i.issue, "left_out": i.refused} for i in evidence.case.quality
+        ],
         runner_up=f"{second} ({chances[second]:.2f})" if second and chances[second] > 0.01 else "",
         rest=_rest_in_words(rest),
         sensors=tuple(evidence.sensors.findings.values()),

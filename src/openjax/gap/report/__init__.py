@@ -51,7 +51,7 @@ class Report:
     gap: Gap
     not_testable: list[str]
     next_flight: str
-    quality: list[dict[str, str]]
+    quality: list[dict]
     runner_up: str = ""
     rest: str = ""
     sensors: tuple[str, ...] = ()
@@ -59,6 +59,11 @@ class Report:
     nuisances: dict[str, str] = field(default_factory=dict)
     seconds: float = 0.0
     plots: dict = field(default_factory=dict, repr=False)
+
+    @property
+    def left_out(self) -> list[str]:
+        """Logs that weren't used, each with the reason."""
+        return [f"{q['flight']}: {q['issue']}" for q in self.quality if q.get("left_out")]
 
     def prediction(self) -> dict:
         """The case's entry in a predictions file."""
@@ -133,7 +138,8 @@ class Report:
 
     def in_words(self) -> list[str]:
         """The shares, then what they mean, in a few plain sentences."""
-        lines = [self.shares_in_words()] if self.effects or self.sensors else []
+        lines = [f"Left out: {text}." for text in self.left_out]
+        lines += [self.shares_in_words()] if self.effects or self.sensors else []
         if self.verdict == "not_testable":
             lines.append("No effect is seen, but these flights could not show most of those that are usual.")
         elif self.verdict == "none":

@@ -128,7 +128,7 @@ def _coordinate(report: Report):
     """Force along the effect's channel against the variable that drives it, binned, before and after."""
     evidence = report.plots["evidence"]
     effect = next((e for e in report.effects if e != "unknown"), None)
-    if effect is None or not evidence.replay.usable[3]:
+    if effect is None or not evidence.replay.usable[3] or evidence.tracks[0].quaternion is None:
         return None
     coordinate = CARDS[effect].coordinate
     points = {0: [], 1: []}
