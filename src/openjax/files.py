@@ -1,6 +1,7 @@
 """Files that people hand in, read strictly; files that openjax writes, whole or not at all."""
 
 import contextlib
+import hashlib
 import json
 import os
 import shutil
@@ -86,8 +87,8 @@ def _check_plain(path, value):
 def replacing(path: str | Path) -> Iterator[Path]:
     """A path to write a file or folder to; it takes the place of `path` when the block ends without an error.
 
-    Readers see what was there before or the whole of the new; after an error nothing of the new is left. Whatever the
-    disk or the permissions have against it is an `OSError`.
+    Readers see what was there before or the whole of the new, also after a power failure; after an error nothing of the
+    new is left. Whatever the disk or the permissions have against it is an `OSError`.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -95,15 +96,46 @@ def replacing(path: str | Path) -> Iterator[Path]:
     partial = path.with_name(f"{WRITING}{os.getpid()}-{path.name}")
     try:
         yield partial
+        for written in (partial, *partial.rglob("*")) if partial.is_dir() else (partial,):
+            _flush(written)
         if path.is_dir() and not path.is_symlink():
             if not partial.is_dir():
                 raise IsADirectoryError(21, "is a folder", str(path))
             shutil.rmtree(path)
         os.replace(partial, path)
+        _flush(path.parent)
     except BaseException:
         with contextlib.suppress(OSError):
             shutil.rmtree(partial) if partial.is_dir() else partial.unlink(missing_ok=True)
         raise
+
+
+def _flush(path):
+    """Wait until a file's content, or a folder's names, are on the disk."""
+    if path.is_dir() and os.name == "nt":  # folders can't be opened there
+        return
+    descriptor = os.open(path, os.O_RDONLY if os.name != "nt" else os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def write_checked(path: str | Path, content: bytes) -> None:
+    """Write a file in one piece, its SHA-256 before its content; for `read_checked`."""
+    with replacing(path) as partial:
+        partial.write_bytes(hashlib.sha256(content).digest() + content)
+
+
+def read_checked(path: str | Path) -> bytes | None:
+    """The content of a file of `write_checked`; None where there is none, or it isn't whole."""
+    try:
+        written = Path(path).read_bytes()
+    except OSError:
+        return None
+    size = hashlib.sha256().digest_size
+    digest, content = written[:size], written[size:]
+    return content if hashlib.sha256(content).digest() == digest else None
 
 
 def write_text(path: str | Path, text: str) -> None:

@@ -1,9 +1,13 @@
 """Compiling: once per machine, by a cache that lasts, and in the background, so that programs are compiled side by side."""
 
+import contextlib
 import hashlib
+import logging
 import os
 import platform
+import stat
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,33 +16,82 @@ from openjax.background import in_background
 CACHE_SIZE = 2 * 2**30
 """Bytes that the cache of compiled programs may take; what was used longest ago goes first."""
 
+_LOGGER = logging.getLogger(__name__)
 _WORTH_KEEPING = 0.5
 """Seconds of compilation from which a program is kept."""
 
 
 def cache_programs() -> Path | None:
-    """Have JAX keep compiled programs in the user's cache folder, and take them from there next time.
+    """Have JAX keep compiled programs in the user's cache folder, each with a checksum, and take them from there next time.
 
     JAX itself knows a program again by its code, its compiler and its devices; the folder is this processor's, as code
     for one need not run on another that shares the home. Where JAX was already told of a folder
-    (JAX_COMPILATION_CACHE_DIR), that one is used.
+    (JAX_COMPILATION_CACHE_DIR), that one is used. A program that an earlier process died of is compiled anew, and said.
 
     Returns:
-      the folder; None where none can be written to, so that nothing is kept.
+      the folder; None where no folder of the user's own can be written to, so that nothing is kept.
     """
     import jax
 
-    if jax.config.jax_compilation_cache_dir is not None:
-        return Path(jax.config.jax_compilation_cache_dir)
-    folder = _user_cache() / "openjax" / f"{jax.__version__}-{_processor_key()}"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        _bound(folder.parent, CACHE_SIZE)
-    except OSError:
+    from openjax.cluster.checked_cache import set_fatal_entries_aside, use_checked_cache
+
+    given = jax.config.jax_compilation_cache_dir
+    if given is not None and "://" in given:  # a bucket; JAX reads it by itself
+        return Path(given)
+    folder = _own_folder() if given is None else Path(given)
+    if folder is None:
         return None
+    if given is not None and folder.exists() and not _is_private(folder):
+        _LOGGER.warning("others can write to %s, and so run what they like here: chmod go-w it", folder)
+    if fatal := set_fatal_entries_aside(folder):
+        _LOGGER.warning(
+            "an earlier start died while loading a compiled program (%s); it's compiled anew", fatal[0]
+        )
+    use_checked_cache()
     jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", _WORTH_KEEPING)
+    # XLA's own caches have no checksums
+    jax.config.update("jax_persistent_cache_enable_xla_caches", "none")
+    if given is None:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", _WORTH_KEEPING)
     return folder
+
+
+def _own_folder():
+    """A folder that only this user can write to, as a program in it is run; None where none can be had."""
+    import jax
+
+    for top in _candidates():
+        try:
+            top.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if _is_own(top):
+                top.chmod(0o700)  # earlier versions left that to the umask
+            if not _is_private(top):
+                continue
+            folder = top / f"{jax.__version__}-{_processor_key()}"
+            folder.mkdir(exist_ok=True)
+            _bound(top, CACHE_SIZE)
+        except OSError:
+            continue
+        return folder
+    return None
+
+
+def _candidates():
+    """Where the folder may be, the usual place first; a user without a home has only the last."""
+    with contextlib.suppress(RuntimeError):
+        yield _user_cache() / "openjax"
+    yield Path(tempfile.gettempdir()) / f"openjax-{os.geteuid() if hasattr(os, 'geteuid') else os.getlogin()}"
+
+
+def _is_own(folder):
+    """Whether it's a folder, no link to one, and this user's."""
+    status = folder.lstat()
+    return stat.S_ISDIR(status.st_mode) and (not hasattr(os, "geteuid") or status.st_uid == os.geteuid())
+
+
+def _is_private(folder):
+    """Whether nobody but its user can write to a folder that is this user's own."""
+    return _is_own(folder) and (os.name == "nt" or not folder.stat().st_mode & 0o022)
 
 
 def _user_cache():

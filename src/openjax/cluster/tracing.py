@@ -10,7 +10,7 @@ import jax
 from jax import export
 
 import openjax
-from openjax.files import replacing
+from openjax.files import read_checked, write_checked
 from openjax.vehicle.parameters import assets_directory
 
 _KERNELS = ("__gpu$xla.gpu.triton", "triton_kernel_call", "triton_kernel_call_ffi")
@@ -42,7 +42,7 @@ def recalled(
     program = _read(file)
     if program is None:
         try:
-            _write(file, _export(function, arguments, type(carry)))
+            write_checked(file, bytes(_export(function, arguments, type(carry)).serialize()))
         except (ValueError, NotImplementedError, OSError):  # a call that can't be kept, a full disk
             return function
         program = _read(file)  # also now, so that it's the same program the first time
@@ -80,22 +80,10 @@ def _replaced(tree, kind, change):
     return jax.tree.map(lambda part: change(part) if is_one(part) else part, tree, is_leaf=is_one)
 
 
-def _write(file, program):
-    file.parent.mkdir(parents=True, exist_ok=True)
-    text = bytes(program.serialize())
-    with replacing(file) as partial:
-        partial.write_bytes(_DIGEST(text).digest() + text)
-
-
 def _read(file):
     """The program in a file; None where there is none, or none that is whole."""
-    try:
-        content = file.read_bytes()
-    except OSError:
-        return None
-    size = _DIGEST().digest_size
-    digest, text = content[:size], content[size:]
-    return export.deserialize(bytearray(text)) if _DIGEST(text).digest() == digest else None
+    text = read_checked(file)
+    return None if text is None else export.deserialize(bytearray(text))
 
 
 def _key(name, arguments, made_from):

@@ -21,9 +21,12 @@ from openjax.store.policy_files import WEIGHTS, fill, load_policy_file, shipped_
 from openjax.store.run_directory import RunDirectory, is_run
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class LoadedPolicy:
-    """A trained policy or a heuristic, called with observations of its game: `openjax.make(policy.settings.environment)`."""
+    """A trained policy or a heuristic, called with observations of its game: `openjax.make(policy.settings.environment)`.
+
+    It goes into `jax.jit` and `jax.vmap` as it is; two are the same only if they're one object.
+    """
 
     policy: Policy | Heuristic
     parameters: PolicyParameters

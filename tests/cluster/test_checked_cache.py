@@ -1,0 +1,78 @@
+"""The cache of compiled programs: damage, a death while loading, and folders that others can write to."""
+
+import os
+import stat
+import subprocess
+import sys
+
+import pytest
+
+from experiments.cache_flips import run_flips
+from openjax.cluster.checked_cache import ASIDE, ENTRY, CheckedCache, set_fatal_entries_aside
+
+
+def test_flipped_bits_end_no_process_and_change_no_number(tmp_path):
+    assert run_flips(8, tmp_path) == {"flips": 8, "deaths": 0, "other_numbers": 0, "noticed": 8}
+
+
+def test_an_entry_that_a_process_died_of_is_set_aside_and_no_other(tmp_path):
+    cache = CheckedCache(tmp_path)
+    for key in ("fatal", "fine"):
+        cache.put(key, b"program")
+    die = f"""
+import os, signal
+from pathlib import Path
+from openjax.cluster.checked_cache import CheckedCache
+cache = CheckedCache(Path({str(tmp_path)!r}))
+with cache.loading("fine"):
+    cache.get("fine")
+with cache.loading("fatal"):
+    cache.get("fatal")
+    os.kill(os.getpid(), signal.SIGILL)
+"""
+    with cache.loading("fine"):  # by a process that lives
+        assert subprocess.run([sys.executable, "-c", die]).returncode < 0
+        assert set_fatal_entries_aside(tmp_path) == ["fatal"]
+    assert cache.get("fatal") is None and cache.get("fine") == b"program"
+    assert (tmp_path / f"fatal{ASIDE}").exists() and set_fatal_entries_aside(tmp_path) == []
+
+
+def test_half_an_entry_is_none(tmp_path):
+    cache = CheckedCache(tmp_path)
+    cache.put("key", b"program")
+    file = tmp_path / f"key{ENTRY}"
+    for size in (0, 10, 35):
+        file.write_bytes(file.read_bytes()[:size])
+        assert cache.get("key") is None
+        cache.put("key", b"program")
+        assert cache.get("key") == b"program"
+
+
+def folder_of(tmp_path, before=""):
+    """What `cache_programs` says in a process whose user has no home."""
+    code = f"""
+import os, pathlib
+def no_home(*_):
+    raise RuntimeError("Could not determine home directory.")
+pathlib.Path.home = no_home
+top = pathlib.Path({str(tmp_path)!r}) / f"openjax-{{os.geteuid()}}"
+{before}
+from openjax.cluster.compilation import cache_programs
+print(cache_programs())
+"""
+    gone = ("JAX_COMPILATION_CACHE_DIR", "XDG_CACHE_HOME")
+    environment = {name: value for name, value in os.environ.items() if name not in gone}
+    environment["TMPDIR"] = str(tmp_path)
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+    assert ran.returncode == 0, ran.stderr
+    return ran.stdout.strip()
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="owners and modes are those of POSIX")
+def test_the_folder_is_the_users_own(tmp_path):
+    top = tmp_path / f"openjax-{os.geteuid()}"
+    assert folder_of(tmp_path, "top.mkdir(mode=0o777); top.chmod(0o777)").startswith(str(top))
+    assert stat.S_IMODE(top.stat().st_mode) == 0o700
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    assert folder_of(elsewhere, "top.symlink_to(top.parent)") == "None"
