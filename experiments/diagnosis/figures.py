@@ -1,0 +1,125 @@
+"""Figures of diagnosed cases, as `development` writes them: counts, calibration, bounds of the shares, seconds."""
+
+import math
+
+import numpy as np
+
+from experiments.pages import table
+
+# figure -> what it says
+FIGURES = {
+    "first": "one cause: first name right",
+    "nothing_else": "one cause: nothing else named",
+    "false_unknown": "a named effect acts: called unknown",
+    "none": "none: nothing named",
+    "not_testable": "not testable: nothing named",
+    "pairs": "two causes: both, nothing else",
+    "unknown": "unknown: called unknown",
+    "wrong_name": "unknown: a wrong name",
+    "garbage": "contradictory logs: refused",
+    "refused": "good logs: refused",
+    "traceback": "tracebacks",
+    "real": "real: first name as expected",
+    "shares": "shares add up, in bounds, intervals ordered",
+    "calibration": "calibration error of the top class",
+    "seconds": "seconds a case after the first, median",
+    "seconds_first": "seconds of a process' first case, median",
+}
+
+
+def wilson(hits: int, n: int, z: float = 1.96) -> tuple[float, float]:
+    """95 % interval of a proportion (Wilson 1927); (0, 1) without data."""
+    if n == 0:
+        return 0.0, 1.0
+    p, d = hits / n, 1 + z * z / n
+    centre, half = p + z * z / (2 * n), z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    return max(0.0, (centre - half) / d), min(1.0, (centre + half) / d)
+
+
+def calibration_error(pairs: list, bins: int = 10) -> float:
+    """Expected calibration error of (stated probability, whether true): nan without data."""
+    if not pairs:
+        return math.nan
+    p, hit = np.array(pairs, float).T
+    slot = np.minimum((p * bins).astype(int), bins - 1)
+    return sum(abs((hit - p)[slot == i].sum()) for i in range(bins)) / len(p)
+
+
+def shares_in_bounds(shares: dict) -> bool:
+    """Whether effects, sensors and unexplained add up to 1, each within -.2 to 1.2, with intervals in order."""
+    parts = [*shares["effects"].values(), shares["sensors"], shares["unexplained"]]
+    values = [p["value"] for p in parts]
+    intervals = [(*p["interval90"], p["value"]) for p in parts if p.get("interval90")]
+    ordered = all(low <= value <= high for low, high, value in intervals)
+    return ordered and abs(sum(values) - 1) < 0.02 and all(-0.2 <= v <= 1.2 for v in values)
+
+
+def figures(lines: list[dict]) -> dict[str, tuple[int, int] | float]:
+    """Figure -> (hits, n), or a number."""
+
+    def of(*categories):
+        return [r for r in lines if r["category"] in categories]
+
+    def count(rows, key):
+        return sum(bool(key(r)) for r in rows), len(rows)
+
+    good = [r for r in lines if r["category"] != "garbage"]
+    named = [r for r in lines if r["category"] in ("single", "pair")]
+    real = [r for r in of("real") if r["truth"]]
+    out = {k: count(of(c), lambda r: r["right"]) for k, c in CATEGORIES.items()}
+    out |= {
+        "nothing_else": count(of("single"), lambda r: not r["wrong_names"]),
+        "false_unknown": count(named, lambda r: "unknown" in r["words"]),
+        "wrong_name": count(of("unknown"), lambda r: r["wrong_names"]),
+        "refused": count(good, lambda r: "garbage" in r["words"] and not r["traceback"]),
+        "traceback": count(lines, lambda r: r["traceback"]),
+        "real": count(real, lambda r: r["right"]),
+        "shares": count([r for r in lines if "shares" in r], lambda r: shares_in_bounds(r["shares"])),
+        "calibration": calibration_error([r["top"] for r in good if r["top"] and r["category"] != "real"]),
+        "seconds": _median(r["seconds"] for r in lines if not r["first"]),
+        "seconds_first": _median(r["seconds"] for r in lines if r["first"]),
+    }
+    return out
+
+
+CATEGORIES = {
+    "first": "single",
+    "none": "none",
+    "not_testable": "not_testable",
+    "pairs": "pair",
+    "unknown": "unknown",
+    "garbage": "garbage",
+}
+
+
+def cell(value: tuple[int, int] | float) -> str:
+    """A figure as text: counts with their 95 % interval."""
+    if isinstance(value, float):
+        return "–" if math.isnan(value) else f"{value:.2f}"
+    hits, n = value
+    low, high = wilson(hits, n)
+    return f"{hits}/{n} [{low:.2f}, {high:.2f}]" if n else "–"
+
+
+def figures_table(lines: list[dict]) -> list[str]:
+    """A Markdown table, a column for each set."""
+    sets = sorted({r["set"] for r in lines})
+    found = [figures([r for r in lines if r["set"] == s]) for s in sets]
+    rows = [[what, *(cell(f[key]) for f in found)] for key, what in FIGURES.items()]
+    return table(["figure", *sets], [row for row in rows if set(row[1:]) != {"–"}])
+
+
+def misses(lines: list[dict]) -> list[str]:
+    """One line for each case that isn't right, or that names more."""
+    out = []
+    for r in sorted(lines, key=lambda r: (r["set"], r["case"])):
+        if r["right"] and not r["wrong_names"]:
+            continue
+        said, why = "+".join(r["words"]) or "none", r["error"] or (r["traceback"] or "").strip()[-160:]
+        out.append(f"* {r['set']}/{r['case']} {r['category']}: {'+'.join(r['truth']) or 'none'} → {said} {why}")
+    return out
+
+
+def _median(values) -> float:
+    values = list(values)
+    return float(np.median(values)) if values else math.nan
