@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from experiments.pages import table
+from experiments.table import table
 
 # figure -> what it says
 FIGURES = {
