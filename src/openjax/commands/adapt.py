@@ -25,6 +25,7 @@ from openjax.errors import UserError
 from openjax.files import check_output_folder, write_text
 from openjax.learning.settings import AdaptSettings
 from openjax.ranges import Interval, Seed
+from openjax.store import DEFAULT_POLICY
 
 PROGRAM = "openjax adapt"
 FIGURES = ("capture_rate", "capture_step", "collision_rate", "crash_rate", "over_speed_rate")
@@ -41,7 +42,7 @@ class AdaptCommand:
 
     flights: Annotated[Path, tyro.conf.Positional] = Path("flights")
     """Folder of flight logs with a vehicle.toml, or an effects.toml of a diagnosis made before."""
-    policy: str = "flight"
+    policy: str = DEFAULT_POLICY
     """A run, a policy file or the name of a policy in the package."""
     out: Path = Path("adapted")
     """Directory for what is found."""

@@ -169,7 +169,7 @@ def _discard_output() -> None:
 
 def quiet_libraries() -> None:
     """Keep libraries' notes that no user can act on off the terminal; what matters comes as an exception."""
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # 3: neither that XLA compiles slowly, an error to it
     for name in ("absl", "jax._src.xla_bridge", "asyncio"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     warnings.filterwarnings("ignore", message="Sharding info not provided when restoring")

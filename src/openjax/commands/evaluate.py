@@ -17,6 +17,7 @@ from openjax.errors import UserError
 from openjax.files import check_output
 from openjax.pursuit.settings import PursuitSettings
 from openjax.ranges import Interval, Seed
+from openjax.store import DEFAULT_POLICY
 
 PROGRAM = "openjax evaluate"
 
@@ -29,7 +30,7 @@ class EvaluateCommand:
     --environment.speed_limit none or --environment.start_attitude level.
     """
 
-    policy: tuple[str, ...] = ("flight",)
+    policy: tuple[str, ...] = (DEFAULT_POLICY,)
     """A run's directory, a policy file (.npz), a checkpoint, or the name of a policy in the package or of a heuristic:
     angelani, janosov, apf.
 

@@ -18,6 +18,7 @@ from openjax.commands.command_line import output_console, parse
 from openjax.errors import UserError
 from openjax.files import check_output_folder, replacing
 from openjax.ranges import Interval, Seed
+from openjax.store import DEFAULT_POLICY
 
 PROGRAM = "openjax export"
 TOLERANCE = 2e-5
@@ -31,7 +32,7 @@ EACH = ("self_state", "others", "pillars", "pillar_seen", "privileged", "positio
 class Arguments:
     """Write a policy as ONNX, as a serialised JAX function, or as C."""
 
-    policy: str = "open"
+    policy: str = DEFAULT_POLICY
     """A run's directory, a policy file (.npz), or the name of a policy in the package."""
     format: Literal["onnx", "jax", "c"] = "onnx"
     """onnx: for onnxruntime and its kin (pip install onnx onnxruntime); jax: for jax.export.deserialize; c: C99."""

@@ -22,6 +22,7 @@ from openjax.files import check_new_folder, replacing
 from openjax.flying.limits import SafetySettings
 from openjax.flying.safety import Request
 from openjax.ranges import Interval
+from openjax.store import DEFAULT_POLICY
 
 PROGRAM = "openjax fly"
 FRESH = 0.05
@@ -36,7 +37,7 @@ class Arguments:
     While it flies: space or q stops all motors, l lands, h waits; Ctrl-C lands.
     """
 
-    policy: str = "flight"
+    policy: str = DEFAULT_POLICY
     """A run's directory, a policy file (.npz), or the name of a policy in the package."""
     uri: tuple[str, ...] = ("udp://127.0.0.1:19850", "udp://127.0.0.1:19851", "udp://127.0.0.1:19852")
     """One vehicle per pursuer: udp://HOST:PORT (virtual), radio://0/80/2M/E7E7E7E7E7 (real)."""

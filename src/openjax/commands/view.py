@@ -1,4 +1,4 @@
-"""Watch a policy in three dimensions in a browser: `openjax view --policy open --scenario wall`.
+"""Watch a policy in three dimensions in a browser: `openjax view --scenario wall`.
 
 Needs `pip install viser`.
 """
@@ -12,6 +12,7 @@ from openjax.commands.command_line import parse
 from openjax.commands.evaluate import EvaluateCommand, fly_scenarios
 from openjax.errors import UserError
 from openjax.ranges import Interval, Seed
+from openjax.store import DEFAULT_POLICY
 
 PROGRAM = "openjax view"
 
@@ -20,7 +21,7 @@ PROGRAM = "openjax view"
 class ViewCommand:
     """Fly one episode of each layout and show them in a browser."""
 
-    policy: str = "open"
+    policy: str = DEFAULT_POLICY
     """A run's directory, a policy file (.npz), a checkpoint, or the name of a policy in the package."""
     scenario: str = "all"
     """wall, narrow_gap, random, passage, empty, hidden, a TOML file with an own layout, or all six."""

@@ -34,10 +34,10 @@ from openjax.pursuit.collisions import TOUCH, drone_distance, pillar_distance
 from openjax.vehicle.family import family_bounds, narrowed_bounds
 from openjax.vehicle.solids import DRONE_RADIUS
 
-STEPS = 50
-"""Control steps that are learnt at once."""
+HORIZON = 0.5
+"""Seconds that are learnt at once."""
 SEGMENTS = 8
-"""A flight is looked at after each of so many times `STEPS`."""
+"""A flight is looked at after each of so many times `HORIZON`."""
 SMOOTH, SMOOTH_BREACH = 0.012, 0.008
 """Distances (m) over which a crash and a breach go from sure to none in what is learnt; ways through rows aren't wide."""
 FAST = 0.05
@@ -98,6 +98,11 @@ class AnalyticGradient:
         """The environment's settings."""
         return self.environment.settings
 
+    @property
+    def steps(self) -> int:
+        """Control steps that are learnt at once."""
+        return max(1, round(HORIZON / self.game.time_step))
+
     def shown(self, observation, state):
         """What the actor is shown of worlds (B, ...): their observations."""
         del state
@@ -151,7 +156,7 @@ class AnalyticGradient:
         """Worlds (SEGMENTS * B, ...) at moments of the policy's flights."""
 
         def segment(world, _):
-            world = self.fly(parameters.actor, parameters, world, STEPS)[0]
+            world = self.fly(parameters.actor, parameters, world, self.steps)[0]
             return world, world
 
         worlds = jax.lax.scan(segment, self.starts(key, bounds), None, length=SEGMENTS)[1]
@@ -164,7 +169,7 @@ class AnalyticGradient:
         mean, log_std = self.policy.distribution(parameters.actor, *inputs)
         change = (self.policy.distribution(actor, *inputs)[0] - mean) * jnp.exp(-log_std)
         worlds = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), starts, flying)
-        (_, end), least, breach, excess = self.fly(actor, parameters, worlds, STEPS)
+        (_, end), least, breach, excess = self.fly(actor, parameters, worlds, self.steps)
         crash, drones = crash_share(least), jax.tree.map(lambda leaf: leaf[:number], end.drones)
         fast, low = _speed(drones) - FASTEST, LOWEST - drones.position[..., 2]
         parts = {
@@ -213,13 +218,12 @@ class AnalyticGradient:
         return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
 
 
-def free_flight(environment: Pursuit, game: PursuitSettings | None = None) -> Pursuit:
+def free_flight(environment: Pursuit) -> Pursuit:
     """`environment` as it is learnt in: nothing is solid while the gradient is taken, a crash is told by the gap."""
     free = dataclasses.replace(
-        game or environment.settings,
+        environment.settings,
         physics="rigid",
         contacts=False,
-        speed_limit="none",
         reward=RewardSettings(),
     )
     return Pursuit(free, environment.vehicle, environment.effects, environment.effect_parameters)

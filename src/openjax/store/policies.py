@@ -14,6 +14,7 @@ from openjax.learning import TrainSettings
 from openjax.learning.train_state import policy_leaf
 from openjax.policy import NetworkSettings, Policy, PolicyParameters, PredictorSettings
 from openjax.pursuit import Observation, Pursuit, PursuitSettings
+from openjax.store import DEFAULT_POLICY
 from openjax.store.checkpoint_files import is_checkpoint, load_arrays
 from openjax.store.checkpoints import Checkpoints
 from openjax.store.old_names import train_settings
@@ -73,12 +74,12 @@ class LoadedPolicy:
         return self.policy.act(self.parameters, observation)
 
 
-def load_policy(name_or_path: str | Path = "flight") -> LoadedPolicy:
+def load_policy(name_or_path: str | Path = DEFAULT_POLICY) -> LoadedPolicy:
     """Load a policy.
 
     Args:
-      name_or_path: a name from `known_policies()` (`flight` if none is given), a policy file (.npz), a run's directory (its best
-        policy) or a checkpoint's directory inside a run.
+      name_or_path: a name from `known_policies()` (`DEFAULT_POLICY` if none is given), a policy file (.npz), a run's directory
+        (its best policy) or a checkpoint's directory inside a run.
 
     Raises:
       UserError: nothing of that kind is there, or it's of another shape than its settings say.
