@@ -121,10 +121,12 @@ def test_killed_in_the_middle_of_a_checkpoint_and_resumed_equals_whole(whole_run
     reached = checkpoints.latest().update
     assert 0 < reached < UPDATES
 
+    (out / ".writing-1-policy.npz").touch()  # a kill in the middle of another file
     printed = finish(start(["openjax.train", "--resume", str(out), *STEPS[2:]]))
     assert f"resumed at update {reached} of {UPDATES}" in printed
     for said in (whole_run[1], printed):  # the step is compiled once, also for a restored carry
         assert said.count("Finished XLA compilation of jit(step)") == 1
+    assert not list(out.glob(".writing-*"))
     whole = Checkpoints(whole_run[0] / "checkpoints").latest()
     again = checkpoints.latest()
     assert whole.update == again.update == UPDATES
@@ -260,6 +262,7 @@ def wrong_layout(change):
             "unknown setting --environment.capture_radios; did you mean",
         ),
         (train, "--environment.num_pursuers 9", "num_pursuers is 9; it must be a whole number in [1, 8]"),
+        (train, "--environment.pillar_radius 5", "leaves no room in an arena of radius 0.9: less than 0.83"),
         (train, "--mappo.epochs two", "invalid literal"),
         (train, "--network.heads 0", "network.heads is 0; it must be a whole number in"),
         (train, "--mappo.learning_rate nan", "mappo.learning_rate is nan; it must be in (0, 1]"),

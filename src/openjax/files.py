@@ -97,20 +97,20 @@ def replacing(path: str | Path) -> Iterator[Path]:
     try:
         yield partial
         for written in (partial, *partial.rglob("*")) if partial.is_dir() else (partial,):
-            _flush(written)
+            flush(written)
         if path.is_dir() and not path.is_symlink():
             if not partial.is_dir():
                 raise IsADirectoryError(21, "is a folder", str(path))
             shutil.rmtree(path)
         os.replace(partial, path)
-        _flush(path.parent)
+        flush(path.parent)
     except BaseException:
         with contextlib.suppress(OSError):
             shutil.rmtree(partial) if partial.is_dir() else partial.unlink(missing_ok=True)
         raise
 
 
-def _flush(path):
+def flush(path: Path) -> None:
     """Wait until a file's content, or a folder's names, are on the disk."""
     if path.is_dir() and os.name == "nt":  # folders can't be opened there
         return

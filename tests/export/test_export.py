@@ -1,6 +1,7 @@
 """Export: the file says what the policy says, for networks of both shapes, and refuses what it can't say."""
 
 import json
+import os
 import shutil
 
 import jax
@@ -53,6 +54,13 @@ def test_the_file_acts_as_the_policy_does(policy_file, tmp_path, kind):
 
 
 @NEEDS_CC
+def test_a_name_in_no_encoding_is_exported(policy_file, tmp_path):
+    odd = shutil.copyfile(policy_file, os.fsdecode(os.fsencode(tmp_path) + b"/policy_\xff.npz"))
+    export(Arguments(str(odd), "c", out=tmp_path, observations=64))
+    assert "policy_\\udcff.npz" in (tmp_path / "policy.c").read_text()
+
+
+@NEEDS_CC
 def test_the_c_program_is_one_vehicles_policy_for_any_observation(policy_file):
     """Numbers that no game shows; a compiler that takes every warning for an error; a workspace full of NaN."""
     policy = load_policy(str(policy_file))
@@ -61,7 +69,7 @@ def test_the_c_program_is_one_vehicles_policy_for_any_observation(policy_file):
     for name, values in seen.items():
         noise = rng.normal(size=values.shape)
         seen[name] = (noise > 0) if values.dtype == bool else noise.astype(np.float32)
-    expected = np.asarray(jax.jit(jax.vmap(lambda fields: policy(Observation(**fields))))(seen))[:, :1]
+    expected = np.asarray(jax.jit(jax.vmap(policy))(Observation(**seen)))[:, :1]
     own = {name: values[:, :1] if name in EACH else values for name, values in seen.items()}
     inputs = {name: jax.ShapeDtypeStruct(values.shape[1:], values.dtype) for name, values in own.items()}
     program = c_program(lambda **fields: policy(Observation(**fields)), inputs, "action", "small", "A policy")

@@ -128,6 +128,11 @@ def export(arguments: Arguments) -> dict:
     return report
 
 
+def _in_ascii(name) -> str:
+    """A file's name as a C compiler and every terminal can read it."""
+    return name.encode("ascii", "backslashreplace").decode()
+
+
 def _described(inputs) -> dict:
     return {name: {"shape": list(kind.shape), "type": str(kind.dtype)} for name, kind in inputs.items()}
 
@@ -142,7 +147,7 @@ def _onnx(act, inputs, seen, source):
     try:
         import onnxruntime
     except ImportError as error:
-        raise UserError('onnxruntime is missing: pip install onnx onnxruntime') from error
+        raise UserError("onnxruntime is missing: pip install onnx onnxruntime") from error
     data = model.SerializeToString()
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
@@ -178,7 +183,7 @@ def _c(act, inputs, seen, source):
     from openjax.export.c_program import c_program
 
     name = Path(NAMES["c"]).stem
-    program = c_program(act, inputs, "action", name, f"The policy {Path(source).name}")
+    program = c_program(act, inputs, "action", name, f"The policy {_in_ascii(Path(source).name)}")
     extra = {
         "inputs": _described({n: inputs[n] for n in program.inputs}),
         "numbers": program.numbers,

@@ -17,6 +17,7 @@ from openjax.commands.machine import describe_machine
 from openjax.commands.training_job import TrainingJob, run_job
 from openjax.commands.training_options import MAY_CHANGE, PROGRAM, TrainCommand
 from openjax.errors import UserError
+from openjax.files import remove_unfinished
 from openjax.learning import TrainSettings, preset
 from openjax.learning.settings import PRESETS
 from openjax.store.checkpoints import Checkpoints
@@ -104,6 +105,8 @@ def start(
                 shutil.copyfile(path, directory.path / name)
             directory.write_settings(command.settings, job.facts)
             _say_what_it_is(command)
+        elif processes.is_first:
+            remove_unfinished(directory.path)
         processes.everyone()
         if not directory.path.is_dir():
             raise UserError(

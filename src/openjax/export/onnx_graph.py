@@ -140,7 +140,7 @@ def onnx_model(function: Callable, inputs: dict[str, jax.ShapeDtypeStruct], outp
     try:
         from onnx import TensorProto, checker, helper
     except ImportError as error:
-        raise UserError('onnx is missing: pip install onnx onnxruntime') from error
+        raise UserError("onnx is missing: pip install onnx onnxruntime") from error
     traced = trace(function, inputs)
     graph = _Graph()
     (result,) = graph.run(traced.jaxpr, traced.consts, list(inputs))

@@ -112,6 +112,12 @@ class PursuitSettings:
             raise UserError(
                 f"environment.min_pillars {self.min_pillars} is more than environment.max_pillars {self.max_pillars}"
             )
+        most = self.arena_radius - self.pillar_clearance
+        if self.max_pillars and self.pillar_radius >= most:
+            raise UserError(
+                f"environment.pillar_radius {self.pillar_radius} leaves no room in an arena of radius {self.arena_radius}: "
+                f"less than {most:.3g} would be right, or environment.max_pillars 0"
+            )
         if self.vehicles:
             from openjax.vehicle.family import check_ranges  # knows the effects, which are written in JAX
 

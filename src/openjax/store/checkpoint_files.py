@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from openjax.errors import UserError
-from openjax.files import write_text
+from openjax.files import flush, write_text
 from openjax.store.leaves import first_device, named_leaves
 
 _CHECKSUMS = ".sha256"
@@ -113,6 +113,8 @@ def commit(path: Path, started: Any) -> None:
     """Wait until orbax has written a checkpoint, and seal it by its checksums."""
     started.result()
     if jax.process_index() == 0:
+        for written in (*_files(path), path, path.parent):
+            flush(written)
         lines = [f"{_checksum(file)}  {file.relative_to(path).as_posix()}" for file in _files(path)]
         write_text(_checksums_file(path), "\n".join(lines) + "\n")
 

@@ -149,6 +149,7 @@ class Checkpoints:
         for record in records[: -self.keep_last]:
             if best is None or record.path != best.path:
                 remove_state(record.path)
+                self._known.pop(record.path.name, None)
 
     def restore_latest(self, abstract: Any, warn=lambda text: None) -> tuple[Any, CheckpointRecord]:
         """The newest checkpoint that can be read; damaged ones are passed over with a warning.
