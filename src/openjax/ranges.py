@@ -6,6 +6,7 @@
 """
 
 import dataclasses
+import difflib
 import functools
 import math
 import numbers
@@ -111,6 +112,27 @@ def check_intervals(settings: Any, group: str = "") -> None:
                 raise UserError(
                     f"{group}{field.name} is {_shown(value)}; it must be {whole} {field.interval}"
                 )
+
+
+def changed(settings: Any, **changes) -> Any:
+    """`dataclasses.replace` for settings within settings: a dict stands for changes of the settings under that name.
+
+    `changed(preset("paper"), seed=1, environment=dict(reward=dict(crash=40.0)))`
+
+    Raises:
+      UserError: no such setting, or a value that it can't have.
+    """
+    names = [field.name for field in dataclasses.fields(settings)]
+    for name in changes:
+        if name not in names:
+            close = difflib.get_close_matches(name, names, n=1)
+            hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(names)}"
+            raise UserError(f"{name}: {type(settings).__name__} has no such setting; {hint}")
+    given = {
+        name: changed(getattr(settings, name), **value) if isinstance(value, dict) else value
+        for name, value in changes.items()
+    }
+    return dataclasses.replace(settings, **given)
 
 
 def _shown(value):

@@ -14,7 +14,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -25,9 +25,12 @@ from openjax.errors import UserError
 from openjax.files import check_output_folder, write_text
 from openjax.learning.settings import AdaptSettings
 from openjax.ranges import Interval, Seed
+from openjax.show.steps import Steps
 from openjax.store import DEFAULT_POLICY
 
 PROGRAM = "openjax adapt"
+STEPS = {"diagnosing and compiling": 60.0, "fine-tuning": 90.0, "measuring": 10.0}
+"""Seconds of each, about."""
 FIGURES = ("capture_rate", "capture_step", "collision_rate", "crash_rate", "over_speed_rate")
 WHICH = ("nominal", "before", "after")
 LOSSES = ("crash_rate", "collision_rate", "capture_step")
@@ -62,19 +65,23 @@ def main(arguments: Sequence[str]) -> int:
     if command.out.exists() and not command.overwrite:
         raise UserError(f"{command.out} already exists: choose another --out or give --overwrite")
     check_output_folder(command.out, "--out")
-    results = adapt(command)
     console = output_console()
+    with Steps(f"adapting {command.policy}", STEPS, console) as steps:
+        results = adapt(command, steps.begin)
     for line in in_words(results):
         console.print(line, soft_wrap=True)
     console.print(f"policy, figures and page are in {command.out}", soft_wrap=True)
     return 0
 
 
-def adapt(command: AdaptCommand) -> dict:
-    """Do all of it and write it down. Raises UserError for flights that can't be diagnosed or an unusable policy."""
+def adapt(command: AdaptCommand, tell: Callable[[str], None] = lambda step: None) -> dict:
+    """Do all of it and write it down; `tell` hears the steps. Raises UserError for flights that can't be diagnosed or an
+    unusable policy."""
     started = time.monotonic()
     _check_flights(command.flights)
     diagnosis = _Diagnosis(command)
+    begin = iter(STEPS)
+    tell(next(begin))
     try:
         import jax
 
@@ -108,9 +115,11 @@ def adapt(command: AdaptCommand) -> dict:
         seconds = {"diagnosis": time.monotonic() - started}
         bounds = bounds_of(values, intervals)
         ready()
+        tell(next(begin))
         seconds["compiled"] = time.monotonic() - started
         score = scores_on(adaptation, parameters, chosen_by, jax.random.fold_in(key, 1), bounds)
         tuned = fine_tune(adaptation, parameters, bounds, command.training, key, score)
+        tell(next(begin))
         seconds["fine-tuned"] = time.monotonic() - started
         flown = {
             which: episodes(adaptation.evaluate(p, measured_on, jax.random.fold_in(key, 2), vehicles))

@@ -1,6 +1,5 @@
 """The commands as functions: what `openjax.train(...)` and `openjax.evaluate(...)` do in Python."""
 
-import dataclasses
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +13,7 @@ from openjax.errors import UserError
 from openjax.learning import TrainSettings, preset
 from openjax.policy import PolicyParameters
 from openjax.pursuit import Observation, PursuitSettings
+from openjax.ranges import changed
 from openjax.store.policies import LoadedPolicy, load_policy
 
 
@@ -99,7 +99,7 @@ def evaluate(
         policy = load_policy(policy)
     elif not isinstance(policy, LoadedPolicy):
         nothing = PolicyParameters(actor={}, critic={}, predictor={})
-        settings = TrainSettings(environment=PursuitSettings(**changes))
+        settings = TrainSettings(environment=changed(PursuitSettings(), **changes))
         policy = LoadedPolicy(OwnController(policy), nothing, settings, "own controller")
     command = EvaluateCommand(
         policy=(policy.source,),
@@ -108,7 +108,7 @@ def evaluate(
         seed=seed,
         vehicle=None if vehicle is None else Path(vehicle),
         effects=None if effects is None else Path(effects),
-        environment=dataclasses.replace(policy.settings.environment, **changes),
+        environment=changed(policy.settings.environment, **changes),
     )
     records, _ = fly_scenarios(command, policy, {})
     return records if scenario == "all" else records[0]

@@ -17,9 +17,12 @@ from openjax.errors import UserError
 from openjax.files import check_output
 from openjax.pursuit.settings import PursuitSettings
 from openjax.ranges import Interval, Seed
+from openjax.show.steps import Steps
 from openjax.store import DEFAULT_POLICY
 
 PROGRAM = "openjax evaluate"
+COMPILING = 15.0
+"""Seconds that a policy's game takes to compile on a laptop, about."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,9 +105,20 @@ def fly_scenarios(command: EvaluateCommand, loaded, evaluators: dict) -> tuple[l
 
     game, loaded, scenarios = _game(command, loaded)
     kind = (game.settings, loaded.policy)
-    if kind not in evaluators:
+    compiled = kind in evaluators
+    if not compiled:
         evaluators[kind] = Evaluator(game, loaded.policy, command.episodes)
-    return evaluate_scenarios(evaluators[kind], loaded.parameters, scenarios, command.episodes, command.seed)
+    expected = {scenario.name: 0.02 * command.episodes for scenario in scenarios}
+    if not compiled:
+        expected[scenarios[0].name] += COMPILING
+    with Steps(f"flying {loaded.source}", expected, output_console()) as steps:
+
+        def tell(layout):
+            steps.begin(layout, "compiled first" if not compiled and layout == scenarios[0].name else "")
+
+        return evaluate_scenarios(
+            evaluators[kind], loaded.parameters, scenarios, command.episodes, command.seed, tell=tell
+        )
 
 
 def _game(command, loaded):

@@ -114,17 +114,21 @@ def evaluate_scenarios(
     episodes: int,
     seed: int,
     extra: tuple[str, ...] = (),
+    tell: Callable[[str], None] = lambda layout: None,
 ) -> tuple[list[dict], list[Trajectory]]:
     """A record (`FIELDS` and `extra`) and the first episode's trajectory for each scenario.
 
     Scenarios whose episodes fill whole batches are flown one by one, so that a scenario's result is the same
-    alone and among others; otherwise all are packed into as few batches as they need.
+    alone and among others; otherwise all are packed into as few batches as they need. `tell` hears which one is flown.
     """
     single = [scenario_task(evaluator.settings, scenario) for scenario in scenarios]
     repeated = [repeat_task(task, episodes) for task in single]
     key = jax.random.key(seed)
     if episodes % evaluator.batch == 0:
-        results = [(*evaluator(parameters, tasks, key), 0) for tasks in repeated]
+        results = []
+        for scenario, tasks in zip(scenarios, repeated, strict=True):
+            tell(scenario.name)
+            results.append((*evaluator(parameters, tasks, key), 0))
     else:
         tasks = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *repeated)
         evaluation, records = evaluator(parameters, tasks, key)

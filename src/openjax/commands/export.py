@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -18,11 +18,14 @@ from openjax.commands.command_line import output_console, parse
 from openjax.errors import UserError
 from openjax.files import check_output_folder, replacing
 from openjax.ranges import Interval, Seed
+from openjax.show.steps import Steps
 from openjax.store import DEFAULT_POLICY
 
 PROGRAM = "openjax export"
 TOLERANCE = 2e-5
 """Largest difference of an action that is put down to the order of sums."""
+STEPS = {"flying games to compare on": 20.0, "writing and comparing": 10.0}
+"""Seconds of each on a laptop, about."""
 NAMES = {"onnx": "policy.onnx", "jax": "policy.jax_export", "c": "policy.c"}
 EACH = ("self_state", "others", "pillars", "pillar_seen", "privileged", "position")
 """What each pursuer sees for itself; the rest of an observation is the team's."""
@@ -78,8 +81,8 @@ def observations(policy, number: int, seed: int) -> dict:
     }
 
 
-def export(arguments: Arguments) -> dict:
-    """Write the files; returns what FORMAT.json says. Raises UserError if it can't be, or differs."""
+def export(arguments: Arguments, tell: Callable[[str], None] = lambda step: None) -> dict:
+    """Write the files; returns what FORMAT.json says. `tell` hears the steps. Raises UserError if it can't be, or differs."""
     import jax
     import numpy as np
 
@@ -95,6 +98,7 @@ def export(arguments: Arguments) -> dict:
     def act(**fields):
         return policy(Observation(**fields))
 
+    tell(next(iter(STEPS)))
     seen = observations(policy, arguments.observations, arguments.seed)
     number = len(next(iter(seen.values())))
     expected = np.asarray(jax.jit(jax.vmap(lambda fields: act(**fields)))(seen))
@@ -103,6 +107,7 @@ def export(arguments: Arguments) -> dict:
         for name in EACH:
             seen[name] = seen[name][:, :1]
             inputs[name] = jax.ShapeDtypeStruct((1, *inputs[name].shape[1:]), inputs[name].dtype)
+    tell(list(STEPS)[1])
     write = {"onnx": _onnx, "jax": _jax, "c": _c}[arguments.format]
     files, found, extra = write(act, inputs, seen, policy.source)
     difference = None if found is None else float(np.abs(found - expected).max())
@@ -202,13 +207,15 @@ def _c(act, inputs, seen, source):
 def main(arguments: Sequence[str]) -> None:
     """The command. Raises UserError for an unusable policy or folder."""
     parsed = parse(Arguments, Arguments(), arguments, PROGRAM)
-    report = export(parsed)
+    console = output_console()
+    with Steps(f"exporting {parsed.policy}", STEPS, console) as steps:
+        report = export(parsed, steps.begin)
     difference = report["largest_difference"]
     compared = (
         "compared with nothing, as there is no C compiler here"
         if difference is None
         else f"differs by at most {difference:.1e} on {report['observations']} observations"
     )
-    output_console().print(
+    console.print(
         f"{parsed.out / report['file']}: {report['bytes'] / 1e6:.2f} MB, {compared}", soft_wrap=True
     )

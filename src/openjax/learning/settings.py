@@ -1,13 +1,12 @@
 """Settings of a training run and its presets."""
 
-import dataclasses
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated
 
 from openjax.errors import UserError
 from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import PursuitSettings, RewardSettings
-from openjax.ranges import Interval, Seed, check_intervals
+from openjax.ranges import Interval, Seed, changed, check_intervals
 
 if TYPE_CHECKING:
     from openjax.learning.schedule import Schedule  # written in JAX, which a command's help needn't wait for
@@ -245,18 +244,6 @@ class TrainSettings:
     def total_updates(self) -> int:
         """Training steps of the run."""
         return max(1, -(-self.total_steps // self.steps_per_update))
-
-
-def changed(settings, **changes):
-    """`dataclasses.replace` for settings within settings: a dict stands for changes of the settings under that name.
-
-    `changed(preset("paper"), seed=1, environment=dict(reward=dict(crash=40.0)))`
-    """
-    given = {
-        name: changed(getattr(settings, name), **value) if isinstance(value, dict) else value
-        for name, value in changes.items()
-    }
-    return dataclasses.replace(settings, **given)
 
 
 def quick() -> TrainSettings:

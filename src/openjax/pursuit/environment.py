@@ -18,6 +18,7 @@ from openjax.pursuit.spaces import Box
 from openjax.pursuit.state import PursuitState
 from openjax.pursuit.statistics import count, empty_statistics
 from openjax.pursuit.task import Task, start_attitude, uniform_task
+from openjax.ranges import changed
 from openjax.vehicle import DroneState, Vehicle, hover_state, load_vehicle, make_drones_step
 from openjax.vehicle.family import draw_vehicles, family_effects
 
@@ -272,5 +273,9 @@ class Pursuit:
 
 
 def make(settings: PursuitSettings | None = None, **changes) -> Pursuit:
-    """An environment. `changes` are fields of `PursuitSettings`: `make(num_pursuers=4, speed_limit="none")`."""
-    return Pursuit(dataclasses.replace(settings or PursuitSettings(), **changes))
+    """An environment. `changes` are fields of `PursuitSettings`: `make(num_pursuers=4, reward=dict(crash=20.0))`.
+
+    Raises:
+      UserError: no such setting, or a value that it can't have.
+    """
+    return Pursuit(changed(settings or PursuitSettings(), **changes))

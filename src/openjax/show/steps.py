@@ -1,0 +1,78 @@
+"""The steps of a command that takes more than a few seconds: which one runs, and about how long all will still take."""
+
+import time
+from collections.abc import Mapping
+
+from rich.console import Console
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.spinner import Spinner
+from rich.table import Table
+from rich.text import Text
+
+
+class Steps:
+    """One line on a terminal; nothing where output goes into a file. Use as a context manager.
+
+    Args:
+      title: what is done.
+      expected: {step: seconds on a usual machine}, in the order in which they come. What the steps so far took against
+        this tells how long the rest takes here.
+      console: where to draw.
+    """
+
+    def __init__(self, title: str, expected: Mapping[str, float], console: Console):
+        self._title, self._expected = title, dict(expected)
+        self._total = sum(self._expected.values())
+        self._done, self._step, self._note = 0.0, None, ""
+        self._start = self._step_start = time.monotonic()
+        self._spinner = Spinner("dots")
+        self._live = (
+            Live(get_renderable=self._render, console=console, refresh_per_second=4, transient=True)
+            if console.is_terminal
+            else None
+        )
+
+    def __enter__(self):
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_):
+        if self._live is not None:
+            self._live.stop()
+
+    def begin(self, step: str, note: str = "") -> None:
+        """The step before is done, and `step` begins; one that isn't in `expected` takes no time of its own."""
+        if step != self._step:
+            self._done += self._expected.get(self._step, 0.0)
+            self._step, self._step_start = step, time.monotonic()
+        self._note = note
+
+    def seconds_left(self, now: float) -> float:
+        """Until all steps are done, at time `now` of `time.monotonic`."""
+        took = self._step_start - self._start
+        slower = took / self._done if self._done > 0 else 1.0
+        running = max(slower * self._expected.get(self._step, 0.0) - (now - self._step_start), 0.0)
+        later = self._total - self._done - self._expected.get(self._step, 0.0)
+        return running + slower * max(later, 0.0)
+
+    def _render(self):
+        now = time.monotonic()
+        left = self.seconds_left(now)
+        done = (now - self._start) / max(now - self._start + left, 1e-6)
+        text = f"{self._title}: {self._step or 'starting'}{f' ({self._note})' if self._note else ''}"
+        row = Table.grid(padding=(0, 1))
+        row.add_row(
+            self._spinner,
+            Text(text),
+            ProgressBar(total=1.0, completed=done, width=24),
+            Text(f"about {clock(left)} left", style="dim"),
+        )
+        return row
+
+
+def clock(seconds: float) -> str:
+    """Minutes and seconds, as 1:05."""
+    minutes, seconds = divmod(round(seconds), 60)
+    return f"{minutes}:{seconds:02d}"
