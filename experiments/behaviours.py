@@ -168,6 +168,7 @@ def trajectory_of(paths: dict, layout: str, title: str) -> Trajectory:
         pursuer_quaternion=np.broadcast_to([1.0, 0.0, 0.0, 0.0], (*pursuers.shape[:2], 4)),
         evader_position=np.array(paths["evader"]),
         captured=captured,
+        crashed=np.zeros_like(captured),
         pillar_position=np.array(SCENARIOS[layout].pillars).reshape(-1, 2),
         arena_radius=settings.arena_radius,
         arena_height=settings.arena_height,

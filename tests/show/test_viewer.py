@@ -26,6 +26,7 @@ def viewer():
             pursuer_quaternion=quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True),
             evader_position=rng.uniform(-0.5, 0.5, (30, 3)),
             captured=np.arange(30)[:, None] >= np.array([20, 99, 99]),
+            crashed=np.zeros((30, 3), bool),
             pillar_position=np.array([[0.0, 0.2], [0.3, 0.0]]),
             arena_radius=0.9,
             arena_height=1.2,

@@ -13,7 +13,7 @@ from openjax.errors import UserError
 from openjax.show.metrics import MetricsWriter, read_metrics
 from openjax.show.plots import plot_training, plot_trajectories
 from openjax.show.trajectory import Trajectory
-from openjax.show.videos import animate
+from openjax.show.videos import animate, caption
 from openjax.store.policy_files import fill, load_policy_file, save_policy_file
 from openjax.store.settings_files import from_plain, to_plain
 
@@ -88,10 +88,12 @@ def trajectory():
     )
     captured = np.zeros((steps, 3), bool)
     captured[30:, 1] = True
+    crashed = np.zeros((steps, 3), bool)
+    crashed[32, 0] = True
     level = np.tile([1.0, 0.0, 0.0, 0.0], (steps, 3, 1))
     pillars = np.array([[0.2, 0.1]])
     return Trajectory(
-        "wall", pursuers, level, pursuers[:, 0] * 0.5, captured, pillars, 0.9, 1.2, 0.1, 0.3, 0.01
+        "wall", pursuers, level, pursuers[:, 0] * 0.5, captured, crashed, pillars, 0.9, 1.2, 0.1, 0.3, 0.01
     )
 
 
@@ -107,6 +109,11 @@ def test_animation_is_drawn_without_a_display(tmp_path, trajectory, renderer, mo
         )
         with Image.open(tmp_path / "chase.gif") as one, Image.open(tmp_path / "both.gif") as both:
             assert both.n_frames == 5 and both.size == (one.width, 2 * one.height)
+
+
+def test_animation_says_when_something_happened(trajectory):
+    assert caption(trajectory, 29) == ("wall: 0.3 s", "")
+    assert caption(trajectory, 40) == ("wall: 0.4 s", "caught at 0.3 s, crashed at 0.3 s")
 
 
 def test_pictures_are_drawn(tmp_path, trajectory):

@@ -88,6 +88,7 @@ class Evaluator:
             pursuer_quaternion=record.quaternion,
             evader_position=record.evader,
             captured=record.captured,
+            crashed=record.crashed,
             pillar_position=np.asarray(task.pillar_position)[np.asarray(task.pillar_active)],
             arena_radius=settings.arena_radius,
             arena_height=settings.arena_height,

@@ -92,10 +92,7 @@ def start(
     _check_same(command, processes)
     cache = cache_programs() if command.compilation_cache else None
     job, directory, files = prepare(command, arguments, started, processes)
-    wanted = command.traced_programs
-    if wanted is None:
-        wanted = jax.default_backend() == "cpu"
-    if keep_traced and wanted and cache is not None:
+    if keep_traced and command.traced_programs and cache is not None:
         job = dataclasses.replace(job, traced=cache / "traced")
     processes.everyone()  # a mistake shows before any process changes a file
     with locked(directory.path) if processes.is_first else contextlib.nullcontext():

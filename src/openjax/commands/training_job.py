@@ -23,6 +23,7 @@ from openjax.cluster.devices import (
 from openjax.cluster.processes import Processes
 from openjax.cluster.tracing import recalled
 from openjax.commands.before_and_after import compare, game_for
+from openjax.commands.closing_words import closing_words, layouts_like
 from openjax.commands.evaluator import (
     before_after_table,
     evaluate_scenarios,
@@ -36,7 +37,7 @@ from openjax.learning.analytic_gradient import AnalyticGradient, compile_analyti
 from openjax.learning.train_state import policy_leaf
 from openjax.policy import PolicyParameters
 from openjax.policy.growth import with_longer_history
-from openjax.pursuit import SCENARIOS, Pursuit
+from openjax.pursuit import Pursuit
 from openjax.show.metrics import METRICS_FILE, MetricsWriter, NoMetrics
 from openjax.show.progress import Progress
 from openjax.store.checkpoint_files import load_orbax
@@ -171,6 +172,10 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
         if not processes.is_first:
             return 0
         _save_best(job, directory, checkpoints, outcome, progress.message)
+        if outcome.update == update and settings.total_updates > update:
+            progress.message(
+                f"nothing was trained: {outcome.stopped_by} came before the first update, {outcome.seconds:.0f} s after the start"
+            )
         if signals:
             progress.message(
                 f"{signals[0]}: saved at update {outcome.update}; "
@@ -182,6 +187,8 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
             progress.message(_learn_analytic(job, directory, learn(), validation()))
         table = _report(job, directory, validation(), outcome, progress)
     console.print(table)
+    for line in closing_words(settings, directory.path, jax.default_backend() == "cpu"):
+        console.print(line, soft_wrap=True)
     console.print(f"run, policy and pictures are in {directory.path}", soft_wrap=True)
     return 0
 
@@ -316,7 +323,7 @@ def _report(job, directory, validation, outcome, progress):
     from openjax.show.videos import animate
 
     settings = job.settings
-    fitting = [s for s in SCENARIOS.values() if len(s.pursuers) == settings.environment.num_pursuers]
+    fitting = layouts_like(settings.environment)
     abstract = jax.eval_shape(lambda: outcome.carry.policy)
     rows, flights = {}, []
     for moment, path in (("before", directory.start_policy), ("after", directory.policy)):

@@ -53,8 +53,8 @@ class TrainCommand:
     """Which of them this one is, from 0. Slurm and Open MPI tell it."""
     compilation_cache: bool = True
     """Keep compiled programs in the user's cache folder, so that the next run starts sooner."""
-    traced_programs: bool | None = None
-    """Keep traced programs there, too, so that the next run traces nothing; by default on a CPU."""
+    traced_programs: bool = True
+    """Keep traced programs there, too, so that the next run traces nothing."""
     layout_episodes: Annotated[int | None, Interval("[1, 100000]")] = None
     """Episodes per layout in the final table; by default 100 on an accelerator, 32 on a CPU, and 1 where all are alike, as
     starts are level."""

@@ -29,6 +29,7 @@ class EpisodeRecord:
     evader: jax.Array  # (B, T, 3) m
     seen: jax.Array  # (B, T) bool
     captured: jax.Array  # (B, T, N) bool
+    crashed: jax.Array  # (B, T, N) bool
     predicted: jax.Array | None  # (B, T, K, 3) m, predicted for the steps after
 
 
@@ -64,6 +65,7 @@ def make_evaluate(
                     evader=state.evader_position,
                     seen=info.seen,
                     captured=info.captured,
+                    crashed=info.crashed,
                     predicted=predicted,
                 )
             return (observation, state, errors), record

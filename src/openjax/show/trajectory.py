@@ -17,6 +17,7 @@ class Trajectory:
     pursuer_quaternion: np.ndarray  # (T, N, 4) wxyz, body to world
     evader_position: np.ndarray  # (T, 3)
     captured: np.ndarray  # (T, N) bool, pursuers that capture in this step
+    crashed: np.ndarray  # (T, N) bool, pursuers that touch something solid or lie on their side in this step
     pillar_position: np.ndarray  # (P, 2), those in use
     arena_radius: float
     arena_height: float
@@ -28,6 +29,12 @@ class Trajectory:
     def capture_index(self) -> int | None:
         """Index of the first step with a capture."""
         steps = np.flatnonzero(self.captured.any(axis=-1))
+        return int(steps[0]) if steps.size else None
+
+    @property
+    def crash_index(self) -> int | None:
+        """Index of the first step with a crash."""
+        steps = np.flatnonzero(self.crashed.any(axis=-1))
         return int(steps[0]) if steps.size else None
 
     def save(self, path: Path) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFont, ImageSequence
 
 from openjax.files import replacing
 from openjax.show.plots import EVADER_COLOR, PURSUER_COLORS, draw_arena
@@ -22,10 +22,11 @@ from openjax.show.trajectory import Trajectory
 FRAMES_PER_SECOND = 12.5
 _BACKENDS = ("egl", "osmesa", "glfw")
 _RENDER_LIMIT = 120  # s for one backend
+_LETTERS = 20  # pixels
 
 
 def animate(path: Path, *trajectories: Trajectory, renderer: str = "auto") -> str:
-    """Write an animated GIF up to a second after the first capture.
+    """Write an animated GIF up to a second after the first capture; time, capture and crash stand above it.
 
     Args:
       path: the .gif file.
@@ -35,15 +36,13 @@ def animate(path: Path, *trajectories: Trajectory, renderer: str = "auto") -> st
     Returns:
       The renderer that drew it: `mujoco` with the backend's name, or `matplotlib`.
     """
-    path = Path(path)
-    if len(trajectories) == 1:
-        return _animate_one(path, trajectories[0], renderer)
+    films = []
     with tempfile.TemporaryDirectory() as directory:
-        parts = [Path(directory) / f"{i}.gif" for i in range(len(trajectories))]
-        for part, trajectory in zip(parts, trajectories, strict=True):
+        for i, trajectory in enumerate(trajectories):
+            part = Path(directory) / f"{i}.gif"
             drawn_by = _animate_one(part, trajectory, renderer)
-        titled = zip(parts, trajectories, strict=True)
-        write_gif(path, _stacked([_frames_of(part, trajectory.title) for part, trajectory in titled]))
+            films.append(_captioned(_frames_of(part), trajectory))
+    write_gif(Path(path), _stacked(films))
     return drawn_by
 
 
@@ -77,16 +76,34 @@ def write_gif(path: Path, frames: list[np.ndarray]) -> None:
         )
 
 
-def _frames_of(path, title):
-    """The (H, W, 3) frames of a GIF, with a title in the corner."""
-    frames = []
+def caption(trajectory: Trajectory, step: int) -> tuple[str, str]:
+    """What is written above the frame of a step: title and time; and what happened until then."""
+    events = []
+    for word, index in (("caught", trajectory.capture_index), ("crashed", trajectory.crash_index)):
+        if index is not None and index <= step:
+            events.append(f"{word} at {(index + 1) * trajectory.time_step:.1f} s")
+    return f"{trajectory.title}: {(step + 1) * trajectory.time_step:.1f} s", ", ".join(events)
+
+
+def _captioned(frames, trajectory):
+    """Frames with a band above that says what one sees."""
+    font, band = ImageFont.load_default(_LETTERS), round(2.8 * _LETTERS)
+    captioned = []
+    for frame, step in zip(frames, frame_indices(trajectory), strict=True):
+        image = Image.new("RGB", (frame.shape[1], frame.shape[0] + band), "white")
+        image.paste(Image.fromarray(frame), (0, band))
+        pen = ImageDraw.Draw(image)
+        for line, text in enumerate(caption(trajectory, int(step))):
+            color = (190, 20, 20) if "crashed" in text else (0, 0, 0)
+            pen.text((8, 4 + 1.3 * line * _LETTERS), text, fill=color, font=font)
+        captioned.append(np.asarray(image))
+    return captioned
+
+
+def _frames_of(path):
+    """The (H, W, 3) frames of a GIF."""
     with Image.open(path) as image:
-        for i in range(image.n_frames):
-            image.seek(i)
-            frame = image.convert("RGB")
-            ImageDraw.Draw(frame).text((6, 4), title, fill=(0, 0, 0))
-            frames.append(np.asarray(frame))
-    return frames
+        return [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(image)]
 
 
 def _stacked(films):
@@ -154,10 +171,6 @@ def _animate_with_matplotlib(path, trajectory):
             trail.set_data(*bodies[max(0, i - 60) : i + 1, body, :2].T)
             dot.set_data(bodies[i, body, :1], bodies[i, body, 1:2])
             height.set_data(bodies[i, body, :1], bodies[i, body, 2:3])
-        captured = trajectory.captured[: i + 1].any()
-        above.set_title(
-            f"{trajectory.title}  {i * trajectory.time_step:.1f} s{'  captured' if captured else ''}"
-        )
         canvas.draw()
         frames.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
     write_gif(path, frames)

@@ -1,0 +1,54 @@
+"""What a run says at its end: what a crash is, how its game differs from the paper's, and what to type next."""
+
+from pathlib import Path
+
+from openjax.learning import TrainSettings
+from openjax.pursuit import SCENARIOS, PursuitSettings, Scenario
+
+
+def layouts_like(game: PursuitSettings) -> list[Scenario]:
+    """The test layouts that a policy of this game can be judged by.
+
+    They have its pursuers, and at most a fifth more pillars than it was trained with, as in the paper (6 for 5).
+    """
+    most = 1.2 * game.max_pillars
+    return [
+        layout
+        for layout in SCENARIOS.values()
+        if len(layout.pursuers) == game.num_pursuers and len(layout.pillars) <= most
+    ]
+
+
+def closing_words(settings: TrainSettings, run: Path, on_cpu: bool) -> list[str]:
+    """Lines below the table of the run in that directory."""
+    game = settings.environment
+    seconds = game.episode_length * game.time_step
+    lines = [
+        "A crash: any drone touches the floor, a pillar or another drone, or tips over, at any time of "
+        f"the {seconds:.0f} s, after the capture, too."
+    ]
+    if easier := _easier(game):
+        lines.append(f"Easier than the paper's game: {', '.join(easier)}.")
+    view = f"openjax view --policy {run}"
+    if layouts := layouts_like(game):
+        view += f" --scenario {layouts[-1].name}"
+    steps = [f"{view} (in a browser)"]
+    if on_cpu:
+        steps.append("openjax train --preset paper (the real game, five minutes on a GPU)")
+    steps.append("openjax sample_flights flights, then openjax diagnose flights (from flight logs to a cause)")
+    return [*lines, f"Next: {'; '.join(steps)}."]
+
+
+def _easier(game):
+    """How a game differs from the paper's, in words; empty where it doesn't."""
+    paper = PursuitSettings()
+    words = []
+    if game.evader_speed < paper.evader_speed:
+        words.append(f"the evader flies {game.evader_speed:g} m/s instead of {paper.evader_speed:g}")
+    if game.max_pillars < paper.max_pillars:
+        words.append(f"up to {game.max_pillars} pillars instead of {paper.max_pillars}")
+    if game.start_attitude != paper.start_attitude:
+        words.append("level starts instead of tilted ones")
+    if game.time_step > paper.time_step:
+        words.append(f"{1 / game.time_step:.0f} commands a second instead of {1 / paper.time_step:.0f}")
+    return words
