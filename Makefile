@@ -2,19 +2,26 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
+PYTEST  = $(BIN)/python -m pytest -n auto --maxprocesses 8 --dist worksteal
 
-.PHONY: train test lint benchmark evaluate tables exam clean
+.PHONY: train test test-slow test-all lint benchmark evaluate tables exam clean
 
 # `make train` accepts extra options: make train ARGS="--preset paper --seed 1"
 train: $(READY)
 	$(BIN)/python -m openjax.train --out runs/train --overwrite $(ARGS)
 
+# the fast part, as long as nothing is wrong; everything: `make test-all`
 test: $(READY)
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
+	$(PYTEST) -m "not slow" $(ARGS)
+
+test-slow: $(READY)
+	$(PYTEST) -m slow $(ARGS)
+
+test-all: lint test test-slow
 
 lint: $(READY)
-	$(BIN)/ruff check src tests experiments
-	$(BIN)/ruff format --check src tests experiments
+	$(BIN)/ruff check src tests experiments examples conftest.py
+	$(BIN)/ruff format --check src tests experiments examples conftest.py
 
 benchmark: $(READY)
 	$(BIN)/python -m openjax.benchmark $(ARGS)

@@ -18,28 +18,12 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # what one test compiled, its other processes, other workers and the next session needn't compile again
-os.environ.setdefault(
-    "JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parent / ".pytest_cache" / "compiled")
-)
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parent / ".pytest_cache" / "compiled"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
 
 # tracing leaves many objects and little garbage
 gc.set_threshold(100_000, 50, 50)
-
-LONGEST = """
-    tests/gap/test_diagnosis tests/cluster/test_distributed tests/test_commands tests/learning/test_training_step
-    tests/test_examples tests/test_readme experiments/tests/test_exam tests/vehicle/test_effects
-    tests/vehicle/test_flight_dynamics experiments/tests/test_scaling tests/test_adapt tests/commands/test_validation
-    tests/fuzz/test_fuzz
-""".split()
-"""The files that take longest: they come first, so that no worker is left with one of them when all else is done."""
-
-
-def pytest_collection_modifyitems(items):
-    place = {f"{name}.py": i for i, name in enumerate(LONGEST)}
-    items.sort(key=lambda item: place.get(item.location[0], len(place)))
-
 
 VEHICLE_TOML = """
 [vehicle]

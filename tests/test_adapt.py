@@ -30,6 +30,8 @@ from openjax.vehicle import family
 from openjax.vehicle.effects import save_effects
 from openjax.vehicle.family import adapted_family
 
+pytestmark = pytest.mark.slow
+
 TINY = TrainSettings(
     environment=PursuitSettings(
         physics="stops", speed_limit="none", episode_length=8, observe_history=2, history_length=2

@@ -23,6 +23,8 @@ from openjax.store.checkpoint_files import is_checkpoint, load_arrays
 from openjax.store.checkpoints import Checkpoints
 from openjax.store.policy_files import shipped_policies
 
+pytestmark = pytest.mark.slow
+
 UPDATES = 24
 TINY = (
     "--num_envs 16 --rollout_length 10 --environment.episode_length 20 --environment.physics rigid "

@@ -10,6 +10,8 @@ import pytest
 import openjax
 from openjax.commands import training_job
 
+pytestmark = pytest.mark.slow
+
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import pytest
 
 import openjax
 from openjax.__main__ import COMMANDS
@@ -55,6 +56,7 @@ def test_modules_that_the_pages_name_are_there():
             assert any(f"/{module}".endswith(f"/{name}") for module in modules), f"{page.name}: {name}"
 
 
+@pytest.mark.slow
 def test_from_sample_flights_to_a_corrected_simulator(tmp_path):
     """sample_flights -> calibrate -> diagnose -> an environment that flies with what was found."""
     case, out = tmp_path / "drag", tmp_path / "diagnosis"

@@ -17,6 +17,8 @@ from experiments.diagnosis import (
     vehicle,
 )
 
+pytestmark = pytest.mark.slow
+
 
 def told(**changes):
     return vehicle.Told(**changes)

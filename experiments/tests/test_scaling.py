@@ -11,6 +11,8 @@ import pytest
 from experiments.scaling import cases, table
 from openjax.learning import MappoSettings, TrainSettings
 
+pytestmark = pytest.mark.slow
+
 TINY = """
     --preset quick --environment.time_step 0.01 --environment.substeps 1
     --environment.episode_length 10 --network.features 8 --network.heads 1

@@ -20,7 +20,6 @@ import numpy as np
 
 from experiments.diagnosis import effects
 from experiments.pages import page_parser, publish, table, where
-from experiments.task_gap.flights import SIZES
 from experiments.worlds.game import play
 from experiments.worlds.plant import PlantWorld, rng_of
 from experiments.worlds.rotorpy import RotorPyWorld
@@ -38,6 +37,23 @@ VEHICLE = {
 """A Crazyflie with motors 40 ms slower than the nominal, commands 15 ms and poses 10 ms late, and drag."""
 SEED = 500  # of the plant's and RotorPy's sensors; used for nothing else
 PLAIN = ("nominal", "table", "plant", "rotorpy")
+SIZES = {
+    "motor_lag": 2.8,  # time constant 95 ms instead of 25
+    "command_latency": 46.0,  # ms
+    "state_latency": 46.0,  # ms
+    "packet_loss": 0.38,
+    "rotor_drag": 0.024,  # N s/m
+    "wind": 2.3,  # m/s
+    "battery_sag": 0.3,  # of the thrust per volt
+    "thrust_scale": 0.155,
+    "thrust_saturation": 0.66,  # of the room above hover: the rotors top out at 0.75
+    "com_offset": 6.0,  # mm
+    "motor_imbalance": 0.11,
+    "yaw_torque": 0.64,  # 0.36 or 1.64 times the nominal
+    "rate_gains": 0.62,  # P 1.62 or 0.62 times the nominal
+    "downwash": 16.0,  # g
+}
+"""Of the causes, in the plant's own unit."""
 CAUSES = tuple(f"plant:{effect}" for effect in SIZES)
 FAST = 10.0  # Hz
 FIGURES = ("captured", "capture_step", "collision_rate", "crashed", "over_speed_rate")

@@ -19,6 +19,8 @@ from openjax.errors import UserError
 from openjax.show.metrics import read_metrics
 from openjax.store.checkpoint_files import is_checkpoint
 
+pytestmark = pytest.mark.slow
+
 UPDATES = 3
 OPTIONS = """
     --preset quick --environment.time_step 0.01 --environment.substeps 1

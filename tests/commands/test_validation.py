@@ -15,6 +15,8 @@ from openjax.policy import NetworkSettings, Policy, PredictorSettings
 from openjax.pursuit import Pursuit, PursuitSettings, RewardSettings
 from openjax.pursuit.task import START_X, starts_clear
 
+pytestmark = pytest.mark.slow
+
 SETTINGS = PursuitSettings()
 
 

@@ -8,6 +8,8 @@ from tests.fuzz.cases import try_cases
 from tests.fuzz.damages import make_checkpoints, try_damages
 from tests.fuzz.inputs import KINDS
 
+pytestmark = pytest.mark.slow
+
 NUMBER = {"settings files": 60, "layouts": 60, "effects files": 60, "vehicle files": 60}
 
 

@@ -23,6 +23,8 @@ from openjax.gap.where import CHANNELS, REGIMES
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.effects import EFFECTS, load_effects
 
+pytestmark = pytest.mark.slow
+
 VEHICLE = '[vehicle]\nmass = 0.0321\nmass_weighed = {weighed}\n\n[motor]\ncommand = "thrust"\n'
 NOTHING = {
     "mass": {"extra": 0.0},

@@ -26,6 +26,8 @@ from openjax.learning.training_step import _initial_carry, _penalty_share
 from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import SCENARIOS, PursuitSettings, hover_action, scenario_task
 
+pytestmark = pytest.mark.slow
+
 GROUPS, LENGTH, ROLLOUT, UPDATES = 3, 12, 4, 7
 SETTINGS = TrainSettings(
     environment=PursuitSettings(episode_length=LENGTH, physics="rigid", capture_radius=1.0, history_length=3),

@@ -20,6 +20,8 @@ from openjax.vehicle import (
 from openjax.vehicle.effects import EFFECTS, Effect, Parameter, make_context
 from openjax.vehicle.rate_controller import rate_controller
 
+pytestmark = pytest.mark.slow
+
 NO_PILLARS = jnp.zeros((0, 2)), jnp.zeros(0, bool)
 NONE = {name: effect.none() for name, effect in EFFECTS.items()}
 VOCABULARY = """mass thrust_scale battery_sag thrust_saturation thrust_curve rotor_drag blade_flapping wind

@@ -35,7 +35,7 @@ def main(arguments: Sequence[str]) -> int:
     """The command; returns its exit status. Raises UserError without viser, or for an unusable policy or layout."""
     command = parse(ViewCommand, ViewCommand(), arguments, PROGRAM)
     if importlib.util.find_spec("viser") is None:
-        raise UserError('the viewer needs viser: pip install viser')
+        raise UserError("the viewer needs viser: pip install viser")
     viewer = open_viewer(command)
     print(f"http://localhost:{viewer.server.get_port()} (Ctrl-C ends)", flush=True)
     viewer.play()
