@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 from openjax.errors import UserError
 from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import PursuitSettings, RewardSettings
+from openjax.pursuit.evaders import check_evaders
 from openjax.ranges import Interval, Seed, changed, check_intervals
 
 if TYPE_CHECKING:
@@ -158,6 +159,12 @@ class TrainSettings:
     """Share of the run in which all vehicles are nominal; after it, the family `environment.vehicles` grows about them ..."""
     vehicles_ramp: Annotated[float, Interval("[0, 1]")] = 0.0
     """... to its whole size over this share of the run."""
+    evaders_start: Annotated[float, Interval("[0, 1]")] = 0.0
+    """Share of the run in which all evaders are the first of `environment.evaders`; after it the others come in, slowly at first ..."""
+    evaders_ramp: Annotated[float, Interval("[0, 1]")] = 0.0
+    """... to their whole odds and speed over this share of the run."""
+    validation_evaders: tuple[str, ...] = ()
+    """Evaders of the validation; none: those of the training."""
     validation_interval: Annotated[int, Interval("[1, 1000000]")] = 50
     """Iterations between validations, on uniform tasks that are never trained on."""
     validation_episodes: Annotated[int, Interval("[1, 1000000]")] = 256
@@ -166,6 +173,8 @@ class TrainSettings:
 
     def __post_init__(self):
         check_intervals(self)
+        if self.validation_evaders:
+            check_evaders(self.validation_evaders)
 
         def need(condition, text):
             if not condition:

@@ -96,7 +96,7 @@ def abstract_carry(settings: TrainSettings, environment: Pursuit | None = None) 
 
 
 def _initial_carry(settings, parts, key):
-    environment = _with_vehicles_of(settings, parts.environment, 0.0)
+    environment = _starting(settings, parts.environment, 0.0)
     archive = empty_archive(empty_task(settings.environment), settings.generator.capacity)
     key, policy_key, task_key, reset_key = jax.random.split(key, 4)
     tasks = _tasks(
@@ -176,7 +176,7 @@ def make_training_step(
         # rollout
         progress = carry.update.astype(jnp.float32) / settings.total_updates
         penalty_share = _penalty_share(settings, progress)
-        starting = _with_vehicles_of(settings, environment, progress)
+        starting = _starting(settings, environment, progress)
         shape = (settings.rollout_length, settings.environment.num_pursuers, policy.sample_size)
         noise = jax.vmap(lambda k: jax.random.normal(k, shape))(own_keys(noise_key, num_envs, axis))
         rollout, observation, state = collect(
@@ -242,13 +242,20 @@ def _penalty_share(settings, progress):
     return start + (1.0 - start) * jnp.minimum(progress / max(settings.mappo.penalty_ramp, 1e-6), 1.0)
 
 
-def _with_vehicles_of(settings, environment, progress):
-    """The environment whose episodes start with the vehicles of that moment of the run."""
+def _starting(settings, environment, progress):
+    """The environment whose episodes start with the vehicles and evaders of that moment of the run."""
+
+    def grown(start, ramp):
+        return jnp.clip((progress - start) / max(ramp, 1e-6), 0.0, 1.0)
+
     family = settings.environment.vehicles
-    if not family or not (settings.vehicles_start or settings.vehicles_ramp):
-        return environment
-    share = jnp.clip((progress - settings.vehicles_start) / max(settings.vehicles_ramp, 1e-6), 0.0, 1.0)
-    return environment.with_bounds(narrowed_bounds(family, share))
+    if family and (settings.vehicles_start or settings.vehicles_ramp):
+        share = grown(settings.vehicles_start, settings.vehicles_ramp)
+        environment = environment.with_bounds(narrowed_bounds(family, share))
+    if settings.evaders_start or settings.evaders_ramp:
+        share = grown(settings.evaders_start, settings.evaders_ramp)
+        environment = environment.with_evader_share(share)
+    return environment
 
 
 def _tasks(settings, archive, keys, close=0.0):

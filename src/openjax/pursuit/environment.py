@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from openjax.pursuit.collisions import breaches, crashed
-from openjax.pursuit.evader import evader_velocity
+from openjax.pursuit.evaders import Around, draw_evader, evader_velocity
 from openjax.pursuit.info import StepInfo
 from openjax.pursuit.observation import Observation, frame, observe, own_frame, rotation_axes
 from openjax.pursuit.reward import captures, over_speed, reward
@@ -74,6 +74,8 @@ class Pursuit:
     """Their parameters, {effect: {parameter: value}}."""
     vehicle_bounds: jax.Array | None = None
     """(R, 4) bounds of `settings.vehicles` that go before those written there."""
+    evader_share: jax.Array | None = None
+    """() from 0 to 1, how far a curriculum over `settings.evaders` has come; None is 1. See `openjax.pursuit.evaders`."""
     dynamics: Dynamics | None = None
     """What moves the pursuers; None: the physics that the settings name, with the effects."""
 
@@ -165,6 +167,7 @@ class Pursuit:
             vehicles=vehicles,
             evader_position=task.evader_position,
             evader_velocity=still,
+            evader=draw_evader(settings, jax.random.fold_in(key, 3), self.evader_share),
             last_seen=jnp.where(seen, task.evader_position, middle),
             in_sight=in_sight,
             frames=frames,
@@ -178,6 +181,10 @@ class Pursuit:
     def with_bounds(self, vehicle_bounds: jax.Array) -> "Pursuit":
         """The same game with vehicles drawn within these bounds (R, 4)."""
         return dataclasses.replace(self, vehicle_bounds=vehicle_bounds)
+
+    def with_evader_share(self, share: jax.Array) -> "Pursuit":
+        """The same game at this share () of its curriculum over evaders."""
+        return dataclasses.replace(self, evader_share=share)
 
     def observe(self, state: PursuitState) -> Observation:
         """The observation of a state; effects on the sensors act on what a pursuer knows of all pursuers."""
@@ -229,9 +236,10 @@ class Pursuit:
         """
         settings, task, before = self.settings, state.task, state
         pillars = (task.pillar_position, task.pillar_active)
-        velocity = evader_velocity(
-            settings, before.evader_position, before.drones.position, before.in_sight, *pillars
+        around = Around(
+            before.evader_position, before.evader_velocity, before.drones.position, before.in_sight, *pillars
         )
+        velocity, evader_state = evader_velocity(settings, before.evader, around)
         evader = before.evader_position + settings.time_step * velocity
         step = before.step + 1
         position = drones.position
@@ -247,6 +255,7 @@ class Pursuit:
             drones=drones,
             evader_position=evader,
             evader_velocity=velocity,
+            evader=evader_state,
             last_seen=jnp.where(seen, evader, before.last_seen),
             in_sight=in_sight,
             frames=jnp.concatenate([before.frames[1:], newest[None]]),
@@ -272,10 +281,17 @@ class Pursuit:
         return observe(settings, state, seen_drones), state, rewards, terminated, truncated, info
 
 
-def make(settings: PursuitSettings | None = None, **changes) -> Pursuit:
-    """An environment. `changes` are fields of `PursuitSettings`: `make(num_pursuers=4, reward=dict(crash=20.0))`.
+def make(settings: PursuitSettings | None = None, evader: str | None = None, **changes) -> Pursuit:
+    """An environment.
+
+    Args:
+      settings: the game; None is the paper's.
+      evader: a name in `openjax.pursuit.evaders.EVADERS`, short for `evaders=(name,)`.
+      changes: fields of `PursuitSettings`: `make(num_pursuers=4, reward=dict(crash=20.0))`.
 
     Raises:
-      UserError: no such setting, or a value that it can't have.
+      UserError: no such setting, a value that it can't have, or an evader that nobody knows.
     """
+    if evader is not None:
+        changes["evaders"] = (evader,)
     return Pursuit(changed(settings or PursuitSettings(), **changes))

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from openjax.errors import UserError
+from openjax.pursuit.evaders.kinds import check_evaders
 from openjax.ranges import Interval, check_intervals
 from openjax.vehicle.arena import Arena
 
@@ -63,6 +64,9 @@ class PursuitSettings:
     """Speed of the evader (m/s)."""
     evader_norm: Literal["euclidean", "axis"] = "euclidean"
     """How the evader's force becomes a velocity; "axis" normalises by the largest component (up to 3**0.5 faster)."""
+    evaders: tuple[str, ...] = ("field",)
+    """Evaders, one of which is drawn for each episode with equal odds; a name that comes twice is drawn twice as often. "field" is
+    the paper's; see `openjax.pursuit.evaders`."""
     max_speed: Annotated[float, Interval("(0, 100]")] = 1.0
     """Maximal speed of a pursuer (m/s)."""
     speed_limit: Literal["clamp", "none"] = "clamp"
@@ -122,6 +126,7 @@ class PursuitSettings:
             from openjax.vehicle.family import check_ranges  # knows the effects, which are written in JAX
 
             check_ranges(self.vehicles)
+        check_evaders(self.evaders)
 
     @property
     def arena(self) -> Arena:

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from openjax.pursuit.evaders.evader import EvaderState
 from openjax.pursuit.statistics import EpisodeStatistics
 from openjax.pursuit.task import Task
 from openjax.vehicle import DroneState
@@ -19,6 +20,8 @@ class PursuitState:
     """effect -> parameter -> (N,), drawn at the start; empty: nominal vehicles"""
     evader_position: jax.Array  # (3,) m, world
     evader_velocity: jax.Array  # (3,) m/s, world
+    evader: EvaderState | None
+    """which evader it is, and its memory; None where all are the paper's, which has none"""
     last_seen: jax.Array  # (3,) where the evader was last seen; the arena's middle before that
     in_sight: jax.Array  # (N,) bool, which pursuers see the evader
     frames: jax.Array  # (n * spacing, F) history, oldest first

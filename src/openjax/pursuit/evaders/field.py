@@ -1,4 +1,4 @@
-"""The evader: a potential field that flees pursuers in sight, pillars and the arena's bounds."""
+"""The paper's evader: a potential field that flees pursuers in sight, pillars and the arena's bounds."""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ INWARD = 1e5
 """Push back where the evader is outside the arena or inside a pillar."""
 
 
-def evader_velocity(
+def field_velocity(
     settings: PursuitSettings,
     evader: jax.Array,
     pursuers: jax.Array,

@@ -1,0 +1,1 @@
+"""Pursuers against evaders: who catches whom."""

@@ -1,0 +1,167 @@
+"""Policies against every evader: `python -m experiments.evaders.cross_play --policy NAME ... [--game own|honest]`.
+
+All evaders by name, on the six layouts and on uniform tasks, with the nominal vehicle, a slower one and the family of the
+preset `flight`. Nothing is chosen by any of it; held-out evaders were never trained on. Game "own": the policy's; "honest": no
+clamp on the speed, the rate loop at 500 Hz. Writes experiments/results/evaders.json and .md (`--out`: others).
+"""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.table import Page, Table, page_parser, publish
+from experiments.vehicles import vehicles
+from openjax.commands.command_line import run_command
+from openjax.commands.evaluator import layout_slots, repeat_task
+from openjax.commands.validation import uniform_tasks
+from openjax.pursuit import SCENARIOS, EpisodeStatistics, Pursuit, PursuitSettings, RewardSettings, Task, scenario_task
+from openjax.pursuit.evaders import EVADERS, draw_evader
+from openjax.store.policies import LoadedPolicy, load_policy
+from openjax.vehicle import load_vehicle
+from openjax.vehicle.family import FLIGHT_FAMILY
+
+ALL = tuple(EVADERS)
+
+
+@functools.cache
+def program(settings: PursuitSettings, policy):
+    """Compiled episodes: (parameters, tasks (B, ...), evaders (B,) places in `ALL`, key, bounds (R, 4)) -> statistics (B,)."""
+    vehicle = load_vehicle()
+
+    def run(parameters, tasks, evaders, key, bounds):
+        environment = Pursuit(settings, vehicle, vehicle_bounds=bounds)
+
+        def begin(key, task, kind):
+            observation, state = environment.reset_to(key, task)
+            evader = draw_evader(settings, jax.random.fold_in(key, 3), kind=kind)
+            return observation, state.replace(evader=evader)
+
+        def one(world, _):
+            observation, state = world
+            action = policy.act(parameters, observation)
+            observation, state, *_ = jax.vmap(environment.step, (None, 0, 0))(key, state, action)
+            return (observation, state), None
+
+        world = jax.vmap(begin)(jax.random.split(key, evaders.shape[0]), tasks, evaders)
+        return jax.lax.scan(one, world, length=settings.episode_length)[0][1].statistics
+
+    return jax.jit(run)
+
+
+def game_of(loaded: LoadedPolicy, game: str, physics: str) -> PursuitSettings:
+    """The policy's game with all evaders and the family of vehicles; see the module."""
+    settings = loaded.settings.environment
+    settings = dataclasses.replace(
+        settings,
+        evaders=ALL,
+        physics=physics,
+        vehicles=FLIGHT_FAMILY,
+        rare_vehicles=0.5,
+        max_pillars=layout_slots(settings),
+        reward=RewardSettings(),  # counts for nothing here: the same program for policies that differ in it
+    )
+    if game == "own":
+        return settings
+    return dataclasses.replace(settings, speed_limit="none", substeps=5)
+
+
+def tasks_of(settings: PursuitSettings, layouts: int, uniform: int) -> tuple[list[str], list[int], Task]:
+    """Names of the kinds of tasks, how many of each, and all of them one after the other."""
+    parts = [repeat_task(scenario_task(settings, scenario), layouts) for scenario in SCENARIOS.values()]
+    parts.append(uniform_tasks(dataclasses.replace(settings, max_pillars=5), uniform, settings.max_pillars))
+    tasks = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+    return [*SCENARIOS, "uniform"], [layouts] * len(SCENARIOS) + [uniform], tasks
+
+
+def fly(name: str, options) -> list[dict]:
+    """A record for each vehicle, evader and kind of task."""
+    loaded = load_policy(name)
+    settings = game_of(loaded, options.game, options.physics)
+    kinds, counts, tasks = tasks_of(settings, options.episodes, options.uniform)
+    run = program(settings, loaded.in_game(Pursuit(settings)).policy)
+    number = sum(counts)
+    repeated = jax.tree.map(lambda leaf: jnp.tile(leaf, (len(ALL), *[1] * (leaf.ndim - 1))), tasks)
+    evaders = jnp.repeat(jnp.arange(len(ALL)), number)
+    records = []
+    for vehicle in options.vehicles:
+        bounds = jnp.asarray(vehicles()[vehicle])
+        found = jax.tree.map(np.asarray, run(loaded.parameters, repeated, evaders, jax.random.key(0), bounds))
+        for i, evader in enumerate(ALL):
+            start = i * number
+            for kind, count in zip(kinds, counts, strict=True):
+                part = jax.tree.map(lambda leaf, s=start, n=count: leaf[s : s + n], found)
+                start += count
+                case = {"policy": name, "game": options.game, "vehicle": vehicle, "evader": evader, "tasks": kind}
+                records.append(case | {"of": EVADERS[evader].of} | summary(part))
+    return records
+
+
+def summary(statistics: EpisodeStatistics) -> dict:
+    """Counts and means over episodes, with Wilson's 95 % interval of the capture rate."""
+    number, captures = len(statistics.captured), int(statistics.captured.sum())
+    return {
+        "episodes": number,
+        "captures": captures,
+        "capture_rate": captures / number,
+        "interval": wilson(captures, number),
+        "crash_rate": float(statistics.crashed.mean()),
+        "capture_step": float(statistics.capture_step.mean()),
+        "collision_rate": float((statistics.collision_steps / statistics.steps).mean()),
+        "over_speed_rate": float((statistics.over_speed_steps / statistics.steps).mean()),
+    }
+
+
+def wilson(successes: int, number: int) -> tuple[float, float]:
+    """Wilson's 95 % interval of a share (Wilson 1927)."""
+    z = 1.959964
+    share = successes / number
+    middle = (share + z**2 / (2 * number)) / (1 + z**2 / number)
+    half = z / (1 + z**2 / number) * (share * (1 - share) / number + z**2 / (4 * number**2)) ** 0.5
+    return max(0.0, middle - half), min(1.0, middle + half)
+
+
+def study(options) -> dict:
+    """Fly the policies."""
+    return {"records": [record for name in options.policy for record in fly(name, options)]}
+
+
+def page(results: dict) -> Page:
+    """Capture rates and crashes by evader, a table for each policy and vehicle."""
+    parts = []
+    records = results["records"]
+    for policy, game, vehicle in dict.fromkeys((r["policy"], r["game"], r["vehicle"]) for r in records):
+        own = [r for r in records if (r["policy"], r["game"], r["vehicle"]) == (policy, game, vehicle)]
+        rows = []
+        for evader in dict.fromkeys(r["evader"] for r in own):
+            by_task = {r["tasks"]: r for r in own if r["evader"] == evader}
+            rates = {name: f"{r['capture_rate']:.3f}, {r['crash_rate']:.3f}" for name, r in by_task.items()}
+            low = min(r["interval"][0] for r in by_task.values())
+            rows.append({"evader": evader, "of": EVADERS[evader].of, "low": low, **rates})
+        columns = {"evader": "evader", "used for": "of", **{name: name for name in by_task}}
+        columns["least lower end"] = "low:.3f"
+        parts.append(Table(columns, rows, title=f"{policy}, {game} game, {vehicle} vehicle"))
+    prose = (
+        "Capture rate, crash rate. The last column is the least lower end of the capture rates' 95 % intervals. "
+        "Held-out evaders were never trained on, nor were checkpoints chosen by them."
+    )
+    return Page("Policies against evaders", prose, parts)
+
+
+def main(arguments: list[str]) -> int:
+    """Evaluate and write both files."""
+    parser = page_parser(__doc__, "evaders")
+    parser.add_argument("--policy", nargs="+", default=["flight"], help="names, runs or policy files")
+    parser.add_argument("--game", choices=("own", "honest"), default="honest")
+    parser.add_argument("--physics", choices=("rigid", "stops"), default="rigid")
+    parser.add_argument("--vehicles", nargs="+", default=["nominal", "table", "family"])
+    parser.add_argument("--episodes", type=int, default=100, help="per layout")
+    parser.add_argument("--uniform", type=int, default=256, help="uniform tasks")
+    publish(parser.parse_args(arguments), study, page)
+    return 0
+
+
+if __name__ == "__main__":
+    run_command(main)

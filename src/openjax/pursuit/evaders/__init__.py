@@ -1,0 +1,19 @@
+"""Evaders as data: what each does, which numbers are drawn for it in each world, and which of them may be trained on."""
+
+from openjax.lazy import lazy_names
+
+# loaded when asked for: the game's settings need the names alone
+_HOMES = {
+    "EVADERS": "kinds",
+    "HELD_OUT": "kinds",
+    "TRAINED": "kinds",
+    "VALIDATED": "kinds",
+    "Around": "evader",
+    "EvaderKind": "kinds",
+    "EvaderState": "evader",
+    "check_evaders": "kinds",
+    "draw_evader": "evader",
+    "evader_velocity": "evader",
+    "field_velocity": "field",
+}
+__getattr__, __dir__, __all__ = lazy_names(__name__, _HOMES)

@@ -1,0 +1,187 @@
+"""What evaders do: pure functions of what one knows and of its memory, of static shapes.
+
+    behaviour(scene, memory) -> wish (3,), memory (MEMORY,)
+
+A wish is a velocity as a share of the evader's speed, of at most length one. `openjax.pursuit.evaders.evader` sees to the
+speed, the acceleration and what is solid.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from openjax.pursuit.sensing import line_of_sight
+from openjax.pursuit.settings import PursuitSettings
+
+MEMORY = 4
+"""Numbers that an evader remembers; drawn uniformly from 0 to 1 at the start of an episode."""
+DIRECTIONS = 64
+"""That a greedy evader tries; one that looks two steps ahead tries half as many at each."""
+MARGIN = 0.02
+"""Distance (m) at which an evader keeps off pillars and the arena's bounds."""
+AROUND = 0.1
+"""A pillar's hugger stays this far from its surface, and way-points are left when nearer than this (m)."""
+FAR_AWAY = 100.0
+"""Distance (m) at which pursuers are put that an evader doesn't know of."""
+
+
+@struct.dataclass
+class Scene:
+    """What an evader in one world knows."""
+
+    settings: PursuitSettings = struct.field(pytree_node=False)
+    position: jax.Array  # (3,) m, its own
+    pursuers: jax.Array  # (N, 3) m
+    known: jax.Array  # (N,) bool, the pursuers that it knows of
+    pillar_position: jax.Array  # (P, 2) m
+    pillar_active: jax.Array  # (P,) bool
+    look_ahead: jax.Array  # () s
+    hiding: jax.Array  # () m
+    reach: jax.Array  # () m/s, its speed
+
+    @property
+    def nearest(self) -> jax.Array:
+        """(3,) m, the nearest pursuer that it knows of."""
+        distance = jnp.sum((self.pursuers - self.position) ** 2, axis=-1)
+        chosen = jnp.argmin(jnp.where(self.known, distance, jnp.inf))
+        return jnp.sum(jnp.where(jnp.arange(distance.shape[0])[:, None] == chosen, self.pursuers, 0.0), axis=0)
+
+
+def directions(number: int) -> np.ndarray:
+    """(number, 3) unit vectors spread evenly over the sphere: a Fibonacci lattice."""
+    i = np.arange(number) + 0.5
+    z, angle = 1.0 - 2.0 * i / number, np.pi * (1.0 + 5.0**0.5) * i
+    radius = np.sqrt(1.0 - z**2)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=-1).astype(np.float32)
+
+
+def into_free_space(
+    settings: PursuitSettings, place: jax.Array, pillar_position: jax.Array, pillar_active: jax.Array
+) -> jax.Array:
+    """(..., 3) the points nearest to `place` (..., 3) that keep their distance from bounds and one pillar."""
+    xy, z = place[..., :2], place[..., 2:]
+    offset = xy[..., None, :] - pillar_position
+    distance = _length(offset)
+    depth = jnp.maximum(settings.pillar_radius + MARGIN - distance, 0.0)
+    xy = xy + jnp.sum(jnp.where(pillar_active[:, None], offset / distance * depth, 0.0), axis=-2)
+    xy = xy * jnp.minimum(1.0, (settings.arena_radius - MARGIN) / _length(xy))
+    return jnp.concatenate([xy, jnp.clip(z, MARGIN, settings.arena_height - MARGIN)], axis=-1)
+
+
+def greedy(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Fly to where, after the look-ahead, the nearest pursuer is farthest away."""
+    tried = directions(DIRECTIONS)
+    ends, open_way = _ends(scene, scene.position, tried)
+    score = jnp.where(open_way, _nearness(scene, ends, scene.pursuers), -jnp.inf)
+    return _chosen(tried, score) * jnp.any(scene.known), memory
+
+
+def two_step(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The same over two steps; after the first the pursuers have come closer, each straight to where it went."""
+    tried = directions(DIRECTIONS // 2)
+    first, open_way = _ends(scene, scene.position, tried)
+
+    def best_after(end):
+        to_end = end - scene.pursuers
+        step = jnp.minimum(scene.settings.max_speed * scene.look_ahead / _length(to_end), 1.0)
+        answer = scene.pursuers + step * to_end
+        second, open_then = _ends(scene, end, tried)
+        later = jnp.where(open_then, _nearness(scene, second, answer), -jnp.inf)
+        return jnp.minimum(_nearness(scene, end[None], answer)[0], jnp.max(later))
+
+    score = jnp.where(open_way, jax.vmap(best_after)(first), -jnp.inf)
+    return _chosen(tried, score) * jnp.any(scene.known), memory
+
+
+def wall_runner(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Run along the wall, round the arena and up or down, away from the nearest pursuer."""
+    settings, threat = scene.settings, scene.nearest
+    radius = _length(scene.position[:2])
+    out = scene.position[:2] / radius
+    left = jnp.stack([-out[1], out[0]])
+    side = jnp.where(threat[0] * out[1] - threat[1] * out[0] >= 0.0, 1.0, -1.0)
+    outward = jnp.clip((settings.arena_radius - AROUND - radius) / AROUND, -1.0, 1.0)
+    goal = jnp.where(threat[2] > settings.arena_height / 2, AROUND, settings.arena_height - AROUND)
+    climb = 0.5 * jnp.clip((goal - scene.position[2:]) / AROUND, -1.0, 1.0)
+    return _unit(jnp.concatenate([side * left + outward * out, climb])), memory
+
+
+def pillar_hugger(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Stay behind a pillar, as seen by the nearest pursuer; where there is none, fly straight away from it."""
+    threat, pillars = scene.nearest, scene.pillar_position
+    behind = pillars - threat[:2]
+    behind = pillars + behind / _length(behind) * (scene.settings.pillar_radius + AROUND)
+    distance = jnp.where(scene.pillar_active, _length(behind - scene.position[:2])[:, 0], jnp.inf)
+    is_chosen = jnp.arange(distance.shape[0])[:, None] == jnp.argmin(distance)
+    goal = jnp.concatenate([jnp.sum(jnp.where(is_chosen, behind, 0.0), axis=0), scene.position[2:]])
+    to_goal, away = goal - scene.position, _unit(scene.position - threat)
+    hidden = to_goal / jnp.maximum(_length(to_goal), AROUND)
+    return jnp.where(jnp.any(scene.pillar_active), hidden, away), memory
+
+
+def way_points(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Fly from point to point, whatever the pursuers do. The points are a sequence of low discrepancy from a drawn one on."""
+    settings = scene.settings
+    share, left = memory[:3], memory[3]
+    angle, radius = 2.0 * jnp.pi * share[0], settings.arena_radius * jnp.sqrt(share[1])
+    goal = jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), settings.arena_height * share[2]])
+    goal = into_free_space(settings, goal, scene.pillar_position, scene.pillar_active)
+    to_goal = goal - scene.position
+    # after a second it gives up a point that it doesn't reach
+    left = left - settings.time_step
+    done = (_length(to_goal)[0] < AROUND) | (left < 0.0)
+    # the additive recurrence of the largest root of x^4 = x + 1 (Roberts 2018, The unreasonable effectiveness of R-sequences)
+    following = jnp.mod(share + 1.2207440846057596 ** -jnp.arange(1.0, 4.0), 1.0)
+    memory = jnp.where(done, jnp.append(following, 1.0), jnp.append(share, left))
+    return _unit(to_goal), memory
+
+
+def frozen(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Stay where it is."""
+    return jnp.zeros_like(scene.position), memory
+
+
+BEHAVIOURS: dict[str, Callable[[Scene, Any], tuple[jax.Array, Any]]] = {
+    "greedy": greedy,
+    "two_step": two_step,
+    "wall_runner": wall_runner,
+    "pillar_hugger": pillar_hugger,
+    "way_points": way_points,
+    "frozen": frozen,
+}
+
+
+def _ends(scene, start, tried):
+    """(K, 3) where K directions lead within the look-ahead, and (K,) whether no pillar is in the way."""
+    pillars = scene.pillar_position, scene.pillar_active
+    ends = start + scene.reach * scene.look_ahead * tried
+    ends = into_free_space(scene.settings, ends, *pillars)
+    return ends, line_of_sight(scene.settings, ends, start, *pillars)
+
+
+def _nearness(scene, ends, pursuers):
+    """(K,) m, from (K, 3) places to the nearest of (N, 3) pursuers; those without a line of sight count farther."""
+    distance = _length(ends[:, None] - pursuers)[..., 0]
+    sees = jax.vmap(
+        lambda end: line_of_sight(scene.settings, pursuers, end, scene.pillar_position, scene.pillar_active)
+    )(ends)
+    distance = distance + jnp.where(sees, 0.0, scene.hiding)
+    return jnp.min(jnp.where(scene.known, distance, FAR_AWAY), axis=-1)
+
+
+def _chosen(tried, score):
+    """The direction of the highest score, by a sum: cheaper on an accelerator than a gather."""
+    is_best = jnp.arange(tried.shape[0])[:, None] == jnp.argmax(score)
+    return jnp.sum(jnp.where(is_best, tried, 0.0), axis=0)
+
+
+def _length(vector):
+    return jnp.sqrt(jnp.sum(vector**2, axis=-1, keepdims=True) + 1e-12)
+
+
+def _unit(vector):
+    return vector / _length(vector)

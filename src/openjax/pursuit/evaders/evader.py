@@ -1,0 +1,150 @@
+"""The evader of one world: which it is, its numbers and its memory, drawn at the start; and its velocity in each step."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from openjax.pursuit.evaders.behaviours import BEHAVIOURS, MEMORY, Scene, into_free_space
+from openjax.pursuit.evaders.field import field_velocity
+from openjax.pursuit.evaders.kinds import EVADERS, NUMBERS
+from openjax.pursuit.settings import PursuitSettings
+
+
+@struct.dataclass
+class EvaderState:
+    """Which evader a world has, and what it remembers."""
+
+    kind: jax.Array  # () int32, place in `settings.evaders`
+    numbers: dict[str, jax.Array]  # those of `EvaderKind`, () each, float32
+    memory: jax.Array  # (MEMORY,)
+
+
+@struct.dataclass
+class Around:
+    """What is around an evader."""
+
+    position: jax.Array  # (3,) m, its own
+    velocity: jax.Array  # (3,) m/s, its own in the last step
+    pursuers: jax.Array  # (N, 3) m
+    in_sight: jax.Array  # (N,) bool
+    pillar_position: jax.Array  # (P, 2) m
+    pillar_active: jax.Array  # (P,) bool
+
+    @property
+    def pillars(self) -> tuple[jax.Array, jax.Array]:
+        """Positions and which are in use."""
+        return self.pillar_position, self.pillar_active
+
+
+def draw_evader(
+    settings: PursuitSettings,
+    key: jax.Array,
+    share: jax.Array | None = None,
+    kind: jax.Array | None = None,
+) -> EvaderState | None:
+    """The evader of an episode; None for the paper's, which has nothing to draw.
+
+    Args:
+      settings: their `evaders` are drawn with equal odds.
+      key: ().
+      share: () from 0 to 1, how far a curriculum has come; None is 1. At 0 all worlds have the first of the evaders; from
+        there the others' odds grow to the equal ones, and their speed from half to the whole.
+      kind: () int32, the place in `settings.evaders` of the one it is; None draws it.
+    """
+    names = settings.evaders
+    if set(names) == {"field"}:
+        return None
+    kind_key, number_key, memory_key = jax.random.split(key, 3)
+    if kind is None:
+        kind = jax.random.randint(kind_key, (), 0, len(names))
+    slow = jnp.ones(())
+    if share is not None:
+        kind = jnp.where(jax.random.uniform(jax.random.fold_in(kind_key, 1)) < share, kind, 0)
+        slow = jnp.where(kind == 0, 1.0, 0.5 + 0.5 * share)
+    draws = jax.random.uniform(number_key, (len(NUMBERS),))
+    numbers = {
+        number: _drawn([getattr(EVADERS[name], number) for name in names], kind, draw)
+        for number, draw in zip(NUMBERS, draws, strict=True)
+    }
+    numbers["speed"] = numbers["speed"] * slow
+    return EvaderState(kind=kind, numbers=numbers, memory=jax.random.uniform(memory_key, (MEMORY,)))
+
+
+def _drawn(values, kind, draw):
+    """One of `values[kind]`, by the uniform `draw`."""
+    width = max(len(own) for own in values)
+    table = np.array([[*own, *[0.0] * (width - len(own))] for own in values], np.float32)
+    lengths = np.array([len(own) for own in values], np.float32)
+    return jnp.asarray(table)[kind, (draw * jnp.asarray(lengths)[kind]).astype(jnp.int32)]
+
+
+def evader_velocity(
+    settings: PursuitSettings, state: EvaderState | None, around: Around
+) -> tuple[jax.Array, EvaderState | None]:
+    """(3,) velocity (m/s, world) of the evader in this step, and its state after it.
+
+    Scripted evaders neither leave the arena nor enter a pillar, and no gradient goes through what they decide.
+    """
+    if state is None:
+        return _field(settings, around), None
+    velocity, memory = _scripted(settings, *jax.lax.stop_gradient((state, around)))
+    is_field = np.array([EVADERS[name].behaviour == "field" for name in settings.evaders])
+    if is_field.any():
+        velocity = jnp.where(jnp.asarray(is_field)[state.kind], _field(settings, around), velocity)
+    return velocity, state.replace(memory=memory)
+
+
+def _field(settings, around):
+    return field_velocity(settings, around.position, around.pursuers, around.in_sight, *around.pillars)
+
+
+def _scripted(settings, state, around):
+    """Velocity (3,) and memory of an evader with a behaviour; of the paper's something finite."""
+    numbers = state.numbers
+    speed = numbers["speed"] * settings.evader_speed
+    scene = Scene(
+        settings=settings,
+        position=around.position,
+        pursuers=around.pursuers,
+        known=around.in_sight | (numbers["sees_all"] > 0.5),
+        pillar_position=around.pillar_position,
+        pillar_active=around.pillar_active,
+        look_ahead=numbers["look_ahead"],
+        hiding=numbers["hiding"],
+        reach=speed,
+    )
+    behaviours = [EVADERS[name].behaviour for name in settings.evaders]
+    used = [name for name in BEHAVIOURS if name in behaviours]
+    place = np.array([used.index(name) if name in used else 0 for name in behaviours], np.int32)
+    # mapped over worlds, a switch works all of them out and selects: each behaviour stands in it once
+    wish, memory = jax.lax.switch(
+        jnp.asarray(place)[state.kind], [BEHAVIOURS[name] for name in used], scene, state.memory
+    )
+    return _flown(settings, around, speed, numbers["acceleration"], wish), memory
+
+
+def _flown(settings, around, speed, acceleration, wish):
+    """(3,) m/s, what is flown of a wish: bounded in speed and acceleration, and past what is solid."""
+
+    def at_most(vector, limit):
+        return vector * jnp.minimum(1.0, limit / jnp.sqrt(jnp.sum(vector**2) + 1e-12))
+
+    dt, start = settings.time_step, around.position
+    velocity = around.velocity + at_most(speed * wish - around.velocity, acceleration * dt)
+    velocity = at_most(velocity, speed)
+    moved = into_free_space(settings, start + dt * velocity, *around.pillars)
+    velocity = at_most((moved - start) / dt, speed)
+    # between pillars that touch, what leads out of one may lead into another
+    free = _is_free(settings, start + dt * velocity, *around.pillars)
+    return jnp.where(free, velocity, 0.0)
+
+
+def _is_free(settings, place, pillar_position, pillar_active):
+    """() bool, whether (3,) `place` is inside the arena and outside all pillars."""
+    squared = jnp.sum((place[:2] - pillar_position) ** 2, axis=-1)
+    inside = (jnp.sum(place[:2] ** 2) < settings.arena_radius**2) & (place[2] > 0.0)
+    inside &= place[2] < settings.arena_height
+    return inside & ~jnp.any(pillar_active & (squared < settings.pillar_radius**2))
