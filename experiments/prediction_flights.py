@@ -18,7 +18,7 @@ from openjax.pursuit import (
     turn_task,
     uniform_task,
 )
-from openjax.pursuit.evader import evader_velocity
+from openjax.pursuit.evaders import field_velocity
 from openjax.pursuit.sensing import line_of_sight
 
 SOURCES = ("its own predictor", "last seen position", "constant velocity", "true position and velocity")
@@ -180,7 +180,7 @@ def evader_rule(
 
         def moved(evader, pursuers, known):
             in_sight = line_of_sight(settings, pursuers, evader, *pillars) & known
-            return evader + dt * evader_velocity(settings, evader, pursuers, in_sight, *pillars)
+            return evader + dt * field_velocity(settings, evader, pursuers, in_sight, *pillars)
 
         def track(believed, now):
             true, seen, pursuers = now

@@ -17,7 +17,15 @@ from experiments.vehicles import vehicles
 from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import layout_slots, repeat_task
 from openjax.commands.validation import uniform_tasks
-from openjax.pursuit import SCENARIOS, EpisodeStatistics, Pursuit, PursuitSettings, RewardSettings, Task, scenario_task
+from openjax.pursuit import (
+    SCENARIOS,
+    EpisodeStatistics,
+    Pursuit,
+    PursuitSettings,
+    RewardSettings,
+    Task,
+    scenario_task,
+)
 from openjax.pursuit.evaders import EVADERS, draw_evader
 from openjax.store.policies import LoadedPolicy, load_policy
 from openjax.vehicle import load_vehicle
@@ -94,7 +102,13 @@ def fly(name: str, options) -> list[dict]:
             for kind, count in zip(kinds, counts, strict=True):
                 part = jax.tree.map(lambda leaf, s=start, n=count: leaf[s : s + n], found)
                 start += count
-                case = {"policy": name, "game": options.game, "vehicle": vehicle, "evader": evader, "tasks": kind}
+                case = {
+                    "policy": name,
+                    "game": options.game,
+                    "vehicle": vehicle,
+                    "evader": evader,
+                    "tasks": kind,
+                }
                 records.append(case | {"of": EVADERS[evader].of} | summary(part))
     return records
 

@@ -15,7 +15,7 @@ from openjax.pursuit import (
     make,
     scenario_task,
 )
-from openjax.pursuit.evader import evader_velocity
+from openjax.pursuit.evaders import field_velocity
 from openjax.pursuit.sensing import line_of_sight
 from openjax.vehicle.effects import EFFECTS
 
@@ -133,7 +133,7 @@ def test_order_within_a_step_and_history():
     @jax.vmap
     def fled(evader, position):
         in_sight = line_of_sight(environment.settings, position, evader, *pillars)
-        return in_sight, evader_velocity(environment.settings, evader, position, in_sight, *pillars)
+        return in_sight, field_velocity(environment.settings, evader, position, in_sight, *pillars)
 
     in_sight, expected = fled(
         np.concatenate([start.evader_position[None], evader[:-1]]),

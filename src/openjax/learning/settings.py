@@ -160,7 +160,7 @@ class TrainSettings:
     vehicles_ramp: Annotated[float, Interval("[0, 1]")] = 0.0
     """... to its whole size over this share of the run."""
     evaders_start: Annotated[float, Interval("[0, 1]")] = 0.0
-    """Share of the run in which all evaders are the first of `environment.evaders`; after it the others come in, slowly at first ..."""
+    """Share of the run in which all evaders are the first of `environment.evaders`; after it the others come in, slow ones ..."""
     evaders_ramp: Annotated[float, Interval("[0, 1]")] = 0.0
     """... to their whole odds and speed over this share of the run."""
     validation_evaders: tuple[str, ...] = ()

@@ -65,8 +65,8 @@ class PursuitSettings:
     evader_norm: Literal["euclidean", "axis"] = "euclidean"
     """How the evader's force becomes a velocity; "axis" normalises by the largest component (up to 3**0.5 faster)."""
     evaders: tuple[str, ...] = ("field",)
-    """Evaders, one of which is drawn for each episode with equal odds; a name that comes twice is drawn twice as often. "field" is
-    the paper's; see `openjax.pursuit.evaders`."""
+    """Evaders, one of which is drawn for each episode with equal odds; a name that comes twice is drawn twice as often. "field"
+    is the paper's; see `openjax.pursuit.evaders`."""
     max_speed: Annotated[float, Interval("(0, 100]")] = 1.0
     """Maximal speed of a pursuer (m/s)."""
     speed_limit: Literal["clamp", "none"] = "clamp"

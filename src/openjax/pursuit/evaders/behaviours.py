@@ -48,7 +48,9 @@ class Scene:
         """(3,) m, the nearest pursuer that it knows of."""
         distance = jnp.sum((self.pursuers - self.position) ** 2, axis=-1)
         chosen = jnp.argmin(jnp.where(self.known, distance, jnp.inf))
-        return jnp.sum(jnp.where(jnp.arange(distance.shape[0])[:, None] == chosen, self.pursuers, 0.0), axis=0)
+        return jnp.sum(
+            jnp.where(jnp.arange(distance.shape[0])[:, None] == chosen, self.pursuers, 0.0), axis=0
+        )
 
 
 def directions(number: int) -> np.ndarray:

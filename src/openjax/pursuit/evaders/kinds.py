@@ -35,7 +35,11 @@ NUMBERS = ("look_ahead", "hiding", "sees_all", "acceleration", "speed")
 EVADERS = {
     "field": EvaderKind("field", "train"),
     "greedy": EvaderKind(
-        "greedy", "train", look_ahead=(0.1, 0.15, 0.2, 0.25, 0.3), hiding=(0.0, 0.3), sees_all=(True, True, False)
+        "greedy",
+        "train",
+        look_ahead=(0.1, 0.15, 0.2, 0.25, 0.3),
+        hiding=(0.0, 0.3),
+        sees_all=(True, True, False),
     ),
     "wall_runner": EvaderKind("wall_runner", "train", speed=(0.8, 1.0)),
     "heavy": EvaderKind("greedy", "validation", look_ahead=(0.2,), acceleration=(8.0,), hiding=(0.0, 0.3)),

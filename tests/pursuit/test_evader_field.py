@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from openjax.pursuit import PursuitSettings
-from openjax.pursuit.evader import evader_velocity
+from openjax.pursuit.evaders import field_velocity
 from openjax.pursuit.sensing import line_of_sight
 
 SPEED = 1.3
@@ -21,7 +21,7 @@ def velocity(evader, pursuers=((FAR),), in_sight=None, pillars=((5.0, 5.0),), ac
     if active.shape == (1,) and pillars[0, 0] == 5.0:
         active = jnp.zeros(1, bool)
     return np.asarray(
-        evader_velocity(PursuitSettings(**settings), jnp.asarray(evader), pursuers, in_sight, pillars, active)
+        field_velocity(PursuitSettings(**settings), jnp.asarray(evader), pursuers, in_sight, pillars, active)
     )
 
 
@@ -93,7 +93,7 @@ def scenes():
 def flee(settings):
     def one(evader, pursuers, pillars, active):
         in_sight = line_of_sight(settings, pursuers, evader, pillars, active)
-        return evader_velocity(settings, evader, pursuers, in_sight, pillars, active)
+        return field_velocity(settings, evader, pursuers, in_sight, pillars, active)
 
     return jax.jit(jax.vmap(one))
 
