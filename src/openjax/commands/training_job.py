@@ -270,7 +270,7 @@ def _abstract_parameters(job) -> PolicyParameters:
 def _validation(job):
     """The validation tasks and their compiled evaluation, which has room for the layouts' pillars."""
     settings, environment = job.settings, job.environment
-    evaders = settings.validation_evaders or settings.environment.evaders
+    evaders = settings.evaders_validation or settings.environment.evaders
     slots = layout_slots(settings.environment)
     wide = Pursuit(
         dataclasses.replace(settings.environment, max_pillars=slots, evaders=evaders),

@@ -163,7 +163,7 @@ class TrainSettings:
     """Share of the run in which all evaders are the first of `environment.evaders`; after it the others come in, slow ones ..."""
     evaders_ramp: Annotated[float, Interval("[0, 1]")] = 0.0
     """... to their whole odds and speed over this share of the run."""
-    validation_evaders: tuple[str, ...] = ()
+    evaders_validation: tuple[str, ...] = ()
     """Evaders of the validation; none: those of the training."""
     validation_interval: Annotated[int, Interval("[1, 1000000]")] = 50
     """Iterations between validations, on uniform tasks that are never trained on."""
@@ -173,8 +173,8 @@ class TrainSettings:
 
     def __post_init__(self):
         check_intervals(self)
-        if self.validation_evaders:
-            check_evaders(self.validation_evaders)
+        if self.evaders_validation:
+            check_evaders(self.evaders_validation)
 
         def need(condition, text):
             if not condition:
