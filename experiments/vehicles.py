@@ -23,7 +23,7 @@ from openjax.learning import make_evaluate, summarise
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, RewardSettings, scenario_task
 from openjax.store.policies import load_policy
 from openjax.vehicle import load_vehicle
-from openjax.vehicle.family import FLIGHT_FAMILY, family_bounds, find_parameter
+from openjax.vehicle.family import family_bounds, find_parameter, vehicle_family
 
 TABLE = {
     "motor_lag.extra_up": 0.04,
@@ -33,6 +33,7 @@ TABLE = {
     "rotor_drag.d_xy": 0.0125,
     "rotor_drag.d_z": 0.0125,
 }
+FLIGHT_FAMILY = vehicle_family()
 NAMES = [entry[0] for entry in FLIGHT_FAMILY]
 EFFECTS = sorted({name.partition(".")[0] for name in NAMES})
 WHOLE = "family"

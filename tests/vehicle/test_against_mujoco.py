@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from openjax.vehicle import hover_state, load_vehicle, make_drones_step, rotor_thrust
-from openjax.vehicle.parameters import assets_directory
+from openjax.vehicle import hover_state, load_vehicle, make_drones_step, max_rotor_thrust, rotor_thrust
+from openjax.vehicle.parameters import find_mjcf
 
 STEPS = 100
 QPOS = np.array([0.0, 0.0, 30.0, 0.9, 0.1, -0.3, 0.2])
@@ -24,12 +24,19 @@ def hard_manoeuvres():
 
 
 @pytest.mark.parametrize(
-    ("physics", "contacts", "substeps"),
-    [("rigid", False, 1), ("mjx", False, 1), ("mjx", True, 1), ("rigid", False, 2)],
+    ("airframe", "physics", "contacts", "substeps"),
+    [
+        ("crazyflie", "rigid", False, 1),
+        ("crazyflie", "mjx", False, 1),
+        ("crazyflie", "mjx", True, 1),
+        ("crazyflie", "rigid", False, 2),
+        ("brushless", "rigid", False, 1),
+        ("brushless", "mjx", True, 1),
+    ],
 )
-def test_a_second_of_hard_manoeuvres(physics, contacts, substeps):
+def test_a_second_of_hard_manoeuvres(airframe, physics, contacts, substeps):
     with jax.enable_x64(True):
-        vehicle = load_vehicle(dtype=jnp.float64)
+        vehicle = load_vehicle(airframe, jnp.float64)
         step = make_drones_step(physics, dt=0.01 * substeps, substeps=substeps, contacts=contacts)
         quaternion = QPOS[3:] / np.linalg.norm(QPOS[3:])
         start = hover_state(vehicle, QPOS[None, :3], quaternion[None], QVEL[None, :3])
@@ -47,10 +54,10 @@ def test_a_second_of_hard_manoeuvres(physics, contacts, substeps):
             thrust = inner_thrusts(vehicle, start, commands, substeps)
         flown = jax.tree.map(np.asarray, flown)
 
-    model = mujoco.MjModel.from_xml_path(str(assets_directory() / "crazyflie.xml"))
+    model = mujoco.MjModel.from_xml_path(str(find_mjcf(airframe)))
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = np.r_[QPOS[:3], quaternion], QVEL
-    assert thrust.max() > 0.12, "the manoeuvres must reach saturation"
+    assert thrust.max() > 0.95 * max_rotor_thrust(vehicle), "the manoeuvres must reach saturation"
     for k in range(STEPS):
         data.ctrl[:] = thrust[k]
         mujoco.mj_step(model, data)

@@ -8,7 +8,6 @@ import pytest
 from openjax.errors import UserError
 from openjax.vehicle import hover_state, load_vehicle, make_drones_step
 from openjax.vehicle.family import (
-    FLIGHT_FAMILY,
     VehicleRange,
     check_ranges,
     draw_vehicles,
@@ -17,7 +16,9 @@ from openjax.vehicle.family import (
     find_parameter,
     narrowed_bounds,
     standard_parameters,
+    vehicle_family,
 )
+from openjax.vehicle.parameters import AIRFRAMES
 
 KEY = jax.random.key(3)
 SMALL = (
@@ -43,13 +44,14 @@ def test_each_vehicle_is_drawn_from_its_ranges_and_one_effect_at_most_from_the_r
     assert draw_vehicles((), KEY, 3) == {}
 
 
-def test_standard_parameters_are_zero_without_the_effect():
-    none = {}
-    for entry in FLIGHT_FAMILY:
+@pytest.mark.parametrize("airframe", AIRFRAMES)
+def test_standard_parameters_are_zero_without_the_effect(airframe):
+    none, family = {}, vehicle_family(airframe)
+    for entry in family:
         effect, _, parameter = entry[0].partition(".")
         none.setdefault(effect, {})[parameter] = jnp.full(2, find_parameter(entry[0])[1].none)
-    np.testing.assert_allclose(standard_parameters(FLIGHT_FAMILY, none), 0.0, atol=1e-6)
-    spread = np.std(standard_parameters(FLIGHT_FAMILY, draw_vehicles(FLIGHT_FAMILY, KEY, 500, 0.5)), axis=0)
+    np.testing.assert_allclose(standard_parameters(family, none), 0.0, atol=1e-6)
+    spread = np.std(standard_parameters(family, draw_vehicles(family, KEY, 500, 0.5)), axis=0)
     assert spread.min() > 0.01 and spread.max() < 3.0
 
 

@@ -7,7 +7,14 @@ import pytest
 
 from openjax.errors import UserError
 from openjax.vehicle import load_vehicle
-from openjax.vehicle.vehicle_file import CalibratedValue, VehicleFile, load_vehicle_file, save_vehicle_file
+from openjax.vehicle.parameters import assets_directory
+from openjax.vehicle.vehicle_file import (
+    CalibratedValue,
+    VehicleFile,
+    copy_vehicle_file,
+    load_vehicle_file,
+    save_vehicle_file,
+)
 
 FULL = """
 [vehicle]
@@ -103,9 +110,32 @@ def test_a_file_made_from_nothing_reads_back(tmp_path):
     np.testing.assert_allclose(again.vehicle.mass, file.vehicle.mass, rtol=1e-5)
 
 
+def test_a_name_or_a_file_says_the_airframe(tmp_path):
+    mass = float(load_vehicle("brushless").mass)
+    assert float(load_vehicle_file("brushless").vehicle.mass) == mass
+    path = write(tmp_path, '[vehicle]\nairframe = "brushless"\n')
+    file = load_vehicle_file(path)
+    assert (file.airframe, file.name) == ("brushless", "brushless") and float(file.vehicle.mass) == mass
+    save_vehicle_file(tmp_path / "again.toml", dataclasses.replace(file, path=None))
+    assert float(load_vehicle_file(tmp_path / "again.toml").vehicle.mass) == mass
+
+
+def test_an_mjcf_of_ones_own_goes_where_its_vehicle_file_goes(tmp_path):
+    xml = (assets_directory() / "crazyflie.xml").read_text()
+    (tmp_path / "heavy.xml").write_text(xml.replace('mass="0.0321"', 'mass="0.0402"'))
+    file = load_vehicle_file(path := write(tmp_path, '[vehicle]\nairframe = "heavy.xml"\n'))
+    copy_vehicle_file(path, tmp_path / "run" / "vehicle.toml")
+    save_vehicle_file(tmp_path / "case" / "vehicle.toml", dataclasses.replace(file, path=None))
+    for folder in ("run", "case"):
+        assert float(load_vehicle_file(tmp_path / folder).vehicle.mass) == pytest.approx(0.0402)
+
+
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
+        ("[vehicle]\nairframe = 'none.xml'", "it must be crazyflie, brushless, or"),
+        ("[vehicle]\nairframe = '../none.xml'", "name of an MJCF file beside it"),
+        ("[vehicle]\nairframe = ['brushless']", "it must be crazyflie, brushless, or"),
         ("[vehicle]\nmas = 0.03", "unknown key 'mas' in \\[vehicle\\]"),
         ("[vehicles.1]\ninertia = 1", "unknown key 'inertia'"),
         ("[motors]\ncommand = 'pwm'", "unknown key 'motors'"),

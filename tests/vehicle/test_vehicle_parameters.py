@@ -1,12 +1,15 @@
 """The MJCF holds the numbers of the nominal Crazyflie, and anything else is refused with a reason."""
 
+import typing
+
 import jax
 import numpy as np
 import pytest
 
 from openjax.errors import UserError
+from openjax.pursuit import PursuitSettings
 from openjax.vehicle import hover_rotor_speed, hover_state, load_vehicle, max_rotor_thrust
-from openjax.vehicle.parameters import assets_directory
+from openjax.vehicle.parameters import AIRFRAMES, assets_directory
 
 
 def test_nominal_numbers_come_out_of_the_compiled_model():
@@ -23,6 +26,22 @@ def test_nominal_numbers_come_out_of_the_compiled_model():
     assert 4 * vehicle.thrust_constant * hover_rotor_speed(vehicle) ** 2 == pytest.approx(0.0321 * 9.81)
     np.testing.assert_allclose(vehicle.rate_kp, [250, 250, 120])
     np.testing.assert_allclose(vehicle.rate_integral_limit, [33.3, 33.3, 166.7])
+
+
+def test_the_brushless_one_meets_its_sources():
+    with jax.enable_x64(True):
+        vehicle = jax.tree.map(np.asarray, load_vehicle("brushless", "float64"))
+    assert vehicle.mass == pytest.approx(0.0434)
+    np.testing.assert_allclose(np.linalg.norm(vehicle.rotor_position, axis=1), 0.05, rtol=1e-4)
+    # crazyflow's curves of thrust and torque over rpm, from hover to the firmware's largest thrust
+    rpm = np.linspace(hover_rotor_speed(vehicle), vehicle.max_rotor_speed, 5) * 60 / (2 * np.pi)
+    thrust = -3.133427e-7 * rpm + 4.407355e-10 * rpm**2
+    torque = 1.658864e-9 * rpm + 2.469348e-12 * rpm**2
+    speed = rpm * 2 * np.pi / 60
+    np.testing.assert_allclose(vehicle.thrust_constant * speed**2, thrust, rtol=0.015)
+    np.testing.assert_allclose(vehicle.torque_constant * speed**2, torque, rtol=0.04)
+    assert max_rotor_thrust(vehicle) == pytest.approx(0.2, rel=1e-5)
+    assert typing.get_args(typing.get_type_hints(PursuitSettings)["airframe"]) == tuple(AIRFRAMES)
 
 
 @pytest.mark.parametrize(

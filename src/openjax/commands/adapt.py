@@ -113,7 +113,7 @@ def adapt(command: AdaptCommand, tell: Callable[[str], None] = lambda step: None
         names, values = load_effects(effects)
         intervals = load_intervals(effects)
         seconds = {"diagnosis": time.monotonic() - started}
-        bounds = bounds_of(values, intervals)
+        bounds = bounds_of(values, intervals, airframe=game.airframe)
         ready()
         tell(next(begin))
         seconds["compiled"] = time.monotonic() - started
@@ -132,7 +132,7 @@ def adapt(command: AdaptCommand, tell: Callable[[str], None] = lambda step: None
         seconds["measured"] = time.monotonic() - started
     finally:
         diagnosis.stop()
-    family = adapted_family(values, intervals)
+    family = adapted_family(values, intervals, airframe=game.airframe)
     results = {
         "command": f"{PROGRAM} {command.flights} --policy {command.policy} --out {command.out}",
         "machine": describe_machine(),

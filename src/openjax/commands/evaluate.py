@@ -49,7 +49,7 @@ class EvaluateCommand:
     json: Path | None = None
     """File to write the records to: an object for one scenario, a list for all."""
     vehicle: Path | None = None
-    """Vehicle to fly (vehicle.toml); by default the nominal Crazyflie."""
+    """Vehicle to fly: crazyflie, brushless, or a vehicle.toml; by default the airframe that the policy was trained for."""
     effects: Path | None = None
     """Physical effects to fly with (effects.toml)."""
     environment: tyro.conf.FlagConversionOff[PursuitSettings] = dataclasses.field(

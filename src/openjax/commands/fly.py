@@ -52,7 +52,7 @@ class Arguments:
     out: Path | None = None
     """Folder for the logs, a case for openjax.diagnose; must not exist or be empty."""
     vehicle: Path | None = None
-    """What flies (vehicle.toml), for the hover thrust and the case."""
+    """What flies (crazyflie, brushless, or a vehicle.toml), for the hover thrust and the case."""
     body_logs: Annotated[int | None, Interval("[0, 5]")] = None
     """Log blocks of motors and accelerometer per vehicle, 0 to 5; default 5 over UDP, 1 over radio."""
     motion_capture: str | None = None

@@ -21,10 +21,11 @@ from openjax.files import remove_unfinished
 from openjax.learning import TrainSettings, preset
 from openjax.learning.settings import PRESETS
 from openjax.store.checkpoints import Checkpoints
-from openjax.store.environments import make_environment
+from openjax.store.environments import make_environment, with_airframe
 from openjax.store.policies import known_policies
 from openjax.store.run_directory import RunDirectory, check_free, create_run, locked, open_run
 from openjax.store.settings_files import to_plain
+from openjax.vehicle.vehicle_file import copy_vehicle_file, load_vehicle_file
 
 
 def read_command(arguments: Sequence[str]) -> TrainCommand:
@@ -47,7 +48,20 @@ def read_command(arguments: Sequence[str]) -> TrainCommand:
         settings = dataclasses.replace(command.settings, total_steps=command.steps)
         command = dataclasses.replace(command, settings=settings)
     _check(command)
-    return command
+    return _with_vehicle(command)
+
+
+def _with_vehicle(command):
+    """The command with its vehicle's airframe in the settings; one that is known by name needs no file."""
+    if command.vehicle is None:
+        return command
+    environment = with_airframe(command.settings.environment, command.vehicle)
+    named = load_vehicle_file(command.vehicle).path is None
+    return dataclasses.replace(
+        command,
+        settings=dataclasses.replace(command.settings, environment=environment),
+        vehicle=None if named else command.vehicle,
+    )
 
 
 def membership(arguments: Sequence[str]) -> Membership | None:
@@ -99,7 +113,8 @@ def start(
         if command.resume is None and processes.is_first:
             create_run(directory.path, command.overwrite)
             for name, path in files.items():
-                shutil.copyfile(path, directory.path / name)
+                copy = copy_vehicle_file if name == "vehicle.toml" else shutil.copyfile
+                copy(path, directory.path / name)
             directory.write_settings(command.settings, job.facts)
             _say_what_it_is(command)
         elif processes.is_first:

@@ -42,7 +42,8 @@ class TrainCommand:
     effects: Path | None = None
     """Physical effects to fly with (effects.toml, as the diagnosis writes it)."""
     vehicle: Path | None = None
-    """Vehicle to fly (vehicle.toml, as the calibration writes it); by default the nominal Crazyflie."""
+    """Vehicle to fly: crazyflie, brushless, or a vehicle.toml, as the calibration writes it; by default the settings'
+    airframe."""
     devices: str = "1"
     """Number of devices to train on, or all (of all processes)."""
     coordinator_address: str | None = None

@@ -34,7 +34,7 @@ class Arguments:
     scenario: str = "wall"
     """They stand below the pursuers' starts of this layout (a name or a TOML file); more of them in a row behind."""
     vehicle: Path | None = None
-    """The vehicle inside (vehicle.toml); by default the nominal Crazyflie."""
+    """The vehicle inside: crazyflie, brushless, or a vehicle.toml; by default the Crazyflie 2.1."""
     effects: Path | None = None
     """Physical effects that it suffers from (effects.toml)."""
     battery: Annotated[float, Interval("(0, 1]")] = 1.0

@@ -34,6 +34,7 @@ from openjax.pursuit import (
 )
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.family import REST, adapted_family, draw_vehicles, family_bounds, known_effects
+from openjax.vehicle.parameters import NOMINAL
 
 RATE_LOOP = 0.002
 """Period of a Crazyflie's rate loop (s)."""
@@ -57,7 +58,7 @@ def adapting_game(game: PursuitSettings) -> PursuitSettings:
     """The game as vehicles fly it, whatever a policy was trained in: no clamp, the rate loop at 500 Hz, solid pillars."""
     return dataclasses.replace(
         game,
-        vehicles=adapted_family({}, {}),
+        vehicles=adapted_family({}, {}, airframe=game.airframe),
         rare_vehicles=0.0,
         observe_history=max(game.observe_history, HISTORY),
         speed_limit="none",
@@ -103,7 +104,7 @@ class Adaptation:
 
 def make_adaptation(trained: TrainSettings, settings: AdaptSettings) -> Adaptation:
     """The programs for a policy that was trained with `trained`."""
-    game, vehicle = adapting_game(trained.environment), load_vehicle()
+    game, vehicle = adapting_game(trained.environment), load_vehicle(trained.environment.airframe)
     # nothing is solid while the gradient is taken: a crash is told by the gap
     free = dataclasses.replace(game, physics="rigid", contacts=False)
     policy = make_policy(Pursuit(game), trained.network, trained.predictor)
@@ -321,6 +322,6 @@ def clearly_better(before: np.ndarray, after: np.ndarray, errors: float = 2.0) -
     return bool(gain.mean() > errors * gain.std() / np.sqrt(len(gain)))
 
 
-def bounds_of(values, intervals, rest: float = REST) -> jax.Array:
+def bounds_of(values, intervals, rest: float = REST, airframe: str = NOMINAL) -> jax.Array:
     """(R, 4) bounds of the family of a diagnosed vehicle; see `adapted_family`. Of nothing found and no rest: nominal."""
-    return jnp.asarray(family_bounds(adapted_family(values, intervals, rest)))
+    return jnp.asarray(family_bounds(adapted_family(values, intervals, rest, airframe)))

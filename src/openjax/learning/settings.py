@@ -332,7 +332,7 @@ def paper() -> TrainSettings:
 def flight() -> TrainSettings:
     """Policies to be flown: no clamp on the speed, the rate loop at 500 Hz, every pursuer its own vehicle; at last half seconds
     by the gradient through the simulation. Five minutes on one large accelerator."""
-    from openjax.vehicle.family import FLIGHT_FAMILY
+    from openjax.vehicle.family import vehicle_family
 
     return changed(
         paper(),
@@ -340,7 +340,7 @@ def flight() -> TrainSettings:
             speed_limit="none",
             substeps=5,
             physics="stops",
-            vehicles=FLIGHT_FAMILY,
+            vehicles=vehicle_family(),
             rare_vehicles=0.5,
             observe_history=12,
             # Without the clamp, a first crash at 5,000 teaches to stay away from rows of pillars, and so does all that is dear

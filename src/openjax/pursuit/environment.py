@@ -67,7 +67,7 @@ class Pursuit:
     settings: PursuitSettings | None = None
     """The game; None: the paper's."""
     vehicle: Vehicle | None = None
-    """The pursuers' vehicle; None: the nominal Crazyflie."""
+    """The pursuers' vehicle; None: the nominal one of the settings' airframe."""
     effects: tuple[str, ...] = ()
     """Names of physical effects to fly with (`openjax.vehicle.effects`)."""
     effect_parameters: dict | None = None
@@ -83,7 +83,7 @@ class Pursuit:
         settings = self.settings or PursuitSettings()
         complete = {
             "settings": settings,
-            "vehicle": load_vehicle() if self.vehicle is None else self.vehicle,
+            "vehicle": load_vehicle(settings.airframe) if self.vehicle is None else self.vehicle,
             "effects": tuple(self.effects),
             "effect_parameters": self.effect_parameters or {},
             "dynamics": self.dynamics

@@ -88,6 +88,8 @@ class PursuitSettings:
     "stops": free flight, and drones are put back out of floor, pillars and one another once per control step."""
     contacts: bool = True
     """Floor, pillars and other drones are solid; False: free flight, in which nothing is touched."""
+    airframe: Literal["crazyflie", "brushless"] = "crazyflie"
+    """The nominal vehicle: the Crazyflie 2.1, or the Crazyflie 2.1 Brushless; see `openjax.vehicle.parameters`."""
     vehicles: tuple[tuple[str, float, float, float, float], ...] = ()
     """Family from which every pursuer's vehicle is drawn in each episode: parameters of effects (`motor_lag.extra_up`), each
     with its range and the wider range of the rare; see `openjax.vehicle.family`. Empty: the nominal vehicle."""

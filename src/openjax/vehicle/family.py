@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -10,9 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from openjax.errors import UserError
+from openjax.files import read_toml
 from openjax.vehicle.disturbances import DISTURBANCES
 from openjax.vehicle.effects.effect import Effect, Parameter
 from openjax.vehicle.effects.registry import EFFECTS
+from openjax.vehicle.parameters import NOMINAL, find_mjcf
 
 
 class VehicleRange(NamedTuple):
@@ -124,98 +127,37 @@ def standard_parameters(ranges: Sequence[VehicleRange], parameters: dict) -> jax
     return jnp.stack(columns, axis=-1)
 
 
-_LINK = "Crazyradio and ROS bridges: 4-60 ms, 1-50 % of the packets lost in crowded rooms"
-_POSE = "motion capture, filtering and network: 4-60 ms"
-_ROTORS = (
-    "rotor speeds logged on real Crazyflies: effective lags of 66-102 ms (brushed), 38-70 ms (brushless)"
-)
-_DRAG = "d/m = .38-.41 1/s in public flights of Crazyflies (d = .010-.013 N s/m); literature .005-.03"
-_SPREAD = "spread between motors, propellers and batteries of one type; trims shift by 1-2 % from day to day"
-_THRUST = "published thrust maps of the Crazyflie"
+@functools.cache
+def vehicle_family(airframe: str = NOMINAL) -> tuple[VehicleRange, ...]:
+    """The family of an airframe: what its vehicles differ by, from `assets`, which has the sources.
 
-FLIGHT_SOURCES: dict[str, tuple[float, float, float, float, str]] = {
-    "mass.extra": (-0.003, 0.004, -0.005, 0.007, "27-42 g with decks and batteries, nominal 32.1 g"),
-    "thrust_scale.scale": (-0.06, 0.06, -0.15, 0.15, _THRUST),
-    "thrust_curve.offset": (-0.01, 0.01, -0.03, 0.03, _THRUST),
-    "thrust_curve.slope": (0.97, 1.03, 0.9, 1.1, _THRUST),
-    "thrust_curve.curvature": (-0.04, 0.04, -0.12, 0.12, _THRUST),
-    "thrust_saturation.limit": (
-        0.92,
-        1.0,
-        0.75,
-        1.0,
-        "brushed motors on a worn battery top out 10-30 % early",
-    ),
-    "battery_sag.exponent": (0.0, 1.0, 0.5, 2.0, "0 with compensation of the voltage, 2 without"),
-    "battery_sag.full": (3.75, 4.15, 3.6, 4.15, "one-cell LiPo under load"),
-    "motor_lag.extra_up": (0.0, 0.06, 0.03, 0.077, _ROTORS),
-    "motor_lag.extra_down": (0.0, 0.065, 0.03, 0.077, _ROTORS),
-    "motor_imbalance.m1": (-0.02, 0.02, -0.11, 0.11, _SPREAD),
-    "motor_imbalance.m2": (-0.02, 0.02, -0.11, 0.11, _SPREAD),
-    "motor_imbalance.m3": (-0.02, 0.02, -0.11, 0.11, _SPREAD),
-    "motor_imbalance.m4": (-0.02, 0.02, -0.11, 0.11, _SPREAD),
-    "com_offset.x": (-0.001, 0.001, -0.006, 0.006, "battery and decks shift it by .05-8 mm"),
-    "com_offset.y": (-0.001, 0.001, -0.006, 0.006, "battery and decks shift it by .05-8 mm"),
-    "com_offset.z": (-0.004, 0.004, -0.008, 0.008, "battery and decks shift it by .05-8 mm"),
-    "inertia.xx": (0.85, 1.25, 0.7, 1.6, "identified inertias of Crazyflies with decks"),
-    "inertia.yy": (0.85, 1.25, 0.7, 1.6, "identified inertias of Crazyflies with decks"),
-    "inertia.zz": (0.85, 1.25, 0.7, 1.6, "identified inertias of Crazyflies with decks"),
-    "yaw_torque.ratio": (0.15, 1.1, 0.15, 1.7, "torque per thrust of .005-.007 m measured, .031 m nominal"),
-    "rate_gains.p": (0.85, 1.2, 0.6, 1.65, "gains that users tune"),
-    "rate_gains.i": (0.8, 1.25, 0.6, 1.65, "gains that users tune"),
-    "rate_gains.d": (0.8, 1.25, 0.6, 1.65, "gains that users tune"),
-    "rotor_drag.d_xy": (0.0, 0.015, 0.005, 0.03, _DRAG),
-    "rotor_drag.d_z": (0.0, 0.015, 0.0, 0.03, _DRAG),
-    "blade_flapping.tilt": (0.0, 0.01, 0.0, 0.03, "tilt of the tip-path plane (Mahony, Kumar, Corke 2012)"),
-    "blade_flapping.stiffness": (0.0, 5e-5, 0.0, 2.5e-4, "hub moment (Hoffmann et al. 2007)"),
-    "wind.x": (-0.3, 0.3, -2.0, 2.0, "indoor draughts and fans, .3-3 m/s"),
-    "wind.y": (-0.3, 0.3, -2.0, 2.0, "indoor draughts and fans, .3-3 m/s"),
-    "wind.drag": (0.0, 0.01, 0.005, 0.02, "as for rotor drag"),
-    "gust.x": (-0.006, 0.006, -0.02, 0.02, "some 1-3 % of the weight"),
-    "gust.y": (-0.006, 0.006, -0.02, 0.02, "some 1-3 % of the weight"),
-    "gust.z": (-0.006, 0.006, -0.02, 0.02, "some 1-3 % of the weight"),
-    "gust.rate": (0.5, 6.0, 0.5, 6.0, "unsteady air of a room"),
-    "gust.phase": (0.0, 6.28, 0.0, 6.28, "any"),
-    "ground_effect.strength": (
-        0.0,
-        0.6,
-        0.2,
-        1.2,
-        "5-25 % at 5 cm (Cheeseman-Bennett; Sanchez-Cuevas et al. 2017)",
-    ),
-    "ground_effect.offset": (0.0, 0.02, 0.0, 0.03, "rotors above the tracked point"),
-    "downwash.force": (
-        0.0,
-        0.08,
-        0.05,
-        0.17,
-        "3-20 g under another Crazyflie (Neural-Swarm; Preiss et al. 2017)",
-    ),
-    "downwash.length": (0.3, 0.8, 0.2, 1.0, "decay below the other vehicle"),
-    "command_latency.delay": (0.0, 0.02, 0.01, 0.05, _LINK),
-    "command_jitter.longest": (0.0, 0.004, 0.0, 0.01, _LINK),
-    "packet_loss.probability": (0.0, 0.05, 0.02, 0.4, _LINK),
-    "state_latency.delay": (0.0, 0.02, 0.01, 0.05, _POSE),
-    "view_noise.position": (0.0, 0.0015, 0.0, 0.003, "motion capture: about 1 mm"),
-    "view_noise.velocity": (0.0, 0.02, 0.0, 0.05, "differences of positions at 100 Hz, filtered"),
-    "view_noise.attitude": (0.0, 0.008, 0.0, 0.02, "about .5 degrees"),
-    "view_noise.jitter": (0.0, 0.004, 0.0, 0.01, _POSE),
-}
-"""The family of the preset `flight`: low, high, rare low, rare high, and where that is known from."""
-
-FLIGHT_FAMILY: tuple[VehicleRange, ...] = tuple(
-    VehicleRange(name, *entry[:4]) for name, entry in FLIGHT_SOURCES.items()
-)
+    Raises:
+      UserError: no such airframe, or its file holds no ranges.
+    """
+    path = find_mjcf(airframe).with_name(f"{find_mjcf(airframe).stem}_family.toml")
+    try:
+        family = tuple(
+            VehicleRange(f"{effect}.{name}", *map(float, (*entry["range"], *entry["rare"])))
+            for effect, parameters in read_toml(path, "family of vehicles").items()
+            for name, entry in parameters.items()
+        )
+    except (AttributeError, KeyError, TypeError, ValueError):
+        raise UserError(
+            f"{path}: each [effect.parameter] needs range and rare, of two numbers each"
+        ) from None
+    check_ranges(family)
+    return family
 
 
 REST = 0.35
-"""The part of `FLIGHT_FAMILY`'s ranges that remains for what a diagnosis didn't find."""
+"""The part of the family's ranges that remains for what a diagnosis didn't find."""
 
 
 def adapted_family(
     values: dict[str, dict[str, float]],
     intervals: dict[str, dict[str, tuple[float, float]]],
     rest: float = REST,
+    airframe: str = NOMINAL,
 ) -> tuple[VehicleRange, ...]:
     """The family of one vehicle that was diagnosed: what was found, within its intervals, and a share of all else.
 
@@ -224,15 +166,17 @@ def adapted_family(
     Args:
       values: {effect: {parameter: value}} of the effects that were found.
       intervals: their 90 % intervals, where known; else a tenth of the value either way.
-      rest: the part of `FLIGHT_FAMILY`'s ranges that remains for effects that weren't found: flights can't rule them out.
+      rest: the part of the airframe's family that remains for effects that weren't found: flights can't rule them out.
+      airframe: that was diagnosed.
     """
+    usual = {entry.parameter: entry for entry in vehicle_family(airframe)}
     family = []
     for effect in known_effects().values():
         found = values.get(effect.name)
         for key, parameter in effect.parameters.items():
             name = f"{effect.name}.{key}"
             if found is None:
-                low, high = FLIGHT_SOURCES.get(name, (parameter.none, parameter.none))[:2]
+                _, low, high, *_ = usual.get(name, (name, parameter.none, parameter.none))
                 low, high = (parameter.none + rest * (bound - parameter.none) for bound in (low, high))
             else:
                 value = found.get(key, parameter.none)

@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 
 from openjax.vehicle.arena import Arena
-from openjax.vehicle.parameters import Vehicle, assets_directory, read_mjcf
+from openjax.vehicle.parameters import NOMINAL, Vehicle, find_mjcf, read_mjcf
 from openjax.vehicle.rigid_body import euler_step
 from openjax.vehicle.solids import DRONE_RADIUS, solids_xml
 
@@ -51,7 +51,9 @@ def world_xml(arena: Arena, n_pillars: int, n_others: int, dt: float, contacts: 
 
     One Newton iteration finds the contact forces for the things that are hit, without a loop.
     """
-    nominal = read_mjcf(str(assets_directory() / "crazyflie.xml"))
+    nominal = read_mjcf(
+        str(find_mjcf(NOMINAL))
+    )  # whoever flies brings mass and inertia along; see `mjx_step`
     shapes, pairs = solids_xml(arena, n_pillars, n_others, dt) if contacts else ("", "")
     inertia = " ".join(str(value) for value in nominal["inertia"].tolist())
     return f"""<mujoco>

@@ -13,6 +13,10 @@ import numpy as np
 
 from openjax.errors import UserError
 
+NOMINAL = "crazyflie"
+AIRFRAMES = {NOMINAL: "crazyflie.xml", "brushless": "crazyflie_brushless.xml"}
+"""Vehicles whose MJCF, and family beside it, the package has: the Crazyflie 2.1 and the Crazyflie 2.1 Brushless."""
+
 ROTORS = ("rotor_1", "rotor_2", "rotor_3", "rotor_4")
 BODY = "crazyflie"
 
@@ -100,14 +104,22 @@ def read_mjcf(path: str) -> dict[str, np.ndarray]:
     }
 
 
-def load_vehicle(path: str | Path | None = None, dtype=jnp.float32) -> Vehicle:
-    """The vehicle described by an MJCF file (default: the nominal Crazyflie 2.1 of `assets/crazyflie.xml`).
-
-    Raises UserError if the file is missing, isn't MJCF or lacks a part of a vehicle.
-    """
-    path = assets_directory() / "crazyflie.xml" if path is None else Path(path)
+def find_mjcf(name_or_path: str | Path) -> Path:
+    """The MJCF file of an airframe: one of `AIRFRAMES`, or a file. UserError: there is none."""
+    known = AIRFRAMES.get(str(name_or_path))
+    path = Path(name_or_path) if known is None else assets_directory() / known
     if not path.is_file():
-        raise UserError(f"{path}: no such MJCF file")
+        raise UserError(f"{path}: no such MJCF file, nor an airframe ({', '.join(AIRFRAMES)})")
+    return path
+
+
+def load_vehicle(airframe: str | Path = NOMINAL, dtype=jnp.float32) -> Vehicle:
+    """The vehicle of an airframe: one of `AIRFRAMES`, or an MJCF file.
+
+    Raises:
+      UserError: the file is missing, isn't MJCF or lacks a part of a vehicle.
+    """
+    path = find_mjcf(airframe)
     return Vehicle(
         **{name: jnp.asarray(value, dtype) for name, value in read_mjcf(str(path.resolve())).items()}
     )

@@ -21,6 +21,7 @@ import tomlkit
 from openjax.errors import UserError
 from openjax.files import read_toml, write_text
 from openjax.vehicle import Vehicle, load_vehicle
+from openjax.vehicle.parameters import AIRFRAMES, NOMINAL
 
 NOMINAL_ORDER = ("front_right", "rear_right", "rear_left", "front_left")
 NOMINAL_SPIN = ("ccw", "cw", "ccw", "cw")
@@ -43,7 +44,8 @@ FAR = 100.0
 LEAST_MASS = 0.005  # kg; the lightest frame with battery weighs twice that
 
 _TABLES = {"vehicle", "vehicles", "motor", "log", "calibrated"}
-_VEHICLE_KEYS = {"name", "mass", "mass_weighed"}
+_VEHICLE_KEYS = {"name", "mass", "mass_weighed", "airframe"}
+_OVERRIDES = {"name", "mass", "mass_weighed"}
 _MOTOR_KEYS = {"command", "order", "spin", "notes", "thrust_map", "torque_per_thrust"}
 _CALIBRATED_KEYS = {"value", "interval90", "unit", "notes"}
 _NO_OVERRIDES: Mapping[str, Any] = MappingProxyType({})
@@ -66,6 +68,8 @@ class VehicleFile:
 
     vehicle: Vehicle
     name: str = NOMINAL_NAME
+    airframe: str = NOMINAL
+    """One of `AIRFRAMES`, or the name of an MJCF file beside the vehicle file: `mjcf`."""
     mass_weighed: bool = False
     motor_command: str = "thrust"
     motor_order: tuple[str, ...] = NOMINAL_ORDER
@@ -78,6 +82,7 @@ class VehicleFile:
     log: Mapping[str, Any] = field(default_factory=dict)
     mass_given: bool = False
     path: Path | None = None
+    mjcf: Path | None = None
 
     @property
     def motor_permutation(self) -> tuple[int, ...]:
@@ -99,14 +104,14 @@ class VehicleFile:
 
 
 def load_vehicle_file(path: str | Path | None = None, dtype=jnp.float32) -> VehicleFile:
-    """Read a `vehicle.toml` (or a folder that holds one); None gives the nominal vehicle.
+    """Read a `vehicle.toml` (or a folder that holds one); None or an airframe's name give that nominal vehicle.
 
     Raises UserError for a missing or unreadable file, an unknown key in a strict table, or an impossible
     value.
     """
-    if path is None:
-        return VehicleFile(vehicle=load_vehicle(dtype=dtype))
-    path = Path(path)
+    path = Path(NOMINAL if path is None else path)
+    if str(path) in AIRFRAMES and not path.exists():
+        return VehicleFile(load_vehicle(str(path), dtype), _usual_name(str(path)), str(path))
     if path.is_dir():
         path = path / "vehicle.toml"
     return _from_tables(read_toml(path, "vehicle file"), path, dtype)
@@ -129,8 +134,39 @@ def save_vehicle_file(path: str | Path, vehicle_file: VehicleFile) -> None:
             tables.add(name, _calibrated_table(name, entry))
         document.add("calibrated", tables)
     text = tomlkit.dumps(document)
+    _copy_mjcf(vehicle_file, Path(path))
     _from_tables(tomllib.loads(text), Path(path), jnp.float32)  # never write what can't be read back
     write_text(path, text)
+
+
+def copy_vehicle_file(source: str | Path, target: Path) -> None:
+    """Copy a vehicle file as it is, with the MJCF that it names. Raises UserError where it can't be used."""
+    vehicle_file = load_vehicle_file(source)
+    _copy_mjcf(vehicle_file, target)
+    write_text(target, vehicle_file.path.read_text(encoding="utf-8"))
+
+
+def _copy_mjcf(vehicle_file, target):
+    """Put the MJCF that a vehicle file names beside another one."""
+    source = vehicle_file.mjcf
+    if source is not None and source.resolve().parent != target.resolve().parent:
+        write_text(target.with_name(source.name), source.read_text(encoding="utf-8"))
+
+
+def _usual_name(airframe):
+    return NOMINAL_NAME if airframe == NOMINAL else Path(airframe).stem
+
+
+def _own_mjcf(name, path):
+    """The MJCF file that `[vehicle] airframe` of the file at `path` names; None for one of `AIRFRAMES`."""
+    if isinstance(name, str) and name in AIRFRAMES:
+        return None
+    plain = isinstance(name, str) and Path(name).name == name
+    if not plain or not path.with_name(name).is_file():
+        raise UserError(
+            f"{path}: [vehicle] airframe is {name!r}; it must be {', '.join(AIRFRAMES)}, or the name of an MJCF file beside it"
+        )
+    return path.with_name(name)
 
 
 def _from_tables(tables: dict, path: Path, dtype) -> VehicleFile:
@@ -141,6 +177,7 @@ def _from_tables(tables: dict, path: Path, dtype) -> VehicleFile:
     for vehicle_id, overrides in vehicles.items():
         if not isinstance(overrides, dict):
             raise UserError(f"{path}: [vehicles] holds tables [vehicles.<id>]; {vehicle_id!r} isn't one")
+        _only(overrides, _OVERRIDES, path, f"[vehicles.{vehicle_id}]")
         _check_vehicle_table(overrides, path, f"[vehicles.{vehicle_id}]")
 
     _only(motor, _MOTOR_KEYS, path, "[motor]")
@@ -162,7 +199,9 @@ def _from_tables(tables: dict, path: Path, dtype) -> VehicleFile:
     if isinstance(floor, bool) or not isinstance(floor, int | float) or not abs(floor) < 1e3:
         raise UserError(f"{path}: log.floor_z is {floor!r}; it must be a number of metres")
 
-    nominal = load_vehicle(dtype=dtype)
+    airframe = vehicle_table.get("airframe", NOMINAL)
+    mjcf = _own_mjcf(airframe, path)
+    nominal = load_vehicle(mjcf or airframe, dtype)
     changes: dict[str, Any] = {}
     if "mass" in vehicle_table:
         changes["mass"] = vehicle_table["mass"]
@@ -181,7 +220,8 @@ def _from_tables(tables: dict, path: Path, dtype) -> VehicleFile:
     vehicle = nominal.replace(**{k: jnp.asarray(v, dtype) for k, v in changes.items()})
     return VehicleFile(
         vehicle=vehicle,
-        name=vehicle_table.get("name", NOMINAL_NAME),
+        name=vehicle_table.get("name", _usual_name(airframe)),
+        airframe=airframe,
         mass_weighed=vehicle_table.get("mass_weighed", False),
         motor_command=command,
         motor_order=order,
@@ -194,6 +234,7 @@ def _from_tables(tables: dict, path: Path, dtype) -> VehicleFile:
         log=log,
         mass_given="mass" in vehicle_table,
         path=path if path.exists() else None,
+        mjcf=mjcf,
     )
 
 
@@ -248,6 +289,8 @@ def _document(vehicle_file: VehicleFile) -> tomlkit.TOMLDocument:
     document = tomlkit.document()
     table = tomlkit.table()
     table.add("name", vehicle_file.name)
+    if vehicle_file.airframe != NOMINAL:
+        table.add("airframe", vehicle_file.airframe)
     table.add("mass", float(f"{float(vehicle_file.vehicle.mass):.6g}"))
     table.value.item("mass").comment("kg, what the simulator should assume")
     table.add("mass_weighed", vehicle_file.mass_weighed)
