@@ -20,7 +20,7 @@ import numpy as np
 
 from experiments.diagnosis import truth
 from experiments.diagnosis.figures import figures_table, misses
-from experiments.single_thread import use_single_thread
+from experiments.flying.single_thread import use_single_thread
 
 _done = 0  # cases that this process has diagnosed
 

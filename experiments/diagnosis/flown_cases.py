@@ -10,7 +10,7 @@ from experiments.diagnosis import vehicle as v
 from experiments.diagnosis.answer_key import HIDDEN, accepted
 from experiments.diagnosis.generate import write_answers
 from experiments.diagnosis.plant import SAMPLE
-from experiments.single_thread import use_single_thread
+from experiments.flying.single_thread import use_single_thread
 
 
 def fly_plan(options, kinds, make_case, column):

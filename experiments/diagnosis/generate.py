@@ -19,7 +19,7 @@ import numpy as np
 
 from experiments.diagnosis import answer_key, cases, effects, measure, unknowns
 from experiments.diagnosis.fleet import Fleet, bodies, write_case
-from experiments.single_thread import use_single_thread
+from experiments.flying.single_thread import use_single_thread
 
 SIZES = 4
 

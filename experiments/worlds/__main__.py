@@ -1,6 +1,6 @@
 """`python -m experiments.worlds`: see `experiments.worlds.study`."""
 
-from experiments.single_thread import use_single_thread
+from experiments.flying.single_thread import use_single_thread
 
 if __name__ == "__main__":
     use_single_thread()  # before JAX is imported

@@ -1,5 +1,6 @@
 """With the real cflib over loopback: its packets mean what we mean, a flight from take-off to its log, the guard."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -18,13 +19,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openjax.errors import UserError
+from openjax.flying.board import Board, Role
+from openjax.flying.controller import nominal_airframe
+from openjax.flying.crtp import Supervisor
 from openjax.flying.flight_files import write_case
-from openjax.flying.guard import _EACH, _HEAD, _MODES, land
+from openjax.flying.guard import RawLinks, fly_down
 from openjax.flying.limits import SafetySettings
 from openjax.flying.links import Links
 from openjax.flying.loop import Flight, Plan
 from openjax.flying.motion_capture import MotionCaptured
-from openjax.flying.safety import Mode
+from openjax.flying.safety import Mode, initial_state, see
 from openjax.flying.set_point import (
     ANGLES,
     LEAST_THRUST,
@@ -89,7 +93,7 @@ def connected(uris, body_logs):
     links = Links(uris, body_logs)
     links.connect()
     try:
-        while any(s.pose is None for s in links.sightings()):
+        while any(s.own is None for s in links.observe()):
             links.wait(time.perf_counter() + 0.1)
         yield links
     finally:
@@ -99,10 +103,10 @@ def connected(uris, body_logs):
 class Hovering:
     """A game whose policy hovers: what the loop needs of a game."""
 
-    hover_thrust = 0.6246
+    airframe = nominal_airframe()
 
     def __init__(self, links):
-        starts = np.array([(*s.pose.position[:2], 0.4) for s in links.sightings()])
+        starts = np.array([(*s.own.position[:2], 0.4) for s in links.observe()])
         self.task = SimpleNamespace(
             pursuer_position=starts,
             evader_position=np.array([-0.5, 0.0, 0.5]),
@@ -191,10 +195,7 @@ def test_the_log_tells_the_links_latency_and_loss(tmp_path, latency, loss):
     )  # a busy machine, and the draw of few set-points
 
 
-def test_the_guard_lands_what_hangs_in_the_air(uris):
-    import cflib.crtp
-
-    cflib.crtp.init_drivers()
+def test_another_process_lands_and_disarms_what_hangs_in_the_air(uris):
     with connected(uris, body_logs=0) as links:
         links.arm()
         flight = Flight(links, Hovering(links), PATIENT, Plan(episode_seconds=60.0))
@@ -203,24 +204,22 @@ def test_the_guard_lands_what_hangs_in_the_air(uris):
             assert time.monotonic() < deadline, [(d.mode, d.reason) for d in flight.state.drones]
             flight.tick(time.perf_counter(), time.perf_counter())
             time.sleep(0.008)
-        assert min(s.pose.position[2] for s in links.sightings()) > 0.3
-        blocks, state = links.pose_blocks(), flight.state
-        numbers = [time.perf_counter(), 1.0, 1.0]
-        for drone in state.drones:
-            e = drone.estimate
-            numbers += [_MODES.index(drone.mode), drone.trim, 1.0]
-            numbers += [*e.position, *e.velocity, *e.quaternion, *e.body_rates]
-        assert len(numbers) == _HEAD + 3 * _EACH
+        assert min(s.own.position[2] for s in links.observe()) > 0.3
+        board = Board(3, multiprocessing.get_context("spawn"))
+        board.write(Role.LOOP, time.perf_counter(), flight.state)
         # the loop is silent from here on; the guard has links of its own
-        own = [cflib.crtp.get_link_driver(uri, lambda *_: None, lambda *_: None) for uri in uris]
+        own = RawLinks(uris, links.pose_blocks())
+        own.open()
         try:
-            last = land(numbers, own, uris, blocks, PATIENT, state)
+            last = fly_down(board, Role.GUARD, own, PATIENT, flight.state)
+            samples = own.observe()
         finally:
-            for link in own:
-                link.close()
-    assert last.all_in(Mode.LANDED) and not any(d.reason == "pose lost" for d in last.drones)
+            own.close()
+        assert last.all_in(Mode.LANDED) and not board.flying
+        assert not any(d.reason == "pose lost" for d in last.drones)
+        assert not any(s.supervisor & Supervisor.ARMED for s in samples)
     with connected(uris, body_logs=0) as links:
-        assert max(s.pose.position[2] for s in links.sightings()) < 0.05
+        assert max(s.own.position[2] for s in links.observe()) < 0.05
 
 
 def test_a_broken_link_process_is_an_error_and_not_a_wait(uris):
@@ -240,13 +239,14 @@ def test_motion_capture_is_seen_here_and_on_board():
     firmware = virtual.firmware[0]
     try:
         with connected(virtual.uris, body_logs=0) as links:
-            captured = MotionCaptured(links)
+            captured, state = MotionCaptured(links), initial_state([(0.4, 0.0, 0.5)])
             for k in range(40):
                 captured.update(0, (0.3 + 0.005 * k, 0.0, 0.5), (1.0, 0.0, 0.0, 0.0), at=100.0 + 0.01 * k)
-            captured.update(0, (np.nan, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), at=101.0)
-            (sighting,) = captured.sightings()
+                (sample,) = captured.observe()
+                state = see(PATIENT, state, 100.0 + 0.01 * k, (sample,))
+                captured.believed(0, state.drones[0].captured.pose)
             assert captured.arrivals() == (100.0 + 0.01 * 39,)
-            np.testing.assert_allclose(sighting.pose.velocity, (0.5, 0.0, 0.0), atol=1e-3)
+            np.testing.assert_allclose(state.drones[0].estimate.velocity, (0.5, 0.0, 0.0), atol=1e-3)
             deadline = time.monotonic() + 5.0
             while firmware.external_poses < 40 and time.monotonic() < deadline:
                 time.sleep(0.01)
@@ -255,39 +255,3 @@ def test_motion_capture_is_seen_here_and_on_board():
         over.set()
         thread.join()
         virtual.close()
-
-
-FROZEN = """
-import os, signal, sys, time
-from openjax.flying.controller import Pose
-from openjax.flying.guard import Guard
-from openjax.flying.limits import SafetySettings
-from openjax.flying.safety import Drone, Mode, initial_state
-from dataclasses import replace
-
-if __name__ == "__main__":
-    state = initial_state([(0.4, 0.0, 0.5)])
-    flying = replace(state, drones=(Drone(Mode.PURSUIT, estimate=Pose(0.0, (0.4, 0.0, 0.0), (0.0,) * 3, (1.0, 0.0, 0.0, 0.0))),))
-    guard = Guard([sys.argv[1]], [1], SafetySettings(), flying, after=0.2)
-    assert guard.wait()
-    guard(time.perf_counter(), flying)
-    os.kill(os.getpid(), signal.SIGSTOP)
-"""
-
-
-def test_a_frozen_loop_is_ended_and_its_vehicle_taken_over(tmp_path):
-    import socket
-
-    listener = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    listener.bind(("127.0.0.1", 0))
-    listener.settimeout(20.0)
-    script = tmp_path / "frozen.py"
-    script.write_text(FROZEN)
-    loop = subprocess.Popen([sys.executable, str(script), f"udp://127.0.0.1:{listener.getsockname()[1]}"])
-    try:
-        assert loop.wait(timeout=60) == -9
-        packet = listener.recv(64)
-        assert packet[0] >> 4 == 7  # a set-point by the guard
-    finally:
-        loop.kill()
-        listener.close()

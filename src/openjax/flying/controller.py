@@ -6,6 +6,7 @@ thrust at which it hovers. Plain numbers instead of arrays: it runs a few times 
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -38,10 +39,38 @@ class Pose(NamedTuple):
 
 @dataclass(frozen=True)
 class Airframe:
-    """What the controller knows of a vehicle."""
+    """What flying needs to know of a vehicle; all of it follows from its parameters."""
 
-    hover_thrust: float = 0.6246
+    hover_thrust: float
     """Share of the maximal thrust at which it hovers."""
+    angular_acceleration: float
+    """The largest about roll or pitch (rad/s^2)."""
+    motor_time_constant: float
+    """s"""
+
+    @property
+    def acceleration(self) -> float:
+        """The largest there is (m/s^2): full thrust downwards."""
+        return GRAVITY * (1.0 + 1.0 / self.hover_thrust)
+
+
+def airframe_of(vehicle) -> Airframe:
+    """The airframe of an `openjax.vehicle.Vehicle`."""
+    thrust = float(vehicle.thrust_constant) * float(vehicle.max_rotor_speed) ** 2
+    arm = float(abs(vehicle.rotor_position[:, :2]).min())
+    return Airframe(
+        float(vehicle.mass * vehicle.gravity) / (4.0 * thrust),
+        2.0 * thrust * arm / float(min(vehicle.inertia[:2])),
+        float(vehicle.motor_time_constant),
+    )
+
+
+@functools.cache
+def nominal_airframe() -> Airframe:
+    """The airframe of the vehicle in the package."""
+    from openjax.vehicle import load_vehicle
+
+    return airframe_of(load_vehicle())
 
 
 def roll_pitch_yaw(quaternion) -> Vector:

@@ -7,7 +7,7 @@ master/functional-areas/crtp/); a packet is one byte of header and up to 30 byte
 from __future__ import annotations
 
 import struct
-from enum import IntEnum
+from enum import IntEnum, IntFlag
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +22,8 @@ FULL_SCALE = 65535
 
 
 class Port(IntEnum):
+    """Ports of packets."""
+
     CONSOLE = 0x0
     PARAMETERS = 0x2
     COMMANDER = 0x3
@@ -32,6 +34,28 @@ class Port(IntEnum):
     SUPERVISOR = 0x9
     PLATFORM = 0xD
     LINK = 0xF
+
+
+class Supervisor(IntFlag):
+    """The bits of `supervisor.info`: what the firmware says of its vehicle."""
+
+    CAN_BE_ARMED = 1
+    ARMED = 2
+    AUTO_ARM = 4
+    CAN_FLY = 8
+    FLYING = 16
+    TUMBLED = 32
+    LOCKED = 64
+    CRASHED = 128
+
+
+class SupervisorCommand(IntEnum):
+    """First byte of a packet on the supervisor's channel 1."""
+
+    ARM = 1
+    RECOVER = 2
+    EMERGENCY_STOP = 3
+    FEED_WATCHDOG = 4
 
 
 class Packet(NamedTuple):

@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from openjax.flying.controller import Pose
+from openjax.flying.controller import Pose, airframe_of
 from openjax.flying.real_time import compile_in_line
-from openjax.pursuit import Pursuit, Task, hover_action
+from openjax.pursuit import Pursuit, Task
 
 FIELDS = (("position", 3), ("quaternion", 4), ("velocity", 3), ("body_rates", 3))
 
@@ -35,7 +35,7 @@ class Play(NamedTuple):
 
 
 def game_functions(policy, task: Task):
-    """The game's settings and hover thrust, and its two steps as pure functions of arrays, to compile or to map.
+    """The game's settings and airframe, and its two steps as pure functions of arrays, to compile or to map.
 
     first(poses (N, 13)) -> state, action (N, 4): an episode begins with the pursuers at `poses`.
     tick(state, action, poses, evader (3,), evader_measured ()) -> state, action, *fields of `Play` but the first: one
@@ -76,8 +76,7 @@ def game_functions(policy, task: Task):
             info.crashed,
         )
 
-    vehicle = environment.vehicle
-    return settings, float(hover_action(vehicle)[0] + 1.0) / 2.0, first, tick
+    return settings, airframe_of(environment.vehicle), first, tick
 
 
 class Game:
@@ -90,7 +89,7 @@ class Game:
 
     def __init__(self, policy, task: Task):
         self.task = task
-        self.settings, self.hover_thrust, first, tick = game_functions(policy, task)
+        self.settings, self.airframe, first, tick = game_functions(policy, task)
         poses = [
             Pose(0.0, (0.3 * i, 0.0, 0.5), (0.0,) * 3, (1.0, 0.0, 0.0, 0.0))
             for i in range(self.settings.num_pursuers)

@@ -1,192 +1,267 @@
-"""A second process that lands the vehicles if the first one stops: killed, frozen, or stuck.
+"""Landing by another process than the loop, and the process that waits for nothing else.
 
-The loop tells it at every tick that it lives and what it knows; when nothing has come for `TAKE_OVER` seconds while
-vehicles fly, the guard ends the loop's process, opens links of its own, and flies the safety's wait-and-land. The
-firmware alone would hold the last body rates for half a second, which is enough to leave any arena.
+`fly_down` is what each process does that takes over: wait where all are, land, disarm, say so. The guard's process has a
+session and signals of its own, watches loop and links, and is watched by the loop, which lands without it.
 
 Over UDP its links are open from the start. A radio dongle belongs to one process: there the guard can only open it once
-the other one has ended.
+the links' process has ended. The links' process, which has it, is the first to take over for a loop that stops.
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
 import multiprocessing
 import os
 import signal
 import struct
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Protocol
 
 from openjax.flying import real_time
-from openjax.flying.controller import Pose
-from openjax.flying.crtp import LOG_TYPES, Port
+from openjax.flying.board import Board, Role, say, stand_alone
+from openjax.flying.crtp import LOG_TYPES, Port, Supervisor, SupervisorCommand
 from openjax.flying.limits import SafetySettings, resting_places
-from openjax.flying.safety import (
-    FLYING,
-    Drone,
-    Event,
-    Mode,
-    Sighting,
-    State,
-    step,
-)
-from openjax.flying.set_point import OFF, manual_arguments
-from openjax.flying.swarm import POSE_BLOCK, Member
+from openjax.flying.safety import FLYING, Event, Mode, PoseSample, State, step
+from openjax.flying.set_point import SetPoint
+from openjax.flying.swarm import POSE_BLOCK, WATCHDOG_PERIOD, Member, send_set_point
 
-TAKE_OVER = 0.1
-"""Silence of the loop after which the guard flies (s)."""
 CHECK = 0.004
 """s between two looks."""
-_MODES = tuple(Mode)
-_HEAD, _EACH = 3, 16  # beat, flying, message; per vehicle mode, trim, known, 13 numbers of its pose
-_READY, _OVER = 1.0, 2.0
+DISARMING = 1.0
+"""A vehicle is asked to disarm until it says that it has, for so long (s)."""
+TICK = 0.01
+
+
+class Raw(Protocol):
+    """Vehicles that can be flown down: `openjax.flying.swarm.Swarm` and `RawLinks` are such."""
+
+    def observe(self) -> tuple[PoseSample, ...]:
+        """What is known of each."""
+        ...
+
+    def send(self, set_points: Sequence[SetPoint]) -> float:
+        """Send each its set-point."""
+        ...
+
+    def arm(self, on: bool) -> None:
+        """Arm or disarm all."""
+        ...
 
 
 def take_over(settings: SafetySettings, state: State, now: float) -> State:
     """The state in which another process goes on flying: all stop where they are, wait, and land."""
     anchors = resting_places(settings, state.pillars, [d.estimate for d in state.drones])
     drones = tuple(
-        replace(d, mode=Mode.HOLD, since=now, anchor=a, reason="the loop stopped")
-        if d.mode in FLYING and d.mode not in (Mode.LAND, Mode.BLIND)
+        replace(
+            d,
+            mode=Mode.LAND if d.mode in (Mode.LAND, Mode.LIFT) else Mode.HOLD,
+            since=now,
+            seen=now,  # the estimate is as good as what the one before knew
+            landing_since=now if d.mode in (Mode.LAND, Mode.LIFT) else None,
+            anchor=a,
+            reason="another process took over",
+        )
+        if d.mode in FLYING
         else d
         for d, a in zip(state.drones, anchors, strict=True)
     )
     return replace(state, drones=drones, time=now, action_time=now)
 
 
-class Guard:
-    """The loop's end of it: start it before take-off, call it at every tick, close it at the end.
+def fly_down(
+    board: Board, role: Role, vehicles: Raw, settings: SafetySettings, state: State,
+    clock: Callable[[], float] = time.perf_counter,
+) -> State:  # fmt: skip
+    """Wait and land from what stands on the board, disarm; the last state.
+
+    Args:
+      board: of the session.
+      role: whose process this is; it gives up should another one take over.
+      vehicles: links.
+      settings: limits.
+      state: any of this flight, for its starts, pillars and airframe.
+      clock: host time (s).
+    """
+    board.take(role)
+    now = due = clock()
+    state = take_over(settings, board.read(state, now), now)
+    while state.flying and board.pilot is role:
+        state, set_points = step(settings, state, Event(clock(), vehicles.observe()))
+        vehicles.send(set_points)
+        board.write(role, clock(), state)
+        due = max(due + TICK, clock() - TICK)
+        time.sleep(max(due - clock(), 0.0))
+    if board.pilot is role:
+        disarm(vehicles, clock)
+        board.write(role, clock(), state)
+    return state
+
+
+def disarm(vehicles: Raw, clock: Callable[[], float] = time.perf_counter) -> bool:
+    """Ask all to disarm until they have, or nothing is heard of it; whether all have."""
+    deadline = clock() + DISARMING
+    while True:
+        vehicles.send([SetPoint()] * len(vehicles.observe()))
+        vehicles.arm(False)
+        time.sleep(0.03)
+        armed = [s.supervisor & (Supervisor.ARMED | Supervisor.AUTO_ARM) == Supervisor.ARMED
+                 for s in vehicles.observe()]  # fmt: skip
+        if not any(armed) or clock() > deadline:
+            return not any(armed)
+
+
+class RawLinks:
+    """Links without `cflib`'s vehicle around them: packets of the pose block in, set-points out.
 
     Args:
       uris: of the vehicles.
-      pose_blocks: ids of their pose blocks, as the log set them up.
-      safety: limits.
-      state: of the loop's state machine; starts, pillars and airframe are taken from it.
-      after: silence of the loop after which it flies (s).
-      links: the links' process, which it ends with the loop's.
+      pose_blocks: ids of their pose blocks, which other links have set up.
+      watchdog: whether those feed the firmware's watchdog, which bites if nobody goes on.
     """
 
-    def __init__(
-        self,
-        uris,
-        pose_blocks,
-        safety: SafetySettings,
-        state: State,
-        after: float = TAKE_OVER,
-        links: int | None = None,
-    ):
+    def __init__(self, uris: Sequence[str], pose_blocks: Sequence[int], watchdog: bool = True):
+        self._members: list[Member] = []
+        self._blocks, self._links = tuple(pose_blocks), dict.fromkeys(uris)
+        self._watchdog, self._fed = watchdog, -math.inf
+        self._names = [name for name, _ in POSE_BLOCK]
+        self._layout = "<" + "".join(LOG_TYPES[kind][1] for _, kind in POSE_BLOCK)
+
+    def open(self, udp_only: bool = False) -> None:
+        """Open what isn't open yet."""
+        import cflib.crtp
+
+        if not cflib.crtp.CLASSES:
+            cflib.crtp.init_drivers()
+        self._members = self._members or [Member(uri, time.perf_counter) for uri in self._links]
+        for uri, link in self._links.items():
+            if link is None and (uri.startswith("udp:") or not udp_only):
+                self._links[uri] = cflib.crtp.get_link_driver(uri, lambda *_: None, lambda *_: None)
+
+    def observe(self) -> tuple[PoseSample, ...]:
+        """What is known of each vehicle, after what has arrived."""
+        for member, link, block in zip(self._members, self._links.values(), self._blocks, strict=True):
+            while (packet := link.receive_packet(0)) is not None:
+                member.last_contact = time.perf_counter()
+                data = bytes(packet.data)
+                if (packet.port, packet.channel) != (Port.LOG, 2) or data[:1] != bytes([block]):
+                    continue
+                if len(data) == 4 + struct.calcsize(self._layout):
+                    values = dict(zip(self._names, struct.unpack(self._layout, data[4:]), strict=True))
+                    member.pose_arrived(int.from_bytes(data[1:4], "little"), values)
+        return tuple(member.sample() for member in self._members)
+
+    def send(self, set_points: Sequence[SetPoint]) -> float:
+        """Send each vehicle its set-point; returns when the last one left (s)."""
+        for link, set_point in zip(self._links.values(), set_points, strict=True):
+            send_set_point(SimpleNamespace(send_packet=link.send_packet), set_point)
+        now = time.perf_counter()
+        if self._watchdog and now - self._fed > WATCHDOG_PERIOD:
+            self._fed = now
+            self._supervise(SupervisorCommand.FEED_WATCHDOG)
+        return now
+
+    def arm(self, on: bool) -> None:
+        """Arm or disarm all."""
+        self._supervise(SupervisorCommand.ARM, on)
+
+    def _supervise(self, *data: int):
+        from cflib.crtp.crtpstack import CRTPPacket
+
+        for link in self._links.values():
+            packet = CRTPPacket()
+            packet.set_header(Port.SUPERVISOR, 1)
+            packet.data = data
+            link.send_packet(packet)
+
+    def close(self) -> None:
+        """Close all."""
+        for link in self._links.values():
+            if link is not None:
+                link.close()
+
+
+class Guard:
+    """The loop's end of the guard's process: start it before take-off, close it at the end.
+
+    Args:
+      board: of the session.
+      links: pid of the links' process, which the guard ends before it flies.
+      own: its links, not open yet.
+      safety: limits.
+      state: of the loop's state machine; starts, pillars and airframe are taken from it.
+    """
+
+    def __init__(self, board: Board, links: int, own: RawLinks, safety: SafetySettings, state: State):
+        self._board = board
         context = multiprocessing.get_context("spawn")
-        self._shared = context.RawArray("d", _HEAD + _EACH * len(uris))
         self._process = context.Process(
             target=watch,
-            args=(self._shared, tuple(uris), tuple(pose_blocks), safety, state, after, os.getpid(), links),
-            daemon=False,
+            args=(board, os.getpid(), links, own, safety, state),
             name="openjax guard",
         )
         self._process.start()
 
+    @property
+    def pid(self) -> int:
+        """Of its process."""
+        return self._process.pid
+
     def wait(self, timeout: float = 20.0) -> bool:
         """Whether it's watching; it takes a second to start."""
         deadline = time.monotonic() + timeout
-        while self._shared[2] != _READY and time.monotonic() < deadline and self._process.is_alive():
+        while not self._board.guarded and time.monotonic() < deadline and self._process.is_alive():
             time.sleep(0.02)
-        return self._shared[2] == _READY
+        return self._board.guarded
 
-    def __call__(self, now: float, state: State) -> None:
-        """The loop lives, and this is what it knows."""
-        numbers = []
-        for drone in state.drones:
-            e = drone.estimate
-            pose = (*e.position, *e.velocity, *e.quaternion, *e.body_rates) if e is not None else (0.0,) * 13
-            numbers += [float(_MODES.index(drone.mode)), drone.trim, float(e is not None), *pose]
-        self._shared[_HEAD:] = numbers
-        self._shared[1] = float(state.flying)
-        self._shared[0] = now
-
-    def hand_over(self) -> None:
-        """Let it fly on: it ends this process before it does."""
-        while self._process.is_alive():
-            time.sleep(0.1)
+    def lives(self, now: float) -> bool:
+        """Whether anything was heard of it lately."""
+        return self._board.silent(Role.GUARD, now) < 2.0 * self._board.silence
 
     def close(self) -> None:
         """End it; the vehicles are down or someone else's."""
-        self._shared[1], self._shared[2] = 0.0, _OVER
-        self._process.join(5.0)
+        self._board.end()
+        self._process.join(2.0)
         if self._process.is_alive():
             self._process.kill()
+            self._process.join()
 
 
-def watch(shared, uris, pose_blocks, safety, state, after, parent, links) -> None:
+def watch(board: Board, parent: int, links: int, own: RawLinks, safety, state) -> None:
     """The guard's process."""
-    import cflib.crtp
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the loop, which lands
-    cflib.crtp.init_drivers()
+    stand_alone()
+    own.open(udp_only=True)
     real_time.hurry()
-    own = {uri: _open(uri) for uri in uris if uri.startswith("udp:")}
-    shared[2] = _READY
-    while shared[2] == _READY:
+    board.watch()
+    while not board.over:
         time.sleep(CHECK)
-        silent = shared[1] > 0.0 and shared[0] > 0.0 and time.perf_counter() - shared[0] > after
-        if not silent:
-            if os.getppid() != parent and shared[1] == 0.0:  # it ended, and nothing flies
+        now = time.perf_counter()
+        board.beat(Role.GUARD, now)
+        if not board.flying:
+            if os.getppid() != parent:  # the loop ended, and nothing flies
+                if board.silent(Role.LINKS, now) > board.silence:
+                    own.open()
+                    disarm(own)
                 break
             continue
-        for process in (parent, links):  # should one wake up, two would fly
-            with contextlib.suppress(ProcessLookupError, TypeError):
-                os.kill(process, signal.SIGKILL)
-        own |= {uri: _open(uri) for uri in uris if uri not in own}
-        land(shared, [own[uri] for uri in uris], uris, pose_blocks, safety, state)
-        break
-    for link in own.values():
-        link.close()
+        links_silent = board.silent(Role.LINKS, now) > board.silence
+        # should the links live and not take over
+        loop_silent = board.pilot is Role.LOOP and board.silent(Role.LOOP, now) > 3.0 * board.silence
+        if (links_silent or loop_silent) and board.pilot is not Role.GUARD:
+            land(board, links, own, safety, state)
+            break
+    own.close()
 
 
-def _open(uri):
-    import cflib.crtp
-
-    return cflib.crtp.get_link_driver(uri, lambda *_: None, lambda *_: None)
-
-
-def land(shared, links, uris, pose_blocks, safety, state) -> State:
-    """Fly wait-and-land over raw links until all motors are off; the last state."""
-    from cflib.crazyflie.commander import Commander
-
-    now = time.perf_counter()
-    members = [Member(uri, time.perf_counter) for uri in uris]
-    drones = []
-    for i in range(len(uris)):
-        mode, trim, known, *numbers = shared[_HEAD + _EACH * i : _HEAD + _EACH * (i + 1)]
-        pose = None
-        if known:
-            pose = Pose(shared[0], *(tuple(numbers[a:b]) for a, b in ((0, 3), (3, 6), (6, 10), (10, 13))))
-            members[i].pose = pose
-        drones.append(Drone(mode=_MODES[int(mode)], trim=trim, estimate=pose))
-    state = take_over(safety, replace(state, drones=tuple(drones)), now)
-    commanders = [Commander(SimpleNamespace(send_packet=link.send_packet)) for link in links]
-    names = [name for name, _ in POSE_BLOCK]
-    layout = "<" + "".join(LOG_TYPES[kind][1] for _, kind in POSE_BLOCK)
-    due = now
-    while state.flying:
-        for member, link, block in zip(members, links, pose_blocks, strict=True):
-            while (packet := link.receive_packet(0)) is not None:
-                member.heard = time.perf_counter()
-                data = bytes(packet.data)
-                if (packet.port, packet.channel) != (Port.LOG, 2) or data[0] != block:
-                    continue
-                stamp = int.from_bytes(data[1:4], "little")
-                if len(data) == 4 + struct.calcsize(layout):
-                    values = struct.unpack(layout, data[4:])
-                    member.pose_arrived(stamp, dict(zip(names, values, strict=True)))
-        sightings = tuple(Sighting(m.pose, m.heard, m.voltage) for m in members)
-        state, set_points = step(safety, state, Event(time.perf_counter(), sightings))
-        for commander, set_point in zip(commanders, set_points, strict=True):
-            if set_point.mode == OFF:
-                commander.send_stop_setpoint()
-            else:
-                commander.send_setpoint_manual(*manual_arguments(set_point))
-        due += 0.01
-        time.sleep(max(due - time.perf_counter(), 0.0))
-    return state
+def land(board: Board, links: int, own: RawLinks, safety: SafetySettings, state: State) -> None:
+    """The guard flies, and says so."""
+    board.take(Role.GUARD)
+    with contextlib.suppress(ProcessLookupError):  # should it wake up, two would fly
+        os.kill(links, signal.SIGKILL)
+    say("openjax.fly: the links' process is silent, the guard lands all vehicles")
+    own.open()
+    fly_down(board, Role.GUARD, own, safety, state)
+    say("openjax.fly: all vehicles are down and disarmed")

@@ -1,4 +1,4 @@
-"""The limits of a flight, and where within them a vehicle may stop, turn back, wait."""
+"""The limits of a flight: what an action may ask for within them, where a vehicle may stop, turn back, part, wait."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
-from openjax.flying.controller import Pose, Vector
+from openjax.flying.controller import Airframe, Pose, Vector
+from openjax.flying.set_point import RATES, SetPoint
 from openjax.ranges import Interval, check_intervals
 
 APART = 0.35
@@ -26,18 +27,20 @@ class SafetySettings:
     """Nor, in pursuit, below this (m)."""
     outside: Annotated[float, Interval("[0, 100]")] = 0.3
     """Farther out than this (m) something is wrong: all land."""
+    separation: Annotated[float, Interval("[0, 10]")] = 0.16
+    """Vehicles in pursuit that couldn't stop at this distance (m) any more brake and part. 0 switches it off."""
     speed_limit: Annotated[float, Interval("(0, 100]")] = 2.5
     """Faster than this (m/s) something is wrong: all land."""
     tilt_limit: Annotated[float, Interval("(0, 180]")] = 80.0
     """More tilted than this (degrees) something is wrong: all land."""
+    tumble_time: Annotated[float, Interval("[0, 10]")] = 0.1
+    """Upside down for longer (s): motors off."""
     braking: Annotated[float, Interval("(0, 100]")] = 5.0
     """Deceleration that is counted on to stop within the arena (m/s^2)."""
     reaction: Annotated[float, Interval("[0, 10]")] = 0.1
     """Time until it acts (s)."""
     pose_timeout: Annotated[float, Interval("(0, 60]")] = 0.06
-    """A pose older than this (s) is lost: blind landing."""
-    pose_jump: Annotated[float, Interval("(0, 100]")] = 0.15
-    """A pose farther than this (m) from where its vehicle must be isn't believed."""
+    """Without a good pose for longer (s) a vehicle is flown by reckoning no more: it lands."""
     link_timeout: Annotated[float, Interval("(0, 60]")] = 0.3
     """A link silent for longer (s) is gone."""
     action_timeout: Annotated[float, Interval("(0, 60]")] = 0.035
@@ -45,12 +48,22 @@ class SafetySettings:
     battery_low: Annotated[float, Interval("[0, 100]")] = 3.2
     """Voltage under load, for `battery_time`, at which a vehicle lands (V)."""
     battery_time: Annotated[float, Interval("[0, 60]")] = 0.5
-    hold_time: Annotated[float, Interval("[0, 600]")] = 1.0
+    battery_start: Annotated[float, Interval("[0, 100]")] = 3.7
+    """No vehicle takes off with less, measured without load (V)."""
+    stand: Annotated[float, Interval("(0, 1000]")] = 0.15
+    """No vehicle takes off farther than this (m) from below its start."""
+    lift: Annotated[float, Interval("(0, 1]")] = 0.1
+    """Height of the test lift (m)."""
+    lift_time: Annotated[float, Interval("(0, 60]")] = 2.0
+    """It must be done by then (s)."""
+    hold_time: Annotated[float, Interval("[0, 600]")] = 0.5
     """How long vehicles wait after a trouble before they land (s)."""
     transfer_speed: Annotated[float, Interval("(0, 10]")] = 0.5
     """On the way to the start (m/s)."""
-    landing_speed: Annotated[float, Interval("(0, 10]")] = 0.35
+    landing_speed: Annotated[float, Interval("(0, 10]")] = 0.4
     """m/s."""
+    landing_time: Annotated[float, Interval("(0, 600]")] = 4.0
+    """A landing that takes longer (s) ends with the motors off: by then a vehicle is near the floor, whatever its pose says."""
 
     def __post_init__(self):
         check_intervals(self, "safety.")
@@ -74,6 +87,49 @@ def fence_velocity(settings: SafetySettings, pose: Pose) -> Vector | None:
     if outside:
         vx, vy = -0.5 * x / out, -0.5 * y / out
     return vx, vy, -0.4 if above else 0.4 if below else 0.0
+
+
+def parting_velocity(settings: SafetySettings, i: int, poses: Sequence[Pose | None]) -> Vector | None:
+    """The velocity (m/s) that keeps vehicle i off the others; None while all could still stop apart.
+
+    Two vehicles that close in at `c` and both brake at `braking` need `c * reaction + c**2 / (4 * braking)` to stop.
+    """
+    own, wanted = poses[i], None
+    for j, other in enumerate(poses):
+        if j == i or other is None:
+            continue
+        distance = math.dist(own.position, other.position)
+        if distance < 1e-6:
+            continue
+        away = tuple((p - q) / distance for p, q in zip(own.position, other.position, strict=True))
+        closing = sum(a * (w - v) for a, v, w in zip(away, own.velocity, other.velocity, strict=True))
+        stopping = max(closing, 0.0) * (settings.reaction + max(closing, 0.0) / (4.0 * settings.braking))
+        lack = settings.separation - (distance - stopping)
+        if lack > 0.0:
+            push = 0.5 * max(closing, 0.0) + min(lack / settings.reaction, 0.5)
+            wanted = tuple(w + push * a for w, a in zip(wanted or own.velocity, away, strict=True))
+    return wanted
+
+
+def within_reach(action: SetPoint, sent: SetPoint, airframe: Airframe, dt: float) -> SetPoint:
+    """The action within its bounds, and no farther from what was sent `dt` (s) before than the vehicle can follow.
+
+    Its rates can't change faster than its largest angular acceleration, its thrust than its motors' time constant.
+    """
+
+    def near(value, old, room):
+        return min(max(value, old - room), old + room) if sent.mode == RATES else value
+
+    turn, lift = airframe.angular_acceleration * dt, dt / airframe.motor_time_constant
+    rates = (
+        near(min(max(new, -math.pi), math.pi), old, turn)
+        for new, old in (
+            (action.roll, sent.roll),
+            (action.pitch, sent.pitch),
+            (action.yaw_rate, sent.yaw_rate),
+        )
+    )
+    return SetPoint(RATES, *rates, near(min(max(action.thrust, 0.0), 1.0), sent.thrust, lift))
 
 
 def resting_places(

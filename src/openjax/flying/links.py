@@ -14,46 +14,66 @@ import math
 import multiprocessing
 import os
 import select
-import signal
 import socket
 import struct
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from openjax.errors import UserError
 from openjax.flying import real_time
+from openjax.flying.board import SILENCE, Board, Role, say, stand_alone
 from openjax.flying.controller import Pose
-from openjax.flying.safety import Sighting
+from openjax.flying.guard import CHECK, disarm, fly_down
+from openjax.flying.limits import SafetySettings
+from openjax.flying.safety import PoseSample, State
 from openjax.flying.set_point import SetPoint
 from openjax.flying.swarm import Member, Samples, Swarm
 
-SILENCE = 1.0
+STUCK = 1.0
 """The links' process is taken for dead if it doesn't pass on set-points for this long (s)."""
-_POSE = struct.Struct("<i16d")  # vehicle; arrival, voltage, time, position, velocity, quaternion, body rates
+STARTING = 20.0
+"""s until its interpreter has loaded `cflib`, on a busy machine."""
+CLOSING = 2.0
+"""s that it has to disarm."""
+_POSE = struct.Struct(
+    "<iI16d"
+)  # vehicle, supervisor; arrival, voltage, time, position, velocity, quaternion, body rates
 _NUMBER = struct.Struct("<q")
 _SET_POINT = struct.Struct("<i4d")
 _SENT = struct.Struct("<qd")  # number of the set-points, when the last one had left
 
 
+class LinksGone(UserError):
+    """The links' process ended, hangs, or flies by itself."""
+
+
 class Links:
     """Crazyflies, real or virtual, over links in another process; to the loop what it flies.
 
-    Args: as `openjax.flying.swarm.Swarm`.
+    Args: as `openjax.flying.swarm.Swarm`, and
+      safety, state: by which the links' process lands all if the loop stops; without them it doesn't.
+      silence: of the loop after which it does (s).
     """
 
     def __init__(
         self,
         uris: Sequence[str],
         body_logs: int = 1,
-        watchdog: bool = False,
-        clock: Callable[[], float] = time.perf_counter,
+        watchdog: bool = True,
+        safety: SafetySettings | None = None,
+        state: State | None = None,
+        silence: float = SILENCE,
     ):
-        self._uris, self._options, self._now = tuple(uris), (body_logs, watchdog), clock
+        self._uris, self._options, self._landing = tuple(uris), (body_logs, watchdog), (safety, state)
+        self._now = time.perf_counter
         n = len(self._uris)
+        self._context = multiprocessing.get_context("spawn")
+        self.board = Board(n, self._context, silence)
         self.poses: list[Pose | None] = [None] * n
         self._arrivals, self._voltages = [-math.inf] * n, [math.nan] * n
+        self._supervisors = [0] * n
         self._rest, self._count, self._calls = b"", 0, 0
         self._process, self._lock = None, threading.Lock()
         self._blocks: tuple[int, ...] = ()
@@ -61,48 +81,76 @@ class Links:
     def connect(self, timeout: float = 20.0) -> None:
         """Open all links and start the log blocks.
 
+        Args:
+          timeout: for each vehicle (s).
+
         Raises:
           UserError: cflib isn't there, a vehicle doesn't answer, or lacks a variable.
         """
-        context = multiprocessing.get_context("spawn")
-        self._heard = context.RawArray("d", [self._now()] * len(self._uris))
+        context = self._context
+        self._contacts = context.RawArray("d", [self._now()] * len(self._uris))
         self._stream, stream = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         self._commands, commands = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._control, control = context.Pipe()
         self._stream.setblocking(False)
-        self._commands.settimeout(SILENCE)
+        self._commands.settimeout(STUCK)
+        ends = (stream, commands, control)
         self._process = context.Process(
             target=_serve,
-            args=(self._uris, *self._options, timeout, self._heard, stream, commands, control),
-            daemon=True,
+            args=(
+                self._uris,
+                *self._options,
+                timeout,
+                self._contacts,
+                *ends,
+                self.board,
+                os.getpid(),
+                self._landing,
+            ),
             name="openjax links",
         )
         self._process.start()
-        for end in (stream, commands, control):
+        for end in ends:
             end.close()
+        complaint = "the links' process doesn't answer"
         try:
-            complaint, self._blocks = self._control.recv()
-        except EOFError as error:
-            raise UserError("the links' process ended before it had connected") from error
+            if self._control.poll(STARTING + timeout * (1 + len(self._uris))):
+                complaint, self._blocks = self._control.recv()
+        except (EOFError, OSError):
+            complaint = "the links' process ended before it had connected"
+        except BaseException:  # Ctrl-C
+            self.kill()
+            raise
         if complaint is not None:
+            self.kill()
+            raise UserError(complaint)
+
+    def kill(self) -> None:
+        """End the links' process at once."""
+        if self._process is not None:
+            self._process.kill()
             self._process.join()
             self._process = None
-            raise UserError(complaint)
 
     @property
     def pid(self) -> int:
         """Of the links' process."""
         return self._process.pid
 
-    def _call(self, name: str, *arguments):
-        """The result of a method of the swarm over there."""
-        with self._lock:
-            self._calls += 1
-            number = self._calls
-            self._control.send((number, name, arguments))
-        answered = 0
-        while answered != number:  # answers of interrupted calls may still be there
-            answered, result = self._control.recv()
+    def _call(self, name: str, *arguments, timeout: float = 30.0):
+        """The result of a method of the swarm over there. UserError: there is no answer."""
+        try:
+            with self._lock:
+                self._calls += 1
+                number = self._calls
+                self._control.send((number, name, arguments))
+            answered = 0
+            while answered != number:  # answers of interrupted calls may still be there
+                if not self._control.poll(timeout):
+                    raise LinksGone("the links' process is stuck")
+                answered, result = self._control.recv()
+        except (EOFError, OSError) as error:
+            raise LinksGone("the links' process is gone") from error
         return result
 
     def _drain(self) -> None:
@@ -110,17 +158,18 @@ class Links:
         while True:
             try:
                 data = self._stream.recv(1 << 16)
-            except BlockingIOError:
+            except (BlockingIOError, ConnectionError):
                 return
             if not data:
                 return
             data = self._rest + data
             whole = len(data) - len(data) % _POSE.size
             self._rest = data[whole:]
-            for vehicle, arrival, voltage, at, *numbers in _POSE.iter_unpack(data[:whole]):
+            for vehicle, supervisor, arrival, voltage, at, *numbers in _POSE.iter_unpack(data[:whole]):
                 parts = (tuple(numbers[a:b]) for a, b in ((0, 3), (3, 6), (6, 10), (10, 13)))
                 self.poses[vehicle] = Pose(at, *parts)
                 self._arrivals[vehicle], self._voltages[vehicle] = arrival, voltage
+                self._supervisors[vehicle] = supervisor
 
     def wait(self, until: float) -> None:
         """Return at `until` (s), or as soon as a pose arrives."""
@@ -128,10 +177,11 @@ class Links:
         if left > 0:
             select.select([self._stream], [], [], left)
 
-    def sightings(self) -> tuple[Sighting, ...]:
+    def observe(self) -> tuple[PoseSample, ...]:
         """What is known of each vehicle now."""
         self._drain()
-        return tuple(Sighting(*s) for s in zip(self.poses, self._heard, self._voltages, strict=True))
+        known = zip(self.poses, self._contacts, self._voltages, self._supervisors, strict=True)
+        return tuple(PoseSample(*sample) for sample in known)
 
     def arrivals(self) -> tuple[float, ...]:
         """When each vehicle's newest pose arrived (s, host)."""
@@ -142,23 +192,28 @@ class Links:
         """Send each vehicle its set-point; returns when the last one left (s).
 
         Raises:
-          UserError: the links' process is gone or stuck.
+          LinksGone: the links' process is gone or stuck, or flies by itself.
         """
+        if self.board.pilot is not Role.LOOP:
+            raise LinksGone("another process flies")
         self._count += 1
-        packed = [_SET_POINT.pack(s.mode, s.roll, s.pitch, s.yaw_rate, s.thrust) for s in set_points]
+        packed = [_SET_POINT.pack(s.mode, *s.numbers()) for s in set_points]
         try:
             self._commands.send(_NUMBER.pack(self._count) + b"".join(packed))
             number = 0
             while number != self._count:
                 number, sent = _SENT.unpack(self._commands.recv(_SENT.size))
         except OSError as error:
-            raise UserError("the links' process is gone or stuck") from error
+            raise LinksGone("the links' process is gone or stuck") from error
         return sent
 
     def send_pose(self, i: int, position, quaternion) -> None:
         """Tell vehicle i where motion capture sees it: (3,) m, (4,) wxyz."""
         with self._lock:
             self._control.send((0, "send_pose", (i, tuple(position), tuple(quaternion))))
+
+    def believed(self, vehicle: int, pose: Pose) -> None:
+        """There is no motion capture here."""
 
     def arm(self, on: bool = True) -> None:
         """Arm or disarm all."""
@@ -181,67 +236,99 @@ class Links:
         return self._blocks
 
     def close(self) -> None:
-        """Motors off, links closed."""
+        """Motors off, disarmed, links closed."""
         if self._process is None:
             return
-        with contextlib.suppress(EOFError, OSError):
-            self._call("close")
-        self._process.join(5.0)
-        if self._process.is_alive():
-            self._process.kill()
-        self._process = None
+        with contextlib.suppress(UserError):
+            self._call("close", timeout=CLOSING)
+        self._process.join(CLOSING)
+        self.kill()
         for end in (self._stream, self._commands, self._control):
             end.close()
 
 
-def _serve(uris, body_logs, watchdog, timeout, heard, stream, commands, control) -> None:
-    """The links' process. It leaves the vehicles alone when the loop's process is gone: they are the guard's then."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the loop, which lands
+def _serve(
+    uris,
+    body_logs,
+    watchdog,
+    timeout,
+    contacts,
+    stream,
+    commands,
+    control,
+    board: Board,
+    parent: int,
+    landing,
+) -> None:
+    """The links' process. Should the loop stop, it lands the vehicles; with nothing in the air it ends with the loop."""
+    stand_alone()
     sys.setswitchinterval(5e-4)  # cflib's threads and the one that passes on set-points
+    threading.excepthook = lambda _: None  # cflib's threads, when their socket goes
     real_time.hurry()
     stream.setblocking(False)
     swarm, lock = Swarm(uris, body_logs, watchdog), threading.Lock()
+    threading.Thread(target=_watch, args=(swarm, board, parent, landing), daemon=True, name="watch").start()
 
     def pass_on(vehicle: int, member: Member, new_pose: bool) -> None:
-        heard[vehicle] = member.heard
+        contacts[vehicle] = member.last_contact
         if not new_pose:
             return
         pose = member.pose
         numbers = (pose.time, *pose.position, *pose.velocity, *pose.quaternion, *pose.body_rates)
+        packed = _POSE.pack(vehicle, member.supervisor, member.arrival, member.voltage, *numbers)
         # nobody reads any more: then there is no loop to tell
         with lock, contextlib.suppress(OSError):
-            stream.send(_POSE.pack(vehicle, member.arrival, member.voltage, *numbers))
+            stream.send(packed)
 
     for i, member in enumerate(swarm.members):
         member.listener = lambda new_pose, i=i, member=member: pass_on(i, member, new_pose)
     try:
         swarm.connect(timeout)
-    except UserError as error:
-        control.send((str(error), ()))
-        return
+    except Exception as error:  # whatever cflib raises, too
+        control.send((" ".join(str(error).split()) or type(error).__name__, ()))
+        os._exit(0)  # cflib's threads may hang
     gc.collect()
     gc.disable()
-    threading.Thread(target=_send_on, args=(swarm, commands), daemon=True, name="set-points").start()
+    threading.Thread(target=_send_on, args=(swarm, commands, board), daemon=True, name="set-points").start()
     control.send((None, swarm.pose_blocks()))
-    while True:
-        try:
+    with contextlib.suppress(EOFError, OSError):
+        while True:
             number, name, arguments = control.recv()
-        except (EOFError, OSError):
-            os._exit(1)
-        result = getattr(swarm, name)(*arguments)
-        if number:
-            control.send((number, result))
-        if name == "close":
-            return
+            result = disarm(swarm) if name == "close" else getattr(swarm, name)(*arguments)
+            if number:
+                control.send((number, result))
+            if name == "close":
+                os._exit(0)
+    threading.Event().wait()  # the loop is gone: the watch ends the process
 
 
-def _send_on(swarm: Swarm, commands: socket.socket) -> None:
-    """Pass on set-points as they come."""
+def _send_on(swarm: Swarm, commands: socket.socket, board: Board) -> None:
+    """Pass on set-points as they come, as long as it's the loop that flies."""
     while True:
         try:
             data = commands.recv(1 << 12)
             (number,) = _NUMBER.unpack_from(data)
+            if board.pilot is not Role.LOOP:
+                return
             sent = swarm.send([SetPoint(*s) for s in _SET_POINT.iter_unpack(data[_NUMBER.size :])])
             commands.send(_SENT.pack(number, sent))
         except (OSError, struct.error):
             return
+
+
+def _watch(swarm: Swarm, board: Board, parent: int, landing) -> None:
+    """Beat; land for a loop that is silent; end the process once the loop's has and nothing flies."""
+    while True:
+        time.sleep(CHECK)
+        now = time.perf_counter()
+        if board.pilot is Role.LOOP:
+            board.beat(Role.LINKS, now)
+            if board.flying and landing[0] is not None and board.silent(Role.LOOP, now) > board.silence:
+                say("openjax.fly: the loop is silent, the links' process lands all vehicles")
+                fly_down(board, Role.LINKS, swarm, *landing)
+                say("openjax.fly: all vehicles are down and disarmed")
+        if os.getppid() != parent and not board.flying:
+            for _ in range(3):
+                swarm.arm(False)
+                time.sleep(0.02)
+            os._exit(1)

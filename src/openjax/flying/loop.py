@@ -12,18 +12,10 @@ from typing import Protocol
 
 import numpy as np
 
-from openjax.flying.controller import Airframe, Pose, accelerate, moved_on, wanted_acceleration
+from openjax.flying.controller import Pose, accelerate, wanted_acceleration
 from openjax.flying.game import Game
 from openjax.flying.limits import SafetySettings
-from openjax.flying.safety import (
-    Event,
-    Mode,
-    Request,
-    Sighting,
-    State,
-    initial_state,
-    step,
-)
+from openjax.flying.safety import Event, Mode, PoseSample, Request, State, decide, initial_state, see
 from openjax.flying.set_point import OFF, RATES, SetPoint, as_sent, from_action
 from openjax.pursuit.environment import THRUST_LIMIT
 
@@ -40,9 +32,17 @@ GONE = 0.1
 class Vehicles(Protocol):
     """What the loop needs of the vehicles; `Links` are some."""
 
-    def sightings(self) -> tuple[Sighting, ...]: ...
+    def observe(self) -> tuple[PoseSample, ...]:
+        """What is known of each vehicle now."""
+        ...
 
-    def send(self, set_points) -> float: ...
+    def send(self, set_points) -> float:
+        """Send each vehicle its set-point; returns when the last one left (s)."""
+        ...
+
+    def believed(self, vehicle: int, pose: Pose) -> None:
+        """A pose of motion capture was judged good."""
+        ...
 
     def arrivals(self) -> tuple[float, ...]:
         """When each vehicle's newest pose arrived (s, host)."""
@@ -132,15 +132,31 @@ class Pace:
 def await_poses(vehicles: Vehicles, due: float, clock: Callable[[], float]) -> None:
     """Return around `due` (s): as soon as each vehicle's newest pose is there that was measured before."""
     while (now := clock()) < due + PATIENCE:
-        measured = _measured(vehicles.sightings())
+        measured = measured_times(vehicles.observe())
         complete = all(t > due - PERIOD or now - t > GONE for t in measured)
         if complete and now >= due - EARLY:
             return
         vehicles.wait(due - EARLY if complete else due + PATIENCE)
 
 
-def _measured(sightings) -> tuple[float, ...]:
-    return tuple(-math.inf if s.pose is None else s.pose.time for s in sightings)
+def measured_times(samples) -> tuple[float, ...]:
+    """When each vehicle's newest pose was measured (s); minus infinity where there is none."""
+    poses = (sample.captured or sample.own for sample in samples)
+    return tuple(-math.inf if pose is None else pose.time for pose in poses)
+
+
+def flight_state(game: Game, number: int, safety: SafetySettings) -> State:
+    """The state in which `number` vehicles stand before a game: pursuers, then, where it's a vehicle, the evader."""
+    task, settings = game.task, game.settings
+    starts = [tuple(map(float, p)) for p in np.asarray(task.pursuer_position)]
+    if number > settings.num_pursuers:
+        starts.append(tuple(map(float, np.asarray(task.evader_position))))
+    pillars = [
+        (float(x), float(y), settings.pillar_radius)
+        for (x, y), active in zip(task.pillar_position, task.pillar_active, strict=True)
+        if active
+    ]
+    return initial_state(starts, pillars, game.airframe, safety)
 
 
 @dataclass(frozen=True)
@@ -166,7 +182,7 @@ class Flight:
       safety: limits.
       plan: what to fly.
       requests: asked at every tick for what the operator wants.
-      beat: called at every tick with time and state, see `openjax.flying.guard`.
+      watched: called after every tick with time and state; if it returns anything, all land for that reason.
       clock: host time (s).
     """
 
@@ -177,27 +193,19 @@ class Flight:
         safety: SafetySettings,
         plan: Plan,
         requests: Callable[[], Request] = lambda: Request.NONE,
-        beat: Callable[[float, State], None] | None = None,
+        watched: Callable[[float, State], str] = lambda now, state: "",
         clock: Callable[[], float] = time.perf_counter,
     ):
         self.vehicles, self.game, self.safety, self.plan = vehicles, game, safety, plan
-        self._requests, self.beat, self._now = requests, beat, clock
-        task, settings = game.task, game.settings
-        self._pursuers = settings.num_pursuers
-        starts = [tuple(map(float, p)) for p in np.asarray(task.pursuer_position)]
-        self._evader_flies = len(vehicles.sightings()) > self._pursuers
-        if self._evader_flies:
-            starts.append(tuple(map(float, np.asarray(task.evader_position))))
-        pillars = [
-            (float(x), float(y), settings.pillar_radius)
-            for (x, y), active in zip(task.pillar_position, task.pillar_active, strict=True)
-            if active
-        ]
-        self.state = initial_state(starts, pillars, Airframe(game.hover_thrust))
+        self._requests, self._watched, self._now = requests, watched, clock
+        number = len(vehicles.observe())
+        self._pursuers = game.settings.num_pursuers
+        self._evader_flies = number > self._pursuers
+        self.state = flight_state(game, number, safety)
         self.record = Record()
         self._play, self._episode, self._begun = None, -1, 0.0
         self._since = clock()
-        self._flown = 0
+        self._flown, self._alarm = 0, ""
 
     def run(self) -> Record:
         """Fly it. Returns when all motors are off."""
@@ -206,39 +214,40 @@ class Flight:
         try:
             pace = Pace(self._now())
             self._since = self._now()
-            while True:
-                now = self._now()
-                self.tick(now, pace.due)
-                if not self.state.flying and self.state.time - self._since > 0.5 and self._finished():
-                    break
-                due = pace.next(self._now(), _measured(self.vehicles.sightings()))
+            while not self.over:
+                self.tick(self._now(), pace.due)
+                due = pace.next(self._now(), measured_times(self.vehicles.observe()))
                 self.record.skipped = pace.skipped
                 await_poses(self.vehicles, due, self._now)
         finally:
             gc.enable()
         return self.record
 
-    def _finished(self) -> bool:
-        return self.state.all_in(Mode.LANDED, Mode.STOPPED) or (
-            self.state.all_in(Mode.GROUND, Mode.LANDED, Mode.STOPPED)
-            and any(d.reason for d in self.state.drones)
-        )
+    @property
+    def over(self) -> bool:
+        """Whether all that flew is down, or nothing is going to fly."""
+        if self.state.flying or self.state.time - self._since < 0.5:
+            return False
+        return self.state.all_in(Mode.LANDED, Mode.STOPPED) or any(d.reason for d in self.state.drones)
 
     def tick(self, now: float, due: float) -> None:
         """One tick at `now` that was due at `due` (s)."""
         arrivals = self.vehicles.arrivals()
-        sightings = self.vehicles.sightings()
-        request = self._requests() or self._planned(now)
+        samples = self.vehicles.observe()
+        before = self.state.drones
+        self.state = see(self.safety, self.state, now, samples)
+        for i, (drone, old) in enumerate(zip(self.state.drones, before, strict=True)):
+            if drone.captured.pose is not old.captured.pose:
+                self.vehicles.believed(i, drone.captured.pose)
+        request = self._requests() or (Request.LAND if self._alarm else self._planned(now))
         actions = None
-        playing = self._episode >= 0 or request is Request.PURSUE
-        if playing and all(s.pose is not None for s in sightings):
-            actions = self._actions(now, sightings, request is Request.PURSUE)
-        event = Event(now, sightings, actions, request)
-        self.state, set_points = step(self.safety, self.state, event)
+        if self._episode >= 0 or request is Request.PURSUE:
+            actions = self._actions(now, request is Request.PURSUE)
+        event = Event(now, samples, actions, request, self._alarm)
+        self.state, set_points = decide(self.safety, self.state, event)
         sent = self.vehicles.send(set_points)
-        if self.beat is not None:
-            self.beat(now, self.state)
-        self._keep(due, sent, arrivals, sightings, set_points)
+        self._alarm = self._watched(now, self.state)
+        self._keep(due, sent, arrivals, samples, set_points)
         if self._episode >= 0 and not any(m is Mode.PURSUIT for m in self.state.modes):
             self._end_episode("safety")
 
@@ -246,7 +255,7 @@ class Flight:
         """What the plan asks for at this tick."""
         state, plan = self.state, self.plan
         waited = now - self._since
-        if state.all_in(Mode.GROUND):
+        if state.all_in(Mode.GROUND) and all(d.estimate is not None for d in state.drones):
             return Request.TRANSFER
         if state.all_in(Mode.READY) and self._episode < 0:
             if now - max(d.since for d in state.drones) < plan.settle:
@@ -259,12 +268,12 @@ class Flight:
         if self._episode >= 0 and (self._play.over or now - self._begun > plan.episode_seconds):
             self._end_episode("over")
             self._since = now
-            return Request.TRANSFER if self._flown < plan.episodes else Request.LAND
+            return Request.TRANSFER  # back to the starts, also to land there
         return Request.NONE
 
-    def _actions(self, now, sightings, first):
-        """The set-points that the policy, and the evader's rule, ask for."""
-        poses = [moved_on(s.pose, max(now, s.pose.time)) for s in sightings]
+    def _actions(self, now, first):
+        """The set-points that the policy, and the evader's rule, ask for; they know of poses only what was believed."""
+        poses = [drone.estimate for drone in self.state.drones]
         if first:
             self._play = self.game.start(poses[: self._pursuers])
             self._episode, self._begun = self._flown, now
@@ -297,12 +306,12 @@ class Flight:
         self._episode = -1
         self._flown += 1
 
-    def _keep(self, due, sent, arrivals, sightings, set_points):
+    def _keep(self, due, sent, arrivals, samples, set_points):
         record = self.record
         record.due.append(due)
         record.sent.append(sent)
         record.age.append(tuple(sent - a for a in arrivals))
-        record.measured.append(tuple(sent - s.pose.time if s.pose else math.inf for s in sightings))
+        record.measured.append(tuple(sent - t for t in measured_times(samples)))
         record.set_points.append(tuple(s if s.mode == OFF else as_sent(s) for s in set_points))
         record.modes.append(self.state.modes)
         record.fenced.append(tuple(d.fenced for d in self.state.drones))

@@ -8,7 +8,8 @@ The adapter of a laboratory is one function that runs for as long as there are p
                 update(vehicle, body.position, body.quaternion)      # metres, wxyz, body to world
 
 and `openjax fly --motion_capture my_lab:poses`. Velocities are differences, smoothed; body rates come from the
-gyroscope on board. Each pose is also sent to its vehicle, for the estimator on board and for the guard, which flies by it.
+gyroscope on board. Each pose that was believed is also sent to its vehicle, for the estimator on board, by which the vehicle
+lands should motion capture fail, or the loop.
 """
 
 from __future__ import annotations
@@ -25,11 +26,8 @@ from pathlib import Path
 from openjax.errors import UserError
 from openjax.flying.controller import Pose
 from openjax.flying.links import Links
-from openjax.flying.safety import Sighting
+from openjax.flying.safety import PoseSample
 from openjax.flying.swarm import Samples
-
-SMOOTHING = 0.02
-"""Time constant of the velocity's low-pass (s)."""
 
 
 def find_feed(name: str) -> Callable:
@@ -68,29 +66,18 @@ class MotionCaptured:
     def update(self, vehicle: int, position, quaternion, at: float | None = None) -> None:
         """Vehicle `vehicle` was seen at position (3,) m, attitude (4,) wxyz, at `at` (s, host clock; default now).
 
-        What isn't finite is left out, so that a lost body counts as a lost pose.
+        It is judged before anything flies by it, see `openjax.flying.judge`.
         """
         at = self._now() if at is None else at
         position, quaternion = tuple(map(float, position)), tuple(map(float, quaternion))
-        if not all(map(math.isfinite, (*position, *quaternion))):
-            return
-        old = self._poses[vehicle]
-        velocity = (0.0, 0.0, 0.0)
-        if old is not None and at > old.time:
-            step = at - old.time
-            share = 1.0 - math.exp(-step / SMOOTHING)
-            velocity = tuple(
-                v + share * ((p - q) / step - v)
-                for p, q, v in zip(position, old.position, old.velocity, strict=True)
-            )
-        own = self._links.poses[vehicle]
-        rates = own.body_rates if own is not None else (0.0, 0.0, 0.0)
-        pose = Pose(at, position, velocity, quaternion, rates)
-        self._poses[vehicle] = pose
+        self._poses[vehicle] = Pose(at, position, (0.0, 0.0, 0.0), quaternion)
         self._arrived.set()
+
+    def believed(self, vehicle: int, pose: Pose) -> None:
+        """This pose of motion capture was judged good."""
         if self._recording:
             self._seen[vehicle].append(pose)
-        self._links.send_pose(vehicle, position, quaternion)
+        self._links.send_pose(vehicle, pose.position, pose.quaternion)
 
     def record(self) -> None:
         """Keep all samples from now on."""
@@ -107,10 +94,12 @@ class MotionCaptured:
         self._arrived.wait(max(until - self._now(), 0.0))
         self._arrived.clear()
 
-    def sightings(self) -> tuple[Sighting, ...]:
+    def observe(self) -> tuple[PoseSample, ...]:
         """What is known of each vehicle now."""
-        own = self._links.sightings()
-        return tuple(Sighting(p, s.heard, s.voltage) for p, s in zip(self._poses, own, strict=True))
+        own = self._links.observe()
+        return tuple(
+            dataclasses.replace(sample, captured=p) for p, sample in zip(self._poses, own, strict=True)
+        )
 
     def arrivals(self) -> tuple[float, ...]:
         """When each vehicle's newest pose arrived (s, host)."""

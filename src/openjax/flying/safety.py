@@ -1,8 +1,8 @@
 """Safety of a flight as a pure state machine: what was seen in, set-points out.
 
-`step(settings, state, event)` decides for every vehicle, at every tick, who flies it: the policy, or the controller
-that waits, lands, or lands blindly. It reads no clock and touches no link, so that a thousand faults can be flown in
-simulated time.
+`see(settings, state, time, samples)` judges the poses and brings each vehicle's estimate to now; `decide` says who flies
+each vehicle: the policy, or the controller that lifts, waits, lands, or lands blindly. `step` is both. Nothing here reads a
+clock or touches a link, so that thousands of faults can be flown in simulated time.
 
 A vehicle in trouble lands; all others stop where they are, wait a moment, and land too. Troubles: its pose is lost, its
 link is silent, its battery low, it is too fast, too tilted, or outside the arena; no action came in time; a key.
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from openjax.flying.controller import (
@@ -22,12 +22,22 @@ from openjax.flying.controller import (
     Vector,
     accelerate,
     moved_on,
+    nominal_airframe,
     up,
     wanted_acceleration,
     wanted_velocity,
 )
-from openjax.flying.limits import APART, SafetySettings, fence_velocity, resting_places
-from openjax.flying.set_point import ANGLES, RATES, SetPoint
+from openjax.flying.crtp import Supervisor
+from openjax.flying.judge import NOTHING_SEEN, PoseLimits, Track, Verdict, agree, follow, pose_limits
+from openjax.flying.limits import (
+    APART,
+    SafetySettings,
+    fence_velocity,
+    parting_velocity,
+    resting_places,
+    within_reach,
+)
+from openjax.flying.set_point import ANGLES, MOTORS_OFF, RATES, SetPoint
 
 ATTITUDE_LAG = 0.12
 """How long the acceleration takes to follow what is asked for (s), in dead reckoning."""
@@ -37,14 +47,23 @@ BLIND_SPEED = 0.6
 """It sinks faster than a landing with poses (m/s): what it doesn't know grows with the square of the time."""
 BLIND_DEPTH = 0.15
 """A blind landing stops the motors this far below the floor by its reckoning (m)."""
-DRIFT = 0.25
-"""What dead reckoning may be wrong by after a second without poses (m): so far from it is a pose believed that returns."""
+SPIN_UP = 0.3
+"""A vehicle that lifts off may stand still for so long (s)."""
+ASIDE = 0.08
+"""How far (m) a vehicle may move sideways in the test lift: a hover that starts beside its trim."""
+RISEN = 0.04
+"""The test lift is over this close (m) to its height."""
+SMOOTHING = 0.02
+"""Time constant of the low-pass of velocities from motion capture (s)."""
 TRIM_GAIN, TRIM_LIMIT = 0.25, 0.15
 
 
 class Mode(StrEnum):
+    """Who flies a vehicle, and what it does."""
+
     GROUND = "ground"
-    TRANSFER = "transfer"  # take-off, and the way to where it is to start
+    LIFT = "test lift"  # a hand's breadth, to see that poses rise as they should
+    TRANSFER = "transfer"  # the way to where it is to start
     READY = "ready"
     PURSUIT = "pursuit"
     HOLD = "hold"
@@ -54,8 +73,9 @@ class Mode(StrEnum):
     STOPPED = "stopped"
 
 
-FLYING = (Mode.TRANSFER, Mode.READY, Mode.PURSUIT, Mode.HOLD, Mode.LAND, Mode.BLIND)
-_UNTROUBLED = (Mode.TRANSFER, Mode.READY, Mode.PURSUIT)
+FLYING = (Mode.LIFT, Mode.TRANSFER, Mode.READY, Mode.PURSUIT, Mode.HOLD, Mode.LAND, Mode.BLIND)
+_DOWN = (Mode.GROUND, Mode.LANDED)
+_UNTROUBLED = (Mode.LIFT, Mode.TRANSFER, Mode.READY, Mode.PURSUIT)
 
 
 class Request(StrEnum):
@@ -70,14 +90,18 @@ class Request(StrEnum):
 
 
 @dataclass(frozen=True)
-class Sighting:
-    """What is known of one vehicle at a tick."""
+class PoseSample:
+    """What is known of one vehicle at a tick, however old."""
 
-    pose: Pose | None
-    """The newest, however old."""
-    heard: float
+    own: Pose | None
+    """The newest estimate of the vehicle itself."""
+    last_contact: float
     """When its link last said anything (s)."""
     voltage: float = math.nan
+    supervisor: int = Supervisor.ARMED | Supervisor.CAN_FLY
+    """The firmware's word on its state."""
+    captured: Pose | None = None
+    """The newest of motion capture, whose velocity and body rates mean nothing; None where there is no motion capture."""
 
 
 @dataclass(frozen=True)
@@ -85,10 +109,12 @@ class Event:
     """One tick."""
 
     time: float
-    sightings: tuple[Sighting, ...]
+    samples: tuple[PoseSample, ...]
     actions: tuple[SetPoint, ...] | None = None
     """The policy's set-points, if they came with this tick."""
     request: Request = Request.NONE
+    reason: str = ""
+    """Why it is requested, where nobody asked."""
 
 
 @dataclass(frozen=True)
@@ -98,13 +124,20 @@ class Drone:
     mode: Mode = Mode.GROUND
     since: float = 0.0  # s, when the mode began
     estimate: Pose | None = None  # now; reckoned on where no pose is fresh
-    seen: float = -math.inf  # s, when the last pose that was believed was measured
+    own: Track = NOTHING_SEEN  # its own estimates
+    captured: Track = NOTHING_SEEN  # motion capture, with velocity and rates
+    seen: float = -math.inf  # s, when the pose that it is flown by was measured
+    distrusted: str = ""  # why motion capture isn't believed any more in this flight
+    stand: tuple[Vector | None, Vector | None] = (None, None)  # own and captured position before the lift
     acceleration: Vector = (0.0, 0.0, 0.0)  # m/s^2, what dead reckoning takes it to be
     anchor: Vector = (0.0, 0.0, 0.0)  # where it waits or lands
     trim: float = 0.0  # of the hover thrust
     low_since: float | None = None  # battery
+    over_since: float | None = None  # upside down
+    landing_since: float | None = None
     reason: str = ""  # why it left the pursuit
-    fenced: bool = False  # the last set-point kept it in the arena instead of doing what the policy wanted
+    fenced: bool = False  # the last set-point kept it in the arena, or off another, instead of doing what the policy wanted
+    sent: SetPoint = MOTORS_OFF
 
 
 @dataclass(frozen=True)
@@ -113,9 +146,11 @@ class State:
 
     drones: tuple[Drone, ...]
     starts: tuple[Vector, ...]
+    limits: PoseLimits
+    airframe: Airframe
     pillars: tuple[tuple[float, float, float], ...] = ()  # x, y, radius (m)
-    airframe: Airframe = field(default_factory=Airframe)
     time: float = 0.0
+    dt: float = 0.0
     action_time: float = 0.0
 
     @property
@@ -125,62 +160,65 @@ class State:
 
     @property
     def modes(self) -> tuple[Mode, ...]:
+        """Of all vehicles."""
         return tuple(drone.mode for drone in self.drones)
 
     def all_in(self, *modes: Mode) -> bool:
+        """Whether every vehicle is in one of these modes."""
         return all(drone.mode in modes for drone in self.drones)
 
 
 def initial_state(
-    starts: Sequence[Vector], pillars: Sequence[Vector] = (), airframe: Airframe | None = None
+    starts: Sequence[Vector],
+    pillars: Sequence[Vector] = (),
+    airframe: Airframe | None = None,
+    settings: SafetySettings | None = None,
 ) -> State:
     """All vehicles on the ground; they are to start at `starts` (m); pillars are x, y, radius."""
-    return State(tuple(Drone() for _ in starts), tuple(starts), tuple(pillars), airframe or Airframe())
+    airframe, settings = airframe or nominal_airframe(), settings or SafetySettings()
+    limits = pose_limits(airframe, settings.pose_timeout)
+    return State(tuple(Drone() for _ in starts), tuple(starts), limits, airframe, tuple(pillars))
 
 
 def step(settings: SafetySettings, state: State, event: Event) -> tuple[State, tuple[SetPoint, ...]]:
     """The state after a tick, and the set-point of each vehicle."""
-    dt = min(max(event.time - state.time, 0.0), 0.1)
-    drones = [
-        _sense(settings, drone, sighting, event.time, dt)
-        for drone, sighting in zip(state.drones, event.sightings, strict=True)
-    ]
-    action_time = event.time if event.actions is not None else state.action_time
-    drones = _requested(settings, state, drones, event)
-    troubles = [
-        _trouble(settings, drone, sighting, event.time)
-        for drone, sighting in zip(drones, event.sightings, strict=True)
-    ]
-    if any(d.mode is Mode.PURSUIT for d in drones) and event.request is not Request.PURSUE:
-        if event.time - action_time > settings.action_timeout:
-            troubles = [t or (Mode.HOLD, "no action in time") for t in troubles]
-    else:
-        action_time = event.time
-    drones = _react(settings, state, drones, troubles, event.time)
-    moved = [_fly(settings, state, drone, i, event, dt) for i, drone in enumerate(drones)]
-    drones = tuple(drone for drone, _ in moved)
-    return replace(state, drones=drones, time=event.time, action_time=action_time), tuple(
-        set_point for _, set_point in moved
+    return decide(settings, see(settings, state, event.time, event.samples), event)
+
+
+# -- what is seen
+
+
+def see(settings: SafetySettings, state: State, time: float, samples: Sequence[PoseSample]) -> State:
+    """The state with each vehicle's estimate brought to `time` (s), by what of its poses can be believed."""
+    dt = min(max(time - state.time, 0.0), 0.1)
+    drones = tuple(
+        _sense(settings, state.limits, drone, sample, time, dt)
+        for drone, sample in zip(state.drones, samples, strict=True)
     )
+    return replace(state, drones=drones, time=time, dt=dt)
 
 
-def usable(pose: Pose | None) -> bool:
-    """Whether a pose is one: finite numbers and an attitude."""
-    if pose is None:
-        return False
-    numbers = (*pose.position, *pose.velocity, *pose.quaternion)
-    return all(map(math.isfinite, numbers)) and abs(sum(q * q for q in pose.quaternion) - 1.0) < 0.1
+def _sense(settings, limits, drone, sample, now, dt) -> Drone:
+    """The drone with its estimate at `now`: the newest good pose moved on, or reckoned from the last estimate.
 
-
-def _sense(settings, drone, sighting, now, dt):
-    """The drone with its estimate brought to `now`: the newest pose moved on, or reckoned from the last estimate."""
-    pose = sighting.pose
-    if usable(pose) and now - pose.time <= settings.pose_timeout and _believable(settings, drone, pose):
-        estimate = moved_on(pose, max(now, pose.time))
-        w, x, y, z = estimate.quaternion
-        lift = max(up(estimate.quaternion), 0.3)
-        tilt = (2 * (x * z + w * y) / lift * GRAVITY, 2 * (y * z - w * x) / lift * GRAVITY, 0.0)
-        return replace(drone, estimate=estimate, seen=pose.time, acceleration=tilt)
+    Motion capture is what it is flown by, until it is lost; from then on the vehicle's own estimate is.
+    """
+    moving = drone.mode in FLYING and not (drone.mode is Mode.LIFT and now - drone.since < SPIN_UP)
+    by_capture = sample.captured is not None and not drone.distrusted
+    reckoned = None if by_capture and drone.own.fresh(now, limits) else drone.estimate
+    own = follow(drone.own, sample.own, now, limits, moving, reckoned)
+    captured, distrusted, source = drone.captured, drone.distrusted, own
+    if by_capture:
+        seen = _with_motion(sample.captured, captured.pose, sample.own)
+        captured = source = follow(captured, seen, now, limits, moving, drone.estimate)
+        if moving and captured.pose is seen and own.fresh(now, limits) and agree(seen, own.pose, limits):
+            captured = source = Track(drone.captured.pose, Verdict.APART)
+        if moving and not captured.fresh(now, limits):
+            distrusted, source = captured.verdict or "pose lost", own
+    drone = replace(drone, own=own, captured=captured, distrusted=distrusted)
+    if source.fresh(now, limits):
+        estimate = moved_on(source.pose, max(now, source.pose.time))
+        return replace(drone, estimate=estimate, seen=source.pose.time, acceleration=_tilted(estimate))
     if drone.estimate is None:
         return drone
     old = drone.estimate
@@ -189,134 +227,264 @@ def _sense(settings, drone, sighting, now, dt):
     return replace(drone, estimate=old._replace(time=now, position=position, velocity=velocity))
 
 
-def _believable(settings, drone, pose) -> bool:
-    """Whether a flying vehicle can have got to where a pose says it is: motion capture takes one for another at times."""
-    if drone.mode not in FLYING or drone.estimate is None:
-        return True
-    room = settings.pose_jump + DRIFT * max(pose.time - drone.seen, 0.0)
-    return math.dist(pose.position, moved_on(drone.estimate, pose.time).position) <= room
+def _tilted(pose) -> Vector:
+    """The acceleration (m/s^2) of a vehicle at this attitude that holds its height."""
+    w, x, y, z = pose.quaternion
+    lift = max(up(pose.quaternion), 0.3)
+    return (2 * (x * z + w * y) / lift * GRAVITY, 2 * (y * z - w * x) / lift * GRAVITY, 0.0)
 
 
-def _requested(settings, state, drones, event):
-    """The drones after what the operator asks for."""
+def _with_motion(pose, last, own) -> Pose:
+    """A pose of motion capture with the velocity from differences, smoothed, and the body rates of the gyroscope."""
+    if last is None or pose.time <= last.time:
+        return pose if last is None else last
+    step = pose.time - last.time
+    share = 1.0 - math.exp(-step / SMOOTHING)
+    velocity = tuple(
+        v + share * ((p - q) / step - v)
+        for p, q, v in zip(pose.position, last.position, last.velocity, strict=True)
+    )
+    return pose._replace(velocity=velocity, body_rates=pose.body_rates if own is None else own.body_rates)
 
-    def to(drone, mode, anchor=None, reason=""):
-        anchor = drone.anchor if anchor is None else anchor
-        return replace(drone, mode=mode, since=event.time, anchor=anchor, reason=reason or drone.reason)
 
-    request = event.request
+# -- what is done
+
+
+def decide(settings: SafetySettings, state: State, event: Event) -> tuple[State, tuple[SetPoint, ...]]:
+    """The state after a tick whose poses were seen already, and the set-point of each vehicle."""
+    now, actions = event.time, event.actions
+    finite = actions is not None and all(math.isfinite(x) for a in actions for x in a.numbers())
+    action_time = now if finite else state.action_time
+    drones = _requested(settings, state, event)
+    troubles = [
+        _trouble(settings, drone, sample, now) for drone, sample in zip(drones, event.samples, strict=True)
+    ]
+    if any(d.mode is Mode.PURSUIT for d in drones) and event.request is not Request.PURSUE:
+        if now - action_time > settings.action_timeout:
+            reason = "no action in time" if actions is None else "action not finite"
+            troubles = [t or (Mode.HOLD, reason) for t in troubles]
+    else:
+        action_time = now
+    drones = _react(settings, state, drones, troubles, now)
+    state = replace(state, drones=tuple(drones), action_time=action_time)
+    moved = tuple(
+        _fly(settings, state, i, actions[i] if finite else None, sample)
+        for i, sample in enumerate(event.samples)
+    )
+    return replace(state, drones=moved), tuple(drone.sent for drone in moved)
+
+
+def _to(drone, mode, now, anchor=None, reason="") -> Drone:
+    """The drone in another mode."""
+    landing = mode in (Mode.LAND, Mode.BLIND)
+    return replace(
+        drone,
+        mode=mode,
+        since=now,
+        anchor=drone.anchor if anchor is None else anchor,
+        reason=reason or drone.reason,
+        landing_since=(drone.landing_since or now) if landing else None,
+    )
+
+
+def _requested(settings, state, event) -> list[Drone]:
+    """The drones after what the operator, or the plan, asks for."""
+    drones, request, now = list(state.drones), event.request, event.time
     if request is Request.STOP:
-        return [to(d, Mode.STOPPED, reason="stopped by hand") for d in drones]
-    if request is Request.LAND:
+        return [_to(d, Mode.STOPPED, now, reason=event.reason or "stopped by hand") for d in drones]
+    if request in (Request.LAND, Request.HOLD):
         anchors = _resting(settings, state, drones)
+        mode = Mode.LAND if request is Request.LAND else Mode.HOLD
+        able = (*_UNTROUBLED, Mode.HOLD) if request is Request.LAND else _UNTROUBLED
+        reason = (event.reason or "asked to land") if request is Request.LAND else ""
+        drones = [
+            _to(d, Mode.LANDED, now, None, reason) if reason and d.mode is Mode.GROUND else d for d in drones
+        ]
         return [
-            to(d, Mode.LAND, a, "asked to land") if d.mode in (*_UNTROUBLED, Mode.HOLD) else d
+            _to(d, mode, now, a, reason) if d.mode in able else d
             for d, a in zip(drones, anchors, strict=True)
         ]
-    if request is Request.HOLD:
-        anchors = _resting(settings, state, drones)
-        return [
-            to(d, Mode.HOLD, a) if d.mode in _UNTROUBLED else d for d, a in zip(drones, anchors, strict=True)
-        ]
     if request is Request.TRANSFER:
-        able = (Mode.GROUND, Mode.LANDED, Mode.HOLD, Mode.PURSUIT, Mode.READY)
+        able = (*_DOWN, Mode.HOLD, Mode.PURSUIT, Mode.READY)
         if all(d.mode in able and not d.reason and d.estimate is not None for d in drones):
-            return [to(d, Mode.TRANSFER, s) for d, s in zip(drones, state.starts, strict=True)]
+            return [
+                _lift_off(settings, d, now) if d.mode in _DOWN else _to(d, Mode.TRANSFER, now, start)
+                for d, start in zip(drones, state.starts, strict=True)
+            ]
     if request is Request.PURSUE and all(d.mode is Mode.READY for d in drones):
-        return [to(d, Mode.PURSUIT) for d in drones]
+        return [_to(d, Mode.PURSUIT, now) for d in drones]
     return drones
 
 
-def _trouble(settings, drone, sighting, now) -> tuple[Mode, str] | None:
+def _lift_off(settings, drone, now) -> Drone:
+    """The drone at the beginning of its test lift."""
+    x, y, z = drone.estimate.position
+    stand = tuple(
+        None if track.pose is None else track.pose.position for track in (drone.own, drone.captured)
+    )
+    return replace(_to(drone, Mode.LIFT, now, (x, y, z + settings.lift)), stand=stand)
+
+
+def lift_fault(settings: SafetySettings, drone: Drone, now: float) -> str:
+    """What speaks against a vehicle's poses in its test lift; empty while nothing does.
+
+    Each source must rise and stay above its stand, and both by the same.
+    """
+    moves = [
+        tuple(p - s for p, s in zip(track.pose.position, stand, strict=True))
+        for track, stand in zip((drone.own, drone.captured), drone.stand, strict=True)
+        if stand is not None
+    ]
+    if any(math.hypot(x, y) > ASIDE for x, y, _ in moves):
+        return "the test lift went sideways: do the poses' axes and yaw agree with the vehicle's?"
+    if len(moves) == 2 and math.dist(*moves) > ASIDE / 2:
+        return "motion capture and own estimate rose differently: do axes and scale agree?"
+    if now - drone.since > settings.lift_time:
+        return f"not {settings.lift:g} m up after {settings.lift_time:g} s: do the poses' z and the weight agree?"
+    return ""
+
+
+def _trouble(settings, drone, sample, now) -> tuple[Mode, str] | None:
     """The mode that a drone must go to, and why; None if all is well."""
     if drone.mode not in FLYING:
         return None
-    silent = now - sighting.heard > settings.link_timeout
-    lost = now - drone.seen > settings.pose_timeout
+    if sample.supervisor & (Supervisor.LOCKED | Supervisor.CRASHED):
+        return Mode.STOPPED, "stopped by its firmware"
+    lost = _lost(settings, drone, sample, now)
+    if drone.mode is Mode.LIFT:  # from there it may fall
+        fault = lost or lift_fault(settings, drone, now)
+        return (Mode.STOPPED, fault) if fault else None
+    if drone.over_since is not None and now - drone.over_since > settings.tumble_time:
+        return Mode.STOPPED, "tumbled"
     if drone.mode is Mode.BLIND:
-        return None if silent or lost else (Mode.LAND, drone.reason)
-    if silent:
-        return Mode.BLIND, "link gone"
+        return None if lost else (Mode.LAND, drone.reason)
     if lost:
-        jumped = usable(sighting.pose) and now - sighting.pose.time <= settings.pose_timeout
-        return Mode.BLIND, "pose jumped" if jumped else "pose lost"
+        return Mode.BLIND, lost
     if drone.mode is Mode.LAND:
         return None
+    ill = drone.distrusted or _unfit(settings, drone, now)
+    return (Mode.LAND, ill) if ill else None
+
+
+def _lost(settings, drone, sample, now) -> str:
+    """Why no pose tells where the drone is; empty if one does."""
+    if now - sample.last_contact > settings.link_timeout:
+        return "link gone"
+    if now - drone.seen > settings.pose_timeout:
+        return drone.own.verdict or "pose lost"
+    return ""
+
+
+def _unfit(settings, drone, now) -> str:
+    """Why a drone whose pose is known mustn't fly on; empty if it may."""
     if drone.low_since is not None and now - drone.low_since > settings.battery_time:
-        return Mode.LAND, "battery low"
+        return "battery low"
+    if drone.own.pose is not None and now - drone.own.pose.time > settings.link_timeout:
+        return f"own estimate lost ({drone.own.verdict or 'silent'})"
     x, y, z = drone.estimate.position
     if math.hypot(x, y) > settings.arena_radius + settings.outside:
-        return Mode.LAND, "outside the arena"
+        return "outside the arena"
     if z > settings.arena_height + settings.outside:
-        return Mode.LAND, "above the arena"
-    if math.dist(drone.estimate.velocity, (0.0, 0.0, 0.0)) > settings.speed_limit:
-        return Mode.LAND, "too fast"
+        return "above the arena"
+    if math.hypot(*drone.estimate.velocity) > settings.speed_limit:
+        return "too fast"
     if up(drone.estimate.quaternion) < math.cos(math.radians(settings.tilt_limit)):
-        return Mode.LAND, "too tilted"
-    return None
+        return "too tilted"
+    return ""
 
 
-def _react(settings, state, drones, troubles, now):
-    """The drones after troubles: those in trouble as told; the others stop, wait, and land."""
-    anchors = None
-    if any(troubles):
-        anchors = _resting(settings, state, drones)
+def _react(settings, state, drones, troubles, now) -> list[Drone]:
+    """The drones after troubles: those in trouble as told; the others stop, wait, and land. A test lift ends at once."""
     team = any(d.reason for d in drones) or any(troubles)
+    anchors = _resting(settings, state, drones) if team else [None] * len(drones)
+    risen = all(d.mode is Mode.LIFT and _risen(d, now) for d in drones) and not team
     reacted = []
-    for i, (drone, trouble) in enumerate(zip(drones, troubles, strict=True)):
+    for drone, trouble, anchor, start in zip(drones, troubles, anchors, state.starts, strict=True):
         if trouble is not None and trouble[0] is not drone.mode:
-            mode, reason = trouble
             keep = drone.mode is Mode.LAND  # a landing that goes blind stays where it lands
-            anchor = drone.anchor if keep else anchors[i]
-            drone = replace(drone, mode=mode, since=now, anchor=anchor, reason=reason)
+            drone = _to(drone, trouble[0], now, None if keep else anchor, trouble[1])
+        elif drone.mode is Mode.LIFT and team:
+            drone = _to(drone, Mode.STOPPED, now, reason="another is in trouble")
         elif drone.mode in _UNTROUBLED and team:
-            anchor = (anchors or _resting(settings, state, drones))[i]
-            drone = replace(drone, mode=Mode.HOLD, since=now, anchor=anchor, reason="another is in trouble")
+            drone = _to(drone, Mode.HOLD, now, anchor, "another is in trouble")
         elif drone.mode is Mode.HOLD and drone.reason and now - drone.since > settings.hold_time:
-            drone = replace(drone, mode=Mode.LAND, since=now)
+            drone = _to(drone, Mode.LAND, now)
+        elif risen:
+            drone = _to(drone, Mode.TRANSFER, now, start)
         reacted.append(drone)
     return reacted
 
 
-def _fly(settings, state, drone, i, event, dt) -> tuple[Drone, SetPoint]:
-    """The drone after this tick, and its set-point."""
-    sighting = event.sightings[i]
-    low = sighting.voltage < settings.battery_low  # an unknown voltage is not low
-    since = (drone.low_since if drone.low_since is not None else event.time) if low else None
-    drone = replace(drone, low_since=since, fenced=False)
+def _risen(drone, now) -> bool:
+    near = abs(drone.estimate.position[2] - drone.anchor[2]) < RISEN
+    return near and now - drone.since > 2.0 * SPIN_UP
+
+
+def _fly(settings, state, i, action, sample) -> Drone:
+    """Vehicle i after this tick, with its set-point."""
+    drone, now = state.drones[i], state.time
+    low = sample.voltage < settings.battery_low  # an unknown voltage is not low
+    over = drone.estimate is not None and up(drone.estimate.quaternion) < 0.0
+    drone = replace(
+        drone,
+        low_since=(drone.low_since if drone.low_since is not None else now) if low else None,
+        over_since=(drone.over_since if drone.over_since is not None else now) if over else None,
+        fenced=False,
+        sent=MOTORS_OFF,
+    )
     if drone.mode not in FLYING or drone.estimate is None:
-        return drone, SetPoint()
-    estimate = drone.estimate
-    height = estimate.position[2]
-    if drone.mode is Mode.PURSUIT and event.actions is not None:
-        fence = fence_velocity(settings, estimate)
-        if fence is None:
-            return drone, event.actions[i]
-        acceleration = wanted_acceleration(estimate.velocity, fence)
-        return replace(drone, fenced=True), accelerate(
-            estimate.quaternion, acceleration, state.airframe, drone.trim, RATES
-        )
-    if drone.mode is Mode.LAND and height < 0.05:
-        return replace(drone, mode=Mode.LANDED, since=event.time), SetPoint()
-    if drone.mode is Mode.BLIND and height < -BLIND_DEPTH:
-        return replace(drone, mode=Mode.LANDED, since=event.time), SetPoint()
+        return drone
+    if _is_down(settings, drone, now):
+        return _to(drone, Mode.LANDED, now)
+    if drone.mode is Mode.PURSUIT and action is not None:
+        return _pursue(settings, state, drone, i, action)
     wanted = _wanted(settings, state, drone, i)
-    acceleration = wanted_acceleration(estimate.velocity, wanted)
+    acceleration = wanted_acceleration(drone.estimate.velocity, wanted)
     if drone.mode is Mode.BLIND:
-        share = min(dt / ATTITUDE_LAG, 1.0)
-        lagged = tuple(a + share * (b - a) for a, b in zip(drone.acceleration, acceleration, strict=True))
-        drone = replace(drone, acceleration=lagged)
-        # the attitude is not known any more: level but for what is asked for on board
-        x, y, z = acceleration
-        yaw_only = _yaw_only(estimate.quaternion)
-        return drone, accelerate(yaw_only, (x, y, z - BLIND_SINK), state.airframe, drone.trim, ANGLES)
-    if height > 0.1:
-        error = min(max(wanted[2] - estimate.velocity[2], -0.3), 0.3)
-        trim = min(max(drone.trim + TRIM_GAIN * dt * error, -TRIM_LIMIT), TRIM_LIMIT)
+        return _descend_blindly(state, drone, acceleration)
+    height, lifting = drone.estimate.position[2], drone.mode is Mode.LIFT
+    if height > (0.02 if lifting else 0.1):
+        error = min(max(wanted[2] - drone.estimate.velocity[2], -0.3), 0.3)
+        trim = min(max(drone.trim + TRIM_GAIN * state.dt * error, -TRIM_LIMIT), TRIM_LIMIT)
         drone = replace(drone, trim=trim)
-    if drone.mode is Mode.TRANSFER and _arrived(estimate, drone.anchor):
-        drone = replace(drone, mode=Mode.READY, since=event.time)
-    return drone, accelerate(estimate.quaternion, acceleration, state.airframe, drone.trim, ANGLES)
+    if drone.mode is Mode.TRANSFER and _arrived(drone.estimate, drone.anchor):
+        drone = _to(drone, Mode.READY, now)
+    flown = accelerate(drone.estimate.quaternion, acceleration, state.airframe, drone.trim, ANGLES)
+    return replace(drone, sent=flown)
+
+
+def _is_down(settings, drone, now) -> bool:
+    """Whether a landing is over: on the floor, below it by reckoning, or long enough on the way."""
+    if drone.landing_since is None:
+        return False
+    floor = -BLIND_DEPTH if drone.mode is Mode.BLIND else 0.05
+    return drone.estimate.position[2] < floor or now - drone.landing_since > settings.landing_time
+
+
+def _pursue(settings, state, drone, i, action) -> Drone:
+    """The drone with the policy's action, or with what keeps it in the arena and off the others."""
+    estimate = drone.estimate
+    parting = None
+    if settings.separation > 0.0:
+        poses = [d.estimate if d.mode in FLYING else None for d in state.drones]
+        parting = parting_velocity(settings, i, poses)
+    aimed = estimate if parting is None else estimate._replace(velocity=parting)
+    wanted = fence_velocity(settings, estimate) or fence_velocity(settings, aimed) or parting
+    if wanted is None:
+        return replace(drone, sent=within_reach(action, state.drones[i].sent, state.airframe, state.dt))
+    acceleration = wanted_acceleration(estimate.velocity, wanted)
+    flown = accelerate(estimate.quaternion, acceleration, state.airframe, drone.trim, RATES)
+    return replace(drone, fenced=True, sent=flown)
+
+
+def _descend_blindly(state, drone, acceleration) -> Drone:
+    """The drone sinking by angles that it tracks itself: its attitude isn't known, so level but for what is asked for."""
+    share = min(state.dt / ATTITUDE_LAG, 1.0)
+    lagged = tuple(a + share * (b - a) for a, b in zip(drone.acceleration, acceleration, strict=True))
+    x, y, z = acceleration
+    yaw_only = _yaw_only(drone.estimate.quaternion)
+    flown = accelerate(yaw_only, (x, y, z - BLIND_SINK), state.airframe, drone.trim, ANGLES)
+    return replace(drone, acceleration=lagged, sent=flown)
 
 
 def _wanted(settings, state, drone, i) -> Vector:

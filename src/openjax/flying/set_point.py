@@ -29,9 +29,16 @@ class SetPoint:
     yaw_rate: float = 0.0
     thrust: float = 0.0
 
+    def numbers(self) -> tuple[float, ...]:
+        """All but the mode."""
+        return self.roll, self.pitch, self.yaw_rate, self.thrust
+
     def array(self) -> np.ndarray:
         """(5,) float32 in the order of the fields."""
         return np.array([self.mode, self.roll, self.pitch, self.yaw_rate, self.thrust], np.float32)
+
+
+MOTORS_OFF = SetPoint()
 
 
 def manual_arguments(set_point: SetPoint) -> tuple[float, float, float, float, bool]:

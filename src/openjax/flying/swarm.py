@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import struct
@@ -17,6 +18,7 @@ from dataclasses import dataclass, field
 from openjax.errors import UserError
 from openjax.flying.controller import Pose
 from openjax.flying.crtp import expand_quaternion
+from openjax.flying.safety import PoseSample
 from openjax.flying.set_point import OFF, SetPoint, manual_arguments
 
 PERIOD_MS = 10
@@ -26,6 +28,7 @@ POSE_BLOCK = (
     ("stateEstimateZ.quat", "uint32_t"),
     *((f"gyro.{v}", "FP16") for v in "xyz"),
     ("pm.vbatMV", "uint16_t"),
+    ("supervisor.info", "uint16_t"),
 )
 BODY_BLOCK = (
     *((f"motor.m{i}", "uint16_t") for i in range(1, 5)),
@@ -33,6 +36,10 @@ BODY_BLOCK = (
 )
 WATCHDOG_PERIOD = 0.1
 """s between two words to the firmware's watchdog."""
+CONNECTING = 3
+"""Attempts to connect: over UDP nothing is sent again, and one lost answer leaves `cflib` waiting."""
+BOOT = {"udp": 0.2, "radio": 5.0}
+"""How long a restarted vehicle takes until it answers (s)."""
 TRIES = 5
 """To have the log blocks sampled at different moments."""
 DRIFT = 5e-5
@@ -75,14 +82,18 @@ class Member:
         self.uri, self._now, self._onboard = uri, clock, _Clock()
         self.pose: Pose | None = None
         self.arrival = -math.inf  # host s, of the newest pose
-        self.heard = clock()
-        self.voltage = math.nan
+        self.last_contact = clock()
+        self.voltage, self.supervisor = math.nan, 0
         self.error: str | None = None
         self.samples, self.recording = Samples(), False
         self.listener: Callable[[bool], None] = lambda new_pose: None
         self.crazyflie = None
         self.blocks: list = []
         self.phases: dict = {}  # when in the period each block of motors was sampled last (ms)
+
+    def sample(self) -> PoseSample:
+        """What is known of it."""
+        return PoseSample(self.pose, self.last_contact, self.voltage, self.supervisor)
 
     def pose_arrived(self, stamp: int, data: dict, _block=None) -> None:
         """A pose block, called by cflib's thread."""
@@ -95,8 +106,8 @@ class Member:
             tuple(expand_quaternion(values[6]).tolist()),
             tuple(math.radians(v) for v in values[7:10]),
         )
-        self.voltage = 1e-3 * values[10]
-        self.pose, self.arrival, self.heard = pose, now, now
+        self.voltage, self.supervisor = 1e-3 * values[10], values[11]
+        self.pose, self.arrival, self.last_contact = pose, now, now
         if self.recording:
             self.samples.poses.append((now, pose, self.voltage))
         self.listener(True)
@@ -104,13 +115,35 @@ class Member:
     def body_arrived(self, stamp: int, data: dict, _block=None) -> None:
         """A block of motors and accelerometer."""
         now = self._now()
-        self.heard = now
+        self.last_contact = now
         self.phases[_block] = stamp % PERIOD_MS
         if self.recording:
             motors = tuple(data[name] / 65536 for name, _ in BODY_BLOCK[:4])
             force = tuple(9.81 * data[name] for name, _ in BODY_BLOCK[4:])
             self.samples.bodies.append((self._onboard.host(stamp, now), motors + force))
         self.listener(False)
+
+
+def send_set_point(crazyflie, set_point: SetPoint) -> None:
+    """Send one vehicle its set-point. `crazyflie` needs no more than `send_packet`."""
+    from cflib.crazyflie.commander import Commander
+
+    commander = Commander(crazyflie)
+    if set_point.mode == OFF:
+        commander.send_stop_setpoint()
+    else:
+        commander.send_setpoint_manual(*manual_arguments(set_point))
+
+
+def _restart(uri: str, crazyflie) -> None:
+    """Restart a vehicle whose firmware is locked: its motors are off."""
+    from cflib.utils.power_switch import PowerSwitch
+
+    crazyflie.close_link()
+    switch = PowerSwitch(uri)
+    switch.stm_power_cycle()
+    switch.close()
+    time.sleep(BOOT[uri.split(":")[0]])
 
 
 class Swarm:
@@ -121,7 +154,7 @@ class Swarm:
       body_logs: log blocks of motors and accelerometer for each vehicle, spread over the 10 ms; more of them tell
           the diagnosis more exactly when a command arrived, and take more of the link. 0 to 5.
       watchdog: feed the firmware's emergency-stop watchdog: motors stop 1 s after the last set-point, instead of 2 s.
-          Once it was fed and has bitten, also after a normal flight, the vehicle must be restarted.
+          Once it was fed it bites, also after a normal flight, and the vehicle is locked; `connect` restarts such vehicles.
       clock: host time (s).
     """
 
@@ -129,7 +162,7 @@ class Swarm:
         self,
         uris: Sequence[str],
         body_logs: int = 1,
-        watchdog: bool = False,
+        watchdog: bool = True,
         clock: Callable[[], float] = time.perf_counter,
     ):
         self._now, self._body_logs, self._watchdog, self._fed = clock, body_logs, watchdog, -math.inf
@@ -159,7 +192,19 @@ class Swarm:
             raise
 
     def _open(self, member, make, timeout):
-        done = threading.Event()
+        """Connect to one vehicle, restarting it once if it is locked."""
+        for attempt in range(CONNECTING):
+            if self._answers(member, make, timeout / CONNECTING):
+                if attempt or not member.crazyflie.supervisor.is_locked:
+                    return
+                _restart(member.uri, member.crazyflie)
+        raise UserError(
+            f"{member.uri}: no connection ({member.error or 'locked'}); is the vehicle on, the URI right?"
+        )
+
+    def _answers(self, member, make, timeout) -> bool:
+        """Whether the vehicle has told all that `cflib` asks for."""
+        done, member.error = threading.Event(), None
         member.crazyflie = crazyflie = make()
         crazyflie.fully_connected.add_callback(lambda _uri: done.set())
 
@@ -171,11 +216,10 @@ class Swarm:
         crazyflie.connection_lost.add_callback(failed)
         crazyflie.open_link(member.uri)
         if not done.wait(timeout):
-            member.error = f"no answer in {timeout:g} s"
+            member.error = f"no answer in {timeout:.0f} s"
         if member.error is not None:
-            raise UserError(
-                f"{member.uri}: no connection ({member.error}); is the vehicle on, the URI right?"
-            )
+            crazyflie.close_link()
+        return member.error is None
 
     def _start_logs(self, timeout):
         from cflib.crazyflie.log import LogConfig
@@ -238,14 +282,14 @@ class Swarm:
         """The id of each vehicle's pose block."""
         return tuple(m.blocks[0].id for m in self.members)
 
+    def observe(self) -> tuple[PoseSample, ...]:
+        """What is known of each vehicle."""
+        return tuple(member.sample() for member in self.members)
+
     def send(self, set_points: Sequence[SetPoint]) -> float:
         """Send each vehicle its set-point; returns when the last one left (s)."""
         for member, set_point in zip(self.members, set_points, strict=True):
-            commander = member.crazyflie.commander
-            if set_point.mode == OFF:
-                commander.send_stop_setpoint()
-            else:
-                commander.send_setpoint_manual(*manual_arguments(set_point))
+            send_set_point(member.crazyflie, set_point)
         sent = self._now()
         if self._watchdog and sent - self._fed > WATCHDOG_PERIOD:
             self._fed = sent
@@ -273,10 +317,6 @@ class Swarm:
         self.arm(False)
         for member in self.members:
             if member.crazyflie is not None:
-                try:
-                    if member.crazyflie.link is not None:
-                        member.crazyflie.commander.send_stop_setpoint()
+                with contextlib.suppress(OSError, struct.error):  # the link is gone already
                     member.crazyflie.close_link()
-                except (OSError, struct.error):  # the link is gone already
-                    pass
                 member.crazyflie = None

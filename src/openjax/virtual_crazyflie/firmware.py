@@ -18,6 +18,7 @@ from openjax.flying.crtp import (
     PROTOCOL_VERSION,
     READ_ONLY,
     Port,
+    SupervisorCommand,
     decode,
     pack_number,
 )
@@ -49,6 +50,10 @@ class VirtualFirmware:
     def __init__(self, needs_arming: bool = True):
         """`needs_arming`: motors stay off until armed; otherwise armed from the start, as on brushed Crazyflies."""
         self.auto_arm = not needs_arming
+        self.restart()
+
+    def restart(self) -> None:
+        """Switch it off and on."""
         self.armed = self.auto_arm
         self.crashed = False
         self.emergency = False
@@ -116,6 +121,10 @@ class VirtualFirmware:
             return []
         if raw == b"\xff":  # the null packet of a scan
             return [raw]
+        if raw[:2] == b"\xff\xfe":  # to the radio's processor, which switches this one off and on
+            if raw[2:3] == b"\x03":
+                self.restart()
+            return [raw]
         packet = decode(raw)
         handler = {
             Port.LINK: self._link,
@@ -165,15 +174,15 @@ class VirtualFirmware:
         answer = None
         if packet.channel == 0 and command == 0x0C:
             answer = struct.pack("<H", self.supervisor_info)
-        elif packet.channel == 1 and command == 0x01:
+        elif packet.channel == 1 and command == SupervisorCommand.ARM:
             answer = bytes(self._arm(bool(packet.data[1])))
-        elif packet.channel == 1 and command == 0x02:
+        elif packet.channel == 1 and command == SupervisorCommand.RECOVER:
             self.crashed = False
             answer = bytes([1, 1])
-        elif packet.channel == 1 and command == 0x03:
+        elif packet.channel == 1 and command == SupervisorCommand.EMERGENCY_STOP:
             self.emergency = True
             answer = b""
-        elif packet.channel == 1 and command == 0x04:
+        elif packet.channel == 1 and command == SupervisorCommand.FEED_WATCHDOG:
             self.feed_watchdog(now)
             answer = b""
         return [] if answer is None else [packet._replace(data=bytes([command | 0x80]) + answer)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 import random
 import socket
@@ -49,7 +50,7 @@ class VirtualLink:
                 f"UDP port {port} of {host} can't be had ({reason}); choose another --port"
             ) from error
         self.socket.setblocking(False)
-        self.faults, self._random, self._peer = faults, random.Random(seed), None
+        self.faults, self._random, self._listener = faults, random.Random(seed), None
         self._incoming: list = []
         self._outgoing: list = []
         self._count = 0
@@ -57,6 +58,7 @@ class VirtualLink:
 
     @property
     def port(self) -> int:
+        """Its UDP port."""
         return self.socket.getsockname()[1]
 
     def poll(self, now: float) -> None:
@@ -70,45 +72,46 @@ class VirtualLink:
                 continue
             if not raw:
                 continue
-            self._peer = peer
             delay = 0.0
-            if raw[0] >> 4 in (Port.COMMANDER, Port.COMMANDER_GENERIC):
+            commanded = raw[0] >> 4 in (Port.COMMANDER, Port.COMMANDER_GENERIC)
+            if commanded or raw[0] >> 4 == Port.LOG or self._listener is None:
+                self._listener = peer
+            if commanded:
                 if self._random.random() < self.faults.loss:
                     self.lost += 1
                     continue
                 jitter = self._random.random() * self.faults.jitter_ms
                 delay = 1e-3 * (self.faults.latency_ms + jitter)
             self._count += 1
-            heapq.heappush(self._incoming, (now + delay, self._count, raw))
+            heapq.heappush(self._incoming, (now + delay, self._count, raw, peer))
 
     def next_due(self) -> float:
         """When the next packet in either direction is due; infinite if none waits."""
         return min((queue[0][0] for queue in (self._incoming, self._outgoing) if queue), default=float("inf"))
 
     def received(self, now: float):
-        """The packets that have come through by `now`, in order: time, bytes."""
+        """The packets that have come through by `now`, in order: time, bytes, who sent them."""
         while self._incoming and self._incoming[0][0] <= now:
-            due, _, raw = heapq.heappop(self._incoming)
-            yield due, raw
+            due, _, raw, peer = heapq.heappop(self._incoming)
+            yield due, raw, peer
 
-    def send(self, raw: bytes, now: float) -> None:
-        """Send a packet to whoever spoke last."""
+    def send(self, raw: bytes, now: float, peer=None) -> None:
+        """Send an answer to who asked, log data to who set up log blocks or commanded last: a stranger gets none."""
         log_data = raw[0] >> 4 == Port.LOG and raw[0] & 3 == 2
         if log_data and self._random.random() < self.faults.pose_loss:
             return
         self._count += 1
         delay = 1e-3 * self.faults.pose_latency_ms if log_data else 0.0
-        heapq.heappush(self._outgoing, (now + delay, self._count, raw))
+        heapq.heappush(self._outgoing, (now + delay, self._count, raw, peer or self._listener))
 
     def flush(self, now: float) -> None:
         """Put on the wire what is due."""
         while self._outgoing and self._outgoing[0][0] <= now:
-            _, _, raw = heapq.heappop(self._outgoing)
-            if self._peer is not None:
-                try:
-                    self.socket.sendto(raw, self._peer)
-                except OSError:  # nobody listens there any more
-                    pass
+            _, _, raw, peer = heapq.heappop(self._outgoing)
+            if peer is not None:
+                with contextlib.suppress(OSError):  # nobody listens there any more
+                    self.socket.sendto(raw, peer)
 
     def close(self) -> None:
+        """Give the port back."""
         self.socket.close()

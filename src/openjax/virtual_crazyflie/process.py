@@ -77,11 +77,11 @@ class VirtualCrazyflies:
         packets = []
         for i, link in enumerate(self.links):
             link.poll(now)
-            packets += [(due, i, raw) for due, raw in link.received(now)]
-        for due, i, raw in sorted(packets, key=lambda packet: packet[0]):
+            packets += [(due, i, raw, peer) for due, raw, peer in link.received(now)]
+        for due, i, raw, peer in sorted(packets, key=lambda packet: packet[0]):
             self._advance(due)
             for answer in self.firmware[i].receive(raw, max(due, self.time)):
-                self.links[i].send(answer, now)
+                self.links[i].send(answer, now, peer)
         self._advance(now)
         for i, (firmware, link) in enumerate(zip(self.firmware, self.links, strict=True)):
             if firmware.logs.next() <= self.time:

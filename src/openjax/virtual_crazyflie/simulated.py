@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from openjax.flying.controller import Pose
-from openjax.flying.safety import Sighting
+from openjax.flying.safety import PoseSample
 from openjax.flying.set_point import SetPoint
 from openjax.virtual_crazyflie.firmware import VirtualFirmware
 from openjax.virtual_crazyflie.vehicles import STEP, VirtualVehicles
@@ -53,10 +53,12 @@ class SimulatedSwarm:
         self.track: list[np.ndarray] = []  # (N, 3) m, after every tick
         self._look()
 
-    def sightings(self) -> tuple[Sighting, ...]:
-        return tuple(Sighting(*s) for s in zip(self._poses, self._heard, self._voltage, strict=True))
+    def observe(self) -> tuple[PoseSample, ...]:
+        """What is known of each vehicle now."""
+        return tuple(PoseSample(*s) for s in zip(self._poses, self._heard, self._voltage, strict=True))
 
     def arrivals(self) -> tuple[float, ...]:
+        """When each vehicle's newest pose arrived (s)."""
         return tuple(pose.time if pose is not None else -np.inf for pose in self._poses)
 
     def send(self, set_points) -> float:

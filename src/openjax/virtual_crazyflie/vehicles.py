@@ -86,10 +86,16 @@ class VirtualVehicles:
         advance = jax.jit(partial(_advance, self._step, vehicle, effect_parameters or {}, unflatten))
         nothing = np.zeros((self.number, 5), np.float32)
         self._advance = compile_in_line(advance.lower(flat, nothing, np.int32(1)))
-        self.battery, self._endurance = np.full(self.number, float(battery)), float(endurance)
+        self._charge, self._endurance = float(battery), float(endurance)
+        self._begin = self._state
         self._hover = float(vehicle.mass * vehicle.gravity) / float(
             4 * vehicle.thrust_constant * vehicle.max_rotor_speed**2
         )
+        self.reset()
+
+    def reset(self) -> None:
+        """As at the beginning."""
+        self._state, self.battery = self._begin, np.full(self.number, self._charge)
         self.report = self.advance(np.zeros((self.number, 5), np.float32), 0)
 
     def advance(self, set_points: np.ndarray, steps: int) -> Report:

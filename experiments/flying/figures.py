@@ -1,4 +1,4 @@
-"""Figures of the flying loop: `python -m experiments.flying_figures OUT [--minutes 10]`.
+"""Figures of the flying loop: `python -m experiments.flying.figures OUT [--minutes 10]`.
 
 Everything goes through the commands that a user types, in processes of their own, with the real cflib over UDP:
 * long: three virtual Crazyflies, game after game, for the minutes given: command age, missed deadlines.
@@ -6,7 +6,7 @@ Everything goes through the commands that a user types, in processes of their ow
 * links: flights with set-points that come late or get lost; each is a case for the diagnosis (see `diagnose`).
 * simulator: the same policy on the same layouts in the simulator alone, from level starts without clamp.
 
-`python -m experiments.flying_figures OUT --part diagnose` diagnoses the cases of an earlier run.
+`python -m experiments.flying.figures OUT --part diagnose` diagnoses the cases of an earlier run.
 """
 
 from __future__ import annotations

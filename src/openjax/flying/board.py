@@ -1,0 +1,108 @@
+"""What the three processes of a flight know of each other: a page of shared memory that outlives any of them.
+
+The loop flies through the links. If it falls silent the links' process lands the vehicles; if that one is silent too the
+guard does, over links of its own; if both are gone the loop does. Whoever flies writes its state here, so that the next one
+can go on from it.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from dataclasses import replace
+from enum import IntEnum
+
+from openjax.flying.controller import Pose
+from openjax.flying.safety import Mode, State
+
+SILENCE = 0.1
+"""Silence of a process after which the next one flies (s): ten ticks."""
+_MODES = tuple(Mode)
+_HEAD, _EACH = 8, 16  # see Board; per vehicle mode, trim, known, 13 numbers of its pose
+_FLYING, _PILOT, _OVER, _READY, _BEATS = 0, 1, 2, 3, 4
+DEAF = ("SIGHUP", "SIGINT", "SIGTSTP", "SIGTERM", "SIGQUIT", "SIGTTOU", "SIGTTIN", "SIGPIPE")
+"""Signals that a terminal, or its end, sends to all that it started."""
+
+
+class Role(IntEnum):
+    """The processes of a flight, in the order in which they fly."""
+
+    LOOP = 0
+    LINKS = 1
+    GUARD = 2
+
+
+class Board:
+    """The page.
+
+    Args:
+      number: of vehicles.
+      context: of multiprocessing.
+      silence: see `SILENCE` (s).
+    """
+
+    def __init__(self, number: int, context, silence: float = SILENCE):
+        self._numbers = context.RawArray("d", _HEAD + _EACH * number)
+        self.silence = silence
+
+    flying = property(lambda self: self._numbers[_FLYING] > 0.0, doc="Whether any motor may be on.")
+    over = property(lambda self: self._numbers[_OVER] > 0.0, doc="Whether the session has ended.")
+    pilot = property(lambda self: Role(int(self._numbers[_PILOT])), doc="Who flies.")
+    guarded = property(lambda self: self._numbers[_READY] > 0.0, doc="Whether the guard watches.")
+
+    def beat(self, role: Role, now: float) -> None:
+        """`role` lives at `now` (s)."""
+        self._numbers[_BEATS + role] = now
+
+    def silent(self, role: Role, now: float) -> float:
+        """For how long (s) nothing was heard of `role`; infinite if it never was."""
+        return now - (self._numbers[_BEATS + role] or -float("inf"))
+
+    def watch(self) -> None:
+        """The guard is ready."""
+        self._numbers[_READY] = 1.0
+
+    def end(self) -> None:
+        """The session is over."""
+        self._numbers[_OVER] = 1.0
+
+    def take(self, role: Role) -> None:
+        """`role` flies from now on."""
+        self._numbers[_PILOT] = float(role)
+
+    def write(self, role: Role, now: float, state: State) -> None:
+        """`role` flew a tick at `now` (s), and this is what it knows."""
+        numbers = []
+        for drone in state.drones:
+            e = drone.estimate
+            pose = (*e.position, *e.velocity, *e.quaternion, *e.body_rates) if e is not None else (0.0,) * 13
+            numbers += [float(_MODES.index(drone.mode)), drone.trim, float(e is not None), *pose]
+        self._numbers[_HEAD:] = numbers
+        self._numbers[_FLYING] = float(state.flying)
+        self.beat(role, now)
+
+    def read(self, state: State, now: float) -> State:
+        """`state` with what was written last."""
+        drones = []
+        for i, drone in enumerate(state.drones):
+            mode, trim, known, *numbers = self._numbers[_HEAD + _EACH * i : _HEAD + _EACH * (i + 1)]
+            parts = (tuple(numbers[a:b]) for a, b in ((0, 3), (3, 6), (6, 10), (10, 13)))
+            pose = Pose(now, *parts) if known else None
+            drones.append(replace(drone, mode=_MODES[int(mode)], trim=trim, estimate=pose))
+        return replace(state, drones=tuple(drones), time=now, action_time=now)
+
+
+def stand_alone() -> None:
+    """Make this process its own: no terminal's signal reaches it, nor the end of whoever started it."""
+    os.setsid()
+    for name in DEAF:
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
+
+
+def say(text: str) -> None:
+    """A line on the terminal, if there still is one."""
+    try:
+        os.write(2, f"\r{text}\n".encode())
+    except OSError:
+        pass

@@ -1,0 +1,155 @@
+"""Whether a pose may be flown by: a measurement against what a vehicle can have done since the last good one.
+
+`judge` compares a pose with the last good one of the same source, `agree` motion capture with the vehicle's own
+estimate. Both are pure. What they don't accept is a lost pose, whatever sent it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import NamedTuple
+
+from openjax.flying.controller import Airframe, Pose, moved_on
+
+
+class Verdict(StrEnum):
+    """What is wrong with a pose; empty where nothing is."""
+
+    GOOD = ""
+    NOT_FINITE = "pose not finite"
+    NO_ATTITUDE = "pose without an attitude"
+    FROZEN = "pose frozen"
+    JUMPED = "pose jumped"
+    TURNED = "attitude jumped"
+    TOO_FAST = "velocity jumped"
+    SPUN = "body rates jumped"
+    APART = "motion capture and the vehicle's own estimate disagree"
+
+
+@dataclass(frozen=True)
+class PoseLimits:
+    """Bounds of a believable pose. The first four are physics, the others accuracies of measurements.
+
+    A bound is an accuracy plus the most that can have happened since the last good pose. What can happen grows for
+    `horizon` seconds only: by then the vehicle lands by itself, level and slow, and `drift` is what reckoning may lose.
+    """
+
+    acceleration: float
+    """The vehicle's largest (m/s^2), see `Airframe.acceleration`."""
+    angular_acceleration: float
+    """The vehicle's largest (rad/s^2)."""
+    body_rate: float = math.radians(2000.0)
+    """Full scale of the gyroscope on board (rad/s); BMI088 data sheet."""
+    horizon: float = 0.06
+    """How long (s) a vehicle is flown without a good pose; `SafetySettings.pose_timeout`."""
+    drift: float = 0.25
+    """Error of the reckoned velocity (m/s): 1.5 degrees of tilt for a second."""
+    position: float = 0.03
+    """Error of one position (m): three times what `locSrv.extPosStdDev` is set to on board."""
+    velocity: float = 0.3
+    """Error of one velocity (m/s): half of a position's error in the time constant of the velocity's low-pass."""
+    angle: float = 0.15
+    """Error of one attitude (rad)."""
+    rate: float = 1.0
+    """Error of one body rate (rad/s): propellers shake the gyroscope."""
+    unit: float = 0.02
+    """How far a quaternion's length may be from one: 9 bits a component on board."""
+    apart: float = 0.1
+    """Distance (m) between motion capture and the own estimate: 5 standard errors of two of .01 m, and 30 ms at 1 m/s."""
+    turned: float = math.radians(20.0)
+    """Angle (rad) between them: a body marked by hand stands within 10 degrees, as does an estimate of the yaw."""
+
+
+def pose_limits(airframe: Airframe, horizon: float) -> PoseLimits:
+    """The limits of a vehicle's poses. `horizon`: see `PoseLimits`."""
+    return PoseLimits(airframe.acceleration, airframe.angular_acceleration, horizon=horizon)
+
+
+def judge(
+    pose: Pose, last: Pose | None, dt: float, limits: PoseLimits, expected: Pose | None = None
+) -> Verdict:
+    """What is wrong with a pose.
+
+    Args:
+      pose: measured `dt` after `last`.
+      last: the last good one of the same source; None if there is none, as on the ground.
+      dt: s.
+      limits: bounds.
+      expected: where reckoning has the vehicle by now; without it, where `last` leads.
+    """
+    if not all(map(math.isfinite, (*pose.position, *pose.velocity, *pose.quaternion, *pose.body_rates))):
+        return Verdict.NOT_FINITE
+    if abs(math.hypot(*pose.quaternion) - 1.0) > limits.unit:
+        return Verdict.NO_ATTITUDE
+    if math.hypot(*pose.body_rates) > limits.body_rate:
+        return Verdict.SPUN
+    if last is None:
+        return Verdict.GOOD
+    if pose[1:] == last[1:]:  # a measurement has noise: identical numbers are one measurement sent again
+        return Verdict.FROZEN
+    expected = expected or moved_on(last, last.time + dt)
+    sudden = min(dt, limits.horizon)
+    if math.dist(pose.position, expected.position) > (
+        limits.position + limits.drift * dt + 0.5 * limits.acceleration * sudden**2
+    ):
+        return Verdict.JUMPED
+    if math.dist(pose.velocity, expected.velocity) > limits.velocity + limits.acceleration * sudden:
+        return Verdict.TOO_FAST
+    if angle_between(pose.quaternion, expected.quaternion) > (
+        limits.angle + 0.5 * limits.angular_acceleration * sudden**2
+    ):
+        return Verdict.TURNED
+    if math.dist(pose.body_rates, last.body_rates) > limits.rate + limits.angular_acceleration * sudden:
+        return Verdict.SPUN
+    return Verdict.GOOD
+
+
+class Track(NamedTuple):
+    """What is known of one source of a vehicle's poses."""
+
+    pose: Pose | None = None  # the last good one
+    verdict: Verdict = Verdict.GOOD  # on the newest
+
+    def fresh(self, now: float, limits: PoseLimits) -> bool:
+        """Whether its last good pose is new enough to fly by at `now` (s)."""
+        return self.pose is not None and now - self.pose.time <= limits.horizon
+
+
+NOTHING_SEEN = Track()
+
+
+def follow(
+    track: Track, pose: Pose | None, now: float, limits: PoseLimits, moving: bool, expected: Pose | None
+) -> Track:
+    """The track after its source's newest pose at `now` (s).
+
+    A pose that isn't newer than the last good one, or old, or from the future, changes nothing. Of a vehicle that isn't
+    `moving` any pose is believed that is one. `expected`: see `judge`; at any time.
+    """
+    last = track.pose
+    if pose is None or not abs(now - pose.time) <= limits.horizon:
+        return track
+    if last is None or not moving:
+        verdict = judge(pose, None, 0.0, limits)
+    elif pose.time <= last.time:
+        return track
+    else:
+        expected = None if expected is None else moved_on(expected, pose.time)
+        verdict = judge(pose, last, pose.time - last.time, limits, expected)
+    return Track(last, verdict) if verdict else Track(pose)
+
+
+def agree(captured: Pose, own: Pose, limits: PoseLimits) -> Verdict:
+    """Whether motion capture and the vehicle's own estimate tell the same, both moved on to the later one's time."""
+    late = max(captured.time, own.time)
+    captured, own = moved_on(captured, late), moved_on(own, late)
+    near = math.dist(captured.position, own.position) <= limits.apart
+    turned = angle_between(captured.quaternion, own.quaternion) <= limits.turned
+    return Verdict.GOOD if near and turned else Verdict.APART
+
+
+def angle_between(a, b) -> float:
+    """The angle (rad) of the rotation between two unit quaternions wxyz."""
+    return 2.0 * math.acos(min(abs(sum(p * q for p, q in zip(a, b, strict=True))), 1.0))

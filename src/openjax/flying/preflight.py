@@ -1,0 +1,128 @@
+"""Before take-off: what must be so, each failure a line that says what to do. And that nobody else commands."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import socket
+import time
+from collections.abc import Iterator, Sequence
+
+from openjax.errors import UserError
+from openjax.flying.controller import Vector, roll_pitch_yaw, up
+from openjax.flying.crtp import Supervisor
+from openjax.flying.judge import PoseLimits, agree, judge
+from openjax.flying.limits import SafetySettings
+from openjax.flying.safety import PoseSample, State
+from openjax.flying.swarm import PERIOD_MS
+
+LOOK = 0.5
+"""For how long (s) links are listened to."""
+RATE = 1000.0 / PERIOD_MS
+"""Own estimates a second (Hz)."""
+SHARE = 0.8
+"""Least share of them that must arrive: a vehicle lands after 60 ms without one, and .2**6 of the time six in a row are lost."""
+LEVEL = math.radians(10.0)
+"""A floor, or a body marked by hand, is this level."""
+AHEAD = math.radians(30.0)
+"""A vehicle stands along x as far as somebody can see."""
+FLOOR = 0.1
+"""Nor higher or lower (m) than this does it stand."""
+
+
+@contextlib.contextmanager
+def sole_command(uris: Sequence[str]) -> Iterator[None]:
+    """Hold the vehicles against another `fly` on this machine, until this process ends. UserError: one has them.
+
+    A name in Linux's abstract namespace ends with its process; elsewhere only the vehicles' own word protects them.
+    """
+    with contextlib.ExitStack() as held:
+        for uri in uris:
+            name = held.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM))
+            try:
+                name.bind(f"\0openjax.fly {uri}")
+            except OSError as error:
+                if error.errno is not None and "in use" in (error.strerror or ""):
+                    raise UserError(f"{uri}: another openjax.fly has this vehicle; end it first") from None
+        yield
+
+
+def poses_arriving(vehicles, duration: float = LOOK, clock=time.perf_counter) -> list[float]:
+    """Each vehicle's own estimates a second (Hz), listened to for `duration` (s)."""
+    begin = clock()
+    counts, last = None, None
+    while clock() < begin + duration:
+        times = [s.own.time if s.own else -math.inf for s in vehicles.observe()]
+        if last is None:
+            counts = [0] * len(times)
+        else:
+            counts = [c + (t > old) for c, t, old in zip(counts, times, last, strict=True)]
+        last = times
+        time.sleep(0.002)
+    return [c / duration for c in counts]
+
+
+def faults(
+    settings: SafetySettings,
+    state: State,
+    samples: Sequence[PoseSample],
+    rates: Sequence[float],
+    guarded: bool,
+) -> list[str]:
+    """What speaks against taking off, a line each; vehicles are counted from 0 in the order of --uri.
+
+    Args:
+      settings: limits.
+      state: before the flight, for the starts.
+      samples: what is known of each vehicle.
+      rates: of each vehicle's poses (Hz).
+      guarded: whether a guard watches, or none is wanted.
+    """
+    lines = [] if guarded else ["the guard's process isn't there; try again, with fewer programs running"]
+    for i, (sample, start, rate) in enumerate(zip(samples, state.starts, rates, strict=True)):
+        found = [
+            *_firmware_faults(settings, sample, rate),
+            *_pose_faults(settings, state.limits, sample, start),
+        ]
+        lines += [f"vehicle {i}: {fault}" for fault in found]
+    return lines
+
+
+def _firmware_faults(settings, sample, rate) -> Iterator[str]:
+    bits = sample.supervisor
+    if bits & (Supervisor.TUMBLED | Supervisor.CRASHED):
+        yield "its firmware says tumbled or crashed; look at it, put it upright, restart it"
+    elif bits & Supervisor.LOCKED:
+        yield "its firmware is locked after an emergency stop; restart it"
+    elif bits & Supervisor.FLYING or (bits & Supervisor.ARMED and not bits & Supervisor.AUTO_ARM):
+        yield "it is armed or flies already; end the program that commands it"
+    elif not bits & (Supervisor.CAN_BE_ARMED | Supervisor.CAN_FLY):
+        yield "its firmware can't be armed; look at its console"
+    if sample.voltage < settings.battery_start:
+        yield f"battery at {sample.voltage:.2f} V; charge it to {settings.battery_start:g} V or more"
+    if rate < SHARE * RATE:
+        yield f"{rate:.0f} of {RATE:.0f} poses a second arrive; bring the antenna nearer or change the channel"
+
+
+def _pose_faults(settings, limits: PoseLimits, sample, start: Vector) -> Iterator[str]:
+    pose = sample.captured or sample.own
+    for source in (sample.own, sample.captured):
+        if source is not None and (verdict := judge(source, None, 0.0, limits)):
+            yield f"{verdict}; look at the positioning system"
+            return
+    x, y, z = pose.position
+    where = f"({x:.2f}, {y:.2f}, {z:.2f})"
+    if math.dist((x, y), start[:2]) > settings.stand or abs(z) > FLOOR:
+        yield (
+            f"stands at {where} m, its start's mark is ({start[0]:.2f}, {start[1]:.2f}, 0): put it there, "
+            "or mend the positioning system's axes, origin or unit"
+        )
+    if up(pose.quaternion) < math.cos(LEVEL):
+        yield "doesn't stand level; put it upright, or mend the body's axes"
+    elif abs(roll_pitch_yaw(pose.quaternion)[2]) > AHEAD:
+        yield "doesn't face +x; turn it, or mend the body's axes"
+    if sample.captured is not None and sample.own is not None and agree(sample.captured, sample.own, limits):
+        yield (
+            f"motion capture sees it at {where} m, itself at ({', '.join(f'{p:.2f}' for p in sample.own.position)}): "
+            "mend axes, unit or origin of one of them"
+        )

@@ -1,0 +1,166 @@
+"""A session: all that a flight needs and that must be given back, whatever happens: command, links, guard, motion capture."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from openjax.errors import UserError
+from openjax.flying import real_time
+from openjax.flying.board import SILENCE, Role, say
+from openjax.flying.crtp import Supervisor
+from openjax.flying.guard import Guard, RawLinks, fly_down
+from openjax.flying.keys import Operator
+from openjax.flying.limits import SafetySettings
+from openjax.flying.links import Links
+from openjax.flying.loop import Flight, measured_times
+from openjax.flying.motion_capture import MotionCaptured
+from openjax.flying.preflight import faults, poses_arriving, sole_command
+from openjax.flying.safety import State
+
+FRESH = 0.05
+"""No flight begins with poses older than this (s)."""
+ARMING = 1.0
+"""A vehicle has this long (s) to say that it is armed."""
+
+
+@dataclass(frozen=True)
+class SessionSettings:
+    """How vehicles are connected and watched."""
+
+    uris: tuple[str, ...]
+    body_logs: int = 1
+    watchdog: bool = True
+    guard: bool = True
+    silence: float = SILENCE
+    """Of the loop, after which the links' process lands the vehicles (s)."""
+    feed: Callable | None = None
+    """Motion capture, see `openjax.flying.motion_capture`."""
+
+
+class Session:
+    """A context manager: inside, vehicles are connected and nobody else's.
+
+    Args:
+      settings: how.
+      safety: limits of the flight.
+      state: before the flight: starts, pillars, airframe.
+    """
+
+    def __init__(self, settings: SessionSettings, safety: SafetySettings, state: State):
+        self._settings, self._safety, self._state = settings, safety, state
+        self.links = Links(
+            settings.uris, settings.body_logs, settings.watchdog, safety, state, settings.silence
+        )
+        self.requests = Operator()
+        self.vehicles: Links | MotionCaptured = self.links
+        self._guard: Guard | None = None
+        self._stack = contextlib.ExitStack()
+
+    def __enter__(self) -> Session:
+        settings = self._settings
+        with self._stack as stack:
+            stack.enter_context(sole_command(settings.uris))
+            stack.callback(self.links.close)
+            self.links.connect()
+            if settings.feed is not None:
+                self.vehicles = MotionCaptured(self.links)
+                self.vehicles.feed(settings.feed)
+            self._wait_for_poses()
+            blocks = self.links.pose_blocks()
+            self._own = RawLinks(settings.uris, blocks, settings.watchdog)
+            if settings.guard:
+                self._guard = Guard(self.links.board, self.links.pid, self._own, self._safety, self._state)
+                stack.callback(self._guard.close)
+                self._guard.wait()
+            self._own.open(udp_only=True)
+            stack.callback(self._own.close)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *_):
+        self._stack.close()
+
+    def check(self) -> None:
+        """All that must be so before take-off. UserError: something isn't; where there is more, each stands in a line."""
+        self._wait_for_poses()
+        rates = poses_arriving(self.vehicles)
+        guarded = self._guard is None or self.links.board.guarded
+        found = faults(self._safety, self._state, self.vehicles.observe(), rates, guarded)
+        if len(found) == 1:
+            raise UserError(f"no take-off: {found[0]}")
+        if found:
+            for line in found:
+                say(line)
+            raise UserError(f"no take-off for these {len(found)} reasons")
+
+    def fly(self, flight: Flight) -> tuple[list, str, str]:
+        """Arm and fly; what was recorded of each vehicle, what of the scheduler was granted, why another process landed."""
+        complaint, samples = "", []
+        with self.requests:
+            self._arm()
+            self.vehicles.record()
+            scheduler = real_time.hurry()
+            try:
+                flight.run()
+            except Exception as error:  # whatever it is, vehicles are in the air
+                complaint = f"{error}; {self._left_to_others()}"
+            with contextlib.suppress(UserError):
+                samples = self.vehicles.samples()
+        return samples, scheduler, complaint
+
+    def watched(self, now: float, state: State) -> str:
+        """Tell the others that the loop lives and what it knows; why it must land, if it must."""
+        self.links.board.write(Role.LOOP, now, state)
+        if self._guard is not None and not self._guard.lives(now):
+            return "the guard is gone"
+        return ""
+
+    def _arm(self):
+        self.links.arm()
+        deadline = time.monotonic() + ARMING
+        while not all(s.supervisor & Supervisor.ARMED for s in self.links.observe()):
+            if time.monotonic() > deadline:
+                raise UserError("a vehicle can't be armed; look at its console")
+            time.sleep(0.01)
+
+    def _left_to_others(self) -> str:
+        """Return once the vehicles are down; land them here if nobody else does. What happened."""
+        board = self.links.board
+        lander = "the links' process"
+        while board.flying:
+            time.sleep(0.005)
+            now = time.perf_counter()
+            lander = {Role.LOOP: lander, Role.LINKS: lander, Role.GUARD: "the guard"}[board.pilot]
+            quiet = [board.silent(role, now) > 2.5 * board.silence for role in (Role.LINKS, Role.GUARD)]
+            if all(quiet):
+                lander = "the loop"
+                self._end_others()
+                self._own.open()
+                fly_down(board, Role.LOOP, self._own, self._safety, self._state)
+        return f"{lander} landed all vehicles"
+
+    def _end_others(self):
+        """Should links or guard wake up, two would fly."""
+        self.links.kill()
+        if self._guard is not None:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self._guard.pid, signal.SIGKILL)
+
+    def _wait_for_poses(self, timeout: float = 5.0):
+        """Return once each vehicle has a pose that is fresh. UserError: one has none."""
+        deadline = time.monotonic() + timeout
+        while True:
+            now = time.perf_counter()
+            old = [now - t > FRESH for t in measured_times(self.vehicles.observe())]
+            if not any(old):
+                return
+            if time.monotonic() > deadline:
+                uris: Sequence[str] = self._settings.uris
+                silent = ", ".join(uri for uri, missing in zip(uris, old, strict=True) if missing)
+                raise UserError(f"no pose from {silent} within {timeout:g} s; is its position known?")
+            self.vehicles.wait(now + 0.02)

@@ -1,0 +1,99 @@
+"""Before take-off: each thing that must be so, wrong on its own, is one line that says what to do."""
+
+import math
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+
+from openjax.errors import UserError
+from openjax.flying.controller import Pose
+from openjax.flying.crtp import Supervisor
+from openjax.flying.limits import SafetySettings
+from openjax.flying.preflight import faults, sole_command
+from openjax.flying.safety import PoseSample, initial_state
+
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+STARTS = ((0.4, 0.2, 0.5), (0.4, -0.2, 0.5))
+READY = Supervisor.CAN_BE_ARMED
+AHEAD = math.sqrt(0.5)
+
+
+def sample(x=0.4, y=0.2, z=0.0, quaternion=LEVEL, captured=None, voltage=4.1, bits=READY):
+    pose = Pose(0.0, (x, y, z), (0.0,) * 3, quaternion)
+    return PoseSample(
+        pose, 0.0, voltage, bits, None if captured is None else pose._replace(position=captured)
+    )
+
+
+def found(first, rates=(100.0, 100.0), guarded=True):
+    second = sample(0.4, -0.2)
+    return faults(SafetySettings(), initial_state(STARTS), (first, second), rates, guarded)
+
+
+def test_all_well_is_no_line():
+    assert found(sample()) == []
+    assert found(sample(bits=Supervisor.ARMED | Supervisor.AUTO_ARM | Supervisor.CAN_FLY)) == []
+    assert found(sample(captured=(0.42, 0.2, 0.0))) == []
+
+
+@pytest.mark.parametrize(
+    ("wrong", "word"),
+    [
+        (sample(0.4, 0.0, 0.2), "mark"),  # y up
+        (sample(400.0, 200.0), "mark"),  # millimetres
+        (sample(0.8, 0.4), "mark"),
+        (sample(quaternion=(AHEAD, AHEAD, 0.0, 0.0)), "upright"),
+        (sample(quaternion=(0.0, 0.0, 0.0, 1.0)), "+x"),
+        (sample(x=math.nan), "finite"),
+        (sample(quaternion=(0.0,) * 4), "attitude"),
+        (sample(captured=(0.28, 0.2, 0.0)), "motion capture"),
+        (sample(voltage=3.5), "charge"),
+        (sample(bits=Supervisor.TUMBLED), "upright"),
+        (sample(bits=Supervisor.LOCKED), "locked"),
+        (sample(bits=Supervisor.ARMED | Supervisor.CAN_FLY), "already"),
+        (sample(bits=Supervisor.FLYING | Supervisor.AUTO_ARM), "already"),
+        (sample(bits=Supervisor(0)), "can't be armed"),
+    ],
+)
+def test_what_is_wrong_is_one_line_with_what_to_do(wrong, word):
+    (line,) = found(wrong)
+    assert word in line and line.startswith("vehicle 0") and "\n" not in line
+
+
+def test_link_and_guard():
+    (line,) = found(sample(), rates=(100.0, 60.0))
+    assert line.startswith("vehicle 1: 60 of 100 poses")
+    (line,) = found(sample(), guarded=False)
+    assert "guard" in line and "--" not in line  # not: fly without
+
+
+HOLDER = """
+from openjax.flying.preflight import sole_command
+with sole_command(["udp://one", "udp://two"]):
+    print("held", flush=True)
+    input()
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux's abstract names")
+def test_a_second_fly_is_refused_until_the_first_is_gone_however_it_went():
+    first = subprocess.Popen([sys.executable, "-c", HOLDER], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    try:
+        assert first.stdout.readline() == b"held\n"
+        with pytest.raises(UserError, match="has this vehicle"), sole_command(["udp://zero", "udp://two"]):
+            pass
+        with sole_command(["udp://zero"]):  # what was held before the refusal is free again
+            pass
+    finally:
+        first.kill()
+        first.wait()
+    with sole_command(["udp://one", "udp://two"]):
+        pass
+
+
+def test_a_scaled_frame_is_told_by_the_vehicles_own():
+    scaled = replace(sample(0.6, 0.3), captured=Pose(0.0, (0.72, 0.36, 0.0), (0.0,) * 3, LEVEL))
+    lines = faults(SafetySettings(), initial_state(((0.66, 0.33, 0.5),)), (scaled,), (100.0,), True)
+    assert len(lines) == 1 and "unit" in lines[0]
