@@ -45,7 +45,7 @@ class Arguments:
     out: Path | None = None
     """Folder for the logs, a case for openjax.diagnose; must not exist or be empty."""
     vehicle: Path | None = None
-    """What flies (crazyflie, brushless, or a vehicle.toml), for the hover thrust and the case."""
+    """What flies (crazyflie, brushless, or a vehicle.toml); by default the airframe that the policy was trained for."""
     body_logs: Annotated[int | None, Interval("[0, 5]")] = None
     """Log blocks of motors and accelerometer per vehicle, 0 to 5; default 5 over UDP, 1 over radio."""
     motion_capture: str | None = None
@@ -126,7 +126,7 @@ def _prepare(arguments) -> _Prepared:
         if number != settings.num_pursuers:
             raise UserError(f"{what} has {number} pursuers, the policy flies {settings.num_pursuers}")
     feed = find_feed(arguments.motion_capture) if arguments.motion_capture else None
-    vehicle = load_vehicle_file(arguments.vehicle)
+    vehicle = load_vehicle_file(arguments.vehicle or settings.airframe)
     slots = max(settings.max_pillars, len(scenario.pillars))
     game = Game(policy, scenario_task(dataclasses.replace(settings, max_pillars=slots), scenario))
     game.airframe = airframe_of(vehicle.vehicle)
