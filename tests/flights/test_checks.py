@@ -68,7 +68,7 @@ REFUSED = {
     "motor column corrupt": (lambda c: c | {"m2": c["m2"] - 1.0}, "corrupt", "commands lie in 0..1"),
     "two recordings in one file": (lambda c: c | {"t": c["t"] % 4.0}, "time", "runs backwards"),
     "frozen clock": (lambda c: c | {"t": np.round(c["t"] / 0.05) * 0.05}, "time", "repeat the time"),
-    "no commands": (without("m1", "cmd_thrust"), "columns", "no commands"),
+    "no commands": (without("m1", "m2", "m3", "m4", "cmd_thrust"), "columns", "no commands"),
     "no state": (without("x", "ax"), "columns", "needs position and orientation"),
     "too short": (lambda c: {k: v[:150] for k, v in c.items()}, "short", "at least 2 s"),
     "never took off": (scaled("m1 m2 m3 m4 cmd_thrust", 0.0), "corrupt", "same value"),

@@ -31,7 +31,9 @@ def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> 
     logs = find_logs(path)
     if not logs:
         raise UserError(f"{path}: holds no flight log (.csv, .csv.gz, micro-SD log or ROS 2 bag)")
-    described = (path / "vehicle.toml").exists() or not comparison
+    described = (path / "vehicle.toml").exists()
+    if not described and not comparison:
+        raise UserError(f"{path}: no vehicle.toml; an empty one there means the nominal Crazyflie")
     vehicle_file = load_vehicle_file(path / "vehicle.toml" if described else None, dtype)
     mapping = load_mapping(path / MAPPING_FILE) if (path / MAPPING_FILE).exists() else None
     flights, issues = [], []
@@ -47,9 +49,7 @@ def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> 
     flights = [f for f in flights if f.log not in copies]
     kept = []
     for flight in flights:
-        checked, found = check_flight(
-            flight, vehicle_file.vehicle_of(flight.vehicle), vehicle_file.log, comparison
-        )
+        checked, found = _check(flight, vehicle_file, comparison)
         issues += found
         kept += [] if checked is None else [checked]
     kept, found = _unproven(kept, issues, vehicle_file)

@@ -32,6 +32,7 @@ CHANNEL_COLUMNS = {
 }
 LOG_COLUMNS = ("t", "vehicle", *(c for columns in CHANNEL_COLUMNS.values() for c in columns))
 
+WHOLE = ("quaternion", "motor_command")  # channels of which a part is a mistake, not a choice
 LARGEST = 256 << 20  # bytes of text in one log: a quarter of an hour at 1 kHz; more is no flight log
 LARGEST_VALUE = 1e6  # no sensor's reading in SI units is larger; squares of what is would overflow
 
@@ -85,8 +86,10 @@ def read_csv(path: str | Path, delimiter: str = ",", known: tuple[str, ...] | No
     unknown = [n for n in names if n and known is not None and n not in known]
     if unknown:
         remarks.append(f"unknown column{'s' * (len(unknown) > 1)} left out: {', '.join(unknown[:8])}")
-    if not kept:
-        raise LogError(f"holds no known column (it has {', '.join(names[:6])})")
+    if known is not None and "t" not in names:
+        raise LogError(
+            f"no column t; the log has {', '.join(n for n in names if n)}: say in columns.toml which is which"
+        )
 
     if (_cells_per_line(body) != len(names)).any():
         raise LogError(_why_not(body, names, kept, ValueError("rows of unequal length")))
@@ -125,7 +128,7 @@ def flights_of(
     """The table's flights, one per vehicle, as logged (not yet sorted, checked or cut), motors in the
     nominal order; and remarks on columns that couldn't be used. Raises LogError without time."""
     if "t" not in table.columns:
-        raise LogError("no column t")
+        raise LogError(f"no column t; the log has {', '.join(table.columns)}: name it in columns.toml")
     channels, remarks = {}, list(table.remarks)
     for channel, names in CHANNEL_COLUMNS.items():
         found = [n for n in names if n in table.columns]
@@ -143,8 +146,10 @@ def flights_of(
         elif found == ["az"]:
             channels["vertical_force"] = table.columns["az"]
         elif found:
-            missing = [n for n in names if n not in table.columns]
-            remarks.append(f"{', '.join(found)} without {', '.join(missing)}: {channel} is left out")
+            missing = ", ".join(n for n in names if n not in table.columns)
+            if channel in WHOLE:
+                raise LogError(f"{', '.join(found)} without {missing}: log {missing}, or none of them")
+            remarks.append(f"{', '.join(found)} without {missing}: {channel} is left out; log {missing}")
     if "motor_command" in channels:
         channels["motor_command"] = channels["motor_command"][:, list(motor_permutation)]
     fingerprint = _fingerprint(channels)

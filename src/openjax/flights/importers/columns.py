@@ -1,6 +1,7 @@
 """Column mapping: which column, log variable or message field holds what, in which unit.
 
-A `columns.toml` in a case folder applies to all its logs:
+A `columns.toml` in a case folder applies to all its logs. A CSV column that it doesn't name and that has a name of the log
+format is taken as it is:
 
     delimiter = ";"                                        # CSV only; "," if left out
     [columns]
@@ -67,20 +68,31 @@ class ColumnMapping:
     columns: dict[str, Source] = field(default_factory=dict)
     delimiter: str = ","
 
+    def over(self, usual: dict[str, Source]) -> dict[str, Source]:
+        """The `usual` sources of columns, and in their place those that the mapping names; time is no source."""
+        kept = _without_attitude(usual) if set(EULER) & set(self.columns) else usual
+        return kept | {c: s for c, s in self.columns.items() if c not in ("t", "vehicle")}
+
     def table(self, name: str, raw: LogTable) -> LogTable:
-        """A raw CSV table with its columns renamed and converted; time starts at zero."""
-        if "t" not in self.columns:
-            raise LogError(f"{MAPPING_FILE} doesn't say where t comes from")
-        columns, remarks = {}, list(raw.remarks)
+        """A raw CSV table with its columns renamed and converted; time starts at zero.
+
+        Columns under the log format's own names are inherited. Raises LogError without time.
+        """
+        taken = {source.name for source in self.columns.values()}
+        inherited = {c: v for c, v in raw.columns.items() if c in LOG_COLUMNS and c not in taken}
+        columns = inherited if not set(EULER) & set(self.columns) else _without_attitude(inherited)
+        remarks = list(raw.remarks)
         for column, source in self.columns.items():
             if column == "vehicle":
                 continue
             if source.name in raw.columns:
                 columns[column] = source.scale * raw.columns[source.name] + source.offset
             else:
+                columns.pop(column, None)
                 remarks.append(f"no column {source.name!r} for {column}")
         if "t" not in columns:
-            raise LogError(f"no column {self.columns['t'].name!r}, which {MAPPING_FILE} names for t")
+            named = f" {self.columns['t'].name!r}, which {MAPPING_FILE} names for t" if "t" in self.columns else " t"
+            raise LogError(f"no column{named}; the log has {', '.join(raw.columns)}")
         columns["t"] = columns["t"] - np.nanmin(columns["t"])
         return LogTable(name, with_quaternion(columns), raw.vehicle, tuple(remarks))
 
@@ -131,6 +143,11 @@ def merge_streams(streams: list[Stream], columns: dict[str, Source]) -> dict[str
         for column, values in converted.items():
             merged.setdefault(column, _onto(clock, time, values, column, period))
     return with_quaternion(merged)
+
+
+def _without_attitude(columns: dict) -> dict:
+    """Without the quaternion: named angles stand in its place."""
+    return {c: v for c, v in columns.items() if c not in CHANNEL_COLUMNS["quaternion"]}
 
 
 def with_quaternion(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -74,7 +74,7 @@ def is_micro_sd(path: Path) -> bool:
 
 
 def read_micro_sd(path: str | Path, mapping: ColumnMapping | None = None) -> LogTable:
-    """Read a micro-SD log. Without a mapping the firmware's usual log variables are looked for.
+    """Read a micro-SD log. The firmware's usual log variables are looked for, unless the mapping names others.
 
     Raises LogError if it isn't such a log, or holds nothing that can be used.
     """
@@ -84,17 +84,16 @@ def read_micro_sd(path: str | Path, mapping: ColumnMapping | None = None) -> Log
     streams, remarks = decode(path.read_bytes())
     streams = [with_mixer(stream) for stream in streams]
     names = {name for stream in streams for name in stream.values}
+    columns = {
+        c: next((s for s in options if s.name in names), None) for c, options in FIRMWARE_SOURCES.items()
+    }
+    columns = {c: s for c, s in columns.items() if s is not None}
     if mapping is not None:
-        columns = {c: s for c, s in mapping.columns.items() if c not in ("t", "vehicle")}
+        columns = mapping.over(columns)
         missing = [s.name for s in columns.values() if s.name not in names]
         remarks += [f"no log variable {name!r}" for name in missing]
-    else:
-        columns = {
-            c: next((s for s in options if s.name in names), None) for c, options in FIRMWARE_SOURCES.items()
-        }
-        columns = {c: s for c, s in columns.items() if s is not None}
-        if columns.get("m1", Source("")).name == "mixer.m1":
-            remarks.append("no motor commands were logged: they are made from the mixer's inputs")
+    if columns.get("m1", Source("")).name == "mixer.m1":
+        remarks.append("no motor commands were logged: they are made from the mixer's inputs")
     merged = merge_streams(streams, columns)
     merged["t"] = merged["t"] - merged["t"][0]
     return LogTable(path.name, merged, np.full(len(merged["t"]), "0"), tuple(remarks))
