@@ -221,7 +221,7 @@ def test_a_copy_with_another_clock_and_layout_is_a_duplicate(case_folder, sample
     ("prepare", "reason"),
     [
         (lambda f: [p.unlink() for p in f.glob("*.gz")], "holds no flight log"),
-        (lambda f: (f / "vehicle.toml").unlink(), "vehicle file"),
+        (lambda f: (f / "vehicle.toml").unlink(), "an empty one"),
         (lambda f: (f / "vehicle.toml").write_text("[motor]\ncomand = 'pwm'\n"), "unknown key 'comand'"),
         (lambda f: [p.write_bytes(b"") for p in f.glob("*.gz")], r"no flight can be used: .* \(and 2 more\)"),
     ],

@@ -57,6 +57,36 @@ def assert_same(table, columns, tolerance=3e-5, skip=("vbat", "vx", "vy", "vz"))
             np.testing.assert_allclose(table.columns[name], values, atol=tolerance, err_msg=name)
 
 
+def test_a_mapping_of_one_column_leaves_the_others_as_they_are(tmp_path, columns):
+    table = log_of([columns], "flight.csv")
+    write_csv(tmp_path / "flight.csv", table)
+    text = (tmp_path / "flight.csv").read_text().replace("cmd_thrust", "throttle", 1)
+    (tmp_path / "flight.csv").write_text(text)
+    (tmp_path / "columns.toml").write_text('[columns]\ncmd_thrust = "throttle"\n')
+    read = read_log(tmp_path / "flight.csv", load_mapping(tmp_path / "columns.toml"))
+    assert set(read.columns) == set(table.columns)
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        ({"t": "time"}, "no column t; the log has time, "),
+        ({"m3": "motor_3"}, "m1, m2, m4 without m3: log m3"),
+        ({"qz": "q_z"}, "qw, qx, qy without qz: log qz"),
+    ],
+)
+def test_a_missing_column_is_named(tmp_path, columns, change, words):
+    write_csv(tmp_path / "flight.csv", log_of([columns], "flight.csv"))
+    head, _, body = (tmp_path / "flight.csv").read_text().partition("\n")
+    names = [change.get(name, name) for name in head.split(",")]
+    (tmp_path / "flight.csv").write_text(",".join(names) + "\n" + body)
+    with pytest.raises(UserError, match="an empty one there means the nominal"):
+        load_case(tmp_path)
+    (tmp_path / "vehicle.toml").write_text("")
+    with pytest.raises(UserError, match=words):
+        load_case(tmp_path)
+
+
 @pytest.mark.parametrize("version", [1, 2])
 def test_micro_sd_log_of_one_clock(tmp_path, columns, version):
     path = tmp_path / "log00"

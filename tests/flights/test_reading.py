@@ -43,7 +43,7 @@ def test_empty_cells_are_not_sampled_and_written_nan_is_remarked(tmp_path):
 
 
 def test_vehicles_in_long_format_are_told_apart(tmp_path):
-    rows = ["t,vehicle,x,y,z,m1", "0,cf2,2,0,1,.1", "0,cf1,1,0,1,.1", ".01,cf2,2.5,0,1,.1"]
+    rows = ["t,vehicle,x,y,z,vbat", "0,cf2,2,0,1,4.0", "0,cf1,1,0,1,4.0", ".01,cf2,2.5,0,1,4.0"]
     text = "\n".join(rows)
     first, second = flights_of(read_csv(write(tmp_path / "log.csv", text)))[0]
     assert (first.vehicle, second.vehicle) == ("cf2", "cf1")
@@ -63,7 +63,7 @@ def test_a_channel_with_a_missing_column_is_left_out_and_named(tmp_path):
     table = read_csv(write(tmp_path / "log.csv", "t,x,y,wx,wy,wz,colour\n0,1,2,3,4,5,6\n"))
     (flight,), remarks = flights_of(table)
     assert flight.position is None and flight.body_rates is not None
-    assert remarks == ["unknown column left out: colour", "x, y without z: position is left out"]
+    assert remarks == ["unknown column left out: colour", "x, y without z: position is left out; log z"]
 
 
 @pytest.mark.parametrize(
@@ -77,7 +77,7 @@ def test_a_channel_with_a_missing_column_is_left_out_and_named(tmp_path):
         ("t,wx\n0,1\n0.01,fast\n", "line 3, column wx: 'fast' is no number"),
         ("t,wx\n0,1\n0.01\n0.02,1\n", "line 3 has 1 cells, the header 2"),
         ("t,wx\n0,1\n0.01,2,3\n", "line 3 has 3 cells, the header 2"),
-        ("colour,shape\n0,1\n", "no known column"),
+        ("colour,shape\n0,1\n", "no column t; the log has colour, shape"),
         ("wx,wy\n0,1\n", "no column t"),
     ],
 )

@@ -86,12 +86,18 @@ def run(options: Options) -> int:
         try:
             with console.status(f"{name}: reading") as status:
                 case = load_case(folder)
+                for issue in case.left_out():
+                    print(f"warning: {name}/{issue.flight} is left out: {issue.issue}", file=sys.stderr)
                 report = diagnose_case(case, options.without, partial(_tell, status, name))
                 _tell(status, name, "writing the report")
                 _write(report, options.out / name, options.html)
         except UserError as error:
             failed += 1
             print(f"error: {one_line(error)}", file=sys.stderr)
+            continue
+        except Exception as error:  # unforeseen: the other cases go on
+            failed += 1
+            print(f"error: {name}: {type(error).__name__}: {one_line(error)}", file=sys.stderr)
             continue
         except Exception as error:  # a fault of the program in one case must not cost the others
             failed += 1
@@ -131,6 +137,10 @@ def _compare(options: Options, names: list[str], console) -> int:
         except UserError as error:
             failed += 1
             print(f"error: {one_line(error)}", file=sys.stderr)
+            continue
+        except Exception as error:  # unforeseen: the other cases go on
+            failed += 1
+            print(f"error: {name}: {type(error).__name__}: {one_line(error)}", file=sys.stderr)
             continue
         except Exception as error:  # as above
             failed += 1

@@ -147,6 +147,10 @@ class Case:
         """The other vehicles that flew together with `flight` (neighbours, for downwash)."""
         return tuple(f for f in self.flights if f.log == flight.log and f.vehicle != flight.vehicle)
 
+    def left_out(self) -> tuple[Issue, ...]:
+        """What refused a log or a vehicle of it."""
+        return tuple(issue for issue in self.quality if issue.refused)
+
     def vehicle_of(self, flight: Flight):
         """The nominal `Vehicle` of this flight: the vehicle file's, with `[vehicles.<id>]` applied."""
         return self.vehicle_file.vehicle_of(flight.vehicle)

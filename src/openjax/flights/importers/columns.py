@@ -91,7 +91,11 @@ class ColumnMapping:
                 columns.pop(column, None)
                 remarks.append(f"no column {source.name!r} for {column}")
         if "t" not in columns:
-            named = f" {self.columns['t'].name!r}, which {MAPPING_FILE} names for t" if "t" in self.columns else " t"
+            named = (
+                f" {self.columns['t'].name!r}, which {MAPPING_FILE} names for t"
+                if "t" in self.columns
+                else " t"
+            )
             raise LogError(f"no column{named}; the log has {', '.join(raw.columns)}")
         columns["t"] = columns["t"] - np.nanmin(columns["t"])
         return LogTable(name, with_quaternion(columns), raw.vehicle, tuple(remarks))
