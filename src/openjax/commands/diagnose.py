@@ -95,10 +95,6 @@ def run(options: Options) -> int:
             failed += 1
             print(f"error: {one_line(error)}", file=sys.stderr)
             continue
-        except Exception as error:  # unforeseen: the other cases go on
-            failed += 1
-            print(f"error: {name}: {type(error).__name__}: {one_line(error)}", file=sys.stderr)
-            continue
         except Exception as error:  # a fault of the program in one case must not cost the others
             failed += 1
             print(f"error: {_unforeseen(name, error)}", file=sys.stderr)
@@ -137,10 +133,6 @@ def _compare(options: Options, names: list[str], console) -> int:
         except UserError as error:
             failed += 1
             print(f"error: {one_line(error)}", file=sys.stderr)
-            continue
-        except Exception as error:  # unforeseen: the other cases go on
-            failed += 1
-            print(f"error: {name}: {type(error).__name__}: {one_line(error)}", file=sys.stderr)
             continue
         except Exception as error:  # as above
             failed += 1
