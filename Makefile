@@ -30,7 +30,7 @@ evaluate: $(READY)
 	$(BIN)/python -m openjax.evaluate --policy open open_seed_1 open_seed_2 --scenario all $(ARGS)
 
 tables: $(READY)
-	$(BIN)/python -m experiments.tables $(ARGS)
+	$(BIN)/python -m experiments.paper.tables $(ARGS)
 
 exam: $(READY)
 	$(BIN)/python -m experiments.diagnosis.run $(ARGS)

@@ -107,13 +107,11 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 
 def made(facts: Mapping) -> str:
     """Command, release, commit and machine of what was stored, as a sentence."""
-    machine = facts["machine"]
-    versions = machine["versions"]
+    machine = facts.get("machine") or {}
+    versions = machine.get("versions", {})
     commit = facts.get("commit") or machine.get("commit") or "commit unknown"
-    return (
-        f"Made with {versions.get('openjax', RELEASE)} ({commit[:12]}) by `{facts['command']}` "
-        f"on {machine['device']}, JAX {versions['jax']}."
-    )
+    device = f" on {machine['device']}, JAX {versions['jax']}" if machine else ""
+    return f"Made with {versions.get('openjax', RELEASE)} ({commit[:14]}) by `{facts['command']}`{device}."
 
 
 def page_parser(doc: str | None, name: str) -> argparse.ArgumentParser:

@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.hard_tasks import close, drawn, row
 from experiments.pages import page_parser, publish, table, where
+from experiments.paper.hard_tasks import close, drawn, row
 from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import layout_slots, repeat_task
 from openjax.commands.validation import uniform_tasks

@@ -37,9 +37,14 @@ def test_links_between_the_pages_lead_somewhere():
 
 def test_the_table_of_experiments_names_them_all():
     page = (ROOT / "experiments" / "README.md").read_text(encoding="utf-8")
-    named = {name.split(".")[0] for name in re.findall(r"`(\w+(?:\.run)?)`", page)}
-    folders = {path.parent for path in (ROOT / "experiments").glob("*/__init__.py")}
-    there = {path.stem for path in {*(ROOT / "experiments").glob("*.py"), *folders}} - {"__init__"}
+    named = set(re.findall(r"`((?:\w+\.)?\w+)`", page))
+    commands = {
+        path.relative_to(ROOT / "experiments").with_suffix("").as_posix().replace("/", ".")
+        for path in (ROOT / "experiments").rglob("*.py")
+        if 'if __name__ == "__main__"' in path.read_text(encoding="utf-8") and path.stem != "__main__"
+    }
+    there = {name for name in commands if not name.startswith("diagnosis.")}
+    there |= {path.parent.name for path in (ROOT / "experiments").glob("*/__main__.py")}
     assert there <= named, there - named
     for path in re.findall(r"\]\(([^)#]+)\)", page):
         assert (ROOT / "experiments" / path).exists(), path

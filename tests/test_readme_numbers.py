@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.headline import PAPER
+from experiments.paper.values import means
 from openjax.pursuit import SCENARIOS
 
 ROOT = Path(__file__).parents[1]
@@ -40,8 +40,8 @@ def test_layouts(layout):
         return float(np.mean([record[field] for record in records]))
 
     paper = "–"
-    if layout in PAPER:
-        rate, step, collisions = PAPER[layout]
+    if of_paper := means(layout, "OPEN"):
+        rate, step, collisions = of_paper
         paper = f"{short(rate, 3)}, {step}, {short(collisions, 3)}"
     assert cells(layout) == [
         short(mean("capture_rate"), 2),

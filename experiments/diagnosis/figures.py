@@ -116,7 +116,9 @@ def misses(lines: list[dict]) -> list[str]:
         if r["right"] and not r["wrong_names"]:
             continue
         said, why = "+".join(r["words"]) or "none", r["error"] or (r["traceback"] or "").strip()[-160:]
-        out.append(f"* {r['set']}/{r['case']} {r['category']}: {'+'.join(r['truth']) or 'none'} → {said} {why}")
+        out.append(
+            f"* {r['set']}/{r['case']} {r['category']}: {'+'.join(r['truth']) or 'none'} → {said} {why}"
+        )
     return out
 
 

@@ -7,8 +7,8 @@ import jax
 import numpy as np
 import pytest
 
-from experiments import ablations, run_comparison
-from experiments.run_comparison import VARIANTS, by_variant, main_effects, read_run, savings, steps_to
+from experiments.paper import ablations, runs
+from experiments.paper.runs import VARIANTS, by_variant, main_effects, read_run, savings, steps_to
 from openjax.errors import UserError
 from openjax.learning import GeneratorSettings, MappoSettings, TrainSettings, build, make_training_step
 from openjax.learning.training_step import _initial_carry
@@ -79,7 +79,7 @@ def test_a_training_step_simulates_exactly_the_steps_that_are_counted():
 
 
 def test_a_run_is_read_with_its_variant_and_refused_if_steps_are_missing(tmp_path, monkeypatch):
-    monkeypatch.setattr(run_comparison, "fly", lambda policy, changes, episodes: [{"flown": episodes}])
+    monkeypatch.setattr(runs, "fly", lambda policy, changes, episodes: [{"flown": episodes}])
     for number, (settings, variant) in enumerate(
         [
             (TINY, "OPEN"),
@@ -140,7 +140,7 @@ def test_runs_that_differ_in_more_than_the_switches_are_refused():
         by_variant([run_of("OPEN", 0, [1.0]), other])
     with pytest.raises(UserError, match="a seed was given twice"):
         by_variant([run_of("OPEN", 0, [1.0]), run_of("OPEN", 0, [1.0])])
-    flat = run_comparison.common_settings(json.loads(json.dumps(dataclasses.asdict(TINY))))
+    flat = runs.common_settings(json.loads(json.dumps(dataclasses.asdict(TINY))))
     assert "num_envs" in flat and "predictor.units" in flat and "mappo.clip_epsilon" in flat
     assert not {"seed", "predictor.enabled", "generator.enabled", "generator.turn"} & set(flat)
 
@@ -181,5 +181,5 @@ def test_the_page_and_figure_from_what_is_stored(tmp_path):
     ablations.main(["--out", str(out)])
     page = out.with_suffix(".md").read_text(encoding="utf-8")
     assert "| OPEN | 0, 0 | 0 | 0.67 (0.67 to 0.67) |" in page
-    assert "generator: capture rate, the paper's four layouts +0.2650" in page
+    assert "| capture rate, the paper's four layouts | +0.2650 ± 0.0139 |" in page
     assert out.with_suffix(".png").stat().st_size > 10_000

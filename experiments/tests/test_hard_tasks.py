@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 
-from experiments import hard_tasks
+from experiments.paper import hard_tasks
 from openjax.pursuit import PursuitSettings
 from openjax.pursuit.task import starts_clear
 

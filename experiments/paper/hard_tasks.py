@@ -1,4 +1,4 @@
-"""Rare failures of policies, on tasks enough to count them: `python -m experiments.hard_tasks [--policy NAME ...]`.
+"""Rare failures of policies, on tasks enough to count them: `python -m experiments.paper.hard_tasks [--policy NAME ...]`.
 
 The layouts' hundred episodes can't tell a crash in a hundred from one in a thousand, and nothing may be chosen by them.
 So policies are compared on three kinds of other tasks: uniform ones, uniform ones with their pillars in a row (which
@@ -8,8 +8,8 @@ starts close to a pillar or another pursuer. Writes experiments/results/hard_tas
 
 import jax
 
-from experiments.headline import evaluator_of, seeds_of_open
-from experiments.pages import page_parser, publish, table, where
+from experiments.paper.headline import evaluator_of, seeds_of_open
+from experiments.table import Page, Table, page_parser, publish
 from openjax.commands.command_line import run_command
 from openjax.commands.validation import uniform_tasks
 from openjax.learning import summarise
@@ -62,39 +62,33 @@ def fly(policy: str, number: int) -> dict[str, dict]:
     return found
 
 
-def report(results: dict) -> list[str]:
-    """The page."""
+def page(results: dict) -> Page:
+    """A row per policy and kind of task."""
+    columns = {
+        "policy": "policy",
+        "tasks": "tasks",
+        "crashes": lambda row: f"{row['crashes']} of {row['episodes']}",
+        "collision rate": "collision_rate:.4f",
+        "capture rate": "capture_rate:.4f",
+        "capture step": "capture_step:.0f",
+    }
     rows = [
-        [
-            name,
-            kind,
-            f"{found['crashes']} of {found['episodes']}",
-            f"{found['collision_rate']:.4f}",
-            f"{found['capture_rate']:.4f}",
-            f"{found['capture_step']:.0f}",
-        ]
+        {"policy": name, "tasks": kind, **found}
         for name, kinds in results["policies"].items()
         for kind, found in kinds.items()
     ]
-    return [
-        "# Rare failures, on many tasks",
-        "",
-        f"{where(results)} "
-        f"{results['seconds']:.0f} s. Uniform: validation uniform tasks; row: their pillars in a row; close: all pursuers "
-        "that can be start close to a pillar or another pursuer. Each policy in the game that it was trained in; start "
-        "attitudes drawn.",
-        "",
-        *table(["policy", "tasks", "crashes", "collision rate", "capture rate", "capture step"], rows),
-    ]
+    return Page(
+        "Rare failures, on many tasks",
+        "Uniform: validation uniform tasks; row: their pillars in a row; close: all pursuers that can be start close to a "
+        "pillar or another pursuer. Each policy in the game that it was trained in; start attitudes drawn.",
+        Table(columns, rows),
+    )
 
 
 def study(options) -> dict:
     """Fly the policies."""
     names = options.policy or seeds_of_open()
-    policies = {name: fly(name, options.number) for name in names}
-    return {
-        "policies": policies,
-    }
+    return {"policies": {name: fly(name, options.number) for name in names}}
 
 
 def main(arguments: list[str]) -> int:
@@ -104,7 +98,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument(
         "--number", type=int, default=4096, help="uniform tasks; a quarter and half of it of the others"
     )
-    publish(parser.parse_args(arguments), study, report)
+    publish(parser.parse_args(arguments), study, page)
     return 0
 
 

@@ -1,19 +1,17 @@
-"""The paper's behaviours, measured and drawn: `python -m experiments.behaviours`, from what tables.py stored.
+"""The paper's behaviours, measured and drawn.
 
 The paper shows four by pictures: surrounding from both sides (wall), a shortcut instead of following (narrow_gap), finding
 the evader behind pillars (random, and hidden, where nobody sees it at the start), blocking all three ways out (passage).
-Here each is a number for every method, beside one episode from above. Writes experiments/results/behaviours.md and .png.
+Here each is a number for every method, beside one episode from above.
 """
 
-import functools
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from experiments.pages import page_from_tables, spread, table, where
-from experiments.roster import METHODS
-from openjax.commands.command_line import run_command
+from experiments.paper.roster import METHODS, flights_of
+from experiments.table import Page, Table
 from openjax.pursuit import SCENARIOS, PursuitSettings
 from openjax.show.plots import draw_from_above
 from openjax.show.trajectory import Trajectory
@@ -105,33 +103,30 @@ def _mean(values):
     return float(np.mean(values)) if values else None
 
 
-def flights_of(results: dict, method: str) -> list[dict]:
-    """A method's flights with the clamp, one per seed."""
-    return [f for f in results["flights"] if f["method"] == method and f["condition"] == "clamp"]
-
-
-def report(results: dict) -> list[str]:
-    """The page."""
+def page(results: dict) -> Page:
+    """What `MEASURES` names, of every method."""
     rows = []
     for layout, measures in MEASURES.items():
         for name in measures:
-            cells = []
-            for method in METHODS:
-                values = [f["layouts"][layout]["behaviour"][name] for f in flights_of(results, method)]
-                cells.append(spread(values, 0 if name == "seen" else 2))
-            rows.append([layout, name, *cells])
-    lines = [
-        "# What the pursuers do",
-        "",
-        f"{where(results)} {results['episodes']} episodes per seed, speed clamp, drawn starts; mean (standard deviation over "
-        "seeds). The paper names these behaviours and shows a picture of each; it has no numbers for them.",
-        "",
+            of_methods = {
+                method: [f["layouts"][layout]["behaviour"][name] for f in flights_of(results, method)]
+                for method in METHODS
+            }
+            rows.append({"layout": layout, "name": name, **of_methods})
+    meanings = [
+        f"* {layout}, {name}: {text}" for layout, own in MEASURES.items() for name, text in own.items()
     ]
-    lines += [
-        f"* {layout}, {name}: {text}" for layout, all_ in MEASURES.items() for name, text in all_.items()
-    ]
-    lines += ["", *table(["layout", "behaviour", *METHODS], rows)]
-    return [*lines, "", "![One episode of each method on each layout](behaviours.png)"]
+    columns = {"layout": "layout", "behaviour": "name"}
+    return Page(
+        "What the pursuers do",
+        f"{results['episodes']} episodes per seed, speed clamp, drawn starts; mean (standard deviation over seeds). The "
+        "paper names these behaviours and shows a picture of each; it has no numbers for them.",
+        (
+            "\n".join(meanings),
+            Table(columns | {method: f"{method}:.3g" for method in METHODS}, rows),
+            "![One episode of each method on each layout](behaviours.png)",
+        ),
+    )
 
 
 def draw(results: dict, path: Path) -> None:
@@ -176,10 +171,3 @@ def trajectory_of(paths: dict, layout: str, title: str) -> Trajectory:
         capture_radius=settings.capture_radius,
         time_step=EVERY * settings.time_step,
     )
-
-
-main = functools.partial(page_from_tables, __doc__, "behaviours", report, draw=draw)
-
-
-if __name__ == "__main__":
-    run_command(main)

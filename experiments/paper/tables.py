@@ -1,8 +1,7 @@
-"""The paper's tables and figures from the shipped weights: `python -m experiments.tables [--episodes 100]`, or `make tables`.
+"""The paper's tables and figures, by the shipped weights: `python -m experiments.paper.tables [--episodes 100]`.
 
 Flies every method once, all its layouts, capture radii and evader speeds in one compiled call, and stores what came of it in
-experiments/results/tables.json; each script named in `PAGES` then writes its page from there. `--report` writes the pages
-again.
+experiments/results/tables.json; the pages in `PAGES` are made from there. `--report` makes them again.
 """
 
 import argparse
@@ -16,22 +15,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import behaviours, learning_curves, sweeps, tab_main, tab_ood, tab_prediction
-from experiments.flights import environment_of, fly
-from experiments.pages import RESULTS
-from experiments.roster import ABLATIONS, METHODS, seeds_of
+from experiments.paper import behaviours, learning_curves, main_tables, sweeps
+from experiments.paper.flights import environment_of, fly
+from experiments.paper.roster import ABLATIONS, METHODS, seeds_of
+from experiments.table import RESULTS, facts, write_page
 from openjax.baselines import METHODS as HEURISTICS
 from openjax.cluster.compilation import compile_ahead
 from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import layout_slots, record_of, repeat_task
-from openjax.commands.machine import describe_machine
 from openjax.files import read_json, write_text
 from openjax.learning import summarise
 from openjax.pursuit import SCENARIOS, Pursuit, RewardSettings, scenario_task
 from openjax.store.policies import LoadedPolicy, load_policy
 from openjax.store.settings_files import to_plain
 
-PAGES = (tab_main, tab_ood, tab_prediction, behaviours, sweeps)
+PAGES = {
+    "tab_main": (main_tables.page, None),
+    "behaviours": (behaviours.page, behaviours.draw),
+    "sweeps": (sweeps.page, sweeps.draw),
+}
+"""By file: page and figure."""
 LAYOUTS = ("wall", "narrow_gap", "random", "passage", "hidden")
 LABELS = (*METHODS, *ABLATIONS)
 LIMITS = {"clamp": "clamp", "no clamp": "none"}
@@ -96,56 +99,54 @@ def of_policy(name: str, seed: int, limit: str, physics: str, episodes: int) -> 
     return {"layouts": layouts, "sweeps": sweeps.figures(parts[len(LAYOUTS) :], game.episode_length)}
 
 
-def study(options: argparse.Namespace) -> None:
-    """Fly and store all methods and the ablations, with the clamp; heuristics without it, too: no training chose their speed.
-
-    What stands in the file already of methods that aren't named is kept, if it was flown alike.
-    """
-    started = time.monotonic()
-    alike = {"episodes": options.episodes, "physics": options.physics}
+def flights_to_keep(options: argparse.Namespace, alike: dict) -> list[dict]:
+    """What stands in the file already of methods that aren't flown anew, if it was flown alike."""
     stored = options.out / "tables.json"
-    kept = read_json(stored) if stored.exists() and len(options.methods) < len(LABELS) else {}
-    kept = kept.get("flights", []) if {name: kept.get(name) for name in alike} == alike else []
-    flights = [flight for flight in kept if flight["method"] not in options.methods]
-    wanted = [
-        (label, condition)
+    if not stored.exists() or len(options.methods) == len(LABELS):
+        return []
+    kept = read_json(stored)
+    same = {name: kept.get(name) for name in alike} == alike
+    return [flight for flight in kept["flights"] if same and flight["method"] not in options.methods]
+
+
+def calls_of(options: argparse.Namespace) -> dict[tuple[str, str], list[tuple[str, int]]]:
+    """Policies and seeds by method and condition; heuristics fly without the clamp, too: no training chose their speed."""
+    return {
+        (label, condition): seeds_of(label)
         for label in options.methods
         for condition in LIMITS
         if condition == "clamp" or METHODS.get(label) in HEURISTICS
-    ]
-    rest = (options.physics, options.episodes)
+    }
+
+
+def study(options: argparse.Namespace) -> None:
+    """Fly and store all methods and the ablations."""
+    started = time.monotonic()
+    alike = {"episodes": options.episodes, "physics": options.physics}
+    rest, wanted = (options.physics, options.episodes), calls_of(options)
+    flights = flights_to_keep(options, alike)
     compiled = {}
-    for label, condition in wanted:  # all programs are compiled side by side, and while others fly
-        for name, seed in seeds_of(label)[:1]:
+    for (label, condition), seeds in wanted.items():  # compiled side by side, and while others fly
+        for name, seed in seeds[:1]:
             compiled[label, condition] = compile_ahead(fly, *call_of(name, seed, LIMITS[condition], *rest))
-    for label in options.methods:
-        for condition, limit in LIMITS.items():
-            if (label, condition) not in compiled:
-                continue
+    for (label, condition), seeds in wanted.items():
+        if (label, condition) in compiled:
             compiled[label, condition]()
-            for name, seed in seeds_of(label):
-                begun = time.monotonic()
-                flown = of_policy(name, seed, limit, *rest)
-                if condition != "clamp" or (name, seed) != seeds_of(label)[0]:
-                    for layout in flown["layouts"].values():  # one episode of each method is drawn
-                        del layout["paths"]
-                flights.append(
-                    {
-                        "method": label,
-                        "policy": name,
-                        "seed": seed,
-                        "condition": condition,
-                        "seconds": time.monotonic() - begun,
-                        **flown,
-                    }
-                )
-                print(f"{time.monotonic() - started:5.0f} s  {label}: {name}, {condition}", flush=True)
-        # after each method, so that an interrupted study leaves what it has
-        command = f"python -m experiments.tables --episodes {options.episodes} --physics {options.physics}"
-        results = {"command": command, "commit": options.commit, "machine": describe_machine()}
-        results |= {"seconds": time.monotonic() - started, **alike, "flights": flights}
+        for name, seed in seeds:
+            begun = time.monotonic()
+            flown = of_policy(name, seed, LIMITS[condition], *rest)
+            if condition != "clamp" or (name, seed) != seeds[0]:
+                for layout in flown["layouts"].values():  # one episode of each method is drawn
+                    del layout["paths"]
+            about = {"method": label, "policy": name, "seed": seed, "condition": condition}
+            flights.append({**about, "seconds": time.monotonic() - begun, **flown})
+            print(f"{time.monotonic() - started:5.0f} s  {label}: {name}, {condition}", flush=True)
+        # after each, so that an interrupted study leaves what it has
+        seconds = time.monotonic() - started
+        results = {**facts(options.commit), "seconds": seconds, **alike, "flights": flights}
         # paths are long: no line for each number
-        write_text(stored, json.dumps(to_plain(results), allow_nan=False, separators=(",", ":")))
+        text = json.dumps(to_plain(results), allow_nan=False, separators=(",", ":"))
+        write_text(options.out / "tables.json", text)
 
 
 def main(arguments: list[str]) -> int:
@@ -160,11 +161,11 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--commit", default="", help="where the machine has no repository")
     parser.add_argument("--out", type=Path, default=RESULTS, help="directory")
     options = parser.parse_args(arguments)
-    flights = options.out / "tables.json"
     if not options.report:
         study(options)
-    for page in PAGES:
-        page.main(["--flights", str(flights), "--out", str(options.out / page.__name__.rpartition(".")[2])])
+    results = read_json(options.out / "tables.json")
+    for name, (page, draw) in PAGES.items():
+        write_page(options.out / name, page, results, draw)
     learning_curves.main(["--out", str(options.out / "learning_curves")])
     return 0
 

@@ -3,11 +3,12 @@
 import itertools
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.stats import t as student
 
-from experiments.headline import fly
+from experiments.paper.headline import fly
 from openjax.errors import UserError
 from openjax.files import read_json
 from openjax.pursuit import SCENARIOS
@@ -108,6 +109,17 @@ def band(runs: list[dict], field: str) -> tuple[np.ndarray, np.ndarray]:
         for run in runs
     ]
     return grid, np.array(values)
+
+
+def draw_band(axis: Any, runs: dict[str, list[dict]], field: str, colors: dict[str, str]) -> None:
+    """Mean and range over seeds of every variant's validation curve."""
+    for name, group in runs.items():
+        steps, values = band(group, field)
+        axis.plot(steps / 1e6, values.mean(axis=0), color=colors[name], label=name)
+        low, high = values.min(axis=0), values.max(axis=0)
+        axis.fill_between(steps / 1e6, low, high, color=colors[name], alpha=0.15, linewidth=0)
+    axis.set(xlabel="environment steps (million)", ylabel=field.replace("_", " "))
+    axis.grid(alpha=0.3)
 
 
 def savings(runs: dict[str, list[dict]], field: str, rate: float) -> list[tuple[str, list, str]]:

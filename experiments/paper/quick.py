@@ -1,6 +1,6 @@
 """The quick preset as a user with two cores meets it: the whole command, installed but nothing compiled, for several seeds.
 
-    python -m experiments.quick [--seeds 0 1 2] [--at_once 1] [--options "..."] [--out experiments/results/quick_runs]
+    python -m experiments.paper.quick [--seeds 0 1 2] [--at_once 1] [--options "..."]
 
 Each run has two cores of its own and an empty cache. Its policy is then flown on the validation tasks once more, with
 captures and crashes looked for in every physics step, and not only at those at which the policy steers.
@@ -18,7 +18,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from experiments.pages import page_parser, publish, table, where
+from experiments.table import Page, Table, page_parser, publish
 from openjax.commands.validation import uniform_tasks
 from openjax.files import read_json
 from openjax.learning.settings import PRESETS
@@ -112,48 +112,49 @@ def study(options: argparse.Namespace) -> dict:
     }
 
 
-def report(results: dict) -> list[str]:
-    """The page."""
-    heads = ["seed", "whole command, s", "steps, M", "every physics step", "validation", "empty"]
-    heads += [f"{name}, `open`" for name in ("validation", "empty")]
-    rows = []
-    for run in results["runs"]:
-        own, other = ({row["scenario"]: row for row in run.get(kind, [])} for kind in ("after", "open"))
-        fine = run["every_physics_step"]
-        cells = [f"{fine['capture_rate']:.2f}, {fine['capture_seconds']:.2f}, {fine['crash_rate']:.2f}"]
-        for records in (own, other):
-            cells += [_three(records.get(name), run["time_step"]) for name in ("validation", "empty")]
-        rows.append([str(run["seed"]), str(run["whole_command"]), f"{run['steps'] / 1e6:.1f}", *cells])
-    return [
-        "# Runs of the quick preset",
-        "",
-        where(results),
-        "",
-        results["preset"] + " Each cell: capture rate, seconds to the capture, crash rate.",
-        "",
-        *([results["note"], ""] if "note" in results else []),
-        *table(heads, rows),
-    ]
+def page(results: dict) -> Page:
+    """A row per seed."""
+    columns = {
+        "seed": "seed",
+        "whole command, s": "whole_command",
+        "steps, M": lambda run: f"{run['steps'] / 1e6:.1f}",
+        "every physics step": lambda run: _three(run["every_physics_step"], 1.0),
+    }
+    for kind, of_whom in (("after", ""), ("open", ", `open`")):
+        for scenario in ("validation", "empty"):
+            columns[scenario + of_whom] = _column(kind, scenario)
+    return Page(
+        "Runs of the quick preset",
+        results["preset"]
+        + " Each cell: capture rate, seconds to the capture, crash rate. "
+        + results.get("note", ""),
+        Table(columns, results["runs"]),
+    )
+
+
+def _column(kind, scenario):
+    def show(run):
+        records = {row["scenario"]: row for row in run.get(kind, [])}
+        return _three(records[scenario], run["time_step"]) if scenario in records else None
+
+    return show
 
 
 def _three(record, time_step):
-    if record is None:
-        return "–"
-    return (
-        f"{record['capture_rate']:.2f}, {record['capture_step'] * time_step:.2f}, {record['crash_rate']:.2f}"
-    )
+    seconds = record.get("capture_seconds", time_step * record.get("capture_step", 0.0))
+    return f"{record['capture_rate']:.2f}, {seconds:.2f}, {record['crash_rate']:.2f}"
 
 
 def main() -> None:
     """The command."""
-    parser = page_parser(__doc__, "quick_runs")
+    parser = page_parser(__doc__, "quick")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument(
         "--at_once", type=int, default=1, help="runs side by side, each on two cores of its own"
     )
     parser.add_argument("--options", default="", help="more options of openjax.train")
     parser.add_argument("--runs", type=Path, default=Path("runs/quick"), help="folder of the runs")
-    publish(parser.parse_args(), study, report)
+    publish(parser.parse_args(), study, page)
 
 
 if __name__ == "__main__":

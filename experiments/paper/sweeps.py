@@ -1,18 +1,16 @@
-"""All methods over the capture radius and the evader's speed: `python -m experiments.sweeps`, from what tables.py stored.
+"""All methods over the capture radius and the evader's speed.
 
 As in the paper's two figures: the radius in `empty`, the speed in `passage`; policies trained at one radius and one speed fly
-at others. Writes experiments/results/sweeps.md and .png.
+at others.
 """
 
-import functools
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from experiments.pages import page_from_tables, spread, table, where
-from experiments.roster import COLORS, METHODS
-from openjax.commands.command_line import run_command
+from experiments.paper.roster import COLORS, METHODS, flights_of
+from experiments.table import Page, Table, spread
 
 RADII = (0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5)
 SPEEDS = (1.0, 1.2, 1.3, 1.4, 1.6, 1.8, 2.0, 2.3, 2.6)
@@ -42,59 +40,60 @@ def figures(flown: list[Any], length: int) -> dict:
 
 def seeds_by_method(results: dict) -> dict[str, list[dict]]:
     """The two sweeps of each method's seeds, with the clamp."""
-    methods = {
-        label: [f["sweeps"] for f in results["flights"] if f["method"] == label and f["condition"] == "clamp"]
-        for label in METHODS
-    }
+    methods = {label: [flight["sweeps"] for flight in flights_of(results, label)] for label in METHODS}
     return {label: seeds for label, seeds in methods.items() if seeds}
 
 
-def report(results: dict) -> list[str]:
-    """The page."""
-    methods = seeds_by_method(results)
-    lines = [
-        "# Capture radius and evader speed",
-        "",
-        f"{where(results)} {max(1, results['episodes'] // 2)} episodes per seed and cell, three seeds, speed clamp, "
-        "drawn starts. Every policy "
-        f"is the one of the main table, trained or searched at a radius of {RADIUS} m and {SPEED} m/s only. Capture rate "
-        "(standard deviation over seeds) / capture step. The paper shows both as figures without numbers.",
-    ]
+def page(results: dict) -> Page:
+    """A table of either sweep."""
+    methods, parts = seeds_by_method(results), []
     for title, axis, values, unit in (
         ("Capture radius, in `empty`", "radius", RADII, "m"),
         ("Evader speed, in `passage`", "speed", SPEEDS, "m/s"),
     ):
-        rows = []
-        for label, seeds in methods.items():
-            cells = []
-            for i in range(len(values)):
-                rate = spread([seed[axis]["capture_rate"][i] for seed in seeds], 2)
-                cells.append(f"{rate} / {np.mean([seed[axis]['capture_step'][i] for seed in seeds]):.0f}")
-            rows.append([label, *cells])
-        lines += ["", f"## {title}", "", *table(["method", *(f"{value} {unit}" for value in values)], rows)]
-        lines += ["", not_above(methods, axis, values, unit)]
-    return [*lines, "", "![Capture rate and step over radius and speed](sweeps.png)"]
+        columns = {"method": "method"} | {f"{value} {unit}": at(axis, i) for i, value in enumerate(values)}
+        rows = [{"method": label, "seeds": seeds} for label, seeds in methods.items()]
+        parts += [Table(columns, rows, title), not_above(methods, axis, values, unit)]
+    return Page(
+        "Capture radius and evader speed",
+        f"{max(1, results['episodes'] // 2)} episodes per seed and cell, three seeds, speed clamp, drawn starts. Every policy "
+        f"is the one of the main table, trained or searched at {RADIUS} m and {SPEED} m/s only. Capture rate (standard "
+        "deviation over seeds) / capture step. The paper shows both as figures without numbers.",
+        (*parts, "![Capture rate and step over radius and speed](sweeps.png)"),
+    )
+
+
+def at(axis: str, i: int):
+    """A column: capture rate / capture step at one value."""
+
+    def show(row: dict) -> str:
+        rate = spread([seed[axis]["capture_rate"][i] for seed in row["seeds"]], 2)
+        return f"{rate} / {np.mean([seed[axis]['capture_step'][i] for seed in row['seeds']]):.0f}"
+
+    return show
 
 
 def not_above(methods: dict, axis: str, values: tuple[float, ...], unit: str) -> str:
     """Where OPEN catches less often than another method, or as often and later."""
+
+    def mean(label, name, i):
+        return np.mean([seed[axis][name][i] for seed in methods[label]])
+
     found = []
-    for label, seeds in methods.items():
-        if label == "OPEN" or "OPEN" not in methods:
-            continue
+    for label in methods.keys() - {"OPEN"} if "OPEN" in methods else ():
         for i, value in enumerate(values):
-            (rate, step), (best, early) = (
-                [
-                    np.mean([seed[axis][name][i] for seed in group])
-                    for name in ("capture_rate", "capture_step")
-                ]
-                for group in (seeds, methods["OPEN"])
+            (rate, best), (step, early) = (
+                (mean(label, name, i), mean("OPEN", name, i)) for name in ("capture_rate", "capture_step")
             )
             if rate > best + 1e-9 or (abs(rate - best) < 1e-9 and step < early):
                 found.append(
                     f"{label} at {value} {unit} ({rate:.2f} / {step:.0f} against {best:.2f} / {early:.0f})"
                 )
-    return "OPEN isn't above: " + "; ".join(found) + "." if found else "No method is above OPEN anywhere."
+    return (
+        "OPEN isn't above: " + "; ".join(sorted(found)) + "."
+        if found
+        else "No method is above OPEN anywhere."
+    )
 
 
 def draw(results: dict, path: Path) -> None:
@@ -126,10 +125,3 @@ def draw(results: dict, path: Path) -> None:
         axes[1, j].set_xlabel(label)
     axes[0, 0].legend(fontsize="small", title="mean and range over seeds", title_fontsize="small")
     figure.savefig(path, dpi=100)
-
-
-main = functools.partial(page_from_tables, __doc__, "sweeps", report, draw=draw)
-
-
-if __name__ == "__main__":
-    run_command(main)
