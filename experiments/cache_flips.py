@@ -18,8 +18,8 @@ START = """
 import os, sys
 import jax, jax.numpy as jnp
 import numpy as np
-from openjax.cluster.checked_cache import ENTRY
-from openjax.cluster.compilation import cache_programs
+from openjax.store.checked_cache import ENTRY
+from openjax.store.compiled_programs import cache_programs
 from openjax.vehicle import hover_state, load_vehicle, make_drones_step
 
 folder, seed, flips = cache_programs(), int(sys.argv[1]), int(sys.argv[2])

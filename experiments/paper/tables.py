@@ -20,7 +20,7 @@ from experiments.paper.flights import environment_of, fly
 from experiments.paper.roster import ABLATIONS, METHODS, seeds_of
 from experiments.table import RESULTS, facts, write_page
 from openjax.baselines import METHODS as HEURISTICS
-from openjax.cluster.compilation import compile_ahead
+from openjax.background import compile_ahead
 from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import layout_slots, record_of, repeat_task
 from openjax.files import read_json, write_text

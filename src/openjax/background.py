@@ -11,3 +11,31 @@ def in_background(make: Callable[[], Any]) -> Callable[[], Any]:
     future = pool.submit(make)
     pool.shutdown(wait=False)
     return future.result
+
+
+def compile_ahead(function: Callable, *arguments) -> Callable[..., bool]:
+    """Start to compile a function of `jax.jit` for arguments of these shapes, dtypes and shardings.
+
+    It's traced before this returns, as two threads that trace hold each other up; only the compiler runs beside.
+    JAX keeps what it compiled, so that a later call of `function` finds it; a call before that compiles again.
+
+    Args:
+      function: from `jax.jit`.
+      arguments: arrays, or `jax.ShapeDtypeStruct`s in their place.
+
+    Returns:
+      a function that waits for the end, for at most as many seconds as it is given, and raises what went wrong in the
+      compiler; it returns whether the end was reached.
+    """
+    ready = in_background(function.lower(*arguments).compile)
+
+    def wait(seconds: float | None = None) -> bool:
+        try:
+            ready(seconds)
+        except TimeoutError:
+            if seconds is None:  # the compiler's own
+                raise
+            return False
+        return True
+
+    return wait

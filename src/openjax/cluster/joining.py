@@ -70,7 +70,10 @@ def find_membership(
 
 
 def _detected(given):
-    """What is missing of address, number and id, as `jax.distributed.initialize` itself would find it."""
+    """What is missing of address, number and id, as `jax.distributed.initialize` itself would find it.
+
+    Only its private part tells; the public one joins at once, and the processes' own connections come before that.
+    """
     from jax._src.clusters import ClusterEnv
 
     for name in _MANAGERS:

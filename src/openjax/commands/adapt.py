@@ -255,7 +255,7 @@ def compile_programs(adaptation, parameters, tasks, bounds):
     """Start to compile flights, update and evaluation; a function that waits for all."""
     import jax
 
-    from openjax.cluster.compilation import compile_ahead
+    from openjax.background import compile_ahead
 
     key = jax.random.key(0)
     flights = jax.eval_shape(adaptation.fly, parameters, key, bounds)

@@ -61,7 +61,7 @@ def main(arguments: Sequence[str]) -> int:
     """The command; returns its exit status."""
     command = parse(EvaluateCommand, EvaluateCommand(), arguments, PROGRAM)
     if command.compilation_cache:
-        from openjax.cluster.compilation import cache_programs
+        from openjax.store.compiled_programs import cache_programs
 
         cache_programs()
     evaluators: dict = {}

@@ -10,7 +10,7 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
-from openjax.cluster.compilation import compile_ahead
+from openjax.background import compile_ahead
 from openjax.learning import Evaluation, make_evaluate, summarise
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, Scenario, Task, scenario_task
@@ -64,7 +64,7 @@ class Evaluator:
         return jax.tree.map(lambda *parts: np.concatenate(parts), *evaluations), records
 
     def compile_ahead(self, parameters: PolicyParameters, tasks: Task) -> Callable[[], None]:
-        """Start to compile for parameters and tasks of these shapes; see `openjax.cluster.compilation`."""
+        """Start to compile for parameters and tasks of these shapes; see `openjax.background`."""
 
         def one_batch(leaf):
             return jax.ShapeDtypeStruct((self.batch, *leaf.shape[1:]), leaf.dtype)

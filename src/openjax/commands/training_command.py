@@ -9,7 +9,6 @@ from pathlib import Path
 
 import jax
 
-from openjax.cluster.compilation import cache_programs
 from openjax.cluster.joining import Membership, find_membership
 from openjax.cluster.processes import Processes
 from openjax.commands.command_line import output_console, parse, peek
@@ -21,6 +20,7 @@ from openjax.files import remove_unfinished
 from openjax.learning import TrainSettings, preset
 from openjax.learning.settings import PRESETS
 from openjax.store.checkpoints import Checkpoints
+from openjax.store.compiled_programs import cache_programs
 from openjax.store.environments import make_environment, with_airframe
 from openjax.store.policies import known_policies
 from openjax.store.run_directory import RunDirectory, check_free, create_run, locked, open_run

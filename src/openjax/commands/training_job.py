@@ -10,8 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-from openjax.background import in_background
-from openjax.cluster.compilation import compile_ahead
+from openjax.background import compile_ahead, in_background
 from openjax.cluster.devices import (
     carry_shardings,
     check_devices,
@@ -21,7 +20,6 @@ from openjax.cluster.devices import (
     own_copy,
 )
 from openjax.cluster.processes import Processes
-from openjax.cluster.tracing import recalled
 from openjax.commands.before_and_after import compare, game_for
 from openjax.commands.closing_words import closing_words, layouts_like
 from openjax.commands.evaluator import (
@@ -47,6 +45,7 @@ from openjax.store.policies import abstract_parameters, load_policy
 from openjax.store.policy_files import fill, load_policy_file, save_policy_file
 from openjax.store.run_directory import RunDirectory
 from openjax.store.settings_files import write_json
+from openjax.store.traced_programs import recalled
 
 _SOON = 3.0
 """Seconds after which a training step that isn't ready doesn't come from the cache."""

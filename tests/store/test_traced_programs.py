@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import pytest
 from flax import struct
 
-from openjax.cluster.tracing import recalled
+from openjax.store.traced_programs import recalled
 
 
 @struct.dataclass

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from openjax.cluster.compilation import compile_ahead
+from openjax.background import compile_ahead
 from openjax.commands.training_loop import guarded
 from openjax.store.leaves import abstract_like, place
 

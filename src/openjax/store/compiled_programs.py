@@ -1,4 +1,4 @@
-"""Compiling: once per machine, by a cache that lasts, and in the background, so that programs are compiled side by side."""
+"""Compiled programs: kept in a folder of the user's own, so that a machine compiles each of them once."""
 
 import contextlib
 import hashlib
@@ -8,10 +8,7 @@ import platform
 import stat
 import sys
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
-
-from openjax.background import in_background
 
 CACHE_SIZE = 2 * 2**30
 """Bytes that the cache of compiled programs may take; what was used longest ago goes first."""
@@ -33,7 +30,7 @@ def cache_programs() -> Path | None:
     """
     import jax
 
-    from openjax.cluster.checked_cache import set_fatal_entries_aside, use_checked_cache
+    from openjax.store.checked_cache import set_fatal_entries_aside, use_checked_cache
 
     given = jax.config.jax_compilation_cache_dir
     if given is not None and "://" in given:  # a bucket; JAX reads it by itself
@@ -128,31 +125,3 @@ def _bound(folder, size):
             return
         path.unlink(missing_ok=True)
         total -= bytes_
-
-
-def compile_ahead(function: Callable, *arguments) -> Callable[..., bool]:
-    """Start to compile a function of `jax.jit` for arguments of these shapes, dtypes and shardings.
-
-    It's traced before this returns, as two threads that trace hold each other up; only the compiler runs beside.
-    JAX keeps what it compiled, so that a later call of `function` finds it; a call before that compiles again.
-
-    Args:
-      function: from `jax.jit`.
-      arguments: arrays, or `jax.ShapeDtypeStruct`s in their place.
-
-    Returns:
-      a function that waits for the end, for at most as many seconds as it is given, and raises what went wrong in the
-      compiler; it returns whether the end was reached.
-    """
-    ready = in_background(function.lower(*arguments).compile)
-
-    def wait(seconds: float | None = None) -> bool:
-        try:
-            ready(seconds)
-        except TimeoutError:
-            if seconds is None:  # the compiler's own
-                raise
-            return False
-        return True
-
-    return wait

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from experiments.cache_flips import run_flips
-from openjax.cluster.checked_cache import ASIDE, ENTRY, CheckedCache, set_fatal_entries_aside
+from openjax.store.checked_cache import ASIDE, ENTRY, CheckedCache, set_fatal_entries_aside
 
 
 def test_flipped_bits_end_no_process_and_change_no_number(tmp_path):
@@ -22,7 +22,7 @@ def test_an_entry_that_a_process_died_of_is_set_aside_and_no_other(tmp_path):
     die = f"""
 import os, signal
 from pathlib import Path
-from openjax.cluster.checked_cache import CheckedCache
+from openjax.store.checked_cache import CheckedCache
 cache = CheckedCache(Path({str(tmp_path)!r}))
 with cache.loading("fine"):
     cache.get("fine")
@@ -57,7 +57,7 @@ def no_home(*_):
 pathlib.Path.home = no_home
 top = pathlib.Path({str(tmp_path)!r}) / f"openjax-{{os.geteuid()}}"
 {before}
-from openjax.cluster.compilation import cache_programs
+from openjax.store.compiled_programs import cache_programs
 print(cache_programs())
 """
     gone = ("JAX_COMPILATION_CACHE_DIR", "XDG_CACHE_HOME")
