@@ -19,8 +19,8 @@ from experiments.paper import behaviours, learning_curves, main_tables, sweeps
 from experiments.paper.flights import environment_of, fly
 from experiments.paper.roster import ABLATIONS, METHODS, seeds_of
 from experiments.table import RESULTS, facts, write_page
-from openjax.baselines import METHODS as HEURISTICS
 from openjax.background import compile_ahead
+from openjax.baselines import METHODS as HEURISTICS
 from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import layout_slots, record_of, repeat_task
 from openjax.files import read_json, write_text
