@@ -14,7 +14,7 @@ import numpy as np
 
 from openjax.errors import UserError
 from openjax.export.c_text import BINARY, UNARY, index_names, literal, loops, offset_by
-from openjax.export.traced import Walk
+from openjax.export.traced import Walk, outer_padding
 
 _SAME = ("stop_gradient", "copy", "copy_p", "optimization_barrier", "convert_element_type")
 _REDUCE = {
@@ -62,14 +62,15 @@ class Readers(Walk):
     def __init__(self):
         self.found: list[list[_Token]] = []
 
-    def node(self, name, parameters, inputs, equation):
-        if name in _SAME:
+    def node(self, operation):
+        """See `Walk`."""
+        if operation.name in _SAME:
             self.found.append([])
-            return inputs[0]
-        for value in inputs:
+            return operation.inputs[0]
+        for value in operation.inputs:
             if isinstance(value, _Token):
                 value.readers += 1
-        self.found.append([_Token() for _ in equation.outvars])
+        self.found.append([_Token() for _ in operation.equation.outvars])
         return self.found[-1]
 
     def count(self, traced, number: int) -> list[int]:
@@ -85,6 +86,9 @@ class Writer(Walk):
     Args:
       readers: how often the result of each operation is read.
     """
+
+    language = "C"
+    elementwise = frozenset((*BINARY, *UNARY))
 
     def __init__(self, readers: list[int]):
         self._readers, self._operation = readers, -1
@@ -120,9 +124,11 @@ class Writer(Walk):
         )
 
     def value(self, value) -> Value:
+        """A value as it is read."""
         return value if isinstance(value, Value) else self.constant(value)
 
     def emit(self, text: str, writes: int, reads: frozenset[int]) -> None:
+        """Append a statement that writes one buffer and reads others."""
         now = len(self.statements)
         for buffer in reads:
             self.buffers[buffer].read = now
@@ -148,65 +154,48 @@ class Writer(Walk):
 
     # -- operations
 
-    def node(self, name, p, inputs, equation):
+    def node(self, operation):
+        """See `Walk`."""
         self._operation += 1
-        shape = tuple(equation.outvars[0].aval.shape)
-        if name in _SAME:
-            kinds = [v.aval.dtype.kind for v in (equation.invars[0], equation.outvars[0])]
-            if kinds[1] == "b" != kinds[0]:
-                raise UserError("the policy turns numbers into flags, which the C export doesn't know yet")
-            return inputs[0]
-        if name == "split":
-            return self._split(inputs[0], p)
-        if name == "dot_general":
-            return self._product(inputs, p["dimension_numbers"], equation, shape)
-        values = [self.value(value) for value in inputs]
-        first = values[0]
-        if name in BINARY:
-            return self._elementwise(BINARY[name], values, shape)
-        if name in UNARY:
-            self.functions += math.prod(shape) * (name not in ("neg", "abs", "not", "floor"))
-            return self._elementwise(UNARY[name], values, shape)
-        if name == "integer_pow":
-            return self._power(first, p["y"], shape)
-        if name == "square":
-            return self._power(first, 2, shape)
-        if name == "select_n" and len(values) == 3:
-            return self._elementwise("({0} != 0.0f ? {2} : {1})", values, shape)
-        if name == "clamp":
-            return self._elementwise("fminf(fmaxf({1}, {0}), {2})", values, shape)
-        if name == "broadcast_in_dim":
-            return self._broadcast(first, shape, p["broadcast_dimensions"])
-        if name in ("reshape", "squeeze", "expand_dims"):
-            return self._reshape(first, shape)
-        if name == "transpose":
-            order = p["permutation"]
-            back = [order.index(axis) for axis in range(len(order))]
-            return self._view(first, shape, lambda at: [at[axis] for axis in back])
-        if name == "slice":
-            starts, steps = p["start_indices"], p["strides"] or [1] * len(shape)
-            return self._view(
-                first,
-                shape,
-                lambda at: [offset_by(i, k, s) for i, k, s in zip(at, starts, steps, strict=True)],
-            )
-        if name == "concatenate":
-            return self._join(values, shape, p["dimension"])
-        if name == "stack":
-            axis = p["axis"]
-            apart = (*shape[:axis], 1, *shape[axis + 1 :])
-            return self._join([self._reshape(value, apart) for value in values], shape, axis)
-        if name == "pad" and all(
-            low >= 0 and high >= 0 and gap == 0 for low, high, gap in p["padding_config"]
-        ):
-            return self._pad(values, shape, p["padding_config"])
-        if name in _REDUCE:
-            return self._reduce(first, shape, p["axes"], *_REDUCE[name])
-        raise UserError(
-            f"the policy uses the operation {name!r}, which has no counterpart in the C export yet"
+        return super().node(operation)
+
+    def _op_stop_gradient(self, operation):
+        before, after = (
+            v.aval.dtype.kind for v in (operation.equation.invars[0], operation.equation.outvars[0])
+        )
+        if after == "b" != before:
+            raise UserError("the policy turns numbers into flags, which the C export doesn't know yet")
+        return operation.inputs[0]
+
+    _op_copy = _op_copy_p = _op_optimization_barrier = _op_convert_element_type = _op_stop_gradient
+
+    def _op_elementwise(self, operation):
+        name, shape = operation.name, operation.shape
+        self.functions += math.prod(shape) * (name in UNARY and name not in ("neg", "abs", "not", "floor"))
+        return self._elementwise({**BINARY, **UNARY}[name], operation.inputs, shape)
+
+    def _op_select_n(self, operation):
+        return self._elementwise("({0} != 0.0f ? {2} : {1})", operation.inputs, operation.shape)
+
+    def _op_clamp(self, operation):
+        return self._elementwise("fminf(fmaxf({1}, {0}), {2})", operation.inputs, operation.shape)
+
+    def _op_transpose(self, operation):
+        order = operation.parameters["permutation"]
+        back = [order.index(axis) for axis in range(len(order))]
+        return self._view(operation.inputs[0], operation.shape, lambda at: [at[axis] for axis in back])
+
+    def _op_slice(self, operation):
+        starts = operation.parameters["start_indices"]
+        steps = operation.parameters["strides"] or [1] * len(starts)
+        return self._view(
+            operation.inputs[0],
+            operation.shape,
+            lambda at: [offset_by(i, k, s) for i, k, s in zip(at, starts, steps, strict=True)],
         )
 
     def _elementwise(self, form, values, shape):
+        values = [self.value(v) for v in values]
         # an axis of length one is repeated; what costs anything is computed once, not for each repetition
         repeated = [math.prod(v.shape) < math.prod(shape) for v in values]
         values = [self.stored(v) if v.computes and r else v for v, r in zip(values, repeated, strict=True)]
@@ -221,24 +210,32 @@ class Writer(Walk):
         # what only one operation reads is computed there
         return self.stored(value) if self._readers[self._operation] > 1 else value
 
-    def _power(self, base, exponent, shape):
+    def power(self, base, exponent, operation):
+        """See `Walk`."""
         base = self.stored(base) if base.computes else base
         factors = " * ".join(["{0}"] * abs(exponent)) or "1.0f"
         form = f"({factors})" if exponent >= 0 else f"(1.0f / ({factors}))"
-        return self._elementwise(form, [base], shape)
+        return self._elementwise(form, [base], operation.shape)
 
     def _view(self, value, shape, back):
         if value.computes and self._readers[self._operation] > 1:
             value = self.stored(value)
         return Value(shape, lambda indices: value.at(back(indices)), value.reads, computes=value.computes)
 
-    def _broadcast(self, value, shape, axes):
+    def _op_broadcast_in_dim(self, operation):
+        value, shape, axes = (
+            operation.inputs[0],
+            operation.shape,
+            operation.parameters["broadcast_dimensions"],
+        )
         if value.computes and math.prod(shape) > math.prod(value.shape):  # computed once, not for each copy
             value = self.stored(value)
         kept = [(axis, size) for axis, size in zip(axes, value.shape, strict=True)]
         return self._view(value, shape, lambda at: ["0" if size == 1 else at[axis] for axis, size in kept])
 
-    def _reshape(self, value, shape):
+    def reshape(self, value, shape):
+        """See `Walk`."""
+        value = self.value(value)
         if value.dense is not None:
             return dense_array(value.dense, shape, value.reads)
         if [n for n in value.shape if n > 1] == [n for n in shape if n > 1]:  # only axes of length one
@@ -248,11 +245,11 @@ class Writer(Walk):
                 return ["0" if n == 1 else next(left) for n in value.shape]
 
             return self._view(value, shape, back)
-        return self._reshape(self.stored(value), shape)
+        return self.reshape(self.stored(value), shape)
 
-    def _split(self, value, p):
-        value, axis, start, parts = self.value(value), p["axis"], 0, []
-        for size in p["sizes"]:
+    def _op_split(self, operation):
+        value, axis, start, parts = operation.inputs[0], operation.parameters["axis"], 0, []
+        for size in operation.parameters["sizes"]:
             shape = (*value.shape[:axis], size, *value.shape[axis + 1 :])
             parts.append(
                 self._view(
@@ -266,10 +263,11 @@ class Writer(Walk):
             start += size
         return parts
 
-    def _join(self, values, shape, axis):
+    def join(self, values, shape, axis):
+        """See `Walk`."""
         number, joined = self.buffer(shape)
         start = 0
-        for value in values:
+        for value in map(self.value, values):
             indices = index_names(value.shape)
             there = [offset_by(i, start if a == axis else 0, 1) for a, i in enumerate(indices)]
             body = f"{joined.at(there)} = {value.at(indices)};"
@@ -277,19 +275,22 @@ class Writer(Walk):
             start += value.shape[axis]
         return joined
 
-    def _pad(self, values, shape, padding):
-        value, filling = values
+    def _op_pad(self, operation):
+        (value, filling), shape = map(self.value, operation.inputs), operation.shape
+        low, _ = outer_padding(operation)
         number, padded = self.buffer(shape)
         indices = index_names(shape)
         body = f"{padded.at(indices)} = {filling.at(())};"
         self.emit(loops(shape, indices, body), number, filling.reads)
         indices = index_names(value.shape)
-        there = [offset_by(i, low, 1) for i, (low, _, _) in zip(indices, padding, strict=True)]
+        there = [offset_by(i, start, 1) for i, start in zip(indices, low, strict=True)]
         body = f"{padded.at(there)} = {value.at(indices)};"
         self.emit(loops(value.shape, indices, body), number, value.reads)
         return padded
 
-    def _reduce(self, value, shape, axes, start, form):
+    def _op_reduce_sum(self, operation):
+        value, shape, axes = operation.inputs[0], operation.shape, operation.parameters["axes"]
+        start, form = _REDUCE[operation.name]
         number, reduced = self.buffer(shape)
         every = index_names(value.shape)
         outer = [i for a, i in enumerate(every) if a not in axes]
@@ -302,9 +303,11 @@ class Writer(Walk):
         self.emit(loops(shape, outer, body), number, value.reads)
         return reduced
 
-    def _product(self, inputs, numbers, equation, shape):
-        (left_sum, right_sum), (left_batch, right_batch) = numbers
-        shapes = [tuple(v.aval.shape) for v in equation.invars]
+    _op_reduce_max = _op_reduce_min = _op_reduce_sum
+
+    def _op_dot_general(self, operation):
+        (left_sum, right_sum), (left_batch, right_batch) = operation.parameters["dimension_numbers"]
+        inputs, shapes = operation.inputs, operation.shapes
         left_free = [a for a in range(len(shapes[0])) if a not in (*left_sum, *left_batch)]
         right_free = [a for a in range(len(shapes[1])) if a not in (*right_sum, *right_batch)]
         left = self._ordered(inputs[0], shapes[0], (*left_batch, *left_free, *left_sum))
@@ -313,7 +316,7 @@ class Writer(Walk):
         rows = math.prod(shapes[0][a] for a in left_free)
         inner = math.prod(shapes[0][a] for a in left_sum)
         columns = math.prod(shapes[1][a] for a in right_free)
-        number, out = self.buffer(shape)
+        number, out = self.buffer(operation.shape)
         for k in range(batch):
             call = (
                 f"product({left.dense} + {k * rows * inner}, {right.dense} + {k * inner * columns}, "

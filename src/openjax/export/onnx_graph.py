@@ -13,11 +13,11 @@ import jax
 import numpy as np
 
 from openjax.errors import UserError
-from openjax.export.traced import Walk, trace
+from openjax.export.traced import Walk, outer_padding, trace
 
 OPSET = 18
 _LETTERS = "abcdefghijklmnopqrstuvwxyz"
-_SAME = {
+_ELEMENTWISE = {
     "add": "Add", "sub": "Sub", "mul": "Mul", "div": "Div", "max": "Max", "min": "Min", "tanh": "Tanh", "exp": "Exp",
     "log": "Log", "logistic": "Sigmoid", "neg": "Neg", "abs": "Abs", "sqrt": "Sqrt", "sin": "Sin", "cos": "Cos",
     "erf": "Erf", "floor": "Floor", "sign": "Sign", "pow": "Pow", "lt": "Less", "le": "LessOrEqual", "gt": "Greater",
@@ -28,6 +28,9 @@ _SAME = {
 
 class _Graph(Walk):
     """Nodes and constants of a graph under construction. A value is a NumPy array or the name of a tensor."""
+
+    language = "ONNX"
+    elementwise = frozenset(_ELEMENTWISE)
 
     def __init__(self):
         from onnx import helper, numpy_helper
@@ -53,75 +56,89 @@ class _Graph(Walk):
         return names[0] if outputs == 1 else names
 
     def reshape(self, value, shape):
-        return self.add("Reshape", value, np.array(shape, np.int64))
+        """See `Walk`."""
+        return self.add("Reshape", value, _whole(shape))
 
-    def node(self, name, p, inputs, equation):
-        shape = equation.outvars[0].aval.shape
-        first = inputs[0]
-        if name in _SAME:
-            return self.add(_SAME[name], *inputs)
-        if name == "ne":
-            return self.add("Not", self.add("Equal", *inputs))
-        if name == "square":
-            return self.add("Mul", first, first)
-        if name == "rsqrt":
-            return self.add("Reciprocal", self.add("Sqrt", first))
-        if name == "integer_pow":
-            return self.add("Pow", first, np.array(p["y"], equation.invars[0].aval.dtype))
-        if name == "select_n" and len(inputs) == 3:
-            return self.add("Where", first, inputs[2], inputs[1])
-        if name == "clamp":
-            return self.add("Min", self.add("Max", inputs[1], first), inputs[2])
-        if name == "convert_element_type":
-            kind = self.helper.np_dtype_to_tensor_dtype(np.dtype(p["new_dtype"]))
-            return self.add("Cast", first, to=kind)
-        if name in ("reshape", "squeeze", "expand_dims"):
-            return self.reshape(first, shape)
-        if name == "broadcast_in_dim":
-            ones = [1] * len(p["shape"])
-            for axis, size in zip(p["broadcast_dimensions"], equation.invars[0].aval.shape, strict=True):
-                ones[axis] = size
-            value = self.reshape(first, ones)
-            return (
-                value if tuple(ones) == tuple(shape) else self.add("Expand", value, np.array(shape, np.int64))
-            )
-        if name == "transpose":
-            return self.add("Transpose", first, perm=list(p["permutation"]))
-        if name == "concatenate":
-            return self.add("Concat", *inputs, axis=p["dimension"])
-        if name == "stack":
-            axis = p["axis"]
-            apart = [*shape[:axis], 1, *shape[axis + 1 :]]
-            return self.add("Concat", *(self.reshape(value, apart) for value in inputs), axis=axis)
-        if name == "split":
-            return self.add(
-                "Split", first, np.array(p["sizes"], np.int64), outputs=len(p["sizes"]), axis=p["axis"]
-            )
-        if name == "slice":
-            starts, limits = np.array(p["start_indices"], np.int64), np.array(p["limit_indices"], np.int64)
-            strides = np.array(p["strides"] or [1] * len(starts), np.int64)
-            return self.add("Slice", first, starts, limits, np.arange(len(starts), dtype=np.int64), strides)
-        if name == "pad" and all(inner == 0 for _, _, inner in p["padding_config"]):
-            low_high = [low for low, _, _ in p["padding_config"]] + [
-                high for _, high, _ in p["padding_config"]
-            ]
-            return self.add("Pad", first, np.array(low_high, np.int64), inputs[1])
-        if name in ("reduce_sum", "reduce_max", "reduce_min"):
-            kind = {"reduce_sum": "ReduceSum", "reduce_max": "ReduceMax", "reduce_min": "ReduceMin"}[name]
-            return self.add(kind, first, np.array(p["axes"], np.int64), keepdims=0)
-        if name == "dot_general":
-            return self.add("Einsum", *inputs, equation=_einsum(equation, p["dimension_numbers"]))
-        raise UserError(
-            f"the policy uses the operation {name!r}, which has no counterpart in the ONNX export yet"
+    def join(self, values, shape, axis):
+        """See `Walk`."""
+        return self.add("Concat", *values, axis=axis)
+
+    def power(self, value, exponent, operation):
+        """See `Walk`."""
+        if exponent == 2:
+            return self.add("Mul", value, value)
+        return self.add("Pow", value, np.array(exponent, operation.equation.invars[0].aval.dtype))
+
+    def _op_elementwise(self, operation):
+        return self.add(_ELEMENTWISE[operation.name], *operation.inputs)
+
+    def _op_ne(self, operation):
+        return self.add("Not", self.add("Equal", *operation.inputs))
+
+    def _op_rsqrt(self, operation):
+        return self.add("Reciprocal", self.add("Sqrt", operation.inputs[0]))
+
+    def _op_select_n(self, operation):
+        which, otherwise, chosen = operation.inputs
+        return self.add("Where", which, chosen, otherwise)
+
+    def _op_clamp(self, operation):
+        low, value, high = operation.inputs
+        return self.add("Min", self.add("Max", low, value), high)
+
+    def _op_convert_element_type(self, operation):
+        kind = self.helper.np_dtype_to_tensor_dtype(np.dtype(operation.parameters["new_dtype"]))
+        return self.add("Cast", operation.inputs[0], to=kind)
+
+    def _op_broadcast_in_dim(self, operation):
+        ones = [1] * len(operation.shape)
+        for axis, size in zip(operation.parameters["broadcast_dimensions"], operation.shapes[0], strict=True):
+            ones[axis] = size
+        value = self.reshape(operation.inputs[0], ones)
+        return value if tuple(ones) == operation.shape else self.add("Expand", value, _whole(operation.shape))
+
+    def _op_transpose(self, operation):
+        return self.add("Transpose", operation.inputs[0], perm=list(operation.parameters["permutation"]))
+
+    def _op_split(self, operation):
+        sizes, axis = operation.parameters["sizes"], operation.parameters["axis"]
+        return self.add("Split", operation.inputs[0], _whole(sizes), outputs=len(sizes), axis=axis)
+
+    def _op_slice(self, operation):
+        p = operation.parameters
+        starts, axes = p["start_indices"], range(len(p["start_indices"]))
+        strides = p["strides"] or [1] * len(starts)
+        return self.add(
+            "Slice", operation.inputs[0], *map(_whole, (starts, p["limit_indices"], axes, strides))
         )
 
+    def _op_pad(self, operation):
+        value, filling = operation.inputs
+        low, high = outer_padding(operation)
+        return self.add("Pad", value, _whole([*low, *high]), filling)
 
-def _einsum(equation, dimension_numbers) -> str:
+    def _op_reduce_sum(self, operation):
+        kind = {"reduce_sum": "ReduceSum", "reduce_max": "ReduceMax", "reduce_min": "ReduceMin"}[
+            operation.name
+        ]
+        return self.add(kind, operation.inputs[0], _whole(operation.parameters["axes"]), keepdims=0)
+
+    _op_reduce_max = _op_reduce_min = _op_reduce_sum
+
+    def _op_dot_general(self, operation):
+        return self.add("Einsum", *operation.inputs, equation=_einsum(operation))
+
+
+def _whole(numbers):
+    return np.array(list(numbers), np.int64)
+
+
+def _einsum(operation) -> str:
     """A product of two arrays in Einstein's notation."""
-    (left_sum, right_sum), (left_batch, right_batch) = dimension_numbers
+    (left_sum, right_sum), (left_batch, right_batch) = operation.parameters["dimension_numbers"]
     letters = iter(_LETTERS)
-    left = [next(letters) for _ in equation.invars[0].aval.shape]
-    right = [""] * len(equation.invars[1].aval.shape)
+    left = [next(letters) for _ in operation.shapes[0]]
+    right = [""] * len(operation.shapes[1])
     for a, b in (*zip(left_sum, right_sum, strict=True), *zip(left_batch, right_batch, strict=True)):
         right[b] = left[a]
     right = [letter or next(letters) for letter in right]
