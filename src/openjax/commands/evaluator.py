@@ -95,6 +95,8 @@ class Evaluator:
             pillar_radius=settings.pillar_radius,
             capture_radius=settings.capture_radius,
             time_step=settings.time_step,
+            seen=record.seen,
+            predicted=record.predicted,
         )
 
 

@@ -1,70 +1,120 @@
-"""Watch a policy in three dimensions in a browser: `openjax view --scenario wall`.
-
-Needs `pip install viser`.
-"""
+"""Watch policies in three dimensions: `openjax view --policy flight open --scenario wall`, in a browser or as a file."""
 
 import dataclasses
-import importlib.util
+import webbrowser
 from collections.abc import Sequence
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Annotated
 
-from openjax.commands.command_line import parse
+from openjax.commands.command_line import output_console, parse
 from openjax.commands.evaluate import EvaluateCommand, fly_scenarios
 from openjax.errors import UserError
+from openjax.files import check_output
 from openjax.ranges import Interval, Seed
+from openjax.show.trajectory import Trajectory
 from openjax.store import DEFAULT_POLICY
 
 PROGRAM = "openjax view"
+OWN_NAMES = ("localhost", "127.0.0.1")
+"""Hosts that a browser may have asked for: a page elsewhere can't make its own name stand for this machine."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ViewCommand:
-    """Fly one episode of each layout and show them in a browser."""
+    """Fly one episode of each layout with each policy, and show them in a browser: the page has all in it."""
 
-    policy: str = DEFAULT_POLICY
-    """A run's directory, a policy file (.npz), a checkpoint, or the name of a policy in the package."""
+    policy: tuple[str, ...] = (DEFAULT_POLICY,)
+    """Runs' directories, policy files (.npz), checkpoints, or names of policies in the package: flight, open ..."""
     scenario: str = "all"
     """wall, narrow_gap, random, passage, empty, hidden, a TOML file with an own layout, or all six."""
     seed: Seed = 0
     """Draws the start attitudes."""
+    html: Path | None = None
+    """Write the page to this file, to send to somebody, instead of serving it."""
+    gif: Path | None = None
+    """Write an animation to this file instead, of the first layout with the first policy."""
     port: Annotated[int, Interval("[0, 65535]")] = 8080
     """Where the page is served, on this machine only."""
+    browser: bool = True
+    """Open a browser with the page."""
 
 
 def main(arguments: Sequence[str]) -> int:
-    """The command; returns its exit status. Raises UserError without viser, or for an unusable policy or layout."""
+    """The command; returns its exit status. Raises UserError for an unusable policy, layout, file or port."""
     command = parse(ViewCommand, ViewCommand(), arguments, PROGRAM)
-    if importlib.util.find_spec("viser") is None:
-        raise UserError("the viewer needs viser: pip install viser")
-    viewer = open_viewer(command)
-    print(f"http://localhost:{viewer.server.get_port()} (Ctrl-C ends)", flush=True)
-    viewer.play()
+    check_output(command.html, "--html")
+    check_output(command.gif, "--gif")
+    flights = fly_all(command)
+    console = output_console()
+    if command.gif is not None:
+        from openjax.show.videos import animate
+
+        drawn_by = animate(command.gif, flights[0][1])
+        console.print(f"{command.gif}: {command.gif.stat().st_size / 1e6:.1f} MB, drawn by {drawn_by}")
+    if command.html is not None:
+        from openjax.show.replay import write_replay
+
+        write_replay(command.html, flights)
+        console.print(f"{command.html}: {command.html.stat().st_size / 1e6:.1f} MB, opens in any browser")
+    if command.gif is None and command.html is None:
+        from openjax.show.replay import replay_page
+
+        with page_server(replay_page(flights), command.port) as server:
+            address = f"http://localhost:{server.server_port}"
+            print(f"{address} (Ctrl-C ends)", flush=True)
+            if command.browser:
+                webbrowser.open(address)
+            server.serve_forever()
     return 0
 
 
-def open_viewer(command: ViewCommand):
-    """Fly the episodes and serve the page; returns the `openjax.show.viewer.Viewer`.
+def fly_all(command: ViewCommand) -> list[tuple[str, Trajectory]]:
+    """(policy, episode) pairs, policies in the order of the command.
 
     Raises:
-      UserError: an unusable policy, layout or port.
+      UserError: an unusable policy or layout.
     """
     from openjax.store.policies import load_policy
 
-    loaded = load_policy(command.policy)
-    flown = EvaluateCommand(
-        policy=(command.policy,),
-        scenario=command.scenario,
-        episodes=1,
-        seed=command.seed,
-        environment=loaded.settings.environment,
-    )
-    _, flights = fly_scenarios(flown, loaded, {})
-    import viser
+    if not command.policy:
+        raise UserError("--policy needs at least one policy")
+    flights, evaluators = [], {}
+    for loaded in [load_policy(name) for name in command.policy]:
+        own = EvaluateCommand(
+            policy=(loaded.source,),
+            scenario=command.scenario,
+            episodes=1,
+            seed=command.seed,
+            environment=loaded.settings.environment,
+        )
+        flights += [(loaded.source, flight) for flight in fly_scenarios(own, loaded, evaluators)[1]]
+    return flights
 
-    from openjax.show.viewer import Viewer
+
+def page_server(page: str, port: int) -> ThreadingHTTPServer:
+    """A server of one page, to be used as a context manager, that this machine's browsers alone can reach.
+
+    Raises:
+      UserError: the port isn't free.
+    """
+    content = page.encode()
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self):
+            host = self.headers.get("Host", "").rpartition(":")[0] or self.headers.get("Host", "")
+            found = self.path == "/" and host in OWN_NAMES
+            self.send_response(200 if found else 404)
+            self.send_header("Content-Type", "text/html; charset=utf-8")
+            self.send_header("Content-Length", str(len(content) if found else 0))
+            self.end_headers()
+            if found:
+                self.wfile.write(content)
+
+        def log_message(self, *_):
+            """Say nothing."""
 
     try:
-        server = viser.ViserServer(host="127.0.0.1", port=command.port, label="openjax", verbose=False)
+        return ThreadingHTTPServer(("127.0.0.1", port), Handler)
     except OSError as error:
-        raise UserError(f"--port {command.port}: {error.strerror or error}") from None
-    return Viewer(server, flights)
+        raise UserError(f"--port {port}: {error.strerror or error}") from None

@@ -37,7 +37,11 @@ def plot_trajectories(path: Path, trajectories: Sequence[Trajectory]) -> None:
         draw_from_above(axes, trajectory)
     for axes in figure.axes[len(trajectories) :]:
         axes.set_axis_off()
-    figure.axes[0].legend(loc="lower left", fontsize="x-small")
+    shown = {}
+    for axes in figure.axes:
+        for artist, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            shown.setdefault(label, artist)
+    figure.legend(shown.values(), shown, loc="outside lower center", ncols=len(shown), fontsize="small")
     _save(figure, path)
 
 
@@ -54,14 +58,16 @@ def draw_from_above(axes: Axes, trajectory: Trajectory) -> None:
     """One episode up to a second after its first capture, or whole without one."""
     draw_arena(axes, trajectory)
     capture = trajectory.capture_index
-    after = round(1.0 / trajectory.time_step)
-    end = len(trajectory.evader_position) if capture is None else capture + after
+    end = trajectory.end()
     for i in range(trajectory.pursuer_position.shape[1]):
         position = trajectory.pursuer_position[:end, i]
         color = PURSUER_COLORS[i % len(PURSUER_COLORS)]
         axes.plot(*position[:, :2].T, color=color, linewidth=1.2, label=f"pursuer {i + 1}")
         axes.plot(*position[0, :2], "o", color=color, fillstyle="none")
         axes.plot(*position[-1, :2], "o", color=color, markersize=4)
+        crash = trajectory.crash_of(i)
+        if crash is not None and crash < end:
+            axes.plot(*position[crash, :2], "X", color="black", markersize=9, label="crash")
     evader = trajectory.evader_position[:end]
     axes.plot(*evader[:, :2].T, color=EVADER_COLOR, linewidth=1.2, label="evader")
     axes.plot(*evader[0, :2], "o", color=EVADER_COLOR, fillstyle="none")

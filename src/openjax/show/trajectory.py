@@ -24,6 +24,8 @@ class Trajectory:
     pillar_radius: float
     capture_radius: float
     time_step: float  # s
+    seen: np.ndarray | None = None  # (T,) bool, whether some pursuer sees the evader
+    predicted: np.ndarray | None = None  # (T, K, 3) where the policy expects the evader in the steps after
 
     @property
     def capture_index(self) -> int | None:
@@ -37,10 +39,23 @@ class Trajectory:
         steps = np.flatnonzero(self.crashed.any(axis=-1))
         return int(steps[0]) if steps.size else None
 
+    def crash_of(self, pursuer: int) -> int | None:
+        """Index of the first step in which this pursuer crashes."""
+        steps = np.flatnonzero(self.crashed[:, pursuer])
+        return int(steps[0]) if steps.size else None
+
+    def end(self, after: float = 1.0) -> int:
+        """Number of steps worth showing: up to `after` seconds after the first capture, or all."""
+        steps = len(self.evader_position)
+        if self.capture_index is None:
+            return steps
+        return min(steps, self.capture_index + round(after / self.time_step))
+
     def save(self, path: Path) -> None:
         """Write as .npz."""
         with replacing(path) as partial:
-            np.savez_compressed(partial, **{name: np.asarray(value) for name, value in vars(self).items()})
+            known = {name: np.asarray(value) for name, value in vars(self).items() if value is not None}
+            np.savez_compressed(partial, **known)
 
     @classmethod
     def load(cls, path: Path) -> "Trajectory":

@@ -59,10 +59,7 @@ def _animate_one(path, trajectory, renderer):
 
 def frame_indices(trajectory: Trajectory) -> np.ndarray:
     """Steps that are drawn."""
-    steps = len(trajectory.evader_position)
-    if trajectory.capture_index is not None:
-        steps = min(steps, trajectory.capture_index + round(1.0 / trajectory.time_step))
-    return np.arange(0, steps, max(1, round(1.0 / (FRAMES_PER_SECOND * trajectory.time_step))))
+    return np.arange(0, trajectory.end(), max(1, round(1.0 / (FRAMES_PER_SECOND * trajectory.time_step))))
 
 
 def write_gif(path: Path, frames: list[np.ndarray]) -> None:
