@@ -100,8 +100,7 @@ def export(arguments: Arguments, tell: Callable[[str], None] = lambda step: None
 
     tell(next(iter(STEPS)))
     seen = observations(policy, arguments.observations, arguments.seed)
-    number = len(next(iter(seen.values())))
-    expected = np.asarray(jax.jit(jax.vmap(lambda fields: act(**fields)))(seen))
+    expected = np.asarray(jax.jit(jax.vmap(policy))(Observation(**seen)))
     if arguments.own:
         expected = expected[:, :1]
         for name in EACH:
@@ -110,27 +109,31 @@ def export(arguments: Arguments, tell: Callable[[str], None] = lambda step: None
     tell(list(STEPS)[1])
     write = {"onnx": _onnx, "jax": _jax, "c": _c}[arguments.format]
     files, found, extra = write(act, inputs, seen, policy.source)
-    difference = None if found is None else float(np.abs(found - expected).max())
-    if difference is not None and not difference <= TOLERANCE:
-        raise UserError(
-            f"the exported policy differs by {difference:.2g} from {policy.source}: nothing was written"
-        )
     report = {
         "policy": policy.source,
         "format": arguments.format,
         "file": NAMES[arguments.format],
         "bytes": len(files[NAMES[arguments.format]]),
-        "observations": number,
-        "largest_difference": difference,
+        "observations": len(expected),
+        "largest_difference": _difference(found, expected, policy.source),
         "output": {"action": [int(n) for n in expected.shape[1:]]},
         **extra,
     }
     files[f"{arguments.format}.json"] = (json.dumps(report, indent=1) + "\n").encode()
-    arguments.out.mkdir(parents=True, exist_ok=True)
     for name, data in files.items():
         with replacing(arguments.out / name) as partial:
             partial.write_bytes(data)
     return report
+
+
+def _difference(found, expected, source):
+    """The largest of an action; None where nothing was compared. Raises UserError for one too large."""
+    if found is None:
+        return None
+    difference = float(abs(found - expected).max())
+    if not difference <= TOLERANCE:
+        raise UserError(f"the exported policy differs by {difference:.2g} from {source}: nothing was written")
+    return difference
 
 
 def _in_ascii(name) -> str:

@@ -19,6 +19,16 @@ AIRFRAMES = {NOMINAL: "crazyflie.xml", "brushless": "crazyflie_brushless.xml"}
 
 ROTORS = ("rotor_1", "rotor_2", "rotor_3", "rotor_4")
 BODY = "crazyflie"
+_NUMBERS = {
+    "thrust_constant": 1,
+    "max_rotor_speed": 1,
+    "motor_time_constant": 1,
+    "rate_kp": 3,
+    "rate_ki": 3,
+    "rate_kd": 3,
+    "rate_integral_limit": 3,
+}
+"""What an MJCF has in `<custom>`, and how many values."""
 
 
 @flax.struct.dataclass
@@ -64,44 +74,41 @@ def read_mjcf(path: str) -> dict[str, np.ndarray]:
         model = mujoco.MjModel.from_xml_path(path)
     except (ValueError, OSError) as error:
         raise UserError(f"{path}: not a readable MJCF model ({str(error).splitlines()[0]})") from None
-
-    def find(kind: str, name: str) -> int:
-        index = mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
-        if index < 0:
-            raise UserError(f"{path}: has no {kind} named {name!r}, which a vehicle needs")
-        return index
-
-    def number(name: str, size: int) -> np.ndarray:
-        index = find("numeric", name)
-        start, count = model.numeric_adr[index], model.numeric_size[index]
-        if count != size:
-            raise UserError(f"{path}: numeric {name!r} holds {count} values, {size} would be right")
-        values = np.array(model.numeric_data[start : start + count])
-        return values[0] if size == 1 else values
-
-    body = find("body", BODY)
+    body = _find(model, path, "body", BODY)
     if not (np.allclose(model.body_iquat[body], [1, 0, 0, 0]) and np.allclose(model.body_ipos[body], 0)):
         raise UserError(
             f"{path}: the inertial frame of {BODY!r} must lie in the body frame (pos 0, diaginertia only)"
         )
-    gear = np.array([model.actuator_gear[find("actuator", name)] for name in ROTORS])
-    thrust_constant = number("thrust_constant", 1)
+    gear = np.array([model.actuator_gear[_find(model, path, "actuator", name)] for name in ROTORS])
+    numbers = {name: _number(model, path, name, size) for name, size in _NUMBERS.items()}
     return {
         "mass": model.body_mass[body],
         "inertia": model.body_inertia[body].copy(),
-        "rotor_position": np.array([model.site_pos[find("site", name)] for name in ROTORS]),
+        "rotor_position": np.array([model.site_pos[_find(model, path, "site", name)] for name in ROTORS]),
         "rotor_spin": np.sign(gear[:, 5]),
-        "thrust_constant": thrust_constant,
-        "torque_constant": np.abs(gear[:, 5]).mean() * thrust_constant,
-        "max_rotor_speed": number("max_rotor_speed", 1),
-        "motor_time_constant": number("motor_time_constant", 1),
+        "torque_constant": np.abs(gear[:, 5]).mean() * numbers["thrust_constant"],
         "motor_slowdown_ratio": np.float64(1.0),
         "gravity": -model.opt.gravity[2],
-        "rate_kp": number("rate_kp", 3),
-        "rate_ki": number("rate_ki", 3),
-        "rate_kd": number("rate_kd", 3),
-        "rate_integral_limit": number("rate_integral_limit", 3),
+        **numbers,
     }
+
+
+def _find(model, path, kind, name):
+    """The index of a named part of a model. Raises UserError where it has none."""
+    index = mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
+    if index < 0:
+        raise UserError(f"{path}: has no {kind} named {name!r}, which a vehicle needs")
+    return index
+
+
+def _number(model, path, name, size):
+    """The values of a `numeric`."""
+    index = _find(model, path, "numeric", name)
+    start, count = model.numeric_adr[index], model.numeric_size[index]
+    if count != size:
+        raise UserError(f"{path}: numeric {name!r} holds {count} values, {size} would be right")
+    values = np.array(model.numeric_data[start : start + count])
+    return values[0] if size == 1 else values
 
 
 def find_mjcf(name_or_path: str | Path) -> Path:

@@ -172,6 +172,7 @@ def _own_mjcf(name, path):
 def _from_tables(tables: dict, path: Path, dtype) -> VehicleFile:
     _only(tables, _TABLES, path, "the file")
     vehicle_table, motor, log = (_table(tables, key, path) for key in ("vehicle", "motor", "log"))
+    _only(vehicle_table, _VEHICLE_KEYS, path, "[vehicle]")
     _check_vehicle_table(vehicle_table, path, "[vehicle]")
     vehicles = _table(tables, "vehicles", path)
     for vehicle_id, overrides in vehicles.items():
@@ -179,7 +180,31 @@ def _from_tables(tables: dict, path: Path, dtype) -> VehicleFile:
             raise UserError(f"{path}: [vehicles] holds tables [vehicles.<id>]; {vehicle_id!r} isn't one")
         _only(overrides, _OVERRIDES, path, f"[vehicles.{vehicle_id}]")
         _check_vehicle_table(overrides, path, f"[vehicles.{vehicle_id}]")
+    floor = log.get("floor_z", 0.0)
+    if isinstance(floor, bool) or not isinstance(floor, int | float) or not abs(floor) < 1e3:
+        raise UserError(f"{path}: log.floor_z is {floor!r}; it must be a number of metres")
+    airframe = vehicle_table.get("airframe", NOMINAL)
+    mjcf = _own_mjcf(airframe, path)
+    nominal = load_vehicle(mjcf or airframe, dtype)
+    motors = _motors(motor, path)
+    calibrated = _calibrated(_table(tables, "calibrated", path), path, nominal)
+    return VehicleFile(
+        vehicle=_changed(nominal, vehicle_table, motors, calibrated),
+        name=vehicle_table.get("name", _usual_name(airframe)),
+        airframe=airframe,
+        mass_weighed=vehicle_table.get("mass_weighed", False),
+        **motors,
+        calibrated=calibrated,
+        vehicles=vehicles,
+        log=log,
+        mass_given="mass" in vehicle_table,
+        path=path if path.exists() else None,
+        mjcf=mjcf,
+    )
 
+
+def _motors(motor: dict, path: Path) -> dict[str, Any]:
+    """The fields of `VehicleFile` that `[motor]` says."""
     _only(motor, _MOTOR_KEYS, path, "[motor]")
     command = motor.get("command", "thrust")
     if command not in MOTOR_COMMANDS:
@@ -194,48 +219,31 @@ def _from_tables(tables: dict, path: Path, dtype) -> VehicleFile:
         raise UserError(
             f'{path}: motor.spin is {list(spin)}; it must hold two "cw" and two "ccw", in the order m1..m4'
         )
-
-    floor = log.get("floor_z", 0.0)
-    if isinstance(floor, bool) or not isinstance(floor, int | float) or not abs(floor) < 1e3:
-        raise UserError(f"{path}: log.floor_z is {floor!r}; it must be a number of metres")
-
-    airframe = vehicle_table.get("airframe", NOMINAL)
-    mjcf = _own_mjcf(airframe, path)
-    nominal = load_vehicle(mjcf or airframe, dtype)
-    changes: dict[str, Any] = {}
-    if "mass" in vehicle_table:
-        changes["mass"] = vehicle_table["mass"]
-    # Spin in the nominal order; +1 where the reaction on the body is along +z (a cw rotor).
-    place = {name: spin[i] for i, name in enumerate(order)}
-    changes["rotor_spin"] = [1.0 if place[name] == "cw" else -1.0 for name in NOMINAL_ORDER]
     torque_per_thrust = motor.get("torque_per_thrust")
-    calibrated = _calibrated(_table(tables, "calibrated", path), path, nominal)
-    for name, entry in calibrated.items():
-        changes[name] = entry.value if name == "inertia" else entry.value[0]
     if torque_per_thrust is not None:
         _positive(torque_per_thrust, path, "motor.torque_per_thrust")
-        if "torque_constant" not in calibrated:
-            thrust_constant = changes.get("thrust_constant", float(nominal.thrust_constant))
-            changes["torque_constant"] = torque_per_thrust * thrust_constant
-    vehicle = nominal.replace(**{k: jnp.asarray(v, dtype) for k, v in changes.items()})
-    return VehicleFile(
-        vehicle=vehicle,
-        name=vehicle_table.get("name", _usual_name(airframe)),
-        airframe=airframe,
-        mass_weighed=vehicle_table.get("mass_weighed", False),
-        motor_command=command,
-        motor_order=order,
-        motor_spin=spin,
-        motor_notes=motor.get("notes", ""),
-        thrust_map=motor.get("thrust_map"),
-        torque_per_thrust=torque_per_thrust,
-        calibrated=calibrated,
-        vehicles=vehicles,
-        log=log,
-        mass_given="mass" in vehicle_table,
-        path=path if path.exists() else None,
-        mjcf=mjcf,
-    )
+    return {
+        "motor_command": command,
+        "motor_order": order,
+        "motor_spin": spin,
+        "motor_notes": motor.get("notes", ""),
+        "thrust_map": motor.get("thrust_map"),
+        "torque_per_thrust": torque_per_thrust,
+    }
+
+
+def _changed(nominal: Vehicle, vehicle_table: dict, motors: dict, calibrated: dict) -> Vehicle:
+    """The nominal vehicle with everything that the file says of it."""
+    changes: dict[str, Any] = {name: vehicle_table[name] for name in ("mass",) if name in vehicle_table}
+    # Spin in the nominal order; +1 where the reaction on the body is along +z (a cw rotor).
+    spin = dict(zip(motors["motor_order"], motors["motor_spin"], strict=True))
+    changes["rotor_spin"] = [1.0 if spin[name] == "cw" else -1.0 for name in NOMINAL_ORDER]
+    for name, entry in calibrated.items():
+        changes[name] = entry.value if name == "inertia" else entry.value[0]
+    ratio = motors["torque_per_thrust"]
+    if ratio is not None and "torque_constant" not in calibrated:
+        changes["torque_constant"] = ratio * changes.get("thrust_constant", float(nominal.thrust_constant))
+    return nominal.replace(**{k: jnp.asarray(v, nominal.mass.dtype) for k, v in changes.items()})
 
 
 def _calibrated(table: dict, path: Path, nominal: Vehicle) -> dict[str, CalibratedValue]:
@@ -273,7 +281,6 @@ def _calibrated(table: dict, path: Path, nominal: Vehicle) -> dict[str, Calibrat
 
 
 def _check_vehicle_table(table: dict, path: Path, where: str) -> None:
-    _only(table, _VEHICLE_KEYS, path, where)
     if "mass" in table:
         _positive(table["mass"], path, f"{where} mass")
         if not LEAST_MASS <= table["mass"] <= 1.0:
