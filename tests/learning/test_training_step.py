@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -143,7 +144,7 @@ def test_what_an_update_changes(run):
 def test_same_seed_same_run(run):
     _, carries, _, step, *_ = run
     carry, _ = step(init_carry(SETTINGS, jax.random.key(0)))
-    jax.tree.map(np.testing.assert_array_equal, _numpy(carry), carries[0])
+    chex.assert_trees_all_equal(_numpy(carry), carries[0])
 
 
 @pytest.fixture

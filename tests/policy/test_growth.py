@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import openjax
-from openjax.policy import NetworkSettings, Policy, PredictorSettings
+from openjax.policy import NetworkSettings, Policy, PolicyParameters, PredictorSettings
 from openjax.policy.growth import with_longer_history
 from openjax.pursuit import Pursuit, PursuitSettings
 
@@ -44,7 +44,8 @@ def test_the_grown_policy_acts_alike(frames, predicts):
 
 def test_a_policy_of_the_same_history_is_left_alone():
     settings = PursuitSettings()
-    assert with_longer_history("anything", PredictorSettings(), settings, settings) == "anything"
+    parameters = PolicyParameters(actor={}, critic={}, predictor={})
+    assert with_longer_history(parameters, PredictorSettings(), settings, settings) is parameters
 
 
 def test_a_policy_without_networks_is_refused():

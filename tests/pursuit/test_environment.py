@@ -1,5 +1,6 @@
 """The environment as pure functions: compiled or not, mapped or not, any size; its end, its gradients, its solids."""
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,10 +24,6 @@ KEY = jax.random.key(0)
 TINY = PursuitSettings(physics="rigid", episode_length=3)
 
 
-def assert_trees_close(a, b, atol):
-    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=atol, rtol=1e-5), a, b)
-
-
 @pytest.fixture(scope="module")
 def tiny():
     return Pursuit(TINY)
@@ -36,12 +33,22 @@ def test_compiled_and_mapped_is_the_same_as_eager_one_by_one(tiny):
     keys = jax.random.split(KEY, 3)
     actions = jax.random.uniform(KEY, (3, 3, 4), minval=-1.0)
     _, states = jax.jit(jax.vmap(tiny.reset))(keys)
-    step = jax.jit(jax.vmap(tiny.step))
+    step = jax.jit(jax.vmap(chex.assert_max_traces(tiny.step, n=1)))
     together = step(keys, states, actions)
+    step(keys, together[1], actions)  # what a step returns is what it takes: nothing is compiled again
     for i in (0, 2):
         eager = tiny.step(keys[i], jax.tree.map(lambda x, i=i: x[i], states), actions[i])
-        assert_trees_close(jax.tree.map(lambda x, i=i: x[i], together), eager, 1e-4)
-    jax.tree.map(np.testing.assert_array_equal, together, step(keys, states, actions))  # pure
+        one = jax.tree.map(lambda x, i=i: x[i], together)
+        chex.assert_trees_all_close(one, eager, atol=1e-4, rtol=1e-5)
+    chex.assert_trees_all_equal(together, step(keys, states, actions))  # pure
+
+
+def test_arrays_of_another_shape_are_refused_while_tracing(tiny):
+    with pytest.raises(AssertionError, match="shape"):
+        jax.eval_shape(tiny.step, KEY, jax.eval_shape(tiny.reset, KEY)[1], jnp.zeros((2, 4)))
+    task = scenario_task(TINY, SCENARIOS["wall"])
+    with pytest.raises(AssertionError, match="shape"):
+        jax.eval_shape(tiny.reset_to, KEY, task.replace(pursuer_position=jnp.zeros((4, 3))))
 
 
 @pytest.mark.parametrize("observe_time", [True, False])

@@ -1,5 +1,6 @@
 """Each effect shows its own signature, does nothing at "no effect" and works beside all others."""
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -287,8 +288,8 @@ def nominal(vehicle):
 
 
 def test_no_effect_means_none(nominal, fly):
-    for with_none, without in zip(jax.tree.leaves(fly()[0]), jax.tree.leaves(nominal), strict=True):
-        np.testing.assert_allclose(with_none, without, rtol=1e-5, atol=1e-5)
+    leaves = jax.tree.leaves(fly()[0]), jax.tree.leaves(nominal)
+    chex.assert_trees_all_close(*leaves, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", sorted(VOCABULARY))

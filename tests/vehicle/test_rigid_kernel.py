@@ -2,6 +2,7 @@
 
 from functools import partial
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -42,8 +43,7 @@ def crowded(worlds):
 
 
 def assert_close(got, expected, tolerance=2e-5):
-    for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
-        np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance)
+    chex.assert_trees_all_close(got, expected, rtol=tolerance, atol=tolerance)
 
 
 def fly(vehicle, drones, command):
@@ -102,7 +102,7 @@ def test_memory_of_effects_that_the_step_does_not_have_is_left_alone():
     memory = {"delay": jnp.arange(30.0).reshape(3, 5, 2), "age": jnp.arange(3)}
     step = jax.jit(fly)
     stepped = step(VEHICLE, drones.replace(effect_memory=memory), command)
-    jax.tree.map(np.testing.assert_array_equal, stepped.effect_memory, memory)
+    chex.assert_trees_all_equal(stepped.effect_memory, memory)
     assert_close(stepped.replace(effect_memory=()), step(VEHICLE, drones, command))
 
 

@@ -2,25 +2,26 @@
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
 
 
 def generalised_advantages(
-    reward: jax.Array,
-    value: jax.Array,
-    next_value: jax.Array,
-    terminated: jax.Array,
-    truncated: jax.Array,
+    reward: Float[Array, " steps *worlds"],
+    value: Float[Array, " steps *worlds"],
+    next_value: Float[Array, " steps *worlds"],
+    terminated: Bool[Array, " steps *worlds"],
+    truncated: Bool[Array, " steps *worlds"],
     discount: float,
     trace: float,
-) -> jax.Array:
-    """Advantages (T, ...) of T consecutive steps.
+) -> Float[Array, " steps *worlds"]:
+    """Advantages of consecutive steps.
 
     Args:
-      reward: (T, ...) of each step.
-      value: (T, ...) of the state in which the step was taken.
-      next_value: (T, ...) of the state it led to, before any reset; ignored where terminated.
-      terminated: (T, ...) bool, the episode ended for good: nothing comes after.
-      truncated: (T, ...) bool, the episode was cut: the value of the state it led to stands for the rest.
+      reward: of each step.
+      value: of the state in which the step was taken.
+      next_value: of the state it led to, before any reset; ignored where terminated.
+      terminated: the episode ended for good: nothing comes after.
+      truncated: the episode was cut: the value of the state it led to stands for the rest.
       discount: gamma.
       trace: lambda.
     """

@@ -4,8 +4,10 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int32, PRNGKeyArray
 
 
 @jax.tree_util.register_dataclass
@@ -14,8 +16,10 @@ class TaskArchive:
     """Tasks (any pytree) with leading axis C (capacity). Used slots come first, newest first."""
 
     tasks: Any
-    success: jax.Array  # (C,) float32, success rate at which each task entered
-    size: jax.Array  # () int32, used slots
+    success: Float[Array, " capacity"]
+    """Success rate at which each task entered."""
+    size: Int32[Array, ""]
+    """Used slots."""
 
     def replace(self, **changes) -> "TaskArchive":
         """A copy with other values for the fields named."""
@@ -34,9 +38,9 @@ def empty_archive(task: Any, capacity: int) -> TaskArchive:
 def insert(
     archive: TaskArchive,
     tasks: Any,
-    success: jax.Array,
-    accepted: jax.Array,
-    descriptor: Callable[[Any], jax.Array],
+    success: Float[Array, " new"],
+    accepted: Bool[Array, " new"],
+    descriptor: Callable[[Any], Float[Array, "tasks features"]],
 ) -> TaskArchive:
     """Add the accepted ones of M tasks; where there are more than slots, keep the spread.
 
@@ -47,12 +51,13 @@ def insert(
     Args:
       archive: C slots.
       tasks: leading axis M, newest last.
-      success: (M,) success rates.
-      accepted: (M,) bool, which of them enter.
+      success: their success rates.
+      accepted: which of them enter.
       descriptor: of tasks (M, ...) the (M, D) numbers by whose distance they are told apart.
     """
     capacity = archive.success.shape[0]
     m = success.shape[0]
+    chex.assert_tree_shape_prefix(tasks, (m,))
     pool = jax.tree.map(lambda new, old: jnp.concatenate([new[::-1], old]), tasks, archive.tasks)
     pool_success = jnp.concatenate([success[::-1], archive.success])
     used = jnp.concatenate([accepted[::-1], jnp.arange(capacity) < archive.size])
@@ -76,7 +81,7 @@ def insert(
     )
 
 
-def draw(archive: TaskArchive, key: jax.Array) -> Any:
+def draw(archive: TaskArchive, key: PRNGKeyArray) -> Any:
     """One used task (leaves without the archive's leading axis), uniformly; of an empty archive zeros: check `size` first."""
     slot = jax.random.randint(key, (), 0, jnp.maximum(archive.size, 1))
     return jax.tree.map(lambda leaf: leaf[slot], archive.tasks)

@@ -1,5 +1,6 @@
 """Rollouts: the policy acts in all worlds for some steps."""
 
+import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -50,6 +51,9 @@ def collect(
     Returns:
       the rollout, and observation and state after it.
     """
+    number, pursuers = noise.shape[1], environment.settings.num_pursuers
+    chex.assert_shape(noise, (None, None, pursuers, policy.sample_size))
+    chex.assert_tree_shape_prefix((observation, state), (number,))
     step = jax.vmap(environment.step, in_axes=(None, 0, 0))
     unused_key = jax.random.key(0)
 

@@ -3,8 +3,8 @@
 import math
 
 import flax.linen as nn
-import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from openjax.policy.encoder import Encoder, HiddenLayer, padded
 from openjax.policy.settings import NetworkSettings
@@ -20,10 +20,13 @@ class Actor(nn.Module):
 
     @nn.compact
     def __call__(
-        self, observation: Observation, predicted: jax.Array | None
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Observation of (..., N) pursuers, predicted (..., K, 3) positions or None -> mean (..., N, 4), log_std (4,) and
-        what the encoder made of it (..., N, features)."""
+        self, observation: Observation, predicted: Float[Array, "*worlds horizons 3"] | None
+    ) -> tuple[
+        Float[Array, "*worlds pursuers sample"],
+        Float[Array, " sample"],
+        Float[Array, "*worlds pursuers features"],
+    ]:
+        """Mean, log standard deviation, and what the encoder made of the observation; predicted positions in m."""
         settings = self.settings
         hidden = Encoder(settings.features, settings.heads, jnp.dtype(settings.compute_type), name="encoder")(
             own_features(observation, predicted),
@@ -52,12 +55,12 @@ class Critic(nn.Module):
 
     @nn.compact
     def __call__(
-        self, observation: Observation, predicted: jax.Array | None, encoded: jax.Array | None = None
-    ) -> jax.Array:
-        """Observation of (..., N) pursuers, predicted (..., K, 3) positions or None -> (..., N).
-
-        `encoded` (..., N, features) is what the actor's encoder made of it, if the encoder is shared.
-        """
+        self,
+        observation: Observation,
+        predicted: Float[Array, "*worlds horizons 3"] | None,
+        encoded: Float[Array, "*worlds pursuers features"] | None = None,
+    ) -> Float[Array, "*worlds pursuers"]:
+        """Values; `encoded` is what the actor's encoder made of the observation, if the encoder is shared."""
         settings = self.settings
         dtype = jnp.dtype(settings.compute_type)
         sees_state = settings.critic_input == "state"
@@ -96,8 +99,10 @@ class Critic(nn.Module):
         return hidden.reshape(*leading, hidden.shape[-1])
 
 
-def own_features(observation: Observation, predicted: jax.Array | None) -> jax.Array:
-    """A pursuer's own part: its state and, relative to it, the predicted (..., K, 3) evader positions."""
+def own_features(
+    observation: Observation, predicted: Float[Array, "*worlds horizons 3"] | None
+) -> Float[Array, "*worlds pursuers own"]:
+    """A pursuer's own part: its state and, relative to it, the predicted evader positions (m)."""
     if predicted is None:
         return observation.self_state
     relative = observation.position[..., :, None, :] - predicted[..., None, :, :]

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from openjax.policy.actor_critic import Actor, Critic
 from openjax.policy.predictor import EvaderPredictor
@@ -61,7 +62,7 @@ class Policy:
     def _predictor(self) -> EvaderPredictor:
         return EvaderPredictor(self.predictor, self.arena_radius, self.arena_height)
 
-    def init(self, key: jax.Array, observation: Observation) -> PolicyParameters:
+    def init(self, key: PRNGKeyArray, observation: Observation) -> PolicyParameters:
         """Initial parameters for observations shaped like `observation`."""
         actor_key, critic_key, predictor_key = jax.random.split(key, 3)
         predictor = {}
@@ -75,20 +76,27 @@ class Policy:
             actor=actor, critic=self._critic.init(critic_key, observation, predicted, encoded)
         )
 
-    def predict(self, parameters: PolicyParameters, observation: Observation) -> jax.Array | None:
-        """Predicted evader positions (..., K, 3) in the world (m); None without a predictor."""
+    def predict(
+        self, parameters: PolicyParameters, observation: Observation
+    ) -> Float[Array, "*worlds horizons 3"] | None:
+        """Predicted evader positions in the world (m); None without a predictor."""
         if not self.predictor.enabled:
             return None
         return self.predict_from(parameters.predictor, observation.frames, observation.last_seen)
 
-    def predict_from(self, predictor: Any, frames: jax.Array, last_seen: jax.Array) -> jax.Array:
-        """Positions (..., K, 3) predicted from windows of frames (..., n, F) and last seen positions (..., 3)."""
+    def predict_from(
+        self,
+        predictor: Any,
+        frames: Float[Array, "*worlds window features"],
+        last_seen: Float[Array, "*worlds 3"],
+    ) -> Float[Array, "*worlds horizons 3"]:
+        """Positions (m) predicted from windows of frames, oldest first, and last seen positions (m)."""
         return self._predictor.apply(predictor, frames, last_seen)
 
     def distribution(
-        self, actor: Any, observation: Observation, predicted: jax.Array | None
-    ) -> tuple[jax.Array, jax.Array]:
-        """Mean (..., N, 4) and log standard deviation (4,) of the Gaussian over samples; see `action`."""
+        self, actor: Any, observation: Observation, predicted: Float[Array, "*worlds horizons 3"] | None
+    ) -> tuple[Float[Array, "*worlds pursuers sample"], Float[Array, " sample"]]:
+        """Mean and log standard deviation of the Gaussian over samples; see `action`."""
         return self._actor.apply(actor, observation, predicted)[:2]
 
     @property
@@ -96,38 +104,56 @@ class Policy:
         """Numbers of one pursuer's sample."""
         return len(self.initial_action)
 
-    def action(self, sample: jax.Array, observation: Observation | None = None) -> jax.Array:
-        """The action (..., N, 4) in -1..1 that a sample of the Gaussian, or its mean, stands for.
+    def action(
+        self, sample: Float[Array, "*worlds pursuers sample"], observation: Observation | None = None
+    ) -> Float[Array, "*worlds pursuers 4"]:
+        """The action in -1..1 that a sample of the Gaussian, or its mean, stands for.
 
         Policies whose samples aren't commands work it out from the `observation` (`openjax.baselines.dacoop`).
         """
         return jnp.clip(sample, -1.0, 1.0) if self.network.squash == "mean" else jnp.tanh(sample)
 
     def value(
-        self, actor: Any, critic: Any, observation: Observation, predicted: jax.Array | None
-    ) -> jax.Array:
-        """Normalised values (..., N); the actor's parameters matter if its encoder is shared."""
+        self,
+        actor: Any,
+        critic: Any,
+        observation: Observation,
+        predicted: Float[Array, "*worlds horizons 3"] | None,
+    ) -> Float[Array, "*worlds pursuers"]:
+        """Normalised values; the actor's parameters matter if its encoder is shared."""
         return self.evaluate(actor, critic, observation, predicted)[2]
 
     def evaluate(
-        self, actor: Any, critic: Any, observation: Observation, predicted: jax.Array | None
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """`distribution` and `value`: mean (..., N, 4), log standard deviation (4,), value (..., N)."""
+        self,
+        actor: Any,
+        critic: Any,
+        observation: Observation,
+        predicted: Float[Array, "*worlds horizons 3"] | None,
+    ) -> tuple[
+        Float[Array, "*worlds pursuers sample"], Float[Array, " sample"], Float[Array, "*worlds pursuers"]
+    ]:
+        """`distribution` and `value`: mean, log standard deviation, value."""
         mean, log_std, encoded = self._actor.apply(actor, observation, predicted)
         return mean, log_std, self._critic.apply(critic, observation, predicted, encoded)
 
-    def act(self, parameters: PolicyParameters, observation: Observation) -> jax.Array:
-        """The mean policy's action (..., N, 4) in -1..1."""
+    def act(
+        self, parameters: PolicyParameters, observation: Observation
+    ) -> Float[Array, "*worlds pursuers 4"]:
+        """The mean policy's action in -1..1."""
         predicted = self.predict(parameters, observation)
         return self.action(self.distribution(parameters.actor, observation, predicted)[0], observation)
 
 
-def gaussian_log_prob(sample: jax.Array, mean: jax.Array, log_std: jax.Array) -> jax.Array:
-    """Log density (...) of (..., 4) samples under independent Gaussians."""
+def gaussian_log_prob(
+    sample: Float[Array, "*samples size"],
+    mean: Float[Array, "*samples size"],
+    log_std: Float[Array, " size"],
+) -> Float[Array, "*samples"]:
+    """Log density of samples under independent Gaussians."""
     scaled = (sample - mean) * jnp.exp(-log_std)
     return jnp.sum(-0.5 * scaled**2 - log_std - 0.5 * jnp.log(2 * jnp.pi), axis=-1)
 
 
-def gaussian_entropy(log_std: jax.Array) -> jax.Array:
-    """Entropy () of independent Gaussians."""
+def gaussian_entropy(log_std: Float[Array, " size"]) -> Float[Array, ""]:
+    """Entropy of independent Gaussians."""
     return jnp.sum(log_std + 0.5 * jnp.log(2 * jnp.pi * jnp.e))

@@ -3,6 +3,7 @@
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from openjax.policy.settings import PredictorSettings
 
@@ -15,8 +16,10 @@ class EvaderPredictor(nn.Module):
     arena_height: float
 
     @nn.compact
-    def __call__(self, frames: jax.Array, last_seen: jax.Array) -> jax.Array:
-        """frames (..., n, F) oldest first, last_seen (..., 3) -> (..., K, 3) positions (m, world)."""
+    def __call__(
+        self, frames: Float[Array, "*worlds window features"], last_seen: Float[Array, "*worlds 3"]
+    ) -> Float[Array, "*worlds horizons 3"]:
+        """Positions (m, world) from frames, oldest first, and where the evader was last seen (m)."""
         units, horizons = self.settings.units, self.settings.horizons
         # all frames' projections in one product; only the recurrent part is sequential
         inputs = nn.Dense(4 * units, name="input")(frames)

@@ -4,6 +4,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Protocol
 
+import chex
 import jax
 import jax.numpy as jnp
 
@@ -133,6 +134,9 @@ class Pursuit:
           observation, state, both of one world.
         """
         settings = self.settings
+        chex.assert_shape(task.pursuer_position, (settings.num_pursuers, 3))
+        chex.assert_shape(task.evader_position, (3,))
+        chex.assert_shape(task.pillar_position, (*task.pillar_active.shape, 2))
         attitude_key, effect_key = jax.random.split(key)
         quaternion = start_attitude(settings, attitude_key)
         drones = jax.vmap(lambda p, q: hover_state(self.vehicle, p, q))(task.pursuer_position, quaternion)
@@ -212,6 +216,7 @@ class Pursuit:
         """
         del key
         settings, task = self.settings, state.task
+        chex.assert_shape(action, (settings.num_pursuers, 4))
         action = jnp.clip(action.astype(jnp.float32), -1.0, 1.0)
         drones = self.dynamics(
             self.vehicle,
