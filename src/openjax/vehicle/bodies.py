@@ -16,6 +16,7 @@ from openjax.vehicle.arena import Arena
 from openjax.vehicle.mjx_body import make_world, mjx_step
 from openjax.vehicle.parameters import Vehicle
 from openjax.vehicle.rigid_body import rigid_step
+from openjax.vehicle.shapes import Seconds, Vector
 from openjax.vehicle.solids import Surroundings, contact_acceleration, encounters, place_solids, surroundings
 from openjax.vehicle.state import DroneState
 
@@ -36,7 +37,13 @@ def make_body(physics: str, contacts: bool, arena: Arena, dt: float) -> Body:
 
 
 def rigid_drone(
-    arena: Arena, dt: float, vehicle: Vehicle, drone: DroneState, force, torque, around: Surroundings | None
+    arena: Arena,
+    dt: Seconds,
+    vehicle: Vehicle,
+    drone: DroneState,
+    force: Vector,
+    torque: Vector,
+    around: Surroundings | None,
 ) -> DroneState:
     """One drone by the written-out equations after dt seconds, in free flight if nothing is `around`."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import jax
@@ -19,6 +20,7 @@ from openjax.vehicle.rate_controller import rate_controller
 from openjax.vehicle.rigid_body import rotate
 from openjax.vehicle.rigid_kernel import FusedStep, step_many
 from openjax.vehicle.rotors import rotor_speed_step
+from openjax.vehicle.shapes import Active, Command, Commands, Pillars, Seconds, Vector
 from openjax.vehicle.solids import others
 from openjax.vehicle.state import DroneState
 from openjax.vehicle.stops import stop
@@ -26,7 +28,15 @@ from openjax.vehicle.stops import stop
 PHYSICS = ("mjx", "rigid", "stops")
 
 
-def motors(effects, vehicle: Vehicle, parameters, drone: DroneState, command, context: Context | None, dt):
+def motors(
+    effects: tuple[Effect, ...],
+    vehicle: Vehicle,
+    parameters: Mapping,
+    drone: DroneState,
+    command: Command,
+    context: Context | None,
+    dt: Seconds,
+) -> tuple[DroneState, Vector, Vector]:
     """One drone up to the wrench on its body, its controller and rotors dt seconds later.
 
     Args:
@@ -64,10 +74,10 @@ class DronesStep:
         self,
         vehicle: Vehicle,
         drones: DroneState,
-        command,
-        pillar_position,
-        pillar_active,
-        effect_parameters=None,
+        command: Commands,
+        pillar_position: Pillars,
+        pillar_active: Active,
+        effect_parameters: Mapping | None = None,
     ) -> DroneState:
         """`drones` (leading axis N) after one step of `dt` seconds.
 

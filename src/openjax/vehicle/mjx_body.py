@@ -22,7 +22,8 @@ import numpy as np
 
 from openjax.vehicle.arena import Arena
 from openjax.vehicle.parameters import NOMINAL, Vehicle, find_mjcf, read_mjcf
-from openjax.vehicle.rigid_body import euler_step
+from openjax.vehicle.rigid_body import Pose, euler_step
+from openjax.vehicle.shapes import Quaternion, Seconds, Things, Vector
 from openjax.vehicle.solids import DRONE_RADIUS, solids_xml
 
 if TYPE_CHECKING:
@@ -51,9 +52,8 @@ def world_xml(arena: Arena, n_pillars: int, n_others: int, dt: float, contacts: 
 
     One Newton iteration finds the contact forces for the things that are hit, without a loop.
     """
-    nominal = read_mjcf(
-        str(find_mjcf(NOMINAL))
-    )  # whoever flies brings mass and inertia along; see `mjx_step`
+    # whoever flies brings its own mass and inertia along; see `mjx_step`
+    nominal = read_mjcf(str(find_mjcf(NOMINAL)))
     shapes, pairs = solids_xml(arena, n_pillars, n_others, dt) if contacts else ("", "")
     inertia = " ".join(str(value) for value in nominal["inertia"].tolist())
     return f"""<mujoco>
@@ -114,15 +114,15 @@ def _forward(model, data, contacts: bool):
 def mjx_step(
     world: World,
     vehicle: Vehicle,
-    shapes,
-    position,
-    quaternion,
-    velocity,
-    body_rates,
-    force_world,
-    torque_body,
-    dt,
-):
+    shapes: Things | None,
+    position: Vector,
+    quaternion: Quaternion,
+    velocity: Vector,
+    body_rates: Vector,
+    force_world: Vector,
+    torque_body: Vector,
+    dt: Seconds,
+) -> Pose:
     """`rigid_step` by MJX among `shapes` of `place_solids`, (n, 3) m (None: contact-free); dt must be the
     world's.
 

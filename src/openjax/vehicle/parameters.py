@@ -6,12 +6,12 @@ from functools import lru_cache
 from pathlib import Path
 
 import flax.struct
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
 from openjax.errors import UserError
+from openjax.vehicle.shapes import Hubs, Rotors, Scalar, Vector
 
 NOMINAL = "crazyflie"
 AIRFRAMES = {NOMINAL: "crazyflie.xml", "brushless": "crazyflie_brushless.xml"}
@@ -36,22 +36,22 @@ class Vehicle:
     """One vehicle: a pytree of arrays. A copy with replaced leaves is another vehicle. Body frame: x forward,
     y left, z up, origin at the centre of mass."""
 
-    mass: jax.Array  # () kg
-    inertia: jax.Array  # (3,) kg m^2, principal, along the body axes
-    rotor_position: jax.Array
-    """(4, 3) m, body frame, m1 front right, m2 rear right, m3 rear left, m4 front left"""
-    rotor_spin: jax.Array
-    """(4,) +1: reaction torque on the body along +z (clockwise rotor), -1: counter-clockwise"""
-    thrust_constant: jax.Array  # () N s^2, thrust = thrust_constant * speed^2
-    torque_constant: jax.Array  # () N m s^2, torque = spin * torque_constant * speed^2
-    max_rotor_speed: jax.Array  # () rad/s
-    motor_time_constant: jax.Array  # () s, while the rotor speeds up
-    motor_slowdown_ratio: jax.Array  # () time constant of slowing down / of speeding up, 1 nominally
-    gravity: jax.Array  # () m/s^2
-    rate_kp: jax.Array  # (3,) motor counts per deg/s; roll, pitch, yaw
-    rate_ki: jax.Array  # (3,) motor counts per deg
-    rate_kd: jax.Array  # (3,) motor counts per deg/s^2
-    rate_integral_limit: jax.Array  # (3,) deg
+    mass: Scalar  # kg
+    inertia: Vector  # kg m^2, principal, along the body axes
+    rotor_position: Hubs
+    """m, body frame, m1 front right, m2 rear right, m3 rear left, m4 front left"""
+    rotor_spin: Rotors
+    """+1: reaction torque on the body along +z (clockwise rotor), -1: counter-clockwise"""
+    thrust_constant: Scalar  # N s^2, thrust = thrust_constant * speed^2
+    torque_constant: Scalar  # N m s^2, torque = spin * torque_constant * speed^2
+    max_rotor_speed: Scalar  # rad/s
+    motor_time_constant: Scalar  # s, while the rotor speeds up
+    motor_slowdown_ratio: Scalar  # time constant of slowing down / of speeding up, 1 nominally
+    gravity: Scalar  # m/s^2
+    rate_kp: Vector  # motor counts per deg/s; roll, pitch, yaw
+    rate_ki: Vector  # motor counts per deg
+    rate_kd: Vector  # motor counts per deg/s^2
+    rate_integral_limit: Vector  # deg
 
 
 def assets_directory() -> Path:
@@ -132,11 +132,11 @@ def load_vehicle(airframe: str | Path = NOMINAL, dtype=jnp.float32) -> Vehicle:
     )
 
 
-def hover_rotor_speed(vehicle: Vehicle) -> jax.Array:
+def hover_rotor_speed(vehicle: Vehicle) -> Scalar:
     """Rotor speed at which four level rotors carry the vehicle, () rad/s."""
     return jnp.sqrt(vehicle.mass * vehicle.gravity / (4 * vehicle.thrust_constant))
 
 
-def max_rotor_thrust(vehicle: Vehicle) -> jax.Array:
+def max_rotor_thrust(vehicle: Vehicle) -> Scalar:
     """Largest thrust of one rotor, () N."""
     return vehicle.thrust_constant * vehicle.max_rotor_speed**2

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 
 from openjax.vehicle.parameters import Vehicle
+from openjax.vehicle.shapes import Command, Hubs, Rotors, Seconds, Vector
 from openjax.vehicle.state import DroneState
 
 COUNTS = 65536.0  # motor commands are 16-bit in the firmware
@@ -14,14 +14,16 @@ _AXIS_LIMIT = 32767.0  # outputs of the rate controllers are int16
 _DEGREES = 57.29577951308232
 
 
-def mixer(vehicle: Vehicle) -> jax.Array:
+def mixer(vehicle: Vehicle) -> Hubs:
     """(4, 3) share of each motor in roll, pitch and yaw outputs: the sign of the torque it exerts, roll and
     pitch halved as in the firmware's x configuration."""
     x, y = vehicle.rotor_position[:, 0], vehicle.rotor_position[:, 1]
     return jnp.stack([0.5 * jnp.sign(y), -0.5 * jnp.sign(x), vehicle.rotor_spin], axis=-1)
 
 
-def rate_controller(vehicle: Vehicle, state: DroneState, command, dt) -> tuple[jax.Array, jax.Array]:
+def rate_controller(
+    vehicle: Vehicle, state: DroneState, command: Command, dt: Seconds
+) -> tuple[Rotors, Vector]:
     """Motor commands (4,) in 0..1 and the new integrals (3,) deg, for one drone.
 
     command (4,): collective thrust in 0..1 as a share of four times the largest rotor thrust, body rates in

@@ -2,32 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 
 from openjax.vehicle.parameters import Vehicle
+from openjax.vehicle.shapes import Quaternion, Seconds, Vector
+
+Pose = tuple[Vector, Quaternion, Vector, Vector]
+"""Position, quaternion, velocity, body rates."""
 
 
-def rotate(quaternion, vector) -> jax.Array:
+def rotate(quaternion: Quaternion, vector: Vector) -> Vector:
     """`vector` (3,) of the body frame in the world frame."""
     w, u = quaternion[0], quaternion[1:]
     t = 2.0 * cross(u, vector)
     return vector + w * t + cross(u, t)
 
 
-def rotate_inverse(quaternion, vector) -> jax.Array:
+def rotate_inverse(quaternion: Quaternion, vector: Vector) -> Vector:
     """`vector` (3,) of the world frame in the body frame."""
     w, u = quaternion[0], quaternion[1:]
     t = 2.0 * cross(u, vector)
     return vector - w * t + cross(u, t)
 
 
-def cross(a, b) -> jax.Array:
+def cross(a: Vector, b: Vector) -> Vector:
     """Cross product of two (3,) vectors; written out, since it fuses better than `jnp.cross`."""
     return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
-def quaternion_multiply(a, b) -> jax.Array:
+def quaternion_multiply(a: Quaternion, b: Quaternion) -> Quaternion:
     """Hamilton product of two (4,) scalar-first quaternions."""
     return jnp.stack([
         a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
@@ -37,7 +43,7 @@ def quaternion_multiply(a, b) -> jax.Array:
     ])  # fmt: skip
 
 
-def quaternion_integrate(quaternion, body_rates, dt) -> jax.Array:
+def quaternion_integrate(quaternion: Quaternion, body_rates: Vector, dt: Seconds) -> Quaternion:
     """Attitude (4,) after dt seconds at constant body rates (3,) rad/s: exact, and smooth at zero rate."""
     half = 0.5 * dt * body_rates
     square = jnp.sum(half * half)
@@ -49,7 +55,15 @@ def quaternion_integrate(quaternion, body_rates, dt) -> jax.Array:
     return turned * jax.lax.rsqrt(jnp.sum(turned * turned))
 
 
-def euler_step(position, quaternion, velocity, body_rates, acceleration, angular_acceleration, dt):
+def euler_step(
+    position: Vector,
+    quaternion: Quaternion,
+    velocity: Vector,
+    body_rates: Vector,
+    acceleration: Vector,
+    angular_acceleration: Vector,
+    dt: Seconds,
+) -> Pose:
     """Advance velocities by the accelerations (3,) m/s^2 world and (3,) rad/s^2 body, then positions by the
     new velocities: MuJoCo's Euler integrator. Returns position, quaternion, velocity, body rates."""
     velocity = velocity + dt * acceleration
@@ -58,8 +72,16 @@ def euler_step(position, quaternion, velocity, body_rates, acceleration, angular
 
 
 def rigid_step(
-    vehicle: Vehicle, position, quaternion, velocity, body_rates, force_world, torque_body, dt, contact=None
-):
+    vehicle: Vehicle,
+    position: Vector,
+    quaternion: Quaternion,
+    velocity: Vector,
+    body_rates: Vector,
+    force_world: Vector,
+    torque_body: Vector,
+    dt: Seconds,
+    contact: Callable[[Vector], Vector] | None = None,
+) -> Pose:
     """Position, quaternion, velocity and body rates of one drone after dt seconds, frames as in `DroneState`.
 
     force_world (3,) N without gravity, torque_body (3,) N m about the centre of mass. Newton-Euler equations.

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 
 from openjax.vehicle.parameters import Vehicle
+from openjax.vehicle.shapes import Rotors, Seconds
 
 # Below this motor command a rotor is asked to stand still: keeps the slope of the square root finite.
 _SMALLEST_COMMAND = 1e-8
 
 
-def commanded_rotor_speed(vehicle: Vehicle, motor_command) -> jax.Array:
+def commanded_rotor_speed(vehicle: Vehicle, motor_command: Rotors) -> Rotors:
     """Speed asked for by a motor command in 0..1, which is a share of the largest thrust: (4,) rad/s."""
     on = motor_command > _SMALLEST_COMMAND
     root = jnp.sqrt(jnp.where(on, motor_command, 1.0))
     return vehicle.max_rotor_speed * jnp.where(on, root, 0.0)
 
 
-def rotor_speed_step(vehicle: Vehicle, rotor_speed, motor_command, dt) -> jax.Array:
+def rotor_speed_step(vehicle: Vehicle, rotor_speed: Rotors, motor_command: Rotors, dt: Seconds) -> Rotors:
     """Rotor speeds after dt seconds of a constant motor command, (4,) rad/s.
 
     T dw/dt = w_commanded - w, solved exactly; T may differ between speeding up and slowing down.
@@ -29,11 +29,11 @@ def rotor_speed_step(vehicle: Vehicle, rotor_speed, motor_command, dt) -> jax.Ar
     return rotor_speed + (target - rotor_speed) * -jnp.expm1(-dt / time_constant)
 
 
-def rotor_thrust(vehicle: Vehicle, rotor_speed) -> jax.Array:
+def rotor_thrust(vehicle: Vehicle, rotor_speed: Rotors) -> Rotors:
     """Thrust of each rotor along body z, (4,) N."""
     return vehicle.thrust_constant * jnp.square(rotor_speed)
 
 
-def rotor_reaction(vehicle: Vehicle, rotor_speed) -> jax.Array:
+def rotor_reaction(vehicle: Vehicle, rotor_speed: Rotors) -> Rotors:
     """Reaction torque of each rotor on the body along body z, signed, (4,) N m."""
     return vehicle.rotor_spin * vehicle.torque_constant * jnp.square(rotor_speed)

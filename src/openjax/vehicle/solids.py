@@ -13,11 +13,11 @@ The same contacts are solved by MuJoCo MJX (`place_solids`, `mjx_body`) and, wri
 from __future__ import annotations
 
 import flax.struct
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from openjax.vehicle.arena import Arena
+from openjax.vehicle.shapes import Active, Gaps, Others, Pillars, Seconds, Team, Things, Vector
 
 DRONE_RADIUS = 0.05  # m, the solid sphere of a drone
 PARKED = -100.0  # m, height of a pillar that isn't there
@@ -27,20 +27,20 @@ PARKED = -100.0  # m, height of a pillar that isn't there
 class Surroundings:
     """What one drone may touch beside the floor: P pillar slots and K other drones."""
 
-    pillar_position: jax.Array  # (P, 2) m, axis of each pillar
-    pillar_active: jax.Array  # (P,) bool, slots in use
-    other_position: jax.Array  # (K, 3) m
-    other_velocity: jax.Array  # (K, 3) m/s
+    pillar_position: Pillars
+    pillar_active: Active
+    other_position: Others  # m
+    other_velocity: Others  # m/s
 
 
 @flax.struct.dataclass
 class Encounters:
     """One drone beside its solid things: floor, P pillars, K other drones, in this order (M = 1 + P + K)."""
 
-    origin: jax.Array  # (M, 3) m, where each shape stands; the floor's below the drone
-    normal: jax.Array  # (M, 3) unit vector from the nearest point of each thing to the drone
-    gap: jax.Array  # (M,) m, between the surfaces now
-    shown: jax.Array  # (M,) m, the gap that the solver of contacts is shown; < 0: it acts
+    origin: Things  # m, where each shape stands; the floor's below the drone
+    normal: Things  # unit vector from the nearest point of each thing to the drone
+    gap: Gaps  # m, between the surfaces now
+    shown: Gaps  # m, the gap that the solver of contacts is shown; < 0: it acts
 
 
 # Contacts in MuJoCo's direct form: acceleration along the normal >= -stiffness * gap - damping * speed, `gap`
@@ -84,7 +84,9 @@ def others(n: int) -> np.ndarray:
     return np.array([[j for j in range(n) if j != i] for i in range(n)], int).reshape(n, n - 1)
 
 
-def surroundings(position, velocity, pillar_position, pillar_active) -> Surroundings:
+def surroundings(
+    position: Team, velocity: Team, pillar_position: Pillars, pillar_active: Active
+) -> Surroundings:
     """What each of N drones may touch, leading axis N.
 
     position and velocity (N, 3) of the drones, pillar_position (P, 2) m, pillar_active (P,).
@@ -103,7 +105,9 @@ def surroundings(position, velocity, pillar_position, pillar_active) -> Surround
     )
 
 
-def encounters(arena: Arena, position, velocity, around: Surroundings, dt) -> Encounters:
+def encounters(
+    arena: Arena, position: Vector, velocity: Vector, around: Surroundings, dt: Seconds
+) -> Encounters:
     """One drone at `position` (3,) m with `velocity` (3,) m/s beside its solid things, for a step of dt seconds."""
     dtype, half = position.dtype, arena.height / 2
     p, k = around.pillar_position.shape[0], around.other_position.shape[0]
@@ -129,14 +133,14 @@ def encounters(arena: Arena, position, velocity, around: Surroundings, dt) -> En
     )
 
 
-def place_solids(met: Encounters) -> jax.Array:
+def place_solids(met: Encounters) -> Things:
     """Where one drone's shapes are shown to it, (M, 3) m, in the order of `solids_xml`."""
     return met.origin - met.normal * (met.shown - met.gap)[:, None]
 
 
 def contact_acceleration(
-    arena: Arena, position, velocity, acceleration, around: Surroundings, dt
-) -> jax.Array:
+    arena: Arena, position: Vector, velocity: Vector, acceleration: Vector, around: Surroundings, dt: Seconds
+) -> Vector:
     """What contacts add over a step of dt seconds to the `acceleration` (3,) m/s^2 that a drone would have without them.
 
     MuJoCo's soft contacts (its documentation, "Computation": constraint model, primal problem) written out for a sphere

@@ -5,28 +5,33 @@ from __future__ import annotations
 from typing import Any
 
 import flax.struct
-import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
 from openjax.vehicle.parameters import Vehicle, hover_rotor_speed
+from openjax.vehicle.shapes import Quaternion, Rotors, Vector
 
 
 @flax.struct.dataclass
 class DroneState:
     """One drone; more drones or environments are leading axes. World frame: z up, z = 0 is the floor."""
 
-    position: jax.Array  # (3,) m, world, of the centre of mass
-    quaternion: jax.Array  # (4,) scalar first, rotates body to world, of unit length
-    velocity: jax.Array  # (3,) m/s, world
-    body_rates: jax.Array  # (3,) rad/s, body frame
-    rotor_speed: jax.Array  # (4,) rad/s
-    rate_integral: jax.Array  # (3,) deg, the rate controller's integrated error
-    previous_body_rates: jax.Array  # (3,) rad/s, the rate controller's last measurement
+    position: Vector  # m, world, of the centre of mass
+    quaternion: Quaternion  # scalar first, rotates body to world, of unit length
+    velocity: Vector  # m/s, world
+    body_rates: Vector  # rad/s, body frame
+    rotor_speed: Rotors  # rad/s
+    rate_integral: Vector  # deg, the rate controller's integrated error
+    previous_body_rates: Vector  # rad/s, the rate controller's last measurement
     effect_memory: Any  # pytree of arrays, () when no effect needs memory
 
 
 def hover_state(
-    vehicle: Vehicle, position, quaternion=None, velocity=None, effect_memory: Any = ()
+    vehicle: Vehicle,
+    position: ArrayLike,
+    quaternion: ArrayLike | None = None,
+    velocity: ArrayLike | None = None,
+    effect_memory: Any = (),
 ) -> DroneState:
     """A drone with its rotors at hover speed, at rest unless `velocity` says otherwise, controller reset.
 

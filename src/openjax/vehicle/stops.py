@@ -8,11 +8,12 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from openjax.vehicle.arena import Arena
+from openjax.vehicle.shapes import Active, Pillars
 from openjax.vehicle.solids import DRONE_RADIUS
 from openjax.vehicle.state import DroneState
 
 
-def stop(arena: Arena, drones: DroneState, pillar_position, pillar_active) -> DroneState:
+def stop(arena: Arena, drones: DroneState, pillar_position: Pillars, pillar_active: Active) -> DroneState:
     """`drones` (leading axis N) out of the floor, pillars (P, 2) m in use (P,) and one another; no friction, no bounce."""
     position, velocity = drones.position, drones.velocity
     if pillar_position.shape[0]:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 
 from openjax.vehicle.parameters import Vehicle
 from openjax.vehicle.rotors import rotor_reaction
+from openjax.vehicle.shapes import Rotors, Vector
 
 
-def total_wrench(vehicle: Vehicle, thrust, reaction) -> tuple[jax.Array, jax.Array]:
+def total_wrench(vehicle: Vehicle, thrust: Rotors, reaction: Rotors) -> tuple[Vector, Vector]:
     """Force (3,) N and torque about the centre of mass (3,) N m of the rotors, body frame.
 
     thrust (4,) N acts along body z at the hubs; reaction (4,) N m are the signed torques of `rotor_reaction`.
@@ -21,6 +21,6 @@ def total_wrench(vehicle: Vehicle, thrust, reaction) -> tuple[jax.Array, jax.Arr
     return force, torque
 
 
-def rotor_wrench(vehicle: Vehicle, thrust, rotor_speed) -> tuple[jax.Array, jax.Array]:
+def rotor_wrench(vehicle: Vehicle, thrust: Rotors, rotor_speed: Rotors) -> tuple[Vector, Vector]:
     """`total_wrench` with the reaction torques that go with the rotor speeds (4,) rad/s."""
     return total_wrench(vehicle, thrust, rotor_reaction(vehicle, rotor_speed))
