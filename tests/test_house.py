@@ -1,0 +1,177 @@
+"""The house: how much there is, how long a function gets, which room may know which.
+
+What is over a function's limits today stands in `house_exceptions.txt`, which only gets shorter: a function over a limit that
+isn't listed fails, and so does a listed one that is no longer over. `python -m tests.test_house` writes the list.
+"""
+
+import ast
+import functools
+from collections import defaultdict
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "src" / "openjax"
+EXCEPTIONS = Path(__file__).with_name("house_exceptions.txt")
+MOST_LINES = {"src": 33_000, "experiments": 12_600}
+"""Of Python; the goals are 26,000 and 8,000."""
+FUNCTION = {"lines": 40, "branches": 10, "arguments": 5}
+"""The most of a function: lines without its docstring, branches and arguments without those of functions inside it."""
+FLOORS = (
+    "errors lazy platform background",
+    "files ranges kernels",
+    "vehicle show",
+    "pursuit flights",
+    "policy gap comparison calibration flying interfaces export",
+    "baselines virtual_crazyflie",
+    "learning",
+    "cluster",
+    "store",
+    "commands",
+    "adapt benchmark calibrate diagnose evaluate fly sample_flights train view",
+)
+"""Rooms from the ground up: each may import those below it."""
+TWICE = {
+    "settings",
+    "state",
+    "parameters",
+    "figures",
+    "report",
+    "firmware",
+    "replay",
+    "policy",
+    "calibration",
+}
+"""Module names that more than one room has."""
+
+
+def modules() -> dict[str, Path]:
+    """Dotted names of all modules but the entries of `python -m`."""
+    found = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+        if parts[-1] != "__main__":
+            found[".".join(parts).removesuffix(".__init__")] = path
+    return found
+
+
+def room(module: str) -> str:
+    """The first name below the package."""
+    return (*module.split("."), "")[1]
+
+
+@functools.cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@functools.cache
+def imports() -> dict[str, set[str]]:
+    """Modules that each module imports, in functions too, but not for types alone."""
+    known, found = modules(), defaultdict(set)
+    for name, path in known.items():
+        types_only = {
+            inner
+            for node in ast.walk(parsed(path))
+            if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+            for inner in ast.walk(node)
+        }
+        for node in ast.walk(parsed(path)):
+            if node in types_only or not isinstance(node, ast.Import | ast.ImportFrom):
+                continue
+            origin = [f"{node.module}."] if isinstance(node, ast.ImportFrom) else [""]
+            for alias in node.names:
+                full = f"{origin[0]}{alias.name}"
+                target = full if full in known else full.rpartition(".")[0]
+                if target in known and target != name:
+                    found[name].add(target)
+    return found
+
+
+def size(function: ast.FunctionDef | ast.AsyncFunctionDef) -> dict[str, int]:
+    """Lines, branches and arguments of a function."""
+    inside = {
+        node
+        for inner in ast.walk(function)
+        if inner is not function and isinstance(inner, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+        for node in ast.walk(inner)
+    }
+    own = [node for node in ast.walk(function) if node not in inside]
+    branches = sum(
+        isinstance(node, ast.If | ast.For | ast.While | ast.ExceptHandler | ast.IfExp | ast.match_case)
+        for node in own
+    )
+    branches += sum(len(node.ifs) for node in own if isinstance(node, ast.comprehension))
+    docstring = ast.get_docstring(function, clean=False)
+    documented = function.body[0].end_lineno - function.body[0].lineno + 1 if docstring else 0
+    arguments = [*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs]
+    return {
+        "lines": function.end_lineno - function.lineno + 1 - documented,
+        "branches": branches,
+        "arguments": sum(argument.arg not in ("self", "cls") for argument in arguments),
+    }
+
+
+def over_the_limits() -> set[str]:
+    """`path function: what` of each function that is over a limit."""
+    found = set()
+    for part in MOST_LINES:
+        for path in sorted((ROOT / part).rglob("*.py")):
+            for node in ast.walk(parsed(path)):
+                if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                    over = [name for name, number in size(node).items() if number > FUNCTION[name]]
+                    if over:
+                        found.add(f"{path.relative_to(ROOT).as_posix()} {node.name}: {', '.join(over)}")
+    return found
+
+
+@pytest.mark.parametrize("part", MOST_LINES)
+def test_there_is_no_more_of_it(part):
+    lines = sum(len(path.read_text(encoding="utf-8").splitlines()) for path in (ROOT / part).rglob("*.py"))
+    assert lines <= MOST_LINES[part]
+
+
+def test_functions_do_one_thing():
+    listed = set(EXCEPTIONS.read_text(encoding="utf-8").splitlines())
+    over = over_the_limits()
+    assert not over - listed, "split them, or hand one object down"
+    assert not listed - over, "no longer over: take them off the list (python -m tests.test_house)"
+
+
+def test_rooms_import_downwards_only():
+    floor = {name: i for i, names in enumerate(FLOORS) for name in names.split()}
+    assert {room(name) for name in modules()} - {""} <= set(floor), "a room without a floor"
+    upwards = {
+        f"{name} imports {target}"
+        for name, targets in imports().items()
+        for target in targets
+        if room(name) and room(target) and room(name) != room(target)
+        if floor[room(target)] >= floor[room(name)]
+    }
+    assert not upwards
+
+
+def test_no_module_imports_itself_by_a_detour():
+    def reachable(start):
+        seen, left = set(), set(imports()[start])
+        while left:
+            name = left.pop()
+            seen.add(name)
+            left |= imports().get(name, set()) - seen
+        return seen
+
+    circles = {name for name in list(imports()) if name in reachable(name)}
+    assert not [name for name in circles if not name.startswith(tuple(CIRCLES))]
+
+
+def test_modules_of_one_name_are_few():
+    rooms = defaultdict(set)
+    for name, path in modules().items():
+        if room(name) not in FLOORS[-1].split():  # thin entries have the names of their commands
+            rooms[path.parent.name if path.name == "__init__.py" else path.stem].add(name)
+    assert {name for name, places in rooms.items() if len(places) > 1} <= TWICE
+
+
+if __name__ == "__main__":
+    EXCEPTIONS.write_text("\n".join(sorted(over_the_limits())) + "\n", encoding="utf-8")
