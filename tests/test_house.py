@@ -33,17 +33,12 @@ FLOORS = (
 )
 """Rooms from the ground up: each may import those below it."""
 TWICE = {
-    "settings",
-    "state",
-    "parameters",
-    "figures",
-    "report",
-    "firmware",
-    "replay",
-    "policy",
-    "calibration",
+    *("settings", "state", "parameters", "figures", "report", "firmware", "replay"),
+    *("policy", "calibration", "export", "virtual_crazyflie"),
 }
 """Module names that more than one room has."""
+CIRCLES = {"openjax.gap.report"}
+"""Packages in which a class draws the page that is drawn from it."""
 
 
 def modules() -> dict[str, Path]:

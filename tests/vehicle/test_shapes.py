@@ -59,7 +59,9 @@ def shaped_functions():
         for name, function in inspect.getmembers(module, inspect.isfunction):
             hints = typing.get_type_hints(function)
             own = function.__module__ == module.__name__ and not name.startswith("_")
-            if own and any(is_array(kind) for hint in hints.values() for kind in (hint, *typing.get_args(hint))):
+            if own and any(
+                is_array(kind) for hint in hints.values() for kind in (hint, *typing.get_args(hint))
+            ):
                 yield pytest.param(function, hints, id=name)
 
 
