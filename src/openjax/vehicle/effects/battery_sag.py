@@ -23,6 +23,7 @@ _CELL = "one-cell LiPo: 4.2 V full, about 3.2 V empty under load, seven minutes 
 EFFECT = Effect(
     name="battery_sag",
     description="the motor command loses (V / reference)^exponent",
+    formula=r"m' = m\,(V/V_0)^{k}",
     parameters={
         "exponent": Parameter(
             unit="1",

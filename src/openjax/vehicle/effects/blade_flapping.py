@@ -30,6 +30,7 @@ def pitches(value, deviation):
 EFFECT = Effect(
     name="blade_flapping",
     description="thrust tilts back with airspeed, and the hubs pass on a torque",
+    formula=r"f_i = -\tau\,T_i\,v_{i,xy},\quad M = \kappa\,(v \times e_3)",
     parameters={
         "tilt": Parameter(
             unit="rad s/m",

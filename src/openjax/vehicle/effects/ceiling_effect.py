@@ -21,6 +21,7 @@ _SOURCE = "as strong as the ground effect or stronger (Hsiao, Chirarattananon 20
 EFFECT = Effect(
     name="ceiling_effect",
     description="thrust grows by strength (R / (distance + offset))^2 near the ceiling, per rotor",
+    formula=r"T_i' = T_i\left(1 + s\,\frac{R^2}{(h_c - z_i + \delta)^2}\right)",
     parameters={
         "strength": Parameter("1", 0.0, (0.2, 1.5), _SOURCE),
         "offset": Parameter("m", 0.0, (0.0, 0.03), "distance of the rotors from the tracked point"),

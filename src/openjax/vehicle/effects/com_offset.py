@@ -16,6 +16,7 @@ _SOURCE = "battery and decks shift it by 0.05-8 mm"
 EFFECT = Effect(
     name="com_offset",
     description="centre of mass away from the middle of the rotors, body frame",
+    formula=r"r_i' = r_i - c",
     parameters={
         "x": Parameter("m", 0.0, (-0.008, 0.008), _SOURCE, "forward"),
         "y": Parameter("m", 0.0, (-0.008, 0.008), _SOURCE, "left"),

@@ -22,6 +22,7 @@ def command(parameters, memory, command, context):
 EFFECT = Effect(
     name="command_latency",
     description="the rate controller gets commands of a fixed time ago",
+    formula=r"u'(t) = u(t - \Delta)",
     parameters={
         "delay": Parameter("s", 0.0, (0.004, 0.06), "radio links of the Crazyflie and of ROS bridges")
     },

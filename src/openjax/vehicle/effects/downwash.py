@@ -28,6 +28,7 @@ _SOURCE = "3-20 g under another Crazyflie, 3-8 cm wide (Shi et al. 2020, Neural-
 EFFECT = Effect(
     name="downwash",
     description="force along -z under another vehicle, decaying with the distance below it and to the side",
+    formula=r"f = -A\,e^{-\Delta z/h}\,e^{-r^2/2s^2}\,e_z,\quad s = w + b\,\Delta z",
     parameters={
         "force": Parameter("N", 0.0, (0.03, 0.2), _SOURCE, "right under the other vehicle"),
         "length": Parameter("m", 0.5, (0.2, 1.0), _SOURCE, "decay below"),

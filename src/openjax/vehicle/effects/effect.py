@@ -169,6 +169,7 @@ class Effect:
     record(memory, state) -> memory: remembers the state at the end of a step, for `sensor`.
     initial_memory(vehicle, state, dt, key) -> memory: needed where `command`, `sensor` or `record` use one.
     random: whether `initial_memory` needs its key.
+    formula: what it changes, in LaTeX, for the documentation.
     card: how the diagnosis tells it; without one it can be flown with, but not be diagnosed.
     """
 
@@ -184,6 +185,7 @@ class Effect:
     record: Callable[[Any, DroneState], Any] | None = None
     initial_memory: Callable[[Vehicle, DroneState, float, Any], Any] | None = None
     random: bool = False
+    formula: str = ""
     card: Card | None = None
 
     def none(self) -> dict[str, float]:

@@ -25,6 +25,7 @@ _SOURCE = (
 EFFECT = Effect(
     name="ground_effect",
     description="thrust grows by strength (R / (z + offset))^2 near the floor, per rotor",
+    formula=r"T_i' = T_i\left(1 + s\,\frac{R^2}{(z_i + \delta)^2}\right)",
     parameters={
         "strength": Parameter("1", 0.0, (0.2, 1.2), _SOURCE),
         "offset": Parameter(

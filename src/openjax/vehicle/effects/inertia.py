@@ -32,6 +32,7 @@ _SOURCE = "published values for the Crazyflie, with and without decks: 0.7-1.6 o
 EFFECT = Effect(
     name="inertia",
     description="moments of inertia as multiples of the assumed ones",
+    formula=r"J' = \mathrm{diag}(k_{xx}, k_{yy}, k_{zz})\,J",
     parameters={axis: Parameter("1", 1.0, (0.7, 1.6), _SOURCE) for axis in ("xx", "yy", "zz")},
     body=body,
     card=Card(

@@ -11,6 +11,7 @@ def body(parameters, vehicle):
 EFFECT = Effect(
     name="mass",
     description="mass differs from what the simulator assumes",
+    formula=r"m' = m + \Delta m",
     parameters={
         "extra": Parameter(
             unit="kg",

@@ -31,6 +31,7 @@ def command(parameters, memory, command, context):
 EFFECT = Effect(
     name="packet_loss",
     description="each command is lost with a fixed probability, and the last one is held",
+    formula=r"u'_k = u_k \text{ with probability } 1 - p,\ \text{else } u'_{k-1}",
     parameters={
         "probability": Parameter("1", 0.0, (0.01, 0.5), "2.4 GHz radio in crowded rooms and swarms: 1-50 %")
     },

@@ -16,6 +16,7 @@ _SOURCE = "retuned gains found in labs: half to twice the firmware's"
 EFFECT = Effect(
     name="rate_gains",
     description="gains of the rate controller as multiples of the assumed ones",
+    formula=r"K_P' = k_p K_P,\quad K_I' = k_i K_I,\quad K_D' = k_d K_D",
     parameters={gain: Parameter("1", 1.0, (0.5, 2.0), _SOURCE) for gain in ("p", "i", "d")},
     body=body,
     card=Card(

@@ -25,6 +25,7 @@ def brakes(value, deviation):
 EFFECT = Effect(
     name="rotor_drag",
     description="force against the hubs' velocity in the body frame",
+    formula=r"f_i = -\tfrac14\,\mathrm{diag}(d_{xy}, d_{xy}, d_z)\,v_i",
     parameters={
         "d_xy": Parameter("N s/m", 0.0, (0.005, 0.03), _SOURCE, "in the rotor plane, all four rotors"),
         "d_z": Parameter("N s/m", 0.0, (0.0, 0.03), _SOURCE, "along the rotor axes, all four rotors"),

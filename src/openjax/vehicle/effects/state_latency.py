@@ -36,6 +36,7 @@ def sensor(parameters, memory, state):
 EFFECT = Effect(
     name="state_latency",
     description="position, attitude and velocity are seen a fixed time late",
+    formula=r"(p, q, v)_{\mathrm{seen}}(t) = (p, q, v)(t - \Delta)",
     parameters={"delay": Parameter("s", 0.0, (0.004, 0.06), "motion capture, filtering and network")},
     sensor=sensor,
     record=record,

@@ -34,6 +34,7 @@ def bends(value, deviation):
 EFFECT = Effect(
     name="thrust_curve",
     description="thrust follows offset + slope m + curvature m^2 of the motor command m",
+    formula=r"m' = c_0 + c_1\,m + c_2\,m^2",
     parameters={
         "offset": Parameter("1", 0.0, (-0.05, 0.05), _SOURCE),
         "slope": Parameter("1", 1.0, (0.7, 1.3), _SOURCE),

@@ -24,6 +24,7 @@ def tops_out(value, deviation):
 EFFECT = Effect(
     name="thrust_saturation",
     description="no rotor gives more than a share of the nominal largest thrust",
+    formula=r"m' = \min\left(m,\ \ell\,(1 + \beta\,(V - V_0))\right)",
     parameters={
         "limit": Parameter(
             unit="1",

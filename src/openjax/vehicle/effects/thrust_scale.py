@@ -13,6 +13,7 @@ def body(parameters, vehicle):
 EFFECT = Effect(
     name="thrust_scale",
     description="thrust and rotor torque differ by a common factor 1 + scale",
+    formula=r"T_i' = (1 + s)\,T_i,\quad Q_i' = (1 + s)\,Q_i",
     parameters={
         "scale": Parameter(
             unit="1",

@@ -28,6 +28,7 @@ def blows(value, deviation):
 EFFECT = Effect(
     name="wind",
     description="drag against air that moves with a constant velocity in the world frame",
+    formula=r"f_i = -\tfrac14\,d\,\mathrm{diag}(1, 1, a)\,(v_i - w)",
     parameters={
         "x": Parameter("m/s", 0.0, (-3.0, 3.0), _SOURCE, "velocity of the air"),
         "y": Parameter("m/s", 0.0, (-3.0, 3.0), _SOURCE, "velocity of the air"),

@@ -10,6 +10,7 @@ def body(parameters, vehicle):
 EFFECT = Effect(
     name="yaw_torque",
     description="torque constant as a multiple of the assumed one",
+    formula=r"Q_i' = k\,Q_i",
     parameters={
         "ratio": Parameter(
             unit="1",
