@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 import openjax
-from openjax.commands import training_job
 
 pytestmark = pytest.mark.slow
 
@@ -49,7 +48,6 @@ def test_training_from_python_gives_a_policy(tmp_path, monkeypatch, capsys):
     )
     monkeypatch.setattr(openjax, "preset", lambda name: tiny, raising=False)
     monkeypatch.setattr(sys, "argv", ["train_from_python.py"])
-    monkeypatch.setattr(training_job, "_report", lambda *_: "")  # the layouts: tests of the command have them
     monkeypatch.chdir(tmp_path)
     runpy.run_path(str(EXAMPLES / "train_from_python.py"))
     assert "distances to the evader" in capsys.readouterr().out

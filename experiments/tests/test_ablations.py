@@ -11,7 +11,7 @@ from experiments.paper import ablations, runs
 from experiments.paper.runs import VARIANTS, by_variant, main_effects, read_run, savings, steps_to
 from openjax.errors import UserError
 from openjax.learning import GeneratorSettings, MappoSettings, TrainSettings, build, make_training_step
-from openjax.learning.training_step import _initial_carry
+from openjax.learning.training_step import initial_carry
 from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings
 from openjax.store.run_directory import create_run
@@ -65,7 +65,7 @@ def test_a_training_step_simulates_exactly_the_steps_that_are_counted():
 
     environment = Watched(TINY.environment)
     parts = build(TINY, environment)
-    carry = jax.eval_shape(lambda key: _initial_carry(TINY, parts, key), jax.random.key(0))
+    carry = jax.eval_shape(lambda key: initial_carry(TINY, parts, key), jax.random.key(0))
     jaxpr = jax.make_jaxpr(make_training_step(TINY, environment))(carry)
     assert len(calls) == 1
     lengths = [

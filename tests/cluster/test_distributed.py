@@ -38,7 +38,7 @@ import sys
 from pathlib import Path
 import jax, numpy as np
 from openjax.learning import TrainSettings, build, init_carry
-from openjax.learning.training_step import _initial_carry
+from openjax.learning.training_step import initial_carry
 from openjax.pursuit import Pursuit
 from openjax.store.checkpoint_files import load_arrays
 from openjax.store.checkpoints import Checkpoints
@@ -51,7 +51,7 @@ run, directory, UPDATES = RunDirectory(Path(sys.argv[1])), Path(sys.argv[2]), in
 settings = run.read_settings()
 environment = Pursuit(settings.environment)
 parts = build(settings, environment)
-shapes = jax.eval_shape(lambda: _initial_carry(settings, parts, jax.random.key(0)))
+shapes = jax.eval_shape(lambda: initial_carry(settings, parts, jax.random.key(0)))
 compilations = []
 jax.monitoring.register_event_duration_secs_listener(
     lambda name, *_, **__: compilations.append(name) if "backend_compile" in name else None
@@ -118,11 +118,11 @@ print("same")
 # Both wait for each other for ever.
 WAITING = """
 import sys
-from openjax.cluster.joining import Membership, _connected
+from openjax.cluster.joining import Membership, connected
 from openjax.cluster.processes import Processes
 
 membership = Membership(sys.argv[1], 2, int(sys.argv[2]), "deactivate")
-with _connected(membership) as (connections, _):
+with connected(membership) as (connections, _):
     processes = Processes(2, membership.process_id, connections)
     assert processes.everyone(membership.process_id) == [0, 1] and processes.of_first(5 + membership.process_id) == 5
     print("here", flush=True)

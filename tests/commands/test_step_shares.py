@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from openjax.commands.step_shares import ARITHMETIC, BANDWIDTH, Share, _products
+from openjax.commands.step_shares import ARITHMETIC, BANDWIDTH, Share, products
 from openjax.learning import preset
 
 F, HEADS, OTHERS, PILLARS = 128, 2, 2, 3
@@ -19,12 +19,12 @@ def test_products_of_a_sample_are_those_of_the_folded_attention():
     encoder = {"self_1": {"kernel": matrix(40, F), "affine": matrix(3, F)}, "attention": attention}
     by_hand = 40 * F + 2 * HEADS * F * F + OTHERS * 3 * F + PILLARS * 5 * F
     by_hand += 2 * HEADS * (1 + OTHERS + PILLARS) * F  # scores and means
-    assert _products(preset("paper"), {"params": {"encoder": encoder}}) == by_hand
+    assert products(preset("paper"), {"params": {"encoder": encoder}}) == by_hand
 
 
 def test_a_critic_of_layers_attends_to_nothing():
     layers = {"layer_1": {"kernel": jax.ShapeDtypeStruct((72, 2 * F), jnp.float32)}}
-    assert _products(preset("paper"), {"params": layers}) == 72 * 2 * F
+    assert products(preset("paper"), {"params": layers}) == 72 * 2 * F
 
 
 def test_the_limit_is_what_takes_longer():

@@ -11,10 +11,10 @@ from openjax.kernels.attention import (
     ROWS,
     EntityKind,
     Layout,
-    _backward_kernel_call,
-    _forward_kernel_call,
     _reference,
     _reference_backward,
+    backward_by_kernel,
+    forward_by_kernel,
 )
 from openjax.policy import encoder
 from openjax.policy.encoder import SelfAttention, normalised_linear
@@ -135,13 +135,13 @@ def test_kernel_is_the_plain_formula_forward_and_backward():
     batch = BLOCK + 2 * ROWS + 3  # not a multiple of the block
     arguments = arguments_of(batch)
     gradient = jax.random.normal(jax.random.key(9), arguments[0].shape)
-    kernel = jax.jit(lambda *a: _forward_kernel_call(LAYOUT, *a, interpret=True))
+    kernel = jax.jit(lambda *a: forward_by_kernel(LAYOUT, *a, interpret=True))
     expected = jax.jit(lambda *a: _reference(LAYOUT, *a))(*arguments)
     got = kernel(*arguments)
     assert got.shape == expected.shape
     np.testing.assert_allclose(got, expected, atol=1e-4)
 
     expected = jax.jit(lambda *a: _reference_backward(LAYOUT, *a))(*arguments, gradient)
-    got = jax.jit(lambda *a: _backward_kernel_call(LAYOUT, *a, interpret=True))(*arguments, gradient)
+    got = jax.jit(lambda *a: backward_by_kernel(LAYOUT, *a, interpret=True))(*arguments, gradient)
     for name, a, b in zip(("query", "own", "inverse", "weights"), got, expected, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-4 * float(jnp.abs(b).max() + 1), err_msg=name)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from openjax.kernels.activation import activation
-from openjax.kernels.normalisation import ROWS, _backward_kernel_call, _forward_kernel_call, normalise
+from openjax.kernels.normalisation import ROWS, backward_by_kernel, forward_by_kernel, normalise
 
 FEATURES = 16
 
@@ -38,8 +38,8 @@ def test_normalise_is_bias_layer_norm_and_activation(activate):
 def test_kernel_computes_the_formula_and_its_gradient(activate):
     x, affine, gradient = drawn(2 * ROWS + 5)  # the last block is only partly filled
     expected, pullback = jax.vjp(lambda x, a: flax_layer(x, a, activate), x, affine)
-    value = _forward_kernel_call(activate, x, affine, interpret=True)
+    value = forward_by_kernel(activate, x, affine, interpret=True)
     np.testing.assert_allclose(value, expected, atol=1e-5)
-    gradients = _backward_kernel_call(activate, x, affine, gradient, interpret=True)
+    gradients = backward_by_kernel(activate, x, affine, gradient, interpret=True)
     for got, want in zip(gradients, pullback(gradient), strict=True):
         np.testing.assert_allclose(got, want, atol=5e-5)

@@ -9,7 +9,7 @@ import optax
 import pytest
 
 from openjax.errors import UserError
-from openjax.learning.mappo import _every, initial_value_scale, make_optimiser, update_policy
+from openjax.learning.mappo import every_nth, initial_value_scale, make_optimiser, update_policy
 from openjax.learning.rollout import Rollout
 from openjax.learning.settings import MappoSettings, preset
 from openjax.learning.train_state import Optimisers
@@ -171,9 +171,9 @@ def test_the_actor_can_start_to_learn_later_than_the_critic():
 
 def test_a_gradient_step_may_see_every_third_step_of_all_worlds():
     steps = jnp.broadcast_to(jnp.arange(12)[None, :, None], (5, 12, 2))
-    thirds = jnp.stack([_every(steps, jnp.int32(first), 3) for first in range(3)])
+    thirds = jnp.stack([every_nth(steps, jnp.int32(first), 3) for first in range(3)])
     np.testing.assert_array_equal(thirds[1, 4, :, 0], [1, 4, 7, 10])
     np.testing.assert_array_equal(np.sort(thirds[:, 2, :, 1], axis=None), np.arange(12))  # none left out
-    assert _every(steps, None, 1) is steps
-    with pytest.raises(UserError, match="sample_every 3 must divide rollout_length 80"):
-        preset("paper", mappo=MappoSettings(minibatches=16, sample_every=3))
+    assert every_nth(steps, None, 1) is steps
+    with pytest.raises(UserError, match="step_subsampling 3 must divide rollout_length 80"):
+        preset("paper", mappo=MappoSettings(minibatches=16, step_subsampling=3))

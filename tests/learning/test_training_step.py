@@ -23,7 +23,7 @@ from openjax.learning import (
     summarise,
     training_step,
 )
-from openjax.learning.training_step import _initial_carry, _penalty_share
+from openjax.learning.training_step import initial_carry, penalty_share_at
 from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import SCENARIOS, PursuitSettings, hover_action, scenario_task
 
@@ -163,7 +163,7 @@ NO_GENERATOR = dataclasses.replace(SETTINGS.generator, enabled=False)
 
 def test_the_step_without_predictor_and_generator_keeps_its_carry():
     settings = dataclasses.replace(SETTINGS, predictor=NO_PREDICTOR, generator=NO_GENERATOR)
-    start = functools.partial(_initial_carry, settings, build(settings))
+    start = functools.partial(initial_carry, settings, build(settings))
     before = jax.eval_shape(start, jax.random.key(0))
     after, metrics = jax.eval_shape(make_training_step(settings), before)
     kinds = [jax.tree.map(lambda x: (x.shape, x.dtype), carry) for carry in (before, after)]
@@ -179,9 +179,9 @@ def test_without_the_generator_every_world_flies_its_own_task():
 
 
 def test_penalties_ramp_up():
-    share = [float(_penalty_share(SETTINGS, progress)) for progress in (0.0, 0.2, 0.5, 0.9)]
+    share = [float(penalty_share_at(SETTINGS, progress)) for progress in (0.0, 0.2, 0.5, 0.9)]
     np.testing.assert_allclose(share, [0.2, 0.52, 1.0, 1.0], atol=1e-6)
-    assert float(_penalty_share(TrainSettings(), 0.0)) == 1.0
+    assert float(penalty_share_at(TrainSettings(), 0.0)) == 1.0
 
 
 def test_evaluation_of_a_policy_that_hovers():

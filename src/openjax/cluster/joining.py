@@ -94,7 +94,7 @@ def joined(membership: Membership | None) -> Iterator[Processes]:
     if membership is None:
         yield Processes()
         return
-    with _connected(membership) as (connections, bind_address):
+    with connected(membership) as (connections, bind_address):
         processes = Processes(membership.num_processes, membership.process_id, connections)
         _tune_alone()
         try:
@@ -139,7 +139,7 @@ def _one_line(error):
 
 
 @contextlib.contextmanager
-def _connected(membership):
+def connected(membership):
     """Connections and hosts by process (to all others on process 0, to process 0 elsewhere), and where JAX's
     coordinator is to listen.
     """

@@ -35,7 +35,9 @@ def closing_words(settings: TrainSettings, run: Path, on_cpu: bool) -> list[str]
     steps = [f"{view} (in a browser)"]
     if on_cpu:
         steps.append("openjax train --preset paper (the real game, five minutes on a GPU)")
-    steps.append("openjax sample_flights flights, then openjax diagnose flights (from flight logs to a cause)")
+    steps.append(
+        "openjax sample_flights flights, then openjax diagnose flights (from flight logs to a cause)"
+    )
     return [*lines, f"Next: {'; '.join(steps)}."]
 
 

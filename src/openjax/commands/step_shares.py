@@ -111,14 +111,14 @@ def measure(settings: TrainSettings, seconds_of: Callable[[Callable, tuple], flo
     prediction_seconds = seconds.get("prediction", 0.0)
 
     samples = agents * steps
-    forward = 2 * _products(settings, carry.policy.actor) + 2 * _products(settings, carry.policy.critic)
-    acting = 2 * _products(settings, carry.policy.actor)
+    forward = 2 * products(settings, carry.policy.actor) + 2 * products(settings, carry.policy.critic)
+    acting = 2 * products(settings, carry.policy.actor)
     windows = settings.predictor.windows * settings.num_envs if settings.predictor.enabled else 0
     predicting = (
         2 * settings.environment.history_length * sum(x.size for x in jax.tree.leaves(carry.policy.predictor))
     )
     observed = _bytes(carry.observation.replace(frames=())) * steps
-    update = settings.mappo.epochs / settings.mappo.sample_every
+    update = settings.mappo.epochs / settings.mappo.step_subsampling
     shares = [
         Share("physics", seconds["physics"], 0.0, 2 * _bytes(carry.state.drones) * steps),
         Share(
@@ -167,7 +167,7 @@ def _bytes(tree: Any) -> int:
     return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
 
 
-def _products(settings: TrainSettings, parameters: Any) -> int:
+def products(settings: TrainSettings, parameters: Any) -> int:
     """Multiplications of one sample in a network's matrix products, its attention with keys and values folded."""
     network, game = settings.network, settings.environment
     uses = {"others_kernel": game.num_pursuers - 1, "pillars_kernel": game.observed_pillars}

@@ -120,7 +120,7 @@ def attend_one_by_one(
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(5,))
 def _attend(query, own, inputs, inverse, weights, layout):
-    return on_platform(_reference, _forward_kernel_call, layout)(query, own, inputs, inverse, weights)
+    return on_platform(_reference, forward_by_kernel, layout)(query, own, inputs, inverse, weights)
 
 
 def _attend_forward(query, own, inputs, inverse, weights, layout):
@@ -129,7 +129,7 @@ def _attend_forward(query, own, inputs, inverse, weights, layout):
 
 
 def _attend_backward(layout, saved, gradient):
-    dquery, down, dinverse, dweights = on_platform(_reference_backward, _backward_kernel_call, layout)(
+    dquery, down, dinverse, dweights = on_platform(_reference_backward, backward_by_kernel, layout)(
         *saved, gradient
     )
     return dquery, down, jnp.zeros_like(saved[2]), dinverse, dweights
@@ -275,7 +275,8 @@ def _block_specs(layout, rows, *arrays):
     ]
 
 
-def _forward_kernel_call(layout, query, own, inputs, inverse, weights, interpret=False):
+def forward_by_kernel(layout, query, own, inputs, inverse, weights, interpret=False):
+    """What the reference gives, by a kernel; `interpret` runs it without a GPU."""
     batch = own.shape[0]
     query, own = whole_blocks(query, ROWS), whole_blocks(own, ROWS)
     inputs, inverse = whole_blocks(inputs, ROWS, axis=1), whole_blocks(inverse, ROWS, axis=1)
@@ -293,7 +294,8 @@ def _forward_kernel_call(layout, query, own, inputs, inverse, weights, interpret
     return mean[:batch]
 
 
-def _backward_kernel_call(layout, query, own, inputs, inverse, weights, gradient, interpret=False):
+def backward_by_kernel(layout, query, own, inputs, inverse, weights, gradient, interpret=False):
+    """The reference\'s gradients, by a kernel; `interpret` runs it without a GPU."""
     batch = own.shape[0]
     # samples that only fill the last block have no gradient, so they add nothing to the sums
     query, own, gradient = (whole_blocks(samples, BLOCK) for samples in (query, own, gradient))

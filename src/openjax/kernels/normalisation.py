@@ -58,7 +58,7 @@ def normalised_layer(x: jax.Array, kernel: jax.Array, affine: jax.Array) -> jax.
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
 def _normalise(x, affine, activate):
-    return on_platform(_reference, _forward_kernel_call, activate)(x, affine)
+    return on_platform(_reference, forward_by_kernel, activate)(x, affine)
 
 
 def _forward(x, affine, activate):
@@ -66,7 +66,7 @@ def _forward(x, affine, activate):
 
 
 def _backward(activate, saved, gradient):
-    return on_platform(_reference_backward, _backward_kernel_call, activate)(*saved, gradient)
+    return on_platform(_reference_backward, backward_by_kernel, activate)(*saved, gradient)
 
 
 _normalise.defvjp(_forward, _backward)
@@ -117,7 +117,8 @@ def _backward_kernel(activate, arithmetic, x_ref, affine_ref, g_ref, dx_ref, daf
     daffine_ref[0, 2, :] = jnp.sum(dout, axis=0)
 
 
-def _forward_kernel_call(activate, x, affine, interpret=False):
+def forward_by_kernel(activate, x, affine, interpret=False):
+    """What the reference gives, by a kernel; `interpret` runs it without a GPU."""
     padded = whole_blocks(x, ROWS)
     block = pl.BlockSpec((ROWS, x.shape[1]), lambda i: (i, 0))
     out = pl.pallas_call(
@@ -133,7 +134,8 @@ def _forward_kernel_call(activate, x, affine, interpret=False):
     return out[: x.shape[0]]
 
 
-def _backward_kernel_call(activate, x, affine, gradient, interpret=False):
+def backward_by_kernel(activate, x, affine, gradient, interpret=False):
+    """The reference\'s gradients, by a kernel; `interpret` runs it without a GPU."""
     # samples that only fill the last block have no gradient, so they add nothing to the sums
     padded, padded_gradient = whole_blocks(x, ROWS), whole_blocks(gradient, ROWS)
     programs, features = padded.shape[0] // ROWS, x.shape[1]

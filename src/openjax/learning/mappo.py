@@ -148,7 +148,7 @@ def update_policy(
     returns = advantage + value
     explained = 1.0 - joint_moments(advantage, axis)[1] ** 2 / (joint_moments(returns, axis)[1] ** 2 + 1e-8)
 
-    keep = settings.value_memory
+    keep = settings.value_norm_decay
     first, second = mean_over_devices((jnp.mean(returns), jnp.mean(returns**2)), axis)
     scale = ValueScale(
         mean=keep * scale.mean + (1 - keep) * first,
@@ -171,7 +171,7 @@ def update_policy(
     def gradient_step(carry, chosen):
         actor, critic = carry
         index, first = chosen
-        part = jax.tree.map(lambda x: _every(x[index], first, settings.sample_every), batch)
+        part = jax.tree.map(lambda x: every_nth(x[index], first, settings.step_subsampling), batch)
         gradient, watch = jax.grad(lambda p: loss(settings, policy, p, part, clip), has_aux=True)(
             (actor.parameters, critic.parameters)
         )
@@ -186,14 +186,14 @@ def update_policy(
         jax.random.split(key, settings.epochs)
     ).ravel()
     first = None
-    if settings.sample_every > 1:
-        first = jax.random.randint(jax.random.fold_in(key, 1), order.shape, 0, settings.sample_every)
+    if settings.step_subsampling > 1:
+        first = jax.random.randint(jax.random.fold_in(key, 1), order.shape, 0, settings.step_subsampling)
     (actor, critic), watch = jax.lax.scan(gradient_step, (actor, critic), (order, first))
     metrics = jax.tree.map(jnp.mean, watch) | {"explained_variance": explained, "value_scale": std}
     return actor, critic, scale, metrics
 
 
-def _every(x, first, number):
+def every_nth(x, first, number):
     """(E, T, ...) to (E, T / number, ...): every `number`-th step from `first` on."""
     if number == 1:
         return x

@@ -24,7 +24,7 @@ class MappoSettings:
     first."""
     epochs: Annotated[int, Interval("[1, 1000]")] = 4
     minibatches: Annotated[int, Interval("[1, 100000]")] = 16
-    sample_every: Annotated[int, Interval("[1, 100000]")] = 1
+    step_subsampling: Annotated[int, Interval("[1, 100000]")] = 1
     """A gradient step sees every n-th step of its trajectories, from a first one drawn each time: consecutive steps are so
     alike that fewer of them teach nearly as much. Divides `rollout_length`."""
     clip_epsilon: Annotated[float, Interval("(0, 10]")] = 0.1
@@ -42,7 +42,7 @@ class MappoSettings:
     """Where the value loss turns linear, in standard deviations of the returns."""
     value_coefficient: Annotated[float, Interval("(0, 1000]")] = 1.0
     """Weight of the value loss; it matters where actor and critic share an encoder."""
-    value_memory: Annotated[float, Interval("[0, 1)")] = 0.95
+    value_norm_decay: Annotated[float, Interval("[0, 1)")] = 0.95
     """Share of the old mean and variance of the returns that value normalisation keeps per iteration."""
     reward_scale: Annotated[float, Interval("(0, 1e6]")] = 0.1
     penalty_start: Annotated[float, Interval("[0, 1]")] = 1.0
@@ -201,8 +201,8 @@ class TrainSettings:
             f"num_envs {self.num_envs} must be a multiple of mappo.minibatches {self.mappo.minibatches}",
         )
         need(
-            rollout % self.mappo.sample_every == 0,
-            f"mappo.sample_every {self.mappo.sample_every} must divide rollout_length {rollout}",
+            rollout % self.mappo.step_subsampling == 0,
+            f"mappo.step_subsampling {self.mappo.step_subsampling} must divide rollout_length {rollout}",
         )
         if self.predictor.enabled:
             room = rollout - self.predictor.horizons[-1] + 1
@@ -286,7 +286,7 @@ def quick() -> TrainSettings:
             learning_rate=1e-3,
             epochs=4,
             minibatches=8,
-            sample_every=2,
+            step_subsampling=2,
             clip_epsilon=0.2,
             clip_epsilon_end=0.2,
             discount=0.99,

@@ -82,7 +82,7 @@ def make_start(
     `jax.eval_shape` of it tells the carry's shapes; it is traced once for both.
     """
     parts = build(settings, environment)
-    return jax.jit(functools.partial(_initial_carry, settings, parts))
+    return jax.jit(functools.partial(initial_carry, settings, parts))
 
 
 def init_carry(settings: TrainSettings, key: jax.Array, environment: Pursuit | None = None) -> TrainCarry:
@@ -95,7 +95,8 @@ def abstract_carry(settings: TrainSettings, environment: Pursuit | None = None) 
     return jax.eval_shape(make_start(settings, environment), jax.random.key(0))
 
 
-def _initial_carry(settings, parts, key):
+def initial_carry(settings: TrainSettings, parts: Building, key: jax.Array) -> TrainCarry:
+    """The carry of a run's start; `parts` are what `build` gives."""
     environment = _starting(settings, parts.environment, 0.0)
     archive = empty_archive(empty_task(settings.environment), settings.generator.capacity)
     key, policy_key, task_key, reset_key = jax.random.split(key, 4)
@@ -175,7 +176,7 @@ def make_training_step(
 
         # rollout
         progress = carry.update.astype(jnp.float32) / settings.total_updates
-        penalty_share = _penalty_share(settings, progress)
+        penalty_share = penalty_share_at(settings, progress)
         starting = _starting(settings, environment, progress)
         shape = (settings.rollout_length, settings.environment.num_pursuers, policy.sample_size)
         noise = jax.vmap(lambda k: jax.random.normal(k, shape))(own_keys(noise_key, num_envs, axis))
@@ -236,7 +237,7 @@ def make_training_step(
     return training_step
 
 
-def _penalty_share(settings, progress):
+def penalty_share_at(settings, progress):
     """Share of the penalties that counts when a share `progress` of the run is done: a ramp from its start to one."""
     start = settings.mappo.penalty_start
     return start + (1.0 - start) * jnp.minimum(progress / max(settings.mappo.penalty_ramp, 1e-6), 1.0)

@@ -5,6 +5,7 @@ import math
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 
 from openjax.kernels.attention import EntityKind, Layout, attend, attend_one_by_one
 from openjax.kernels.normalisation import normalise, normalised_layer
@@ -24,7 +25,7 @@ class SelfAttention(nn.Module):
 
     features: int
     heads: int
-    dtype: jnp.dtype
+    dtype: DTypeLike
 
     @nn.compact
     def __call__(
@@ -133,7 +134,7 @@ class Encoder(nn.Module):
 
     features: int
     heads: int
-    dtype: jnp.dtype
+    dtype: DTypeLike
 
     @nn.compact
     def __call__(
@@ -160,7 +161,7 @@ class HiddenLayer(nn.Module):
     """Linear layer, layer normalisation and activation."""
 
     features: int
-    dtype: jnp.dtype
+    dtype: DTypeLike
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:

@@ -13,6 +13,8 @@ _RENAMED = {
     "mappo.entropy_coefficient": "entropy",
     "mappo.gae_lambda": "trace",
     "mappo.max_grad_norm": "gradient_norm",
+    "mappo.value_norm_decay": "value_memory",
+    "mappo.step_subsampling": "sample_every",
 }
 """Where a setting is now, and its old name in the same group."""
 
