@@ -9,9 +9,7 @@ import pytest
 from jaxtyping import install_import_hook
 
 # shapes and types of arrays in signatures are checked at each call, which is when a function is traced
-install_import_hook(
-    ["openjax.policy", "openjax.learning.advantages", "openjax.learning.archive"], "beartype.beartype"
-)
+install_import_hook(["openjax.policy", "openjax.learning.advantages"], "beartype.beartype")
 
 _flags = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 # workers are the parallel part: more threads would only wait for each other's cores
