@@ -67,15 +67,21 @@ def main(arguments: Sequence[str]) -> int:
     return 0 if flight is not None else 2
 
 
-def fly(arguments: Arguments):
-    """Fly; returns the record. Raises UserError for what can't be, and where another process had to land the vehicles."""
+def fly(arguments: Arguments, prepared: Prepared | None = None):
+    """Fly; returns the record. Raises UserError for what can't be, and where another process had to land the vehicles.
+
+    Args:
+      arguments: the command's.
+      prepared: what `prepare` made of them, where that was done before.
+    """
     _check(arguments)
     console = output_console()
-    console.print("loading the policy, compiling the tick ...")
     from openjax.flying.loop import Flight, Plan
     from openjax.flying.session import Session
 
-    flown = _prepare(arguments)
+    if prepared is None:
+        console.print("loading the policy, compiling the tick ...")
+    flown = prepared or prepare(arguments)
     console.print(f"connecting to {', '.join(flown.session.uris)} ...")
     with Session(flown.session, arguments.safety, flown.state) as session:
         session.check()
@@ -84,19 +90,19 @@ def fly(arguments: Arguments):
             session.vehicles, flown.game, arguments.safety, plan, session.requests, session.watched
         )
         console.print("flying: space or q stops all motors; l, Ctrl-C or Ctrl-Z land; h waits")
-        samples, scheduler, complaint = session.fly(flight)
+        samples, complaint = session.fly(flight)
     _show(console, flight)
-    if scheduler != "real time":
+    if session.scheduler != "real time":
         console.print("no real-time scheduler: on a busy machine deadlines are missed (docs/flying.md)")
     if arguments.out is not None and samples:
-        _write(arguments.out, flown, flight, samples, scheduler)
+        _write(arguments.out, flown, flight, samples, session.scheduler)
         console.print(f"{arguments.out}: next, openjax diagnose {arguments.out}")
     if complaint:
         raise UserError(complaint)
     return flight.record
 
 
-class _Prepared(NamedTuple):
+class Prepared(NamedTuple):
     """What is to be flown, and with what."""
 
     game: object
@@ -106,7 +112,7 @@ class _Prepared(NamedTuple):
     about: dict
 
 
-def _prepare(arguments) -> _Prepared:
+def prepare(arguments: Arguments) -> Prepared:
     """Policy, layout and vehicle, compiled; vehicles aren't needed for it."""
     from openjax.flying import real_time
     from openjax.flying.controller import airframe_of
@@ -138,7 +144,7 @@ def _prepare(arguments) -> _Prepared:
         uris, body_logs, arguments.watchdog, arguments.guard, arguments.guard_after, feed
     )
     state = flight_state(game, len(uris), arguments.safety)
-    return _Prepared(
+    return Prepared(
         game, state, session, vehicle, {"policy": policy.source, "scenario": scenario.name, "uris": uris}
     )
 

@@ -7,6 +7,7 @@ can go on from it.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 from dataclasses import replace
@@ -18,8 +19,8 @@ from openjax.flying.safety import Mode, State
 SILENCE = 0.1
 """Silence of a process after which the next one flies (s): ten ticks."""
 _MODES = tuple(Mode)
-_HEAD, _EACH = 8, 16  # see Board; per vehicle mode, trim, known, 13 numbers of its pose
-_FLYING, _PILOT, _OVER, _READY, _BEATS = 0, 1, 2, 3, 4
+_HEAD, _EACH = 11, 16  # see Board; per vehicle mode, trim, known, 13 numbers of its pose
+_FLYING, _PILOT, _OVER, _READY, _ARMED, _BEATS, _PIDS = 0, 1, 2, 3, 4, 5, 8
 DEAF = ("SIGHUP", "SIGINT", "SIGTSTP", "SIGTERM", "SIGQUIT", "SIGTTOU", "SIGTTIN", "SIGPIPE")
 """Signals that a terminal, or its end, sends to all that it started."""
 
@@ -48,6 +49,7 @@ class Board:
     flying = property(lambda self: self._numbers[_FLYING] > 0.0, doc="Whether any motor may be on.")
     over = property(lambda self: self._numbers[_OVER] > 0.0, doc="Whether the session has ended.")
     pilot = property(lambda self: Role(int(self._numbers[_PILOT])), doc="Who flies.")
+    armed = property(lambda self: self._numbers[_ARMED] > 0.0, doc="Whether any vehicle may be armed.")
     guarded = property(lambda self: self._numbers[_READY] > 0.0, doc="Whether the guard watches.")
 
     def beat(self, role: Role, now: float) -> None:
@@ -57,6 +59,21 @@ class Board:
     def silent(self, role: Role, now: float) -> float:
         """For how long (s) nothing was heard of `role`; infinite if it never was."""
         return now - (self._numbers[_BEATS + role] or -float("inf"))
+
+    def enter(self, role: Role) -> None:
+        """This process is `role`'s."""
+        self._numbers[_PIDS + role] = float(os.getpid())
+
+    def end_process(self, role: Role) -> None:
+        """Kill the process of `role`, should there be one: if it woke up, two would fly."""
+        pid = int(self._numbers[_PIDS + role])
+        if pid:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+
+    def arm(self, on: bool) -> None:
+        """Vehicles are being armed, or have been disarmed."""
+        self._numbers[_ARMED] = float(on)
 
     def watch(self) -> None:
         """The guard is ready."""

@@ -88,7 +88,7 @@ class Game:
     """
 
     def __init__(self, policy, task: Task):
-        self.task = task
+        self.task = jax.tree.map(np.asarray, task)
         self.settings, self.airframe, first, tick = game_functions(policy, task)
         poses = [
             Pose(0.0, (0.3 * i, 0.0, 0.5), (0.0,) * 3, (1.0, 0.0, 0.0, 0.0))

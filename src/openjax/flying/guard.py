@@ -9,11 +9,9 @@ the links' process has ended. The links' process, which has it, is the first to 
 
 from __future__ import annotations
 
-import contextlib
 import math
 import multiprocessing
 import os
-import signal
 import struct
 import time
 from collections.abc import Callable, Sequence
@@ -96,12 +94,17 @@ def fly_down(
         due = max(due + TICK, clock() - TICK)
         time.sleep(max(due - clock(), 0.0))
     if board.pilot is role:
-        disarm(vehicles, clock)
+        disarm(vehicles, board, clock)
         board.write(role, clock(), state)
+        say("openjax fly: all vehicles are down and disarmed")
+        time.sleep(3.0 * board.silence)
+        for other in Role:  # what still hangs would only be in the way
+            if other is not role and board.silent(other, clock()) > 3.0 * board.silence:
+                board.end_process(other)
     return state
 
 
-def disarm(vehicles: Raw, clock: Callable[[], float] = time.perf_counter) -> bool:
+def disarm(vehicles: Raw, board: Board, clock: Callable[[], float] = time.perf_counter) -> bool:
     """Ask all to disarm until they have, or nothing is heard of it; whether all have."""
     deadline = clock() + DISARMING
     while True:
@@ -111,6 +114,7 @@ def disarm(vehicles: Raw, clock: Callable[[], float] = time.perf_counter) -> boo
         armed = [s.supervisor & (Supervisor.ARMED | Supervisor.AUTO_ARM) == Supervisor.ARMED
                  for s in vehicles.observe()]  # fmt: skip
         if not any(armed) or clock() > deadline:
+            board.arm(any(armed))
             return not any(armed)
 
 
@@ -189,26 +193,20 @@ class Guard:
 
     Args:
       board: of the session.
-      links: pid of the links' process, which the guard ends before it flies.
       own: its links, not open yet.
       safety: limits.
       state: of the loop's state machine; starts, pillars and airframe are taken from it.
     """
 
-    def __init__(self, board: Board, links: int, own: RawLinks, safety: SafetySettings, state: State):
+    def __init__(self, board: Board, own: RawLinks, safety: SafetySettings, state: State):
         self._board = board
         context = multiprocessing.get_context("spawn")
         self._process = context.Process(
             target=watch,
-            args=(board, os.getpid(), links, own, safety, state),
+            args=(board, os.getpid(), own, safety, state),
             name="openjax guard",
         )
         self._process.start()
-
-    @property
-    def pid(self) -> int:
-        """Of its process."""
-        return self._process.pid
 
     def wait(self, timeout: float = 20.0) -> bool:
         """Whether it's watching; it takes a second to start."""
@@ -230,38 +228,30 @@ class Guard:
             self._process.join()
 
 
-def watch(board: Board, parent: int, links: int, own: RawLinks, safety, state) -> None:
+def watch(board: Board, parent: int, own: RawLinks, safety: SafetySettings, state: State) -> None:
     """The guard's process."""
     stand_alone()
     own.open(udp_only=True)
     real_time.hurry()
+    board.enter(Role.GUARD)
     board.watch()
     while not board.over:
         time.sleep(CHECK)
         now = time.perf_counter()
         board.beat(Role.GUARD, now)
-        if not board.flying:
-            if os.getppid() != parent:  # the loop ended, and nothing flies
-                if board.silent(Role.LINKS, now) > board.silence:
-                    own.open()
-                    disarm(own)
-                break
-            continue
         links_silent = board.silent(Role.LINKS, now) > board.silence
         # should the links live and not take over
         loop_silent = board.pilot is Role.LOOP and board.silent(Role.LOOP, now) > 3.0 * board.silence
-        if (links_silent or loop_silent) and board.pilot is not Role.GUARD:
-            land(board, links, own, safety, state)
+        if board.flying and (links_silent or loop_silent):
+            board.take(Role.GUARD)
+            board.end_process(Role.LINKS)
+            say("openjax fly: nothing from the links' process, the guard lands all vehicles")
+            own.open()
+            fly_down(board, Role.GUARD, own, safety, state)
+        elif board.armed and not board.flying and links_silent:
+            board.end_process(Role.LINKS)
+            own.open()
+            disarm(own, board)
+        elif not board.flying and os.getppid() != parent and (links_silent or not board.armed):
             break
-    own.close()
-
-
-def land(board: Board, links: int, own: RawLinks, safety: SafetySettings, state: State) -> None:
-    """The guard flies, and says so."""
-    board.take(Role.GUARD)
-    with contextlib.suppress(ProcessLookupError):  # should it wake up, two would fly
-        os.kill(links, signal.SIGKILL)
-    say("openjax.fly: the links' process is silent, the guard lands all vehicles")
-    own.open()
-    fly_down(board, Role.GUARD, own, safety, state)
-    say("openjax.fly: all vehicles are down and disarmed")
+    os._exit(0)  # the links' threads would take a second each

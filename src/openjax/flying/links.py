@@ -74,6 +74,8 @@ class Links:
         self.poses: list[Pose | None] = [None] * n
         self._arrivals, self._voltages = [-math.inf] * n, [math.nan] * n
         self._supervisors = [0] * n
+        self.counts = [0] * n
+        """Poses of each vehicle that have arrived."""
         self._rest, self._count, self._calls = b"", 0, 0
         self._process, self._lock = None, threading.Lock()
         self._blocks: tuple[int, ...] = ()
@@ -170,6 +172,7 @@ class Links:
                 self.poses[vehicle] = Pose(at, *parts)
                 self._arrivals[vehicle], self._voltages[vehicle] = arrival, voltage
                 self._supervisors[vehicle] = supervisor
+                self.counts[vehicle] += 1
 
     def wait(self, until: float) -> None:
         """Return at `until` (s), or as soon as a pose arrives."""
@@ -215,9 +218,14 @@ class Links:
     def believed(self, vehicle: int, pose: Pose) -> None:
         """There is no motion capture here."""
 
-    def arm(self, on: bool = True) -> None:
-        """Arm or disarm all."""
-        self._call("arm", on)
+    def arm(self) -> None:
+        """Arm all."""
+        self.board.arm(True)
+        self._call("arm", True)
+
+    def disarm(self) -> bool:
+        """Motors off, and disarm all; whether all said that they are."""
+        return self._call("disarm")
 
     def emergency_stop(self) -> None:
         """Stop all motors at once; the vehicles must be restarted afterwards."""
@@ -262,6 +270,7 @@ def _serve(
 ) -> None:
     """The links' process. Should the loop stop, it lands the vehicles; with nothing in the air it ends with the loop."""
     stand_alone()
+    board.enter(Role.LINKS)
     sys.setswitchinterval(5e-4)  # cflib's threads and the one that passes on set-points
     threading.excepthook = lambda _: None  # cflib's threads, when their socket goes
     real_time.hurry()
@@ -294,7 +303,8 @@ def _serve(
     with contextlib.suppress(EOFError, OSError):
         while True:
             number, name, arguments = control.recv()
-            result = disarm(swarm) if name == "close" else getattr(swarm, name)(*arguments)
+            disarming = name in ("disarm", "close")
+            result = disarm(swarm, board) if disarming else getattr(swarm, name)(*arguments)
             if number:
                 control.send((number, result))
             if name == "close":
@@ -321,14 +331,12 @@ def _watch(swarm: Swarm, board: Board, parent: int, landing) -> None:
     while True:
         time.sleep(CHECK)
         now = time.perf_counter()
-        if board.pilot is Role.LOOP:
-            board.beat(Role.LINKS, now)
-            if board.flying and landing[0] is not None and board.silent(Role.LOOP, now) > board.silence:
-                say("openjax.fly: the loop is silent, the links' process lands all vehicles")
-                fly_down(board, Role.LINKS, swarm, *landing)
-                say("openjax.fly: all vehicles are down and disarmed")
+        board.beat(Role.LINKS, now)
+        silent = board.silent(Role.LOOP, now)
+        if board.pilot is Role.LOOP and board.flying and landing[0] is not None and silent > board.silence:
+            say(f"openjax fly: nothing from the loop for {silent:.2f} s, the links' process lands all vehicles")
+            fly_down(board, Role.LINKS, swarm, *landing)
         if os.getppid() != parent and not board.flying:
-            for _ in range(3):
-                swarm.arm(False)
-                time.sleep(0.02)
+            if board.armed:
+                disarm(swarm, board)
             os._exit(1)

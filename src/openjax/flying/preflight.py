@@ -47,19 +47,15 @@ def sole_command(uris: Sequence[str]) -> Iterator[None]:
         yield
 
 
-def poses_arriving(vehicles, duration: float = LOOK, clock=time.perf_counter) -> list[float]:
-    """Each vehicle's own estimates a second (Hz), listened to for `duration` (s)."""
-    begin = clock()
-    counts, last = None, None
-    while clock() < begin + duration:
-        times = [s.own.time if s.own else -math.inf for s in vehicles.observe()]
-        if last is None:
-            counts = [0] * len(times)
-        else:
-            counts = [c + (t > old) for c, t, old in zip(counts, times, last, strict=True)]
-        last = times
-        time.sleep(0.002)
-    return [c / duration for c in counts]
+def poses_arriving(links, duration: float = LOOK) -> list[float]:
+    """Each vehicle's own estimates a second of its own time (Hz), listened to for `duration` (s)."""
+    before = [s.own.time for s in links.observe()], list(links.counts)
+    time.sleep(duration)
+    after = [s.own.time for s in links.observe()], list(links.counts)
+    return [
+        (c - old) / max(t - since, duration)
+        for t, c, since, old in zip(*after, *before, strict=True)
+    ]
 
 
 def faults(

@@ -238,6 +238,8 @@ def _with_motion(pose, last, own) -> Pose:
     """A pose of motion capture with the velocity from differences, smoothed, and the body rates of the gyroscope."""
     if last is None or pose.time <= last.time:
         return pose if last is None else last
+    if (pose.position, pose.quaternion) == (last.position, last.quaternion):
+        return last._replace(time=pose.time)  # which is judged frozen
     step = pose.time - last.time
     share = 1.0 - math.exp(-step / SMOOTHING)
     velocity = tuple(

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import signal
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -59,12 +57,15 @@ class Session:
         self.requests = Operator()
         self.vehicles: Links | MotionCaptured = self.links
         self._guard: Guard | None = None
+        self.scheduler = "ordinary"
+        """What of the real-time scheduler was granted, see `openjax.flying.real_time`."""
         self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> Session:
         settings = self._settings
         with self._stack as stack:
             stack.enter_context(sole_command(settings.uris))
+            self.links.board.enter(Role.LOOP)
             stack.callback(self.links.close)
             self.links.connect()
             if settings.feed is not None:
@@ -74,11 +75,11 @@ class Session:
             blocks = self.links.pose_blocks()
             self._own = RawLinks(settings.uris, blocks, settings.watchdog)
             if settings.guard:
-                self._guard = Guard(self.links.board, self.links.pid, self._own, self._safety, self._state)
+                self._guard = Guard(self.links.board, self._own, self._safety, self._state)
                 stack.callback(self._guard.close)
                 self._guard.wait()
             self._own.open(udp_only=True)
-            stack.callback(self._own.close)
+            self.scheduler = real_time.hurry()
             self._stack = stack.pop_all()
         return self
 
@@ -88,7 +89,7 @@ class Session:
     def check(self) -> None:
         """All that must be so before take-off. UserError: something isn't; where there is more, each stands in a line."""
         self._wait_for_poses()
-        rates = poses_arriving(self.vehicles)
+        rates = poses_arriving(self.links)
         guarded = self._guard is None or self.links.board.guarded
         found = faults(self._safety, self._state, self.vehicles.observe(), rates, guarded)
         if len(found) == 1:
@@ -98,20 +99,20 @@ class Session:
                 say(line)
             raise UserError(f"no take-off for these {len(found)} reasons")
 
-    def fly(self, flight: Flight) -> tuple[list, str, str]:
-        """Arm and fly; what was recorded of each vehicle, what of the scheduler was granted, why another process landed."""
+    def fly(self, flight: Flight) -> tuple[list, str]:
+        """Arm and fly; what was recorded of each vehicle, and why another process landed, if one did."""
         complaint, samples = "", []
         with self.requests:
             self._arm()
             self.vehicles.record()
-            scheduler = real_time.hurry()
             try:
                 flight.run()
             except Exception as error:  # whatever it is, vehicles are in the air
                 complaint = f"{error}; {self._left_to_others()}"
             with contextlib.suppress(UserError):
+                self.links.disarm()
                 samples = self.vehicles.samples()
-        return samples, scheduler, complaint
+        return samples, complaint
 
     def watched(self, now: float, state: State) -> str:
         """Tell the others that the loop lives and what it knows; why it must land, if it must."""
@@ -130,26 +131,19 @@ class Session:
 
     def _left_to_others(self) -> str:
         """Return once the vehicles are down; land them here if nobody else does. What happened."""
-        board = self.links.board
-        lander = "the links' process"
+        board, lander = self.links.board, Role.LINKS
         while board.flying:
             time.sleep(0.005)
             now = time.perf_counter()
-            lander = {Role.LOOP: lander, Role.LINKS: lander, Role.GUARD: "the guard"}[board.pilot]
-            quiet = [board.silent(role, now) > 2.5 * board.silence for role in (Role.LINKS, Role.GUARD)]
-            if all(quiet):
-                lander = "the loop"
-                self._end_others()
+            board.beat(Role.LOOP, now)
+            lander = max(lander, board.pilot)
+            if all(board.silent(role, now) > 2.5 * board.silence for role in (Role.LINKS, Role.GUARD)):
+                lander = Role.LOOP
+                for role in (Role.LINKS, Role.GUARD):
+                    board.end_process(role)
                 self._own.open()
                 fly_down(board, Role.LOOP, self._own, self._safety, self._state)
-        return f"{lander} landed all vehicles"
-
-    def _end_others(self):
-        """Should links or guard wake up, two would fly."""
-        self.links.kill()
-        if self._guard is not None:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(self._guard.pid, signal.SIGKILL)
+        return f"all vehicles were landed by the process of the {lander.name.lower()}"
 
     def _wait_for_poses(self, timeout: float = 5.0):
         """Return once each vehicle has a pose that is fresh. UserError: one has none."""

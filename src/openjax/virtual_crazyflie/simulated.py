@@ -1,16 +1,20 @@
-"""Vehicles in simulated time: virtual firmware and vehicles without sockets or clock, with faults to order.
+"""Vehicles in simulated time: virtual firmware and vehicles without sockets or clock.
 
-What `Swarm` is to the loop, for flights that must not wait for a clock: a thousand faults in minutes.
+What `Swarm` is to the loop, for flights that must not wait for a clock. What the vehicles and a camera would send passes
+through two functions, in which an experiment can damage it at its source.
 """
 
 from __future__ import annotations
 
+import math
 import random
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from openjax.flying.controller import Pose
+from openjax.flying.crtp import compress_quaternion, expand_quaternion
 from openjax.flying.safety import PoseSample
 from openjax.flying.set_point import SetPoint
 from openjax.virtual_crazyflie.firmware import VirtualFirmware
@@ -18,55 +22,89 @@ from openjax.virtual_crazyflie.vehicles import STEP, VirtualVehicles
 
 TICK = 0.01
 """s"""
+FOLLOWING = (0.1, 0.5)
+"""How the estimator on board follows motion capture: share of the innovation taken into the position at each pose, and into
+the velocity (1/s). Steady state of a Kalman filter for .01 m and .5 m/s^2 at 100 Hz (Kalata 1984: tracking index .005)."""
+CAMERA_NOISE = 5e-4
+"""Of positions of motion capture, and of components of its quaternions."""
+
+Damage = Callable[[int, float, Pose], Pose | None]
+"""What is received of vehicle i at a time (s) in place of the true pose; None: nothing."""
+
+
+def untouched(i: int, now: float, pose: Pose) -> Pose | None:
+    """The pose."""
+    return pose
 
 
 @dataclass
-class Faults:
-    """What goes wrong with one vehicle from now on; changed while it flies."""
+class Uplink:
+    """What goes wrong with one vehicle's set-points, and what its battery is said to have; changed while it flies."""
 
-    command_loss: float = 0.0
-    """Share of the set-points that are lost."""
-    pose_loss: float = 0.0
-    """Share of the poses that are lost."""
-    command_delay: int = 0
-    """Steps of 2 ms by which set-points come late."""
+    loss: float = 0.0
+    """Share that is lost."""
+    delay: int = 0
+    """Steps of 2 ms by which they come late."""
     voltage: float | None = None
-    """What the battery is said to have (V)."""
-    pose_jump: float = 0.0
-    """Offset of the poses along x (m)."""
+    """V"""
 
 
 class SimulatedSwarm:
-    """N vehicles that are advanced by `advance`."""
+    """N vehicles that are advanced by `advance`.
 
-    def __init__(self, vehicles: VirtualVehicles, seed: int = 0, watchdog: bool = False):
-        self.vehicles, self.now, self._watchdog = vehicles, 0.0, watchdog
+    Args:
+      vehicles: what flies.
+      seed: draws losses and noise.
+      watchdog: feed the firmware's.
+      captured: there is motion capture.
+      following: whether the estimator on board of each vehicle follows it, as far as it is believed, instead of knowing its
+        place by itself.
+      radio, camera: what is received of own estimates and of motion capture.
+    """
+
+    def __init__(
+        self,
+        vehicles: VirtualVehicles,
+        seed: int = 0,
+        watchdog: bool = True,
+        captured: bool = False,
+        following: Sequence[bool] | None = None,
+        radio: Damage = untouched,
+        camera: Damage = untouched,
+    ):
+        self.vehicles, self.now, self._watchdog, self._captured = vehicles, 0.0, watchdog, captured
+        self._radio, self._camera = radio, camera
         n = vehicles.number
+        self._following = [True] * n if following is None else following
         self.firmware = [VirtualFirmware(needs_arming=False) for _ in range(n)]
-        self.faults = [Faults() for _ in range(n)]
+        self.uplinks = [Uplink() for _ in range(n)]
         self._random = random.Random(seed)
-        self._poses: list[Pose | None] = [None] * n
-        self._heard = [0.0] * n
-        self._voltage = [4.0] * n
+        self._offsets = np.zeros((n, 2, 3))  # of the own estimates from the truth: position, velocity
+        self._samples = [PoseSample(None, 0.0, 4.0) for _ in range(n)]
         self._waiting: list[tuple[int, int, SetPoint]] = []
         self._steps = 0
-        self.track: list[np.ndarray] = []  # (N, 3) m, after every tick
         self._look()
 
     def observe(self) -> tuple[PoseSample, ...]:
         """What is known of each vehicle now."""
-        return tuple(PoseSample(*s) for s in zip(self._poses, self._heard, self._voltage, strict=True))
+        return tuple(self._samples)
 
-    def arrivals(self) -> tuple[float, ...]:
-        """When each vehicle's newest pose arrived (s)."""
-        return tuple(pose.time if pose is not None else -np.inf for pose in self._poses)
-
-    def send(self, set_points) -> float:
+    def send(self, set_points: Sequence[SetPoint | None]) -> float:
         """Send each vehicle its set-point, or nothing where it is None."""
         for i, set_point in enumerate(set_points):
-            if set_point is not None and self._random.random() >= self.faults[i].command_loss:
-                self._waiting.append((self._steps + self.faults[i].command_delay, i, set_point))
+            if set_point is not None and self._random.random() >= self.uplinks[i].loss:
+                self._waiting.append((self._steps + self.uplinks[i].delay, i, set_point))
         return self.now
+
+    def believed(self, i: int, pose: Pose) -> None:
+        """The estimator of vehicle i is told this pose of motion capture."""
+        if not self._following[i]:
+            return
+        offset = self._offsets[i]
+        truth = self.vehicles.report.position[i]
+        innovation = np.asarray(pose.position) - truth - offset[0]
+        offset[0] += FOLLOWING[0] * innovation
+        offset[1] += FOLLOWING[1] * innovation
 
     def advance(self) -> None:
         """One tick of 10 ms."""
@@ -82,7 +120,7 @@ class SimulatedSwarm:
                 if crashed:
                     firmware.crash()
         self.now = self._steps * STEP
-        self.track.append(self.vehicles.report.position.copy())
+        self._offsets[:, 0] += TICK * self._offsets[:, 1]
         self._look()
 
     def _deliver(self):
@@ -94,17 +132,27 @@ class SimulatedSwarm:
         self._waiting = [w for w in self._waiting if w[0] > self._steps]
 
     def _look(self):
-        report = self.vehicles.report
-        for i, fault in enumerate(self.faults):
-            if self._random.random() < fault.pose_loss:
-                continue
-            position = report.position[i] + [fault.pose_jump, 0.0, 0.0]
-            self._poses[i] = Pose(
+        report, noise = self.vehicles.report, self._random.gauss
+        for i, old in enumerate(self._samples):
+            quaternion, rates = report.quaternion[i], tuple(report.body_rates[i].tolist())
+            shaken = tuple(q + noise(0.0, CAMERA_NOISE) for q in quaternion.tolist())
+            size = math.sqrt(sum(q * q for q in shaken))
+            seen = Pose(
                 self.now,
-                tuple(position.tolist()),
-                tuple(report.velocity[i].tolist()),
-                tuple(report.quaternion[i].tolist()),
-                tuple(report.body_rates[i].tolist()),
+                tuple(p + noise(0.0, CAMERA_NOISE) for p in report.position[i].tolist()),
+                (0.0, 0.0, 0.0),
+                tuple(q / size for q in shaken),
             )
-            self._heard[i] = self.now
-            self._voltage[i] = self.vehicles.sensors(i).voltage if fault.voltage is None else fault.voltage
+            # in the packets' units: millimetres
+            position, velocity = np.round([report.position[i], report.velocity[i]] + self._offsets[i], 3).tolist()
+            on_board = tuple(expand_quaternion(compress_quaternion(quaternion)).tolist())
+            own = self._radio(i, self.now, Pose(self.now, tuple(position), tuple(velocity), on_board, rates))
+            captured = self._camera(i, self.now, seen) if self._captured else None
+            voltage = self.uplinks[i].voltage
+            self._samples[i] = PoseSample(
+                own or old.own,
+                self.now if own else old.last_contact,
+                self.vehicles.sensors(i).voltage if voltage is None else voltage,
+                self.firmware[i].supervisor_info if own else old.supervisor,
+                captured or old.captured,
+            )

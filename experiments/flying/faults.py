@@ -1,0 +1,134 @@
+"""Faults of a flight where they happen: in what a camera or a radio sends, in a link, a policy, a process, a key.
+
+A fault is drawn from its number: kind, moment, vehicle, amount. `PoseDamage` does to poses what the kind says.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections import deque
+from dataclasses import dataclass
+
+from openjax.flying.controller import Pose
+
+FOLLOWED = "camera drifts, the estimator follows"
+"""A limit: with nothing on board that sees the floor, a slow drift looks like a tilt that is wrong by two degrees."""
+CAMERA = (
+    "camera lost", "camera lost for a while", "camera frozen", "camera frozen, all", "camera: one frame wrong",
+    "camera: four frames wrong", "camera moved", "camera: a number that is none", "camera: no attitude",
+    "camera: yaw turned", "camera: bodies swapped", "camera scaled", "camera late", "camera drifts", FOLLOWED,
+)  # fmt: skip
+RADIO = (
+    "poses lost", "poses lost for a while", "packets lost", "poses frozen", "poses jump",
+    "poses: a number that is none", "gyroscope: a number that is none", "poses: no attitude",
+)  # fmt: skip
+OTHER = (
+    "loop stopped", "links stopped", "guard stopped", "loop and links stopped", "loop and guard stopped",
+    "policy silent", "policy: a number that is none", "policy wild", "battery low", "drone gone", "key",
+)  # fmt: skip
+KINDS = (*CAMERA, *RADIO, *OTHER)
+START = 0.2
+"""Nothing goes wrong before (s)."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What goes wrong, when (s), with which vehicle, for how long (s), how much, in which direction."""
+
+    kind: str
+    time: float
+    vehicle: int
+    duration: float = math.inf
+    amount: float = 0.0
+    direction: float = 0.0
+    number: float = math.nan
+
+    @property
+    def captured(self) -> bool:
+        """Whether there is motion capture in this flight."""
+        return self.kind in CAMERA or self.direction < math.pi
+
+    def on(self, now: float) -> bool:
+        """Whether it is there at `now` (s)."""
+        return 0.0 <= now - self.time < self.duration
+
+
+def draw_fault(seed: int, latest: float) -> Fault:
+    """The fault number `seed`, which begins by `latest` (s); the kinds take turns."""
+    rng = random.Random(seed)
+    kind = KINDS[seed % len(KINDS)]
+    time, vehicle, direction = rng.uniform(START, latest), rng.randrange(3), rng.uniform(0.0, 2.0 * math.pi)
+    number = rng.choice((math.nan, math.inf, -math.inf, 1e300))
+    duration = {
+        "camera: one frame wrong": 0.0099, "camera: four frames wrong": 0.0399,
+    }.get(kind, math.inf)  # fmt: skip
+    if kind.endswith("for a while"):
+        duration = rng.uniform(0.05, 1.0)
+    elif "none" in kind or "attitude" in kind or kind in ("poses jump", "camera: yaw turned", "camera: bodies swapped"):
+        duration = rng.choice((0.0099, 0.05, 1.0, math.inf))
+    amount = {
+        "packets lost": rng.uniform(0.1, 0.7), "camera scaled": rng.choice((0.8, 1.2, 1.5, 1000.0)),
+        "camera late": rng.uniform(0.02, 0.4), "camera drifts": rng.uniform(0.1, 0.5), FOLLOWED: rng.uniform(0.1, 0.5),
+    }.get(kind, rng.choice((0.14, 0.3, 0.5, 2.0)))  # fmt: skip
+    return Fault(kind, time, vehicle, duration, amount, direction, number)
+
+
+class PoseDamage:
+    """What is received in place of a vehicle's true poses, camera's or radio's."""
+
+    def __init__(self, fault: Fault, vehicles: int):
+        self._fault, self._random = fault, random.Random(fault.time)
+        self._held: dict[tuple, Pose] = {}
+        self._past = [deque(maxlen=50) for _ in range(vehicles)]
+        self._field = self._random.randrange(100)
+
+    def __call__(self, source: str, i: int, now: float, pose: Pose, others) -> Pose | None:
+        """The pose received from `source`, "camera" or "radio"; `others`: true poses of all."""
+        fault = self._fault
+        past = self._past[i]
+        if source == "camera":
+            past.append(pose)
+        mine = i == fault.vehicle or fault.kind.endswith("all")
+        if fault.kind == "drone gone" and mine and fault.on(now) and source == "radio":
+            return None
+        names = CAMERA if source == "camera" else RADIO
+        if fault.kind not in names or not mine or not fault.on(now):
+            self._held[source, i] = pose
+            return pose
+        return self._damaged(fault.kind.replace("poses", "camera"), source, i, now, pose, others)
+
+    def _damaged(self, kind, source, i, now, pose, others):
+        fault, what = self._fault, kind.removeprefix("camera").removeprefix(":").strip()
+        away = (fault.amount * math.cos(fault.direction), fault.amount * math.sin(fault.direction), 0.0)
+        since = now - fault.time
+        if what.startswith("lost"):
+            return None
+        if kind == "packets lost":
+            return None if self._random.random() < fault.amount else pose
+        if what.startswith("frozen"):
+            return self._held.get((source, i), pose)._replace(time=now)
+        if what in ("one frame wrong", "four frames wrong", "moved", "jump"):
+            return _shifted(pose, away, 1.0)
+        if what.startswith("drifts"):
+            return _shifted(pose, away, since)
+        if what == "scaled":
+            return pose._replace(position=tuple(fault.amount * p for p in pose.position))
+        if what == "no attitude":
+            return pose._replace(quaternion=(0.0,) * 4)
+        if what == "yaw turned":
+            w, x, y, z = pose.quaternion
+            return pose._replace(quaternion=(-z, y, -x, w))
+        if what == "bodies swapped":
+            other = others[(i + 1) % len(others)]
+            return pose._replace(position=other.position, quaternion=other.quaternion)
+        if what == "late":
+            return self._past[i][max(len(self._past[i]) - 1 - round(100 * fault.amount), 0)]._replace(time=now)
+        name = "body_rates" if kind.startswith("gyroscope") else ("position", "quaternion")[self._field % 2]
+        values = list(getattr(pose, name))
+        values[self._field % len(values)] = fault.number
+        return pose._replace(**{name: tuple(values)})
+
+
+def _shifted(pose: Pose, away, share: float) -> Pose:
+    return pose._replace(position=tuple(p + share * a for p, a in zip(pose.position, away, strict=True)))

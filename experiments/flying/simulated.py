@@ -1,0 +1,309 @@
+"""Faults at their source, in simulated time: `python -m experiments.flying.simulated [--faults 3000] [--processes 4]`.
+
+Three vehicles hunt in a layout; at a drawn moment something goes wrong (`experiments.flying.faults`). Counted is where the
+*true* vehicles are, from then to the end: how far out, how high, whether one fell or stayed armed. The vehicles are
+openjax's with the firmware's watchdogs; policy, game, judge and state machine are those of `openjax fly`. In half of the
+flights there is motion capture, which the estimators on board follow as far as it is believed.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+from experiments.flying.faults import FOLLOWED, KINDS, Fault, PoseDamage, draw_fault
+from experiments.table import RESULTS
+
+LATEST, SECONDS = 4.0, 10.0
+"""Nothing begins to go wrong after; flown in all (s)."""
+ENDING = 5.0
+"""A flight must be over this long (s) after its fault took effect."""
+FALL = 0.3
+"""Motors off above this height (m) is a fall."""
+MARGIN = 0.1
+"""Out of the arena by more than this (m) is out."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Fly thousands of faults."""
+
+    faults: int = 3000
+    policy: str = "flight"
+    layouts: tuple[str, ...] = ("wall", "random", "passage")
+    seed: int = 0
+    batch: int = 30
+    """Worlds flown side by side."""
+    processes: int = 4
+    seconds_left: float = 1e9
+    """Begin no batch that wouldn't be over by then (s)."""
+    separation: float = 0.16
+    """See `SafetySettings.separation`."""
+    out: Path = RESULTS / "flying_faults.json"
+
+
+def fly(
+    seeds: list[int], layout: str, policy_name: str, separation=0.16, latest=LATEST, seconds=SECONDS
+) -> list[dict]:
+    """Fly one fault per seed, side by side; a record of each. A seed below zero is a flight without fault."""
+    worlds = Worlds([draw(seed, latest) for seed in seeds], layout, policy_name, separation)
+    for _ in range(round(seconds / 0.01)):
+        worlds.tick()
+    return worlds.records(seeds, layout)
+
+
+def draw(seed, latest) -> Fault:
+    """The fault of a seed, or none."""
+    return draw_fault(seed, latest) if seed >= 0 else Fault("none", math.inf, 0)
+
+
+class Worlds:
+    """Flights side by side, one fault each."""
+
+    def __init__(self, faults: list[Fault], layout: str, policy_name: str, separation: float):
+        import jax
+
+        import openjax
+        from openjax.flying.game import game_functions
+        from openjax.flying.limits import SafetySettings
+        from openjax.pursuit import find_scenario, scenario_task
+        from openjax.vehicle import load_vehicle
+        from openjax.virtual_crazyflie.simulated import SimulatedSwarm
+        from openjax.virtual_crazyflie.vehicles import VirtualVehicles
+
+        policy = openjax.load_policy(policy_name)
+        game = policy.settings.environment
+        scenario = find_scenario(layout, game)
+        slots = max(game.max_pillars, len(scenario.pillars))
+        task = scenario_task(replace(game, max_pillars=slots), scenario)
+        self.game, self.airframe, first, tick = game_functions(policy, task)
+        self._first = jax.jit(jax.vmap(first))
+        self._tick = jax.jit(jax.vmap(tick, in_axes=(0, 0, 0, None, None)))
+        self.faults, self.n = faults, len(scenario.pursuers)
+        self.safety = SafetySettings(separation=separation)
+        starts = np.array(scenario.pursuers)
+        self._damage = [PoseDamage(fault, self.n) for fault in faults]
+        vehicles = VirtualVehicles(load_vehicle(), np.tile(starts, (len(faults), 1)), flying=True)
+        self._vehicles = vehicles
+        self.swarm = SimulatedSwarm(
+            vehicles,
+            captured=True,
+            following=[fault.kind != "camera drifts" for fault in faults for _ in range(self.n)],
+            radio=lambda *a: self._received("radio", *a),
+            camera=lambda *a: self._received("camera", *a),
+        )
+        pillars = [(x, y, self.game.pillar_radius) for x, y in scenario.pillars]
+        self.states = [self._begin(w, starts.tolist(), pillars) for w in range(len(faults))]
+        self._landing = [False] * len(faults)
+        self._measured, self._play, self._tracks = None, None, []
+        self.captured = [None] * len(faults)
+
+    def _begin(self, w, starts, pillars):
+        from openjax.flying.safety import Drone, Mode, initial_state
+
+        state = initial_state([tuple(s) for s in starts], pillars, self.airframe, self.safety)
+        return replace(state, drones=(Drone(Mode.PURSUIT),) * self.n)
+
+    def _received(self, source, k, now, pose):
+        w, i = divmod(k, self.n)
+        fault = self.faults[w]
+        if source == "camera" and not fault.captured:
+            return None
+        report, first = self._vehicles.report, w * self.n
+        from openjax.flying.controller import Pose
+
+        others = [
+            Pose(now, tuple(report.position[j].tolist()), (0.0,) * 3, tuple(report.quaternion[j].tolist()))
+            for j in range(first, first + self.n)
+        ] if fault.kind == "camera: bodies swapped" else ()  # fmt: skip
+        return self._damage[w](source, i, now, pose, others)
+
+    def tick(self) -> None:
+        """10 ms of all flights."""
+        from openjax.flying.safety import Mode, see
+
+        now, samples = self.swarm.now, self.swarm.observe()
+        for w in range(len(self.faults)):
+            first = w * self.n
+            before = self.states[w].drones
+            self.states[w] = see(self.safety, self.states[w], now, samples[first : first + self.n])
+            for i, (drone, old) in enumerate(zip(self.states[w].drones, before, strict=True)):
+                if drone.captured.pose is not old.captured.pose:
+                    self.swarm.believed(first + i, drone.captured.pose)
+        if any(Mode.PURSUIT in state.modes for state in self.states):
+            self._play_on()
+        set_points = []
+        for w in range(len(self.faults)):
+            set_points += self._flown(w, now, samples[w * self.n : (w + 1) * self.n])
+        self.swarm.send(set_points)
+        self.swarm.advance()
+        report = self.swarm.vehicles.report
+        off = [f.set_point(self.swarm.now).mode == 0 for f in self.swarm.firmware]
+        self._tracks.append(np.column_stack([report.position, off]))
+
+    def _play_on(self):
+        from openjax.flying.game import pose_array
+
+        poses = [drone.estimate for state in self.states for drone in state.drones]
+        poses = pose_array(poses).reshape(len(self.faults), self.n, -1)
+        if self._measured is None:
+            self._measured = self._first(poses)
+        else:
+            self._measured = self._tick(*self._measured[:2], poses, np.zeros(3, np.float32), np.zeros((), bool))
+            for w, caught in enumerate(np.asarray(self._measured[4])):
+                if caught and self.captured[w] is None:
+                    self.captured[w] = len(self._tracks)
+        self._actions = np.asarray(self._measured[1])
+
+    def _flown(self, w, now, samples):
+        """The set-points of flight w at this tick; None where none is sent."""
+        from openjax.flying.board import SILENCE
+        from openjax.flying.guard import take_over
+        from openjax.flying.safety import Event, Request, decide
+        from openjax.flying.set_point import from_action
+        from openjax.pursuit.environment import THRUST_LIMIT
+
+        fault, on = self.faults[w], self.faults[w].on(now)
+        uplink = self.swarm.uplinks[w * self.n + fault.vehicle]
+        lost = {"packets lost": fault.amount, "drone gone": 1.0}.get(fault.kind, 0.0)
+        uplink.loss = lost if on else 0.0
+        uplink.voltage = 3.0 if on and fault.kind == "battery low" else None
+        actions = tuple(from_action(a, THRUST_LIMIT) for a in self._actions[w])
+        request, reason = Request.NONE, ""
+        if on and fault.kind == "policy silent":
+            actions = None
+        elif on and fault.kind == "policy: a number that is none":
+            actions = (replace(actions[0], thrust=fault.number), *actions[1:])
+        elif on and fault.kind == "policy wild":
+            wild = np.random.default_rng(round(1000 * now) + w).uniform(-1.0, 1.0, (self.n, 4))
+            actions = tuple(from_action(a, THRUST_LIMIT) for a in wild)
+        elif on and fault.kind == "key":
+            request = Request.LAND
+        elif on and fault.kind == "guard stopped" and now - fault.time > 2.0 * SILENCE:
+            request, reason = Request.LAND, "the guard is gone"
+        if on and fault.kind in PILOTS and not self._landing[w]:
+            if now - fault.time < SILENCE:
+                return [None] * self.n
+            state = take_over(self.safety, self.states[w], now)
+            # who takes over knows no motion capture, and hears the vehicles' own estimates
+            drones = tuple(replace(d, distrusted="taken over") for d in state.drones)
+            self.states[w], self._landing[w] = replace(state, drones=drones), True
+        event = Event(now, samples, None if self._landing[w] else actions, request, reason)
+        self.states[w], wanted = decide(self.safety, self.states[w], event)
+        return list(wanted)
+
+    def records(self, seeds, layout) -> list[dict]:
+        """What became of each flight."""
+        track = np.array(self._tracks).reshape(len(self._tracks), len(self.faults), self.n, 4)
+        crashed = np.array([f.crashed for f in self.swarm.firmware]).reshape(-1, self.n)
+        return [
+            record(fault, seed, layout, self.states[w], track[:, w], crashed[w], self.safety, self.captured[w])
+            for w, (fault, seed) in enumerate(zip(self.faults, seeds, strict=True))
+        ]
+
+
+PILOTS = ("loop stopped", "links stopped", "loop and links stopped", "loop and guard stopped")
+"""Somebody else flies after a tenth of a second. (Which one takes over is for real processes: `experiments.flying.real_time`.)"""
+
+
+def record(fault, seed, layout, state, track, crashed, safety, caught) -> dict:
+    """Where the vehicles were from the fault on. track (T, N, 4): true position (m), motors off."""
+    begin = min(int(min(fault.time, 1e6) / 0.01), len(track) - 1)
+    after = track[begin:]
+    height, off = after[..., 2], after[..., 3] > 0.0
+    out = np.maximum(np.linalg.norm(after[..., :2], axis=-1) - safety.arena_radius, height - safety.arena_height)
+    held = np.array([not (fault.kind == "drone gone" and i == fault.vehicle) for i in range(track.shape[1])])
+    ended = any(d.reason for d in state.drones)
+    down = off & (height < 0.02)
+    reaction = next((k for k in range(len(after)) if down[k:].all()), len(after)) * 0.01
+    nearest = min(
+        float(np.linalg.norm(track[:, i, :3] - track[:, j, :3], axis=-1).min()) for i in range(3) for j in range(i)
+    )
+    return {
+        "seed": seed, "kind": fault.kind, "layout": layout, "captured_by_camera": fault.captured,
+        **{k: v for k, v in asdict(fault).items() if k in ("time", "vehicle", "duration", "amount")},
+        "ended": ended, "reasons": [d.reason for d in state.drones], "out": float(out[:, held].max()),
+        "out_gone": float(out[:, ~held].max()) if not held.all() else None,
+        "fell": bool((off & (height > FALL))[:, held].any()), "hard": bool(crashed[held].any()),
+        "armed": bool((~off[-1])[held].any()) and ended, "seconds": reaction if ended else None,
+        "nearest": nearest, "caught": caught,
+    }  # fmt: skip
+
+
+def well(row: dict) -> bool:
+    """Whether a flight ended as it must."""
+    in_time = row["seconds"] is None or row["seconds"] <= ENDING or row["kind"] in SLOW
+    return row["out"] <= MARGIN and not (row["fell"] or row["hard"] or row["armed"]) and in_time
+
+
+SLOW = ("packets lost", "camera scaled", "camera late", "camera drifts", FOLLOWED)
+"""These may take effect long after they begin."""
+
+
+ALL = "all but the estimator that follows"
+
+
+def summary(records) -> list[dict]:
+    """A row per kind."""
+    rows = []
+    for kind in (*KINDS, "none", ALL):
+        mine = [r for r in records if kind == r["kind"] or (kind == ALL and r["kind"] != FOLLOWED)]
+        if not mine:
+            continue
+        seconds = [r["seconds"] for r in mine if r["seconds"] is not None and r["kind"] not in SLOW]
+        rows.append({
+            "kind": kind, "faults": len(mine), "well": sum(map(well, mine)),
+            "landed": sum(r["ended"] for r in mine), "out": sum(r["out"] > MARGIN for r in mine),
+            "farthest": max(r["out"] for r in mine) + 0.9, "fell": sum(r["fell"] for r in mine),
+            "hard": sum(r["hard"] for r in mine), "armed": sum(r["armed"] for r in mine),
+            "longest": max(seconds, default=None), "nearest": min(r["nearest"] for r in mine),
+        })  # fmt: skip
+    return rows
+
+
+def main() -> None:
+    arguments = tyro.cli(Arguments)
+    begin = time.time()
+    seeds = range(arguments.seed, arguments.seed + arguments.faults)
+    jobs = []
+    for k, layout in enumerate(arguments.layouts):
+        mine = [s for s in seeds if (s // len(KINDS)) % len(arguments.layouts) == k]
+        jobs += [(mine[i : i + arguments.batch], layout) for i in range(0, len(mine), arguments.batch)]
+    jobs.sort(key=lambda job: job[0][0])
+    records = []
+    with ProcessPoolExecutor(arguments.processes, mp_context=get_context("spawn")) as pool:
+        waiting = iter(jobs)
+        running = set()
+        while True:
+            late = time.time() - begin > arguments.seconds_left
+            while len(running) < arguments.processes and not late and (job := next(waiting, None)):
+                running.add(pool.submit(fly, *job, arguments.policy, arguments.separation))
+            if not running:
+                break
+            done = next(as_completed(running))
+            running.discard(done)
+            records += done.result()
+            write(arguments, records, time.time() - begin)
+    for row in summary(records):
+        print(row)
+
+
+def write(arguments, records, seconds) -> None:
+    """Write what there is until now."""
+    result = {
+        "policy": arguments.policy, "separation": arguments.separation, "seconds": round(seconds),
+        "summary": summary(records), "not_well": [r for r in records if not well(r)],
+    }  # fmt: skip
+    arguments.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
