@@ -42,7 +42,7 @@ def answer_of(fleet, i, squares, floor, wrong):
     energy = {k: e for k, e in energy.items() if isinstance(k, str)}
     excess = energy["nominal"] - energy["truth"]
     severity = float(np.sqrt(np.maximum(excess, 0)).max())
-    if set(names) & set(unknowns.SENSOR_KINDS):
+    if set(names) & set(unknowns.SENSOR_SITES):
         seen = names  # the plant's measure reads no logs
     elif spec["category"] == "pair":
         seen = [n for n in names if shows[n].max() >= HIDDEN]
@@ -76,7 +76,7 @@ def answer_of(fleet, i, squares, floor, wrong):
         "acceptable": acceptable,
         "also_fine": spec["also_fine"] + parts + [n for n in names if n not in seen],
         "held_ms": 1e3 / spec["sensors"]["pose_rate"] if sensors.holds_poses(spec["sensors"]) else None,
-        "in_sensors": bool(set(names) & set(unknowns.SENSOR_KINDS)),
+        "in_sensors": bool(set(names) & set(unknowns.SENSOR_SITES)),
         "causes": causes,
         "severity": cases.label(severity) if own else None,
         "severity_ratio": round(severity, 3),

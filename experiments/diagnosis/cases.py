@@ -1,12 +1,13 @@
 """Which cases are drawn. Everything follows from the seed, the column (`known` or `stranger`) and the case's number.
 
-The known column may be used for development at will. The stranger's column draws sensors, a controller, unknown
-kinds and garbage that the known column never draws; it is for reported runs only.
+The known column may be used for development at will, and the real one, the same on vehicles with the errors of form
+that real ones have. The stranger's column draws sensors, a controller, vehicles, unknown kinds and garbage that the
+others never draw; it is for reported runs only.
 """
 
 import numpy as np
 
-from experiments.diagnosis import controllers, effects, garbage, missions, sensors, unknowns, vehicle
+from experiments.diagnosis import controllers, effects, garbage, missions, real, sensors, unknowns, vehicle
 
 SHARES = {"single": 0.50, "none": 0.14, "pair": 0.10, "unknown": 0.12, "not_testable": 0.06, "garbage": 0.08}
 BANDS = {"low": (0.8, 1.6), "medium": (2.0, 4.0), "high": (5.0, 40.0)}  # gap in noise floors, see `measure`
@@ -27,7 +28,7 @@ BLIND = {
     "inertia": ("hover",),
     "rate_gains": ("hover",),
 }
-COLUMN = {"known": 0, "stranger": 1}
+COLUMN = {"known": 0, "stranger": 1, "real": 2}
 
 
 def case_rng(seed, column, number, *more):
@@ -58,16 +59,19 @@ def draw_missions(rng, needed, style, two):
 
 
 def _kinds(column, known, strangers):
-    return list(known) if column == "known" else list(strangers)
+    return list(strangers) if column == "stranger" else list(known)
 
 
 def draw_case(seed, column, number, category, index):
     """One case as a dict of plain values; `index` counts within the category, so that kinds come in turn."""
     rng = case_rng(seed, column, number)
     told = vehicle.draw_told(rng)
+    wrong_form = None
+    if column == "real" or (column == "stranger" and rng.random() < 0.5):
+        told, wrong_form = real.draw(rng, column == "stranger")
     turn = int(case_rng(seed, column, 0, 7, sorted(SHARES).index(category)).integers(1000))
     names = list(effects.EFFECTS)
-    causes, targets, needed, channels, fine, spoiled = [], [], [], "", [], None
+    causes, targets, needed, channels, spoiled = [], [], [], "", None
     if category == "single":
         effect = names[(index + turn) % len(names)]
         causes = [effects.draw(rng, effect)]
@@ -80,13 +84,14 @@ def draw_case(seed, column, number, category, index):
         causes = [effects.draw(rng, e) for e in (one, two)]
         targets = [float(2.0 * 6.0 ** rng.uniform()) for _ in causes]  # both matter
     elif category == "unknown":
-        kinds = _kinds(column, unknowns.KINDS, unknowns.STRANGERS)
+        kinds = list(unknowns.SITES)
         kind = kinds[(index + turn) % len(kinds)]
-        (low, high), unit, exposing, fine = unknowns.ALL[kind]
-        causes = [{"effect": kind, "form": "outside", "shape": rng.uniform(0, 1, 8).tolist()}]
+        (low, high), unit, logs = unknowns.SITES[kind]
+        form = unknowns.FORMS["stranger" if column == "stranger" else "known"]
+        causes = [{"effect": kind, "form": form, "shape": rng.uniform(0, 1, 8).tolist()}]
         causes[0] |= {"size": float(low * (high / low) ** rng.uniform()), "unit": unit}
-        targets, needed = [_target(rng, str(rng.choice(["medium", "high"])))], [exposing]
-        channels = "pgm" + ("a" if kind == "world_tilt" else "")
+        targets, needed = [_target(rng, str(rng.choice(["medium", "high"])))], [unknowns.MISSIONS]
+        channels = "pgmv" + logs
     elif category == "not_testable":
         effect = list(BLIND)[(index + turn) % len(BLIND)]
         # a form that is really zero away from the surface: the others reach further
@@ -129,7 +134,8 @@ def draw_case(seed, column, number, category, index):
         "category": category,
         "causes": causes,
         "targets": targets,
-        "also_fine": list(fine),
+        "also_fine": real.fine(wrong_form, [c["effect"] for c in causes]),
+        "form_errors": wrong_form,
         "garbage": spoiled,
         "missions": flights,
         "style": style,

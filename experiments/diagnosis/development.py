@@ -20,8 +20,10 @@ import numpy as np
 
 from experiments.diagnosis import truth
 from experiments.diagnosis.figures import figures_table, misses
+from experiments.diagnosis.magnitudes import parameters
 from experiments.flying.single_thread import use_single_thread
 
+UNTOLD = {"category": "real", "effects": []}
 _done = 0  # cases that this process has diagnosed
 
 
@@ -32,21 +34,22 @@ def answers_of(folder: Path) -> Path | None:
 
 
 def find_jobs(sets: list[str], options: dict) -> list[tuple]:
-    """(set, folder, truth, options) of every case, sets interleaved in a fixed random order."""
+    """(set, folder, answer, options) of every case, sets interleaved in a fixed random order."""
     jobs = []
     for entry in sets:
         place, _, named = entry.partition("=")
         answers = Path(named) if named else answers_of(Path(place))
-        truths = truth.read_truths(answers) if answers else {}
+        told = truth.read_answers(answers) if answers else {}
         for case in sorted(p.parent for p in Path(place).glob("*/vehicle.toml")):
-            jobs.append((Path(place).name, case, truths.get(case.name, truth.Truth("real")), options))
+            jobs.append((Path(place).name, case, told.get(case.name, UNTOLD), options))
     return [jobs[i] for i in np.random.default_rng(0).permutation(len(jobs))]
 
 
 def diagnose(job: tuple) -> dict:
     """The line of one case."""
     global _done
-    place, folder, true, options = job
+    place, folder, answer, options = job
+    true = truth.truth_of(answer)
     start, report, error, trace = time.perf_counter(), None, None, None
     try:
         from openjax.errors import UserError
@@ -64,6 +67,7 @@ def diagnose(job: tuple) -> dict:
     line = {"set": place, "case": folder.name, "category": true.category, "truth": true.effects}
     line |= {"words": words} | truth.judge(true, words)
     line |= {"top": truth.top_probability(true, (report or {}).get("probabilities", {}))}
+    line |= {"severity": answer.get("severity"), "magnitudes": parameters(answer, report)}
     line |= {"seconds": seconds, "first": _done == 1, "error": error, "traceback": trace}
     kept = ("probabilities", "shares", "parameters", "gap", "not_testable", "rest", "quality", "residual")
     return line | {k: report[k] for k in kept if report and k in report}

@@ -42,7 +42,7 @@ _EFFECTS = {
         "p",
     ),
     "blade_flapping": ((0.05, 3.0), ("linear", "advance_ratio"), ("fast", "agile", "laps"), "pg"),
-    "wind": ((0.2, 3.0), ("steady", "quadratic", "shear", "gusty"), ("yaw", "fast", "hover"), "p"),
+    "wind": ((0.2, 12.0), ("steady", "quadratic", "shear", "gusty"), ("yaw", "fast", "hover"), "p"),
     "ground_effect": ((0.015, 0.35), ("inverse_square", "cheeseman_bennett", "exponential"), ("low",), "pm"),
     "ceiling_effect": (
         (0.015, 0.35),
@@ -51,7 +51,7 @@ _EFFECTS = {
         "pm",
     ),
     "downwash": ((2.0, 20.0), ("gaussian", "jet"), ("pass", "pass_moving"), "pm"),
-    "motor_lag": ((0.2, 3.5), ("slower", "up_down", "second_order"), ("agile", "step"), "gm"),
+    "motor_lag": ((0.2, 3.5), ("slower", "up_down", "second_order", "brushed"), ("agile", "step"), "gm"),
     "command_latency": ((4.0, 60.0), ("constant", "jitter", "spikes"), ("agile", "step", "yaw"), "gcm"),
     "packet_loss": ((0.01, 0.5), ("independent", "bursts"), ("agile", "step", "yaw"), "gcm"),
     "thrust_curve": ((0.05, 1.0), ("quadratic", "power", "dip"), ("climb",), "m"),
@@ -281,7 +281,7 @@ def apply(cause, p, c, arrival=None, rng=None):
         return {"gain_at_5cm": a, "offset": offset}
     if name == "downwash":
         p["wake"][c] = a * 1e-3 * GRAVITY
-        p["wake_width"][c], p["wake_spread"][c] = 0.03 + 0.02 * s[1], 0.06 + 0.08 * s[2]
+        p["wake_width"][c], p["wake_spread"][c] = 0.02 * 7.5 ** s[1], 0.12 * s[2]
         p["wake_height"][c] = 0.25 + 0.5 * s[3]
         p["wake_jet"][c] = 1.0 if form == "jet" else 0.0
         return {"A_g": a, "width_m": float(p["wake_width"][c][0]), "height_m": float(p["wake_height"][c][0])}
@@ -289,6 +289,11 @@ def apply(cause, p, c, arrival=None, rng=None):
         up, down = 1 + a, 1 + a
         if form == "up_down":
             up, down = 1 + a * (0.5 + 0.4 * s[1]), 1 + a * (1.1 + 0.6 * s[2])
+        if (
+            form == "brushed"
+        ):  # as measured on real ones: several times slower, differently up and down, 5 ms late
+            up, down = 1 + a * (0.75 + 0.1 * s[1]), 1 + a * (1.0 + 0.2 * s[2])
+            p["tau_second"][c] = 0.004 + 0.002 * s[3]
         said = {"tau_up": float(p["tau_up"][c][0] * up), "tau_down": float(p["tau_down"][c][0] * down)}
         if form == "second_order":
             p["tau_second"][c] = p["tau_up"][c] * 0.3 * a

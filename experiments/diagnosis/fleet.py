@@ -4,7 +4,7 @@ import gzip
 
 import numpy as np
 
-from experiments.diagnosis import cases, effects, garbage, measure, plant, sensors, unknowns, vehicle
+from experiments.diagnosis import cases, effects, garbage, measure, plant, real, sensors, unknowns, vehicle
 
 VOCABULARY = list(effects.EFFECTS)
 LINK = ("command_latency", "packet_loss")  # effects that the commands in force tell
@@ -25,16 +25,12 @@ def bodies(seed, column, spec):
     return out
 
 
-def _write(cause, p, columns, arrival, strangers, count, rng):
+def _write(cause, p, columns, arrival, strangers, rng):
     """Write one cause into the batch; returns its magnitudes."""
     name, size = cause["effect"], cause["size"]
     if name in effects.EFFECTS:
         return effects.apply(cause, p, columns, arrival, rng)
-    if name == "gyro_scale":
-        p["gyro_gain"][columns] = 1 + (size if cause["shape"][0] < 0.5 else -size)
-    entry = strangers.setdefault(name, {"strength": np.zeros(count), "shape": np.zeros((8, count))})
-    entry["strength"][columns] = size
-    entry["shape"][:, columns] = np.asarray(cause["shape"])[:, None]
+    strangers.setdefault(name, []).append((columns, cause))
     return {"strength": size, "unit": cause["unit"]}
 
 
@@ -74,10 +70,11 @@ class Fleet:
         scratch = np.zeros((cases.TICKS, len(self.told)), int) if arrival is None else arrival
         for (spec, _), columns, own in zip(self.variants, self.columns, causes_of, strict=True):
             sensors.apply_nuisances(p, columns, spec["sensors"])
+            real.apply(spec.get("form_errors"), p, columns)
             said = []
             for i, cause in enumerate(own):
                 rng = cases.case_rng(self.seed, self.column, spec["number"], 2, i)
-                said.append(_write(cause, p, columns, scratch, strangers, len(self.told), rng))
+                said.append(_write(cause, p, columns, scratch, strangers, rng))
             magnitudes.append(said)
         return p, strangers, magnitudes
 
@@ -122,18 +119,21 @@ class Fleet:
         """Share of the longest flight that every body of variant i stays in the air."""
         return float(self.flown["crashed"][self.columns[i]].min() / (5 * cases.TICKS))
 
+    def _log(self, rng, spec, body, ticks, sensed):
+        """The rows of one body, motors as its vehicle commands them."""
+        rows = sensors.log_rows(rng, spec["sensors"], self.flown, body, ticks, sensed, spec["told"].hover)
+        return real.as_logged(spec.get("form_errors"), spec["told"], rows)
+
     def rows(self, i, spoiled=False):
         """The log of variant i: list over flights of lists over vehicles of {column: (n,)}, and the rows that are wrong."""
         spec, causes = self.variants[i]
         rng = cases.case_rng(self.seed, self.column, spec["number"], 3)
-        sensed = {
-            c["effect"]: (c["size"], c["shape"]) for c in causes if c["effect"] in unknowns.SENSOR_KINDS
-        }
+        sensed = [c for c in causes if c["effect"] in unknowns.SENSOR_SITES]
         out, j = [], self.columns[i][0]
         for mission, ticks in zip(spec["missions"], spec["ticks"], strict=True):
             bodies = range(j, j + (2 if len(mission) == 2 else 1))
             ticks = int(min([ticks] + [self.flown["crashed"][b] // 5 - 5 for b in bodies]))
-            out.append([sensors.log_rows(rng, spec["sensors"], self.flown, b, ticks, sensed) for b in bodies])
+            out.append([self._log(rng, spec, b, ticks, sensed) for b in bodies])
             j = bodies[-1] + 1
         wrong = []
         if spoiled and spec["garbage"]:
@@ -166,6 +166,6 @@ def write_case(fleet, i, folder, spoiled=False):
     for letter, flight in zip("abc", rows, strict=True):
         write_flight(folder / f"flight_{letter}.csv.gz", flight, spec["sensors"]["channels"])
     (folder / "vehicle.toml").write_text(
-        vehicle.toml(spec["told"], "simulated", spec["sensors"]["pose_rate"])
+        real.toml(spec.get("form_errors"), spec["told"], spec["sensors"]["pose_rate"])
     )
     return rows, wrong

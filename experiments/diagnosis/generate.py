@@ -30,7 +30,7 @@ def _variants(spec):
         return {"final": []}
     out = {"nominal": []} if spec["category"] == "unknown" else {}
     for i, cause in enumerate(spec["causes"]):
-        low, high = (unknowns.ALL if spec["category"] == "unknown" else effects.EFFECTS)[
+        low, high = (unknowns.SITES if spec["category"] == "unknown" else effects.EFFECTS)[
             cause["effect"]
         ].sizes
         for n in range(SIZES):
@@ -66,7 +66,7 @@ def fly_chunk(job):
                 at = place[name, (i, n)]
                 after = nominal[:, place[name, "nominal"]] if spec["category"] == "unknown" else truth[:, at]
                 severity = max(float(_ratios(nominal[:, at], after, floor).max()), 1e-3)
-                if cause["effect"] in unknowns.SENSOR_KINDS:  # the motion shows nothing: a middle size
+                if cause["effect"] in unknowns.SENSOR_SITES:  # the motion shows nothing: a middle size
                     severity = spec["targets"][i] * (1 + abs(n - 1.5))
                 crash = 10 * (first.lasts(at) < 0.7)
                 if spec["category"] == "not_testable":  # as large as stays hidden

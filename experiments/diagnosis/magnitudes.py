@@ -1,63 +1,11 @@
-"""How far the numbers of a report are from the answer's: shares of the gap, the gap itself, and the parameters.
+"""How far the parameters of a report are from the answer's, and whether their intervals hold the truth.
 
-What is read of `report.json`: `parameters` {effect: {name: {value, interval90}}}; `shares` {"effects": {effect: {value,
-interval90}}, "sensors": …} of the gap's mean square; `gap` {before, after, floor, reduction}, in floors.
+What is read of `report.json`: `parameters` {effect: {name: {value, interval90}}}.
 """
 
 import numpy as np
 
 from experiments.diagnosis.vehicle import GRAVITY, PROPELLER
-
-BRAKING = ("wind", "blade_flapping")  # with what they are, air brakes: see `judge.fine`
-
-
-def share_errors(answer, prediction):
-    """[{"effect", "said", "true"}] of the true effects' shares of the gap's mean square over the floor; said 0 where the report
-    doesn't name it. What the report leaves to the sensors is no part of the whole here, as the plant's measure reads none.
-    """
-    report = prediction["report"]
-    if report is None:
-        return []
-    said = report.get("shares") or {}
-    rest = 1.0 - (said.get("sensors") or {}).get("value", 0.0)
-    shares, out = said.get("effects", {}), []
-    for effect in answer["effects"]:
-        if effect not in answer["shares"]:
-            continue
-        names = [effect, *answer["acceptable"].get(effect, [])]
-        entry = next((shares[n] for n in names if n in shares), None)
-        value = 0.0 if entry is None else float(entry["value"])
-        if (
-            entry is not None
-            and effect in BRAKING
-            and "rotor_drag" in shares
-            and entry is not shares["rotor_drag"]
-        ):
-            value += float(shares["rotor_drag"]["value"])
-        value /= max(rest, 0.02)
-        out.append(
-            {"effect": effect, "said": value, "true": answer["shares"][effect], "named": entry is not None}
-        )
-    return out
-
-
-def gap_said(answer, prediction):
-    """What the report closes of the gap's excess, over what the true effect closes of it by the plant's measure."""
-    gap, truth = (prediction["report"] or {}).get("gap"), answer["gap"]["closed_by_truth"]
-    if truth <= 0.02:
-        return None
-    if not gap or gap.get("reduction") is None:
-        return 0.0
-    return float(gap["reduction"]) / truth
-
-
-def before_thrust(answer, prediction):
-    """The report's gap before, in floors, of a mass or thrust that is off by 5 to 10 %."""
-    cause = next(c for c in answer["causes"] if c["effect"] == answer["effects"][0])
-    if cause["effect"] not in ("mass", "thrust_scale") or not 0.05 <= cause["size"] <= 0.10:
-        return None
-    gap = (prediction["report"] or {}).get("gap") or {}
-    return float(gap["before"]) if gap.get("before") is not None else 0.0
 
 
 def _lag(magnitudes, told):
@@ -100,20 +48,20 @@ TRUTH = {
 }
 
 
-def parameters(answer, prediction):
-    """[{"effect", "error", "covered", "half_widths", "severity"}] of the true causes whose parameters the report gives.
+def parameters(answer, report):
+    """[{"effect", "error", "covered"}] of the true causes whose parameters the report gives.
 
     The error is |estimate - truth| / |truth - absent|, vectors taken as one; surface effects and wakes are compared as
     what they do at one distance.
     """
-    said, rows = (prediction["report"] or {}).get("parameters") or {}, []
-    for cause in answer["causes"]:
+    said, rows = (report or {}).get("parameters") or {}, []
+    for cause in answer.get("causes", ()):
         effect, magnitudes = cause["effect"], cause["magnitudes"]
         fitted = said.get(effect)
         if not fitted:
             continue
         values = {k: v["value"] for k, v in fitted.items() if v.get("value") is not None}
-        row = {"effect": effect, "severity": answer["severity"], "covered": [], "half_widths": []}
+        row = {"effect": effect, "covered": []}
         derived = _derived(effect, cause, values)
         if derived is not None:
             estimate, true = derived
@@ -136,9 +84,6 @@ def parameters(answer, prediction):
             interval = fitted[k].get("interval90")
             if interval:
                 row["covered"].append(bool(interval[0] - centre <= t <= interval[1] - centre))
-                row["half_widths"].append(
-                    0.5 * (interval[1] - interval[0]) / max(abs(t - absent), 0.3 * size)
-                )
         rows.append(row | {"error": float(np.linalg.norm(estimate - centre - true)) / size})
     return rows
 

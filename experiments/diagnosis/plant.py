@@ -31,7 +31,7 @@ class Batch:
     partner: np.ndarray  # (B,) index of the vehicle that may fly above; itself if alone
     arrival: np.ndarray  # (K, B) ms at which the command of tick k reaches the vehicle; >= 10**8: lost
     air: dict  # see `sensors.draw_air`
-    unknowns: dict = field(default_factory=dict)  # name -> {"strength": (B,), "shape": (8, B)}
+    unknowns: dict = field(default_factory=dict)  # site -> [(columns, cause), …], see `unknowns`
 
 
 class Filter:
@@ -96,6 +96,7 @@ class Body:
         self.rotor, self.drive, self.specific = rotor, rotor.copy(), np.zeros_like(rates)
         self.count = rates.shape[1]
         self.wake = bool(np.any(p["wake"] != 0))
+        self.gyroscopes = bool(np.any(p["propeller_inertia"] != 0))
         self.inverse = np.moveaxis(np.linalg.inv(np.moveaxis(p["inertia"], 2, 0)), 0, 2)
         self.diagonal = not np.any(p["inertia"][~np.eye(3, dtype=bool)])
         self.principal = p["inertia"][np.arange(3), np.arange(3)]
@@ -114,12 +115,15 @@ class Body:
         p, zero = self.p, self.zero
         u = effects.motor_demand(p, self.active, m, voltage, load)
         if unknowns:
+            unknowns.look(self.position, self.q, self.velocity, self.rates, m, voltage)
             u = unknowns.motors(u, time)
+        before = self.rotor
         self.drive = self.drive + self.second * (vehicle.MAX_SPEED * np.sqrt(u) - self.drive)
         self.rotor = self.rotor + np.where(self.drive > self.rotor, self.up, self.down) * (
             self.drive - self.rotor
         )
         squared = self.rotor * self.rotor
+        spinning = self.gyroscopes and p["propeller_inertia"] * vehicle.SPIN[:, None]
         thrust = self.lifts * squared * effects.surface_gain(p, self.active, self.position, self.q)
         moment = np.stack(
             [(self.arm_y * thrust).sum(0), -(self.arm_x * thrust).sum(0), (self.reacts * squared).sum(0)]
@@ -139,10 +143,17 @@ class Body:
         force = force + vehicle.rotate_back(self.q, outside)
         torque = torque + moment + gust_torque
         if unknowns:
-            more_force, more_torque = unknowns.wrench(
-                time, self.position, self.q, self.velocity, self.rates, thrust, moment, p["mass"]
-            )
+            more_force, more_torque = unknowns.wrench(self.q, time)
             force, torque = force + more_force, torque + more_torque
+        if self.gyroscopes:  # what speeds a rotor up turns the body; spinning rotors resist being tilted
+            spun = (spinning * self.rotor).sum(0)
+            torque = torque + np.stack(
+                [
+                    self.rates[1] * spun,
+                    -self.rates[0] * spun,
+                    (spinning * (self.rotor - before)).sum(0) / DT,
+                ]
+            )
         specific = force / p["mass"]
         accel = vehicle.rotate(self.q, specific)
         accel[2] -= vehicle.GRAVITY
@@ -208,9 +219,9 @@ class Flight:
     ):
         ticks, count = arrival.shape
         self.p, self.air, self.solids, self.sample = parameters, air, solids, 0
-        self.unknowns = Unknowns(unknowns or {}, count)
-        self.received = received(arrival, 10 * ticks)
         hover = np.array([t.hover for t in told])
+        self.unknowns = Unknowns(unknowns or {}, count, hover)
+        self.received = received(arrival, 10 * ticks)
         self.start = np.concatenate([hover[None], np.zeros((3, count))])
         self.body = Body(
             parameters,

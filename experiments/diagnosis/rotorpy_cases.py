@@ -10,21 +10,17 @@ what flapping does.
 """
 
 import argparse
+import multiprocessing
+from pathlib import Path
 
 import numpy as np
 
-from experiments.diagnosis import sensors
+from experiments.diagnosis import cases, fleet, measure, sensors
 from experiments.diagnosis import vehicle as v
-from experiments.diagnosis.flown_cases import (
-    answer,
-    choose_paths,
-    fly_plan,
-    slow_enough,
-    told_for,
-    write_case,
-)
-from experiments.diagnosis.generate import add_case_arguments
+from experiments.diagnosis.answer_key import HIDDEN, accepted
+from experiments.diagnosis.generate import add_case_arguments, write_answers
 from experiments.diagnosis.plant import KEPT, POSE, SAMPLE, Battery, Filter
+from experiments.flying.single_thread import use_single_thread
 
 SECONDS = 8.0
 TUNNEL_HEIGHT = 0.65  # m
@@ -265,7 +261,7 @@ def make_case(job):
     """Fly and write one case; returns its answer."""
     seed, number, kind, folder = job
     rng = np.random.default_rng(np.random.SeedSequence([17, seed, number]))
-    draw, effects, form, exposing = KINDS[kind]
+    draw, effects, _, exposing = KINDS[kind]
     told = told_for(rng, effects)
     changed, wind, said = draw(rng, told, v.MAX_SPEED * np.sqrt(told.hover))
     np.random.seed(seed * 1000 + number)  # noqa: NPY002  RotorPy draws its motor noise from the global state
@@ -289,11 +285,101 @@ def make_case(job):
         length = min(ticks, int(flown[-1]["crashed"][0]) // 5 - 5)
         flights.append([sensors.log_rows(rng, drawn, flown[-1], 0, length)])
     joined = {k: np.concatenate([f[k] for f in flown], axis=-1) for k in flown[0]}
-    place = write_case(folder, number, flights, drawn, v.toml(told, "RotorPy 3", drawn["pose_rate"]))
-    fine = ["wind", "rotor_drag"] if kind == "wind_tunnel" else []
-    return answer(
-        place.name, kind, told, drawn, names, joined, flights, effects, form, said, "SE3Control", fine
+    place = write_logs(folder, number, flights, drawn, v.toml(told, "RotorPy 3", drawn["pose_rate"]))
+    return answer(place.name, kind, told, drawn, joined, flights, said)
+
+
+def fly_plan(options, kinds):
+    """Fly the cases of `kinds` in an order drawn by the seed (or those of `--cases`), and write their answers."""
+    use_single_thread()
+    order = np.random.default_rng(options.seed).permutation(len(kinds))
+    jobs = [(options.seed, n, kinds[i], str(options.logs)) for n, i in enumerate(order, 1)]
+    if options.cases:
+        jobs = [job for job in jobs if f"case_{job[1]:03d}" in options.cases.split(",")]
+    with multiprocessing.get_context("spawn").Pool(options.jobs) as pool:
+        answers = sorted(pool.imap_unordered(make_case, jobs), key=lambda a: a["case"])
+    print("sha256", write_answers(options.answers, answers, options.seed, "rotorpy"))
+
+
+def told_for(rng, effects):
+    """The told vehicle of a case; one whose mass is the cause wasn't weighed."""
+    told = v.draw_told(rng)
+    return v.Told(**(told.__dict__ | {"weighed": False})) if "mass" in effects else told
+
+
+def choose_paths(rng, exposing, paths):
+    """Names of a case's three trajectories: one that exposes the cause, where only some do, and others."""
+    names = [str(rng.choice(exposing))] if exposing else []
+    return names + [str(n) for n in rng.choice(paths, 3 - len(names), replace=False)]
+
+
+def slow_enough(attempt, enough):
+    """The first flight of `attempt(slower)` that lasts `enough` samples, ever slower: some vehicles can't follow fast paths."""
+    for slower in (1.0, 0.7, 0.5, 0.35):
+        flight = attempt(slower)
+        if flight["crashed"][0] >= enough:
+            break
+    return flight
+
+
+def write_logs(folder, number, flights, drawn, vehicle):
+    """Write a case's three logs and its vehicle file; its folder."""
+    place = Path(folder) / f"case_{number:03d}"
+    place.mkdir(parents=True, exist_ok=True)
+    for letter, flight in zip("abc", flights, strict=True):
+        fleet.write_flight(place / f"flight_{letter}.csv.gz", flight, drawn["channels"])
+    (place / "vehicle.toml").write_text(vehicle)
+    return place
+
+
+def floor_of(told, drawn, joined, flights):
+    """(seen, floor): mean squares (12,) of the told vehicle without a cause, and root mean squares of what air, sensors
+    and the rows of the log leave to a true one."""
+    many, none = [told] * 3, np.zeros(3, bool)
+    p = v.nominal_parameters(many)
+    p["rotor_gain"] *= 1 + drawn["thrust_offset"]
+
+    def errors(flown):
+        return (measure.errors(flown, many, p, np.arange(3), none, none) ** 2).mean(axis=1)
+
+    rows, samples, seen = [f[0] for f in flights], len(joined["motor"]), errors(joined)
+    sensed = (np.array([measure.sensor_floor(drawn, r, joined, j) for j, r in enumerate(rows)]) ** 2).mean(
+        axis=0
     )
+    logged = np.stack([measure.motors_of_log(r, samples) for r in rows], axis=-1)
+    lasts = np.minimum(joined["crashed"], [round(r["t"][-1] / SAMPLE) for r in rows])
+    hidden = [errors(joined | {"motor": m, "crashed": lasts}) for m in logged]
+    return seen, np.sqrt(sensed + np.maximum(np.min(hidden, axis=0) - seen, 0.0))
+
+
+def answer(name, kind, told, drawn, joined, flights, said):
+    """The answer of one case; `said`: magnitudes of each effect."""
+    _, effects, form, _ = KINDS[kind]
+    seen, floor = floor_of(told, drawn, joined, flights)
+    known = np.isfinite(floor)
+    severity = float(np.sqrt(np.where(known, seen / floor**2, 0.0).max()))
+    truth = [e if e != "unknown" else kind for e in effects]
+    category = {0: "none", 1: "unknown" if effects == ["unknown"] else "single", 2: "pair"}[len(effects)]
+    if effects and severity < HIDDEN:
+        category = "not_testable"
+    forms, each = ([x] if isinstance(x, str | dict) else list(x) for x in (form, said))
+    fine = ["wind", "rotor_drag"] if kind == "wind_tunnel" else []
+    return {
+        "case": name,
+        "category": category,
+        "effects": truth,
+        "expected": ["none"] if category in ("none", "not_testable") else effects,
+        "acceptable": {e: accepted(e, told.weighed) for e in effects if e != "unknown"},
+        "also_fine": truth if category == "not_testable" else fine,
+        "causes": [
+            {"effect": e, "form": f, "magnitudes": m} for e, f, m in zip(truth, forms, each, strict=False)
+        ],
+        "severity": cases.label(severity) if effects else None,
+        "severity_ratio": round(severity, 3),
+        "told": told.__dict__,
+        "sensors": drawn,
+        "rotorpy": kind,
+    }
 
 
 def main():
@@ -305,7 +391,7 @@ def main():
     parser.add_argument("--kinds", default=",".join(KINDS))
     options = parser.parse_args()
     kinds = [kind for kind in options.kinds.split(",") for _ in range(options.each)]
-    fly_plan(options, kinds, make_case, "RotorPy")
+    fly_plan(options, kinds)
 
 
 if __name__ == "__main__":

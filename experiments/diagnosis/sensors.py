@@ -8,7 +8,7 @@ Every case, "none" included, has biases, a tilt up to 1 degree between IMU and t
 import numpy as np
 from scipy.signal import butter, lfilter, lfilter_zi
 
-from experiments.diagnosis import vehicle
+from experiments.diagnosis import unknowns, vehicle
 from experiments.diagnosis.plant import SAMPLE
 
 KINDS = ("white", "coloured", "filtered", "vibrating", "quantised", "radio")
@@ -254,11 +254,17 @@ def smooth_derivative(position, step):
     return out
 
 
-def log_rows(rng, sensors, flown, j, ticks, unknown=None):
+def _inputs(flown, j, times, hover):
+    """What `unknowns.misread` depends on, from the truth at `times`."""
+    names = ("position", "quaternion", "velocity", "rates", "motor")
+    rows = [at(flown[name][:, :, j].astype(float), times).T for name in names]
+    return unknowns.inputs_of(*rows, at(flown["voltage"][:, j].astype(float), times), hover)
+
+
+def log_rows(rng, sensors, flown, j, ticks, unknown=(), hover=0.5):
     """Rows of body j: dict column -> (n,) with NaN where a channel was not sampled; `t` first. All groups are made,
-    the caller leaves out what was not logged. `unknown`: {name: (strength, shape)} of the kinds that sit in sensors.
+    the caller leaves out what was not logged. `unknown`: causes that sit in sensors.
     """
-    unknown = unknown or {}
     seconds, rate = 0.01 * ticks, sensors["rate"]
     t = np.arange(int(seconds * rate)) / rate
     if sensors["dropped"]:
@@ -297,26 +303,10 @@ def log_rows(rng, sensors, flown, j, ticks, unknown=None):
         empty = np.full((n, 10), np.nan)
         empty[row[ok]] = pose[ok]
         pose = empty
-    if "world_tilt" in unknown:
-        s, shape = unknown["world_tilt"]
-        half = 0.5 * np.deg2rad(s)
-        turn = np.array(
-            [np.cos(half), np.sin(half) * np.cos(6.28 * shape[0]), np.sin(half) * np.sin(6.28 * shape[0]), 0]
-        )
-        turn = np.repeat(turn[:, None], n, axis=1)
-        pose = np.concatenate(
-            [
-                vehicle.rotate(turn, pose[:, :3].T).T,
-                vehicle.multiply(turn, pose[:, 3:7].T).T,
-                vehicle.rotate(turn, pose[:, 7:].T).T,
-            ],
-            axis=1,
-        )
-    if "marker_jumps" in unknown:
-        s, shape = unknown["marker_jumps"]
-        slot = np.floor(t / (0.5 + shape[0])).astype(int)
-        jumps = np.random.default_rng(int(1e6 * shape[1])).uniform(-1, 1, (slot[-1] + 1, 3))
-        pose[:, :3] += s * jumps[slot]
+    wrong = unknowns.misread(unknown, _inputs(flown, j, t, hover), t) if unknown else {}
+    pose[:, :3] += wrong.get("unknown_position", 0.0)
+    if "unknown_attitude" in wrong:
+        pose[:, 3:7] = unknowns.turned(pose[:, 3:7], wrong["unknown_attitude"])
 
     # IMU: the firmware's gyroscope, and the accelerometer with its own noise, vibration and filter
     tilt = np.array(sensors["tilt"])
@@ -350,9 +340,11 @@ def log_rows(rng, sensors, flown, j, ticks, unknown=None):
     voltage = flown["voltage"][place, j] + 0.012 * rng.standard_normal(n)
     seldom = np.floor(t * 10 + 1e-6)
     voltage[np.concatenate([[False], seldom[1:] == seldom[:-1]])] = np.nan
-    values = np.concatenate(
-        [pose, stream(gyro, t, 0), stream(accel, t, 0), command, motors, voltage[:, None]], axis=1
-    )
+    imu = [
+        stream(gyro, t, 0) + wrong.get("unknown_gyroscope", 0.0),
+        stream(accel, t, 0) + wrong.get("unknown_accelerometer", 0.0),
+    ]
+    values = np.concatenate([pose, *imu, command, motors, voltage[:, None]], axis=1)
     for i, column in enumerate(COLUMNS[2:]):
         step = 10.0 ** -DECIMALS[column]
         if sensors["quantum"] > 1 and column not in GROUPS["c"]:

@@ -139,6 +139,7 @@ NEUTRAL = {
     "wake_spread": 0.1,
     "wake_jet": 0.0,
     "gyro_gain": 1.0,
+    "propeller_inertia": 0.0,  # kg m^2
     "link_delay": 0.0,  # ms, of a model that knows a delay of the commands
     "pose_delay": 0.0,  # ms
     "pose_jitter": 0.0,
@@ -225,3 +226,15 @@ def mix(thrust, output):
     r, p = roll / 2, pitch / 2
     m = np.stack([thrust - r - p - yaw, thrust - r + p + yaw, thrust + r + p - yaw, thrust + r - p + yaw])
     return np.minimum(np.maximum(m, 0.0), 1.0)
+
+
+def matrix_of(q):
+    """Rotations (3, 3, ...), body to world, of unit quaternions (4, ...)."""
+    w, x, y, z = q
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

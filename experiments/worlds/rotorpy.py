@@ -10,8 +10,8 @@ vehicle's.
 import numpy as np
 
 from experiments.diagnosis import vehicle as v
-from experiments.diagnosis.onboard import matrix_of
 from experiments.diagnosis.plant import PER_TICK, SAMPLE, Firmware
+from experiments.diagnosis.vehicle import matrix_of
 from experiments.worlds.plant import air_of, limit_speed, sensors_of, solids_of
 from experiments.worlds.world import Poses, per_world
 from openjax.pursuit import Task
