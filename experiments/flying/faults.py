@@ -65,7 +65,11 @@ def draw_fault(seed: int, latest: float) -> Fault:
     }.get(kind, math.inf)  # fmt: skip
     if kind.endswith("for a while"):
         duration = rng.uniform(0.05, 1.0)
-    elif "none" in kind or "attitude" in kind or kind in ("poses jump", "camera: yaw turned", "camera: bodies swapped"):
+    elif (
+        "none" in kind
+        or "attitude" in kind
+        or kind in ("poses jump", "camera: yaw turned", "camera: bodies swapped")
+    ):
         duration = rng.choice((0.0099, 0.05, 1.0, math.inf))
     amount = {
         "packets lost": rng.uniform(0.1, 0.7), "camera scaled": rng.choice((0.8, 1.2, 1.5, 1000.0)),
@@ -123,7 +127,9 @@ class PoseDamage:
             other = others[(i + 1) % len(others)]
             return pose._replace(position=other.position, quaternion=other.quaternion)
         if what == "late":
-            return self._past[i][max(len(self._past[i]) - 1 - round(100 * fault.amount), 0)]._replace(time=now)
+            return self._past[i][max(len(self._past[i]) - 1 - round(100 * fault.amount), 0)]._replace(
+                time=now
+            )
         name = "body_rates" if kind.startswith("gyroscope") else ("position", "quaternion")[self._field % 2]
         values = list(getattr(pose, name))
         values[self._field % len(values)] = fault.number

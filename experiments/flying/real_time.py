@@ -73,7 +73,17 @@ def kinds() -> list[str]:
     """All kinds of faults, signals first."""
     signals = [f"{name} {role}" for name in SIGNALS for role in ROLES]
     pairs = [f"{name} {pair}" for name in ("KILL", "STOP") for pair in PAIRS]
-    return [*signals, *pairs, "terminal closed", "KILL links then guard", "KILL loop then links", *KEYS, *POSES, *START, *OTHER]
+    return [
+        *signals,
+        *pairs,
+        "terminal closed",
+        "KILL links then guard",
+        "KILL loop then links",
+        *KEYS,
+        *POSES,
+        *START,
+        *OTHER,
+    ]
 
 
 def main() -> None:
@@ -86,7 +96,10 @@ def main() -> None:
     for item in work:
         queue.put(item)
     ends = time.time() + arguments.seconds_left
-    workers = [context.Process(target=worker, args=(arguments, queue, done, ends)) for _ in range(arguments.processes)]
+    workers = [
+        context.Process(target=worker, args=(arguments, queue, done, ends))
+        for _ in range(arguments.processes)
+    ]
     for process in workers:
         process.start()
     records, begin = [], time.time()
@@ -110,7 +123,11 @@ def worker(arguments, queue, done, ends) -> None:
 
     virtual = VirtualProcess(arguments.scenario)
     fly = FlyArguments(
-        policy=arguments.policy, scenario=arguments.scenario, uri=tuple(virtual.uris), episode_seconds=8.0, body_logs=1
+        policy=arguments.policy,
+        scenario=arguments.scenario,
+        uri=tuple(virtual.uris),
+        episode_seconds=8.0,
+        body_logs=1,
     )
     prepared = prepare(fly)
     real_time.hurry()
@@ -128,7 +145,9 @@ def fault_of(number: int, kind: str) -> Fault:
     rng = random.Random(number)
     time, vehicle = rng.uniform(0.3, LATEST), rng.randrange(3)
     if kind in (*POSES, "drone gone"):
-        like = next(s for s in range(1000 * number, 1000 * number + 1000) if draw_fault(s, LATEST).kind == kind)
+        like = next(
+            s for s in range(1000 * number, 1000 * number + 1000) if draw_fault(s, LATEST).kind == kind
+        )
         return replace(draw_fault(like, LATEST), time=time)
     if kind in START:
         return Fault(kind, -math.inf, 1, direction=0.0)
@@ -156,7 +175,9 @@ def feed_of(fault: Fault, truth):
             now = time.perf_counter() - truth.take_off
             poses = truth.poses()
             for i, pose in enumerate(poses):
-                shaken = tuple(p + e for p, e in zip(pose.position, noise.normal(0, 5e-4, 3).tolist(), strict=True))
+                shaken = tuple(
+                    p + e for p, e in zip(pose.position, noise.normal(0, 5e-4, 3).tolist(), strict=True)
+                )
                 seen = damage("camera", i, now, at_start(pose._replace(position=shaken)), poses)
                 if seen is not None:
                     update(i, seen.position, seen.quaternion)
@@ -302,7 +323,9 @@ class Flown:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
             for _ in range(300):
                 head = rng.choice((0xFF, 0x2C, 0x0C, 0xFC, 0x4C, 0xDC, 0x1C))
-                other.sendto(bytes([head, *rng.randbytes(rng.randrange(20))]), ("127.0.0.1", rng.choice(ports)))
+                other.sendto(
+                    bytes([head, *rng.randbytes(rng.randrange(20))]), ("127.0.0.1", rng.choice(ports))
+                )
 
     def _try_second(self):
         from openjax.errors import UserError
@@ -337,13 +360,19 @@ class Flown:
         times, position, off = track["time"], track["position"], track["off"].astype(bool)
         late = times >= (injected or begin)
         held = np.array([not (fault.kind == "drone gone" and i == fault.vehicle) for i in range(3)])
-        out = np.maximum(np.linalg.norm(position[..., :2], axis=-1) - 0.9, position[..., 2] - 1.2)[late][:, held]
+        out = np.maximum(np.linalg.norm(position[..., :2], axis=-1) - 0.9, position[..., 2] - 1.2)[late][
+            :, held
+        ]
         down = (off & (position[..., 2] < 0.02))[late][:, held].all(1)
         over = next((k for k in range(len(down)) if down[k:].all()), None)
         seconds = None if over is None or injected is None else float(times[late][over] - injected)
         fell = bool((off & (position[..., 2] > FALL))[late][:, held].any())
         armed = bool(track["armed"][-1][held].any())
-        said = [line for line in self._said.decode(errors="replace").replace("\r", "\n").split("\n") if line.strip()]
+        said = [
+            line
+            for line in self._said.decode(errors="replace").replace("\r", "\n").split("\n")
+            if line.strip()
+        ]
         row = {
             "number": self._number, "kind": self._kind, "time": round(min(max(fault.time, 0.0), 99.0), 2), "status": status,
             "took_off": not math.isinf(self._virtual.truth.take_off), "out": round(float(out.max(initial=-1.0)), 3), "fell": fell,

@@ -157,7 +157,9 @@ class Worlds:
         if self._measured is None:
             self._measured = self._first(poses)
         else:
-            self._measured = self._tick(*self._measured[:2], poses, np.zeros(3, np.float32), np.zeros((), bool))
+            self._measured = self._tick(
+                *self._measured[:2], poses, np.zeros(3, np.float32), np.zeros((), bool)
+            )
             for w, caught in enumerate(np.asarray(self._measured[4])):
                 if caught and self.captured[w] is None:
                     self.captured[w] = len(self._tracks)
@@ -205,7 +207,9 @@ class Worlds:
         track = np.array(self._tracks).reshape(len(self._tracks), len(self.faults), self.n, 4)
         crashed = np.array([f.crashed for f in self.swarm.firmware]).reshape(-1, self.n)
         return [
-            record(fault, seed, layout, self.states[w], track[:, w], crashed[w], self.safety, self.captured[w])
+            record(
+                fault, seed, layout, self.states[w], track[:, w], crashed[w], self.safety, self.captured[w]
+            )
             for w, (fault, seed) in enumerate(zip(self.faults, seeds, strict=True))
         ]
 
@@ -219,13 +223,17 @@ def record(fault, seed, layout, state, track, crashed, safety, caught) -> dict:
     begin = min(int(min(fault.time, 1e6) / 0.01), len(track) - 1)
     after = track[begin:]
     height, off = after[..., 2], after[..., 3] > 0.0
-    out = np.maximum(np.linalg.norm(after[..., :2], axis=-1) - safety.arena_radius, height - safety.arena_height)
+    out = np.maximum(
+        np.linalg.norm(after[..., :2], axis=-1) - safety.arena_radius, height - safety.arena_height
+    )
     held = np.array([not (fault.kind == "drone gone" and i == fault.vehicle) for i in range(track.shape[1])])
     ended = any(d.reason for d in state.drones)
     down = off & (height < 0.02)
     reaction = next((k for k in range(len(after)) if down[k:].all()), len(after)) * 0.01
     nearest = min(
-        float(np.linalg.norm(track[:, i, :3] - track[:, j, :3], axis=-1).min()) for i in range(3) for j in range(i)
+        float(np.linalg.norm(track[:, i, :3] - track[:, j, :3], axis=-1).min())
+        for i in range(3)
+        for j in range(i)
     )
     return {
         "seed": seed, "kind": fault.kind, "layout": layout, "captured_by_camera": fault.captured,

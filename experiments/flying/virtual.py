@@ -22,7 +22,9 @@ class Truth:
     def __init__(self, number: int, context):
         self.number, self._numbers = number, context.RawArray("d", 1 + _POSE * number)
 
-    take_off = property(lambda self: self._numbers[0] or math.inf, doc="When motors turned first (s); infinite before.")
+    take_off = property(
+        lambda self: self._numbers[0] or math.inf, doc="When motors turned first (s); infinite before."
+    )
 
     def begin(self, take_off: float) -> None:
         """Motors turn since `take_off` (s); zero: they don't."""
@@ -31,7 +33,13 @@ class Truth:
     def write(self, now: float, report) -> None:
         """The vehicles are as `report` says at `now` (s)."""
         rows = np.column_stack(
-            [np.full(self.number, now), report.position, report.velocity, report.quaternion, report.body_rates]
+            [
+                np.full(self.number, now),
+                report.position,
+                report.velocity,
+                report.quaternion,
+                report.body_rates,
+            ]
         )
         self._numbers[1:] = rows.ravel().tolist()
 
@@ -102,7 +110,9 @@ class _Flown:
         """What vehicle i senses, as its log blocks tell it."""
         sensors = self._sensors(i)
         now = time.perf_counter() - self._truth.take_off
-        pose = Pose(now, *(tuple(x.tolist()) for x in (sensors.position, sensors.velocity, sensors.quaternion)))
+        pose = Pose(
+            now, *(tuple(x.tolist()) for x in (sensors.position, sensors.velocity, sensors.quaternion))
+        )
         pose = pose._replace(body_rates=tuple(sensors.body_rates.tolist()))
         sent = self._damage("radio", i, now, pose, ())
         if sent is pose or sent is None:
@@ -118,7 +128,9 @@ class _Flown:
         if now - self._last >= EVERY:
             self._last = now
             off = [f.set_point(virtual.time).mode == 0 for f in virtual.firmware]
-            self._rows.append((now, report.position.copy(), off, [f.armed and not f.emergency for f in virtual.firmware]))
+            self._rows.append(
+                (now, report.position.copy(), off, [f.armed and not f.emergency for f in virtual.firmware])
+            )
             if math.isinf(self._truth.take_off) and not all(off):
                 self._truth.begin(now)
             self._spoil(now - self._truth.take_off)
@@ -137,7 +149,12 @@ class _Flown:
     def _spoil(self, now):
         """Do to a vehicle's link what the fault does."""
         fault = self._fault
-        lost = {"packets lost": fault.amount, "drone gone": 1.0, "poses lost": 1.0, "poses lost for a while": 1.0}
+        lost = {
+            "packets lost": fault.amount,
+            "drone gone": 1.0,
+            "poses lost": 1.0,
+            "poses lost for a while": 1.0,
+        }
         share = lost.get(fault.kind, 0.0) if fault.on(now) else 0.0
         uplink = share if fault.kind in ("packets lost", "drone gone") else 0.0
         link = self._virtual.links[fault.vehicle]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.scaling import cases, table
+from experiments.speed.scaling import cases
 from openjax.learning import MappoSettings, TrainSettings
 
 pytestmark = pytest.mark.slow
@@ -43,20 +43,20 @@ def test_worlds_or_minibatches_grow_with_the_devices_and_what_cannot_be_shared_o
 def test_script_measures_one_device_and_two(tmp_path):
     flags = os.environ["XLA_FLAGS"].replace("--xla_cpu_multi_thread_eigen=false", "")
     flags += " --xla_force_host_platform_device_count=2"
-    out = tmp_path / "scaling.json"
-    options = ["--json", str(out), "--kinds", "weak", "--calls", "2", "--seconds", "600", "--commit", "abc"]
+    out = tmp_path / "scaling"
+    options = ["--out", str(out), "--kinds", "weak", "--calls", "2", "--seconds", "600", "--commit", "abc"]
     done = subprocess.run(
-        [sys.executable, "-m", "experiments.scaling", *TINY, *options],
+        [sys.executable, "-m", "experiments.speed.scaling", *TINY, *options],
         cwd=Path(__file__).parents[2],
         env={**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"},
         capture_output=True,
         text=True,
     )
     assert done.returncode == 0, done.stderr[-3000:]
-    results = json.loads(out.read_text())
+    results = json.loads(out.with_suffix(".json").read_text())
     assert results["machine"]["commit"] == "abc" and results["machine"]["device_count"] == 2
     rows = results["rows"]
     assert [(row["devices"], row["num_envs"]) for row in rows] == [(1, 8), (2, 16)]
     for row in rows:
         assert row["env_steps_per_second"] * row["seconds"] == pytest.approx(row["num_envs"] * 10)
-    assert out.with_suffix(".md").read_text().endswith("\n".join(table(rows)) + "\n")
+    assert "| weak | 2 | 16 |" in out.with_suffix(".md").read_text()

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from experiments.cache_flips import run_flips
+from experiments.speed.cache_flips import run_flips
 from openjax.store.checked_cache import ASIDE, ENTRY, CheckedCache, set_fatal_entries_aside
 
 

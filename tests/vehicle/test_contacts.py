@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.crashes import KINDS, PILLARS, by_mujoco, crashes, flown
+from tests.vehicle.crashes import KINDS, PILLARS, by_mujoco, crashes, flown
 
 
 @pytest.fixture(scope="module")

@@ -334,7 +334,9 @@ def _watch(swarm: Swarm, board: Board, parent: int, landing) -> None:
         board.beat(Role.LINKS, now)
         silent = board.silent(Role.LOOP, now)
         if board.pilot is Role.LOOP and board.flying and landing[0] is not None and silent > board.silence:
-            say(f"openjax fly: nothing from the loop for {silent:.2f} s, the links' process lands all vehicles")
+            say(
+                f"openjax fly: nothing from the loop for {silent:.2f} s, the links' process lands all vehicles"
+            )
             fly_down(board, Role.LINKS, swarm, *landing)
         if os.getppid() != parent and not board.flying:
             if board.armed:

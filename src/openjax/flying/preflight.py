@@ -52,10 +52,7 @@ def poses_arriving(links, duration: float = LOOK) -> list[float]:
     before = [s.own.time for s in links.observe()], list(links.counts)
     time.sleep(duration)
     after = [s.own.time for s in links.observe()], list(links.counts)
-    return [
-        (c - old) / max(t - since, duration)
-        for t, c, since, old in zip(*after, *before, strict=True)
-    ]
+    return [(c - old) / max(t - since, duration) for t, c, since, old in zip(*after, *before, strict=True)]
 
 
 def faults(

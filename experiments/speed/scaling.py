@@ -1,4 +1,4 @@
-"""Scaling of the whole training step over the devices of a host: `python -m experiments.scaling [--commit HASH]`.
+"""Scaling of the whole training step over the devices of a host: `python -m experiments.speed.scaling [--commit HASH]`.
 
 weak          as many worlds on every device as one has alone, minibatches as many and so larger: how one would train
 weak_batches  the same worlds, but as many more minibatches: each is as large as on one device
@@ -21,17 +21,16 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from experiments import pages
+from experiments.table import RESULTS, Page, Table, facts, write_page
 from openjax.cluster.devices import carry_shardings, check_devices, everywhere, make_device_step
 from openjax.commands.command_line import parse, peek, run_command
-from openjax.commands.machine import describe_machine
 from openjax.commands.training_loop import guarded
 from openjax.errors import UserError
 from openjax.learning import TrainCarry, TrainSettings, build, init_carry, preset
 from openjax.store.leaves import place
-from openjax.store.settings_files import write_json
+from openjax.store.settings_files import to_plain, write_json
 
-PROGRAM = "python -m experiments.scaling"
+PROGRAM = "python -m experiments.speed.scaling"
 Kind = Literal["weak", "weak_batches", "strong"]
 
 
@@ -49,8 +48,8 @@ class ScalingCommand:
     """Timed training steps of each."""
     seconds: float = 90.0
     """Time after which no further measurement is begun."""
-    json: Path = Path(__file__).parent / "results" / "scaling.json"
-    """File of the results."""
+    out: Path = RESULTS / "scaling"
+    """Results are written to this path with .json and .md."""
     commit: str | None = None
     """Commit that is measured, where the source tree can't tell."""
     settings: Annotated[tyro.conf.FlagConversionOff[TrainSettings], tyro.conf.arg(name="")] = (
@@ -161,38 +160,29 @@ def row_of(case: Case, times: Sequence[float], trace: float, compile_: float) ->
     }
 
 
-def table(rows: Sequence[dict]) -> list[str]:
-    """The rows as a Markdown table."""
-    heads = ["what grows", "devices", "worlds", "minibatches", "training step [s]", "env steps/s"]
-    one = rows[0]["env_steps_per_second"]
-    body = []
-    for row in rows:
-        gain = row["env_steps_per_second"] / one
-        sizes = [row["kind"], str(row["devices"]), f"{row['num_envs']:,}", str(row["minibatches"])]
-        speeds = [f"{row['seconds']:.3f}", f"{row['env_steps_per_second']:,.0f}"]
-        body.append([*sizes, *speeds, f"{gain:.2f}", f"{gain / row['devices']:.2f}"])
-    return pages.table([*heads, "against one device", "per device"], body)
-
-
-def report(facts: dict, settings: TrainSettings, rows: Sequence[dict], left_out: Sequence[str]) -> str:
-    """The Markdown file beside the results."""
-    machine = facts["machine"]
-    lines = [
-        "# Scaling of the training step over the devices of a host",
-        "",
-        f"`{facts['command']}`: {machine['device']}, JAX {machine['versions']['jax']}, commit {machine['commit']}, "
-        f"{machine['date'][:10]}.",
-        f"Physics {settings.environment.physics}, {settings.mappo.epochs} epochs, rollouts of "
-        f"{settings.rollout_length} steps, networks in {settings.network.compute_type}. Median of the timed steps, "
-        "each waited for; compilation apart.",
-        "`weak`: every device has the worlds of one alone, minibatches grow; `weak_batches`: there are more "
-        "minibatches instead; `strong`: the worlds of one device, shared out.",
-        "",
-        *table(rows),
-    ]
-    if left_out:
-        lines += ["", "Left out:", "", *(f"* {reason}" for reason in left_out)]
-    return "\n".join(lines) + "\n"
+def page(results: dict) -> Page:
+    """A row per measurement."""
+    one = results["rows"][0]["env_steps_per_second"]
+    columns = {
+        "what grows": "kind",
+        "devices": "devices",
+        "worlds": "num_envs:,",
+        "minibatches": "minibatches",
+        "training step [s]": "seconds:.3f",
+        "env steps/s": "env_steps_per_second:,.0f",
+        "against one device": lambda row: f"{row['env_steps_per_second'] / one:.2f}",
+        "per device": lambda row: f"{row['env_steps_per_second'] / one / row['devices']:.2f}",
+    }
+    settings = results["settings"]
+    left_out = [f"Left out: {'; '.join(results['left_out'])}."] if results["left_out"] else []
+    return Page(
+        "Scaling of the training step over the devices of a host",
+        f"Physics {settings['environment']['physics']}, {settings['mappo']['epochs']} epochs, rollouts of "
+        f"{settings['rollout_length']} steps, networks in {settings['network']['compute_type']}. Median of the timed "
+        "steps, each waited for; compilation apart. `weak`: every device has the worlds of one alone, minibatches grow; "
+        "`weak_batches`: there are more minibatches instead; `strong`: the worlds of one device, shared out.",
+        (Table(columns, results["rows"]), *left_out),
+    )
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -206,27 +196,24 @@ def main(arguments: Sequence[str]) -> int:
     if not all(1 <= number <= available for number in devices) or command.calls < 1:
         raise UserError(f"--devices takes numbers from 1 to the {available} that are here, --calls from 1 on")
     found, left_out = cases(command.settings, devices, command.kinds)
-    machine = describe_machine()
-    if command.commit is not None:
-        machine |= {"commit": command.commit, "commit_clean": None}
-    facts = {"command": pages.typed_command(), "machine": machine}
-    print(f"{machine['device']} × {available}: compiling {len(found)} programs ...", flush=True)
+    about = facts(command.commit)
+    print(f"{about['machine']['device']} × {available}: compiling {len(found)} programs ...", flush=True)
     start = init_carry(command.settings, jax.random.key(0))
     programs = compiled_cases(found, start)
     print(f"compiled after {time.monotonic() - began:.0f} s", flush=True)
-    rows = []
+    results = to_plain({**about, "settings": command.settings, "rows": [], "left_out": left_out})
     for case, (program, trace, compile_) in zip(found, programs, strict=True):
-        if rows and time.monotonic() - began > command.seconds:
-            left_out.append(f"{case.kind} on {case.devices} devices: {command.seconds:.0f} s were over")
+        if results["rows"] and time.monotonic() - began > command.seconds:
+            results["left_out"].append(
+                f"{case.kind} on {case.devices} devices: {command.seconds:.0f} s were over"
+            )
             continue
-        rows.append(row_of(case, measure(case, program, start, command.calls), trace, compile_))
-        print(table(rows[:1] + rows[-1:])[-1], flush=True)
-        # After each, so that what was measured stays if the rest fails.
-        write_json(command.json, {**facts, "settings": command.settings, "rows": rows, "left_out": left_out})
-    write_json(command.json, {**facts, "settings": command.settings, "rows": rows, "left_out": left_out})
-    text = report(facts, command.settings, rows, left_out)
-    command.json.with_suffix(".md").write_text(text, encoding="utf-8")
-    print(f"written to {command.json} after {time.monotonic() - began:.0f} s")
+        row = row_of(case, measure(case, program, start, command.calls), trace, compile_)
+        results["rows"].append(row)
+        print(f"{case.kind}, {case.devices} devices: {row['seconds']:.3f} s", flush=True)
+        write_json(command.out.with_suffix(".json"), results)  # what was measured stays if the rest fails
+    write_json(command.out.with_suffix(".json"), results)
+    write_page(command.out, page, results)
     return 0
 
 

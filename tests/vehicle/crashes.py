@@ -1,17 +1,10 @@
-"""How well do the written-out contacts of `rigid` agree with MuJoCo C? `python -m experiments.crashes [--number 10000]`.
-
-Random crashes (floor, pillar, drone on drone, pillar and floor at once) flown by `rigid` and by MuJoCo C on the same model:
-positions, velocities and what is touched over .1 s, then over 1 s how far each of them goes apart from itself when the starts
-are moved by 1e-6, which no agreement can fall below. Writes experiments/results/crashes.json and .md (`--out`: others).
-"""
+"""Random crashes (floor, pillar, drone on drone, pillar and floor at once), by `rigid` and by MuJoCo C on the same model."""
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from experiments.pages import page_parser, publish, table, where
-from openjax.commands.command_line import run_command
 from openjax.vehicle import hover_state, load_vehicle, make_drones_step
 from openjax.vehicle.arena import Arena
 from openjax.vehicle.mjx_body import world_xml
@@ -19,10 +12,8 @@ from openjax.vehicle.solids import encounters, place_solids, surroundings
 
 DT, DRONES, PILLARS = 0.01, 3, 5
 KINDS = ("floor", "pillar", "drone on drone", "pillar and floor at once")
-SHORT, LONG = 10, 100
-"""Steps of .1 s and 1 s."""
-MOVED = 1e-6
-"""By which starts are moved (m and m/s, standard deviation)."""
+STEPS = 10
+"""Of the flights, .1 s."""
 
 
 def crashes(number, seed):
@@ -64,7 +55,7 @@ def crashes(number, seed):
     return [leaf[np.min(gaps, 0) > 0] for leaf in (*start, kind)]
 
 
-def flown(start, dtype, steps=SHORT):
+def flown(start, dtype, steps=STEPS):
     """Positions and velocities (B, T, 3, 3), attitudes and body rates over T `steps`, and those of free flight."""
     vehicle = load_vehicle(dtype=dtype)
 
@@ -127,94 +118,3 @@ def by_mujoco(start, free):
         position = position + DT * velocity
         positions.append(position), velocities.append(velocity), touched.append(hit)
     return [np.stack(leaf, axis=1) for leaf in (positions, velocities, touched)]
-
-
-def deviation(one, other) -> dict:
-    """Of positions (m) and velocities (m/s): the median over the crashes, 95 and 99 in a hundred, the largest."""
-    found = {}
-    for name, a, b in zip(("position", "velocity"), one, other, strict=False):
-        worst = np.max(np.linalg.norm(a - b, axis=-1), axis=(1, 2))
-        found[name] = [float(x) for x in (*np.quantile(worst, (0.5, 0.95, 0.99)), worst.max())]
-    return found
-
-
-def study(options) -> dict:
-    """Fly the crashes."""
-    with jax.enable_x64(True):
-        *start, kind = crashes(options.number, options.seed)
-        exact, free = flown(start, jnp.float64)
-        rounded = flown(start, jnp.float32)[0]
-        reference = by_mujoco(start, free)
-        short = {
-            "rigid, float64": deviation(exact, reference),
-            "rigid, float32": deviation(rounded, reference),
-        }
-        touched = reference[2]
-        start = [leaf[: options.long] for leaf in start]
-        draw = np.random.default_rng(options.seed + 1)
-        moved = [leaf + draw.normal(0, MOVED, leaf.shape) for leaf in start[:2]] + start[2:]
-        one, free = flown(start, jnp.float64, LONG)
-        other, free_other = flown(moved, jnp.float64, LONG)
-        mujoco_one, mujoco_other = by_mujoco(start, free), by_mujoco(moved, free_other)
-        long = {
-            "rigid against itself, moved": deviation(one, other),
-            "MuJoCo C against itself, moved": deviation(mujoco_one, mujoco_other),
-            "rigid, float64, against MuJoCo C": deviation(one, mujoco_one),
-            "rigid, float32, against MuJoCo C": deviation(flown(start, jnp.float32, LONG)[0], mujoco_one),
-        }
-    kinds = {name: int(np.sum(kind == i)) for i, name in enumerate(KINDS)}
-    return {
-        "kinds": kinds,
-        "touching": float(touched.any((1, 2, 3)).mean()),
-        "short": short,
-        "long": long,
-        "number_long": len(start[0]),
-    }
-
-
-def report(results: dict) -> list[str]:
-    """The page."""
-
-    def rows(found):
-        return [
-            [name, what, *(f"{value:.1e}" for value in values)]
-            for name, both in found.items()
-            for what, values in both.items()
-        ]
-
-    heads = ["", "largest difference over a crash, m and m/s", "median", "95 %", "99 %", "largest"]
-    kinds = ", ".join(f"{number} {name}" for name, number in results["kinds"].items())
-    return [
-        "# Contacts of the rigid step against MuJoCo C",
-        "",
-        f"{where(results)} {results['seconds']:.0f} s. Random crashes of three drones among five pillars, steps of "
-        f"10 ms: {kinds}; "
-        f"in {results['touching']:.2f} of them something is touched within .1 s.",
-        "",
-        "Over .1 s, against MuJoCo C:",
-        "",
-        *table(heads, rows(results["short"])),
-        "",
-        f"Over 1 s, the first {results['number_long']} of them; moved: starts with {MOVED:.0e} m and m/s of noise.",
-        "",
-        *table(heads, rows(results["long"])),
-    ]
-
-
-def main(arguments: list[str]) -> int:
-    """Fly, write both files."""
-    parser = page_parser(__doc__, "crashes")
-    parser.add_argument(
-        "--number",
-        type=int,
-        default=10_000,
-        help="crashes drawn; those that begin inside something are left out",
-    )
-    parser.add_argument("--long", type=int, default=1_000, help="of them, how many fly for 1 s")
-    parser.add_argument("--seed", type=int, default=0)
-    publish(parser.parse_args(arguments), study, report)
-    return 0
-
-
-if __name__ == "__main__":
-    run_command(main)

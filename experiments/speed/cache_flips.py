@@ -1,6 +1,6 @@
 """Flipped bits in entries of the compilation cache: each start after one ends well and gives the same numbers.
 
-`python -m experiments.cache_flips --flips 500 --json experiments/results/cache_flips.json`
+`python -m experiments.speed.cache_flips --flips 500 --json experiments/results/cache_flips.json`
 """
 
 import argparse
@@ -54,7 +54,7 @@ def run_flips(flips: int, cache: Path, seed: int = 0) -> dict:
         number = min(BATCH, flips - found["flips"])
         command = [sys.executable, "-c", START, str(seed + found["flips"]), str(number)]
         ran = subprocess.run(
-            command, capture_output=True, text=True, env=_environment(cache), cwd=Path(__file__).parents[1]
+            command, capture_output=True, text=True, env=_environment(cache), cwd=Path(__file__).parents[2]
         )
         numbers = ran.stdout.split()
         expected = expected or numbers[0]
