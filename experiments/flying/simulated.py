@@ -8,6 +8,7 @@ flights there is motion capture, which the estimators on board follow as far as 
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import time
@@ -40,7 +41,7 @@ class Arguments:
     policy: str = "flight"
     layouts: tuple[str, ...] = ("wall", "random", "passage")
     seed: int = 0
-    batch: int = 30
+    batch: int = 60
     """Worlds flown side by side."""
     processes: int = 4
     seconds_left: float = 1e9
@@ -65,28 +66,34 @@ def draw(seed, latest) -> Fault:
     return draw_fault(seed, latest) if seed >= 0 else Fault("none", math.inf, 0)
 
 
+@functools.cache
+def compiled_game(layout: str, policy_name: str):
+    """The layout, the game's settings, the airframe, and the game's two functions for flights side by side."""
+    import jax
+
+    import openjax
+    from openjax.flying.game import game_functions
+    from openjax.pursuit import find_scenario, scenario_task
+
+    policy = openjax.load_policy(policy_name)
+    game = policy.settings.environment
+    scenario = find_scenario(layout, game)
+    slots = max(game.max_pillars, len(scenario.pillars))
+    task = scenario_task(replace(game, max_pillars=slots), scenario)
+    settings, airframe, first, tick = game_functions(policy, task)
+    return scenario, settings, airframe, jax.jit(jax.vmap(first)), jax.jit(jax.vmap(tick, in_axes=(0, 0, 0, None, None)))
+
+
 class Worlds:
     """Flights side by side, one fault each."""
 
     def __init__(self, faults: list[Fault], layout: str, policy_name: str, separation: float):
-        import jax
-
-        import openjax
-        from openjax.flying.game import game_functions
         from openjax.flying.limits import SafetySettings
-        from openjax.pursuit import find_scenario, scenario_task
         from openjax.vehicle import load_vehicle
         from openjax.virtual_crazyflie.simulated import SimulatedSwarm
         from openjax.virtual_crazyflie.vehicles import VirtualVehicles
 
-        policy = openjax.load_policy(policy_name)
-        game = policy.settings.environment
-        scenario = find_scenario(layout, game)
-        slots = max(game.max_pillars, len(scenario.pillars))
-        task = scenario_task(replace(game, max_pillars=slots), scenario)
-        self.game, self.airframe, first, tick = game_functions(policy, task)
-        self._first = jax.jit(jax.vmap(first))
-        self._tick = jax.jit(jax.vmap(tick, in_axes=(0, 0, 0, None, None)))
+        scenario, self.game, self.airframe, self._first, self._tick = compiled_game(layout, policy_name)
         self.faults, self.n = faults, len(scenario.pursuers)
         self.safety = SafetySettings(separation=separation)
         starts = np.array(scenario.pursuers)

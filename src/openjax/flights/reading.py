@@ -175,8 +175,12 @@ def write_csv(path: str | Path, table: LogTable, decimals: dict[str, int] | None
         if name == "vehicle":
             cells.append(table.vehicle.tolist())
             continue
-        digits = decimals.get(name, 6)
-        cells.append(["" if np.isnan(v) else f"{v:.{digits}f}" for v in table.columns[name]])
+        column = np.asarray(table.columns[name], float)
+        form = f"%.{decimals.get(name, 6)}f"
+        text = np.full(len(column), "", object)
+        known = ~np.isnan(column)
+        text[known] = [form % v for v in column[known].tolist()]
+        cells.append(text.tolist())
     lines = [",".join(names), *(",".join(row) for row in zip(*cells, strict=True))]
     data = ("\n".join(lines) + "\n").encode()
     path = Path(path)

@@ -6,16 +6,16 @@ those in force at that moment, as sent: body rates and thrust.
 
 from __future__ import annotations
 
-import bisect
 import json
-import math
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 
 from openjax.flights.reading import CHANNEL_COLUMNS, LogTable, write_csv
-from openjax.flying.loop import Record, measured_numbers
+from openjax.flying.loop import Record
 from openjax.flying.set_point import RATES
+from openjax.flying.swarm import Samples
 from openjax.vehicle.vehicle_file import VehicleFile, save_vehicle_file
 
 SHORTEST = 2.0
@@ -24,6 +24,8 @@ DECIMALS = {"t": 4, "vbat": 3}
 _POSE = tuple(
     c for channel in ("position", "quaternion", "velocity", "body_rates") for c in CHANNEL_COLUMNS[channel]
 )
+_ORDER = (0, 1, 2, 6, 7, 8, 9, 3, 4, 5, 10, 11, 12)
+"""Of a `Pose`'s 13 numbers, in the order of `_POSE`."""
 _BODY = CHANNEL_COLUMNS["motor_command"] + CHANNEL_COLUMNS["specific_force"]
 _COMMAND = CHANNEL_COLUMNS["command_thrust"] + CHANNEL_COLUMNS["command_body_rates"]
 
@@ -38,53 +40,70 @@ def write_case(folder: Path, samples, record: Record, vehicle: VehicleFile, abou
       vehicle: what flew, for all I know.
       about: what flight.json is to say beside timing and games.
     """
-    files = []
+    sent = np.array(record.sent)
+    commands = np.array([[(c.mode, c.thrust, *c.numbers()[:3]) for c in row] for row in record.set_points])
+    episode, files = np.array(record.episode), []
     for number in range(len(record.episodes)):
-        ticks = [k for k, episode in enumerate(record.episode) if episode == number]
-        if not ticks or record.sent[ticks[-1]] - record.sent[ticks[0]] < SHORTEST:
+        ticks = np.flatnonzero(episode == number)
+        if not len(ticks) or sent[ticks[-1]] - sent[ticks[0]] < SHORTEST:
             continue
-        path = folder / f"game_{number:02d}.csv.gz"
-        write_csv(path, _table(path.name, samples, record, ticks), DECIMALS)
-        files.append(path)
+        files.append((folder / f"game_{number:02d}.csv.gz", ticks))
+
+    def write(path, ticks):
+        write_csv(path, _table(path.name, samples, sent[ticks], commands[ticks]), DECIMALS)
+        return path
+
+    with ThreadPoolExecutor(4) as pool:  # half of the time is zlib's, which lets others run
+        files = list(pool.map(lambda file: write(*file), files))
     save_vehicle_file(folder / "vehicle.toml", vehicle)
     text = json.dumps({**about, "timing": record.timing(), "games": record.episodes}, indent=1)
     (folder / "flight.json").write_text(text + "\n", encoding="utf-8")
     return [*files, folder / "vehicle.toml", folder / "flight.json"]
 
 
-def _table(name, samples, record, ticks) -> LogTable:
-    """One game's log."""
-    begin, end = record.sent[ticks[0]], record.sent[ticks[-1]]
-    sent = [record.sent[k] for k in ticks]
-    rows, ids = [], []
+def _table(name: str, samples, sent: np.ndarray, commands: np.ndarray) -> LogTable:
+    """One game's log.
 
-    def within(samples, time_of):
-        """(time, sample) of those in this game."""
-        times = ((round(time_of(sample), 4), sample) for sample in samples)
-        return [(at, sample) for at, sample in times if begin <= at <= end]
+    Args:
+      name: of the file.
+      samples: as of `write_case`.
+      sent: (T,) s, when the set-points of each tick had left.
+      commands: (T, N, 5) of them: mode, thrust, body rates.
+    """
+    vehicles = [_rows(vehicle, sent, commands[:, i]) for i, vehicle in enumerate(samples)]
+    ids = np.repeat([str(i) for i in range(len(vehicles))], [len(rows["t"]) for rows in vehicles])
+    columns = {n: np.concatenate([rows[n] for rows in vehicles]) for n in vehicles[0]}
+    order = np.lexsort((ids, columns["t"]))
+    columns = {n: c[order] for n, c in columns.items() if not np.isnan(c).all()}
+    return LogTable(name, columns, ids[order])
 
-    for i, vehicle in enumerate(samples):
-        at_time: dict[float, dict] = {}
-        for at, (_, pose, voltage) in within(vehicle.poses, lambda sample: sample[1].time):
-            values = dict(zip(_POSE, measured_numbers(pose), strict=True))
-            if vehicle.seen:
-                values = {name: values[name] for name in _POSE[10:]}
-            at_time.setdefault(at, {}).update(values, vbat=voltage)
-        # motion capture in place of the estimate on board
-        for at, pose in within(vehicle.seen, lambda pose: pose.time):
-            at_time.setdefault(at, {}).update(zip(_POSE[:10], measured_numbers(pose)[:10], strict=True))
-        for at, (_, values) in within(vehicle.bodies, lambda sample: sample[0]):
-            at_time.setdefault(at, {}).update(zip(_BODY, values, strict=True))
-        for at in sorted(at_time):
-            command = record.set_points[ticks[max(bisect.bisect_right(sent, at) - 1, 0)]][i]
-            row = at_time[at]
-            if command.mode == RATES:
-                numbers = (command.thrust, command.roll, command.pitch, command.yaw_rate)
-                row.update(zip(_COMMAND, numbers, strict=True))
-            rows.append({"t": at - begin, **row})
-            ids.append(str(i))
-    order = sorted(range(len(rows)), key=lambda k: (rows[k]["t"], ids[k]))
-    names = ("t", *_POSE, *_BODY, *_COMMAND, "vbat")
-    columns = {n: np.array([rows[k].get(n, math.nan) for k in order]) for n in names}
-    columns = {n: c for n, c in columns.items() if not np.isnan(c).all()}
-    return LogTable(name, columns, np.array([ids[k] for k in order]))
+
+def _rows(vehicle: Samples, sent, commands) -> dict[str, np.ndarray]:
+    """The rows of one vehicle, by column: one for each moment at which something was measured."""
+    own, seen = vehicle.poses[:, 3:][:, _ORDER], vehicle.seen[:, 1:][:, _ORDER]
+    sources = [  # when, columns, values; what comes later replaces what came before
+        (vehicle.poses[:, 2], (*_POSE, "vbat"), np.column_stack([own, vehicle.poses[:, 1]])),
+        (vehicle.bodies[:, 0], _BODY, vehicle.bodies[:, 1:]),
+    ]
+    if len(seen):  # motion capture in place of the estimate on board
+        sources[0] = (sources[0][0], (*_POSE[10:], "vbat"), sources[0][2][:, 10:])
+        sources.append((vehicle.seen[:, 0], _POSE[:10], seen[:, :10]))
+    inside = []
+    for when, names, values in sources:
+        when = np.round(when, 4)
+        during = (when >= sent[0]) & (when <= sent[-1])
+        inside.append((when[during], names, values[during]))
+    times, row_of = np.unique(np.concatenate([when for when, _, _ in inside]), return_inverse=True)
+    rows = {n: np.full(len(times), np.nan) for n in ("t", *_POSE, *_BODY, *_COMMAND, "vbat")}
+    rows["t"] = times - sent[0]
+    begin = 0
+    for when, names, values in inside:
+        at = row_of[begin : begin + len(when)]
+        begin += len(when)
+        for n, column in zip(names, values.T, strict=True):
+            rows[n][at] = column
+    command = commands[np.maximum(np.searchsorted(sent, times, side="right") - 1, 0)]
+    rated = command[:, 0] == RATES
+    for n, column in zip(_COMMAND, command[:, 1:].T, strict=True):
+        rows[n][rated] = column[rated]
+    return rows

@@ -21,6 +21,8 @@ import threading
 import time
 from collections.abc import Sequence
 
+import numpy as np
+
 from openjax.errors import UserError
 from openjax.flying import real_time
 from openjax.flying.board import SILENCE, Board, Role, say, stand_alone
@@ -29,7 +31,7 @@ from openjax.flying.guard import CHECK, disarm, fly_down
 from openjax.flying.limits import SafetySettings
 from openjax.flying.safety import PoseSample, State
 from openjax.flying.set_point import SetPoint
-from openjax.flying.swarm import Member, Samples, Swarm
+from openjax.flying.swarm import Member, Samples, Swarm, numbers_of
 
 STUCK = 1.0
 """The links' process is taken for dead if it doesn't pass on set-points for this long (s)."""
@@ -237,7 +239,11 @@ class Links:
 
     def samples(self) -> list[Samples]:
         """What was recorded of each vehicle."""
-        return self._call("samples")
+        nothing = np.zeros((0, 14))
+        return [
+            Samples(np.frombuffer(poses).reshape(-1, 16), np.frombuffer(bodies).reshape(-1, 8), nothing)
+            for poses, bodies in self._call("samples")
+        ]
 
     def pose_blocks(self) -> tuple[int, ...]:
         """The id of each vehicle's pose block."""
@@ -283,8 +289,7 @@ def _serve(
         if not new_pose:
             return
         pose = member.pose
-        numbers = (pose.time, *pose.position, *pose.velocity, *pose.quaternion, *pose.body_rates)
-        packed = _POSE.pack(vehicle, member.supervisor, member.arrival, member.voltage, *numbers)
+        packed = _POSE.pack(vehicle, member.supervisor, member.arrival, member.voltage, *numbers_of(pose))
         # nobody reads any more: then there is no loop to tell
         with lock, contextlib.suppress(OSError):
             stream.send(packed)

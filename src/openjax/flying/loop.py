@@ -319,8 +319,3 @@ class Flight:
         record.evader.append(
             tuple(self._play.evader_position.tolist()) if self._play is not None else (math.nan,) * 3
         )
-
-
-def measured_numbers(pose: Pose) -> tuple[float, ...]:
-    """The pose's numbers in the order of a log's columns: position, quaternion, velocity, body rates."""
-    return (*pose.position, *pose.quaternion, *pose.velocity, *pose.body_rates)

@@ -20,14 +20,17 @@ import math
 import sys
 import threading
 import time
+from array import array
 from collections.abc import Callable
 from pathlib import Path
+
+import numpy as np
 
 from openjax.errors import UserError
 from openjax.flying.controller import Pose
 from openjax.flying.links import Links
 from openjax.flying.safety import PoseSample
-from openjax.flying.swarm import Samples
+from openjax.flying.swarm import Samples, numbers_of
 
 
 def find_feed(name: str) -> Callable:
@@ -56,7 +59,7 @@ class MotionCaptured:
     def __init__(self, links: Links, clock: Callable[[], float] = time.perf_counter):
         self._links, self._now = links, clock
         self._poses: list[Pose | None] = [None] * len(links.poses)
-        self._seen: list[list[Pose]] = [[] for _ in links.poses]
+        self._seen = [array("d") for _ in links.poses]
         self._recording, self._arrived = False, threading.Event()
 
     def feed(self, function: Callable) -> None:
@@ -76,7 +79,7 @@ class MotionCaptured:
     def believed(self, vehicle: int, pose: Pose) -> None:
         """This pose of motion capture was judged good."""
         if self._recording:
-            self._seen[vehicle].append(pose)
+            self._seen[vehicle].extend(numbers_of(pose))
         self._links.send_pose(vehicle, pose.position, pose.quaternion)
 
     def record(self) -> None:
@@ -87,7 +90,7 @@ class MotionCaptured:
     def samples(self) -> list[Samples]:
         """What was recorded of each vehicle, here and on board."""
         both = zip(self._links.samples(), self._seen, strict=True)
-        return [dataclasses.replace(samples, seen=seen) for samples, seen in both]
+        return [dataclasses.replace(s, seen=np.frombuffer(seen).reshape(-1, 14)) for s, seen in both]
 
     def wait(self, until: float) -> None:
         """Return at `until` (s), or as soon as a pose arrives."""

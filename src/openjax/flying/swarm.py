@@ -12,8 +12,11 @@ import struct
 import threading
 import time
 import warnings
+from array import array
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+
+import numpy as np
 
 from openjax.errors import UserError
 from openjax.flying.controller import Pose
@@ -64,15 +67,21 @@ class _Clock:
         return own + self.offset
 
 
-@dataclass
+@dataclass(frozen=True)
 class Samples:
-    """What was recorded of one vehicle; times are host seconds."""
+    """What was recorded of one vehicle; times are host seconds. NumPy."""
 
-    poses: list[tuple[float, Pose, float]] = field(default_factory=list)  # arrival, pose, voltage
-    bodies: list[tuple[float, tuple[float, ...]]] = field(default_factory=list)
-    """When measured; m1..m4 0..1 and the specific force (m/s^2)."""
-    seen: list[Pose] = field(default_factory=list)
-    """By motion capture, where there is one."""
+    poses: np.ndarray
+    """(K, 16) own estimates: arrival, voltage (V), when measured, position, velocity, quaternion, body rates."""
+    bodies: np.ndarray
+    """(K, 8): when measured, m1..m4 0..1, the specific force (m/s^2)."""
+    seen: np.ndarray
+    """(K, 14) by motion capture, where there is one: when measured, position, velocity, quaternion, body rates."""
+
+
+def numbers_of(pose: Pose) -> tuple[float, ...]:
+    """The 14 numbers of a pose, in the order of its fields."""
+    return (pose.time, *pose.position, *pose.velocity, *pose.quaternion, *pose.body_rates)
 
 
 class Member:
@@ -85,7 +94,7 @@ class Member:
         self.last_contact = clock()
         self.voltage, self.supervisor = math.nan, 0
         self.error: str | None = None
-        self.samples, self.recording = Samples(), False
+        self.poses, self.bodies, self.recording = array("d"), array("d"), False  # rows as in `Samples`
         self.listener: Callable[[bool], None] = lambda new_pose: None
         self.crazyflie = None
         self.blocks: list = []
@@ -109,7 +118,7 @@ class Member:
         self.voltage, self.supervisor = 1e-3 * values[10], values[11]
         self.pose, self.arrival, self.last_contact = pose, now, now
         if self.recording:
-            self.samples.poses.append((now, pose, self.voltage))
+            self.poses.extend((now, self.voltage, *numbers_of(pose)))
         self.listener(True)
 
     def body_arrived(self, stamp: int, data: dict, _block=None) -> None:
@@ -120,7 +129,7 @@ class Member:
         if self.recording:
             motors = tuple(data[name] / 65536 for name, _ in BODY_BLOCK[:4])
             force = tuple(9.81 * data[name] for name, _ in BODY_BLOCK[4:])
-            self.samples.bodies.append((self._onboard.host(stamp, now), motors + force))
+            self.bodies.extend((self._onboard.host(stamp, now), *motors, *force))
         self.listener(False)
 
 
@@ -307,10 +316,9 @@ class Swarm:
         for member in self.members:
             member.recording = on
 
-    def samples(self) -> list[Samples]:
-        """What was recorded of each vehicle until now."""
-        recorded = [member.samples for member in self.members]
-        return [Samples(list(s.poses), list(s.bodies)) for s in recorded]
+    def samples(self) -> list[tuple[bytes, bytes]]:
+        """What was recorded of each vehicle until now: poses and bodies, rows of float64 as in `Samples`."""
+        return [(member.poses.tobytes(), member.bodies.tobytes()) for member in self.members]
 
     def close(self) -> None:
         """Motors off, disarmed, links closed."""
