@@ -151,6 +151,7 @@ def fly_hovering(uris, folder, body_logs, seconds):
     return flight, samples[0], load_case(folder)
 
 
+@pytest.mark.slow
 def test_a_flight_from_the_floor_to_its_log(uris, tmp_path):
     flight, samples, case = fly_hovering(uris, tmp_path, body_logs=1, seconds=2.3)
     assert flight.state.all_in(Mode.LANDED)
@@ -168,6 +169,7 @@ def test_a_flight_from_the_floor_to_its_log(uris, tmp_path):
         assert abs(np.nanmedian(flown.specific_force[:, 2]) - 9.81) < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("latency", "loss"), [(0.0, 0.0), (6.0, 0.0), (12.0, 0.1)])
 def test_the_log_tells_the_links_latency_and_loss(tmp_path, latency, loss):
     """By the motors, whose mean is the thrust that was asked for as long as none of them is at its limit."""
@@ -195,6 +197,7 @@ def test_the_log_tells_the_links_latency_and_loss(tmp_path, latency, loss):
     )  # a busy machine, and the draw of few set-points
 
 
+@pytest.mark.slow
 def test_another_process_lands_and_disarms_what_hangs_in_the_air(uris):
     with connected(uris, body_logs=0) as links:
         links.arm()
@@ -222,6 +225,7 @@ def test_another_process_lands_and_disarms_what_hangs_in_the_air(uris):
         assert max(s.own.position[2] for s in links.observe()) < 0.05
 
 
+@pytest.mark.slow
 def test_a_broken_link_process_is_an_error_and_not_a_wait(uris):
     with connected(uris, body_logs=0) as links:
         os.kill(links.pid, signal.SIGKILL)
@@ -230,6 +234,7 @@ def test_a_broken_link_process_is_an_error_and_not_a_wait(uris):
                 links.send([SetPoint()] * 3)
 
 
+@pytest.mark.slow
 def test_motion_capture_is_seen_here_and_on_board():
     """The virtual Crazyflie in a thread of this process, so that its firmware can be looked into."""
     virtual = VirtualCrazyflies(VirtualVehicles(load_vehicle(), [(0.4, 0.0)]), port=0, faults=LinkFaults())

@@ -58,6 +58,7 @@ def stage():
     return AnalyticGradient(how, environment, policy), policy.init(jax.random.key(1), observation)
 
 
+@pytest.mark.slow
 def test_smooth_breaches_are_those_of_the_game(stage):
     game = stage[0].game
     key = jax.random.split(jax.random.key(2), 3)
@@ -72,6 +73,7 @@ def test_smooth_breaches_are_those_of_the_game(stage):
     assert np.abs(smooth - hard).mean() < 0.1
 
 
+@pytest.mark.slow
 def test_gradient_is_that_of_the_loss_and_learning_follows_it(stage):
     gradient, parameters = stage
     starts = gradient.starts(jax.random.key(3), gradient.bounds())
