@@ -39,12 +39,15 @@ def test_the_table_of_experiments_names_them_all():
     page = (ROOT / "experiments" / "README.md").read_text(encoding="utf-8")
     named = set(re.findall(r"`((?:\w+\.)?\w+)`", page))
     commands = {
-        path.relative_to(ROOT / "experiments").with_suffix("").as_posix().replace("/", ".")
+        path.relative_to(ROOT / "experiments")
+        .with_suffix("")
+        .as_posix()
+        .replace("/", ".")
+        .removesuffix(".__main__")
         for path in (ROOT / "experiments").rglob("*.py")
-        if 'if __name__ == "__main__"' in path.read_text(encoding="utf-8") and path.stem != "__main__"
+        if 'if __name__ == "__main__"' in path.read_text(encoding="utf-8")
     }
     there = {name for name in commands if not name.startswith("diagnosis.")}
-    there |= {path.parent.name for path in (ROOT / "experiments").glob("*/__main__.py")}
     assert there <= named, there - named
     for path in re.findall(r"\]\(([^)#]+)\)", page):
         assert (ROOT / "experiments" / path).exists(), path

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.flying.vehicles import vehicles
 from experiments.table import Page, Table, page_parser, publish
-from experiments.vehicles import vehicles
 from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import layout_slots, repeat_task
 from openjax.commands.validation import uniform_tasks

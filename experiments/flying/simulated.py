@@ -81,7 +81,13 @@ def compiled_game(layout: str, policy_name: str):
     slots = max(game.max_pillars, len(scenario.pillars))
     task = scenario_task(replace(game, max_pillars=slots), scenario)
     settings, airframe, first, tick = game_functions(policy, task)
-    return scenario, settings, airframe, jax.jit(jax.vmap(first)), jax.jit(jax.vmap(tick, in_axes=(0, 0, 0, None, None)))
+    return (
+        scenario,
+        settings,
+        airframe,
+        jax.jit(jax.vmap(first)),
+        jax.jit(jax.vmap(tick, in_axes=(0, 0, 0, None, None))),
+    )
 
 
 class Worlds:

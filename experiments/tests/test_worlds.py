@@ -4,8 +4,8 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.worlds.rotorpy import Bodies, crazyflie
-from experiments.worlds.study import make_world, smoothness
+from experiments.flying.worlds.rotorpy import Bodies, crazyflie
+from experiments.flying.worlds.study import make_world, smoothness
 from openjax.pursuit import Pursuit, PursuitSettings
 
 

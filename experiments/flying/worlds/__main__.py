@@ -1,9 +1,9 @@
-"""`python -m experiments.worlds`: see `experiments.worlds.study`."""
+"""`python -m experiments.flying.worlds`: see `experiments.flying.worlds.study`."""
 
 from experiments.flying.single_thread import use_single_thread
 
 if __name__ == "__main__":
     use_single_thread()  # before JAX is imported
-    from experiments.worlds.study import main
+    from experiments.flying.worlds.study import main
 
     main()

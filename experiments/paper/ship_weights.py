@@ -1,4 +1,4 @@
-"""Put trained policies into the package, without their critics: `python -m experiments.ship_weights NAME=RUN ...`."""
+"""Put trained policies into the package, without their critics: `python -m experiments.paper.ship_weights NAME=RUN ...`."""
 
 from pathlib import Path
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import jax
 import numpy as np
 
-from experiments.worlds.world import World
+from experiments.flying.worlds.world import World
 from openjax.pursuit import EpisodeStatistics, Pursuit, PursuitSettings, Task, action_to_command
 from openjax.vehicle import DroneState
 

@@ -1,6 +1,6 @@
 """Policies in worlds that aren't the simulator: six layouts, drawn starts, no clamp.
 
-    python -m experiments.worlds [--policy open flight] [--world nominal plant ...] [--episodes 100] [--jobs N]
+    python -m experiments.flying.worlds [--policy open flight] [--world nominal plant ...] [--episodes 100] [--jobs N]
 
 Worlds: the nominal simulator (rate loop at 500 Hz); `table`, the same with the slower vehicle of VEHICLE; `plant`,
 the exam's plant, and with `plant:motor_lag` and so on each of its causes at three quarters of its range; `rotorpy`,
@@ -19,11 +19,11 @@ import jax
 import numpy as np
 
 from experiments.diagnosis import effects
-from experiments.pages import page_parser, publish, table, where
-from experiments.worlds.game import play
-from experiments.worlds.plant import PlantWorld, rng_of
-from experiments.worlds.rotorpy import RotorPyWorld
-from experiments.worlds.simulator import SimulatorWorld
+from experiments.flying.worlds.game import play
+from experiments.flying.worlds.plant import PlantWorld, rng_of
+from experiments.flying.worlds.rotorpy import RotorPyWorld
+from experiments.flying.worlds.simulator import SimulatorWorld
+from experiments.table import Page, Table, page_parser, publish
 from openjax.commands.evaluator import layout_slots
 from openjax.pursuit import SCENARIOS, scenario_task
 from openjax.store.policies import load_policy
@@ -179,47 +179,44 @@ def study(options: argparse.Namespace) -> dict:
         }
         for policy, worlds in found.items()
     }
-    return {
-        "records": records,
+    return {"records": records}
+
+
+def page(results: dict) -> Page:
+    """A row per layout and the mean over them, for each policy in each world."""
+    rows = []
+    for world in next(iter(results["records"].values())):
+        for policy, worlds in results["records"].items():
+            records = worlds.get(world, {})
+            for layout, record in records.items():
+                rows.append({"world": world, "policy": policy, "layout": layout, **record})
+            if records:
+                mean = _mean(list(records.values()))
+                for name in ("captured", "crashed"):
+                    mean[name] = f"{mean[name]:.3f} {interval(mean[name], mean['episodes'])}"
+                rows.append({"world": world, "policy": policy, "layout": "**mean**", **mean})
+    columns = {
+        **{name: name for name in ("world", "policy", "layout", "episodes")},
+        "capture": lambda row: _rate(row["captured"]),
+        "step": "capture_step:.0f",
+        "collision": "collision_rate:.4f",
+        "crash": lambda row: _rate(row["crashed"]),
+        "over speed": "over_speed_rate:.3f",
+        "change": "change:.3f",
+        "above 10 Hz": "fast:.3f",
     }
-
-
-def report(results: dict) -> list[str]:
-    """The page."""
-    lines = [
-        "# Policies in worlds that aren't the simulator",
-        "",
-        f"{where(results)} {results['seconds']:.0f} s. "
+    return Page(
+        "Policies in worlds that aren't the simulator",
         "No clamp, drawn starts. Nominal: the simulator with the rate loop at 500 Hz; table: the same with motors 40 ms "
         "slower, commands 15 ms and poses 10 ms late, and drag of .0125 N s/m; plant: the exam's plant (1 kHz, no shared "
         "code), also with each of its causes at three quarters of its range; rotorpy: RotorPy's own Crazyflie. Change: mean norm "
         "of a command's change in a step, commands in -1 to 1; above 10 Hz: that share of the commands' variance.",
-        "",
-    ]
-    rows = []
-    for world in next(iter(results["records"].values())):
-        for policy, worlds in results["records"].items():
-            for layout, record in worlds.get(world, {}).items():
-                rows.append([world, policy, layout, *_cells(record)])
-            if worlds.get(world):
-                mean = _mean(list(worlds[world].values()))
-                rows.append([world, policy, "**mean**", *_cells(mean)])
-                rows[-1][4] += " " + interval(mean["captured"], mean["episodes"])
-                rows[-1][7] += " " + interval(mean["crashed"], mean["episodes"])
-    heads = [
-        "world",
-        "policy",
-        "layout",
-        "episodes",
-        "capture",
-        "step",
-        "collision",
-        "crash",
-        "over speed",
-        "change",
-        "above 10 Hz",
-    ]
-    return lines + table(heads, rows)
+        Table(columns, rows),
+    )
+
+
+def _rate(value):
+    return value if isinstance(value, str) else f"{value:.3f}"
 
 
 def interval(share: float, number: int, z: float = 1.96) -> str:
@@ -236,19 +233,6 @@ def _mean(records):
     }
 
 
-def _cells(record):
-    return [
-        str(record["episodes"]),
-        f"{record['captured']:.3f}",
-        f"{record['capture_step']:.0f}",
-        f"{record['collision_rate']:.4f}",
-        f"{record['crashed']:.3f}",
-        f"{record['over_speed_rate']:.3f}",
-        f"{record['change']:.3f}",
-        f"{record['fast']:.3f}",
-    ]
-
-
 def main() -> None:
     """Fly, or read, and write the page."""
     parser = page_parser(__doc__, "worlds")
@@ -259,4 +243,4 @@ def main() -> None:
     parser.add_argument("--chunk", type=int, default=50, help="episodes that one process flies at once")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--seconds", type=float, default=math.inf, help="begin nothing new after this long")
-    publish(parser.parse_args(), study, report)
+    publish(parser.parse_args(), study, page)

@@ -1,4 +1,4 @@
-"""Policies on vehicles that they weren't made for: `python -m experiments.vehicles [--policy NAME ...] [--number 1024]`.
+"""Policies on vehicles that they weren't made for: `python -m experiments.flying.vehicles [--policy NAME ...] [--number 1024]`.
 
 No clamp, rate loop at 500 Hz, solid contacts. Vehicles: the nominal one; `table`, with motors 40 ms slower, commands 15 ms
 and poses 10 ms late, and drag; the family of the preset `flight`, ordinary and whole; and for each of its effects vehicles
@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.pages import page_parser, publish, table, where
 from experiments.paper.hard_tasks import close, drawn, row
+from experiments.table import Page, Table, cell, page_parser, publish
 from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import layout_slots, repeat_task
 from openjax.commands.validation import uniform_tasks
@@ -37,6 +37,13 @@ FLIGHT_FAMILY = vehicle_family()
 NAMES = [entry[0] for entry in FLIGHT_FAMILY]
 EFFECTS = sorted({name.partition(".")[0] for name in NAMES})
 WHOLE = "family"
+FIGURES = {
+    "capture": "capture_rate:.3f",
+    "step": "capture_step:.0f",
+    "collision": "collision_rate:.4f",
+    "crash": "crash_rate:.4f",
+    "over speed": "over_speed_rate:.4f",
+}
 
 
 def vehicles() -> dict[str, np.ndarray]:
@@ -115,7 +122,7 @@ def fly(
                 part = slice(i * layouts, (i + 1) * layouts)
                 own[layout] = finite(summarise(jax.tree.map(lambda leaf, part=part: leaf[part], together)))
         for task_kind, summary in own.items():
-            print(name, kind, task_kind, " ".join(cells(summary)), flush=True)
+            print(name, kind, task_kind, *(cell(summary, column) for column in FIGURES.values()), flush=True)
     return found
 
 
@@ -133,17 +140,6 @@ def widened(tasks, slots: int):
     )
 
 
-def cells(summary: dict) -> list[str]:
-    """What the page says of a summary."""
-    return [
-        f"{summary['capture_rate']:.3f}",
-        f"{summary['capture_step']:.0f}",
-        f"{summary['collision_rate']:.4f}",
-        f"{summary['crash_rate']:.4f}",
-        f"{summary['over_speed_rate']:.4f}",
-    ]
-
-
 def study(options) -> dict:
     """Fly the policies."""
     policies = {
@@ -158,29 +154,23 @@ def study(options) -> dict:
     }
 
 
-def report(results: dict) -> list[str]:
-    """The page."""
+def page(results: dict) -> Page:
+    """A row per policy, kind of vehicle and kind of task."""
     rows = [
-        [name, kind, tasks, *cells(summary)]
+        {"policy": name, "vehicle": kind, "tasks": tasks, **summary}
         for name, kinds in results["policies"].items()
         for kind, found in kinds.items()
         for tasks, summary in found.items()
     ]
-    return [
-        "# Policies on other vehicles",
-        "",
-        f"{where(results)} {results['seconds']:.0f} s. "
+    return Page(
+        "Policies on other vehicles",
         f"No clamp, rate loop at 500 Hz, {results.get('attitude', 'drawn')} starts; {results['number']} validation tasks of each "
         f"kind, {results['layouts']} episodes of each layout. Nominal: the nominal vehicle; table: motors 40 ms slower, "
         "commands 15 ms and poses 10 ms late, drag of .0125 N s/m; ordinary and family: the vehicles of the preset flight "
         "without and with the rare ones; a name: all vehicles out of the ordinary in that effect. "
         + results.get("note", ""),
-        "",
-        *table(
-            ["policy", "vehicle", "tasks", "capture", "step", "collision", "crash", "over speed"],
-            rows,
-        ),
-    ]
+        Table({"policy": "policy", "vehicle": "vehicle", "tasks": "tasks", **FIGURES}, rows),
+    )
 
 
 def main(arguments: list[str]) -> int:
@@ -196,7 +186,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument(
         "--vehicles", nargs="+", choices=list(vehicles()), help="kinds of vehicles; default: all"
     )
-    publish(parser.parse_args(arguments), study, report)
+    publish(parser.parse_args(arguments), study, page)
     return 0
 
 

@@ -5,7 +5,7 @@ import functools
 import jax
 import numpy as np
 
-from experiments.worlds.world import Poses
+from experiments.flying.worlds.world import Poses
 from openjax.pursuit import Task
 from openjax.vehicle import DroneState, load_vehicle, make_drones_step
 
