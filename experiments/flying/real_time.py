@@ -18,8 +18,10 @@ import random
 import select
 import signal
 import socket
+import sys
 import threading
 import time
+import traceback
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -260,6 +262,9 @@ class Flown:
         from openjax.commands.command_line import run_command
         from openjax.commands.fly import fly
 
+        # the worker's are others: what multiprocessing puts in their place, files
+        sys.stdin, sys.stdout, sys.stderr = open(0), open(1, "w", buffering=1), open(2, "w", buffering=1)
+
         def main(_):
             return 0 if fly(self._arguments, self._prepared) else 2
 
@@ -267,6 +272,8 @@ class Flown:
             run_command(main)
         except SystemExit as stop:
             os._exit(int(stop.code or 0))
+        except BaseException:
+            traceback.print_exc()
         finally:
             os._exit(3)
 
@@ -377,7 +384,7 @@ class Flown:
             "number": self._number, "kind": self._kind, "time": round(min(max(fault.time, 0.0), 99.0), 2), "status": status,
             "took_off": not math.isinf(self._virtual.truth.take_off), "out": round(float(out.max(initial=-1.0)), 3), "fell": fell,
             "hard": bool(track["crashed"][held].any()), "armed": armed, "seconds": seconds, "left": self._find_left,
-            "second": self._second, "said": " | ".join(said[2:])[-600:],
+            "second": self._second, "said": " | ".join(said[1:])[-600:],
         }  # fmt: skip
         return row | {"well": self._well(row)}
 
@@ -385,7 +392,7 @@ class Flown:
         """Whether all went as it must."""
         if self._kind in START:
             return not row["took_off"] and row["status"] == 2
-        if row["out"] > MARGIN or row["armed"] or row["status"] is None or row["left"]:
+        if not row["took_off"] or row["out"] > MARGIN or row["armed"] or row["status"] is None or row["left"]:
             return False
         if any(name in self._kind for name in STOPPED):  # the operator wants them to fall
             return row["seconds"] is not None and row["seconds"] < 1.5
