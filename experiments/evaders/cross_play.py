@@ -26,12 +26,12 @@ from openjax.pursuit import (
     Task,
     scenario_task,
 )
-from openjax.pursuit.evaders import EVADERS, draw_evader
+from openjax.pursuit.evaders import EVADERS, SCRIPTED, draw_evader
 from openjax.store.policies import LoadedPolicy, load_policy
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.family import FLIGHT_FAMILY
 
-ALL = tuple(EVADERS)
+ALL = SCRIPTED
 
 
 @functools.cache
@@ -44,7 +44,7 @@ def program(settings: PursuitSettings, policy):
 
         def begin(key, task, kind):
             observation, state = environment.reset_to(key, task)
-            evader = draw_evader(settings, jax.random.fold_in(key, 3), kind=kind)
+            evader = draw_evader(settings, jax.random.fold_in(key, 3), task.pursuer_position, kind=kind)
             return observation, state.replace(evader=evader)
 
         def one(world, _):

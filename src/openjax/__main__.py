@@ -14,6 +14,7 @@ COMMANDS = {
     "train": "train pursuers, or go on with a run",
     "evaluate": "fly policies on layouts: captures, collisions, crashes",
     "view": "watch episodes in three dimensions, in a browser or as an HTML file",
+    "exploit": "train an evader against a policy, and see how well the policy holds",
     "sample_flights": "write logs of a simulated vehicle with an effect, to try the diagnosis on",
     "diagnose": "say from flight logs what causes the sim-to-real gap, or what changed",
     "calibrate": "fit thrust, torque, motor lag and inertia of the nominal vehicle to flights",

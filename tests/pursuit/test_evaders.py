@@ -7,10 +7,10 @@ import pytest
 
 from openjax import UserError, make
 from openjax.pursuit import SCENARIOS, PursuitSettings, scenario_settings, scenario_task
-from openjax.pursuit.evaders import EVADERS, HELD_OUT, TRAINED, VALIDATED, draw_evader
+from openjax.pursuit.evaders import EVADERS, HELD_OUT, SCRIPTED, TRAINED, VALIDATED, draw_evader
 from openjax.pursuit.evaders.behaviours import DIRECTIONS, MARGIN, MEMORY, Scene, directions, greedy
 
-ALL = tuple(EVADERS)
+ALL = SCRIPTED
 SETTINGS = PursuitSettings(physics="stops", evaders=ALL, episode_length=240)
 
 
@@ -28,7 +28,7 @@ def flown():
     @jax.vmap
     def fly(key, task, kind):
         _, state = environment.reset_to(key, task)
-        state = state.replace(evader=draw_evader(settings, key, kind=kind))
+        state = state.replace(evader=draw_evader(settings, key, task.pursuer_position, kind=kind))
 
         def one(state, action):
             _, state, *_ = environment.step(key, state, action)
@@ -129,7 +129,7 @@ def test_greedy_against_plain_python():
         look_ahead, hiding = draw.uniform(0.05, 0.4), draw.choice([0.0, 0.3])
         scene = Scene(
             settings,
-            *(jnp.asarray(x, jnp.float32) for x in (position, np.array(pursuers))),
+            *(jnp.asarray(x, jnp.float32) for x in (position, np.zeros(3), np.array(pursuers))),
             jnp.asarray(known),
             jnp.asarray(padded, jnp.float32),
             jnp.asarray(active),
@@ -160,7 +160,7 @@ def test_draws_of_worlds():
     """Kinds with the odds that the names give, numbers from the lists; a curriculum from the first alone to all."""
     settings = PursuitSettings(evaders=("field", "greedy", "greedy", "wall_runner"))
     keys = jax.random.split(jax.random.key(5), 6000)
-    drawn = jax.vmap(lambda key: draw_evader(settings, key))(keys)
+    drawn = jax.vmap(lambda key: draw_evader(settings, key, jnp.zeros((3, 3))))(keys)
     counts = np.bincount(np.asarray(drawn.kind), minlength=4) / 6000
     np.testing.assert_allclose(counts, 0.25, atol=0.03)
     greedy_worlds = np.isin(np.asarray(drawn.kind), (1, 2))
@@ -171,7 +171,9 @@ def test_draws_of_worlds():
         np.testing.assert_array_equal(values, wanted)
         np.testing.assert_allclose(found / found.sum(), odds / odds.sum(), atol=0.05)
     for share in (0.0, 0.4):
-        part = jax.vmap(lambda key, share=share: draw_evader(settings, key, jnp.float32(share)))(keys)
+        part = jax.vmap(
+            lambda key, share=share: draw_evader(settings, key, jnp.zeros((3, 3)), jnp.float32(share))
+        )(keys)
         others = np.asarray(part.kind) != 0
         np.testing.assert_allclose(others.mean(), 0.75 * share, atol=0.03)
         assert (np.asarray(part.numbers["speed"])[others] <= 0.5 + 0.5 * share).all()

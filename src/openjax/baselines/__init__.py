@@ -1,4 +1,5 @@
-"""The methods that the paper compares with: Angelani, Janosov, potential field, DACOOP; see docs/methods.md."""
+"""Methods without a learned policy of their own: those that the paper compares with (Angelani, Janosov, potential field, DACOOP;
+see docs/methods.md), and stack, which forces a capture."""
 
 from openjax.baselines.craft_policy import CraftPolicy
 from openjax.baselines.dacoop import DacoopPolicy

@@ -11,6 +11,7 @@ from openjax.baselines.angelani import AngelaniParameters, angelani
 from openjax.baselines.apf import ApfParameters, apf
 from openjax.baselines.janosov import JanosovParameters, janosov
 from openjax.baselines.parameters import best
+from openjax.baselines.stack import StackParameters, stack
 from openjax.baselines.surroundings import Craft, Surroundings, surroundings
 from openjax.baselines.velocity_controller import check_flyable, velocity_action
 from openjax.policy import PolicyParameters, PredictorSettings
@@ -29,6 +30,7 @@ METHODS = {
     "angelani": Method(AngelaniParameters, angelani),
     "janosov": Method(JanosovParameters, janosov),
     "apf": Method(ApfParameters, apf),
+    "stack": Method(StackParameters, stack),
 }
 
 

@@ -73,6 +73,7 @@ def evaluate(
     seed: int = 0,
     vehicle: str | Path | None = None,
     effects: str | Path | None = None,
+    opponent: str | Path | None = None,
     **changes,
 ) -> dict | list[dict]:
     """Fly a policy's mean on layouts as `openjax evaluate` does.
@@ -84,6 +85,7 @@ def evaluate(
       episodes: per layout.
       seed: draws the start attitudes.
       vehicle, effects: files to fly with, vehicle.toml and effects.toml.
+      opponent: evader to fly against, a name in `openjax.pursuit.evaders.SCRIPTED` or a file; None: those of the policy's game.
       changes: of the game that the policy was trained in, for example speed_limit="none".
 
     Returns:
@@ -108,6 +110,7 @@ def evaluate(
         seed=seed,
         vehicle=None if vehicle is None else Path(vehicle),
         effects=None if effects is None else Path(effects),
+        opponent=None if opponent is None else str(opponent),
         environment=changed(policy.settings.environment, **changes),
     )
     records, _ = fly_scenarios(command, policy, {})

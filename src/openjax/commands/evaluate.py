@@ -52,6 +52,9 @@ class EvaluateCommand:
     """Vehicle to fly: crazyflie, brushless, or a vehicle.toml; by default the airframe that the policy was trained for."""
     effects: Path | None = None
     """Physical effects to fly with (effects.toml)."""
+    opponent: str | None = None
+    """Evader to fly against: field, greedy, wall_runner, heavy, pillar_hugger, greedy_far, greedy_near, two_step, way_points,
+    frozen, or a file that openjax exploit wrote; by default those of the policy's game."""
     environment: tyro.conf.FlagConversionOff[PursuitSettings] = dataclasses.field(
         default_factory=PursuitSettings
     )
@@ -104,7 +107,7 @@ def fly_scenarios(command: EvaluateCommand, loaded, evaluators: dict) -> tuple[l
     from openjax.commands.evaluator import Evaluator, evaluate_scenarios
 
     game, loaded, scenarios = _game(command, loaded)
-    kind = (game.settings, loaded.policy)
+    kind = (game.settings, loaded.policy, command.opponent)
     compiled = kind in evaluators
     if not compiled:
         evaluators[kind] = Evaluator(game, loaded.policy, command.episodes)
@@ -134,7 +137,7 @@ def _game(command, loaded):
         scenarios = [find_scenario(command.scenario, settings)]
     slots = max(layout_slots(settings), *(len(scenario.pillars) for scenario in scenarios))
     settings = dataclasses.replace(settings, max_pillars=slots, num_pursuers=len(scenarios[0].pursuers))
-    environment = make_environment(settings, command.vehicle, command.effects)
+    environment = make_environment(settings, command.vehicle, command.effects, command.opponent)
     return environment, loaded.in_game(environment), scenarios
 
 

@@ -115,7 +115,7 @@ def start(
             for name, path in files.items():
                 copy = copy_vehicle_file if name == "vehicle.toml" else shutil.copyfile
                 copy(path, directory.path / name)
-            directory.write_settings(command.settings, job.facts)
+            directory.write_settings(job.settings, job.facts)
             _say_what_it_is(command)
         elif processes.is_first:
             remove_unfinished(directory.path)
@@ -145,7 +145,9 @@ def prepare(
     vehicle = command.vehicle or (resumed.optional("vehicle.toml") if resumed else None)
     effects = command.effects or (resumed.optional("effects.toml") if resumed else None)
     start_from = resumed.read_facts().get("start_from") if resumed else _lasting(command.start_from)
-    environment = make_environment(command.settings.environment, vehicle, effects)
+    opponent = command.opponent or (resumed.optional("evader.npz") if resumed else None)
+    environment = make_environment(command.settings.environment, vehicle, effects, opponent)
+    settings = dataclasses.replace(command.settings, environment=environment.settings)
     compare_with = _comparison(command, resumed)
     devices = _devices(command.devices)
     if resumed is None:
@@ -154,7 +156,7 @@ def prepare(
         out = Path(processes.of_first(str(out)))
         check_free(out, command.overwrite)
     job = TrainingJob(
-        settings=command.settings,
+        settings=settings,
         environment=environment,
         # what a run started from is needed again only where it was killed before its first checkpoint
         start_from=None if resumed and Checkpoints(resumed.checkpoints).any_finished() else start_from,
@@ -172,7 +174,8 @@ def prepare(
         started=started,
     )
     job.check()
-    files = {"vehicle.toml": vehicle, "effects.toml": effects}
+    learned = opponent if environment.evader_network is not None else None
+    files = {"vehicle.toml": vehicle, "effects.toml": effects, "evader.npz": learned}
     return job, resumed or RunDirectory(out), {name: path for name, path in files.items() if path is not None}
 
 
@@ -242,7 +245,7 @@ def _check(command):
         f"--resume {command.resume} writes there; leave --out away",
     )
     need(not command.overwrite, "--resume and --overwrite exclude each other")
-    for option in ("start_from", "effects", "vehicle"):
+    for option in ("start_from", "effects", "vehicle", "opponent"):
         need(getattr(command, option) is None, f"--{option} can't change when a run is resumed")
 
 

@@ -81,7 +81,8 @@ class TrainingJob:
         """What the run's programs depend on, beside the package's sources; the seed comes in as a key."""
         game = self.environment
         arrays = [
-            np.asarray(leaf).tolist() for leaf in jax.tree.leaves((game.vehicle, game.effect_parameters))
+            np.asarray(leaf).tolist()
+            for leaf in jax.tree.leaves((game.vehicle, game.effect_parameters, game.evader_network))
         ]
         names = jax.tree.structure(game.effect_parameters)
         return repr(
@@ -276,6 +277,7 @@ def _validation(job):
         environment.vehicle,
         environment.effects,
         environment.effect_parameters,
+        evader_network=environment.evader_network,
     )
     policy = build(settings, environment).policy
     return Validation(wide, settings.environment, policy, settings.validation_episodes)

@@ -44,6 +44,9 @@ class TrainCommand:
     vehicle: Path | None = None
     """Vehicle to fly: crazyflie, brushless, or a vehicle.toml, as the calibration writes it; by default the settings'
     airframe."""
+    opponent: str | None = None
+    """Evader to train against: field, greedy, wall_runner and others (openjax evaluate --help), or a file that openjax exploit
+    wrote; short for --environment.evaders."""
     devices: str = "1"
     """Number of devices to train on, or all (of all processes)."""
     coordinator_address: str | None = None

@@ -30,6 +30,9 @@ class ViewCommand:
     """wall, narrow_gap, random, passage, empty, hidden, a TOML file with an own layout, or all six."""
     seed: Seed = 0
     """Draws the start attitudes."""
+    opponent: str | None = None
+    """Evader to fly against: field, greedy, wall_runner, heavy, pillar_hugger, greedy_far, greedy_near, two_step, way_points,
+    frozen, or a file that openjax exploit wrote; by default those of the policy's game."""
     html: Path | None = None
     """Write the page to this file, to send to somebody, instead of serving it."""
     gif: Path | None = None
@@ -86,6 +89,7 @@ def fly_all(command: ViewCommand) -> list[tuple[str, Trajectory]]:
             scenario=command.scenario,
             episodes=1,
             seed=command.seed,
+            opponent=command.opponent,
             environment=loaded.settings.environment,
         )
         flights += [(loaded.source, flight) for flight in fly_scenarios(own, loaded, evaluators)[1]]

@@ -226,7 +226,13 @@ def free_flight(environment: Pursuit) -> Pursuit:
         contacts=False,
         reward=RewardSettings(),
     )
-    return Pursuit(free, environment.vehicle, environment.effects, environment.effect_parameters)
+    return Pursuit(
+        free,
+        environment.vehicle,
+        environment.effects,
+        environment.effect_parameters,
+        evader_network=environment.evader_network,
+    )
 
 
 def nearest_gap(game: PursuitSettings, state: PursuitState) -> jax.Array:

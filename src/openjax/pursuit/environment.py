@@ -2,7 +2,7 @@
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import chex
 import jax
@@ -77,6 +77,9 @@ class Pursuit:
     """(R, 4) bounds of `settings.vehicles` that go before those written there."""
     evader_share: jax.Array | None = None
     """() from 0 to 1, how far a curriculum over `settings.evaders` has come; None is 1. See `openjax.pursuit.evaders`."""
+    evader_network: Any = None
+    """Parameters of the learned evader (`openjax.pursuit.evaders.learned`), if the settings name it; None: it does as the
+    greedy one."""
     dynamics: Dynamics | None = None
     """What moves the pursuers; None: the physics that the settings name, with the effects."""
 
@@ -171,7 +174,9 @@ class Pursuit:
             vehicles=vehicles,
             evader_position=task.evader_position,
             evader_velocity=still,
-            evader=draw_evader(settings, jax.random.fold_in(key, 3), self.evader_share),
+            evader=draw_evader(
+                settings, jax.random.fold_in(key, 3), task.pursuer_position, self.evader_share
+            ),
             last_seen=jnp.where(seen, task.evader_position, middle),
             in_sight=in_sight,
             frames=frames,
@@ -202,7 +207,7 @@ class Pursuit:
         return self.dynamics.seen(drones, self._parameters(vehicles))
 
     def step(
-        self, key: jax.Array, state: PursuitState, action: jax.Array
+        self, key: jax.Array, state: PursuitState, action: jax.Array, wish: jax.Array | None = None
     ) -> tuple[Observation, PursuitState, jax.Array, jax.Array, jax.Array, StepInfo]:
         """One control step.
 
@@ -210,6 +215,7 @@ class Pursuit:
           key: for an interface like other environments'; the game itself draws nothing after its reset.
           state: of this step's start.
           action: (N, 4) in -1..1: collective thrust, roll, pitch and yaw rate; see `action_to_command`.
+          wish: (3,) where an evader from outside flies, as a share of its speed (at most length one); None: its own rule.
 
         Returns:
           observation, state, reward (N,), terminated (), truncated (), info.
@@ -229,10 +235,21 @@ class Pursuit:
         if settings.speed_limit == "clamp":
             speed = jnp.sqrt(jnp.sum(drones.velocity**2, axis=-1, keepdims=True) + 1e-12)
             drones = drones.replace(velocity=drones.velocity * jnp.minimum(1.0, settings.max_speed / speed))
-        return self.follow(state, action, drones)
+        return self.follow(state, action, drones, wish)
+
+    def around_evader(self, state: PursuitState) -> Around:
+        """What is around the evader in `state`."""
+        return Around(
+            position=state.evader_position,
+            velocity=state.evader_velocity,
+            pursuers=state.drones.position,
+            in_sight=state.in_sight,
+            pillar_position=state.task.pillar_position,
+            pillar_active=state.task.pillar_active,
+        )
 
     def follow(
-        self, state: PursuitState, action: jax.Array, drones: DroneState
+        self, state: PursuitState, action: jax.Array, drones: DroneState, wish: jax.Array | None = None
     ) -> tuple[Observation, PursuitState, jax.Array, jax.Array, jax.Array, StepInfo]:
         """The game's part of a step that began at `state` with `action` and ended with the pursuers as `drones`.
 
@@ -241,10 +258,9 @@ class Pursuit:
         """
         settings, task, before = self.settings, state.task, state
         pillars = (task.pillar_position, task.pillar_active)
-        around = Around(
-            before.evader_position, before.evader_velocity, before.drones.position, before.in_sight, *pillars
+        velocity, evader_state = evader_velocity(
+            settings, before.evader, self.around_evader(before), self.evader_network, wish
         )
-        velocity, evader_state = evader_velocity(settings, before.evader, around)
         evader = before.evader_position + settings.time_step * velocity
         step = before.step + 1
         position = drones.position

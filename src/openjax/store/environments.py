@@ -1,9 +1,10 @@
-"""The game with what two files add to it: a vehicle and physical effects."""
+"""The game with what files add to it: a vehicle, physical effects, an evader."""
 
 import dataclasses
 from pathlib import Path
 
 from openjax.pursuit import Pursuit, PursuitSettings
+from openjax.store.evader_files import find_opponent
 from openjax.vehicle.effects import load_effects
 from openjax.vehicle.family import vehicle_family
 from openjax.vehicle.parameters import AIRFRAMES
@@ -24,16 +25,23 @@ def with_airframe(settings: PursuitSettings, vehicle: Path | None) -> PursuitSet
     return dataclasses.replace(settings, airframe=airframe)
 
 
-def make_environment(settings: PursuitSettings, vehicle: Path | None, effects: Path | None) -> Pursuit:
-    """The game with the vehicle of a vehicle.toml, or of an airframe's name, and the effects of an effects.toml, where given.
+def make_environment(
+    settings: PursuitSettings, vehicle: Path | None, effects: Path | None, opponent: str | Path | None = None
+) -> Pursuit:
+    """The game with the vehicle of a vehicle.toml, or of an airframe's name, the effects of an effects.toml, and one evader
+    (`find_opponent`), where given.
 
     Raises:
-      UserError: a file that can't be used.
+      UserError: a file that can't be used, or an evader that nobody knows.
     """
+    network = None
+    if opponent is not None:
+        settings, network = find_opponent(opponent, settings)
     names, parameters = load_effects(effects) if effects else ((), {})
     return Pursuit(
         with_airframe(settings, vehicle),
         vehicle=load_vehicle_file(vehicle).vehicle if vehicle else None,
         effects=names,
         effect_parameters=parameters,
+        evader_network=network,
     )

@@ -6,6 +6,7 @@ from openjax.lazy import lazy_names
 _HOMES = {
     "EVADERS": "kinds",
     "HELD_OUT": "kinds",
+    "SCRIPTED": "kinds",
     "TRAINED": "kinds",
     "VALIDATED": "kinds",
     "Around": "evader",
@@ -15,5 +16,7 @@ _HOMES = {
     "draw_evader": "evader",
     "evader_velocity": "evader",
     "field_velocity": "field",
+    "init_network": "learned",
+    "scene_of": "evader",
 }
 __getattr__, __dir__, __all__ = lazy_names(__name__, _HOMES)

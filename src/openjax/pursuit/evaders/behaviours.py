@@ -18,7 +18,7 @@ from openjax.pursuit.sensing import line_of_sight
 from openjax.pursuit.settings import PursuitSettings
 
 MEMORY = 4
-"""Numbers that an evader remembers; drawn uniformly from 0 to 1 at the start of an episode."""
+"""Numbers that a scripted evader remembers; drawn uniformly from 0 to 1 at the start of an episode."""
 DIRECTIONS = 64
 """That a greedy evader tries; one that looks two steps ahead tries half as many at each."""
 MARGIN = 0.02
@@ -35,6 +35,7 @@ class Scene:
 
     settings: PursuitSettings = struct.field(pytree_node=False)
     position: jax.Array  # (3,) m, its own
+    velocity: jax.Array  # (3,) m/s, its own in the last step
     pursuers: jax.Array  # (N, 3) m
     known: jax.Array  # (N,) bool, the pursuers that it knows of
     pillar_position: jax.Array  # (P, 2) m
@@ -128,7 +129,7 @@ def pillar_hugger(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array
 def way_points(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Fly from point to point, whatever the pursuers do. The points are a sequence of low discrepancy from a drawn one on."""
     settings = scene.settings
-    share, left = memory[:3], memory[3]
+    share, left, rest = memory[:3], memory[3], memory[4:]
     angle, radius = 2.0 * jnp.pi * share[0], settings.arena_radius * jnp.sqrt(share[1])
     goal = jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), settings.arena_height * share[2]])
     goal = into_free_space(settings, goal, scene.pillar_position, scene.pillar_active)
@@ -138,8 +139,8 @@ def way_points(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
     done = (_length(to_goal)[0] < AROUND) | (left < 0.0)
     # the additive recurrence of the largest root of x^4 = x + 1 (Roberts 2018, The unreasonable effectiveness of R-sequences)
     following = jnp.mod(share + 1.2207440846057596 ** -jnp.arange(1.0, 4.0), 1.0)
-    memory = jnp.where(done, jnp.append(following, 1.0), jnp.append(share, left))
-    return _unit(to_goal), memory
+    own = jnp.where(done, jnp.append(following, 1.0), jnp.append(share, left))
+    return _unit(to_goal), jnp.concatenate([own, rest])
 
 
 def frozen(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:

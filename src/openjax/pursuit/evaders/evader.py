@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import functools
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from openjax.pursuit.evaders.behaviours import BEHAVIOURS, MEMORY, Scene, into_free_space
+from openjax.pursuit.evaders.behaviours import BEHAVIOURS, MEMORY, Scene, greedy, into_free_space
 from openjax.pursuit.evaders.field import field_velocity
-from openjax.pursuit.evaders.kinds import EVADERS, NUMBERS
+from openjax.pursuit.evaders.kinds import EVADERS, NUMBERS, UNBOUNDED
+from openjax.pursuit.evaders.learned import STEPS, learned
 from openjax.pursuit.settings import PursuitSettings
 
 
@@ -19,7 +23,7 @@ class EvaderState:
 
     kind: jax.Array  # () int32, place in `settings.evaders`
     numbers: dict[str, jax.Array]  # those of `EvaderKind`, () each, float32
-    memory: jax.Array  # (MEMORY,)
+    memory: jax.Array  # (M,)
 
 
 @struct.dataclass
@@ -42,6 +46,7 @@ class Around:
 def draw_evader(
     settings: PursuitSettings,
     key: jax.Array,
+    pursuers: jax.Array,
     share: jax.Array | None = None,
     kind: jax.Array | None = None,
 ) -> EvaderState | None:
@@ -50,6 +55,7 @@ def draw_evader(
     Args:
       settings: their `evaders` are drawn with equal odds.
       key: ().
+      pursuers: (N, 3) m, their starts, for the memory of a learned evader.
       share: () from 0 to 1, how far a curriculum has come; None is 1. At 0 all worlds have the first of the evaders; from
         there the others' odds grow to the equal ones, and their speed from half to the whole.
       kind: () int32, the place in `settings.evaders` of the one it is; None draws it.
@@ -70,7 +76,10 @@ def draw_evader(
         for number, draw in zip(NUMBERS, draws, strict=True)
     }
     numbers["speed"] = numbers["speed"] * slow
-    return EvaderState(kind=kind, numbers=numbers, memory=jax.random.uniform(memory_key, (MEMORY,)))
+    memory = jax.random.uniform(memory_key, (MEMORY,))
+    if "learned" in names:
+        memory = jnp.concatenate([memory, jnp.tile(pursuers.ravel(), STEPS)])
+    return EvaderState(kind=kind, numbers=numbers, memory=memory)
 
 
 def _drawn(values, kind, draw):
@@ -82,48 +91,71 @@ def _drawn(values, kind, draw):
 
 
 def evader_velocity(
-    settings: PursuitSettings, state: EvaderState | None, around: Around
+    settings: PursuitSettings,
+    state: EvaderState | None,
+    around: Around,
+    network: Any = None,
+    wish: jax.Array | None = None,
 ) -> tuple[jax.Array, EvaderState | None]:
     """(3,) velocity (m/s, world) of the evader in this step, and its state after it.
 
-    Scripted evaders neither leave the arena nor enter a pillar, and no gradient goes through what they decide.
+    Evaders other than the paper's neither leave the arena nor enter a pillar, and no gradient goes through what they decide.
+
+    Args:
+      settings: the game.
+      state: which evader it is, from `draw_evader`.
+      around: where it and the others are.
+      network: parameters of the learned evader, if it is one of the settings'.
+      wish: (3,) a velocity, as a share of its speed, that is flown in place of its own; None is its own.
     """
-    if state is None:
+    if state is None and wish is None:
         return _field(settings, around), None
-    velocity, memory = _scripted(settings, *jax.lax.stop_gradient((state, around)))
+    around, state = jax.lax.stop_gradient((around, state))
+    if state is None:
+        return _flown(settings, around, settings.evader_speed, UNBOUNDED, wish), None
+    own, memory = _wish(settings, state, around, network)
+    speed = state.numbers["speed"] * settings.evader_speed
+    velocity = _flown(settings, around, speed, state.numbers["acceleration"], own if wish is None else wish)
     is_field = np.array([EVADERS[name].behaviour == "field" for name in settings.evaders])
-    if is_field.any():
+    if wish is None and is_field.any():
         velocity = jnp.where(jnp.asarray(is_field)[state.kind], _field(settings, around), velocity)
     return velocity, state.replace(memory=memory)
 
 
-def _field(settings, around):
-    return field_velocity(settings, around.position, around.pursuers, around.in_sight, *around.pillars)
-
-
-def _scripted(settings, state, around):
-    """Velocity (3,) and memory of an evader with a behaviour; of the paper's something finite."""
+def scene_of(settings: PursuitSettings, state: EvaderState, around: Around) -> Scene:
+    """What an evader knows of what is around it."""
     numbers = state.numbers
-    speed = numbers["speed"] * settings.evader_speed
-    scene = Scene(
+    return Scene(
         settings=settings,
         position=around.position,
+        velocity=around.velocity,
         pursuers=around.pursuers,
         known=around.in_sight | (numbers["sees_all"] > 0.5),
         pillar_position=around.pillar_position,
         pillar_active=around.pillar_active,
         look_ahead=numbers["look_ahead"],
         hiding=numbers["hiding"],
-        reach=speed,
+        reach=numbers["speed"] * settings.evader_speed,
     )
+
+
+def _field(settings, around):
+    return field_velocity(settings, around.position, around.pursuers, around.in_sight, *around.pillars)
+
+
+def _wish(settings, state, around, network):
+    """Wish (3,) and memory of an evader with a behaviour; of the paper's something finite."""
+    known = {**BEHAVIOURS, "learned": greedy if network is None else functools.partial(learned, network)}
     behaviours = [EVADERS[name].behaviour for name in settings.evaders]
-    used = [name for name in BEHAVIOURS if name in behaviours]
+    used = [name for name in known if name in behaviours]
     place = np.array([used.index(name) if name in used else 0 for name in behaviours], np.int32)
     # mapped over worlds, a switch works all of them out and selects: each behaviour stands in it once
-    wish, memory = jax.lax.switch(
-        jnp.asarray(place)[state.kind], [BEHAVIOURS[name] for name in used], scene, state.memory
+    return jax.lax.switch(
+        jnp.asarray(place)[state.kind],
+        [known[name] for name in used],
+        scene_of(settings, state, around),
+        state.memory,
     )
-    return _flown(settings, around, speed, numbers["acceleration"], wish), memory
 
 
 def _flown(settings, around, speed, acceleration, wish):

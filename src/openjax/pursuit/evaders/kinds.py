@@ -15,8 +15,9 @@ class EvaderKind:
 
     behaviour: str
     """A name in `openjax.pursuit.evaders.behaviours.BEHAVIOURS`; "field" is the paper's, which has none of these numbers."""
-    of: Literal["train", "validation", "held out"]
-    """What it may be used for: held-out ones are never trained on, nor are checkpoints chosen by them."""
+    of: Literal["train", "validation", "held out", "file"]
+    """What it may be used for: held-out ones are never trained on, nor are checkpoints chosen by them. "file": it is read from
+    one."""
     look_ahead: tuple[float, ...] = (0.15,)
     """Seconds after which it looks at where a direction leads."""
     hiding: tuple[float, ...] = (0.0,)
@@ -49,7 +50,9 @@ EVADERS = {
     "two_step": EvaderKind("two_step", "held out"),
     "way_points": EvaderKind("way_points", "held out"),
     "frozen": EvaderKind("frozen", "held out"),
+    "learned": EvaderKind("learned", "file"),
 }
+SCRIPTED = tuple(name for name, kind in EVADERS.items() if kind.of != "file")
 
 
 def _of(split):
@@ -65,4 +68,4 @@ def check_evaders(names: tuple[str, ...]) -> None:
         raise UserError("environment.evaders is empty; it names at least one evader, for example field")
     for name in names:
         if name not in EVADERS:
-            raise UserError(f"evader {str(name)[:60]}: unknown; possible are {', '.join(EVADERS)}")
+            raise UserError(f"evader {str(name)[:60]}: unknown; possible are {', '.join(SCRIPTED)}")

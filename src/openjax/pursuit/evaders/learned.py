@@ -1,0 +1,89 @@
+"""A learned evader: a small network with a memory, added to what the greedy evader would do.
+
+Its memory holds where the pursuers were in the last steps. Pursuers and pillars are pooled, so that their number and order
+don't matter. With zeros in its last layer, as it starts, it is the greedy evader.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from openjax.pursuit.evaders.behaviours import MEMORY, Scene, greedy
+
+STEPS = 10
+"""Steps that it remembers."""
+WIDTH = 64
+_OWN, _PURSUER, _PILLAR = 9, 10, 4
+
+
+def memory_size(pursuers: int) -> int:
+    """Numbers that it remembers of so many pursuers."""
+    return STEPS * 3 * pursuers
+
+
+def init_network(key: jax.Array) -> dict[str, Any]:
+    """Parameters of a network (actor and critic alike) whose output, three numbers and one, is zero."""
+    sizes = {
+        "pursuer": (_PURSUER, WIDTH),
+        "pillar": (_PILLAR, WIDTH),
+        "own": (_OWN + 3 * WIDTH, WIDTH),
+        "hidden": (WIDTH, WIDTH),
+    }
+    layers = {
+        name: {"kernel": jax.nn.initializers.orthogonal(2.0**0.5)(own, size), "bias": jnp.zeros(size[1])}
+        for (name, size), own in zip(sizes.items(), jax.random.split(key, len(sizes)), strict=True)
+    }
+    return {**layers, "output": {"kernel": jnp.zeros((WIDTH, 4)), "bias": jnp.zeros(4)}}
+
+
+def features(scene: Scene, memory: jax.Array) -> dict[str, jax.Array]:
+    """What the network sees: own (9,), pursuers (N, 10), pillars (P, 4), in_use (P,), greedy (3,)."""
+    settings = scene.settings
+    before = memory[MEMORY:].reshape(STEPS, *scene.pursuers.shape)
+    relative = scene.pursuers - scene.position
+    distance = jnp.sqrt(jnp.sum(relative**2, axis=-1, keepdims=True) + 1e-12)
+    half, whole = (scene.pursuers - before[STEPS // 2]), (scene.pursuers - before[0])
+    scale = settings.max_speed * settings.time_step * STEPS
+    to_pillar = scene.pillar_position - scene.position[:2]
+    gap = jnp.sqrt(jnp.sum(to_pillar**2, axis=-1, keepdims=True) + 1e-12)
+    in_use = scene.pillar_active[:, None]
+    size = np.array([settings.arena_radius] * 2 + [settings.arena_height / 2], np.float32)
+    middle = np.array(settings.middle, np.float32)
+    wish = greedy(scene, memory)[0]
+    return {
+        "own": jnp.concatenate(
+            [(scene.position - middle) / size, scene.velocity / settings.evader_speed, wish]
+        ),
+        "pursuers": jnp.concatenate([relative, distance, 2.0 * half / scale, whole / scale], axis=-1),
+        "pillars": jnp.where(in_use, jnp.concatenate([to_pillar, gap, in_use], axis=-1), 0.0),
+        "in_use": scene.pillar_active,
+        "greedy": wish,
+    }
+
+
+def outputs(network: dict[str, Any], seen: dict[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    """Mean wish (..., 3) and value (...,) for features with leading axes."""
+
+    def dense(name, x):
+        return x @ network[name]["kernel"] + network[name]["bias"]
+
+    pursuers = jnp.tanh(dense("pursuer", seen["pursuers"]))
+    pillars = jnp.where(seen["in_use"][..., None], jnp.tanh(dense("pillar", seen["pillars"])), 0.0)
+    pooled = [jnp.mean(pursuers, axis=-2), jnp.max(pursuers, axis=-2), jnp.sum(pillars, axis=-2)]
+    hidden = jnp.tanh(dense("own", jnp.concatenate([seen["own"], *pooled], axis=-1)))
+    out = dense("output", jnp.tanh(dense("hidden", hidden)))
+    return seen["greedy"] + out[..., :3], out[..., 3]
+
+
+def remember(scene: Scene, memory: jax.Array) -> jax.Array:
+    """The memory after this step."""
+    return jnp.concatenate([memory[:MEMORY], memory[MEMORY + scene.pursuers.size :], scene.pursuers.ravel()])
+
+
+def learned(network: dict[str, Any], scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The behaviour of a network, without exploration."""
+    wish = outputs(network, features(scene, memory))[0]
+    size = jnp.sqrt(jnp.sum(wish**2) + 1e-12)
+    return wish / jnp.maximum(size, 1.0), remember(scene, memory)

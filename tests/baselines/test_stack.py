@@ -1,0 +1,83 @@
+"""Stack with point pursuers: it catches every scripted evader inside its bound, and some get away outside."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from openjax.baselines import Heuristic
+from openjax.baselines.stack import Points, StackParameters, stack, stack_bound
+from openjax.baselines.surroundings import Craft, surroundings
+from openjax.pursuit import Pursuit, PursuitSettings, uniform_task
+from openjax.pursuit.evaders import draw_evader
+
+STEP = 0.01
+EVADERS = ("field", "greedy", "greedy_near", "wall_runner", "way_points")
+
+
+def captures(number=64, **changes):
+    """(kinds, number) whether each scripted evader is caught, from drawn starts in an empty arena; (kinds, number) steps."""
+    settings = PursuitSettings(
+        physics="stops",
+        speed_limit="none",
+        evaders=EVADERS,
+        episode_length=500,
+        min_pillars=0,
+        max_pillars=1,
+        **changes,
+    )
+    environment = Pursuit(settings, dynamics=Points(settings.max_speed, STEP))
+    craft = Craft.of(environment)
+    craft = dataclasses.replace(craft, speed=settings.max_speed, response=0.0)
+    parameters = StackParameters(tolerance=0.05, gain=1.0 / STEP)
+
+    def fly(key, kind):
+        task = uniform_task(settings, key)
+        task = task.replace(pillar_active=jnp.zeros(1, bool))
+        observation, state = environment.reset_to(key, task)
+        state = state.replace(evader=draw_evader(settings, key, task.pursuer_position, kind=kind))
+
+        def one(world, _):
+            observation, state = world
+            velocity = stack(craft, parameters, surroundings(craft, observation))
+            action = jnp.concatenate([jnp.zeros((3, 1)), velocity / settings.max_speed], axis=-1)
+            observation, state, *_ = environment.step(key, state, action)
+            return (observation, state), None
+
+        return jax.lax.scan(one, (observation, state), length=settings.episode_length)[0][1].statistics
+
+    keys = jax.random.split(jax.random.key(0), number)
+    kinds = jnp.arange(len(EVADERS))
+    fly_all = jax.jit(jax.vmap(jax.vmap(fly, (0, None)), (None, 0)))
+    statistics = fly_all(keys, kinds)
+    return np.asarray(statistics.captured), np.asarray(statistics.capture_step)
+
+
+def test_the_bound_of_the_papers_arena():
+    assert stack_bound(PursuitSettings()) == pytest.approx(0.9 / (0.9 - 0.05**0.5))
+    assert stack_bound(PursuitSettings(num_pursuers=2)) == 0.0  # a height of .3 m isn't covered by .3 m
+
+
+def test_every_scripted_evader_is_caught_inside_the_bound():
+    assert PursuitSettings().evader_speed < stack_bound(PursuitSettings())
+    caught, steps = captures()
+    assert caught.all(), dict(zip(EVADERS, caught.mean(1), strict=True))
+    assert steps.max() * STEP < 4.0
+
+
+def test_outside_the_bound_greedy_evaders_get_away():
+    assert PursuitSettings(capture_radius=0.27).evader_speed > stack_bound(
+        PursuitSettings(capture_radius=0.27)
+    )
+    caught, _ = captures(capture_radius=0.27)
+    assert min(caught.mean(1)) < 0.7
+
+
+def test_it_is_a_policy_like_the_others():
+    environment = Pursuit(PursuitSettings(physics="stops"))
+    policy = Heuristic.for_environment("stack", environment)
+    observation, _ = environment.reset(jax.random.key(0))
+    action = policy.act(policy.parameters(), observation)
+    assert action.shape == (3, 4) and np.isfinite(action).all()
