@@ -12,11 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.flying.vehicles import vehicles
+from experiments.flying.vehicles import FLIGHT_FAMILY, vehicles
 from experiments.table import Page, Table, page_parser, publish
 from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import layout_slots, repeat_task
 from openjax.commands.validation import uniform_tasks
+from openjax.learning.best_response import make_duel
 from openjax.pursuit import (
     SCENARIOS,
     EpisodeStatistics,
@@ -26,37 +27,16 @@ from openjax.pursuit import (
     Task,
     scenario_task,
 )
-from openjax.pursuit.evaders import EVADERS, SCRIPTED, draw_evader
+from openjax.pursuit.evaders import EVADERS, SCRIPTED
 from openjax.store.policies import LoadedPolicy, load_policy
-from openjax.vehicle import load_vehicle
-from openjax.vehicle.family import FLIGHT_FAMILY
 
 ALL = SCRIPTED
 
 
 @functools.cache
 def program(settings: PursuitSettings, policy):
-    """Compiled episodes: (parameters, tasks (B, ...), evaders (B,) places in `ALL`, key, bounds (R, 4)) -> statistics (B,)."""
-    vehicle = load_vehicle()
-
-    def run(parameters, tasks, evaders, key, bounds):
-        environment = Pursuit(settings, vehicle, vehicle_bounds=bounds)
-
-        def begin(key, task, kind):
-            observation, state = environment.reset_to(key, task)
-            evader = draw_evader(settings, jax.random.fold_in(key, 3), task.pursuer_position, kind=kind)
-            return observation, state.replace(evader=evader)
-
-        def one(world, _):
-            observation, state = world
-            action = policy.act(parameters, observation)
-            observation, state, *_ = jax.vmap(environment.step, (None, 0, 0))(key, state, action)
-            return (observation, state), None
-
-        world = jax.vmap(begin)(jax.random.split(key, evaders.shape[0]), tasks, evaders)
-        return jax.lax.scan(one, world, length=settings.episode_length)[0][1].statistics
-
-    return jax.jit(run)
+    """Compiled episodes; see `make_duel`."""
+    return jax.jit(make_duel(Pursuit(settings), policy))
 
 
 def game_of(loaded: LoadedPolicy, game: str, physics: str) -> PursuitSettings:
@@ -96,7 +76,10 @@ def fly(name: str, options) -> list[dict]:
     records = []
     for vehicle in options.vehicles:
         bounds = jnp.asarray(vehicles()[vehicle])
-        found = jax.tree.map(np.asarray, run(loaded.parameters, repeated, evaders, jax.random.key(0), bounds))
+        found = jax.tree.map(
+            np.asarray,
+            run(loaded.parameters, repeated, evaders, jax.random.key(0), {"vehicle_bounds": bounds}),
+        )
         for i, evader in enumerate(ALL):
             start = i * number
             for kind, count in zip(kinds, counts, strict=True):

@@ -4,6 +4,7 @@ Payoff is the time to the capture and not whether there is one: where captures a
 other. Seeds learn side by side in one compiled step, each with worlds of its own; pursuers fly their mean policy.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -175,8 +176,8 @@ class BestResponse:
         mean = jnp.sum(weight * (0.5 * error - surrogate)) / jnp.maximum(jnp.sum(weight), 1.0)
         return mean - self.how.entropy_coefficient * gaussian_entropy(log_std)
 
-    def _learn(self, carry, samples, last_value, key):
-        """Evader and optimiser's state after all epochs on the samples."""
+    def _batch(self, samples, last_value):
+        """What a gradient step needs of samples (see `_loss`), each (minibatches, S, n, ...), whole worlds together."""
         how = self.how
         following = jnp.concatenate([samples.value[1:], last_value[None]])
         advantage = generalised_advantages(
@@ -189,20 +190,27 @@ class BestResponse:
             how.gae_lambda,
         )
         target, weight = advantage + samples.value, samples.flying.astype(jnp.float32)
-        total = jnp.maximum(jnp.sum(weight, axis=(0, 2), keepdims=True), 1.0)
-        mean = jnp.sum(weight * advantage, axis=(0, 2), keepdims=True) / total
-        deviation = jnp.sqrt(jnp.sum(weight * (advantage - mean) ** 2, axis=(0, 2), keepdims=True) / total)
-        advantage = (advantage - mean) / (deviation + 1e-8)
+
+        def mean(value):
+            return jnp.sum(weight * value, (0, 2), keepdims=True) / jnp.maximum(
+                jnp.sum(weight, (0, 2), keepdims=True), 1.0
+            )
+
+        centred = advantage - mean(advantage)
+        advantage = centred / (jnp.sqrt(mean(centred**2)) + 1e-8)
 
         def parts(leaf):
-            """(T, S, E, ...) to (minibatches, S, n, ...), whole worlds together."""
             steps, seeds, worlds = leaf.shape[:3]
             leaf = leaf.reshape(steps, seeds, how.minibatches, worlds // how.minibatches, *leaf.shape[3:])
             leaf = jnp.moveaxis(leaf, (2, 1), (0, 1))
             return leaf.reshape(how.minibatches, seeds, -1, *leaf.shape[4:])
 
         batch = (samples.seen, samples.sample, samples.log_prob, advantage, target, weight)
-        batch = jax.tree.map(parts, batch)
+        return jax.tree.map(parts, batch)
+
+    def _learn(self, carry, samples, last_value, key):
+        """Evader and optimiser's state after all epochs on the samples."""
+        how, batch = self.how, self._batch(samples, last_value)
 
         def step(carry, index):
             networks, state = carry
@@ -258,26 +266,20 @@ class BestResponse:
 
 def make_duel(
     environment: Pursuit, policy: Policy
-) -> Callable[[PolicyParameters, Task, jax.Array, jax.Array, Any, jax.Array | None], EpisodeStatistics]:
-    """`duel(parameters, tasks (B, ...), kinds (B,), key, network, bounds) -> statistics (B,)`: whole episodes of the mean policy.
+) -> Callable[[PolicyParameters, Task, jax.Array, jax.Array, dict], EpisodeStatistics]:
+    """`duel(parameters, tasks (B, ...), kinds (B,), key, changes) -> statistics (B,)`: whole episodes of the mean policy.
 
-    `kinds` are places in the settings' evaders, `network` the learned one's, `bounds` (R, 4) of the vehicles or None.
+    `kinds` are places in the settings' evaders; `changes` are fields of the environment that hold arrays: the learned evader's
+    `evader_network`, the `vehicle_bounds`.
     """
 
-    def duel(parameters, tasks, kinds, key, network=None, bounds=None):
-        game = Pursuit(
-            environment.settings,
-            environment.vehicle,
-            environment.effects,
-            environment.effect_parameters,
-            vehicle_bounds=bounds,
-            evader_network=network,
-            dynamics=environment.dynamics,
-        )
+    def duel(parameters, tasks, kinds, key, changes):
+        game = dataclasses.replace(environment, **changes)
 
         def begin(key, task, kind):
             observation, state = game.reset_to(key, task)
-            evader = draw_evader(game.settings, jax.random.fold_in(key, 3), task.pursuer_position, kind=kind)
+            evader_key = jax.random.fold_in(key, 3)
+            evader = draw_evader(game.settings, evader_key, task.pursuer_position, kind=kind)
             return observation, state.replace(evader=evader)
 
         def one(world, _):
