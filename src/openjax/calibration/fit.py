@@ -29,9 +29,11 @@ class CalibrationFit:
             )
 
     def equations_at(self, log_lag: float):
+        """The linear equations of the flights for motors with a time constant of exp(`log_lag`) s."""
         return build(self.tracks, self.vehicles, self.names, float(np.exp(log_lag)), self.floor_z)
 
     def run(self) -> None:
+        """Fit constants and lag by turns, until neither moves."""
         beta, lag = self.mean.copy(), self.log_nominal
         sigma = None
         for _ in range(_ITERATIONS):

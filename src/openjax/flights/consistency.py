@@ -62,6 +62,7 @@ class Match:
 
     @property
     def changed(self) -> np.ndarray:
+        """(3,) bool, axes that the best labelling takes from elsewhere or turns round."""
         return np.array(
             [o != i or s < 0 for i, (o, s) in enumerate(zip(self.order, self.signs, strict=True))]
         )
@@ -74,6 +75,7 @@ class Match:
 
     @property
     def fits(self) -> bool:
+        """The labelling is right, and at least two axes agree well with the reference."""
         return not self.wrong and bool((self.as_labelled > _FITS).sum() >= 2)
 
     def words(self, names: tuple[str, ...], reference: tuple[str, ...] = ("x", "y", "z")) -> str:

@@ -83,18 +83,22 @@ class Flight:
 
     @property
     def has_pose(self) -> bool:
+        """Whether position and attitude are logged."""
         return self.position is not None and self.quaternion is not None
 
     @property
     def has_imu(self) -> bool:
+        """Whether gyroscope and accelerometer are logged."""
         return self.body_rates is not None and self.specific_force is not None
 
     @property
     def has_motors(self) -> bool:
+        """Whether motor commands are logged."""
         return self.motor_command is not None
 
     @property
     def has_commands(self) -> bool:
+        """Whether commanded thrust and body rates are logged."""
         return self.command_thrust is not None and self.command_body_rates is not None
 
     def sampled(self, channel: str) -> tuple[Array, Array]:
