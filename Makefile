@@ -4,7 +4,7 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 PYTEST  = $(BIN)/python -m pytest -n auto --maxprocesses 8 --dist worksteal
 
-.PHONY: train test test-slow test-all lint benchmark evaluate tables exam clean
+.PHONY: train test test-slow test-all lint docs benchmark evaluate tables exam clean
 
 # `make train` accepts extra options: make train ARGS="--preset paper --seed 1"
 train: $(READY)
@@ -22,6 +22,11 @@ test-all: lint test test-slow
 lint: $(READY)
 	$(BIN)/ruff check src tests experiments examples conftest.py
 	$(BIN)/ruff format --check src tests experiments examples conftest.py
+
+# the site, into docs/_build/html; a warning is an error
+docs: $(READY)
+	$(BIN)/python -m pip install -q -e ".[docs]"
+	$(BIN)/python -m sphinx -W --keep-going -q docs docs/_build/html
 
 benchmark: $(READY)
 	$(BIN)/python -m openjax.benchmark $(ARGS)

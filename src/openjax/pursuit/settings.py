@@ -31,7 +31,7 @@ class RewardSettings:
     """Seconds of an episode before the speed counts: a dive saves some of those that start tilted towards something (not in the
     paper)."""
     smoothness: Annotated[float, Interval("[0, 1e6]")] = 0.0
-    """Weight of exp(-|a_t - a_{t-1}|); 2.0 in the paper's second stage."""
+    """Weight of `exp(-|a_t - a_{t-1}|)`; 2.0 in the paper's second stage."""
     crash: Annotated[float, Interval("[0, 1e6]")] = 0.0
     """Subtracted in each step in which a pursuer touches something solid or tips over (not in the paper)."""
     first_crash: Annotated[float, Interval("[0, 1e6]")] = 0.0
