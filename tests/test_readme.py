@@ -22,15 +22,28 @@ def test_every_command_and_target_of_the_readme_exists():
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     for target in set(re.findall(r"\bmake ([a-z]+)\b", README)) - {"it"}:
         assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
-    commands = set(re.findall(r"(?:^|`)openjax (\w+)", README, re.MULTILINE))
-    assert len(commands) >= 5
-    assert commands <= set(COMMANDS), commands - set(COMMANDS)
+    pages = "".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs").rglob("*.md"))
+    commands = set(re.findall(r"(?:^ *|`)openjax ([a-z]\w+)", README + pages, re.MULTILINE))
+    assert commands == set(COMMANDS), commands ^ set(COMMANDS)
     for path in re.findall(r"\]\(((?:experiments|docs|examples)[^)#]*)\)", README):
         assert (ROOT / path).exists(), path
 
 
+def test_readme_and_pages_stay_short():
+    """Words with a letter or a digit; README 1,200, all pages of the documentation 10,000."""
+
+    def words(text):
+        return len(re.findall(r"\S*\w\S*", text))
+
+    assert words(README) <= 1200
+    pages = (ROOT / "docs").rglob("*.md")
+    assert (
+        sum(words(page.read_text(encoding="utf-8")) for page in pages if "_build" not in page.parts) <= 10_000
+    )
+
+
 def test_links_between_the_pages_lead_somewhere():
-    for page in sorted((ROOT / "docs").glob("*.md")):
+    for page in sorted((ROOT / "docs").rglob("*.md")):
         for path in re.findall(r"\]\((?!http)([^)#]+)", page.read_text(encoding="utf-8")):
             assert (page.parent / path).exists(), f"{page.name}: {path}"
 
@@ -59,7 +72,7 @@ def test_modules_that_the_pages_name_are_there():
         for part in ("src", "experiments", "examples", "tests")
         for path in (ROOT / part).rglob("*.py")
     ]
-    for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")):
+    for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")):
         for name in re.findall(r"`([\w/]+\.py)`", page.read_text(encoding="utf-8")):
             assert any(f"/{module}".endswith(f"/{name}") for module in modules), f"{page.name}: {name}"
 

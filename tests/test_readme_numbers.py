@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from experiments.paper.values import means
-from openjax.pursuit import SCENARIOS
+from openjax.pursuit import SCENARIOS, PursuitSettings
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -93,3 +93,16 @@ def test_diagnosis(label, figure):
     figures = read("exam")["columns"]["stranger"]["figures"]
     assert figures["traceback"]["n"] == 240
     assert cells(label)[0] == short(figures[figure]["value"], 2)
+
+
+def test_the_game():
+    """The numbers of the paper's game are the settings' defaults."""
+    game = PursuitSettings()
+    seconds = game.episode_length * game.time_step
+    pillars = f"{game.min_pillars} to {game.max_pillars} pillars"
+    row = (
+        f"| radius {short(game.arena_radius, 1)} m, height {game.arena_height} m, {pillars} "
+        f"| {game.num_pursuers}, up to {game.max_speed:g} m/s | {game.evader_speed} m/s, a moving point "
+        f"| within {short(game.capture_radius, 1)} m, in {seconds:.0f} s | thrust and body rates, {1 / game.time_step:.0f} Hz |"
+    )
+    assert row in README

@@ -221,7 +221,7 @@ def make_drones_step(
     physics "mjx": MuJoCo MJX; "rigid": the same equations written out, many times faster. In both floor, pillars
     (sized by `arena`) and other drones are solid unless `contacts` is off. "stops": free
     flight, and drones are put back out of solid things once per step. dt is the step
-    in seconds; `substeps` divide it, and the rate controller runs in each. `effects` (names or `Effect`s) are modelled
+    in seconds; `substeps` divide it, and the rate controller runs in each. `effects` (names, or of type `Effect`) are modelled
     beyond the nominal vehicle. Within a substep: controller on the present state, motors, rotor speeds,
     wrench from the updated rotor speeds, body.
 
