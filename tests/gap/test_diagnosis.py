@@ -161,7 +161,7 @@ def test_the_command_writes_everything_or_nothing(folders, reports, tmp_path, ca
     assert names == ("rotor_drag",) and parameters["rotor_drag"]["d_xy"] == pytest.approx(
         DRAG["d_xy"], rel=0.1
     )
-    assert "<img" in (out / "drag" / "report.html").read_text()
+    assert "<svg" in (out / "drag" / "report.html").read_text()
     assert json.loads((tmp_path / "p.json").read_text())["drag"]["effects"] == ["rotor_drag"]
     assert sorted(p.name for p in out.iterdir()) == ["drag"]
     capsys.readouterr()

@@ -1,169 +1,258 @@
-"""Pictures of a report."""
+"""Figures of a report, as SVG that takes its colours from the page: light and dark."""
 
 from __future__ import annotations
 
-import base64
 import io
+import re
+from collections.abc import Sequence
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
 
 from openjax.flights.track import rotation, smooth
 from openjax.gap.library import CARDS
 from openjax.gap.report import Report
 from openjax.gap.rest import disturbances, residuals_of
 from openjax.gap.table import HORIZONS
-from openjax.gap.where import CHANNELS, REGIMES
+from openjax.gap.where import CALM, CHANNELS, Place
+
+BEFORE, AFTER = "#d1495b", "#2e86ab"  # both stand out on white and on black
+INK = "#0a0b0c"  # becomes the page's text colour
+STYLE = {
+    "svg.fonttype": "none",
+    "font.family": "sans-serif",
+    "font.size": 11,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "legend.frameon": False,
+    **dict.fromkeys(("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), INK),
+}
+SHOWN_PLACES = 8
+HORIZONS_SHOWN = (0.02, 0.05, 0.1, 0.25, 0.5, 1.0)  # s
+BINS = 15
+FIRST_ROWS = 20  # of a track: filters still settle
 
 
-def pictures(report: Report) -> list[tuple[str, str]]:
-    """(title, PNG in base64) of every picture that the report's arrays allow."""
+def figures(report: Report) -> list[tuple[str, str, str]]:
+    """(title, what it shows, SVG) of every figure that the report's arrays allow; a gap only where there is one."""
     if not report.plots:
         return []
-    drawn = (
-        ("Shares of the gap", _shares),
-        ("Where the gap lies", _where),
-        ("A flight before and after", _overlay),
-        ("The rest against the effect's own coordinate", _coordinate),
-    )
-    found = [(title, draw(report)) for title, draw in drawn]
-    return [(title, _encoded(figure)) for title, figure in found if figure is not None]
+    with rc_context(STYLE):
+        drawn = [draw(report) for draw in (_places, _course, _horizons, _coordinate)]
+        return [(title, text, _svg(figure, title)) for title, text, figure in filter(None, drawn)]
 
 
-def _encoded(figure) -> str:
-    data = io.BytesIO()
-    figure.savefig(data, format="png", dpi=85, bbox_inches="tight")
-    plt.close(figure)
-    return base64.b64encode(data.getvalue()).decode()
+def _named(report: Report) -> list[str]:
+    return [effect for effect in report.effects if effect != "unknown"]
 
 
-def _where(report: Report):
-    if not report.where:
+def _residuals(report: Report) -> tuple[list, list]:
+    """Residuals of each track of the nominal simulator, and with the named effects."""
+    replay = report.plots["evidence"].replay
+    fits = report.plots["evidence"].nothing, report.plots["selection"].fit
+    return tuple(residuals_of(replay, fit) for fit in fits)
+
+
+def _places(report: Report):
+    """The parts of the flights that hold most of the gap: error before and after, in noise and in units."""
+    places = [place for place in report.where if place.share > 0.01][:SHOWN_PLACES][::-1]
+    if not report.effects or not places:
         return None
-    figure, axes = plt.subplots(1, 2, figsize=(11, 3.4), sharey=True)
-    for axis, kind in zip(axes, ("before", "after"), strict=True):
-        table = np.full((len(CHANNELS), len(REGIMES)), np.nan)
-        for place in report.where:
-            table[CHANNELS.index(place.channel), REGIMES.index(place.regime)] = getattr(place, kind)
-        shown = axis.imshow(np.log2(np.maximum(table, 1.0)), vmin=0, vmax=4, cmap="YlOrRd", aspect="auto")
-        for row in range(len(CHANNELS)):
-            for column in range(len(REGIMES)):
-                if np.isfinite(table[row, column]):
-                    axis.text(column, row, f"{table[row, column]:.1f}", ha="center", va="center", fontsize=7)
-        axis.set_xticks(
-            range(len(REGIMES)), [r.replace("_", " ") for r in REGIMES], rotation=45, ha="right", fontsize=8
-        )
-        axis.set_yticks(range(len(CHANNELS)), [c.replace("_", " ") for c in CHANNELS], fontsize=8)
-        axis.set_title(f"{kind}, in units of the noise floor", fontsize=10)
-    figure.colorbar(shown, ax=axes, label="log2")
-    return figure
-
-
-def _shares(report: Report):
-    """The split of the gap, and what it was and is."""
-    parts = {
-        **report.shares.effects,
-        "sensors and clocks": report.shares.sensors,
-        "unexplained": report.shares.unexplained,
-    }
-    names = list(parts)[::-1]
-    values = np.array([parts[n].value for n in names])
-    low, high = np.array([parts[n].interval90 for n in names]).T
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 0.6 + 0.45 * max(len(names), 4)))
-    left.barh(names, values, xerr=[values - low, high - values], color="#2b6cb0", ecolor="#888")
-    left.set_xlabel("share of the gap's square, 90 % interval")
-    left.tick_params(labelsize=8)
-    gap = report.gap
-    right.bar(
-        ["before", "after", "floor"], [gap.before, gap.after, gap.floor], color=["#c53030", "#2b6cb0", "#999"]
+    noise = _noise_levels(report)
+    figure, axes = _figure(0.6 + 0.42 * len(places))
+    rows = np.arange(len(places))
+    before = np.array([place.before for place in places])
+    after = np.array([place.after for place in places])
+    axes.hlines(rows, after, before, color="#8a8f98", linewidth=2)
+    axes.plot(before, rows, "o", color=BEFORE, markersize=7, label="nominal simulator")
+    if report.parameters:
+        axes.plot(after, rows, "o", color=AFTER, markersize=7, label="with the named effects")
+    axes.axvline(1.0, color="#8a8f98", linestyle=":", linewidth=1.2)
+    axes.set_yticks(rows, [_place_name(place) for place in places])
+    axes.set(xlabel="error, in units of the noise", xlim=(0, None), ylim=(-0.6, len(places) - 0.4))
+    for row, place in zip(rows, places, strict=True):
+        if (level := noise.get(place.channel)) is not None:
+            axes.annotate(
+                f"{level[0] * place.before:.2g} {level[1]}",
+                (1.01, row),
+                xycoords=("axes fraction", "data"),
+                va="center",
+                fontsize=10,
+            )
+    _legend(axes)
+    return (
+        "Where the gap lies",
+        "Channel and part of the flight; at the right the error in its own unit.",
+        figure,
     )
-    right.set_ylabel("gap, units of the floor")
-    right.tick_params(labelsize=8)
-    return figure
 
 
-def _overlay(report: Report):
+def _place_name(place: Place) -> str:
+    return f"{place.channel.replace('_', ' ')}, {place.regime.replace('_', ' ')}"
+
+
+def _noise_levels(report: Report) -> dict[str, tuple[float, str]]:
+    """{channel: (rms of what is left, unit)} of forces and torques, as accelerations."""
     evidence = report.plots["evidence"]
-    track = evidence.tracks[-1]
-    before = residuals_of(evidence.replay, evidence.nothing)[-1]
-    after = residuals_of(evidence.replay, report.plots["selection"].fit)[-1]
+    linear = slice(3, 6) if evidence.replay.usable[3] else slice(6, 9)
+    left = []
+    for track, residual in zip(evidence.tracks, _residuals(report)[1], strict=True):
+        rest = disturbances(track, residual)
+        left.append(smooth(np.concatenate([rest[:, linear], rest[:, :3]], 1), CALM, track.dt)[FIRST_ROWS:])
+    levels = np.sqrt(np.mean(np.concatenate(left) ** 2, axis=0))
+    units = ("m/s²",) * 3 + ("rad/s²",) * 3
+    return dict(zip(CHANNELS, zip(levels, units, strict=True), strict=False))
+
+
+def _worst(report: Report) -> tuple:
+    """(track, its residuals before and after, axis): where the nominal simulator errs most, against what is left."""
+    evidence = report.plots["evidence"]
+    axes = (*range(3), *range(3, 6)) if evidence.replay.usable[3] else range(3)
+    before, after = _residuals(report)
+
+    def ratio(number, axis):
+        step = max(round(HORIZONS["velocity"] / evidence.tracks[number].dt), 1)
+        errors = [np.std(r[number][step:, axis] - r[number][:-step, axis]) for r in (before, after)]
+        return errors[0] / errors[1]
+
+    number, axis = max(((n, a) for n in range(len(before)) for a in axes), key=lambda place: ratio(*place))
+    return evidence.tracks[number], before[number], after[number], axis
+
+
+def _axis_name(axis: int) -> tuple[str, str]:
+    """What an axis of the residuals is, and its unit."""
+    if axis >= 3:
+        return f"velocity {'xyz'[axis - 3]}", "m/s"
+    return f"{('roll', 'pitch', 'yaw')[axis]} rate", "rad/s"
+
+
+def _course(report: Report):
+    """Errors of short predictions along the flight where they are largest."""
+    track, before, after, axis = _worst(report)
     step = max(round(HORIZONS["velocity"] / track.dt), 1)
-    axis = 3 + int(np.argmax([np.std(before[step:, 3 + a] - before[:-step, 3 + a]) for a in range(3)]))
-    if not evidence.replay.usable[3]:
-        axis = 2
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 2.8), width_ratios=(2, 1))
-    time = track.time[step:]
-    for residual, colour, label in (
-        (before, "#c53030", "nominal"),
-        (after, "#2b6cb0", "with the named effects"),
-    ):
-        left.plot(time, residual[step:, axis] - residual[:-step, axis], color=colour, lw=0.9, label=label)
+    name, unit = _axis_name(axis)
+    figure, axes = _figure(2.6)
+    time = track.time[step:] - track.time[0]
     band = 1.645 * np.std(after[step:, axis] - after[:-step, axis])
-    left.axhspan(-band, band, color="#999", alpha=0.3, lw=0, label="90 % of what is left")
-    left.set_xlabel("s")
-    unit = "m/s" if axis >= 3 else "rad/s"
-    left.set_ylabel(
-        f"{'velocity' if axis >= 3 else 'rate'} {'xyz'[axis % 3]}, error after "
-        f"{HORIZONS['velocity']} s, {unit}"
+    axes.axhspan(
+        -band,
+        band,
+        color="#8a8f98",
+        alpha=0.25,
+        linewidth=0,
+        label="90 % of what is left" if report.parameters else "90 % of all errors",
     )
-    left.legend(fontsize=8)
-    rows = [max(round(h / track.dt), 1) for h in (0.02, 0.05, 0.1, 0.25, 0.5, 1.0)]
-    for residual, colour in ((before, "#c53030"), (after, "#2b6cb0")):
-        right.loglog(
-            [r * track.dt for r in rows],
-            [np.std(residual[r:, axis] - residual[:-r, axis]) for r in rows],
-            "o-",
-            color=colour,
-            ms=3,
+    for residual, colour, label in _lines(report, before, after):
+        axes.plot(
+            time, residual[step:, axis] - residual[:-step, axis], color=colour, linewidth=1.1, label=label
         )
-    right.set_xlabel("horizon, s")
-    right.set_ylabel(f"rms error, {unit}")
-    return figure
+    axes.set(xlabel="time in the flight [s]", ylabel=f"error of {name} [{unit}]", xlim=(time[0], time[-1]))
+    _legend(axes)
+    return "One flight", f"{track.name}: error of predictions {HORIZONS['velocity']} s ahead.", figure
+
+
+def _lines(report: Report, before, after) -> Sequence[tuple]:
+    """(residual, colour, label): the nominal simulator, and the corrected one where effects were named."""
+    if not report.parameters:
+        return ((before, AFTER if report.verdict == "none" else BEFORE, "nominal simulator"),)
+    return (before, BEFORE, "nominal simulator"), (after, AFTER, "with the named effects")
+
+
+def _horizons(report: Report):
+    """How errors grow with the time that is predicted."""
+    track, before, after, axis = _worst(report)
+    name, unit = _axis_name(axis)
+    rows = sorted({max(round(horizon / track.dt), 1) for horizon in HORIZONS_SHOWN})
+    figure, axes = _figure(2.6)
+    most = 0.0
+    for residual, colour, label in _lines(report, before, after):
+        errors = [np.std(residual[r:, axis] - residual[:-r, axis]) for r in rows]
+        most = max(most, *errors)
+        axes.semilogx([r * track.dt for r in rows], errors, "o-", color=colour, markersize=5, label=label)
+    axes.set(xlabel="time ahead [s]", ylabel=f"rms error of {name} [{unit}]", ylim=(0, 1.1 * most))
+    axes.set_xticks(HORIZONS_SHOWN, [f"{horizon:g}" for horizon in HORIZONS_SHOWN])
+    axes.minorticks_off()
+    _legend(axes)
+    return "How far ahead", f"{track.name}: the error grows with the time that is predicted.", figure
 
 
 def _coordinate(report: Report):
-    """Force along the effect's channel against the variable that drives it, binned, before and after."""
-    evidence = report.plots["evidence"]
-    effect = next((e for e in report.effects if e != "unknown"), None)
-    if effect is None or not evidence.replay.usable[3] or evidence.tracks[0].quaternion is None:
+    """What the nominal simulator misses, against the variable that the first named effect follows."""
+    evidence, named = report.plots["evidence"], _named(report)
+    if not named or not evidence.replay.usable[3] or evidence.tracks[0].quaternion is None:
         return None
-    coordinate = CARDS[effect].coordinate
-    points = {0: [], 1: []}
-    for kind, residuals in enumerate(
-        residuals_of(evidence.replay, f) for f in (evidence.nothing, report.plots["selection"].fit)
-    ):
-        for number, residual in enumerate(residuals):
-            track = evidence.tracks[number]
-            rest = smooth(disturbances(track, residual), 0.12, track.dt)[:, 3:6]
-            if coordinate == "body velocity":
-                x = np.einsum("tji,tj->ti", rotation(track.quaternion), track.velocity)[:, 0]
-                y = rest[:, 0]
-            else:
-                y = rest[:, 2]
-                x = {
-                    "height": track.position[:, 2],
-                    "thrust": smooth(track.motor.mean(1), 0.05, track.dt),
-                    "voltage": track.voltage if track.voltage is not None else track.time,
-                }.get(coordinate)
-                if coordinate == "height below a neighbour":
-                    if not len(track.neighbours):
-                        continue
-                    x = track.neighbours[0][:, 2] - track.position[:, 2]
-            points[kind].append(np.stack([x, y], 1)[20:])
-    if not points[0]:
-        return None
-    figure, axis = plt.subplots(figsize=(6, 3))
-    for kind, colour, label in ((0, "#c53030", "nominal"), (1, "#2b6cb0", "with the named effects")):
-        data = np.concatenate(points[kind])
-        edges = np.quantile(data[:, 0], np.linspace(0, 1, 16))
-        bins = np.clip(np.searchsorted(edges, data[:, 0]) - 1, 0, 14)
-        middle = [data[bins == b].mean(0) if (bins == b).any() else (np.nan, np.nan) for b in range(15)]
-        axis.plot(*np.array(middle).T, "o-", color=colour, ms=3, label=label)
-    units = {"body velocity": " x, m/s", "voltage": ", V", "thrust": ", mean motor command"}
-    axis.set_xlabel(coordinate + units.get(coordinate, ", m"))
-    axis.set_ylabel("unexplained acceleration, m/s²")
-    axis.legend(fontsize=8)
-    return figure
+    coordinate = CARDS[named[0]].coordinate
+    figure, axes = _figure(2.6)
+    for residuals, (_, colour, label) in zip(_residuals(report), _lines(report, None, None), strict=False):
+        pairs = [
+            _pairs(track, residual, coordinate)
+            for track, residual in zip(evidence.tracks, residuals, strict=True)
+        ]
+        pairs = [pair for pair in pairs if pair is not None]
+        if not pairs:
+            return None
+        axes.plot(*_binned(np.concatenate(pairs)).T, "o-", color=colour, markersize=5, label=label)
+    units = {"body velocity": "forward speed [m/s]", "voltage": "voltage [V]", "thrust": "mean motor command"}
+    axes.axhline(0.0, color="#8a8f98", linestyle=":", linewidth=1.2)
+    axes.set(xlabel=units.get(coordinate, f"{coordinate} [m]"), ylabel="missing acceleration [m/s²]")
+    _legend(axes)
+    return "The strongest effect", f"{named[0]}: what the simulator misses, against what drives it.", figure
+
+
+def _pairs(track, residual, coordinate):
+    """(T', 2) of the coordinate and the missing acceleration along its axis; None where the track hasn't it."""
+    missing = smooth(disturbances(track, residual), CALM, track.dt)[:, 3:6]
+    if coordinate == "body velocity":
+        x, y = np.einsum("tji,tj->ti", rotation(track.quaternion), track.velocity)[:, 0], missing[:, 0]
+    else:
+        y = missing[:, 2]
+        x = {
+            "height": lambda: track.position[:, 2],
+            "thrust": lambda: smooth(track.motor.mean(1), 0.05, track.dt),
+            "voltage": lambda: track.voltage,
+            "height below a neighbour": lambda: (
+                track.neighbours[0][:, 2] - track.position[:, 2] if len(track.neighbours) else None
+            ),
+        }.get(coordinate, lambda: None)()
+    return None if x is None else np.stack([x, y], 1)[FIRST_ROWS:]
+
+
+def _binned(data: np.ndarray) -> np.ndarray:
+    """(B, 2) means over bins of as many samples each."""
+    edges = np.quantile(data[:, 0], np.linspace(0, 1, BINS + 1))
+    bins = np.clip(np.searchsorted(edges, data[:, 0]) - 1, 0, BINS - 1)
+    return np.array([data[bins == b].mean(0) for b in range(BINS) if (bins == b).any()])
+
+
+def _figure(height: float) -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(5.8, height + 0.4), layout="constrained")
+    figure.patch.set_alpha(0.0)
+    axes = figure.subplots()
+    axes.patch.set_alpha(0.0)
+    return figure, axes
+
+
+def _legend(axes: Axes) -> None:
+    """Above the axes, where it covers nothing."""
+    axes.legend(
+        loc="lower left",
+        bbox_to_anchor=(0.0, 1.0),
+        ncols=2,
+        fontsize=10,
+        borderaxespad=0.2,
+        columnspacing=1.2,
+    )
+
+
+def _svg(figure: Figure, salt: str) -> str:
+    """The figure as an element for a page: text stays text, ink takes the page's colour, sizes are the page's."""
+    FigureCanvasSVG(figure)
+    data = io.StringIO()
+    with rc_context({"svg.hashsalt": salt}):
+        figure.savefig(data, format="svg", metadata={"Date": None, "Creator": None})
+    text = data.getvalue()
+    text = text[text.index("<svg") :].replace(INK, "currentColor")
+    return re.sub(r'<svg ([^>]*?)height="[^"]*"([^>]*?)width="[^"]*"', r"<svg \1\2", text, count=1)

@@ -2,31 +2,132 @@
 
 from __future__ import annotations
 
+import datetime
 from pathlib import Path
 
 import jinja2
 
 from openjax.gap.report import Report
-from openjax.gap.report.figures import pictures
+from openjax.gap.report.figures import figures
 
 TEMPLATE = Path(__file__).with_name("page.html.jinja")
-SHOWN = 5e-4  # probabilities below are left out
+LEAST_CHANCE = 5e-4
+"""Probabilities below are left out."""
 
 
 def page_of(report: Report) -> str:
-    """The whole page as text: shares first, then words, causes, parameters, pictures, data."""
+    """The whole page as text: the answer and what to type next, figures, values, and folded what is rarely asked."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(TEMPLATE.parent), autoescape=True, undefined=jinja2.StrictUndefined
     )
-    shares = {
-        **report.shares.effects,
-        "sensors and clocks": report.shares.sensors,
-        "unexplained": report.shares.unexplained,
-    }
     ranked = sorted(report.probabilities.items(), key=lambda item: -item[1])
     return environment.get_template(TEMPLATE.name).render(
         report=report,
-        shares=shares if report.effects or report.sensors else {},
-        ranked=[(name, p) for name, p in ranked[:8] if p > SHOWN],
-        pictures=pictures(report),
+        facts=facts(report),
+        sentence=sentence(report),
+        shares=shares(report),
+        steps=next_steps(report),
+        figures=figures(report),
+        ranked=[(name, p) for name, p in ranked[:8] if p > LEAST_CHANCE],
     )
+
+
+def facts(report: Report) -> list[tuple[str, str]]:
+    """Date, vehicle and flights."""
+    found = [("Diagnosed", datetime.datetime.now().strftime("%d %B %Y, %H:%M"))]
+    evidence = report.plots.get("evidence")
+    if evidence is None:
+        return found
+    case = evidence.case
+    mass = f"{1000 * float(case.vehicle_file.vehicle.mass):.1f} g"
+    weighed = ", weighed" if case.vehicle_file.mass_weighed else ""
+    seconds = sum(float(flight.time[-1] - flight.time[0]) for flight in case.flights)
+    return [
+        *found,
+        ("Vehicle", f"{case.vehicle_file.name}, {mass}{weighed}"),
+        ("Flights", f"{len(case.flights)}, {seconds:.0f} s in all"),
+    ]
+
+
+def sentence(report: Report) -> str:
+    """What was found, in one plain sentence."""
+    named = [effect for effect in report.effects if effect != "unknown"]
+    if report.verdict == "none":
+        return "The simulator agrees with these flights to within the sensors' noise."
+    if report.verdict == "not_testable":
+        return "No effect is seen, but these flights couldn't show most of those that are usual."
+    if not named:
+        return "The simulator misses something that no known effect explains."
+    parts = " and ".join(
+        f"{e.replace('_', ' ')} ({100 * report.shares.effects[e].value:.0f} %)" for e in named
+    )
+    text = f"What the simulator misses is mostly {parts}"
+    if report.parameters:
+        those = "it" if len(named) == 1 else "them"
+        text += f"; with {those}, errors on held-out flights shrink by {100 * report.gap.reduction:.0f} %"
+    unknown = " Something unknown acts as well." if "unknown" in report.effects else ""
+    return f"{text}.{unknown}"
+
+
+def shares(report: Report) -> list[dict]:
+    """Rows of the chart: name, value and interval in per cent, and what kind of thing it is."""
+    if not report.effects and not report.sensors:
+        return []
+    rows = [(effect, share, "effect") for effect, share in report.shares.effects.items()]
+    rows += [("sensors and clocks", report.shares.sensors, "nuisance")]
+    rows += [("unexplained", report.shares.unexplained, "unexplained")]
+
+    def percent(value):
+        return min(max(100.0 * value, 0.0), 100.0)
+
+    return [
+        {
+            "name": name.replace("_", " "),
+            "kind": kind,
+            "value": percent(share.value),
+            "low": percent(share.interval90[0]),
+            "high": percent(share.interval90[1]),
+        }
+        for name, share, kind in rows
+    ]
+
+
+def next_steps(report: Report) -> list[tuple[str, str]]:
+    """(why, command or empty) of what to do next; commands are typed in the folder of this page."""
+    steps = []
+    if report.parameters:
+        names = ", ".join(effect.replace("_", " ") for effect in report.parameters)
+        steps.append(
+            (
+                f"Fine-tune shipped weights to a vehicle with {names}:",
+                "openjax adapt effects.toml --policy flight",
+            )
+        )
+        steps.append(
+            (
+                "Or train from scratch in the corrected simulator:",
+                "openjax train --preset flight --effects effects.toml",
+            )
+        )
+    for name, others in report.equivalent.items():
+        steps.append((f"These flights can't tell {name} from {', '.join(others)}. {_fly(report)}", ""))
+    if report.left_out:
+        steps.append(
+            ("Mend the logs that were left out, and diagnose again: each says above what is wrong.", "")
+        )
+    if report.verdict == "none":
+        steps.append(("Nothing needs correcting. Keep these flights as the reference for later ones:",
+                      f"openjax diagnose NEW_FLIGHTS --reference {report.case}"))  # fmt: skip
+    if "unknown" in report.effects:
+        follows = f" {report.rest}" if report.rest else ""
+        steps.append((f"Look for what is not on the list of effects.{follows} Did anything change since it flew well?",
+                      f"openjax diagnose {report.case} --reference EARLIER_FLIGHTS"))  # fmt: skip
+    if report.not_testable and not report.equivalent and report.next_flight:
+        missing = ", ".join(effect.replace("_", " ") for effect in report.not_testable)
+        steps.append((f"To see whether there is {missing}, {_fly(report)[:1].lower()}{_fly(report)[1:]}", ""))
+    return steps
+
+
+def _fly(report: Report) -> str:
+    text = report.next_flight.strip().rstrip(".")
+    return f"Fly {text[:1].lower()}{text[1:]}, and diagnose again." if text else ""

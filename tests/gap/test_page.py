@@ -1,0 +1,73 @@
+"""What the page of a diagnosis says first: one sentence, and what to do next, which depends on the case."""
+
+import inspect
+
+import pytest
+
+from openjax.gap.report import Estimate, Report
+from openjax.gap.report.page import next_steps, page_of, sentence, shares
+from openjax.gap.shares import Gap, Share, Split
+
+
+def report(verdict, effects=(), parameters=(), **more):
+    """A report with shares of .7 for the first effect and .2 for the others."""
+    named = [effect for effect in effects if effect != "unknown"]
+    found = {e: Share(0.2 if i else 0.7, (0.1, 0.8)) for i, e in enumerate(named)}
+    gap = Gap("rms", 4.0, 1.2, 1.0, 0.7, (0.6, 0.8), True)
+
+    fields = {name: {} for name in inspect.signature(Split).parameters}
+    fields |= {
+        "gap": gap,
+        "effects": found,
+        "sensors": Share(0.1, (0.0, 0.2)),
+        "unexplained": Share(0.0, (0.0, 0.1)),
+    }
+    values = {e: {"size": Estimate(1.0, "N", (0.5, 1.5), (0.0, 2.0))} for e in parameters}
+    filled = {"equivalent": {}, "not_testable": [], "next_flight": "slow passes.", "quality": []} | more
+    return Report(
+        case="tuesday", verdict=verdict, effects=tuple(effects), probabilities={"none": 0.5, "unknown": 0.3},
+        shares=Split(**fields), parameters=values, where=[], gap=gap, **filled
+    )  # fmt: skip
+
+
+CASES = {
+    "effect": report("effect", ["rotor_x"], ["rotor_x"]),
+    "two": report("effect", ["rotor_x", "y"], ["rotor_x", "y"], equivalent={"y": ["z"]}),
+    "none": report("none", not_testable=["z"]),
+    "unknown": report("unknown", ["unknown"], rest="It follows the height."),
+    "not testable": report("not_testable", not_testable=["y", "z"]),
+}
+
+
+def test_next_steps_depend_on_the_case():
+    commands = {name: [command for _, command in next_steps(case) if command] for name, case in CASES.items()}
+    assert any("train" in command for command in commands["effect"])
+    assert not any(
+        "train" in command for name in ("none", "unknown", "not testable") for command in commands[name]
+    )
+    assert any("--reference tuesday" in command for command in commands["none"])
+    told = {name: " ".join(why for why, _ in next_steps(case)) for name, case in CASES.items()}
+    assert "can't tell y from z" in told["two"] and "slow passes" in told["two"]
+    assert "It follows the height" in told["unknown"]
+    assert "y, z, fly slow passes" in told["not testable"]
+    assert len(set(told.values())) == len(CASES)
+
+
+def test_a_normal_flight_is_not_charted_as_a_gap():
+    assert shares(CASES["none"]) == []
+    assert sentence(CASES["none"]).startswith("The simulator agrees")
+    assert "rotor x (70 %)" in sentence(CASES["effect"]) and "shrink by 70 %" in sentence(CASES["effect"])
+
+
+@pytest.mark.parametrize("name", list(CASES))
+def test_page_is_whole_and_says_each_share_once(name):
+    page = page_of(CASES[name])
+    assert page.count("<h1>") == 1 and page.rstrip().endswith("</html>")
+    assert "http" not in page
+    assert page.count('<div class="share">') == len(shares(CASES[name]))
+
+
+def test_what_was_left_out_stands_above_the_answer():
+    left_out = [{"flight": "torn.csv", "issue": "no column t", "left_out": True}]
+    page = page_of(report("effect", ["x"], ["x"], quality=left_out))
+    assert page.index("Left out: torn.csv: no column t") < page.index("Shares of the gap")
