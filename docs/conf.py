@@ -3,7 +3,7 @@
 import openjax
 
 project = "openjax"
-author = "the openjax contributors"
+author = copyright = "the openjax contributors"
 release = version = openjax.__version__
 
 extensions = [
@@ -11,6 +11,7 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
+    "sphinx-mathjax-offline",  # the site needs nothing from elsewhere
 ]
 myst_enable_extensions = ["dollarmath", "colon_fence", "deflist"]
 myst_heading_anchors = 3

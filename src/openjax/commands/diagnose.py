@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,9 +17,12 @@ import tyro
 from openjax.commands.command_line import one_line, output_console, parse
 from openjax.errors import UserError
 from openjax.files import check_output_folder, replacing, write_json
+from openjax.show.steps import Steps
 from openjax.vehicle.effect_names import effect_names
 
 PROGRAM = "openjax diagnose"
+SECONDS = 8.0
+"""Of a case on a laptop, about."""
 _WITHOUT_HELP = f"Effects that the library must do without, of {', '.join(effect_names())}."
 
 
@@ -84,12 +88,12 @@ def run(options: Options) -> int:
     predictions, failed = {}, 0
     for folder, name in zip(options.cases, names, strict=True):
         try:
-            with console.status(f"{name}: reading") as status:
+            with _steps(names, name, console) as tell:
                 case = load_case(folder)
                 for issue in case.left_out():
                     print(f"warning: {name}/{issue.flight} is left out: {issue.issue}", file=sys.stderr)
-                report = diagnose_case(case, options.without, partial(_tell, status, name))
-                _tell(status, name, "writing the report")
+                report = diagnose_case(case, options.without, tell)
+                tell("writing the report")
                 _write(report, options.out / name, options.html)
         except UserError as error:
             failed += 1
@@ -125,7 +129,7 @@ def _compare(options: Options, names: list[str], console) -> int:
     predictions, failed = {}, 0
     for folder, name in zip(options.cases, names, strict=True):
         try:
-            with console.status(f"{name}: comparing"):
+            with _steps(names, name, console):
                 change = comparison.compare(folder, options.reference)
                 with replacing(options.out / name) as partial:
                     partial.mkdir()
@@ -152,9 +156,13 @@ def _compare(options: Options, names: list[str], console) -> int:
     return 2 if failed == len(names) else 0
 
 
-def _tell(status, name: str, text: str) -> None:
-    """Show what is being done to a case."""
-    status.update(f"{name}: {text}")
+@contextlib.contextmanager
+def _steps(names: list[str], name: str, console) -> Iterator[Callable[[str], None]]:
+    """Shows which case is worked on and about how long it and those after it still take; yields what hears the work."""
+    left = names[names.index(name) :]
+    with Steps("diagnosing", {case: SECONDS for case in left}, console) as steps:
+        steps.begin(name)
+        yield partial(steps.begin, name)
 
 
 def _write(report, folder: Path, pictures: bool) -> None:
