@@ -19,6 +19,7 @@ exclude_patterns = ["_build"]
 
 # notebooks run when the site is built, and again only when they change
 nb_execution_mode = "cache"
+nb_execution_in_temp = True
 nb_execution_timeout = 600
 nb_execution_raise_on_error = True
 nb_merge_streams = True
