@@ -24,6 +24,7 @@ nb_execution_timeout = 600
 nb_execution_raise_on_error = True
 nb_merge_streams = True
 
+default_role = "code"
 autodoc_typehints = "none"  # docstrings say shapes and units, which types don't
 autodoc_member_order = "bysource"
 autodoc_default_options = {"exclude-members": "replace, tree_flatten, tree_unflatten"}

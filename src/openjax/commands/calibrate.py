@@ -17,8 +17,11 @@ from rich.table import Table
 from openjax.commands.command_line import output_console, parse
 from openjax.errors import UserError
 from openjax.files import check_output
+from openjax.show.steps import Steps
 
 PROGRAM = "openjax calibrate"
+SECONDS = 8.0
+"""That it takes on a laptop, about."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,9 @@ def run(arguments: Arguments, console: Console):
             f"[yellow]{'left out' if issue.refused else 'noted'}[/] {issue.flight}: {issue.issue}",
             highlight=False,
         )
-    result = calibrate(case)
+    with Steps("calibrating", {arguments.case.name: SECONDS}, console) as steps:
+        steps.begin(arguments.case.name)
+        result = calibrate(case)
     _print(result, console)
     if not result.calibrated():
         raise UserError(
