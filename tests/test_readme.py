@@ -1,5 +1,6 @@
 """The README's commands: each exists, and the way from sample flights to a corrected simulator works as written."""
 
+import importlib.util
 import json
 import re
 from pathlib import Path
@@ -27,6 +28,12 @@ def test_every_command_and_target_of_the_readme_exists():
     assert commands == set(COMMANDS), commands ^ set(COMMANDS)
     for path in re.findall(r"\]\(((?:experiments|docs|examples)[^)#]*)\)", README):
         assert (ROOT / path).exists(), path
+
+
+def test_modules_that_the_pages_run_are_there():
+    for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")):
+        for name in re.findall(r"python -m ([a-z_.]+)", page.read_text(encoding="utf-8")):
+            assert importlib.util.find_spec(name.rstrip(".")), f"{page.name}: {name}"
 
 
 def test_readme_and_pages_stay_short():
