@@ -32,5 +32,6 @@ autodoc_default_options = {"exclude-members": "replace, tree_flatten, tree_unfla
 html_theme = "furo"
 html_title = f"openjax {release}"
 html_static_path = []
+html_extra_path = ["extra"]  # a replay of six layouts: `openjax view --scenario all --seed 3 --html FILE`
 # links to files beside the site (results, examples) are offered as they are
 suppress_warnings = ["myst.xref_missing"]

@@ -19,10 +19,10 @@ _NAMES = {
     "accelerometer_noise": "accelerometer noise above 20 Hz", "motor_noise": "motor command noise above 20 Hz",
 }  # fmt: skip
 _LOGARITHMS = {"torque_gain", "gyroscope_noise", "accelerometer_noise", "motor_noise"}
-STYLE = """body{font:15px/1.5 system-ui,sans-serif;max-width:62rem;margin:2rem auto;padding:0 1rem;color:#222}
+STYLE = """:root{color-scheme:light dark}body{font:16px/1.5 system-ui,sans-serif;max-width:62rem;margin:2rem auto;padding:0 1rem}
 h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2rem}table{border-collapse:collapse;margin:.6rem 0}
-td,th{border-bottom:1px solid #ddd;padding:.2rem .7rem;text-align:left}img{max-width:100%}
-.verdict{background:#f3f6fa;padding:.8rem 1.2rem;border-left:4px solid #2b6cb0}"""
+td,th{border-bottom:1px solid #8885;padding:.2rem .7rem;text-align:left}img{max-width:100%;border-radius:8px}
+.verdict{background:#8882;padding:.8rem 1.2rem;border-left:4px solid #2e86ab}"""
 
 
 def prediction(change: Change) -> dict:
@@ -167,7 +167,8 @@ def html_of(change: Change) -> str:
     )
     title = html.escape(f"What changed: {change.name}")
     return (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>{STYLE}</style></head>'
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
+        f'<meta name="viewport" content="width=device-width"><style>{STYLE}</style></head>'
         f'<body><h1>{title}</h1><div class="verdict">{lines}</div><h2>Flights</h2>'
         f'<img alt="trims of every flight" src="data:image/png;base64,{image}"><h2>Besides the trims</h2>'
         f"<table>{table}</table>"
