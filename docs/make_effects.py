@@ -212,7 +212,7 @@ def page() -> str:
         module = __import__(f"openjax.vehicle.effects.{name}", fromlist=["EFFECT"])
         sentence = " ".join(module.__doc__.split("\n\n")[0].split())
         lines += ["", f"## {name}", "", sentence, "", f"$${effect.formula}$$", ""]
-        lines += [f"![{effect.description}](pictures/effects/{name}.png)", ""]
+        lines += [f"![{name}](pictures/effects/{name}.png)", ""]
         lines += ["| parameter | unit | usual |", "|---|---|---|"]
         for parameter, what in effect.parameters.items():
             meaning = f" ({what.meaning})" if what.meaning else ""
