@@ -43,7 +43,7 @@ command = "thrust"
 @pytest.fixture(scope="session")
 def sample_columns():
     """Columns of three sample flights of the nominal vehicle: {"flight_a": {"t": ..., ...}, ...}."""
-    from openjax.gap.samples import fly, references
+    from openjax.flights.samples import fly, references
     from openjax.vehicle import load_vehicle
 
     vehicle = load_vehicle()
@@ -57,7 +57,7 @@ def sample_columns():
 def case_folder(tmp_path, sample_columns):
     """A case folder with the three sample flights."""
     from openjax.flights.reading import write_csv
-    from openjax.gap.samples import log_of
+    from openjax.flights.samples import log_of
 
     folder = tmp_path / "case"
     folder.mkdir()

@@ -25,7 +25,7 @@ from scipy.stats import spearmanr
 from openjax import comparison
 from openjax.comparison.report import draw, in_words, prediction
 from openjax.flights.reading import write_csv
-from openjax.gap.samples import fly, log_of, references
+from openjax.flights.samples import fly, log_of, references
 from openjax.vehicle import load_vehicle
 
 RESULTS = Path(__file__).parent / "results"

@@ -12,7 +12,7 @@ from openjax.comparison.figures import FlightFigures, mixer_of
 from openjax.comparison.report import in_words, prediction, to_dict
 from openjax.flights.case import load_case
 from openjax.flights.reading import LogTable, write_csv
-from openjax.gap.samples import fly, log_of, references
+from openjax.flights.samples import fly, log_of, references
 from openjax.vehicle import load_vehicle
 
 VEHICLE = load_vehicle()

@@ -4,16 +4,13 @@ import numpy as np
 import pytest
 
 from openjax.flights.track import Track
-from openjax.gap.feedback import (
-    AT_ONCE,
+from openjax.gap.channels.instruments import (
     COUNT,
-    Gains,
-    answers_noise,
     caused_by_commands,
     outputs_of,
     read_feedback,
-    read_gains,
 )
+from openjax.gap.channels.rate_loop import RateLoop, read_gains
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.rate_controller import mixer
 
@@ -75,14 +72,9 @@ def flown(seed, p=1.0, gust=0.0, noise=0.005, sampled=False):
 def test_gains_are_what_the_loop_has_whatever_gusts_and_noise_do(p, sampled):
     flights = [flown(seed, p, gust=5.0, sampled=sampled) for seed in range(3)]
     commanded = [caused_by_commands(*f) for f in flights]
-    gains = read_gains(*zip(*flights, strict=True), commanded, at_once=sampled, late=0.0005)
-    assert gains.change[0] == pytest.approx(p - 1.0, abs=0.12)
-    assert gains.clear == (p != 1.0)
-
-
-def test_single_samples_answer_the_gyroscopes_noise():
-    answer = [answers_noise(*([x] for x in flown(0, noise=0.02, sampled=s)[:2])) for s in (False, True)]
-    assert answer[0] < answer[1] and answer[1] > 4.0 * AT_ONCE
+    change, error = read_gains(*zip(*flights, strict=True), commanded, at_once=sampled, late=0.0005)
+    assert change[0] == pytest.approx(p - 1.0, abs=0.12)
+    assert bool(loop(change, error).acting()) == (p != 1.0)
 
 
 def test_calm_flights_leave_all_of_the_motors_to_feedback():
@@ -96,14 +88,18 @@ def test_calm_flights_leave_all_of_the_motors_to_feedback():
     assert made.std() > 0.01
 
 
-def test_yaw_tells_of_gains_where_rows_do_not_make_them_look_small():
-    def gains(p, error, yaw, yaw_error=0.015, by_commands=(0.0, 0.4)):
-        change = np.array([p, 0.0, p, by_commands[0], 0.0, 0.0])
-        return Gains(change, np.array([error, 0.1, 0.1, by_commands[1], 0.3, 0.4]), (yaw, yaw_error))
+def loop(change, error):
+    return RateLoop(np.array(change), np.array(error), [], [], [], ("rate_gains",))
 
-    raised = gains(-0.25, 0.12, 0.4)
-    assert raised.clear and raised.found[0] == pytest.approx([0.4, 0.0, 0.0])
-    assert not gains(0.1, 0.1, -0.3).clear  # interpolated rows
-    assert gains(0.1, 0.1, -0.3, by_commands=(-0.28, 0.05)).clear
-    assert not gains(0.4, 0.09, 0.02).clear  # roll and pitch at their limits; yaw is as it should be
-    assert gains(0.4, 0.07, 0.02).clear
+
+def test_gains_of_all_axes_are_one_reading_that_covers_what_they_disagree_by():
+    value, error = loop([0.4, 0, 0, 0.4, 0, 0], [0.05] * 6).gain
+    assert value[0] == pytest.approx(0.4) and error[0] == pytest.approx(0.05 / np.sqrt(2.0))
+    apart = loop([0.4, 0, 0, -0.4, 0, 0], [0.05] * 6)
+    assert apart.gain[1][0] > 0.35 and not apart.acting()
+    assert loop([0.4, 0, 0, 0.0, 0, 0], [0.05] * 3 + [np.inf] * 3).acting()
+    assert not loop([0.1, 0, 0, 0.1, 0, 0], [0.01] * 6).acting()  # filters of a firmware do as much
+
+
+def test_without_enough_flight_gains_cannot_be_told():
+    assert loop(np.zeros(6), np.full(6, np.inf)).undetectable() == ["rate_gains"]

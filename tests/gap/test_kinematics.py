@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from openjax.flights.track import Track, rotation
-from openjax.gap.kinematics import corrected, read_kinematics
+from openjax.gap.channels.sensors import corrected, read_kinematics
 
 
 def _track(gain=1.0, tilt=0.0, seed=1, rows=1500):

@@ -3,9 +3,9 @@
 import numpy as np
 
 from openjax.flights.track import Track
-from openjax.gap.library import ABSENT, STEP
-from openjax.gap.observer import TICKS
-from openjax.gap.prediction import LANES, make_physics
+from openjax.gap.model.library import ABSENT, STEP
+from openjax.gap.model.observer import TICKS
+from openjax.gap.model.prediction import LANES, make_physics
 from openjax.vehicle import load_vehicle
 
 

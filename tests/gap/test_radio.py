@@ -1,6 +1,5 @@
 """What a link did to the commands, read from logs whose motors are sampled every 2 ms, as `openjax.fly` writes them."""
 
-import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,9 +7,8 @@ import pytest
 
 from openjax.flights.flight import Flight
 from openjax.flights.track import flight_tracks
-from openjax.gap.firmware import read_radio
-from openjax.gap.selection import LEAST_NATS
-from openjax.gap.verdict import CLOCK, LEAST_LOSS, _material
+from openjax.gap.channels.radio import read_radio
+from openjax.gap.model.library import library
 
 BOTH = ("command_latency", "packet_loss")
 CASE = SimpleNamespace(vehicle_file=SimpleNamespace(motor_command="thrust"), others=lambda flight: ())
@@ -49,8 +47,8 @@ def flown(latency, loss, jitter=0.0005, phase=0.004, seed=0, seconds=16.0):
 @pytest.mark.parametrize(("latency", "loss"), [(0.0, 0.05), (0.0, 0.2), (0.012, 0.05), (0.02, 0.1)])
 def test_a_loss_is_told_alone_and_beside_a_latency(latency, loss, phase):
     tracks, lost = flown(latency, loss, phase=phase)
-    radio = read_radio(tracks)
-    assert radio.shown(BOTH, CLOCK, LEAST_LOSS, LEAST_NATS) == (BOTH if latency else BOTH[1:])
+    radio = read_radio(tracks, library())
+    assert tuple(radio.acting()) == (BOTH if latency else BOTH[1:])
     assert radio.loss == pytest.approx(lost, abs=0.03)
     assert radio.delay == pytest.approx(latency, abs=0.001)
 
@@ -59,8 +57,8 @@ def test_a_loss_is_told_alone_and_beside_a_latency(latency, loss, phase):
     ("latency", "jitter"), [(0.0, 0.0005), (0.006, 0.001), (0.012, 0.003), (0.02, 0.0005)]
 )
 def test_a_latency_that_jitters_is_no_loss(latency, jitter):
-    radio = read_radio(flown(latency, 0.0, jitter)[0])
-    assert "packet_loss" not in radio.shown(BOTH, CLOCK, LEAST_LOSS, LEAST_NATS)
+    radio = read_radio(flown(latency, 0.0, jitter)[0], library())
+    assert "packet_loss" not in radio.acting()
 
 
 def test_rows_begin_where_commands_do():
@@ -68,15 +66,3 @@ def test_rows_begin_where_commands_do():
     changed = np.diff(track.command[:, 0]) != 0.0
     assert changed.mean() > 0.98
     assert np.abs(track.motor.mean(1) - track.command[:, 0]).max() < 1e-4  # no row mixes two commands
-
-
-def test_a_small_loss_stays_beside_a_latency_only_where_rows_hold_one_command():
-    shares = {"command_latency": SimpleNamespace(value=0.8), "packet_loss": SimpleNamespace(value=0.001)}
-    parts = SimpleNamespace(effects=shares, unexplained=SimpleNamespace(value=0.0))
-    radio = read_radio(flown(0.02, 0.1)[0])
-    assert radio.single and radio.delay == pytest.approx(0.02, abs=0.002)
-    named = {}
-    for single in (True, False):
-        evidence = SimpleNamespace(radio=dataclasses.replace(radio, single=single))
-        named[single] = _material(evidence, SimpleNamespace(gains={}), parts)
-    assert named == {True: ["command_latency", "packet_loss"], False: ["command_latency"]}

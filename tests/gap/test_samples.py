@@ -6,7 +6,7 @@ import pytest
 from openjax.commands.sample_flights import main
 from openjax.errors import UserError
 from openjax.flights.case import load_case
-from openjax.gap.samples import fly, references
+from openjax.flights.samples import fly, references
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.effects import EFFECTS
 

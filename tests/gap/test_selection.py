@@ -1,44 +1,41 @@
-"""The search for a set of effects, its fits replaced by a table of scores."""
+"""The criterion against closed forms: differences of log density, shares that add up, probabilities of form errors."""
 
-from types import SimpleNamespace
-
+import numpy as np
 import pytest
 
-from openjax.gap import selection
-
-SCORES = {"": 0.0, "a": 100.0, "b": 50.0, "a b": 60.0, "a c": 110.0, "b c": 120.0}
-
-
-def fit_of(*effects):
-    return SimpleNamespace(effects=tuple(sorted(effects)), score=SCORES[" ".join(sorted(effects))])
+from openjax.gap.model.cross_validation import Judged
+from openjax.gap.selection import difference
 
 
-@pytest.fixture
-def search(monkeypatch):
-    """A search in which `a` makes way for `b` and `c`, `b` for `a` and `c`, and `c` is pruned each time."""
-    asked = []
-
-    def mended(replay, fit, singles, newest):
-        asked.append(fit)
-        assert len(asked) < 20, "the search goes round and round"
-        return fit_of(newest, "c")
-
-    singles = {e: None for e in "ab"}
-    for name, stub in {
-        "_openings": lambda replay, nothing, left: [fit_of("a")],
-        "_ranked": lambda table, singles, now: ["b" if now.effects == ("a",) else "a"],
-        "_joined": lambda replay, fit, singles, effect: fit_of(effect, *fit.effects),
-        "_mended": mended,
-        "_stays": lambda table, whole, added: True,
-        "build": lambda replay, fit, singles: fit,
-        "with_effects": lambda fit: fit,
-        "judge": lambda table, fit: fit,
-        "_pruned": lambda replay, fit, table, now, singles: (fit_of(*set(fit.effects) - {"c"}),) * 3,
-    }.items():
-        monkeypatch.setattr(selection, name, stub)
-    nothing = fit_of()
-    return lambda: selection._widened(None, nothing, nothing, nothing, singles, selection._Trail())[0]
+def judged(left: np.ndarray, blocks: int) -> Judged:
+    """A hypothesis that leaves whitened residuals `left` in equal blocks."""
+    starts = np.arange(0, len(left), len(left) // blocks)
+    nats = -0.5 * np.add.reduceat(left**2, starts)
+    return Judged(nats, np.ones((blocks, 6)), np.zeros((2, 1)), left, starts)
 
 
-def test_a_search_does_not_come_back_to_what_it_left(search):
-    assert search().effects == ("b",)
+def test_the_difference_of_two_hypotheses_has_the_error_that_repeated_noise_shows():
+    rng = np.random.default_rng(0)
+    effect = np.zeros(1000)
+    effect[300:350] = 0.8  # acts in one block of twenty
+    found = np.array([
+        difference(judged(noise, 20), judged(noise + effect, 20)) for noise in rng.standard_normal((400, 1000))
+    ])  # fmt: skip
+    assert found[:, 0].mean() == pytest.approx(0.5 * (effect**2).sum(), rel=0.1)
+    assert found[:, 1].mean() == pytest.approx(found[:, 0].std(), rel=0.25)
+    # A gain in one block alone is told: it is five standard errors there, though the rest of the flight says nothing.
+    assert np.median(found[:, 0] / found[:, 1]) > 2.0
+
+
+def test_the_difference_counts_blocks_not_samples_where_the_residual_is_coloured():
+    rng = np.random.default_rng(1)
+    slow = np.repeat(rng.standard_normal((300, 20)), 50, axis=1)  # every block has one draw of noise
+    effect = np.full(1000, 0.3)
+    found = np.array([difference(judged(n, 20), judged(n + effect, 20)) for n in slow])
+    assert found[:, 1].mean() == pytest.approx(found[:, 0].std(), rel=0.2)
+    assert found[:, 1].mean() > 3.0 * np.sqrt((effect**2).sum())
+
+
+def test_one_hypothesis_is_as_good_as_itself():
+    one = judged(np.random.default_rng(2).standard_normal(100), 5)
+    assert difference(one, one) == (0.0, 0.0)

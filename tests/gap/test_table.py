@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from openjax.gap.bounds import BOUND, held_objective
-from openjax.gap.judging import judge, offers
-from openjax.gap.table import Model, Table, _errors
+from openjax.gap.model.bounds import BOUND, held_objective
+from openjax.gap.model.cross_validation import judge
+from openjax.gap.model.table import Model, Table, _errors
 
 SHARED = np.array([True, True, False])
 
@@ -30,21 +30,9 @@ def table_of(columns) -> Table:
     white = np.array([b @ b.T for b in blocks])
     return Table(
         SimpleNamespace(effects=(), theta=np.zeros(0)), white, np.repeat(white[:, None], 6, 1), np.full(8, 100),
-        np.repeat([0, 1], 4), np.repeat([0, 1], 4), np.repeat([0, 1, 2, 3], 2), {}, {}, {}, np.arange(1, 5), SHARED,
-        np.ones(6),
+        np.repeat([0, 1], 4), np.repeat([0, 1], 4), np.repeat([0, 1, 2, 3], 2), {}, {}, {}, SHARED,
+        np.ones(6), blocks,
     )  # fmt: skip
-
-
-def test_an_offer_is_what_judging_each_column_finds(columns):
-    table = table_of(columns)
-    model = Model((), np.array([3]), np.zeros(1), np.eye(1))
-    precision = np.array([1.0, 25.0, 4.0])
-    offered = offers(table, model, np.array([1, 2, 4]), precision)
-    for column, sure, nats in zip((1, 2, 4), precision, offered, strict=True):
-        wider = Model((), np.array([3, column]), np.zeros(2), np.diag([1.0, sure]))
-        np.testing.assert_allclose(nats, judge(table, wider).nats, rtol=1e-9)
-    gains = offered.sum(1) - judge(table, model).nats.sum()
-    assert gains[1] > 50.0 and max(gains[0], gains[2]) < 5.0  # column 2 is part of what is left
 
 
 def test_what_half_a_track_cannot_show_of_its_clock_is_not_foretold(columns):

@@ -82,7 +82,7 @@ def run(options: Options) -> int:
 
     from openjax.flights.case import load_case
     from openjax.gap.diagnosis import diagnose_case
-    from openjax.gap.library import library
+    from openjax.gap.model.library import library
 
     library(options.without)
     predictions, failed = {}, 0

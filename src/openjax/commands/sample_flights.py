@@ -60,7 +60,7 @@ def make_case(arguments: Arguments) -> list[Path]:
     """Write the case; returns its files. Raises UserError for an unknown effect or a folder that isn't
     empty."""
     from openjax.flights.reading import LOG_COLUMNS, write_csv
-    from openjax.gap.samples import fly, log_of, references
+    from openjax.flights.samples import fly, log_of, references
     from openjax.vehicle import load_vehicle
     from openjax.vehicle.effects import EFFECTS
 

@@ -4,27 +4,23 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from openjax.flights.flight import Case, Flight, Issue
-from openjax.gap import verdict as rules
-from openjax.gap.bounds import BOUND
+from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence, gather
 from openjax.gap.intervals import estimates
-from openjax.gap.judging import judge
-from openjax.gap.library import CARDS, Library, library
+from openjax.gap.model.bounds import BOUND
+from openjax.gap.model.library import CARDS, Library, library, path_of
+from openjax.gap.probabilities import beyond_form_error, probabilities
 from openjax.gap.report import Report
-from openjax.gap.rest import Rest, look
-from openjax.gap.selection import CLASS, Selection, select
-from openjax.gap.shares import ERROR_NAMES, split
-from openjax.gap.table import with_effects
+from openjax.gap.residual import Check, check_residual
+from openjax.gap.selection import DETECTABLE, Selection, select
+from openjax.gap.shares import Split, split
 from openjax.gap.where import locate
 from openjax.vehicle.vehicle_file import VehicleFile, load_vehicle_file
-
-# Pairs that motion alone can't split, whatever their scores, unless something was measured beforehand.
-ALWAYS_EQUAL = (("mass", "thrust_scale"),)
 
 
 def diagnose(
@@ -56,26 +52,76 @@ def diagnose_case(case: Case, without: Iterable[str] = (), progress=None) -> Rep
 def conclude(evidence: Evidence) -> Report:
     """The report that the evidence supports."""
     selection = select(evidence)
-    rest = look(evidence, selection)
-    named = [*selection.effects, *rules.other_paths(evidence)]
-    parts = split(evidence, selection, rest, named)
-    material = [e for e in named if rules.shrinks(parts, e)]
+    check = check_residual(evidence.replay, selection.fit)
+    beyond = {e: beyond_form_error(selection.fit, e) for e in selection.effects}
+    acting = {e: selection.probability(e) * beyond[e] for e in selection.effects}
+    acting |= evidence.acting()
+    named = [e for e, p in acting.items() if p >= 0.5]
+    parts = split(evidence, selection, check.predicted, named)
+    material = [e for e in named if e in selection.effects or _matters(parts, e)]
     if material != named:
-        parts = split(evidence, selection, rest, material)
-    missing = rules.not_testable(evidence)
-    found = rules.decide(evidence, selection, rest, parts, missing)
-    named = [e for e in found.effects if e != "unknown"]
-    parts = replace(parts, effects={e: parts.effects[e] for e in named})
-    equivalent = equivalents(evidence, selection, named)
-    chances = found.probabilities
-    ranked = sorted(chances, key=lambda e: -chances[e])
-    second = next(
-        (e for e in ranked if e not in found.effects and not (e == "none" and not found.effects)), ""
+        parts = split(evidence, selection, check.predicted, material)
+    found = words(evidence, check, parts, not_testable(evidence))
+    chances = probabilities(
+        {e: acting[e] for e in material}, beyond, parts.largest, check.probability, selection.weights
     )
-    splitter = next((o for e in named for o in equivalent.get(e, ())), missing[0] if missing else second)
+    return _report(evidence, selection, check, parts, found, chances)
+
+
+@dataclass(frozen=True)
+class Words:
+    """`verdict` of report.VERDICTS; `effects` by share, "unknown" among them where what is left isn't noise."""
+
+    verdict: str
+    effects: tuple[str, ...]
+    missing: list[str]
+
+
+def words(evidence: Evidence, check: Check, parts: Split, missing: list[str]) -> Words:
+    """What is said first: the effects by their shares, and whether anything unknown acts."""
+    effects = sorted(parts.effects, key=lambda e: -parts.effects[e].value)
+    if check.rejects or set(evidence.sensors.findings) - {"clocks"}:
+        larger = sum(parts.effects[e].value > parts.unexplained.value for e in effects)
+        effects.insert(larger, "unknown")
+    if effects:
+        verdict = "unknown" if effects[0] == "unknown" else "effect"
+    else:
+        hidden = len(missing) >= len(evidence.library.effects) // 2
+        verdict = "not_testable" if hidden else "none"
+    return Words(verdict, tuple(effects), missing)
+
+
+def not_testable(evidence: Evidence) -> list[str]:
+    """Effects of the library that, at a usual size, these flights would not show."""
+    motion = evidence.motion
+    missing = [
+        e for e in evidence.library.physics if e in motion.confounded or motion.exposure[e] < DETECTABLE
+    ]
+    logged = {c.path for c in evidence.channels} | {"physics"}
+    missing += [e for e in evidence.library.effects if path_of(e) not in logged]
+    return missing + [e for c in evidence.channels for e in c.undetectable()]
+
+
+def _matters(parts: Split, effect: str) -> bool:
+    """Whether an effect's share shrinks the gap by what matters: a gain may be read more finely than that."""
+    whole = max(parts.gap.before**2 - 1.0, 0.0)
+    return parts.effects[effect].value * whole > (1.0 + DECISION.least_gap) ** 2 - 1.0
+
+
+def _report(
+    evidence: Evidence, selection: Selection, check: Check, parts: Split, found: Words, chances
+) -> Report:
+    named = [e for e in found.effects if e != "unknown"]
+    equivalent = {e: selection.equivalent[e] for e in named if e in selection.equivalent}
+    ranked = sorted(chances, key=lambda e: -chances[e])
+    first = found.effects or ("none",)
+    second = next((e for e in ranked if e not in first), "")
+    splitter = next(
+        (o for e in named for o in equivalent.get(e, ())), found.missing[0] if found.missing else second
+    )
     return Report(
         case=evidence.case.name,
-        verdict=found.word,
+        verdict=found.verdict,
         effects=found.effects,
         probabilities=chances,
         shares=parts,
@@ -83,53 +129,25 @@ def conclude(evidence: Evidence) -> Report:
         parameters=estimates(evidence, selection.fit, named),
         where=locate(evidence, selection.fit, named),
         gap=parts.gap,
-        not_testable=missing,
+        not_testable=found.missing,
         next_flight=CARDS[splitter].next_flight if splitter in CARDS else "",
         quality=[
             {"flight": i.flight, "issue": i.issue, "left_out": i.refused} for i in evidence.case.quality
         ],
         runner_up=f"{second} ({chances[second]:.2f})" if second and chances[second] > 0.01 else "",
-        rest=_rest_in_words(rest),
+        rest=check.in_words(),
         sensors=tuple(evidence.sensors.findings.values()),
         contradictions=tuple(f"{i.flight}: {i.issue}" for i in evidence.case.quality if i.kind == "garbage"),
         nuisances=_nuisances(evidence, selection),
+        residual=check.statistics | {"statistic": max(check.statistics.values()), "p_value": check.p_value},
         plots={"evidence": evidence, "selection": selection},
-    )
-
-
-def equivalents(evidence: Evidence, selection: Selection, named) -> dict[str, list[str]]:
-    """For each named effect those that would do as well in its place."""
-    out = {}
-    for effect in named:
-        others = [o for o, nats in selection.swaps.get(effect, {}).items() if nats > -CLASS]
-        for pair in ALWAYS_EQUAL:
-            if effect in pair and not evidence.case.vehicle_file.mass_weighed:
-                others += [e for e in pair if e != effect and e in evidence.library.effects]
-        if others:
-            out[effect] = sorted(set(others))
-    return out
-
-
-def _rest_in_words(rest: Rest) -> str:
-    words = [f"What is left isn't noise: {', '.join(rest.local)}."] if rest.local else []
-    predicted = rest.everything.predicted
-    best = int(np.argmax(predicted))
-    if predicted[best] <= rules.FOLLOWED or rest.everything.nats < rules.LEAST_NATS:
-        return " ".join(words)
-    return (
-        " ".join(words)
-        + (" " if words else "")
-        + (
-            f"What is left in {ERROR_NAMES[best]} isn't noise: {100 * predicted[best]:.0f} % of it follows "
-            f"{'; '.join(rest.followed)} on stretches left out."
-        )
     )
 
 
 def _nuisances(evidence: Evidence, selection: Selection) -> dict[str, str]:
     """What the vehicle's numbers and the sensors' mounting took, in usual sizes; a number at its bound says so."""
     names = np.array(evidence.replay.nuisance_names)[evidence.replay.shared]
-    taken = judge(selection.table, with_effects(selection.table)).taken.mean(0)
+    taken = selection.chosen.judged.taken.mean(0)
 
     def at(v):
         return ", at its bound" if abs(v) > 0.99 * BOUND else ""

@@ -9,21 +9,14 @@ import numpy as np
 from scipy.stats import t as student
 
 from openjax.gap.evidence import Evidence
-from openjax.gap.hypotheses import SetFit
-from openjax.gap.library import CARDS, PLACE, path_of
+from openjax.gap.model.fit import SetFit
+from openjax.gap.model.library import CARDS, PLACE, path_of
 from openjax.gap.report import Estimate
 from openjax.vehicle.effects import EFFECTS
 
 REACH = 1.645  # standard deviations of a 90 % interval
 FORM = 0.05  # of an effect's size, one standard deviation: real effects don't have the library's form
 LEAST_ERROR = 0.01  # of a value that isn't zero without the effect
-LAG_ERROR = 0.001  # s, of a motor's lag: what the half-known commands inside a row leave
-GRID_ERROR = 0.0005  # s, of a command's delay: it is read on a grid of a millisecond
-ROW_ERROR = (0.1, 0.29)  # of a row, likewise: rows that are means, rows that are single samples
-BURSTS = 3.0  # packets that are lost together
-GYROSCOPE_LATE = (
-    0.0028  # s by which a low-pass of second order at 80 Hz holds a gyroscope back: sqrt(2) / (2 pi 80 Hz)
-)
 
 
 def estimates(evidence: Evidence, fit: SetFit, named) -> dict[str, dict[str, Estimate]]:
@@ -34,16 +27,16 @@ def estimates(evidence: Evidence, fit: SetFit, named) -> dict[str, dict[str, Est
         out[effect] = {}
         physics = path_of(effect) == "physics"
         sizes = _sizes(effect, fit.theta) if physics else {}
-        for number, fitted in enumerate(CARDS[effect].fitted):
+        for fitted in CARDS[effect].fitted:
             parameter = EFFECTS[effect].parameters[fitted.name]
             if physics:
                 place = PLACE[effect, fitted.name]
                 value = float(fit.theta[place])
-                own = (deviation[place], FORM * sizes[fitted.name], LEAST_ERROR * value)
-                lag = LAG_ERROR if effect == "motor_lag" else 0.0
-                low = high = float(np.linalg.norm([*own, lag]))
+                own = (deviation[place], FORM * sizes[fitted.name], LEAST_ERROR * value, fitted.error)
+                low = high = float(np.linalg.norm(own))
             else:
-                value, low, high = _path_estimate(evidence, effect, number)
+                told = evidence.channel_of(effect).estimate(effect, fitted.name)
+                value, low, high = told.value, told.below, told.above
             out[effect][fitted.name] = Estimate(
                 value, parameter.unit, (value - REACH * low, value + REACH * high), parameter.prior
             )
@@ -76,23 +69,3 @@ def robust_deviation(fit: SetFit) -> np.ndarray:
     # Few flights: Student's quantile instead of the normal one.
     sandwich *= student.ppf(0.95, count - 1) / REACH
     return np.clip(sandwich, model, 4.0 * model)
-
-
-def _path_estimate(evidence: Evidence, effect: str, number: int) -> tuple[float, float, float]:
-    """Value and standard deviations below and above it."""
-    if effect == "state_latency":
-        _, theta, covariance = evidence.pose.score()
-        spread = float(np.sqrt(covariance[0, 0]))
-        # The delay is against the gyroscope, and a gyroscope may be late itself.
-        return float(theta[0]), spread, spread + GYROSCOPE_LATE / REACH
-    if effect == "rate_gains":
-        change, error = (float(v[number]) for v in evidence.gains.found)
-        return 1.0 + change, error, error
-    radio = evidence.radio
-    if effect == "command_latency":
-        sampled = any(n.startswith("motors within a row") for n in evidence.replay.nuisance_names)
-        spread = float(np.hypot(GRID_ERROR, ROW_ERROR[sampled] * max(t.dt for t in evidence.tracks)))
-        return radio.delay, spread, spread
-    n = max(radio.told / BURSTS, 1.0)
-    spread = float(np.sqrt(radio.loss * (1 - radio.loss) / n) + 0.5 / n)
-    return radio.loss, spread, spread

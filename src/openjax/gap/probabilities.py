@@ -1,100 +1,56 @@
-"""How sure the words are: the probability of each cause to be the strongest one.
+"""How sure the words are: the probability of each cause to be the strongest.
 
-A name is as certain as what its effect takes off the gap: half where that is no more than what forms, filters and rows of a
-log commonly have wrong, nearly sure where it is many times that. Where nothing is named, something small or
-hidden acts more often than one would think. The numbers are round, and were set on four worlds that share no code at all
-or none but the sensors: two seeds of the exam's known column, RotorPy and the second plant.
-"""
+Three uncertainties, each with a number of its own: whether an effect acts (how often its set is chosen, `selection`), whether
+what it takes is more than real vehicles without a fault have (`beyond_form_error`), and which part is the largest (the shares'
+bootstrap). What remains goes to the sets that were chosen otherwise, to nothing and to the unknown."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from openjax.gap.evidence import Evidence
-from openjax.gap.rest import Rest
-from openjax.gap.selection import LEAST_GAIN, LEAST_NATS, Selection
-from openjax.gap.shares import Split
+from openjax.gap.model.fit import SetFit
+from openjax.gap.model.library import CARDS
 from openjax.vehicle.effects import EFFECTS
 
-FOLLOWED = 0.2  # of a channel's rest that follows something in the log: something is left to explain
-TEMPERATURE = (
-    4.0  # divides differences of log-likelihood: residuals are never quite as independent as they count
-)
-SURE = 0.92  # no name by its gain is more certain than this
-HALF = 0.07  # floors that a name takes off the gap if it is half as certain
-READ = 0.97  # certainty of what radio, rate loop and pose say: they have bounds of their own
-SEEN = 0.9  # certainty of "unknown" where a sensor is off or the rest has a rhythm
-LEFT = 0.6  # the most where something is left that follows the log
-NOTHING = 0.68  # certainty of "none"
-BROAD = 3.0  # by which a share's power makes the largest the strongest
+
+def beyond_form_error(fit: SetFit, effect: str) -> float:
+    """Probability that an effect's fitted parameters are more than the form error of a vehicle without a fault: both are normal
+    about no effect, with the card's `form_error` and with its prior's spread, and equally likely beforehand."""
+    card = CARDS[effect]
+    if not card.form_error:
+        return 1.0
+    found, log_odds = fit.parameters()[effect], 0.0
+    spreads = {f.name: np.hypot(f.spread, card.common) for f in card.fitted}
+    for name, small in card.form_error.items():
+        value, error = found[name]
+        away = (value - EFFECTS[effect].parameters[name].none) ** 2
+        usual, wide = (s**2 + error**2 for s in (small, spreads[name]))
+        log_odds += 0.5 * (away / usual - away / wide + np.log(usual / wide))
+    return float(1.0 / (1.0 + np.exp(-np.clip(log_odds, -30.0, 30.0))))
 
 
-def probabilities_of(
-    evidence: Evidence, selection: Selection, parts: Split, rest: Rest, effects
+def probabilities(
+    present: dict[str, float], beyond: dict[str, float], largest: dict[str, float], unknown: float, weights
 ) -> dict[str, float]:
-    """{cause, "none", "unknown": probability}, whose sum is one and whose largest is the first word."""
-    names = dict.fromkeys((*evidence.library.effects, "none", "unknown"), 0.0)
-    if not effects:
-        chance = {"none": NOTHING}
-    else:
-        sure = {e: _certainty(evidence, selection, parts, rest, e) for e in effects}
-        power = {e: max(_share(parts, e), 0.02) ** BROAD for e in effects}
-        total = sum(power.values())
-        chance = {e: sure[e] * power[e] / total for e in effects}
-    doubt = 1.0 - sum(chance.values())
-    chance = names | chance
-    others = _alternatives(evidence, selection, rest, effects)
-    total = sum(others.values())
-    for name, weight in others.items():
-        chance[name] += doubt * weight / total
-    return dict.fromkeys(EFFECTS, 0.0) | _first_on_top(chance, effects[0] if effects else "none")
+    """{cause, "none", "unknown": probability of being the strongest}, whose sum is one.
 
-
-def _share(parts: Split, effect: str) -> float:
-    return parts.unexplained.value if effect == "unknown" else parts.effects[effect].value
-
-
-def _certainty(evidence: Evidence, selection: Selection, parts: Split, rest: Rest, effect: str) -> float:
-    if effect == "unknown":
-        if rest.local or set(evidence.sensors.findings) - {"clocks"}:
-            return SEEN
-        return LEFT * _by_size(parts.gap.after - 1.0)
-    if effect in selection.gains:
-        return SURE * _by_size(selection.gains[effect].floors)
-    return READ
-
-
-def _by_size(floors: float) -> float:
-    square = max(floors, 0.0) ** 2
-    return square / (square + HALF**2)
-
-
-def _alternatives(evidence: Evidence, selection: Selection, rest: Rest, effects) -> dict[str, float]:
-    """Weights of what it may be instead: what does nearly as well in a name's place or was nearly accepted, nothing at
-    all, something unknown."""
-    weights = dict.fromkeys(evidence.library.effects, 0.01)
-    for effect in effects:
-        for other, nats in selection.swaps.get(effect, {}).items():
-            weights[other] += float(np.exp(min(nats / TEMPERATURE, 0.0)))
-    for effect, gain in selection.offered.items():
-        nearly = min(max(gain.floors / LEAST_GAIN, 0.0), 1.0) ** 2
-        weights[effect] += nearly * float(np.exp(min((gain.nats - 2 * LEAST_NATS) / TEMPERATURE, 0.0)))
-    weights["unknown"] = (
-        0.5 if effects else 0.5 + min(float(rest.strange.predicted.max()) / FOLLOWED, 1.0) ** 2
-    )
-    weights["none"] = 0.5
-    return {e: w for e, w in weights.items() if e not in effects and (effects or e != "none")}
-
-
-def _first_on_top(chance: dict[str, float], first: str) -> dict[str, float]:
-    """The probabilities with none above that of the first word: what is too much goes to all others alike."""
-    for _ in range(len(chance)):
-        top = max(chance, key=lambda e: chance[e])
-        over = chance[top] - 0.99 * chance[first]
-        if top == first or over <= 0.0:
-            return chance
-        chance[top] -= over
-        below = [e for e in chance if e != top and chance[e] < 0.99 * chance[first]] or [first]
-        for e in below:
-            chance[e] += over / len(below)
+    present: {named effect: probability that it acts}. beyond: {effect: `beyond_form_error`}. largest: {effect or "unexplained":
+    how often it is the largest part}. unknown: probability that what is unexplained is real. weights: {effects: how often that
+    set was chosen}."""
+    chance = dict.fromkeys((*EFFECTS, "none", "unknown"), 0.0)
+    sure = (1.0 - unknown) if present else 1.0
+    for effect, p in present.items():
+        chance[effect] = p * sure * largest.get(effect, 0.0)
+    chance["unknown"] = unknown * (largest.get("unexplained", 0.0) if present else 1.0)
+    left = 1.0 - sum(chance.values())
+    others = {effects: w for effects, w in weights.items() if not effects & set(present)}
+    shared = {"none": 1e-3, **dict.fromkeys(present, 1e-3)}
+    for effects, w in others.items():
+        for effect in effects or ("none",):
+            real = w * beyond.get(effect, 1.0) / max(len(effects), 1)
+            shared[effect] = shared.get(effect, 0.0) + real
+            shared["none"] += w / max(len(effects), 1) - real
+    total = sum(shared.values())
+    for name, weight in shared.items():
+        chance[name] += left * weight / total
     return chance

@@ -3,8 +3,9 @@ parameter was fitted to.
 
 The gap is the rms over channels of each channel's prediction error over its floor: velocity over 0.25 s, body rates
 over 0.05 s, the pose against the gyroscope over 0.1 s, the motor commands from the body-rate commands. The floor is what
-is left with all accepted effects once a flexible model has taken what follows anything in the log: sensor noise and
-gusts. A share is the growth of the gap's square when one part goes and all others stay, over the whole of it."""
+is left with all accepted effects once the residual check's model has taken what follows the state: sensor noise and gusts.
+A share is what the gap's square grows by when one part goes and all others stay (its usefulness, Darlington 1968), in proportion
+to that of all parts, so that shares add up to one with what is unexplained."""
 
 from __future__ import annotations
 
@@ -12,20 +13,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from openjax.flights.track import smooth
+from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
-from openjax.gap.judging import keep
-from openjax.gap.replay import SKIP
-from openjax.gap.rest import Rest
-from openjax.gap.selection import LEAST_GAIN, Selection
-from openjax.gap.table import ERRORS, with_effects
+from openjax.gap.model.cross_validation import Ablation
+from openjax.gap.model.replay import SKIP
+from openjax.gap.model.table import ERRORS
+from openjax.gap.selection import Selection
 
 METRIC = (
     "rms over channels of prediction error / noise floor on stretches left out (velocity over 0.25 s, body rates over "
     "0.05 s, pose against gyroscope over 0.1 s, motor commands from body-rate commands)"
 )
-POSE_HORIZON = 0.1  # s
-THRUST_FLOOR = 2e-3  # of thrust: below, the link is perfect for every purpose
 # Nuisances that are the sensors' and the clocks': how they are mounted, biased, filtered and timed.
 SENSORS = (
     "frame tilt",
@@ -35,7 +33,7 @@ SENSORS = (
     "gyroscope's low-pass",
     "clock of",
 )
-DRAWS = 400  # of the bootstrap over seconds of flight
+DRAWS = 400  # of the Bayesian bootstrap over seconds of flight
 
 
 @dataclass(frozen=True)
@@ -62,113 +60,113 @@ class Gap:
 
 @dataclass(frozen=True)
 class Split:
-    """`effects` {name: Share}; `sensors`: sensors and clocks; `unexplained`: what follows something in the log but no
-    accepted effect; `channels` {name: (before, after)} rms in units of its floor."""
+    """`effects` {name: Share}; `sensors`: sensors and clocks; `unexplained`: what follows the state but no accepted
+    effect; `channels` {name: (before, after)} rms in units of its floor; `largest` {part: share of the bootstrap's draws in
+    which it is the largest}, of effects and "unexplained"."""
 
     gap: Gap
     effects: dict[str, Share]
     sensors: Share
     unexplained: Share
     channels: dict[str, tuple[float, float]]
+    largest: dict[str, float]
 
 
-def split(evidence: Evidence, selection: Selection, rest: Rest, named) -> Split:
-    """Shares of the `named` effects, of all paths."""
+def split(evidence: Evidence, selection: Selection, predicted: np.ndarray, named) -> Split:
+    """Shares of the `named` effects, of all paths. `predicted` (6,): share of each motion channel's squared error that the
+    residual check's model explains."""
     named = tuple(named)
-    physics = [e for e in named if e in selection.fit.effects]
-    states = {"all": _squares(evidence, selection, physics, named)}
-    states["before"] = _squares(evidence, selection, (), ())
-    states["raw"] = _squares(evidence, selection, (), (), sensors=False)
-    states["plain"] = _squares(evidence, selection, physics, named, sensors=False)
-    for effect in named:
-        others = [e for e in named if e != effect]
-        states[effect] = _squares(evidence, selection, [e for e in physics if e != effect], others)
-    names = list(states["all"])
-    left = {k: np.stack([v[n] for n in names], 1) for k, v in states.items()}
-    predicted = np.array(
-        [rest.everything.predicted[ERROR_NAMES.index(n)] if n in ERROR_NAMES else 0.0 for n in names]
+    parts = (*named, "sensors")
+    channels, squares = _squares_of_sets(evidence, selection, named)  # (sets, blocks, channels)
+    known = dict(zip((n for n, _ in ERRORS), predicted, strict=True))
+    left = 1.0 - np.array([known.get(n, 0.0) for n in channels])
+    blocks = squares.shape[1]
+    drawn = np.random.default_rng(0).dirichlet(np.ones(blocks), DRAWS)
+    values, before = shares_of_squares(
+        squares, np.concatenate([np.full((1, blocks), 1.0 / blocks), drawn]), left
     )
-    rows = left["all"].shape[0]
-
-    def power(kind, pick, floor):
-        return float(np.mean(left[kind][pick].mean(0) / floor))
-
-    def measure(pick):
-        floor = left["all"][pick].mean(0) * (1.0 - predicted) + 1e-30
-        value = {k: power(k, pick, floor) for k in left}
-        whole = max(value["raw"], value["before"]) - 1.0
-        # Without a gap there is nothing to share.
-        scale = 1.0 / whole if whole > 2.0 * LEAST_GAIN else 0.0
-        parts = {e: scale * (value[e] - value["all"]) for e in named}
-        parts["sensors"] = scale * max(value["plain"] - value["all"], 0.0)
-        parts["unexplained"] = scale * (value["all"] - 1.0)
-        return parts, value
-
-    everything = np.arange(rows)
-    parts, value = measure(everything)
-    generator, drawn = np.random.default_rng(0), []
-    for _ in range(DRAWS):
-        own, level = measure(generator.integers(0, rows, rows))
-        drawn.append([*own.values(), 1.0 - np.sqrt(level["all"] / level["before"])])
-    low, high = np.quantile(np.array(drawn), [0.05, 0.95], axis=0)
+    names = (*parts, "unexplained")
+    low, high = np.quantile(values[1:], [0.05, 0.95], axis=0)
     shares = {
-        k: Share(float(v), (float(min(a, v)), float(max(b, v))))
-        for (k, v), a, b in zip(parts.items(), low, high, strict=False)
+        n: Share(float(v), (float(min(a, v)), float(max(b, v))))
+        for n, v, a, b in zip(names, values[0], low, high, strict=True)
     }
-    reduction = 1.0 - np.sqrt(value["all"] / value["before"])
-    gap = Gap(
-        METRIC,
-        float(np.sqrt(value["before"])),
-        float(np.sqrt(value["all"])),
-        1.0,
-        float(reduction),
-        (float(min(low[-1], reduction)), float(max(high[-1], reduction))),
-        len(evidence.replay.flights) > 1,
+    rows = [k for k, n in enumerate(names) if n != "sensors"]
+    first = np.argmax(values[1:][:, rows], 1)
+    largest = {names[k]: float(np.mean(first == place)) for place, k in enumerate(rows)}
+    return Split(
+        _gap(before, len(evidence.replay.flights) > 1),
+        {e: shares[e] for e in named},
+        shares["sensors"],
+        shares["unexplained"],
+        _by_channel(channels, squares, left),
+        largest,
     )
-    floor = left["all"].mean(0) * (1.0 - predicted) + 1e-30
-    channels = {
-        n: (
-            float(np.sqrt(left["before"][:, k].mean() / floor[k])),
-            float(np.sqrt(left["all"][:, k].mean() / floor[k])),
-        )
-        for k, n in enumerate(names)
-    }
-    return Split(gap, {e: shares[e] for e in named}, shares["sensors"], shares["unexplained"], channels)
 
 
-ERROR_NAMES = tuple(n for n, _ in ERRORS)
+def shares_of_squares(squares: np.ndarray, weights: np.ndarray, left: np.ndarray):
+    """Shares (draws, parts + 1), what is unexplained last, and the gap's square before and after (draws, 2).
+
+    squares (sets, blocks, channels): of all parts, none, none but the sensors, and all without each part. weights (draws,
+    blocks). left (channels,): of the squares that all parts leave, what is floor."""
+    level = np.einsum("db,sbc->dsc", weights, squares)
+    floor = level[:, :1] * left + 1e-30
+    level = (level / floor).mean(2)  # (draws, sets)
+    after, raw, before = level[:, :3].T
+    whole = np.maximum(raw, before) - 1.0
+    sure = whole > 2.0 * DECISION.least_gap  # without a gap there is nothing to share
+    unexplained = np.where(sure, np.clip((after - 1.0) / np.where(sure, whole, 1.0), 0.0, 1.0), 0.0)
+    useful = np.maximum(level[:, 3:] - after[:, None], 0.0)
+    total = useful.sum(1, keepdims=True)
+    shares = useful / np.maximum(total, 1e-30) * np.where(sure, 1.0 - unexplained, 0.0)[:, None]
+    return np.concatenate([shares, unexplained[:, None]], 1), np.stack([before, after], 1)
 
 
-def _squares(evidence: Evidence, selection: Selection, physics, named, sensors=True) -> dict[str, np.ndarray]:
-    """{channel: (B,) mean squared errors by second of flight} with the effects `physics` of the selection's and those
-    of `named` that act on other paths; `sensors`: with what sensors and clocks take within their bounds, or without."""
-    table = selection.table
+def _gap(square: np.ndarray, held_out: bool) -> Gap:
+    """The gap from its square before and after (1 + draws, 2)."""
+    reduction = 1.0 - np.sqrt(square[:, 1] / square[:, 0])
+    low, high = np.quantile(reduction[1:], [0.05, 0.95])
+    before, after = np.sqrt(square[0])
+    value = float(reduction[0])
+    interval = (min(float(low), value), max(float(high), value))
+    return Gap(METRIC, float(before), float(after), 1.0, value, interval, held_out)
+
+
+def _by_channel(channels, squares: np.ndarray, left: np.ndarray) -> dict[str, tuple[float, float]]:
+    """{channel: rms before and after, in units of its floor}."""
+    mean = squares.mean(1)
+    rms = np.sqrt(mean / (mean[0] * left + 1e-30))
+    return {n: (float(rms[2, k]), float(rms[0, k])) for k, n in enumerate(channels)}
+
+
+def _squares_of_sets(evidence: Evidence, selection: Selection, named) -> tuple[list[str], np.ndarray]:
+    """Channels, and their squared errors (sets, blocks, channels) by set of parts, as `shares_of_squares` takes them."""
+    ablation, table = Ablation(selection.table), selection.table
     # Numbers of the vehicle and what feedback makes of gusts are no sensor's fault and no effect: they stay.
-    off = None if sensors else np.array([n.startswith(SENSORS) for n in evidence.replay.nuisance_names])
-    drop = tuple(e for e in selection.fit.effects if e not in physics and e not in evidence.feigned)
-    squares = keep(table, with_effects(table), drop, off) / table.rows[:, None]
-    out = {n: squares[:, k] for k, (n, _) in enumerate(ERRORS) if table.usable[k] > 0}
+    sensors = np.array([n.startswith(SENSORS) for n in evidence.replay.nuisance_names])
+    never = [e for e in selection.fit.effects if e not in named and e not in evidence.confounded]
+
+    def squares(there, off=None) -> dict[str, np.ndarray]:
+        gone = [e for e in named if e not in there and e in selection.fit.effects]
+        motion = ablation.squares((*never, *gone), off) / table.rows[:, None]
+        heard = {n: motion[:, k] for k, (n, _) in enumerate(ERRORS) if table.usable[k] > 0}
+        return heard | _other_squares(evidence, [e for e in there if e not in selection.fit.effects], table)
+
+    sets = [squares(named), squares((), sensors), squares(())]
+    sets += [squares([e for e in named if e != gone]) for gone in named]
+    sets.append(squares(named, sensors))
+    return list(sets[0]), np.stack([np.stack(list(s.values()), 1) for s in sets])
+
+
+def _other_squares(evidence: Evidence, named, table) -> dict[str, np.ndarray]:
+    """{channel: (blocks,) mean squared errors} of pose, rate loop and radio with the effects `named`."""
     counts = [int((table.track_of == k).sum()) for k in range(len(evidence.tracks))]
-
-    def blocks(values):
-        return np.concatenate(
-            [[b.mean(0) for b in np.array_split(v, n)] for v, n in zip(values, counts, strict=True)]
-        )
-
-    skips = [int(SKIP / t.dt) for t in evidence.tracks]
-    if evidence.pose is not None:
-        used = evidence.pose.residual if "state_latency" in named else evidence.pose.before
-        steps = [max(round(POSE_HORIZON / t.dt), 1) for t in evidence.tracks]
-        errors = [(r[n:] - r[:-n])[s:] ** 2 for r, n, s in zip(used, steps, skips, strict=True)]
-        out |= {f"pose {a}": v for a, v in zip("xyz", blocks(errors).T, strict=True)}
-    if evidence.rate_loop is not None:
-        used = evidence.rate_loop.residual if "rate_gains" in named else evidence.rate_loop.before
-        errors = [
-            smooth(r, 0.05, t.dt)[s:] ** 2 for r, t, s in zip(used, evidence.tracks, skips, strict=True)
-        ]
-        out |= {f"motors {a}": v for a, v in zip(("roll", "pitch", "yaw"), blocks(errors).T, strict=True)}
-    if evidence.radio is not None:
-        key = tuple(e for e in ("command_latency", "packet_loss") if e in named)
-        misfit = evidence.radio.misfit[key]
-        out["motors all"] = np.full(len(table.rows), misfit**2 + THRUST_FLOOR**2)
+    out: dict[str, np.ndarray] = {}
+    for channel in evidence.channels:
+        for name, series in channel.residuals(named).items():
+            blocks = []
+            for track, errors, count in zip(evidence.tracks, series, counts, strict=True):
+                used = errors[int(SKIP / track.dt) :] if len(errors) > 1 else np.repeat(errors, count)
+                blocks += [float((b**2).mean()) for b in np.array_split(used, count)]
+            out[name] = np.array(blocks)
     return out

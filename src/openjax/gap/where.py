@@ -8,9 +8,10 @@ import numpy as np
 
 from openjax.flights.track import Track, smooth
 from openjax.gap.evidence import Evidence
-from openjax.gap.hypotheses import SetFit
-from openjax.gap.replay import SKIP
-from openjax.gap.rest import disturbances, residuals_of
+from openjax.gap.model.fit import SetFit
+from openjax.gap.model.library import path_of
+from openjax.gap.model.replay import SKIP
+from openjax.gap.residual import disturbances, residuals_of
 
 CHANNELS = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z", "estimator", "firmware")
 REGIMES = (
@@ -71,7 +72,7 @@ def regimes_of(track: Track) -> dict[str, np.ndarray]:
 def locate(evidence: Evidence, fit: SetFit, named=()) -> list[Place]:
     """The table, largest share first. `fit` is the physics part of the verdict, `named` all named effects."""
     before, after, floor = (_powers(evidence, r) for r in (evidence.nothing, fit, fit))
-    paths = _other_paths(evidence, named)
+    paths = _other_powers(evidence, named)
     cells, total = [], 0.0
     masks = [{r: m[int(SKIP / t.dt) :] for r, m in regimes_of(t).items()} for t in evidence.tracks]
     for number, channel in enumerate(CHANNELS):
@@ -114,34 +115,27 @@ def _powers(evidence: Evidence, fit: SetFit) -> list[np.ndarray]:
     return out
 
 
-def _other_paths(evidence: Evidence, named) -> dict[str, list]:
-    """Squared residuals before, after and at the floor, per track, of estimator and firmware."""
-    skips = [int(SKIP / t.dt) for t in evidence.tracks]
-    found = {}
-    for channel, path, effect in (
-        ("estimator", evidence.pose, "state_latency"),
-        ("firmware", evidence.rate_loop, "rate_gains"),
-    ):
-        if path is None:
-            continue
-
-        def power(residuals, path=path):
-            scale = np.concatenate(path.residual).std(0) + 1e-12
-            return [
-                (((r - r.mean(0)) / scale)[s:] ** 2).mean(1) for r, s in zip(residuals, skips, strict=True)
-            ]
-
-        after = path.residual if effect in named else path.before
-        found[channel] = [power(path.before), power(after), power(path.residual)]
-    if evidence.radio is not None and "firmware" in found:
-        radio = evidence.radio
-        used = tuple(sorted(e for e in named if e in ("command_latency", "packet_loss")))
-        floor = radio.misfit[("command_latency", "packet_loss")] + 1e-3
-        for k, key in ((0, ()), (1, used)):
-            extra = (radio.misfit[key] / floor) ** 2
-            found["firmware"][k] = [p + extra for p in found["firmware"][k]]
-        found["firmware"][2] = [p + 1.0 for p in found["firmware"][2]]
+def _other_powers(evidence: Evidence, named) -> dict[str, list]:
+    """Squared residuals before, after and at the floor, per track, of the channels that aren't the motion."""
+    found: dict[str, list] = {}
+    for channel in evidence.channels:
+        floor = channel.residuals([e for e in evidence.library.effects if path_of(e) == channel.path])
+        scale = {n: float(np.sqrt(np.mean(np.concatenate(v) ** 2))) + 1e-12 for n, v in floor.items()}
+        powers = []
+        for errors in (channel.residuals(()), channel.residuals(named), floor):
+            tracks = zip(evidence.tracks, *([v / scale[n] for v in errors[n]] for n in errors), strict=True)
+            powers.append([_rows(np.mean(np.square(own), 0), track) for track, *own in tracks])
+        name = "estimator" if channel.path == "estimator" else "firmware"
+        known = found.get(name)
+        found[name] = powers if known is None else [
+            [a + b for a, b in zip(one, other, strict=True)] for one, other in zip(known, powers, strict=True)
+        ]  # fmt: skip
     return found
+
+
+def _rows(power: np.ndarray, track) -> np.ndarray:
+    """A channel's power (T,) or (1,) at the rows of a track that count."""
+    return np.broadcast_to(power, len(track))[int(SKIP / track.dt) :]
 
 
 def in_words(places: list[Place]) -> str:

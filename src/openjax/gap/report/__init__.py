@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from pathlib import Path
 
 import numpy as np
 
+from openjax.gap.model.library import CARDS
 from openjax.gap.shares import Gap, Split
 from openjax.gap.where import Place, in_words
 from openjax.vehicle.effects import EFFECTS, save_effects
 
-REFERENCE_VOLTAGE = 3.9  # V, to which the limit of `thrust_saturation` refers
 VERDICTS = ("effect", "none", "unknown", "not_testable")
 
 
@@ -57,6 +57,7 @@ class Report:
     sensors: tuple[str, ...] = ()
     contradictions: tuple[str, ...] = ()
     nuisances: dict[str, str] = field(default_factory=dict)
+    residual: dict[str, float] = field(default_factory=dict)
     seconds: float = 0.0
     plots: dict = field(default_factory=dict, repr=False)
 
@@ -76,59 +77,23 @@ class Report:
         }
 
     def to_dict(self) -> dict:
-        """`report.json`."""
-        return {
-            "verdict": self.verdict,
-            "effects": list(self.effects),
-            "probabilities": {k: round(v, 6) for k, v in self.probabilities.items()},
-            "shares": {
-                "effects": {e: _share(v) for e, v in self.shares.effects.items()},
-                "sensors": _share(self.shares.sensors),
-                "unexplained": _share(self.shares.unexplained),
-            },
-            "equivalent": self.equivalent,
-            "parameters": {
-                e: {
-                    p: {
-                        "value": v.value,
-                        "unit": v.unit,
-                        "interval90": list(v.interval90),
-                        "unusual": v.unusual,
-                    }
-                    for p, v in values.items()
-                }
-                for e, values in self.parameters.items()
-            },
-            "where": [
-                {
-                    "channel": p.channel,
-                    "regime": p.regime,
-                    "share": round(p.share, 4),
-                    "before": round(p.before, 3),
-                    "after": round(p.after, 3),
-                }
-                for p in self.where
-            ],
-            "gap": {
-                "metric": self.gap.metric,
-                "before": round(self.gap.before, 4),
-                "after": round(self.gap.after, 4),
-                "floor": round(self.gap.floor, 4),
-                "reduction": round(self.gap.reduction, 4),
-                "interval90": [round(v, 4) for v in self.gap.interval90],
-            },
-            "not_testable": list(self.not_testable),
-            "next_flight": self.next_flight,
-            "quality": self.quality,
-            "runner_up": self.runner_up,
-            "rest": self.rest,
-            "sensors": list(self.sensors),
-            "contradictions": list(self.contradictions),
-            "nuisances": self.nuisances,
+        """`report.json`: every field but the pictures' arrays, numbers rounded."""
+        shares = {
+            "effects": self.shares.effects,
+            "sensors": self.shares.sensors,
+            "unexplained": self.shares.unexplained,
         }
+        estimates = {
+            e: {p: asdict(v) | {"unusual": v.unusual} for p, v in found.items()}
+            for e, found in self.parameters.items()
+        }
+        found = {
+            f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("case", "plots", "seconds")
+        }
+        return _plain(found | {"shares": shares, "parameters": estimates})
 
     def shares_in_words(self) -> str:
-        """ "rotor_drag .52 [.47, .56], motor_lag .17 [.12, .21]; sensors and clocks .03; unexplained .11" """
+        """Every named effect's share with its interval, then sensors and clocks, then what is unexplained."""
         named = [(e, self.shares.effects[e]) for e in self.effects if e != "unknown"]
         parts = ", ".join(
             f"{e} {_short(v.value)} [{_short(v.interval90[0])}, {_short(v.interval90[1])}]" for e, v in named
@@ -176,8 +141,15 @@ class Report:
         return lines
 
 
-def _share(share) -> dict:
-    return {"value": round(share.value, 4), "interval90": [round(v, 4) for v in share.interval90]}
+def _plain(value):
+    """JSON-ready: dataclasses as dicts, tuples as lists, floats with six digits."""
+    if is_dataclass(value):
+        value = asdict(value)
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
 def _short(value: float) -> str:
@@ -196,14 +168,9 @@ def to_fly(report: Report) -> tuple[dict, dict]:
     if not logged:
         return values, intervals
     voltage = float(np.median(np.concatenate(logged)))
-    if "battery_sag" in values:
-        values["battery_sag"] |= {"full": voltage, "discharge": 0.0}
-    if "thrust_saturation" in values:
-        own, reach = values["thrust_saturation"], intervals["thrust_saturation"]
-        factor = 1.0 + own["voltage_slope"] * (voltage - REFERENCE_VOLTAGE)
-        own |= {"limit": own["limit"] * factor, "voltage_slope": 0.0}
-        reach["limit"] = tuple(factor * v for v in reach["limit"])
-        reach.pop("voltage_slope", None)
+    for effect, found in values.items():
+        if CARDS[effect].at_voltage is not None:
+            values[effect], intervals[effect] = CARDS[effect].at_voltage(found, intervals[effect], voltage)
     return values, intervals
 
 

@@ -13,10 +13,10 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 from openjax.flights.track import rotation, smooth
-from openjax.gap.library import CARDS
+from openjax.gap.model.library import CARDS
+from openjax.gap.model.table import HORIZONS
 from openjax.gap.report import Report
-from openjax.gap.rest import disturbances, residuals_of
-from openjax.gap.table import HORIZONS
+from openjax.gap.residual import disturbances, residuals_of
 from openjax.gap.where import CALM, CHANNELS, Place
 
 BEFORE, AFTER = "#d1495b", "#2e86ab"  # both stand out on white and on black

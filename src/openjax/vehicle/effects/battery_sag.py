@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
+from openjax.vehicle.effects.effect import RARE, Card, Effect, Fitted, Parameter
 
 
 def voltage(parameters, context):
@@ -19,6 +19,12 @@ def motor(parameters, motor_command, context):
 
 
 _CELL = "one-cell LiPo: 4.2 V full, about 3.2 V empty under load, seven minutes of hover"
+
+
+def frozen(values, intervals, voltage):
+    """The battery as it is at one voltage: nothing is discharged."""
+    return values | {"full": voltage, "discharge": 0.0}, intervals
+
 
 EFFECT = Effect(
     name="battery_sag",
@@ -45,7 +51,8 @@ EFFECT = Effect(
         needs="voltage",
         coordinate="voltage",
         thrust_map=True,
-        commoner=("thrust_scale",),
+        log_odds=RARE,
+        at_voltage=frozen,
         sample={"exponent": 1.0},
         next_flight="the same hover on a full and on a nearly empty battery.",
     ),

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from openjax.vehicle.effects.airspeed import body_velocity, hub_velocity, hub_wrench
-from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
+from openjax.vehicle.effects.effect import VERY_RARE, Card, Effect, Fitted, Parameter
 
 
 def wrench(parameters, context):
@@ -14,17 +14,9 @@ def wrench(parameters, context):
     return force, torque + parameters["stiffness"] * jnp.stack([vy, -vx, jnp.zeros_like(vx)])
 
 
-_LEVER = 0.003  # N m: one centimetre of a weight of 0.3 N
-
-
-def pitches(value, deviation):
-    """Whether blades flap: they pitch the body by more than drag a centimetre above its centre of mass would do. If not, it
-    is drag. Blades on stiff hubs may do that without tilting the thrust, but then beyond doubt."""
-    tilts = value["tilt"] > 3.0 * deviation["tilt"]
-    pitches_alone = (
-        value["stiffness"] > 5.0 * deviation["stiffness"] and value["tilt"] > -3.0 * deviation["tilt"]
-    )
-    return bool((tilts or pitches_alone) and value["stiffness"] > _LEVER * max(value["tilt"], 0.0))
+def tilts_back(value, deviation):
+    """Whether blades don't clearly tilt the thrust along the motion, and pitch the body back."""
+    return bool(value["tilt"] > -3.0 * deviation["tilt"] and value["stiffness"] > 0.0)
 
 
 EFFECT = Effect(
@@ -54,8 +46,8 @@ EFFECT = Effect(
         ),
         needs="velocity",
         coordinate="body velocity",
-        commoner=("rotor_drag",),
-        is_itself=pitches,
+        log_odds=VERY_RARE,
+        possible=tilts_back,
         sample={"tilt": 0.02, "stiffness": 0.0002},
         next_flight="fast straight passes with sudden stops, to load roll and pitch.",
     ),

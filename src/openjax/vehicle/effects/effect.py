@@ -95,7 +95,8 @@ class Parameter:
 @dataclass(frozen=True)
 class Fitted:
     """How one parameter is fitted: prior mean and standard deviation, start of the search, step of the difference
-    quotient, all in the parameter's unit. `positive`: a value below the effect-free one is implausible."""
+    quotient, all in the parameter's unit. `positive`: a value below the effect-free one is implausible. `error`: standard
+    deviation that rows of a log leave, whatever a fit says."""
 
     name: str
     mean: float
@@ -103,6 +104,11 @@ class Fitted:
     start: float
     step: float
     positive: bool = False
+    error: float = 0.0
+
+
+# Log prior odds of effects, in round numbers: one vehicle in twenty, one in a hundred and fifty, one in four hundred.
+UNCOMMON, RARE, VERY_RARE = -3.0, -5.0, -6.0
 
 
 @dataclass(frozen=True)
@@ -112,16 +118,18 @@ class Card:
     path: by which way of the log it is read: "physics" (motors to motion), "radio", "rate_loop", "estimator".
     fitted: its parameters; `common` is the spread that all share, `balanced`: their mean belongs to another effect and is
         held near zero, `linear`: the first scales the whole effect, `others`: more starts of the search.
-    companions: ((effect, parameter, spread), ...) of other effects that may move a little whenever this one does, because
-        real effects seldom have exactly this form.
     needs: the channel without which it can't be told, though it leaves a trace in others.
     coordinate: the variable that it follows, for pictures.
     thrust_map: a map from duty cycles to thrust that isn't known can imitate it.
     torque_axes: those of the torques by which it is told, which gusts can imitate, and what motors do between two rows.
-    commoner: effects one of which is named instead where it does equally well.
-    is_itself({parameter: value}, {parameter: deviation}): whether it isn't by its fitted value another effect; `beside`:
-        effects that are fitted with it for that, whose parameters follow as "effect.parameter"; "gusts" is their share in
-        the torques.
+    log_odds: log prior odds that it acts at a size that matters.
+    possible({parameter: value}, {parameter: deviation}): whether fitted values lie within physical bounds.
+    nuisance: {parameter: size} by which the vehicle's number is usually off: free in every hypothesis, never a cause.
+    nuisance_duty, nuisance_samples: the same where motor commands are duty cycles, or single samples whose rows hide the rest.
+    gusts: {parameter: (size, torque axes)} by which a nuisance may be larger per share of gusts in those torques.
+    weighed: whether a weighed vehicle rules it out.
+    at_voltage(values, intervals, voltage): both as they are at one voltage, for simulators that know none.
+    form_error: {parameter: spread} of what real vehicles without a fault seem to have: what lies within it isn't named.
     sample: a strength within its usual range to fly with, strong enough to see.
     impossible(position): whether a flight along position (T, 3), m, rules it out.
     next_flight: what would show it, in words.
@@ -133,14 +141,19 @@ class Card:
     balanced: bool = False
     linear: bool = False
     others: tuple[tuple[float, ...], ...] = ()
-    companions: tuple[tuple[str, str, float], ...] = ()
     needs: str = ""
     coordinate: str = "thrust"
     thrust_map: bool = False
     torque_axes: tuple[int, ...] = ()
-    commoner: tuple[str, ...] = ()
-    beside: tuple[str, ...] = ()
-    is_itself: Callable[[Mapping[str, float], Mapping[str, float]], bool] | None = None
+    log_odds: float = UNCOMMON
+    possible: Callable[[Mapping[str, float], Mapping[str, float]], bool] | None = None
+    nuisance: Mapping[str, float] = field(default_factory=dict)
+    nuisance_duty: Mapping[str, float] = field(default_factory=dict)
+    nuisance_samples: Mapping[str, float] = field(default_factory=dict)
+    form_error: Mapping[str, float] = field(default_factory=dict)
+    gusts: Mapping[str, tuple[float, tuple[int, ...]]] = field(default_factory=dict)
+    weighed: bool = False
+    at_voltage: Callable[[dict, dict, float], tuple[dict, dict]] | None = None
     impossible: Callable[[Any], bool] | None = None
     sample: Mapping[str, float] = field(default_factory=dict)
     next_flight: str = ""

@@ -25,8 +25,8 @@ EFFECT = Effect(
     card=Card(
         path="physics",
         fitted=(Fitted("extra", mean=0.0, spread=0.005, start=0.001, step=2e-05),),
-        companions=(("inertia", "xx", 0.02), ("inertia", "yy", 0.02), ("inertia", "zz", 0.02)),
         thrust_map=True,
+        weighed=True,
         sample={"extra": 0.003},
         next_flight="weigh the vehicle, then hover and climb hard: a weighed mass leaves only the thrust.",
     ),

@@ -40,11 +40,15 @@ EFFECT = Effect(
     card=Card(
         path="physics",
         fitted=(
-            Fitted("extra_up", mean=0.0, spread=0.03, start=0.01, step=0.0005),
-            Fitted("extra_down", mean=0.0, spread=0.03, start=0.01, step=0.0005),
+            Fitted("extra_up", mean=0.0, spread=0.03, start=0.01, step=0.0005, error=0.001),
+            Fitted("extra_down", mean=0.0, spread=0.03, start=0.01, step=0.0005, error=0.001),
         ),
         common=0.03,
-        is_itself=lags,
+        possible=lags,
+        gusts={"extra_up": (0.01, (0, 1)), "extra_down": (0.01, (0, 1))},
+        nuisance={"extra_up": 0.0015, "extra_down": 0.0015},
+        nuisance_duty={"extra_up": 0.01, "extra_down": 0.01},
+        nuisance_samples={"extra_up": 0.01, "extra_down": 0.01},
         sample={"extra_up": 0.02, "extra_down": 0.03},
         next_flight="roll, pitch and thrust doublets, as short as the vehicle allows.",
     ),

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
+from openjax.vehicle.effects.effect import RARE, Card, Effect, Fitted, Parameter
 
 
 def motor(parameters, motor_command, context):
@@ -15,20 +15,14 @@ def motor(parameters, motor_command, context):
 _SOURCE = "spread of quadratic thrust maps published for the Crazyflie, as shares of the largest thrust"
 
 
-_BEND = 0.02, 0.03  # of the thrust over the usual commands: least of all, and beside a change of all thrust
 _STEEPNESS = 0.4, 2.2  # of the curve, where a straight line has 1: powers of the command from 0.6 to 1.9
 
 
-def bends(value, deviation):
-    """Whether a fitted curve bends over the usual commands, and rises as a motor's does; if not, it is another thrust or
-    mass, or a force that the motors don't make."""
+def rises(value, deviation):
+    """Whether a fitted curve rises over the usual commands as a motor's does; if not, the motors don't make this force."""
     del deviation
-    commands = np.linspace(0.45, 0.85, 9)
-    steepness = value["slope"] + 2.0 * value["curvature"] * commands
-    if steepness.min() < _STEEPNESS[0] or steepness.max() > _STEEPNESS[1]:
-        return False
-    change = value["offset"] / commands + value["slope"] + value["curvature"] * commands - 1.0
-    return bool(np.ptp(change) > np.clip(0.5 * abs(change.mean()), *_BEND))
+    steepness = value["slope"] + 2.0 * value["curvature"] * np.array([0.45, 0.85])
+    return bool(_STEEPNESS[0] < steepness.min() and steepness.max() < _STEEPNESS[1])
 
 
 EFFECT = Effect(
@@ -49,8 +43,9 @@ EFFECT = Effect(
             Fitted("curvature", mean=0.0, spread=0.25, start=0.02, step=0.001),
         ),
         thrust_map=True,
-        commoner=("thrust_scale", "mass"),
-        is_itself=bends,
+        log_odds=RARE,
+        possible=rises,
+        nuisance_duty={"offset": 0.15, "curvature": 0.3},
         sample={"curvature": 0.25},
         next_flight="steps of collective thrust between 40 and 90 %.",
     ),

@@ -21,6 +21,13 @@ def tops_out(value, deviation):
     return value["limit"] < 1.0
 
 
+def frozen(values, intervals, voltage):
+    """The limit as it is at one voltage."""
+    factor = 1.0 + values["voltage_slope"] * (voltage - _REFERENCE_VOLTAGE)
+    limit = tuple(factor * v for v in intervals["limit"])
+    return values | {"limit": values["limit"] * factor, "voltage_slope": 0.0}, {"limit": limit}
+
+
 EFFECT = Effect(
     name="thrust_saturation",
     description="no rotor gives more than a share of the nominal largest thrust",
@@ -50,7 +57,8 @@ EFFECT = Effect(
         ),
         others=((0.95, 0.0), (0.92, 0.0), (0.89, 0.0), (0.865, 0.0), (0.84, 0.0), (0.76, 0.0), (0.7, 0.0)),
         thrust_map=True,
-        is_itself=tops_out,
+        possible=tops_out,
+        at_voltage=frozen,
         sample={"limit": 0.82},
         next_flight="short full-thrust climbs.",
     ),

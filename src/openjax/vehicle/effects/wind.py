@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from openjax.vehicle.effects.airspeed import hub_velocity, hub_wrench
-from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
+from openjax.vehicle.effects.effect import VERY_RARE, Card, Effect, Fitted, Parameter
 from openjax.vehicle.rigid_body import rotate_inverse
 
 
@@ -16,13 +16,11 @@ def wrench(parameters, context):
 
 _SOURCE = "indoor draughts and fans, 0.3-3 m/s"
 
-_CALM = 0.2  # m/s: air that moves less is calm
 
-
-def blows(value, deviation):
-    """Whether a fitted wind drags and moves; if not, it is drag, or nothing."""
-    speed = (value["x"] ** 2 + value["y"] ** 2) ** 0.5
-    return bool(value["drag"] > 0.0 and speed > max(_CALM, 3.0 * deviation["x"], 3.0 * deviation["y"]))
+def drags(value, deviation):
+    """Whether air that moves drags the vehicle along."""
+    del deviation
+    return bool(value["drag"] > 0.0)
 
 
 EFFECT = Effect(
@@ -48,11 +46,10 @@ EFFECT = Effect(
             Fitted("drag", mean=0.013, spread=0.006, start=0.013, step=0.0001, positive=True),
             Fitted("along", mean=0.8, spread=0.4, start=1.0, step=0.01),
         ),
-        companions=(("blade_flapping", "stiffness", 4e-05),),  # as for rotor_drag
         needs="velocity",
         coordinate="body velocity",
-        commoner=("rotor_drag",),
-        is_itself=blows,
+        log_odds=VERY_RARE,
+        possible=drags,
         sample={"x": 1.2, "y": -0.8, "drag": 0.015},
         next_flight="hover, turning slowly through a full circle of yaw.",
     ),

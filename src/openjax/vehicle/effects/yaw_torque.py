@@ -23,6 +23,9 @@ EFFECT = Effect(
     card=Card(
         path="physics",
         torque_axes=(2,),
+        nuisance={"ratio": 0.01},
+        nuisance_duty={"ratio": 0.5},
+        nuisance_samples={"ratio": 0.2},
         fitted=(Fitted("ratio", mean=1.0, spread=0.5, start=0.9, step=0.005),),
         sample={"ratio": 0.4},
         next_flight="yaw doublets and steps.",

@@ -15,11 +15,12 @@ from functools import cached_property
 
 import numpy as np
 
-from openjax.gap.bounds import BOUND
-from openjax.gap.hypotheses import SetFit, linearised_at
-from openjax.gap.library import ABSENT, CARDS, places, prior
-from openjax.gap.replay import SKIP, Replay
+from openjax.gap.model.bounds import BOUND
+from openjax.gap.model.fit import SetFit, linearised_at
+from openjax.gap.model.library import ABSENT, CARDS, places, prior
+from openjax.gap.model.replay import SKIP, Replay
 
+FOLD = 2.5  # s that are left out together
 BLOCK = 1.0  # s: gusts and sensors forget within less
 HORIZONS = {"velocity": 0.25, "rates": 0.05}  # s of the predictions whose errors are the gap
 ERRORS = tuple((f"{kind} {axis}", 3 * number + k) for number, kind in enumerate(("rates", "velocity"))
@@ -30,8 +31,7 @@ ERRORS = tuple((f"{kind} {axis}", 3 * number + k) for number, kind in enumerate(
 class Table:
     """`white` (B, C, C) and `error` (B, 6, C, C) by block; `rows` (B,) that count; `track_of`, `flight_of`, `fold_of`
     (B,). Columns: 0 is what is left; `derivative` {place: column}; `step` {effect: column}; `part` {effect: column};
-    `more` those that a caller
-    added; the last are nuisances, of which `shared` (N,) are the case's and the others a track's."""
+    the last are nuisances, of which `shared` (N,) are the case's and the others a track's."""
 
     fit: SetFit
     white: np.ndarray
@@ -43,9 +43,9 @@ class Table:
     derivative: dict[int, int]
     step: dict[str, int]
     part: dict[str, int]
-    more: np.ndarray
     shared: np.ndarray
     usable: np.ndarray  # (6,) of the errors
+    columns: list  # whitened columns (C, M) of each block
 
     @property
     def size(self) -> int:
@@ -79,11 +79,11 @@ class Model:
     bound: float = BOUND
 
 
-def build(replay: Replay, fit: SetFit, singles: dict[str, SetFit], more=None) -> Table:
-    """The table around a fitted set; `singles` {effect: its fit alone} are the effects that may come in, `more` [(K, T,
-    9)] further columns of each track."""
-    own = fit.effects
-    others = [e for e in singles if e not in own]
+def build(replay: Replay, fit: SetFit, singles: dict[str, SetFit] | None) -> Table:
+    """The table around a fitted set; `singles` {effect: its fit alone} are the effects that may come in; None: nothing may
+    come in or go."""
+    own = fit.effects if singles is not None else ()
+    others = [e for e in singles or () if e not in own]
     index = np.array(
         sorted({int(i) for e in (*own, *others) for i in places((e,))} | set(fit.index.tolist())), int
     )
@@ -98,23 +98,23 @@ def build(replay: Replay, fit: SetFit, singles: dict[str, SetFit], more=None) ->
         points.append(point)
     columns = linearised_at(replay, fit, index)
     moved = replay.predict(np.array(points)) if points else [np.zeros((0, *y.shape)) for y in replay.measured]
-    white, error, rows, track_of, fold_of = [], [], [], [], []
-    added = [()] * len(replay.tracks) if more is None else [(m,) for m in more]
+    white, error, rows, track_of, fold_of, whole = [], [], [], [], [], []
     for number, (c, m, track) in enumerate(zip(columns, moved, replay.tracks, strict=True)):
         now = replay.measured[number] - c[0]
         nuisances = replay.nuisances[number]
-        x = np.concatenate([c, m[: len(others)] - now, now - m[len(others) :], *added[number], nuisances])
+        x = np.concatenate([c, m[: len(others)] - now, now - m[len(others) :], nuisances])
         skip, size = int(SKIP / track.dt), max(int(BLOCK / track.dt), 1)
         w = np.concatenate([replay.whiten(x[: -len(nuisances)], number), replay.whitened_nuisances[number]])
         e = _errors(x, track.dt, replay.usable)
         count = max(w.shape[1] // size, 1)
         for k, (a, b) in enumerate(zip(np.array_split(w, count, 1), _split(e, skip, count), strict=True)):
             flat = a.reshape(len(x), -1)
+            whole.append(flat)
             white.append(flat @ flat.T)
             error.append(np.einsum("ctk,dtk->kcd", b, b, optimize=True))
             rows.append(b.shape[1])
             track_of.append(number)
-            fold_of.append(2 * number + (2 * k >= count))
+            fold_of.append(1000 * number + k * max(round(count * BLOCK / FOLD), 1) // count)
     track_of = np.array(track_of)
     at = 1 + len(index)
     return Table(
@@ -123,9 +123,9 @@ def build(replay: Replay, fit: SetFit, singles: dict[str, SetFit], more=None) ->
         {int(i): 1 + k for k, i in enumerate(index)},
         {e: at + k for k, e in enumerate(others)},
         {e: at + len(others) + k for k, e in enumerate(own)},
-        at + len(others) + len(own) + np.arange(0 if more is None else len(more[0])),
         replay.shared,
-        np.concatenate([replay.usable[:3], replay.usable[3:6] if replay.usable[3] else replay.usable[6:9]]),
+        replay.heard,
+        whole,
     )  # fmt: skip
 
 
@@ -172,13 +172,3 @@ def with_effects(table: Table, add=(), drop=()) -> Model:
         out[at : at + len(block), at : at + len(block)] = block
         at += len(block)
     return Model(tuple(table.part[e] for e in drop), free.astype(int), np.concatenate(means), out)
-
-
-def widened(model: Model, columns: np.ndarray, precision: np.ndarray) -> Model:
-    """The model with further columns free, whose coefficients have `precision` about none."""
-    size, more = len(model.free), len(columns)
-    block = np.zeros((size + more, size + more))
-    block[:size, :size] = model.precision
-    block[np.arange(size, size + more), np.arange(size, size + more)] = precision
-    free = np.concatenate([model.free, columns]).astype(int)
-    return Model(model.parts, free, np.concatenate([model.mean, np.zeros(more)]), block, model.bound)

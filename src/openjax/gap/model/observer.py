@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 
 from openjax.vehicle import DroneState
-from openjax.vehicle.effects import EFFECTS
 from openjax.vehicle.rate_controller import rate_controller
 from openjax.vehicle.rotors import rotor_reaction, rotor_speed_step, rotor_thrust
 from openjax.vehicle.wrench import total_wrench
@@ -24,7 +23,6 @@ GYRO_GAIN = 0.3  # share of a gyro innovation that corrects the observer, near t
 FOLLOWED = (
     0.2  # share of what single samples of the motors miss that corrects the next ones: their noise stays out
 )
-GAIN_NAMES = ("p", "i", "d")
 
 
 def _observe(gains, vehicle, command, motor, gyro, disturbance, dt, at_once):
@@ -35,7 +33,11 @@ def _observe(gains, vehicle, command, motor, gyro, disturbance, dt, at_once):
 
     Returns the controller's motor command as it would be logged (T, 4), the motor commands of the ticks (T, TICKS, 4) that
     suit the log, and the rates at the end of each row as predicted (T, 3)."""
-    controller = EFFECTS["rate_gains"].body(dict(zip(GAIN_NAMES, gains, strict=True)), vehicle)
+    controller = vehicle.replace(
+        rate_kp=vehicle.rate_kp * gains[0],
+        rate_ki=vehicle.rate_ki * gains[1],
+        rate_kd=vehicle.rate_kd * gains[2],
+    )
     h = dt / TICKS
     at_rest = jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0])
 

@@ -11,10 +11,10 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from openjax.flights.track import Track
-from openjax.gap.library import ABSENT, NUISANCES, PLACE, STEP
-from openjax.gap.nuisances import OF_A_TRACK, columns_of
-from openjax.gap.prediction import FORCE, RATES, VELOCITY, Physics, make_physics
-from openjax.gap.whitening import Noise, first_noise, whiten
+from openjax.gap.model.library import ABSENT, PLACE, STEP
+from openjax.gap.model.nuisances import OF_A_TRACK, columns_of
+from openjax.gap.model.prediction import FORCE, RATES, VELOCITY, Physics, make_physics
+from openjax.gap.model.whitening import Noise, first_noise, whiten
 
 # Groups of channels that share a noise model: axes, whether integrated.
 GROUPS = (((0, 1), True), ((2,), True), ((3, 4), True), ((5,), True), ((6, 7), False), ((8,), False))
@@ -51,6 +51,11 @@ class Replay:
     def flight_of(self) -> np.ndarray:
         """(tracks,) index of a track's flight."""
         return np.array([self.flights.index(t.flight) for t in self.tracks])
+
+    @property
+    def heard(self) -> np.ndarray:
+        """(6,) whether the gap's channels were logged: body rates, and velocity or, without a pose, specific force."""
+        return np.concatenate([self.usable[:3], self.usable[3:6] if self.usable[3] else self.usable[6:9]])
 
     @cached_property
     def shared(self) -> np.ndarray:
@@ -143,7 +148,7 @@ def marginal_gram(w: np.ndarray, nuisances: np.ndarray) -> np.ndarray:
 
 
 def make_replay(
-    tracks, vehicles, motor_ticks, feedback, numbers=NUISANCES, one_clock=True, at_once=False, wander=0.0
+    tracks, vehicles, motor_ticks, feedback, numbers, one_clock=True, at_once=False, wander=0.0
 ) -> Replay:
     """Replay of tracks with their nominal vehicles and motor commands (T, TICKS, 4) of the rate loop's ticks. `feedback` of
     each track: what it made of the motors may be anything in strength and lag. `at_once`: motor commands are single

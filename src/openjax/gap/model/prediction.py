@@ -11,8 +11,8 @@ import jax
 import numpy as np
 
 from openjax.flights.track import Track, smooth
-from openjax.gap.library import PHYSICS_EFFECTS, THETA
-from openjax.gap.physics import Path, compiled_physics
+from openjax.gap.model.library import PHYSICS_EFFECTS, THETA
+from openjax.gap.model.physics import Path, compiled_physics
 from openjax.vehicle.effects.effect import ARENA_CEILING
 
 RATES, VELOCITY, FORCE = slice(0, 3), slice(3, 6), slice(6, 9)

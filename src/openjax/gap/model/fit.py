@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import norm
 
-from openjax.gap.bounds import held_objective
-from openjax.gap.library import ABSENT, CARDS, PLACE, STEP, Library, places, prior, start_of
-from openjax.gap.replay import GROUPS, SKIP, Replay, stepped
-from openjax.gap.whitening import Noise, fit_noise
+from openjax.gap.model.bounds import held_objective
+from openjax.gap.model.library import ABSENT, CARDS, PLACE, STEP, Library, places, prior, start_of
+from openjax.gap.model.replay import GROUPS, SKIP, Replay, stepped
+from openjax.gap.model.whitening import Noise, fit_noise
 
 ITERATIONS = 6
 SMALL_STEP = 0.05  # nats: an improvement below this ends the search
@@ -27,7 +27,7 @@ UNEXPOSED = 0.5  # nats that a typical effect would leave: below, the effect isn
 @dataclass(frozen=True, eq=False)
 class SetFit:
     """A fitted set of effects. `grams` (F, 1 + p, 1 + p) of residual and derivatives at the optimum, by
-    flight; `score` the log marginal likelihood; `index` (p,) places in `theta` (P,), companions last."""
+    flight; `score` the log marginal likelihood; `index` (p,) places in `theta` (P,)."""
 
     effects: tuple[str, ...]
     theta: np.ndarray
@@ -81,8 +81,8 @@ def fit_set(replay: Replay, effects, start: np.ndarray | None = None, iterations
     hessian = grams.sum(0)[1:, 1:] + precision
     covariance = np.linalg.inv(hessian) if len(index) else np.zeros((0, 0))
     volume = np.linalg.slogdet(hessian)[1] - np.linalg.slogdet(precision)[1] if len(index) else 0.0
-    least, free_ride = _held(replay, products, theta, index, mean, precision, len(places(effects)))
-    score = -least - 0.5 * volume + _sign_term(effects, index, theta, covariance) - free_ride
+    score = -_held(replay, products, theta[index] - mean, precision) - 0.5 * volume
+    score += _sign_term(effects, index, theta, covariance)
     return SetFit(effects, theta, index, grams, columns, covariance, float(score), float(objective))
 
 
@@ -112,17 +112,6 @@ def linearised_at(replay: Replay, fit: SetFit, index) -> list[np.ndarray]:
     return out
 
 
-def step_with(replay: Replay, fit: SetFit, more) -> dict[str, dict[str, tuple[float, float]]]:
-    """{effect: {parameter: (value, standard deviation)}} of a fitted set and `more` effects, by one step from the fit."""
-    effects = (*fit.effects, *more)
-    index, mean, precision = prior(effects)
-    gram = replay.grams(linearised_at(replay, fit, index)).sum(0)
-    _, step, hessian = _newton(gram, precision, fit.theta[index] - mean)
-    theta = fit.theta.copy()
-    theta[index] += step
-    return _named(effects, theta, index, np.linalg.inv(hessian))
-
-
 def _named(effects, theta, index, covariance) -> dict[str, dict[str, tuple[float, float]]]:
     deviation = dict(zip(index.tolist(), np.sqrt(np.diag(covariance)), strict=True))
     return {
@@ -145,33 +134,14 @@ def _sign_term(effects, index, theta, covariance) -> float:
     return float(total)
 
 
-def _held(replay: Replay, products, theta, index, mean, precision, own: int) -> tuple[float, float]:
-    """Least objective of a set with nuisances within their bounds, and the vehicle's alike in all flights; and what its
-    companions, beyond the first `own` columns, alone gain over no effect (nats), or beside the set's own effects where that
-    is less: a set must not live off them."""
+def _held(replay: Replay, products, off: np.ndarray, precision: np.ndarray) -> float:
+    """Least objective of a set, `off` from its prior's mean, with nuisances within their bounds and the vehicle's alike in
+    all flights."""
     grams = [
         np.block([[gram, cross], [cross.T, inner]])
         for (gram, cross), inner in zip(products, replay.nuisance_grams, strict=True)
     ]
-    off, away = theta[index] - mean, theta[index] - ABSENT[index]
-
-    def least(free, back):
-        """With the columns `free`, and those of `back` as if they were absent."""
-        taken = np.concatenate([[0], 1 + free, np.arange(1 + len(index), len(grams[0]))])
-        mixed = np.eye(len(grams[0]))[taken]
-        mixed[0, 1 + back] = away[back]
-        return held_objective(
-            [mixed @ g @ mixed.T for g in grams], replay.shared, off[free], precision[np.ix_(free, free)]
-        )
-
-    every, none = np.arange(len(index)), np.arange(0)
-    best = least(every, none)
-    if len(index) == own:
-        return best, 0.0
-    effects, companions = every[:own], every[own:]
-    alone = least(none, every) - least(companions, effects)
-    beside = least(effects, companions) - best
-    return best, max(0.0, min(alone, beside))
+    return held_objective(grams, replay.shared, off, precision)
 
 
 def model_noise(replay: Replay, library: Library) -> tuple[Replay, list[np.ndarray], dict[str, float]]:
@@ -253,18 +223,13 @@ def without_nuisances(
     return residual - np.tensordot(taken, replay.nuisances[track], 1)
 
 
-def weigh_singles(
-    replay: Replay, library: Library, exposure=None, before=None
-) -> dict[tuple[str, ...], SetFit]:
-    """Full fits of no effect and of every effect alone that the flights could show; `before`: what an earlier look
-    found, to start from."""
-    found = {(): fit_set(replay, ())}
+def fit_singles(replay: Replay, library: Library, exposure) -> tuple[SetFit, dict[str, SetFit]]:
+    """Fits of no effect and of every effect alone that the flights could show."""
+    found = {}
     for effect in library.physics:
-        if exposure is None or exposure.get(effect, 1.0) >= UNEXPOSED:
-            known = before is not None and (effect,) in before
-            start = before[effect,].theta if known else _best_start(replay, effect)
-            found[effect,] = fit_set(replay, (effect,), start)
-    return found
+        if exposure[effect] >= UNEXPOSED:
+            found[effect] = fit_set(replay, (effect,), _best_start(replay, effect))
+    return fit_set(replay, ()), found
 
 
 def _best_start(replay: Replay, effect: str) -> np.ndarray:

@@ -13,24 +13,20 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
 from openjax.flights.track import Track, rotation
-from openjax.gap.estimator import turn_increments
+from openjax.gap.channels.pose import turn_increments
+from openjax.gap.decision import DECISION
 
 BAND = (0.3, 6.0)  # Hz: above drift, below most of the sensors' noise
 SLOW = 2.0  # Hz, below which path and accelerometer are compared
 GRAVITY = 9.81  # m/s^2
-GAIN_BOUND = 0.03  # a gyroscope's gain may be off by so much
-TILT_BOUND = np.radians(1.5)  # of the world against gravity
-SEEN = 3.0  # standard errors from which a tilt is taken off, finding or not
 CLEAR = 5.0  # jackknife standard errors by which a finding must exceed nothing
 LEAST_RATE = 0.1  # rad/s rms in the band: an axis that hardly turns shows no gain
 COHERENT = 0.97  # correlation below which the two streams don't fit well enough to compare gains
 ONE_CLOCK = 0.93  # below which they don't share a clock
 EDGE = 0.3  # s at either end that the filters spoil
-WINDOW = 1.0  # s over which a clock hardly moves
 WANDER_SCALE = 0.002  # s: windows that tell more than this aren't told apart
-WANDER_CLEAR = 2.0  # standard errors
 SEEN_WANDER, MOST_WANDER = 0.0015, 0.01  # s: below and above, it is noise
-GRANULE = 1.0  # s, unit of the jackknife
+SEGMENT = 1.0  # s, unit of the jackknife, over which a clock hardly moves
 
 
 @dataclass(frozen=True)
@@ -52,7 +48,9 @@ class Kinematics:
     @property
     def upright(self) -> np.ndarray | None:
         """Rotation (2,) rad about x and y that puts the world upright, where its tilt is clear, however small."""
-        if self.tilt is None or float(np.hypot(*self.tilt)) < SEEN * float(np.hypot(*self.tilt_error)):
+        if self.tilt is None or float(np.hypot(*self.tilt)) < DECISION.standard_errors * float(
+            np.hypot(*self.tilt_error)
+        ):
             return None
         return -self.tilt
 
@@ -70,7 +68,7 @@ def read_kinematics(tracks: list[Track]) -> Kinematics:
     tilt, tilt_error = _world(tracks)
     findings = {}
     # Two axes alike are a sensor; one alone may be an axis that the flights hardly turn about.
-    off = (np.abs(gain - 1.0) > np.maximum(GAIN_BOUND, CLEAR * error)) & np.isfinite(gain)
+    off = (np.abs(gain - 1.0) > np.maximum(DECISION.gyroscope_gain, CLEAR * error)) & np.isfinite(gain)
     if off.sum() >= 2:
         words = ", ".join(f"{a} {g:.3f}" for a, g, o in zip("xyz", gain, off, strict=True) if o)
         findings["gyroscope gain"] = f"the gyroscope reads {words} times the rate of the attitude"
@@ -83,7 +81,7 @@ def read_kinematics(tracks: list[Track]) -> Kinematics:
     if tilt is not None:
         size = float(np.hypot(*tilt))
         along = tilt / max(size, 1e-12)
-        if size > max(TILT_BOUND, CLEAR * float(np.sqrt(along**2 @ tilt_error**2))):
+        if size > max(np.radians(DECISION.world_tilt), CLEAR * float(np.sqrt(along**2 @ tilt_error**2))):
             findings["world tilt"] = (
                 f"motion capture's world leans by {np.degrees(size):.1f} degrees against gravity "
                 f"({np.degrees(tilt[0]):+.1f} about x, {np.degrees(tilt[1]):+.1f} about y)"
@@ -130,7 +128,7 @@ def _gyroscope(streams) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     an axis turns enough (3,)."""
     sums = []  # per granule: (3, 3) sums of squares and products
     for dt, a, b in streams:
-        size = max(int(GRANULE / dt), 1)
+        size = max(int(SEGMENT / dt), 1)
         for k in range(0, len(a) - size // 2, size):
             p, q = a[k : k + size], b[k : k + size]
             sums.append(np.stack([(p * p).sum(0), (p * q).sum(0), (q * q).sum(0), np.full(3, len(p))]))
@@ -156,7 +154,7 @@ def _wander(streams) -> float:
     """How far (s, rms) the delay between gyroscope and attitude's rate varies from window to window, beyond its errors."""
     delays, errors = [], []
     for dt, a, b in streams:
-        size = max(int(WINDOW / dt), 1)
+        size = max(int(SEGMENT / dt), 1)
         if len(a) < 2 * int(EDGE / dt) + size:
             continue
         slope = np.gradient(a, dt, axis=0)
@@ -166,7 +164,7 @@ def _wander(streams) -> float:
             power = float(x @ x)
             delay = float(x @ y) / max(power, 1e-12)
             # Within the band some ten independent values a second and axis are left.
-            left = float(((y - delay * x) ** 2).mean()) * len(x) / (3 * WINDOW * 2.0 * BAND[1])
+            left = float(((y - delay * x) ** 2).mean()) * len(x) / (3 * SEGMENT * 2.0 * BAND[1])
             of_track.append((delay, left / max(power, 1e-12)))
         of_track = np.array(of_track)
         delays.append(of_track[:, 0] - np.average(of_track[:, 0], weights=1.0 / of_track[:, 1]))
@@ -177,7 +175,7 @@ def _wander(streams) -> float:
     weights = 1.0 / (errors + WANDER_SCALE**2)
     each = weights * (delays**2 - errors) / weights.sum()
     excess = float(each.sum())
-    if excess < WANDER_CLEAR * float(np.sqrt((each**2).sum())):
+    if excess < DECISION.standard_errors * float(np.sqrt((each**2).sum())):
         return 0.0
     found = float(np.sqrt(max(excess, 0.0)))
     return min(found, MOST_WANDER) if found > SEEN_WANDER else 0.0
@@ -195,7 +193,7 @@ def _world(tracks) -> tuple[np.ndarray | None, np.ndarray | None]:
         turn = rotation(track.quaternion)
         rest = np.einsum("tij,tj->ti", turn, track.specific_force) - np.array([0.0, 0.0, GRAVITY])
         low = butter(2, SLOW, fs=1.0 / track.dt, output="sos")
-        edge, size = int(EDGE / track.dt), max(int(GRANULE / track.dt), 1)
+        edge, size = int(EDGE / track.dt), max(int(SEGMENT / track.dt), 1)
         rest = rest - np.gradient(track.velocity, track.dt, axis=0)
         if len(rest) < 4 * edge:
             continue

@@ -53,9 +53,8 @@ def first_noise(axes, integrated: bool, deviation: float) -> Noise:
     return Noise(tuple(axes), *_kalman(0.9, 0.04, 0.15 if integrated else 0.0, integrated), deviation)
 
 
-def fit_noise(axes, residuals, integrated: bool, masks=None, skip: int = 20) -> Noise:
-    """Noise model of residuals [(T, C), ...], pooled over tracks and `axes`; rows where a mask is 0 don't
-    count.
+def fit_noise(axes, residuals, integrated: bool, skip: int = 20) -> Noise:
+    """Noise model of residuals [(T, C), ...], pooled over tracks and `axes`.
 
     The model of the grid is chosen by Whittle's likelihood, the autoregression by Yule-Walker on its
     innovations."""
@@ -63,11 +62,8 @@ def fit_noise(axes, residuals, integrated: bool, masks=None, skip: int = 20) -> 
     chosen = _choose([r[skip:, list(axes)] for r in residuals], integrated)
     numerator, denominator = _kalman(*chosen, integrated)
     series = []
-    for number, residual in enumerate(residuals):
-        z = lfilter(numerator, denominator, residual[:, list(axes)], axis=0)
-        if masks is not None:
-            z = z * masks[number][:, None]
-        series += list(z[skip:].T)
+    for residual in residuals:
+        series += list(lfilter(numerator, denominator, residual[:, list(axes)], axis=0)[skip:].T)
     regression, deviation = _autoregression(series)
     return Noise(axes, np.convolve(numerator, np.r_[1.0, -regression]), denominator, deviation)
 

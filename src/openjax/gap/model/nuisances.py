@@ -3,36 +3,30 @@ their standard deviations."""
 
 from __future__ import annotations
 
+import pathlib
+import tomllib
+
 import numpy as np
 
 from openjax.flights.track import Track, rotation, smooth
-from openjax.gap.library import MOTOR_SHIFT, PLACE, STEP
-from openjax.gap.physics import Path
-from openjax.gap.prediction import FORCE, RATES, VELOCITY
+from openjax.gap.model.library import CARDS, PLACE, STEP
+from openjax.gap.model.physics import Path
+from openjax.gap.model.prediction import FORCE, RATES, VELOCITY
 from openjax.vehicle.effects.airspeed import PROPELLER_RADIUS
 from openjax.vehicle.effects.effect import ARENA_CEILING
 
+SIZE = {
+    name: float(entry["size"])
+    for name, entry in tomllib.loads(
+        pathlib.Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")
+    ).items()
+}
 TRIM = 0.5  # s: what motors do more slowly is no answer to a gust, but what the vehicle needs
-# Standard deviations.
-TILT = np.radians(0.5)  # between tracked frame and thrust axis
-LEVEL = np.radians(0.15)  # of motion capture's world
-IMU_TILT = 0.01  # rad, between the IMU's axes and the body's
-GYROSCOPIC = 0.1  # relative to the moments of inertia
-DAMPING = 0.15  # 1/s, of the body rates by what the rotors do
-APART = 0.03  # s, the same of motor commands whose stream isn't on the pose's clock
-ACCELEROMETER_BIAS = 0.2  # m/s^2: zero-g offset of a BMI088, 20 mg
-ACCELEROMETER_LAG = 0.004  # s, of a low-pass before the log: 30 Hz in the firmware of the Crazyflie
-GYROSCOPE_LAG = 0.0015  # s, likewise: 80 Hz
-POSE_SHIFT = 0.0015  # s between motion capture and the vehicle's clock
-FEEDBACK = 1.0  # of the strength of what feedback makes of the motor commands, at each of
-FEEDBACK_ROWS = (0, 2)  # rows of delay
-QUICK_ROWS = (0, 1, 2)
+FEEDBACK_ROWS, QUICK_ROWS = (0, 2), (0, 1, 2)  # rows of delay
+WAKE_WIDTHS = (0.05, 0.1)  # m
+NEAR_OFFSET = 0.02  # m
 # Nuisances that belong to a track, not to the vehicle.
 OF_A_TRACK = ("clock of the motors", "accelerometer bias", "clock of the pose")
-WAKE_TORQUE = 5.0  # rad/s^2 at the edge of another vehicle's wake, which no simple form of it has right
-WAKE_WIDTHS = (0.05, 0.1)  # m
-NEAR_TORQUE = 500.0  # 1/s^2 per rad of tilt a propeller's radius from floor or ceiling: what half of a usual ground effect does
-NEAR_OFFSET = 0.02  # m
 
 
 def columns_of(
@@ -46,14 +40,18 @@ def columns_of(
         for key, m, k in zip(numbers, moved, places, strict=False)
     }
     for name in columns:
-        if name.startswith("inertia "):
+        if CARDS[name.split()[0]].torque_axes:
             _without_trim(columns[name], track)
-    shift = max(MOTOR_SHIFT, wander + (track.dt / 4 if at_once or wander else 0.0)) if one_clock else APART
+    shift = (
+        max(SIZE["motor_clock"], wander + (track.dt / 4 if at_once or wander else 0.0))
+        if one_clock
+        else SIZE["streams_apart"]
+    )
     columns["clock of the motors"] = (moved[-1] - nominal) * shift / STEP[-1]
     columns |= _late_torques("feedback", track, feedback.acceleration, FEEDBACK_ROWS)
     if at_once:
         columns |= _late_torques("motors within a row", track, feedback.quick, QUICK_ROWS)
-    columns |= _sensor_nuisances(track, path, nominal, max(POSE_SHIFT, wander))
+    columns |= _sensor_nuisances(track, path, nominal, max(SIZE["pose_clock"], wander))
     return columns | _wake_torques(track) | _near_torques(track)
 
 
@@ -78,22 +76,24 @@ def _sensor_nuisances(
     rates = smooth(track.body_rates, 0.03, track.dt)
     force = nominal[:, FORCE]
     for name, axis in zip("xy", np.eye(3), strict=False):
-        column(f"frame tilt {name}", VELOCITY, moved(np.cross(axis, body)), TILT)
+        column(f"frame tilt {name}", VELOCITY, moved(np.cross(axis, body)), SIZE["frame_tilt"])
     for number, name in enumerate("xyz"):
-        column(f"accelerometer bias {name}", 6 + number, 1.0, ACCELEROMETER_BIAS)
+        column(f"accelerometer bias {name}", 6 + number, 1.0, SIZE["accelerometer_bias"])
     for name, axis in zip("xyz", np.eye(3), strict=True):
-        column(f"IMU tilt {name}", RATES, -np.cross(axis, rates - rates[0]), IMU_TILT)
-        column(f"IMU tilt {name}", FORCE, -np.cross(axis, force), IMU_TILT)
+        column(f"IMU tilt {name}", RATES, -np.cross(axis, rates - rates[0]), SIZE["imu_tilt"])
+        column(f"IMU tilt {name}", FORCE, -np.cross(axis, force), SIZE["imu_tilt"])
     for axis, name in enumerate("xyz"):
         turning = np.cumsum(rates[:, axis - 2] * rates[:, axis - 1]) * track.dt
-        column(f"gyroscopic torque {name}", axis, turning, GYROSCOPIC)
+        column(f"gyroscopic torque {name}", axis, turning, SIZE["gyroscopic"])
     for name, axes in (("roll and pitch damping", (0, 1)), ("yaw damping", (2,))):
-        column(name, axes, -np.cumsum(rates, 0)[:, axes] * track.dt, DAMPING)
+        column(name, axes, -np.cumsum(rates, 0)[:, axes] * track.dt, SIZE["damping"])
     for axis, name in enumerate("xy"):
-        column(f"level of the world {name}", 3 + axis, 9.81 * track.dt * np.arange(rows), LEVEL)
-    column("accelerometer's low-pass", FORCE, -np.gradient(force, track.dt, axis=0), ACCELEROMETER_LAG)
+        column(f"level of the world {name}", 3 + axis, 9.81 * track.dt * np.arange(rows), SIZE["world_level"])
+    column(
+        "accelerometer's low-pass", FORCE, -np.gradient(force, track.dt, axis=0), SIZE["accelerometer_lag"]
+    )
     spinning = np.gradient(nominal[:, RATES], track.dt, axis=0)
-    column("gyroscope's low-pass", RATES, -(spinning - spinning[0]), GYROSCOPE_LAG)
+    column("gyroscope's low-pass", RATES, -(spinning - spinning[0]), SIZE["gyroscope_lag"])
     if track.velocity is not None:
         late = -moved(np.cross(np.asarray(path.body_rates, float)[:rows], body))
         late += smooth(np.gradient(track.velocity, track.dt, axis=0), 0.05, track.dt)
@@ -114,7 +114,9 @@ def _late_torques(name: str, track: Track, acceleration: np.ndarray, delays) -> 
     for rows in delays:
         late = np.concatenate([np.zeros((rows, 3)), acceleration[: len(acceleration) - rows]])
         for axes, mask in (("roll and pitch", [1.0, 1.0, 0.0]), ("yaw", [0.0, 0.0, 1.0])):
-            columns[f"{name}, {axes}, {rows} rows late"] = torque_channels(late * mask, track.dt) * FEEDBACK
+            columns[f"{name}, {axes}, {rows} rows late"] = (
+                torque_channels(late * mask, track.dt) * SIZE["feedback"]
+            )
     return columns
 
 
@@ -134,7 +136,7 @@ def _near_torques(track: Track) -> dict[str, np.ndarray]:
     out = {}
     for name, distance in (("floor", height), ("ceiling", ARENA_CEILING - height)):
         near = (PROPELLER_RADIUS / (np.maximum(distance, 0.0) + NEAR_OFFSET)) ** 3
-        out[f"torque near the {name}"] = torque_channels(tilt * near[:, None], track.dt) * NEAR_TORQUE
+        out[f"torque near the {name}"] = torque_channels(tilt * near[:, None], track.dt) * SIZE["near_torque"]
     return out
 
 
@@ -151,5 +153,5 @@ def _wake_torques(track: Track) -> dict[str, np.ndarray]:
         # The side nearer to the wake is pushed down: (gap) x (-e_z).
         world = np.stack([-gap[..., 1], gap[..., 0], np.zeros_like(gap[..., 0])], -1) * strength
         turned = np.einsum("tji,tj->ti", rotation(track.quaternion), world.sum(0))
-        out[f"wake, {width:g} m"] = torque_channels(turned, track.dt) * WAKE_TORQUE
+        out[f"wake, {width:g} m"] = torque_channels(turned, track.dt) * SIZE["wake_torque"]
     return out

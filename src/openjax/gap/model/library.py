@@ -1,9 +1,7 @@
 """How each effect of `openjax.vehicle.effects` is fitted: which parameters, where to start, what is
 plausible.
 
-Priors are weak: their spread is of the order of the effect's usual range. A *companion* is a parameter of
-another effect that may move a little whenever this one does, because real effects seldom have exactly the
-library's form (a payload adds inertia, drag acts above the centre of mass)."""
+Priors are weak: their spread is of the order of the effect's usual range."""
 
 from __future__ import annotations
 
@@ -18,52 +16,14 @@ from openjax.vehicle.effects import EFFECTS, Card
 # {effect: its card}: what can be diagnosed.
 CARDS: dict[str, Card] = {name: effect.card for name, effect in EFFECTS.items() if effect.card is not None}
 
-# Small errors of the vehicle's numbers that no effect is blamed for - a thrust off by less than a per cent - and what the
-# replay's own step and the half-known motor commands inside a row leave: some per cent of a torque, a millisecond.
-NUISANCES = (
-    ("thrust_scale", "scale", 0.004),
-    ("inertia", "xx", 0.04),
-    ("inertia", "yy", 0.04),
-    ("inertia", "zz", 0.015),
-    ("motor_lag", "extra_up", 0.0015),
-    ("motor_lag", "extra_down", 0.0015),
-    ("yaw_torque", "ratio", 0.01),
-)
-# With duty cycles for motor commands the map to thrust is a guess: scale, shape, lag and torques are free, and what they
-# can imitate isn't testable.
-PWM_NUISANCES = (
-    ("thrust_scale", "scale", 0.3),
-    ("inertia", "xx", 0.2),
-    ("inertia", "yy", 0.2),
-    ("inertia", "zz", 0.2),
-    ("motor_lag", "extra_up", 0.01),
-    ("motor_lag", "extra_down", 0.01),
-    ("thrust_curve", "offset", 0.15),
-    ("thrust_curve", "curvature", 0.3),
-    ("yaw_torque", "ratio", 0.5),
-)
-# With single samples of the motors and no way to tell what they did between them, kicks at the rows' beginnings make
-# them look stronger than they are, and up to two rows earlier.
-SAMPLED_NUISANCES = (
-    ("thrust_scale", "scale", 0.004),
-    ("inertia", "xx", 0.3),
-    ("inertia", "yy", 0.3),
-    ("inertia", "zz", 0.3),
-    ("motor_lag", "extra_up", 0.01),
-    ("motor_lag", "extra_down", 0.01),
-    ("yaw_torque", "ratio", 0.2),
-)
-# By how much more these may seem wrong, per share of gusts in the torques (`feedback.gustiness`), about which axes:
-# commands answer gusts by way of the attitude, so that in closed loop motors look weak and early.
-GUSTY = {
-    ("inertia", "xx"): (1.0, (0,)),
-    ("inertia", "yy"): (1.0, (1,)),
-    ("inertia", "zz"): (0.3, (2,)),
-    ("motor_lag", "extra_up"): (0.01, (0, 1)),
-    ("motor_lag", "extra_down"): (0.01, (0, 1)),
-}
+
+def numbers_of(situation: str) -> tuple[tuple[str, str, float], ...]:
+    """(effect, parameter, usual size) of small errors of the vehicle's numbers, which are free in every hypothesis; `situation`
+    is the field of `Card` that holds them."""
+    return tuple((e, p, size) for e, card in CARDS.items() for p, size in getattr(card, situation).items())
+
+
 BALANCE = 0.9999  # share of the common variance that `balanced` parameters go without
-MOTOR_SHIFT = 0.001  # s, standard deviation of the motors' clock offset
 
 
 @dataclass(frozen=True)
@@ -112,8 +72,7 @@ def start_of(effect: str, number: int = 0) -> np.ndarray:
 
 
 def prior(effects) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Indices (p,), mean (p,) and precision (p, p) of the parameters of a set of physics effects,
-    companions last."""
+    """Indices (p,), mean (p,) and precision (p, p) of the parameters of a set of physics effects."""
     index, mean, blocks = [], [], []
     for effect in effects:
         card = CARDS[effect]
@@ -121,12 +80,6 @@ def prior(effects) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         mean += [p.mean for p in card.fitted]
         block = np.diag([p.spread**2 for p in card.fitted]) + card.common**2
         blocks.append(block - BALANCE * block.mean() if card.balanced else block)
-    for effect in effects:
-        for other, parameter, spread in CARDS[effect].companions:
-            if PLACE[other, parameter] not in index:
-                index.append(PLACE[other, parameter])
-                mean.append(ABSENT[index[-1]])
-                blocks.append(np.array([[spread**2]]))
     size = len(index)
     covariance, at = np.zeros((size, size)), 0
     for block in blocks:

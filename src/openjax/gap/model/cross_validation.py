@@ -7,9 +7,9 @@ from functools import cached_property
 
 import numpy as np
 
-from openjax.gap.bounds import bounded, normal_equations
-from openjax.gap.library import prior
-from openjax.gap.table import Model, Table, widened
+from openjax.gap.model.bounds import bounded, normal_equations
+from openjax.gap.model.library import prior
+from openjax.gap.model.table import Model, Table, with_effects
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,6 +20,8 @@ class Judged:
     nats: np.ndarray
     squares: np.ndarray
     taken: np.ndarray
+    left: np.ndarray  # (M,) whitened residuals, block after block
+    starts: np.ndarray  # (B,) where each block begins
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,11 +104,13 @@ class Equations:
         return out
 
 
-def solve(table: Table, model: Model) -> np.ndarray:
-    """Coefficients (tracks, C) of every column, fitted to all folds."""
-    equations = Equations(table, model)
-    found = equations.solved()
-    return np.stack([equations.coefficients(found, k) for k in range(len(equations.tracks))])
+def promise(table: Table, model: Model) -> float:
+    """Log posterior of a model at its best, fitted to all folds, up to what all models of a table share: what screening needs."""
+    equations, own = Equations(table, model), [0, *model.parts]
+    hessian, push = equations.without(None)
+    found, _ = bounded(hessian, push, len(model.free), model.bound)
+    square = table.folds[0].sum(0)[np.ix_(own, own)].sum()
+    return float(push @ found - 0.5 * found @ hessian @ found - 0.5 * square)
 
 
 def left_out(table: Table, model: Model):
@@ -119,51 +123,37 @@ def left_out(table: Table, model: Model):
 def judge(table: Table, model: Model) -> Judged:
     """The model on each fold, fitted to all others."""
     nats, squares = np.zeros(len(table.white)), np.zeros((len(table.white), 6))
-    taken = []
+    taken, left = [], [np.zeros(0)] * len(table.white)
     for blocks, u in left_out(table, model):
+        for k in range(blocks.start, blocks.stop):
+            left[k] = u @ table.columns[k]
         nats[blocks] = -0.5 * (table.white[blocks] @ u) @ u
         squares[blocks] = (table.error[blocks] @ u) @ u
         taken.append(-u[table.nuisances[table.shared]])
-    return Judged(nats, squares, np.array(taken))
+    starts = np.cumsum([0, *map(len, left)])[:-1]
+    return Judged(nats, squares, np.array(taken), np.concatenate(left), starts)
 
 
-def keep(table: Table, model: Model, drop=(), off: np.ndarray | None = None) -> np.ndarray:
-    """Squared errors (B, 6) on each fold of a model fitted to all others, once the effects `drop` and the nuisances `off`
-    (N,) go and everything else stays as fitted."""
-    squares = np.zeros((len(table.white), 6))
-    for blocks, u in left_out(table, model):
-        for effect in drop:
-            others = {int(i) for e in table.fit.effects if e not in drop for i in prior((e,))[0]}
-            own = [table.derivative[int(i)] for i in prior((effect,))[0] if int(i) not in others]
-            u[own] = 0.0
-            u[table.part[effect]] = 1.0
-        if off is not None:
-            u[table.nuisances[off]] = 0.0
-        squares[blocks] = (table.error[blocks] @ u) @ u
-    return squares
+class Ablation:
+    """A table's set fitted to all folds but one, whose effects and nuisances may go while everything else stays as fitted."""
 
+    def __init__(self, table: Table):
+        self.table = table
+        self.left_out = list(left_out(table, with_effects(table)))
 
-def offers(table: Table, model: Model, columns: np.ndarray, precision: np.ndarray) -> np.ndarray:
-    """Nats (K, B) on each fold of the model with one more of `columns` (K,) free, whose coefficient has `precision` (K,) about
-    none: `judge` for each, with the nuisances that are at their bounds left there."""
-    wide = Equations(table, widened(model, columns, precision))
-    added = len(model.free) + np.arange(len(columns))
-    nats = np.zeros((len(columns), len(table.white)))
-    for fold, track in enumerate(table.folds[1]):
-        hessian, push = wide.without(fold)
-        kept = np.setdiff1d(np.arange(len(push)), added)
-        found, open_ = bounded(hessian[np.ix_(kept, kept)], push[kept], len(model.free), model.bound)
-        inside = kept[open_]
-        follow = np.linalg.solve(hessian[np.ix_(inside, inside)], hessian[np.ix_(inside, added)])
-        stiff = hessian[added, added] - (hessian[np.ix_(inside, added)] * follow).sum(0)
-        size = (push[added] - hessian[np.ix_(added, kept)] @ found) / stiff
-        whole = np.zeros((len(columns), len(push)))
-        whole[:, kept] = found
-        whole[:, inside] -= (follow * size).T
-        whole[np.arange(len(columns)), added] = size
-        u, blocks = wide.coefficients(wide.own_again(whole, track), track), table.blocks_of(fold)
-        nats[:, blocks] = -0.5 * ((u @ table.white[blocks]) * u).sum(2).T
-    return nats
+    def squares(self, drop=(), off: np.ndarray | None = None) -> np.ndarray:
+        """Squared errors (B, 6) on each fold without the effects `drop` and the nuisances `off` (N,)."""
+        table, squares = self.table, np.zeros((len(self.table.white), 6))
+        kept = {int(i) for e in table.fit.effects if e not in drop for i in prior((e,))[0]}
+        for blocks, solution in self.left_out:
+            u = solution.copy()
+            for effect in drop:
+                u[[table.derivative[int(i)] for i in prior((effect,))[0] if int(i) not in kept]] = 0.0
+                u[table.part[effect]] = 1.0
+            if off is not None:
+                u[table.nuisances[off]] = 0.0
+            squares[blocks] = (table.error[blocks] @ u) @ u
+        return squares
 
 
 def level(squares: np.ndarray, floor: np.ndarray) -> float:

@@ -1,0 +1,45 @@
+"""What a log says by ways of its own: pose, radio, rate loop and motion, each a channel with the same few methods."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from openjax.gap.model.library import CARDS
+
+
+@dataclass(frozen=True)
+class Estimated:
+    """A parameter's value and its standard deviations below and above."""
+
+    value: float
+    below: float
+    above: float
+
+
+class Channel:
+    """One way by which a log tells effects. `path` is the `Card.path` of those that it reads."""
+
+    path: str = ""
+
+    def acting(self) -> dict[str, float]:
+        """{effect: probability} of the channel's effects that the log shows."""
+        raise NotImplementedError
+
+    def undetectable(self) -> list[str]:
+        """The channel's effects that these flights would not show at their usual size."""
+        raise NotImplementedError
+
+    def estimate(self, effect: str, parameter: str) -> Estimated:
+        """A parameter of an acting effect."""
+        raise NotImplementedError
+
+    def residuals(self, named) -> dict[str, list[np.ndarray]]:
+        """{name: [(T,) per track]} of normalised prediction errors with the effects `named`."""
+        raise NotImplementedError
+
+
+def effects_of(path: str, library) -> tuple[str, ...]:
+    """Effects of a library that a channel reads."""
+    return tuple(e for e in library.effects if CARDS[e].path == path)

@@ -1,0 +1,117 @@
+"""What commands caused of the motors, and what feedback made of them.
+
+In closed loop the motors answer gusts, noise of the gyroscope and whatever pushes the body, so a regression on the motors
+as logged is biased: towards weak motors where they were logged as single samples, towards any cause that feedback
+follows. What body-rate commands caused is free of all that. It serves as an instrument (two-stage least squares): the
+first stage here tells the two parts apart; the second lets the feedback part do what it likes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import butter, lfilter, sosfiltfilt
+
+from openjax.flights.track import Track, smooth
+from openjax.gap.model.nuisances import TRIM
+from openjax.gap.model.observer import TICKS, commanded
+from openjax.gap.model.prediction import bucket, padded
+from openjax.vehicle.rate_controller import mixer
+
+SLOW = 0.06  # s over which commands implied by motors and rates are smoothed
+QUICK = 0.1  # s: within it, single samples say little about what motors did between them
+COUNT = 57.29577951308232 / 65536.0  # motor command per count and rad/s
+BAND, EDGE = (
+    (0.5, 10.0),
+    0.3,
+)  # Hz above trims and below filters and single samples; s at either end that the filter spoils
+
+
+@dataclass(frozen=True, eq=False)
+class Feedback:
+    """Of one track: `acceleration` (T, 3) rad/s^2 that the feedback part of the motors makes, through their lag;
+    `quick` (T, 3) the same of what motors do within QUICK s, whoever caused it; `caused` (T, 3) the same of what the
+    commands caused."""
+
+    acceleration: np.ndarray
+    quick: np.ndarray
+    caused: np.ndarray
+
+
+def outputs_of(vehicle) -> np.ndarray:
+    """(4, 3) that turns motor commands into the rate controller's outputs, roll, pitch, yaw."""
+    return np.linalg.pinv(np.asarray(mixer(vehicle), float)).T
+
+
+def in_force(track: Track, arrived) -> np.ndarray:
+    """Command (T, TICKS, 4) that rules at each tick of the rate loop."""
+    part, rows = arrived
+    out = np.repeat(track.command[rows[:, 0]][:, None], TICKS, 1)
+    older = round(part * TICKS)
+    out[:, :older] = track.command[rows[:, 1]][:, None]
+    return out
+
+
+def read_feedback(tracks, vehicles, by_commands) -> list[Feedback]:
+    """The feedback part of every track's motors. `by_commands`: `caused_by_commands` of each."""
+    given, caused, made = [], [], []
+    for track, vehicle, (motors, _) in zip(tracks, vehicles, by_commands, strict=True):
+        outputs = outputs_of(vehicle)
+        given.append(motors - motors.mean(0))
+        caused.append(given[-1] @ outputs)
+        made.append(track.motor @ outputs)
+    # First stage: as much of the outputs as is proportional to what commands would have caused, axis by axis. More freedom
+    # (a filter) would let the outer loop's answers to gusts in.
+    made = [m - m.mean(0) for m in made]
+    power = sum((c * c).sum(0) for c in caused)
+    share = sum((c * m).sum(0) for c, m in zip(caused, made, strict=True)) / np.maximum(power, 1e-12)
+    rest = [m - share * c for c, m in zip(caused, made, strict=True)]
+    return [
+        Feedback(
+            _turning((r - smooth(r, TRIM, t.dt)) @ np.asarray(mixer(v), float).T, t, v),
+            _turning(t.motor - smooth(t.motor, QUICK, t.dt), t, v),
+            _turning(g, t, v),
+        )
+        for r, g, t, v in zip(rest, given, tracks, vehicles, strict=True)
+    ]
+
+
+def gustiness(tracks, feedback: list[Feedback], floor) -> np.ndarray:
+    """(3,) rms of the angular accelerations that nothing explains over those that commands caused, in BAND. Commands
+    answer gusts too, by way of the attitude, so this bounds how wrong torques may look. `floor` [(T, 9)]: residuals when
+    all effects may act."""
+    left, caused = np.zeros(3), np.full(3, 1e-12)
+    for track, part, rest in zip(tracks, feedback, floor, strict=True):
+        band = butter(2, BAND, "bandpass", fs=1.0 / track.dt, output="sos")
+        edge = int(EDGE / track.dt)
+        both = np.stack([np.gradient(rest[:, :3], track.dt, axis=0), part.caused])[:, edge:]
+        both = sosfiltfilt(band, both, axis=1)[:, edge:-edge]
+        left += (both[0] ** 2).sum(0)
+        caused += (both[1] ** 2).sum(0)
+    return np.sqrt(left / caused)
+
+
+def caused_by_commands(track: Track, vehicle, link) -> tuple[np.ndarray, np.ndarray]:
+    """Motor commands (T, 4) and rates (T, 3) that the body-rate commands alone cause; `link`: what arrived of them, None where
+    that wasn't read. Where none were logged, the nominal controller's law says which ones the motors and rates imply, slowly."""
+    if track.command is not None:
+        sent = track.command if link is None else in_force(track, link).mean(1)
+    else:
+        gain = np.asarray(vehicle.rate_kp, float) * COUNT
+        implied = track.motor @ outputs_of(vehicle) / gain + track.body_rates
+        sent = np.concatenate(
+            [track.motor.mean(1)[:, None], smooth(implied - implied.mean(0), SLOW, track.dt)], 1
+        )
+    motors, rates = commanded(vehicle, padded(sent, bucket(len(track))), np.float32(track.dt))
+    return np.asarray(motors, float)[: len(track)], np.asarray(rates, float)[: len(track)]
+
+
+def _turning(motors: np.ndarray, track: Track, vehicle) -> np.ndarray:
+    """Angular acceleration (T, 3) that changes of the motor commands (T, 4) make, through the motors' lag."""
+    blend = -np.expm1(-track.dt / float(vehicle.motor_time_constant))
+    pushed = lfilter([blend], [1.0, blend - 1.0], motors, axis=0)
+    thrust = pushed * float(vehicle.thrust_constant * vehicle.max_rotor_speed**2)
+    place, spin = np.asarray(vehicle.rotor_position, float), np.asarray(vehicle.rotor_spin, float)
+    ratio = float(vehicle.torque_constant / vehicle.thrust_constant)
+    torque = np.stack([thrust @ place[:, 1], -thrust @ place[:, 0], ratio * (thrust @ spin)], 1)
+    return torque / np.asarray(vehicle.inertia, float)

@@ -1,0 +1,143 @@
+"""The motion: motors to body rates, velocity and specific force. What each physics effect alone explains of it."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from openjax.flights.flight import Case
+from openjax.flights.track import GRID_PERIOD, Track
+from openjax.gap.channels.instruments import caused_by_commands, gustiness, read_feedback
+from openjax.gap.channels.rate_loop import ROW_DELAY, RateLoop
+from openjax.gap.channels.sensors import Kinematics
+from openjax.gap.model.fit import SetFit, fit_singles, model_noise, without_nuisances
+from openjax.gap.model.library import CARDS, Library, numbers_of
+from openjax.gap.model.observer import TICKS
+from openjax.gap.model.replay import Replay, make_replay
+
+FEW_ROWS = 2.4  # of a log in one of the grid's: if they are samples, their mean isn't what five ticks of the loop did
+SLOW_ROWS = (
+    1.2  # grid periods: rows as slow as this hide every other command of a loop that sends one each 10 ms
+)
+MOST_GUSTS = 0.25  # of the torques that commands cause: from then on feedback is all that is seen of them
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """How the rows of a case are read. `arrived`: the commands that the link let through, None without commands; `pwm`: motors
+    are duty cycles; `at_once`: a row's motors are one sample, as the vehicle file's [log] says by motor_rows = "sample";
+    `blind`: what motors do within a row isn't known; `late` s: by how much they may be off against the gyroscope, None where
+    that isn't known either."""
+
+    library: Library
+    tracks: list[Track]
+    vehicles: list
+    arrived: list | None
+    sensors: Kinematics
+    pwm: bool
+    at_once: bool
+    blind: bool
+    late: float | None
+
+    @property
+    def numbers(self):
+        return numbers_of("nuisance_duty" if self.pwm else "nuisance_samples" if self.blind else "nuisance")
+
+    @cached_property
+    def by_commands(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """`caused_by_commands` of each track."""
+        links = self.arrived if self.arrived is not None else [None] * len(self.tracks)
+        return [caused_by_commands(*of) for of in zip(self.tracks, self.vehicles, links, strict=True)]
+
+
+def make_reading(case: Case, library: Library, tracks, vehicles, arrived, sensors: Kinematics) -> Reading:
+    """How the rows of a case are to be read."""
+    shortest = min(f.row_period for f in case.flights)
+    slow = shortest > 0.8 * GRID_PERIOD  # faster logs are averaged
+    drifts, seldom = sensors.wander > 0.0, max(t.dt for t in tracks) > SLOW_ROWS * GRID_PERIOD
+    known = arrived is not None and not seldom and not drifts
+    sampled = case.vehicle_file.log.get("motor_rows", "mean") == "sample"
+    at_once = sampled and slow and all(t.motors_logged for t in tracks)
+    hidden = (not slow and GRID_PERIOD / shortest < FEW_ROWS) or any(
+        f.body_rates_derived for f in case.flights
+    )
+    blind = (at_once and not known) or drifts or hidden
+    late = None if blind or seldom else ROW_DELAY[0 if slow else 1]
+    pwm = case.vehicle_file.motor_command == "pwm"
+    return Reading(library, tracks, vehicles, arrived, sensors, pwm, at_once, blind, late)
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """`replay` of the flights; `singles` {effect: its fit alone} and the fit of `nothing`; `exposure` {effect: nats that it
+    would leave at its usual size}; `confounded`: effects that gusts or hidden samples look like: they take what they can, and
+    aren't named."""
+
+    replay: Replay
+    nothing: SetFit
+    singles: dict[str, SetFit]
+    exposure: dict[str, float]
+    confounded: frozenset[str]
+
+
+def read_motion(reading: Reading, loop: RateLoop | None) -> Motion:
+    """Replay the flights and fit every effect alone; `loop` knows what the motors did within a row."""
+    tracks, sensors, library = reading.tracks, reading.sensors, reading.library
+    ticks = [np.repeat(t.motor[:, None], TICKS, 1) for t in tracks] if loop is None else loop.ticks
+    if loop is not None and reading.at_once:
+        tracks = [dataclasses.replace(t, motor=m.mean(1)) for t, m in zip(tracks, ticks, strict=True)]
+    feedback = read_feedback(tracks, reading.vehicles, reading.by_commands)
+    replay = make_replay(
+        tracks,
+        reading.vehicles,
+        ticks,
+        feedback,
+        reading.numbers,
+        sensors.one_clock,
+        reading.at_once,
+        sensors.wander,
+    )
+    replay, floor, exposure = model_noise(replay, library)
+    gusts = gustiness(tracks, feedback, floor)
+    replay = dataclasses.replace(replay, gusts=gusts).loosened(_gusty(replay, gusts))
+    exposure |= {e: 0.0 for e in library.physics if _hidden(CARDS[e], tracks)}
+    nothing, singles = fit_singles(replay, library, exposure)
+
+    def remains(effect: str) -> bool:
+        """Whether an effect is confounded. A large one leaves more than a straight line takes, which looked like gusts: what is
+        left of its own fit tells."""
+        if not _confounded(CARDS[effect], reading.blind, gusts):
+            return False
+        if reading.blind or effect not in singles:
+            return True
+        left = [without_nuisances(replay, c[0], k) for k, c in enumerate(singles[effect].columns)]
+        return _confounded(CARDS[effect], False, gustiness(tracks, feedback, left))
+
+    return Motion(replay, nothing, singles, exposure, frozenset(e for e in library.physics if remains(e)))
+
+
+def _gusty(replay: Replay, gusts: np.ndarray) -> dict[str, float]:
+    """{nuisance: times} by which the vehicle's numbers may seem more wrong than usual: in closed loop commands answer gusts by
+    way of the attitude, so motors look weak and early."""
+    times = {}
+    for effect, parameter, usual in replay.numbers:
+        if parameter in CARDS[effect].gusts:
+            size, axes = CARDS[effect].gusts[parameter]
+            times[f"{effect} {parameter}"] = float(np.hypot(1.0, size * gusts[list(axes)].mean() / usual))
+    return times
+
+
+def _hidden(card, tracks) -> bool:
+    """Whether an effect can't be told from these logs, however large it is."""
+    if card.needs and any(getattr(t, card.needs) is None for t in tracks):
+        return True
+    return card.impossible is not None and any(card.impossible(t.position) for t in tracks)
+
+
+def _confounded(card, blind: bool, gusts: np.ndarray) -> bool:
+    """Whether gusts, or what motors do between two rows, look like an effect."""
+    axes = list(card.torque_axes)
+    return bool(axes) and bool(blind or gusts[axes].mean() > MOST_GUSTS)

@@ -1,0 +1,211 @@
+"""The radio: delay and lost packets of the commands, read without any dynamics.
+
+The mean of the motor commands is the commanded thrust, so its delay and its lost packets show row by row."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from openjax.flights.track import Track, held_means
+from openjax.gap.channels import Channel, Estimated, effects_of
+from openjax.gap.decision import DECISION
+from openjax.gap.model.library import CARDS
+
+LONGEST_DELAY = 0.1  # s
+DELAY_STEP = 0.0005  # s
+TOLERANCE = 3e-4  # of thrust: rounding of the logs and of the firmware's integers
+READABLE = 3e-3  # of thrust: mean misfit above which motors and commands aren't one stream
+INFORMATIVE = 1.5e-3  # smallest change of commanded thrust that shows what the link does at all
+HELD, BETWEEN = 0.2, 0.6  # of the way from the command held to the one due: up to here it is held, or neither
+DEPENDENT = 3.0  # rows that count as one independent error
+FEWEST = 30  # changes of the command that tell what a link does
+CLEAR = 20.0  # nats that a delay or losses must gain: errors of a link aren't independent
+THRUST_FLOOR = 2e-3  # of thrust: below, the link is perfect for every purpose
+ROW_ERROR = (
+    0.1,
+    0.29,
+)  # of a row, by which a delay is known: rows that are means, rows that are single samples
+BURSTS = 3.0  # packets that are lost together
+
+DELAY, LOSS = "delay", "probability"  # the parameters of the effects that a radio tells
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """The link under one hypothesis. `arrived` [(fraction, (T, 2) rows)]: of each track the command in force at the end and at
+    the start of each row, and the share of the row that the older one rules; `error` (M,) of the collective thrust;
+    `informative` rows have a new command, `told` ones are so clear that they tell whether it arrived, in `lost` of them it
+    didn't, and `between` rows neither hold the old command nor follow the new one."""
+
+    arrived: list
+    error: np.ndarray
+    informative: int
+    told: int
+    lost: int
+    between: int
+
+    @property
+    def misfit(self) -> float:
+        return float(np.mean(np.abs(self.error))) if len(self.error) else 0.0
+
+    @property
+    def nats(self) -> float:
+        """Log-likelihood of the errors under a Laplace distribution of unknown scale."""
+        return -len(self.error) / DEPENDENT * float(np.log(self.misfit + TOLERANCE))
+
+
+@dataclass(frozen=True, eq=False)
+class Radio(Channel):
+    """`links` {parameters that aren't as nominal: the link}; `names` {parameter: effect} of the library."""
+
+    delay: float
+    links: dict[frozenset, Link]
+    names: dict[str, str]
+    row: float = 0.01
+    sampled: bool = False
+    path = "radio"
+
+    @property
+    def loss(self) -> float:
+        """Share of the packets that were lost."""
+        used = self.links[frozenset({DELAY, LOSS} if self.delay > 0 else {LOSS})]
+        return used.lost / max(used.told, 1)
+
+    @property
+    def readable(self) -> bool:
+        """Whether the motors' stream follows the commands closely enough to tell single packets."""
+        return self.links[frozenset({DELAY, LOSS})].misfit < READABLE
+
+    @property
+    def found(self) -> frozenset:
+        """The parameters that aren't nominal: each must gain beside the other, exceed what clocks may differ by, or a share of
+        lost packets. Packets aren't lost where as many rows lie between two commands: a delay that jitters leaves those."""
+        if not self.readable:
+            return frozenset()
+        both = frozenset({DELAY, LOSS})
+        gain = {p: self.links[both].nats - self.links[both - {p}].nats for p in both}
+        used = self.links[both if self.delay > 0 else frozenset({LOSS})]
+        late = self.delay > DECISION.clock and gain[DELAY] > CLEAR
+        lost = self.loss > DECISION.packet_loss and gain[LOSS] > CLEAR and used.between < 0.5 * used.lost
+        return frozenset(p for p, on in ((DELAY, late), (LOSS, lost)) if on and p in self.names)
+
+    @property
+    def arrived(self) -> list:
+        """The commands that the link let through."""
+        return self.links[self.found].arrived
+
+    def acting(self) -> dict[str, float]:
+        return {self.names[p]: 1.0 - DECISION.unknown for p in sorted(self.found)}
+
+    def undetectable(self) -> list[str]:
+        told = self.links[frozenset({DELAY, LOSS})].informative >= FEWEST
+        return [] if self.readable and told else list(self.names.values())
+
+    def estimate(self, effect: str, parameter: str) -> Estimated:
+        if parameter == DELAY:
+            error = float(np.hypot(DELAY_STEP, ROW_ERROR[self.sampled] * self.row))
+            return Estimated(self.delay, error, error)
+        count = max(self.links[frozenset({DELAY, LOSS})].told / BURSTS, 1.0)
+        error = float(np.sqrt(self.loss * (1 - self.loss) / count) + 0.5 / count)
+        return Estimated(self.loss, error, error)
+
+    def residuals(self, named) -> dict[str, list[np.ndarray]]:
+        used = self.links[frozenset(p for p, effect in self.names.items() if effect in named)]
+        return {"motors all": [np.array([np.hypot(used.misfit, THRUST_FLOOR)]) for _ in used.arrived]}
+
+
+def read_radio(tracks: list[Track], library, sampled: bool = False) -> Radio:
+    """Delay and lost packets from the commanded thrust against the mean of the motor commands."""
+    delays = np.arange(0.0, LONGEST_DELAY, DELAY_STEP)
+    delay = float(delays[int(np.argmin(sum(_delay_misfit(t, delays) for t in tracks)))])
+    links = {
+        frozenset(p for p, on in ((DELAY, late), (LOSS, lost)) if on): _decode(tracks, late * delay, lost)
+        for late in (False, True)
+        for lost in (False, True)
+    }
+    names = {CARDS[e].fitted[0].name: e for e in effects_of("radio", library)}
+    return Radio(delay, links, names, max(t.dt for t in tracks), sampled)
+
+
+def _clean_rows(track: Track) -> np.ndarray:
+    clean = ((track.motor < 0.997) & (track.motor > 0.003)).all(1)
+    clean[: int(LONGEST_DELAY / track.dt) + 2] = False
+    return clean
+
+
+def _delay_misfit(track: Track, delays: np.ndarray) -> np.ndarray:
+    thrust, clean = track.command[:, 0], _clean_rows(track)
+    cap = 0.3 * np.std(np.diff(thrust)) + 1e-9  # a lost packet must not pull at the delay
+    return np.array([np.minimum(np.abs(_late_error(track, d)[clean]), cap).sum() for d in delays])
+
+
+def _late_error(track: Track, delay: float) -> np.ndarray:
+    """(T,) mean of the motors less the commanded thrust of `delay` s ago."""
+    whole, part, given, _ = _link_rows(track, delay)
+    thrust = track.command[:, 0]
+    return given - (1 - part) * _late(thrust, whole) - part * _late(thrust, whole + 1)
+
+
+def _late(values: np.ndarray, rows: int) -> np.ndarray:
+    return np.concatenate([np.repeat(values[:1], rows, 0), values[: len(values) - rows]])
+
+
+def _rows_late(track: Track, delay: float) -> tuple[int, float]:
+    """A delay (s) in rows: whole ones and the rest."""
+    whole = int(delay / track.dt + 1e-9)
+    return whole, delay / track.dt - whole
+
+
+def _link_rows(track: Track, delay: float) -> tuple[int, float, np.ndarray, np.ndarray]:
+    """Rows in which commands of `delay` s ago are in force: whole rows late, the share of a row that the one before still
+    rules, the motors' mean (T,), whether it can be read (T,). Logs faster than the rows are cut anew where the commands
+    arrive, so that a row holds one command."""
+    clean = _clean_rows(track)
+    if track.fast_thrust is None:
+        return *_rows_late(track, delay), track.motor.mean(1), clean
+    given = held_means(*track.fast_thrust, track.time + delay, track.dt)
+    rows = int(np.ceil(delay / track.dt - 1e-9))
+    for later in range(1, rows + 1):  # what a row holds then is in these
+        clean = clean & np.concatenate([clean[later:], np.zeros(min(later, len(clean)), bool)])
+    return 0, 0.0, given, clean
+
+
+def _decode(tracks, delay: float, may_lose: bool) -> Link:
+    """Row by row: did the command due in this row arrive, or is the one before still held?"""
+    errors, arrived, counts = [], [], np.zeros(4, int)
+    for track in tracks:
+        in_force, error, counted = _follow(track, delay, may_lose)
+        errors.append(error)
+        counts += counted
+        whole, part = _rows_late(track, delay)
+        in_force = in_force if track.fast_thrust is None else _late(in_force, whole)
+        arrived.append((part, np.stack([in_force, _late(in_force, 1)], 1)))
+    return Link(arrived, np.concatenate(errors), *map(int, counts))
+
+
+def _follow(track: Track, delay: float, may_lose: bool):
+    """Row of the command in force (T,), errors of the thrust in clean rows, and how many rows are informative, told, lost,
+    between."""
+    whole, part, given, clean = _link_rows(track, delay)
+    error = np.abs(_late_error(track, delay)[clean])
+    noise = float(np.median(error)) if len(error) else 0.0
+    telling = (
+        TOLERANCE + 2.0 * noise
+    ) / HELD  # the smallest change of thrust that shows whether a packet arrived
+    thrust, given, flags = track.command[:, 0].tolist(), given.tolist(), clean.tolist()
+    held, in_force, error, counts = 0, np.zeros(len(track), int), np.zeros(len(track)), np.zeros(4, int)
+    for row in range(len(track)):
+        due = max(row - whole, 0)
+        expected = (1 - part) * thrust[due] + part * thrust[held]
+        change, missed = abs(thrust[held] - expected), False
+        if flags[row] and change > INFORMATIVE:
+            way = abs(given[row] - thrust[held]) / change
+            missed = may_lose and way < abs(given[row] - expected) / change
+            told = change > telling
+            counts += [1, told, told and way < HELD, told and HELD <= way < BETWEEN]
+        error[row] = given[row] - (thrust[held] if missed else expected)
+        held = held if missed else due
+        in_force[row] = held
+    return in_force, error[clean], counts

@@ -1,0 +1,1 @@
+"""The linear-Gaussian model: residuals, nuisances, noise, fits, cross-validation."""

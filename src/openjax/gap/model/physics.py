@@ -1,0 +1,103 @@
+"""Forces and torques along a flight: the simulator's own functions on logged states, driven by the logged
+motors.
+
+Nothing is rolled out: at every row the vehicle is where the log says, only the rotor speeds are simulated,
+from the motor commands through the motors' lag. So an error stays where it arises, and one call is a few
+milliseconds."""
+
+from __future__ import annotations
+
+from functools import lru_cache, partial
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from openjax.vehicle import DroneState
+from openjax.vehicle.effects import make_context, resolve
+from openjax.vehicle.effects.composition import added_wrench, change_body, change_motor_command, change_thrust
+from openjax.vehicle.rigid_body import rotate
+from openjax.vehicle.rotors import commanded_rotor_speed, rotor_reaction, rotor_thrust
+from openjax.vehicle.wrench import total_wrench
+
+CHANNELS = 9  # angular acceleration (body), acceleration (world), specific force (body)
+
+
+@flax.struct.dataclass
+class Path:
+    """A track as the physics sees it: T rows, each the state amid its interval. float32, padded."""
+
+    position: jax.Array  # (T, 3) m
+    quaternion: jax.Array  # (T, 4)
+    velocity: jax.Array  # (T, 3) m/s
+    body_rates: jax.Array  # (T, 3) rad/s
+    motor: jax.Array  # (T, TICKS, 4) 0..1 in the row's ticks
+    voltage: jax.Array  # (T,) V, NaN where unknown
+    others: jax.Array  # (T, M, 3) m
+    dt: jax.Array  # () s
+
+
+@lru_cache(maxsize=16)
+def compiled_physics(names: tuple[str, ...], parameters: tuple[tuple[str, str], ...]):
+    """The batched physics with the effects `names`: theta (B, P), and of each its vehicle and path (leaves (B, ...)) ->
+    (B, T, 9).
+
+    `parameters` says which (effect, parameter) each entry of theta is; parameters not named stay without
+    effect. A last entry of theta beyond them shifts the motors in time (s, later is positive)."""
+    return jax.jit(jax.vmap(partial(_channels, resolve(names), parameters)))
+
+
+def _channels(effects, parameters, theta, vehicle, path: Path):
+    """(T, 9) of one track with parameters theta (P,)."""
+    values = {e.name: {k: jnp.asarray(v, theta.dtype) for k, v in e.none().items()} for e in effects}
+    for number, (effect, parameter) in enumerate(parameters):
+        values[effect] = {**values[effect], parameter: theta[number]}
+    flown = change_body(effects, values, vehicle)
+    step = path.dt / path.motor.shape[1]
+
+    def context(position, quaternion, velocity, rates, voltage, others, speed):
+        state = DroneState(position, quaternion, velocity, rates, speed, rates, rates, ())
+        return make_context(flown, state, others_position=others, battery_voltage=voltage, dt=step)
+
+    along = (path.position, path.quaternion, path.velocity, path.body_rates, path.voltage, path.others)
+    still = jax.vmap(context)(*along, jnp.zeros_like(path.motor[:, 0]))
+
+    def demanded(commands, around):
+        return jax.vmap(lambda m: change_motor_command(effects, values, m, around))(commands)
+
+    given = jax.vmap(demanded)(path.motor, still)
+
+    wanted = commanded_rotor_speed(flown, given)
+    # As `rotor_speed_step`, with what doesn't change outside the loop.
+    faster = -jnp.expm1(-step / flown.motor_time_constant)
+    slower = -jnp.expm1(-step / (flown.motor_time_constant * flown.motor_slowdown_ratio))
+
+    def row(speed, targets):
+        total = 0.0
+        for tick in range(len(targets)):
+            target = targets[tick]
+            after = speed + (target - speed) * jnp.where(target < speed, slower, faster)
+            # Mean of the square over a tick, in which the speed is nearly straight.
+            total = total + (speed * speed + speed * after + after * after) / 3.0
+            speed = after
+        return speed, total / len(targets)
+
+    start = jnp.sqrt(jnp.clip(given[0, 0], 1e-6, None)) * flown.max_rotor_speed
+    _, square = jax.lax.scan(row, start, wanted)
+    square = square - theta[-1] * jnp.gradient(square, path.dt, axis=0)
+    speed = jnp.sqrt(jnp.maximum(square, 0.0))
+
+    def wrench(position, quaternion, velocity, rates, voltage, others, speed):
+        around = context(position, quaternion, velocity, rates, voltage, others, speed)
+        thrust, reaction = rotor_thrust(flown, speed), rotor_reaction(flown, speed)
+        thrust, reaction = change_thrust(effects, values, thrust, reaction, around)
+        around = around.replace(thrust=thrust)
+        force, torque = total_wrench(flown, thrust, reaction)
+        more_force, more_torque = added_wrench(effects, values, around)
+        force, torque = force + more_force, torque + more_torque
+        angular = (torque - jnp.cross(rates, flown.inertia * rates)) / flown.inertia
+        specific = force / flown.mass
+        gravity = jnp.array([0.0, 0.0, 1.0], force.dtype) * flown.gravity
+        return jnp.concatenate([angular, rotate(quaternion, specific) - gravity, specific])
+
+    return jax.vmap(wrench)(*along, speed)

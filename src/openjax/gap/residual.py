@@ -1,0 +1,196 @@
+"""What the chosen effects leave: one omnibus check whether it is noise.
+
+Two statistics, each with its conformal p-value over nominal and named cases of several worlds (`residual.json`, made by
+`experiments.diagnosis`; Vovk et al. 2005), joined by Bonferroni. *Dependence*: log Bayes factor of a Gaussian process against
+white noise on the whitened residual of one channel, in random Fourier features (Rahimi, Recht 2007) of one group of the state -
+place, motion, attitude, thrust, battery, vehicles near - the largest of all. *Periodicity*: Fisher's (1929) test for a line in
+the spectrum, the largest of all channels. Nobody tells either which form, place or frequency to look for."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from scipy.signal import lfilter
+
+from openjax.flights.track import Track, rotation, smooth
+from openjax.gap.decision import DECISION
+from openjax.gap.model.fit import SetFit, without_nuisances
+from openjax.gap.model.replay import FORCE, RATES, SKIP, VELOCITY, Replay
+
+FEATURES = 40  # of each group
+LENGTHS = (0.5, 1.0, 2.0)  # of the features, in standard deviations of what they are functions of
+STATE_FILTER = 0.1  # s over which the state is smoothed: sensors' noise isn't what anything depends on
+VARIANCES = 10.0 ** np.arange(-4.0, 4.5, 1.0)  # of the process, in units of the channel's noise
+CALIBRATION = Path(__file__).with_name("residual.json")
+
+
+@dataclass(frozen=True)
+class Check:
+    """`statistics` {name: value}, `where` {name: in words}, `p_value` of both together; `predicted` (6,): share of each motion
+    channel's squared error that the state tells, where the check rejects."""
+
+    statistics: dict[str, float]
+    where: dict[str, str]
+    p_value: float
+    predicted: np.ndarray
+
+    @property
+    def rejects(self) -> bool:
+        """Whether what is left isn't noise."""
+        return self.p_value <= DECISION.unknown
+
+    @property
+    def probability(self) -> float:
+        """That something acts which no effect explains: posterior odds are the prior's over the p-value."""
+        return DECISION.unknown / (DECISION.unknown + self.p_value)
+
+    def in_words(self) -> str:
+        """What is left, in one sentence."""
+        if not self.rejects:
+            return ""
+        name = min(self.statistics, key=lambda n: conformal_p(n, self.statistics[n]))
+        return f"What is left isn't noise (p = {self.p_value:.2g}): {self.where[name]}."
+
+
+def check_residual(replay: Replay, fit: SetFit) -> Check:
+    """Whether the residual of a fit is noise."""
+    residuals = residuals_of(replay, fit)
+    dependent = dependence(replay, residuals)
+    found = {"dependence": max(dependent), "periodicity": periodicity(replay, residuals)}
+    statistics = {name: value for name, (value, *_) in found.items()}
+    where = {name: words for name, (_, words, *_) in found.items()}
+    p_value = min(1.0, len(statistics) * min(conformal_p(n, v) for n, v in statistics.items()))
+    predicted = np.zeros(6)
+    if p_value <= DECISION.unknown:
+        for value, _, axis, share in dependent:
+            predicted[axis] = max(predicted[axis], share if value > 0.0 else 0.0)
+    return Check(statistics, where, p_value, predicted)
+
+
+def residuals_of(replay: Replay, fit: SetFit) -> list[np.ndarray]:
+    """Residual (T, 9) of each track under a fit, nuisances taken off."""
+    return [without_nuisances(replay, column[0], number) for number, column in enumerate(fit.columns)]
+
+
+def disturbances(track: Track, residual: np.ndarray) -> np.ndarray:
+    """A residual as accelerations (T, 9): angular (body), linear (body, from the velocity), specific force (body)."""
+    out = np.zeros_like(residual)
+    out[:, RATES] = np.gradient(residual[:, RATES], track.dt, axis=0)
+    world = np.gradient(residual[:, VELOCITY], track.dt, axis=0)
+    turn = np.eye(3)[None] if track.quaternion is None else rotation(track.quaternion)
+    out[:, VELOCITY] = np.einsum("tji,tj->ti", np.broadcast_to(turn, (len(track), 3, 3)), world)
+    out[:, FORCE] = residual[:, FORCE]
+    return out
+
+
+def conformal_p(name: str, value: float) -> float:
+    """Share of the calibration's cases, this one among them, whose statistic is as large."""
+    known = np.array(_calibration()[name])
+    return float((1 + (known >= value).sum()) / (1 + len(known)))
+
+
+@lru_cache(maxsize=1)
+def _calibration() -> dict[str, list[float]]:
+    return json.loads(CALIBRATION.read_text(encoding="utf-8"))["statistics"]
+
+
+def state_groups(track: Track) -> dict[str, np.ndarray]:
+    """{group: (T, n)} of the state that a push may depend on."""
+    rows = len(track)
+    turn = rotation(track.quaternion) if track.quaternion is not None else np.tile(np.eye(3), (rows, 1, 1))
+    groups = {"the body rates": track.body_rates, "the thrust": track.motor.mean(1)[:, None]}
+    if track.quaternion is not None:
+        groups |= {"the attitude": turn[:, 2, :2], "the heading": turn[:, :2, 0]}
+    if track.position is not None:
+        groups["the place"] = track.position
+    if track.velocity is not None:
+        groups["the velocity"] = track.velocity
+        groups["the velocity in the body's frame"] = np.einsum("tji,tj->ti", turn, track.velocity)
+    if track.voltage is not None:
+        groups["the voltage"] = track.voltage[:, None]
+    groups |= {f"vehicle {k} near": other - track.position for k, other in enumerate(track.neighbours)}
+    groups = {name: smooth(values, STATE_FILTER, track.dt) for name, values in groups.items()}
+    return groups | {"the time": (track.time - track.time[0])[:, None]}
+
+
+def dependence(replay: Replay, residuals: list[np.ndarray]) -> list[tuple[float, str, int, float]]:
+    """Of each motion channel and group of the state: log Bayes factor, words, axis (0 to 5) and the share of the whitened
+    residual's square that the process takes."""
+    states, found = [state_groups(t) for t in replay.tracks], [(0.0, "", 0, 0.0)]
+    for group in (g for g in states[0] if all(g in s for s in states)):
+        features = _fourier_features([s[group] for s in states])
+        if features is None:
+            continue
+        for axis in np.flatnonzero(replay.heard > 0):
+            channel = int(axis) if axis < 3 or replay.usable[3] else int(axis) + 3
+            gain, share = _log_bayes_factor(*_whitened_sums(replay, residuals, features, channel))
+            found.append((gain, f"{_name(channel)} depends on {group}", int(axis), share))
+    return found
+
+
+def _fourier_features(states: list[np.ndarray]) -> list[np.ndarray] | None:
+    """Random Fourier features (T, FEATURES) of each track's state (T, n) in its standard deviations over all tracks."""
+    every = np.concatenate(states)
+    spread = every.std(0)
+    moving = spread > 1e-6 * (1.0 + np.abs(every).max(0))
+    if not moving.any():
+        return None
+    generator = np.random.default_rng(0)
+    weights = generator.standard_normal((int(moving.sum()), FEATURES)) / generator.choice(LENGTHS, FEATURES)
+    phases = generator.uniform(0.0, 2.0 * np.pi, FEATURES)
+    scaled = [(s - every.mean(0))[:, moving] / spread[moving] for s in states]
+    return [np.cos(s @ weights + phases) * np.sqrt(2.0 / FEATURES) for s in scaled]
+
+
+def _whitened_sums(replay: Replay, residuals, features, channel: int) -> tuple[np.ndarray, np.ndarray, float]:
+    """Inner products of what the features would do in a channel, whitened, with each other and with the residual, and the
+    residual's square."""
+    noise = next(n for n in replay.noises if channel in n.axes)
+    gram, cross, square = 0.0, 0.0, 0.0
+    for track, residual, push in zip(replay.tracks, residuals, features, strict=True):
+        done = push if channel >= 6 else np.cumsum(push, 0) * track.dt
+        both = np.concatenate([done, residual[:, [channel]]], 1)
+        white = lfilter(noise.numerator / noise.deviation, noise.denominator, both, axis=0)
+        white = white[int(SKIP / track.dt) :]
+        white = white - white.mean(0)
+        gram, cross = gram + white[:, :-1].T @ white[:, :-1], cross + white[:, :-1].T @ white[:, -1]
+        square += float(white[:, -1] @ white[:, -1])
+    return gram, cross, square
+
+
+def _log_bayes_factor(gram: np.ndarray, cross: np.ndarray, square: float) -> tuple[float, float]:
+    """Of a linear model with independent normal coefficients against none, at the variance that fits best, and the share of
+    the square that it takes."""
+    values, vectors = np.linalg.eigh(gram)
+    values, along = np.maximum(values, 0.0), (vectors.T @ cross) ** 2
+    each = [0.5 * (v * along / (1.0 + v * values) - np.log1p(v * values)).sum() for v in VARIANCES]
+    best = int(np.argmax(each))
+    taken = VARIANCES[best] * along / (1.0 + VARIANCES[best] * values)
+    return max(0.0, float(each[best])), float(np.clip(taken.sum() / max(square, 1e-12), 0.0, 0.99))
+
+
+def periodicity(replay: Replay, residuals: list[np.ndarray]) -> tuple[float, str]:
+    """The largest minus log p-value of Fisher's test over channels and tracks, and where."""
+    best = (0.0, "")
+    for noise in replay.noises:
+        if replay.usable[noise.axes[0]] <= 0.0:
+            continue
+        for track, residual in zip(replay.tracks, residuals, strict=True):
+            white = noise.whiten(residual[:, list(noise.axes)])[int(SKIP / track.dt) :]
+            power = np.abs(np.fft.rfft(white - white.mean(0), axis=0))[1:] ** 2
+            count = len(power)
+            for place, column in zip(noise.axes, power.T, strict=True):
+                line = int(column.argmax())
+                share = min(float(column[line] / column.sum()), 1.0 - 1e-9)
+                value = -np.log(count) - (count - 1) * np.log1p(-share)
+                at = (line + 1) / (len(white) * track.dt)
+                best = max(best, (float(value), f"{_name(place)} swings at {at:.1f} Hz"))
+    return best
+
+
+def _name(channel: int) -> str:
+    return f"{('torque', 'force', 'specific force')[channel // 3]} {'xyz'[channel % 3]}"

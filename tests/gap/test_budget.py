@@ -1,0 +1,52 @@
+"""The diagnosis stays small: lines, named numbers and numbers that decide have budgets, and no effect is named outside its file."""
+
+import ast
+import re
+import tomllib
+from pathlib import Path
+
+import openjax.gap
+from openjax.vehicle.effects import EFFECTS
+
+ROOM = Path(openjax.gap.__file__).parent
+SOURCES = {path: path.read_text(encoding="utf-8") for path in sorted(ROOM.rglob("*.py"))}
+LINES, NUMBERS, DECIDING = 4400, 110, 10  # may only fall
+LONGEST = 60  # lines of a function
+
+
+def named_numbers(source: str) -> list[str]:
+    """Constants of a module, in capitals, that hold a number."""
+    found = []
+    for node in ast.parse(source).body:
+        if isinstance(node, ast.Assign) and any(
+            isinstance(part, ast.Constant) and type(part.value) in (int, float)
+            for part in ast.walk(node.value)
+        ):
+            names = [n.id for target in node.targets for n in ast.walk(target) if isinstance(n, ast.Name)]
+            found += [name for name in names if name.isupper()]
+    return found
+
+
+def test_lines_and_named_numbers_are_within_their_budgets():
+    assert sum(source.count("\n") for source in SOURCES.values()) <= LINES
+    assert len([n for source in SOURCES.values() for n in named_numbers(source)]) <= NUMBERS
+
+
+def test_few_numbers_decide_and_each_has_a_meaning_and_a_source():
+    table = tomllib.loads((ROOM / "decision.toml").read_text(encoding="utf-8"))
+    assert len(table) <= DECIDING
+    assert all(set(entry) == {"value", "meaning", "source"} for entry in table.values())
+
+
+def test_no_effect_is_named_outside_its_file():
+    pattern = re.compile("[\"'](" + "|".join(EFFECTS) + ")\\b")
+    assert not [(path.name, hit) for path, source in SOURCES.items() for hit in pattern.findall(source)]
+
+
+def test_no_function_is_longer_than_one_thing_needs():
+    long = []
+    for path, source in SOURCES.items():
+        for node in ast.walk(ast.parse(source)):
+            if isinstance(node, ast.FunctionDef) and node.end_lineno - node.lineno >= LONGEST:
+                long.append(f"{path.name}:{node.name}")
+    assert not long
