@@ -34,7 +34,7 @@ FLOORS = (
 """Rooms from the ground up: each may import those below it."""
 TWICE = {
     *("settings", "state", "parameters", "figures", "report", "firmware", "replay"),
-    *("policy", "calibration", "export", "virtual_crazyflie"),
+    *("policy", "calibration", "export", "virtual_crazyflie", "model"),
 }
 """Module names that more than one room has."""
 CIRCLES = {"openjax.gap.report"}

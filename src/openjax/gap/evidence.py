@@ -13,7 +13,7 @@ from openjax.gap.channels.pose import Pose, read_pose, undelayed
 from openjax.gap.channels.radio import read_radio
 from openjax.gap.channels.rate_loop import read_rate_loop, with_motors
 from openjax.gap.channels.sensors import Kinematics, corrected, read_kinematics
-from openjax.gap.model.fit import SetFit
+from openjax.gap.model.hypotheses import SetFit
 from openjax.gap.model.library import CARDS, Library, path_of
 from openjax.gap.model.replay import Replay
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from openjax.gap.evidence import Evidence
-from openjax.gap.model.fit import SetFit
+from openjax.gap.model.hypotheses import SetFit
 from openjax.gap.model.library import CARDS, PLACE, path_of
 from openjax.gap.report import Estimate
 from openjax.vehicle.effects import EFFECTS

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from openjax.gap.model.fit import SetFit
+from openjax.gap.model.hypotheses import SetFit
 from openjax.gap.model.library import CARDS
 from openjax.vehicle.effects import EFFECTS
 

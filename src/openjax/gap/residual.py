@@ -18,7 +18,7 @@ from scipy.signal import lfilter
 
 from openjax.flights.track import Track, rotation, smooth
 from openjax.gap.decision import DECISION
-from openjax.gap.model.fit import SetFit, without_nuisances
+from openjax.gap.model.hypotheses import SetFit, without_nuisances
 from openjax.gap.model.replay import FORCE, RATES, SKIP, VELOCITY, Replay
 
 FEATURES = 40  # of each group

@@ -17,7 +17,7 @@ import numpy as np
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
 from openjax.gap.model.cross_validation import Judged, judge, level, promise
-from openjax.gap.model.fit import SetFit, fit_set
+from openjax.gap.model.hypotheses import SetFit, fit_set
 from openjax.gap.model.library import ABSENT, CARDS, places, prior, start_of
 from openjax.gap.model.table import Table, build, with_effects
 

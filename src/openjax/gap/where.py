@@ -8,7 +8,7 @@ import numpy as np
 
 from openjax.flights.track import Track, smooth
 from openjax.gap.evidence import Evidence
-from openjax.gap.model.fit import SetFit
+from openjax.gap.model.hypotheses import SetFit
 from openjax.gap.model.library import path_of
 from openjax.gap.model.replay import SKIP
 from openjax.gap.residual import disturbances, residuals_of

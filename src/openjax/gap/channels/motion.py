@@ -13,7 +13,7 @@ from openjax.flights.track import GRID_PERIOD, Track
 from openjax.gap.channels.instruments import caused_by_commands, gustiness, read_feedback
 from openjax.gap.channels.rate_loop import ROW_DELAY, RateLoop
 from openjax.gap.channels.sensors import Kinematics
-from openjax.gap.model.fit import SetFit, fit_singles, model_noise, without_nuisances
+from openjax.gap.model.hypotheses import SetFit, fit_singles, model_noise, without_nuisances
 from openjax.gap.model.library import CARDS, Library, numbers_of
 from openjax.gap.model.observer import TICKS
 from openjax.gap.model.replay import Replay, make_replay

@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from openjax.gap.model.bounds import BOUND
-from openjax.gap.model.fit import SetFit, linearised_at
+from openjax.gap.model.hypotheses import SetFit, linearised_at
 from openjax.gap.model.library import ABSENT, CARDS, places, prior
 from openjax.gap.model.replay import SKIP, Replay
 
