@@ -52,11 +52,11 @@ def diagnose_case(case: Case, without: Iterable[str] = (), progress=None) -> Rep
 def conclude(evidence: Evidence) -> Report:
     """The report that the evidence supports."""
     selection = select(evidence)
-    check = check_residual(evidence.replay, selection.fit)
     beyond = {e: beyond_form_error(selection.fit, e) for e in selection.effects}
     acting = {e: selection.probability(e) * beyond[e] for e in selection.effects}
     acting |= evidence.acting()
     named = [e for e, p in acting.items() if p >= 0.5]
+    check = check_residual(evidence.replay, selection.fit, bool(named))
     parts = split(evidence, selection, check.predicted, named)
     material = [e for e in named if e in selection.effects or _matters(parts, e)]
     if material != named:
@@ -104,8 +104,8 @@ def not_testable(evidence: Evidence) -> list[str]:
 
 def _matters(parts: Split, effect: str) -> bool:
     """Whether an effect's share shrinks the gap by what matters: a gain may be read more finely than that."""
-    whole = max(parts.gap.before**2 - 1.0, 0.0)
-    return parts.effects[effect].value * whole > (1.0 + DECISION.least_gap) ** 2 - 1.0
+    whole, share = max(parts.gap.before**2 - 1.0, 0.0), parts.effects[effect].value
+    return share > DECISION.form_error and share * whole > (1.0 + DECISION.least_gap) ** 2 - 1.0
 
 
 def _report(
@@ -152,7 +152,10 @@ def _nuisances(evidence: Evidence, selection: Selection) -> dict[str, str]:
     def at(v):
         return ", at its bound" if abs(v) > 0.99 * BOUND else ""
 
-    return {n: f"{v:+.2f} of its usual size{at(v)}" for n, v in zip(names, taken, strict=True)}
+    found = {n: f"{v:+.2f} of its usual size{at(v)}" for n, v in zip(names, taken, strict=True)}
+    if "motor_rows" not in evidence.case.vehicle_file.log:
+        found["rows of motor commands"] = "taken for means over the row: [log] motor_rows doesn't say"
+    return found
 
 
 __all__ = ["Library", "conclude", "diagnose", "diagnose_case", "library"]

@@ -1,10 +1,10 @@
 """What the chosen effects leave: one omnibus check whether it is noise.
 
-Two statistics, each with its conformal p-value over nominal and named cases of several worlds (`residual.json`, made by
-`experiments.diagnosis`; Vovk et al. 2005), joined by Bonferroni. *Dependence*: log Bayes factor of a Gaussian process against
-white noise on the whitened residual of one channel, in random Fourier features (Rahimi, Recht 2007) of one group of the state -
-place, motion, attitude, thrust, battery, vehicles near - the largest of all. *Periodicity*: Fisher's (1929) test for a line in
-the spectrum, the largest of all channels. Nobody tells either which form, place or frequency to look for."""
+Two statistics, each with its conformal p-value over cases of several worlds in which nothing was named, or something
+(Mondrian conformal prediction, Vovk et al. 2005; `residual.json`), joined by Bonferroni. *Dependence*: log Bayes factor of a
+Gaussian process against white noise on the whitened residual of one channel, in random Fourier features (Rahimi, Recht 2007)
+of one group of the state - place, motion, attitude, thrust, battery, vehicles near - the largest of all. *Periodicity*:
+Fisher's (1929) test for a line in the spectrum, the largest of all channels. Neither asks for a form, place or frequency."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ CALIBRATION = Path(__file__).with_name("residual.json")
 
 @dataclass(frozen=True)
 class Check:
-    """`statistics` {name: value}, `where` {name: in words}, `p_value` of both together; `predicted` (6,): share of each motion
-    channel's squared error that the state tells, where the check rejects."""
+    """`statistics` {name: value}, `where` the more telling one stands out, `p_value` of both together; `predicted` (6,): share
+    of each motion channel's squared error that the state tells, where the check rejects."""
 
     statistics: dict[str, float]
-    where: dict[str, str]
+    where: str
     p_value: float
     predicted: np.ndarray
 
@@ -52,23 +52,23 @@ class Check:
         """What is left, in one sentence."""
         if not self.rejects:
             return ""
-        name = min(self.statistics, key=lambda n: conformal_p(n, self.statistics[n]))
-        return f"What is left isn't noise (p = {self.p_value:.2g}): {self.where[name]}."
+        return f"What is left isn't noise (p = {self.p_value:.2g}): {self.where}."
 
 
-def check_residual(replay: Replay, fit: SetFit) -> Check:
-    """Whether the residual of a fit is noise."""
+def check_residual(replay: Replay, fit: SetFit, named: bool) -> Check:
+    """Whether the residual of a fit is noise, as cases go in which effects are `named` or nothing is."""
     residuals = residuals_of(replay, fit)
     dependent = dependence(replay, residuals)
     found = {"dependence": max(dependent), "periodicity": periodicity(replay, residuals)}
     statistics = {name: value for name, (value, *_) in found.items()}
     where = {name: words for name, (_, words, *_) in found.items()}
-    p_value = min(1.0, len(statistics) * min(conformal_p(n, v) for n, v in statistics.items()))
+    p_value = min(1.0, len(statistics) * min(conformal_p(n, v, named) for n, v in statistics.items()))
     predicted = np.zeros(6)
     if p_value <= DECISION.unknown:
         for value, _, axis, share in dependent:
             predicted[axis] = max(predicted[axis], share if value > 0.0 else 0.0)
-    return Check(statistics, where, p_value, predicted)
+    telling = min(statistics, key=lambda n: conformal_p(n, statistics[n], named))
+    return Check(statistics, where[telling], p_value, predicted)
 
 
 def residuals_of(replay: Replay, fit: SetFit) -> list[np.ndarray]:
@@ -87,14 +87,14 @@ def disturbances(track: Track, residual: np.ndarray) -> np.ndarray:
     return out
 
 
-def conformal_p(name: str, value: float) -> float:
-    """Share of the calibration's cases, this one among them, whose statistic is as large."""
-    known = np.array(_calibration()[name])
+def conformal_p(name: str, value: float, named: bool) -> float:
+    """Share of the calibration's cases of the same kind, this one among them, whose statistic is as large."""
+    known = np.array(_calibration()["named" if named else "none"][name])
     return float((1 + (known >= value).sum()) / (1 + len(known)))
 
 
 @lru_cache(maxsize=1)
-def _calibration() -> dict[str, list[float]]:
+def _calibration() -> dict[str, dict[str, list[float]]]:
     return json.loads(CALIBRATION.read_text(encoding="utf-8"))["statistics"]
 
 

@@ -29,7 +29,6 @@ EFFECT = Effect(
             Fitted("x", mean=0.0, spread=0.002, start=0.0003, step=2e-05),
             Fitted("y", mean=0.0, spread=0.002, start=0.0003, step=2e-05),
         ),
-        form_error={"x": 0.00005, "y": 0.00005},
         sample={"x": 0.003, "y": -0.002},
         next_flight="hover and climbs at several thrusts, with yaw free.",
     ),

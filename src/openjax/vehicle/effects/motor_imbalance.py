@@ -28,7 +28,6 @@ EFFECT = Effect(
             Fitted("m4", mean=0.0, spread=0.05, start=-0.01, step=0.001),
         ),
         balanced=True,
-        form_error={"m1": 0.005, "m2": 0.005, "m3": 0.005, "m4": 0.005},
         sample={"m1": 0.06, "m2": -0.04, "m3": 0.02, "m4": -0.05},
         next_flight="hover and climbs at several thrusts, with yaw free.",
     ),
