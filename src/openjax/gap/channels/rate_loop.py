@@ -64,14 +64,14 @@ class RateLoop(Channel):
         return mean, np.maximum(apart, 1.0) / np.sqrt(total)
 
     def acting(self) -> dict[str, float]:
-        change, error = (float(v[0]) for v in self.gain)
-        beyond = (abs(change) - DECISION.rate_gain) / error
-        told = abs(change) > DECISION.standard_errors * error
-        chance = float(norm.cdf(beyond)) * (1.0 - DECISION.unknown) if told else 0.0
-        return {e: chance for e in self.names if chance > 0.5}
+        """Either group of axes may be retuned alone: the surer one tells."""
+        change, error = np.abs(self.change[[0, 3]]), self.error[[0, 3]]
+        told = change > DECISION.standard_errors * error
+        chance = norm.cdf((change - DECISION.rate_gain) / error) * told * (1.0 - DECISION.unknown)
+        return {e: float(chance.max()) for e in self.names if chance.max() > 0.5}
 
     def undetectable(self) -> list[str]:
-        return [] if self.gain[1][0] < DECISION.rate_gain else list(self.names)
+        return [] if self.error[[0, 3]].min() < DECISION.rate_gain else list(self.names)
 
     def estimate(self, effect: str, parameter: str) -> Estimated:
         place = GAINS.index(parameter)
