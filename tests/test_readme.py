@@ -88,7 +88,7 @@ def test_modules_that_the_pages_name_are_there():
 def test_from_sample_flights_to_a_corrected_simulator(tmp_path):
     """sample_flights -> calibrate -> diagnose -> an environment that flies with what was found."""
     case, out = tmp_path / "drag", tmp_path / "diagnosis"
-    sample_flights.main([str(case), "--effect", "rotor_drag", "--seed", "3"])
+    sample_flights.main([str(case), "--effect", "rotor_drag"])
     calibrate.main([str(case), "--out", str(tmp_path / "vehicle_calibrated.toml")])
     vehicle = load_vehicle_file(tmp_path / "vehicle_calibrated.toml").vehicle
     nominal = load_vehicle_file(case).vehicle
@@ -101,6 +101,11 @@ def test_from_sample_flights_to_a_corrected_simulator(tmp_path):
     assert report["verdict"] == "effect"
     assert "rotor_drag" in report["effects"]
     assert report["gap"]["reduction"] > 0.5
+    # what the README prints is what is found
+    (value,) = re.findall(r"d_xy = ([\d.]+) \[", README)
+    assert abs(report["parameters"]["rotor_drag"]["d_xy"]["value"] / float(value) - 1) < 0.02
+    (share,) = re.findall(r"Shares of the gap: rotor_drag (\.\d+) \[", README)
+    assert abs(report["shares"]["effects"]["rotor_drag"]["value"] - float(share)) < 0.03
 
     settings = openjax.PursuitSettings(physics="rigid", speed_limit="none")
     corrected = make_environment(settings, None, out / "drag" / "effects.toml")

@@ -49,13 +49,14 @@ def test_next_steps_depend_on_the_case():
     told = {name: " ".join(why for why, _ in next_steps(case)) for name, case in CASES.items()}
     assert "can't tell y from z" in told["two"] and "slow passes" in told["two"]
     assert "It follows the height" in told["unknown"]
-    assert "y, z, fly slow passes" in told["not testable"]
+    assert "wouldn't show y, z. Next flight: slow passes" in told["not testable"]
     assert len(set(told.values())) == len(CASES)
 
 
 def test_a_normal_flight_is_not_charted_as_a_gap():
     assert shares(CASES["none"]) == []
     assert sentence(CASES["none"]).startswith("The simulator agrees")
+    assert "y or z (20 %)" in sentence(CASES["two"])
     assert "rotor x (70 %)" in sentence(CASES["effect"]) and "shrink by 70 %" in sentence(CASES["effect"])
 
 

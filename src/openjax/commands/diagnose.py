@@ -21,7 +21,7 @@ from openjax.show.steps import Steps
 from openjax.vehicle.effect_names import effect_names
 
 PROGRAM = "openjax diagnose"
-SECONDS = 8.0
+SECONDS = 5.0
 """Of a case on a laptop, about."""
 _WITHOUT_HELP = f"Effects that the library must do without, of {', '.join(effect_names())}."
 

@@ -59,7 +59,8 @@ def sentence(report: Report) -> str:
     if not named:
         return "The simulator misses something that no known effect explains."
     parts = " and ".join(
-        f"{e.replace('_', ' ')} ({100 * report.shares.effects[e].value:.0f} %)" for e in named
+        f"{' or '.join([e, *report.equivalent.get(e, ())]).replace('_', ' ')} ({100 * report.shares.effects[e].value:.0f} %)"
+        for e in named
     )
     text = f"What the simulator misses is mostly {parts}"
     if report.parameters:
@@ -124,10 +125,10 @@ def next_steps(report: Report) -> list[tuple[str, str]]:
                       f"openjax diagnose {report.case} --reference EARLIER_FLIGHTS"))  # fmt: skip
     if report.not_testable and not report.equivalent and report.next_flight:
         missing = ", ".join(effect.replace("_", " ") for effect in report.not_testable)
-        steps.append((f"To see whether there is {missing}, {_fly(report)[:1].lower()}{_fly(report)[1:]}", ""))
+        steps.append((f"These flights wouldn't show {missing}. {_fly(report)}", ""))
     return steps
 
 
 def _fly(report: Report) -> str:
     text = report.next_flight.strip().rstrip(".")
-    return f"Fly {text[:1].lower()}{text[1:]}, and diagnose again." if text else ""
+    return f"Next flight: {text[:1].lower()}{text[1:]}; then diagnose all of them again." if text else ""
