@@ -17,7 +17,7 @@ test: $(READY)
 test-slow: $(READY)
 	$(PYTEST) -m slow $(ARGS)
 
-test-all: lint test test-slow
+test-all: lint test test-slow docs
 
 lint: $(READY)
 	$(BIN)/ruff check src tests experiments examples conftest.py
