@@ -56,6 +56,7 @@ def test_what_pushes_along_the_motion_is_no_drag():
     assert seems("rotor_drag", d_xy=0.004, d_z=0.0) and not seems("rotor_drag", d_xy=-0.01, d_z=0.004)
     assert seems("wind", x=0.5, y=0.0, z=0.0, drag=0.004, along=1.0)
     assert not seems("wind", x=0.5, y=0.0, z=0.0, drag=-0.004, along=1.0)
+    assert not seems("wind", x=0.5, y=0.0, z=1.0, drag=0.004, along=-0.1)
 
 
 def test_above_the_ceiling_there_is_none():

@@ -25,6 +25,7 @@ FEATURES = 40  # of each group
 LENGTHS = (0.5, 1.0, 2.0)  # of the features, in standard deviations of what they are functions of
 STATE_FILTER = 0.1  # s over which the state is smoothed: sensors' noise isn't what anything depends on
 VARIANCES = 10.0 ** np.arange(-4.0, 4.5, 1.0)  # of the process, in units of the channel's noise
+WAKE = "the vehicle near"
 CALIBRATION = Path(__file__).with_name("residual.json")
 
 
@@ -112,7 +113,7 @@ def state_groups(track: Track) -> dict[str, np.ndarray]:
         groups["the velocity in the body's frame"] = np.einsum("tji,tj->ti", turn, track.velocity)
     if track.voltage is not None:
         groups["the voltage"] = track.voltage[:, None]
-    groups |= {f"vehicle {k} near": other - track.position for k, other in enumerate(track.neighbours)}
+    groups |= {f"{WAKE} {k}": other - track.position for k, other in enumerate(track.neighbours)}
     groups = {name: smooth(values, STATE_FILTER, track.dt) for name, values in groups.items()}
     return groups | {"the time": (track.time - track.time[0])[:, None]}
 
@@ -126,6 +127,8 @@ def dependence(replay: Replay, residuals: list[np.ndarray]) -> list[tuple[float,
         if features is None:
             continue
         for axis in np.flatnonzero(replay.heard > 0):
+            if group.startswith(WAKE) and axis < 3:
+                continue  # how wakes turn a vehicle is a nuisance
             channel = int(axis) if axis < 3 or replay.usable[3] else int(axis) + 3
             gain, share = _log_bayes_factor(*_whitened_sums(replay, residuals, features, channel))
             found.append((gain, f"{_name(channel)} depends on {group}", int(axis), share))
@@ -143,7 +146,8 @@ def _fourier_features(states: list[np.ndarray]) -> list[np.ndarray] | None:
     weights = generator.standard_normal((int(moving.sum()), FEATURES)) / generator.choice(LENGTHS, FEATURES)
     phases = generator.uniform(0.0, 2.0 * np.pi, FEATURES)
     scaled = [(s - every.mean(0))[:, moving] / spread[moving] for s in states]
-    return [np.cos(s @ weights + phases) * np.sqrt(2.0 / FEATURES) for s in scaled]
+    features = [np.cos(s @ weights + phases) * np.sqrt(2.0 / FEATURES) for s in scaled]
+    return [f - f.mean(0) for f in features]  # a trim is nobody's surprise
 
 
 def _whitened_sums(replay: Replay, residuals, features, channel: int) -> tuple[np.ndarray, np.ndarray, float]:

@@ -18,9 +18,9 @@ _SOURCE = "indoor draughts and fans, 0.3-3 m/s"
 
 
 def drags(value, deviation):
-    """Whether air that moves drags the vehicle along."""
+    """Whether air that moves drags the vehicle along, along the rotors' axes too."""
     del deviation
-    return bool(value["drag"] > 0.0)
+    return bool(value["drag"] > 0.0 and value["along"] > 0.0)
 
 
 EFFECT = Effect(
