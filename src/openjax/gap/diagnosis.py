@@ -62,8 +62,9 @@ def conclude(evidence: Evidence) -> Report:
     if material != named:
         parts = split(evidence, selection, check.predicted, material)
     found = words(evidence, check, parts, not_testable(evidence))
+    strange = 1.0 - DECISION.unknown if _misread(evidence) else check.probability
     chances = probabilities(
-        {e: acting[e] for e in material}, beyond, parts.largest, check.probability, selection.weights
+        {e: acting[e] for e in material}, beyond, parts.largest, strange, selection.weights
     )
     return _report(evidence, selection, check, parts, found, chances)
 
@@ -80,7 +81,7 @@ class Words:
 def words(evidence: Evidence, check: Check, parts: Split, missing: list[str]) -> Words:
     """What is said first: the effects by their shares, and whether anything unknown acts."""
     effects = sorted(parts.effects, key=lambda e: -parts.effects[e].value)
-    if check.rejects or set(evidence.sensors.findings) - {"clocks"}:
+    if check.rejects or _misread(evidence):
         larger = sum(parts.effects[e].value > parts.unexplained.value for e in effects)
         effects.insert(larger, "unknown")
     if effects:
@@ -100,6 +101,11 @@ def not_testable(evidence: Evidence) -> list[str]:
     logged = {c.path for c in evidence.channels} | {"physics"}
     missing += [e for e in evidence.library.effects if path_of(e) not in logged]
     return missing + [e for c in evidence.channels for e in c.undetectable()]
+
+
+def _misread(evidence: Evidence) -> bool:
+    """Whether a sensor is off by more than sensors usually are, clocks aside."""
+    return bool(set(evidence.sensors.findings) - {"clocks"})
 
 
 def _matters(parts: Split, effect: str) -> bool:

@@ -8,7 +8,7 @@ from openjax.errors import UserError
 from openjax.flights.flight import Case
 from openjax.flights.track import Track, tracks_of
 from openjax.gap.channels import Channel
-from openjax.gap.channels.motion import Motion, make_reading, read_motion
+from openjax.gap.channels.motion import Motion, make_reading, read_motion, rows_are_samples
 from openjax.gap.channels.pose import Pose, read_pose, undelayed
 from openjax.gap.channels.radio import read_radio
 from openjax.gap.channels.rate_loop import read_rate_loop, with_motors
@@ -62,8 +62,7 @@ def gather(case: Case, library: Library, progress=None) -> Evidence:
     tracks = [with_motors(t, v) for t, v in zip(tracks, vehicles, strict=True)]
     radio = None
     if all(t.command is not None and t.motors_logged for t in tracks):
-        sampled = case.vehicle_file.log.get("motor_rows", "mean") == "sample"
-        radio = read_radio(tracks, library, sampled)
+        radio = read_radio(tracks, library, rows_are_samples(case))
     arrived = None if radio is None else radio.arrived
     reading = make_reading(case, library, tracks, vehicles, arrived, sensors)
     loop = None if radio is None else read_rate_loop(reading)

@@ -89,9 +89,13 @@ def disturbances(track: Track, residual: np.ndarray) -> np.ndarray:
 
 
 def conformal_p(name: str, value: float, named: bool) -> float:
-    """Share of the calibration's cases of the same kind, this one among them, whose statistic is as large."""
+    """Share of the calibration's cases of the same kind, this one among them, whose statistic is as large. Beyond the largest
+    the tail is exponential, as long as that of the upper quarter (Pickands 1975)."""
     known = np.array(_calibration()["named" if named else "none"][name])
-    return float((1 + (known >= value).sum()) / (1 + len(known)))
+    share = float((1 + (known >= value).sum()) / (1 + len(known)))
+    start, largest = np.quantile(known, 0.75), known.max()
+    scale = max(float((known[known >= start] - start).mean()), 1e-9)
+    return share * float(np.exp(-max(value - largest, 0.0) / scale))
 
 
 @lru_cache(maxsize=1)
@@ -101,7 +105,7 @@ def _calibration() -> dict[str, dict[str, list[float]]]:
 
 def state_groups(track: Track) -> dict[str, np.ndarray]:
     """{group: (T, n)} of the state that a push may depend on."""
-    rows = len(track)
+    rows = len(track.time)
     turn = rotation(track.quaternion) if track.quaternion is not None else np.tile(np.eye(3), (rows, 1, 1))
     groups = {"the body rates": track.body_rates, "the thrust": track.motor.mean(1)[:, None]}
     if track.quaternion is not None:

@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from openjax.errors import UserError
 from openjax.flights.flight import Case
 from openjax.flights.track import GRID_PERIOD, Track
 from openjax.gap.channels.instruments import caused_by_commands, gustiness, read_feedback
@@ -53,14 +54,23 @@ class Reading:
         return [caused_by_commands(*of) for of in zip(self.tracks, self.vehicles, links, strict=True)]
 
 
+def rows_are_samples(case: Case) -> bool:
+    """Whether a row's motor commands are one sample, and not the mean since the last row. Raises UserError for anything else."""
+    rows = case.vehicle_file.log.get("motor_rows", "mean")
+    if rows not in ("mean", "sample"):
+        raise UserError(
+            f'{case.name}: vehicle.toml has [log] motor_rows = {rows!r}; "mean" or "sample" is needed'
+        )
+    return rows == "sample"
+
+
 def make_reading(case: Case, library: Library, tracks, vehicles, arrived, sensors: Kinematics) -> Reading:
     """How the rows of a case are to be read."""
     shortest = min(f.row_period for f in case.flights)
     slow = shortest > 0.8 * GRID_PERIOD  # faster logs are averaged
     drifts, seldom = sensors.wander > 0.0, max(t.dt for t in tracks) > SLOW_ROWS * GRID_PERIOD
     known = arrived is not None and not seldom and not drifts
-    sampled = case.vehicle_file.log.get("motor_rows", "mean") == "sample"
-    at_once = sampled and slow and all(t.motors_logged for t in tracks)
+    at_once = rows_are_samples(case) and slow and all(t.motors_logged for t in tracks)
     hidden = (not slow and GRID_PERIOD / shortest < FEW_ROWS) or any(
         f.body_rates_derived for f in case.flights
     )
