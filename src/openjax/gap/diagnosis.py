@@ -56,16 +56,13 @@ def conclude(evidence: Evidence) -> Report:
     acting = {e: selection.probability(e) * beyond[e] for e in selection.effects}
     acting |= evidence.acting()
     named = [e for e, p in acting.items() if p >= 0.5]
+    parts = split(evidence, selection, np.zeros(6), named)
+    named = [e for e in named if e in selection.effects or _matters(parts, e)]
     check = check_residual(evidence.replay, selection.fit, bool(named))
     parts = split(evidence, selection, check.predicted, named)
-    material = [e for e in named if e in selection.effects or _matters(parts, e)]
-    if material != named:
-        parts = split(evidence, selection, check.predicted, material)
     found = words(evidence, check, parts, not_testable(evidence))
     strange = 1.0 - DECISION.unknown if _misread(evidence) else check.probability
-    chances = probabilities(
-        {e: acting[e] for e in material}, beyond, parts.largest, strange, selection.weights
-    )
+    chances = probabilities({e: acting[e] for e in named}, beyond, parts.largest, strange, selection.weights)
     return _report(evidence, selection, check, parts, found, chances)
 
 
