@@ -6,17 +6,17 @@ import dataclasses
 import json
 import os
 import socket
-import subprocess
-import sys
+import threading
 import time
 from collections.abc import Iterator
 
-from openjax.cluster import relay
 from openjax.cluster.processes import Processes, encoded
 from openjax.errors import UserError
 
 JOIN = 300.0
 """Seconds to wait for all processes at the start."""
+LINE = 1000
+"""Bytes of the longest greeting."""
 
 _MANAGERS = ("slurm", "ompi")
 _BY_HAND = "deactivate"
@@ -27,7 +27,7 @@ class Membership:
     """This process' place in a job of several."""
 
     coordinator_address: str
-    """host:port of process 0."""
+    """host:port of process 0; JAX's coordinator gets the port after it."""
     num_processes: int
     process_id: int
     detection: str
@@ -58,7 +58,7 @@ def find_membership(
         )
     address, number, index = given
     host, _, port = address.rpartition(":")
-    if not (host and port.isdecimal() and len(port) <= 5 and 0 < int(port) < 65536):
+    if not (host and port.isdecimal() and len(port) <= 5 and 0 < int(port) < 65535):
         raise UserError(f"--coordinator_address is {address[:80]!r}; expected host:port of process 0")
     if number < 1 or not 0 <= index < number:
         raise UserError(
@@ -94,18 +94,17 @@ def joined(membership: Membership | None) -> Iterator[Processes]:
     if membership is None:
         yield Processes()
         return
-    with connected(membership) as (connections, bind_address):
+    with _connected(membership) as (connections, address):
         processes = Processes(membership.num_processes, membership.process_id, connections)
         _tune_alone()
         try:
             import jax
 
             jax.distributed.initialize(
-                coordinator_address=membership.coordinator_address,
+                coordinator_address=address,
                 num_processes=membership.num_processes,
                 process_id=membership.process_id,
                 cluster_detection_method=membership.detection,
-                coordinator_bind_address=bind_address,
             )
             yield processes
             processes.everyone()  # JAX's own barrier would not wait as long as process 0 draws
@@ -139,42 +138,67 @@ def _one_line(error):
 
 
 @contextlib.contextmanager
-def connected(membership):
-    """Connections and hosts by process (to all others on process 0, to process 0 elsewhere), and where JAX's
-    coordinator is to listen.
+def _connected(membership):
+    """Connections, their readers and hosts by process (to all others on process 0, to process 0 elsewhere), and where JAX
+    is to look for its coordinator: at the port after process 0's own.
     """
     host, _, port = membership.coordinator_address.rpartition(":")
+    host, port = host.strip("[]"), int(port)
     if membership.process_id != 0:
-        yield {0: _call(host.strip("[]"), int(port), membership)}, None
+        connection = _call(host, port, membership)
+        with _held_open(host, port + 1) as address:
+            yield {0: connection}, address
         return
-    own = socket.create_server(("127.0.0.1", 0))
-    with own, _relay(int(port), own.getsockname()[1]) as coordinator_port:
-        yield _accept(own, membership.num_processes), f"127.0.0.1:{coordinator_port}"
+    _listen(port + 1).close()  # JAX would say in many lines that it's taken
+    with _listen(port) as server:
+        yield _accept(server, membership.num_processes), f"localhost:{port + 1}"
+
+
+def _listen(port):
+    """A server on all of this host's addresses. Raises UserError where the port is taken."""
+    both = socket.has_dualstack_ipv6()
+    try:
+        return socket.create_server(
+            ("", port), family=socket.AF_INET6 if both else socket.AF_INET, dualstack_ipv6=both
+        )
+    except OSError as error:
+        raise UserError(f"the coordinator's port {port} can't be used: {error.strerror or error}") from None
 
 
 @contextlib.contextmanager
-def _relay(port, own_port):
-    """Start the relay; gives the port that it keeps for JAX's coordinator."""
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        coordinator_port = free.getsockname()[1]
-    process = subprocess.Popen(
-        [sys.executable, "-I", relay.__file__, str(port), str(coordinator_port), str(own_port)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,  # Ctrl-C is not for it
-    )
-    try:
-        if not process.stdout.readline():
-            raise UserError(f"the coordinator's port {port} can't be used: {process.stderr.read().strip()}")
-        yield coordinator_port
-    finally:
-        process.stdin.close()  # it ends when the others have closed their connections
+def _held_open(host, port):
+    """An address on this host that leads to another one, and whose connections stay open when that is gone.
+
+    JAX ends a process at once, by a stack trace, when its connection to the coordinator closes; like this the process has
+    time to say in one line what happened, which it learns from its own connection.
+    """
+
+    def serve():
+        with contextlib.suppress(OSError):
+            while True:
+                near, _ = server.accept()
+                try:
+                    far = socket.create_connection((host, port), timeout=10.0)
+                except OSError:  # refused: JAX tries again
+                    near.close()
+                    continue
+                far.settimeout(None)
+                for source, sink in ((near, far), (far, near)):
+                    threading.Thread(target=_pump, args=(source, sink), daemon=True).start()
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        threading.Thread(target=serve, daemon=True).start()
+        yield f"127.0.0.1:{server.getsockname()[1]}"
+
+
+def _pump(source, sink):
+    with contextlib.suppress(OSError):
+        while data := source.recv(1 << 16):
+            sink.sendall(data)
 
 
 def _call(host, port, membership):
-    """Connection to process 0, and its host; waits until all processes have come."""
+    """Connection to process 0, its reader and host; waits until all processes have come."""
     deadline = time.monotonic() + JOIN
     greeting = {
         "process": membership.process_id,
@@ -187,8 +211,9 @@ def _call(host, port, membership):
             connection = socket.create_connection((host, port), timeout=10.0)
             connection.sendall(encoded(greeting))
             connection.settimeout(max(deadline - time.monotonic(), 1.0))
-            if welcome := _read_line(connection):
-                return connection, json.loads(welcome)["host"]
+            reader = connection.makefile("rb")
+            if welcome := reader.readline(LINE):
+                return connection, reader, json.loads(welcome)["host"]
         except OSError as error:
             reason = str(error.strerror or error)
         if time.monotonic() > deadline:
@@ -197,8 +222,8 @@ def _call(host, port, membership):
 
 
 def _accept(server, number):
-    """Connections to all others and their hosts, by process."""
-    found: dict[int, tuple[socket.socket, str]] = {}
+    """Connections to all others, their readers and hosts, by process."""
+    found: dict[int, tuple] = {}
     deadline = time.monotonic() + JOIN
     while len(found) < number - 1:
         server.settimeout(max(deadline - time.monotonic(), 0.01))
@@ -207,33 +232,15 @@ def _accept(server, number):
         except TimeoutError:
             missing = ", ".join(str(i) for i in range(1, number) if i not in found)
             raise UserError(f"process {missing} of {number} didn't come within {JOIN:.0f} s") from None
-        other, host = _greeted(connection, number)
-        if other is None or other in found:
-            connection.close()  # a stranger, or a second process of that number
-        else:
-            found[other] = (connection, host)
-    for connection, _ in found.values():
+        connection.settimeout(10.0)
+        reader = connection.makefile("rb")
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # a stranger
+            greeting = json.loads(reader.readline(LINE))
+            other = greeting["process"]
+            if greeting["of"] == number and 1 <= other < number and other not in found:
+                found[other] = connection, reader, str(greeting["host"])
+                continue
+        connection.close()
+    for connection, _, _ in found.values():
         connection.sendall(encoded({"host": socket.gethostname()}))
     return found
-
-
-def _greeted(connection, number):
-    """The number and host of the process that greets; None for a stranger."""
-    connection.settimeout(10.0)
-    try:
-        greeting = json.loads(_read_line(connection))
-        other, of, host = greeting["process"], greeting["of"], str(greeting["host"])
-        return (other, host) if of == number and 1 <= other < number else (None, host)
-    except (OSError, ValueError, KeyError, TypeError):
-        return None, None
-
-
-def _read_line(connection):
-    """A short line, byte by byte, as what follows belongs to the link; empty where there is none."""
-    line = b""
-    while not line.endswith(b"\n"):
-        byte = connection.recv(1)
-        if not byte or len(line) > 1000:
-            return b""
-        line += byte
-    return line

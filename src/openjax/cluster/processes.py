@@ -14,7 +14,7 @@ import socket
 import sys
 import threading
 from collections.abc import Callable
-from typing import Any
+from typing import Any, BinaryIO
 
 BEAT = 2.0
 """Seconds between two signs of life."""
@@ -35,12 +35,12 @@ class Processes:
     """
 
     def __init__(self, number: int = 1, index: int = 0, connections: dict | None = None):
-        """`connections`: (socket, host) by process: to all others on process 0, to process 0 elsewhere."""
+        """`connections`: (socket, its reader, host) by process: to all others on process 0, to process 0 elsewhere."""
         self.number, self.index = number, index
         self.advice = "start it again"
         self._links = {
-            other: _Link(connection, other, host, self._receive, self._gone)
-            for other, (connection, host) in (connections or {}).items()
+            other: _Link(connection, reader, other, host, self._receive, self._gone)
+            for other, (connection, reader, host) in (connections or {}).items()
         }
         self._asked = {other: queue.Queue() for other in self._links}
         self._answers: queue.Queue = queue.Queue()
@@ -123,10 +123,6 @@ class Processes:
             self._send_all(message, but)
         show_cursor = "\x1b[?25h\n" if sys.stdout.isatty() else ""  # a live display hides it
         os.write(2, f"{show_cursor}error: {text}\n".encode())
-        # Process 0 holds JAX's coordinator; without it the others' JAX would end them before they speak.
-        for other, link in self._links.items():
-            if self.is_first and other != but:
-                link.wait_closed(GRACE)
         os._exit(status)
 
     def _send_all(self, message, but=None):
@@ -141,12 +137,13 @@ class _Link:
     def __init__(
         self,
         connection: socket.socket,
+        reader: BinaryIO,
         other: int,
         host: str,
         receive: Callable[[int, dict], None],
         gone: Callable[[int, str, str], None],
     ):
-        self._socket, self._other, self._host = connection, other, host
+        self._socket, self._reader, self._other, self._host = connection, reader, other, host
         self._receive, self._gone = receive, gone
         self._sending = threading.Lock()
         self._closed = threading.Event()
@@ -165,15 +162,12 @@ class _Link:
         """No more from here; wait until the other side closes too."""
         with contextlib.suppress(OSError):
             self._socket.shutdown(socket.SHUT_WR)
-        self.wait_closed(seconds)
-
-    def wait_closed(self, seconds: float) -> None:
         self._closed.wait(seconds)
 
     def _read(self):
         why = "its connection closed"
         try:
-            for line in self._socket.makefile("rb"):
+            for line in self._reader:
                 message = json.loads(line)
                 if message:
                     self._receive(self._other, message)
