@@ -1,0 +1,74 @@
+"""Real processes, a real terminal, real cflib: whatever is killed, stopped or typed, true vehicles come down and are disarmed."""
+
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+pytest.importorskip("cflib", reason='the extra "fly" is not installed')
+
+from experiments.flying.real_time import Flown
+from experiments.flying.virtual import VirtualProcess
+from openjax.commands.fly import Arguments, Prepared
+from openjax.flying.controller import nominal_airframe
+from openjax.flying.limits import SafetySettings
+from openjax.flying.loop import flight_state
+from openjax.flying.session import SessionSettings
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc"),
+]
+
+
+class Level:
+    """A game whose policy hovers."""
+
+    airframe = nominal_airframe()
+
+    def __init__(self, starts):
+        import numpy as np
+
+        self._nothing, self._action = np.zeros(3), np.array([[2 * self.airframe.hover_thrust - 1, 0, 0, 0]] * 3)
+        self.task = SimpleNamespace(
+            pursuer_position=np.array(starts), evader_position=np.array([-0.5, 0.0, 0.5]),
+            pillar_position=np.zeros((1, 2)), pillar_active=np.zeros(1, bool),
+        )  # fmt: skip
+        self.settings = SimpleNamespace(num_pursuers=3, pillar_radius=0.1, max_speed=1.0)
+
+    def start(self, poses):
+        return self.step(poses)
+
+    def step(self, poses, evader=None):
+        # angles don't come from rates that are zero: level by what is seen
+        action = self._action.copy()
+        action[:, 1:3] = [[-2.0 * p.quaternion[1], -2.0 * p.quaternion[2]] for p in poses]
+        return SimpleNamespace(
+            action=action, evader_position=self._nothing, evader_velocity=self._nothing, captured=False, over=False,
+            breaches=self._nothing, crashed=self._nothing.astype(bool),
+        )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def flying():
+    virtual = VirtualProcess("wall")
+    starts = [(*pose.position[:2], 0.5) for pose in virtual.truth.poses()]
+    game, uris = Level(starts), tuple(virtual.uris)
+    state = flight_state(game, 3, SafetySettings())
+    prepared = Prepared(game, state, SessionSettings(uris), None, {"policy": "level", "scenario": "wall", "uris": uris})
+    yield lambda number, kind: Flown(number, kind, virtual, Arguments(uri=uris, episode_seconds=8.0), prepared).fly()
+    virtual.close()
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "KILL loop", "STOP loop", "KILL links", "STOP guard", "KILL loop+links", "KILL loop+guard", "KILL links+guard",
+        "TERM links", "HUP loop", "terminal closed", "Ctrl-Z", "Ctrl-C three times", "l and space",
+        "camera frozen", "camera: yaw turned", "camera drifts", "gyroscope: a number that is none", "start: millimetres",
+        "strangers' packets", "second fly",
+    ],
+)  # fmt: skip
+def test_whatever_happens_all_are_down_inside_and_disarmed(flying, kind):
+    record = flying(7, kind)
+    assert record["well"], record
