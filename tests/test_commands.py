@@ -1,5 +1,6 @@
 """The commands as a user runs them, tiny: training, kill and resume, evaluation, benchmark, bad input."""
 
+import dataclasses
 import json
 import os
 import signal
@@ -18,6 +19,7 @@ from openjax.commands import benchmark, evaluate, train, training_job
 from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import FIELDS
 from openjax.learning import training_step
+from openjax.learning.training_step import Phases, make_phases
 from openjax.show.metrics import read_metrics
 from openjax.store.checkpoint_files import is_checkpoint, load_arrays
 from openjax.store.checkpoints import Checkpoints
@@ -160,16 +162,16 @@ def test_signal_saves_and_exits_cleanly(whole_run, tmp_path, train_arguments):
 
 
 def test_nan_stops_the_run_and_leaves_the_state(tmp_path, monkeypatch, capsys, train_arguments):
-    def make_broken_step(settings, environment, devices):
-        def step(carry):
+    def make_broken_phases(settings, environment, devices):
+        def renew(carry):
             update = carry.update + 1
             broken = jax.tree.map(lambda leaf: leaf + (0.0 / (update != 4)), carry.policy.actor)
             carry = carry.with_policy(carry.policy.replace(actor=broken))
             return carry.replace(update=update), {"reward": 0.0 * update}
 
-        return step
+        return Phases(lambda carry: (carry, (), {}), (), renew)
 
-    monkeypatch.setattr(training_job, "make_device_step", make_broken_step)
+    monkeypatch.setattr(training_job, "make_device_phases", make_broken_phases)
     out = tmp_path / "broken"
     options = [*train_arguments[1:], *ALONE, "--out", out]
     status, _ = in_process(train.main, options, monkeypatch, capsys)
@@ -234,10 +236,11 @@ def test_shipped_policies_act_in_their_game_and_refuse_another():
 
 
 def test_benchmark_writes_table_and_file(tmp_path, monkeypatch, capsys):
-    def learn_nothing(settings, parts, carry, *_):  # most of what there is to compile
-        return carry.actor, carry.critic, carry.value_scale, {}
+    def phases_without(*arguments, **named):  # most of what there is to compile
+        phases = make_phases(*arguments, **named)
+        return dataclasses.replace(phases, learn=phases.learn[:-1])
 
-    monkeypatch.setattr(training_step, "learn_policy", learn_nothing)
+    monkeypatch.setattr(training_step, "make_phases", phases_without)
     file = tmp_path / "speed.json"
     arguments = [*TINY, "--predictor.enabled", "False", "--generator.enabled", "False"]
     arguments += ["--parts", "rigid", "training", "--envs", "8", "--training_envs", "16"]

@@ -23,7 +23,7 @@ from openjax.learning import (
     summarise,
     training_step,
 )
-from openjax.learning.training_step import initial_carry, penalty_share_at
+from openjax.learning.training_step import initial_carry, make_phases, penalty_share_at
 from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import SCENARIOS, PursuitSettings, hover_action, scenario_task
 
@@ -151,10 +151,11 @@ def test_same_seed_same_run(run):
 def no_learning(monkeypatch):
     """Actor and critic stay as they are: their update takes most of the compiler's time."""
 
-    def learn_nothing(settings, parts, carry, *_):
-        return carry.actor, carry.critic, carry.value_scale, {}
+    def phases_without(*arguments, **named):
+        phases = make_phases(*arguments, **named)
+        return dataclasses.replace(phases, learn=phases.learn[:-1])
 
-    monkeypatch.setattr(training_step, "learn_policy", learn_nothing)
+    monkeypatch.setattr(training_step, "make_phases", phases_without)
 
 
 NO_PREDICTOR = dataclasses.replace(SETTINGS.predictor, enabled=False)

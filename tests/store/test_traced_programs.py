@@ -46,7 +46,7 @@ def test_what_was_traced_once_is_found_again_and_does_the_same(tmp_path, step, t
         return Carry(jax.random.key(3), jnp.arange(4.0))
 
     def of(made_from):
-        return recalled("step", step, (carry(),), carry(), made_from, tmp_path)
+        return recalled("step", step, lambda: (carry(),), carry(), made_from, tmp_path)
 
     expected = outcome(step, carry())
     before = len(traces)
@@ -56,16 +56,16 @@ def test_what_was_traced_once_is_found_again_and_does_the_same(tmp_path, step, t
     def never(carry):
         raise AssertionError("traced again")
 
-    found = recalled("step", jax.jit(never), (carry(),), carry(), "these settings", tmp_path)
+    found = recalled("step", jax.jit(never), lambda: (carry(),), carry(), "these settings", tmp_path)
     assert outcome(found, carry()) == expected
     with pytest.raises(AssertionError, match="traced again"):
-        recalled("step", jax.jit(never), (carry(),), carry(), "other settings", tmp_path)
+        recalled("step", jax.jit(never), lambda: (carry(),), carry(), "other settings", tmp_path)
 
     # a damaged file is traced and written anew
     whole = file.read_bytes()
     file.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
     assert outcome(of("these settings"), carry()) == expected
-    again = recalled("step", jax.jit(never), (carry(),), carry(), "these settings", tmp_path)
+    again = recalled("step", jax.jit(never), lambda: (carry(),), carry(), "these settings", tmp_path)
     assert outcome(again, carry()) == expected and list(tmp_path.iterdir()) == [file]
 
 
@@ -74,5 +74,5 @@ def test_a_program_that_cannot_be_kept_is_used_as_it_is(tmp_path):
     def told(x):
         return jax.pure_callback(lambda x: x, x, x)
 
-    assert recalled("told", told, (jnp.zeros(2),), Carry(0, 0), "", tmp_path) is told
+    assert recalled("told", told, lambda: (jnp.zeros(2),), Carry(jnp.zeros(()), jnp.zeros(())), "", tmp_path) is told
     assert not list(tmp_path.iterdir())

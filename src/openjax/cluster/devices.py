@@ -12,12 +12,14 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from openjax.errors import UserError
-from openjax.learning import TrainCarry, TrainSettings, make_training_step
+from openjax.learning import TrainCarry, TrainSettings
+from openjax.learning.training_step import Flown, Phases, make_phases
 from openjax.pursuit import Pursuit
 
 AXIS = "devices"
 _SHARED_OUT = ("observation", "state")
 """Fields of the carry whose leading axis is the worlds."""
+_FLOWN = Flown(PartitionSpec(None, AXIS), PartitionSpec(AXIS), PartitionSpec(AXIS))
 
 
 def check_devices(settings: TrainSettings, number: int) -> None:
@@ -92,17 +94,34 @@ def own_copy(tree: Any) -> Any:
 
 def make_device_step(settings: TrainSettings, environment: Pursuit, number: int):
     """The training step `carry -> (carry, metrics)` on `number` devices, not yet compiled."""
+    phases = make_device_phases(settings, environment, number)
+    return lambda carry: phases(carry)
+
+
+def make_device_phases(settings: TrainSettings, environment: Pursuit, number: int) -> Phases:
+    """The programs of the training step on `number` devices, not yet compiled."""
     if number == 1:
-        return make_training_step(settings, environment)
-    specs = _carry_of(PartitionSpec(AXIS), PartitionSpec())
-    return jax.shard_map(
-        make_training_step(settings, environment, axis=AXIS),
-        mesh=_mesh(number),
-        in_specs=(specs,),
-        out_specs=(specs, PartitionSpec()),
+        return make_phases(settings, environment)
+    phases = make_phases(settings, environment, axis=AXIS)
+    carry, same = _carry_of(PartitionSpec(AXIS), PartitionSpec()), PartitionSpec()
+
+    def shared(phase, takes, gives):
         # The step averages gradients itself; with the check on, they'd be summed before that.
-        check_vma=False,
+        return jax.shard_map(phase, mesh=_mesh(number), in_specs=takes, out_specs=gives, check_vma=False)
+
+    return Phases(
+        fly=shared(phases.fly, (carry,), (carry, _FLOWN, same)),
+        learn=tuple(shared(phase, (carry, _FLOWN), (carry, same)) for phase in phases.learn),
+        renew=shared(phases.renew, (carry,), (carry, same)),
     )
+
+
+def flown_shardings(number: int) -> Flown | jax.sharding.Sharding:
+    """Where the leaves of what was flown lie, as a prefix of its tree."""
+    if number == 1:
+        return jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    parts = _FLOWN.rollout, _FLOWN.frames, _FLOWN.predicted
+    return Flown(*(NamedSharding(_mesh(number), spec) for spec in parts))
 
 
 def _mesh(number):

@@ -13,9 +13,8 @@ from rich import box
 from rich.table import Table
 
 from openjax.learning import TrainSettings, build, init_carry, make_training_step
-from openjax.learning.collectives import own_keys
 from openjax.learning.rollout import collect
-from openjax.learning.training_step import learn_policy, learn_predictor
+from openjax.learning.training_step import make_phases
 from openjax.pursuit.environment import action_to_command
 
 BANDWIDTH = 4.3e12
@@ -87,24 +86,18 @@ def measure(settings: TrainSettings, seconds_of: Callable[[Callable, tuple], flo
         parameters = carry.policy
         return jax.lax.scan(one, (carry.observation, jnp.zeros(())), None, length=steps)
 
-    def predictor_update(carry, rollout):
-        return learn_predictor(parts, carry, rollout, own_keys(jax.random.key(2), settings.num_envs, None))
-
-    def policy_update(carry, rollout, observation):
-        last = observation, policy.predict(carry.policy, observation)
-        return learn_policy(settings, parts, carry, rollout, last, jax.random.key(3))
-
-    collected, observation, _ = jax.jit(rollout)(carry, noise)
+    phases = make_phases(settings)
+    _, flown, _ = jax.jit(phases.fly)(carry)
     programs: dict[str, tuple[Callable, tuple]] = {
         "physics": (physics, (carry.state, actions)),
         "environment": (game, (carry.state, actions)),
         "rollout": (rollout, (carry, noise)),
-        "policy update": (policy_update, (carry, collected, observation)),
+        "policy update": (phases.learn[-1], (carry, flown)),
         "step": (make_training_step(settings), (carry,)),
     }
     if settings.predictor.enabled:
         programs["prediction"] = (prediction, (carry, noise))
-        programs["predictor update"] = (predictor_update, (carry, collected))
+        programs["predictor update"] = (phases.learn[0], (carry, flown))
     seconds = {name: seconds_of(*program) for name, program in programs.items()}
     if None in seconds.values():
         return []

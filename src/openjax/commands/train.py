@@ -18,9 +18,13 @@ def main(arguments: Sequence[str], *, keep_traced: bool = False) -> int:
         return _help(arguments)
     if peek(arguments, "process_id") in (None, "0"):
         print("openjax.train: loading JAX and MuJoCo ...", flush=True)  # takes seconds; nobody should wonder
+    import jax
+
     from openjax.cluster.joining import joined
     from openjax.commands.training_command import membership, read_command, start
 
+    # the same numbers by a kernel of JAX's own: written out, they're half of what there is to compile for a GPU
+    jax.config.update("jax_threefry_gpu_kernel_lowering", True)
     with joined(membership(arguments)) as processes:
         return start(read_command(arguments), arguments, started, processes, keep_traced=keep_traced)
 

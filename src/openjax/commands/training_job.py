@@ -10,13 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-from openjax.background import compile_ahead, in_background
+from openjax.background import in_background
 from openjax.cluster.devices import (
     carry_shardings,
     check_devices,
     check_memory,
-    everywhere,
-    make_device_step,
+    make_device_phases,
     own_copy,
 )
 from openjax.cluster.processes import Processes
@@ -28,10 +27,11 @@ from openjax.commands.evaluator import (
     layout_slots,
     record_of,
 )
-from openjax.commands.training_loop import NotFiniteError, Plan, StopRequest, guarded, run_updates
+from openjax.commands.gradient_stages import compile_first_flights, compile_last_stage, on_one_device
+from openjax.commands.step_programs import step_programs
+from openjax.commands.training_loop import NotFiniteError, Plan, StopRequest, run_updates
 from openjax.commands.validation import SCORE_RULE, Validation, flat_metrics, selection_score
 from openjax.learning import TrainSettings, build, make_start, summarise
-from openjax.learning.analytic_gradient import AnalyticGradient, compile_analytic, free_flight
 from openjax.learning.train_state import policy_leaf
 from openjax.policy import PolicyParameters
 from openjax.policy.growth import with_longer_history
@@ -115,8 +115,13 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
         processes.advice = f"go on with openjax train --resume {directory.path} --devices all"
         progress.phase("compiling the start: networks, first tasks")
         start, step, abstract = _programs(job)
-        step_ready = compile_ahead(step, abstract)  # takes longest, so it comes first
-        carry, update, seconds = _first_carry(job, start, abstract, directory, checkpoints, progress)
+        step_ready = step.compile_ahead(abstract)  # takes longest, so it comes first
+        first_flights = None
+        if settings.first_flights.updates and not job.start_from and not checkpoints.any_finished():
+            first_flights = compile_first_flights(settings, job.environment, abstract.policy)
+        carry, update, seconds = _first_carry(
+            job, start, abstract, directory, checkpoints, progress, first_flights
+        )
         if processes.is_first:
             directory.write_settings(settings, job.facts)
 
@@ -143,7 +148,7 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
             if processes.is_first and not beside:
                 validation = in_background(prepare_validation)
             if processes.is_first and settings.analytic.updates:
-                learn = in_background(functools.partial(_analytic_ready, job, abstract))
+                learn = in_background(lambda: compile_last_stage(settings, job.environment, abstract.policy))
             outcome = run_updates(
                 step,
                 carry,
@@ -152,6 +157,8 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
                     steps_per_update=settings.steps_per_update,
                     validation_interval=settings.validation_interval,
                     time_limit=seconds + job.time_limit,
+                    # an accelerator would wait for the validation's program
+                    validate_start=first_flights is not None and jax.default_backend() == "cpu",
                 ),
                 checkpoints=checkpoints,
                 metrics=metrics,
@@ -198,42 +205,26 @@ def _programs(job):
     settings, shardings = job.settings, carry_shardings(job.devices)
     start = make_start(settings, job.environment)
     abstract = abstract_like(jax.eval_shape(start, jax.random.key(settings.seed)), shardings)
-    step = guarded(
-        make_device_step(settings, job.environment, job.devices), shardings, everywhere(job.devices)
-    )
+    phases = make_device_phases(settings, job.environment, job.devices)
     if job.traced is None or job.devices > 1:
-        return start, step, abstract
+        return start, step_programs(phases, job.devices, abstract), abstract
     keep = functools.partial(recalled, carry=abstract, made_from=job.made_from, folder=job.traced)
 
     def kept_start(key):
-        return jax.jit(keep("start", start, (key,)), out_shardings=shardings)(key)
+        return jax.jit(keep("start", start, lambda: (key,)), out_shardings=shardings)(key)
 
-    kept_step = jax.jit(keep("step", step, (abstract,)), donate_argnums=0, out_shardings=shardings)
-    return kept_start, kept_step, abstract
+    return kept_start, step_programs(phases, job.devices, abstract, keep), abstract
 
 
 def _validation_ready(job, abstract):
     """The validation, compiled; and what else is needed soon after the first update is loaded."""
     load_orbax()
     validation = _validation(job)
-    validation.evaluator.compile_ahead(_on_one_device(abstract.policy), validation.tasks)()
+    validation.evaluator.compile_ahead(on_one_device(abstract.policy), validation.tasks)()
     return validation
 
 
-def _on_one_device(abstract):
-    return abstract_like(abstract, jax.sharding.SingleDeviceSharding(jax.local_devices()[0]))
-
-
-def _analytic_ready(job, abstract):
-    """The stage after MAPPO, being compiled while that learns."""
-    policy = build(job.settings, job.environment).policy
-    # fifty steps of the simulation follow each action: too far for the gradient of rough arithmetic
-    policy = dataclasses.replace(policy, network=dataclasses.replace(policy.network, compute_type="float32"))
-    stage = AnalyticGradient(job.settings.analytic, free_flight(job.environment), policy)
-    return compile_analytic(stage, _on_one_device(abstract.policy))
-
-
-def _first_carry(job, start, abstract, directory, checkpoints, progress):
+def _first_carry(job, start, abstract, directory, checkpoints, progress, first_flights):
     """The carry to start from, the updates done and the seconds spent; `abstract` is its kind."""
     settings = job.settings
     checkpoints.remove_unfinished()
@@ -244,10 +235,13 @@ def _first_carry(job, start, abstract, directory, checkpoints, progress):
     carry = start(jax.random.key(settings.seed))
     if job.start_from is not None:
         carry = carry.with_policy(_start_parameters(job, carry.policy))
-    carry = place(carry, carry_shardings(job.devices))
     if job.processes.is_first:
         save_policy_file(directory.start_policy, carry.policy, settings, {"update": 0}, storage="float32")
-    return carry, 0, 0.0
+    if first_flights is not None:
+        progress.phase("learning to fly by the gradient through the simulation")
+        key = jax.random.fold_in(jax.random.key(settings.seed), 1)
+        carry = carry.with_policy(first_flights(carry.policy, key, progress.message))
+    return place(carry, carry_shardings(job.devices)), 0, 0.0
 
 
 def _start_parameters(job, fresh: PolicyParameters) -> PolicyParameters:

@@ -45,6 +45,8 @@ class Plan:
     """Longest time without a checkpoint."""
     time_limit: float = float("inf")
     """Seconds of training time (compilation included) after which to stop."""
+    validate_start: bool = False
+    """Validate before the first update, too: what a run starts from may be the best there will be."""
     overlap: bool | None = None
     """Start an update before the last one's metrics are read: an accelerator then never waits for the host.
 
@@ -178,7 +180,19 @@ def run_updates(
         _, over, late = asked[0]
         return signals[0] if signals else "the time limit" if over else None, late
 
+    def validated():
+        """The score of the carry, which is written and shown."""
+        nonlocal best_score
+        progress.phase("evaluating on validation tasks", announce=False)
+        score, validation = evaluate(carry)
+        metrics.write("validation", update, update * plan.steps_per_update, elapsed(), validation)
+        progress.validation(validation, is_best=score >= best_score)
+        best_score = max(score, best_score)
+        return score
+
     reason, _ = decide()
+    if plan.validate_start and evaluate is not None and update == 0:
+        checkpoints.save(0, carry, validated(), {"seconds": elapsed()})
     try:
         while update < plan.total_updates and reason is None:
             if update == first_update:
@@ -193,13 +207,7 @@ def run_updates(
             if not overlap or due or late or reason:
                 finish(pending)
                 pending = None
-            score = None
-            if due and evaluate is not None:
-                progress.phase("evaluating on validation tasks", announce=False)
-                score, validation = evaluate(carry)
-                metrics.write("validation", update, update * plan.steps_per_update, elapsed(), validation)
-                progress.validation(validation, is_best=score >= best_score)
-                best_score = max(score, best_score)
+            score = validated() if due and evaluate is not None else None
             if due or late:
                 checkpoints.save(update, carry, score, {"seconds": elapsed()})
                 saved_at = time.monotonic()

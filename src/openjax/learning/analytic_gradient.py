@@ -11,7 +11,7 @@ import dataclasses
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -40,12 +40,16 @@ SEGMENTS = 8
 """A flight is looked at after each of so many times `HORIZON`."""
 SMOOTH, SMOOTH_BREACH = 0.012, 0.008
 """Distances (m) over which a crash and a breach go from sure to none in what is learnt; ways through rows aren't wide."""
+SMOOTH_CAPTURE = 0.1
+"""The same for a capture (m)."""
 FAST = 0.05
 """Speed (m/s) above where the speed begins to cost that costs as much as a crash in every step would."""
 CRASH_IN_FLIGHT, BREACH_AT_START = 4.0, 0.5
 """Weights beside the crashes from starts: an episode has one start, and many half seconds after it."""
 LOWEST, FASTEST = 0.35, 1.0
 """Height (m) below, and speed (m/s) above which the end of a start costs."""
+REST = 0.9
+"""Share of the capture radius within which a pursuer needn't come nearer to the evader."""
 CLOSE, SIDE_BY_SIDE = 0.45, 0.35
 """Shares of the starts close to something (70 % of the pursuers), and of those in which all stand side by side."""
 APART = 0.1
@@ -84,6 +88,21 @@ def draw_start(settings: PursuitSettings, key: jax.Array) -> Task:
     )
 
 
+class Way(NamedTuple):
+    """What the pursuers of B worlds met in some steps, all smooth and (B, N) unless said otherwise."""
+
+    least: jax.Array
+    """m, least gap to anything solid"""
+    breach: jax.Array
+    """mean number of breaches"""
+    excess: jax.Array
+    """mean excess of speed, in units of `FAST`"""
+    distance: jax.Array
+    """m, mean distance to the evader beyond where a pursuer may rest"""
+    free: jax.Array
+    """(B,) share of the steps in which nobody has caught the evader"""
+
+
 @dataclass(frozen=True)
 class AnalyticGradient:
     """A policy's game in free flight, and what is learnt in it. `World`s are observations and states (B, ...)."""
@@ -103,54 +122,41 @@ class AnalyticGradient:
         """Control steps that are learnt at once."""
         return max(1, round(HORIZON / self.game.time_step))
 
-    def shown(self, observation, state):
-        """What the actor is shown of worlds (B, ...): their observations."""
-        del state
-        return observation
-
-    def begin(self, tasks: Task, keys: jax.Array, bounds: jax.Array):
-        """Worlds of tasks (B, ...) whose vehicles have bounds (B, R, 4)."""
-
-        def one(key, task, bounds):
-            return self.environment.with_bounds(bounds).reset_to(key, task)
-
-        return jax.vmap(one)(keys, tasks, bounds)
-
-    def inputs(self, parameters: PolicyParameters, observation, state):
+    def inputs(self, parameters: PolicyParameters, observation):
         """What the actor acts on: observations and predictions, without a gradient through the predictor."""
-        predicted = jax.lax.stop_gradient(self.policy.predict(parameters, observation))
-        return self.shown(observation, state), predicted
+        return observation, jax.lax.stop_gradient(self.policy.predict(parameters, observation))
 
-    def fly(self, actor: Any, parameters: PolicyParameters, world, steps: int):
-        """Worlds some steps later.
-
-        Returns:
-          the worlds; (B, N) least gaps to anything solid (m), mean number of breaches and mean excess of speed, all smooth.
-        """
+    def fly(self, actor: Any, parameters: PolicyParameters, world, steps: int) -> tuple[Any, "Way"]:
+        """Worlds some steps later, and what their pursuers met on the way."""
         step = jax.vmap(self.environment.step, in_axes=(None, 0, 0))
         limit = self.how.speed_from * self.game.max_speed
 
         def one(carry, _):
-            (observation, state), least, breach, excess = carry
-            inputs = self.inputs(parameters, observation, state)
+            (observation, state), way = carry
+            inputs = self.inputs(parameters, observation)
             action = self.policy.action(self.policy.distribution(actor, *inputs)[0], observation)
             observation, state, *_ = step(jax.random.key(0), state, action)
-            least = jnp.minimum(least, nearest_gap(self.game, state))
-            breach = breach + breach_share(self.game, state)
-            excess = excess + jax.nn.relu(_speed(state.drones) - limit) / FAST
-            return ((observation, state), least, breach, excess), None
+            way = Way(
+                jnp.minimum(way.least, nearest_gap(self.game, state)),
+                way.breach + breach_share(self.game, state) / steps,
+                way.excess + jax.nn.relu(_speed(state.drones) - limit) / FAST / steps,
+                way.distance + jax.nn.relu(evader_distance(state) - rest) / steps,
+                way.free + free_share(self.game, state) / steps,
+            )
+            return ((observation, state), way), None
 
-        shape = world[1].drones.position.shape[:2]
-        first = world, jnp.full(shape, jnp.inf), jnp.zeros(shape), jnp.zeros(shape)
-        (world, least, breach, excess), _ = jax.lax.scan(jax.checkpoint(one), first, None, length=steps)
-        return world, least, breach / steps, excess / steps
+        rest = REST * self.game.capture_radius
+        zeros = jnp.zeros(world[1].drones.position.shape[:2])
+        first = world, Way(zeros + jnp.inf, zeros, zeros, zeros, zeros[:, 0])
+        return jax.lax.scan(jax.checkpoint(one), first, None, length=steps)[0]
 
     def starts(self, key: jax.Array, bounds: jax.Array):
         """Worlds to learn from, at their starts; bounds (B, R, 4)."""
-        task_key, reset_key = jax.random.split(key)
-        number = bounds.shape[0]
-        tasks = jax.vmap(lambda key: draw_start(self.game, key))(jax.random.split(task_key, number))
-        return self.begin(tasks, jax.random.split(reset_key, number), bounds)
+
+        def one(task_key, key, bounds):
+            return self.environment.with_bounds(bounds).reset_to(key, draw_start(self.game, task_key))
+
+        return jax.vmap(one)(*(jax.random.split(k, bounds.shape[0]) for k in jax.random.split(key)), bounds)
 
     def flights(self, parameters: PolicyParameters, key: jax.Array, bounds: jax.Array):
         """Worlds (SEGMENTS * B, ...) at moments of the policy's flights."""
@@ -165,21 +171,21 @@ class AnalyticGradient:
     def loss(self, actor: Any, parameters: PolicyParameters, starts, flying):
         """What is learnt (), and its parts. `parameters` are the policy's before."""
         how, number = self.how, starts[1].step.shape[0]
-        inputs = self.inputs(parameters, *flying)
+        inputs = self.inputs(parameters, flying[0])
         mean, log_std = self.policy.distribution(parameters.actor, *inputs)
         change = (self.policy.distribution(actor, *inputs)[0] - mean) * jnp.exp(-log_std)
         worlds = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), starts, flying)
-        (_, end), least, breach, excess = self.fly(actor, parameters, worlds, self.steps)
-        crash, drones = crash_share(least), jax.tree.map(lambda leaf: leaf[:number], end.drones)
+        (_, end), way = self.fly(actor, parameters, worlds, self.steps)
+        crash, drones = crash_share(way.least), jax.tree.map(lambda leaf: leaf[:number], end.drones)
         fast, low = _speed(drones) - FASTEST, LOWEST - drones.position[..., 2]
         parts = {
             "crashes_from_starts": (1.0, crash[:number]),
-            "breaches_from_starts": (BREACH_AT_START, breach[:number]),
+            "breaches_from_starts": (BREACH_AT_START, way.breach[:number]),
             # a dive saves some of those that start tilted towards something, so there the speed is free but for its end
             "ends": (0.2, jax.nn.relu(fast) + jax.nn.relu(low)),
             "crashes_in_flight": (CRASH_IN_FLIGHT, crash[number:]),
-            "breaches_in_flight": (how.breach, breach[number:]),
-            "speed_in_flight": (how.speed, excess[number:]),
+            "breaches_in_flight": (how.breach, way.breach[number:]),
+            "speed_in_flight": (how.speed, way.excess[number:]),
             "change": (how.hold, jnp.sum(change**2, axis=-1)),
         }
         parts = {name: (weight, jnp.mean(value)) for name, (weight, value) in parts.items()}
@@ -265,6 +271,18 @@ def breach_share(game: PursuitSettings, state: PursuitState) -> jax.Array:
 
     total = jnp.sum(near(to_pillar), axis=-1) + jnp.sum(near(to_drone), axis=-1)
     return total + near(to_wall) + near(to_ceiling)
+
+
+def evader_distance(state: PursuitState) -> jax.Array:
+    """(W, N) m, from each pursuer of worlds (W, ...) to its evader, whose flight has no gradient: what it answers is a cliff."""
+    evader = jax.lax.stop_gradient(state.evader_position)[:, None]
+    return jnp.sqrt(jnp.sum((state.drones.position - evader) ** 2, axis=-1) + 1e-9)
+
+
+def free_share(game: PursuitSettings, state: PursuitState) -> jax.Array:
+    """(W,) how free the evader of worlds (W, ...) is, from 0 to 1: smooth, and felt from afar."""
+    nearest = jnp.min(evader_distance(state), axis=-1)
+    return jax.nn.sigmoid((nearest - 0.95 * game.capture_radius) / SMOOTH_CAPTURE)
 
 
 def _speed(drones):

@@ -24,14 +24,14 @@ def generate_task(
     environment: PursuitSettings,
     archive: TaskArchive,
     key: jax.Array,
-    close: float = 0.0,
+    close: jax.Array | None = None,
 ) -> Task:
     """Draw one task: with probability p an archived one, expanded, else a uniform one.
 
     A share `close` of its pursuers is put close to a pillar or to another one (not in the paper).
     """
     task = _archived_or_uniform(settings, environment, archive, key)
-    return close_starts(environment, jax.random.fold_in(key, 1), task, close) if close else task
+    return task if close is None else close_starts(environment, jax.random.fold_in(key, 1), task, close)
 
 
 def _archived_or_uniform(settings, environment, archive, key):

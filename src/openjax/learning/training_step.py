@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from openjax.baselines import make_policy
@@ -119,122 +120,130 @@ def initial_carry(settings: TrainSettings, parts: Building, key: jax.Array) -> T
     )
 
 
-def learn_predictor(
-    parts: Building, carry: TrainCarry, rollout: Rollout, keys: jax.Array, axis: str | None = None
-) -> tuple[TrainState, jax.Array]:
-    """The carry's predictor after an update on a rollout, and its () loss; `keys` (E,) draw the windows."""
-    game, optimiser = parts.environment.settings, parts.optimisers.predictor
-    return update_predictor(
-        parts.policy, optimiser, game, carry.predictor, carry.state.frames, rollout, keys, axis
-    )
+@struct.dataclass
+class Flown:
+    """What a training step learns from: a rollout, and what it needs of before and after it."""
+
+    rollout: Rollout  # (T, E, ...)
+    frames: jax.Array  # (E, H, F), the history before
+    predicted: jax.Array | None  # (E, K, 3) m, predicted after it
 
 
-def learn_policy(
-    settings: TrainSettings,
-    parts: Building,
-    carry: TrainCarry,
-    rollout: Rollout,
-    last: tuple[Observation, jax.Array | None],
-    key: jax.Array,
-    axis: str | None = None,
-    progress: jax.Array | float = 0.0,
-) -> tuple[TrainState, TrainState, ValueScale, dict[str, jax.Array]]:
-    """Actor, critic and value scale of the carry after an update on a rollout, and () metrics; see `update_policy`.
+@dataclass(frozen=True)
+class Phases:
+    """The training step in parts, one after the other: a compiler is done sooner with several at once than with the whole.
 
-    `last` is the (E, ...) observation after the rollout and its (E, K, 3) prediction; `key` shuffles, `progress` () is the
-    share of the run that is done.
+    Metrics are () by name, counted over the rollout or over the episodes that ended with it.
     """
-    return update_policy(
-        settings.mappo,
-        parts.policy,
-        parts.optimisers,
-        carry.actor,
-        carry.critic,
-        carry.value_scale,
-        rollout,
-        *last,
-        key,
-        axis,
-        progress,
-    )
+
+    fly: Callable[[TrainCarry], tuple[TrainCarry, Flown, dict[str, jax.Array]]]
+    """carry -> carry after a rollout, what is learnt from it, metrics"""
+    learn: tuple[Callable[[TrainCarry, Flown], tuple[TrainCarry, dict[str, jax.Array]]], ...]
+    """(carry, flown) -> carry after an update, metrics; one for each network that learns on its own"""
+    renew: Callable[[TrainCarry], tuple[TrainCarry, dict[str, jax.Array]]]
+    """carry -> carry whose worlds have new tasks where their episodes have just ended, metrics of these episodes"""
+
+    def __call__(self, carry: TrainCarry) -> tuple[TrainCarry, dict[str, jax.Array]]:
+        """The whole step."""
+        carry, flown, metrics = self.fly(carry)
+        for learn in self.learn:
+            carry, watched = learn(carry, flown)
+            metrics |= watched
+        carry, counted = self.renew(carry)
+        return carry, metrics | counted
+
+
+def make_phases(
+    settings: TrainSettings, environment: Pursuit | None = None, axis: str | None = None
+) -> Phases:
+    """The parts of the training step; `axis` names the axis of devices when they run under `shard_map`."""
+    step = _Step(settings, build(settings, environment), axis)
+    learn = (step.learn_predictor,) if settings.predictor.enabled else ()
+    return Phases(step.fly, (*learn, step.learn_policy), step.renew)
 
 
 def make_training_step(
     settings: TrainSettings, environment: Pursuit | None = None, axis: str | None = None
 ) -> Callable[[TrainCarry], tuple[TrainCarry, dict[str, jax.Array]]]:
-    """The training step `carry -> (carry, metrics)`; compile it with `jax.jit(step, donate_argnums=0)`.
+    """The training step `carry -> (carry, metrics)` as one function; compile it with `jax.jit(step, donate_argnums=0)`.
 
     `axis` names the axis of devices when it runs under `shard_map` (see `openjax.cluster.devices`).
-    Metrics are () float32, counted over the rollout or over the episodes that ended with it.
     """
-    parts = build(settings, environment)
-    environment, policy, schedule = parts.environment, parts.policy, settings.schedule
+    phases = make_phases(settings, environment, axis)
+    return lambda carry: phases(carry)  # a function by its name, as the compiler's cache knows programs by theirs
 
-    def training_step(carry: TrainCarry) -> tuple[TrainCarry, dict[str, jax.Array]]:
-        key, noise_key, window_key, shuffle_key, task_key, reset_key = jax.random.split(carry.key, 6)
-        num_envs = carry.state.step.shape[0]  # of this device
 
-        # rollout
-        progress = carry.update.astype(jnp.float32) / settings.total_updates
-        penalty_share = penalty_share_at(settings, progress)
-        starting = _starting(settings, environment, progress)
+@dataclass(frozen=True)
+class _Step:
+    """What the phases have in common."""
+
+    settings: TrainSettings
+    parts: Building
+    axis: str | None
+
+    def fly(self, carry):
+        settings, axis = self.settings, self.axis
+        environment, policy = self.parts.environment, self.parts.policy
         shape = (settings.rollout_length, settings.environment.num_pursuers, policy.sample_size)
-        noise = jax.vmap(lambda k: jax.random.normal(k, shape))(own_keys(noise_key, num_envs, axis))
+        keys = own_keys(self._key(carry, 1), carry.state.step.shape[0], axis)
+        noise = jax.vmap(lambda k: jax.random.normal(k, shape))(keys)
+        world, share = (carry.observation, carry.state), penalty_share_at(settings, self._progress(carry))
         rollout, observation, state = collect(
-            environment,
-            policy,
-            carry.policy,
-            carry.observation,
-            carry.state,
-            jnp.moveaxis(noise, 1, 0),
-            penalty_share,
+            environment, policy, carry.policy, *world, jnp.moveaxis(noise, 1, 0), share
         )
-        last_predicted = policy.predict(carry.policy, observation)
+        flown = Flown(rollout, carry.state.frames, policy.predict(carry.policy, observation))
+        metrics = {"reward": mean_over_devices(jnp.mean(rollout.reward), axis)}
+        return carry.replace(observation=observation, state=state), flown, metrics
 
-        # predictor update
-        predictor, metrics = carry.predictor, {}
-        if settings.predictor.enabled:
-            predictor, loss = learn_predictor(
-                parts, carry, rollout, own_keys(window_key, num_envs, axis), axis
-            )
-            error = jnp.linalg.norm(rollout.predicted[:, :, 0] - rollout.evader, axis=-1)
-            metrics |= {"predictor_loss": loss, "prediction_error": mean_over_devices(jnp.mean(error), axis)}
+    def learn_predictor(self, carry, flown):
+        rollout, axis = flown.rollout, self.axis
+        keys = own_keys(self._key(carry, 2), flown.frames.shape[0], axis)
+        how = self.parts.policy, self.parts.optimisers.predictor, self.parts.environment.settings
+        predictor, loss = update_predictor(*how, carry.predictor, flown.frames, rollout, keys, axis)
+        error = jnp.linalg.norm(rollout.predicted[:, :, 0] - rollout.evader, axis=-1)
+        metrics = {"predictor_loss": loss, "prediction_error": mean_over_devices(jnp.mean(error), axis)}
+        return carry.replace(predictor=predictor), metrics
 
-        # policy update
-        actor, critic, scale, watched = learn_policy(
-            settings, parts, carry, rollout, (observation, last_predicted), shuffle_key, axis, progress
+    def learn_policy(self, carry, flown):
+        before, last = (carry.actor, carry.critic, carry.value_scale), (carry.observation, flown.predicted)
+        how = self.settings.mappo, self.parts.policy, self.parts.optimisers
+        actor, critic, scale, metrics = update_policy(
+            *how, *before, flown.rollout, *last, self._key(carry, 3), self.axis, self._progress(carry)
         )
-        metrics |= watched
+        return carry.replace(actor=actor, critic=critic, value_scale=scale), metrics
 
-        # selection of tasks: the one start group whose episodes have just ended gets new ones
+    def renew(self, carry):
+        settings, schedule, axis = self.settings, self.settings.schedule, self.axis
+        progress = self._progress(carry)
+        starting = _starting(settings, self.parts.environment, progress)
         group = schedule.ending(carry.update)
-        ended = schedule.members(state, group)
-        archive, counted = _selection(settings, carry.archive, ended, penalty_share, axis)
-        metrics |= counted
-        fresh = _fresh(settings, starting, archive, task_key, reset_key, ended.step.shape[0], axis)
-        worlds = schedule.with_members((observation, state), fresh, group)
-        if number := schedule.restarts(num_envs):
-            # and so do the worlds that are started anew within the episodes of other groups
-            keys = (jax.random.fold_in(task_key, 1), jax.random.fold_in(reset_key, 1))
-            fresh = _fresh(settings, starting, archive, *keys, number, axis, settings.restart_close)
-            worlds = schedule.with_restarts(worlds, fresh, group)
-        observation, state = worlds
-
-        carry = TrainCarry(
-            actor=actor,
-            critic=critic,
-            predictor=predictor,
-            value_scale=scale,
-            observation=observation,
-            state=state,
+        ended = schedule.members(carry.state, group)
+        archive, metrics = _selection(
+            settings, carry.archive, ended, penalty_share_at(settings, progress), axis
+        )
+        # new worlds for those that end, and for those that are started anew within the episodes of other groups
+        numbers = ended.step.shape[0], schedule.restarts(carry.state.step.shape[0])
+        keys = self._key(carry, 4), self._key(carry, 5)
+        new, anew = _fresh(settings, starting, archive, *keys, numbers, axis)
+        worlds = schedule.with_members((carry.observation, carry.state), new, group)
+        if numbers[1]:
+            worlds = schedule.with_restarts(worlds, anew, group)
+        carry = carry.replace(
+            observation=worlds[0],
+            state=worlds[1],
             archive=archive,
-            key=key,
+            key=self._key(carry, 0),
             update=carry.update + 1,
         )
-        metrics["reward"] = mean_over_devices(jnp.mean(rollout.reward), axis)
-        return carry, {name: value.astype(jnp.float32) for name, value in metrics.items()}
+        return carry, metrics
 
-    return training_step
+    def _key(self, carry, number):
+        """One of the keys of this step: of the next step, noise, windows, shuffling, tasks, resets."""
+        return jax.random.split(carry.key, 6)[number]
+
+    def _progress(self, carry):
+        """() share of the run that is done."""
+        return carry.update.astype(jnp.float32) / self.settings.total_updates
 
 
 def penalty_share_at(settings, progress):
@@ -259,17 +268,33 @@ def _starting(settings, environment, progress):
     return environment
 
 
-def _tasks(settings, archive, keys, close=0.0):
-    """One task per key, repeated for the environments that share it; a share of pursuers starts close to something."""
+def _tasks(settings, archive, keys, close=None):
+    """One task per key, repeated for the environments that share it; shares `close` of pursuers start close to something."""
+    draw = functools.partial(generate_task, settings.generator, settings.environment, archive)
+    tasks = jax.vmap(draw)(keys, close if settings.restart_close else None)
+    return jax.tree.map(lambda x: jnp.repeat(x, settings.episodes_per_task, axis=0), tasks)
 
-    draw = functools.partial(generate_task, settings.generator, settings.environment, archive, close=close)
-    return jax.tree.map(lambda x: jnp.repeat(x, settings.episodes_per_task, axis=0), jax.vmap(draw)(keys))
 
+def _fresh(settings, environment, archive, task_key, reset_key, numbers, axis):
+    """Observations and states of two `numbers` of worlds of this device at the start of newly drawn tasks.
 
-def _fresh(settings, environment, archive, task_key, reset_key, number, axis, close=0.0):
-    """Observations and states of `number` worlds of this device at the start of newly drawn tasks."""
-    tasks = _tasks(settings, archive, own_keys(task_key, number // settings.episodes_per_task, axis), close)
-    return jax.vmap(environment.reset_to)(own_keys(reset_key, number, axis), tasks)
+    Of the second ones some pursuers start close to something. All are drawn at once, by a program half as large.
+    """
+    share = settings.episodes_per_task
+    close = jnp.repeat(jnp.array([0.0, settings.restart_close]), np.array(numbers) // share)
+
+    def keys(key, numbers):
+        parts = (
+            own_keys(jax.random.fold_in(key, i), number, axis) for i, number in enumerate(numbers) if number
+        )
+        return jnp.concatenate(list(parts))
+
+    tasks = _tasks(settings, archive, keys(task_key, [number // share for number in numbers]), close)
+    fresh = jax.vmap(environment.reset_to)(keys(reset_key, numbers), tasks)
+    return tuple(
+        jax.tree.map(lambda x, part=part: x[part], fresh)
+        for part in (slice(numbers[0]), slice(numbers[0], None))
+    )
 
 
 def _selection(settings, archive, ended, penalty_share, axis):
@@ -294,4 +319,4 @@ def _selection(settings, archive, ended, penalty_share, axis):
     lasting = settings.schedule.lasting(statistics.steps.shape[0])
     counted = {name: jnp.mean(value.astype(jnp.float32)[lasting]) for name, value in counted.items()}
     counted = mean_over_devices(counted, axis)
-    return archive, counted | {"archive_size": archive.size}
+    return archive, counted | {"archive_size": archive.size.astype(jnp.float32)}

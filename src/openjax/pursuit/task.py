@@ -136,7 +136,7 @@ def expand_task(
     return _first_clear(settings, draw, key, task)
 
 
-def close_starts(settings: PursuitSettings, key: jax.Array, task: Task, share: float) -> Task:
+def close_starts(settings: PursuitSettings, key: jax.Array, task: Task, share: float | jax.Array) -> Task:
     """Put a `share` (0 to 1) of the pursuers next to a pillar or another pursuer: starts that leave the least room.
 
     They stand 0 to 0.05 m outside its safety distance, in any direction, within 0.1 m of half the arena's height. One

@@ -20,29 +20,29 @@ _DIGEST = hashlib.sha256
 
 
 def recalled(
-    name: str, function: Callable, arguments: Sequence[Any], carry: Any, made_from: str, folder: Path
+    name: str, function: Callable, arguments: Callable[[], Sequence[Any]], carry: Any, made_from: str, folder: Path
 ) -> Callable:
     """A function for `jax.jit` that does what `function` does, without tracing it where an earlier process has.
 
-    What is kept is found again by all that it can depend on: the package's sources, `made_from`, the arguments' kinds,
-    the devices, JAX's settings and the libraries' versions. It's read only whole, and holds no code but the program's.
+    What is kept is found again by all that it can depend on: the package's sources, `made_from`, the carry's kind, the
+    devices, JAX's settings and the libraries' versions. It's read only whole, and holds no code but the program's.
 
     Args:
       name: of the program.
       function: from `jax.jit`; of its results, what isn't of the carry's type is of tuples, dictionaries and arrays.
-      arguments: arrays, or `jax.ShapeDtypeStruct`s in their place.
+      arguments: gives arrays, or `jax.ShapeDtypeStruct`s in their place; asked where `function` is traced.
       carry: its type and structure are those of every such part of the results.
-      made_from: what `function` was made from, beside the package's sources.
+      made_from: what `function` and its arguments' kinds were made from, beside the package's sources.
       folder: where programs are kept.
 
     Returns:
       the function; `function` itself where it can't be kept.
     """
-    file = folder / f"{name}-{_key(name, arguments, made_from)}.traced"
+    file = folder / f"{name}-{_key(name, carry, made_from)}.traced"
     program = _read(file)
     if program is None:
         try:
-            write_checked(file, bytes(_export(function, arguments, type(carry)).serialize()))
+            write_checked(file, bytes(_export(function, arguments(), type(carry)).serialize()))
         except (ValueError, NotImplementedError, ImportError, OSError):  # a call that can't be kept, a full disk
             return function
         program = _read(file)  # also now, so that it's the same program the first time
@@ -86,16 +86,16 @@ def _read(file):
     return None if text is None else export.deserialize(bytearray(text))
 
 
-def _key(name, arguments, made_from):
+def _key(name, carry, made_from):
     """What a program depends on, in short."""
     digest = _DIGEST()
     sources = [*Path(openjax.__file__).parent.rglob("*.py"), *assets_directory().iterdir()]
     for path in sorted(path for path in sources if path.is_file()):
         digest.update(path.name.encode() + path.read_bytes())
-    kinds = [(leaf.shape, str(leaf.dtype)) for leaf in jax.tree.leaves(tuple(arguments))]
+    kinds = [(leaf.shape, str(leaf.dtype)) for leaf in jax.tree.leaves(carry)]
     options = {name: value for name, value in sorted(jax.config.values.items()) if "cache" not in name}
     versions = [importlib.metadata.version(library) for library in _LIBRARIES]
     devices = [(device.platform, device.device_kind) for device in jax.devices()]
-    parts = (name, made_from, kinds, str(jax.tree.structure(tuple(arguments))), options, versions, devices)
+    parts = (name, made_from, kinds, str(jax.tree.structure(carry)), options, versions, devices)
     digest.update(repr(parts).encode())
     return digest.hexdigest()[:32]

@@ -23,6 +23,8 @@ from openjax.vehicle.parameters import Vehicle
 from openjax.vehicle.solids import Surroundings, others, surroundings
 from openjax.vehicle.state import DroneState
 
+WORTH = 16384
+"""Worlds from which the kernel is taken: it saves microseconds a step, and the compiler needs half a minute for it."""
 WORLDS = 128
 """Worlds of one program."""
 WARPS = 4
@@ -68,6 +70,8 @@ def _many_worlds(step):
 
     @jax.custom_batching.custom_vmap
     def run(vehicle, drones, command, pillars):
+        if command.shape[0] < WORTH:
+            return mapped(vehicle, drones, command, pillars)
         return on_platform(mapped, functools.partial(kernel_call, step))(vehicle, drones, command, pillars)
 
     @run.def_vmap

@@ -1,0 +1,73 @@
+"""The stages of a run by the gradient through the simulation, before MAPPO and after it, compiled while other things are."""
+
+import dataclasses
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from openjax.background import in_background
+from openjax.learning import build
+from openjax.learning.analytic_gradient import AnalyticGradient, compile_analytic, free_flight
+from openjax.learning.first_flights import FirstFlights, first_game, make_first_flights
+from openjax.learning.settings import TrainSettings
+from openjax.policy import Policy, PolicyParameters
+from openjax.pursuit import Pursuit
+from openjax.store.leaves import abstract_like
+
+TOGETHER = 50
+"""Updates of the first stage in one call: some seconds on a CPU."""
+
+
+def compile_last_stage(settings: TrainSettings, environment: Pursuit, policy: Any) -> Callable:
+    """The stage after MAPPO, compiled for parameters of these shapes; see `compile_analytic`."""
+    stage = AnalyticGradient(settings.analytic, free_flight(environment), _exact(settings, environment))
+    return compile_analytic(stage, on_one_device(policy))
+
+
+def compile_first_flights(
+    settings: TrainSettings, environment: Pursuit, policy: Any
+) -> Callable[[PolicyParameters, jax.Array, Callable[[str], None]], PolicyParameters]:
+    """Start to compile the stage before MAPPO for parameters of these shapes, in the background.
+
+    Returns:
+      the stage, which waits for the compiler: (fresh parameters, key, where to say how it goes) -> parameters.
+    """
+    how = settings.first_flights
+    flights = FirstFlights(how, first_game(environment, how), _exact(settings, environment))
+    begin = jax.jit(flights.begin)
+    some = jax.jit(make_first_flights(flights, min(TOGETHER, how.updates)), donate_argnums=0)
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    policy = on_one_device(policy)
+    carry = jax.eval_shape(begin, policy, key)
+    done = jax.ShapeDtypeStruct((), jnp.int32)
+    lowered = some.lower(carry, key, done), begin.lower(policy, key)
+    ready = [in_background(program.compile) for program in lowered]
+
+    def learn(parameters, key, say):
+        some, begin = (wait() for wait in ready)
+        started = time.monotonic()
+        own = jax.tree.map(lambda leaf: jax.device_put(leaf, jax.local_devices()[0]), parameters)
+        carry = begin(own, key)
+        for done in range(0, how.updates, TOGETHER):
+            carry, parts = some(carry, key, jnp.int32(done))
+            shown = ", ".join(f"{name} {float(value):.3f}" for name, value in parts.items())
+            say(
+                f"{min(done + TOGETHER, how.updates)} of {how.updates}, {time.monotonic() - started:.0f} s | {shown}"
+            )
+        return parameters.replace(actor=carry[0].actor)
+
+    return learn
+
+
+def _exact(settings: TrainSettings, environment: Pursuit) -> Policy:
+    """The run's policy in float32: tens of steps of the simulation follow each action, too far for rough arithmetic."""
+    policy = build(settings, environment).policy
+    return dataclasses.replace(policy, network=dataclasses.replace(policy.network, compute_type="float32"))
+
+
+def on_one_device(abstract: Any) -> Any:
+    """Shapes and dtypes of a tree as of arrays on this process' first device."""
+    return abstract_like(abstract, jax.sharding.SingleDeviceSharding(jax.local_devices()[0]))

@@ -1,0 +1,128 @@
+"""The first stage of a run: to fly, and to go after the evader, by the gradient through the simulation.
+
+From scratch MAPPO spends half of its data on learning to fly. The equations of motion teach that in seconds: the mean
+distance to the evader over the next moments has a gradient, and so have near misses (`openjax.learning.analytic_gradient`).
+What has none, waiting, cutting off, going round, is left to MAPPO.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from openjax.learning.analytic_gradient import AnalyticGradient, crash_share, free_flight, nearest_gap
+from openjax.learning.settings import AnalyticSettings, FirstFlightsSettings
+from openjax.policy import Policy, PolicyParameters
+from openjax.pursuit import Pursuit, turn_task, uniform_task
+from openjax.vehicle.family import narrowed_bounds
+
+OUTSIDE = 1.2
+"""A world starts anew where a pursuer is farther out than this share of the arena's radius or height."""
+PHYSICS_STEP = 0.01
+"""Seconds of a physics step: finer ones teach nothing more."""
+LOW = 0.25
+"""Height (m) below which the end of a moment costs: the gap to the floor is felt too late."""
+
+
+def first_game(environment: Pursuit, how: FirstFlightsSettings) -> Pursuit:
+    """`environment` as it is learnt in: in free flight, with control steps of its own and episodes as long."""
+    free = free_flight(environment)
+    game = free.settings
+    ratio = max(1, round(how.time_step / game.time_step))
+    game = dataclasses.replace(
+        game,
+        time_step=ratio * game.time_step,
+        substeps=max(1, round(ratio * game.time_step / PHYSICS_STEP)),
+        episode_length=max(how.steps, game.episode_length // ratio),
+    )
+    return dataclasses.replace(free, settings=game, dynamics=None)
+
+
+@dataclass(frozen=True)
+class FirstFlights:
+    """How a fresh actor learns to fly. `World`s are observations and states (B, ...)."""
+
+    how: FirstFlightsSettings
+    environment: Pursuit
+    """See `first_game`."""
+    policy: Policy
+
+    @property
+    def stage(self) -> AnalyticGradient:
+        """What flies, and measures."""
+        return AnalyticGradient(AnalyticSettings(), self.environment, self.policy)
+
+    def start(self, key: jax.Array):
+        """Worlds at the starts of uniform tasks, their vehicles nominal."""
+        game, number = self.environment.settings, self.how.worlds
+        task_key, turn_key, reset_key = (jax.random.split(k, number) for k in jax.random.split(key, 3))
+        tasks = jax.vmap(lambda k, turn: turn_task(turn, uniform_task(game, k)))(task_key, turn_key)
+        environment = self.environment
+        if game.vehicles:
+            environment = environment.with_bounds(narrowed_bounds(game.vehicles, 0.0))
+        return jax.vmap(environment.reset_to)(reset_key, tasks)
+
+    def loss(self, actor: Any, parameters: PolicyParameters, world):
+        """What is learnt (); worlds after it and its parts."""
+        end, way = self.stage.fly(actor, parameters, world, self.how.steps)
+        parts = {
+            "free": (1.0, way.free),
+            "distance": (self.how.distance, way.distance),
+            "crashes": (self.how.crash, crash_share(way.least)),
+            "breaches": (self.how.breach, way.breach),
+            "speed": (self.how.speed * (self.environment.settings.speed_limit == "none"), way.excess),
+            "low": (1.0, jax.nn.relu(LOW - end[1].drones.position[..., 2])),
+        }
+        means = {name: jnp.mean(value) for name, (_, value) in parts.items()}
+        return sum(weight * means[name] for name, (weight, _) in parts.items()), (end, means)
+
+    def update(self, carry, key: jax.Array):
+        """The carry (parameters, optimiser's state, worlds) after an update, and the loss's parts."""
+        parameters, state, world = carry
+        gradient, (end, parts) = jax.grad(self.loss, has_aux=True)(parameters.actor, parameters, world)
+        # a world that tumbles may have no gradient
+        finite = jnp.isfinite(optax.global_norm(gradient))
+        gradient = jax.tree.map(lambda leaf: jnp.where(finite, leaf, 0.0), gradient)
+        change, state = self.optimiser.update(gradient, state)
+        parameters = parameters.replace(actor=optax.apply_updates(parameters.actor, change))
+        start_key, choice_key = jax.random.split(key)
+        over = self._over(end[1]) | (jax.random.uniform(choice_key, (self.how.worlds,)) < self.how.anew)
+
+        def chosen(old, new):
+            return jnp.where(over.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+
+        return (parameters, state, jax.tree.map(chosen, end, self.start(start_key))), parts
+
+    def _over(self, state):
+        """(B,) worlds that end: crashed, far outside, or too late for another moment."""
+        game, position = self.environment.settings, state.drones.position
+        outside = jnp.sum(position[..., :2] ** 2, axis=-1) > (OUTSIDE * game.arena_radius) ** 2
+        outside |= position[..., 2] > OUTSIDE * game.arena_height
+        crashed = nearest_gap(game, state) < 0.0
+        return jnp.any(outside | crashed, axis=-1) | (state.step > game.episode_length - self.how.steps)
+
+    @functools.cached_property
+    def optimiser(self) -> optax.GradientTransformation:
+        """Adam with clipped gradients; its step size falls to a twentieth."""
+        schedule = optax.cosine_decay_schedule(self.how.learning_rate, max(self.how.updates, 1), 0.05)
+        return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
+
+    def begin(self, parameters: PolicyParameters, key: jax.Array):
+        """The carry of `update` before the first one."""
+        return parameters, self.optimiser.init(parameters.actor), self.start(key)
+
+
+def make_first_flights(flights: FirstFlights, together: int) -> Callable:
+    """`together` updates as one function (carry, key, updates done) -> carry, mean parts of the loss; to be compiled."""
+
+    def some(carry, key, done):
+        keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(done + jnp.arange(together))
+        carry, parts = jax.lax.scan(flights.update, carry, keys)
+        return carry, jax.tree.map(jnp.mean, parts)
+
+    return some

@@ -1,0 +1,53 @@
+"""The stage before MAPPO: its game is the run's, and what it teaches brings pursuers nearer to the evader."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from openjax.learning import preset
+from openjax.learning.analytic_gradient import evader_distance, free_share
+from openjax.learning.first_flights import FirstFlights, first_game, make_first_flights
+from openjax.learning.settings import FirstFlightsSettings
+from openjax.policy import NetworkSettings, Policy, PredictorSettings
+from openjax.pursuit import Pursuit, PursuitSettings
+
+GAME = PursuitSettings(
+    physics="rigid", num_pursuers=2, min_pillars=0, max_pillars=1, start_attitude="level", evader_speed=0.8
+)
+
+
+def test_a_second_of_the_stage_is_a_second_of_the_game():
+    how = FirstFlightsSettings()
+    for name in ("quick", "paper", "flight"):
+        game = preset(name).environment
+        own = first_game(Pursuit(game), how).settings
+        assert own.time_step == pytest.approx(how.time_step)
+        assert own.episode_length * own.time_step == pytest.approx(game.episode_length * game.time_step)
+        assert not own.contacts and own.speed_limit == game.speed_limit
+
+
+@pytest.mark.slow
+def test_pursuers_come_nearer():
+    how = FirstFlightsSettings(updates=160, worlds=48, learning_rate=5e-3)
+    environment = first_game(Pursuit(GAME), how)
+    policy = Policy.for_environment(
+        environment, NetworkSettings(features=16, heads=1, squash="sample"), PredictorSettings(enabled=False)
+    )
+    flights = FirstFlights(how, environment, policy)
+    observation, _ = environment.reset(jax.random.key(0))
+    carry = jax.jit(flights.begin)(policy.init(jax.random.key(1), observation), jax.random.key(2))
+    some = jax.jit(make_first_flights(flights, 20))
+    distances = []
+    for done in range(0, 120, 20):
+        carry, parts = some(carry, jax.random.key(3), done)
+        assert all(jnp.isfinite(value) for value in parts.values())
+        distances.append(float(parts["distance"]))
+    assert distances[-1] < 0.5 * distances[0]
+
+
+def test_an_evader_within_reach_is_not_free():
+    state = jax.vmap(Pursuit(GAME).reset)(jax.random.split(jax.random.key(0), 4))[1]
+    near = state.drones.position.at[:, 0].set(state.evader_position + jnp.array([0.1, 0.0, 0.0]))
+    near = state.replace(drones=state.drones.replace(position=near))
+    assert evader_distance(near)[:, 0] == pytest.approx(0.1, abs=1e-3)
+    assert (free_share(GAME, near) < 0.2).all() and (free_share(GAME, near) < free_share(GAME, state)).all()
