@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 from jaxtyping import install_import_hook
 
-# shapes and types of arrays in signatures are checked at each call, which is when a function is traced
-install_import_hook(["openjax.policy", "openjax.learning.advantages"], "beartype.beartype")
+# shapes and types of arrays in signatures are checked at each call, which is when a function is traced; settings check themselves
+_networks = [f"openjax.policy.{name}" for name in ("actor_critic", "encoder", "policy", "predictor")]
+install_import_hook([*_networks, "openjax.learning.advantages"], "beartype.beartype")
 
 _flags = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 # workers are the parallel part: more threads would only wait for each other's cores

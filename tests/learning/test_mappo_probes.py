@@ -69,7 +69,7 @@ def learn():
         observation = observation_of(flag[:-1], late)
         mean, log_std = POLICY.distribution(actor.parameters, observation, None)
         action = mean + jnp.exp(log_std) * jax.random.normal(noise_key, mean.shape)
-        miss = (POLICY.action(action[..., 0, 0]) - 0.5 * flag[:-1]) ** 2
+        miss = (POLICY.action(action)[..., 0, 0] - 0.5 * flag[:-1]) ** 2
         reward = (
             probe["constant"]
             + probe["by_flag"] * flag[:-1]

@@ -10,7 +10,7 @@ import pytest
 
 from openjax.kernels.componentwise import evaluate, split
 from openjax.vehicle import hover_state, load_vehicle, make_drones_step
-from openjax.vehicle.rigid_kernel import WORLDS, kernel_call, mapped_step
+from openjax.vehicle.rigid_kernel import WORLDS, WORTH, kernel_call, mapped_step
 
 VEHICLE = load_vehicle()
 FREE = make_drones_step(physics="rigid", dt=0.01, substeps=2, contacts=False)
@@ -116,8 +116,9 @@ def test_worlds_become_more_worlds_of_one_call(monkeypatch):
     )
     assert_close(jax.tree.map(lambda leaf: leaf.reshape(6, *leaf.shape[2:]), got), expected)
     monkeypatch.setattr("openjax.platform.can_compile_for_cuda", lambda: True)
-    traced = str(jax.make_jaxpr(jax.vmap(jax.vmap(step)))(*twice))
-    assert "f32[6,2,3]" in traced and "platform_index" in traced
+    many = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((2, WORTH // 2, *leaf.shape[2:]), leaf.dtype), twice)
+    traced = str(jax.make_jaxpr(jax.vmap(jax.vmap(step)))(*many))
+    assert f"f32[{WORTH},2,3]" in traced and "platform_index" in traced
 
 
 @pytest.mark.parametrize("argument", ["vehicle", "command"])

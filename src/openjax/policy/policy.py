@@ -106,10 +106,10 @@ class Policy:
 
     def action(
         self, sample: Float[Array, "*worlds pursuers sample"], observation: Observation | None = None
-    ) -> Float[Array, "*worlds pursuers 4"]:
+    ) -> Float[Array, "*worlds pursuers sample"]:
         """The action in -1..1 that a sample of the Gaussian, or its mean, stands for.
 
-        Policies whose samples aren't commands work it out from the `observation` (`openjax.baselines.dacoop`).
+        Policies whose samples aren't commands work the four out from the `observation` (`openjax.baselines.dacoop`).
         """
         return jnp.clip(sample, -1.0, 1.0) if self.network.squash == "mean" else jnp.tanh(sample)
 
