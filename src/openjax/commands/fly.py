@@ -82,6 +82,8 @@ def fly(arguments: Arguments, prepared: Prepared | None = None):
     if prepared is None:
         console.print("loading the policy, compiling the tick ...")
     flown = prepared or prepare(arguments)
+    for line in flown.remarks:
+        console.print(line, soft_wrap=True)
     console.print(f"connecting to {', '.join(flown.session.uris)} ...")
     with Session(flown.session, arguments.safety, flown.state) as session:
         session.check()
@@ -110,6 +112,7 @@ class Prepared(NamedTuple):
     session: object  # its settings
     vehicle: object
     about: dict
+    remarks: tuple[str, ...] = ()
 
 
 def prepare(arguments: Arguments) -> Prepared:
@@ -144,9 +147,11 @@ def prepare(arguments: Arguments) -> Prepared:
         uris, body_logs, arguments.watchdog, arguments.guard, arguments.guard_after, feed
     )
     state = flight_state(game, len(uris), arguments.safety)
-    return Prepared(
-        game, state, session, vehicle, {"policy": policy.source, "scenario": scenario.name, "uris": uris}
-    )
+    remarks = ()
+    if vehicle.airframe != settings.airframe:
+        remarks = (f"the policy was trained for {settings.airframe}; what flies is {vehicle.airframe}",)
+    about = {"policy": policy.source, "scenario": scenario.name, "uris": uris}
+    return Prepared(game, state, session, vehicle, about, remarks)
 
 
 def _write(out, flown, flight, samples, scheduler):
