@@ -29,7 +29,7 @@ import numpy as np
 import tyro
 
 from experiments.flying.faults import CAMERA, FOLLOWED, Fault, PoseDamage, draw_fault
-from experiments.table import RESULTS
+from experiments.table import RESULTS, Table, facts
 
 ROLES = ("loop", "links", "guard")
 SIGNALS = ("KILL", "STOP", "TERM", "HUP", "INT", "TSTP", "QUIT")
@@ -104,16 +104,50 @@ def main() -> None:
     ]
     for process in workers:
         process.start()
-    records, begin = [], time.time()
+    records, begin, stands = [], time.time(), facts()
     while any(w.is_alive() for w in workers) or not done.empty():
         with contextlib.suppress(Exception):
             records.append(done.get(timeout=1.0))
             row = records[-1]
             print("well" if row["well"] else "NOT WELL", json.dumps(row), flush=True)
-            result = {"flights": len(records), "well": sum(r["well"] for r in records), "policy": arguments.policy,
+            result = {**stands, "flights": len(records), "well": sum(r["well"] for r in records), "policy": arguments.policy,
                       "seconds": round(time.time() - begin), "records": sorted(records, key=lambda r: r["number"])}  # fmt: skip
             arguments.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    print(f"{sum(r['well'] for r in records)} of {len(records)} well")
+    print("\n".join(table_of(records).lines()))
+
+
+GROUPS = {
+    "a signal to one process": lambda k: k.split()[0] in SIGNALS and "+" not in k and "then" not in k,
+    "to two processes": lambda k: k.split()[0] in SIGNALS and ("+" in k or "then" in k),
+    "keys, terminal closed": lambda k: k in KEYS or k == "terminal closed",
+    "motion capture": lambda k: k in CAMERA,
+    "own estimates, links": lambda k: (k in POSES and k not in CAMERA) or k == "drone gone",
+    "wrong from the start": lambda k: k in START,
+    "strangers, a second fly, nothing": lambda k: k in OTHER and k != "drone gone",
+    "all": lambda k: True,
+}
+
+
+def table_of(records) -> Table:
+    """What became of the flights, by groups of kinds."""
+    rows = []
+    for group, belongs in GROUPS.items():
+        mine = [r for r in records if belongs(r["kind"])]
+        if not mine:
+            continue
+        ends = [r["seconds"] for r in mine if r["seconds"] is not None and r["kind"] not in (*POSES, *OTHER)]
+        rows.append({
+            "group": group, "flights": len(mine), "well": sum(r["well"] for r in mine),
+            "farthest": 0.9 + max(r["out"] for r in mine), "armed": sum(r["armed"] for r in mine),
+            "fell": sum(r["fell"] and not any(name in r["kind"] for name in STOPPED) for r in mine),
+            "left": sum(bool(r["left"]) for r in mine), "longest": max(ends, default=None),
+        })  # fmt: skip
+    columns = {
+        "faults": "group", "flights": "flights:d", "as they must": "well:d", "farthest (m)": "farthest:.2f",
+        "armed at the end": "armed:d", "fell unasked": "fell:d", "left a process": "left:d",
+        "longest end (s)": "longest:.1f",
+    }  # fmt: skip
+    return Table(columns, rows)
 
 
 def worker(arguments, queue, done, ends) -> None:
@@ -309,7 +343,9 @@ class Flown:
         elif " then " in kind:
             first, second = target.split(" then ")
             self._kill("KILL", first)
-            time.sleep(0.05)
+            time.sleep(0.3 if second in KEYS else 0.05)
+            if second in KEYS:
+                os.write(self._terminal, KEYS[second].encode())
             self._kill("KILL", second)
         elif name in SIGNALS:
             for role in target.split("+"):

@@ -21,7 +21,7 @@ import numpy as np
 import tyro
 
 from experiments.flying.faults import FOLLOWED, KINDS, Fault, PoseDamage, draw_fault
-from experiments.table import RESULTS
+from experiments.table import RESULTS, Table, facts
 
 LATEST, SECONDS = 4.0, 10.0
 """Nothing begins to go wrong after; flown in all (s)."""
@@ -313,14 +313,23 @@ def main() -> None:
             running.discard(done)
             records += done.result()
             write(arguments, records, time.time() - begin)
-    for row in summary(records):
-        print(row)
+    print("\n".join(table_of(summary(records)).lines()))
+
+
+def table_of(rows) -> Table:
+    """Of `summary`."""
+    columns = {
+        "fault": "kind", "flights": "faults:d", "as they must": "well:d", "landed": "landed:d",
+        "out by more than .1 m": "out:d", "farthest (m)": "farthest:.2f", "fell": "fell:d", "hard": "hard:d",
+        "on at the end": "armed:d", "longest end (s)": "longest:.1f", "nearest two (m)": "nearest:.2f",
+    }  # fmt: skip
+    return Table(columns, rows)
 
 
 def write(arguments, records, seconds) -> None:
     """Write what there is until now."""
     result = {
-        "policy": arguments.policy, "separation": arguments.separation, "seconds": round(seconds),
+        **facts(), "policy": arguments.policy, "separation": arguments.separation, "seconds": round(seconds),
         "summary": summary(records), "not_well": [r for r in records if not well(r)],
     }  # fmt: skip
     arguments.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")

@@ -202,7 +202,7 @@ def test_another_process_lands_and_disarms_what_hangs_in_the_air(uris):
     with connected(uris, body_logs=0) as links:
         links.arm()
         flight = Flight(links, Hovering(links), PATIENT, Plan(episode_seconds=60.0))
-        deadline = time.monotonic() + 30.0
+        deadline = time.monotonic() + 120.0
         while not flight.state.all_in(Mode.PURSUIT):
             assert time.monotonic() < deadline, [(d.mode, d.reason) for d in flight.state.drones]
             flight.tick(time.perf_counter(), time.perf_counter())
@@ -252,7 +252,7 @@ def test_motion_capture_is_seen_here_and_on_board():
                 captured.believed(0, state.drones[0].captured.pose)
             assert captured.arrivals() == (100.0 + 0.01 * 39,)
             np.testing.assert_allclose(state.drones[0].estimate.velocity, (0.5, 0.0, 0.0), atol=1e-3)
-            deadline = time.monotonic() + 5.0
+            deadline = time.monotonic() + 60.0
             while firmware.external_poses < 40 and time.monotonic() < deadline:
                 time.sleep(0.01)
             np.testing.assert_allclose(firmware.external_pose[:4], (0.495, 0.0, 0.5, 1.0), atol=1e-6)

@@ -28,7 +28,7 @@ def test_a_vehicle_that_says_nothing_is_a_line(mute):
     with pytest.raises(UserError, match="no connection") as error:
         Links([mute]).connect(timeout=3.0)
     assert mute in str(error.value) and "\n" not in str(error.value)
-    assert time.monotonic() - begin < 20.0
+    assert time.monotonic() - begin < 60.0
 
 
 CONNECTING = """
@@ -49,7 +49,7 @@ def test_the_links_process_doesnt_outlive_one_that_is_killed_while_it_connects(m
     children = []
     try:
         assert loop.stdout.readline() == b"connecting\n"
-        deadline = time.monotonic() + 20.0
+        deadline = time.monotonic() + 60.0
         while len(children) < 2 and time.monotonic() < deadline:  # the links' and multiprocessing's own
             time.sleep(0.1)
             with open(f"/proc/{loop.pid}/task/{loop.pid}/children") as file:
@@ -57,7 +57,7 @@ def test_the_links_process_doesnt_outlive_one_that_is_killed_while_it_connects(m
         time.sleep(2.0)  # it has loaded cflib, and connects
         os.kill(loop.pid, signal.SIGKILL)
         loop.wait()
-        deadline = time.monotonic() + 3.0
+        deadline = time.monotonic() + 60.0  # it would go on trying for longer
         while (left := [c for c in children if _lives(c)]) and time.monotonic() < deadline:
             time.sleep(0.05)
         assert not left

@@ -19,8 +19,8 @@ from openjax.flying.safety import Mode, State
 SILENCE = 0.1
 """Silence of a process after which the next one flies (s): ten ticks."""
 _MODES = tuple(Mode)
-_HEAD, _EACH = 11, 16  # see Board; per vehicle mode, trim, known, 13 numbers of its pose
-_FLYING, _PILOT, _OVER, _READY, _ARMED, _BEATS, _PIDS = 0, 1, 2, 3, 4, 5, 8
+_HEAD, _EACH = 12, 16  # see Board; per vehicle mode, trim, known, 13 numbers of its pose
+_FLYING, _PILOT, _OVER, _READY, _ARMED, _STOP, _BEATS, _PIDS = 0, 1, 2, 3, 4, 5, 6, 9
 DEAF = ("SIGHUP", "SIGINT", "SIGTSTP", "SIGTERM", "SIGQUIT", "SIGTTOU", "SIGTTIN", "SIGPIPE")
 """Signals that a terminal, or its end, sends to all that it started."""
 
@@ -50,6 +50,7 @@ class Board:
     over = property(lambda self: self._numbers[_OVER] > 0.0, doc="Whether the session has ended.")
     pilot = property(lambda self: Role(int(self._numbers[_PILOT])), doc="Who flies.")
     armed = property(lambda self: self._numbers[_ARMED] > 0.0, doc="Whether any vehicle may be armed.")
+    stopped = property(lambda self: self._numbers[_STOP] > 0.0, doc="Whether the operator wants all motors off.")
     guarded = property(lambda self: self._numbers[_READY] > 0.0, doc="Whether the guard watches.")
 
     def beat(self, role: Role, now: float) -> None:
@@ -63,6 +64,14 @@ class Board:
     def enter(self, role: Role) -> None:
         """This process is `role`'s."""
         self._numbers[_PIDS + role] = float(os.getpid())
+
+    def leave(self, role: Role) -> None:
+        """This process has nothing more to do with the flight: nobody need end it."""
+        self._numbers[_PIDS + role] = 0.0
+
+    def stop(self) -> None:
+        """The operator wants all motors off, whoever flies."""
+        self._numbers[_STOP] = 1.0
 
     def end_process(self, role: Role) -> None:
         """Kill the process of `role`, should there be one: if it woke up, two would fly."""

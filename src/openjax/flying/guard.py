@@ -23,7 +23,7 @@ from openjax.flying import real_time
 from openjax.flying.board import Board, Role, say, stand_alone
 from openjax.flying.crtp import LOG_TYPES, Port, Supervisor, SupervisorCommand
 from openjax.flying.limits import SafetySettings, resting_places
-from openjax.flying.safety import FLYING, Event, Mode, PoseSample, State, step
+from openjax.flying.safety import FLYING, Event, Mode, PoseSample, Request, State, step
 from openjax.flying.set_point import SetPoint
 from openjax.flying.swarm import POSE_BLOCK, WATCHDOG_PERIOD, Member, send_set_point
 
@@ -88,7 +88,8 @@ def fly_down(
     now = due = clock()
     state = take_over(settings, board.read(state, now), now)
     while state.flying and board.pilot is role:
-        state, set_points = step(settings, state, Event(clock(), vehicles.observe()))
+        request = Request.STOP if board.stopped else Request.NONE
+        state, set_points = step(settings, state, Event(clock(), vehicles.observe(), request=request))
         vehicles.send(set_points)
         board.write(role, clock(), state)
         due = max(due + TICK, clock() - TICK)

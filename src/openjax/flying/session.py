@@ -18,7 +18,7 @@ from openjax.flying.links import Links
 from openjax.flying.loop import Flight, measured_times
 from openjax.flying.motion_capture import MotionCaptured
 from openjax.flying.preflight import faults, poses_arriving, sole_command
-from openjax.flying.safety import State
+from openjax.flying.safety import Request, State
 
 FRESH = 0.05
 """No flight begins with poses older than this (s)."""
@@ -136,6 +136,8 @@ class Session:
             time.sleep(0.005)
             now = time.perf_counter()
             board.beat(Role.LOOP, now)
+            if self.requests() is Request.STOP:
+                board.stop()
             lander = max(lander, board.pilot)
             if all(board.silent(role, now) > 2.5 * board.silence for role in (Role.LINKS, Role.GUARD)):
                 lander = Role.LOOP
@@ -143,6 +145,7 @@ class Session:
                     board.end_process(role)
                 self._own.open()
                 fly_down(board, Role.LOOP, self._own, self._safety, self._state)
+        board.leave(Role.LOOP)
         return f"all vehicles were landed by the process of the {lander.name.lower()}"
 
     def _wait_for_poses(self, timeout: float = 5.0):
@@ -150,7 +153,9 @@ class Session:
         deadline = time.monotonic() + timeout
         while True:
             now = time.perf_counter()
-            old = [now - t > FRESH for t in measured_times(self.vehicles.observe())]
+            samples = self.vehicles.observe()
+            newest = zip(measured_times(samples), samples, strict=True)
+            old = [now - t > FRESH or s.own is None for t, s in newest]
             if not any(old):
                 return
             if time.monotonic() > deadline:
