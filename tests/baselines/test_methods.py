@@ -53,7 +53,7 @@ def unit(vector):
     return np.asarray(vector) / np.linalg.norm(vector)
 
 
-@pytest.mark.parametrize("name", list(METHODS))
+@pytest.mark.parametrize("name", sorted({*METHODS} - {"stack"}))  # stack gathers on the axis first
 def test_a_lone_pursuer_flies_straight_to_a_resting_evader(name):
     method = METHODS[name]
     known = situation([[0.0, 0.0, 1.0]], [0.3, -0.4, 1.2])

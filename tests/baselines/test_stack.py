@@ -67,11 +67,9 @@ def test_every_scripted_evader_is_caught_inside_the_bound():
     assert steps.max() * STEP < 4.0
 
 
-def test_outside_the_bound_greedy_evaders_get_away():
-    assert PursuitSettings(capture_radius=0.27).evader_speed > stack_bound(
-        PursuitSettings(capture_radius=0.27)
-    )
-    caught, _ = captures(capture_radius=0.27)
+def test_well_outside_the_bound_greedy_evaders_get_away():
+    assert PursuitSettings().evader_speed > stack_bound(PursuitSettings(capture_radius=0.22))
+    caught, _ = captures(capture_radius=0.22)
     assert min(caught.mean(1)) < 0.7
 
 

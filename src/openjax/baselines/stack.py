@@ -59,9 +59,7 @@ def stack(craft: Craft, parameters: StackParameters, known: Surroundings) -> jax
         return speed, jnp.sqrt(jnp.maximum(left**2 - speed**2, 0.0))
 
     left = jnp.full_like(height, craft.speed)
-    # as the ray turns, a pursuer at radius x must turn with it
-    turning = jnp.sum(known.target_velocity[..., :2] * aside, axis=-1) / length(target)[..., 0]
-    aside_speed, left = cut(-parameters.gain * across + along * turning, left)
+    aside_speed, left = cut(-parameters.gain * across, left)
     up, left = cut(parameters.gain * height, left)
     forwards = out * left[..., None] + aside * aside_speed[..., None]
     gather = -parameters.gain * place
