@@ -34,7 +34,8 @@ TINY = (
     "--network.features 8 --network.heads 1 --network.critic_encoder layers "
     "--predictor.units 4 --predictor.windows 4 --predictor.steps 2 --predictor.horizons 1 2 "
     "--mappo.minibatches 2 --mappo.epochs 1 --generator.capacity 8 "
-    "--validation_interval 3 --validation_episodes 4"
+    "--validation_interval 3 --validation_episodes 4 "
+    "--first_flights.updates 1 --first_flights.worlds 4 --first_flights.steps 2"
 ).split()
 STEPS = ["--steps", str(UPDATES * 160), "--layout_episodes", "4"]
 ALONE = ["--compare_with", "none"]
