@@ -14,6 +14,7 @@ from openjax.flights.case import load_case
 from openjax.flights.reading import LogTable, write_csv
 from openjax.flights.samples import fly, log_of, references
 from openjax.vehicle import load_vehicle
+from openjax.vehicle.effects import EFFECTS
 
 VEHICLE = load_vehicle()
 CHANGES = {
@@ -21,7 +22,7 @@ CHANGES = {
     "rotor": {"motor_imbalance": {"m1": 0.0, "m2": 0.0, "m3": -0.15, "m4": 0.0}},
     "heavier": {"mass": {"extra": 0.004}},
     "weight": {"mass": {"extra": 0.003}, "com_offset": {"x": 0.0, "y": 0.004}},
-    "drag": {"rotor_drag": {"d_xy": 0.02, "d_z": 0.0}},
+    **{name: {name: EFFECTS[name].card.sample} for name in ("rotor_drag", "motor_lag", "rate_gains")},
 }
 
 
@@ -67,11 +68,15 @@ def test_a_weight_at_a_side_names_the_side_and_what_it_cannot_be_told_from(folde
     assert {"motor_imbalance", "mass"} <= set(change.effects)
 
 
-def test_drag_shows_beside_the_trims(folders):
-    change = compared(folders, "drag")
-    assert change.changed and change.effects == ("rotor_drag",)
-    (drag,) = [o for o in change.others if o.name == "drag_x"]
-    assert drag.difference.low < 0.02 / float(VEHICLE.mass) < drag.difference.high
+@pytest.mark.parametrize("effect", ["rotor_drag", "motor_lag", "rate_gains"])
+def test_what_moves_no_trim_is_named_alone(folders, effect):
+    change = compared(folders, effect)
+    assert change.changed and change.effects == (effect,) and not change.trims_changed
+
+
+def test_the_drag_is_that_of_the_effect(folders):
+    drag = compared(folders, "rotor_drag").figures["drag_x"]
+    assert drag.low < EFFECTS["rotor_drag"].card.sample["d_xy"] / float(VEHICLE.mass) < drag.high
 
 
 @pytest.mark.parametrize("kept", [("m",), ("m", "x", "y", "z"), ("m", "a", "w")])

@@ -2,8 +2,7 @@
 simulator, so that what model and sensors share cancels.
 
 `figures` reads what each flight says about its vehicle; `days` takes a day as a random effect; `causes` says what each
-cause would do, `weigh` how well each explains what differs, `others` what is compared besides the trims; `result` is what
-comes out, `report` tells it."""
+cause would do, `weigh` how well each explains what differs; `result` is what comes out, `report` tells it."""
 
 from __future__ import annotations
 
@@ -12,11 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from openjax.comparison.causes import ROTOR_PLACES, SIDES, hypotheses_of
+from openjax.comparison.causes import CHANGES, ROTOR_PLACES, SIDES, hypotheses_of
 from openjax.comparison.days import battery_of, by_day, days_told_apart, spread_of_days
-from openjax.comparison.figures import TRIMS, FlightFigures, figures_of, mixer_of
-from openjax.comparison.others import compare_others, support_of
-from openjax.comparison.result import SHOWN, Change, Interval, OtherFigure
+from openjax.comparison.figures import FIGURES, TRIMS, FlightFigures, figures_of, mixer_of
+from openjax.comparison.result import SHOWN, Change, Interval
 from openjax.comparison.weigh import least_shown, weigh
 from openjax.errors import UserError
 from openjax.flights.case import load_case
@@ -39,6 +37,7 @@ def compare(flights: Path, references: Sequence[Path]) -> Change:
 
 
 def read(folder: Path) -> tuple[Case, list[FlightFigures], list[Issue]]:
+    """A folder's case, the figures of its flights by day, and what was left out. Raises UserError as `compare`."""
     case = load_case(folder, comparison=True)
     if len({f.vehicle for f in case.flights}) > 1:
         raise UserError(f"{folder}: holds several vehicles; a comparison is of one vehicle with itself")
@@ -68,40 +67,36 @@ def change_between(
     before, after = (by_day(f, battery) for f in (old, new))
     spread, freedom = spread_of_days(before, after)
     difference = after.mean - before.mean
-    scale = np.sqrt(
-        spread**2 * (1 / len(before.days) + 1 / len(after.days)) + before.error**2 + after.error**2
-    )
-    hypotheses = hypotheses_of(mixer, before.mean)
-    others = compare_others(new, old)
-    evidence = weigh(hypotheses, difference, scale, freedom, support_of(others))
+    days = 1 / np.maximum(before.count, 1) + 1 / np.maximum(after.count, 1)
+    scale = np.sqrt(spread**2 * days + before.error**2 + after.error**2)
+    trims = before.mean[: len(TRIMS)]
+    hypotheses = hypotheses_of(mixer, trims)
+    evidence = weigh(hypotheses, difference, scale, freedom)
     logged = [case.vehicle_file.motor_permutation[j] + 1 for j in range(4)]
     place, within = evidence.place()
-    unchanged = 1.0 - evidence.changed
-    for other in others:
-        unchanged *= 1.0 - other.probability if not other.name.endswith("noise") else 1.0
-    reach = 1.645 * scale
+    here, reach = evidence.causes_at(within), 1.645 * scale
     return Change(
         name=name,
-        changed=unchanged < 1.0 - SHOWN,
-        probability=1.0 - unchanged,
-        trims_changed=evidence.changed > SHOWN,
+        changed=evidence.changed > SHOWN,
+        probability=evidence.changed,
+        trims_changed=evidence.changed > SHOWN and max(here, key=lambda c: here[c]) not in CHANGES,
         rotors=tuple(sorted(logged[j] for j in place)),
         side=ROTOR_PLACES[place[0]] if len(place) == 1 else SIDES.get(place, ""),
         causes=evidence.causes,
-        causes_here=evidence.causes_at(within),
+        causes_here=here,
         places={tuple(sorted(logged[j] for j in p)): share for p, share in evidence.places.items()},
         size=evidence.size(within),
-        trims={
+        figures={
             n: Interval(float(d), float(d - r), float(d + r))
-            for n, d, r in zip(TRIMS, difference, reach, strict=True)
+            for n, d, r in zip(FIGURES, difference, reach, strict=True)
+            if np.isfinite(d)
         },
-        others=others,
-        least=least_shown(hypotheses, mixer, before.mean, scale, freedom),
+        least=least_shown(hypotheses, mixer, trims, scale, freedom),
         reference=tuple(old),
         flights=tuple(new),
         quality=quality,
-        spread=dict(zip(TRIMS, spread.tolist(), strict=True)),
+        spread=dict(zip(FIGURES, spread.tolist(), strict=True)),
     )
 
 
-__all__ = ["SHOWN", "Change", "Interval", "OtherFigure", "change_between", "compare", "read"]
+__all__ = ["SHOWN", "Change", "Interval", "change_between", "compare", "read"]

@@ -1,12 +1,16 @@
-"""What a cause would do to the trims: draws of its size, its place and how well real changes follow its pattern.
+"""What a cause would do to a flight's figures: draws of its size, its place and how well real changes follow its pattern.
 
     one rotor weaker by a share e     hover, roll, pitch and yaw move alike, signs by the rotor's place and spin
     two rotors weaker                 the sum of two such
     a weight beside a rotor or side   hover, roll and pitch, no yaw
     the whole vehicle                 hover alone (mass, propellers, thrust)
-    something else                    no pattern
+    drag                              both drags
+    motors                            the lag from motors to angular acceleration, a little the gains' estimate
+    inertia                           the angular acceleration per command
+    gains                             the commands per rate error
+    something else                    trims without a pattern
 
-A rotor that is weaker by e at the same command is given 1 / (1 - e) of it.
+A rotor that is weaker by e at the same command is given 1 / (1 - e) of it. What is cut, bent or taped on also shakes.
 """
 
 from __future__ import annotations
@@ -16,13 +20,30 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import norm, qmc
 
+from openjax.comparison.figures import FIGURES, TRIMS
+
+# Prior probabilities, if something changed: people knock propellers and tape things on more often than they swap motors.
 CAUSES = {
-    "one rotor weaker": 0.3,
-    "two rotors weaker": 0.3,
-    "weight": 0.2,
+    "one rotor weaker": 0.25,
+    "two rotors weaker": 0.2,
+    "weight": 0.15,
     "whole vehicle": 0.1,
-    "something else": 0.1,
+    "drag": 0.08,
+    "motors": 0.06,
+    "inertia": 0.03,
+    "gains": 0.06,
+    "something else": 0.07,
 }
+DAMAGES = ("one rotor weaker", "two rotors weaker", "weight")
+# Of a cause besides the trims: its figures, mean and standard deviation of a usual change. Motors wear, drag is added.
+CHANGES = {
+    "drag": (("drag_x", "drag_y"), 0.15, 0.3),
+    "motors": (("lag",), 0.2, 0.5),
+    "inertia": (("torque_gain",), 0.0, 0.3),
+    "gains": (("loop_gain",), 0.0, 0.5),
+}
+LOOP_WITH_MOTORS = 0.1  # standard deviation by which a motors' change also moves the estimate of the loop's gain
+SHAKES = (0.4, 0.4)  # mean and standard deviation of the rise of the logarithm with a damage
 USUAL_CHANGE = 0.15  # of a rotor's command, or of the weight
 STRONGER = 0.15  # share of changes the other way: a mended rotor, a weight taken off
 INEXACT = 0.25  # of each trim of a cause: real changes don't follow their pattern exactly
@@ -43,7 +64,7 @@ EVERYWHERE = (0, 1, 2, 3)
 
 @dataclass(frozen=True)
 class Hypotheses:
-    """Draws from all causes: change of the trims (N, 4), prior weight, cause, place and size of each."""
+    """Draws from all causes: change of the figures (N, F), prior weight, cause, place and size of each."""
 
     change: np.ndarray
     weight: np.ndarray
@@ -53,65 +74,87 @@ class Hypotheses:
     places: tuple[tuple[int, ...], ...]
 
 
+class _Draws:
+    """Even draws that all causes share, and the parts that they make of them."""
+
+    def __init__(self, mixer: np.ndarray, trims: np.ndarray):
+        even = np.clip(qmc.Sobol(11, seed=0).random(DRAWS), 1e-6, 1 - 1e-6)
+        sign = np.where(even[:, 2] < STRONGER, -1.0, 1.0)
+        self.sizes = np.abs(norm.ppf(0.5 + 0.5 * even[:, :2])) * USUAL_CHANGE * sign[:, None]
+        self.places, self.normal = even[:, 3:5], norm.ppf(even[:, 5:])
+        self.mixer, self.trims = mixer, trims
+        # Rotor commands in level flight of the reference, in units of their mean.
+        self.level = np.linalg.solve(mixer, np.r_[1.0, trims[1:]])
+        self.place_of = {p: k for k, p in enumerate([(0,), (1,), (2,), (3,), *SIDES, EVERYWHERE, ()])}
+        self.parts: list[tuple] = []
+
+    def add(self, cause: str, share: float, change: dict, place, size: np.ndarray) -> None:
+        """Draws of a cause at a place; `change`: {figure: (DRAWS,)}."""
+        table = np.zeros((DRAWS, len(FIGURES)))
+        for name, values in change.items():
+            table[:, FIGURES.index(name)] = values
+        if cause in DAMAGES:
+            table[:, FIGURES.index("shaking")] = SHAKES[0] + SHAKES[1] * self.normal[:, 4]
+        weight = np.full(DRAWS, share * CAUSES[cause] / DRAWS)
+        where = np.broadcast_to(place if isinstance(place, np.ndarray) else self.place_of[place], DRAWS)
+        self.parts.append((table, weight, np.full(DRAWS, list(CAUSES).index(cause)), where, size))
+
+    def trims_of(self, factors: np.ndarray) -> dict:
+        """What rotor commands that rise by `factors` (DRAWS, 4) do to the trims, inexactly."""
+        mixed = (self.level * np.maximum(factors, 0.2)) @ self.mixer.T
+        change = np.c_[np.log(mixed[:, 0]), mixed[:, 1:] / mixed[:, :1] - self.trims[1:]]
+        return dict(zip(TRIMS, (change * (1.0 + INEXACT * self.normal[:, :4])).T, strict=True))
+
+
 def hypotheses_of(mixer: np.ndarray, trims: np.ndarray) -> Hypotheses:
     """Draws for a vehicle of this `mixer` (4, 4) whose reference has these trims (4,), the first a logarithm."""
-    # Even draws of: two sizes, their sign, two places, four shares of inexactness.
-    draws = qmc.Sobol(9, seed=0).random(DRAWS)
-    draws = np.clip(draws, 1e-6, 1 - 1e-6)
-    sizes = np.abs(norm.ppf(0.5 + 0.5 * draws[:, :2])) * USUAL_CHANGE
-    sign = np.where(draws[:, 2] < STRONGER, -1.0, 1.0)
-    sizes = sizes * sign[:, None]
-    inexact = 1.0 + INEXACT * norm.ppf(draws[:, 5:])
-    place_of = {p: k for k, p in enumerate([(0,), (1,), (2,), (3,), *SIDES, EVERYWHERE, ()])}
-    # Rotor commands in level flight of the reference, in units of their mean: columns of the inverse mixer.
-    level = np.linalg.solve(mixer, np.r_[1.0, trims[1:]])
-    signs = 4.0 * mixer[1:3]
-    parts = []
+    draws = _Draws(mixer, trims)
+    _rotors(draws)
+    _weights(draws)
+    for cause, (names, mean, spread) in CHANGES.items():
+        size = mean + spread * draws.normal[:, 0]
+        each = {n: size * (1 + INEXACT * draws.normal[:, k + 1]) for k, n in enumerate(names)}
+        if cause == "motors":
+            each["loop_gain"] = LOOP_WITH_MOTORS * size * draws.normal[:, 2]
+        draws.add(cause, 1.0, each, (), size)
+    anything = USUAL_CHANGE / 2 * draws.normal[:, :4]
+    each = dict(zip(TRIMS, anything.T, strict=True))
+    draws.add("something else", 1.0, each, (), np.abs(anything).sum(1))
+    joined = (np.concatenate(part) for part in zip(*draws.parts, strict=True))
+    return Hypotheses(*joined, tuple(draws.place_of))
 
-    def add(cause, share, factors, places, size):
-        command = level * np.maximum(factors, 0.2)
-        mixed = command @ mixer.T
-        change = np.c_[np.log(mixed[:, 0]), mixed[:, 1:] / mixed[:, :1] - trims[1:]] * inexact
-        parts.append((change, np.full(DRAWS, share * CAUSES[cause] / DRAWS), cause, places, size))
 
-    lost = sizes / (1.0 + sizes)  # a rotor that needs 1 + d of its command has lost d / (1 + d)
+def _rotors(draws: _Draws) -> None:
+    """One rotor weaker, or two."""
+    sizes, lost = draws.sizes, draws.sizes / (1.0 + draws.sizes)  # one that needs 1 + d has lost d / (1 + d)
     for rotor in range(4):
         factors = np.ones((DRAWS, 4))
         factors[:, rotor] += sizes[:, 0]
-        add("one rotor weaker", 0.25, factors, np.full(DRAWS, rotor), lost[:, 0])
+        draws.add("one rotor weaker", 0.25, draws.trims_of(factors), (rotor,), lost[:, 0])
     for pair, side in SIDES.items():
         factors = np.ones((DRAWS, 4))
         factors[:, pair] += sizes
-        places = np.full(DRAWS, place_of[pair])
+        places = np.full(DRAWS, draws.place_of[pair])
         for one, other in ((0, 1), (1, 0)):
             alone = np.abs(sizes[:, other]) < LEAST_PARTNER * np.abs(sizes[:, one])
             places[alone] = pair[one]
-        add("two rotors weaker", 0.05 if side == "diagonal" else 0.225, factors, places, lost.sum(1))
-    # A weight within the circle through the rotors, in units of their distance from the axes.
-    radius, angle = np.sqrt(2.0 * draws[:, 3]), 2 * np.pi * draws[:, 4]
-    left, rear = radius * np.cos(angle), radius * np.sin(angle)
-    weight = sizes[:, 0]
-    factors = 1.0 + weight[:, None] * (1.0 + left[:, None] * signs[0] + rear[:, None] * signs[1])
-    near = np.clip(0.5 * (left[:, None] * signs[0] + rear[:, None] * signs[1]), -1.0, 1.0)
-    places = np.array([place_of.get(_beside(row), place_of[EVERYWHERE]) for row in near])
-    add("weight", 1.0, factors, places, 4.0 * weight)
-    add(
-        "whole vehicle",
-        1.0,
-        np.repeat(1.0 + sizes[:, :1], 4, 1),
-        np.full(DRAWS, place_of[EVERYWHERE]),
-        4.0 * weight,
-    )
-    anything = USUAL_CHANGE / 2 * norm.ppf(draws[:, 5:])
-    parts.append((anything, np.full(DRAWS, CAUSES["something else"] / DRAWS), "something else",
-                  np.full(DRAWS, place_of[()]), np.abs(anything).sum(1)))  # fmt: skip
-    causes = list(CAUSES)
-    return Hypotheses(
-        *(np.concatenate([p[k] for p in parts]) for k in (0, 1)),
-        np.repeat([causes.index(p[2]) for p in parts], DRAWS),
-        *(np.concatenate([p[k] for p in parts]) for k in (3, 4)),
-        tuple(place_of),
-    )
+        share = 0.05 if side == "diagonal" else 0.225
+        draws.add("two rotors weaker", share, draws.trims_of(factors), places, lost.sum(1))
+
+
+def _weights(draws: _Draws) -> None:
+    """A weight within the circle through the rotors, and one that all carry alike."""
+    # In units of the rotors' distance from the axes.
+    radius, angle = np.sqrt(2.0 * draws.places[:, 0]), 2 * np.pi * draws.places[:, 1]
+    left, rear = (radius * f(angle) for f in (np.cos, np.sin))
+    signs, weight = 4.0 * draws.mixer[1:3], draws.sizes[:, 0]
+    beside = left[:, None] * signs[0] + rear[:, None] * signs[1]
+    near = np.clip(0.5 * beside, -1.0, 1.0)
+    places = np.array([draws.place_of[_beside(row)] for row in near])
+    factors = 1.0 + weight[:, None] * (1.0 + beside)
+    draws.add("weight", 1.0, draws.trims_of(factors), places, 4.0 * weight)
+    alike = np.repeat(1.0 + draws.sizes[:, :1], 4, 1)
+    draws.add("whole vehicle", 1.0, draws.trims_of(alike), EVERYWHERE, 4.0 * weight)
 
 
 def _beside(near: np.ndarray) -> tuple[int, ...]:

@@ -1,4 +1,4 @@
-"""Days as a random effect: trims of each day, how far normal days of a vehicle lie apart, and what the battery has in it.
+"""Days as a random effect: figures of each day, how far normal days of a vehicle lie apart, and what the battery has in it.
 
 A flight's trims (how hard it had to work to hover, and the roll, pitch and yaw that the mixer added to stay level)
 repeat within a day far better than from day to day: batteries, propellers and how the frame was put together
@@ -15,14 +15,28 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 
-from openjax.comparison.figures import TRIMS, FlightFigures
+from openjax.comparison.figures import FIGURES, FlightFigures
 
-# Spread (standard deviation) of a vehicle's normal days: for trims 1 to 2.5 % of hover, measured on published flights
-# of two Crazyflies; yaw more, because its torque is a hundredth of thrust times arm and a tilted motor shows in it.
-DAY_SPREAD = {"hover": 0.012, "roll": 0.02, "pitch": 0.02, "yaw": 0.03}
+# Spread (standard deviation) of a vehicle's normal days, and of flights within a day. Trims, as shares of hover: 1 to 2.5 %,
+# measured on published flights of two Crazyflies; yaw more, because its torque is a hundredth of thrust times arm and a
+# tilted motor shows in it. Drag in 1/s; the others are logarithms. Gains are the firmware's numbers, which no day moves:
+# theirs is what the estimate repeats to.
+SPREADS = {
+    "hover": (0.012, 0.003),
+    "roll": (0.02, 0.0025),
+    "pitch": (0.02, 0.0025),
+    "yaw": (0.03, 0.005),
+    "drag_x": (0.04, 0.02),
+    "drag_y": (0.04, 0.02),
+    "lag": (0.1, 0.05),
+    "torque_gain": (0.07, 0.03),
+    "loop_gain": (0.03, 0.03),
+    "shaking": (0.35, 0.1),
+}
+DAY_SPREAD, WITHIN_DAY = (np.array([SPREADS[n][k] for n in FIGURES]) for k in (0, 1))
+HOVER = FIGURES.index("hover")
 PRIOR_DAYS = 6.0  # days of experience that this prior is worth
 SAME_DAY = 0.012  # of hover: roll and pitch trims further apart were flown on different days
-WITHIN_DAY = {"hover": 0.003, "roll": 0.0025, "pitch": 0.0025, "yaw": 0.005}  # repeatability of a flight
 VOLTAGE_SLOPE = (0.0, 0.15)  # 1/V of hover, prior mean and standard deviation
 VOLTAGE_SPREAD = 0.1  # V, by which flights without a logged voltage may differ
 
@@ -32,19 +46,24 @@ def days_told_apart(figures: Sequence[FlightFigures]) -> list[FlightFigures]:
     a day ever do count as flown on different days."""
     if len(figures) < 2:
         return list(figures)
-    trims = np.array([f.trims()[0][1:3] for f in figures])
-    error = max(float(np.median([f.trims()[1][1:3].max() for f in figures])), 1e-9)
+    trims = np.array([f.all()[0][1:3] for f in figures])
+    error = max(float(np.median([f.all()[1][1:3].max() for f in figures])), 1e-9)
     groups = fcluster(linkage(trims, "complete"), max(SAME_DAY, 3.0 * error), "distance")
     return [dataclasses.replace(f, day=f"{f.day}#{g}") for f, g in zip(figures, groups, strict=True)]
 
 
 @dataclass(frozen=True)
 class Days:
-    """Trims by day."""
+    """Figures by day, hover as its logarithm; NaN where no flight of the day gives one."""
 
-    days: np.ndarray  # (D, 4) logarithm of hover, roll, pitch, yaw
-    mean: np.ndarray  # (4,)
-    error: np.ndarray  # (4,) of the mean, without the spread of days
+    days: np.ndarray  # (D, F)
+    mean: np.ndarray  # (F,)
+    error: np.ndarray  # (F,) of the mean, without the spread of days
+
+    @property
+    def count(self) -> np.ndarray:
+        """Days (F,) that give a figure."""
+        return np.isfinite(self.days).sum(0)
 
 
 @dataclass(frozen=True)
@@ -72,40 +91,48 @@ def battery_of(figures: Sequence[FlightFigures]) -> Battery:
             voltages += v.tolist()
             xx += ((v - v.mean()) ** 2).sum()
             xy += ((v - v.mean()) * (h - h.mean())).sum()
-    noise = WITHIN_DAY["hover"] ** 2
+    noise = WITHIN_DAY[HOVER] ** 2
     precision = xx / noise + 1 / sigma**2
     voltage = float(np.mean(voltages)) if voltages else 0.0
     return Battery(voltage, float((xy / noise + mean / sigma**2) / precision), float(precision**-0.5))
 
 
 def by_day(figures: Sequence[FlightFigures], battery: Battery) -> Days:
-    within = np.array([WITHIN_DAY[n] for n in TRIMS])
+    """Means of each day's flights, weighted by their errors, at the voltage of `battery`."""
     days, variances = [], []
     for day in dict.fromkeys(f.day for f in figures):
-        values, errors = [], []
-        for flight in (f for f in figures if f.day == day):
-            value, error = flight.trims()
-            error = error.copy()
-            error[0] /= value[0]
-            value = np.r_[np.log(value[0]), value[1:]]
-            if flight.voltage is None:
-                error[0] = np.hypot(error[0], np.hypot(battery.slope, battery.error) * VOLTAGE_SPREAD)
-            else:
-                value[0] -= battery.slope * (flight.voltage - battery.voltage)
-                error[0] = np.hypot(error[0], battery.error * (flight.voltage - battery.voltage))
-            values.append(value)
-            errors.append(np.hypot(error, within))
-        precision = 1 / np.array(errors) ** 2
-        days.append((np.array(values) * precision).sum(0) / precision.sum(0))
-        variances.append(1 / precision.sum(0))
-    return Days(np.array(days), np.mean(days, 0), np.sqrt(np.mean(variances, 0) / len(days)))
+        each = [_at_voltage(f, battery) for f in figures if f.day == day]
+        values, errors = (np.array(part) for part in zip(*each, strict=True))
+        precision = np.where(np.isfinite(values), 1 / (errors**2 + WITHIN_DAY**2), 0.0)
+        total = precision.sum(0)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            days.append((np.nan_to_num(values) * precision).sum(0) / total)
+            variances.append(np.where(total > 0, 1 / total, np.nan))
+    days, variances = np.array(days), np.array(variances)
+    count = np.maximum(np.isfinite(days).sum(0), 1)
+    mean = np.where(np.isfinite(days).any(0), np.nansum(days, 0) / count, np.nan)
+    return Days(days, mean, np.sqrt(np.nansum(variances, 0)) / count)
 
 
-def spread_of_days(*sets: Days) -> tuple[np.ndarray, float]:
-    """Standard deviation (4,) of normal days and the degrees of freedom behind it: the prior and what the days of each
+def _at_voltage(flight: FlightFigures, battery: Battery) -> tuple[np.ndarray, np.ndarray]:
+    """Figures and errors (F,), the logarithm of hover at the battery's voltage."""
+    value, error = (part.copy() for part in flight.all())
+    error[HOVER] /= value[HOVER]
+    value[HOVER] = np.log(value[HOVER])
+    if flight.voltage is None:
+        unsure = np.hypot(battery.slope, battery.error) * VOLTAGE_SPREAD
+    else:
+        value[HOVER] -= battery.slope * (flight.voltage - battery.voltage)
+        unsure = battery.error * (flight.voltage - battery.voltage)
+    error[HOVER] = np.hypot(error[HOVER], unsure)
+    return value, error
+
+
+def spread_of_days(*sets: Days) -> tuple[np.ndarray, np.ndarray]:
+    """Standard deviation (F,) of normal days and the degrees of freedom (F,) behind it: the prior and what the days of each
     set show."""
-    freedom, total = PRIOR_DAYS, PRIOR_DAYS * np.array([DAY_SPREAD[n] for n in TRIMS]) ** 2
+    freedom, total = np.full(len(FIGURES), PRIOR_DAYS), PRIOR_DAYS * DAY_SPREAD**2
     for one in sets:
-        freedom += len(one.days) - 1
-        total = total + ((one.days - one.mean) ** 2).sum(0)
+        freedom = freedom + np.maximum(one.count - 1, 0)
+        total = total + np.nansum((one.days - one.mean) ** 2, 0)
     return np.sqrt(total / freedom), freedom

@@ -10,15 +10,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from openjax.flights.flight import Case, Flight
-from openjax.flights.signals import GRAVITY, RATE, clock_of, in_band, on_clock, to_body
+from openjax.flights.signals import GRAVITY, RATE, clock_of, first_order, in_band, on_clock, to_body
 from openjax.flights.track import pwm_thrust
 
 TRIMS = ("hover", "roll", "pitch", "yaw")
+DYNAMICS = ("drag_x", "drag_y", "lag", "torque_gain", "loop_gain", "shaking")
+FIGURES = (*TRIMS, *DYNAMICS)
 CLEAR_OF_FLOOR = 0.25  # m, where the ground's cushion is gone
 SETTLED = 0.5  # s after take-off and before landing that are left out
 BLOCK = 2.0  # s, over which rows of a flight count as one
 FULL = 0.98  # motor command from which on a rotor has nothing left to trim with
 LOW = 2.5  # Hz, below which drag isn't covered by vibration
+TURNING = (1.0, 10.0)  # Hz, where motors turn the vehicle
+DELAYS = (0, 2, 4, 6)  # rows, of the commands as instruments
+LAGS = np.geomspace(0.004, 0.2, 40)  # s, time constants that are tried
 
 
 @dataclass(frozen=True)
@@ -27,8 +32,9 @@ class FlightFigures:
 
     hover: mean thrust command per specific thrust, as a fraction of a rotor's maximum at 1 g; roll, pitch, yaw: the
     mixer's share of it that keeps the vehicle level (left, rear and clockwise rotors harder: positive), also
-    fractions of hover; drag_x, drag_y: 1/s; lag: s; torque_gain; noise of gyroscope, accelerometer and
-    motors: logarithms of the rms above 20 Hz. What the log can't give is missing.
+    fractions of hover; drag_x, drag_y: 1/s. Logarithms of: lag, the time constant in s from motors to angular
+    acceleration; torque_gain, angular acceleration per command; loop_gain, command per rate error; shaking, the rms of
+    gyroscope and motors above 20 Hz. What the log can't give is missing.
     """
 
     name: str
@@ -36,9 +42,10 @@ class FlightFigures:
     values: dict[str, tuple[float, float]]
     voltage: float | None  # V, mean
 
-    def trims(self) -> tuple[np.ndarray, np.ndarray]:
-        """Values and standard errors (4,) in the order of TRIMS."""
-        return tuple(np.array([self.values[n][i] for n in TRIMS]) for i in (0, 1))
+    def all(self) -> tuple[np.ndarray, np.ndarray]:
+        """Values and standard errors (F,) in the order of FIGURES, NaN where the log gives none."""
+        both = [self.values.get(n, (np.nan, np.nan)) for n in FIGURES]
+        return tuple(np.array(part, float) for part in zip(*both, strict=True))
 
 
 def mixer_of(vehicle) -> np.ndarray:
@@ -123,16 +130,12 @@ def _dynamics(flight: Flight, case: Case, vehicle) -> dict:
     if quaternion is not None and velocity is not None:
         out |= _drag(quaternion, velocity, force)
     if gyro is not None:
-        out |= _torque(motor @ mixer_of(vehicle)[1:3].T, gyro[:, :2])
-    if flight.row_period < 0.015:
-        for name, values in (("gyroscope", gyro), ("accelerometer", force), ("motor", motor)):
-            if values is not None:
-                parts = np.array_split(in_band(values, (20.0, 45.0)), 6)
-                levels = np.array([0.5 * np.log((p**2).sum(1).mean() + 1e-12) for p in parts])
-                out[f"{name}_noise"] = (
-                    float(levels.mean()),
-                    float(levels.std(ddof=1) / np.sqrt(len(levels))),
-                )
+        torque = motor @ mixer_of(vehicle)[1:3].T
+        out |= _torque(torque, gyro[:, :2])
+        commands = on_clock(flight, "command_body_rates", grid)
+        out |= {} if commands is None else _loop(torque, gyro[:, :2], commands[:, :2])
+        if flight.row_period < 0.015:
+            out |= _shaking(gyro, motor)
     return out
 
 
@@ -150,28 +153,57 @@ def _drag(quaternion, velocity, force) -> dict:
 
 
 def _torque(torque, rates) -> dict:
-    """How late roll and pitch acceleration follow the motors' torques, and how strongly."""
-    band = (1.0, 10.0)
-    if in_band(rates, band).std(0).min() < 0.15:
+    """The time constant from roll and pitch torques to angular accelerations: of all first-order lags the one whose output
+    correlates best, by quarters of the flight; and the gain behind it."""
+    if in_band(rates, TURNING).std(0).min() < 0.15:
         return {}
-    y, x = in_band(np.gradient(rates, 1 / RATE, axis=0), band), in_band(torque, band)
-    lags = np.arange(-5, 16)
-    inner = slice(20, -20)
+    y = in_band(np.gradient(rates, 1 / RATE, axis=0), TURNING)
+    lagged = np.stack([in_band(first_order(torque, lag), TURNING) for lag in LAGS])
     estimates = []
     for part in np.array_split(np.arange(len(y)), 4):
-        own, other = y[part], x[part]
-        scores = np.array([(own[inner] * np.roll(other, lag, 0)[inner]).sum() for lag in lags])
+        cross, power = (y[part] * lagged[:, part]).sum((1, 2)), (lagged[:, part] ** 2).sum((1, 2))
+        scores = cross / np.sqrt(power)
         best = int(np.argmax(scores))
-        if not 0 < best < len(lags) - 1:
+        if not 0 < best < len(LAGS) - 1 or cross[best] <= 0:
             return {}
         a, b, c = scores[best - 1 : best + 2]
-        peak = 0.5 * (a - c) / (a - 2 * b + c)
-        moved = np.roll(other, lags[best], 0)[inner]
-        estimates.append(
-            ((lags[best] + peak) / RATE, np.log(max((own[inner] * moved).sum() / (moved**2).sum(), 1e-6)))
-        )
+        peak = 0.5 * (a - c) / (a - 2 * b + c) * np.log(LAGS[1] / LAGS[0])
+        estimates.append((np.log(LAGS[best]) + peak, np.log(cross[best] / power[best])))
     mean, error = np.mean(estimates, 0), np.std(estimates, 0, ddof=1) / 2.0
     return {"lag": (float(mean[0]), float(error[0])), "torque_gain": (float(mean[1]), float(error[1]))}
+
+
+def _loop(torque, rates, commands) -> dict:
+    """How strongly the rate loop answers a rate error, beside what it answers to a change of the rates, by quarters of the
+    flight. In closed loop noise is in all three, so the commands are the instruments (two-stage least squares)."""
+    after = np.concatenate([rates[1:], rates[-1:]])  # motors hold from a row to the next: rates count in the middle
+    error, change = commands - 0.5 * (rates + after), (after - rates) * RATE
+    signals = (torque, error, change, *(np.roll(commands, k, 0) for k in DELAYS))
+    filtered = np.stack([in_band(values, TURNING) for values in signals], -1)
+    if in_band(rates, TURNING).std(0).min() < 0.15:
+        return {}
+    gains = []
+    for part in np.array_split(filtered, 4):
+        target, regressors, instruments = np.split(part.reshape(-1, len(signals)), (1, 3), axis=1)
+        excited = instruments @ np.linalg.lstsq(instruments, regressors, rcond=None)[0]
+        gains.append(np.linalg.lstsq(excited, target[:, 0], rcond=None)[0][0])
+    if min(gains) <= 0:
+        return {}
+    logs = np.log(gains)
+    return {"loop_gain": (float(logs.mean()), float(logs.std(ddof=1) / 2.0))}
+
+
+def _shaking(gyro, motor) -> dict:
+    """Mean logarithm of the rms of gyroscope and motors above 20 Hz, sixths of the flight as units."""
+    levels = [
+        [
+            0.5 * np.log((part**2).sum(1).mean() + 1e-12)
+            for part in np.array_split(in_band(values, (20.0, 45.0)), 6)
+        ]
+        for values in (gyro, motor)
+    ]
+    each = np.mean(levels, 0)
+    return {"shaking": (float(each.mean()), float(each.std(ddof=1) / np.sqrt(len(each))))}
 
 
 def _slope(x, y) -> tuple[float, float]:

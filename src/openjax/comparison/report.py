@@ -10,15 +10,29 @@ from pathlib import Path
 
 import numpy as np
 
+from openjax.comparison.causes import CHANGES
 from openjax.comparison.figures import TRIMS
-from openjax.comparison.result import SHOWN, Change, Interval
+from openjax.comparison.result import Change, Interval
 
+# figure: what it is, its unit, the factor to it; a logarithm's is a change in per cent
 _NAMES = {
-    "drag_x": "drag along x", "drag_y": "drag along y", "lag": "delay from motors to angular acceleration",
-    "torque_gain": "angular acceleration per motor command", "gyroscope_noise": "gyroscope noise above 20 Hz",
-    "accelerometer_noise": "accelerometer noise above 20 Hz", "motor_noise": "motor command noise above 20 Hz",
-}  # fmt: skip
-_LOGARITHMS = {"torque_gain", "gyroscope_noise", "accelerometer_noise", "motor_noise"}
+    "hover": ("thrust command at hover", "%", 0.0),
+    "roll": ("roll trim", "% of hover", 100.0),
+    "pitch": ("pitch trim", "% of hover", 100.0),
+    "yaw": ("yaw trim", "% of hover", 100.0),
+    "drag_x": ("drag along x", "1/s", 1.0),
+    "drag_y": ("drag along y", "1/s", 1.0),
+    "lag": ("time constant from motors to angular acceleration", "%", 0.0),
+    "torque_gain": ("angular acceleration per motor command", "%", 0.0),
+    "loop_gain": ("motor command per rate error", "%", 0.0),
+    "shaking": ("gyroscope and motors above 20 Hz", "%", 0.0),
+}
+_CHANGED = {
+    "drag": "the drag changed",
+    "motors": "the motors' lag changed",
+    "inertia": "the inertia changed",
+    "gains": "the rate gains changed",
+}
 STYLE = """:root{color-scheme:light dark}body{font:16px/1.5 system-ui,sans-serif;max-width:62rem;margin:2rem auto;padding:0 1rem}
 h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2rem}table{border-collapse:collapse;margin:.6rem 0}
 td,th{border-bottom:1px solid #8885;padding:.2rem .7rem;text-align:left}img{max-width:100%;border-radius:8px}
@@ -52,11 +66,7 @@ def to_dict(change: Change) -> dict:
         "places": {
             "+".join(map(str, p)) or "unclear": round(v, 4) for p, v in change.places.items() if v > 5e-4
         },
-        "trims": {n: interval(v) for n, v in change.trims.items()},
-        "others": {
-            o.name: interval(o.difference) | {"unit": o.unit, "probability": round(o.probability, 4)}
-            for o in change.others
-        },
+        "figures": {n: interval(v) for n, v in change.figures.items()},
         "days": {"reference": change.days, "spread": {n: round(v, 4) for n, v in change.spread.items()}},
         "flights": [
             {"flight": f.name, "set": name, "day": f.day.rpartition("/")[2], "voltage": f.voltage}
@@ -70,37 +80,32 @@ def to_dict(change: Change) -> dict:
 
 def in_words(change: Change) -> list[str]:
     """The answer in a few plain sentences."""
-    lines = []
+    told = list(dict.fromkeys(_cause_in_words(change, cause) for cause in change.likely_causes))
+    chance = f"probability{'' if change.changed else ' of one:'} {change.probability:.2f}"
+    if not change.changed:
+        lines = [f"No change that these flights can show ({chance})."]
+        lines += [f"Below the spread of days; if anything, {told[0]}."] * (change.probability > 0.2)
+    else:
+        lines = [f"The vehicle changed ({chance}): {' or '.join(told)}."]
     if change.trims_changed:
-        told = list(dict.fromkeys(_cause_in_words(change, cause) for cause in change.likely_causes))
-        what = " or ".join(told)
-        lines.append(f"The vehicle changed (probability {change.probability:.2f}): {what}.")
-        low, high = change.size.low, change.size.high
-        lines.append(
-            f"Size: {100 * change.size.value:.0f} % [{100 * low:.0f}, {100 * high:.0f}] of a rotor's thrust"
-            + (" lost." if change.size.value > 0 else " (negative: it got stronger or lighter).")
-        )
+        value, low, high = (100 * v for v in (change.size.value, change.size.low, change.size.high))
+        end = " lost." if value > 0 else " (negative: it got stronger or lighter)."
+        lines.append(f"Size: {value:.0f} % [{low:.0f}, {high:.0f}] of a rotor's thrust{end}")
         if len(told) > 1:
             lines.append(
                 "These flights can't split the causes named; a weighed vehicle or another propeller would."
             )
     elif change.changed:
-        lines.append(f"The vehicle changed (probability {change.probability:.2f}), though its trims didn't.")
-    else:
-        lines.append(f"No change that these flights can show (probability of one: {change.probability:.2f}).")
-        if change.probability > 0.2:
-            likely = _cause_in_words(change, change.likely_causes[0])
-            lines.append(
-                f"Below the spread of days; if anything, {likely} by {100 * change.size.value:.0f} %."
-            )
-    for other in change.others:
-        if other.probability > SHOWN:
-            lines.append(
-                f"{_NAMES[other.name].capitalize()}: {_difference(other)} (probability {other.probability:.2f})."
-            )
+        moved = dict.fromkeys(n for c in change.likely_causes if c in CHANGES for n in CHANGES[c][0])
+        lines += [
+            f"{_NAMES[n][0].capitalize()}: {_difference(n, change.figures[n])}."
+            for n in moved
+            if n in change.figures
+        ]
     differences = ", ".join(
         f"{n} {100 * v.value:+.1f} % [{100 * v.low:+.1f}, {100 * v.high:+.1f}]"
-        for n, v in change.trims.items()
+        for n, v in change.figures.items()
+        if n in TRIMS
     )
     lines.append(f"Trims against the reference, as shares of hover, with the spread of days: {differences}.")
     days = f"{change.days} day{'s' * (change.days > 1)}"
@@ -115,34 +120,27 @@ def in_words(change: Change) -> list[str]:
 
 
 def _cause_in_words(change: Change, cause: str) -> str:
-    rotors = " and ".join(str(r) for r in change.rotors)
-    weaker = "weaker" if change.size.value > 0 else "stronger"
-    if len(change.rotors) == 1 and cause.endswith("weaker"):
-        return f"rotor {rotors} ({change.side}) is {weaker}"
-    if cause == "one rotor weaker":
+    rotors, more = " and ".join(str(r) for r in change.rotors), change.size.value > 0
+    weaker, several = "weaker" if more else "stronger", len(change.rotors) > 1
+    if cause == "one rotor weaker" and several:
         return f"one of rotors {rotors} ({change.side}) is {weaker}"
-    if cause == "two rotors weaker":
-        return f"rotors {rotors} ({change.side}) are {weaker}"
+    if cause.endswith("weaker"):
+        return f"rotor{'s' * several} {rotors} ({change.side}) {'are' if several else 'is'} {weaker}"
     if cause == "weight":
         beside = f" at the {change.side}" if change.side and change.side != "diagonal" else ""
-        return f"a weight was {'added' if change.size.value > 0 else 'taken off'}{beside}"
+        return f"a weight was {'added' if more else 'taken off'}{beside}"
     if cause == "whole vehicle":
         return (
-            "the whole vehicle is heavier or its thrust weaker"
-            if change.size.value > 0
-            else "it is lighter or stronger"
+            "the whole vehicle is heavier or its thrust weaker" if more else "it is lighter or stronger"
         )
-    return "something without a known pattern"
+    return _CHANGED.get(cause, "something without a known pattern")
 
 
-def _difference(other) -> str:
-    d = other.difference
-    if other.name in _LOGARITHMS:
-        return (
-            f"{100 * np.expm1(d.value):+.0f} % [{100 * np.expm1(d.low):+.0f}, {100 * np.expm1(d.high):+.0f}]"
-        )
-    scale, unit = (1e3, "ms") if other.unit == "s" else (1.0, other.unit)
-    return f"{scale * d.value:+.3g} {unit} [{scale * d.low:+.3g}, {scale * d.high:+.3g}]"
+def _difference(name: str, d: Interval) -> str:
+    """ "+12 % [+8, +16]"; a factor of 0 in `_NAMES` marks a logarithm."""
+    _, unit, factor = _NAMES[name]
+    value, low, high = (factor * v if factor else 100 * np.expm1(v) for v in (d.value, d.low, d.high))
+    return f"{value:+.3g} {unit} [{low:+.3g}, {high:+.3g}]"
 
 
 def write(change: Change, folder: Path, pictures: bool = True) -> None:
@@ -159,8 +157,8 @@ def html_of(change: Change) -> str:
     figure.savefig(buffer, format="png", dpi=110)
     image = base64.b64encode(buffer.getvalue()).decode()
     lines = "".join(f"<p>{html.escape(line)}</p>" for line in in_words(change))
-    rows = [["figure", "difference", "probability of a change"]]
-    rows += [[_NAMES[o.name], _difference(o), f"{o.probability:.2f}"] for o in change.others]
+    rows = [["figure", "difference [90 %]"]]
+    rows += [[_NAMES[name][0], _difference(name, d)] for name, d in change.figures.items()]
     table = "".join("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in row) + "</tr>" for row in rows)
     notes = "".join(
         f"<tr><td>{html.escape(i.flight)}</td><td>{html.escape(i.issue)}</td></tr>" for i in change.quality
@@ -170,7 +168,7 @@ def html_of(change: Change) -> str:
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
         f'<meta name="viewport" content="width=device-width"><style>{STYLE}</style></head>'
         f'<body><h1>{title}</h1><div class="verdict">{lines}</div><h2>Flights</h2>'
-        f'<img alt="trims of every flight" src="data:image/png;base64,{image}"><h2>Besides the trims</h2>'
+        f'<img alt="trims of every flight" src="data:image/png;base64,{image}"><h2>What differs</h2>'
         f"<table>{table}</table>"
         + (f"<h2>Data</h2><table>{notes}</table>" if notes else "")
         + "</body></html>\n"

@@ -20,25 +20,14 @@ class Interval:
 
 
 @dataclass(frozen=True)
-class OtherFigure:
-    """A figure besides the trims: how it differs, and the probability that this is more than a day's."""
-
-    name: str
-    unit: str
-    difference: Interval
-    probability: float
-
-
-@dataclass(frozen=True)
 class Change:
     """What differs between two sets of flights.
 
-    `probability` that the vehicle changed, and whether its trims did (`trims_changed`). `places` {rotors: p} and
-    `causes` {cause: p} say how probable each is if the trims changed (`causes_here`: at the most probable place);
-    rotors count 1 to 4 as logged (m1..m4).
-    `size` is the thrust that was lost, as a share of one rotor's, at the most probable place (for a weight: its share
-    of a rotor's load); `trims` are the differences, their intervals with the spread of a day in them; `least` is
-    the loss of a single rotor that these flights would have shown.
+    `probability` that the vehicle changed. `places` {rotors: p} and `causes` {cause: p} say how probable each is if it
+    did (`causes_here`: at the most probable place); rotors count 1 to 4 as logged (m1..m4). `trims_changed`: the most
+    probable cause moves the trims. `size` is the thrust that was lost, as a share of one rotor's, at the most probable place (for
+    a weight: its share of a rotor's load); `figures` are the differences, their intervals with the spread of a day in
+    them; `least` is the loss of a single rotor that these flights would have shown.
     """
 
     name: str
@@ -51,8 +40,7 @@ class Change:
     causes_here: dict[str, float]
     places: dict[tuple[int, ...], float]
     size: Interval
-    trims: dict[str, Interval]
-    others: tuple[OtherFigure, ...]
+    figures: dict[str, Interval]
     least: float
     reference: tuple[FlightFigures, ...]
     flights: tuple[FlightFigures, ...]
@@ -74,11 +62,9 @@ class Change:
     @property
     def effects(self) -> tuple[str, ...]:
         """What changed by the names of the effect library, the most probable first."""
-        names: list[str] = []
-        if self.trims_changed:
-            names += [effect for cause in self.likely_causes for effect in _EFFECTS[cause]]
-        names += [_EFFECTS[o.name][0] for o in self.others if o.probability > SHOWN and o.name in _EFFECTS]
-        return tuple(dict.fromkeys(names))
+        if not self.changed:
+            return ()
+        return tuple(dict.fromkeys(effect for cause in self.likely_causes for effect in _EFFECTS[cause]))
 
 
 _EFFECTS = {
@@ -87,8 +73,8 @@ _EFFECTS = {
     "weight": ("mass", "com_offset"),
     "whole vehicle": ("mass", "thrust_scale"),
     "something else": (),
-    "drag_x": ("rotor_drag",),
-    "drag_y": ("rotor_drag",),
-    "lag": ("motor_lag",),
-    "torque_gain": ("inertia",),
+    "drag": ("rotor_drag",),
+    "motors": ("motor_lag",),
+    "inertia": ("inertia",),
+    "gains": ("rate_gains",),
 }

@@ -1,5 +1,5 @@
 """Causes weighed against each other and against no change, by how well each, with the spread of a day, predicts the
-difference of the four trims."""
+difference of all figures: one Bayesian model selection."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PRIOR_CHANGED = 0.5
 
 @dataclass(frozen=True)
 class Weighed:
-    """`changed`: probability that the trims changed; the rest holds if they did: `posterior` (N,) of the hypotheses."""
+    """`changed`: probability that something changed; the rest holds if so: `posterior` (N,) of the hypotheses."""
 
     changed: float
     causes: dict[str, float]
@@ -53,16 +53,23 @@ class Weighed:
         return Interval(middle, low, high)
 
 
-def weigh(hypotheses: Hypotheses, difference, scale, freedom: float, support: float = 1.0) -> Weighed:
-    """Posterior of every cause, place and size: Student's distribution around the change that each predicts."""
+def weigh(hypotheses: Hypotheses, difference: np.ndarray, scale: np.ndarray, freedom: np.ndarray) -> Weighed:
+    """Posterior of every cause, place and size: Student's distribution around the change that each predicts.
+
+    difference, scale and freedom (F,) of the figures; what the logs don't give is NaN and tells nothing.
+    """
+    given = np.isfinite(difference)
+    scale, freedom = scale[given], freedom[given]
 
     def log_density(rest: np.ndarray) -> np.ndarray:
-        return -0.5 * (freedom + 1.0) * np.log1p((rest / scale) ** 2 / freedom).sum(-1)
+        return -0.5 * ((freedom + 1.0) * np.log1p((rest[..., given] / scale) ** 2 / freedom)).sum(-1)
 
     none = log_density(difference)
-    each = np.log(hypotheses.weight) + log_density(difference - hypotheses.change)
+    # what would show only in figures that these logs lack can't be weighed
+    shows = (hypotheses.change[:, given] != 0).any(1)
+    each = np.where(shows, np.log(hypotheses.weight), -np.inf) + log_density(difference - hypotheses.change)
     top = max(each.max(), none)
-    posterior = support * PRIOR_CHANGED * np.exp(each - top)
+    posterior = PRIOR_CHANGED * np.exp(each - top)
     total = posterior.sum() + (1.0 - PRIOR_CHANGED) * np.exp(none - top)
     changed = float(posterior.sum() / total)
     posterior /= posterior.sum()
@@ -71,8 +78,10 @@ def weigh(hypotheses: Hypotheses, difference, scale, freedom: float, support: fl
     return Weighed(changed, causes, places, posterior, hypotheses)
 
 
-def least_shown(hypotheses, mixer, trims, scale, freedom) -> float:
-    """The loss of a single rotor that would just be said to be a change, whichever rotor it is."""
+def least_shown(
+    hypotheses: Hypotheses, mixer: np.ndarray, trims: np.ndarray, scale: np.ndarray, freedom: np.ndarray
+) -> float:
+    """The loss of a single rotor that would just be said to be a change, whichever rotor it is, by its trims alone."""
     level = np.linalg.solve(mixer, np.r_[1.0, trims[1:]])
     worst = 0.0
     for rotor in range(4):
@@ -82,7 +91,8 @@ def least_shown(hypotheses, mixer, trims, scale, freedom) -> float:
             command = level.copy()
             command[rotor] *= 1.0 + middle
             mixed = mixer @ command
-            change = np.r_[np.log(mixed[0]), mixed[1:] / mixed[0] - trims[1:]]
+            change = np.full(len(scale), np.nan)
+            change[: len(trims)] = np.r_[np.log(mixed[0]), mixed[1:] / mixed[0] - trims[1:]]
             shown = weigh(hypotheses, change, scale, freedom).changed > SHOWN
             low, high = (low, middle) if shown else (middle, high)
         worst = max(worst, high / (1.0 + high))
