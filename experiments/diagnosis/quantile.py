@@ -1,55 +1,48 @@
-"""The threshold of the engine's omnibus check: a conformal quantile over cases in which nothing unknown acts.
+"""The calibration of the engine's residual check: its statistics over cases in which nothing unknown acts.
 
-    python -m experiments.diagnosis.quantile CASES.jsonl … --level 0.03 --out experiments/results/residual_quantile.json
+    python -m experiments.diagnosis.quantile CASES.jsonl … --source WORDS --out src/openjax/gap/residual.json
 
-Reads what `development` wrote. The score of a case is `residual.statistic` of its report. Over n exchangeable cases the
-ceil((n + 1)(1 - level))-th smallest score is exceeded by a further one with a probability of at most `level` (Vovk, Gammerman,
-Shafer 2005). Worlds aren't exchangeable, so each gets its own quantile, and the largest is the threshold.
+Reads what `development` wrote. Nominal cases in which nothing was named, and cases whose effects were named rightly, whether or
+not the check then in use rejected them; the engine takes conformal p-values within each kind (Vovk, Gammerman, Shafer 2005).
 """
 
 import argparse
-import math
 from pathlib import Path
 
 from experiments.diagnosis.development import read_lines
 from openjax.files import write_json
 
-KNOWN = ("none", "not_testable", "single", "pair")
+KINDS = {"none": ("none", "not_testable"), "named": ("single", "pair")}
+STATISTICS = ("dependence", "periodicity")
 
 
-def conformal_quantile(scores: list[float], level: float) -> float:
-    """The smallest threshold that a further score exceeds with a probability of at most `level`; inf for too few."""
-    rank = math.ceil((len(scores) + 1) * (1 - level))
-    return sorted(scores)[rank - 1] if rank <= len(scores) else math.inf
+def statistics_of(lines: list[dict]) -> dict[str, dict[str, list[float]]]:
+    """Kind -> statistic -> its sorted values over the cases of this kind that no wrong name blurs."""
 
+    def clear(line: dict, kind: str) -> bool:
+        names = [w for w in line["words"] if w != "unknown"]
+        right = line["right"] if kind == "named" else not names
+        return right and not line["wrong_names"] and bool(line.get("residual"))
 
-def worlds_of(lines: list[dict]) -> dict[str, list[float]]:
-    """World -> scores of its cases without an unknown cause."""
-    worlds: dict[str, list[float]] = {}
-    for line in lines:
-        score = (line.get("residual") or {}).get("statistic")
-        if line["category"] in KNOWN and score is not None:
-            worlds.setdefault(line["set"], []).append(float(score))
-    return worlds
+    chosen = {
+        kind: [line["residual"] for line in lines if line["category"] in categories and clear(line, kind)]
+        for kind, categories in KINDS.items()
+    }
+    return {k: {s: sorted(round(r[s], 1) for r in chosen[k]) for s in STATISTICS} for k in KINDS}
 
 
 def main() -> None:
-    """Write the threshold and the scores that it comes from."""
+    """Write the calibration."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("cases", nargs="+", type=Path)
-    parser.add_argument("--level", type=float, default=0.03)
+    parser.add_argument("--source", required=True, help="which cases these are, in words")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
-    worlds = worlds_of(read_lines(options.cases))
-    # a world with fewer cases than the level asks for gives its largest score
-    values = {
-        world: min(conformal_quantile(scores, options.level), max(scores)) for world, scores in worlds.items()
-    }
-    found = {"level": options.level, "value": max(values.values()), "worlds": values, "scores": worlds}
-    write_json(options.out, found)
-    print(found["value"], values)
+    found = statistics_of(read_lines(options.cases))
+    write_json(options.out, {"source": options.source, "statistics": found})
+    print({kind: len(values["dependence"]) for kind, values in found.items()})
 
 
 if __name__ == "__main__":

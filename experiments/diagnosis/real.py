@@ -86,7 +86,7 @@ def as_logged(errors, told, rows):
     return out
 
 
-def toml(errors, told, pose_rate):
+def toml(errors, told, sensors):
     """Text of the case's `vehicle.toml`."""
-    text = vehicle.toml(told, "simulated", pose_rate)
+    text = vehicle.toml(told, "simulated", sensors)
     return text.replace('command = "thrust"', 'command = "pwm"') if errors and errors["pwm"] else text

@@ -285,7 +285,7 @@ def make_case(job):
         length = min(ticks, int(flown[-1]["crashed"][0]) // 5 - 5)
         flights.append([sensors.log_rows(rng, drawn, flown[-1], 0, length)])
     joined = {k: np.concatenate([f[k] for f in flown], axis=-1) for k in flown[0]}
-    place = write_logs(folder, number, flights, drawn, v.toml(told, "RotorPy 3", drawn["pose_rate"]))
+    place = write_logs(folder, number, flights, drawn, v.toml(told, "RotorPy 3", drawn))
     return answer(place.name, kind, told, drawn, joined, flights, said)
 
 

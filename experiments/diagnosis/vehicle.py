@@ -64,8 +64,8 @@ def draw_told(rng):
     )
 
 
-def toml(told, source, pose_rate):
-    """Text of the case's `vehicle.toml`."""
+def toml(told, source, sensors):
+    """Text of the case's `vehicle.toml`: the vehicle as told, and what a laboratory knows of its logger."""
     lines = ["[vehicle]", 'name = "crazyflie-2.1"', f"mass = {told.mass:.5f}"]
     lines += [f"mass_weighed = {'true' if told.weighed else 'false'}", "", "[motor]", 'command = "thrust"']
     lines += [
@@ -74,7 +74,8 @@ def toml(told, source, pose_rate):
     ]
     if (told.torque_ratio, told.thrust_constant) != (TORQUE_RATIO, THRUST_CONSTANT):
         lines.append(f"torque_per_thrust = {told.torque_ratio:.4g}")
-    lines += ["", "[log]", f'source = "{source}"', f"motion_capture_rate = {pose_rate}"]
+    lines += ["", "[log]", f'source = "{source}"', f"motion_capture_rate = {sensors['pose_rate']}"]
+    lines.append(f'motor_rows = "{"mean" if sensors["motor"] == "mean" else "sample"}"')
     for name, value, nominal, unit in (
         ("thrust_constant", told.thrust_constant, THRUST_CONSTANT, "N s^2"),
         ("motor_time_constant", told.motor_time, MOTOR_TIME, "s"),
