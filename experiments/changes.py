@@ -6,7 +6,7 @@ Masalimov et al., Data 2024, 9(6), 79), micro-SD logs of two Crazyflies without 
     python -m experiments.changes figure FOLDER    # flies three days into an empty folder: the figure of docs/what_changed.md
 
 `open` compares every condition with all normal flights, and each day of normal flights with the other days; the table
-goes to experiments/results/changes_e8.md. `answer` writes experiments/results/changes_e9.json. Nothing is fitted to
+goes to experiments/results/changes_e8.md. `answer` writes changes_e9.json. Nothing is fitted to
 either: what the comparison assumes stands at the top of the modules of `openjax.comparison`.
 """
 
