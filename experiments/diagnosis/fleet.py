@@ -165,7 +165,5 @@ def write_case(fleet, i, folder, spoiled=False):
     folder.mkdir(parents=True, exist_ok=True)
     for letter, flight in zip("abc", rows, strict=True):
         write_flight(folder / f"flight_{letter}.csv.gz", flight, spec["sensors"]["channels"])
-    (folder / "vehicle.toml").write_text(
-        real.toml(spec.get("form_errors"), spec["told"], spec["sensors"])
-    )
+    (folder / "vehicle.toml").write_text(real.toml(spec.get("form_errors"), spec["told"], spec["sensors"]))
     return rows, wrong

@@ -126,7 +126,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument(
         "--policy", nargs="+", help="shipped names, runs or policy files; by default OPEN's seeds"
     )
-    trained = "How the policies were trained: h200_runs.md, ablations.md."
+    trained = "How the policies were trained: h200_runs.md."
     parser.add_argument("--note", default=trained, help="what to say of the policies")
     publish(parser.parse_args(arguments), study, page)
     return 0

@@ -45,7 +45,9 @@ def test_bytes_of_no_key_at_all_dont_hide_a_stop(terminal):
 
 @pytest.mark.parametrize("name", LANDING)
 def test_a_signal_lands_and_ends_nothing(name, terminal):
-    before = [signal.getsignal(getattr(signal, each)) for each in LANDING]  # a shell may have had some ignored
+    before = [
+        signal.getsignal(getattr(signal, each)) for each in LANDING
+    ]  # a shell may have had some ignored
     with Operator(terminal[1]) as operator:
         for _ in range(3):
             signal.raise_signal(getattr(signal, name))

@@ -29,7 +29,10 @@ class Level:
     def __init__(self, starts):
         import numpy as np
 
-        self._nothing, self._action = np.zeros(3), np.array([[2 * self.airframe.hover_thrust - 1, 0, 0, 0]] * 3)
+        self._nothing, self._action = (
+            np.zeros(3),
+            np.array([[2 * self.airframe.hover_thrust - 1, 0, 0, 0]] * 3),
+        )
         self.task = SimpleNamespace(
             pursuer_position=np.array(starts), evader_position=np.array([-0.5, 0.0, 0.5]),
             pillar_position=np.zeros((1, 2)), pillar_active=np.zeros(1, bool),
@@ -55,8 +58,12 @@ def flying():
     starts = [(*pose.position[:2], 0.5) for pose in virtual.truth.poses()]
     game, uris = Level(starts), tuple(virtual.uris)
     state = flight_state(game, 3, SafetySettings())
-    prepared = Prepared(game, state, SessionSettings(uris), None, {"policy": "level", "scenario": "wall", "uris": uris})
-    yield lambda number, kind: Flown(number, kind, virtual, Arguments(uri=uris, episode_seconds=8.0), prepared).fly()
+    prepared = Prepared(
+        game, state, SessionSettings(uris), None, {"policy": "level", "scenario": "wall", "uris": uris}
+    )
+    yield lambda number, kind: Flown(
+        number, kind, virtual, Arguments(uri=uris, episode_seconds=8.0), prepared
+    ).fly()
     virtual.close()
 
 

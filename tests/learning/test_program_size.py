@@ -15,9 +15,14 @@ def test_the_programs_of_a_training_step_have_not_grown():
     settings = preset("paper")
     phases, carry = make_phases(settings), abstract_carry(settings)
     flown = jax.eval_shape(phases.fly, carry)[1]
-    programs = [(phases.fly, (carry,)), *((learn, (carry, flown)) for learn in phases.learn), (phases.renew, (carry,))]
+    programs = [
+        (phases.fly, (carry,)),
+        *((learn, (carry, flown)) for learn in phases.learn),
+        (phases.renew, (carry,)),
+    ]
     counted = {
-        phase.__name__: jax.jit(phase).lower(*arguments).as_text().count(" = ") for phase, arguments in programs
+        phase.__name__: jax.jit(phase).lower(*arguments).as_text().count(" = ")
+        for phase, arguments in programs
     }
     assert counted.keys() == MOST.keys()
     assert all(counted[name] <= most for name, most in MOST.items()), counted

@@ -7,12 +7,49 @@ import sys
 
 import pytest
 
-from experiments.speed.cache_flips import run_flips
 from openjax.store.checked_cache import ASIDE, ENTRY, CheckedCache, set_fatal_entries_aside
+
+FLIPS = """
+import os, sys
+import jax, jax.numpy as jnp
+import numpy as np
+from openjax.store.checked_cache import ENTRY
+from openjax.store.compiled_programs import cache_programs
+from openjax.vehicle import hover_state, load_vehicle, make_drones_step
+
+folder, seed, flips = cache_programs(), int(sys.argv[1]), int(sys.argv[2])
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+vehicle = load_vehicle()
+step = make_drones_step("rigid", substeps=2)
+start = hover_state(vehicle, jnp.array([[0.0, 0.0, 0.5], [0.3, 0.0, 0.6], [-0.3, 0.1, 0.7]]))
+pillars = jnp.array([[0.2, 0.2]]), jnp.array([True])
+
+def fly(drones):
+    command = jnp.tile(jnp.array([0.7, 1.0, -1.0, 0.5]), (3, 1))
+    return jax.lax.scan(lambda d, _: (step(vehicle, d, command, *pillars), d.position), drones, None, length=20)
+
+rng = np.random.default_rng(seed)
+for flip in range(flips + 1):
+    if flip:
+        (file,) = folder.glob(f"jit_fly*{ENTRY}")
+        content = bytearray(file.read_bytes())
+        bit = int(rng.integers(8 * len(content)))
+        content[bit // 8] ^= 1 << bit % 8
+        file.write_bytes(content)
+    jax.clear_caches()
+    print(np.asarray(jax.jit(fly)(start)[1]).tobytes().hex(), flush=True)
+"""
 
 
 def test_flipped_bits_end_no_process_and_change_no_number(tmp_path):
-    assert run_flips(8, tmp_path) == {"flips": 8, "deaths": 0, "other_numbers": 0, "noticed": 8}
+    """Each start after a flip says that the entry is damaged and compiles anew."""
+    environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(tmp_path), "JAX_PLATFORMS": "cpu"}
+    command = [sys.executable, "-c", FLIPS, "0", "8"]
+    ran = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert ran.returncode == 0, ran.stderr[-2000:]
+    numbers = ran.stdout.split()
+    assert len(numbers) == 9 and set(numbers) == {numbers[0]}
+    assert ran.stderr.count("is damaged") == 8
 
 
 def test_an_entry_that_a_process_died_of_is_set_aside_and_no_other(tmp_path):

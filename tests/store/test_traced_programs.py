@@ -74,5 +74,8 @@ def test_a_program_that_cannot_be_kept_is_used_as_it_is(tmp_path):
     def told(x):
         return jax.pure_callback(lambda x: x, x, x)
 
-    assert recalled("told", told, lambda: (jnp.zeros(2),), Carry(jnp.zeros(()), jnp.zeros(())), "", tmp_path) is told
+    assert (
+        recalled("told", told, lambda: (jnp.zeros(2),), Carry(jnp.zeros(()), jnp.zeros(())), "", tmp_path)
+        is told
+    )
     assert not list(tmp_path.iterdir())

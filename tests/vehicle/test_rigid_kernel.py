@@ -116,7 +116,9 @@ def test_worlds_become_more_worlds_of_one_call(monkeypatch):
     )
     assert_close(jax.tree.map(lambda leaf: leaf.reshape(6, *leaf.shape[2:]), got), expected)
     monkeypatch.setattr("openjax.platform.can_compile_for_cuda", lambda: True)
-    many = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((2, WORTH // 2, *leaf.shape[2:]), leaf.dtype), twice)
+    many = jax.tree.map(
+        lambda leaf: jax.ShapeDtypeStruct((2, WORTH // 2, *leaf.shape[2:]), leaf.dtype), twice
+    )
     traced = str(jax.make_jaxpr(jax.vmap(jax.vmap(step)))(*many))
     assert f"f32[{WORTH},2,3]" in traced and "platform_index" in traced
 
