@@ -176,7 +176,9 @@ def _torque(torque, rates) -> dict:
 def _loop(torque, rates, commands) -> dict:
     """How strongly the rate loop answers a rate error, beside what it answers to a change of the rates, by quarters of the
     flight. In closed loop noise is in all three, so the commands are the instruments (two-stage least squares)."""
-    after = np.concatenate([rates[1:], rates[-1:]])  # motors hold from a row to the next: rates count in the middle
+    after = np.concatenate(
+        [rates[1:], rates[-1:]]
+    )  # motors hold from a row to the next: rates count in the middle
     error, change = commands - 0.5 * (rates + after), (after - rates) * RATE
     signals = (torque, error, change, *(np.roll(commands, k, 0) for k in DELAYS))
     filtered = np.stack([in_band(values, TURNING) for values in signals], -1)

@@ -130,9 +130,7 @@ def _cause_in_words(change: Change, cause: str) -> str:
         beside = f" at the {change.side}" if change.side and change.side != "diagonal" else ""
         return f"a weight was {'added' if more else 'taken off'}{beside}"
     if cause == "whole vehicle":
-        return (
-            "the whole vehicle is heavier or its thrust weaker" if more else "it is lighter or stronger"
-        )
+        return "the whole vehicle is heavier or its thrust weaker" if more else "it is lighter or stronger"
     return _CHANGED.get(cause, "something without a known pattern")
 
 

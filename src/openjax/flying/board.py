@@ -50,7 +50,9 @@ class Board:
     over = property(lambda self: self._numbers[_OVER] > 0.0, doc="Whether the session has ended.")
     pilot = property(lambda self: Role(int(self._numbers[_PILOT])), doc="Who flies.")
     armed = property(lambda self: self._numbers[_ARMED] > 0.0, doc="Whether any vehicle may be armed.")
-    stopped = property(lambda self: self._numbers[_STOP] > 0.0, doc="Whether the operator wants all motors off.")
+    stopped = property(
+        lambda self: self._numbers[_STOP] > 0.0, doc="Whether the operator wants all motors off."
+    )
     guarded = property(lambda self: self._numbers[_READY] > 0.0, doc="Whether the guard watches.")
 
     def beat(self, role: Role, now: float) -> None:

@@ -20,7 +20,12 @@ _DIGEST = hashlib.sha256
 
 
 def recalled(
-    name: str, function: Callable, arguments: Callable[[], Sequence[Any]], carry: Any, made_from: str, folder: Path
+    name: str,
+    function: Callable,
+    arguments: Callable[[], Sequence[Any]],
+    carry: Any,
+    made_from: str,
+    folder: Path,
 ) -> Callable:
     """A function for `jax.jit` that does what `function` does, without tracing it where an earlier process has.
 
@@ -43,7 +48,12 @@ def recalled(
     if program is None:
         try:
             write_checked(file, bytes(_export(function, arguments(), type(carry)).serialize()))
-        except (ValueError, NotImplementedError, ImportError, OSError):  # a call that can't be kept, a full disk
+        except (
+            ValueError,
+            NotImplementedError,
+            ImportError,
+            OSError,
+        ):  # a call that can't be kept, a full disk
             return function
         program = _read(file)  # also now, so that it's the same program the first time
         if program is None:
