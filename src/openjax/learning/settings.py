@@ -150,7 +150,7 @@ class AdaptSettings:
     """Worlds of each kind of flight in an update; by default 320 on an accelerator, 8 on a CPU: enough to see it work."""
     updates: Annotated[int, Interval("[1, 1000000]")] = 120
     look_every: Annotated[int, Interval("[1, 1000000]")] = 40
-    """Updates between looks at what the policy has become; the best of all looks is kept."""
+    """Updates between evaluations of the policy; the best of all is kept."""
     learning_rate: Annotated[float, Interval("(0, 1]")] = 3e-4
     """Adam step size at the start; falls linearly to a twentieth."""
     follow: Annotated[float, Interval("[0, 1000]")] = 0.1

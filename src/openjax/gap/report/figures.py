@@ -185,6 +185,8 @@ def _coordinate(report: Report):
     if not named or not evidence.replay.usable[3] or evidence.tracks[0].quaternion is None:
         return None
     coordinate = CARDS[named[0]].coordinate
+    if not coordinate:  # its force follows none, or it makes torques or delays
+        return None
     figure, axes = _figure(2.6)
     for residuals, (_, colour, label) in zip(_residuals(report), _lines(report, None, None), strict=False):
         pairs = [

@@ -21,7 +21,7 @@ def page_of(report: Report) -> str:
         loader=jinja2.FileSystemLoader(TEMPLATE.parent), autoescape=True, undefined=jinja2.StrictUndefined
     )
     ranked = sorted(report.probabilities.items(), key=lambda item: -item[1])
-    return environment.get_template(TEMPLATE.name).render(
+    page = environment.get_template(TEMPLATE.name).render(
         report=report,
         facts=facts(report),
         sentence=sentence(report),
@@ -30,6 +30,7 @@ def page_of(report: Report) -> str:
         figures=figures(report),
         ranked=[(name, p) for name, p in ranked[:8] if p > LEAST_CHANCE],
     )
+    return page.replace(" % ", "\u00a0% ").replace(" %.", "\u00a0%.")  # a number and its sign stay on one line
 
 
 def facts(report: Report) -> list[tuple[str, str]]:

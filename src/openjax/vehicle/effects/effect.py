@@ -119,7 +119,7 @@ class Card:
     fitted: its parameters; `common` is the spread that all share, `balanced`: their mean belongs to another effect and is
         held near zero, `linear`: the first scales the whole effect, `others`: more starts of the search.
     needs: the channel without which it can't be told, though it leaves a trace in others.
-    coordinate: the variable that it follows, for pictures.
+    coordinate: the variable that its force follows, for pictures; none where it makes torques or delays.
     thrust_map: a map from duty cycles to thrust that isn't known can imitate it.
     torque_axes: those of the torques by which it is told, which gusts can imitate, and what motors do between two rows.
     log_odds: log prior odds that it acts at a size that matters.
@@ -142,7 +142,7 @@ class Card:
     linear: bool = False
     others: tuple[tuple[float, ...], ...] = ()
     needs: str = ""
-    coordinate: str = "thrust"
+    coordinate: str = ""
     thrust_map: bool = False
     torque_axes: tuple[int, ...] = ()
     log_odds: float = UNCOMMON

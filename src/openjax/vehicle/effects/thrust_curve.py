@@ -37,6 +37,7 @@ EFFECT = Effect(
     motor=motor,
     card=Card(
         path="physics",
+        coordinate="thrust",
         fitted=(
             Fitted("offset", mean=0.0, spread=0.08, start=0.02, step=0.001),
             Fitted("slope", mean=1.0, spread=0.2, start=0.95, step=0.001),

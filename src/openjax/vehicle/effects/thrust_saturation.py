@@ -51,6 +51,7 @@ EFFECT = Effect(
     motor=motor,
     card=Card(
         path="physics",
+        coordinate="thrust",
         fitted=(
             Fitted("limit", mean=0.8, spread=0.12, start=0.8, step=0.002),
             Fitted("voltage_slope", mean=0.0, spread=0.1, start=0.0, step=0.01),
