@@ -59,7 +59,8 @@ def game_of(loaded: LoadedPolicy, game: str, physics: str) -> PursuitSettings:
 def tasks_of(settings: PursuitSettings, layouts: int, uniform: int) -> tuple[list[str], list[int], Task]:
     """Names of the kinds of tasks, how many of each, and all of them one after the other."""
     parts = [repeat_task(scenario_task(settings, scenario), layouts) for scenario in SCENARIOS.values()]
-    parts.append(uniform_tasks(dataclasses.replace(settings, max_pillars=5), uniform, settings.max_pillars))
+    drawn = dataclasses.replace(settings, min_pillars=4, max_pillars=5)
+    parts.append(uniform_tasks(drawn, uniform, settings.max_pillars))
     tasks = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
     return [*SCENARIOS, "uniform"], [layouts] * len(SCENARIOS) + [uniform], tasks
 

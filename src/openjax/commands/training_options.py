@@ -25,8 +25,9 @@ class TrainCommand:
 
     preset: str | None = None
     """quick: minutes on two CPU cores, an easier game; paper: the paper's task on an accelerator; flight: policies to be flown,
-    every pursuer another vehicle; mappo: without predictor and generator; dacoop: parameters of a potential field. By default
-    quick without an accelerator, else paper."""
+    every pursuer another vehicle; evaders, evaders_second: the same against evaders that fight back, in two runs; mappo:
+    without predictor and generator; dacoop: parameters of a potential field. By default quick without an accelerator, else
+    paper."""
     out: Path | None = None
     """Directory of the run; by default runs/DATE-PRESET."""
     steps: Annotated[int | None, Interval("[1, 1e15]")] = None

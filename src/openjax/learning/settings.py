@@ -391,6 +391,38 @@ def flight() -> TrainSettings:
     )
 
 
+def evaders() -> TrainSettings:
+    """Policies to be flown after evaders that fight back: `flight`, and from a sixth of the run on two thirds of the evaders are
+    greedy or run along the wall, slow ones first. `evaders_second` goes on from it. Five minutes on one large accelerator."""
+    return changed(
+        flight(),
+        environment=dict(evaders=("field", "field", "greedy", "greedy", "greedy", "wall_runner")),
+        mappo=dict(penalty_ramp=0.5),
+        vehicles_start=0.12,
+        vehicles_ramp=0.14,
+        evaders_start=0.18,
+        evaders_ramp=0.3,
+        evaders_validation=("field", "heavy", "pillar_hugger"),
+        total_steps=620_000_000,
+    )
+
+
+def evaders_second() -> TrainSettings:
+    """The second run of `evaders`, with `--start_from` the first: all evaders and vehicles from its start, arenas with few
+    pillars too, and penalties that grow anew. Five minutes on one large accelerator."""
+    return changed(
+        evaders(),
+        # under full penalties, those who had learnt them before they met fast evaders hovered far from these
+        environment=dict(min_pillars=0, reward=dict(distance=0.3)),
+        mappo=dict(actor_start=0.01, penalty_start=0.3, penalty_ramp=0.5),
+        analytic=dict(updates=0),
+        vehicles_start=0.0,
+        vehicles_ramp=0.0,
+        evaders_start=0.0,
+        evaders_ramp=0.0,
+    )
+
+
 def mappo() -> TrainSettings:
     """The paper's plain MAPPO, without predictor and generator, with penalties under which it learns to catch: where a
     first crash costs 5,000, only the generator's tasks lead past hovering."""
@@ -412,6 +444,8 @@ PRESETS = {
     "quick": quick,
     "paper": paper,
     "flight": flight,
+    "evaders": evaders,
+    "evaders_second": evaders_second,
     "mappo": mappo,
     "dacoop": dacoop,
 }
