@@ -17,21 +17,21 @@ from openjax.vehicle.vehicle_file import load_vehicle_file
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+MADE = ("_build", "jupyter_execute", "measured")  # folders that building the site leaves
+PAGES = [path for path in sorted((ROOT / "docs").rglob("*.md")) if not set(MADE) & set(path.parts)]
 
 
 def test_every_command_and_target_of_the_readme_exists():
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     for target in set(re.findall(r"\bmake ([a-z]+)\b", README)) - {"it"}:
         assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
-    pages = "".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs").rglob("*.md"))
+    pages = "".join(page.read_text(encoding="utf-8") for page in PAGES)
     commands = set(re.findall(r"(?:^ *|`)openjax ([a-z]\w+)", README + pages, re.MULTILINE))
     assert commands == set(COMMANDS), commands ^ set(COMMANDS)
-    for path in re.findall(r"\]\(((?:experiments|docs|examples)[^)#]*)\)", README):
-        assert (ROOT / path).exists(), path
 
 
 def test_modules_that_the_pages_run_are_there():
-    for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")):
+    for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES):
         for name in re.findall(r"python -m ([a-z_.]+)", page.read_text(encoding="utf-8")):
             assert importlib.util.find_spec(name.rstrip(".")), f"{page.name}: {name}"
 
@@ -43,16 +43,22 @@ def test_readme_and_pages_stay_short():
         return len(re.findall(r"\S*[^\W\d_]\S*", text))
 
     assert words(README) <= 1200
-    pages = (ROOT / "docs").rglob("*.md")
-    assert (
-        sum(words(page.read_text(encoding="utf-8")) for page in pages if "_build" not in page.parts) <= 10_000
-    )
+    assert sum(words(page.read_text(encoding="utf-8")) for page in PAGES) <= 10_000
 
 
-def test_links_between_the_pages_lead_somewhere():
-    for page in sorted((ROOT / "docs").rglob("*.md")):
-        for path in re.findall(r"\]\((?!http)([^)#]+)", page.read_text(encoding="utf-8")):
-            assert (page.parent / path).exists(), f"{page.name}: {path}"
+def test_links_lead_somewhere():
+    """To a file, and where a page is named with a heading, to that heading."""
+    results = (ROOT / "experiments" / "results").rglob("*.md")
+    for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES, *results):
+        text = page.read_text(encoding="utf-8")
+        for path, heading in re.findall(r"\]\((?!http)([^)#]*)#?([^)]*)\)", text):
+            target = page.parent / path if path else page
+            assert target.exists(), f"{page.name}: {path}"
+            if heading:
+                titles = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), re.MULTILINE)
+                assert heading in [title.lower().replace(" ", "-") for title in titles], (
+                    f"{page.name}: {heading}"
+                )
 
 
 def test_the_table_of_experiments_names_them_all():
@@ -79,9 +85,17 @@ def test_modules_that_the_pages_name_are_there():
         for part in ("src", "experiments", "examples", "tests")
         for path in (ROOT / part).rglob("*.py")
     ]
-    for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")):
+    for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES):
         for name in re.findall(r"`([\w/]+\.py)`", page.read_text(encoding="utf-8")):
             assert any(f"/{module}".endswith(f"/{name}") for module in modules), f"{page.name}: {name}"
+
+
+@pytest.mark.slow
+def test_python_of_the_readme_runs():
+    names = {}
+    exec(re.search(r"```python\n(.*?)```", README, re.DOTALL).group(1), names)
+    assert names["record"]["capture_rate"] > 0.95
+    assert names["observation"].position.shape == (3, 3)
 
 
 @pytest.mark.slow

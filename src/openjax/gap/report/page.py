@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import re
 from pathlib import Path
 
 import jinja2
@@ -30,7 +31,7 @@ def page_of(report: Report) -> str:
         figures=figures(report),
         ranked=[(name, p) for name, p in ranked[:8] if p > LEAST_CHANCE],
     )
-    return page.replace(" % ", "\u00a0% ").replace(" %.", "\u00a0%.")  # a number and its sign stay on one line
+    return re.sub(r"(?<=\d) %", "\u00a0%", page)  # a number and its sign stay on one line
 
 
 def facts(report: Report) -> list[tuple[str, str]]:
