@@ -89,16 +89,7 @@ def surroundings(craft: Craft, observation: Observation) -> Surroundings:
     apart_velocity = velocities[..., :, None, :] - velocities[..., index, :]
     target_velocity = for_all(jnp.where(seen, newest[..., 4:7], 0.0))
 
-    pillar = observation.pillars
-    across = jnp.sqrt(jnp.sum(pillar[..., :2] ** 2, axis=-1) + 1e-12)
-    to_pillar = jnp.where(observation.pillar_seen, across - pillar[..., 4], jnp.inf)
-    radius = jnp.sqrt(jnp.sum(own[..., :2] ** 2, axis=-1, keepdims=True) + 1e-12)
-    normal = jnp.concatenate(
-        [pillar[..., :2] / across[..., None], (-own[..., :2] / radius)[..., None, :]], axis=-2
-    )
-    distance = jnp.concatenate([to_pillar, craft.arena_radius - radius], axis=-1)
-    # along today's normal: straight on, a drone might come out behind a pillar
-    receding = jnp.sum(normal * velocity[..., None, :2], axis=-1)
+    normal, distance = _obstacles(craft, observation)
     position = own + craft.response * velocity
     return Surroundings(
         position=position,
@@ -109,10 +100,26 @@ def surroundings(craft: Craft, observation: Observation) -> Surroundings:
         from_others_velocity=apart_velocity,
         team_velocity=for_all(jnp.mean(velocities, axis=-2)),
         obstacle_normal=normal,
-        obstacle_distance=distance + craft.response * receding,
+        obstacle_distance=distance,
         floor_distance=position[..., 2],
         ceiling_distance=craft.arena_height - position[..., 2],
     )
+
+
+def _obstacles(craft, observation):
+    """`obstacle_normal` and `obstacle_distance`."""
+    own, velocity = observation.position, observation.self_state[..., VELOCITY]
+    pillar = observation.pillars
+    across = jnp.sqrt(jnp.sum(pillar[..., :2] ** 2, axis=-1) + 1e-12)
+    to_pillar = jnp.where(observation.pillar_seen, across - pillar[..., 4], jnp.inf)
+    radius = jnp.sqrt(jnp.sum(own[..., :2] ** 2, axis=-1, keepdims=True) + 1e-12)
+    normal = jnp.concatenate(
+        [pillar[..., :2] / across[..., None], (-own[..., :2] / radius)[..., None, :]], axis=-2
+    )
+    distance = jnp.concatenate([to_pillar, craft.arena_radius - radius], axis=-1)
+    # along today's normal: straight on, a drone might come out behind a pillar
+    receding = jnp.sum(normal * velocity[..., None, :2], axis=-1)
+    return normal, distance + craft.response * receding
 
 
 def length(vector: jax.Array) -> jax.Array:

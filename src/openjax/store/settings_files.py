@@ -40,21 +40,25 @@ def from_plain(kind: Any, value: Any, where: str = "settings") -> Any:
         return from_plain(arguments[0], value, where)
     if origin in (typing.Union, types.UnionType):
         return _union_from_plain(arguments, value, where)
-    if origin is typing.Literal:
-        if value not in arguments:
-            raise UserError(f"{where} is {value!r}; expected one of {', '.join(map(repr, arguments))}")
-        return value
     if origin is tuple:
-        if not isinstance(value, list | tuple):
-            raise UserError(f"{where} is {value!r}; expected a list")
-        if len(arguments) == 2 and arguments[1] is Ellipsis:
-            return tuple(from_plain(arguments[0], entry, f"{where}[{i}]") for i, entry in enumerate(value))
-        if len(arguments) != len(value):
-            raise UserError(f"{where} has {len(value)} entries; expected {len(arguments)}")
-        return tuple(
-            from_plain(argument, entry, f"{where}[{i}]")
-            for i, (argument, entry) in enumerate(zip(arguments, value, strict=True))
-        )
+        return _tuple_from_plain(arguments, value, where)
+    if origin is typing.Literal and value not in arguments:
+        raise UserError(f"{where} is {value!r}; expected one of {', '.join(map(repr, arguments))}")
+    return value if origin is typing.Literal else _leaf_from_plain(kind, value, where)
+
+
+def _tuple_from_plain(arguments, value, where):
+    if not isinstance(value, list | tuple):
+        raise UserError(f"{where} is {value!r}; expected a list")
+    if len(arguments) == 2 and arguments[1] is Ellipsis:
+        arguments = arguments[:1] * len(value)
+    if len(arguments) != len(value):
+        raise UserError(f"{where} has {len(value)} entries; expected {len(arguments)}")
+    places = (f"{where}[{i}]" for i in range(len(value)))
+    return tuple(map(from_plain, arguments, value, places))
+
+
+def _leaf_from_plain(kind, value, where):
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if kind is Path and isinstance(value, str):

@@ -48,12 +48,8 @@ def recalled(
     if program is None:
         try:
             write_checked(file, bytes(_export(function, arguments(), type(carry)).serialize()))
-        except (
-            ValueError,
-            NotImplementedError,
-            ImportError,
-            OSError,
-        ):  # a call that can't be kept, a full disk
+        except (ValueError, NotImplementedError, ImportError, OSError):
+            # a call that can't be kept, a full disk
             return function
         program = _read(file)  # also now, so that it's the same program the first time
         if program is None:
