@@ -104,7 +104,7 @@ def test_train_shows_progress_and_leaves_what_the_readme_says(whole_run):
     assert [r["update"] for r in read_metrics(out / "metrics.jsonl", "train")] == list(range(1, UPDATES + 1))
     layouts = json.loads((out / "layouts.json").read_text())
     scenarios = [row["scenario"] for row in layouts["after"]]
-    assert scenarios[:3] == ["validation", "validation_far", "wall"]
+    assert scenarios[:3] == ["validation", "validation_far", "empty"]
     assert [row["scenario"] for row in layouts["angelani"]] == [scenarios[0], *scenarios[2:]]
     assert layouts["machine"]["versions"]["jax"] == jax.__version__
 

@@ -46,11 +46,14 @@ def train(options: argparse.Namespace, seed: int, cores: list[int]) -> dict:
         )
     seconds = round(time.monotonic() - started)
     print(f"seed {seed}: {seconds} s", flush=True)
+    return {"seed": seed, "whole_command": seconds, **record(run)}
+
+
+def record(run: Path) -> dict:
+    """What the table of a run says, and its policy flown on the validation tasks once more."""
     layouts, loaded = read_json(run / "layouts.json"), load_policy(run)
     kept = {name: layouts[name] for name in ("after", "open", "seconds", "steps") if name in layouts}
     return {
-        "seed": seed,
-        "whole_command": seconds,
         "time_step": loaded.settings.environment.time_step,
         **kept,
         "every_physics_step": fly_finely(loaded),
@@ -117,30 +120,36 @@ def page(results: dict) -> Page:
     columns = {
         "seed": "seed",
         "whole command, s": "whole_command",
-        "steps, M": lambda run: f"{run['steps'] / 1e6:.1f}",
-        "every physics step": lambda run: _three(run["every_physics_step"], 1.0),
+        "new tasks": _column("after", "validation"),
     }
-    for kind, of_whom in (("after", ""), ("open", ", `open`")):
-        for scenario in ("validation", "empty"):
-            columns[scenario + of_whom] = _column(kind, scenario)
+    columns |= {
+        "... every 10 ms": lambda run: _three(run.get("every_physics_step"), 1.0),
+        "from far": _column("after", "validation_far"),
+        "`empty`": _column("after", "empty"),
+        "new tasks, `open`": _column("open", "validation"),
+        "`empty`, `open`": _column("open", "empty"),
+    }
+    earlier = results.get("earlier", {"runs": []})
     return Page(
-        "Runs of the quick preset",
-        results["preset"]
-        + " Each cell: capture rate, seconds to the capture, crash rate. "
-        + results.get("note", ""),
-        Table(columns, results["runs"]),
+        "The quick preset: what two CPU cores learn",
+        f"{results['preset']} Each cell: capture rate, seconds to the capture, crash rate. {results.get('note', '')}",
+        [Table(columns, results["runs"]), Table(columns, earlier["runs"], "Before", earlier.get("note", ""))]
+        if earlier["runs"]
+        else Table(columns, results["runs"]),
     )
 
 
 def _column(kind, scenario):
     def show(run):
         records = {row["scenario"]: row for row in run.get(kind, [])}
-        return _three(records[scenario], run["time_step"]) if scenario in records else None
+        return _three(records.get(scenario), run["time_step"])
 
     return show
 
 
 def _three(record, time_step):
+    if record is None:
+        return "–"
     seconds = record.get("capture_seconds", time_step * record.get("capture_step", 0.0))
     return f"{record['capture_rate']:.2f}, {seconds:.2f}, {record['crash_rate']:.2f}"
 

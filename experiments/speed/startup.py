@@ -1,6 +1,7 @@
 """Seconds to a training run's first update: `python -m experiments.speed.startup [--preset paper] [--repeats 2]`.
 
-Once with an empty and some times with a filled cache of compiled programs. Writes experiments/results/startup.json and .md.
+Once with an empty and some times with a filled cache of compiled programs; then how long the compiler takes for each program
+of the training step alone, for all of them side by side, and for the step as one. Writes experiments/results/startup.json, .md.
 """
 
 import argparse
@@ -12,9 +13,14 @@ import threading
 import time
 from pathlib import Path
 
+import jax
+
 from experiments.table import Page, Table, page_parser, publish
+from openjax.background import compile_ahead
 from openjax.commands.command_line import run_command
 from openjax.errors import UserError
+from openjax.learning import abstract_carry, make_training_step, preset
+from openjax.learning.training_step import make_phases
 from openjax.show.metrics import METRICS_FILE, read_metrics
 
 
@@ -54,25 +60,45 @@ def start_once(options: argparse.Namespace, scratch: Path, name: str) -> dict:
     }
 
 
+def compile_programs(name: str) -> list[dict]:
+    """What the programs of a preset's training step cost until they're compiled, with nothing kept: a record for each."""
+    jax.config.update("jax_threefry_gpu_kernel_lowering", True)  # as the command has it
+    settings = preset(name)
+    phases, carry = make_phases(settings), abstract_carry(settings)
+    flown = jax.eval_shape(phases.fly, carry)[1]
+    parts = [(phases.fly, carry), *((learn, carry, flown) for learn in phases.learn), (phases.renew, carry)]
+    cases = {part[0].__name__: [part] for part in parts}
+    cases |= {"these side by side": parts, "the step as one": [(make_training_step(settings), carry)]}
+    records = []
+    for case, programs in cases.items():
+        started, processor = time.monotonic(), time.process_time()
+        for wait in [compile_ahead(jax.jit(function), *arguments) for function, *arguments in programs]:
+            wait()
+        spent = {"seconds": time.monotonic() - started, "processor": time.process_time() - processor}
+        records.append({"program": case, **spent})
+    return records
+
+
 def study(options: argparse.Namespace) -> dict:
-    """All starts."""
+    """All starts, and the programs."""
     with tempfile.TemporaryDirectory() as folder:
         names = ["cold", *(f"warm_{i + 1}" for i in range(options.repeats))]
         starts = [start_once(options, Path(folder), name) for name in names]
-        cache = [path.stat().st_size for path in Path(folder, "cache").rglob("*") if path.is_file()]
-    return {"preset": options.preset, "starts": starts, "cache_megabytes": round(sum(cache) / 2**20, 1)}
+    return {"preset": options.preset, "starts": starts, "programs": compile_programs(options.preset)}
 
 
 def page(results: dict) -> Page:
-    """A row per start."""
-    phases = dict.fromkeys(name for start in results["starts"] for name in start["phases"])
+    """A row per start, and one per program."""
+    phases = dict.fromkeys(name for start in results["starts"] for name in start.get("phases", ()))
     columns = {"cache": "cache"} | {f"{phase}, from s": f"phases.{phase}" for phase in phases}
     columns |= {"first update done, s": "first_update:.1f", "of processor, s": "processor:.0f"}
+    prose = f"Preset `{results['preset']}` on {results['machine']['cpu_cores']} CPU cores."
+    programs = {"program": "program", "compiled, s": "seconds:.1f", "of processor, s": "processor:.0f"}
+    compiled = Table(programs, results["programs"], "What the compiler takes", results.get("note", ""))
     return Page(
         "Seconds to the first update",
-        f"Preset `{results.get('preset', 'paper')}` on {results['machine']['cpu_cores']} CPU cores. The cache of compiled "
-        f"programs holds {results['cache_megabytes']} MB then.",
-        Table(columns, results["starts"]),
+        results.get("prose", prose),
+        [Table(columns, results["starts"]), compiled],
     )
 
 

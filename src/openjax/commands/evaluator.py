@@ -195,10 +195,14 @@ def spread_table(results: Sequence[Sequence[dict]]) -> Table:
     return table
 
 
+_KINDS = {"validation": "new tasks", "validation_far": "from far"}
+"""What the rows that aren't layouts are called."""
+
+
 def before_after_table(
     before: Sequence[dict], after: Sequence[dict], other: str | None = None, others: Sequence[dict] = ()
 ) -> Table:
-    """Returns, captures and collisions per layout, before and after training; last what the policy `other` does there."""
+    """Captures, collisions and crashes before and after training; last what the policy `other` does in the same game."""
     columns = (
         *([("episode_return", "return", ".0f")] if other is None else []),
         ("capture_rate", "capture rate", ".2f"),
@@ -206,9 +210,9 @@ def before_after_table(
         ("collision_rate", "collision rate", ".3f"),
         ("crash_rate", "crash rate", ".2f"),
     )
-    last = [] if other is None else [f"{other}: rate,\nstep, crash"]
+    last = [] if other is None else [f"policy {other}:\nrate, step, crash"]
     heads = [label if other is None else label.replace(" ", "\n") for _, label, _ in columns]
-    table = _table("Before and after training", "layout", *heads, *last)
+    table = _table("Before and after training, in the game that was trained", "", *heads, *last)
     theirs = {row["scenario"]: row for row in others}
     for old, new in zip(before, after, strict=True):
         cells = [f"{old[name]:{style}} → {new[name]:{style}}" for name, _, style in columns]
@@ -219,7 +223,7 @@ def before_after_table(
                 if row
                 else "–"
             )
-        table.add_row(old["scenario"], *cells)
+        table.add_row(_KINDS.get(old["scenario"], old["scenario"]), *cells)
     return table
 
 

@@ -15,6 +15,7 @@ from openjax.learning.first_flights import FirstFlights, first_game, make_first_
 from openjax.learning.settings import TrainSettings
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Pursuit
+from openjax.show.progress import duration
 from openjax.store.leaves import abstract_like
 
 TOGETHER = 50
@@ -28,12 +29,22 @@ def compile_last_stage(settings: TrainSettings, environment: Pursuit, policy: An
 
 
 def compile_first_flights(
-    settings: TrainSettings, environment: Pursuit, policy: Any
-) -> Callable[[PolicyParameters, jax.Array, Callable[[str], None]], PolicyParameters]:
+    settings: TrainSettings,
+    environment: Pursuit,
+    policy: Any,
+    say: Callable[[str], None],
+    over: Callable[[], bool],
+) -> Callable[[PolicyParameters, jax.Array], PolicyParameters]:
     """Start to compile the stage before MAPPO for parameters of these shapes, in the background.
 
+    Args:
+      settings, environment: the run's.
+      policy: the parameters' shapes and dtypes.
+      say: hears how it goes.
+      over: is asked every few seconds whether to stop.
+
     Returns:
-      the stage, which waits for the compiler: (fresh parameters, key, where to say how it goes) -> parameters.
+      the stage, which waits for the compiler: (fresh parameters, key) -> parameters.
     """
     how = settings.first_flights
     flights = FirstFlights(how, first_game(environment, how), _exact(settings, environment))
@@ -46,16 +57,21 @@ def compile_first_flights(
     lowered = some.lower(carry, key, done), begin.lower(policy, key)
     ready = [in_background(program.compile) for program in lowered]
 
-    def learn(parameters, key, say):
+    def learn(parameters, key):
         some, begin = (wait() for wait in ready)
         started = time.monotonic()
         own = jax.tree.map(lambda leaf: jax.device_put(leaf, jax.local_devices()[0]), parameters)
         carry = begin(own, key)
-        for done in range(0, how.updates, TOGETHER):
-            carry, parts = some(carry, key, jnp.int32(done))
-            shown = ", ".join(f"{name} {float(value):.3f}" for name, value in parts.items())
+        for before in range(0, how.updates, TOGETHER):
+            if over():
+                break
+            carry, parts = some(carry, key, jnp.int32(before))
+            done = min(before + TOGETHER, how.updates)
+            left = (time.monotonic() - started) * (how.updates / done - 1.0)
+            shown = {name: float(value) for name, value in parts.items()}
             say(
-                f"{min(done + TOGETHER, how.updates)} of {how.updates}, {time.monotonic() - started:.0f} s | {shown}"
+                f"{done} of {how.updates} updates, {duration(left)} left | evader not caught {shown['free']:.0%} of the time, "
+                f"pursuers {shown['distance']:.2f} m out of reach, crashing {shown['crashes']:.1%}"
             )
         return parameters.replace(actor=carry[0].actor)
 

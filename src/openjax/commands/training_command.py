@@ -13,12 +13,12 @@ from openjax.cluster.joining import Membership, find_membership
 from openjax.cluster.processes import Processes
 from openjax.commands.command_line import output_console, parse, peek
 from openjax.commands.machine import describe_machine
+from openjax.commands.run_words import opening_words
 from openjax.commands.training_job import TrainingJob, run_job
 from openjax.commands.training_options import MAY_CHANGE, PROGRAM, TrainCommand
 from openjax.errors import UserError
 from openjax.files import remove_unfinished
 from openjax.learning import TrainSettings, preset
-from openjax.learning.settings import PRESETS
 from openjax.store.checkpoints import Checkpoints
 from openjax.store.compiled_programs import cache_programs
 from openjax.store.environments import make_environment, with_airframe
@@ -116,7 +116,7 @@ def start(
                 copy = copy_vehicle_file if name == "vehicle.toml" else shutil.copyfile
                 copy(path, directory.path / name)
             directory.write_settings(job.settings, job.facts)
-            _say_what_it_is(command)
+            output_console().print(opening_words(job.settings), soft_wrap=True)
         elif processes.is_first:
             remove_unfinished(directory.path)
         processes.everyone()
@@ -125,12 +125,6 @@ def start(
                 f"{directory.path} isn't there on the host of process {processes.index}; all hosts must share it"
             )
         return run_job(job, directory, console=output_console())
-
-
-def _say_what_it_is(command):
-    """What the chosen preset is, as nobody reads a table right who takes an easier game for the paper's."""
-    name = command.preset or default_preset()
-    output_console().print(f"preset {name}: {' '.join(PRESETS[name].__doc__.split())}", soft_wrap=True)
 
 
 def prepare(

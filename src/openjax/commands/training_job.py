@@ -20,7 +20,6 @@ from openjax.cluster.devices import (
 )
 from openjax.cluster.processes import Processes
 from openjax.commands.before_and_after import compare, game_for
-from openjax.commands.closing_words import closing_words, layouts_like
 from openjax.commands.evaluator import (
     before_after_table,
     evaluate_scenarios,
@@ -28,6 +27,7 @@ from openjax.commands.evaluator import (
     record_of,
 )
 from openjax.commands.gradient_stages import compile_first_flights, compile_last_stage, on_one_device
+from openjax.commands.run_words import closing_words, layouts_like
 from openjax.commands.step_programs import step_programs
 from openjax.commands.training_loop import NotFiniteError, Plan, StopRequest, run_updates
 from openjax.commands.validation import SCORE_RULE, Validation, flat_metrics, selection_score
@@ -118,7 +118,10 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
         step_ready = step.compile_ahead(abstract)  # takes longest, so it comes first
         first_flights = None
         if settings.first_flights.updates and not job.start_from and not checkpoints.any_finished():
-            first_flights = compile_first_flights(settings, job.environment, abstract.policy)
+            over = functools.partial(_over, job, stop)
+            first_flights = compile_first_flights(
+                settings, job.environment, abstract.policy, progress.message, over
+            )
         carry, update, seconds = _first_carry(
             job, start, abstract, directory, checkpoints, progress, first_flights
         )
@@ -180,8 +183,9 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
             return 0
         _save_best(job, directory, checkpoints, outcome, progress.message)
         if outcome.update == update and settings.total_updates > update:
+            what = "MAPPO did not begin" if first_flights else "nothing was trained"
             progress.message(
-                f"nothing was trained: {outcome.stopped_by} came before the first update, {outcome.seconds:.0f} s after the start"
+                f"{what}: {outcome.stopped_by} came before the first update, {outcome.seconds:.0f} s after the start"
             )
         if signals:
             progress.message(
@@ -196,7 +200,7 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
     console.print(table)
     for line in closing_words(settings, directory.path, jax.default_backend() == "cpu"):
         console.print(line, soft_wrap=True)
-    console.print(f"run, policy and pictures are in {directory.path}", soft_wrap=True)
+    console.print(f"run, policy and pictures are in {directory.path}, the chase in chase.gif", soft_wrap=True)
     return 0
 
 
@@ -214,6 +218,12 @@ def _programs(job):
         return jax.jit(keep("start", start, lambda: (key,)), out_shardings=shardings)(key)
 
     return kept_start, step_programs(phases, job.devices, abstract, keep), abstract
+
+
+def _over(job, stop):
+    """Whether the run is to end: a signal to any process counts, and the first one's clock."""
+    asked = job.processes.everyone([stop.name, time.monotonic() - job.started >= job.time_limit])
+    return any(name is not None for name, _ in asked) or asked[0][1]
 
 
 def _validation_ready(job, abstract):
@@ -240,7 +250,7 @@ def _first_carry(job, start, abstract, directory, checkpoints, progress, first_f
     if first_flights is not None:
         progress.phase("learning to fly by the gradient through the simulation")
         key = jax.random.fold_in(jax.random.key(settings.seed), 1)
-        carry = carry.with_policy(first_flights(carry.policy, key, progress.message))
+        carry = carry.with_policy(first_flights(carry.policy, key))
     return place(carry, carry_shardings(job.devices)), 0, 0.0
 
 

@@ -196,7 +196,7 @@ def run_updates(
     try:
         while update < plan.total_updates and reason is None:
             if update == first_update:
-                progress.phase("compiling the training step")
+                progress.phase("compiling the training step", announce=False)
             carry, values, broken = step(carry)
             update += 1
             if pending is not None:

@@ -100,11 +100,11 @@ class Progress:
         return [(label, _number(values[name])) for name, label in _SHOWN.items() if name in values]
 
     def _speed(self):
-        left = max(self._total - self._steps, 0) / self._rate if self._rate > 0 else float("nan")
-        return (
-            f"{100 * min(self._steps / self._total, 1):.0f} %, {_count(self._steps)} steps, "
-            f"{_count(self._rate)} steps/s, {_duration(left)} left"
-        )
+        done = f"{100 * min(self._steps / self._total, 1):.0f} %, {_count(self._steps)} steps"
+        if self._rate == 0.0:  # a speed takes two updates
+            return done
+        left = max(self._total - self._steps, 0) / self._rate
+        return f"{done}, {_count(self._rate)} steps/s, {duration(left)} left"
 
     def _print(self, text):
         self._console.print(Text(text), soft_wrap=True)
@@ -137,7 +137,8 @@ def _count(value):
     return f"{value:.0f}"
 
 
-def _duration(seconds):
+def duration(seconds: float) -> str:
+    """Minutes and seconds, 3:02, and hours where there are any; a dash where it isn't known."""
     if seconds != seconds:
         return "–"
     minutes, seconds = divmod(round(seconds), 60)

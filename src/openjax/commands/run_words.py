@@ -1,9 +1,41 @@
-"""What a run says at its end: what a crash is, how its game differs from the paper's, and what to type next."""
+"""What a run says in words: at its start what is trained, at its end what a crash is, what was easier, and what to type next."""
 
 from pathlib import Path
+from typing import Any
 
 from openjax.learning import TrainSettings
+from openjax.learning.settings import PRESETS
 from openjax.pursuit import SCENARIOS, PursuitSettings, Scenario
+from openjax.store.settings_files import to_plain
+
+NAMED = 3
+"""Most changed settings that are named."""
+
+
+def opening_words(settings: TrainSettings) -> str:
+    """Which preset this is, or comes nearest to, and what that is: nobody should take an easier game for the paper's."""
+    own = _leaves(to_plain(settings))
+    others = {name: _leaves(to_plain(make())) for name, make in PRESETS.items()}
+    changed = {
+        name: [leaf for leaf in own if own[leaf] != other.get(leaf) and leaf != "seed"]
+        for name, other in others.items()
+    }
+    name = min(changed, key=lambda name: len(changed[name]))
+    words = changed[name][:NAMED]
+    if more := len(changed[name]) - len(words):
+        words.append(f"{more} more")
+    return (
+        f"preset {name}{', changed in ' if words else ''}{', '.join(words)}: "
+        f"{' '.join(PRESETS[name].__doc__.split())}"
+    )
+
+
+def _leaves(plain: Any, path: str = "") -> dict[str, Any]:
+    """The values of nested dictionaries by their dotted names."""
+    if not isinstance(plain, dict):
+        return {path: plain}
+    parts = (_leaves(value, f"{path}.{name}" if path else name) for name, value in plain.items())
+    return {name: value for part in parts for name, value in part.items()}
 
 
 def layouts_like(game: PursuitSettings) -> list[Scenario]:
@@ -20,7 +52,7 @@ def layouts_like(game: PursuitSettings) -> list[Scenario]:
 
 
 def closing_words(settings: TrainSettings, run: Path, on_cpu: bool) -> list[str]:
-    """Lines below the table of the run in that directory."""
+    """Three lines below the table of the run in that directory."""
     game = settings.environment
     seconds = game.episode_length * game.time_step
     lines = [

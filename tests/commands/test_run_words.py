@@ -1,8 +1,9 @@
-"""What a run says at its end fits its game."""
+"""What a run says fits its game."""
 
+import dataclasses
 from pathlib import Path
 
-from openjax.commands.closing_words import closing_words, layouts_like
+from openjax.commands.run_words import closing_words, layouts_like, opening_words
 from openjax.learning import preset
 
 
@@ -18,3 +19,12 @@ def test_the_papers_game_is_judged_by_all_six():
     paper = preset("paper")
     assert len(layouts_like(paper.environment)) == 6
     assert not any("Easier" in line for line in closing_words(paper, Path("runs/train"), on_cpu=False))
+
+
+def test_a_changed_preset_is_not_announced_as_the_preset():
+    flight = preset("flight")
+    assert opening_words(dataclasses.replace(flight, seed=3)).startswith(
+        "preset flight: Policies to be flown"
+    )
+    changed = preset("flight", environment=dict(evader_speed=2.0), num_envs=20480)
+    assert opening_words(changed).startswith("preset flight, changed in environment.evader_speed, num_envs: ")
