@@ -67,8 +67,8 @@ def compile_first_flights(
                 break
             carry, parts = some(carry, key, jnp.int32(before))
             done = min(before + TOGETHER, how.updates)
+            shown = {name: float(value) for name, value in parts.items()}  # waits for them
             left = (time.monotonic() - started) * (how.updates / done - 1.0)
-            shown = {name: float(value) for name, value in parts.items()}
             say(
                 f"{done} of {how.updates} updates, {duration(left)} left | evader not caught {shown['free']:.0%} of the time, "
                 f"pursuers {shown['distance']:.2f} m out of reach, crashing {shown['crashes']:.1%}"
