@@ -11,6 +11,7 @@ from __future__ import annotations
 import functools
 import json
 import math
+import random
 import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
@@ -58,6 +59,8 @@ def fly(
     worlds = Worlds([draw(seed, latest) for seed in seeds], layout, policy_name, separation)
     for _ in range(round(seconds / 0.01)):
         worlds.tick()
+        if worlds.over:
+            break
     return worlds.records(seeds, layout)
 
 
@@ -161,6 +164,12 @@ class Worlds:
         report = self.swarm.vehicles.report
         off = [f.set_point(self.swarm.now).mode == 0 for f in self.swarm.firmware]
         self._tracks.append(np.column_stack([report.position, off]))
+
+    @property
+    def over(self) -> bool:
+        """Whether all have lain on the floor with their motors off for half a second."""
+        late = np.array(self._tracks[-50:])
+        return len(late) == 50 and bool(((late[..., 2] < 0.02) & (late[..., 3] > 0.0)).all())
 
     def _play_on(self):
         from openjax.flying.game import pose_array
@@ -297,8 +306,9 @@ def main() -> None:
     jobs = []
     for k, layout in enumerate(arguments.layouts):
         mine = [s for s in seeds if (s // len(KINDS)) % len(arguments.layouts) == k]
+        mine.sort(key=lambda s: s % len(KINDS))  # flights of a kind end together
         jobs += [(mine[i : i + arguments.batch], layout) for i in range(0, len(mine), arguments.batch)]
-    jobs.sort(key=lambda job: job[0][0])
+    random.Random(arguments.seed).shuffle(jobs)
     records = []
     with ProcessPoolExecutor(arguments.processes, mp_context=get_context("spawn")) as pool:
         waiting = iter(jobs)

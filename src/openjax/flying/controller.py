@@ -89,6 +89,13 @@ def up(quaternion) -> float:
     return 1.0 - 2.0 * (x * x + y * y)
 
 
+def level_acceleration(quaternion) -> Vector:
+    """The acceleration (m/s^2, world) of a vehicle at this attitude that holds its height."""
+    w, x, y, z = quaternion
+    lift = max(up(quaternion), 0.3)
+    return (2 * (x * z + w * y) / lift * GRAVITY, 2 * (y * z - w * x) / lift * GRAVITY, 0.0)
+
+
 def moved_on(pose: Pose, now: float) -> Pose:
     """The pose at `now` (s) if velocity and body rates have stayed what they were."""
     age = now - pose.time

@@ -6,11 +6,10 @@ master/functional-areas/crtp/); a packet is one byte of header and up to 30 byte
 
 from __future__ import annotations
 
+import math
 import struct
 from enum import IntEnum, IntFlag
 from typing import NamedTuple
-
-import numpy as np
 
 PROTOCOL_VERSION = 12
 """The version answered: tables of contents with 16-bit ids (4 and up), arming by the supervisor's port (12)."""
@@ -104,21 +103,21 @@ def pack_number(fmt: str, value: float) -> bytes:
 
 def compress_quaternion(wxyz) -> int:
     """A unit quaternion (4,) wxyz in 32 bits: which component is largest, then sign and 9 bits of the others."""
-    xyzw = np.roll(np.asarray(wxyz, float), -1)
-    xyzw = xyzw / np.linalg.norm(xyzw)
-    largest = int(np.argmax(np.abs(xyzw)))
+    w, *xyz = map(float, wxyz)
+    xyzw = (*xyz, w)
+    size = math.hypot(*xyzw)
+    largest = max(range(4), key=lambda i: abs(xyzw[i]))
     packed = largest
-    for i in range(4):
+    for i, value in enumerate(xyzw):
         if i != largest:
-            negative = int((xyzw[i] < 0) != (xyzw[largest] < 0))
-            size = min(round(511 * abs(xyzw[i]) * 2**0.5), 511)
-            packed = packed << 10 | negative << 9 | size
+            negative = int((value < 0) != (xyzw[largest] < 0))
+            packed = packed << 10 | negative << 9 | min(round(511 * abs(value) / size * 2**0.5), 511)
     return packed
 
 
-def expand_quaternion(packed: int) -> np.ndarray:
-    """(4,) wxyz from 32 bits, see `compress_quaternion`; precise to about 1e-3."""
-    xyzw, largest, square = np.zeros(4), packed >> 30, 0.0
+def expand_quaternion(packed: int) -> tuple[float, float, float, float]:
+    """wxyz from 32 bits, see `compress_quaternion`; precise to about 1e-3."""
+    xyzw, largest, square = [0.0] * 4, packed >> 30, 0.0
     for i in (3, 2, 1, 0):
         if i != largest:
             value = (packed & 0x1FF) / 511 / 2**0.5
@@ -126,4 +125,4 @@ def expand_quaternion(packed: int) -> np.ndarray:
             square += value * value
             packed >>= 10
     xyzw[largest] = max(0.0, 1.0 - square) ** 0.5
-    return np.roll(xyzw, 1)
+    return (xyzw[3], *xyzw[:3])

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
-from openjax.flying.controller import Airframe, Pose, Vector
+from openjax.flying.controller import Airframe, Pose, Vector, level_acceleration
 from openjax.flying.set_point import RATES, SetPoint
 from openjax.ranges import Interval, check_intervals
 
@@ -70,10 +70,14 @@ class SafetySettings:
 
 
 def stopping_point(settings: SafetySettings, pose: Pose) -> Vector:
-    """Where a vehicle comes to rest that brakes now (m)."""
-    speed = math.dist(pose.velocity, (0.0, 0.0, 0.0))
-    time = settings.reaction + speed / (2.0 * settings.braking)
-    return tuple(p + time * v for p, v in zip(pose.position, pose.velocity, strict=True))
+    """Where a vehicle comes to rest that brakes now (m): what its tilt asks for fades while it turns the other way."""
+    turn, tilted = settings.reaction, level_acceleration(pose.quaternion)
+    velocity = [v + turn / 2.0 * a for v, a in zip(pose.velocity, tilted, strict=True)]
+    time = math.hypot(*velocity) / (2.0 * settings.braking)
+    return tuple(
+        p + turn * v + turn**2 / 3.0 * a + time * w
+        for p, v, a, w in zip(pose.position, pose.velocity, tilted, velocity, strict=True)
+    )
 
 
 def fence_velocity(settings: SafetySettings, pose: Pose) -> Vector | None:

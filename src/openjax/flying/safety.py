@@ -16,11 +16,11 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from openjax.flying.controller import (
-    GRAVITY,
     Airframe,
     Pose,
     Vector,
     accelerate,
+    level_acceleration,
     moved_on,
     nominal_airframe,
     up,
@@ -218,20 +218,13 @@ def _sense(settings, limits, drone, sample, now, dt) -> Drone:
     drone = replace(drone, own=own, captured=captured, distrusted=distrusted)
     if source.fresh(now, limits):
         estimate = moved_on(source.pose, max(now, source.pose.time))
-        return replace(drone, estimate=estimate, seen=source.pose.time, acceleration=_tilted(estimate))
+        return replace(drone, estimate=estimate, seen=source.pose.time, acceleration=level_acceleration(estimate.quaternion))
     if drone.estimate is None:
         return drone
     old = drone.estimate
     velocity = tuple(v + dt * a for v, a in zip(old.velocity, drone.acceleration, strict=True))
     position = tuple(p + dt * v for p, v in zip(old.position, velocity, strict=True))
     return replace(drone, estimate=old._replace(time=now, position=position, velocity=velocity))
-
-
-def _tilted(pose) -> Vector:
-    """The acceleration (m/s^2) of a vehicle at this attitude that holds its height."""
-    w, x, y, z = pose.quaternion
-    lift = max(up(pose.quaternion), 0.3)
-    return (2 * (x * z + w * y) / lift * GRAVITY, 2 * (y * z - w * x) / lift * GRAVITY, 0.0)
 
 
 def _with_motion(pose, last, own) -> Pose:

@@ -112,7 +112,7 @@ class Member:
             self._onboard.host(stamp, now),
             tuple(1e-3 * v for v in values[:3]),
             tuple(1e-3 * v for v in values[3:6]),
-            tuple(expand_quaternion(values[6]).tolist()),
+            expand_quaternion(values[6]),
             tuple(math.radians(v) for v in values[7:10]),
         )
         self.voltage, self.supervisor = 1e-3 * values[10], values[11]

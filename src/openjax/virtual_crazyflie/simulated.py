@@ -147,7 +147,7 @@ class SimulatedSwarm:
             position, velocity = np.round(
                 [report.position[i], report.velocity[i]] + self._offsets[i], 3
             ).tolist()
-            on_board = tuple(expand_quaternion(compress_quaternion(quaternion)).tolist())
+            on_board = expand_quaternion(compress_quaternion(quaternion.tolist()))
             own = self._radio(i, self.now, Pose(self.now, tuple(position), tuple(velocity), on_board, rates))
             captured = self._camera(i, self.now, seen) if self._captured else None
             voltage = self.uplinks[i].voltage
