@@ -73,7 +73,7 @@ class Arguments:
 
 def kinds() -> list[str]:
     """All kinds of faults, signals first."""
-    signals = [f"{name} {role}" for name in SIGNALS for role in ROLES]
+    signals = [f"{name} {role}" for name in SIGNALS for role in ROLES] + ["TERM group", "HUP group"]
     pairs = [f"{name} {pair}" for name in ("KILL", "STOP") for pair in PAIRS]
     return [
         *signals,
@@ -356,8 +356,9 @@ class Flown:
             self._try_second()
 
     def _kill(self, name, role):
+        send, role = (os.killpg, "loop") if role == "group" else (os.kill, role)
         with contextlib.suppress(ProcessLookupError, KeyError):
-            os.kill(self._pids[role], getattr(signal, f"SIG{name}"))
+            send(self._pids[role], getattr(signal, f"SIG{name}"))
 
     def _strangers(self):
         """Scans, echoes, requests and noise from another address; set-points aren't among them."""

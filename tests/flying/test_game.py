@@ -19,7 +19,7 @@ def test_the_packed_tick_plays_as_the_games_own_functions():
     slots = max(settings.max_pillars, len(scenario.pillars))
     task = scenario_task(dataclasses.replace(settings, max_pillars=slots), scenario)
     game = Game(policy, task)
-    first, tick = (jax.jit(function) for function in game_functions(policy, task)[2:])
+    first, tick = (jax.jit(function) for function in game_functions(policy)[2:])
 
     offsets = np.array([[0.1, 0.0, 0.0], [-0.1, 0.1, 0.0], [0.0, -0.2, 0.1]])
 
@@ -28,7 +28,7 @@ def test_the_packed_tick_plays_as_the_games_own_functions():
         return [Pose(0.0, tuple(place + offset), (0.1, 0.2, 0.0), level) for offset in offsets]
 
     play = game.start(poses(np.array([0.0, 0.5, 0.6])))
-    state, action = first(pose_array(poses(np.array([0.0, 0.5, 0.6]))))
+    state, action = first(task, pose_array(poses(np.array([0.0, 0.5, 0.6]))))
     np.testing.assert_allclose(play.action, action, atol=1e-6)
     caught = False
     for step in range(1, 31):

@@ -4,9 +4,12 @@ import itertools
 import os
 import pty
 import signal
+import subprocess
+import sys
 
 import pytest
 
+from openjax.flying.board import DEAF
 from openjax.flying.keys import LANDING, Operator
 from openjax.flying.safety import Request
 
@@ -70,3 +73,24 @@ def test_a_terminal_that_is_gone_lands_once(terminal):
         os.close(ours)
         assert operator() is Request.LAND
         assert operator() is Request.NONE
+
+
+ALONE = """
+import os
+from openjax.flying.board import stand_alone
+stand_alone()
+print(os.getsid(0) == os.getpid(), flush=True)
+print(input())
+"""
+
+
+def test_who_stands_alone_is_deaf_to_a_terminal_and_its_end():
+    command = [sys.executable, "-c", ALONE]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout.readline() == "True\n"
+            for name in DEAF:
+                process.send_signal(getattr(signal, name))
+            assert process.communicate("still there\n")[0] == "still there\n"
+        finally:
+            process.kill()

@@ -218,6 +218,12 @@ def test_the_fence_turns_back_what_could_not_stop_any_more():
     assert fence_velocity(LIMITS, Pose(0.0, (0.6, 0.0, 0.5), (0.3, 0.0, 0.0), LEVEL)) is None
     back = fence_velocity(LIMITS, Pose(0.0, (0.8, 0.0, 0.5), (1.0, 0.0, 0.0), LEVEL))
     assert back[0] < 0.0
+    # 35 degrees outwards must be undone first, 35 inwards brake already
+    half = math.radians(17.5)
+    outwards, inwards = ((math.cos(half), 0.0, sign * math.sin(half), 0.0) for sign in (1.0, -1.0))
+    assert fence_velocity(LIMITS, Pose(0.0, (0.6, 0.0, 0.5), (1.0, 0.0, 0.0), outwards))[0] < 0.0
+    assert fence_velocity(LIMITS, Pose(0.0, (0.65, 0.0, 0.5), (1.0, 0.0, 0.0), LEVEL)) is None
+    assert fence_velocity(LIMITS, Pose(0.0, (0.7, 0.0, 0.5), (1.0, 0.0, 0.0), inwards)) is None
 
 
 numbers = st.floats(-3.0, 3.0)

@@ -34,10 +34,10 @@ class Play(NamedTuple):
     crashed: np.ndarray  # (N,)
 
 
-def game_functions(policy, task: Task):
+def game_functions(policy):
     """The game's settings and airframe, and its two steps as pure functions of arrays, to compile or to map.
 
-    first(poses (N, 13)) -> state, action (N, 4): an episode begins with the pursuers at `poses`.
+    first(task, poses (N, 13)) -> state, action (N, 4): an episode begins with the pursuers at `poses`.
     tick(state, action, poses, evader (3,), evader_measured ()) -> state, action, *fields of `Play` but the first: one
     control step later they are at `poses`.
     """
@@ -53,7 +53,7 @@ def game_functions(policy, task: Task):
         size = jnp.linalg.norm(drones["quaternion"], axis=1, keepdims=True)
         return drones | {"quaternion": drones["quaternion"] / size}
 
-    def first(poses):
+    def first(task: Task, poses):
         drones = drones_of(poses)
         _, state = environment.reset_to(jax.random.key(0), task.replace(pursuer_position=drones["position"]))
         state = state.replace(drones=state.drones.replace(**drones))
@@ -89,13 +89,13 @@ class Game:
 
     def __init__(self, policy, task: Task):
         self.task = jax.tree.map(np.asarray, task)
-        self.settings, self.airframe, first, tick = game_functions(policy, task)
+        self.settings, self.airframe, first, tick = game_functions(policy)
         poses = [
             Pose(0.0, (0.3 * i, 0.0, 0.5), (0.0,) * 3, (1.0, 0.0, 0.0, 0.0))
             for i in range(self.settings.num_pursuers)
         ]
         example = pose_array(poses)
-        kinds = jax.eval_shape(first, example)
+        kinds = jax.eval_shape(first, task, example)
         nothing = jax.tree.map(lambda kind: jnp.zeros(kind.shape, kind.dtype), kinds)
         flat, unflatten = ravel_pytree(nothing)
         nowhere = (np.zeros(3, np.float32), np.zeros((), bool))
@@ -107,7 +107,7 @@ class Game:
         # the state as one array: as a tree of some thirty the call takes half as long again
 
         def begin(poses):
-            state, action = first(poses)
+            state, action = first(task, poses)
             return ravel_pytree((state, action))[0], action
 
         def move(flat, poses, evader, evader_measured):
