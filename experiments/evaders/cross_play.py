@@ -7,6 +7,8 @@ clamp on the speed, the rate loop at 500 Hz. Writes experiments/results/evaders.
 
 import dataclasses
 import functools
+from collections import defaultdict
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +19,7 @@ from experiments.table import Page, Table, page_parser, publish
 from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import layout_slots, repeat_task
 from openjax.commands.validation import uniform_tasks
+from openjax.files import read_json
 from openjax.learning.best_response import make_duel
 from openjax.pursuit import (
     SCENARIOS,
@@ -122,36 +125,85 @@ def wilson(successes: int, number: int) -> tuple[float, float]:
 
 
 def study(options) -> dict:
-    """Fly the policies."""
-    return {"records": [record for name in options.policy for record in fly(name, options)]}
+    """Fly the policies, beside what other runs found."""
+    found = [read_json(path) for path in options.add]
+    records = [record for other in found if "curve" not in other for record in other["records"]]
+    return {
+        "records": records + [record for name in options.policy for record in fly(name, options)],
+        "best_responses": [other for other in found if "curve" in other],
+    }
 
 
 def page(results: dict) -> Page:
-    """Capture rates and crashes by evader, a table for each policy and vehicle."""
-    parts = []
-    records = results["records"]
-    for policy, game, vehicle in dict.fromkeys((r["policy"], r["game"], r["vehicle"]) for r in records):
-        own = [r for r in records if (r["policy"], r["game"], r["vehicle"]) == (policy, game, vehicle)]
-        rows = []
-        for evader in dict.fromkeys(r["evader"] for r in own):
-            by_task = {r["tasks"]: r for r in own if r["evader"] == evader}
-            rates = {name: f"{r['capture_rate']:.3f}, {r['crash_rate']:.3f}" for name, r in by_task.items()}
-            low = min(r["interval"][0] for r in by_task.values())
-            rows.append({"evader": evader, "of": EVADERS[evader].of, "low": low, **rates})
-        columns = {"evader": "evader", "used for": "of", **{name: name for name in by_task}}
-        columns["least lower end"] = "low:.3f"
-        parts.append(Table(columns, rows, title=f"{policy}, {game} game, {vehicle} vehicle"))
+    """First what matters of each policy and vehicle, then capture rates and crashes by evader and by best response."""
+    records, of = results["records"], ("policy", "game", "vehicle")
+    by_policy = defaultdict(list)
+    for record in records:
+        by_policy[tuple(record[name] for name in of)].append(record)
+    columns = {
+        **{name: name for name in of},
+        "the paper's field: capture": "field.capture:.3f",
+        "crash": "field.crash:.3f",
+        "steps": "field.step:.0f",
+        "mean of the held-out evaders": "held_out.mean:.3f",
+        "crash, held out": "held_out.crash:.3f",
+        "worst scripted evader and layout": "worst",
+    }
+    rows = [dict(zip(of, name, strict=True)) | overview(own) for name, own in by_policy.items()]
+    parts: list[Table | str] = [Table(columns, rows, title="Overview, the six layouts")]
+    for name, own in by_policy.items():
+        parts.append(by_evader(own, "tasks", f"{name[0]}, {name[1]} game, {name[2]} vehicle"))
+    for response in results.get("best_responses", ()):
+        steps = response["curve"][-1]["steps"] / 1e6
+        title = f"{response['policy']} against evaders that learned {steps:.0f} million steps against it, in its own game"
+        parts.append(by_evader(response["records"], "scenario", title))
     prose = (
         "Capture rate, crash rate. The last column is the least lower end of the capture rates' 95 % intervals. "
-        "Held-out evaders were never trained on, nor were checkpoints chosen by them."
+        "Held-out evaders were never trained on, nor were checkpoints chosen by them. Crashes count to the end of the 8 s, "
+        "after the capture too."
     )
     return Page("Policies against evaders", prose, parts)
+
+
+def overview(records: list[dict]) -> dict:
+    """Of one policy and vehicle on the layouts: the paper's evader, the held-out ones, the worst cell."""
+    layouts = [record for record in records if record["tasks"] in SCENARIOS]
+
+    def mean(rows, figure):
+        return float(np.mean([row[figure] for row in rows]))
+
+    field = [row for row in layouts if row["evader"] == "field"]
+    held_out = [row for row in layouts if row["of"] == "held out"]
+    worst = min(layouts, key=lambda row: row["capture_rate"])
+    return {
+        "field": {
+            "capture": mean(field, "capture_rate"),
+            "crash": mean(field, "crash_rate"),
+            "step": mean(field, "capture_step"),
+        },
+        "held_out": {"mean": mean(held_out, "capture_rate"), "crash": mean(held_out, "crash_rate")},
+        "worst": f"{worst['capture_rate']:.2f} ({worst['evader']}, {worst['tasks']})",
+    }
+
+
+def by_evader(records: list[dict], kind: str, title: str) -> Table:
+    """A row for each evader, a column for each `kind` of tasks."""
+    rows = []
+    for evader in dict.fromkeys(record["evader"] for record in records):
+        own = {record[kind]: record for record in records if record["evader"] == evader}
+        rates = {name: f"{r['capture_rate']:.3f}, {r['crash_rate']:.3f}" for name, r in own.items()}
+        low = min(wilson(round(r["capture_rate"] * r["episodes"]), r["episodes"])[0] for r in own.values())
+        of = EVADERS[evader].of if evader in EVADERS else "learned against it"
+        rows.append({"evader": evader, "of": of, "low": low, **rates})
+    columns = {"evader": "evader", "used for": "of", **{name: name for name in own}}
+    return Table(columns | {"least lower end": "low:.3f"}, rows, title=title)
 
 
 def main(arguments: list[str]) -> int:
     """Evaluate and write both files."""
     parser = page_parser(__doc__, "evaders")
-    parser.add_argument("--policy", nargs="+", default=["flight"], help="names, runs or policy files")
+    parser.add_argument("--add", nargs="*", type=Path, default=[], help="files of other runs, or of exploit")
+    parser.add_argument("--policy", nargs="*", default=["flight"], help="names, runs or policy files")
     parser.add_argument("--game", choices=("own", "honest"), default="honest")
     parser.add_argument("--physics", choices=("rigid", "stops"), default="rigid")
     parser.add_argument("--vehicles", nargs="+", default=["nominal", "table", "family"])

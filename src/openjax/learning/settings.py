@@ -414,7 +414,7 @@ def evaders_second() -> TrainSettings:
         evaders(),
         # under full penalties, those who had learnt them before they met fast evaders hovered far from these
         environment=dict(min_pillars=0, reward=dict(distance=0.3)),
-        mappo=dict(actor_start=0.01, penalty_start=0.3, penalty_ramp=0.5),
+        mappo=dict(actor_start=0.01, penalty_start=0.1, penalty_ramp=0.6),
         analytic=dict(updates=0),
         vehicles_start=0.0,
         vehicles_ramp=0.0,
