@@ -81,6 +81,7 @@ def kinds() -> list[str]:
         "terminal closed",
         "KILL links then guard",
         "KILL loop then links",
+        "KILL links then space",
         *KEYS,
         *POSES,
         *START,
@@ -346,7 +347,8 @@ class Flown:
             time.sleep(0.3 if second in KEYS else 0.05)
             if second in KEYS:
                 os.write(self._terminal, KEYS[second].encode())
-            self._kill("KILL", second)
+            else:
+                self._kill("KILL", second)
         elif name in SIGNALS:
             for role in target.split("+"):
                 self._kill(name, role)

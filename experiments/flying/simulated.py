@@ -286,7 +286,9 @@ def summary(records) -> list[dict]:
     """A row per kind."""
     rows = []
     for kind in (*KINDS, "none", ALL):
-        mine = [r for r in records if kind == r["kind"] or (kind == ALL and r["kind"] not in (FOLLOWED, "none"))]
+        mine = [
+            r for r in records if kind == r["kind"] or (kind == ALL and r["kind"] not in (FOLLOWED, "none"))
+        ]
         if not mine:
             continue
         seconds = [r["seconds"] for r in mine if r["seconds"] is not None and r["kind"] not in SLOW]

@@ -218,7 +218,12 @@ def _sense(settings, limits, drone, sample, now, dt) -> Drone:
     drone = replace(drone, own=own, captured=captured, distrusted=distrusted)
     if source.fresh(now, limits):
         estimate = moved_on(source.pose, max(now, source.pose.time))
-        return replace(drone, estimate=estimate, seen=source.pose.time, acceleration=level_acceleration(estimate.quaternion))
+        return replace(
+            drone,
+            estimate=estimate,
+            seen=source.pose.time,
+            acceleration=level_acceleration(estimate.quaternion),
+        )
     if drone.estimate is None:
         return drone
     old = drone.estimate
