@@ -21,8 +21,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-import numpy as np
 import tyro
+
+from experiments.table import Table
 
 LAYOUTS = ("wall", "narrow_gap", "random", "passage", "hidden")
 LINKS = (
@@ -58,7 +59,7 @@ LANDING = 60.0
 """Seconds that a flight has for its landing and its files, once it was asked to end."""
 
 
-def pair(arguments, number: int, out: Path, virtual: list[str], fly: list[str], seconds: float) -> dict:
+def pair(arguments, number: int, out: Path, virtual: str, fly: str, seconds: float) -> dict:
     """Fly with virtual Crazyflies of their own, landing after `seconds` if the games aren't over before.
 
     Returns what flight.json says, or why there is none.
@@ -66,62 +67,54 @@ def pair(arguments, number: int, out: Path, virtual: list[str], fly: list[str], 
     port = PORTS + 10 * number
     environment = {**os.environ, "JAX_PLATFORMS": "cpu", "OMP_NUM_THREADS": "1"}
     own = [f"--{option}" for option in arguments.virtual]
-    command = [sys.executable, "-m", "openjax.virtual_crazyflie", "--port", str(port), *virtual, *own]
-    vehicles = subprocess.Popen(
-        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
-    try:
-        said = vehicles.stdout.readline()
-        if "listening" not in said:
-            return {"error": said + vehicles.stdout.read()}
-        uris = [f"udp://127.0.0.1:{port + i}" for i in range(3)]
-        command = [sys.executable, "-m", "openjax.fly", "--policy", arguments.policy, "--out", str(out), *fly]
-        command += ["--body_logs", str(arguments.body_logs)]
-        flying = subprocess.Popen(
-            [*command, "--uri", *uris],
-            env=environment,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+    command = [sys.executable, "-m", "openjax.virtual_crazyflie", "--port", str(port), *virtual.split(), *own]
+    pipes = {"env": environment, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    with subprocess.Popen(command, **pipes) as vehicles:
         try:
-            said, complaint = flying.communicate(timeout=seconds)
+            said = vehicles.stdout.readline()
+            if "listening" not in said:
+                return {"error": said}
+            uris = [f"udp://127.0.0.1:{port + i}" for i in range(3)]
+            command = [sys.executable, "-m", "openjax.fly", "--policy", arguments.policy, "--out", str(out)]
+            command += [*fly.split(), "--body_logs", str(arguments.body_logs), "--uri", *uris]
+            return flown(subprocess.Popen(command, **pipes), out, seconds)
+        finally:
+            vehicles.terminate()
+
+
+def flown(flying, out: Path, seconds: float) -> dict:
+    """What flight.json says once the process has ended, or why there is none."""
+    try:
+        said, _ = flying.communicate(timeout=seconds)
+    except subprocess.TimeoutExpired:
+        flying.send_signal(signal.SIGINT)  # Ctrl-C: all land, and the log is written
+        try:
+            said, _ = flying.communicate(timeout=LANDING)
         except subprocess.TimeoutExpired:
-            flying.send_signal(signal.SIGINT)  # Ctrl-C: all land, and the log is written
-            try:
-                said, complaint = flying.communicate(timeout=LANDING)
-            except subprocess.TimeoutExpired:
-                flying.kill()
-                return {"error": f"not over {LANDING:g} s after it was asked to land"}
-        print(out.name, " ".join((said[-500:] + complaint[-1500:]).split()), flush=True)
-        if flying.returncode != 0 or not (out / "flight.json").exists():
-            return {"error": said[-600:] + complaint[-1500:]}
-        return json.loads((out / "flight.json").read_text(encoding="utf-8"))
-    finally:
-        vehicles.terminate()
-        vehicles.wait()
+            flying.kill()
+            return {"error": f"not over {LANDING:g} s after it was asked to land"}
+    print(out.name, " ".join(said[-2000:].split()), flush=True)
+    if flying.returncode != 0 or not (out / "flight.json").exists():
+        return {"error": said[-2000:]}
+    return json.loads((out / "flight.json").read_text(encoding="utf-8"))
 
 
 def long(arguments) -> dict:
     """One flight, game after game, until the minutes are over: then it's asked to land."""
-    options = ["--scenario", "wall", "--episodes", str(max(1, int(20 * arguments.minutes)))]
-    place = arguments.out / "long"
-    return pair(arguments, 0, place, ["--endurance", "7200"], options, 60 * arguments.minutes)
+    options = f"--scenario wall --episodes {max(1, int(20 * arguments.minutes))}"
+    return pair(arguments, 0, arguments.out / "long", "--endurance 7200", options, 60 * arguments.minutes)
 
 
 def layouts(arguments) -> dict:
     """A few games on each layout."""
 
     def fly(number):
-        layout = LAYOUTS[number]
-        options = ["--scenario", layout, "--episodes", str(arguments.games)]
-        out = arguments.out / f"layout_{layout}"
-        return layout, pair(
-            arguments, 20 + number, out, ["--scenario", layout], options, 120 + 20 * arguments.games
-        )
+        scenario = f"--scenario {LAYOUTS[number]}"
+        out, games = arguments.out / f"layout_{LAYOUTS[number]}", arguments.games
+        return pair(arguments, 20 + number, out, scenario, f"{scenario} --episodes {games}", 120 + 20 * games)
 
     with ThreadPoolExecutor(max(1, arguments.at_once // 2)) as pool:
-        return dict(pool.map(fly, range(len(LAYOUTS))))
+        return dict(zip(LAYOUTS, pool.map(fly, range(len(LAYOUTS))), strict=True))
 
 
 def links(arguments) -> dict:
@@ -129,21 +122,10 @@ def links(arguments) -> dict:
 
     def fly(number):
         latency, loss = LINKS[number]
-        name = f"latency_{latency:g}_loss_{100 * loss:g}"
-        virtual = [
-            "--latency_ms",
-            str(latency),
-            "--loss",
-            str(loss),
-            "--seed",
-            str(number),
-            "--scenario",
-            "random",
-        ]
-        options = ["--scenario", "random", "--episodes", str(arguments.games)]
-        result = pair(
-            arguments, 1 + number, arguments.out / name, virtual, options, 60 + 20 * arguments.games
-        )
+        name, games = f"latency_{latency:g}_loss_{100 * loss:g}", arguments.games
+        virtual = f"--latency_ms {latency} --loss {loss} --seed {number} --scenario random"
+        options = f"--scenario random --episodes {games}"
+        result = pair(arguments, 1 + number, arguments.out / name, virtual, options, 60 + 20 * games)
         return name, {"latency_ms": latency, "loss": loss, **result}
 
     with ThreadPoolExecutor(max(1, arguments.at_once // 2)) as pool:
@@ -177,27 +159,20 @@ def diagnose(arguments, flown: dict) -> dict:
     return json.loads(predictions.read_text(encoding="utf-8"))
 
 
-def capture_table(figures) -> list[str]:
+def captures(figures) -> Table:
     """Flown and simulated captures, by layout."""
-    rows = [
-        "| layout | games | captured, flown | step, flown | captured, simulated | step, simulated | ratio |",
-        "|---|" + 6 * "---|",
-    ]
+    rows = []
     for layout, flight in figures["layouts"].items():
-        if "error" in flight:
-            rows.append(f"| {layout} | {' '.join(flight['error'].split())[-200:]} |")
-            continue
-        games = [g for g in flight["games"] if g["end"] == "over"]
-        steps = [g["capture_step"] or 800 for g in games]
-        row = figures.get("simulator", {}).get(layout)
-        mean = float(np.mean(steps)) if steps else float("nan")
-        caught = float(np.mean([g["capture_step"] is not None for g in games])) if games else float("nan")
-        simulated = (row["capture_rate"], row["capture_step"]) if row else (float("nan"), float("nan"))
-        rows.append(
-            f"| {layout} | {len(games)} | {caught:.2f} | {mean:.0f} | {simulated[0]:.2f} | {simulated[1]:.0f} "
-            f"| {mean / simulated[1]:.2f} |"
-        )
-    return rows
+        games = [g for g in flight.get("games", ()) if g["end"] == "over"]
+        rows.append({
+            "layout": layout, "games": games, "caught": [g["capture_step"] is not None for g in games],
+            "steps": [g["capture_step"] or 800 for g in games], **figures.get("simulator", {}).get(layout, {}),
+        })  # fmt: skip
+    columns = {
+        "layout": "layout", "games": lambda row: len(row["games"]), "captured, flown": "caught:.2f", "step, flown": "steps:.0f",
+        "captured, simulated": "capture_rate:.2f", "step, simulated": "capture_step:.0f",
+    }  # fmt: skip
+    return Table(columns, rows)
 
 
 def main() -> None:
@@ -217,14 +192,8 @@ def main() -> None:
     if arguments.part == "diagnose":
         figures["diagnosis"] = diagnose(arguments, figures["links"])
     path.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
-    if "long" in figures:
-        print(
-            "long", json.dumps(figures["long"].get("timing", figures["long"])), figures["long"].get("reasons")
-        )
     if "layouts" in figures:
-        print("\n".join(capture_table(figures)))
-    for name, flight in figures.get("links", {}).items():
-        print(name, flight.get("error") or [g["steps"] for g in flight["games"]], flight.get("reasons"))
+        print("\n".join(captures(figures).lines()))
 
 
 if __name__ == "__main__":

@@ -22,7 +22,8 @@ import numpy as np
 import tyro
 
 from experiments.flying.faults import FOLLOWED, KINDS, Fault, PoseDamage, draw_fault
-from experiments.table import RESULTS, Table, facts
+from experiments.table import RESULTS, Page, Table, facts, write_page
+from openjax.files import read_json
 
 LATEST, SECONDS = 4.0, 10.0
 """Nothing begins to go wrong after; flown in all (s)."""
@@ -327,17 +328,23 @@ def main() -> None:
             running.discard(done)
             records += done.result()
             write(arguments, records, time.time() - begin)
-    print("\n".join(table_of(summary(records)).lines()))
+    write_page(arguments.out, page, read_json(arguments.out))
 
 
-def table_of(rows) -> Table:
-    """Of `summary`."""
+def page(results) -> Page:
+    """Rows of `summary`."""
+    prose = (
+        f"{sum(r['faults'] for r in results['summary'] if r['kind'] in KINDS)} flights of three vehicles with the policy "
+        f"`{results['policy']}`, one fault each, from its moment to the end. As they must: nobody more than {MARGIN:g} m out "
+        f"of the arena (.9 m), no fall from above {FALL:g} m, nobody down hard, nobody armed at the end, motors off on the "
+        f"floor {ENDING:g} s after a fault that ends the flight."
+    )
     columns = {
         "fault": "kind", "flights": "faults:d", "as they must": "well:d", "landed": "landed:d",
         "out by more than .1 m": "out:d", "farthest (m)": "farthest:.2f", "fell": "fell:d", "hard": "hard:d",
         "on at the end": "armed:d", "longest end (s)": "longest:.1f", "nearest two (m)": "nearest:.2f",
     }  # fmt: skip
-    return Table(columns, rows)
+    return Page("Faults where they happen, in simulated time", prose, Table(columns, results["summary"]))
 
 
 def write(arguments, records, seconds) -> None:
