@@ -156,13 +156,8 @@ def worker(arguments, queue, done, ends) -> None:
     from openjax.flying import real_time
 
     virtual = VirtualProcess(arguments.scenario)
-    fly = FlyArguments(
-        policy=arguments.policy,
-        scenario=arguments.scenario,
-        uri=tuple(virtual.uris),
-        episode_seconds=8.0,
-        body_logs=1,
-    )
+    of_both = {name: getattr(arguments, name) for name in ("policy", "scenario")}
+    fly = FlyArguments(**of_both, uri=tuple(virtual.uris), episode_seconds=8.0, body_logs=1)
     prepared = prepare(fly)
     real_time.hurry()
     while time.time() < ends:
@@ -411,11 +406,7 @@ class Flown:
         seconds = None if over is None or injected is None else float(times[late][over] - injected)
         fell = bool((off & (position[..., 2] > FALL))[late][:, held].any())
         armed = bool(track["armed"][-1][held].any())
-        said = [
-            line
-            for line in self._said.decode(errors="replace").replace("\r", "\n").split("\n")
-            if line.strip()
-        ]
+        said = [line for line in self._said.decode(errors="replace").splitlines() if line.strip()]
         row = {
             "number": self._number, "kind": self._kind, "time": round(min(max(fault.time, 0.0), 99.0), 2), "status": status,
             "took_off": not math.isinf(self._virtual.truth.take_off), "out": round(float(out.max(initial=-1.0)), 3), "fell": fell,

@@ -26,24 +26,17 @@ from openjax.vehicle import load_vehicle
 from openjax.vehicle.family import family_bounds, find_parameter, vehicle_family
 
 TABLE = {
-    "motor_lag.extra_up": 0.04,
-    "motor_lag.extra_down": 0.04,
-    "command_latency.delay": 0.015,
-    "state_latency.delay": 0.01,
-    "rotor_drag.d_xy": 0.0125,
-    "rotor_drag.d_z": 0.0125,
-}
+    "motor_lag.extra_up": 0.04, "motor_lag.extra_down": 0.04, "command_latency.delay": 0.015, "state_latency.delay": 0.01,
+    "rotor_drag.d_xy": 0.0125, "rotor_drag.d_z": 0.0125,
+}  # fmt: skip
 FLIGHT_FAMILY = vehicle_family()
 NAMES = [entry[0] for entry in FLIGHT_FAMILY]
 EFFECTS = sorted({name.partition(".")[0] for name in NAMES})
 WHOLE = "family"
 FIGURES = {
-    "capture": "capture_rate:.3f",
-    "step": "capture_step:.0f",
-    "collision": "collision_rate:.4f",
-    "crash": "crash_rate:.4f",
-    "over speed": "over_speed_rate:.4f",
-}
+    "capture": "capture_rate:.3f", "step": "capture_step:.0f", "collision": "collision_rate:.4f",
+    "crash": "crash_rate:.4f", "over speed": "over_speed_rate:.4f",
+}  # fmt: skip
 
 
 def vehicles() -> dict[str, np.ndarray]:
@@ -74,13 +67,8 @@ def program(settings, policy):
 
 
 def fly(
-    name: str,
-    number: int,
-    layouts: int,
-    physics: str,
-    chosen: list[str] | None = None,
-    attitude: str = "drawn",
-) -> dict[str, dict[str, dict]]:
+    name: str, number: int, layouts: int, physics: str, chosen: list[str] | None = None, attitude: str = "drawn"
+) -> dict[str, dict[str, dict]]:  # fmt: skip
     """Summaries by vehicle (all kinds, or those `chosen`) and kind of task."""
     loaded = load_policy(name)
     game = dataclasses.replace(
@@ -146,12 +134,8 @@ def study(options) -> dict:
         name: fly(name, options.number, options.layouts, options.physics, options.vehicles, options.attitude)
         for name in options.policy
     }
-    return {
-        "number": options.number,
-        "layouts": options.layouts,
-        "attitude": options.attitude,
-        "policies": policies,
-    }
+    drawn_by = {name: getattr(options, name) for name in ("number", "layouts", "attitude")}
+    return {**drawn_by, "policies": policies}
 
 
 def page(results: dict) -> Page:

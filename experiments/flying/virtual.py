@@ -32,16 +32,8 @@ class Truth:
 
     def write(self, now: float, report) -> None:
         """The vehicles are as `report` says at `now` (s)."""
-        rows = np.column_stack(
-            [
-                np.full(self.number, now),
-                report.position,
-                report.velocity,
-                report.quaternion,
-                report.body_rates,
-            ]
-        )
-        self._numbers[1:] = rows.ravel().tolist()
+        of_all = (report.position, report.velocity, report.quaternion, report.body_rates)
+        self._numbers[1:] = np.column_stack([np.full(self.number, now), *of_all]).ravel().tolist()
 
     def poses(self) -> list[Pose]:
         """Of all vehicles."""
@@ -149,13 +141,9 @@ class _Flown:
     def _spoil(self, now):
         """Do to a vehicle's link what the fault does."""
         fault = self._fault
-        lost = {
-            "packets lost": fault.amount,
-            "drone gone": 1.0,
-            "poses lost": 1.0,
-            "poses lost for a while": 1.0,
-        }
-        share = lost.get(fault.kind, 0.0) if fault.on(now) else 0.0
+        gone = fault.kind in ("drone gone", "poses lost", "poses lost for a while")
+        share = fault.amount if fault.kind == "packets lost" else float(gone)
+        share *= fault.on(now)
         uplink = share if fault.kind in ("packets lost", "drone gone") else 0.0
         link = self._virtual.links[fault.vehicle]
         link.faults = link.faults.__class__(loss=uplink, pose_loss=share)
