@@ -76,6 +76,6 @@ def test_well_outside_the_bound_greedy_evaders_get_away():
 def test_it_is_a_policy_like_the_others():
     environment = Pursuit(PursuitSettings(physics="stops"))
     policy = Heuristic.for_environment("stack", environment)
-    observation, _ = environment.reset(jax.random.key(0))
-    action = policy.act(policy.parameters(), observation)
+    observation, _ = jax.jit(environment.reset)(jax.random.key(0))
+    action = jax.jit(policy.act)(policy.parameters(), observation)
     assert action.shape == (3, 4) and np.isfinite(action).all()

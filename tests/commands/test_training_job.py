@@ -29,7 +29,7 @@ def test_last_stage_is_kept_where_it_validates_better(better, tmp_path, monkeypa
     environment = Pursuit(settings.environment)
     observation = jax.eval_shape(lambda key: environment.reset(key)[0], jax.random.key(0))
     observation = jax.tree.map(lambda kind: jnp.zeros(kind.shape, kind.dtype), observation)
-    before = build(settings, environment).policy.init(jax.random.key(1), observation)
+    before = jax.jit(build(settings, environment).policy.init)(jax.random.key(1), observation)
     directory = RunDirectory(tmp_path)
     save_policy_file(directory.policy, before, settings, {"update": 7}, storage="float32")
     job = types.SimpleNamespace(settings=settings, environment=environment)

@@ -24,7 +24,7 @@ def game():
 
 
 def test_flat_observation_is_all_that_a_pursuer_has(game):
-    observation, _ = game.reset(jax.random.key(0))
+    observation, _ = jax.jit(game.reset)(jax.random.key(0))
     flat = flat_observation(observation)
     assert flat.shape == (3, flat_size(game.settings))
     start = game.settings.self_size
@@ -35,7 +35,7 @@ def test_flat_observation_is_all_that_a_pursuer_has(game):
 
 
 def test_spaces_hold_what_the_game_gives(game):
-    observation, _ = game.reset(jax.random.key(1))
+    observation, _ = jax.jit(game.reset)(jax.random.key(1))
     assert jax.tree.all(jax.tree.map(lambda space, x: space.contains(x), game.observation_space, observation))
     assert game.action_space.contains(game.action_space.sample(jax.random.key(2)))
     assert not game.action_space.contains(np.full((3, 4), 1.5, np.float32))
@@ -86,7 +86,7 @@ def test_jaxmarl_interface_is_the_game_and_starts_anew(game):
     key = jax.random.key(4)
     observations, state = adapter.reset(key)
     jitted = jax.jit(game.step)
-    expected, expected_state = game.reset(key)
+    expected, expected_state = jax.jit(game.reset)(key)
     np.testing.assert_allclose(observations["pursuer_2"], flat_observation(expected)[2], atol=1e-6)
     actions = {agent: adapter.action_space(agent).sample(jax.random.key(5)) for agent in adapter.agents}
     for step in range(1, LENGTH + 1):

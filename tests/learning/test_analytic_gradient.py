@@ -54,8 +54,8 @@ def stage():
     )
     how = AnalyticSettings(updates=6, worlds=4, learning_rate=3e-3, hold=0.0)
     environment = free_flight(Pursuit(game))
-    observation, _ = environment.reset(jax.random.key(0))
-    return AnalyticGradient(how, environment, policy), policy.init(jax.random.key(1), observation)
+    observation, _ = jax.jit(environment.reset)(jax.random.key(0))
+    return AnalyticGradient(how, environment, policy), jax.jit(policy.init)(jax.random.key(1), observation)
 
 
 @pytest.mark.slow

@@ -34,8 +34,8 @@ def test_pursuers_come_nearer():
         environment, NetworkSettings(features=16, heads=1, squash="sample"), PredictorSettings(enabled=False)
     )
     flights = FirstFlights(how, environment, policy)
-    observation, _ = environment.reset(jax.random.key(0))
-    carry = jax.jit(flights.begin)(policy.init(jax.random.key(1), observation), jax.random.key(2))
+    observation, _ = jax.jit(environment.reset)(jax.random.key(0))
+    carry = jax.jit(flights.begin)(jax.jit(policy.init)(jax.random.key(1), observation), jax.random.key(2))
     some = jax.jit(make_first_flights(flights, 20))
     distances = []
     for done in range(0, 120, 20):
@@ -46,7 +46,7 @@ def test_pursuers_come_nearer():
 
 
 def test_an_evader_within_reach_is_not_free():
-    state = jax.vmap(Pursuit(GAME).reset)(jax.random.split(jax.random.key(0), 4))[1]
+    state = jax.jit(jax.vmap(Pursuit(GAME).reset))(jax.random.split(jax.random.key(0), 4))[1]
     near = state.drones.position.at[:, 0].set(state.evader_position + jnp.array([0.1, 0.0, 0.0]))
     near = state.replace(drones=state.drones.replace(position=near))
     assert evader_distance(near)[:, 0] == pytest.approx(0.1, abs=1e-3)

@@ -146,7 +146,7 @@ def test_greedy_against_plain_python():
 def test_one_that_knows_of_no_pursuer_waits():
     settings = scenario_settings(PursuitSettings(evaders=("greedy",)), SCENARIOS["hidden"])
     environment = make(settings, physics="stops", start_attitude="level")
-    _, state = environment.reset_to(jax.random.key(0), scenario_task(settings, SCENARIOS["hidden"]))
+    _, state = jax.jit(environment.reset_to)(jax.random.key(0), scenario_task(settings, SCENARIOS["hidden"]))
     assert not state.in_sight.any()
     for sees_all in (0.0, 1.0):
         numbers = state.evader.numbers | {"sees_all": jnp.float32(sees_all)}

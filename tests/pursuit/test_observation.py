@@ -32,7 +32,7 @@ def observed(seen=True, active=(True,) * 4, pillars=PILLARS, quaternion=TURNED, 
         pillar_position=jnp.asarray(pillars),
         pillar_active=jnp.asarray(active),
     )
-    _, state = Pursuit(settings).reset_to(jax.random.key(0), task)
+    _, state = jax.jit(Pursuit(settings).reset_to)(jax.random.key(0), task)
     state = state.replace(
         step=jnp.int32(200),
         drones=drones,

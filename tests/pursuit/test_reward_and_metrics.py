@@ -92,7 +92,7 @@ def test_capture_bounds_pillar_and_speed(play):
 
 def test_speed_counts_from_a_time_on():
     settings = dataclasses.replace(SETTINGS, reward=RewardSettings(over_speed_after=0.02))
-    _, before = Pursuit(settings).reset_to(jax.random.key(0), task(APART, (0, 0, 0.6)))
+    _, before = jax.jit(Pursuit(settings).reset_to)(jax.random.key(0), task(APART, (0, 0, 0.6)))
     none = jnp.zeros(3, bool)
     parts = Breaches(*[jnp.zeros(3)] * 3)
     info = StepInfo(none, jnp.zeros((), bool), parts, jnp.array([True, True, False]), none, jnp.zeros(3))
