@@ -1,0 +1,35 @@
+"""The first stage of a run stops when it is asked to, and keeps what was learnt until then."""
+
+import jax
+import numpy as np
+import pytest
+
+from openjax.commands.gradient_stages import TOGETHER, compile_first_flights
+from openjax.learning import build, make_start, preset
+
+SETTINGS = preset(
+    "quick",
+    environment=dict(num_pursuers=1, min_pillars=0, max_pillars=1),
+    network=dict(features=8, heads=1),
+    predictor=dict(enabled=False),
+    first_flights=dict(updates=2 * TOGETHER, worlds=4, steps=2),
+    num_envs=40,
+)
+
+
+@pytest.mark.slow
+def test_the_first_flights_stop_when_asked_to():
+    environment = build(SETTINGS).environment
+    fresh = make_start(SETTINGS)(jax.random.key(0)).policy
+    said, asked = [], iter([False, True])
+    learn = compile_first_flights(
+        SETTINGS, environment, jax.eval_shape(lambda: fresh), said.append, lambda: next(asked)
+    )
+    learnt = learn(fresh, jax.random.key(1))
+    assert len(said) == 1 and said[0].startswith(f"{TOGETHER} of {2 * TOGETHER} updates, ")
+    moved = [
+        np.abs(np.asarray(new) - old).max()
+        for new, old in zip(jax.tree.leaves(learnt.actor), jax.tree.leaves(fresh.actor), strict=True)
+    ]
+    assert 0.0 < max(moved) < 1.0
+    assert learnt.critic is fresh.critic
