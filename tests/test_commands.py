@@ -236,6 +236,12 @@ def test_shipped_policies_act_in_their_game_and_refuse_another():
             policy(jax.eval_shape(other.reset, jax.random.key(0))[0])
 
 
+def test_the_preset_evaders_is_what_the_shipped_weights_of_that_name_come_from():
+    shipped = openjax.load_policy("evaders").settings
+    network = {"compute_type": shipped.network.compute_type}  # of this machine
+    assert shipped == openjax.preset("evaders", network=network)
+
+
 def test_benchmark_writes_table_and_file(tmp_path, monkeypatch, capsys):
     def phases_without(*arguments, **named):  # most of what there is to compile
         phases = make_phases(*arguments, **named)

@@ -8,6 +8,7 @@ import pytest
 
 from experiments.paper.values import means
 from openjax.pursuit import SCENARIOS, PursuitSettings
+from openjax.pursuit.evaders import SCRIPTED
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -79,6 +80,29 @@ def test_slower_vehicle():
     ]
     value = cells("a slower Crazyflie without clamp: crash rate of `flight`, of `open`")[0]
     assert value == f"{short(crashes[0], 3)}, {short(crashes[1], 2)}"
+
+
+def test_evaders():
+    """Captures of the paper's evader and of the least favourable scripted one, by two policies."""
+    rates = {
+        (r["policy"], r["evader"], r["tasks"]): r["capture_rate"]
+        for r in read("evaders")["records"]
+        if r["vehicle"] == "nominal"
+    }
+
+    def least(evaders, places):
+        return ", ".join(
+            short(min(rates[policy, e, place] for e in evaders for place in places), 2)
+            for policy in ("flight", "evaders")
+        )
+
+    label = "uniform tasks without clamp, captures by `flight`, by `evaders`: the paper's evader"
+    assert cells(label)[0] == least(["field"], ["uniform"])
+    assert cells("... of ten scripted evaders the one that suits the team least")[0] == least(
+        SCRIPTED, ["uniform"]
+    )
+    assert cells("... that one on the worst of the six layouts")[0] == least(SCRIPTED, SCENARIOS)
+    assert len(SCRIPTED) == 10
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ clamp on the speed, the rate loop at 500 Hz. Writes experiments/results/evaders.
 import dataclasses
 import functools
 from collections import defaultdict
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +18,6 @@ from experiments.table import Page, Table, page_parser, publish
 from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import layout_slots, repeat_task
 from openjax.commands.validation import uniform_tasks
-from openjax.files import read_json
 from openjax.learning.best_response import make_duel
 from openjax.pursuit import (
     SCENARIOS,
@@ -30,10 +28,8 @@ from openjax.pursuit import (
     Task,
     scenario_task,
 )
-from openjax.pursuit.evaders import EVADERS, SCRIPTED
+from openjax.pursuit.evaders import EVADERS, HELD_OUT, SCRIPTED, VALIDATED
 from openjax.store.policies import LoadedPolicy, load_policy
-
-ALL = SCRIPTED
 
 
 @functools.cache
@@ -47,7 +43,7 @@ def game_of(loaded: LoadedPolicy, game: str, physics: str) -> PursuitSettings:
     settings = loaded.settings.environment
     settings = dataclasses.replace(
         settings,
-        evaders=ALL,
+        evaders=SCRIPTED,
         physics=physics,
         vehicles=FLIGHT_FAMILY,
         rare_vehicles=0.5,
@@ -75,8 +71,8 @@ def fly(name: str, options) -> list[dict]:
     kinds, counts, tasks = tasks_of(settings, options.episodes, options.uniform)
     run = program(settings, loaded.in_game(Pursuit(settings)).policy)
     number = sum(counts)
-    repeated = jax.tree.map(lambda leaf: jnp.tile(leaf, (len(ALL), *[1] * (leaf.ndim - 1))), tasks)
-    evaders = jnp.repeat(jnp.arange(len(ALL)), number)
+    repeated = jax.tree.map(lambda leaf: jnp.tile(leaf, (len(SCRIPTED), *[1] * (leaf.ndim - 1))), tasks)
+    evaders = jnp.repeat(jnp.arange(len(SCRIPTED)), number)
     records = []
     for vehicle in options.vehicles:
         bounds = jnp.asarray(vehicles()[vehicle])
@@ -84,7 +80,7 @@ def fly(name: str, options) -> list[dict]:
             np.asarray,
             run(loaded.parameters, repeated, evaders, jax.random.key(0), {"vehicle_bounds": bounds}),
         )
-        for i, evader in enumerate(ALL):
+        for i, evader in enumerate(SCRIPTED):
             start = i * number
             for kind, count in zip(kinds, counts, strict=True):
                 part = jax.tree.map(lambda leaf, s=start, n=count: leaf[s : s + n], found)
@@ -125,38 +121,42 @@ def wilson(successes: int, number: int) -> tuple[float, float]:
 
 
 def study(options) -> dict:
-    """Fly the policies, beside what other runs found."""
-    found = [read_json(path) for path in options.add]
-    records = [record for other in found if "curve" not in other for record in other["records"]]
-    return {
-        "records": records + [record for name in options.policy for record in fly(name, options)],
-        "best_responses": [other for other in found if "curve" in other],
-    }
+    """Fly the policies."""
+    return {"records": [record for name in options.policy for record in fly(name, options)]}
 
 
 def page(results: dict) -> Page:
-    """First what matters of each policy and vehicle, then capture rates and crashes by evader and by best response."""
-    records, of = results["records"], ("policy", "game", "vehicle")
+    """First what matters of each policy and vehicle, then capture rates and crashes by evader, then how it was learnt."""
+    of = ("policy", "game", "vehicle")
     by_policy = defaultdict(list)
-    for record in records:
+    for record in results["records"]:
         by_policy[tuple(record[name] for name in of)].append(record)
     columns = {
         **{name: name for name in of},
-        "the paper's field: capture": "field.capture:.3f",
-        "crash": "field.crash:.3f",
-        "steps": "field.step:.0f",
-        "mean of the held-out evaders": "held_out.mean:.3f",
-        "crash, held out": "held_out.crash:.3f",
-        "worst scripted evader and layout": "worst",
+        "the paper's field: capture": "field.capture_rate:.3f",
+        "crash": "field.crash_rate:.3f",
+        "steps": "field.capture_step:.0f",
+        "held-out evaders, layouts": "held_out.layouts.capture_rate:.3f",
+        "held-out evaders, uniform tasks": "held_out.uniform.capture_rate:.3f",
+        "their crashes": "held_out.layouts.crash_rate:.3f",
+        "worst evader, uniform tasks": "worst.uniform",
+        "worst evader, layouts": "worst.layouts",
     }
     rows = [dict(zip(of, name, strict=True)) | overview(own) for name, own in by_policy.items()]
-    parts: list[Table | str] = [Table(columns, rows, title="Overview, the six layouts")]
+    parts: list[Table | str] = [Table(columns, rows, title="Overview")]
     for name, own in by_policy.items():
-        parts.append(by_evader(own, "tasks", f"{name[0]}, {name[1]} game, {name[2]} vehicle"))
-    for response in results.get("best_responses", ()):
-        steps = response["curve"][-1]["steps"] / 1e6
-        title = f"{response['policy']} against evaders that learned {steps:.0f} million steps against it, in its own game"
-        parts.append(by_evader(response["records"], "scenario", title))
+        parts.append(by_evader(own, f"{name[0]}, {name[1]} game, {name[2]} vehicle"))
+    if "training" in results:
+        columns = {
+            "M steps": "millions:.0f",
+            "s": "seconds:.0f",
+            "capture": "capture_rate:.3f",
+            "crash": "crash_rate:.3f",
+        }
+        title = f"Training of evaders, on validation tasks against field, {', '.join(VALIDATED)}"
+        parts.append(Table(columns, results["training"], title=title))
+    if "tried" in results:
+        parts.append("\n".join(["## What else was tried", "", *(f"* {line}" for line in results["tried"])]))
     prose = (
         "Capture rate, crash rate. The last column is the least lower end of the capture rates' 95 % intervals. "
         "Held-out evaders were never trained on, nor were checkpoints chosen by them. Crashes count to the end of the 8 s, "
@@ -166,35 +166,38 @@ def page(results: dict) -> Page:
 
 
 def overview(records: list[dict]) -> dict:
-    """Of one policy and vehicle on the layouts: the paper's evader, the held-out ones, the worst cell."""
-    layouts = [record for record in records if record["tasks"] in SCENARIOS]
+    """Of one policy and vehicle: the paper's evader on the layouts, the held-out ones, the worst cells."""
+    places = {
+        "layouts": [record for record in records if record["tasks"] in SCENARIOS],
+        "uniform": [record for record in records if record["tasks"] == "uniform"],
+    }
 
-    def mean(rows, figure):
-        return float(np.mean([row[figure] for row in rows]))
+    def mean(rows, evaders):
+        rows = [row for row in rows if row["evader"] in evaders]
+        return {
+            name: np.mean([row[name] for row in rows])
+            for name in ("capture_rate", "crash_rate", "capture_step")
+        }
 
-    field = [row for row in layouts if row["evader"] == "field"]
-    held_out = [row for row in layouts if row["of"] == "held out"]
-    worst = min(layouts, key=lambda row: row["capture_rate"])
+    def worst(rows):
+        row = min(rows, key=lambda row: row["capture_rate"])
+        return f"{row['capture_rate']:.3f} ({row['evader']}, {row['tasks']})"
+
     return {
-        "field": {
-            "capture": mean(field, "capture_rate"),
-            "crash": mean(field, "crash_rate"),
-            "step": mean(field, "capture_step"),
-        },
-        "held_out": {"mean": mean(held_out, "capture_rate"), "crash": mean(held_out, "crash_rate")},
-        "worst": f"{worst['capture_rate']:.2f} ({worst['evader']}, {worst['tasks']})",
+        "field": mean(places["layouts"], ["field"]),
+        "held_out": {name: mean(rows, HELD_OUT) for name, rows in places.items()},
+        "worst": {name: worst(rows) for name, rows in places.items()},
     }
 
 
-def by_evader(records: list[dict], kind: str, title: str) -> Table:
-    """A row for each evader, a column for each `kind` of tasks."""
+def by_evader(records: list[dict], title: str) -> Table:
+    """A row for each evader, a column for each kind of tasks."""
     rows = []
     for evader in dict.fromkeys(record["evader"] for record in records):
-        own = {record[kind]: record for record in records if record["evader"] == evader}
+        own = {record["tasks"]: record for record in records if record["evader"] == evader}
         rates = {name: f"{r['capture_rate']:.3f}, {r['crash_rate']:.3f}" for name, r in own.items()}
-        low = min(wilson(round(r["capture_rate"] * r["episodes"]), r["episodes"])[0] for r in own.values())
-        of = EVADERS[evader].of if evader in EVADERS else "learned against it"
-        rows.append({"evader": evader, "of": of, "low": low, **rates})
+        low = min(r["interval"][0] for r in own.values())
+        rows.append({"evader": evader, "of": EVADERS[evader].of, "low": low, **rates})
     columns = {"evader": "evader", "used for": "of", **{name: name for name in own}}
     return Table(columns | {"least lower end": "low:.3f"}, rows, title=title)
 
@@ -202,8 +205,9 @@ def by_evader(records: list[dict], kind: str, title: str) -> Table:
 def main(arguments: list[str]) -> int:
     """Evaluate and write both files."""
     parser = page_parser(__doc__, "evaders")
-    parser.add_argument("--add", nargs="*", type=Path, default=[], help="files of other runs, or of exploit")
-    parser.add_argument("--policy", nargs="*", default=["flight"], help="names, runs or policy files")
+    parser.add_argument(
+        "--policy", nargs="+", default=["flight", "evaders"], help="names, runs or policy files"
+    )
     parser.add_argument("--game", choices=("own", "honest"), default="honest")
     parser.add_argument("--physics", choices=("rigid", "stops"), default="rigid")
     parser.add_argument("--vehicles", nargs="+", default=["nominal", "table", "family"])

@@ -393,7 +393,7 @@ def flight() -> TrainSettings:
 
 def evaders() -> TrainSettings:
     """Policies to be flown after evaders that fight back: `flight`, and from a sixth of the run on two thirds of the evaders are
-    greedy or run along the wall, slow ones first. `evaders_second` goes on from it. Five minutes on one large accelerator."""
+    greedy or run along the wall, slow ones first. `evaders_second` goes on from it. Six minutes on one large accelerator."""
     return changed(
         flight(),
         environment=dict(evaders=("field", "field", "greedy", "greedy", "greedy", "wall_runner")),
@@ -409,7 +409,7 @@ def evaders() -> TrainSettings:
 
 def evaders_second() -> TrainSettings:
     """The second run of `evaders`, with `--start_from` the first: all evaders and vehicles from its start, arenas with few
-    pillars too, and penalties that grow anew. Five minutes on one large accelerator."""
+    pillars too, and penalties that grow anew. What it reaches isn't measured yet."""
     return changed(
         evaders(),
         # who knows the penalties before fast evaders hovers far from these: the distance pays for going there, and cheaper
