@@ -60,8 +60,8 @@ def tasks_of(settings: PursuitSettings, layouts: int, uniform: int) -> tuple[lis
     parts = [repeat_task(scenario_task(settings, scenario), layouts) for scenario in SCENARIOS.values()]
     drawn = dataclasses.replace(settings, min_pillars=4, max_pillars=5)
     parts.append(uniform_tasks(drawn, uniform, settings.max_pillars))
-    tasks = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
-    return [*SCENARIOS, "uniform"], [layouts] * len(SCENARIOS) + [uniform], tasks
+    counts = [layouts] * len(SCENARIOS) + [uniform]
+    return [*SCENARIOS, "uniform"], counts, jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
 
 def fly(name: str, options) -> list[dict]:
@@ -75,24 +75,17 @@ def fly(name: str, options) -> list[dict]:
     evaders = jnp.repeat(jnp.arange(len(SCRIPTED)), number)
     records = []
     for vehicle in options.vehicles:
-        bounds = jnp.asarray(vehicles()[vehicle])
-        found = jax.tree.map(
-            np.asarray,
-            run(loaded.parameters, repeated, evaders, jax.random.key(0), {"vehicle_bounds": bounds}),
-        )
+        changes = {"vehicle_bounds": jnp.asarray(vehicles()[vehicle])}
+        found = run(loaded.parameters, repeated, evaders, jax.random.key(0), changes)
+        found = jax.tree.map(np.asarray, found)
         for i, evader in enumerate(SCRIPTED):
             start = i * number
             for kind, count in zip(kinds, counts, strict=True):
                 part = jax.tree.map(lambda leaf, s=start, n=count: leaf[s : s + n], found)
                 start += count
-                case = {
-                    "policy": name,
-                    "game": options.game,
-                    "vehicle": vehicle,
-                    "evader": evader,
-                    "tasks": kind,
-                }
-                records.append(case | {"of": EVADERS[evader].of} | summary(part))
+                case = {"policy": name, "game": options.game, "vehicle": vehicle, "evader": evader}
+                case |= {"tasks": kind, "of": EVADERS[evader].of}
+                records.append(case | summary(part))
     return records
 
 
@@ -196,8 +189,8 @@ def by_evader(records: list[dict], title: str) -> Table:
     for evader in dict.fromkeys(record["evader"] for record in records):
         own = {record["tasks"]: record for record in records if record["evader"] == evader}
         rates = {name: f"{r['capture_rate']:.3f}, {r['crash_rate']:.3f}" for name, r in own.items()}
-        low = min(r["interval"][0] for r in own.values())
-        rows.append({"evader": evader, "of": EVADERS[evader].of, "low": low, **rates})
+        rates["low"] = min(r["interval"][0] for r in own.values())
+        rows.append({"evader": evader, "of": EVADERS[evader].of, **rates})
     columns = {"evader": "evader", "used for": "of", **{name: name for name in own}}
     return Table(columns | {"least lower end": "low:.3f"}, rows, title=title)
 

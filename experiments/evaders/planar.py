@@ -199,7 +199,6 @@ def study(options) -> dict:
                 "captured": [float(c.mean()) for c in captured],
             }
         )
-        print(records[-1], flush=True)
     for radius in (0.3, 0.27):
         settings = game(capture_radius=radius)
         environment = Pursuit(settings, dynamics=Points(settings.max_speed, settings.time_step))
@@ -209,9 +208,9 @@ def study(options) -> dict:
         record |= {
             "captured": [float(c.mean()) for c in captured[:-1]],
             "captured_greedy": float(captured[-1].mean()),
+            "slowest": [float(s.max()) for s in seconds[:-1]],
         }
-        against_stack.append(record | {"slowest": [float(s.max()) for s in seconds[:-1]]})
-        print(against_stack[-1], flush=True)
+        against_stack.append(record)
     return {"planar": records, "stack": against_stack, "steps": options.steps}
 
 
