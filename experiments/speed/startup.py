@@ -71,6 +71,7 @@ def compile_programs(name: str) -> list[dict]:
     cases |= {"these side by side": parts, "the step as one": [(make_training_step(settings), carry)]}
     records = []
     for case, programs in cases.items():
+        jax.clear_caches()  # of what other cases traced
         started, processor = time.monotonic(), time.process_time()
         for wait in [compile_ahead(jax.jit(function), *arguments) for function, *arguments in programs]:
             wait()
