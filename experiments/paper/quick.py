@@ -103,16 +103,9 @@ def study(options: argparse.Namespace) -> dict:
     available = sorted(os.sched_getaffinity(0))
     places = [available[CORES * i : CORES * (i + 1)] for i in range(options.at_once)]
     with ThreadPoolExecutor(options.at_once) as pool:
-        runs = list(
-            pool.map(
-                lambda i: train(options, options.seeds[i], places[i % options.at_once]),
-                range(len(options.seeds)),
-            )
-        )
-    return {
-        "preset": " ".join(PRESETS["quick"].__doc__.split()),
-        "runs": runs,
-    }
+        start = lambda i: train(options, options.seeds[i], places[i % options.at_once])  # noqa: E731
+        runs = list(pool.map(start, range(len(options.seeds))))
+    return {"preset": " ".join(PRESETS["quick"].__doc__.split()), "runs": runs}
 
 
 def page(results: dict) -> Page:
@@ -129,13 +122,10 @@ def page(results: dict) -> Page:
         "new tasks, `open`": _column("open", "validation"),
         "`empty`, `open`": _column("open", "empty"),
     }
-    earlier = results.get("earlier", {"runs": []})
     return Page(
         "The quick preset: what two CPU cores learn",
         f"{results['preset']} Each cell: capture rate, seconds to the capture, crash rate. {results.get('note', '')}",
-        [Table(columns, results["runs"]), Table(columns, earlier["runs"], "Before", earlier.get("note", ""))]
-        if earlier["runs"]
-        else Table(columns, results["runs"]),
+        Table(columns, results["runs"]),
     )
 
 
