@@ -46,7 +46,23 @@ def study(options) -> dict:
         {k: v for k, v in line.items() if k not in ("parameters", "quality", "gap")}
         for line in development.read_lines([out])
     ]
-    return {"seed": options.seed, "answers_sha256": digests, "cases": lines}
+    columns = {
+        name: {"figures": stored_figures([x for x in lines if x["set"] == name])}
+        for name in sorted({x["set"] for x in lines})
+    }
+    return {"seed": options.seed, "answers_sha256": digests, "columns": columns, "cases": lines}
+
+
+def stored_figures(lines: list[dict]) -> dict[str, dict]:
+    """Figure -> {"hits", "n", "value"}, or its value alone; what no case tells is left out."""
+    out = {}
+    for name, found in figures.figures(lines).items():
+        hits, n = found if isinstance(found, tuple) else (None, None)
+        if n is None:
+            out[name] = {"value": found}
+        elif n:
+            out[name] = {"hits": hits, "n": n, "value": hits / n}
+    return out
 
 
 def page(results: dict) -> Page:

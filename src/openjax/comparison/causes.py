@@ -42,9 +42,7 @@ CHANGES = {
     "inertia": (("torque_gain",), 0.0, 0.3),
     "gains": (("loop_gain",), 0.0, 0.5),
 }
-LOOP_WITH_MOTORS = (
-    0.1  # standard deviation by which a motors' change also moves the estimate of the loop's gain
-)
+LOOP_WITH_MOTORS = 0.3  # standard deviation: a motors' change also moves the estimate of the loop's gain
 SHAKES = (0.4, 0.4)  # mean and standard deviation of the rise of the logarithm with a damage
 USUAL_CHANGE = 0.15  # of a rotor's command, or of the weight
 STRONGER = 0.15  # share of changes the other way: a mended rotor, a weight taken off

@@ -20,7 +20,7 @@ from openjax.comparison.figures import FIGURES, FlightFigures
 # Spread (standard deviation) of a vehicle's normal days, and of flights within a day. Trims, as shares of hover: 1 to 2.5 %,
 # measured on published flights of two Crazyflies; yaw more, because its torque is a hundredth of thrust times arm and a
 # tilted motor shows in it. Drag in 1/s; the others are logarithms. Gains are the firmware's numbers, which no day moves:
-# theirs is what the estimate repeats to.
+# theirs is what the estimate repeats to in flights of different kinds.
 SPREADS = {
     "hover": (0.012, 0.003),
     "roll": (0.02, 0.0025),
@@ -30,7 +30,7 @@ SPREADS = {
     "drag_y": (0.04, 0.02),
     "lag": (0.1, 0.05),
     "torque_gain": (0.07, 0.03),
-    "loop_gain": (0.03, 0.03),
+    "loop_gain": (0.02, 0.02),
     "shaking": (0.35, 0.1),
 }
 DAY_SPREAD, WITHIN_DAY = (np.array([SPREADS[n][k] for n in FIGURES]) for k in (0, 1))

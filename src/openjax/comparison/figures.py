@@ -23,6 +23,10 @@ FULL = 0.98  # motor command from which on a rotor has nothing left to trim with
 LOW = 2.5  # Hz, below which drag isn't covered by vibration
 TURNING = (1.0, 10.0)  # Hz, where motors turn the vehicle
 DELAYS = (0, 2, 4, 6)  # rows, of the commands as instruments
+LEAST_EXCITED = (
+    0.7  # share of the regressors that commands must explain: weak instruments bias (Staiger, Stock 1997)
+)
+ANSWERING = (4.0, 15.0)  # Hz, where the rate loop's proportional part outweighs its integral
 LAGS = np.geomspace(0.004, 0.2, 40)  # s, time constants that are tried
 
 
@@ -181,13 +185,13 @@ def _loop(torque, rates, commands) -> dict:
     )  # motors hold from a row to the next: rates count in the middle
     error, change = commands - 0.5 * (rates + after), (after - rates) * RATE
     signals = (torque, error, change, *(np.roll(commands, k, 0) for k in DELAYS))
-    filtered = np.stack([in_band(values, TURNING) for values in signals], -1)
-    if in_band(rates, TURNING).std(0).min() < 0.15:
-        return {}
+    filtered = np.stack([in_band(values, ANSWERING) for values in signals], -1)
     gains = []
     for part in np.array_split(filtered, 4):
         target, regressors, instruments = np.split(part.reshape(-1, len(signals)), (1, 3), axis=1)
         excited = instruments @ np.linalg.lstsq(instruments, regressors, rcond=None)[0]
+        if min((excited**2).sum(0) / (regressors**2).sum(0)) < LEAST_EXCITED:
+            return {}
         gains.append(np.linalg.lstsq(excited, target[:, 0], rcond=None)[0][0])
     if min(gains) <= 0:
         return {}

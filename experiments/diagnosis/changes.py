@@ -1,0 +1,167 @@
+"""What changed, where the answer is known: sample flights with a known effect, and real flights of two Crazyflies.
+
+    python -m experiments.diagnosis.changes --work DIR --seeds 11 12 13 --vehicles E8=FOLDER E9=FOLDER=ANSWERS.json
+
+Sample flights of each effect, and of none, are compared with those of none flown with another seed. A vehicle is a folder of
+conditions with `labels.json` (or a file of answers) and its normal flights in `normal_flight` or `reference`. These two are of
+CrazyPAD (github.com/AerialRoboticsUUST/CrazyPAD, commit 5448265, MIT; Masalimov et al., Data 2024, 9(6), 79): no orientation.
+Every condition is compared with all normal flights, and each day of normal flights with the others.
+`--figure` draws the figure of docs/what_changed.md into `--work` instead.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from experiments.table import Page, Table, page_parser, publish
+from openjax import comparison
+from openjax.commands.sample_flights import Arguments, make_case
+from openjax.comparison import Change
+from openjax.comparison.report import draw, prediction
+from openjax.files import read_json
+from openjax.flights.reading import write_csv
+from openjax.flights.samples import fly, log_of, references
+from openjax.vehicle import load_vehicle
+
+EFFECTS = ("motor_lag", "mass", "rotor_drag", "rate_gains", "none")
+NORMAL = ("normal_flight", "reference")
+WEAKER = (0.0, 0.0, 0.0, 0.22)  # of rotor 3 in the figure, its normal days first
+
+
+def record_of(vehicle: str, condition: str, truth: dict, change: Change) -> dict:
+    """One comparison: what was done, and what was said."""
+    answer, size = prediction(change), change.size
+    return {
+        "vehicle": vehicle,
+        "condition": condition,
+        "truth": truth,
+        "probability": change.probability,
+        "size90": [size.value, size.low, size.high],
+        "least": change.least,
+        "said": list(change.likely_causes) if change.changed else [],
+    } | {key: answer[key] for key in ("changed", "effects", "rotors")}
+
+
+def sample_records(work: Path, seeds: list[int]) -> list[dict]:
+    """Sample flights of each effect against normal ones of the next seed."""
+    for seed in seeds:
+        for effect in EFFECTS:
+            folder = work / f"{effect}_{seed}"
+            if not folder.exists():
+                make_case(Arguments(folder, effect=effect, seed=seed))
+    out = []
+    for effect in EFFECTS:
+        for seed, other in zip(seeds, [*seeds[1:], seeds[0]], strict=True):
+            change = comparison.compare(work / f"{effect}_{seed}", [work / f"none_{other}"])
+            out.append(record_of("sample", f"{effect}, seed {seed}", {"cause": effect}, change))
+    return out
+
+
+def vehicle_records(name: str, folder: Path, labels: dict) -> list[dict]:
+    """Each condition against all normal flights, each day of these against the others."""
+    (normal,) = [n for n in NORMAL if (folder / n).is_dir()]
+    case, old, _ = comparison.read(folder / normal)
+    out = []
+    for number, day in enumerate(dict.fromkeys(f.day for f in old), 1):
+        new, others = ([f for f in old if (f.day == day) == own] for own in (True, False))
+        if others:
+            change = comparison.change_between(day, new, others, case)
+            out.append(record_of(name, f"normal flights, day {number}", {"cause": "none"}, change))
+    for condition, truth in labels.items():
+        if condition != normal:
+            change = comparison.change_between(condition, comparison.read(folder / condition)[1], old, case)
+            out.append(record_of(name, condition, truth, change))
+    return out
+
+
+def study(options) -> dict:
+    """All comparisons."""
+    records = sample_records(options.work, options.seeds) if options.seeds else []
+    for entry in options.vehicles:
+        name, folder, *answers = entry.split("=")
+        labels = read_json(Path(answers[0]) if answers else Path(folder) / "labels.json")
+        records += vehicle_records(name, Path(folder), labels)
+    return {"records": records}
+
+
+def cut(record: dict) -> float:
+    """Millimetres cut off the propeller that lost most; 0 for anything else."""
+    return max(record["truth"].get("mm", {"": 0.0}).values())
+
+
+def figures_of(records: list[dict]) -> str:
+    """How often the answers are right."""
+
+    def share(what: str, chosen: list[dict], right) -> str:
+        return f"* {what}: {sum(map(right, chosen))} of {len(chosen)}"
+
+    samples = [r for r in records if r["vehicle"] == "sample"]
+    real = [r for r in records if r["vehicle"] != "sample"]
+    quiet = [r for r in real if r["truth"]["cause"] in ("none", "tape")]
+    found = [r for r in real if cut(r) and r["changed"]]
+    sampled = [r for r in samples if r["truth"]["cause"] != "none"]
+    lines = [
+        share("sample flights with an effect: it is named first", sampled,
+              lambda r: r["effects"][:1] == [r["truth"]["cause"]]),
+        share("sample flights without: no change", [r for r in samples if r not in sampled], lambda r: not r["changed"]),
+        share("real, normal flights of another day and tape: no change", quiet, lambda r: not r["changed"]),
+        share("real, a propeller cut by 4 mm or more: changed", [r for r in real if cut(r) >= 4], lambda r: r["changed"]),
+        share("real, cut by less: changed", [r for r in real if 0 < cut(r) < 4], lambda r: r["changed"]),
+        share("real, cuts that were found: the rotors are among those named", found,
+              lambda r: set(r["truth"]["rotors"]) <= set(r["rotors"])),
+    ]  # fmt: skip
+    return "\n".join(lines)
+
+
+def page(results: dict) -> Page:
+    """Figures, then every comparison."""
+    columns = {
+        "vehicle": "vehicle",
+        "condition": "condition",
+        "P(changed)": "probability:.2f",
+        "changed": "changed",
+        "said": lambda r: ", ".join(r["said"]) or None,
+        "rotors": lambda r: "+".join(f"m{i}" for i in r["rotors"]) or None,
+        "thrust lost, % of a rotor's [90 %]": lambda r: "{:.0f} [{:.0f}, {:.0f}]".format(
+            *(100 * v for v in r["size90"])
+        ),
+        "least that shows, %": lambda r: f"{100 * r['least']:.0f}",
+    }
+    prose = (
+        "Two sets of flights of one vehicle are compared; what was changed is known. The real flights are open: they were in "
+        "sight when the priors were settled. The sample flights' seeds were not."
+    )
+    records = results["records"]
+    return Page("What changed", prose, [figures_of(records), Table(columns, records)])
+
+
+def figure(folder: Path) -> None:
+    """Two normal days, whose rotors differ by 2 % as new propellers do, and one with a weaker rotor."""
+    vehicle, rng = load_vehicle(), np.random.default_rng(3)
+    for seed, name in enumerate(("friday", "monday", "tuesday"), 1):
+        (folder / name).mkdir(parents=True)
+        factors = 0.02 * rng.standard_normal(4)
+        factors[2] -= WEAKER[seed]
+        effects = {"motor_imbalance": {f"m{i}": float(f) for i, f in enumerate(factors, 1)}}
+        for k, (flight, reference) in enumerate(references(seed=seed, duration=8.0).items()):
+            columns = fly(vehicle, vehicle, reference, 10 * seed + k, effects)
+            write_csv(folder / name / f"{flight}.csv.gz", log_of(columns, flight))
+    change = comparison.compare(folder / "tuesday", [folder / "friday", folder / "monday"])
+    draw(change).savefig(folder / "what_changed.png", dpi=90)
+
+
+def main() -> None:
+    """Compare and report, or draw."""
+    parser = page_parser(__doc__, "changes")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[])
+    parser.add_argument(
+        "--vehicles", nargs="+", default=[], metavar="NAME=FOLDER[=ANSWERS]", help="real flights"
+    )
+    parser.add_argument("--work", type=Path, default=Path("runs/changes"), help="folder for sample flights")
+    parser.add_argument("--figure", action="store_true")
+    options = parser.parse_args()
+    figure(options.work) if options.figure else publish(options, study, page)
+
+
+if __name__ == "__main__":
+    main()
