@@ -122,14 +122,13 @@ def page(results: dict) -> Page:
         "changed": "changed",
         "said": lambda r: ", ".join(r["said"]) or None,
         "rotors": lambda r: "+".join(f"m{i}" for i in r["rotors"]) or None,
-        "thrust lost, % of a rotor's [90 %]": lambda r: "{:.0f} [{:.0f}, {:.0f}]".format(
-            *(100 * v for v in r["size90"])
-        ),
+        "size, % [90 %]": lambda r: "{:.0f} [{:.0f}, {:.0f}]".format(*(100 * v for v in r["size90"])),
         "least that shows, %": lambda r: f"{100 * r['least']:.0f}",
     }
     prose = (
         "Two sets of flights of one vehicle are compared; what was changed is known. The real flights are open: they were in "
-        "sight when the priors were settled. The sample flights' seeds were not."
+        "sight when the priors were settled. The sample flights' seeds were not. Sizes are of a rotor's thrust, or of what "
+        "changed."
     )
     records = results["records"]
     return Page("What changed", prose, [figures_of(records), Table(columns, records)])
