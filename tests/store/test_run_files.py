@@ -1,6 +1,7 @@
 """Settings, metrics, policies and pictures on disk."""
 
 import dataclasses
+import os
 import pickle
 from typing import Literal
 
@@ -10,6 +11,7 @@ import pytest
 from PIL import Image
 
 from openjax.errors import UserError
+from openjax.files import replacing
 from openjax.show.metrics import MetricsWriter, read_metrics
 from openjax.show.plots import plot_training, plot_trajectories
 from openjax.show.trajectory import Trajectory
@@ -30,6 +32,17 @@ class Outer:
     inner: Inner = dataclasses.field(default_factory=Inner)
     rate: float = 0.5
     count: int = 3
+
+
+def test_what_gets_its_name_is_on_the_disk_before_and_the_name_after(tmp_path, monkeypatch):
+    happened, fsync, rename = [], os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda of: (happened.append(os.fstat(of).st_ino), fsync(of)))
+    monkeypatch.setattr(os, "replace", lambda *paths: (happened.append("renamed"), rename(*paths)))
+    with replacing(tmp_path / "run") as partial:
+        partial.mkdir()
+        (partial / "weights").write_bytes(b"1")
+    inodes = [path.stat().st_ino for path in (tmp_path / "run", tmp_path / "run" / "weights")]
+    assert set(happened[:2]) == set(inodes) and happened[2:] == ["renamed", tmp_path.stat().st_ino]
 
 
 def test_settings_round_trip_and_are_strict():
