@@ -35,12 +35,15 @@ from openjax.files import read_json
 ROLES = ("loop", "links", "guard")
 SIGNALS = ("KILL", "STOP", "TERM", "HUP", "INT", "TSTP", "QUIT")
 KEYS = {
-    "key l": "l", "key h": "h", "key h, then l": "hl", "Ctrl-C": "\x03", "Ctrl-Z": "\x1a", "Ctrl-\\": "\x1c",
+    "key l": "l", "key h, l a second later": "h…l", "h and l": "hl", "Ctrl-C": "\x03", "Ctrl-Z": "\x1a", "Ctrl-\\": "\x1c",
     "space": " ", "q": "q", "space and l": " l", "l and space": "l ", "x x space": "xx ", "an arrow and space": "\x1b[A ",
     "Ctrl-C and space": "\x03 ", "Ctrl-C three times": "\x03\x03\x03",
 }  # fmt: skip
 STOPPED = ("space", "q")
 """In these keys' names: motors off at once."""
+THEN = (
+    "terminal closed", "policy fails", "KILL links then guard", "KILL loop then links", "KILL links then space",
+)  # fmt: skip
 PAIRS = ("loop+links", "loop+guard", "links+guard")
 START = ("start: y up", "start: millimetres", "start: yaw turned", "start: scaled", "start: beside the mark")
 POSES = (
@@ -76,8 +79,7 @@ def kinds() -> list[str]:
     """All kinds of faults, signals first."""
     signals = [f"{name} {role}" for name in SIGNALS for role in ROLES] + ["TERM group", "HUP group"]
     pairs = [f"{name} {pair}" for name in ("KILL", "STOP") for pair in PAIRS]
-    then = ["terminal closed", "KILL links then guard", "KILL loop then links", "KILL links then space"]
-    return [*signals, *pairs, *then, *KEYS, *POSES, *START, *OTHER]
+    return [*signals, *pairs, *THEN, *KEYS, *POSES, *START, *OTHER]
 
 
 def main() -> None:
@@ -89,11 +91,8 @@ def main() -> None:
     queue, done = context.Queue(), context.Queue()
     for item in work:
         queue.put(item)
-    ends = time.time() + arguments.seconds_left
-    workers = [
-        context.Process(target=worker, args=(arguments, queue, done, ends))
-        for _ in range(arguments.processes)
-    ]
+    given = (arguments, queue, done, time.time() + arguments.seconds_left)
+    workers = [context.Process(target=worker, args=given) for _ in range(arguments.processes)]
     for process in workers:
         process.start()
     records, begin, stands = [], time.time(), facts()
@@ -174,10 +173,8 @@ def fault_of(number: int, kind: str) -> Fault:
     rng = random.Random(number)
     time, vehicle = rng.uniform(0.3, LATEST), rng.randrange(3)
     if kind in (*POSES, "drone gone"):
-        like = next(
-            s for s in range(1000 * number, 1000 * number + 1000) if draw_fault(s, LATEST).kind == kind
-        )
-        return replace(draw_fault(like, LATEST), time=time)
+        drawn = (draw_fault(seed, LATEST) for seed in range(1000 * number, 1000 * number + 1000))
+        return replace(next(like for like in drawn if like.kind == kind), time=time)
     if kind in START:
         return Fault(kind, -math.inf, 1, direction=0.0)
     return Fault(kind, time, vehicle, direction=0.0 if "camera" in kind else 4.0)
@@ -204,9 +201,7 @@ def feed_of(fault: Fault, truth):
             now = time.perf_counter() - truth.take_off
             poses = truth.poses()
             for i, pose in enumerate(poses):
-                shaken = tuple(
-                    p + e for p, e in zip(pose.position, noise.normal(0, 5e-4, 3).tolist(), strict=True)
-                )
+                shaken = tuple((np.array(pose.position) + noise.normal(0, 5e-4, 3)).tolist())
                 seen = damage("camera", i, now, at_start(pose._replace(position=shaken)), poses)
                 if seen is not None:
                     update(i, seen.position, seen.quaternion)
@@ -217,10 +212,11 @@ def feed_of(fault: Fault, truth):
 
 
 class RemoteGame:
-    """The game of a flight, played by the worker."""
+    """The game of a flight, played by the worker until it fails."""
 
-    def __init__(self, game, pipe):
-        self.task, self.settings, self.airframe, self._pipe = game.task, game.settings, game.airframe, pipe
+    def __init__(self, game, pipe, fails):
+        self.task, self.settings, self.airframe = game.task, game.settings, game.airframe
+        self._pipe, self._fails = pipe, fails
 
     def start(self, poses):
         """See `openjax.flying.game.Game.start`."""
@@ -229,6 +225,8 @@ class RemoteGame:
 
     def step(self, poses, evader=None):
         """See `openjax.flying.game.Game.step`."""
+        if self._fails():
+            raise ValueError("the policy failed")
         self._pipe.send(("step", (poses, evader)))
         return self._pipe.recv()
 
@@ -260,7 +258,7 @@ class Flown:
         game = self._prepared.game
         pid, self._terminal = pty.fork()
         if pid == 0:
-            self._prepared = self._prepared._replace(game=RemoteGame(game, theirs))
+            self._prepared = self._prepared._replace(game=RemoteGame(game, theirs, self._policy_fails))
             self._child()
         theirs.close()
         threading.Thread(target=play, args=(game, ours), daemon=True).start()
@@ -304,6 +302,12 @@ class Flown:
         finally:
             os._exit(3)
 
+    def _policy_fails(self):
+        return (
+            self._kind == "policy fails"
+            and time.perf_counter() - self._virtual.truth.take_off > self.fault.time
+        )
+
     def _drain(self):
         if self._open and select.select([self._terminal], [], [], 0.005)[0]:
             try:
@@ -329,7 +333,9 @@ class Flown:
         kind = self._kind
         name, _, target = kind.partition(" ")
         if kind in KEYS:
-            os.write(self._terminal, KEYS[kind].encode())
+            for wait, keys in enumerate(KEYS[kind].split("…")):
+                time.sleep(wait)
+                os.write(self._terminal, keys.encode())
         elif kind == "terminal closed":
             os.close(self._terminal)
             self._open = False
@@ -361,9 +367,8 @@ class Flown:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
             for _ in range(300):
                 head = rng.choice((0xFF, 0x2C, 0x0C, 0xFC, 0x4C, 0xDC, 0x1C))
-                other.sendto(
-                    bytes([head, *rng.randbytes(rng.randrange(20))]), ("127.0.0.1", rng.choice(ports))
-                )
+                noise = rng.randbytes(rng.randrange(20))
+                other.sendto(bytes([head, *noise]), ("127.0.0.1", rng.choice(ports)))
 
     def _try_second(self):
         from openjax.errors import UserError
@@ -398,9 +403,8 @@ class Flown:
         times, position, off = track["time"], track["position"], track["off"].astype(bool)
         late = times >= (injected or begin)
         held = np.array([not (fault.kind == "drone gone" and i == fault.vehicle) for i in range(3)])
-        out = np.maximum(np.linalg.norm(position[..., :2], axis=-1) - 0.9, position[..., 2] - 1.2)[late][
-            :, held
-        ]
+        beyond = np.maximum(np.linalg.norm(position[..., :2], axis=-1) - 0.9, position[..., 2] - 1.2)
+        out = beyond[late][:, held]
         down = (off & (position[..., 2] < 0.02))[late][:, held].all(1)
         over = next((k for k in range(len(down)) if down[k:].all()), None)
         seconds = None if over is None or injected is None else float(times[late][over] - injected)
@@ -428,7 +432,7 @@ class Flown:
         name, _, target = self._kind.partition(" ")
         deaf = name in SIGNALS[2:] and target in ("links", "guard")  # the flight goes on
         seconds = math.inf if row["seconds"] is None else row["seconds"]
-        in_time = deaf or self._kind in (*POSES, *OTHER, "key h", "key h, then l") or seconds <= ENDING
+        in_time = deaf or self._kind in (*POSES, *OTHER) or seconds <= ENDING
         return in_time and not row["fell"] and not row["hard"]
 
 

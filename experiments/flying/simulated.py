@@ -254,11 +254,8 @@ def record(fault, seed, layout, state, track, crashed, safety, caught) -> dict:
     ended = any(d.reason for d in state.drones)
     down = off & (height < 0.02)
     reaction = next((k for k in range(len(after)) if down[k:].all()), len(after)) * 0.01
-    nearest = min(
-        float(np.linalg.norm(track[:, i, :3] - track[:, j, :3], axis=-1).min())
-        for i in range(3)
-        for j in range(i)
-    )
+    pairs = [track[:, i, :3] - track[:, j, :3] for i in range(3) for j in range(i)]
+    nearest = float(np.linalg.norm(pairs, axis=-1).min())
     return {
         "seed": seed, "kind": fault.kind, "layout": layout, "captured_by_camera": fault.captured,
         **{k: v for k, v in asdict(fault).items() if k in ("time", "vehicle", "duration", "amount")},

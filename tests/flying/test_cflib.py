@@ -90,7 +90,7 @@ def uris():
 @contextmanager
 def connected(uris, body_logs):
     """Links that know all poses."""
-    links = Links(uris, body_logs)
+    links = Links(uris, body_logs, silence=1.0)  # a busy machine
     links.connect()
     try:
         while any(s.own is None for s in links.observe()):

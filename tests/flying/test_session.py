@@ -71,7 +71,7 @@ def flying():
     "kind",
     [
         "KILL loop", "STOP loop", "KILL links", "STOP guard", "KILL loop+links", "KILL loop+guard", "KILL links+guard",
-        "KILL links then space",
+        "KILL links then guard", "KILL links then space", "STOP links+guard", "policy fails",
         "TERM links", "TERM group", "HUP loop", "terminal closed", "Ctrl-Z", "Ctrl-C three times", "l and space",
         "camera frozen", "camera: yaw turned", "camera drifts", "gyroscope: a number that is none", "start: millimetres",
         "strangers' packets", "second fly",

@@ -33,8 +33,6 @@ from openjax.flying.safety import PoseSample, State
 from openjax.flying.set_point import SetPoint
 from openjax.flying.swarm import Member, Samples, Swarm, numbers_of
 
-STUCK = 1.0
-"""The links' process is taken for dead if it doesn't pass on set-points for this long (s)."""
 STARTING = 20.0
 """s until its interpreter has loaded `cflib`, on a busy machine."""
 CLOSING = 2.0
@@ -56,7 +54,8 @@ class Links:
 
     Args: as `openjax.flying.swarm.Swarm`, and
       safety, state: by which the links' process lands all if the loop stops; without them it doesn't.
-      silence: of the loop after which it does (s).
+      silence: of the loop after which it does (s). If it doesn't pass on set-points for half as long again it is taken for
+          dead: vehicles go on turning as they were told last.
     """
 
     def __init__(
@@ -97,7 +96,7 @@ class Links:
         self._commands, commands = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._control, control = context.Pipe()
         self._stream.setblocking(False)
-        self._commands.settimeout(STUCK)
+        self._commands.settimeout(1.5 * self.board.silence)
         ends = (stream, commands, control)
         self._process = context.Process(
             target=_serve,
@@ -338,10 +337,9 @@ def _watch(swarm: Swarm, board: Board, parent: int, landing) -> None:
         now = time.perf_counter()
         board.beat(Role.LINKS, now)
         silent = board.silent(Role.LOOP, now)
-        if board.pilot is Role.LOOP and board.flying and landing[0] is not None and silent > board.silence:
-            say(
-                f"openjax fly: nothing from the loop for {silent:.2f} s, the links' process lands all vehicles"
-            )
+        left = board.pilot is Role.LINKS or (board.pilot is Role.LOOP and silent > board.silence)
+        if left and board.flying and landing[0] is not None:
+            say("openjax fly: the loop doesn't fly any more, the links' process lands all vehicles")
             fly_down(board, Role.LINKS, swarm, *landing)
         if os.getppid() != parent and not board.flying:
             if board.armed:

@@ -132,6 +132,8 @@ class Session:
     def _left_to_others(self) -> str:
         """Return once the vehicles are down; land them here if nobody else does. What happened."""
         board, lander = self.links.board, Role.LINKS
+        if board.pilot is Role.LOOP:
+            board.take(Role.LINKS)
         while board.flying:
             time.sleep(0.005)
             now = time.perf_counter()
@@ -139,7 +141,7 @@ class Session:
             if self.requests() is Request.STOP:
                 board.stop()
             lander = max(lander, board.pilot)
-            if all(board.silent(role, now) > 2.5 * board.silence for role in (Role.LINKS, Role.GUARD)):
+            if all(board.silent(role, now) > board.silence for role in (Role.LINKS, Role.GUARD)):
                 lander = Role.LOOP
                 for role in (Role.LINKS, Role.GUARD):
                     board.end_process(role)
