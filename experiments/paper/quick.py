@@ -125,7 +125,7 @@ def page(results: dict) -> Page:
     return Page(
         "The quick preset: what two CPU cores learn",
         f"{results['preset']} Each cell: capture rate, seconds to the capture, crash rate. {results.get('note', '')}",
-        Table(columns, results["runs"]),
+        [Table(columns, results["runs"]), "\n".join(f"* {found}" for found in results.get("findings", ()))],
     )
 
 
