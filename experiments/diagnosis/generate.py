@@ -22,6 +22,7 @@ from experiments.diagnosis.fleet import Fleet, bodies, write_case
 from experiments.flying.single_thread import use_single_thread
 
 SIZES = 4
+CHUNK = 8  # cases that a process flies at once
 
 
 def _variants(spec):
@@ -98,11 +99,10 @@ def fly_chunk(job):
     return answers
 
 
-def generate(seed, column, count, logs, jobs=1, only=None, chunk=8, progress=True, names=None):
-    """All cases, or those of `names`; writes the logs and returns the answers, sorted by case."""
+def generate(seed, column, count, logs, jobs=1, only=None, progress=True):
+    """All cases; writes the logs and returns the answers, sorted by case."""
     specs = cases.draw_cases(seed, column, count, only)
-    specs = [s for s in specs if names is None or s["name"] in names]
-    size = max(1, min(chunk, math.ceil(len(specs) / jobs)))
+    size = max(1, min(CHUNK, math.ceil(len(specs) / jobs)))
     work = [(seed, column, specs[i : i + size], Path(logs)) for i in range(0, len(specs), size)]
     answers, start = [], time.perf_counter()
 
@@ -121,14 +121,14 @@ def generate(seed, column, count, logs, jobs=1, only=None, chunk=8, progress=Tru
     return sorted(answers, key=lambda a: a["case"])
 
 
-def write_answers(path, answers, seed, column, count=None):
+def write_answers(path, answers, seed, column):
     """Write the answers as JSON; returns the SHA-256 of the file."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     text = json.dumps(
         {
             "seed": seed,
-            "count": count or len(answers),  # of the plan that these cases are of
+            "count": len(answers),
             "column": column,
             "channels": measure.CHANNELS,
             "cases": {a["case"]: a for a in answers},
@@ -144,7 +144,6 @@ def write_answers(path, answers, seed, column, count=None):
 def add_case_arguments(parser):
     """What all that fly cases are told: which, and where to."""
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--cases", help="these cases of the plan alone, comma-separated: case_003,case_017")
     parser.add_argument("--logs", type=Path, required=True)
     parser.add_argument("--answers", type=Path, required=True)
     parser.add_argument("--jobs", type=int, default=1)
@@ -163,11 +162,8 @@ def main():
     if options.answers.resolve().is_relative_to(options.logs.resolve()):
         parser.error("--answers must not lie inside --logs")
     only = options.only.split(",") if options.only else None
-    names = options.cases.split(",") if options.cases else None
-    answers = generate(
-        options.seed, options.column, options.count, options.logs, options.jobs, only, names=names
-    )
-    print("sha256", write_answers(options.answers, answers, options.seed, options.column, options.count))
+    answers = generate(options.seed, options.column, options.count, options.logs, options.jobs, only)
+    print("sha256", write_answers(options.answers, answers, options.seed, options.column))
 
 
 if __name__ == "__main__":

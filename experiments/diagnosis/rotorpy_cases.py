@@ -290,12 +290,10 @@ def make_case(job):
 
 
 def fly_plan(options, kinds):
-    """Fly the cases of `kinds` in an order drawn by the seed (or those of `--cases`), and write their answers."""
+    """Fly the cases of `kinds` in an order drawn by the seed, and write their answers."""
     use_single_thread()
     order = np.random.default_rng(options.seed).permutation(len(kinds))
     jobs = [(options.seed, n, kinds[i], str(options.logs)) for n, i in enumerate(order, 1)]
-    if options.cases:
-        jobs = [job for job in jobs if f"case_{job[1]:03d}" in options.cases.split(",")]
     with multiprocessing.get_context("spawn").Pool(options.jobs) as pool:
         answers = sorted(pool.imap_unordered(make_case, jobs), key=lambda a: a["case"])
     print("sha256", write_answers(options.answers, answers, options.seed, "rotorpy"))
@@ -388,10 +386,8 @@ def main():
     )
     add_case_arguments(parser)
     parser.add_argument("--each", type=int, default=4, help="cases of each kind")
-    parser.add_argument("--kinds", default=",".join(KINDS))
     options = parser.parse_args()
-    kinds = [kind for kind in options.kinds.split(",") for _ in range(options.each)]
-    fly_plan(options, kinds)
+    fly_plan(options, [kind for kind in KINDS for _ in range(options.each)])
 
 
 if __name__ == "__main__":
