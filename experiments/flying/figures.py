@@ -23,8 +23,6 @@ from typing import Annotated, Literal
 
 import tyro
 
-from experiments.table import Table
-
 LAYOUTS = ("wall", "narrow_gap", "random", "passage", "hidden")
 LINKS = (
     (0.0, 0.0), (6.0, 0.0), (12.0, 0.0), (20.0, 0.0), (30.0, 0.0),
@@ -100,8 +98,12 @@ def flown(flying, out: Path, seconds: float) -> dict:
 
 
 def long(arguments) -> dict:
-    """One flight, game after game, until the minutes are over: then it's asked to land."""
-    options = f"--scenario wall --episodes {max(1, int(20 * arguments.minutes))}"
+    """One flight, game after game, until the minutes are over: then it's asked to land.
+
+    It measures, so it goes on after stops of the machine that would land others.
+    """
+    options = f"--scenario wall --episodes {max(1, int(20 * arguments.minutes))} --guard_after .5"
+    options += " --safety.pose_timeout .5 --safety.link_timeout 1 --safety.action_timeout .5"
     return pair(arguments, 0, arguments.out / "long", "--endurance 7200", options, 60 * arguments.minutes)
 
 
@@ -159,22 +161,6 @@ def diagnose(arguments, flown: dict) -> dict:
     return json.loads(predictions.read_text(encoding="utf-8"))
 
 
-def captures(figures) -> Table:
-    """Flown and simulated captures, by layout."""
-    rows = []
-    for layout, flight in figures["layouts"].items():
-        games = [g for g in flight.get("games", ()) if g["end"] == "over"]
-        rows.append({
-            "layout": layout, "games": games, "caught": [g["capture_step"] is not None for g in games],
-            "steps": [g["capture_step"] or 800 for g in games], **figures.get("simulator", {}).get(layout, {}),
-        })  # fmt: skip
-    columns = {
-        "layout": "layout", "games": lambda row: len(row["games"]), "captured, flown": "caught:.2f", "step, flown": "steps:.0f",
-        "captured, simulated": "capture_rate:.2f", "step, simulated": "capture_step:.0f",
-    }  # fmt: skip
-    return Table(columns, rows)
-
-
 def main() -> None:
     arguments = tyro.cli(Arguments)
     arguments.out.mkdir(parents=True, exist_ok=True)
@@ -192,8 +178,6 @@ def main() -> None:
     if arguments.part == "diagnose":
         figures["diagnosis"] = diagnose(arguments, figures["links"])
     path.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
-    if "layouts" in figures:
-        print("\n".join(captures(figures).lines()))
 
 
 if __name__ == "__main__":

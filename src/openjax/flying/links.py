@@ -339,7 +339,7 @@ def _watch(swarm: Swarm, board: Board, parent: int, landing) -> None:
         silent = board.silent(Role.LOOP, now)
         left = board.pilot is Role.LINKS or (board.pilot is Role.LOOP and silent > board.silence)
         if left and board.flying and landing[0] is not None:
-            say("openjax fly: the loop doesn't fly any more, the links' process lands all vehicles")
+            say(f"openjax fly: the loop, heard {silent:.2f} s ago, left all vehicles to the links' process")
             fly_down(board, Role.LINKS, swarm, *landing)
         if os.getppid() != parent and not board.flying:
             if board.armed:
