@@ -79,4 +79,4 @@ def flying():
 )  # fmt: skip
 def test_whatever_happens_all_are_down_inside_and_disarmed(flying, kind):
     record = flying(7, kind)
-    assert record["well"], record
+    assert record["well"], str(record)
