@@ -62,8 +62,8 @@ def stage():
 def test_smooth_breaches_are_those_of_the_game(stage):
     game = stage[0].game
     key = jax.random.split(jax.random.key(2), 3)
-    tasks = jax.vmap(lambda key: uniform_task(game, key))(jax.random.split(key[0], 256))
-    _, state = jax.vmap(stage[0].environment.reset_to)(jax.random.split(key[1], 256), tasks)
+    tasks = jax.jit(jax.vmap(lambda key: uniform_task(game, key)))(jax.random.split(key[0], 256))
+    _, state = jax.jit(jax.vmap(stage[0].environment.reset_to))(jax.random.split(key[1], 256), tasks)
     position = jax.random.uniform(key[2], (256, 3, 3), minval=-0.6, maxval=0.6) * jnp.array([2.0, 2.0, 2.2])
     state = state.replace(drones=state.drones.replace(position=position))
     counted = jax.vmap(lambda p, t: breaches(game, p, t.pillar_position, t.pillar_active).total)
