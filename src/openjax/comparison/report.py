@@ -197,7 +197,7 @@ def draw(change: Change):
         axis.set(title=name, xticks=(0, 1), xticklabels=("reference", "new"), xlim=(-0.6, 1.6))
     axes[0].set_ylabel("% of hover (band: 90 % of normal days)")
     places = sorted(change.places.items(), key=lambda item: -item[1])[:6]
-    names = ["all" if len(p) == 4 else "+".join(f"m{i}" for i in p) or "unclear" for p, _ in places]
+    names = ["all" if len(p) == 4 else "+".join(f"m{i}" for i in p) or "no rotor's" for p, _ in places]
     shares = [change.probability * share for _, share in places]
     axes[4].barh(["no change", *names][::-1], [1 - change.probability, *shares][::-1], color="#2b6cb0")
     axes[4].set(title="probability", xlim=(0, 1))
