@@ -27,10 +27,10 @@ def test_one_part_alone_has_all_that_is_explained():
     )
 
 
-def test_without_a_gap_there_is_nothing_to_share():
+def test_without_a_gap_all_there_is_are_the_sensors():
     squares = np.ones((4, 10, 2))
     values, square = shares_of_squares(squares, np.full((1, 10), 0.1), np.ones(2))
-    assert not values.any() and square == pytest.approx(np.ones((1, 2)))
+    assert values[0] == pytest.approx([1.0, 0.0]) and square == pytest.approx(np.ones((1, 2)))
 
 
 def fit(effect, value, error):

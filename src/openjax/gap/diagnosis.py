@@ -156,6 +156,10 @@ def _nuisances(evidence: Evidence, selection: Selection) -> dict[str, str]:
         return ", at its bound" if abs(v) > 0.99 * BOUND else ""
 
     found = {n: f"{v:+.2f} of its usual size{at(v)}" for n, v in zip(names, taken, strict=True)}
+    if (evidence.sensors.gain != 1.0).any():
+        found["gyroscope gain"] = ", ".join(
+            f"{a} {g:.3f}" for a, g in zip("xyz", evidence.sensors.gain, strict=True)
+        )
     if "motor_rows" not in evidence.case.vehicle_file.log:
         found["rows of motor commands"] = "taken for means over the row: [log] motor_rows doesn't say"
     return found

@@ -89,8 +89,7 @@ def _sensors(tracks: list[Track], library: Library) -> tuple[list[Track], Pose |
     if moved:
         tracks = [undelayed(t, pose.delay[0]) for t in tracks]
     sensors = read_kinematics(tracks)
-    if sensors.upright is not None or sensors.findings:
-        tracks = [corrected(t, sensors) for t in tracks]
+    tracks = [corrected(t, sensors) for t in tracks]
     if pose is not None and not moved:
         pose = read_pose(tracks, library, sensors.wander)
     return tracks, pose if sensors.one_clock else None, sensors

@@ -114,11 +114,11 @@ def shares_of_squares(squares: np.ndarray, weights: np.ndarray, left: np.ndarray
     level = (level / floor).mean(2)  # (draws, sets)
     after, raw, before = level[:, :3].T
     whole = np.maximum(raw, before) - 1.0
-    sure = whole > 2.0 * DECISION.least_gap  # without a gap there is nothing to share
+    sure = whole > 2.0 * DECISION.least_gap  # without a gap, all there is are the sensors
     unexplained = np.where(sure, np.clip((after - 1.0) / np.where(sure, whole, 1.0), 0.0, 1.0), 0.0)
-    useful = np.maximum(level[:, 3:] - after[:, None], 0.0)
-    total = useful.sum(1, keepdims=True)
-    shares = useful / np.maximum(total, 1e-30) * np.where(sure, 1.0 - unexplained, 0.0)[:, None]
+    useful = np.maximum(level[:, 3:] - after[:, None], 0.0) * sure[:, None]
+    useful[:, -1] += 1e-12
+    shares = useful / useful.sum(1, keepdims=True) * (1.0 - unexplained)[:, None]
     return np.concatenate([shares, unexplained[:, None]], 1), np.stack([before, after], 1)
 
 

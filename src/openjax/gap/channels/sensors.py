@@ -31,13 +31,12 @@ SEGMENT = 1.0  # s, unit of the jackknife, over which a clock hardly moves
 
 @dataclass(frozen=True)
 class Kinematics:
-    """`gain` (3,) of the gyroscope with `gain_error` (3,), NaN where it couldn't be judged; `tilt` (2,) rad about the
-    world's x and y axes with `tilt_error` (2,), None without path or accelerometer; `coherence` (3,) of attitude's
-    rate and gyroscope, `turning` (3,) whether the flights turn enough to tell; `findings`: what is off, in words, by name;
+    """`gain` (3,) of the gyroscope, 1 where it isn't clearly another; `tilt` (2,) rad about the world's x and y axes with
+    `tilt_error` (2,), None without path or accelerometer; `coherence` (3,) of attitude's rate and gyroscope, `turning` (3,)
+    whether the flights turn enough to tell; `findings`: what is off by more than usual, in words, by name;
     `wander` s: by how much (rms) the clocks of gyroscope and pose drift apart and back within a flight."""
 
     gain: np.ndarray
-    gain_error: np.ndarray
     tilt: np.ndarray | None
     tilt_error: np.ndarray | None
     coherence: np.ndarray
@@ -68,7 +67,9 @@ def read_kinematics(tracks: list[Track]) -> Kinematics:
     tilt, tilt_error = _world(tracks)
     findings = {}
     # Two axes alike are a sensor; one alone may be an axis that the flights hardly turn about.
-    off = (np.abs(gain - 1.0) > np.maximum(DECISION.gyroscope_gain, CLEAR * error)) & np.isfinite(gain)
+    clear = (np.abs(gain - 1.0) > CLEAR * error) & np.isfinite(gain)
+    clear &= clear.sum() >= 2
+    off = clear & (np.abs(gain - 1.0) > DECISION.gyroscope_gain)
     if off.sum() >= 2:
         words = ", ".join(f"{a} {g:.3f}" for a, g, o in zip("xyz", gain, off, strict=True) if o)
         findings["gyroscope gain"] = f"the gyroscope reads {words} times the rate of the attitude"
@@ -86,14 +87,15 @@ def read_kinematics(tracks: list[Track]) -> Kinematics:
                 f"motion capture's world leans by {np.degrees(size):.1f} degrees against gravity "
                 f"({np.degrees(tilt[0]):+.1f} about x, {np.degrees(tilt[1]):+.1f} about y)"
             )
-    return Kinematics(gain, error, tilt, tilt_error, coherence, turning, findings, _wander(streams))
+    gain = np.where(clear, gain, 1.0)
+    return Kinematics(gain, tilt, tilt_error, coherence, turning, findings, _wander(streams))
 
 
 def corrected(track: Track, found: Kinematics) -> Track:
     """The track as it would read with sensors that agree."""
     changes = {}
-    if "gyroscope gain" in found.findings:
-        changes["body_rates"] = track.body_rates / np.where(np.isfinite(found.gain), found.gain, 1.0)
+    if (found.gain != 1.0).any():
+        changes["body_rates"] = track.body_rates / found.gain
     if found.upright is not None:
         x, y = found.upright  # small rotation that puts the world upright
         turn = np.array([[1.0, 0.0, y], [0.0, 1.0, -x], [-y, x, 1.0]])
