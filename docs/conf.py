@@ -25,7 +25,7 @@ suppress_warnings = ["myst.header"]  # pages of results may skip a level
 # notebooks run when the site is built, and again only when they change
 nb_execution_mode = "cache"
 nb_execution_in_temp = True
-nb_execution_timeout = 600
+nb_execution_timeout = 1800  # s a cell, on a busy machine
 nb_execution_raise_on_error = True
 nb_merge_streams = True
 
