@@ -50,7 +50,8 @@ def study(options) -> dict:
         name: {"figures": stored_figures([x for x in lines if x["set"] == name])}
         for name in sorted({x["set"] for x in lines})
     }
-    return {"seed": options.seed, "answers_sha256": digests, "columns": columns, "cases": lines}
+    found = {"seed": options.seed, "note": options.note, "answers_sha256": digests}
+    return found | {"columns": columns, "cases": lines}
 
 
 def stored_figures(lines: list[dict]) -> dict[str, dict]:
@@ -70,7 +71,8 @@ def page(results: dict) -> Page:
     digests = ", ".join(f"{c} {d[:16]}" for c, d in results["answers_sha256"].items())
     prose = (
         "Cases are flown, their answers sealed, the logs diagnosed, the answers opened, once. "
-        f"In brackets: 95 % interval. Seed {results['seed']}; SHA-256 of the answers: {digests or 'given'}."
+        f"In brackets: 95 % interval. Seed {results['seed']}; SHA-256 of the answers: {digests or 'given'}. "
+        f"{results['note']}"
     )
     lines = results["cases"]
     return Page(
@@ -87,6 +89,7 @@ def main() -> None:
     parser.add_argument("--sets", nargs="+", default=[], metavar="DIR[=ANSWERS]")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--cores", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--note", default="", help="a sentence for the page")
     parser.add_argument("--seconds", type=float, help="for the diagnoses; what is done by then counts")
     parser.add_argument(
         "--work", type=Path, default=Path("runs/exam"), help="logs and answers; not committed"
