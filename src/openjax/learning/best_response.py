@@ -148,14 +148,13 @@ class BestResponse:
             seen = self._seen(state)
             mean = jax.vmap(outputs)(evader.actor, seen)[0]
             value = jax.vmap(outputs)(evader.critic, seen)[1]
-            log_std = evader.log_std[:, None]
-            sample = mean + jnp.exp(log_std) * noise
+            sample = mean + jnp.exp(evader.log_std[:, None]) * noise
             flying = ~self._by_seed(state.statistics.captured)
             observation, state, *_ = step(key, state, action, sample.reshape(-1, 3))
             record = _Samples(
                 seen=seen,
                 sample=sample,
-                log_prob=gaussian_log_prob(sample, mean, log_std),
+                log_prob=jax.vmap(gaussian_log_prob)(sample, mean, evader.log_std),
                 value=value,
                 flying=flying,
                 caught=self._by_seed(state.statistics.captured),
