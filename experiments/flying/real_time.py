@@ -161,7 +161,7 @@ def worker(arguments, queue, done, ends) -> None:
     real_time.hurry()
     while time.time() < ends:
         try:
-            number, kind = queue.get(timeout=0.5)
+            number, kind = queue.get(timeout=10.0)
         except Exception:
             break
         done.put(Flown(number, kind, virtual, fly, prepared).fly())
