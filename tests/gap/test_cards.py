@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from openjax.gap.model.bounds import bounded
+from openjax.gap.model.bounds import BOUND, bounded
 from openjax.gap.model.library import ABSENT, CARDS, STEP, THETA, places, prior, start_of
 from openjax.vehicle.effects import EFFECTS
 
@@ -37,10 +37,10 @@ def test_nuisances_stay_within_their_bounds():
     for _ in range(5):
         root = rng.standard_normal((6, 6))
         hessian, push = root @ root.T + np.eye(6), 20.0 * rng.standard_normal(6)
-        found, _ = bounded(hessian, push, 2, 1.5)
-        assert (np.abs(found[2:]) <= 1.5 + 1e-12).all()
+        found, _ = bounded(hessian, push, 2)
+        assert (np.abs(found[2:]) <= BOUND + 1e-12).all()
         cost = lambda x, h=hessian, p=push: 0.5 * x @ h @ x - p @ x  # noqa: E731
-        best = minimize(cost, np.zeros(6), bounds=[(None, None)] * 2 + [(-1.5, 1.5)] * 4).fun
+        best = minimize(cost, np.zeros(6), bounds=[(None, None)] * 2 + [(-BOUND, BOUND)] * 4).fun
         free = cost(np.linalg.solve(hessian, push))
         assert (
             cost(found) - best <= 0.15 * (best - free) + 1e-6

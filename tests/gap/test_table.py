@@ -30,7 +30,7 @@ def table_of(columns) -> Table:
     white = np.array([b @ b.T for b in blocks])
     return Table(
         SimpleNamespace(effects=(), theta=np.zeros(0)), white, np.repeat(white[:, None], 6, 1), np.full(8, 100),
-        np.repeat([0, 1], 4), np.repeat([0, 1], 4), np.repeat([0, 1, 2, 3], 2), {}, {}, {}, SHARED,
+        np.repeat([0, 1], 4), np.repeat([0, 1, 2, 3], 2), {}, {}, {}, SHARED,
         np.ones(6), blocks,
     )  # fmt: skip
 

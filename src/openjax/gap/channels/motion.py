@@ -112,7 +112,7 @@ def read_motion(reading: Reading, loop: RateLoop | None) -> Motion:
     )
     replay, floor, exposure = model_noise(replay, library)
     gusts = gustiness(tracks, feedback, floor)
-    replay = dataclasses.replace(replay, gusts=gusts).loosened(_gusty(replay, gusts))
+    replay = replay.loosened(_gusty(replay, gusts))
     exposure |= {e: 0.0 for e in library.physics if _hidden(CARDS[e], tracks)}
     nothing, singles = fit_singles(replay, library, exposure)
 

@@ -7,17 +7,17 @@ import numpy as np
 BOUND = 2.0  # usual sizes that a nuisance may take
 
 
-def bounded(hessian, push, free: int = 0, bound: float = BOUND) -> tuple[np.ndarray, np.ndarray]:
-    """Minimum of x'Hx/2 - push'x with |x| <= bound beyond the first `free` entries, by fixing what leaves the box; and
+def bounded(hessian, push, free: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Minimum of x'Hx/2 - push'x with |x| <= BOUND beyond the first `free` entries, by fixing what leaves the box; and
     which entries are inside it."""
     open_ = np.ones(len(push), bool)
     found = np.linalg.solve(hessian, push)
     while True:
-        beyond = open_ & (np.abs(found) > bound)
+        beyond = open_ & (np.abs(found) > BOUND)
         beyond[:free] = False
         if not beyond.any():
             return found, open_
-        found[beyond] = np.sign(found[beyond]) * bound
+        found[beyond] = np.sign(found[beyond]) * BOUND
         open_ &= ~beyond
         inside, fixed = np.flatnonzero(open_), np.flatnonzero(~open_)
         rest = push[inside] - hessian[np.ix_(inside, fixed)] @ found[fixed]

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from openjax.gap.model.bounds import bounded, normal_equations
+from openjax.gap.model.bounds import BOUND, bounded, normal_equations
 from openjax.gap.model.library import prior
 from openjax.gap.model.table import Model, Table, with_effects
 
@@ -35,8 +35,6 @@ class Equations:
     def nuisances(self) -> tuple[np.ndarray, np.ndarray]:
         """Columns of the nuisances that the model uses: the case's and a track's."""
         every, shared = self.table.nuisances, self.table.shared
-        if self.model.bound == 0.0:
-            return every[:0], every[:0]
         return every[shared], every[~shared]
 
     @property
@@ -73,7 +71,7 @@ class Equations:
     def solved(self, fold: int | None = None) -> np.ndarray:
         """Solution over all folds but one, whose track has its own nuisances fitted to all of it."""
         hessian, push = self.without(fold)
-        found, _ = bounded(hessian, push, len(self.model.free), self.model.bound)
+        found, _ = bounded(hessian, push, len(self.model.free))
         return found if fold is None else self.own_again(found[None], self.table.folds[1][fold])[0]
 
     def own_again(self, found: np.ndarray, track: int) -> np.ndarray:
@@ -88,8 +86,8 @@ class Equations:
         free = np.linalg.solve(hessian, push.T).T
         found, mine = found.copy(), slice(common + own * track, common + own * (track + 1))
         for each, alone, right in zip(found, free, push, strict=True):
-            inside = (np.abs(alone) <= self.model.bound).all()
-            each[mine] = alone if inside else bounded(hessian, right, 0, self.model.bound)[0]
+            inside = (np.abs(alone) <= BOUND).all()
+            each[mine] = alone if inside else bounded(hessian, right)[0]
         return found
 
     def coefficients(self, found: np.ndarray, track: int) -> np.ndarray:
@@ -108,7 +106,7 @@ def promise(table: Table, model: Model) -> float:
     """Log posterior of a model at its best, fitted to all folds, up to what all models of a table share: what screening needs."""
     equations, own = Equations(table, model), [0, *model.parts]
     hessian, push = equations.without(None)
-    found, _ = bounded(hessian, push, len(model.free), model.bound)
+    found, _ = bounded(hessian, push, len(model.free))
     square = table.folds[0].sum(0)[np.ix_(own, own)].sum()
     return float(push @ found - 0.5 * found @ hessian @ found - 0.5 * square)
 

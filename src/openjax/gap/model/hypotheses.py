@@ -36,7 +36,6 @@ class SetFit:
     columns: list
     covariance: np.ndarray
     score: float
-    objective: float
 
     def parameters(self) -> dict[str, dict[str, tuple[float, float]]]:
         """{effect: {parameter: (value, standard deviation)}} of the set's own effects."""
@@ -77,13 +76,13 @@ def fit_set(replay: Replay, effects, start: np.ndarray | None = None, iterations
             break
         theta = theta.copy()
         theta[index] += np.clip(step, -reach, reach)
-    objective, theta, grams, columns, products = best
+    _, theta, grams, columns, products = best
     hessian = grams.sum(0)[1:, 1:] + precision
     covariance = np.linalg.inv(hessian) if len(index) else np.zeros((0, 0))
     volume = np.linalg.slogdet(hessian)[1] - np.linalg.slogdet(precision)[1] if len(index) else 0.0
     score = -_held(replay, products, theta[index] - mean, precision) - 0.5 * volume
     score += _sign_term(effects, index, theta, covariance)
-    return SetFit(effects, theta, index, grams, columns, covariance, float(score), float(objective))
+    return SetFit(effects, theta, index, grams, columns, covariance, float(score))
 
 
 def _newton(gram, precision, off) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

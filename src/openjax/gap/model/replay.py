@@ -35,9 +35,6 @@ class Replay:
     numbers: tuple  # the vehicle's numbers among the nuisances, which come first
     usable: np.ndarray  # (9,) channels that were logged
     noises: tuple[Noise, ...]  # unlogged channels have one, but count nothing
-    gusts: np.ndarray | None = (
-        None  # (3,) their share in the torques about each axis, see `feedback.gustiness`
-    )
 
     @property
     def tracks(self) -> tuple[Track, ...]:

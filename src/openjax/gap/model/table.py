@@ -15,7 +15,6 @@ from functools import cached_property
 
 import numpy as np
 
-from openjax.gap.model.bounds import BOUND
 from openjax.gap.model.hypotheses import SetFit, linearised_at
 from openjax.gap.model.library import ABSENT, CARDS, places, prior
 from openjax.gap.model.replay import SKIP, Replay
@@ -29,16 +28,15 @@ ERRORS = tuple((f"{kind} {axis}", 3 * number + k) for number, kind in enumerate(
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """`white` (B, C, C) and `error` (B, 6, C, C) by block; `rows` (B,) that count; `track_of`, `flight_of`, `fold_of`
-    (B,). Columns: 0 is what is left; `derivative` {place: column}; `step` {effect: column}; `part` {effect: column};
-    the last are nuisances, of which `shared` (N,) are the case's and the others a track's."""
+    """`white` (B, C, C) and `error` (B, 6, C, C) by block; `rows` (B,) that count; `track_of`, `fold_of` (B,). Columns: 0 is
+    what is left; `derivative` {place: column}; `step` {effect: column}; `part` {effect: column}; the last are nuisances, of
+    which `shared` (N,) are the case's and the others a track's."""
 
     fit: SetFit
     white: np.ndarray
     error: np.ndarray
     rows: np.ndarray
     track_of: np.ndarray
-    flight_of: np.ndarray
     fold_of: np.ndarray
     derivative: dict[int, int]
     step: dict[str, int]
@@ -70,13 +68,12 @@ class Table:
 @dataclass(frozen=True, eq=False)
 class Model:
     """One combination of a table's columns: column 0 and `parts` are there, the coefficients of `free` are fitted, with
-    prior `mean` and `precision`; `bound`: the box of the nuisances in their usual sizes (0: without them)."""
+    prior `mean` and `precision`."""
 
     parts: tuple[int, ...]
     free: np.ndarray
     mean: np.ndarray
     precision: np.ndarray
-    bound: float = BOUND
 
 
 def build(replay: Replay, fit: SetFit, singles: dict[str, SetFit] | None) -> Table:
@@ -118,7 +115,7 @@ def build(replay: Replay, fit: SetFit, singles: dict[str, SetFit] | None) -> Tab
     track_of = np.array(track_of)
     at = 1 + len(index)
     return Table(
-        fit, np.array(white), np.array(error), np.array(rows), track_of, replay.flight_of[track_of],
+        fit, np.array(white), np.array(error), np.array(rows), track_of,
         np.unique(fold_of, return_inverse=True)[1],
         {int(i): 1 + k for k, i in enumerate(index)},
         {e: at + k for k, e in enumerate(others)},
