@@ -8,6 +8,7 @@ diagnosis. A column whose answers lie in the work folder isn't flown again, and 
 `--report` makes the page anew from what is stored. Seeds below 1000 are for development; each other seed is answered once.
 """
 
+import math
 import os
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from pathlib import Path
 from experiments.diagnosis import development, figures
 from experiments.table import Page, page_parser, publish
 
+LEFT_OUT = ("parameters", "quality", "gap", "probabilities", "not_testable", "rest", "false_unknown")
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -42,10 +44,7 @@ def study(options) -> dict:
     sets = [str(options.work / column) for column in wanted] + options.sets
     arguments = ["--sets", *sets, "--cores", str(options.cores), "--out", str(out)]
     development.main(arguments + (["--seconds", str(options.seconds)] if options.seconds else []))
-    lines = [
-        {k: v for k, v in line.items() if k not in ("parameters", "quality", "gap")}
-        for line in development.read_lines([out])
-    ]
+    lines = [{k: v for k, v in line.items() if k not in LEFT_OUT} for line in development.read_lines([out])]
     columns = {
         name: {"figures": stored_figures([x for x in lines if x["set"] == name])}
         for name in sorted({x["set"] for x in lines})
@@ -59,7 +58,7 @@ def stored_figures(lines: list[dict]) -> dict[str, dict]:
     out = {}
     for name, found in figures.figures(lines).items():
         hits, n = found if isinstance(found, tuple) else (None, None)
-        if n is None:
+        if n is None and math.isfinite(found):
             out[name] = {"value": found}
         elif n:
             out[name] = {"hits": hits, "n": n, "value": hits / n}
