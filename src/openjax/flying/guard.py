@@ -95,7 +95,7 @@ def fly_down(
         due = max(due + TICK, clock() - TICK)
         time.sleep(max(due - clock(), 0.0))
     if board.pilot is role:
-        disarm(vehicles, board, clock)
+        disarm(vehicles, board, role)
         board.write(role, clock(), state)
         say("openjax fly: all vehicles are down and disarmed")
         time.sleep(3.0 * board.silence)
@@ -105,16 +105,17 @@ def fly_down(
     return state
 
 
-def disarm(vehicles: Raw, board: Board, clock: Callable[[], float] = time.perf_counter) -> bool:
-    """Ask all to disarm until they have, or nothing is heard of it; whether all have."""
-    deadline = clock() + DISARMING
+def disarm(vehicles: Raw, board: Board, role: Role) -> bool:
+    """Ask all to disarm until they have, or nothing is heard of it; whether all have. `role`: whose process this is."""
+    deadline = time.perf_counter() + DISARMING
     while True:
+        board.beat(role, time.perf_counter())
         vehicles.send([SetPoint()] * len(vehicles.observe()))
         vehicles.arm(False)
         time.sleep(0.03)
         armed = [s.supervisor & (Supervisor.ARMED | Supervisor.AUTO_ARM) == Supervisor.ARMED
                  for s in vehicles.observe()]  # fmt: skip
-        if not any(armed) or clock() > deadline:
+        if not any(armed) or time.perf_counter() > deadline:
             board.arm(any(armed))
             return not any(armed)
 
@@ -252,7 +253,7 @@ def watch(board: Board, parent: int, own: RawLinks, safety: SafetySettings, stat
         elif board.armed and not board.flying and links_silent:
             board.end_process(Role.LINKS)
             own.open()
-            disarm(own, board)
+            disarm(own, board, Role.GUARD)
         elif not board.flying and os.getppid() != parent and (links_silent or not board.armed):
             break
     os._exit(0)  # the links' threads would take a second each

@@ -308,7 +308,7 @@ def _serve(
         while True:
             number, name, arguments = control.recv()
             disarming = name in ("disarm", "close")
-            result = disarm(swarm, board) if disarming else getattr(swarm, name)(*arguments)
+            result = disarm(swarm, board, Role.LINKS) if disarming else getattr(swarm, name)(*arguments)
             if number:
                 control.send((number, result))
             if name == "close":
@@ -343,5 +343,5 @@ def _watch(swarm: Swarm, board: Board, parent: int, landing) -> None:
             fly_down(board, Role.LINKS, swarm, *landing)
         if os.getppid() != parent and not board.flying:
             if board.armed:
-                disarm(swarm, board)
+                disarm(swarm, board, Role.LINKS)
             os._exit(1)
