@@ -4,7 +4,7 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 PYTEST  = $(BIN)/python -m pytest -n auto --maxprocesses 8 --dist worksteal
 
-.PHONY: train test test-slow test-all lint docs benchmark evaluate tables exam clean
+.PHONY: train test test-slow test-real-time test-all lint docs benchmark evaluate tables exam clean
 
 # `make train` accepts extra options: make train ARGS="--preset paper --seed 1"
 train: $(READY)
@@ -15,9 +15,13 @@ test: $(READY)
 	$(PYTEST) -m "not slow" $(ARGS)
 
 test-slow: $(READY)
-	$(PYTEST) -m slow $(ARGS)
+	$(PYTEST) -m "slow and not real_time" $(ARGS)
 
-test-all: lint test test-slow docs
+# flights of real processes at 100 Hz: one after the other, with nothing beside them
+test-real-time: $(READY)
+	$(BIN)/python -m pytest -m real_time $(ARGS)
+
+test-all: lint test test-slow test-real-time docs
 
 lint: $(READY)
 	$(BIN)/ruff check src tests experiments examples conftest.py

@@ -152,6 +152,7 @@ def fly_hovering(uris, folder, body_logs, seconds):
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 def test_a_flight_from_the_floor_to_its_log(uris, tmp_path):
     flight, samples, case = fly_hovering(uris, tmp_path, body_logs=1, seconds=2.3)
     assert flight.state.all_in(Mode.LANDED)
@@ -170,6 +171,7 @@ def test_a_flight_from_the_floor_to_its_log(uris, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 @pytest.mark.parametrize(("latency", "loss"), [(0.0, 0.0), (6.0, 0.0), (12.0, 0.1)])
 def test_the_log_tells_the_links_latency_and_loss(tmp_path, latency, loss):
     """By the motors, whose mean is the thrust that was asked for as long as none of them is at its limit."""
@@ -198,6 +200,7 @@ def test_the_log_tells_the_links_latency_and_loss(tmp_path, latency, loss):
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 def test_another_process_lands_and_disarms_what_hangs_in_the_air(uris):
     with connected(uris, body_logs=0) as links:
         links.arm()
@@ -226,6 +229,7 @@ def test_another_process_lands_and_disarms_what_hangs_in_the_air(uris):
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 def test_a_broken_link_process_is_an_error_and_not_a_wait(uris):
     with connected(uris, body_logs=0) as links:
         os.kill(links.pid, signal.SIGKILL)
@@ -235,6 +239,7 @@ def test_a_broken_link_process_is_an_error_and_not_a_wait(uris):
 
 
 @pytest.mark.slow
+@pytest.mark.real_time
 def test_motion_capture_is_seen_here_and_on_board():
     """The virtual Crazyflie in a thread of this process, so that its firmware can be looked into."""
     virtual = VirtualCrazyflies(VirtualVehicles(load_vehicle(), [(0.4, 0.0)]), port=0, faults=LinkFaults())
