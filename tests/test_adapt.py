@@ -110,10 +110,16 @@ def test_what_is_won_back_is_the_share_of_a_loss_beyond_chance():
     assert shares["capture_step"] is None and shares["collision_rate"] is None
 
 
+def only(names, monkeypatch):
+    """Effects by `names` are all there are: the others take long to compile."""
+    family.vehicle_family(family.NOMINAL)  # read, checked and kept while there are all
+    few = {name: family.known_effects()[name] for name in names}
+    monkeypatch.setattr(family, "known_effects", lambda: few)
+
+
 def test_moments_in_flight_are_the_nominal_vehicles_with_a_settled_other_one(policy_file, monkeypatch):
     """A heavy vehicle at a moment of the light one's flight: where that is, with rotors that carry its own weight."""
-    few = {name: family.known_effects()[name] for name in ("mass", "state_latency")}
-    monkeypatch.setattr(family, "known_effects", lambda: few)
+    only(("mass", "state_latency"), monkeypatch)
     loaded = load_policy(policy_file)
     adaptation = make_adaptation(loaded.settings, AdaptSettings(worlds=2))
     parameters = starting_parameters(loaded.parameters, loaded.settings)
@@ -144,10 +150,7 @@ def test_a_flight_may_come_late_but_not_elsewhere():
 
 
 def test_a_policy_is_fine_tuned_measured_and_written(policy_file, tmp_path, monkeypatch):
-    few = {
-        name: family.known_effects()[name] for name in ("motor_lag", "mass")
-    }  # the others take long to compile
-    monkeypatch.setattr(family, "known_effects", lambda: few)
+    only(("motor_lag", "mass"), monkeypatch)
     effects = tmp_path / "effects.toml"
     save_effects(effects, VALUES, INTERVALS)
     training = AdaptSettings(worlds=2, updates=1)
