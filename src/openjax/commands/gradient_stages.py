@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from openjax.background import in_background
+from openjax.cluster.devices import own_copy
 from openjax.learning import build
 from openjax.learning.analytic_gradient import AnalyticGradient, compile_analytic, free_flight
 from openjax.learning.first_flights import FirstFlights, first_game, make_first_flights
@@ -25,7 +26,7 @@ TOGETHER = 50
 def compile_last_stage(settings: TrainSettings, environment: Pursuit, policy: Any) -> Callable:
     """The stage after MAPPO, compiled for parameters of these shapes; see `compile_analytic`."""
     stage = AnalyticGradient(settings.analytic, free_flight(environment), _exact(settings, environment))
-    return compile_analytic(stage, on_one_device(policy))
+    return compile_analytic(stage, abstract_like(policy))
 
 
 def compile_first_flights(
@@ -51,7 +52,7 @@ def compile_first_flights(
     begin = jax.jit(flights.begin)
     some = jax.jit(make_first_flights(flights, min(TOGETHER, how.updates)), donate_argnums=0)
     key = jax.eval_shape(lambda: jax.random.key(0))
-    policy = on_one_device(policy)
+    policy = abstract_like(policy)
     carry = jax.eval_shape(begin, policy, key)
     done = jax.ShapeDtypeStruct((), jnp.int32)
     lowered = some.lower(carry, key, done), begin.lower(policy, key)
@@ -60,8 +61,7 @@ def compile_first_flights(
     def learn(parameters, key):
         some, begin = (wait() for wait in ready)
         started = time.monotonic()
-        own = jax.tree.map(lambda leaf: jax.device_put(leaf, jax.local_devices()[0]), parameters)
-        carry = begin(own, key)
+        carry = begin(own_copy(parameters), key)
         for before in range(0, how.updates, TOGETHER):
             if over():
                 break
@@ -82,8 +82,3 @@ def _exact(settings: TrainSettings, environment: Pursuit) -> Policy:
     """The run's policy in float32: tens of steps of the simulation follow each action, too far for rough arithmetic."""
     policy = build(settings, environment).policy
     return dataclasses.replace(policy, network=dataclasses.replace(policy.network, compute_type="float32"))
-
-
-def on_one_device(abstract: Any) -> Any:
-    """Shapes and dtypes of a tree as of arrays on this process' first device."""
-    return abstract_like(abstract, jax.sharding.SingleDeviceSharding(jax.local_devices()[0]))

@@ -26,7 +26,7 @@ from openjax.commands.evaluator import (
     layout_slots,
     record_of,
 )
-from openjax.commands.gradient_stages import compile_first_flights, compile_last_stage, on_one_device
+from openjax.commands.gradient_stages import compile_first_flights, compile_last_stage
 from openjax.commands.run_words import closing_words, layouts_like
 from openjax.commands.step_programs import step_programs
 from openjax.commands.training_loop import NotFiniteError, Plan, StopRequest, run_updates
@@ -230,7 +230,7 @@ def _validation_ready(job, abstract):
     """The validation, compiled; and what else is needed soon after the first update is loaded."""
     load_orbax()
     validation = _validation(job)
-    validation.evaluator.compile_ahead(on_one_device(abstract.policy), validation.tasks)()
+    validation.evaluator.compile_ahead(abstract_like(abstract.policy), validation.tasks)()
     return validation
 
 
@@ -308,7 +308,7 @@ def _learn_analytic(job, directory, learn, validation):
     leaves, _, notes = load_policy_file(directory.policy)
     before = fill(_abstract_parameters(job), leaves, str(directory.policy))
     # where the validation, too, was compiled for
-    before = jax.device_put(before, jax.sharding.SingleDeviceSharding(jax.local_devices()[0]))
+    before = place(before)
     after, history = learn(before, jax.random.key(settings.seed))
     summaries = [summarise(validation(parameters)[0]) for parameters in (before, after)]
     scores = [selection_score(summary, settings.environment.episode_length) for summary in summaries]

@@ -18,7 +18,13 @@ import optax
 from flax import struct
 
 from openjax.baselines import make_policy
-from openjax.learning.analytic_gradient import breach_share, crash_share, draw_start, nearest_gap
+from openjax.learning.analytic_gradient import (
+    breach_share,
+    crash_share,
+    draw_start,
+    finite_or_zero,
+    nearest_gap,
+)
 from openjax.learning.evaluation import Evaluation, make_evaluate
 from openjax.learning.settings import AdaptSettings, TrainSettings
 from openjax.policy import Policy, PolicyParameters
@@ -194,9 +200,7 @@ def make_adaptation(trained: TrainSettings, settings: AdaptSettings) -> Adaptati
 
     def update(actor, state, parameters, flights, key, bounds):
         gradient, watch = jax.grad(loss, has_aux=True)(actor, parameters, flights, key, bounds)
-        whole = jnp.isfinite(optax.global_norm(gradient))
-        gradient = jax.tree.map(lambda leaf: jnp.where(whole, leaf, 0.0), gradient)
-        change, state = optimiser.update(gradient, state, actor)
+        change, state = optimiser.update(finite_or_zero(gradient), state, actor)
         return optax.apply_updates(actor, change), state, watch
 
     def evaluate(parameters, tasks, key, bounds):

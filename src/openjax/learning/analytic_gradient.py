@@ -202,10 +202,7 @@ class AnalyticGradient:
         flying = jax.tree.map(lambda leaf: leaf[chosen], flights)
         starts = self.starts(start_key, bounds)
         gradient, parts = jax.grad(self.loss, has_aux=True)(actor, parameters, starts, flying)
-        # a world that tumbles may have no gradient
-        finite = jnp.isfinite(optax.global_norm(gradient))
-        gradient = jax.tree.map(lambda leaf: jnp.where(finite, leaf, 0.0), gradient)
-        change, state = self.optimiser.update(gradient, state)
+        change, state = self.optimiser.update(finite_or_zero(gradient), state)
         return optax.apply_updates(actor, change), state, parts
 
     def bounds(self) -> jax.Array:
@@ -239,6 +236,12 @@ def free_flight(environment: Pursuit) -> Pursuit:
         environment.effect_parameters,
         evader_network=environment.evader_network,
     )
+
+
+def finite_or_zero(gradient: Any) -> Any:
+    """A gradient through the simulation, zero where it isn't finite: a world that tumbles may have none."""
+    finite = jnp.isfinite(optax.global_norm(gradient))
+    return jax.tree.map(lambda leaf: jnp.where(finite, leaf, 0.0), gradient)
 
 
 def nearest_gap(game: PursuitSettings, state: PursuitState) -> jax.Array:

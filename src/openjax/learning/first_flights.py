@@ -15,7 +15,13 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from openjax.learning.analytic_gradient import AnalyticGradient, crash_share, free_flight, nearest_gap
+from openjax.learning.analytic_gradient import (
+    AnalyticGradient,
+    crash_share,
+    finite_or_zero,
+    free_flight,
+    nearest_gap,
+)
 from openjax.learning.settings import AnalyticSettings, FirstFlightsSettings
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Pursuit, turn_task, uniform_task
@@ -85,10 +91,7 @@ class FirstFlights:
         """The carry (parameters, optimiser's state, worlds) after an update, and the loss's parts."""
         parameters, state, world = carry
         gradient, (end, parts) = jax.grad(self.loss, has_aux=True)(parameters.actor, parameters, world)
-        # a world that tumbles may have no gradient
-        finite = jnp.isfinite(optax.global_norm(gradient))
-        gradient = jax.tree.map(lambda leaf: jnp.where(finite, leaf, 0.0), gradient)
-        change, state = self.optimiser.update(gradient, state)
+        change, state = self.optimiser.update(finite_or_zero(gradient), state)
         parameters = parameters.replace(actor=optax.apply_updates(parameters.actor, change))
         start_key, choice_key = jax.random.split(key)
         over = self._over(end[1]) | (jax.random.uniform(choice_key, (self.how.worlds,)) < self.how.anew)

@@ -170,9 +170,8 @@ def make_training_step(
     `axis` names the axis of devices when it runs under `shard_map` (see `openjax.cluster.devices`).
     """
     phases = make_phases(settings, environment, axis)
-    return lambda carry: phases(
-        carry
-    )  # a function by its name, as the compiler's cache knows programs by theirs
+    # a function by its name, as the compiler's cache knows programs by theirs
+    return lambda carry: phases(carry)
 
 
 @dataclass(frozen=True)
