@@ -31,6 +31,7 @@ from openjax.pursuit import (
     uniform_task,
 )
 from openjax.pursuit.collisions import TOUCH, drone_distance, pillar_distance
+from openjax.pursuit.observation import rotation_axes
 from openjax.vehicle.family import family_bounds, narrowed_bounds
 from openjax.vehicle.solids import DRONE_RADIUS
 
@@ -40,6 +41,8 @@ SEGMENTS = 8
 """A flight is looked at after each of so many times `HORIZON`."""
 SMOOTH, SMOOTH_BREACH = 0.012, 0.008
 """Distances (m) over which a crash and a breach go from sure to none in what is learnt; ways through rows aren't wide."""
+SMOOTH_TILT = 0.05
+"""The same for a tip over 90 degrees (cosine of the tilt)."""
 SMOOTH_CAPTURE = 0.1
 """The same for a capture (m)."""
 FAST = 0.05
@@ -93,6 +96,8 @@ class Way(NamedTuple):
 
     least: jax.Array
     """m, least gap to anything solid"""
+    upright: jax.Array
+    """least cosine of the tilt"""
     breach: jax.Array
     """mean number of breaches"""
     excess: jax.Array
@@ -138,6 +143,7 @@ class AnalyticGradient:
             observation, state, *_ = step(jax.random.key(0), state, action)
             way = Way(
                 jnp.minimum(way.least, nearest_gap(self.game, state)),
+                jnp.minimum(way.upright, rotation_axes(state.drones.quaternion)[1][..., 2]),
                 way.breach + breach_share(self.game, state) / steps,
                 way.excess + jax.nn.relu(_speed(state.drones) - limit) / FAST / steps,
                 way.distance + jax.nn.relu(evader_distance(state) - rest) / steps,
@@ -147,7 +153,7 @@ class AnalyticGradient:
 
         rest = REST * self.game.capture_radius
         zeros = jnp.zeros(world[1].drones.position.shape[:2])
-        first = world, Way(zeros + jnp.inf, zeros, zeros, zeros, zeros[:, 0])
+        first = world, Way(zeros + jnp.inf, zeros + 1.0, zeros, zeros, zeros, zeros[:, 0])
         return jax.lax.scan(jax.checkpoint(one), first, None, length=steps)[0]
 
     def starts(self, key: jax.Array, bounds: jax.Array):
@@ -258,6 +264,11 @@ def nearest_gap(game: PursuitSettings, state: PursuitState) -> jax.Array:
 def crash_share(gap: jax.Array) -> jax.Array:
     """How much of a crash a least gap (m) counts as, from 0 to 1: what has a gradient before anything is touched."""
     return jax.nn.sigmoid((3 * TOUCH - gap) / SMOOTH)
+
+
+def tip_share(upright: jax.Array) -> jax.Array:
+    """The same of a least cosine of the tilt."""
+    return jax.nn.sigmoid((2 * SMOOTH_TILT - upright) / SMOOTH_TILT)
 
 
 def breach_share(game: PursuitSettings, state: PursuitState) -> jax.Array:

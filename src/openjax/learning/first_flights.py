@@ -21,6 +21,7 @@ from openjax.learning.analytic_gradient import (
     finite_or_zero,
     free_flight,
     nearest_gap,
+    tip_share,
 )
 from openjax.learning.settings import AnalyticSettings, FirstFlightsSettings
 from openjax.policy import Policy, PolicyParameters
@@ -73,24 +74,29 @@ class FirstFlights:
             environment = environment.with_bounds(narrowed_bounds(game.vehicles, 0.0))
         return jax.vmap(environment.reset_to)(reset_key, tasks)
 
-    def loss(self, actor: Any, parameters: PolicyParameters, world):
-        """What is learnt (); worlds after it and its parts."""
-        end, way = self.stage.fly(actor, parameters, world, self.how.steps)
+    def loss(self, actor: Any, parameters: PolicyParameters, world, risen: jax.Array):
+        """What is learnt (); worlds after it and its parts. `risen` () is how far the penalties have risen, 0 to 1."""
+        how = self.how
+        end, way = self.stage.fly(actor, parameters, world, how.steps)
+        penalty = how.penalty_start + (1.0 - how.penalty_start) * risen
         parts = {
             "free": (1.0, way.free),
-            "distance": (self.how.distance, way.distance),
-            "crashes": (self.how.crash, crash_share(way.least)),
-            "breaches": (self.how.breach, way.breach),
-            "speed": (self.how.speed * (self.environment.settings.speed_limit == "none"), way.excess),
+            "distance": (how.distance, way.distance),
+            "crashes": (penalty * how.crash, crash_share(way.least)),
+            "tips": (risen * how.crash, tip_share(way.upright)),
+            "breaches": (penalty * how.breach, way.breach),
+            "speed": (how.speed * (self.environment.settings.speed_limit == "none"), way.excess),
             "low": (1.0, jax.nn.relu(LOW - end[1].drones.position[..., 2])),
         }
         means = {name: jnp.mean(value) for name, (_, value) in parts.items()}
         return sum(weight * means[name] for name, (weight, _) in parts.items()), (end, means)
 
     def update(self, carry, key: jax.Array):
-        """The carry (parameters, optimiser's state, worlds) after an update, and the loss's parts."""
-        parameters, state, world = carry
-        gradient, (end, parts) = jax.grad(self.loss, has_aux=True)(parameters.actor, parameters, world)
+        """The carry (parameters, optimiser's state, worlds, share of the penalties' rise) after an update, and the parts."""
+        parameters, state, world, risen = carry
+        gradient, (end, parts) = jax.grad(self.loss, has_aux=True)(parameters.actor, parameters, world, risen)
+        step = 1.0 / (self.how.penalty_ramp * max(self.how.updates, 1))
+        risen = jnp.minimum(risen + jnp.where(parts["free"] < self.how.penalty_free, step, 0.0), 1.0)
         change, state = self.optimiser.update(finite_or_zero(gradient), state)
         parameters = parameters.replace(actor=optax.apply_updates(parameters.actor, change))
         start_key, choice_key = jax.random.split(key)
@@ -99,7 +105,7 @@ class FirstFlights:
         def chosen(old, new):
             return jnp.where(over.reshape(-1, *[1] * (old.ndim - 1)), new, old)
 
-        return (parameters, state, jax.tree.map(chosen, end, self.start(start_key))), parts
+        return (parameters, state, jax.tree.map(chosen, end, self.start(start_key)), risen), parts
 
     def _over(self, state):
         """(B,) worlds that end: crashed, far outside, or too late for another moment."""
@@ -117,7 +123,7 @@ class FirstFlights:
 
     def begin(self, parameters: PolicyParameters, key: jax.Array):
         """The carry of `update` before the first one."""
-        return parameters, self.optimiser.init(parameters.actor), self.start(key)
+        return parameters, self.optimiser.init(parameters.actor), self.start(key), jnp.zeros(())
 
 
 def make_first_flights(flights: FirstFlights, together: int) -> Callable:

@@ -106,12 +106,18 @@ class FirstFlightsSettings:
     """Share of the worlds that start anew after each update, beside those that have to."""
     distance: Annotated[float, Interval("[0, 1000]")] = 3.0
     """Weight of the mean distance to the evader (m), beside the share of the time in which it is free ..."""
-    crash: Annotated[float, Interval("[0, 1000]")] = 4.0
-    """... of the share of pursuers that touch something ..."""
-    breach: Annotated[float, Interval("[0, 1000]")] = 2.0
-    """... of the mean number of breaches ..."""
+    crash: Annotated[float, Interval("[0, 1000]")] = 20.0
+    """... at the end of the share of pursuers that touch something or tip over ..."""
+    breach: Annotated[float, Interval("[0, 1000]")] = 10.0
+    """... and of the mean number of breaches ..."""
     speed: Annotated[float, Interval("[0, 1000]")] = 1.0
     """... and of speeds over the limit."""
+    penalty_start: Annotated[float, Interval("[0, 1]")] = 0.2
+    """Share of the weights of crashes and breaches at the start: who fears them then stays away from the evader."""
+    penalty_free: Annotated[float, Interval("[0, 1]")] = 0.42
+    """They rise, and tips over begin to count, in updates in which the evader is free for less than this share of the time ..."""
+    penalty_ramp: Annotated[float, Interval("(0, 1]")] = 0.4
+    """... and have their whole weights after this share of the stage of such updates."""
 
     def __post_init__(self):
         check_intervals(self, "first_flights.")
@@ -312,8 +318,10 @@ def quick() -> TrainSettings:
             critic_encoder="layers",
         ),
         predictor=PredictorSettings(units=16, horizons=(1, 2, 3, 5, 10)),
+        # its critic knows nothing when it begins, and its actor is good already
         mappo=MappoSettings(
-            learning_rate=3e-4,
+            learning_rate=1e-4,
+            actor_start=0.3,
             epochs=4,
             minibatches=8,
             step_subsampling=2,
@@ -321,7 +329,7 @@ def quick() -> TrainSettings:
             clip_epsilon_end=0.2,
             discount=0.99,
         ),
-        first_flights=FirstFlightsSettings(updates=700),
+        first_flights=FirstFlightsSettings(updates=850),
         # few tasks reach the archive in so short a run; drawn from too often, they'd be all that is learnt
         generator=GeneratorSettings(capacity=500, expansion=0.3),
         num_envs=640,
