@@ -9,7 +9,7 @@ import optax
 import pytest
 
 from openjax.errors import UserError
-from openjax.learning.mappo import every_nth, initial_value_scale, make_optimiser, update_policy
+from openjax.learning.mappo import every_nth, follow_kl, initial_value_scale, make_optimiser, update_policy
 from openjax.learning.rollout import Rollout
 from openjax.learning.settings import MappoSettings, preset
 from openjax.learning.train_state import Optimisers
@@ -53,82 +53,76 @@ def flags(key, length):
     return jnp.where(jax.random.bernoulli(key, 0.5, (length, WORLDS)), 1.0, -1.0)
 
 
-@pytest.fixture(scope="module")
-def learn():
-    """Train on a probe; returns values and mean actions for flag -1, +1 (rows) in the first, second step (columns).
-
-    The reward is constant + by_flag * flag + by_step * (second step) - by_action * (first action - 0.5 flag)^2.
-    """
-    optimisers = Optimisers(*make_optimiser(SETTINGS, UPDATES), predictor=optax.identity())
+def one_update(settings, policy, optimisers, probe, carry, key):
+    """The update after a rollout of one probe; carry: actor, critic, value scale. Also its metrics."""
+    actor, critic, scale = carry
+    flag_key, noise_key, shuffle_key = jax.random.split(key, 3)
+    flag = flags(flag_key, STEPS + 1)
     late = jnp.broadcast_to(jnp.arange(STEPS, dtype=jnp.float32)[:, None], (STEPS, WORLDS))
+    observation = observation_of(flag[:-1], late)
+    mean, log_std = policy.distribution(actor.parameters, observation, None)
+    action = mean + jnp.exp(log_std) * jax.random.normal(noise_key, mean.shape)
+    miss = (policy.action(action)[..., 0, 0] - 0.5 * flag[:-1]) ** 2
+    reward = (
+        probe["constant"] + probe["by_flag"] * flag[:-1] + probe["by_step"] * late - probe["by_action"] * miss
+    )
+    rollout = Rollout(
+        observation=observation,
+        predicted=None,
+        action=action,
+        log_prob=gaussian_log_prob(action, mean, log_std),
+        reward=reward[..., None],
+        terminated=jnp.broadcast_to(probe["terminated"][:, None], (STEPS, WORLDS)),
+        truncated=jnp.broadcast_to(probe["truncated"][:, None], (STEPS, WORLDS)),
+        evader=jnp.zeros((STEPS, WORLDS, 3)),
+    )
+    networks = policy, optimisers, actor, critic, scale
+    last = observation_of(flag[-1], jnp.ones(WORLDS))
+    *carry, metrics = update_policy(settings, *networks, rollout, last, None, shuffle_key, None)
+    return tuple(carry), metrics
 
-    def one_update(probe, carry, key):
-        actor, critic, scale = carry
-        flag_key, noise_key, shuffle_key = jax.random.split(key, 3)
-        flag = flags(flag_key, STEPS + 1)
-        observation = observation_of(flag[:-1], late)
-        mean, log_std = POLICY.distribution(actor.parameters, observation, None)
-        action = mean + jnp.exp(log_std) * jax.random.normal(noise_key, mean.shape)
-        miss = (POLICY.action(action)[..., 0, 0] - 0.5 * flag[:-1]) ** 2
-        reward = (
-            probe["constant"]
-            + probe["by_flag"] * flag[:-1]
-            + probe["by_step"] * late
-            - probe["by_action"] * miss
-        )
-        rollout = Rollout(
-            observation=observation,
-            predicted=None,
-            action=action,
-            log_prob=gaussian_log_prob(action, mean, log_std),
-            reward=reward[..., None],
-            terminated=jnp.broadcast_to(probe["terminated"][:, None], (STEPS, WORLDS)),
-            truncated=jnp.broadcast_to(probe["truncated"][:, None], (STEPS, WORLDS)),
-            evader=jnp.zeros((STEPS, WORLDS, 3)),
-        )
-        last = observation_of(flag[-1], jnp.ones(WORLDS))
-        actor, critic, scale, _ = update_policy(
-            SETTINGS,
-            POLICY,
-            optimisers,
-            actor,
-            critic,
-            scale,
-            rollout,
-            last,
-            None,
-            shuffle_key,
-            None,
-        )
-        return (actor, critic, scale), None
+
+CORNERS = np.array([[-1.0, -1.0], [1.0, 1.0]], np.float32), np.array([[0.0, 1.0], [0.0, 1.0]], np.float32)
+"""Flag and second step, of flag -1, +1 (rows) in the first, second step (columns)."""
+
+
+def trained(settings, policy, updates):
+    """`train(probe)`: actor, critic and value scale after `updates`, and metrics (updates,)."""
+    optimisers = Optimisers(*make_optimiser(settings, updates), predictor=optax.identity())
 
     @jax.jit
     def train(probe):
-        corners = observation_of(jnp.array([[-1.0, -1.0], [1.0, 1.0]]), jnp.array([[0.0, 1.0], [0.0, 1.0]]))
-        parameters = POLICY.init(jax.random.key(0), corners)
-        states = optimisers.start(parameters)
-        carry = (states["actor"], states["critic"], initial_value_scale())
-        (actor, critic, scale), _ = jax.lax.scan(
-            lambda carry, key: one_update(probe, carry, key),
-            carry,
-            jax.random.split(jax.random.key(1), UPDATES),
+        states = optimisers.start(policy.init(jax.random.key(0), observation_of(*map(jnp.array, CORNERS))))
+        return jax.lax.scan(
+            lambda carry, key: one_update(settings, policy, optimisers, probe, carry, key),
+            (states["actor"], states["critic"], initial_value_scale()),
+            jax.random.split(jax.random.key(1), updates),
         )
-        mean, std = scale.moments
-        value = mean + std * POLICY.value(actor.parameters, critic.parameters, corners, None)[..., 0]
-        return value, POLICY.action(POLICY.distribution(actor.parameters, corners, None)[0])[..., 0, :]
 
-    def call(
-        constant=0.0,
-        by_flag=0.0,
-        by_step=0.0,
-        by_action=0.0,
-        terminated=(True, True),
-        truncated=(False, False),
-    ):
-        numbers = dict(constant=constant, by_flag=by_flag, by_step=by_step, by_action=by_action)
-        probe = {name: jnp.float32(value) for name, value in numbers.items()}
-        probe |= {"terminated": jnp.array(terminated), "truncated": jnp.array(truncated)}
-        return jax.tree.map(np.asarray, train(probe))
+    return train
+
+
+def probe_of(
+    constant=0.0, by_flag=0.0, by_step=0.0, by_action=0.0, terminated=(True, True), truncated=(False, False)
+):
+    """The reward is constant + by_flag * flag + by_step * (second step) - by_action * (first action - 0.5 flag)^2."""
+    numbers = dict(constant=constant, by_flag=by_flag, by_step=by_step, by_action=by_action)
+    probe = {name: jnp.float32(value) for name, value in numbers.items()}
+    return probe | {"terminated": jnp.array(terminated), "truncated": jnp.array(truncated)}
+
+
+@pytest.fixture(scope="module")
+def learn():
+    """Train on a probe; returns values and mean actions in the corners."""
+    train = trained(SETTINGS, POLICY, UPDATES)
+
+    def call(**probe):
+        (actor, critic, scale), _ = train(probe_of(**probe))
+        mean, std = scale.moments
+        corners = observation_of(*map(jnp.array, CORNERS))
+        value = mean + std * POLICY.value(actor.parameters, critic.parameters, corners, None)[..., 0]
+        action = POLICY.action(POLICY.distribution(actor.parameters, corners, None)[0])[..., 0, :]
+        return np.asarray(value), np.asarray(action)
 
     return call
 
@@ -167,6 +161,33 @@ def test_the_actor_can_start_to_learn_later_than_the_critic():
         moves.append(own)
     assert moves[0][:2] == [0.0, 0.0] and min(moves[0][2:]) > 0.0
     assert min(moves[1]) > 0.0
+
+
+def test_steps_shrink_while_the_policy_has_moved_too_far_and_grow_again():
+    scaled = follow_kl(0.01)
+    change, state = jnp.ones(3), scaled.init(jnp.ones(3))
+    scales = []
+    for kl in [0.0] * 30 + [0.015] * 3 + [0.03] * 5 + [jnp.inf, jnp.nan] + [0.001] * 9:
+        step, state = scaled.update(change, state, kl=jnp.float32(kl))
+        scales.append(float(step[0]))
+    rise, rest, fall, again = scales[:30], scales[30:33], scales[33:40], scales[40:]
+    assert rise == sorted(rise) and rise[-1] == 1.0 and set(rest) == {1.0}
+    np.testing.assert_allclose(fall, 1.5 ** -np.arange(1.0, 8.0), rtol=1e-5)
+    assert again[-1] == 1.0
+    # an actor that is still frozen doesn't earn larger steps
+    _, frozen = scaled.update(jnp.zeros(3), scaled.init(change), kl=jnp.float32(0.0))
+    assert frozen == scaled.init(change)
+
+
+def test_a_policy_with_little_noise_stays_near_itself():
+    network = dataclasses.replace(POLICY.network, initial_log_std=-5.0)
+    policy, kl = dataclasses.replace(POLICY, network=network), {}
+    for target in (0.0, 0.01):
+        settings = dataclasses.replace(SETTINGS, epochs=8, minibatches=8, target_kl=target)
+        kl[target] = np.asarray(trained(settings, policy, 15)(probe_of(by_action=1.0))[1]["kl"])
+    # the samples of a minibatch are few, so that some updates go a few times as far
+    assert 0.5 * 0.01 < kl[0.01].mean() < 5 * 0.01 and kl[0.01].max() < 10 * 0.01
+    assert kl[0.0].mean() > 1000 * kl[0.01].mean()
 
 
 def test_a_gradient_step_may_see_every_third_step_of_all_worlds():

@@ -1,6 +1,6 @@
 """Multi-agent PPO (Yu et al., 2022): shared actor, clipped ratio, normalised values."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -53,22 +53,59 @@ class Batch:
     target: jax.Array  # (..., N) normalised returns
 
 
+LEAST_SCALE = 1e-4
+"""Of a step, as a share of the schedule's: the first one, and none is smaller."""
+
+
+class StepScale(NamedTuple):
+    """State of `follow_kl`."""
+
+    scale: jax.Array  # () of the last step, as a share of the schedule's
+
+
+def follow_kl(target: float) -> optax.GradientTransformationExtraArgs:
+    """Scale steps so that the policy's divergence from the one that flew stays near `target` (nats).
+
+    Its `update` takes `kl` (), that divergence before the step: above twice the target the step is divided by 1.5, below half
+    of it multiplied, never past the schedule's (the adaptive rule of Schulman et al., 2017, section 4, on the step size as in
+    Rudin et al., 2022). From a policy whose noise is small, a step of fixed size leads far outside the ratio's clip range,
+    where the clipped loss has no gradient that would lead back.
+    """
+
+    def init(parameters):
+        return StepScale(jnp.full((), LEAST_SCALE, jnp.float32))
+
+    def update(change, state, parameters=None, *, kl, **others):
+        # an actor that doesn't learn yet says nothing about the size of its steps
+        grows = (kl < target / 2) & jnp.any(change != 0.0)
+        # a divergence that isn't finite is too large, too
+        factor = jnp.where(kl <= 2 * target, jnp.where(grows, 1.5, 1.0), 1 / 1.5)
+        scale = jnp.clip(state.scale * factor, LEAST_SCALE, 1.0)
+        return scale * change, StepScale(scale)
+
+    return optax.GradientTransformationExtraArgs(init, update)
+
+
 def make_optimiser(
     settings: MappoSettings, total_updates: int
-) -> tuple[optax.GradientTransformation, optax.GradientTransformation]:
-    """Optimisers of actor and critic; the step size falls linearly to zero over the run, the actor's may start late."""
+) -> tuple[optax.GradientTransformationExtraArgs, optax.GradientTransformationExtraArgs]:
+    """Optimisers of actor and critic; the step size falls linearly to zero over the run, the actor's may start late.
+
+    With a `target_kl` the actor's update takes `kl`; see `follow_kl`.
+    """
     steps = total_updates * settings.epochs * settings.minibatches
     schedule = optax.linear_schedule(settings.learning_rate, 0.0, steps)
 
     def late(count):
         return jnp.where(count < settings.actor_start * steps, 0.0, schedule(count))
 
-    def one(schedule):
-        adam = optax.chain(optax.clip_by_global_norm(settings.max_grad_norm), optax.adam(schedule, eps=1e-5))
+    def one(schedule, *after):
+        parts = optax.clip_by_global_norm(settings.max_grad_norm), optax.adam(schedule, eps=1e-5), *after
         # one vector instead of dozens of small arrays: on a GPU their updates cost by number, not by size
-        return optax.flatten(adam)
+        return optax.flatten(optax.chain(*parts))
 
-    return one(late if settings.actor_start else schedule), one(schedule)
+    after = (follow_kl(settings.target_kl),) if settings.target_kl else ()
+    return one(late if settings.actor_start else schedule, *after), one(schedule)
 
 
 def loss(
@@ -178,7 +215,7 @@ def update_policy(
         (actor_gradient, critic_gradient), watch = mean_over_devices((gradient, watch), axis)
         # of one vector, like the optimiser's: a norm leaf by leaf is twenty kernels more
         watch |= {"actor_gradient": jnp.linalg.norm(ravel_pytree(actor_gradient)[0])}
-        actor = actor.updated(optimisers.actor, actor_gradient)
+        actor = actor.updated(optimisers.actor, actor_gradient, kl=watch["kl"])
         critic = critic.updated(optimisers.critic, critic_gradient)
         return (actor, critic), watch
 

@@ -31,6 +31,9 @@ class MappoSettings:
     """Clip range of the probability ratio at the start ..."""
     clip_epsilon_end: Annotated[float, Interval("(0, 10]")] = 0.1
     """... which changes linearly to this over `total_steps`."""
+    target_kl: Annotated[float, Interval("[0, 10]")] = 0.0
+    """Divergence (nats) of the learning policy from the one that flew, near which the actor's step size keeps it; 0: steps
+    aren't scaled. A run that starts from a policy with little noise needs it."""
     entropy_coefficient: Annotated[float, Interval("[0, 10]")] = 1e-3
     """Weight of the entropy."""
     discount: Annotated[float, Interval("[0, 1]")] = 0.995

@@ -17,9 +17,9 @@ class TrainState:
     optimiser: Any
     """State of the `optax` transformation."""
 
-    def updated(self, optimiser: optax.GradientTransformation, gradient: Any) -> "TrainState":
-        """One step against `gradient`, a tree like the parameters."""
-        update, state = optimiser.update(gradient, self.optimiser, self.parameters)
+    def updated(self, optimiser: optax.GradientTransformation, gradient: Any, **others: Any) -> "TrainState":
+        """One step against `gradient`, a tree like the parameters; `others` is what else the optimiser's update takes."""
+        update, state = optimiser.update(gradient, self.optimiser, self.parameters, **others)
         return TrainState(optax.apply_updates(self.parameters, update), state)
 
 
