@@ -426,7 +426,13 @@ def evaders_second() -> TrainSettings:
         # who knows the penalties before fast evaders hovers far from these: the distance pays for going there, and cheaper
         # penalties and more noise lead past pillars once more
         environment=dict(min_pillars=0, reward=dict(distance=0.5)),
-        mappo=dict(actor_start=0.01, penalty_start=0.2, penalty_ramp=0.35, entropy_coefficient=3e-3),
+        mappo=dict(
+            actor_start=0.01,
+            target_kl=0.01,
+            penalty_start=0.15,
+            penalty_ramp=0.6,
+            entropy_coefficient=3e-3,
+        ),
         analytic=dict(updates=0),
         vehicles_start=0.0,
         vehicles_ramp=0.0,
