@@ -47,6 +47,8 @@ def game_of(loaded: LoadedPolicy, game: str, physics: str) -> PursuitSettings:
         physics=physics,
         vehicles=FLIGHT_FAMILY,
         rare_vehicles=0.5,
+        # of uniform tasks, which have four or five
+        min_pillars=4,
         max_pillars=layout_slots(settings),
         reward=RewardSettings(),  # counts for nothing here: the same program for policies that differ in it
     )
@@ -58,7 +60,7 @@ def game_of(loaded: LoadedPolicy, game: str, physics: str) -> PursuitSettings:
 def tasks_of(settings: PursuitSettings, layouts: int, uniform: int) -> tuple[list[str], list[int], Task]:
     """Names of the kinds of tasks, how many of each, and all of them one after the other."""
     parts = [repeat_task(scenario_task(settings, scenario), layouts) for scenario in SCENARIOS.values()]
-    drawn = dataclasses.replace(settings, min_pillars=4, max_pillars=5)
+    drawn = dataclasses.replace(settings, max_pillars=5)
     parts.append(uniform_tasks(drawn, uniform, settings.max_pillars))
     counts = [layouts] * len(SCENARIOS) + [uniform]
     return [*SCENARIOS, "uniform"], counts, jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)

@@ -419,25 +419,30 @@ def evaders() -> TrainSettings:
 
 
 def evaders_second() -> TrainSettings:
-    """The second run of `evaders`, with `--start_from` the first: all evaders and vehicles from its start, arenas with few
-    pillars too, and penalties that grow anew. What it reaches isn't measured yet."""
+    """Policies to be flown after evaders that fight back, from `--start_from flight`: two thirds of the evaders are greedy or
+    run along the wall, slow ones first. Five minutes on one large accelerator. What it reaches isn't measured yet."""
     return changed(
-        evaders(),
-        # who knows the penalties before fast evaders hovers far from these: the distance pays for going there, and cheaper
-        # penalties and more noise lead past pillars once more
-        environment=dict(min_pillars=0, reward=dict(distance=0.5)),
+        flight(),
+        # who knows the whole penalties before clever evaders hovers far from these: cheaper ones lead past pillars once more,
+        # and the distance pays for going there
+        environment=dict(
+            evaders=("field", "field", "greedy", "greedy", "greedy", "wall_runner"),
+            min_pillars=0,
+            reward=dict(distance=0.5),
+        ),
         mappo=dict(
-            actor_start=0.01,
+            actor_start=0.015,
             target_kl=0.01,
             penalty_start=0.15,
             penalty_ramp=0.6,
-            entropy_coefficient=3e-3,
+            entropy_coefficient=2e-3,
         ),
         analytic=dict(updates=0),
         vehicles_start=0.0,
         vehicles_ramp=0.0,
-        evaders_start=0.0,
-        evaders_ramp=0.0,
+        evaders_ramp=0.1,
+        evaders_validation=("field", "heavy", "pillar_hugger"),
+        total_steps=620_000_000,
     )
 
 

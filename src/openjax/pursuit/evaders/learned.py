@@ -18,11 +18,6 @@ WIDTH = 64
 _OWN, _PURSUER, _PILLAR = 9, 10, 4
 
 
-def memory_size(pursuers: int) -> int:
-    """Numbers that it remembers of so many pursuers."""
-    return STEPS * 3 * pursuers
-
-
 def init_network(key: jax.Array) -> dict[str, Any]:
     """Parameters of a network (actor and critic alike) whose output, three numbers and one, is zero."""
     sizes = {
