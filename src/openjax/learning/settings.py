@@ -317,14 +317,15 @@ def quick() -> TrainSettings:
             features=32,
             heads=2,
             squash="sample",
-            initial_log_std=-2.0,
+            initial_log_std=-3.0,
             critic_encoder="layers",
         ),
         predictor=PredictorSettings(units=16, horizons=(1, 2, 3, 5, 10)),
         # its critic knows nothing when it begins, and its actor is good already
         mappo=MappoSettings(
-            learning_rate=1e-4,
-            actor_start=0.3,
+            learning_rate=3e-4,
+            actor_start=0.2,
+            target_kl=0.01,
             epochs=4,
             minibatches=8,
             step_subsampling=2,
