@@ -10,6 +10,8 @@ import random
 from collections import deque
 from dataclasses import dataclass
 
+import numpy as np
+
 from openjax.flying.controller import Pose
 
 FOLLOWED = "camera drifts, the estimator follows"
@@ -23,9 +25,17 @@ RADIO = (
     "poses lost", "poses lost for a while", "packets lost", "poses frozen", "poses jump",
     "poses: a number that is none", "gyroscope: a number that is none", "poses: no attitude",
 )  # fmt: skip
+WILD = {
+    "policy wild": lambda tick, n, shape: np.random.default_rng(10 * tick + n).uniform(-1.0, 1.0, shape),
+    "policy huge": lambda tick, n, shape: np.random.default_rng(n).choice((-1e30, 1e30), shape),
+    "policy alternating": lambda tick, n, shape: (
+        np.random.default_rng(n).choice((-1.0, 1.0), shape) * (-1) ** (tick // (1 + n % 5))
+    ),
+}
+"""The policy's action (N, 4) at a tick of flight n: drawn anew; one extreme for good; from one to the other."""
 OTHER = (
     "loop stopped", "links stopped", "guard stopped", "loop and links stopped", "loop and guard stopped",
-    "policy silent", "policy: a number that is none", "policy wild", "battery low", "drone gone", "key",
+    "policy silent", "policy: a number that is none", *WILD, "battery low", "drone gone", "key",
 )  # fmt: skip
 KINDS = (*CAMERA, *RADIO, *OTHER)
 START = 0.2

@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from experiments.flying.faults import CAMERA, FOLLOWED, Fault, PoseDamage, draw_fault
+from experiments.flying.faults import CAMERA, FOLLOWED, WILD, Fault, PoseDamage, draw_fault
 from experiments.table import RESULTS, Page, Table, facts, write_page
 from openjax.files import read_json
 
@@ -48,8 +48,9 @@ PAIRS = ("loop+links", "loop+guard", "links+guard")
 START = ("start: y up", "start: millimetres", "start: yaw turned", "start: scaled", "start: beside the mark")
 POSES = (
     *(kind for kind in CAMERA if kind != FOLLOWED), "poses lost", "poses lost for a while", "packets lost", "poses frozen",
-    "gyroscope: a number that is none",
+    "poses jump", "gyroscope: a number that is none",
 )  # fmt: skip
+POLICY = ("policy: a number that is none", *WILD)
 OTHER = ("strangers' packets", "drone gone", "none", "second fly", "none with camera")
 LATEST = 6.0
 LONGEST = 25.0
@@ -79,7 +80,7 @@ def kinds() -> list[str]:
     """All kinds of faults, signals first."""
     signals = [f"{name} {role}" for name in SIGNALS for role in ROLES] + ["TERM group", "HUP group"]
     pairs = [f"{name} {pair}" for name in ("KILL", "STOP") for pair in PAIRS]
-    return [*signals, *pairs, *THEN, *KEYS, *POSES, *START, *OTHER]
+    return [*signals, *pairs, *THEN, *KEYS, *POSES, *POLICY, *START, *OTHER]
 
 
 def main() -> None:
@@ -113,6 +114,7 @@ GROUPS = {
     "keys, terminal closed": lambda k: k in KEYS or k == "terminal closed",
     "motion capture": lambda k: k in CAMERA,
     "own estimates, links": lambda k: (k in POSES and k not in CAMERA) or k == "drone gone",
+    "the policy": lambda k: k in POLICY or k == "policy fails",
     "wrong from the start": lambda k: k in START,
     "strangers, a second fly, nothing": lambda k: k in OTHER and k != "drone gone",
     "all": lambda k: True,
@@ -126,7 +128,11 @@ def page(results) -> Page:
         mine = [r for r in records if belongs(r["kind"])]
         if not mine:
             continue
-        ends = [r["seconds"] for r in mine if r["seconds"] is not None and r["kind"] not in (*POSES, *OTHER)]
+        ends = [
+            r["seconds"]
+            for r in mine
+            if r["seconds"] is not None and r["kind"] not in (*POSES, *WILD, *OTHER)
+        ]
         rows.append({
             "group": group, "flights": len(mine), "well": sum(r["well"] for r in mine),
             "farthest": 0.9 + max(r["out"] for r in mine), "armed": sum(r["armed"] for r in mine),
@@ -172,7 +178,7 @@ def fault_of(number: int, kind: str) -> Fault:
     """The fault with this number and kind."""
     rng = random.Random(number)
     time, vehicle = rng.uniform(0.3, LATEST), rng.randrange(3)
-    if kind in (*POSES, "drone gone"):
+    if kind in (*POSES, *POLICY, "drone gone"):
         drawn = (draw_fault(seed, LATEST) for seed in range(1000 * number, 1000 * number + 1000))
         return replace(next(like for like in drawn if like.kind == kind), time=time)
     if kind in START:
@@ -212,11 +218,11 @@ def feed_of(fault: Fault, truth):
 
 
 class RemoteGame:
-    """The game of a flight, played by the worker until it fails."""
+    """The game of a flight, played by the worker; `spoil` makes of each play what the policy is said to have answered."""
 
-    def __init__(self, game, pipe, fails):
+    def __init__(self, game, pipe, spoil):
         self.task, self.settings, self.airframe = game.task, game.settings, game.airframe
-        self._pipe, self._fails = pipe, fails
+        self._pipe, self._spoil = pipe, spoil
 
     def start(self, poses):
         """See `openjax.flying.game.Game.start`."""
@@ -225,10 +231,8 @@ class RemoteGame:
 
     def step(self, poses, evader=None):
         """See `openjax.flying.game.Game.step`."""
-        if self._fails():
-            raise ValueError("the policy failed")
         self._pipe.send(("step", (poses, evader)))
-        return self._pipe.recv()
+        return self._spoil(self._pipe.recv())
 
 
 def play(game, pipe) -> None:
@@ -258,7 +262,7 @@ class Flown:
         game = self._prepared.game
         pid, self._terminal = pty.fork()
         if pid == 0:
-            self._prepared = self._prepared._replace(game=RemoteGame(game, theirs, self._policy_fails))
+            self._prepared = self._prepared._replace(game=RemoteGame(game, theirs, self._spoil_play))
             self._child()
         theirs.close()
         threading.Thread(target=play, args=(game, ours), daemon=True).start()
@@ -302,11 +306,18 @@ class Flown:
         finally:
             os._exit(3)
 
-    def _policy_fails(self):
-        return (
-            self._kind == "policy fails"
-            and time.perf_counter() - self._virtual.truth.take_off > self.fault.time
-        )
+    def _spoil_play(self, play):
+        now, kind = time.perf_counter() - self._virtual.truth.take_off, self._kind
+        if now < self.fault.time or not kind.startswith("policy"):
+            return play
+        if kind == "policy fails":
+            raise ValueError("the policy failed")
+        action = np.array(play.action)
+        if kind in WILD:
+            action = WILD[kind](round(100 * now), self._number, action.shape)
+        else:
+            action[self.fault.vehicle, self._number % 4] = self.fault.number
+        return play._replace(action=action)
 
     def _drain(self):
         if self._open and select.select([self._terminal], [], [], 0.005)[0]:
@@ -432,7 +443,7 @@ class Flown:
         name, _, target = self._kind.partition(" ")
         deaf = name in SIGNALS[2:] and target in ("links", "guard")  # the flight goes on
         seconds = math.inf if row["seconds"] is None else row["seconds"]
-        in_time = deaf or self._kind in (*POSES, *OTHER) or seconds <= ENDING
+        in_time = deaf or self._kind in (*POSES, *WILD, *OTHER) or seconds <= ENDING
         return in_time and not row["fell"] and not row["hard"]
 
 

@@ -3,12 +3,23 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from openjax.flying.controller import Pose, moved_on, nominal_airframe
-from openjax.flying.judge import NOTHING_SEEN, Track, Verdict, agree, follow, judge, pose_limits
+from openjax.flying.judge import (
+    NO_LAG,
+    NOTHING_SEEN,
+    Track,
+    Verdict,
+    agree,
+    at_one_time,
+    follow,
+    judge,
+    pose_limits,
+)
 
 LIMITS = pose_limits(nominal_airframe(), 0.06)
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -96,11 +107,50 @@ def test_a_refused_pose_leaves_the_last_good_one():
 def test_agreement_is_of_place_and_attitude_at_one_time():
     fast = replace_velocity(HERE, (2.0, 0.0, 0.0))
     later = moved_on(fast, 0.05)
-    assert agree(fast, later, LIMITS) is Verdict.GOOD
+    assert agree(*at_one_time(fast, later), LIMITS) is Verdict.GOOD
     assert agree(HERE, HERE._replace(position=(0.55, 0.0, 0.5)), LIMITS) is Verdict.APART
     assert agree(HERE, HERE._replace(quaternion=turned(math.pi)), LIMITS) is Verdict.APART
     scaled = replace(LIMITS, apart=0.05)
     assert agree(HERE, HERE._replace(position=(0.48, 0.0, 0.5)), scaled) is Verdict.APART
+
+
+def age_of(late, wrong, noise, seed, seconds=4.0):
+    """What the lag's age is told at each 10 ms, of a vehicle that turns as in a pursuit, about all axes.
+
+    Motion capture is `late` (s), its body marked `wrong` (rad) about a drawn axis; `noise` (rad) lasts for a tenth of a second.
+    """
+    rng = np.random.default_rng(seed)
+    waves = [
+        (rng.uniform(2.0, 12.0), rng.uniform(0.3, 1.5), rng.uniform(0.0, 6.0), axis) for axis in (0, 1, 2) * 2
+    ]
+
+    def rates(t):
+        return tuple(sum(a * math.sin(w * t + p) for w, a, p, k in waves if k == axis) for axis in range(3))
+
+    steps, attitude, ages, lag = round(seconds / 0.01), [HERE._replace(body_rates=rates(0.0))], [], NO_LAG
+    for k in range(steps):
+        attitude.append(moved_on(attitude[-1]._replace(body_rates=rates(0.01 * k + 0.005)), 0.01 * (k + 1)))
+    marked, shaken = rng.normal(size=3), np.zeros(3)
+    marked *= wrong / np.linalg.norm(marked)
+    for k in range(50, steps):
+        own = attitude[k]._replace(body_rates=rates(0.01 * k))
+        shaken = 0.9 * shaken + rng.normal(0.0, noise * math.sqrt(0.19 / 3), 3)
+        seen = attitude[k - round(100 * late)]._replace(time=0.0, body_rates=tuple(marked + shaken))
+        lag = lag.after(moved_on(seen, 1.0), own, 0.01)
+        ages.append(lag.age)
+    return np.array(ages)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.01, 0.03, 0.1, 0.2])
+def test_the_age_of_motion_capture_is_told_by_the_gyroscope(late):
+    """Ten degrees of a body marked by hand and a degree of noise are no age; an age is told within half a second."""
+    for seed in range(10):
+        ages = age_of(late, math.radians(10.0), math.radians(1.0), seed)
+        if late <= 0.03:
+            assert np.abs(ages[50:] - late).max() < 0.5 * LIMITS.horizon
+        else:
+            assert np.median(ages[50:]) > LIMITS.horizon
+    assert abs(np.median(age_of(late, 0.0, 0.0, 7)) - late) < 0.3 * late + 1e-3
 
 
 def replace_velocity(pose, velocity):

@@ -140,4 +140,5 @@ class Game:
 
 def pose_array(poses) -> np.ndarray:
     """(N, 13) position, quaternion, velocity, body rates."""
-    return np.array([[x for name, _ in FIELDS for x in getattr(p, name)] for p in poses], np.float32)
+    rows = [(*p.position, *p.quaternion, *p.velocity, *p.body_rates) for p in poses]
+    return np.array(rows, np.float32)

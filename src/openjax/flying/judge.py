@@ -11,7 +11,12 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
-from openjax.flying.controller import Airframe, Pose, moved_on
+from openjax.flying.controller import Airframe, Pose, Vector, moved_on
+
+MEMORY, MARKED = 0.2, 1.0
+"""See `Lag` (s): a turn of a pursuit; some of them."""
+STILL = 0.3
+"""Body rates (rad/s) below which an error of a degree or two, as estimators have, would look like an age."""
 
 
 class Verdict(StrEnum):
@@ -26,6 +31,7 @@ class Verdict(StrEnum):
     TOO_FAST = "velocity jumped"
     SPUN = "body rates jumped"
     APART = "motion capture and the vehicle's own estimate disagree"
+    LATE = "motion capture is late"
 
 
 @dataclass(frozen=True)
@@ -141,13 +147,63 @@ def follow(
     return Track(last, verdict) if verdict else Track(pose)
 
 
+class Lag(NamedTuple):
+    """How late motion capture is, told by the gyroscope: the slope of what its attitude lacks over the body rates.
+
+    A pose that is late by `age` shows the attitude of then: captured minus own is -age times the body rates (rad/s), plus a
+    constant, as no body is marked exactly. Mean values of the last `MEMORY` seconds; the constant of the last `MARKED`.
+    """
+
+    constant: Vector | None = None  # rad
+    product: float = 0.0  # rad^2/s
+    square: float = 0.0  # rad^2/s^2
+
+    @property
+    def age(self) -> float:
+        """s; towards zero where the vehicle hardly turns."""
+        return self.product / (self.square + STILL**2)
+
+    def after(self, captured: Pose, own: Pose, dt: float) -> Lag:
+        """With two poses of one time, `dt` (s) after the last ones."""
+        lacks = turn_between(own.quaternion, captured.quaternion)
+        share, slow = 1.0 - math.exp(-dt / MEMORY), 1.0 - math.exp(-dt / MARKED)
+        constant = tuple(c + slow * (e - c) for c, e in zip(self.constant or lacks, lacks, strict=True))
+        rates = own.body_rates
+        product = -sum((e - c) * rate for e, c, rate in zip(lacks, constant, rates, strict=True))
+        square = sum(rate * rate for rate in rates)
+        return Lag(
+            constant,
+            self.product + share * (product - self.product),
+            self.square + share * (square - self.square),
+        )
+
+
+NO_LAG = Lag()
+
+
+def at_one_time(a: Pose, b: Pose) -> tuple[Pose, Pose]:
+    """Both, moved on to the later one's time."""
+    late = max(a.time, b.time)
+    return moved_on(a, late), moved_on(b, late)
+
+
 def agree(captured: Pose, own: Pose, limits: PoseLimits) -> Verdict:
-    """Whether motion capture and the vehicle's own estimate tell the same, both moved on to the later one's time."""
-    late = max(captured.time, own.time)
-    captured, own = moved_on(captured, late), moved_on(own, late)
+    """Whether motion capture and the vehicle's own estimate, of one time, tell the same."""
     near = math.dist(captured.position, own.position) <= limits.apart
     turned = angle_between(captured.quaternion, own.quaternion) <= limits.turned
     return Verdict.GOOD if near and turned else Verdict.APART
+
+
+def turn_between(a, b) -> Vector:
+    """The rotation vector (rad, in a's frame, up to about one) that leads from attitude a to b, quaternions wxyz."""
+    w, x, y, z = a
+    p, q, r, s = b
+    size = math.copysign(2.0, w * p + x * q + y * r + z * s)
+    return (
+        size * (w * q - x * p - y * s + z * r),
+        size * (w * r + x * s - y * p - z * q),
+        size * (w * s - x * r + y * q - z * p),
+    )
 
 
 def angle_between(a, b) -> float:

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from openjax.errors import UserError
 from openjax.flying.controller import Vector, roll_pitch_yaw, up
 from openjax.flying.crtp import Supervisor
-from openjax.flying.judge import PoseLimits, agree, judge
+from openjax.flying.judge import PoseLimits, agree, at_one_time, judge
 from openjax.flying.limits import SafetySettings
 from openjax.flying.safety import PoseSample, State
 from openjax.flying.swarm import PERIOD_MS
@@ -114,7 +114,11 @@ def _pose_faults(settings, limits: PoseLimits, sample, start: Vector) -> Iterato
         yield "doesn't stand level; put it upright, or mend the body's axes"
     elif abs(roll_pitch_yaw(pose.quaternion)[2]) > AHEAD:
         yield "doesn't face +x; turn it, or mend the body's axes"
-    if sample.captured is not None and sample.own is not None and agree(sample.captured, sample.own, limits):
+    if (
+        sample.captured is not None
+        and sample.own is not None
+        and agree(*at_one_time(sample.captured, sample.own), limits)
+    ):
         yield (
             f"motion capture sees it at {where} m, itself at ({', '.join(f'{p:.2f}' for p in sample.own.position)}): "
             "mend axes, unit or origin of one of them"

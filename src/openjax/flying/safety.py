@@ -28,7 +28,18 @@ from openjax.flying.controller import (
     wanted_velocity,
 )
 from openjax.flying.crtp import Supervisor
-from openjax.flying.judge import NOTHING_SEEN, PoseLimits, Track, Verdict, agree, follow, pose_limits
+from openjax.flying.judge import (
+    NO_LAG,
+    NOTHING_SEEN,
+    Lag,
+    PoseLimits,
+    Track,
+    Verdict,
+    agree,
+    at_one_time,
+    follow,
+    pose_limits,
+)
 from openjax.flying.limits import (
     APART,
     SafetySettings,
@@ -126,6 +137,7 @@ class Drone:
     estimate: Pose | None = None  # now; reckoned on where no pose is fresh
     own: Track = NOTHING_SEEN  # its own estimates
     captured: Track = NOTHING_SEEN  # motion capture, with velocity and rates
+    lag: Lag = NO_LAG  # of motion capture
     seen: float = -math.inf  # s, when the pose that it is flown by was measured
     distrusted: str = ""  # why motion capture isn't believed any more in this flight
     stand: tuple[Vector | None, Vector | None] = (None, None)  # own and captured position before the lift
@@ -138,6 +150,11 @@ class Drone:
     reason: str = ""  # why it left the pursuit
     fenced: bool = False  # the last set-point kept it in the arena, or off another, instead of doing what the policy wanted
     sent: SetPoint = MOTORS_OFF
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether it lands by reckoning, or by an own estimate that had followed what wasn't to be believed."""
+        return self.mode is Mode.BLIND or bool(self.distrusted)
 
 
 @dataclass(frozen=True)
@@ -211,8 +228,10 @@ def _sense(settings, limits, drone, sample, now, dt) -> Drone:
     if by_capture:
         seen = _with_motion(sample.captured, captured.pose, sample.own)
         captured = source = follow(captured, seen, now, limits, moving, drone.estimate)
-        if moving and captured.pose is seen and own.fresh(now, limits) and agree(seen, own.pose, limits):
-            captured = source = Track(drone.captured.pose, Verdict.APART)
+        if captured.pose is seen and own.fresh(now, limits):
+            drone, verdict = _compared(drone, seen, own.pose, dt, limits)
+            if moving and verdict:
+                captured = source = Track(drone.captured.pose, verdict)
         if moving and not captured.fresh(now, limits):
             distrusted, source = captured.verdict or "pose lost", own
     drone = replace(drone, own=own, captured=captured, distrusted=distrusted)
@@ -230,6 +249,14 @@ def _sense(settings, limits, drone, sample, now, dt) -> Drone:
     velocity = tuple(v + dt * a for v, a in zip(old.velocity, drone.acceleration, strict=True))
     position = tuple(p + dt * v for p, v in zip(old.position, velocity, strict=True))
     return replace(drone, estimate=old._replace(time=now, position=position, velocity=velocity))
+
+
+def _compared(drone, seen, own, dt, limits) -> tuple[Drone, Verdict]:
+    """The drone with what was learnt of motion capture's age, and whether it and the own estimate tell the same."""
+    seen, own = at_one_time(seen, own)
+    drone = replace(drone, lag=drone.lag.after(seen, own, dt))
+    late = Verdict.LATE if drone.lag.age > limits.horizon else Verdict.GOOD
+    return drone, agree(seen, own, limits) or late
 
 
 def _with_motion(pose, last, own) -> Pose:
@@ -457,7 +484,7 @@ def _is_down(settings, drone, now) -> bool:
     """Whether a landing is over: on the floor, below it by reckoning, or long enough on the way."""
     if drone.landing_since is None:
         return False
-    floor = -BLIND_DEPTH if drone.mode is Mode.BLIND else 0.05
+    floor = -BLIND_DEPTH if drone.doubtful else 0.05
     return drone.estimate.position[2] < floor or now - drone.landing_since > settings.landing_time
 
 
@@ -492,7 +519,7 @@ def _wanted(settings, state, drone, i) -> Vector:
     position = drone.estimate.position
     if drone.mode in (Mode.LAND, Mode.BLIND):
         x, y, _ = wanted_velocity(position, (*drone.anchor[:2], position[2]), 0.5)
-        if drone.mode is Mode.BLIND:
+        if drone.doubtful:
             return x, y, -BLIND_SPEED
         return x, y, -(0.6 if position[2] < 0.2 else 1.0) * settings.landing_speed
     x, y, z = wanted_velocity(position, drone.anchor, settings.transfer_speed)

@@ -83,6 +83,8 @@ class SimulatedSwarm:
         self._samples = [PoseSample(None, 0.0, 4.0) for _ in range(n)]
         self._waiting: list[tuple[int, int, SetPoint]] = []
         self._steps = 0
+        self.asleep: set[int] = set()
+        """Vehicles of which nothing new is told: nobody listens any more."""
         self._look()
 
     def observe(self) -> tuple[PoseSample, ...]:
@@ -134,6 +136,8 @@ class SimulatedSwarm:
     def _look(self):
         report, noise = self.vehicles.report, self._random.gauss
         for i, old in enumerate(self._samples):
+            if i in self.asleep:
+                continue
             quaternion, rates = report.quaternion[i], tuple(report.body_rates[i].tolist())
             shaken = tuple(q + noise(0.0, CAMERA_NOISE) for q in quaternion.tolist())
             size = math.sqrt(sum(q * q for q in shaken))
