@@ -88,13 +88,13 @@ def uris():
 
 
 @contextmanager
-def connected(uris, body_logs):
+def connected(uris, body_logs, kind=Links):
     """Links that know all poses."""
-    links = Links(uris, body_logs, silence=1.0)  # a busy machine
+    links = kind(uris, body_logs, silence=1.0)  # a busy machine
     links.connect()
     try:
         while any(s.own is None for s in links.observe()):
-            links.wait(time.perf_counter() + 0.1)
+            links.wait(time.perf_counter() + 0.02)
         yield links
     finally:
         links.close()
@@ -248,8 +248,8 @@ def test_motion_capture_is_seen_here_and_on_board():
     thread.start()
     firmware = virtual.firmware[0]
     try:
-        with connected(virtual.uris, body_logs=0) as links:
-            captured, state = MotionCaptured(links), initial_state([(0.4, 0.0, 0.5)])
+        with connected(virtual.uris, 0, MotionCaptured) as captured:
+            state = initial_state([(0.4, 0.0, 0.5)])
             for k in range(40):
                 captured.update(0, (0.3 + 0.005 * k, 0.0, 0.5), (1.0, 0.0, 0.0, 0.0), at=100.0 + 0.01 * k)
                 (sample,) = captured.observe()

@@ -88,9 +88,7 @@ def fly(arguments: Arguments, prepared: Prepared | None = None):
     with Session(flown.session, arguments.safety, flown.state) as session:
         session.check()
         plan = Plan(arguments.episodes, arguments.episode_seconds or math.inf)
-        flight = Flight(
-            session.vehicles, flown.game, arguments.safety, plan, session.requests, session.watched
-        )
+        flight = Flight(session.links, flown.game, arguments.safety, plan, session.requests, session.watched)
         console.print("flying: space or q stops all motors; l, Ctrl-C or Ctrl-Z land; h waits")
         samples, complaint = session.fly(flight)
     _show(console, flight)
@@ -131,9 +129,15 @@ def prepare(arguments: Arguments) -> Prepared:
     policy = load_policy(arguments.policy)
     settings = policy.settings.environment
     scenario = find_scenario(arguments.scenario, settings)
-    for what, number in (("--uri", len(arguments.uri)), ("--scenario", len(scenario.pursuers))):
-        if number != settings.num_pursuers:
-            raise UserError(f"{what} has {number} pursuers, the policy flies {settings.num_pursuers}")
+    n = settings.num_pursuers
+    if len(arguments.uri) != n:
+        raise UserError(
+            f"--uri names {len(arguments.uri)} vehicles, the policy flies {n}: name all after one --uri"
+        )
+    if len(scenario.pursuers) != n:
+        raise UserError(
+            f"--scenario {arguments.scenario} has {len(scenario.pursuers)} starts, the policy flies {n}"
+        )
     feed = find_feed(arguments.motion_capture) if arguments.motion_capture else None
     vehicle = load_vehicle_file(arguments.vehicle or settings.airframe)
     slots = max(settings.max_pillars, len(scenario.pillars))
@@ -172,6 +176,9 @@ def _check(arguments):
     uris = (*arguments.uri, arguments.evader_uri)
     if len(set(uris)) < len(uris):
         raise UserError("--uri names a vehicle twice")
+    for uri in uris:
+        if uri is not None and not uri.startswith(("udp://", "radio://")):
+            raise UserError(f"--uri {uri}: expected udp://HOST:PORT or radio://0/80/2M/E7E7E7E7E7")
     if arguments.out is not None:
         check_new_folder(arguments.out, "--out")
 

@@ -20,7 +20,7 @@ SILENCE = 0.1
 """Silence of a process after which the next one flies (s): ten ticks."""
 _MODES = tuple(Mode)
 _HEAD, _EACH = 12, 16  # see Board; per vehicle mode, trim, known, 13 numbers of its pose
-_FLYING, _PILOT, _OVER, _READY, _ARMED, _STOP, _BEATS, _PIDS = 0, 1, 2, 3, 4, 5, 6, 9
+_BEATS, _PIDS = 6, 9  # one each per role, after the six words
 DEAF = ("SIGHUP", "SIGINT", "SIGTSTP", "SIGTERM", "SIGQUIT", "SIGTTOU", "SIGTTIN", "SIGPIPE")
 """Signals that a terminal, or its end, sends to all that it started."""
 
@@ -33,6 +33,19 @@ class Role(IntEnum):
     GUARD = 2
 
 
+class _Word:
+    """One number of the page, read and written as a `kind`."""
+
+    def __init__(self, at: int, kind: type = bool):
+        self._at, self._kind = at, kind
+
+    def __get__(self, board, _=None):
+        return self._kind(int(board._numbers[self._at]))
+
+    def __set__(self, board, value):
+        board._numbers[self._at] = float(value)
+
+
 class Board:
     """The page.
 
@@ -40,20 +53,22 @@ class Board:
       number: of vehicles.
       context: of multiprocessing.
       silence: see `SILENCE` (s).
+
+    Attributes:
+      flying: whether any motor may be on.
+      pilot: the `Role` that flies.
+      over: whether the session has ended.
+      guarded: whether the guard watches.
+      armed: whether any vehicle may be armed.
+      stopped: whether the operator wants all motors off, whoever flies.
     """
+
+    flying, pilot, over = _Word(0), _Word(1, Role), _Word(2)
+    guarded, armed, stopped = _Word(3), _Word(4), _Word(5)
 
     def __init__(self, number: int, context, silence: float = SILENCE):
         self._numbers = context.RawArray("d", _HEAD + _EACH * number)
         self.silence = silence
-
-    flying = property(lambda self: self._numbers[_FLYING] > 0.0, doc="Whether any motor may be on.")
-    over = property(lambda self: self._numbers[_OVER] > 0.0, doc="Whether the session has ended.")
-    pilot = property(lambda self: Role(int(self._numbers[_PILOT])), doc="Who flies.")
-    armed = property(lambda self: self._numbers[_ARMED] > 0.0, doc="Whether any vehicle may be armed.")
-    stopped = property(
-        lambda self: self._numbers[_STOP] > 0.0, doc="Whether the operator wants all motors off."
-    )
-    guarded = property(lambda self: self._numbers[_READY] > 0.0, doc="Whether the guard watches.")
 
     def beat(self, role: Role, now: float) -> None:
         """`role` lives at `now` (s)."""
@@ -71,32 +86,12 @@ class Board:
         """This process has nothing more to do with the flight: nobody need end it."""
         self._numbers[_PIDS + role] = 0.0
 
-    def stop(self) -> None:
-        """The operator wants all motors off, whoever flies."""
-        self._numbers[_STOP] = 1.0
-
     def end_process(self, role: Role) -> None:
         """Kill the process of `role`, should there be one: if it woke up, two would fly."""
         pid = int(self._numbers[_PIDS + role])
         if pid:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
-
-    def arm(self, on: bool) -> None:
-        """Vehicles are being armed, or have been disarmed."""
-        self._numbers[_ARMED] = float(on)
-
-    def watch(self) -> None:
-        """The guard is ready."""
-        self._numbers[_READY] = 1.0
-
-    def end(self) -> None:
-        """The session is over."""
-        self._numbers[_OVER] = 1.0
-
-    def take(self, role: Role) -> None:
-        """`role` flies from now on."""
-        self._numbers[_PILOT] = float(role)
 
     def write(self, role: Role, now: float, state: State) -> None:
         """`role` flew a tick at `now` (s), and this is what it knows."""
@@ -106,7 +101,7 @@ class Board:
             pose = (*e.position, *e.velocity, *e.quaternion, *e.body_rates) if e is not None else (0.0,) * 13
             numbers += [float(_MODES.index(drone.mode)), drone.trim, float(e is not None), *pose]
         self._numbers[_HEAD:] = numbers
-        self._numbers[_FLYING] = float(state.flying)
+        self.flying = state.flying
         self.beat(role, now)
 
     def read(self, state: State, now: float) -> State:

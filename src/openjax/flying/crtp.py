@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 PROTOCOL_VERSION = 12
 """The version answered: tables of contents with 16-bit ids (4 and up), arming by the supervisor's port (12)."""
-MAX_DATA = 30
 MAX_LOG_DATA = 26
 """Bytes of variables in one log packet; the rest is the block's id and the time stamp."""
 FULL_SCALE = 65535
@@ -89,15 +88,14 @@ PARAMETER_TYPES = {"uint8_t": (0x08, "B"), "uint16_t": (0x09, "H"), "float": (0x
 READ_ONLY = 0x40
 """Added to a parameter's type in the table of contents."""
 LOG_FORMATS = dict(LOG_TYPES.values())
-_INTEGER_BITS = {"B": (0, 8), "H": (0, 16), "I": (0, 32), "b": (1, 8), "h": (1, 16), "i": (1, 32)}
 
 
 def pack_number(fmt: str, value: float) -> bytes:
     """`value` in the struct format `fmt`, cut to what an integer type holds."""
-    if fmt in _INTEGER_BITS:
-        signed, bits = _INTEGER_BITS[fmt]
-        low, high = (-(1 << (bits - 1)), (1 << (bits - 1)) - 1) if signed else (0, (1 << bits) - 1)
-        value = min(max(round(value), low), high)
+    if fmt in "BHIbhi":
+        span = 1 << 8 * struct.calcsize(fmt)
+        low = -span // 2 if fmt.islower() else 0
+        value = min(max(round(value), low), low + span - 1)
     return struct.pack("<" + fmt, value)
 
 

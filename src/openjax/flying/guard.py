@@ -14,10 +14,9 @@ import multiprocessing
 import os
 import struct
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Protocol
 
 from openjax.flying import real_time
 from openjax.flying.board import Board, Role, say, stand_alone
@@ -25,29 +24,13 @@ from openjax.flying.crtp import LOG_TYPES, Port, Supervisor, SupervisorCommand
 from openjax.flying.limits import SafetySettings, resting_places
 from openjax.flying.safety import FLYING, Event, Mode, PoseSample, Request, State, step
 from openjax.flying.set_point import SetPoint
-from openjax.flying.swarm import POSE_BLOCK, WATCHDOG_PERIOD, Member, send_set_point
+from openjax.flying.swarm import POSE_BLOCK, WATCHDOG_PERIOD, Member, Swarm, send_set_point
 
 CHECK = 0.004
 """s between two looks."""
 DISARMING = 1.0
 """A vehicle is asked to disarm until it says that it has, for so long (s)."""
 TICK = 0.01
-
-
-class Raw(Protocol):
-    """Vehicles that can be flown down: `openjax.flying.swarm.Swarm` and `RawLinks` are such."""
-
-    def observe(self) -> tuple[PoseSample, ...]:
-        """What is known of each."""
-        ...
-
-    def send(self, set_points: Sequence[SetPoint]) -> float:
-        """Send each its set-point."""
-        ...
-
-    def arm(self, on: bool) -> None:
-        """Arm or disarm all."""
-        ...
 
 
 def take_over(settings: SafetySettings, state: State, now: float) -> State:
@@ -71,9 +54,8 @@ def take_over(settings: SafetySettings, state: State, now: float) -> State:
 
 
 def fly_down(
-    board: Board, role: Role, vehicles: Raw, settings: SafetySettings, state: State,
-    clock: Callable[[], float] = time.perf_counter,
-) -> State:  # fmt: skip
+    board: Board, role: Role, vehicles: Swarm | RawLinks, settings: SafetySettings, state: State
+) -> State:
     """Wait and land from what stands on the board, disarm; the last state.
 
     Args:
@@ -82,30 +64,31 @@ def fly_down(
       vehicles: links.
       settings: limits.
       state: any of this flight, for its starts, pillars and airframe.
-      clock: host time (s).
     """
-    board.take(role)
-    now = due = clock()
+    board.pilot = role
+    now = due = time.perf_counter()
     state = take_over(settings, board.read(state, now), now)
     while state.flying and board.pilot is role:
         request = Request.STOP if board.stopped else Request.NONE
-        state, set_points = step(settings, state, Event(clock(), vehicles.observe(), request=request))
+        state, set_points = step(
+            settings, state, Event(time.perf_counter(), vehicles.observe(), request=request)
+        )
         vehicles.send(set_points)
-        board.write(role, clock(), state)
-        due = max(due + TICK, clock() - TICK)
-        time.sleep(max(due - clock(), 0.0))
+        board.write(role, time.perf_counter(), state)
+        due = max(due + TICK, time.perf_counter() - TICK)
+        time.sleep(max(due - time.perf_counter(), 0.0))
     if board.pilot is role:
         disarm(vehicles, board, role)
-        board.write(role, clock(), state)
+        board.write(role, time.perf_counter(), state)
         say("openjax fly: all vehicles are down and disarmed")
         time.sleep(3.0 * board.silence)
         for other in Role:  # what still hangs would only be in the way
-            if other is not role and board.silent(other, clock()) > 3.0 * board.silence:
+            if other is not role and board.silent(other, time.perf_counter()) > 3.0 * board.silence:
                 board.end_process(other)
     return state
 
 
-def disarm(vehicles: Raw, board: Board, role: Role) -> bool:
+def disarm(vehicles: Swarm | RawLinks, board: Board, role: Role) -> bool:
     """Ask all to disarm until they have, or nothing is heard of it; whether all have. `role`: whose process this is."""
     deadline = time.perf_counter() + DISARMING
     while True:
@@ -116,7 +99,7 @@ def disarm(vehicles: Raw, board: Board, role: Role) -> bool:
         armed = [s.supervisor & (Supervisor.ARMED | Supervisor.AUTO_ARM) == Supervisor.ARMED
                  for s in vehicles.observe()]  # fmt: skip
         if not any(armed) or time.perf_counter() > deadline:
-            board.arm(any(armed))
+            board.armed = any(armed)
             return not any(armed)
 
 
@@ -142,7 +125,7 @@ class RawLinks:
 
         if not cflib.crtp.CLASSES:
             cflib.crtp.init_drivers()
-        self._members = self._members or [Member(uri, time.perf_counter) for uri in self._links]
+        self._members = self._members or [Member(uri) for uri in self._links]
         for uri, link in self._links.items():
             if link is None and (uri.startswith("udp:") or not udp_only):
                 self._links[uri] = cflib.crtp.get_link_driver(uri, lambda *_: None, lambda *_: None)
@@ -223,7 +206,7 @@ class Guard:
 
     def close(self) -> None:
         """End it; the vehicles are down or someone else's."""
-        self._board.end()
+        self._board.over = True
         self._process.join(2.0)
         if self._process.is_alive():
             self._process.kill()
@@ -236,7 +219,7 @@ def watch(board: Board, parent: int, own: RawLinks, safety: SafetySettings, stat
     own.open(udp_only=True)
     real_time.hurry()
     board.enter(Role.GUARD)
-    board.watch()
+    board.guarded = True
     while not board.over:
         time.sleep(CHECK)
         now = time.perf_counter()
@@ -245,7 +228,7 @@ def watch(board: Board, parent: int, own: RawLinks, safety: SafetySettings, stat
         # should the links live and not take over
         loop_silent = board.pilot is Role.LOOP and board.silent(Role.LOOP, now) > 3.0 * board.silence
         if board.flying and (links_silent or loop_silent):
-            board.take(Role.GUARD)
+            board.pilot = Role.GUARD
             board.end_process(Role.LINKS)
             say("openjax fly: nothing from the links' process, the guard lands all vehicles")
             own.open()

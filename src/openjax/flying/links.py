@@ -68,7 +68,6 @@ class Links:
         silence: float = SILENCE,
     ):
         self._uris, self._options, self._landing = tuple(uris), (body_logs, watchdog), (safety, state)
-        self._now = time.perf_counter
         n = len(self._uris)
         self._context = multiprocessing.get_context("spawn")
         self.board = Board(n, self._context, silence)
@@ -91,7 +90,7 @@ class Links:
           UserError: cflib isn't there, a vehicle doesn't answer, or lacks a variable.
         """
         context = self._context
-        self._contacts = context.RawArray("d", [self._now()] * len(self._uris))
+        self._contacts = context.RawArray("d", [time.perf_counter()] * len(self._uris))
         self._stream, stream = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
         self._commands, commands = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._control, control = context.Pipe()
@@ -101,11 +100,9 @@ class Links:
         self._process = context.Process(
             target=_serve,
             args=(
-                self._uris,
-                *self._options,
+                (self._uris, *self._options),
                 timeout,
-                self._contacts,
-                *ends,
+                (self._contacts, *ends),
                 self.board,
                 os.getpid(),
                 self._landing,
@@ -177,7 +174,7 @@ class Links:
 
     def wait(self, until: float) -> None:
         """Return at `until` (s), or as soon as a pose arrives."""
-        left = until - self._now()
+        left = until - time.perf_counter()
         if left > 0:
             select.select([self._stream], [], [], left)
 
@@ -211,30 +208,26 @@ class Links:
             raise LinksGone("the links' process is gone or stuck") from error
         return sent
 
-    def send_pose(self, i: int, position, quaternion) -> None:
-        """Tell vehicle i where motion capture sees it: (3,) m, (4,) wxyz."""
+    def send_pose(self, i: int, pose: Pose) -> None:
+        """Tell vehicle i where motion capture sees it."""
         with self._lock:
-            self._control.send((0, "send_pose", (i, tuple(position), tuple(quaternion))))
+            self._control.send((0, "send_pose", (i, pose.position, pose.quaternion)))
 
     def believed(self, vehicle: int, pose: Pose) -> None:
         """There is no motion capture here."""
 
     def arm(self) -> None:
         """Arm all."""
-        self.board.arm(True)
+        self.board.armed = True
         self._call("arm", True)
 
     def disarm(self) -> bool:
         """Motors off, and disarm all; whether all said that they are."""
         return self._call("disarm")
 
-    def emergency_stop(self) -> None:
-        """Stop all motors at once; the vehicles must be restarted afterwards."""
-        self._call("emergency_stop")
-
-    def record(self, on: bool = True) -> None:
-        """Keep all samples from now on (or no longer)."""
-        self._call("record", on)
+    def record(self) -> None:
+        """Keep all samples from now on."""
+        self._call("record")
 
     def samples(self) -> list[Samples]:
         """What was recorded of each vehicle."""
@@ -260,27 +253,16 @@ class Links:
             end.close()
 
 
-def _serve(
-    uris,
-    body_logs,
-    watchdog,
-    timeout,
-    contacts,
-    stream,
-    commands,
-    control,
-    board: Board,
-    parent: int,
-    landing,
-) -> None:
+def _serve(options, timeout, ends, board: Board, parent: int, landing) -> None:
     """The links' process. Should the loop stop, it lands the vehicles; with nothing in the air it ends with the loop."""
+    contacts, stream, commands, control = ends
     stand_alone()
     board.enter(Role.LINKS)
     sys.setswitchinterval(5e-4)  # cflib's threads and the one that passes on set-points
     threading.excepthook = lambda _: None  # cflib's threads, when their socket goes
     real_time.hurry()
     stream.setblocking(False)
-    swarm, lock = Swarm(uris, body_logs, watchdog), threading.Lock()
+    swarm, lock = Swarm(*options), threading.Lock()
     threading.Thread(target=_watch, args=(swarm, board, parent, landing), daemon=True, name="watch").start()
 
     def pass_on(vehicle: int, member: Member, new_pose: bool) -> None:

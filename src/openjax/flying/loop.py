@@ -5,17 +5,17 @@ from __future__ import annotations
 import gc
 import itertools
 import math
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from time import perf_counter
 
 import numpy as np
 
-from openjax.flying.controller import Pose, accelerate, wanted_acceleration
+from openjax.flying.controller import accelerate, wanted_acceleration
 from openjax.flying.game import Game
 from openjax.flying.limits import SafetySettings
-from openjax.flying.safety import Event, Mode, PoseSample, Request, State, decide, initial_state, see
+from openjax.flying.links import Links
+from openjax.flying.safety import Event, Mode, Request, State, decide, initial_state, see
 from openjax.flying.set_point import OFF, RATES, SetPoint, as_sent, from_action
 from openjax.pursuit.environment import THRUST_LIMIT
 
@@ -25,32 +25,10 @@ MARGIN = 2.0e-3
 """A tick is due this long after the newest poses were measured (s), as far as the fastest packets tell."""
 EARLY, PATIENCE = 3.0e-3, 5.0e-3
 """It begins as soon as all poses are there, up to this much before or after it is due (s)."""
+TRANSFER, SETTLE = 20.0, 0.3
+"""All land if their starts aren't reached within this time (s); there they wait for so long."""
 GONE = 0.1
 """A vehicle whose newest pose is older (s) isn't waited for."""
-
-
-class Vehicles(Protocol):
-    """What the loop needs of the vehicles; `Links` are some."""
-
-    def observe(self) -> tuple[PoseSample, ...]:
-        """What is known of each vehicle now."""
-        ...
-
-    def send(self, set_points) -> float:
-        """Send each vehicle its set-point; returns when the last one left (s)."""
-        ...
-
-    def believed(self, vehicle: int, pose: Pose) -> None:
-        """A pose of motion capture was judged good."""
-        ...
-
-    def arrivals(self) -> tuple[float, ...]:
-        """When each vehicle's newest pose arrived (s, host)."""
-        ...
-
-    def wait(self, until: float) -> None:
-        """Return at `until` (s), or as soon as a pose arrives."""
-        ...
 
 
 @dataclass
@@ -129,9 +107,9 @@ class Pace:
         return self.due
 
 
-def await_poses(vehicles: Vehicles, due: float, clock: Callable[[], float]) -> None:
+def await_poses(vehicles: Links, due: float) -> None:
     """Return around `due` (s): as soon as each vehicle's newest pose is there that was measured before."""
-    while (now := clock()) < due + PATIENCE:
+    while (now := perf_counter()) < due + PATIENCE:
         measured = measured_times(vehicles.observe())
         complete = all(t > due - PERIOD or now - t > GONE for t in measured)
         if complete and now >= due - EARLY:
@@ -167,10 +145,6 @@ class Plan:
     """Games, one after the other; between them all fly back to their starts."""
     episode_seconds: float = math.inf
     """End each game after this time, if it isn't over before (s)."""
-    transfer_timeout: float = 20.0
-    """Land if the starts aren't reached within this time (s)."""
-    settle: float = 0.3
-    """Wait this long at the starts (s)."""
 
 
 class Flight:
@@ -183,28 +157,26 @@ class Flight:
       plan: what to fly.
       requests: asked at every tick for what the operator wants.
       watched: called after every tick with time and state; if it returns anything, all land for that reason.
-      clock: host time (s).
     """
 
     def __init__(
         self,
-        vehicles: Vehicles,
+        vehicles: Links,
         game: Game,
         safety: SafetySettings,
         plan: Plan,
         requests: Callable[[], Request] = lambda: Request.NONE,
         watched: Callable[[float, State], str] = lambda now, state: "",
-        clock: Callable[[], float] = time.perf_counter,
     ):
         self.vehicles, self.game, self.safety, self.plan = vehicles, game, safety, plan
-        self._requests, self._watched, self._now = requests, watched, clock
+        self._requests, self._watched = requests, watched
         number = len(vehicles.observe())
         self._pursuers = game.settings.num_pursuers
         self._evader_flies = number > self._pursuers
         self.state = flight_state(game, number, safety)
         self.record = Record()
         self._play, self._episode, self._begun = None, -1, 0.0
-        self._since = clock()
+        self._since = perf_counter()
         self._flown, self._alarm = 0, ""
 
     def run(self) -> Record:
@@ -212,13 +184,13 @@ class Flight:
         gc.collect()
         gc.disable()
         try:
-            pace = Pace(self._now())
-            self._since = self._now()
+            pace = Pace(perf_counter())
+            self._since = perf_counter()
             while not self.over:
-                self.tick(self._now(), pace.due)
-                due = pace.next(self._now(), measured_times(self.vehicles.observe()))
+                self.tick(perf_counter(), pace.due)
+                due = pace.next(perf_counter(), measured_times(self.vehicles.observe()))
                 self.record.skipped = pace.skipped
-                await_poses(self.vehicles, due, self._now)
+                await_poses(self.vehicles, due)
         finally:
             gc.enable()
         return self.record
@@ -258,12 +230,12 @@ class Flight:
         if state.all_in(Mode.GROUND) and all(d.estimate is not None for d in state.drones):
             return Request.TRANSFER
         if state.all_in(Mode.READY) and self._episode < 0:
-            if now - max(d.since for d in state.drones) < plan.settle:
+            if now - max(d.since for d in state.drones) < SETTLE:
                 return Request.NONE
             if self._flown >= plan.episodes:
                 return Request.LAND
             return Request.PURSUE
-        if any(m in (Mode.TRANSFER, Mode.READY) for m in state.modes) and waited > plan.transfer_timeout:
+        if any(m in (Mode.TRANSFER, Mode.READY) for m in state.modes) and waited > TRANSFER:
             return Request.LAND
         if self._episode >= 0 and (self._play.over or now - self._begun > plan.episode_seconds):
             self._end_episode("over")

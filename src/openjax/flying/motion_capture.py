@@ -48,18 +48,13 @@ def find_feed(name: str) -> Callable:
     return found
 
 
-class MotionCaptured:
-    """Vehicles whose poses come from outside; to the loop what `Links` is.
+class MotionCaptured(Links):
+    """Vehicles whose poses come from outside. Arguments as of `Links`."""
 
-    Args:
-      links: to the vehicles.
-      clock: host time (s).
-    """
-
-    def __init__(self, links: Links, clock: Callable[[], float] = time.perf_counter):
-        self._links, self._now = links, clock
-        self._poses: list[Pose | None] = [None] * len(links.poses)
-        self._seen = [array("d") for _ in links.poses]
+    def __init__(self, *arguments, **options):
+        super().__init__(*arguments, **options)
+        self._captured: list[Pose | None] = [None] * len(self.poses)
+        self._seen = [array("d") for _ in self.poses]
         self._recording, self._arrived = False, threading.Event()
 
     def feed(self, function: Callable) -> None:
@@ -71,43 +66,37 @@ class MotionCaptured:
 
         It is judged before anything flies by it, see `openjax.flying.judge`.
         """
-        at = self._now() if at is None else at
+        at = time.perf_counter() if at is None else at
         position, quaternion = tuple(map(float, position)), tuple(map(float, quaternion))
-        self._poses[vehicle] = Pose(at, position, (0.0, 0.0, 0.0), quaternion)
+        self._captured[vehicle] = Pose(at, position, (0.0, 0.0, 0.0), quaternion)
         self._arrived.set()
 
     def believed(self, vehicle: int, pose: Pose) -> None:
-        """This pose of motion capture was judged good."""
+        """This pose of motion capture was judged good: it is kept, and told to the vehicle."""
         if self._recording:
             self._seen[vehicle].extend(numbers_of(pose))
-        self._links.send_pose(vehicle, pose.position, pose.quaternion)
+        self.send_pose(vehicle, pose)
 
     def record(self) -> None:
         """Keep all samples from now on."""
         self._recording = True
-        self._links.record()
+        super().record()
 
     def samples(self) -> list[Samples]:
         """What was recorded of each vehicle, here and on board."""
-        both = zip(self._links.samples(), self._seen, strict=True)
+        both = zip(super().samples(), self._seen, strict=True)
         return [dataclasses.replace(s, seen=np.frombuffer(seen).reshape(-1, 14)) for s, seen in both]
 
     def wait(self, until: float) -> None:
-        """Return at `until` (s), or as soon as a pose arrives."""
-        self._arrived.wait(max(until - self._now(), 0.0))
+        """Return at `until` (s), or as soon as motion capture sends a pose."""
+        self._arrived.wait(max(until - time.perf_counter(), 0.0))
         self._arrived.clear()
 
     def observe(self) -> tuple[PoseSample, ...]:
         """What is known of each vehicle now."""
-        own = self._links.observe()
-        return tuple(
-            dataclasses.replace(sample, captured=p) for p, sample in zip(self._poses, own, strict=True)
-        )
+        own = super().observe()
+        return tuple(dataclasses.replace(s, captured=p) for p, s in zip(self._captured, own, strict=True))
 
     def arrivals(self) -> tuple[float, ...]:
-        """When each vehicle's newest pose arrived (s, host)."""
-        return tuple(-math.inf if p is None else p.time for p in self._poses)
-
-    def send(self, set_points) -> float:
-        """See `Links.send`."""
-        return self._links.send(set_points)
+        """When each vehicle's newest pose of motion capture arrived (s, host)."""
+        return tuple(-math.inf if p is None else p.time for p in self._captured)

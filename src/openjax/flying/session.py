@@ -51,11 +51,11 @@ class Session:
 
     def __init__(self, settings: SessionSettings, safety: SafetySettings, state: State):
         self._settings, self._safety, self._state = settings, safety, state
-        self.links = Links(
+        kind = Links if settings.feed is None else MotionCaptured
+        self.links = kind(
             settings.uris, settings.body_logs, settings.watchdog, safety, state, settings.silence
         )
         self.requests = Operator()
-        self.vehicles: Links | MotionCaptured = self.links
         self._guard: Guard | None = None
         self.scheduler = "ordinary"
         """What of the real-time scheduler was granted, see `openjax.flying.real_time`."""
@@ -68,9 +68,8 @@ class Session:
             self.links.board.enter(Role.LOOP)
             stack.callback(self.links.close)
             self.links.connect()
-            if settings.feed is not None:
-                self.vehicles = MotionCaptured(self.links)
-                self.vehicles.feed(settings.feed)
+            if isinstance(self.links, MotionCaptured):
+                self.links.feed(settings.feed)
             self._wait_for_poses()
             blocks = self.links.pose_blocks()
             self._own = RawLinks(settings.uris, blocks, settings.watchdog)
@@ -91,7 +90,7 @@ class Session:
         self._wait_for_poses()
         rates = poses_arriving(self.links)
         guarded = self._guard is None or self.links.board.guarded
-        found = faults(self._safety, self._state, self.vehicles.observe(), rates, guarded)
+        found = faults(self._safety, self._state, self.links.observe(), rates, guarded)
         if len(found) == 1:
             raise UserError(f"no take-off: {found[0]}")
         if found:
@@ -104,14 +103,14 @@ class Session:
         complaint, samples = "", []
         with self.requests:
             self._arm()
-            self.vehicles.record()
+            self.links.record()
             try:
                 flight.run()
             except Exception as error:  # whatever it is, vehicles are in the air
                 complaint = f"{error}; {self._left_to_others()}"
             with contextlib.suppress(UserError):
                 self.links.disarm()
-                samples = self.vehicles.samples()
+                samples = self.links.samples()
         return samples, complaint
 
     def watched(self, now: float, state: State) -> str:
@@ -133,13 +132,13 @@ class Session:
         """Return once the vehicles are down; land them here if nobody else does. What happened."""
         board, lander = self.links.board, Role.LINKS
         if board.pilot is Role.LOOP:
-            board.take(Role.LINKS)
+            board.pilot = Role.LINKS
         while board.flying:
             time.sleep(0.005)
             now = time.perf_counter()
             board.beat(Role.LOOP, now)
             if self.requests() is Request.STOP:
-                board.stop()
+                board.stopped = True
             lander = max(lander, board.pilot)
             if all(board.silent(role, now) > board.silence for role in (Role.LINKS, Role.GUARD)):
                 lander = Role.LOOP
@@ -155,7 +154,7 @@ class Session:
         deadline = time.monotonic() + timeout
         while True:
             now = time.perf_counter()
-            samples = self.vehicles.observe()
+            samples = self.links.observe()
             newest = zip(measured_times(samples), samples, strict=True)
             old = [now - t > FRESH or s.own is None for t, s in newest]
             if not any(old):
@@ -164,4 +163,4 @@ class Session:
                 uris: Sequence[str] = self._settings.uris
                 silent = ", ".join(uri for uri, missing in zip(uris, old, strict=True) if missing)
                 raise UserError(f"no pose from {silent} within {timeout:g} s; is its position known?")
-            self.vehicles.wait(now + 0.02)
+            self.links.wait(now + 0.02)

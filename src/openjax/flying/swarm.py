@@ -10,11 +10,11 @@ import logging
 import math
 import struct
 import threading
-import time
 import warnings
 from array import array
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from time import perf_counter, sleep
 
 import numpy as np
 
@@ -87,11 +87,11 @@ def numbers_of(pose: Pose) -> tuple[float, ...]:
 class Member:
     """One vehicle of the swarm."""
 
-    def __init__(self, uri: str, clock: Callable[[], float]):
-        self.uri, self._now, self._onboard = uri, clock, _Clock()
+    def __init__(self, uri: str):
+        self.uri, self._onboard = uri, _Clock()
         self.pose: Pose | None = None
         self.arrival = -math.inf  # host s, of the newest pose
-        self.last_contact = clock()
+        self.last_contact = perf_counter()
         self.voltage, self.supervisor = math.nan, 0
         self.error: str | None = None
         self.poses, self.bodies, self.recording = array("d"), array("d"), False  # rows as in `Samples`
@@ -106,7 +106,7 @@ class Member:
 
     def pose_arrived(self, stamp: int, data: dict, _block=None) -> None:
         """A pose block, called by cflib's thread."""
-        now = self._now()
+        now = perf_counter()
         values = [data[name] for name, _ in POSE_BLOCK]
         pose = Pose(
             self._onboard.host(stamp, now),
@@ -123,7 +123,7 @@ class Member:
 
     def body_arrived(self, stamp: int, data: dict, _block=None) -> None:
         """A block of motors and accelerometer."""
-        now = self._now()
+        now = perf_counter()
         self.last_contact = now
         self.phases[_block] = stamp % PERIOD_MS
         if self.recording:
@@ -152,7 +152,7 @@ def _restart(uri: str, crazyflie) -> None:
     switch = PowerSwitch(uri)
     switch.stm_power_cycle()
     switch.close()
-    time.sleep(BOOT[uri.split(":")[0]])
+    sleep(BOOT[uri.split(":")[0]])
 
 
 class Swarm:
@@ -164,7 +164,6 @@ class Swarm:
           the diagnosis more exactly when a command arrived, and take more of the link. 0 to 5.
       watchdog: feed the firmware's emergency-stop watchdog: motors stop 1 s after the last set-point, instead of 2 s.
           Once it was fed it bites, also after a normal flight, and the vehicle is locked; `connect` restarts such vehicles.
-      clock: host time (s).
     """
 
     def __init__(
@@ -172,10 +171,9 @@ class Swarm:
         uris: Sequence[str],
         body_logs: int = 1,
         watchdog: bool = True,
-        clock: Callable[[], float] = time.perf_counter,
     ):
-        self._now, self._body_logs, self._watchdog, self._fed = clock, body_logs, watchdog, -math.inf
-        self.members = [Member(uri, clock) for uri in uris]
+        self._body_logs, self._watchdog, self._fed = body_logs, watchdog, -math.inf
+        self.members = [Member(uri) for uri in uris]
 
     def connect(self, timeout: float = 20.0) -> None:
         """Open all links and start the log blocks.
@@ -207,9 +205,8 @@ class Swarm:
                 if attempt or not member.crazyflie.supervisor.is_locked:
                     return
                 _restart(member.uri, member.crazyflie)
-        raise UserError(
-            f"{member.uri}: no connection ({member.error or 'locked'}); is the vehicle on, the URI right?"
-        )
+        on = "does openjax virtual_crazyflie run" if member.uri.startswith("udp:") else "is the vehicle on"
+        raise UserError(f"{member.uri}: no connection ({member.error or 'locked'}); {on}, is the URI right?")
 
     def _answers(self, member, make, timeout) -> bool:
         """Whether the vehicle has told all that `cflib` asks for."""
@@ -249,25 +246,25 @@ class Swarm:
                     ) from error
                 block.start()
                 member.blocks.append(block)
-        deadline = self._now() + timeout
+        deadline = perf_counter() + timeout
         while not all(b.started for m in self.members for b in m.blocks):
-            if self._now() > deadline:
+            if perf_counter() > deadline:
                 raise UserError(f"the log blocks didn't start within {timeout:g} s")
-            time.sleep(0.01)
+            sleep(0.01)
         # Once more, in step. A vehicle samples every 1 or 2 ms: blocks that share a sample leave a gap elsewhere.
         for _ in range(TRIES):
             self._start_in_step()
-            time.sleep(5e-3 * PERIOD_MS)
+            sleep(5e-3 * PERIOD_MS)
             if all(len(set(m.phases.values())) == self._body_logs for m in self.members):
                 break
 
     def _start_in_step(self):
         """All poses at the same moment, the blocks of motors spread evenly over the 10 ms."""
-        begin = self._now() + 0.01
+        begin = perf_counter() + 0.01
         for number in range(1 + self._body_logs):
             due = begin + 1e-3 * PERIOD_MS * (number - 0.5) / self._body_logs if number else begin
-            while self._now() < due:
-                time.sleep(1e-4)
+            while perf_counter() < due:
+                sleep(1e-4)
             for member in self.members:
                 member.blocks[number].start()
 
@@ -278,14 +275,6 @@ class Swarm:
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore")  # older firmware: cflib falls back by itself
                     member.crazyflie.supervisor.send_arming_request(on)
-
-    def emergency_stop(self) -> None:
-        """Stop all motors at once; the vehicles must be restarted afterwards."""
-        for member in self.members:
-            if member.crazyflie is not None and member.crazyflie.link is not None:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")
-                    member.crazyflie.supervisor.send_emergency_stop()
 
     def pose_blocks(self) -> tuple[int, ...]:
         """The id of each vehicle's pose block."""
@@ -299,7 +288,7 @@ class Swarm:
         """Send each vehicle its set-point; returns when the last one left (s)."""
         for member, set_point in zip(self.members, set_points, strict=True):
             send_set_point(member.crazyflie, set_point)
-        sent = self._now()
+        sent = perf_counter()
         if self._watchdog and sent - self._fed > WATCHDOG_PERIOD:
             self._fed = sent
             for member in self.members:
@@ -311,10 +300,10 @@ class Swarm:
         w, x, y, z = quaternion
         self.members[i].crazyflie.loc.send_extpose(tuple(position), (x, y, z, w))
 
-    def record(self, on: bool = True) -> None:
-        """Keep all samples from now on (or no longer)."""
+    def record(self) -> None:
+        """Keep all samples from now on."""
         for member in self.members:
-            member.recording = on
+            member.recording = True
 
     def samples(self) -> list[tuple[bytes, bytes]]:
         """What was recorded of each vehicle until now: poses and bodies, rows of float64 as in `Samples`."""
