@@ -1,4 +1,4 @@
-"""The state machine: rules one by one, properties under any events, and faults flown in simulated time."""
+"""The state machine: rules one by one, and properties under any events."""
 
 import math
 from dataclasses import replace
@@ -85,6 +85,21 @@ def test_a_pose_that_jumps_is_not_followed(ticks, mode):
     back = PoseSample(still(time, PLACES[1]), time, 4.0)
     state, _ = step(LIMITS, state, event(time, _1=back))
     assert state.modes[1] is (Mode.LAND if mode is Mode.BLIND else Mode.PURSUIT)
+
+
+@pytest.mark.parametrize("frames", [1, 4])
+@pytest.mark.parametrize("off", [0.14, 2.0])
+def test_wrong_frames_of_motion_capture_move_nothing(frames, off):
+    """Velocities are differences of its positions: a frame that isn't refused in time is a velocity of metres a second."""
+    state, place = pursuing(), PLACES[1]
+    for k in range(1, 30):
+        time, wrong = 0.01 * k, 10 <= k < 10 + frames
+        seen = still(time, (place[0] + off * wrong, *place[1:]))
+        sample = PoseSample(still(time, place), time, 4.0, captured=seen)
+        state, _ = step(LIMITS, state, event(time, _1=sample))
+        assert math.dist(state.drones[1].estimate.position, place) < 0.01
+        assert math.hypot(*state.drones[1].estimate.velocity) < 0.05
+    assert state.all_in(Mode.PURSUIT)
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from experiments.flying.real_time import Flown
 from experiments.flying.virtual import VirtualProcess
 from openjax.commands.fly import Arguments, Prepared
 from openjax.flying.controller import nominal_airframe
+from openjax.flying.game import Play
 from openjax.flying.limits import SafetySettings
 from openjax.flying.loop import flight_state
 from openjax.flying.session import SessionSettings
@@ -47,10 +48,8 @@ class Level:
         # angles don't come from rates that are zero: level by what is seen
         action = self._action.copy()
         action[:, 1:3] = [[-2.0 * p.quaternion[1], -2.0 * p.quaternion[2]] for p in poses]
-        return SimpleNamespace(
-            action=action, evader_position=self._nothing, evader_velocity=self._nothing, captured=False, over=False,
-            breaches=self._nothing, crashed=self._nothing.astype(bool),
-        )  # fmt: skip
+        nothing = self._nothing
+        return Play(action, nothing, nothing, False, False, nothing, nothing.astype(bool))
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +74,7 @@ def flying():
         "KILL links then guard", "KILL links then space", "STOP links+guard", "policy fails",
         "TERM links", "TERM group", "HUP loop", "terminal closed", "Ctrl-Z", "Ctrl-C three times", "l and space",
         "camera frozen", "camera: yaw turned", "camera drifts", "gyroscope: a number that is none", "start: millimetres",
-        "strangers' packets", "second fly",
+        "KILL guard", "policy: a number that is none", "policy alternating", "camera late", "strangers' packets", "second fly",
     ],
 )  # fmt: skip
 def test_whatever_happens_all_are_down_inside_and_disarmed(flying, kind):
