@@ -141,6 +141,8 @@ def page(results: dict) -> Page:
     parts: list[Table | str] = [Table(columns, rows, title="Overview")]
     for name, own in by_policy.items():
         parts.append(by_evader(own, f"{name[0]}, {name[1]} game, {name[2]} vehicle"))
+    if "responses" in results:
+        parts.append(learned_ones(results["responses"]))
     if "training" in results:
         columns = {
             "M steps": "millions:.0f",
@@ -195,6 +197,31 @@ def by_evader(records: list[dict], title: str) -> Table:
         rows.append({"evader": evader, "of": EVADERS[evader].of, **rates})
     columns = {"evader": "evader", "used for": "of", **{name: name for name in own}}
     return Table(columns | {"least lower end": "low:.3f"}, rows, title=title)
+
+
+def learned_ones(responses: list[dict]) -> Table:
+    """What `openjax exploit --json` wrote of each policy: the least captures of a scripted and of a learned evader."""
+    rows = []
+    for response in responses:
+        row = {"policy": response["policy"], "millions": response["curve"][-1]["steps"] / 1e6}
+        for kind in dict.fromkeys(record["scenario"] for record in response["records"]):
+            own = [record for record in response["records"] if record["scenario"] == kind]
+            least = [
+                min(r["capture_rate"] for r in own if r["evader"].startswith("learned") == learned)
+                for learned in (False, True)
+            ]
+            row[kind] = ", ".join(f"{rate:.3f}" for rate in least)
+        rows.append(row)
+    columns = {
+        "policy": "policy",
+        "M steps a seed": "millions:.0f",
+        **{name: name for name in [*SCENARIOS, "uniform"]},
+    }
+    prose = (
+        "Captures of the worst scripted evader, of the best of three learned ones (`openjax exploit`), with the vehicles that "
+        "the policy was trained on. A learned evader that is caught more often than a scripted one is no best response."
+    )
+    return Table(columns, rows, title="Against evaders that learned", prose=prose)
 
 
 def main(arguments: list[str]) -> int:
