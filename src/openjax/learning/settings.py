@@ -434,8 +434,7 @@ def evaders_second() -> TrainSettings:
         mappo=dict(
             actor_start=0.015,
             target_kl=0.02,
-            penalty_start=0.15,
-            penalty_ramp=0.6,
+            penalty_start=0.1,
             entropy_coefficient=2e-3,
             # a hunt lasts four seconds: discounted by .995 a step, its end is worth an eighth of what it costs now
             discount=0.998,
@@ -444,7 +443,7 @@ def evaders_second() -> TrainSettings:
         vehicles_start=0.0,
         vehicles_ramp=0.0,
         # who meets fast ones at once learns to stand half a metre off the corner in which one waits
-        evaders_ramp=0.4,
+        evaders_ramp=0.3,
         evaders_validation=("field", "heavy", "pillar_hugger"),
         total_steps=740_000_000,
     )
