@@ -9,10 +9,12 @@ import dataclasses
 import functools
 from pathlib import Path
 
+import jax
+
 from experiments.paper.values import PREDICTION, means
 from experiments.table import Page, Table, page_parser, publish
 from openjax.commands.command_line import run_command
-from openjax.commands.evaluator import Evaluator, evaluate_scenarios, layout_slots
+from openjax.commands.evaluator import Evaluator, layout_slots, layout_tasks
 from openjax.learning import TrainSettings
 from openjax.policy import Policy
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings
@@ -57,8 +59,9 @@ def fly(
     settings = loaded.settings.environment
     settings = dataclasses.replace(settings, max_pillars=layout_slots(settings), **changes)
     evaluator = evaluator_of(settings, loaded.policy, episodes)
-    scenarios = [SCENARIOS[name] for name in layouts]
-    return evaluate_scenarios(evaluator, loaded.parameters, scenarios, episodes, 0, EXTRA)[0]
+    tasks = layout_tasks(settings, [SCENARIOS[name] for name in layouts], episodes)
+    flown = evaluator.fly(loaded.parameters, tasks, jax.random.key(0))
+    return [kind.record(EXTRA) for kind in flown]
 
 
 def shipped_with_clamp() -> dict[str, TrainSettings]:

@@ -1,13 +1,11 @@
 """The last stage of a run keeps what it learns only where that validates better."""
 
-import types
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from openjax.commands import training_job
+from openjax.commands.training_job import keep_if_better
 from openjax.files import read_json
 from openjax.learning import build, preset
 from openjax.pursuit import Pursuit
@@ -24,7 +22,7 @@ GOOD = {
 
 
 @pytest.mark.parametrize("better", [True, False])
-def test_last_stage_is_kept_where_it_validates_better(better, tmp_path, monkeypatch):
+def test_last_stage_is_kept_where_it_validates_better(better, tmp_path):
     settings = preset("quick", network=dict(features=8, heads=1), predictor=dict(enabled=False))
     environment = Pursuit(settings.environment)
     observation = jax.eval_shape(lambda key: environment.reset(key)[0], jax.random.key(0))
@@ -32,18 +30,16 @@ def test_last_stage_is_kept_where_it_validates_better(better, tmp_path, monkeypa
     before = jax.jit(build(settings, environment).policy.init)(jax.random.key(1), observation)
     directory = RunDirectory(tmp_path)
     save_policy_file(directory.policy, before, settings, {"update": 7}, storage="float32")
-    job = types.SimpleNamespace(settings=settings, environment=environment)
-    monkeypatch.setattr(training_job, "summarise", lambda summary: summary)
 
     def learn(parameters, key):
         return jax.tree.map(lambda leaf: leaf + 1.0, parameters), [{"crashes_from_starts": 0.1}]
 
     crashes = iter([0.1, 0.0] if better else [0.0, 0.1])
 
-    def validation(parameters):
-        return [GOOD | {"crash_rate": next(crashes)}]
+    def validate(parameters):
+        return GOOD | {"crash_rate": next(crashes)}
 
-    message = training_job._learn_analytic(job, directory, learn, validation)
+    message = keep_if_better(directory, learn, validate, settings)
     leaves, _, notes = load_policy_file(directory.policy)
     moved = [np.abs(np.asarray(leaf)).max() for leaf in jax.tree.leaves(leaves)]
     first = [np.abs(np.asarray(leaf)).max() for leaf in jax.tree.leaves(before)]

@@ -11,7 +11,7 @@ import pytest
 from flax import struct
 from rich.console import Console
 
-from openjax.commands.training_loop import NotFiniteError, Plan, StopRequest, guarded, run_updates
+from openjax.commands.training_loop import Loop, NotFiniteError, Plan, StopRequest, guarded
 from openjax.show.metrics import MetricsWriter, read_metrics
 from openjax.show.progress import Progress
 from openjax.store.checkpoint_files import is_checkpoint
@@ -72,9 +72,8 @@ def run(directory, compiled_step, updates, resume=False, evaluate=None, **plan):
         StopRequest() as stop,
     ):
         try:
-            return run_updates(
+            loop = Loop(
                 compiled_step,
-                carry,
                 plan,
                 checkpoints=checkpoints,
                 metrics=metrics,
@@ -84,6 +83,7 @@ def run(directory, compiled_step, updates, resume=False, evaluate=None, **plan):
                 evaluate=evaluate(stop) if evaluate else None,
                 first_update=first,
             )
+            return loop.run(carry)
         finally:
             metrics.close()
 

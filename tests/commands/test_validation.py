@@ -57,13 +57,12 @@ def test_uniform_tasks_fly_as_they_would_alone():
     key = jax.random.key(1)
     parameters = jax.jit(lambda key: policy.init(key, environment.reset(key)[0]))(key)
     validation = Validation(environment, game, policy, 4)
-    uniform, far, _ = validation(parameters)
+    uniform, far = (kind.evaluation for kind in validation(parameters))
     rewarded = dataclasses.replace(
         game, reward=RewardSettings(smoothness=2.0, first_crash=5000.0, distance=3.0)
     )
-    alone, _ = Evaluator(Pursuit(rewarded), policy, 4)(
-        parameters, uniform_tasks(game, 4, 5), jax.random.key(0)
-    )
+    evaluator, tasks = Evaluator(Pursuit(rewarded), policy, 4), {"alone": uniform_tasks(game, 4, 5)}
+    alone = evaluator.fly(parameters, tasks, jax.random.key(0))[0].evaluation
     together, by_itself = summarise(uniform), summarise(alone)
     assert abs(together.pop("episode_return") - by_itself.pop("episode_return")) > 1.0
     assert selection_score(together, 3) == pytest.approx(selection_score(by_itself, 3), abs=1e-6)

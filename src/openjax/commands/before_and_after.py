@@ -4,13 +4,10 @@ import dataclasses
 from collections.abc import Sequence
 
 import jax
-import jax.numpy as jnp
-import numpy as np
 
-from openjax.commands.evaluator import Evaluator, layout_slots, record_of, repeat_task
+from openjax.commands.evaluator import Evaluator, layout_slots, layout_tasks
 from openjax.commands.validation import uniform_tasks
-from openjax.learning import summarise
-from openjax.pursuit import Pursuit, PursuitSettings, Scenario, scenario_task
+from openjax.pursuit import Pursuit, PursuitSettings, Scenario
 from openjax.show.trajectory import Trajectory
 from openjax.store.policies import LoadedPolicy
 
@@ -56,7 +53,7 @@ def compare(
       validation: number of tasks.
 
     Returns:
-      records as of `evaluate_scenarios`, that of the validation tasks first, their capture steps in steps of the run; and
+      records as of `Flown.record`, that of the validation tasks first, their capture steps in steps of the run; and
       the first episode of each.
 
     Raises:
@@ -65,20 +62,10 @@ def compare(
     settings = game_for(environment.settings, policy)
     game = dataclasses.replace(environment, settings=settings, dynamics=None)
     policy = policy.in_game(game)
-    single = [scenario_task(settings, scenario) for scenario in scenarios]
-    parts = [uniform_tasks(environment.settings, validation, settings.max_pillars)]
-    parts += [repeat_task(task, episodes) for task in single]
-    tasks = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
-    ends = np.cumsum([validation, *[episodes] * len(single)])
-    evaluator = Evaluator(game, policy.policy, int(ends[-1]))
-    evaluation, records = evaluator(policy.parameters, tasks, jax.random.key(0))
-    rows, flights = [], []
-    for name, first, end in zip(
-        ("validation", *(scenario.name for scenario in scenarios)), [0, *ends[:-1]], ends, strict=True
-    ):
-        summary = summarise(jax.tree.map(lambda leaf, first=first, end=end: leaf[first:end], evaluation))
-        summary["capture_step"] *= settings.time_step / environment.settings.time_step
-        rows.append(record_of(name, int(end - first), summary))
-        task = jax.tree.map(lambda leaf, first=first: np.asarray(leaf[first]), tasks)
-        flights.append(evaluator.trajectory(records, int(first), task, f"{name}, {policy.source}"))
-    return rows, flights
+    tasks = {"validation": uniform_tasks(environment.settings, validation, settings.max_pillars)}
+    tasks |= layout_tasks(settings, scenarios, episodes)
+    evaluator = Evaluator(game, policy.policy, validation + episodes * len(scenarios))
+    flown = evaluator.fly(policy.parameters, tasks, jax.random.key(0))
+    longer = settings.time_step / environment.settings.time_step
+    rows = [row | {"capture_step": longer * row["capture_step"]} for row in (kind.record() for kind in flown)]
+    return rows, [kind.trajectory(0, f"{kind.name}, {policy.source}") for kind in flown]

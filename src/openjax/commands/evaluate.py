@@ -104,7 +104,9 @@ def fly_scenarios(command: EvaluateCommand, loaded, evaluators: dict) -> tuple[l
     Raises:
       UserError: an unusable layout, or a game that the policy can't play.
     """
-    from openjax.commands.evaluator import Evaluator, evaluate_scenarios
+    import jax
+
+    from openjax.commands.evaluator import Evaluator, layout_tasks
 
     game, loaded, scenarios = _game(command, loaded)
     kind = (game.settings, loaded.policy, command.opponent)
@@ -119,9 +121,9 @@ def fly_scenarios(command: EvaluateCommand, loaded, evaluators: dict) -> tuple[l
         def tell(layout):
             steps.begin(layout, "compiled first" if not compiled and layout == scenarios[0].name else "")
 
-        return evaluate_scenarios(
-            evaluators[kind], loaded.parameters, scenarios, command.episodes, command.seed, tell=tell
-        )
+        tasks, key = layout_tasks(game.settings, scenarios, command.episodes), jax.random.key(command.seed)
+        flown = evaluators[kind].fly(loaded.parameters, tasks, key, tell)
+        return [kind.record() for kind in flown], [kind.trajectory(0, kind.name) for kind in flown]
 
 
 def _game(command, loaded):

@@ -1,7 +1,8 @@
 """Evaluation of policies on layouts and on validation tasks, as tables, records and trajectories."""
 
+import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -44,14 +45,39 @@ class Evaluator:
         self.batch = batch
         self._evaluate = jax.jit(make_evaluate(environment, policy, trajectory=True))
 
-    def __call__(
-        self, parameters: PolicyParameters, tasks: Task, key: jax.Array
-    ) -> tuple[Evaluation, list[Any]]:
-        """One episode per task (leading axis B).
+    def fly(
+        self,
+        parameters: PolicyParameters,
+        kinds: Mapping[str, Task],
+        key: jax.Array,
+        tell: Callable[[str], None] = lambda name: None,
+    ) -> list["Flown"]:
+        """One episode per task; `kinds` are tasks by name, each with a leading axis of its own.
 
-        Returns:
-          Evaluation with leading axis B on the host, and the device trajectories of each batch.
+        Kinds that fill whole batches are flown one by one (`tell` hears which), so that a kind's result is the same alone
+        and among others; else all are packed into as few batches as they need.
         """
+        numbers = [tasks.evader_position.shape[0] for tasks in kinds.values()]
+        if not any(number % self.batch for number in numbers):
+            flown = []
+            for name, tasks in kinds.items():
+                tell(name)
+                flown.append(Flown(self, name, tasks, *self._fly(parameters, tasks, key)))
+            return flown
+        packed = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *kinds.values())
+        evaluation, records = self._fly(parameters, packed, key)
+        ends = np.cumsum(numbers)
+        parts = [
+            jax.tree.map(lambda leaf, start=end - number, end=end: leaf[start:end], evaluation)
+            for number, end in zip(numbers, ends, strict=True)
+        ]
+        return [
+            Flown(self, *kind, part, records, int(end - number))
+            for kind, part, number, end in zip(kinds.items(), parts, numbers, ends, strict=True)
+        ]
+
+    def _fly(self, parameters, tasks, key):
+        """Evaluation (B,) of the tasks on the host, and the device trajectories of each batch."""
         number = tasks.evader_position.shape[0]
         evaluations, records = [], []
         for i, start in enumerate(range(0, number, self.batch)):
@@ -63,25 +89,40 @@ class Evaluator:
             records.append(record)
         return jax.tree.map(lambda *parts: np.concatenate(parts), *evaluations), records
 
-    def compile_ahead(self, parameters: PolicyParameters, tasks: Task) -> Callable[[], None]:
-        """Start to compile for parameters and tasks of these shapes; see `openjax.background`."""
+    def compile_ahead(self, parameters: PolicyParameters, task: Task) -> Callable[[], None]:
+        """Start to compile for parameters and tasks of these shapes, of which `task` has a leading axis of any length."""
 
         def one_batch(leaf):
             return jax.ShapeDtypeStruct((self.batch, *leaf.shape[1:]), leaf.dtype)
 
-        return compile_ahead(
-            self._evaluate,
-            parameters,
-            jax.tree.map(one_batch, tasks),
-            jax.random.fold_in(jax.random.key(0), 0),
-        )
+        key = jax.random.fold_in(jax.random.key(0), 0)
+        return compile_ahead(self._evaluate, parameters, jax.tree.map(one_batch, task), key)
 
-    def trajectory(self, records: list[Any], episode: int, task: Task, title: str) -> Trajectory:
-        """Episode number `episode` of a call, for drawing; `task` is that episode's."""
-        record = jax.tree.map(
-            lambda leaf: np.asarray(leaf[episode % self.batch]), records[episode // self.batch]
-        )
-        settings = self.settings
+
+@dataclasses.dataclass(frozen=True)
+class Flown:
+    """Episodes of one kind of tasks."""
+
+    evaluator: Evaluator
+    name: str
+    tasks: Task  # (B, ...)
+    evaluation: Evaluation  # (B,), on the host
+    records: list[Any]
+    """Device trajectories by batch ..."""
+    first: int = 0
+    """... of which this many are of other kinds."""
+
+    def record(self, extra: tuple[str, ...] = ()) -> dict:
+        """Means over the episodes; see `record_of`."""
+        number = self.tasks.evader_position.shape[0]
+        return record_of(self.name, number, summarise(self.evaluation), extra)
+
+    def trajectory(self, episode: int, title: str) -> Trajectory:
+        """One of the episodes, for drawing."""
+        batch, place = divmod(self.first + episode, self.evaluator.batch)
+        record = jax.tree.map(lambda leaf: np.asarray(leaf[place]), self.records[batch])
+        settings = self.evaluator.settings
+        active = np.asarray(self.tasks.pillar_active[episode])
         return Trajectory(
             title=title,
             pursuer_position=record.pursuers,
@@ -89,7 +130,7 @@ class Evaluator:
             evader_position=record.evader,
             captured=record.captured,
             crashed=record.crashed,
-            pillar_position=np.asarray(task.pillar_position)[np.asarray(task.pillar_active)],
+            pillar_position=np.asarray(self.tasks.pillar_position[episode])[active],
             arena_radius=settings.arena_radius,
             arena_height=settings.arena_height,
             pillar_radius=settings.pillar_radius,
@@ -110,40 +151,9 @@ def repeat_task(task: Task, number: int) -> Task:
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (number, *leaf.shape)), task)
 
 
-def evaluate_scenarios(
-    evaluator: Evaluator,
-    parameters: PolicyParameters,
-    scenarios: Sequence[Scenario],
-    episodes: int,
-    seed: int,
-    extra: tuple[str, ...] = (),
-    tell: Callable[[str], None] = lambda layout: None,
-) -> tuple[list[dict], list[Trajectory]]:
-    """A record (`FIELDS` and `extra`) and the first episode's trajectory for each scenario.
-
-    Scenarios whose episodes fill whole batches are flown one by one, so that a scenario's result is the same
-    alone and among others; otherwise all are packed into as few batches as they need. `tell` hears which one is flown.
-    """
-    single = [scenario_task(evaluator.settings, scenario) for scenario in scenarios]
-    repeated = [repeat_task(task, episodes) for task in single]
-    key = jax.random.key(seed)
-    if episodes % evaluator.batch == 0:
-        results = []
-        for scenario, tasks in zip(scenarios, repeated, strict=True):
-            tell(scenario.name)
-            results.append((*evaluator(parameters, tasks, key), 0))
-    else:
-        tasks = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *repeated)
-        evaluation, records = evaluator(parameters, tasks, key)
-        results = []
-        for start in range(0, len(scenarios) * episodes, episodes):
-            part = jax.tree.map(lambda leaf, start=start: leaf[start : start + episodes], evaluation)
-            results.append((part, records, start))
-    rows, flights = [], []
-    for scenario, task, (evaluation, records, first) in zip(scenarios, single, results, strict=True):
-        rows.append(record_of(scenario.name, episodes, summarise(evaluation), extra))
-        flights.append(evaluator.trajectory(records, first, task, scenario.name))
-    return rows, flights
+def layout_tasks(settings: PursuitSettings, scenarios: Sequence[Scenario], episodes: int) -> dict[str, Task]:
+    """So many times each layout, by name."""
+    return {layout.name: repeat_task(scenario_task(settings, layout), episodes) for layout in scenarios}
 
 
 def record_of(scenario: str, episodes: int, summary: dict, extra: tuple[str, ...] = ()) -> dict:

@@ -1,14 +1,17 @@
 """One training run from its settings to its report: compile, train, evaluate, draw."""
 
+import contextlib
 import dataclasses
 import functools
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
+from rich.table import Table
 
 from openjax.background import in_background
 from openjax.cluster.devices import (
@@ -20,16 +23,11 @@ from openjax.cluster.devices import (
 )
 from openjax.cluster.processes import Processes
 from openjax.commands.before_and_after import compare, game_for
-from openjax.commands.evaluator import (
-    before_after_table,
-    evaluate_scenarios,
-    layout_slots,
-    record_of,
-)
+from openjax.commands.evaluator import before_after_table, layout_slots, layout_tasks
 from openjax.commands.gradient_stages import compile_first_flights, compile_last_stage
 from openjax.commands.run_words import closing_words, layouts_like
 from openjax.commands.step_programs import step_programs
-from openjax.commands.training_loop import NotFiniteError, Plan, StopRequest, run_updates
+from openjax.commands.training_loop import Loop, NotFiniteError, Outcome, Plan, StopRequest
 from openjax.commands.validation import SCORE_RULE, Validation, flat_metrics, selection_score
 from openjax.learning import TrainSettings, build, make_start, summarise
 from openjax.learning.train_state import policy_leaf
@@ -94,7 +92,8 @@ class TrainingJob:
         check_devices(self.settings, self.devices)
         check_memory(self.settings, self.devices)
         if self.start_from is not None:
-            _start_parameters(self, _abstract_parameters(self))
+            abstract = abstract_parameters(self.environment, build(self.settings, self.environment).policy)
+            _start_parameters(self, abstract)
         if self.compare_with is not None:
             other = load_policy(self.compare_with)
             other.in_game(Pursuit(game_for(self.settings.environment, other)))
@@ -106,102 +105,184 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
     Returns:
       the exit status: 0, or 1 after a NaN.
     """
-    settings, processes = job.settings, job.processes
-    if not processes.is_first:
+    if not job.processes.is_first:
         console = Console(quiet=True)
     title = f"openjax.train → {directory.path}"
-    with StopRequest() as stop, Progress(title, settings.total_steps, console) as progress:
-        checkpoints = Checkpoints(directory.checkpoints, processes=processes, score_rule=SCORE_RULE)
-        processes.advice = f"go on with openjax train --resume {directory.path} --devices all"
-        progress.phase("compiling the start: networks, first tasks")
-        start, step, abstract = _programs(job)
-        step_ready = step.compile_ahead(abstract)  # takes longest, so it comes first
-        first_flights = None
-        if settings.first_flights.updates and not job.start_from and not checkpoints.any_finished():
-            over = functools.partial(_over, job, stop)
-            first_flights = compile_first_flights(
-                settings, job.environment, abstract.policy, progress.message, over
-            )
-        carry, update, seconds = _first_carry(
-            job, start, abstract, directory, checkpoints, progress, first_flights
-        )
-        if processes.is_first:
-            directory.write_settings(settings, job.facts)
-
-        def evaluate(carry):
-            if not processes.is_first:
-                return processes.of_first()
-            uniform, far = (summarise(part) for part in validation()(own_copy(carry.policy))[:2])
-            score = selection_score(uniform, settings.environment.episode_length)
-            return processes.of_first((score, {**flat_metrics(uniform, far), "score": score}))
-
-        metrics = NoMetrics()
-        if processes.is_first:
-            steps = update * settings.steps_per_update
-            metrics = MetricsWriter(directory.path, update or None, resumed_steps=steps)
+    with StopRequest() as stop, Progress(title, job.settings.total_steps, console) as progress:
+        run = _Run(job, directory, stop, progress)
         try:
-            progress.phase("compiling the training step")
-            prepare_validation = functools.partial(_validation_ready, job, abstract)
-            # while an accelerator's compiler works for long, validation is made beside it; else its tracing would
-            # only hold up the first update, and on a CPU both would share the same cores
-            beside = processes.is_first and jax.default_backend() != "cpu" and not step_ready(_SOON)
-            if beside:
-                validation = in_background(prepare_validation)
-            step_ready()
-            if processes.is_first and not beside:
-                validation = in_background(prepare_validation)
-            if processes.is_first and settings.analytic.updates:
-                learn = in_background(lambda: compile_last_stage(settings, job.environment, abstract.policy))
-            outcome = run_updates(
-                step,
-                carry,
-                Plan(
-                    total_updates=settings.total_updates,
-                    steps_per_update=settings.steps_per_update,
-                    validation_interval=settings.validation_interval,
-                    time_limit=seconds + job.time_limit,
-                    # an accelerator would wait for the validation's program
-                    validate_start=first_flights is not None and jax.default_backend() == "cpu",
-                ),
-                checkpoints=checkpoints,
-                metrics=metrics,
-                progress=progress,
-                directory=directory.path,
-                stop=stop,
-                evaluate=evaluate,
-                first_update=update,
-                seconds=seconds + time.monotonic() - job.started,
-                everyone=processes.everyone,
-            )
+            outcome = run.train()
         except NotFiniteError as error:
             progress.message(f"stopped: {error}")
             return 1
-        finally:
-            metrics.close()
-        signals = [name for name in processes.everyone(stop.name) if name is not None]
-        if not processes.is_first:
-            return 0
-        _save_best(job, directory, checkpoints, outcome, progress.message)
-        if outcome.update == update and settings.total_updates > update:
-            what = "MAPPO did not begin" if first_flights else "nothing was trained"
-            progress.message(
-                f"{what}: {outcome.stopped_by} came before the first update, {outcome.seconds:.0f} s after the start"
-            )
-        if signals:
-            progress.message(
-                f"{signals[0]}: saved at update {outcome.update}; "
-                f"go on with openjax train --resume {directory.path}"
-            )
-            return 0
-        if settings.analytic.updates:
-            progress.phase("learning by the gradient through the simulation")
-            progress.message(_learn_analytic(job, directory, learn(), validation()))
-        table = _report(job, directory, validation(), outcome, progress)
-    console.print(table)
-    for line in closing_words(settings, directory.path, jax.default_backend() == "cpu"):
-        console.print(line, soft_wrap=True)
-    console.print(f"run, policy and pictures are in {directory.path}, the chase in chase.gif", soft_wrap=True)
+        table = run.finish(outcome)
+    if table is not None:
+        console.print(table)
+        for line in closing_words(job.settings, directory.path, jax.default_backend() == "cpu"):
+            console.print(line, soft_wrap=True)
+        console.print(
+            f"run, policy and pictures are in {directory.path}, the chase in chase.gif", soft_wrap=True
+        )
     return 0
+
+
+class _Run:
+    """One process' part of a run: what its steps share, and the programs as they get ready."""
+
+    def __init__(self, job: TrainingJob, directory: RunDirectory, stop: StopRequest, progress: Progress):
+        self.job, self.directory, self.stop, self.progress = job, directory, stop, progress
+        self.settings, self.processes = job.settings, job.processes
+        self.checkpoints = Checkpoints(directory.checkpoints, processes=job.processes, score_rule=SCORE_RULE)
+        self.processes.advice = f"go on with openjax train --resume {directory.path} --devices all"
+
+    def train(self) -> Outcome:
+        """Compile and train. Raises NotFiniteError."""
+        job, settings = self.job, self.settings
+        self.progress.phase("compiling the start: networks, first tasks")
+        start, step, self.abstract = _programs(job)
+        step_ready = step.compile_ahead(self.abstract)  # takes longest, so it comes first
+        self.first_flights = self._first_flights()
+        carry, self.first_update, seconds = self._first_carry(start)
+        if self.processes.is_first:
+            self.directory.write_settings(settings, job.facts)
+        with self._metrics() as metrics:
+            self.progress.phase("compiling the training step")
+            self._compile_beside(step_ready)
+            plan = Plan(
+                total_updates=settings.total_updates,
+                steps_per_update=settings.steps_per_update,
+                validation_interval=settings.validation_interval,
+                time_limit=seconds + job.time_limit,
+                # an accelerator would wait for the validation's program
+                validate_start=self.first_flights is not None and jax.default_backend() == "cpu",
+            )
+            loop = Loop(
+                step,
+                plan,
+                checkpoints=self.checkpoints,
+                metrics=metrics,
+                progress=self.progress,
+                directory=self.directory.path,
+                stop=self.stop,
+                evaluate=self._evaluate,
+                first_update=self.first_update,
+                seconds=seconds + time.monotonic() - job.started,
+                everyone=self.processes.everyone,
+            )
+            return loop.run(carry)
+
+    def finish(self, outcome: Outcome) -> Table | None:
+        """Write the best policy, then the report, whose table it is; None where a signal ended the run."""
+        settings, path = self.settings, self.directory.path
+        signals = [name for name in self.processes.everyone(self.stop.name) if name is not None]
+        if not self.processes.is_first:
+            return None
+        self._save_best(outcome)
+        if outcome.update == self.first_update and settings.total_updates > outcome.update:
+            what = "MAPPO did not begin" if self.first_flights else "nothing was trained"
+            when = f"before the first update, {outcome.seconds:.0f} s after the start"
+            self.progress.message(f"{what}: {outcome.stopped_by} came {when}")
+        if signals:
+            advice = f"go on with openjax train --resume {path}"
+            self.progress.message(f"{signals[0]}: saved at update {outcome.update}; {advice}")
+            return None
+        validation = self.validation()
+        if settings.analytic.updates:
+            self.progress.phase("learning by the gradient through the simulation")
+
+            def validate(parameters):
+                return summarise(validation(parameters)[0].evaluation)
+
+            self.progress.message(keep_if_better(self.directory, self.last_stage(), validate, settings))
+        return report(self.job, self.directory, validation, outcome, self.progress)
+
+    def _first_flights(self):
+        """The stage before MAPPO, of a run that has it still to come; else None."""
+        if not self.settings.first_flights.updates or self.job.start_from or self.checkpoints.any_finished():
+            return None
+        return compile_first_flights(
+            self.settings, self.job.environment, self.abstract.policy, self.progress.message, self._over
+        )
+
+    def _over(self):
+        """Whether the run is to end: a signal to any process counts, and the first one's clock."""
+        late = time.monotonic() - self.job.started >= self.job.time_limit
+        asked = self.processes.everyone([self.stop.name, late])
+        return any(name is not None for name, _ in asked) or asked[0][1]
+
+    def _first_carry(self, start):
+        """The carry to start from, the updates done and the seconds spent."""
+        job, settings, checkpoints = self.job, self.settings, self.checkpoints
+        checkpoints.remove_unfinished()
+        if self.processes.of_first(checkpoints.any_finished()):
+            carry, record = checkpoints.restore_latest(self.abstract, self.progress.message)
+            self.progress.message(f"resumed at update {record.update} of {settings.total_updates}")
+            return carry, record.update, float(record.notes.get("seconds", 0.0))
+        carry = start(jax.random.key(settings.seed))
+        if job.start_from is not None:
+            carry = carry.with_policy(_start_parameters(job, carry.policy))
+        if self.processes.is_first:
+            save_policy_file(
+                self.directory.start_policy, carry.policy, settings, {"update": 0}, storage="float32"
+            )
+        if self.first_flights is not None:
+            self.progress.phase("learning to fly by the gradient through the simulation")
+            key = jax.random.fold_in(jax.random.key(settings.seed), 1)
+            carry = carry.with_policy(self.first_flights(carry.policy, key))
+        return place(carry, carry_shardings(job.devices)), 0, 0.0
+
+    def _metrics(self):
+        """Where this process writes metrics, as a context manager."""
+        if not self.processes.is_first:
+            return contextlib.closing(NoMetrics())
+        steps = self.first_update * self.settings.steps_per_update
+        writer = MetricsWriter(self.directory.path, self.first_update or None, resumed_steps=steps)
+        return contextlib.closing(writer)
+
+    def _compile_beside(self, step_ready):
+        """Wait for the training step; what is needed later is compiled in the background."""
+        first, settings = self.processes.is_first, self.settings
+        # while an accelerator's compiler works for long, validation is made beside it; else its tracing would
+        # only hold up the first update, and on a CPU both would share the same cores
+        beside = first and jax.default_backend() != "cpu" and not step_ready(_SOON)
+        if beside:
+            self.validation = in_background(self._ready_validation)
+        step_ready()
+        if first and not beside:
+            self.validation = in_background(self._ready_validation)
+        if first and settings.analytic.updates:
+            kinds = settings, self.job.environment, self.abstract.policy
+            self.last_stage = in_background(functools.partial(compile_last_stage, *kinds))
+
+    def _ready_validation(self):
+        """The validation, compiled; and what else is needed soon after the first update is loaded."""
+        load_orbax()
+        validation = _validation(self.job)
+        tasks = validation.tasks["validation"]
+        validation.evaluator.compile_ahead(abstract_like(self.abstract.policy), tasks)()
+        return validation
+
+    def _evaluate(self, carry):
+        """Score and metrics of a carry on the validation tasks; the same in all processes."""
+        if not self.processes.is_first:
+            return self.processes.of_first()
+        uniform, far = (summarise(kind.evaluation) for kind in self.validation()(own_copy(carry.policy)))
+        score = selection_score(uniform, self.settings.environment.episode_length)
+        return self.processes.of_first((score, {**flat_metrics(uniform, far), "score": score}))
+
+    def _save_best(self, outcome):
+        """Write the policy of the best checkpoint, or of the latest where none was evaluated."""
+        leaves, record = self.checkpoints.load_best(policy_leaf, self.progress.message)
+        abstract = jax.eval_shape(lambda: outcome.carry.policy)
+        notes = {
+            "update": record.update,
+            "steps": record.update * self.settings.steps_per_update,
+            "validation_score": record.score,
+            "seconds": record.notes.get("seconds"),
+            **self.job.facts,
+        }
+        parameters = fill(abstract, leaves, str(record.path))
+        save_policy_file(self.directory.policy, parameters, self.settings, notes, storage="float32")
 
 
 def _programs(job):
@@ -220,40 +301,6 @@ def _programs(job):
     return kept_start, step_programs(phases, job.devices, abstract, keep), abstract
 
 
-def _over(job, stop):
-    """Whether the run is to end: a signal to any process counts, and the first one's clock."""
-    asked = job.processes.everyone([stop.name, time.monotonic() - job.started >= job.time_limit])
-    return any(name is not None for name, _ in asked) or asked[0][1]
-
-
-def _validation_ready(job, abstract):
-    """The validation, compiled; and what else is needed soon after the first update is loaded."""
-    load_orbax()
-    validation = _validation(job)
-    validation.evaluator.compile_ahead(abstract_like(abstract.policy), validation.tasks)()
-    return validation
-
-
-def _first_carry(job, start, abstract, directory, checkpoints, progress, first_flights):
-    """The carry to start from, the updates done and the seconds spent; `abstract` is its kind."""
-    settings = job.settings
-    checkpoints.remove_unfinished()
-    if job.processes.of_first(checkpoints.any_finished()):
-        carry, record = checkpoints.restore_latest(abstract, progress.message)
-        progress.message(f"resumed at update {record.update} of {settings.total_updates}")
-        return carry, record.update, float(record.notes.get("seconds", 0.0))
-    carry = start(jax.random.key(settings.seed))
-    if job.start_from is not None:
-        carry = carry.with_policy(_start_parameters(job, carry.policy))
-    if job.processes.is_first:
-        save_policy_file(directory.start_policy, carry.policy, settings, {"update": 0}, storage="float32")
-    if first_flights is not None:
-        progress.phase("learning to fly by the gradient through the simulation")
-        key = jax.random.fold_in(jax.random.key(settings.seed), 1)
-        carry = carry.with_policy(first_flights(carry.policy, key))
-    return place(carry, carry_shardings(job.devices)), 0, 0.0
-
-
 def _start_parameters(job, fresh: PolicyParameters) -> PolicyParameters:
     """Those of the policy that the run starts from; `fresh` ones where it has no critic, or one of another game."""
     loaded = load_policy(job.start_from)
@@ -267,12 +314,8 @@ def _start_parameters(job, fresh: PolicyParameters) -> PolicyParameters:
     return kept.replace(critic=own.critic if fits else fresh.critic)
 
 
-def _abstract_parameters(job) -> PolicyParameters:
-    return abstract_parameters(job.environment, build(job.settings, job.environment).policy)
-
-
 def _validation(job):
-    """The validation tasks and their compiled evaluation, which has room for the layouts' pillars."""
+    """The validation tasks and their evaluation, which has room for the layouts' pillars."""
     settings, environment = job.settings, job.environment
     evaders = settings.evaders_validation or settings.environment.evaders
     slots = layout_slots(settings.environment)
@@ -287,30 +330,30 @@ def _validation(job):
     return Validation(wide, settings.environment, policy, settings.validation_episodes)
 
 
-def _save_best(job, directory, checkpoints, outcome, warn):
-    """Write the policy of the best checkpoint, or of the latest where none was evaluated."""
-    leaves, record = checkpoints.load_best(policy_leaf, warn)
-    abstract = jax.eval_shape(lambda: outcome.carry.policy)
-    parameters = fill(abstract, leaves, str(record.path))
-    notes = {
-        "update": record.update,
-        "steps": record.update * job.settings.steps_per_update,
-        "validation_score": record.score,
-        "seconds": record.notes.get("seconds"),
-        **job.facts,
-    }
-    save_policy_file(directory.policy, parameters, job.settings, notes, storage="float32")
+def keep_if_better(
+    directory: RunDirectory,
+    learn: Callable[[PolicyParameters, jax.Array], tuple[PolicyParameters, list[dict]]],
+    validate: Callable[[PolicyParameters], dict],
+    settings: TrainSettings,
+) -> str:
+    """Take a run's policy through the last stage, and keep what it becomes if that validates better.
 
+    Args:
+      directory: the run's; `policy.npz` is what the stage starts from, and what it writes.
+      learn: (parameters, key) -> parameters after it, its history.
+      validate: parameters -> summary of the uniform validation tasks.
+      settings: of the run.
 
-def _learn_analytic(job, directory, learn, validation):
-    """Take the run's policy through the last stage, and keep what it becomes if that validates better; a message."""
-    began, settings = time.monotonic(), job.settings
-    leaves, _, notes = load_policy_file(directory.policy)
-    before = fill(_abstract_parameters(job), leaves, str(directory.policy))
+    Returns:
+      what to tell of it.
+    """
+    began = time.monotonic()
+    before, _, notes = load_policy_file(directory.policy)
+    abstract = abstract_parameters(Pursuit(settings.environment), build(settings).policy)
     # where the validation, too, was compiled for
-    before = place(before)
+    before = place(fill(abstract, before, str(directory.policy)))
     after, history = learn(before, jax.random.key(settings.seed))
-    summaries = [summarise(validation(parameters)[0]) for parameters in (before, after)]
+    summaries = [validate(parameters) for parameters in (before, after)]
     scores = [selection_score(summary, settings.environment.episode_length) for summary in summaries]
     kept = scores[1] > scores[0]
     facts = {"seconds": round(time.monotonic() - began, 1), "kept": kept, "validation_scores": scores}
@@ -324,63 +367,54 @@ def _learn_analytic(job, directory, learn, validation):
     )
 
 
-def _report(job, directory, validation, outcome, progress):
-    """Evaluate the first and the best policy on the layouts and draw the best one's flights."""
-    from openjax.show.plots import plot_training, plot_trajectories
-    from openjax.show.videos import animate
-
+def report(
+    job: TrainingJob, directory: RunDirectory, validation: Validation, outcome: Outcome, progress: Progress
+) -> Table:
+    """Evaluate the first and the best policy on the layouts, draw the best one's flights; the table of both."""
     settings = job.settings
     fitting = layouts_like(settings.environment)
     abstract = jax.eval_shape(lambda: outcome.carry.policy)
-    rows, flights = {}, []
+    rows = {}
     for moment, path in (("before", directory.start_policy), ("after", directory.policy)):
         progress.phase(f"evaluating the policy {moment} training on the layouts")
         parameters = fill(abstract, load_policy_file(path)[0], str(path))
-        *evaluations, records = validation(parameters)
-        rows[moment] = [
-            record_of(name, validation.number, summarise(evaluation), _BESIDE_RECORD)
-            for name, evaluation in zip(("validation", "validation_far"), evaluations, strict=True)
-        ]
-        flights = [_flight(validation, records, i) for i in range(min(3, validation.number))]
+        flown = validation(parameters)
+        shown = [(flown[0], i, f"validation task {i + 1}") for i in range(min(3, validation.number))]
         if fitting:
-            layouts, flights = evaluate_scenarios(
-                validation.evaluator, parameters, fitting, job.layout_episodes, seed=0, extra=_BESIDE_RECORD
-            )
-            rows[moment] += layouts
+            tasks = layout_tasks(validation.evaluator.settings, fitting, job.layout_episodes)
+            layouts = validation.evaluator.fly(parameters, tasks, jax.random.key(0))
+            flown, shown = [*flown, *layouts], [(layout, 0, layout.name) for layout in layouts]
+        rows[moment] = [kind.record(_BESIDE_RECORD) for kind in flown]
+    flights = [kind.trajectory(episode, title) for kind, episode, title in shown]
     others, their_flights = [], []
     if job.compare_with is not None:
         progress.phase(f"evaluating {job.compare_with} in the same game")
         # its networks may be large, and these are minutes on a small machine
-        others, their_flights = compare(
-            load_policy(job.compare_with),
-            job.environment,
-            fitting,
-            min(job.layout_episodes, 8),
-            min(validation.number, 32),
-        )
+        number = min(job.layout_episodes, 8), min(validation.number, 32)
+        others, their_flights = compare(load_policy(job.compare_with), job.environment, fitting, *number)
     progress.phase("drawing")
-    write_json(
-        directory.path / "layouts.json",
-        {
-            **rows,
-            **({job.compare_with: others} if others else {}),
-            "updates": outcome.update,
-            "steps": outcome.update * settings.steps_per_update,
-            "seconds": round(outcome.seconds, 1),
-            **job.facts,
-        },
-    )
+    facts = {
+        **({job.compare_with: others} if others else {}),
+        "updates": outcome.update,
+        "steps": outcome.update * settings.steps_per_update,
+        "seconds": round(outcome.seconds, 1),
+        **job.facts,
+    }
+    write_json(directory.path / "layouts.json", {**rows, **facts})
+    drawn_by = _draw(directory, flights, their_flights)
+    progress.phase(f"done (animation by {drawn_by})")
+    return before_after_table(rows["before"], rows["after"], job.compare_with, others)
+
+
+def _draw(directory, flights, their_flights):
+    """Curves, paths and the chase; who drew the latter."""
+    from openjax.show.plots import plot_training, plot_trajectories
+    from openjax.show.videos import animate
+
     plot_training(directory.path / "training.png", directory.path / METRICS_FILE)
     plot_trajectories(directory.path / "trajectories.png", flights)
     captured = [flight for flight in flights if flight.capture_index is not None]
     chosen = (captured or flights)[0]
     shown = [flight for flight in their_flights if flight.title.startswith(f"{chosen.title}, ")]
     shown.insert(0, dataclasses.replace(chosen, title=f"{chosen.title}, this run") if shown else chosen)
-    drawn_by = animate(directory.path / "chase.gif", *shown)
-    progress.phase(f"done (animation by {drawn_by})")
-    return before_after_table(rows["before"], rows["after"], job.compare_with, others)
-
-
-def _flight(validation, records, episode):
-    task = jax.tree.map(lambda leaf: np.asarray(leaf[episode]), validation.tasks)
-    return validation.evaluator.trajectory(records, episode, task, f"validation task {episode + 1}")
+    return animate(directory.path / "chase.gif", *shown)

@@ -119,115 +119,112 @@ def float_leaves(carry: Any) -> dict[str, jax.Array]:
     }
 
 
-def run_updates(
-    step: Callable,
-    carry: Any,
-    plan: Plan,
-    *,
-    checkpoints: Checkpoints,
-    metrics: MetricsWriter,
-    progress: Progress,
-    directory: Path,
-    stop: StopRequest,
-    evaluate: Callable[[Any], tuple[float, dict[str, float]]] | None = None,
-    first_update: int = 0,
-    seconds: float = 0.0,
-    everyone: Callable[[Any], list] = lambda value: [value],
-) -> Outcome:
-    """Train until the plan is done, a time limit, a signal or a NaN.
+@dataclasses.dataclass
+class Loop:
+    """Training until the plan is done, a time limit, a signal or a NaN.
 
-    Several processes run this together: each must come to the same decisions after the same update.
-
-    Args:
-      step: from `guarded`.
-      carry: its leaves are donated.
-      plan: how long, how often.
-      checkpoints, metrics, progress: where to save, log and show.
-      directory: the run's directory; the state with a NaN is left in `not_finite` there.
-      stop: asks for an early end.
-      evaluate: carry -> (score, metrics) on the validation tasks; must not touch the carry.
-      first_update: updates done before (a resumed run).
-      seconds: training time spent before.
-      everyone: gathers a value of each process, as `Processes.everyone` does.
-
-    Raises:
-      NotFiniteError: a leaf of the carry holds a NaN.
+    Several processes run it together: each comes to the same decisions after the same update.
     """
-    started = saved_at = time.monotonic()
-    update, pending, best = first_update, None, checkpoints.best()
-    best_score = best.score if best and best.score_rule == checkpoints.score_rule else -float("inf")
-    overlap = jax.devices()[0].platform != "cpu" if plan.overlap is None else plan.overlap
-    names = list(float_leaves(carry))
 
-    def elapsed():
-        return seconds + time.monotonic() - started
+    step: Callable
+    """From `guarded`; takes the carry's buffers."""
+    plan: Plan
+    checkpoints: Checkpoints
+    metrics: MetricsWriter
+    progress: Progress
+    directory: Path
+    """The run's; the state with a NaN is left in `not_finite` there."""
+    stop: StopRequest
+    evaluate: Callable[[Any], tuple[float, dict[str, float]]] | None = None
+    """carry -> (score, metrics) on the validation tasks; must not touch the carry."""
+    first_update: int = 0
+    """Updates done before (a resumed run) ..."""
+    seconds: float = 0.0
+    """... and the training time that they took."""
+    everyone: Callable[[Any], list] = lambda value: [value]
+    """Gathers a value of each process, as `Processes.everyone` does."""
 
-    def finish(entry):
-        at, values, broken = entry
-        broken = np.asarray(broken)
+    def run(self, carry: Any) -> Outcome:
+        """Train; the carry's leaves are donated.
+
+        Raises:
+          NotFiniteError: a leaf of the carry holds a NaN.
+        """
+        plan, update, pending = self.plan, self.first_update, None
+        self._started = self._saved_at = time.monotonic()
+        best = self.checkpoints.best()
+        comparable = best and best.score_rule == self.checkpoints.score_rule
+        self._best_score = best.score if comparable else -float("inf")
+        overlap = jax.devices()[0].platform != "cpu" if plan.overlap is None else plan.overlap
+        names = list(float_leaves(carry))
+        reason, _ = self._decide()
+        if plan.validate_start and self.evaluate is not None and update == 0:
+            self._save(0, carry, validate=True)
+        self.progress.phase("compiling the training step", announce=False)
+        try:
+            while update < plan.total_updates and reason is None:
+                carry, *results = self.step(carry)
+                update += 1
+                if pending is not None:
+                    self._finish(names, *pending)
+                pending = (update, *results)
+                due = update % plan.validation_interval == 0 or update == plan.total_updates
+                reason, late = self._decide()
+                if not overlap or due or late or reason:
+                    self._finish(names, *pending)
+                    pending = None
+                if due or late:
+                    self._save(update, carry, validate=due)
+        except _Broken as broken:
+            raise self._leave_broken_state(carry, update, *broken.args) from None
+        self._save(update, carry)  # does nothing where it's saved already
+        self.checkpoints.wait()
+        return Outcome(carry, update, self._elapsed(), reason if update < plan.total_updates else None)
+
+    def _elapsed(self):
+        return self.seconds + time.monotonic() - self._started
+
+    def _finish(self, names, update, values, broken):
+        """Read, write and show the metrics of an update. Raises _Broken for a NaN in the carry."""
+        broken, steps = np.asarray(broken), update * self.plan.steps_per_update
         values = {name: float(value) for name, value in jax.device_get(values).items()}
-        metrics.write("train", at, at * plan.steps_per_update, elapsed(), values)
+        self.metrics.write("train", update, steps, self._elapsed(), values)
         if broken.any():
-            raise _Broken(at, [name for name, bad in zip(names, broken, strict=True) if bad], values)
-        progress.phase("training", announce=at == first_update + 1)
-        progress.update(at * plan.steps_per_update, values)
+            raise _Broken(update, [name for name, bad in zip(names, broken, strict=True) if bad], values)
+        self.progress.phase("training", announce=update == self.first_update + 1)
+        self.progress.update(steps, values)
 
-    def decide():
+    def _decide(self):
         """Why to stop, and whether a checkpoint is late: a signal to any process counts, and the first one's clock."""
-        late = time.monotonic() - saved_at > plan.checkpoint_seconds
-        asked = everyone([stop.name, elapsed() >= plan.time_limit, late])
+        late = time.monotonic() - self._saved_at > self.plan.checkpoint_seconds
+        asked = self.everyone([self.stop.name, self._elapsed() >= self.plan.time_limit, late])
         signals = [name for name, _, _ in asked if name is not None]
         _, over, late = asked[0]
         return signals[0] if signals else "the time limit" if over else None, late
 
-    def validated():
-        """The score of the carry, which is written and shown."""
-        nonlocal best_score
-        progress.phase("evaluating on validation tasks", announce=False)
-        score, validation = evaluate(carry)
-        metrics.write("validation", update, update * plan.steps_per_update, elapsed(), validation)
-        progress.validation(validation, is_best=score >= best_score)
-        best_score = max(score, best_score)
-        return score
+    def _save(self, update, carry, validate=False):
+        """Write a checkpoint, with its score on the validation tasks where it is to have one."""
+        score = None
+        if validate and self.evaluate is not None:
+            self.progress.phase("evaluating on validation tasks", announce=False)
+            score, validation = self.evaluate(carry)
+            steps = update * self.plan.steps_per_update
+            self.metrics.write("validation", update, steps, self._elapsed(), validation)
+            self.progress.validation(validation, is_best=score >= self._best_score)
+            self._best_score = max(score, self._best_score)
+        self.checkpoints.save(update, carry, score, {"seconds": self._elapsed()})
+        self._saved_at = time.monotonic()
 
-    reason, _ = decide()
-    if plan.validate_start and evaluate is not None and update == 0:
-        checkpoints.save(0, carry, validated(), {"seconds": elapsed()})
-    try:
-        while update < plan.total_updates and reason is None:
-            if update == first_update:
-                progress.phase("compiling the training step", announce=False)
-            carry, values, broken = step(carry)
-            update += 1
-            if pending is not None:
-                finish(pending)
-            pending = (update, values, broken)
-            due = update % plan.validation_interval == 0 or update == plan.total_updates
-            reason, late = decide()
-            if not overlap or due or late or reason:
-                finish(pending)
-                pending = None
-            score = validated() if due and evaluate is not None else None
-            if due or late:
-                checkpoints.save(update, carry, score, {"seconds": elapsed()})
-                saved_at = time.monotonic()
-    except _Broken as broken:
-        raise _leave_broken_state(directory, carry, update, checkpoints, *broken.args) from None
-    checkpoints.save(update, carry, None, {"seconds": elapsed()})  # does nothing where it's saved already
-    checkpoints.wait()
-    return Outcome(carry, update, elapsed(), reason if update < plan.total_updates else None)
-
-
-def _leave_broken_state(directory, carry, reached, checkpoints, update, leaves, values):
-    """Save the carry, which `reached` one update more than the broken one where updates overlap."""
-    checkpoints.wait()
-    place = Path(directory) / NOT_FINITE
-    save_state(place / f"{reached:09d}", carry, {"update": reached})
-    metrics = {name: value if np.isfinite(value) else str(value) for name, value in values.items()}
-    report = {"update": update, "state_after_update": reached, "leaves": leaves, "metrics": metrics}
-    if jax.process_index() == 0:
-        write_json(place / "report.json", report)
-    latest = checkpoints.latest()
-    good = f"the last good checkpoint is {latest.path}" if latest else "there is no checkpoint yet"
-    shown = ", ".join(leaves[:3]) + (f" and {len(leaves) - 3} more" if len(leaves) > 3 else "")
-    return NotFiniteError(f"NaN in update {update} in {shown}; the state is in {place}, {good}")
+    def _leave_broken_state(self, carry, reached, update, leaves, values):
+        """Save the carry, which `reached` one update more than the broken one where updates overlap."""
+        self.checkpoints.wait()
+        place = Path(self.directory) / NOT_FINITE
+        save_state(place / f"{reached:09d}", carry, {"update": reached})
+        metrics = {name: value if np.isfinite(value) else str(value) for name, value in values.items()}
+        report = {"update": update, "state_after_update": reached, "leaves": leaves, "metrics": metrics}
+        if jax.process_index() == 0:
+            write_json(place / "report.json", report)
+        latest = self.checkpoints.latest()
+        good = f"the last good checkpoint is {latest.path}" if latest else "there is no checkpoint yet"
+        shown = ", ".join(leaves[:3]) + (f" and {len(leaves) - 3} more" if len(leaves) > 3 else "")
+        return NotFiniteError(f"NaN in update {update} in {shown}; the state is in {place}, {good}")

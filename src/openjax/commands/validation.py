@@ -1,12 +1,9 @@
 """Validation tasks, never trained on: the same in every run, to watch it and to choose its best checkpoint. Never the layouts."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
-from openjax.commands.evaluator import Evaluator
-from openjax.learning import Evaluation
+from openjax.commands.evaluator import Evaluator, Flown
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Pursuit, PursuitSettings, Task, expand_task, turn_task, uniform_task
 
@@ -55,15 +52,14 @@ class Validation:
         slots = environment.settings.max_pillars
         self.number = number
         self.evaluator = Evaluator(environment, policy, 2 * number)
-        parts = uniform_tasks(drawn, number, slots), far_tasks(drawn, number, slots)
-        self.tasks: Task = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+        self.tasks: dict[str, Task] = {
+            "validation": uniform_tasks(drawn, number, slots),
+            "validation_far": far_tasks(drawn, number, slots),
+        }
 
-    def __call__(self, parameters: PolicyParameters) -> tuple[Evaluation, Evaluation, list[Any]]:
-        """Evaluations on the uniform and on the far tasks, and the device trajectories of both."""
-        evaluation, records = self.evaluator(parameters, self.tasks, jax.random.key(0))
-        uniform = jax.tree.map(lambda leaf: leaf[: self.number], evaluation)
-        far = jax.tree.map(lambda leaf: leaf[self.number :], evaluation)
-        return uniform, far, records
+    def __call__(self, parameters: PolicyParameters) -> list[Flown]:
+        """The uniform and the far tasks, flown."""
+        return self.evaluator.fly(parameters, self.tasks, jax.random.key(0))
 
 
 SCORE_RULE = 2
