@@ -1,11 +1,28 @@
-"""Choosing between a formula and its hand-written kernel, and what kernels need of their arrays."""
+"""What this machine computes with: cores as devices; a formula or its hand-written kernel, and what kernels need of arrays."""
 
 import functools
 import importlib.util
+import os
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+
+MOST_CORES = 4
+"""Cores that become devices: of more, some are other cores' second threads."""
+
+
+def make_cores_devices() -> None:
+    """Have JAX see a processor's cores as devices, before anything asks for them.
+
+    Worlds are shared out to devices whole, while most operations on all of them are too short for several threads. It
+    does nothing where there may be an accelerator, or the number of devices was asked for.
+    """
+    accelerator = can_compile_for_cuda() and jax.config.jax_platforms != "cpu"
+    asked = jax.config.jax_num_cpu_devices >= 0 or "device_count" in os.environ.get("XLA_FLAGS", "")
+    if not accelerator and not asked:
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        jax.config.update("jax_num_cpu_devices", min(cores or 1, MOST_CORES))
 
 
 @functools.cache

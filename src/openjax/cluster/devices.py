@@ -22,17 +22,22 @@ _SHARED_OUT = ("observation", "state")
 _FLOWN = Flown(PartitionSpec(None, AXIS), PartitionSpec(AXIS), PartitionSpec(AXIS))
 
 
+def can_share_out(settings: TrainSettings, number: int) -> bool:
+    """Whether each of `number` devices gets the same share of the worlds, of every task and of every minibatch."""
+    group = int(np.lcm(settings.world_unit, settings.mappo.minibatches))
+    return number == 1 or settings.num_envs % (number * group) == 0
+
+
 def check_devices(settings: TrainSettings, number: int) -> None:
     """Whether the worlds can be shared out.
 
     Raises:
       UserError: they can't, with the next number of worlds that could, and the numbers of devices that can.
     """
-    group = int(np.lcm(settings.world_unit, settings.mappo.minibatches))
-    unit = number * group
-    if number > 1 and settings.num_envs % unit:
+    if not can_share_out(settings, number):
+        unit = number * int(np.lcm(settings.world_unit, settings.mappo.minibatches))
         possible = -(-settings.num_envs // unit) * unit
-        fewer = [n for n in range(1, number) if n == 1 or settings.num_envs % (n * group) == 0]
+        fewer = [n for n in range(1, number) if can_share_out(settings, n)]
         raise UserError(
             f"num_envs {settings.num_envs} can't be shared out to {number} devices; {possible} could, "
             f"or --devices {' or '.join(map(str, fewer))}"
@@ -116,12 +121,11 @@ def make_device_phases(settings: TrainSettings, environment: Pursuit, number: in
     )
 
 
-def flown_shardings(number: int) -> Flown | jax.sharding.Sharding:
-    """Where the leaves of what was flown lie, as a prefix of its tree."""
+def flown_shardings(number: int) -> tuple[jax.sharding.Sharding, ...]:
+    """Where the leaves of each part of what was flown lie."""
     if number == 1:
-        return jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    parts = _FLOWN.rollout, _FLOWN.frames, _FLOWN.predicted
-    return Flown(*(NamedSharding(_mesh(number), spec) for spec in parts))
+        return (everywhere(1),) * len(vars(_FLOWN))
+    return tuple(NamedSharding(_mesh(number), spec) for spec in vars(_FLOWN).values())
 
 
 def _mesh(number):

@@ -3,7 +3,6 @@
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 
@@ -13,18 +12,20 @@ from openjax.commands.training_loop import guarded
 from openjax.learning import TrainCarry
 from openjax.learning.training_step import Phases
 
+Parts = tuple[tuple[jax.Array, ...], ...]
+
 
 @dataclass(frozen=True)
 class StepPrograms:
     """The training step `carry -> (carry, metrics, broken)`, as `openjax.commands.training_loop.guarded` has it.
 
-    What was flown goes from program to program as the leaves of its tree: a kept program knows no other types.
+    What was flown goes from program to program as the leaves of its parts: a kept program knows no other types.
     """
 
-    fly: Callable[[TrainCarry], tuple[TrainCarry, tuple[jax.Array, ...], dict]]
-    learn: tuple[Callable[[TrainCarry, tuple[jax.Array, ...]], tuple[TrainCarry, dict]], ...]
+    fly: Callable[[TrainCarry], tuple[TrainCarry, Parts, dict]]
+    learn: tuple[Callable[[TrainCarry, Parts], tuple[TrainCarry, dict]], ...]
     renew: Callable[[TrainCarry], tuple[TrainCarry, dict, jax.Array]]
-    flown: tuple[jax.ShapeDtypeStruct, ...]
+    flown: tuple[tuple[jax.ShapeDtypeStruct, ...], ...]
 
     def __call__(self, carry: TrainCarry) -> tuple[TrainCarry, dict, jax.Array]:
         """One step; the carry is donated."""
@@ -49,7 +50,7 @@ def step_programs(
     phases: Phases,
     devices: int,
     carry: TrainCarry,
-    keep: Callable[[str, Callable, Callable[[], tuple]], Callable] | None = None,
+    keep: Callable[[str, Callable, Callable[[], tuple]], Callable] = lambda name, program, arguments: program,
 ) -> StepPrograms:
     """The programs of the phases.
 
@@ -59,44 +60,42 @@ def step_programs(
       carry: shapes, dtypes and shardings of a run's carry.
       keep: (name, program, its arguments) -> the program as an earlier run traced it.
     """
-    shardings, same = carry_shardings(devices), everywhere(devices)
-    compiled = functools.partial(jax.jit, donate_argnums=0)
+    shardings, same, at = carry_shardings(devices), everywhere(devices), flown_shardings(devices)
+    options = {}
+    if devices > 1 and jax.default_backend() == "cpu":
+        options["xla_cpu_multi_thread_eigen"] = False  # devices are cores: threads would get in their way
+    compiled = functools.partial(jax.jit, donate_argnums=0, compiler_options=options)
     fly_tree = jax.jit(phases.fly)
 
     @functools.cache
-    def flown():
-        """What is flown, shapes for arrays: it takes a trace."""
-        shapes = jax.eval_shape(fly_tree, carry)[1]
-        at = jax.tree.broadcast(flown_shardings(devices), shapes)
-        return jax.tree.map(lambda s, at: jax.ShapeDtypeStruct(s.shape, s.dtype, sharding=at), shapes, at)
+    def structure():
+        """Of what is flown: it takes a trace."""
+        return jax.tree.structure(jax.eval_shape(fly_tree, carry)[1])
 
     def fly(carry):
         carry, flown, metrics = fly_tree(carry)
-        return carry, tuple(jax.tree.leaves(flown)), metrics
+        return carry, tuple(tuple(jax.tree.leaves(part)) for part in vars(flown).values()), metrics
 
-    def learn(phase, carry, leaves):
-        return phase(carry, jax.tree.unflatten(jax.tree.structure(flown()), leaves))
+    def learn(phase, carry, parts):
+        return phase(carry, jax.tree.unflatten(structure(), jax.tree.leaves(parts)))
 
-    def arguments():
-        return carry, tuple(jax.tree.leaves(flown()))
+    fly = keep("fly", jax.jit(fly), lambda: (carry,))
 
-    learners = [functools.partial(learn, phase) for phase in phases.learn]
-    renew = guarded(phases.renew, shardings, same)
-    if keep is None:
-        leaves = arguments()[1]
-        at: Any = tuple(leaf.sharding for leaf in leaves)
-    else:
-        fly = keep("fly", jax.jit(fly), lambda: (carry,))
-        learners = [keep(f"learn_{i}", jax.jit(learner), arguments) for i, learner in enumerate(learners)]
-        renew = compiled(keep("renew", renew, lambda: (carry,)), out_shardings=(shardings, same, same))
-        at = same
-        leaves = tuple(
-            jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=same)
-            for leaf in jax.eval_shape(fly, carry)[1]
-        )
+    @functools.cache
+    def flown():
+        """Its parts, shapes for arrays."""
+        shapes = jax.eval_shape(fly, carry)[1]
+        places = jax.tree.broadcast(at, shapes)
+        return jax.tree.map(lambda s, at: jax.ShapeDtypeStruct(s.shape, s.dtype, sharding=at), shapes, places)
+
+    learners = [
+        keep(f"learn_{i}", jax.jit(functools.partial(learn, phase)), lambda: (carry, flown()))
+        for i, phase in enumerate(phases.learn)
+    ]
+    renew = keep("renew", guarded(phases.renew, shardings, same), lambda: (carry,))
     return StepPrograms(
         compiled(fly, out_shardings=(shardings, at, same)),
         tuple(compiled(learner, out_shardings=(shardings, same)) for learner in learners),
-        renew,
-        leaves,
+        compiled(renew, out_shardings=(shardings, same, same)),
+        flown(),
     )

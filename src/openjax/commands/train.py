@@ -22,10 +22,14 @@ def main(arguments: Sequence[str], *, keep_traced: bool = False) -> int:
 
     from openjax.cluster.joining import joined
     from openjax.commands.training_command import membership, read_command, start
+    from openjax.platform import make_cores_devices
 
     # the same numbers by a kernel of JAX's own: written out, they're half of what there is to compile for a GPU
     jax.config.update("jax_threefry_gpu_kernel_lowering", True)
-    with joined(membership(arguments)) as processes:
+    place = membership(arguments)
+    if place is None and peek(arguments, "devices") is None:
+        make_cores_devices()
+    with joined(place) as processes:
         return start(read_command(arguments), arguments, started, processes, keep_traced=keep_traced)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import jax
 
+from openjax.cluster.devices import can_share_out
 from openjax.cluster.joining import Membership, find_membership
 from openjax.cluster.processes import Processes
 from openjax.commands.command_line import output_console, parse, peek
@@ -143,7 +144,7 @@ def prepare(
     environment = make_environment(command.settings.environment, vehicle, effects, opponent)
     settings = dataclasses.replace(command.settings, environment=environment.settings)
     compare_with = _comparison(command, resumed)
-    devices = _devices(command.devices)
+    devices = _devices(command.devices, settings, resumed.read_facts().get("devices") if resumed else None)
     if resumed is None:
         name = command.preset or default_preset()
         out = command.out or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{name}"
@@ -162,6 +163,7 @@ def prepare(
         facts={
             "command": " ".join([PROGRAM, *arguments]),
             "machine": describe_machine(),
+            "devices": devices,
             "start_from": start_from,
             "compare_with": compare_with,
         },
@@ -243,8 +245,13 @@ def _check(command):
         need(getattr(command, option) is None, f"--{option} can't change when a run is resumed")
 
 
-def _devices(text):
+def _devices(text, settings, before):
+    """How many; where nobody says, as many as `before`, or as many cores as the worlds can be shared out to."""
     available = len(jax.devices())
+    if text is None and jax.default_backend() == "cpu" and jax.process_count() == 1:
+        cores = max(number for number in range(1, available + 1) if can_share_out(settings, number))
+        return before if before in range(1, available + 1) else cores
+    text = text or "1"
     if text == "all":
         return available
     if not (text.isdecimal() and len(text) <= 9 and 1 <= int(text) <= available):

@@ -84,7 +84,14 @@ class TrainingJob:
         ]
         names = jax.tree.structure(game.effect_parameters)
         return repr(
-            (dataclasses.replace(self.settings, seed=0), game.settings, game.effects, str(names), arrays)
+            (
+                self.devices,
+                dataclasses.replace(self.settings, seed=0),
+                game.settings,
+                game.effects,
+                str(names),
+                arrays,
+            )
         )
 
     def check(self) -> None:
@@ -291,7 +298,8 @@ def _programs(job):
     start = make_start(settings, job.environment)
     abstract = abstract_like(jax.eval_shape(start, jax.random.key(settings.seed)), shardings)
     phases = make_device_phases(settings, job.environment, job.devices)
-    if job.traced is None or job.devices > 1:
+    tried = job.devices == 1 or (jax.default_backend() == "cpu" and jax.process_count() == 1)
+    if job.traced is None or not tried:
         return start, step_programs(phases, job.devices, abstract), abstract
     keep = functools.partial(recalled, carry=abstract, made_from=job.made_from, folder=job.traced)
 

@@ -48,8 +48,8 @@ class TrainCommand:
     opponent: str | None = None
     """Evader to train against: field, greedy, wall_runner and others (openjax evaluate --help), or a file that openjax exploit
     wrote; short for --environment.evaders."""
-    devices: str = "1"
-    """Number of devices to train on, or all (of all processes)."""
+    devices: str | None = None
+    """Number of devices to train on, or all (of all processes); by default one accelerator, or up to four cores."""
     coordinator_address: str | None = None
     """With several processes: host:port of process 0. Slurm and Open MPI tell it."""
     num_processes: Annotated[int | None, Interval("[1, 100000]")] = None
