@@ -8,7 +8,8 @@ from rich.console import Console
 
 import openjax
 from openjax.errors import UserError
-from openjax.show.steps import Steps, clock
+from openjax.show.progress import duration
+from openjax.show.steps import Steps
 
 
 def test_time_left_follows_this_machine(monkeypatch):
@@ -29,7 +30,7 @@ def test_nothing_but_text_goes_into_files():
     with Steps("work", {"only": 1.0}, Console(file=output)) as steps:
         steps.begin("only")
     assert output.getvalue() == ""
-    assert clock(65.2) == "1:05"
+    assert duration(65.2) == "1:05"
 
 
 def test_mistyped_setting():

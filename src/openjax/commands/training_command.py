@@ -137,14 +137,15 @@ def prepare(
       UserError: whatever can be wrong with the files or the settings.
     """
     resumed = None if command.resume is None else open_run(command.resume)
-    vehicle = command.vehicle or (resumed.optional("vehicle.toml") if resumed else None)
-    effects = command.effects or (resumed.optional("effects.toml") if resumed else None)
-    start_from = resumed.read_facts().get("start_from") if resumed else _lasting(command.start_from)
-    opponent = command.opponent or (resumed.optional("evader.npz") if resumed else None)
+    known = {} if resumed is None else resumed.read_facts()
+    kept = (lambda name: None) if resumed is None else resumed.optional
+    vehicle, effects = command.vehicle or kept("vehicle.toml"), command.effects or kept("effects.toml")
+    opponent = command.opponent or kept("evader.npz")
+    start_from = _lasting(command.start_from) or known.get("start_from")
     environment = make_environment(command.settings.environment, vehicle, effects, opponent)
     settings = dataclasses.replace(command.settings, environment=environment.settings)
-    compare_with = _comparison(command, resumed)
-    devices = _devices(command.devices, settings, resumed.read_facts().get("devices") if resumed else None)
+    compare_with = _comparison(command, known)
+    devices = _devices(command.devices, settings, known.get("devices"))
     if resumed is None:
         name = command.preset or default_preset()
         out = command.out or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{name}"
@@ -183,12 +184,12 @@ def _layout_episodes(environment):
     return 1 if not drawn else 32 if jax.default_backend() == "cpu" else 100
 
 
-def _comparison(command, resumed):
+def _comparison(command, known):
     """The policy to compare with; None for none."""
     if command.compare_with is not None:
         return None if command.compare_with == "none" else _lasting(command.compare_with)
-    if resumed is not None:
-        return resumed.read_facts().get("compare_with")
+    if command.resume is not None:
+        return known.get("compare_with")
     fits = command.settings.environment.num_pursuers == TrainSettings().environment.num_pursuers
     return "open" if fits and (command.preset or default_preset()) == "quick" else None
 

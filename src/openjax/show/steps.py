@@ -10,6 +10,8 @@ from rich.spinner import Spinner
 from rich.table import Table
 from rich.text import Text
 
+from openjax.show.progress import duration
+
 
 class Steps:
     """One line on a terminal; nothing where output goes into a file. Use as a context manager.
@@ -67,12 +69,6 @@ class Steps:
             self._spinner,
             Text(text),
             ProgressBar(total=1.0, completed=done, width=24),
-            Text(f"about {clock(left)} left", style="dim"),
+            Text(f"about {duration(left)} left", style="dim"),
         )
         return row
-
-
-def clock(seconds: float) -> str:
-    """Minutes and seconds, as 1:05."""
-    minutes, seconds = divmod(round(seconds), 60)
-    return f"{minutes}:{seconds:02d}"
