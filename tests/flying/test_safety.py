@@ -10,15 +10,7 @@ from hypothesis import strategies as st
 from openjax.flying.controller import Pose, nominal_airframe
 from openjax.flying.judge import Track
 from openjax.flying.limits import SafetySettings, fence_velocity, parting_velocity, resting_places
-from openjax.flying.safety import (
-    Drone,
-    Event,
-    Mode,
-    PoseSample,
-    Request,
-    initial_state,
-    step,
-)
+from openjax.flying.safety import Drone, Event, Mode, PoseSample, Request, initial_state, step
 from openjax.flying.set_point import OFF, RATES, SetPoint
 
 LIMITS = SafetySettings()

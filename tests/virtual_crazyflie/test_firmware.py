@@ -11,12 +11,7 @@ from openjax.errors import UserError
 from openjax.flying.crtp import Packet, Port, compress_quaternion, decode, expand_quaternion, pack_number
 from openjax.flying.motion_capture import find_feed
 from openjax.flying.set_point import ANGLES, OFF, RATES, SetPoint
-from openjax.virtual_crazyflie.firmware import (
-    LEVEL_AFTER,
-    STOP_AFTER,
-    WATCHDOG,
-    VirtualFirmware,
-)
+from openjax.virtual_crazyflie.firmware import LEVEL_AFTER, STOP_AFTER, WATCHDOG, VirtualFirmware
 from openjax.virtual_crazyflie.link import LinkFaults, VirtualLink
 from openjax.virtual_crazyflie.tables import LOG_VARIABLES, Sensors
 

@@ -96,12 +96,7 @@ class Bodies:
         x, y, z, w = q
         p, q_, r = rates
         turn = 0.5 * np.stack(
-            [
-                w * p - z * q_ + y * r,
-                z * p + w * q_ - x * r,
-                -y * p + x * q_ + w * r,
-                -x * p - y * q_ - z * r,
-            ]
+            [w * p - z * q_ + y * r, z * p + w * q_ - x * r, -y * p + x * q_ + w * r, -x * p - y * q_ - z * r]
         )
         return np.concatenate(
             [

@@ -14,9 +14,7 @@ from openjax.vehicle import DroneState, load_vehicle, make_drones_step
 def _compiled(physics, effects):
     vehicle = load_vehicle()
     step = make_drones_step(physics, substeps=5, effects=effects)
-    fly = jax.jit(
-        jax.vmap(functools.partial(step, vehicle), in_axes=(0, 0, 0, 0, None)),
-    )
+    fly = jax.jit(jax.vmap(functools.partial(step, vehicle), in_axes=(0, 0, 0, 0, None)))
     reset = jax.jit(jax.vmap(functools.partial(step.reset, vehicle)))
     return fly, reset, jax.jit(jax.vmap(step.seen, in_axes=(0, None)))
 

@@ -187,9 +187,7 @@ class Guard:
         self._board = board
         context = multiprocessing.get_context("spawn")
         self._process = context.Process(
-            target=watch,
-            args=(board, os.getpid(), own, safety, state),
-            name="openjax guard",
+            target=watch, args=(board, os.getpid(), own, safety, state), name="openjax guard"
         )
         self._process.start()
 

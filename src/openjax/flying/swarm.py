@@ -33,10 +33,7 @@ POSE_BLOCK = (
     ("pm.vbatMV", "uint16_t"),
     ("supervisor.info", "uint16_t"),
 )
-BODY_BLOCK = (
-    *((f"motor.m{i}", "uint16_t") for i in range(1, 5)),
-    *((f"acc.{v}", "FP16") for v in "xyz"),
-)
+BODY_BLOCK = (*((f"motor.m{i}", "uint16_t") for i in range(1, 5)), *((f"acc.{v}", "FP16") for v in "xyz"))
 WATCHDOG_PERIOD = 0.1
 """s between two words to the firmware's watchdog."""
 CONNECTING = 3
@@ -166,12 +163,7 @@ class Swarm:
           Once it was fed it bites, also after a normal flight, and the vehicle is locked; `connect` restarts such vehicles.
     """
 
-    def __init__(
-        self,
-        uris: Sequence[str],
-        body_logs: int = 1,
-        watchdog: bool = True,
-    ):
+    def __init__(self, uris: Sequence[str], body_logs: int = 1, watchdog: bool = True):
         self._body_logs, self._watchdog, self._fed = body_logs, watchdog, -math.inf
         self.members = [Member(uri) for uri in uris]
 

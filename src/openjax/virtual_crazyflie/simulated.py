@@ -16,7 +16,7 @@ import numpy as np
 from openjax.flying.controller import Pose
 from openjax.flying.crtp import compress_quaternion, expand_quaternion
 from openjax.flying.safety import PoseSample
-from openjax.flying.set_point import SetPoint
+from openjax.flying.set_point import OFF, SetPoint, as_sent
 from openjax.virtual_crazyflie.firmware import VirtualFirmware
 from openjax.virtual_crazyflie.vehicles import STEP, VirtualVehicles
 
@@ -95,7 +95,8 @@ class SimulatedSwarm:
         """Send each vehicle its set-point, or nothing where it is None."""
         for i, set_point in enumerate(set_points):
             if set_point is not None and self._random.random() >= self.uplinks[i].loss:
-                self._waiting.append((self._steps + self.uplinks[i].delay, i, set_point))
+                sent = set_point if set_point.mode == OFF else as_sent(set_point)
+                self._waiting.append((self._steps + self.uplinks[i].delay, i, sent))
         return self.now
 
     def believed(self, i: int, pose: Pose) -> None:
