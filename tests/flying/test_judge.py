@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from openjax.flying.controller import Pose, moved_on, nominal_airframe
 from openjax.flying.judge import (
-    NO_LAG,
-    NOTHING_SEEN,
+    Lag,
     Track,
     Verdict,
     agree,
@@ -93,7 +92,7 @@ def test_poses_out_of_order_late_or_from_the_future_change_nothing():
             follow(track, HERE._replace(time=time, position=(0.401, 0.0, 0.5)), 1.01, LIMITS, True, None)
             is track
         )
-    assert follow(NOTHING_SEEN, None, 1.0, LIMITS, True, None) is NOTHING_SEEN
+    assert follow(Track(), None, 1.0, LIMITS, True, None) == Track()
 
 
 def test_a_refused_pose_leaves_the_last_good_one():
@@ -127,7 +126,7 @@ def age_of(late, wrong, noise, seed, seconds=4.0):
     def rates(t):
         return tuple(sum(a * math.sin(w * t + p) for w, a, p, k in waves if k == axis) for axis in range(3))
 
-    steps, attitude, ages, lag = round(seconds / 0.01), [HERE._replace(body_rates=rates(0.0))], [], NO_LAG
+    steps, attitude, ages, lag = round(seconds / 0.01), [HERE._replace(body_rates=rates(0.0))], [], Lag()
     for k in range(steps):
         attitude.append(moved_on(attitude[-1]._replace(body_rates=rates(0.01 * k + 0.005)), 0.01 * (k + 1)))
     marked, shaken = rng.normal(size=3), np.zeros(3)

@@ -129,15 +129,7 @@ def prepare(arguments: Arguments) -> Prepared:
     policy = load_policy(arguments.policy)
     settings = policy.settings.environment
     scenario = find_scenario(arguments.scenario, settings)
-    n = settings.num_pursuers
-    if len(arguments.uri) != n:
-        raise UserError(
-            f"--uri names {len(arguments.uri)} vehicles, the policy flies {n}: name all after one --uri"
-        )
-    if len(scenario.pursuers) != n:
-        raise UserError(
-            f"--scenario {arguments.scenario} has {len(scenario.pursuers)} starts, the policy flies {n}"
-        )
+    _check_numbers(arguments, len(scenario.pursuers), settings.num_pursuers)
     feed = find_feed(arguments.motion_capture) if arguments.motion_capture else None
     vehicle = load_vehicle_file(arguments.vehicle or settings.airframe)
     slots = max(settings.max_pillars, len(scenario.pillars))
@@ -170,6 +162,16 @@ def _write(out, flown, flight, samples, scheduler):
     with replacing(out) as folder:
         folder.mkdir()
         write_case(folder, samples, flight.record, described, about)
+
+
+def _check_numbers(arguments, starts, pursuers):
+    names = len(arguments.uri)
+    if names != pursuers:
+        raise UserError(
+            f"--uri names {names} vehicles, the policy flies {pursuers}: name all after one --uri"
+        )
+    if starts != pursuers:
+        raise UserError(f"--scenario {arguments.scenario} has {starts} starts, the policy flies {pursuers}")
 
 
 def _check(arguments):

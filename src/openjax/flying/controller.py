@@ -91,9 +91,14 @@ def up(quaternion) -> float:
 
 def level_acceleration(quaternion) -> Vector:
     """The acceleration (m/s^2, world) of a vehicle at this attitude that holds its height."""
+    return lift_acceleration(quaternion, 1.0 / max(up(quaternion), 0.3))
+
+
+def lift_acceleration(quaternion, lift: float) -> Vector:
+    """The acceleration (m/s^2, world) at an attitude (4,) with a thrust that is `lift` times the weight."""
     w, x, y, z = quaternion
-    lift = max(up(quaternion), 0.3)
-    return (2 * (x * z + w * y) / lift * GRAVITY, 2 * (y * z - w * x) / lift * GRAVITY, 0.0)
+    axis = (2 * (x * z + w * y), 2 * (y * z - w * x), up(quaternion) - 1.0 / lift)
+    return tuple(lift * GRAVITY * a for a in axis)
 
 
 def moved_on(pose: Pose, now: float) -> Pose:

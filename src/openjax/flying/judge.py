@@ -123,9 +123,6 @@ class Track(NamedTuple):
         return self.pose is not None and now - self.pose.time <= limits.horizon
 
 
-NOTHING_SEEN = Track()
-
-
 def follow(
     track: Track, pose: Pose | None, now: float, limits: PoseLimits, moving: bool, expected: Pose | None
 ) -> Track:
@@ -176,9 +173,6 @@ class Lag(NamedTuple):
             self.product + share * (product - self.product),
             self.square + share * (square - self.square),
         )
-
-
-NO_LAG = Lag()
 
 
 def at_one_time(a: Pose, b: Pose) -> tuple[Pose, Pose]:

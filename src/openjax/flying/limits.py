@@ -69,9 +69,12 @@ class SafetySettings:
         check_intervals(self, "safety.")
 
 
-def stopping_point(settings: SafetySettings, pose: Pose) -> Vector:
-    """Where a vehicle comes to rest that brakes now (m): what its tilt asks for fades while it turns the other way."""
-    turn, tilted = settings.reaction, level_acceleration(pose.quaternion)
+def stopping_point(settings: SafetySettings, pose: Pose, acceleration: Vector | None = None) -> Vector:
+    """Where a vehicle comes to rest that brakes now (m): its acceleration fades while it turns the other way.
+
+    `acceleration`: at present (m/s^2, world); that of level flight at its tilt, if it isn't known.
+    """
+    turn, tilted = settings.reaction, acceleration or level_acceleration(pose.quaternion)
     velocity = [v + turn / 2.0 * a for v, a in zip(pose.velocity, tilted, strict=True)]
     time = math.hypot(*velocity) / (2.0 * settings.braking)
     return tuple(
@@ -80,9 +83,9 @@ def stopping_point(settings: SafetySettings, pose: Pose) -> Vector:
     )
 
 
-def fence_velocity(settings: SafetySettings, pose: Pose) -> Vector | None:
-    """The velocity (m/s) that keeps a vehicle in the arena; None while it could still stop inside."""
-    x, y, z = stopping_point(settings, pose)
+def fence_velocity(settings: SafetySettings, pose: Pose, acceleration: Vector | None = None) -> Vector | None:
+    """The velocity (m/s) that keeps a vehicle in the arena; None while it could still stop inside. See `stopping_point`."""
+    x, y, z = stopping_point(settings, pose, acceleration)
     out = math.hypot(x, y)
     outside, above, below = out > settings.arena_radius, z > settings.arena_height, z < settings.floor
     if not (outside or above or below):

@@ -21,6 +21,7 @@ from openjax.flying.controller import (
     Vector,
     accelerate,
     level_acceleration,
+    lift_acceleration,
     moved_on,
     nominal_airframe,
     up,
@@ -28,18 +29,7 @@ from openjax.flying.controller import (
     wanted_velocity,
 )
 from openjax.flying.crtp import Supervisor
-from openjax.flying.judge import (
-    NO_LAG,
-    NOTHING_SEEN,
-    Lag,
-    PoseLimits,
-    Track,
-    Verdict,
-    agree,
-    at_one_time,
-    follow,
-    pose_limits,
-)
+from openjax.flying.judge import Lag, PoseLimits, Track, Verdict, agree, at_one_time, follow, pose_limits
 from openjax.flying.limits import (
     APART,
     SafetySettings,
@@ -48,7 +38,7 @@ from openjax.flying.limits import (
     resting_places,
     within_reach,
 )
-from openjax.flying.set_point import ANGLES, MOTORS_OFF, RATES, SetPoint
+from openjax.flying.set_point import ANGLES, LEAST_THRUST, MOTORS_OFF, RATES, SetPoint
 
 ATTITUDE_LAG = 0.12
 """How long the acceleration takes to follow what is asked for (s), in dead reckoning."""
@@ -67,6 +57,7 @@ RISEN = 0.04
 SMOOTHING = 0.02
 """Time constant of the low-pass of velocities from motion capture (s)."""
 TRIM_GAIN, TRIM_LIMIT = 0.25, 0.15
+_NOTHING_SEEN, _NO_LAG = Track(), Lag()
 
 
 class Mode(StrEnum):
@@ -135,9 +126,9 @@ class Drone:
     mode: Mode = Mode.GROUND
     since: float = 0.0  # s, when the mode began
     estimate: Pose | None = None  # now; reckoned on where no pose is fresh
-    own: Track = NOTHING_SEEN  # its own estimates
-    captured: Track = NOTHING_SEEN  # motion capture, with velocity and rates
-    lag: Lag = NO_LAG  # of motion capture
+    own: Track = _NOTHING_SEEN  # its own estimates
+    captured: Track = _NOTHING_SEEN  # motion capture, with velocity and rates
+    lag: Lag = _NO_LAG  # of motion capture
     seen: float = -math.inf  # s, when the pose that it is flown by was measured
     distrusted: str = ""  # why motion capture isn't believed any more in this flight
     stand: tuple[Vector | None, Vector | None] = (None, None)  # own and captured position before the lift
@@ -496,9 +487,15 @@ def _pursue(settings, state, drone, i, action) -> Drone:
         poses = [d.estimate if d.mode in FLYING else None for d in state.drones]
         parting = parting_velocity(settings, i, poses)
     aimed = estimate if parting is None else estimate._replace(velocity=parting)
-    wanted = fence_velocity(settings, estimate) or fence_velocity(settings, aimed) or parting
+    sent = state.drones[i].sent
+    present = lift_acceleration(
+        estimate.quaternion, max(sent.thrust, LEAST_THRUST) / state.airframe.hover_thrust
+    )
+    wanted = (
+        fence_velocity(settings, estimate, present) or fence_velocity(settings, aimed, present) or parting
+    )
     if wanted is None:
-        return replace(drone, sent=within_reach(action, state.drones[i].sent, state.airframe, state.dt))
+        return replace(drone, sent=within_reach(action, sent, state.airframe, state.dt))
     acceleration = wanted_acceleration(estimate.velocity, wanted)
     flown = accelerate(estimate.quaternion, acceleration, state.airframe, drone.trim, RATES)
     return replace(drone, fenced=True, sent=flown)

@@ -73,16 +73,8 @@ class VirtualFirmware:
     def supervisor_info(self) -> int:
         """The supervisor's bits: can be armed, is armed, auto arming, can fly, is flying, tumbled, locked, crashed."""
         ready = not (self.crashed or self.emergency)
-        bits = (
-            ready and not self.armed,
-            self.armed,
-            self.auto_arm,
-            ready and self.armed,
-            self.flying,
-            self.crashed,
-            self.emergency,
-            self.crashed,
-        )
+        flies = (ready and not self.armed, self.armed, self.auto_arm, ready and self.armed, self.flying)
+        bits = (*flies, self.crashed, self.emergency, self.crashed)
         return sum(int(bit) << i for i, bit in enumerate(bits))
 
     def set_point(self, now: float) -> SetPoint:

@@ -111,15 +111,7 @@ class VirtualVehicles:
         r = self.report
         motor = r.motor_command[i]
         voltage = FULL_VOLTAGE - SPENT * (1.0 - self.battery[i]) - SAG * motor.mean()
-        return Sensors(
-            r.position[i],
-            r.velocity[i],
-            r.quaternion[i],
-            r.body_rates[i],
-            r.specific_force[i],
-            motor,
-            voltage,
-        )
+        return Sensors(*(array[i] for array in r[:5]), motor, voltage)
 
 
 def commands(quaternion, set_points):
@@ -168,16 +160,8 @@ def _advance(drones_step, vehicle, parameters, unflatten, flat, set_points, step
     drones, (motor, force, on_floor), crashed = jax.lax.fori_loop(
         0, steps, step, (drones, nothing, jnp.zeros(number, bool))
     )
-    return ravel_pytree(drones)[0], Report(
-        drones.position,
-        drones.velocity,
-        drones.quaternion,
-        drones.body_rates,
-        force,
-        motor,
-        on_floor,
-        crashed,
-    )
+    moved = (drones.position, drones.velocity, drones.quaternion, drones.body_rates)
+    return ravel_pytree(drones)[0], Report(*moved, force, motor, on_floor, crashed)
 
 
 def _stand(drones):
