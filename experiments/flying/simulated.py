@@ -17,12 +17,26 @@ from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 
+import jax
 import numpy as np
 import tyro
 
+import openjax
 from experiments.flying.faults import FOLLOWED, KINDS, WILD, Fault, PoseDamage, draw_fault
 from experiments.table import RESULTS, Page, Table, facts, write_page
 from openjax.files import read_json
+from openjax.flying.board import SILENCE
+from openjax.flying.controller import Pose
+from openjax.flying.game import game_functions, pose_array
+from openjax.flying.guard import take_over
+from openjax.flying.limits import SafetySettings
+from openjax.flying.safety import Drone, Event, Mode, Request, decide, initial_state, see
+from openjax.flying.set_point import from_action
+from openjax.pursuit import find_scenario, scenario_task
+from openjax.pursuit.environment import THRUST_LIMIT
+from openjax.vehicle import load_vehicle
+from openjax.virtual_crazyflie.simulated import SimulatedSwarm
+from openjax.virtual_crazyflie.vehicles import VirtualVehicles
 
 LATEST, SECONDS = 4.0, 14.0
 """Nothing begins to go wrong after; flown in all (s)."""
@@ -77,11 +91,6 @@ def draw(seed, latest) -> Fault:
 def compiled_game(policy_name: str):
     """A policy's game: layout by name -> (layout, task); its settings, the airframe, and its two functions for flights
     side by side, the first one with the task as its first argument."""
-    import jax
-
-    import openjax
-    from openjax.flying.game import game_functions
-    from openjax.pursuit import find_scenario, scenario_task
 
     policy = openjax.load_policy(policy_name)
     game = policy.settings.environment
@@ -99,11 +108,6 @@ class Worlds:
     """Flights side by side, one fault each."""
 
     def __init__(self, faults: list[Fault], layout: str, policy_name: str, separation: float):
-        from openjax.flying.limits import SafetySettings
-        from openjax.vehicle import load_vehicle
-        from openjax.virtual_crazyflie.simulated import SimulatedSwarm
-        from openjax.virtual_crazyflie.vehicles import VirtualVehicles
-
         task_of, self.game, self.airframe, self._first, self._tick = compiled_game(policy_name)
         scenario, self._task = task_of(layout)
         self.faults, self.n = faults, len(scenario.pursuers)
@@ -112,12 +116,12 @@ class Worlds:
         self._damage = [PoseDamage(fault, self.n) for fault in faults]
         vehicles = VirtualVehicles(load_vehicle(), np.tile(starts, (len(faults), 1)), flying=True)
         self._vehicles = vehicles
+        following = [fault.kind != "camera drifts" for fault in faults for _ in range(self.n)]
         self.swarm = SimulatedSwarm(
             vehicles,
-            captured=True,
-            following=[fault.kind != "camera drifts" for fault in faults for _ in range(self.n)],
-            radio=lambda *a: self._received("radio", *a),
-            camera=lambda *a: self._received("camera", *a),
+            following,
+            lambda *a: self._received("radio", *a),
+            lambda *a: self._received("camera", *a),
         )
         pillars = [(x, y, self.game.pillar_radius) for x, y in scenario.pillars]
         self.states = [self._begin(w, starts.tolist(), pillars) for w in range(len(faults))]
@@ -127,8 +131,6 @@ class Worlds:
         self._down = np.zeros(len(faults), int)  # ticks on the floor with motors off
 
     def _begin(self, w, starts, pillars):
-        from openjax.flying.safety import Drone, Mode, initial_state
-
         state = initial_state([tuple(s) for s in starts], pillars, self.airframe, self.safety)
         return replace(state, drones=(Drone(Mode.PURSUIT),) * self.n)
 
@@ -138,8 +140,6 @@ class Worlds:
         if source == "camera" and not fault.captured:
             return None
         report, first = self._vehicles.report, w * self.n
-        from openjax.flying.controller import Pose
-
         others = [
             Pose(now, tuple(report.position[j].tolist()), (0.0,) * 3, tuple(report.quaternion[j].tolist()))
             for j in range(first, first + self.n)
@@ -148,8 +148,6 @@ class Worlds:
 
     def tick(self) -> None:
         """10 ms of all flights."""
-        from openjax.flying.safety import Mode, see
-
         now, samples = self.swarm.now, list(self.swarm.observe())
         flown = np.flatnonzero(self._down < LAIN).tolist()
         self.swarm.asleep = {
@@ -185,8 +183,6 @@ class Worlds:
         return bool((self._down >= LAIN).all())
 
     def _play_on(self):
-        from openjax.flying.game import pose_array
-
         poses = [drone.estimate for state in self.states for drone in state.drones]
         poses = pose_array(poses).reshape(len(self.faults), self.n, -1)
         if self._measured is None:
@@ -202,12 +198,6 @@ class Worlds:
 
     def _flown(self, w, now, samples):
         """The set-points of flight w at this tick; None where none is sent."""
-        from openjax.flying.board import SILENCE
-        from openjax.flying.guard import take_over
-        from openjax.flying.safety import Event, Request, decide
-        from openjax.flying.set_point import from_action
-        from openjax.pursuit.environment import THRUST_LIMIT
-
         fault, on = self.faults[w], self.faults[w].on(now)
         uplink = self.swarm.uplinks[w * self.n + fault.vehicle]
         lost = {"packets lost": fault.amount, "drone gone": 1.0}.get(fault.kind, 0.0)

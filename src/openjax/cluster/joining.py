@@ -200,16 +200,12 @@ def _pump(source, sink):
 def _call(host, port, membership):
     """Connection to process 0, its reader and host; waits until all processes have come."""
     deadline = time.monotonic() + JOIN
-    greeting = {
-        "process": membership.process_id,
-        "of": membership.num_processes,
-        "host": socket.gethostname(),
-    }
+    place = {"process": membership.process_id, "of": membership.num_processes}
     while True:
         reason = "it went away, or counts another number of processes"
         try:
             connection = socket.create_connection((host, port), timeout=10.0)
-            connection.sendall(encoded(greeting))
+            connection.sendall(encoded({**place, "host": socket.gethostname()}))
             connection.settimeout(max(deadline - time.monotonic(), 1.0))
             reader = connection.makefile("rb")
             if welcome := reader.readline(LINE):

@@ -13,7 +13,6 @@ import queue
 import socket
 import sys
 import threading
-from collections.abc import Callable
 from typing import Any, BinaryIO
 
 BEAT = 2.0
@@ -111,8 +110,7 @@ class Processes:
 
     def _gone(self, other: int, host: str, why: str) -> None:
         if not self._closing.is_set():
-            text = f"process {other} of {self.number} (on {host}) was lost: {why}"
-            text = f"{text}; {self.advice}"
+            text = f"process {other} of {self.number} (on {host}) was lost: {why}; {self.advice}"
             self._end(1, text, {"lost": text}, but=other)
 
     def _end(self, status: int, text: str, message: dict, but: int | None = None) -> None:
@@ -134,15 +132,8 @@ class Processes:
 class _Link:
     """A connection to another process: lines of JSON, and signs of life in both directions."""
 
-    def __init__(
-        self,
-        connection: socket.socket,
-        reader: BinaryIO,
-        other: int,
-        host: str,
-        receive: Callable[[int, dict], None],
-        gone: Callable[[int, str, str], None],
-    ):
+    def __init__(self, connection: socket.socket, reader: BinaryIO, other: int, host: str, receive, gone):
+        """receive(other, message) and gone(other, host, why) are called by its reader's thread."""
         self._socket, self._reader, self._other, self._host = connection, reader, other, host
         self._receive, self._gone = receive, gone
         self._sending = threading.Lock()

@@ -32,19 +32,12 @@ Damage = Callable[[int, float, Pose], Pose | None]
 """What is received of vehicle i at a time (s) in place of the true pose; None: nothing."""
 
 
-def untouched(i: int, now: float, pose: Pose) -> Pose | None:
-    """The pose."""
-    return pose
-
-
 @dataclass
 class Uplink:
     """What goes wrong with one vehicle's set-points, and what its battery is said to have; changed while it flies."""
 
     loss: float = 0.0
     """Share that is lost."""
-    delay: int = 0
-    """Steps of 2 ms by which they come late."""
     voltage: float | None = None
     """V"""
 
@@ -54,34 +47,20 @@ class SimulatedSwarm:
 
     Args:
       vehicles: what flies.
-      seed: draws losses and noise.
-      watchdog: feed the firmware's.
-      captured: there is motion capture.
-      following: whether the estimator on board of each vehicle follows it, as far as it is believed, instead of knowing its
-        place by itself.
+      following: whether the estimator on board of each vehicle follows motion capture, as far as it is believed, instead of
+        knowing its place by itself.
       radio, camera: what is received of own estimates and of motion capture.
     """
 
-    def __init__(
-        self,
-        vehicles: VirtualVehicles,
-        seed: int = 0,
-        watchdog: bool = True,
-        captured: bool = False,
-        following: Sequence[bool] | None = None,
-        radio: Damage = untouched,
-        camera: Damage = untouched,
-    ):
-        self.vehicles, self.now, self._watchdog, self._captured = vehicles, 0.0, watchdog, captured
+    def __init__(self, vehicles: VirtualVehicles, following: Sequence[bool], radio: Damage, camera: Damage):
+        self.vehicles, self.now, self._following = vehicles, 0.0, following
         self._radio, self._camera = radio, camera
         n = vehicles.number
-        self._following = [True] * n if following is None else following
         self.firmware = [VirtualFirmware(needs_arming=False) for _ in range(n)]
         self.uplinks = [Uplink() for _ in range(n)]
-        self._random = random.Random(seed)
+        self._random = random.Random(0)  # losses, noise
         self._offsets = np.zeros((n, 2, 3))  # of the own estimates from the truth: position, velocity
         self._samples = [PoseSample(None, 0.0, 4.0) for _ in range(n)]
-        self._waiting: list[tuple[int, int, SetPoint]] = []
         self._steps = 0
         self.asleep: set[int] = set()
         """Vehicles of which nothing new is told: nobody listens any more."""
@@ -91,13 +70,13 @@ class SimulatedSwarm:
         """What is known of each vehicle now."""
         return tuple(self._samples)
 
-    def send(self, set_points: Sequence[SetPoint | None]) -> float:
-        """Send each vehicle its set-point, or nothing where it is None."""
+    def send(self, set_points: Sequence[SetPoint | None]) -> None:
+        """Send each vehicle its set-point, and a word to its watchdog, or nothing where it is None."""
         for i, set_point in enumerate(set_points):
             if set_point is not None and self._random.random() >= self.uplinks[i].loss:
                 sent = set_point if set_point.mode == OFF else as_sent(set_point)
-                self._waiting.append((self._steps + self.uplinks[i].delay, i, sent))
-        return self.now
+                self.firmware[i].accept(sent, self.now)
+                self.firmware[i].feed_watchdog(self.now)
 
     def believed(self, i: int, pose: Pose) -> None:
         """The estimator of vehicle i is told this pose of motion capture."""
@@ -111,28 +90,16 @@ class SimulatedSwarm:
 
     def advance(self) -> None:
         """One tick of 10 ms."""
-        end = self._steps + round(TICK / STEP)
-        while self._steps < end:
-            self._deliver()
-            steps = min((due - self._steps for due, _, _ in self._waiting), default=end)
-            steps = min(steps, end - self._steps)
-            wanted = np.stack([f.set_point(self._steps * STEP).array() for f in self.firmware])
-            report = self.vehicles.advance(wanted, steps)
-            self._steps += steps
-            for firmware, crashed in zip(self.firmware, report.crashed, strict=True):
-                if crashed:
-                    firmware.crash()
+        wanted = np.stack([f.set_point(self.now).array() for f in self.firmware])
+        steps = round(TICK / STEP)
+        report = self.vehicles.advance(wanted, steps)
+        self._steps += steps
         self.now = self._steps * STEP
+        for firmware, crashed in zip(self.firmware, report.crashed, strict=True):
+            if crashed:
+                firmware.crash()
         self._offsets[:, 0] += TICK * self._offsets[:, 1]
         self._look()
-
-    def _deliver(self):
-        for due, i, set_point in self._waiting:
-            if due <= self._steps:
-                self.firmware[i].accept(set_point, self._steps * STEP)
-                if self._watchdog:
-                    self.firmware[i].feed_watchdog(self._steps * STEP)
-        self._waiting = [w for w in self._waiting if w[0] > self._steps]
 
     def _look(self):
         report, noise = self.vehicles.report, self._random.gauss
@@ -154,7 +121,7 @@ class SimulatedSwarm:
             ).tolist()
             on_board = expand_quaternion(compress_quaternion(quaternion.tolist()))
             own = self._radio(i, self.now, Pose(self.now, tuple(position), tuple(velocity), on_board, rates))
-            captured = self._camera(i, self.now, seen) if self._captured else None
+            captured = self._camera(i, self.now, seen)
             voltage = self.uplinks[i].voltage
             self._samples[i] = PoseSample(
                 own or old.own,
