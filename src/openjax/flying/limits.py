@@ -31,8 +31,10 @@ class SafetySettings:
     """Vehicles in pursuit that couldn't stop at this distance (m) any more brake and part. 0 switches it off."""
     speed_limit: Annotated[float, Interval("(0, 100]")] = 2.5
     """Faster than this (m/s) something is wrong: all land."""
-    tilt_limit: Annotated[float, Interval("(0, 180]")] = 45.0
-    """More tilted than this (degrees) something is wrong: all land. The controller's own limit is 35, `flight` stays below 25."""
+    tilt: Annotated[float, Interval("(0, 180]")] = 45.0
+    """In pursuit a vehicle more tilted than this (degrees) is levelled: what is more can't be undone within `reaction`."""
+    tilt_limit: Annotated[float, Interval("(0, 180]")] = 80.0
+    """More tilted than this (degrees) something is wrong: all land."""
     tumble_time: Annotated[float, Interval("[0, 10]")] = 0.1
     """Upside down for longer (s): motors off."""
     braking: Annotated[float, Interval("(0, 100]")] = 5.0
