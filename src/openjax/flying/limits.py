@@ -31,9 +31,7 @@ class SafetySettings:
     """Vehicles in pursuit that couldn't stop at this distance (m) any more brake and part. 0 switches it off."""
     speed_limit: Annotated[float, Interval("(0, 100]")] = 2.5
     """Faster than this (m/s) something is wrong: all land."""
-    tilt: Annotated[float, Interval("(0, 180]")] = 45.0
-    """In pursuit a vehicle more tilted than this (degrees) is levelled: what is more can't be undone within `reaction`."""
-    tilt_limit: Annotated[float, Interval("(0, 180]")] = 80.0
+    tilt_limit: Annotated[float, Interval("(0, 180]")] = 50.0
     """More tilted than this (degrees) something is wrong: all land."""
     tumble_time: Annotated[float, Interval("[0, 10]")] = 0.1
     """Upside down for longer (s): motors off."""

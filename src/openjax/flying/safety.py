@@ -494,8 +494,6 @@ def _pursue(settings, state, drone, i, action) -> Drone:
     wanted = (
         fence_velocity(settings, estimate, present) or fence_velocity(settings, aimed, present) or parting
     )
-    if wanted is None and up(estimate.quaternion) < math.cos(math.radians(settings.tilt)):
-        wanted = estimate.velocity
     if wanted is None:
         return replace(drone, sent=within_reach(action, sent, state.airframe, state.dt))
     acceleration = wanted_acceleration(estimate.velocity, wanted)
