@@ -16,6 +16,8 @@ from openjax.vehicle import (
 from openjax.vehicle.rate_controller import rate_controller
 from openjax.vehicle.state import DroneState
 
+pytestmark = pytest.mark.slow
+
 TICKS = 500
 FLIGHTS = {1: ("agile", "yaw", "fast"), 2: ("climb", "step", "agile"), 3: ("laps",)}
 

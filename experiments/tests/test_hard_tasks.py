@@ -2,10 +2,13 @@
 
 import jax
 import numpy as np
+import pytest
 
 from experiments.paper import hard_tasks
 from openjax.pursuit import PursuitSettings
 from openjax.pursuit.task import starts_clear
+
+pytestmark = pytest.mark.slow
 
 SETTINGS = PursuitSettings()
 

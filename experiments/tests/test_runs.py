@@ -14,6 +14,8 @@ from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import Pursuit, PursuitSettings
 from openjax.store.run_directory import create_run
 
+pytestmark = pytest.mark.slow
+
 TINY = TrainSettings(
     environment=PursuitSettings(episode_length=12, physics="rigid", history_length=3),
     network=NetworkSettings(features=8, heads=2),

@@ -5,10 +5,13 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from experiments.paper.flights import fly
 from openjax.policy import NetworkSettings, Policy, PredictorSettings
 from openjax.pursuit import Pursuit, PursuitSettings, uniform_task
+
+pytestmark = pytest.mark.slow
 
 SETTINGS = PursuitSettings(
     physics="rigid", episode_length=60, max_pillars=6, history_length=4, history_spacing=3

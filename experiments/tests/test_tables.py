@@ -11,6 +11,8 @@ from experiments.paper.values import MAIN
 from experiments.table import RESULTS
 from openjax.files import read_json
 
+pytestmark = pytest.mark.slow
+
 
 def flight(pursuers, evader, capture, who=0, seen=None):
     """One episode (leading axis 1) of pursuers (T, N, 2) and evader (T, 2), captured by `who` in step `capture`."""

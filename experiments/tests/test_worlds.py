@@ -8,6 +8,8 @@ from experiments.flying.worlds.rotorpy import Bodies, crazyflie
 from experiments.flying.worlds.study import make_world, smoothness
 from openjax.pursuit import Pursuit, PursuitSettings
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def start():

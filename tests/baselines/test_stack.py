@@ -60,6 +60,7 @@ def test_the_bound_of_the_papers_arena():
     assert stack_bound(PursuitSettings(num_pursuers=2)) == 0.0  # a height of .3 m isn't covered by .3 m
 
 
+@pytest.mark.slow
 def test_every_scripted_evader_is_caught_inside_the_bound():
     assert PursuitSettings().evader_speed < stack_bound(PursuitSettings())
     caught, steps = captures()
@@ -67,6 +68,7 @@ def test_every_scripted_evader_is_caught_inside_the_bound():
     assert steps.max() * STEP < 4.0
 
 
+@pytest.mark.slow
 def test_well_outside_the_bound_greedy_evaders_get_away():
     assert PursuitSettings().evader_speed > stack_bound(PursuitSettings(capture_radius=0.22))
     caught, _ = captures(capture_radius=0.22)

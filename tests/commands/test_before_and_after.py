@@ -3,12 +3,14 @@
 import dataclasses
 
 import numpy as np
+import pytest
 
 import openjax
 from openjax.commands.before_and_after import compare, game_for
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings
 
 
+@pytest.mark.slow
 def test_it_plays_the_runs_game_and_steers_as_it_was_trained_to():
     """In steps and episodes of its own length, which the record counts in the run's."""
     run = PursuitSettings(

@@ -81,6 +81,7 @@ def test_gymnasium_passes_its_recorder(game):
     np.testing.assert_array_equal(infos["episode"]["l"], LENGTH)
 
 
+@pytest.mark.slow
 def test_jaxmarl_interface_is_the_game_and_starts_anew(game):
     adapter = PursuitMultiAgentEnv(game)
     key = jax.random.key(4)

@@ -19,6 +19,8 @@ from openjax.kernels.attention import (
 from openjax.policy import encoder
 from openjax.policy.encoder import SelfAttention, normalised_linear
 
+pytestmark = pytest.mark.slow
+
 FEATURES, HEADS = 16, 4
 
 

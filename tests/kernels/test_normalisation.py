@@ -8,6 +8,8 @@ import pytest
 from openjax.kernels.activation import activation
 from openjax.kernels.normalisation import ROWS, backward_by_kernel, forward_by_kernel, normalise
 
+pytestmark = pytest.mark.slow
+
 FEATURES = 16
 
 

@@ -112,6 +112,7 @@ def test_windows_and_labels_are_those_of_the_game_and_cross_no_reset(recorded):
     np.testing.assert_allclose(frames[0, :, -1, 0], (STEPS + np.arange(room)) / 12, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_learns_a_circling_evader():
     """An evader that circles at 1.3 m/s in view is foreseen far better than by keeping where it was last seen."""
     worlds, steps, span, radius = 32, 20, 10, 0.5

@@ -12,6 +12,8 @@ from openjax.policy import NetworkSettings, Policy, PolicyParameters, PredictorS
 from openjax.policy.growth import with_longer_history
 from openjax.pursuit import Pursuit, PursuitSettings
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("frames, predicts", [(0, True), (2, False)])
 def test_the_grown_policy_acts_alike(frames, predicts):

@@ -29,6 +29,7 @@ def tiny():
     return Pursuit(TINY)
 
 
+@pytest.mark.slow
 def test_compiled_and_mapped_is_the_same_as_eager_one_by_one(tiny):
     keys = jax.random.split(KEY, 3)
     actions = jax.random.uniform(KEY, (3, 3, 4), minval=-1.0)
@@ -178,6 +179,7 @@ def test_clamp_cuts_the_norm_of_the_velocity():
     np.testing.assert_allclose(clamped, [[0.6, 0.8, 0], [0.3, 0.4, 0], [0, 0, 1]], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_gradients_of_free_flight_are_finite_and_right(tiny):
     """Of the distance to the evader after some steps, by the actions; checked along one direction."""
 

@@ -40,6 +40,7 @@ def flown():
     return settings, start, jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 1, 0), states)
 
 
+@pytest.mark.slow
 def test_every_evader_stays_inside_and_out_of_pillars(flown):
     settings, _, states = flown
     place = np.asarray(states.evader_position)
@@ -51,6 +52,7 @@ def test_every_evader_stays_inside_and_out_of_pillars(flown):
     assert to_axis[in_use].min() >= settings.pillar_radius
 
 
+@pytest.mark.slow
 def test_speed_and_acceleration_are_bounded(flown):
     settings, _, states = flown
     velocity = np.asarray(states.evader_velocity)
@@ -71,6 +73,7 @@ def test_speed_and_acceleration_are_bounded(flown):
     assert change[:, ~heavy].max() > 50  # the others may turn at once
 
 
+@pytest.mark.slow
 def test_frozen_ones_stay_and_the_others_move(flown):
     _, start, states = flown
     flown_off = np.linalg.norm(

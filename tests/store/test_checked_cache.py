@@ -41,6 +41,7 @@ for flip in range(flips + 1):
 """
 
 
+@pytest.mark.slow
 def test_flipped_bits_end_no_process_and_change_no_number(tmp_path):
     """Each start after a flip says that the entry is damaged and compiles anew."""
     environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(tmp_path), "JAX_PLATFORMS": "cpu"}

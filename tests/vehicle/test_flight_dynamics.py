@@ -142,6 +142,7 @@ def test_motor_lag_is_exact(vehicle):
     np.testing.assert_allclose(twice, once, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_gradients_are_right_and_finite(vehicle):
     """By MJX among solids as by the written-out equations; finite on the floor, where a contact acts, and at full stop of
     a rotor, where the square root of the command has no slope."""

@@ -12,6 +12,8 @@ from openjax.kernels.componentwise import evaluate, split
 from openjax.vehicle import hover_state, load_vehicle, make_drones_step
 from openjax.vehicle.rigid_kernel import WORLDS, WORTH, kernel_call, mapped_step
 
+pytestmark = pytest.mark.slow
+
 VEHICLE = load_vehicle()
 FREE = make_drones_step(physics="rigid", dt=0.01, substeps=2, contacts=False)
 AMONG_SOLIDS = make_drones_step(physics="rigid", dt=0.01)
