@@ -153,14 +153,8 @@ def _result(case: Case, fit: CalibrationFit) -> Calibration:
         "inertia", nominal, [logs["roll"], logs["pitch"], (0.0, 0.0)], _notes("inertia", weighed)
     )
     pairs = (*inertia.interval90[:2], (low * nominal[2], high * nominal[2]))
-    quantities["inertia"] = Quantity(
-        (*inertia.value[:2], nominal[2]),
-        pairs,
-        inertia.nominal,
-        inertia.unit,
-        inertia.determined,
-        inertia.notes,
-    )
+    value = (*inertia.value[:2], nominal[2])
+    quantities["inertia"] = dataclasses.replace(inertia, value=value, interval90=pairs)
     explained = _explained(fit)
     rates_fit = explained["body rates"][1] > LEAST_EXPLAINED
     untold = ["thrust_constant"] if fit.per_flight else []

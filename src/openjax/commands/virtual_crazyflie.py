@@ -62,14 +62,8 @@ def make(arguments: Arguments):
     stands = [start[:2] for start in scenario.pursuers][: arguments.number]
     stands += [(0.2 * i, -1.4) for i in range(arguments.number - len(stands))]
     effects, parameters = load_effects(arguments.effects) if arguments.effects else ((), {})
-    vehicles = VirtualVehicles(
-        load_vehicle_file(arguments.vehicle).vehicle,
-        stands,
-        effects,
-        parameters,
-        arguments.battery,
-        arguments.endurance,
-    )
+    vehicle, charge = load_vehicle_file(arguments.vehicle).vehicle, (arguments.battery, arguments.endurance)
+    vehicles = VirtualVehicles(vehicle, stands, effects, parameters, *charge)
     return VirtualCrazyflies(
         vehicles, arguments.host, arguments.port, arguments.link, arguments.seed, arguments.needs_arming
     )

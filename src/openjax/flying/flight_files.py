@@ -22,10 +22,9 @@ SHORTEST = 2.0
 """Shorter games (s) tell a diagnosis nothing and get no log."""
 DECIMALS = {"t": 4, "vbat": 3}
 _POSE = tuple(
-    c for channel in ("position", "quaternion", "velocity", "body_rates") for c in CHANNEL_COLUMNS[channel]
+    c for channel in ("position", "velocity", "quaternion", "body_rates") for c in CHANNEL_COLUMNS[channel]
 )
-_ORDER = (0, 1, 2, 6, 7, 8, 9, 3, 4, 5, 10, 11, 12)
-"""Of a `Pose`'s 13 numbers, in the order of `_POSE`."""
+"""Of a `Pose`'s 13 numbers, in their order."""
 _BODY = CHANNEL_COLUMNS["motor_command"] + CHANNEL_COLUMNS["specific_force"]
 _COMMAND = CHANNEL_COLUMNS["command_thrust"] + CHANNEL_COLUMNS["command_body_rates"]
 
@@ -80,7 +79,7 @@ def _table(name: str, samples, sent: np.ndarray, commands: np.ndarray) -> LogTab
 
 def _rows(vehicle: Samples, sent, commands) -> dict[str, np.ndarray]:
     """The rows of one vehicle, by column: one for each moment at which something was measured."""
-    own, seen = vehicle.poses[:, 3:][:, _ORDER], vehicle.seen[:, 1:][:, _ORDER]
+    own, seen = vehicle.poses[:, 3:], vehicle.seen[:, 1:]
     sources = [  # when, columns, values; what comes later replaces what came before
         (vehicle.poses[:, 2], (*_POSE, "vbat"), np.column_stack([own, vehicle.poses[:, 1]])),
         (vehicle.bodies[:, 0], _BODY, vehicle.bodies[:, 1:]),

@@ -97,18 +97,9 @@ class Links:
         self._stream.setblocking(False)
         self._commands.settimeout(1.5 * self.board.silence)
         ends = (stream, commands, control)
-        self._process = context.Process(
-            target=_serve,
-            args=(
-                (self._uris, *self._options),
-                timeout,
-                (self._contacts, *ends),
-                self.board,
-                os.getpid(),
-                self._landing,
-            ),
-            name="openjax links",
-        )
+        options, given = (self._uris, *self._options), (self._contacts, *ends)
+        arguments = (options, timeout, given, self.board, os.getpid(), self._landing)
+        self._process = context.Process(target=_serve, args=arguments, name="openjax links")
         self._process.start()
         for end in ends:
             end.close()

@@ -8,11 +8,7 @@ PRIORITY = 10
 """Of the real-time scheduler: above all ordinary processes, below the kernel's own threads (50). The same for loop, links and
 virtual vehicles: with the loop first and the vehicles last, late poses made the commands older (14.7 ms at p99, not 6 to 8)."""
 NICE = -10
-IN_LINE = (
-    {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"},
-    {"xla_cpu_enable_concurrency_optimized_scheduler": False},
-)
-"""What tells XLA's compiler so, in its later and its earlier versions."""
+IN_LINE = {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"}
 
 
 def prepare() -> None:
@@ -32,12 +28,10 @@ def compile_in_line(lowered):
     XLA's CPU compiler otherwise arranges them for its worker threads, and on a busy machine a call waits for those: of 1,500
     ticks of the loop on two cores at a load of nine 1.3 ms at the median, 9.9 at p99; in line .8 and 2.7.
     """
-    for option in IN_LINE:
-        try:
-            return lowered.compile(compiler_options=option)
-        except (RuntimeError, ValueError, TypeError):  # a compiler that knows no such option
-            continue
-    return lowered.compile()
+    try:
+        return lowered.compile(compiler_options=IN_LINE)
+    except (RuntimeError, ValueError, TypeError):  # a compiler that knows no such option
+        return lowered.compile()
 
 
 def hurry() -> str:

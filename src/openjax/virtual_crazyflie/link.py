@@ -54,7 +54,6 @@ class VirtualLink:
         self._incoming: list = []
         self._outgoing: list = []
         self._count = 0
-        self.lost = 0
 
     @property
     def port(self) -> int:
@@ -78,7 +77,6 @@ class VirtualLink:
                 self._listener = peer
             if commanded:
                 if self._random.random() < self.faults.loss:
-                    self.lost += 1
                     continue
                 jitter = self._random.random() * self.faults.jitter_ms
                 delay = 1e-3 * (self.faults.latency_ms + jitter)
