@@ -87,12 +87,7 @@ def adapt(command: AdaptCommand, tell: Callable[[str], None] = lambda step: None
 
         from openjax.commands.machine import describe_machine
         from openjax.commands.validation import uniform_tasks
-        from openjax.learning.adaptation import (
-            bounds_of,
-            fine_tune,
-            make_adaptation,
-            starting_parameters,
-        )
+        from openjax.learning.adaptation import bounds_of, fine_tune, make_adaptation, starting_parameters
         from openjax.store.policies import load_policy
         from openjax.store.policy_files import save_policy_file
         from openjax.store.settings_files import write_json

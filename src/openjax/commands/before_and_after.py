@@ -37,11 +37,7 @@ def game_for(settings: PursuitSettings, policy: LoadedPolicy) -> PursuitSettings
 
 
 def compare(
-    policy: LoadedPolicy,
-    environment: Pursuit,
-    scenarios: Sequence[Scenario],
-    episodes: int,
-    validation: int,
+    policy: LoadedPolicy, environment: Pursuit, scenarios: Sequence[Scenario], episodes: int, validation: int
 ) -> tuple[list[dict], list[Trajectory]]:
     """Fly a policy in the game of a run: `validation` of the uniform validation tasks, and layouts.
 

@@ -14,13 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from openjax.background import in_background
-from openjax.cluster.devices import (
-    carry_shardings,
-    check_devices,
-    check_memory,
-    make_device_phases,
-    own_copy,
-)
+from openjax.cluster.devices import carry_shardings, check_devices, check_memory, make_device_phases, own_copy
 from openjax.cluster.processes import Processes
 from openjax.commands.before_and_after import compare, game_for
 from openjax.commands.evaluator import before_after_table, layout_slots, layout_tasks

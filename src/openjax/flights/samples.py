@@ -218,11 +218,7 @@ def _physics(vehicle, effects, parameters, drone: DroneState, motor_command, con
         vehicle, *body, rotate(drone.quaternion, force), torque, context.dt
     )
     drone = drone.replace(
-        position=position,
-        quaternion=quaternion,
-        velocity=velocity,
-        body_rates=body_rates,
-        rotor_speed=speed,
+        position=position, quaternion=quaternion, velocity=velocity, body_rates=body_rates, rotor_speed=speed
     )
     return drone, force
 

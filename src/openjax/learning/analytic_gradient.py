@@ -229,12 +229,7 @@ class AnalyticGradient:
 
 def free_flight(environment: Pursuit) -> Pursuit:
     """`environment` as it is learnt in: nothing is solid while the gradient is taken, a crash is told by the gap."""
-    free = dataclasses.replace(
-        environment.settings,
-        physics="rigid",
-        contacts=False,
-        reward=RewardSettings(),
-    )
+    free = dataclasses.replace(environment.settings, physics="rigid", contacts=False, reward=RewardSettings())
     return Pursuit(
         free,
         environment.vehicle,

@@ -145,9 +145,7 @@ class Policy:
 
 
 def gaussian_log_prob(
-    sample: Float[Array, "*samples size"],
-    mean: Float[Array, "*samples size"],
-    log_std: Float[Array, " size"],
+    sample: Float[Array, "*samples size"], mean: Float[Array, "*samples size"], log_std: Float[Array, " size"]
 ) -> Float[Array, "*samples"]:
     """Log density of samples under independent Gaussians."""
     scaled = (sample - mean) * jnp.exp(-log_std)

@@ -55,11 +55,7 @@ class Checkpoints:
     """
 
     def __init__(
-        self,
-        directory: Path,
-        keep_last: int = 2,
-        processes: Processes | None = None,
-        score_rule: int = 1,
+        self, directory: Path, keep_last: int = 2, processes: Processes | None = None, score_rule: int = 1
     ):
         self.directory = Path(directory).absolute()
         self.keep_last = keep_last
