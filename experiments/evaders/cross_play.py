@@ -151,7 +151,10 @@ def page(results: dict) -> Page:
             "crash": "crash_rate:.3f",
         }
         title = f"Training of evaders, on validation tasks against field, {', '.join(VALIDATED)}"
-        parts.append(Table(columns, results["training"], title=title))
+        prose = (
+            "The checkpoint that scored best on these tasks is the one in the package; s counts compilation."
+        )
+        parts.append(Table(columns, results["training"], title=title, prose=prose))
     if "tried" in results:
         parts.append("\n".join(["## What else was tried", "", *(f"* {line}" for line in results["tried"])]))
     prose = (

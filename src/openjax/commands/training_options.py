@@ -25,7 +25,7 @@ class TrainCommand:
 
     preset: str | None = None
     """quick: minutes on two CPU cores, an easier game; paper: the paper's task on an accelerator; flight: policies to be flown,
-    every pursuer another vehicle; evaders, evaders_second (from flight): against evaders that fight back; mappo:
+    every pursuer another vehicle; evaders (--start_from flight): against evaders that fight back; mappo:
     without predictor and generator; dacoop: parameters of a potential field. By default quick without an accelerator, else
     paper."""
     out: Path | None = None
