@@ -144,17 +144,7 @@ def page(results: dict) -> Page:
     if "responses" in results:
         parts.append(learned_ones(results["responses"]))
     if "training" in results:
-        columns = {
-            "M steps": "millions:.0f",
-            "s": "seconds:.0f",
-            "capture": "capture_rate:.3f",
-            "crash": "crash_rate:.3f",
-        }
-        title = f"Training of evaders, on validation tasks against field, {', '.join(VALIDATED)}"
-        prose = (
-            "The checkpoint that scored best on these tasks is the one in the package; s counts compilation."
-        )
-        parts.append(Table(columns, results["training"], title=title, prose=prose))
+        parts.append(learning_curve(results["training"]))
     if "tried" in results:
         parts.append("\n".join(["## What else was tried", "", *(f"* {line}" for line in results["tried"])]))
     prose = (
@@ -200,6 +190,19 @@ def by_evader(records: list[dict], title: str) -> Table:
         rows.append({"evader": evader, "of": EVADERS[evader].of, **rates})
     columns = {"evader": "evader", "used for": "of", **{name: name for name in own}}
     return Table(columns | {"least lower end": "low:.3f"}, rows, title=title)
+
+
+def learning_curve(validations: list[dict]) -> Table:
+    """Captures and crashes over a training run."""
+    columns = {
+        "M steps": "millions:.0f",
+        "s": "seconds:.0f",
+        "capture": "capture_rate:.3f",
+        "crash": "crash_rate:.3f",
+    }
+    title = f"Training of evaders, on validation tasks against field, {', '.join(VALIDATED)}"
+    prose = "The checkpoint that scored best on these tasks is the one in the package; s counts compilation."
+    return Table(columns, validations, title=title, prose=prose)
 
 
 def learned_ones(responses: list[dict]) -> Table:
