@@ -105,8 +105,15 @@ def moved_on(pose: Pose, now: float) -> Pose:
     """The pose at `now` (s) if velocity and body rates have stayed what they were."""
     age = now - pose.time
     position = tuple(p + age * v for p, v in zip(pose.position, pose.velocity, strict=True))
-    w, x, y, z = pose.quaternion
-    a, b, c = (0.5 * age * rate for rate in pose.body_rates)
+    return pose._replace(
+        time=now, position=position, quaternion=turned_on(pose.quaternion, pose.body_rates, age)
+    )
+
+
+def turned_on(quaternion, rates: Vector, duration: float) -> tuple[float, float, float, float]:
+    """The attitude, wxyz, after turning at body rates (rad/s) for `duration` (s)."""
+    w, x, y, z = quaternion
+    a, b, c = (0.5 * duration * rate for rate in rates)
     turned = (
         w - x * a - y * b - z * c,
         x + w * a + y * c - z * b,
@@ -114,7 +121,7 @@ def moved_on(pose: Pose, now: float) -> Pose:
         z + w * c + x * b - y * a,
     )
     size = math.sqrt(sum(q * q for q in turned))
-    return pose._replace(time=now, position=position, quaternion=tuple(q / size for q in turned))
+    return tuple(q / size for q in turned)
 
 
 def wanted_velocity(position: Vector, target: Vector, speed: float) -> Vector:

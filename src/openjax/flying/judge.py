@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
-from openjax.flying.controller import Airframe, Pose, Vector, moved_on
+from openjax.flying.controller import Airframe, Pose, Vector, moved_on, turned_on
 
 MEMORY, MARKED = 0.2, 1.0
 """See `Lag` (s): a turn of a pursuit; some of them."""
@@ -147,11 +147,14 @@ def follow(
 class Lag(NamedTuple):
     """How late motion capture is, told by the gyroscope: the slope of what its attitude lacks over the body rates.
 
-    A pose that is late by `age` shows the attitude of then: captured minus own is -age times the body rates (rad/s), plus a
-    constant, as no body is marked exactly. Mean values of the last `MEMORY` seconds; the constant of the last `MARKED`.
+    The attitude that it lacks something of is its own, carried on by the gyroscope and drawn after it within `MARKED`
+    seconds: a body marked askew lacks nothing, one that is late lacks its age times the body rates. The slope is that of the
+    last `MEMORY` seconds. The estimator on board isn't asked: it is told motion capture's attitudes, too.
     """
 
-    constant: Vector | None = None  # rad
+    time: float = -math.inf  # s
+    attitude: tuple[float, ...] = ()  # wxyz
+    rates: Vector = (0.0, 0.0, 0.0)  # rad/s
     product: float = 0.0  # rad^2/s
     square: float = 0.0  # rad^2/s^2
 
@@ -160,18 +163,20 @@ class Lag(NamedTuple):
         """s; towards zero where the vehicle hardly turns."""
         return self.product / (self.square + STILL**2)
 
-    def after(self, captured: Pose, own: Pose, dt: float) -> Lag:
-        """With two poses of one time, `dt` (s) after the last ones."""
-        lacks = turn_between(own.quaternion, captured.quaternion)
+    def after(self, captured: Pose, rates: Vector) -> Lag:
+        """With a pose of motion capture, and the gyroscope's `rates` (rad/s) at its time."""
+        dt = captured.time - self.time
+        if dt > MEMORY:
+            return Lag(captured.time, captured.quaternion, rates)
+        mean = tuple(0.5 * (old + new) for old, new in zip(self.rates, rates, strict=True))
+        attitude = turned_on(self.attitude, mean, dt)
+        lacks = turn_between(attitude, captured.quaternion)
         share, slow = 1.0 - math.exp(-dt / MEMORY), 1.0 - math.exp(-dt / MARKED)
-        constant = tuple(c + slow * (e - c) for c, e in zip(self.constant or lacks, lacks, strict=True))
-        rates = own.body_rates
-        product = -sum((e - c) * rate for e, c, rate in zip(lacks, constant, rates, strict=True))
-        square = sum(rate * rate for rate in rates)
+        product = -sum(e * rate for e, rate in zip(lacks, rates, strict=True)) - self.product
+        square = sum(rate * rate for rate in rates) - self.square
+        attitude = turned_on(attitude, lacks, slow)
         return Lag(
-            constant,
-            self.product + share * (product - self.product),
-            self.square + share * (square - self.square),
+            captured.time, attitude, rates, self.product + share * product, self.square + share * square
         )
 
 

@@ -220,7 +220,7 @@ def _sense(settings, limits, drone, sample, now, dt) -> Drone:
         seen = _with_motion(sample.captured, captured.pose, sample.own)
         captured = source = follow(captured, seen, now, limits, moving, drone.estimate)
         if captured.pose is seen and own.fresh(now, limits):
-            drone, verdict = _compared(drone, seen, own.pose, dt, limits)
+            drone, verdict = _compared(drone, seen, own.pose, limits)
             if moving and verdict:
                 captured = source = Track(drone.captured.pose, verdict)
         if moving and not captured.fresh(now, limits):
@@ -242,10 +242,10 @@ def _sense(settings, limits, drone, sample, now, dt) -> Drone:
     return replace(drone, estimate=old._replace(time=now, position=position, velocity=velocity))
 
 
-def _compared(drone, seen, own, dt, limits) -> tuple[Drone, Verdict]:
+def _compared(drone, seen, own, limits) -> tuple[Drone, Verdict]:
     """The drone with what was learnt of motion capture's age, and whether it and the own estimate tell the same."""
     seen, own = at_one_time(seen, own)
-    drone = replace(drone, lag=drone.lag.after(seen, own, dt))
+    drone = replace(drone, lag=drone.lag.after(seen, own.body_rates))
     late = Verdict.LATE if drone.lag.age > limits.horizon else Verdict.GOOD
     return drone, agree(seen, own, limits) or late
 

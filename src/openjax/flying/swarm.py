@@ -177,7 +177,7 @@ class Swarm:
             import cflib.crtp
             from cflib.crazyflie import Crazyflie
         except ImportError as error:
-            raise UserError("cflib is missing: pip install cflib (it is GPLv3)") from error
+            raise UserError(f"{error.name or 'cflib'} is missing: pip install cflib (it is GPLv3)") from error
         for name in ("cflib.crazyflie", "cflib.crazyflie.toccache", "cflib.crazyflie.log"):
             logging.getLogger(name).setLevel(logging.CRITICAL)
         if not cflib.crtp.CLASSES:
