@@ -1,6 +1,5 @@
 """Every command of the package: `openjax NAME ...`, or `python -m openjax NAME ...`."""
 
-import difflib
 import functools
 import importlib
 import sys
@@ -8,7 +7,7 @@ from collections.abc import Sequence
 
 from openjax import __version__
 from openjax.commands.command_line import run_command
-from openjax.errors import UserError
+from openjax.errors import UserError, suggestion
 
 COMMANDS = {
     "train": "train pursuers, or go on with a run",
@@ -50,9 +49,7 @@ def main(arguments: Sequence[str]) -> int | None:
         return 0
     command = name.replace("-", "_")
     if command not in COMMANDS:
-        close = difflib.get_close_matches(command, COMMANDS, n=1, cutoff=0.5)
-        hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(COMMANDS)}"
-        raise UserError(f"{name}: no such command; {hint}")
+        raise UserError(f"{name}: no such command; {suggestion(command, COMMANDS)}")
     run = importlib.import_module(f"openjax.commands.{command}").main
     if command == "train":  # a process of its own: nobody can have changed a function of the package
         run = functools.partial(run, keep_traced=True)

@@ -1,8 +1,11 @@
-"""Work in a thread beside: programs are compiled side by side."""
+"""Compiling: side by side, in threads of their own, and without noise."""
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
+
+import jax
 
 
 def in_background(make: Callable[[], Any]) -> Callable[[], Any]:
@@ -39,3 +42,15 @@ def compile_ahead(function: Callable, *arguments) -> Callable[..., bool]:
         return True
 
     return wait
+
+
+@contextlib.contextmanager
+def quiet_compiler() -> Iterator[None]:
+    """Keep XLA from logging how long it takes, as an error to be filed; what does go wrong is raised."""
+    before = jax.config.jax_logging_level
+    jax.config.update("jax_logging_level", "CRITICAL")
+    try:
+        yield
+    finally:
+        jax.config.update("jax_logging_level", before or "WARNING")  # XLA's own level has no "as before"
+        jax.config.update("jax_logging_level", before)

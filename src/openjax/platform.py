@@ -1,5 +1,6 @@
 """What this machine computes with: cores as devices; a formula or its hand-written kernel, and what kernels need of arrays."""
 
+import contextlib
 import functools
 import importlib.util
 import os
@@ -22,7 +23,8 @@ def make_cores_devices() -> None:
     asked = jax.config.jax_num_cpu_devices >= 0 or "device_count" in os.environ.get("XLA_FLAGS", "")
     if not accelerator and not asked:
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        jax.config.update("jax_num_cpu_devices", min(cores or 1, MOST_CORES))
+        with contextlib.suppress(RuntimeError):  # somebody asked before
+            jax.config.update("jax_num_cpu_devices", min(cores or 1, MOST_CORES))
 
 
 @functools.cache

@@ -6,7 +6,6 @@
 """
 
 import dataclasses
-import difflib
 import functools
 import math
 import numbers
@@ -15,7 +14,7 @@ import types
 import typing
 from typing import Annotated, Any
 
-from openjax.errors import UserError
+from openjax.errors import UserError, suggestion
 
 _NOTATION = re.compile(r"([\[(])\s*([^,\s]+)\s*,\s*([^,\s]+)\s*([\])])")
 
@@ -125,9 +124,8 @@ def changed(settings: Any, **changes) -> Any:
     names = [field.name for field in dataclasses.fields(settings)]
     for name in changes:
         if name not in names:
-            close = difflib.get_close_matches(name, names, n=1)
-            hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(names)}"
-            raise UserError(f"{name}: {type(settings).__name__} has no such setting; {hint}")
+            of = type(settings).__name__
+            raise UserError(f"{name}: {of} has no such setting; {suggestion(name, names)}")
     given = {
         name: changed(getattr(settings, name), **value) if isinstance(value, dict) else value
         for name, value in changes.items()

@@ -269,7 +269,7 @@ def test_presets():
     assert dear != paper and changed(dear, environment=dict(reward=dict(crash=20.0))) == paper
     with pytest.raises(UserError, match="crash"):
         preset("paper", environment=dict(reward=dict(crash=float("nan"))))
-    with pytest.raises(UserError, match="possible are quick, paper"):
+    with pytest.raises(UserError, match="papers: no such preset; did you mean paper"):
         preset("papers")
 
 

@@ -129,7 +129,7 @@ def test_what_is_wrong_with_a_layout_is_said_in_one_line(tmp_path, old, new, mes
 
 
 def test_unknown_names_and_missing_files(tmp_path):
-    with pytest.raises(UserError, match="not one of wall, narrow_gap"):
+    with pytest.raises(UserError, match="no such layout"):
         find_scenario("walls", NOMINAL)
     with pytest.raises(UserError, match="no such layout"):
         find_scenario(str(tmp_path / "none.toml"), NOMINAL)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import jax
 
+from openjax.background import quiet_compiler
 from openjax.cluster.processes import Processes
 from openjax.commands.own_controller import OwnController
 from openjax.commands.training_command import TrainCommand, default_preset, start
@@ -60,7 +61,9 @@ def train(
         overwrite=overwrite,
         settings=settings,
     )
-    if start(command, ["(called from Python)"], time.monotonic(), Processes()):
+    with quiet_compiler():
+        status = start(command, ["(called from Python)"], time.monotonic(), Processes())
+    if status:
         raise UserError(f"training in {out} stopped at a NaN; what is left to look at lies there")
     return load_policy(out)
 

@@ -6,6 +6,7 @@ import difflib
 import io
 import logging
 import os
+import re
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -203,6 +204,7 @@ def _one_line(box: str) -> str:
             break
         words.append(text)
     message = " ".join(" ".join(words).split())
+    message = re.sub(r"Error parsing (\S+): .*?(\[?'[^']*'\]?)\.?$", r"\1 can't be \2", message)
     return f"{message.rstrip('.')}; see --help"
 
 

@@ -11,7 +11,7 @@ from typing import Annotated
 import tyro
 
 from openjax.commands.command_line import output_console, parse
-from openjax.errors import UserError
+from openjax.errors import UserError, suggestion
 from openjax.files import check_new_folder, replacing
 from openjax.ranges import Interval, Seed
 from openjax.vehicle.effect_names import effect_names
@@ -65,8 +65,8 @@ def make_case(arguments: Arguments) -> list[Path]:
     from openjax.vehicle.effects import EFFECTS
 
     if arguments.effect not in ("none", *EFFECTS):
-        known = ", ".join(("none", *EFFECTS))
-        raise UserError(f"--effect {arguments.effect}: no such effect; known are {known}")
+        hint = suggestion(arguments.effect, ("none", *EFFECTS))
+        raise UserError(f"--effect {arguments.effect}: no such effect; {hint}")
     check_new_folder(arguments.out, "OUT")
     effects = {} if arguments.effect == "none" else {arguments.effect: EFFECTS[arguments.effect].card.sample}
     vehicle = load_vehicle()

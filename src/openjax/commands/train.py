@@ -27,7 +27,7 @@ def main(arguments: Sequence[str], *, keep_traced: bool = False) -> int:
     # the same numbers by a kernel of JAX's own: written out, they're half of what there is to compile for a GPU
     jax.config.update("jax_threefry_gpu_kernel_lowering", True)
     place = membership(arguments)
-    if place is None and peek(arguments, "devices") is None:
+    if place is None and peek(arguments, "devices") != "all":
         make_cores_devices()
     with joined(place) as processes:
         return start(read_command(arguments), arguments, started, processes, keep_traced=keep_traced)

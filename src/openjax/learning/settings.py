@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated
 
-from openjax.errors import UserError
+from openjax.errors import UserError, suggestion
 from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import PursuitSettings, RewardSettings
 from openjax.pursuit.evaders import check_evaders
@@ -465,5 +465,5 @@ def preset(name: str, **changes) -> TrainSettings:
       UserError: no such preset.
     """
     if name not in PRESETS:
-        raise UserError(f"preset {name}: unknown; possible are {', '.join(PRESETS)}")
+        raise UserError(f"preset {name}: no such preset; {suggestion(name, PRESETS)}")
     return changed(PRESETS[name](), **changes)

@@ -6,7 +6,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from openjax.errors import UserError
+from openjax.errors import UserError, suggestion
 from openjax.files import read_toml
 from openjax.pursuit.settings import PursuitSettings
 from openjax.pursuit.task import Task
@@ -123,7 +123,9 @@ def find_scenario(name_or_path: str, settings: PursuitSettings) -> Scenario:
         return SCENARIOS[name_or_path]
     path = Path(name_or_path)
     if path.suffix != ".toml":
-        raise UserError(f"scenario {name_or_path}: not one of {', '.join(SCENARIOS)} and not a .toml file")
+        raise UserError(
+            f"scenario {name_or_path}: no such layout, nor a .toml file; {suggestion(str(name_or_path), SCENARIOS)}"
+        )
     data = read_toml(path, "layout")
     unknown = sorted(set(data) - {"name", "pillars", "pursuers", "evader"})
     if unknown:

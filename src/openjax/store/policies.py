@@ -9,7 +9,7 @@ import jax
 from openjax.baselines import METHODS, CraftPolicy, Heuristic, make_policy
 from openjax.baselines.surroundings import Craft
 from openjax.baselines.velocity_controller import check_flyable
-from openjax.errors import UserError
+from openjax.errors import UserError, suggestion
 from openjax.learning import TrainSettings
 from openjax.learning.train_state import policy_leaf
 from openjax.policy import NetworkSettings, Policy, PolicyParameters, PredictorSettings
@@ -100,10 +100,8 @@ def load_policy(name_or_path: str | Path = DEFAULT_POLICY) -> LoadedPolicy:
         raise UserError(
             f"{path} is no policy; expected a .npz file, a run of openjax.train or one of its checkpoints"
         )
-    names = ", ".join(known_policies())
-    raise UserError(
-        f"policy {name_or_path}: no such file or directory, nor shipped with the package ({names})"
-    )
+    hint = suggestion(source, known_policies())
+    raise UserError(f"policy {source}: no such file or directory, nor shipped with the package; {hint}")
 
 
 def known_policies() -> list[str]:
