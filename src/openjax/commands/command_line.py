@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import difflib
 import io
+import itertools
 import logging
 import os
 import re
@@ -23,8 +24,6 @@ _OF_THE_DISK = ("No space left on device", "Disk quota exceeded", "Read-only fil
 
 LONGEST = 500
 """Characters of an error's line."""
-
-_BOX = "╭╮╰╯│─ "
 
 
 def parse(command: type[Command], default: Command, arguments: Sequence[str], program: str) -> Command:
@@ -194,16 +193,11 @@ def _bool_like_python(argument):
 
 
 def _one_line(box: str) -> str:
-    """The message of tyro's box: all lines of it up to its first rule, joined."""
-    words = []
-    for line in box.splitlines():
-        if line.startswith("╭"):
-            continue
-        text = line.strip(_BOX)
-        if not text and words:
-            break
-        words.append(text)
-    message = " ".join(" ".join(words).split())
+    """The message of tyro's box: what stands in it up to its first rule, below its title where no box can be drawn."""
+    lines = [line.strip("╰╯│ ") for line in box.splitlines() if not line.startswith("╭")]
+    parts = itertools.groupby(lines, key=lambda line: bool(line.strip("─-")))
+    parts = [" ".join(part) for says_something, part in parts if says_something]
+    message = " ".join(next(iter(parts if "╭" in box else parts[1:] or parts), "").split())
     message = re.sub(r"Error parsing (\S+): .*?(\[?'[^']*'\]?)\.?$", r"\1 can't be \2", message)
     return f"{message.rstrip('.')}; see --help"
 
