@@ -1,4 +1,4 @@
-"""What a run says in words: at its start what is trained, at its end what a crash is, what was easier, and what to type next."""
+"""What a run says in words: at its start what is trained, at its end what a crash is, what differed from the paper, and what to type next."""
 
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ NAMED = 3
 
 
 def opening_words(settings: TrainSettings) -> str:
-    """Which preset this is, or comes nearest to, and what that is: nobody should take an easier game for the paper's."""
+    """Which preset this is, or comes nearest to, and what that is: nobody should take another game for the paper's."""
     own = _leaves(to_plain(settings))
     others = {name: _leaves(to_plain(make())) for name, make in PRESETS.items()}
     changed = {
@@ -59,8 +59,8 @@ def closing_words(settings: TrainSettings, run: Path, on_cpu: bool) -> list[str]
         "A crash: any drone touches the floor, a pillar or another drone, or tips over, at any time of "
         f"the {seconds:.0f} s, after the capture, too."
     ]
-    if easier := _easier(game):
-        lines.append(f"Easier than the paper's game: {', '.join(easier)}.")
+    if differs := _differs(game):
+        lines.append(f"Unlike the paper's game: {', '.join(differs)}.")
     view = f"openjax view --policy {run}"
     if layouts := layouts_like(game):
         view += f" --scenario {layouts[-1].name}"
@@ -73,14 +73,16 @@ def closing_words(settings: TrainSettings, run: Path, on_cpu: bool) -> list[str]
     return [*lines, f"Next: {'; '.join(steps)}."]
 
 
-def _easier(game):
+def _differs(game):
     """How a game differs from the paper's, in words; empty where it doesn't."""
     paper = PursuitSettings()
     words = []
     if game.evader_speed < paper.evader_speed:
         words.append(f"the evader flies {game.evader_speed:g} m/s instead of {paper.evader_speed:g}")
-    if game.max_pillars < paper.max_pillars:
-        words.append(f"up to {game.max_pillars} pillars instead of {paper.max_pillars}")
+    if (game.min_pillars, game.max_pillars) != (paper.min_pillars, paper.max_pillars):
+        words.append(
+            f"{game.min_pillars} to {game.max_pillars} pillars instead of {paper.min_pillars} to {paper.max_pillars}"
+        )
     if game.start_attitude != paper.start_attitude:
         words.append("level starts instead of tilted ones")
     if game.time_step > paper.time_step:

@@ -24,7 +24,7 @@ class TrainCommand:
     """
 
     preset: str | None = None
-    """quick: minutes on two CPU cores, an easier game; paper: the paper's task on an accelerator; flight: policies to be flown,
+    """quick: minutes on two CPU cores, coarser steps; paper: the paper's task on an accelerator; flight: policies to be flown,
     every pursuer another vehicle; evaders (--start_from flight): against evaders that fight back; mappo:
     without predictor and generator; dacoop: parameters of a potential field. By default quick without an accelerator, else
     paper."""
