@@ -1,4 +1,4 @@
-"""What a run says in words: at its start what is trained, at its end what a crash is, what differed from the paper, and what to type next."""
+"""What a run says in words: what is trained, and at its end what a crash is, what isn't the paper's, and what to type next."""
 
 from pathlib import Path
 from typing import Any
