@@ -65,7 +65,9 @@ class Fault:
 
 
 def draw_fault(seed: int, latest: float) -> Fault:
-    """The fault number `seed`, which begins by `latest` (s); the kinds take turns."""
+    """The fault number `seed`, which begins by `latest` (s); the kinds take turns. None below zero."""
+    if seed < 0:
+        return Fault("none", math.inf, 0)
     rng = random.Random(seed)
     kind = KINDS[seed % len(KINDS)]
     time, vehicle, direction = rng.uniform(START, latest), rng.randrange(3), rng.uniform(0.0, 2.0 * math.pi)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import functools
 import json
-import math
 import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
@@ -23,7 +22,7 @@ import tyro
 
 import openjax
 from experiments.flying.faults import FOLLOWED, KINDS, WILD, Fault, PoseDamage, draw_fault
-from experiments.table import RESULTS, Page, Table, facts, write_page
+from experiments.table import RESULTS, Page, Table, facts, made, write_page
 from openjax.files import read_json
 from openjax.flying.board import SILENCE
 from openjax.flying.controller import Pose
@@ -65,33 +64,26 @@ class Arguments:
     processes: int = 4
     seconds_left: float = 1e9
     """Begin no batch that wouldn't be over by then (s)."""
-    separation: float = 0.16
-    """See `SafetySettings.separation`."""
+    kinds: tuple[str, ...] = ()
+    """Those that contain one of these; all by default."""
+    again: bool = False
+    """Of an earlier result in `out` these flights become the second part: some kinds flown again by later code."""
     out: Path = RESULTS / "flying_faults.json"
 
 
-def fly(
-    seeds: list[int], layout: str, policy_name: str, separation=0.16, latest=LATEST, seconds=SECONDS
-) -> list[dict]:
+def fly(seeds: list[int], layout: str, policy_name: str, latest=LATEST, seconds=SECONDS) -> list[dict]:
     """Fly one fault per seed, side by side; a record of each. A seed below zero is a flight without fault."""
-    worlds = Worlds([draw(seed, latest) for seed in seeds], layout, policy_name, separation)
+    worlds = Worlds([draw_fault(seed, latest) for seed in seeds], layout, policy_name)
     for _ in range(round(seconds / 0.01)):
-        worlds.tick()
-        if worlds.over:
+        if not worlds.tick():
             break
     return worlds.records(seeds, layout)
-
-
-def draw(seed, latest) -> Fault:
-    """The fault of a seed, or none."""
-    return draw_fault(seed, latest) if seed >= 0 else Fault("none", math.inf, 0)
 
 
 @functools.cache
 def compiled_game(policy_name: str):
     """A policy's game: layout by name -> (layout, task); its settings, the airframe, and its two functions for flights
     side by side, the first one with the task as its first argument."""
-
     policy = openjax.load_policy(policy_name)
     game = policy.settings.environment
 
@@ -107,11 +99,11 @@ def compiled_game(policy_name: str):
 class Worlds:
     """Flights side by side, one fault each."""
 
-    def __init__(self, faults: list[Fault], layout: str, policy_name: str, separation: float):
+    def __init__(self, faults: list[Fault], layout: str, policy_name: str):
         task_of, self.game, self.airframe, self._first, self._tick = compiled_game(policy_name)
         scenario, self._task = task_of(layout)
         self.faults, self.n = faults, len(scenario.pursuers)
-        self.safety = SafetySettings(separation=separation)
+        self.safety = SafetySettings()
         starts = np.array(scenario.pursuers)
         self._damage = [PoseDamage(fault, self.n) for fault in faults]
         vehicles = VirtualVehicles(load_vehicle(), np.tile(starts, (len(faults), 1)), flying=True)
@@ -124,15 +116,13 @@ class Worlds:
             lambda *a: self._received("camera", *a),
         )
         pillars = [(x, y, self.game.pillar_radius) for x, y in scenario.pillars]
-        self.states = [self._begin(w, starts.tolist(), pillars) for w in range(len(faults))]
+        state = initial_state([tuple(s) for s in starts.tolist()], pillars, self.airframe, self.safety)
+        state = replace(state, drones=(Drone(Mode.PURSUIT),) * self.n)
+        self.states = [state] * len(faults)
         self._landing = [False] * len(faults)
         self._measured, self._play, self._tracks = None, None, []
         self.captured = [None] * len(faults)
         self._down = np.zeros(len(faults), int)  # ticks on the floor with motors off
-
-    def _begin(self, w, starts, pillars):
-        state = initial_state([tuple(s) for s in starts], pillars, self.airframe, self.safety)
-        return replace(state, drones=(Drone(Mode.PURSUIT),) * self.n)
 
     def _received(self, source, k, now, pose):
         w, i = divmod(k, self.n)
@@ -146,8 +136,8 @@ class Worlds:
         ] if fault.kind == "camera: bodies swapped" else ()  # fmt: skip
         return self._damage[w](source, i, now, pose, others)
 
-    def tick(self) -> None:
-        """10 ms of all flights."""
+    def tick(self) -> bool:
+        """10 ms of all flights; whether any goes on."""
         now, samples = self.swarm.now, list(self.swarm.observe())
         flown = np.flatnonzero(self._down < LAIN).tolist()
         self.swarm.asleep = {
@@ -176,11 +166,7 @@ class Worlds:
         self._tracks.append(np.column_stack([report.position, off]))
         down = ((report.position[:, 2] < 0.02) & off).reshape(-1, self.n).all(1)
         self._down = np.where(down, self._down + 1, 0)
-
-    @property
-    def over(self) -> bool:
-        """Whether all lie."""
-        return bool((self._down >= LAIN).all())
+        return bool((self._down < LAIN).any())
 
     def _play_on(self):
         poses = [drone.estimate for state in self.states for drone in state.drones]
@@ -301,7 +287,11 @@ def summary(records) -> list[dict]:
 def main() -> None:
     arguments = tyro.cli(Arguments)
     begin = time.time()
-    seeds = range(arguments.seed, arguments.seed + arguments.faults)
+    drawn = range(arguments.seed, arguments.seed + arguments.faults)
+    seeds = [
+        s for s in drawn if not arguments.kinds or any(k in KINDS[s % len(KINDS)] for k in arguments.kinds)
+    ]
+    first = read_json(arguments.out) if arguments.again else {}
     jobs = []
     for k, layout in enumerate(arguments.layouts):
         mine = [s for s in seeds if (s // len(KINDS)) % len(arguments.layouts) == k]
@@ -315,13 +305,13 @@ def main() -> None:
         while True:
             late = time.time() - begin > arguments.seconds_left
             while len(running) < arguments.processes and not late and (job := next(waiting, None)):
-                running.add(pool.submit(fly, *job, arguments.policy, arguments.separation))
+                running.add(pool.submit(fly, *job, arguments.policy))
             if not running:
                 break
             done = next(as_completed(running))
             running.discard(done)
             records += done.result()
-            write(arguments, records, time.time() - begin)
+            write(arguments, first, records, time.time() - begin)
     write_page(arguments.out, page, read_json(arguments.out))
 
 
@@ -338,15 +328,19 @@ def page(results) -> Page:
         "out by more than .1 m": "out:d", "farthest (m)": "farthest:.2f", "fell": "fell:d", "hard": "hard:d",
         "on at the end": "armed:d", "longest end (s)": "longest:.1f", "nearest two (m)": "nearest:.2f",
     }  # fmt: skip
-    return Page("Faults where they happen, in simulated time", prose, Table(columns, results["summary"]))
+    tables = [Table(columns, results["summary"])]
+    if again := results.get("again"):
+        tables.append(Table(columns, again["summary"], "Some kinds again, by later code", made(again)))
+    return Page("Faults where they happen, in simulated time", prose, tables)
 
 
-def write(arguments, records, seconds) -> None:
+def write(arguments, first, records, seconds) -> None:
     """Write what there is until now."""
     result = {
-        **facts(), "policy": arguments.policy, "separation": arguments.separation, "seconds": round(seconds),
+        **facts(), "policy": arguments.policy, "seconds": round(seconds),
         "summary": summary(records), "not_well": [r for r in records if not well(r)],
     }  # fmt: skip
+    result = {**first, "again": result} if first else result
     arguments.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 
 

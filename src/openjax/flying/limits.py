@@ -37,8 +37,8 @@ class SafetySettings:
     """Upside down for longer (s): motors off."""
     braking: Annotated[float, Interval("(0, 100]")] = 5.0
     """Deceleration that is counted on to stop within the arena (m/s^2)."""
-    reaction: Annotated[float, Interval("[0, 10]")] = 0.1
-    """Time until it acts (s)."""
+    reaction: Annotated[float, Interval("(0, 10]")] = 0.12
+    """Time constant with which the acceleration follows what is asked for (s)."""
     pose_timeout: Annotated[float, Interval("(0, 60]")] = 0.06
     """Without a good pose for longer (s) a vehicle is flown by reckoning no more: it lands."""
     link_timeout: Annotated[float, Interval("(0, 60]")] = 0.3
@@ -70,17 +70,15 @@ class SafetySettings:
 
 
 def stopping_point(settings: SafetySettings, pose: Pose, acceleration: Vector | None = None) -> Vector:
-    """Where a vehicle comes to rest that brakes now (m): its acceleration fades while it turns the other way.
+    """Where a vehicle comes to rest that brakes now (m): its acceleration fades with the time constant `reaction`, and as
+    slowly the braking sets in.
 
     `acceleration`: at present (m/s^2, world); that of level flight at its tilt, if it isn't known.
     """
-    turn, tilted = settings.reaction, acceleration or level_acceleration(pose.quaternion)
-    velocity = [v + turn / 2.0 * a for v, a in zip(pose.velocity, tilted, strict=True)]
-    time = math.hypot(*velocity) / (2.0 * settings.braking)
-    return tuple(
-        p + turn * v + turn**2 / 3.0 * a + time * w
-        for p, v, a, w in zip(pose.position, pose.velocity, tilted, velocity, strict=True)
-    )
+    lag, present = settings.reaction, acceleration or level_acceleration(pose.quaternion)
+    velocity = [v + lag * a for v, a in zip(pose.velocity, present, strict=True)]  # once it has faded
+    time = lag + math.hypot(*velocity) / (2.0 * settings.braking)
+    return tuple(p + time * v - lag**2 * a for p, v, a in zip(pose.position, velocity, present, strict=True))
 
 
 def fence_velocity(settings: SafetySettings, pose: Pose, acceleration: Vector | None = None) -> Vector | None:

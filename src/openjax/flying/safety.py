@@ -24,6 +24,7 @@ from openjax.flying.controller import (
     lift_acceleration,
     moved_on,
     nominal_airframe,
+    turned_on,
     up,
     wanted_acceleration,
     wanted_velocity,
@@ -40,8 +41,6 @@ from openjax.flying.limits import (
 )
 from openjax.flying.set_point import ANGLES, LEAST_THRUST, MOTORS_OFF, RATES, SetPoint
 
-ATTITUDE_LAG = 0.12
-"""How long the acceleration takes to follow what is asked for (s), in dead reckoning."""
 BLIND_SINK = 0.4
 """A blind landing asks for this much less upward acceleration (m/s^2), so that it surely goes down."""
 BLIND_SPEED = 0.6
@@ -459,7 +458,7 @@ def _fly(settings, state, i, action, sample) -> Drone:
     wanted = _wanted(settings, state, drone, i)
     acceleration = wanted_acceleration(drone.estimate.velocity, wanted)
     if drone.mode is Mode.BLIND:
-        return _descend_blindly(state, drone, acceleration)
+        return _descend_blindly(settings, state, drone, acceleration)
     height, lifting = drone.estimate.position[2], drone.mode is Mode.LIFT
     if height > (0.02 if lifting else 0.1):
         error = min(max(wanted[2] - drone.estimate.velocity[2], -0.3), 0.3)
@@ -488,9 +487,9 @@ def _pursue(settings, state, drone, i, action) -> Drone:
         parting = parting_velocity(settings, i, poses)
     aimed = estimate if parting is None else estimate._replace(velocity=parting)
     sent = state.drones[i].sent
-    present = lift_acceleration(
-        estimate.quaternion, max(sent.thrust, LEAST_THRUST) / state.airframe.hover_thrust
-    )
+    # until its motors have followed it turns on
+    turned = turned_on(estimate.quaternion, estimate.body_rates, state.airframe.motor_time_constant)
+    present = lift_acceleration(turned, max(sent.thrust, LEAST_THRUST) / state.airframe.hover_thrust)
     wanted = (
         fence_velocity(settings, estimate, present) or fence_velocity(settings, aimed, present) or parting
     )
@@ -501,9 +500,9 @@ def _pursue(settings, state, drone, i, action) -> Drone:
     return replace(drone, fenced=True, sent=flown)
 
 
-def _descend_blindly(state, drone, acceleration) -> Drone:
+def _descend_blindly(settings, state, drone, acceleration) -> Drone:
     """The drone sinking by angles that it tracks itself: its attitude isn't known, so level but for what is asked for."""
-    share = min(state.dt / ATTITUDE_LAG, 1.0)
+    share = min(state.dt / settings.reaction, 1.0)
     lagged = tuple(a + share * (b - a) for a, b in zip(drone.acceleration, acceleration, strict=True))
     x, y, z = acceleration
     yaw_only = _yaw_only(drone.estimate.quaternion)
