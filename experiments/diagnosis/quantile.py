@@ -13,7 +13,7 @@ from experiments.diagnosis.development import read_lines
 from openjax.files import write_json
 
 KINDS = {"none": ("none", "not_testable"), "named": ("single", "pair")}
-STATISTICS = ("dependence", "periodicity")
+STATISTICS = ("dependence",)
 
 
 def statistics_of(lines: list[dict]) -> dict[str, dict[str, list[float]]]:

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize
+from scipy.optimize import lsq_linear
 
 from openjax.gap.model.bounds import BOUND, bounded
 from openjax.gap.model.library import ABSENT, CARDS, STEP, THETA, places, prior, start_of
@@ -19,7 +19,9 @@ def test_a_card_is_complete(name):
     assert all(p.spread > 0 and p.step > 0 for p in card.fitted)
     assert all(len(start) == len(card.fitted) for start in card.others)
     sizes = (card.nuisance, card.nuisance_duty, card.nuisance_samples, card.form_error)
-    assert all(set(s) <= set(effect.parameters) and all(v > 0 for v in s.values()) for s in sizes)
+    assert all(
+        set(s) <= set(effect.parameters) and all(callable(v) or v > 0 for v in s.values()) for s in sizes
+    )
     assert card.log_odds < 0
 
 
@@ -32,19 +34,21 @@ def test_every_fitted_parameter_has_its_own_place():
         assert len(start_of(effect)) == len(CARDS[effect].fitted)
 
 
-def test_nuisances_stay_within_their_bounds():
+def test_bounded_least_squares_agree_with_scipy():
     rng = np.random.default_rng(0)
-    for _ in range(5):
-        root = rng.standard_normal((6, 6))
-        hessian, push = root @ root.T + np.eye(6), 20.0 * rng.standard_normal(6)
-        found, _ = bounded(hessian, push, 2)
-        assert (np.abs(found[2:]) <= BOUND + 1e-12).all()
-        cost = lambda x, h=hessian, p=push: 0.5 * x @ h @ x - p @ x  # noqa: E731
-        best = minimize(cost, np.zeros(6), bounds=[(None, None)] * 2 + [(-BOUND, BOUND)] * 4).fun
-        free = cost(np.linalg.solve(hessian, push))
-        assert (
-            cost(found) - best <= 0.15 * (best - free) + 1e-6
-        )  # fixing what leaves the box comes close to the best
+    for size, free in ((6, 2), (30, 0), (30, 7)):
+        root = np.concatenate(
+            [rng.standard_normal((size, size)) * 10.0 ** rng.uniform(-2, 2, size), np.eye(size)]
+        )
+        target = root @ (5.0 * rng.standard_normal(size))
+        limits = np.full(size, BOUND)
+        limits[:free] = np.inf
+        found, inside = bounded(root.T @ root, root.T @ target, free)
+        best = lsq_linear(root, target, (-limits, limits), method="bvls", tol=1e-14)
+        np.testing.assert_allclose(
+            ((root @ found - target) ** 2).sum(), 2.0 * best.cost, rtol=1e-9, atol=1e-9
+        )
+        assert inside[:free].all() and (np.abs(found[free:]) <= BOUND * (1 + 1e-6)).all()
 
 
 def seems(effect, deviation=1e-6, **value):

@@ -61,8 +61,9 @@ def conclude(evidence: Evidence) -> Report:
     check = check_residual(evidence.replay, selection.fit, bool(named))
     parts = split(evidence, selection, check.predicted, named)
     found = words(evidence, check, parts, not_testable(evidence))
-    strange = 1.0 - DECISION.unknown if _misread(evidence) else check.probability
-    chances = probabilities({e: acting[e] for e in named}, beyond, parts.largest, strange, selection.weights)
+    chances = probabilities(
+        {e: acting[e] for e in named}, beyond, parts.largest, check.probability, selection.weights
+    )
     return _report(evidence, selection, check, parts, found, chances)
 
 
@@ -78,7 +79,7 @@ class Words:
 def words(evidence: Evidence, check: Check, parts: Split, missing: list[str]) -> Words:
     """What is said first: the effects by their shares, and whether anything unknown acts."""
     effects = sorted(parts.effects, key=lambda e: -parts.effects[e].value)
-    if check.rejects or _misread(evidence):
+    if check.rejects:
         larger = sum(parts.effects[e].value > parts.unexplained.value for e in effects)
         effects.insert(larger, "unknown")
     if effects:
@@ -98,11 +99,6 @@ def not_testable(evidence: Evidence) -> list[str]:
     logged = {c.path for c in evidence.channels} | {"physics"}
     missing += [e for e in evidence.library.effects if path_of(e) not in logged]
     return missing + [e for c in evidence.channels for e in c.undetectable()]
-
-
-def _misread(evidence: Evidence) -> bool:
-    """Whether a sensor is off by more than sensors usually are, clocks aside."""
-    return bool(set(evidence.sensors.findings) - {"clocks"})
 
 
 def _matters(parts: Split, effect: str) -> bool:
@@ -142,7 +138,7 @@ def _report(
         sensors=tuple(evidence.sensors.findings.values()),
         contradictions=tuple(f"{i.flight}: {i.issue}" for i in evidence.case.quality if i.kind == "garbage"),
         nuisances=_nuisances(evidence, selection),
-        residual=check.statistics | {"statistic": max(check.statistics.values()), "p_value": check.p_value},
+        residual={"dependence": check.dependence, "p_value": check.p_value, "growth": check.growth},
         plots={"evidence": evidence, "selection": selection},
     )
 

@@ -1,15 +1,14 @@
 """What the chosen effects leave: one omnibus check whether it is noise.
 
-Two statistics, each with its conformal p-value over cases of several worlds in which nothing was named, or something
-(Mondrian conformal prediction, Vovk et al. 2005; `residual.json`), joined by Bonferroni. *Dependence*: log Bayes factor of a
-Gaussian process against white noise on the whitened residual of one channel, in random Fourier features (Rahimi, Recht 2007)
-of one group of the state - place, motion, attitude, thrust, battery, vehicles near - the largest of all. *Periodicity*:
-Fisher's (1929) test for a line in the spectrum, the largest of all channels. Neither asks for a form, place or frequency."""
+The statistic is the log Bayes factor of a Gaussian process against white noise on the whitened residual of one channel, in
+random Fourier features (Rahimi, Recht 2007) of one group of the state - place, motion, attitude, thrust, battery, vehicles
+near, time - the largest of all. Its p-value is conformal over cases of several worlds in which nothing was named, or something
+(Mondrian conformal prediction, Vovk et al. 2005; `residual.json`)."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from openjax.flights.track import Track, rotation, smooth
 from openjax.gap.decision import DECISION
 from openjax.gap.model.hypotheses import SetFit, without_nuisances
 from openjax.gap.model.replay import FORCE, RATES, SKIP, VELOCITY, Replay
+from openjax.gap.model.table import HORIZONS
 
 FEATURES = 40  # of each group
 LENGTHS = (0.5, 1.0, 2.0)  # of the features, in standard deviations of what they are functions of
@@ -31,23 +31,26 @@ CALIBRATION = Path(__file__).with_name("residual.json")
 
 @dataclass(frozen=True)
 class Check:
-    """`statistics` {name: value}, `where` the more telling one stands out, `p_value` of both together; `predicted` (6,): share
-    of each motion channel's squared error that the state tells, where the check rejects."""
+    """`dependence`, the statistic, `where` it stands out, its `p_value`, `growth` of the gap, in floors, by what was found;
+    `predicted` (6,): share of each motion channel's squared error that it is, where the check rejects."""
 
-    statistics: dict[str, float]
+    dependence: float
     where: str
     p_value: float
+    growth: float
     predicted: np.ndarray
 
     @property
     def rejects(self) -> bool:
-        """Whether what is left isn't noise."""
-        return self.p_value <= DECISION.unknown
+        """Whether what is left isn't noise, and matters."""
+        return self.p_value <= DECISION.unknown and self.growth > DECISION.least_gap
 
     @property
     def probability(self) -> float:
-        """That something acts which no effect explains: posterior odds are the prior's over the p-value."""
-        return DECISION.unknown / (DECISION.unknown + self.p_value)
+        """That something acts which no effect explains and matters: posterior odds are the prior's over the p-value."""
+        return DECISION.unknown / (
+            DECISION.unknown + (self.p_value if self.growth > DECISION.least_gap else 1.0)
+        )
 
     def in_words(self) -> str:
         """What is left, in one sentence."""
@@ -58,18 +61,15 @@ class Check:
 
 def check_residual(replay: Replay, fit: SetFit, named: bool) -> Check:
     """Whether the residual of a fit is noise, as cases go in which effects are `named` or nothing is."""
-    residuals = residuals_of(replay, fit)
-    dependent = dependence(replay, residuals)
-    found = {"dependence": max(dependent), "periodicity": periodicity(replay, residuals)}
-    statistics = {name: value for name, (value, *_) in found.items()}
-    where = {name: words for name, (_, words, *_) in found.items()}
-    p_value = min(1.0, len(statistics) * min(conformal_p(n, v, named) for n, v in statistics.items()))
+    found = dependence(replay, residuals_of(replay, fit))
+    value, where, *_ = max(found)
     predicted = np.zeros(6)
-    if p_value <= DECISION.unknown:
-        for value, _, axis, share in dependent:
-            predicted[axis] = max(predicted[axis], share if value > 0.0 else 0.0)
-    telling = min(statistics, key=lambda n: conformal_p(n, statistics[n], named))
-    return Check(statistics, where[telling], p_value, predicted)
+    for each, _, axis, share in found:
+        if each == value or conformal_p(each, named) <= DECISION.unknown:
+            predicted[axis] = max(predicted[axis], share)
+    growth = np.sqrt((1.0 / (1.0 - predicted[replay.heard > 0])).mean()) - 1.0
+    check = Check(value, where, conformal_p(value, named), float(growth), predicted)
+    return check if check.rejects else replace(check, predicted=np.zeros(6))
 
 
 def residuals_of(replay: Replay, fit: SetFit) -> list[np.ndarray]:
@@ -88,10 +88,10 @@ def disturbances(track: Track, residual: np.ndarray) -> np.ndarray:
     return out
 
 
-def conformal_p(name: str, value: float, named: bool) -> float:
+def conformal_p(value: float, named: bool) -> float:
     """Share of the calibration's cases of the same kind, this one among them, whose statistic is as large. Beyond the largest
     the tail is exponential, as long as that of the upper quarter (Pickands 1975)."""
-    known = np.array(_calibration()["named" if named else "none"][name])
+    known = np.array(_calibration()["named" if named else "none"]["dependence"])
     share = float((1 + (known >= value).sum()) / (1 + len(known)))
     start, largest = np.quantile(known, 0.75), known.max()
     scale = max(float((known[known >= start] - start).mean()), 1e-9)
@@ -123,8 +123,8 @@ def state_groups(track: Track) -> dict[str, np.ndarray]:
 
 
 def dependence(replay: Replay, residuals: list[np.ndarray]) -> list[tuple[float, str, int, float]]:
-    """Of each motion channel and group of the state: log Bayes factor, words, axis (0 to 5) and the share of the whitened
-    residual's square that the process takes."""
+    """Of each motion channel and group of the state: log Bayes factor, words, axis (0 to 5) and the share that the process has
+    of the squared errors that make the gap."""
     states, found = [state_groups(t) for t in replay.tracks], [(0.0, "", 0, 0.0)]
     for group in (g for g in states[0] if all(g in s for s in states)):
         features = _fourier_features([s[group] for s in states])
@@ -134,7 +134,12 @@ def dependence(replay: Replay, residuals: list[np.ndarray]) -> list[tuple[float,
             if group.startswith(WAKE) and axis < 3:
                 continue  # how wakes turn a vehicle is a nuisance
             channel = int(axis) if axis < 3 or replay.usable[3] else int(axis) + 3
-            gain, share = _log_bayes_factor(*_whitened_sums(replay, residuals, features, channel))
+            gain, weights = _log_bayes_factor(*_whitened_sums(replay, residuals, features, channel))
+            pushes = [
+                _done(f, channel, t.dt) @ weights[:, None]
+                for f, t in zip(features, replay.tracks, strict=True)
+            ]
+            share = _share_of_errors(replay, residuals, pushes, channel) if gain > 0.0 else 0.0
             found.append((gain, f"{_name(channel)} depends on {group}", int(axis), share))
     return found
 
@@ -154,50 +159,46 @@ def _fourier_features(states: list[np.ndarray]) -> list[np.ndarray] | None:
     return [f - f.mean(0) for f in features]  # a trim is nobody's surprise
 
 
-def _whitened_sums(replay: Replay, residuals, features, channel: int) -> tuple[np.ndarray, np.ndarray, float]:
-    """Inner products of what the features would do in a channel, whitened, with each other and with the residual, and the
-    residual's square."""
+def _done(push: np.ndarray, channel: int, dt: float) -> np.ndarray:
+    """What accelerations (T, n) do to a channel: rates and velocity add them up."""
+    return push if channel >= 6 else np.cumsum(push, 0) * dt
+
+
+def _share_of_errors(replay: Replay, residuals, shapes, channel: int) -> float:
+    """Share of a channel's squared errors over the gap's horizon that `shapes` [(T, n)], least squares, explain."""
+    gram, cross, square = 1e-12, 0.0, 1e-12
+    for track, residual, shape in zip(replay.tracks, residuals, shapes, strict=True):
+        both = np.concatenate([shape, residual[:, [channel]]], 1)
+        both = both if channel < 6 else np.cumsum(both, 0) * track.dt
+        step = max(round(HORIZONS["rates" if channel < 3 else "velocity"] / track.dt), 1)
+        moved = (both[step:] - both[:-step])[int(SKIP / track.dt) :]
+        gram, cross = gram + moved[:, :-1].T @ moved[:, :-1], cross + moved[:, :-1].T @ moved[:, -1]
+        square += float(moved[:, -1] @ moved[:, -1])
+    return float(np.clip(cross @ np.linalg.lstsq(gram, cross, rcond=None)[0] / square, 0.0, 0.99))
+
+
+def _whitened_sums(replay: Replay, residuals, features, channel: int) -> tuple[np.ndarray, np.ndarray]:
+    """Inner products of what the features would do in a channel, whitened, with each other and with the residual."""
     noise = next(n for n in replay.noises if channel in n.axes)
-    gram, cross, square = 0.0, 0.0, 0.0
+    gram, cross = 0.0, 0.0
     for track, residual, push in zip(replay.tracks, residuals, features, strict=True):
-        done = push if channel >= 6 else np.cumsum(push, 0) * track.dt
-        both = np.concatenate([done, residual[:, [channel]]], 1)
+        both = np.concatenate([_done(push, channel, track.dt), residual[:, [channel]]], 1)
         white = lfilter(noise.numerator / noise.deviation, noise.denominator, both, axis=0)
         white = white[int(SKIP / track.dt) :]
         white = white - white.mean(0)
         gram, cross = gram + white[:, :-1].T @ white[:, :-1], cross + white[:, :-1].T @ white[:, -1]
-        square += float(white[:, -1] @ white[:, -1])
-    return gram, cross, square
+    return gram, cross
 
 
-def _log_bayes_factor(gram: np.ndarray, cross: np.ndarray, square: float) -> tuple[float, float]:
-    """Of a linear model with independent normal coefficients against none, at the variance that fits best, and the share of
-    the square that it takes."""
+def _log_bayes_factor(gram: np.ndarray, cross: np.ndarray) -> tuple[float, np.ndarray]:
+    """Of a linear model with independent normal coefficients against none, at the variance that fits best, and the
+    coefficients."""
     values, vectors = np.linalg.eigh(gram)
-    values, along = np.maximum(values, 0.0), (vectors.T @ cross) ** 2
-    each = [0.5 * (v * along / (1.0 + v * values) - np.log1p(v * values)).sum() for v in VARIANCES]
+    values, along = np.maximum(values, 0.0), vectors.T @ cross
+    each = [0.5 * (v * along**2 / (1.0 + v * values) - np.log1p(v * values)).sum() for v in VARIANCES]
     best = int(np.argmax(each))
     taken = VARIANCES[best] * along / (1.0 + VARIANCES[best] * values)
-    return max(0.0, float(each[best])), float(np.clip(taken.sum() / max(square, 1e-12), 0.0, 0.99))
-
-
-def periodicity(replay: Replay, residuals: list[np.ndarray]) -> tuple[float, str]:
-    """The largest minus log p-value of Fisher's test over channels and tracks, and where."""
-    best = (0.0, "")
-    for noise in replay.noises:
-        if replay.usable[noise.axes[0]] <= 0.0:
-            continue
-        for track, residual in zip(replay.tracks, residuals, strict=True):
-            white = noise.whiten(residual[:, list(noise.axes)])[int(SKIP / track.dt) :]
-            power = np.abs(np.fft.rfft(white - white.mean(0), axis=0))[1:] ** 2
-            count = len(power)
-            for place, column in zip(noise.axes, power.T, strict=True):
-                line = int(column.argmax())
-                share = min(float(column[line] / column.sum()), 1.0 - 1e-9)
-                value = -np.log(count) - (count - 1) * np.log1p(-share)
-                at = (line + 1) / (len(white) * track.dt)
-                best = max(best, (float(value), f"{_name(place)} swings at {at:.1f} Hz"))
-    return best
+    return max(0.0, float(each[best])), vectors @ taken
 
 
 def _name(channel: int) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -71,65 +71,48 @@ def regimes_of(track: Track) -> dict[str, np.ndarray]:
 
 def locate(evidence: Evidence, fit: SetFit, named=()) -> list[Place]:
     """The table, largest share first. `fit` is the physics part of the verdict, `named` all named effects."""
-    before, after, floor = (_powers(evidence, r) for r in (evidence.nothing, fit, fit))
-    paths = _other_powers(evidence, named)
-    cells, total = [], 0.0
     masks = [{r: m[int(SKIP / t.dt) :] for r, m in regimes_of(t).items()} for t in evidence.tracks]
-    for number, channel in enumerate(CHANNELS):
-        if number < 6:
-            columns = [[p[k][:, number] for k in range(len(p))] for p in (before, after, floor)]
-        elif channel in paths:
-            columns = paths[channel]
-        else:
-            continue
-        level = np.mean(np.concatenate(columns[2])) + 1e-18
-        for regime in REGIMES:
-            inside = [m[regime] for m in masks]
-            count = sum(int(i.sum()) for i in inside)
-            seconds = count * evidence.tracks[0].dt
-            if seconds < LEAST_TIME:
-                continue
-            b, a = (
-                float(sum(c[i].sum() for c, i in zip(column, inside, strict=True)) / count / level)
-                for column in columns[:2]
-            )
-            excess = max(b - 1.0, 0.0) * seconds
-            total += excess
-            cells.append((channel, regime, excess, np.sqrt(b), np.sqrt(a), seconds))
-    places = [
-        Place(c, r, float(e / total) if total > 0 else 0.0, float(b), float(a), float(s))
-        for c, r, e, b, a, s in cells
-    ]
-    return sorted(places, key=lambda p: -p.share)
+    inside = {r: np.concatenate([m[r] for m in masks]) for r in REGIMES}
+    seconds = {r: int(m.sum()) * evidence.tracks[0].dt for r, m in inside.items()}
+    places = []
+    for channel, powers in (_motion_powers(evidence, fit) | _other_powers(evidence, named)).items():
+        floor = powers[2].mean() + 1e-18
+        for regime in (r for r in REGIMES if seconds[r] >= LEAST_TIME):
+            b, a = (float(p[inside[regime]].mean() / floor) for p in powers[:2])
+            excess = max(b - 1.0, 0.0) * seconds[regime]
+            places.append(Place(channel, regime, excess, b**0.5, a**0.5, seconds[regime]))
+    total = sum(p.share for p in places) or 1.0
+    return sorted((replace(p, share=p.share / total) for p in places), key=lambda p: -p.share)
 
 
-def _powers(evidence: Evidence, fit: SetFit) -> list[np.ndarray]:
-    """Squared smoothed disturbances (T', 6) per track: force then torque channels."""
-    residuals = residuals_of(evidence.replay, fit)
-    out = []
-    for track, residual in zip(evidence.tracks, residuals, strict=True):
-        rest = disturbances(track, residual)
-        force = rest[:, 3:6] if evidence.replay.usable[3] else rest[:, 6:9]
-        calm = smooth(np.concatenate([force, rest[:, :3]], 1), CALM, track.dt)[int(SKIP / track.dt) :]
-        out.append(calm**2)
-    return out
+def _motion_powers(evidence: Evidence, fit: SetFit) -> dict[str, list[np.ndarray]]:
+    """{channel: squared smoothed disturbances (rows,) before, after and at the floor}."""
+    both = []
+    for of in (evidence.nothing, fit):
+        rows = []
+        for track, residual in zip(evidence.tracks, residuals_of(evidence.replay, of), strict=True):
+            rest = disturbances(track, residual)
+            force = rest[:, 3:6] if evidence.replay.usable[3] else rest[:, 6:9]
+            calm = smooth(np.concatenate([force, rest[:, :3]], 1), CALM, track.dt)
+            rows.append(calm[int(SKIP / track.dt) :] ** 2)
+        both.append(np.concatenate(rows))
+    return {name: [both[0][:, k], both[1][:, k], both[1][:, k]] for k, name in enumerate(CHANNELS[:6])}
 
 
-def _other_powers(evidence: Evidence, named) -> dict[str, list]:
-    """Squared residuals before, after and at the floor, per track, of the channels that aren't the motion."""
-    found: dict[str, list] = {}
+def _other_powers(evidence: Evidence, named) -> dict[str, list[np.ndarray]]:
+    """The same of pose, radio and rate loop: their squared residuals."""
+    found: dict[str, list[np.ndarray]] = {}
     for channel in evidence.channels:
         floor = channel.residuals([e for e in evidence.library.effects if path_of(e) == channel.path])
         scale = {n: float(np.sqrt(np.mean(np.concatenate(v) ** 2))) + 1e-12 for n, v in floor.items()}
         powers = []
         for errors in (channel.residuals(()), channel.residuals(named), floor):
             tracks = zip(evidence.tracks, *([v / scale[n] for v in errors[n]] for n in errors), strict=True)
-            powers.append([_rows(np.mean(np.square(own), 0), track) for track, *own in tracks])
+            powers.append(
+                np.concatenate([_rows(np.mean(np.square(own), 0), track) for track, *own in tracks])
+            )
         name = "estimator" if channel.path == "estimator" else "firmware"
-        known = found.get(name)
-        found[name] = powers if known is None else [
-            [a + b for a, b in zip(one, other, strict=True)] for one, other in zip(known, powers, strict=True)
-        ]  # fmt: skip
+        found[name] = [a + b for a, b in zip(found[name], powers, strict=True)] if name in found else powers
     return found
 
 

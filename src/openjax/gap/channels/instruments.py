@@ -21,10 +21,8 @@ from openjax.vehicle.rate_controller import mixer
 SLOW = 0.06  # s over which commands implied by motors and rates are smoothed
 QUICK = 0.1  # s: within it, single samples say little about what motors did between them
 COUNT = 57.29577951308232 / 65536.0  # motor command per count and rad/s
-BAND, EDGE = (
-    (0.5, 10.0),
-    0.3,
-)  # Hz above trims and below filters and single samples; s at either end that the filter spoils
+BAND = (0.5, 10.0)  # Hz above trims and below filters and single samples
+EDGE = 0.3  # s at either end that the filter spoils
 
 
 @dataclass(frozen=True, eq=False)

@@ -45,7 +45,8 @@ class Reading:
 
     @property
     def numbers(self):
-        return numbers_of("nuisance_duty" if self.pwm else "nuisance_samples" if self.blind else "nuisance")
+        situation = "nuisance_duty" if self.pwm else "nuisance_samples" if self.blind else "nuisance"
+        return numbers_of(situation, self.vehicles[0])
 
     @cached_property
     def by_commands(self) -> list[tuple[np.ndarray, np.ndarray]]:

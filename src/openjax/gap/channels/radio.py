@@ -22,11 +22,7 @@ HELD, BETWEEN = 0.2, 0.6  # of the way from the command held to the one due: up 
 DEPENDENT = 3.0  # rows that count as one independent error
 FEWEST = 30  # changes of the command that tell what a link does
 CLEAR = 20.0  # nats that a delay or losses must gain: errors of a link aren't independent
-THRUST_FLOOR = 2e-3  # of thrust: below, the link is perfect for every purpose
-ROW_ERROR = (
-    0.1,
-    0.29,
-)  # of a row, by which a delay is known: rows that are means, rows that are single samples
+ROW_ERROR = (0.1, 0.29)  # of a row, by which a delay is known: rows that are means, single samples
 BURSTS = 3.0  # packets that are lost together
 
 DELAY, LOSS = "delay", "probability"  # the parameters of the effects that a radio tells
@@ -113,7 +109,7 @@ class Radio(Channel):
 
     def residuals(self, named) -> dict[str, list[np.ndarray]]:
         used = self.links[frozenset(p for p, effect in self.names.items() if effect in named)]
-        return {"motors all": [np.array([np.hypot(used.misfit, THRUST_FLOOR)]) for _ in used.arrived]}
+        return {"motors all": [np.array([np.hypot(used.misfit, TOLERANCE)]) for _ in used.arrived]}
 
 
 def read_radio(tracks: list[Track], library, sampled: bool = False) -> Radio:

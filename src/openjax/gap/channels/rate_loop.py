@@ -26,10 +26,8 @@ from openjax.vehicle.rate_controller import mixer
 GAIN_STEP = 0.05
 PRIOR = np.array([0.4, 0.4, 0.4, 1.0, 1.0])  # spreads of the gains and of the delays of P and D
 FILTER_DELAY = 0.004  # s, usual size of what low-passes do to the derivative
-ROW_DELAY = (
-    0.0005,
-    0.0025,
-)  # s by which motors may be off, where rows are the log's own and where they are means of its rows
+# s by which motors may be off, where rows are the log's own and where they are means of its rows.
+ROW_DELAY = (0.0005, 0.0025)
 MARGIN = 0.05  # of a motor command: nearer to its limits some tick of the row was cut
 SEGMENT = 0.5  # s, unit of the errors
 LEAST_SECONDS = 6  # without a motor at its limit

@@ -5,23 +5,32 @@ from __future__ import annotations
 import numpy as np
 
 BOUND = 2.0  # usual sizes that a nuisance may take
+PATIENCE = 4
 
 
 def bounded(hessian, push, free: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Minimum of x'Hx/2 - push'x with |x| <= BOUND beyond the first `free` entries, by fixing what leaves the box; and
-    which entries are inside it."""
-    open_ = np.ones(len(push), bool)
-    found = np.linalg.solve(hessian, push)
+    """Minimum of x'Hx/2 - push'x with |x| <= BOUND beyond the first `free` entries, H positive definite; and which entries
+    (size,) are inside the box.
+
+    Block principal pivoting (Judice, Pires 1994): entries that leave the box are fixed at its edge and those that would come
+    back are let go, all at once as long as fewer are wrong each time, else the last of them alone, so that it ends."""
+    limit = np.full(len(push), BOUND)
+    limit[:free] = np.inf
+    side, fewest, patience = np.zeros(len(push)), len(push) + 1, PATIENCE
     while True:
-        beyond = open_ & (np.abs(found) > BOUND)
-        beyond[:free] = False
-        if not beyond.any():
-            return found, open_
-        found[beyond] = np.sign(found[beyond]) * BOUND
-        open_ &= ~beyond
-        inside, fixed = np.flatnonzero(open_), np.flatnonzero(~open_)
-        rest = push[inside] - hessian[np.ix_(inside, fixed)] @ found[fixed]
-        found[inside] = np.linalg.solve(hessian[np.ix_(inside, inside)], rest)
+        found = np.where(side == 0.0, 0.0, side * BOUND)
+        inside, fixed = np.flatnonzero(side == 0.0), np.flatnonzero(side)
+        right = push[inside] - hessian[np.ix_(inside, fixed)] @ found[fixed]
+        found[inside] = np.linalg.solve(hessian[np.ix_(inside, inside)], right)
+        pull = side * (hessian @ found - push)  # positive: back into the box is downhill
+        beyond, back = np.abs(found) > limit * (1.0 + 1e-9), pull > 1e-9 * np.abs(push)
+        wrong = np.flatnonzero(beyond | back)
+        if not len(wrong):
+            return found, side == 0.0
+        patience = PATIENCE if len(wrong) < fewest else patience - 1
+        fewest = min(fewest, len(wrong))
+        changed = wrong if patience > 0 else wrong[-1:]
+        side[changed] = np.where(beyond[changed], np.sign(found[changed]), 0.0)
 
 
 def normal_equations(precision: np.ndarray, push: np.ndarray, common: int, own: int, parts) -> tuple:

@@ -17,10 +17,14 @@ from openjax.vehicle.effects import EFFECTS, Card
 CARDS: dict[str, Card] = {name: effect.card for name, effect in EFFECTS.items() if effect.card is not None}
 
 
-def numbers_of(situation: str) -> tuple[tuple[str, str, float], ...]:
-    """(effect, parameter, usual size) of small errors of the vehicle's numbers, which are free in every hypothesis; `situation`
+def numbers_of(situation: str, vehicle) -> tuple[tuple[str, str, float], ...]:
+    """(effect, parameter, usual size) of small errors of a vehicle's numbers, which are free in every hypothesis; `situation`
     is the field of `Card` that holds them."""
-    return tuple((e, p, size) for e, card in CARDS.items() for p, size in getattr(card, situation).items())
+    return tuple(
+        (e, p, float(size(vehicle) if callable(size) else size))
+        for e, card in CARDS.items()
+        for p, size in (card.nuisance | getattr(card, situation)).items()
+    )
 
 
 BALANCE = 0.9999  # share of the common variance that `balanced` parameters go without

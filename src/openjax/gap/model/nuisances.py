@@ -30,7 +30,15 @@ OF_A_TRACK = ("clock of the motors", "accelerometer bias", "clock of the pose")
 
 
 def columns_of(
-    track: Track, path: Path, nominal, moved, numbers, feedback, one_clock: bool, at_once: bool, wander: float
+    track: Track,
+    path: Path,
+    nominal,
+    moved,
+    numbers,
+    feedback,
+    one_clock: bool,
+    at_once: bool,
+    wander: float,
 ) -> dict[str, np.ndarray]:
     """{name: column (T, 9)} of one track. `moved` (numbers + 1, T, 9): channels with one of the vehicle's `numbers` a step
     off, the motors' clock last; the other arguments as in `make_replay`."""
@@ -47,7 +55,9 @@ def columns_of(
         if one_clock
         else SIZE["streams_apart"]
     )
-    columns["clock of the motors"] = (moved[-1] - nominal) * shift / STEP[-1]
+    later = (moved[-1] - nominal) / STEP[-1]
+    columns["clock of the motors"] = later * shift
+    columns["delay of the motors"] = later * SIZE["motor_delay"]
     columns |= _late_torques("feedback", track, feedback.acceleration, FEEDBACK_ROWS)
     if at_once:
         columns |= _late_torques("motors within a row", track, feedback.quick, QUICK_ROWS)

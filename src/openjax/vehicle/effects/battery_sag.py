@@ -49,6 +49,7 @@ EFFECT = Effect(
             Fitted("reference", mean=3.85, spread=0.15, start=3.85, step=0.01),
         ),
         needs="voltage",
+        nuisance_duty={"exponent": 0.4},
         coordinate="voltage",
         thrust_map=True,
         log_odds=RARE,

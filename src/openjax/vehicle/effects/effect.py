@@ -124,7 +124,8 @@ class Card:
     torque_axes: those of the torques by which it is told, which gusts can imitate, and what motors do between two rows.
     log_odds: log prior odds that it acts at a size that matters.
     possible({parameter: value}, {parameter: deviation}): whether fitted values lie within physical bounds.
-    nuisance: {parameter: size} by which the vehicle's number is usually off: free in every hypothesis, never a cause.
+    nuisance: {parameter: size, or a function of the vehicle that gives it} by which the vehicle's number is usually off: free in
+        every hypothesis, never a cause.
     nuisance_duty, nuisance_samples: the same where motor commands are duty cycles, or single samples whose rows hide the rest.
     gusts: {parameter: (size, torque axes)} by which a nuisance may be larger per share of gusts in those torques.
     weighed: whether a weighed vehicle rules it out.
@@ -147,7 +148,7 @@ class Card:
     torque_axes: tuple[int, ...] = ()
     log_odds: float = UNCOMMON
     possible: Callable[[Mapping[str, float], Mapping[str, float]], bool] | None = None
-    nuisance: Mapping[str, float] = field(default_factory=dict)
+    nuisance: Mapping[str, float | Callable[[Vehicle], float]] = field(default_factory=dict)
     nuisance_duty: Mapping[str, float] = field(default_factory=dict)
     nuisance_samples: Mapping[str, float] = field(default_factory=dict)
     form_error: Mapping[str, float] = field(default_factory=dict)

@@ -22,6 +22,16 @@ def lags(value, deviation):
     return -EARLY < max(value["extra_up"], value["extra_down"]) < _SLOWEST
 
 
+def spin_up_error(vehicle):
+    """s: motors of a kind differ by some per cent."""
+    return 0.05 * vehicle.motor_time_constant
+
+
+def spin_down_error(vehicle):
+    """s: braking isn't driving; brushed motors were measured up to a third slower down than up."""
+    return 0.15 * vehicle.motor_time_constant * vehicle.motor_slowdown_ratio
+
+
 _SOURCE = "coreless motors of this size: time constants of 0.02-0.12 s, against a nominal 0.025 s"
 
 EFFECT = Effect(
@@ -46,7 +56,7 @@ EFFECT = Effect(
         common=0.03,
         possible=lags,
         gusts={"extra_up": (0.01, (0, 1)), "extra_down": (0.01, (0, 1))},
-        nuisance={"extra_up": 0.0015, "extra_down": 0.0015},
+        nuisance={"extra_up": spin_up_error, "extra_down": spin_down_error},
         nuisance_duty={"extra_up": 0.01, "extra_down": 0.01},
         nuisance_samples={"extra_up": 0.01, "extra_down": 0.01},
         sample={"extra_up": 0.02, "extra_down": 0.03},

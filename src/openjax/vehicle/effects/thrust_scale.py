@@ -29,7 +29,6 @@ EFFECT = Effect(
         fitted=(Fitted("scale", mean=0.0, spread=0.1, start=0.02, step=0.001),),
         nuisance={"scale": 0.004},
         nuisance_duty={"scale": 0.3},
-        nuisance_samples={"scale": 0.004},
         thrust_map=True,
         sample={"scale": -0.08},
         next_flight="weigh the vehicle, then hover and climb hard: a weighed mass leaves only the thrust.",
