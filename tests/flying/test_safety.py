@@ -9,7 +9,13 @@ from hypothesis import strategies as st
 
 from openjax.flying.controller import Pose, nominal_airframe
 from openjax.flying.judge import Track
-from openjax.flying.limits import SafetySettings, fence_velocity, parting_velocity, resting_places
+from openjax.flying.limits import (
+    SafetySettings,
+    fence_velocity,
+    parting_velocity,
+    resting_places,
+    stopping_point,
+)
 from openjax.flying.safety import Drone, Event, Mode, PoseSample, Request, initial_state, step
 from openjax.flying.set_point import OFF, RATES, SetPoint
 
@@ -231,6 +237,19 @@ def test_the_fence_turns_back_what_could_not_stop_any_more():
     assert fence_velocity(LIMITS, Pose(0.0, (0.6, 0.0, 0.5), (1.0, 0.0, 0.0), outwards))[0] < 0.0
     assert fence_velocity(LIMITS, Pose(0.0, (0.65, 0.0, 0.5), (1.0, 0.0, 0.0), LEVEL)) is None
     assert fence_velocity(LIMITS, Pose(0.0, (0.7, 0.0, 0.5), (1.0, 0.0, 0.0), inwards)) is None
+
+
+@given(st.floats(0.0, 3.0), st.floats(-5.0, 14.0))
+def test_who_brakes_stops_before_the_point_that_the_fence_counts_on(speed, present):
+    """Stepped in plain numbers: an acceleration that follows the braking with a lag."""
+    counted_on = stopping_point(LIMITS, Pose(0.0, (0.0,) * 3, (speed, 0.0, 0.0), LEVEL), (present, 0.0, 0.0))
+    x, farthest, acceleration = 0.0, 0.0, present
+    while speed > 0.0 or acceleration > 0.0:
+        acceleration += 1e-3 / LIMITS.reaction * (-LIMITS.braking - acceleration)
+        speed += 1e-3 * acceleration
+        x += 1e-3 * speed
+        farthest = max(farthest, x)
+    assert farthest - 0.02 < max(counted_on[0], 0.0) < farthest + 0.1
 
 
 numbers = st.floats(-3.0, 3.0)
