@@ -8,22 +8,21 @@ what a limit would be. Same command on CPU and GPU.
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import tyro
-from rich import box
 from rich.table import Table
 
 from openjax.commands.command_line import output_console, parse, peek
 from openjax.files import check_output
 from openjax.learning.settings import TrainSettings, preset
 from openjax.ranges import Interval
+from openjax.show.tables import numbers_table
 
 PROGRAM = "openjax benchmark"
 PHYSICS = ("rigid_free", "rigid", "mjx_free", "mjx")
-PARTS = (*PHYSICS, "environment", "rollout", "training", "shares")
-
 Part = Literal["rigid_free", "rigid", "mjx_free", "mjx", "environment", "rollout", "training", "shares"]
+PARTS = get_args(Part)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,10 +123,8 @@ def _row(part, num_envs, steps, settings, timing) -> dict:
 
 def results_table(rows: Sequence[dict]) -> Table:
     """Measurements as a table."""
-    table = Table(title="Speed", title_justify="left", box=box.SIMPLE, pad_edge=False)
-    table.add_column("part")
-    for name in ("envs", "env steps/s", "drone steps/s", "compile [s]", "memory [MB]"):
-        table.add_column(name, justify="right")
+    heads = ("envs", "env steps/s", "drone steps/s", "compile [s]", "memory [MB]")
+    table = numbers_table("Speed", "part", *heads)
     for row in rows:
         table.add_row(*_cells(row))
     return table

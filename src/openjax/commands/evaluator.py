@@ -8,13 +8,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from rich import box
 from rich.table import Table
 
 from openjax.background import compile_ahead
 from openjax.learning import Evaluation, make_evaluate, summarise
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, Scenario, Task, scenario_task
+from openjax.show.tables import numbers_table
 from openjax.show.trajectory import Trajectory
 
 FIELDS = (
@@ -171,7 +171,7 @@ def record_of(scenario: str, episodes: int, summary: dict, extra: tuple[str, ...
 def results_table(title: str, rows: Sequence[dict]) -> Table:
     """Records as a table."""
     heads = ("epi-\nsodes", "capture\nrate", "capture\nstep", "colli-\nsions", "pillar/drone/\nbounds")
-    table = _table(title, "scenario", *heads, "crash\nrate", "over-\nspeed", "predicted\noff by, m")
+    table = numbers_table(title, "scenario", *heads, "crash\nrate", "over-\nspeed", "predicted\noff by, m")
     for row in rows:
         parts = row["collision_parts"]
         table.add_row(
@@ -197,7 +197,7 @@ def spread_table(results: Sequence[Sequence[dict]]) -> Table:
         ("collision_rate", "collision rate", ".4f"),
         ("crash_rate", "crash rate", ".3f"),
     )
-    table = _table(title, "scenario", *(label for _, label, _ in columns))
+    table = numbers_table(title, "scenario", *(label for _, label, _ in columns))
     for rows in zip(*results, strict=True):
         values = [(np.array([row[name] for row in rows]), style) for name, _, style in columns]
         cells = [f"{value.mean():{style}} ± {value.std(ddof=1):{style}}" for value, style in values]
@@ -222,7 +222,7 @@ def before_after_table(
     )
     last = [] if other is None else [f"policy {other}:\nrate, step, crash"]
     heads = [label if other is None else label.replace(" ", "\n") for _, label, _ in columns]
-    table = _table("Before and after training, in the game that was trained", "", *heads, *last)
+    table = numbers_table("Before and after training, in the game that was trained", "", *heads, *last)
     theirs = {row["scenario"]: row for row in others}
     for old, new in zip(before, after, strict=True):
         cells = [f"{old[name]:{style}} → {new[name]:{style}}" for name, _, style in columns]
@@ -234,13 +234,4 @@ def before_after_table(
                 else "–"
             )
         table.add_row(_KINDS.get(old["scenario"], old["scenario"]), *cells)
-    return table
-
-
-def _table(title, first, *heads):
-    """An empty table; the column `first` holds names, the others numbers."""
-    table = Table(title=title, title_justify="left", box=box.SIMPLE, pad_edge=False, padding=0)
-    table.add_column(first)
-    for head in heads:
-        table.add_column(head, justify="right")
     return table

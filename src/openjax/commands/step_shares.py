@@ -9,13 +9,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from rich import box
 from rich.table import Table
 
 from openjax.learning import TrainSettings, build, init_carry, make_training_step
 from openjax.learning.rollout import collect
 from openjax.learning.training_step import make_phases
 from openjax.pursuit.environment import action_to_command
+from openjax.show.tables import numbers_table
 
 BANDWIDTH = 4.3e12
 """Bytes per second that an NVIDIA H200 was measured to read or write at best ..."""
@@ -46,20 +46,43 @@ def measure(settings: TrainSettings, seconds_of: Callable[[Callable, tuple], flo
     `seconds_of` times a function of arrays. What only shows inside a larger part is the difference of two measurements:
     game = environment - physics, policy = rollout - environment - prediction, rest = step - all of these.
     """
-    parts, carry = build(settings), init_carry(settings, jax.random.key(0))
-    environment, policy, steps = parts.environment, parts.policy, settings.rollout_length
-    agents = settings.num_envs * settings.environment.num_pursuers
+    carry = init_carry(settings, jax.random.key(0))
+    seconds = {name: seconds_of(*program) for name, program in _programs(settings, carry).items()}
+    if None in seconds.values():
+        return []
+    predicted = seconds.get("prediction", 0.0)
+    seconds["rest (tasks, resets, noise)"] = seconds["step"] - sum(
+        value
+        for name, value in seconds.items()
+        if name in ("rollout", "predictor's update", "policy's update")
+    )
+    seconds["policy"] = seconds.pop("rollout") - seconds["environment"] - predicted
+    seconds["game"] = seconds.pop("environment") - seconds["physics"]
+    work = _work(settings, carry)
+    work["step"] = tuple(map(sum, zip(*(work[name] for name in seconds if name in work), strict=True)))
+    order = [
+        *(name for name in work if name in seconds and name != "step"),
+        "rest (tasks, resets, noise)",
+        "step",
+    ]
+    return [Share(name, seconds[name], *work.get(name, (0.0, 0.0))) for name in order]
+
+
+def _programs(settings, carry) -> dict[str, tuple[Callable, tuple]]:
+    """What is timed: functions and their arguments."""
+    parts, steps = build(settings), settings.rollout_length
+    environment, policy = parts.environment, parts.policy
     shape = (steps, settings.num_envs, settings.environment.num_pursuers)
     noise = jax.random.normal(jax.random.key(1), (*shape, policy.sample_size))
     actions = jnp.tanh(jax.random.normal(jax.random.key(1), (*shape, 4)))
 
     def physics(state, actions):
+        move = jax.vmap(environment.dynamics, (None, 0, 0, 0, 0, 0 if state.vehicles else None))
+        pillars = (state.task.pillar_position, state.task.pillar_active)
+        effects = {**state.vehicles, **environment.effect_parameters}
+
         def one(drones, action):
-            command = action_to_command(action)
-            move = jax.vmap(environment.dynamics, (None, 0, 0, 0, 0, 0 if state.vehicles else None))
-            pillars = (state.task.pillar_position, state.task.pillar_active)
-            effects = {**state.vehicles, **environment.effect_parameters}
-            return move(environment.vehicle, drones, command, *pillars, effects), None
+            return move(environment.vehicle, drones, action_to_command(action), *pillars, effects), None
 
         return jax.lax.scan(one, state.drones, actions)[0]
 
@@ -74,86 +97,53 @@ def measure(settings: TrainSettings, seconds_of: Callable[[Callable, tuple], flo
     def rollout(carry, noise):
         return collect(environment, policy, carry.policy, carry.observation, carry.state, noise)
 
-    def prediction(carry, noise):
-        def one(carry, _):
+    def prediction(carry):
+        def one(shift, _):
             # shifted a little each time, so that the loop can't be taken apart
-            observation, shift = carry
-            predicted = policy.predict(
-                parameters, observation.replace(last_seen=observation.last_seen + shift)
-            )
-            return (observation, 1e-6 * jnp.mean(predicted)), predicted
+            seen = carry.observation.replace(last_seen=carry.observation.last_seen + shift)
+            predicted = policy.predict(carry.policy, seen)
+            return 1e-6 * jnp.mean(predicted), predicted
 
-        parameters = carry.policy
-        return jax.lax.scan(one, (carry.observation, jnp.zeros(())), None, length=steps)
+        return jax.lax.scan(one, jnp.zeros(()), None, length=steps)
 
     phases = make_phases(settings)
     _, flown, _ = jax.jit(phases.fly)(carry)
-    programs: dict[str, tuple[Callable, tuple]] = {
+    programs = {
         "physics": (physics, (carry.state, actions)),
         "environment": (game, (carry.state, actions)),
         "rollout": (rollout, (carry, noise)),
-        "policy update": (phases.learn[-1], (carry, flown)),
+        "policy's update": (phases.learn[-1], (carry, flown)),
         "step": (make_training_step(settings), (carry,)),
     }
     if settings.predictor.enabled:
-        programs["prediction"] = (prediction, (carry, noise))
-        programs["predictor update"] = (phases.learn[0], (carry, flown))
-    seconds = {name: seconds_of(*program) for name, program in programs.items()}
-    if None in seconds.values():
-        return []
-    prediction_seconds = seconds.get("prediction", 0.0)
+        programs |= {
+            "prediction": (prediction, (carry,)),
+            "predictor's update": (phases.learn[0], (carry, flown)),
+        }
+    return programs
 
-    samples = agents * steps
-    forward = 2 * products(settings, carry.policy.actor) + 2 * products(settings, carry.policy.critic)
-    acting = 2 * products(settings, carry.policy.actor)
-    windows = settings.predictor.windows * settings.num_envs if settings.predictor.enabled else 0
-    predicting = (
-        2 * settings.environment.history_length * sum(x.size for x in jax.tree.leaves(carry.policy.predictor))
+
+def _work(settings, carry) -> dict[str, tuple[float, float]]:
+    """Operations of the matrix products that a part can't do without, and bytes that it can't avoid to read or write."""
+    steps, worlds = settings.rollout_length, settings.num_envs
+    samples = worlds * settings.environment.num_pursuers * steps
+    acting, judging = (2 * products(settings, own) for own in (carry.policy.actor, carry.policy.critic))
+    history = settings.environment.history_length
+    predicting = 2 * history * sum(x.size for x in jax.tree.leaves(carry.policy.predictor))
+    observed, frames = _bytes(carry.observation.replace(frames=())) * steps, _bytes(carry.observation.frames)
+    windows, update = settings.predictor.windows, settings.mappo.epochs / settings.mappo.step_subsampling
+    moved = (
+        2 * steps * _bytes(carry.state.drones),
+        2 * steps * _bytes(carry.state.replace(drones=(), task=())),
     )
-    observed = _bytes(carry.observation.replace(frames=())) * steps
-    update = settings.mappo.epochs / settings.mappo.step_subsampling
-    shares = [
-        Share("physics", seconds["physics"], 0.0, 2 * _bytes(carry.state.drones) * steps),
-        Share(
-            "game",
-            seconds["environment"] - seconds["physics"],
-            0.0,
-            2 * _bytes(carry.state.replace(drones=(), task=())) * steps + observed,
-        ),
-        Share(
-            "policy",
-            seconds["rollout"] - seconds["environment"] - prediction_seconds,
-            acting * samples,
-            2 * observed,
-        ),
-    ]
-    if settings.predictor.enabled:
-        shares += [
-            Share(
-                "prediction",
-                prediction_seconds,
-                predicting * settings.num_envs * steps,
-                _bytes(carry.observation.frames) * steps,
-            ),
-            Share(
-                "predictor's update",
-                seconds["predictor update"],
-                3 * predicting * windows,
-                _bytes(carry.observation.frames) * settings.predictor.windows,
-            ),
-        ]
-    shares.append(
-        Share(
-            "policy's update",
-            seconds["policy update"],
-            (3 * update + 1) * forward * samples,
-            (update + 1) * observed,
-        )
-    )
-    rest = seconds["step"] - sum(share.seconds for share in shares)
-    shares.append(Share("rest (tasks, resets, noise)", rest, 0.0, 0.0))
-    flops, moved = sum(share.flops for share in shares), sum(share.bytes for share in shares)
-    return [*shares, Share("step", seconds["step"], flops, moved)]
+    return {
+        "physics": (0.0, moved[0]),
+        "game": (0.0, moved[1] + observed),
+        "policy": (acting * samples, 2 * observed),
+        "prediction": (predicting * worlds * steps, frames * steps),
+        "predictor's update": (3 * predicting * windows * worlds, frames * windows),
+        "policy's update": ((3 * update + 1) * (acting + judging) * samples, (update + 1) * observed),
+    }
 
 
 def _bytes(tree: Any) -> int:
@@ -182,17 +172,8 @@ def shares_table(shares: list[Share], settings: TrainSettings) -> Table:
     speed = settings.steps_per_update / shares[-1].seconds
     title = f"Where a training step's time goes: {settings.num_envs:,} worlds, {speed:,.0f} env steps/s"
     caption = f"limit: {BANDWIDTH / 1e12:.1f} TB/s, {ARITHMETIC / 1e12:.0f} TFLOP/s (H200) for what must be moved or multiplied"
-    table = Table(
-        title=title,
-        title_justify="left",
-        caption=None if on_cpu else caption,
-        caption_justify="left",
-        box=box.SIMPLE,
-        pad_edge=False,
-    )
-    table.add_column("part")
-    for name in ("ms", "share", "GFLOP", "GB", *([] if on_cpu else ["limit [ms]"])):
-        table.add_column(name, justify="right")
+    heads = ("ms", "share", "GFLOP", "GB", *([] if on_cpu else ["limit [ms]"]))
+    table = numbers_table(title, "part", *heads, caption=None if on_cpu else caption)
     for share in shares:
         table.add_row(
             share.part,
