@@ -6,6 +6,7 @@ what a limit would be. Same command on CPU and GPU.
 """
 
 import dataclasses
+import importlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal, get_args
@@ -17,7 +18,7 @@ from openjax.commands.command_line import output_console, parse, peek
 from openjax.files import check_output
 from openjax.learning.settings import TrainSettings, preset
 from openjax.ranges import Interval
-from openjax.show.tables import numbers_table
+from openjax.show.number_tables import numbers_table
 
 PROGRAM = "openjax benchmark"
 PHYSICS = ("rigid_free", "rigid", "mjx_free", "mjx")
@@ -50,7 +51,7 @@ class BenchmarkCommand:
 
 def main(arguments: Sequence[str]) -> int:
     """The command; returns its exit status."""
-    on_cpu = bool({"-h", "--help"} & set(arguments)) or _on_cpu()
+    on_cpu = {"-h", "--help"} & set(arguments) or importlib.import_module("jax").default_backend() == "cpu"
     default = BenchmarkCommand(
         envs=(64, 512) if on_cpu else (2048, 8192, 32768, 131072, 1048576),
         training_envs=(320,) if on_cpu else (2048, 4096, 8192, 16384),
@@ -98,12 +99,6 @@ def main(arguments: Sequence[str]) -> int:
         write()
     console.print(f"written to {command.json}")
     return 0
-
-
-def _on_cpu():
-    import jax
-
-    return jax.default_backend() == "cpu"
 
 
 def _row(part, num_envs, steps, settings, timing) -> dict:

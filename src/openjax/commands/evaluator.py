@@ -14,7 +14,7 @@ from openjax.background import compile_ahead
 from openjax.learning import Evaluation, make_evaluate, summarise
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, Scenario, Task, scenario_task
-from openjax.show.tables import numbers_table
+from openjax.show.number_tables import numbers_table
 from openjax.show.trajectory import Trajectory
 
 FIELDS = (

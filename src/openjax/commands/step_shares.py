@@ -15,7 +15,7 @@ from openjax.learning import TrainSettings, build, init_carry, make_training_ste
 from openjax.learning.rollout import collect
 from openjax.learning.training_step import make_phases
 from openjax.pursuit.environment import action_to_command
-from openjax.show.tables import numbers_table
+from openjax.show.number_tables import numbers_table
 
 BANDWIDTH = 4.3e12
 """Bytes per second that an NVIDIA H200 was measured to read or write at best ..."""

@@ -231,19 +231,17 @@ def _check_kept(stored, given):
 
 
 def _check(command):
-    def need(condition, text):
-        if not condition:
-            raise UserError(text)
-
-    if command.resume is None:
+    """Raises UserError for options that don't go with --resume."""
+    resume = command.resume
+    if resume is None:
         return
-    need(
-        command.out is None or command.out.resolve() == command.resume.resolve(),
-        f"--resume {command.resume} writes there; leave --out away",
-    )
-    need(not command.overwrite, "--resume and --overwrite exclude each other")
+    if command.out is not None and command.out.resolve() != resume.resolve():
+        raise UserError(f"--resume {resume} writes there; leave --out away")
+    if command.overwrite:
+        raise UserError("--resume and --overwrite exclude each other")
     for option in ("start_from", "effects", "vehicle", "opponent"):
-        need(getattr(command, option) is None, f"--{option} can't change when a run is resumed")
+        if getattr(command, option) is not None:
+            raise UserError(f"--{option} can't change when a run is resumed")
 
 
 def _devices(text, settings, before):
