@@ -88,6 +88,7 @@ def main() -> None:
     arguments = tyro.cli(Arguments)
     names = [k for k in kinds() if not arguments.only or any(part in k for part in arguments.only)]
     work = [(n, names[n % len(names)]) for n in range(arguments.seed, arguments.seed + arguments.flights)]
+    random.Random(arguments.seed).shuffle(work)  # whenever it stops, kinds were flown without favour
     context = multiprocessing.get_context("spawn")
     queue, done = context.Queue(), context.Queue()
     for item in work:
