@@ -194,12 +194,8 @@ def by_evader(records: list[dict], title: str) -> Table:
 
 def learning_curve(validations: list[dict]) -> Table:
     """Captures and crashes over a training run."""
-    columns = {
-        "M steps": "millions:.0f",
-        "s": "seconds:.0f",
-        "capture": "capture_rate:.3f",
-        "crash": "crash_rate:.3f",
-    }
+    columns = {"M steps": "millions:.0f", "s": "seconds:.0f", "capture": "capture_rate:.3f"}
+    columns |= {"crash": "crash_rate:.3f"}
     title = f"Training of evaders, on validation tasks against field, {', '.join(VALIDATED)}"
     prose = "The checkpoint that scored best on these tasks is the one in the package; s counts compilation."
     return Table(columns, validations, title=title, prose=prose)
@@ -218,11 +214,8 @@ def learned_ones(responses: list[dict]) -> Table:
             ]
             row[kind] = ", ".join(f"{rate:.3f}" for rate in least)
         rows.append(row)
-    columns = {
-        "policy": "policy",
-        "M steps a seed": "millions:.0f",
-        **{name: name for name in [*SCENARIOS, "uniform"]},
-    }
+    columns = {"policy": "policy", "M steps a seed": "millions:.0f"}
+    columns |= {name: name for name in [*SCENARIOS, "uniform"]}
     prose = (
         "Captures of the worst scripted evader, of the best of three learned ones (`openjax exploit`), with the vehicles that "
         "the policy was trained on. A learned evader that is caught more often than a scripted one is no best response."

@@ -42,11 +42,8 @@ class Planar(Empty):
     def reset_to(self, key, task):
         """As `Pursuit.reset_to`, with all starts in the plane."""
         height = self.settings.arena_height / 2
-        starts = {
-            name: getattr(task, name).at[..., 2].set(height)
-            for name in ("pursuer_position", "evader_position")
-        }
-        return super().reset_to(key, task.replace(**starts))
+        pursuers, evader = (x.at[..., 2].set(height) for x in (task.pursuer_position, task.evader_position))
+        return super().reset_to(key, task.replace(pursuer_position=pursuers, evader_position=evader))
 
     def step(self, key, state, action, wish=None):
         """As `Pursuit.step`, with a wish in the plane."""
@@ -74,7 +71,7 @@ def straight(observation):
 def stack_of(craft: Craft):
     """Stack, by a function like `straight`."""
     how = StackParameters(0.05, 100.0)
-    return lambda observation: stack(craft, how, surroundings(craft, observation)) / craft.speed
+    return lambda seen: stack(craft, how, surroundings(craft, seen)) / craft.speed
 
 
 def game(**changes) -> PursuitSettings:
@@ -122,17 +119,16 @@ def exact(settings: PursuitSettings, radii: int, angles: int) -> Callable:
             return jnp.maximum(so_far, jnp.where(caught(moved, closer), 0.0, later)), None
 
         later = jax.lax.scan(best, jnp.zeros(grid.shape[0]), jnp.concatenate([moves, jnp.zeros((1, 2))]))[0]
-        most = settings.episode_length * settings.time_step
         return jnp.where(caught(evader, pursuers), 0.0, jnp.minimum(STEP + later, most)).reshape(shape)
 
-    iterations = round(settings.episode_length * settings.time_step / STEP)
-    value = jax.jit(lambda: jax.lax.fori_loop(0, iterations, improve, jnp.zeros(shape)))()
+    most = settings.episode_length * settings.time_step
+    value = jax.jit(lambda: jax.lax.fori_loop(0, round(most / STEP), improve, jnp.zeros(shape)))()
     return lambda evader, pursuers: map_coordinates(
         value, list(_places(radii, angles, evader / size, pursuers / size)), order=1, mode="nearest"
     )
 
 
-def learn(environment: Pursuit, team: Team, how: BestResponseSettings, starts: int):
+def learn(environment: Pursuit, team: Team, how: BestResponseSettings):
     """Tasks (B, ...), and seconds to the capture and captures (S + 1, B) of the learned evaders and of the greedy one."""
     settings = environment.settings
     layouts = jax.tree.map(lambda leaf: leaf[None], empty_task(settings))
@@ -142,17 +138,14 @@ def learn(environment: Pursuit, team: Team, how: BestResponseSettings, starts: i
     for _ in range(how.total_updates):
         # one at a time: a CPU with dozens of them under way waits for ever
         carry, _ = jax.block_until_ready(step({}, carry))
-    tasks = jax.vmap(lambda key: uniform_task(settings, key))(jax.random.split(jax.random.key(77), starts))
+    keys = jax.random.split(jax.random.key(77), how.num_envs)
+    tasks = jax.vmap(lambda key: uniform_task(settings, key))(keys)
     networks = [jax.tree.map(lambda leaf, i=i: leaf[i], carry.evader.actor) for i in range(how.seeds)]
-    duel, kinds = jax.jit(make_duel(environment, team)), jnp.zeros(starts, jnp.int32)
-
-    def fly(network):
-        return jax.device_get(duel({}, tasks, kinds, jax.random.key(0), {"evader_network": network}))
-
+    duel, kinds = jax.jit(make_duel(environment, team)), jnp.zeros(how.num_envs, jnp.int32)
     # without a network it is the greedy one
-    found = [fly(network) for network in [*networks, None]]
-    seconds = np.stack([s.capture_step for s in found]) * settings.time_step
-    return tasks, seconds, np.stack([s.captured for s in found])
+    found = [duel({}, tasks, kinds, keys[0], {"evader_network": own}) for own in [*networks, None]]
+    seconds = np.stack([np.asarray(s.capture_step) for s in found]) * settings.time_step
+    return tasks, seconds, np.stack([np.asarray(s.captured) for s in found])
 
 
 def study(options) -> dict:
@@ -160,10 +153,10 @@ def study(options) -> dict:
     how = BestResponseSettings(total_steps=options.steps, seeds=3, num_envs=options.worlds, layouts=0.0)
     planar, against_stack = [], []
     for number in options.pursuers:
-        speed, radii = (0.8, options.fine) if number == 1 else (1.1, options.coarse)
+        speed, radii = (0.8, 1.1)[number - 1], options.radii[number - 1]
         settings = game(num_pursuers=number, evader_speed=speed, max_speed=1.0)
         environment = Planar(settings, dynamics=Points(settings.max_speed, settings.time_step))
-        tasks, seconds, _ = learn(environment, Team(straight), how, options.starts)
+        tasks, seconds, _ = learn(environment, Team(straight), how)
         value = exact(settings, radii, 2 * radii + 1)
         best = float(value(tasks.evader_position[:, :2], tasks.pursuer_position[..., :2]).mean())
         *learned, greedy = (float(s.mean()) for s in seconds)
@@ -173,43 +166,36 @@ def study(options) -> dict:
         settings = game(capture_radius=radius)
         environment = Empty(settings, dynamics=Points(settings.max_speed, settings.time_step))
         craft = dataclasses.replace(Craft.of(environment), speed=settings.max_speed, response=0.0)
-        _, seconds, captured = learn(environment, Team(stack_of(craft)), how, options.starts)
+        _, seconds, captured = learn(environment, Team(stack_of(craft)), how)
         *learned, greedy = (float(c.mean()) for c in captured)
         record = {"capture_radius": radius, "bound": stack_bound(settings), "ratio": settings.evader_speed}
         slowest = [float(s.max()) for s in seconds[:-1]]
         against_stack.append(record | {"learned": learned, "greedy": greedy, "slowest": slowest})
-    return {"planar": planar, "stack": against_stack, "steps": options.steps, "starts": options.starts}
+    return {"planar": planar, "stack": against_stack, "steps": options.steps, "starts": options.worlds}
 
 
 def page(results: dict) -> Page:
     """Both tables."""
-
-    def seeds(name, digits):
-        return lambda row: ", ".join(f"{x:.{digits}f}" for x in row[name])
-
     of_planar = {
         "pursuers": "pursuers",
         "evader's speed, m/s": "evader_speed",
         "exact, s": "exact:.3f",
-        "learned, s (three seeds)": seeds("learned", 3),
-        "share of the exact": seeds("share", 3),
+        "learned, s": "learned:.3f",
+        "share of the exact": "share:.3f",
         "greedy, s": "greedy:.3f",
     }
     of_stack = {
         "capture radius, m": "capture_radius",
         "bound of v_e / v_p": "bound:.3f",
         "v_e / v_p": "ratio:.3f",
-        "captured, learned (three seeds)": seeds("learned", 4),
+        "captured, learned": "learned:.4f",
         "captured, greedy": "greedy:.4f",
-        "slowest capture, s": seeds("slowest", 2),
+        "slowest capture, s": "slowest:.2f",
     }
-    tables = [
-        Table(of_planar, results["planar"], title="Planar games"),
-        Table(of_stack, results["stack"], title="Stack"),
-    ]
+    tables = [Table(of_planar, results["planar"], "Planar games"), Table(of_stack, results["stack"], "Stack")]
     prose = (
-        f"Mean time to the capture over {results['starts']:,} uniform starts, at most 8 s; the evaders learned "
-        f"{results['steps'] / 1e6:g} M steps a seed."
+        f"Mean time to the capture over {results['starts']:,} uniform starts, at most 8 s. Of the evaders that learned "
+        f"{results['steps'] / 1e6:g} M steps: mean (standard deviation) of three seeds."
     )
     return Page("The learned evader where the truth is known", prose, tables)
 
@@ -222,9 +208,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument(
         "--pursuers", nargs="+", type=int, choices=(1, 2), default=[1, 2], help="planar games"
     )
-    parser.add_argument("--starts", type=int, default=2048)
-    parser.add_argument("--fine", type=int, default=46, help="radii of the grid of one against one")
-    parser.add_argument("--coarse", type=int, default=19, help="radii of the grid of two against one")
+    parser.add_argument("--radii", nargs=2, type=int, default=[46, 19], help="of the grids, by pursuers")
     publish(parser.parse_args(arguments), study, page)
     return 0
 
