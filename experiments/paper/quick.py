@@ -22,7 +22,7 @@ from experiments.table import Page, Table, page_parser, publish
 from openjax.commands.validation import uniform_tasks
 from openjax.files import read_json
 from openjax.learning.settings import PRESETS
-from openjax.pursuit import Pursuit
+from openjax.pursuit import SCENARIOS, Pursuit
 from openjax.store.policies import LoadedPolicy, load_policy
 
 CORES = 2
@@ -46,7 +46,7 @@ def train(options: argparse.Namespace, seed: int, cores: list[int]) -> dict:
         )
     seconds = round(time.monotonic() - started)
     print(f"seed {seed}: {seconds} s", flush=True)
-    return {"seed": seed, "whole_command": seconds, **record(run)}
+    return {"seed": seed, "jax": jax.__version__, "whole_command": seconds, **record(run)}
 
 
 def record(run: Path) -> dict:
@@ -112,15 +112,13 @@ def page(results: dict) -> Page:
     """A row per seed."""
     columns = {
         "seed": "seed",
+        "JAX": "jax",
         "whole command, s": "whole_command",
         "new tasks": _column("after", "validation"),
-    }
-    columns |= {
         "... every 10 ms": lambda run: _three(run.get("every_physics_step"), 1.0),
         "from far": _column("after", "validation_far"),
-        "`empty`": _column("after", "empty"),
+        **{f"`{name}`": _column("after", name) for name in SCENARIOS},
         "new tasks, `open`": _column("open", "validation"),
-        "`empty`, `open`": _column("open", "empty"),
     }
     return Page(
         "The quick preset: what two CPU cores learn",
