@@ -12,8 +12,8 @@ from pathlib import Path
 from experiments.diagnosis.development import read_lines
 from openjax.files import write_json
 
-KINDS = {"none": ("none", "not_testable"), "named": ("single", "pair")}
-STATISTICS = ("dependence",)
+KINDS = {"none": ("none", "not_testable"), "named": ("single", "pair", "real")}
+STATISTICS = ("growth",)
 
 
 def statistics_of(lines: list[dict]) -> dict[str, dict[str, list[float]]]:
@@ -28,7 +28,7 @@ def statistics_of(lines: list[dict]) -> dict[str, dict[str, list[float]]]:
         kind: [line["residual"] for line in lines if line["category"] in categories and clear(line, kind)]
         for kind, categories in KINDS.items()
     }
-    return {k: {s: sorted(round(r[s], 1) for r in chosen[k]) for s in STATISTICS} for k in KINDS}
+    return {k: {s: sorted(round(r[s], 4) for r in chosen[k]) for s in STATISTICS} for k in KINDS}
 
 
 def main() -> None:
@@ -42,7 +42,7 @@ def main() -> None:
     options = parser.parse_args()
     found = statistics_of(read_lines(options.cases))
     write_json(options.out, {"source": options.source, "statistics": found})
-    print({kind: len(values["dependence"]) for kind, values in found.items()})
+    print({kind: len(values["growth"]) for kind, values in found.items()})
 
 
 if __name__ == "__main__":

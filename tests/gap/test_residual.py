@@ -50,5 +50,5 @@ def test_a_push_that_follows_the_place_is_found_and_where(replay):
 
 @pytest.mark.parametrize("named", [True, False])
 def test_p_values_fall_with_the_statistic(named):
-    values = [conformal_p(v, named) for v in (0.0, 10.0, 100.0, 1e4)]
+    values = [conformal_p(v, named) for v in (0.0, 0.1, 1.0, 100.0)]
     assert values[0] > 0.9 and values == sorted(values, reverse=True) and values[-1] < 0.01

@@ -1,9 +1,9 @@
 """What the chosen effects leave: one omnibus check whether it is noise.
 
-The statistic is the log Bayes factor of a Gaussian process against white noise on the whitened residual of one channel, in
-random Fourier features (Rahimi, Recht 2007) of one group of the state - place, motion, attitude, thrust, battery, vehicles
-near, time - the largest of all. Its p-value is conformal over cases of several worlds in which nothing was named, or something
-(Mondrian conformal prediction, Vovk et al. 2005; `residual.json`)."""
+On the whitened residual of each channel, a Gaussian process in random Fourier features (Rahimi, Recht 2007) of one group of the
+state - place, motion, attitude, thrust, battery, vehicles near, time - is weighed against white noise. The statistic is what the
+processes with very strong evidence make the gap grow by. Its p-value is conformal over cases of several worlds in which nothing
+was named, or something (Mondrian conformal prediction, Vovk et al. 2005; `residual.json`)."""
 
 from __future__ import annotations
 
@@ -25,14 +25,15 @@ FEATURES = 40  # of each group
 LENGTHS = (0.5, 1.0, 2.0)  # of the features, in standard deviations of what they are functions of
 STATE_FILTER = 0.1  # s over which the state is smoothed: sensors' noise isn't what anything depends on
 VARIANCES = 10.0 ** np.arange(-4.0, 4.5, 1.0)  # of the process, in units of the channel's noise
+VERY_STRONG = 5.0  # nats of a Bayes factor (Kass, Raftery 1995)
 WAKE = "the vehicle near"
 CALIBRATION = Path(__file__).with_name("residual.json")
 
 
 @dataclass(frozen=True)
 class Check:
-    """`dependence`, the statistic, `where` it stands out, its `p_value`, `growth` of the gap, in floors, by what was found;
-    `predicted` (6,): share of each motion channel's squared error that it is, where the check rejects."""
+    """`dependence`, the largest log Bayes factor, and `where` it is; `growth` of the gap, in floors, by what was found, and its
+    `p_value`; `predicted` (6,): share of each motion channel's squared error that it is, where the check rejects."""
 
     dependence: float
     where: str
@@ -62,13 +63,13 @@ class Check:
 def check_residual(replay: Replay, fit: SetFit, named: bool) -> Check:
     """Whether the residual of a fit is noise, as cases go in which effects are `named` or nothing is."""
     found = dependence(replay, residuals_of(replay, fit))
-    value, where, *_ = max(found)
     predicted = np.zeros(6)
-    for each, _, axis, share in found:
-        if each == value or conformal_p(each, named) <= DECISION.unknown:
+    for gain, _, axis, share in found:
+        if gain > VERY_STRONG:
             predicted[axis] = max(predicted[axis], share)
-    growth = np.sqrt((1.0 / (1.0 - predicted[replay.heard > 0])).mean()) - 1.0
-    check = Check(value, where, conformal_p(value, named), float(growth), predicted)
+    growth = float(np.sqrt((1.0 / (1.0 - predicted[replay.heard > 0])).mean()) - 1.0)
+    value, where, *_ = max(found)
+    check = Check(value, where, conformal_p(growth, named), growth, predicted)
     return check if check.rejects else replace(check, predicted=np.zeros(6))
 
 
@@ -91,7 +92,7 @@ def disturbances(track: Track, residual: np.ndarray) -> np.ndarray:
 def conformal_p(value: float, named: bool) -> float:
     """Share of the calibration's cases of the same kind, this one among them, whose statistic is as large. Beyond the largest
     the tail is exponential, as long as that of the upper quarter (Pickands 1975)."""
-    known = np.array(_calibration()["named" if named else "none"]["dependence"])
+    known = np.array(_calibration()["named" if named else "none"]["growth"])
     share = float((1 + (known >= value).sum()) / (1 + len(known)))
     start, largest = np.quantile(known, 0.75), known.max()
     scale = max(float((known[known >= start] - start).mean()), 1e-9)

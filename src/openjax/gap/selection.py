@@ -133,7 +133,7 @@ class Search:
         key = frozenset(fit.effects)
         if key not in self.visited:
             table = build(self.evidence.replay, fit, None)
-            odds = sum(CARDS[e].log_odds for e in fit.effects if e not in self.evidence.confounded)
+            odds = sum(CARDS[e].log_odds for e in key - self.evidence.confounded)
             self.visited[key] = Hypothesis(fit, judge(table, with_effects(table)), odds)
         return self.visited[key]
 
@@ -146,6 +146,10 @@ class Search:
             return self.of_fit(self.singles[next(iter(key))])
         ordered = [e for e in CARDS if e in key]
         return self.of_fit(fit_set(self.evidence.replay, ordered, self._start(near, ordered)))
+
+    def named(self, h: Hypothesis) -> frozenset:
+        """The effects of a hypothesis that it would name: not those that are confounded."""
+        return frozenset(h.effects) - self.evidence.confounded
 
     def without(self, here: Hypothesis, effect: str) -> Hypothesis:
         """The hypothesis without one of its effects."""
@@ -184,10 +188,10 @@ class Search:
         return max(ends, key=lambda h: h.score)
 
     def climb(self, here: Hypothesis) -> Hypothesis:
-        """Move to the best neighbour while the score rises and flights tell the two apart."""
+        """Move to the best neighbour while the score rises and, where it names anything else, flights tell the two apart."""
         while True:
             better = [h for h in self.neighbours(here) if h.score > here.score and possible(h.fit)]
-            better = [h for h in better if self.clearly_worse(here, h)]
+            better = [h for h in better if self.named(h) == self.named(here) or self.clearly_worse(here, h)]
             if not better:
                 return here
             here = max(better, key=lambda h: h.score)
@@ -277,7 +281,6 @@ class Search:
             count[int(np.argmax(np.where(worse, -np.inf, odds + 1e-6 * (nats - nats[best]))))] += 1
         out: dict[frozenset, float] = {}
         for h, share in zip(sets, count / DRAWS, strict=True):
-            named = frozenset(h.effects) - self.evidence.confounded
             if share:
-                out[named] = out.get(named, 0.0) + float(share)
+                out[self.named(h)] = out.get(self.named(h), 0.0) + float(share)
         return out

@@ -18,7 +18,7 @@ from openjax.gap.evidence import Evidence
 from openjax.gap.model.cross_validation import Ablation
 from openjax.gap.model.replay import SKIP
 from openjax.gap.model.table import ERRORS
-from openjax.gap.selection import Selection
+from openjax.gap.selection import DRAWS, Selection
 
 METRIC = (
     "rms over channels of prediction error / noise floor on stretches left out (velocity over 0.25 s, body rates over "
@@ -33,7 +33,6 @@ SENSORS = (
     "gyroscope's low-pass",
     "clock of",
 )
-DRAWS = 400  # of the Bayesian bootstrap over seconds of flight
 
 
 @dataclass(frozen=True)

@@ -14,17 +14,7 @@ from openjax.gap.model.replay import SKIP
 from openjax.gap.residual import disturbances, residuals_of
 
 CHANNELS = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z", "estimator", "firmware")
-REGIMES = (
-    "hover",
-    "fast",
-    "climb",
-    "low",
-    "high",
-    "under_neighbour",
-    "low_battery",
-    "high_thrust",
-    "transient",
-)
+REGIMES = tuple("hover fast climb low high under_neighbour low_battery high_thrust transient".split())
 LEAST_TIME = 0.5  # s in a regime, or it isn't judged
 CALM = 0.12  # s over which the rest is smoothed: sensor noise out, causes in
 
