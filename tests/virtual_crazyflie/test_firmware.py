@@ -40,6 +40,7 @@ def test_quaternions_come_out_of_32_bits_as_the_same_attitude(wxyz):
 def test_integers_are_cut_to_what_they_hold():
     assert pack_number("h", 1e9) == struct.pack("<h", 32767)
     assert pack_number("H", -5) == b"\0\0"
+    assert pack_number("e", -1e300) == struct.pack("<e", -np.inf)
 
 
 def test_a_log_block_holds_what_was_asked_for_in_its_units_and_order():

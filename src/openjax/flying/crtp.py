@@ -96,7 +96,10 @@ def pack_number(fmt: str, value: float) -> bytes:
         span = 1 << 8 * struct.calcsize(fmt)
         low = -span // 2 if fmt.islower() else 0
         value = min(max(round(value), low), low + span - 1)
-    return struct.pack("<" + fmt, value)
+    try:
+        return struct.pack("<" + fmt, value)
+    except OverflowError:  # more than half or single precision holds
+        return struct.pack("<" + fmt, math.copysign(math.inf, value))
 
 
 def compress_quaternion(wxyz) -> int:
