@@ -22,7 +22,6 @@ FULL_SCALE = 65535
 class Port(IntEnum):
     """Ports of packets."""
 
-    CONSOLE = 0x0
     PARAMETERS = 0x2
     COMMANDER = 0x3
     MEMORY = 0x4
