@@ -21,6 +21,7 @@ from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import FIELDS
 from openjax.learning import training_step
 from openjax.learning.training_step import Flown, Phases, make_phases
+from openjax.pursuit import SCENARIOS
 from openjax.show.metrics import read_metrics
 from openjax.store.checkpoint_files import is_checkpoint, load_arrays
 from openjax.store.checkpoints import Checkpoints
@@ -111,7 +112,7 @@ def test_train_shows_progress_and_leaves_what_the_readme_says(whole_run):
     assert [r["update"] for r in read_metrics(out / "metrics.jsonl", "train")] == list(range(1, UPDATES + 1))
     layouts = json.loads((out / "layouts.json").read_text())
     scenarios = [row["scenario"] for row in layouts["after"]]
-    assert scenarios[:3] == ["validation", "validation_far", "empty"]
+    assert scenarios == ["validation", "validation_far", *SCENARIOS]
     assert [row["scenario"] for row in layouts["angelani"]] == [scenarios[0], *scenarios[2:]]
     assert layouts["machine"]["versions"]["jax"] == jax.__version__
 
