@@ -17,7 +17,7 @@ from openjax.flying.limits import (
     stopping_point,
 )
 from openjax.flying.safety import Drone, Event, Mode, PoseSample, Request, initial_state, step
-from openjax.flying.set_point import OFF, RATES, SetPoint
+from openjax.flying.set_point import OFF, RATES, SetPoint, from_action
 
 LIMITS = SafetySettings()
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -135,7 +135,7 @@ def test_upside_down_for_long_its_motors_are_off_and_the_others_land():
 def test_an_action_that_is_no_number_is_none(bad):
     state = pursuing()
     for k in range(1, 8):
-        actions = (POLICY, replace(POLICY, roll=bad), POLICY)
+        actions = (POLICY, from_action([0.0, bad, 0.0, 0.0], 1.0), POLICY)
         state, out = step(LIMITS, state, event(0.01 * k, actions=actions))
         assert all(math.isfinite(x) for o in out for x in o.numbers())
     assert state.all_in(Mode.HOLD) and state.drones[0].reason == "action not finite"
