@@ -313,7 +313,7 @@ class Flown:
             return play
         if kind == "policy fails":
             raise ValueError("the policy failed")
-        action = np.array(play.action)
+        action = np.array(play.action, np.float32)  # as networks answer: larger numbers are infinite
         if kind in WILD:
             action = WILD[kind](round(100 * now), self._number, action.shape)
         else:
