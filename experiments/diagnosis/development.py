@@ -59,7 +59,7 @@ def diagnose(job: tuple) -> dict:
         try:
             report = diagnose_case(load_case(folder), **options).to_dict()
         except UserError as refusal:
-            error = str(refusal)[:500]
+            error = str(refusal).replace(f"{folder.parent}/", "")[:500]  # a case, not a place of this machine
     except Exception:  # a traceback is a finding, not the end
         trace = traceback.format_exc()[-2000:]
     seconds, _done = round(time.perf_counter() - start, 2), _done + 1
