@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from experiments.table import Page, Table, page_parser, publish
 from openjax.commands.validation import uniform_tasks
 from openjax.files import read_json
-from openjax.learning.settings import PRESETS
+from openjax.learning.presets import PRESETS
 from openjax.pursuit import SCENARIOS, Pursuit
 from openjax.store.policies import LoadedPolicy, load_policy
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:  # so that editors complete and check what is loaded on first use only
     from openjax.commands.calls import evaluate, train
     from openjax.errors import UserError
-    from openjax.learning.settings import preset
+    from openjax.learning.presets import preset
     from openjax.pursuit.environment import Pursuit, make
     from openjax.pursuit.scenarios import SCENARIOS
     from openjax.pursuit.settings import PursuitSettings

@@ -10,8 +10,9 @@ import pytest
 
 from openjax.errors import UserError
 from openjax.learning.mappo import every_nth, follow_kl, initial_value_scale, make_optimiser, update_policy
+from openjax.learning.presets import preset
 from openjax.learning.rollout import Rollout
-from openjax.learning.settings import MappoSettings, preset
+from openjax.learning.settings import MappoSettings
 from openjax.learning.train_state import Optimisers
 from openjax.policy import NetworkSettings, Policy, PredictorSettings, gaussian_log_prob
 from openjax.pursuit import Observation

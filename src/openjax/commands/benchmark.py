@@ -16,7 +16,8 @@ from rich.table import Table
 
 from openjax.commands.command_line import output_console, parse, peek
 from openjax.files import check_output
-from openjax.learning.settings import TrainSettings, preset
+from openjax.learning.presets import preset
+from openjax.learning.settings import TrainSettings
 from openjax.ranges import Interval
 from openjax.show.number_tables import numbers_table
 

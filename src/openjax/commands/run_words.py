@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from openjax.learning import TrainSettings
-from openjax.learning.settings import PRESETS
+from openjax.learning.presets import PRESETS
 from openjax.pursuit import SCENARIOS, PursuitSettings, Scenario
 from openjax.store.settings_files import to_plain
 

@@ -36,7 +36,7 @@ def main(arguments: Sequence[str], *, keep_traced: bool = False) -> int:
 def _help(arguments):
     """The options and a preset's defaults, without waiting for JAX to find its devices."""
     from openjax.commands.training_options import PROGRAM, TrainCommand
-    from openjax.learning.settings import preset
+    from openjax.learning.presets import preset
 
     default = TrainCommand(settings=preset(peek(arguments, "preset") or "quick"))
     parse(TrainCommand, default, ["--help"], PROGRAM)  # prints and exits

@@ -7,17 +7,9 @@ __getattr__, __dir__, __all__ = lazy_names(
     {
         **dict.fromkeys(("EpisodeRecord", "Evaluation", "make_evaluate", "summarise"), "evaluation"),
         **dict.fromkeys(
-            (
-                "PRESETS",
-                "AnalyticSettings",
-                "GeneratorSettings",
-                "MappoSettings",
-                "TrainSettings",
-                "changed",
-                "preset",
-            ),
-            "settings",
+            ("AnalyticSettings", "GeneratorSettings", "MappoSettings", "TrainSettings"), "settings"
         ),
+        **dict.fromkeys(("PRESETS", "changed", "preset"), "presets"),
         **dict.fromkeys(
             ("TrainCarry", "abstract_carry", "build", "init_carry", "make_start", "make_training_step"),
             "training_step",

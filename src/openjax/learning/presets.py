@@ -1,0 +1,184 @@
+"""The presets: settings of whole training runs by name."""
+
+from openjax.errors import UserError, suggestion
+from openjax.learning.settings import (
+    FirstFlightsSettings,
+    GeneratorSettings,
+    MappoSettings,
+    TrainSettings,
+)
+from openjax.policy import NetworkSettings, PredictorSettings
+from openjax.pursuit import PursuitSettings, RewardSettings
+from openjax.ranges import changed
+
+
+def quick() -> TrainSettings:
+    """Six minutes on two CPU cores: the paper's evader and starts, any number of pillars up to five, and 25 commands a second
+    instead of 100. The gradient through the simulation teaches to fly and to chase, then MAPPO goes on."""
+    return TrainSettings(
+        environment=PursuitSettings(
+            physics="rigid",
+            observe_position=True,
+            min_pillars=0,
+            # fewer, longer steps: the same noise tries more, and there is less to learn from a second
+            time_step=0.04,
+            substeps=4,
+            episode_length=200,
+            history_length=5,
+            reward=RewardSettings(crash=10.0, first_crash=300.0, margin=0.03, lookahead=0.15),
+        ),
+        # in so short a run the mean policy learns faster this way; over longer ones the other is better
+        network=NetworkSettings(
+            features=32,
+            heads=2,
+            squash="sample",
+            initial_log_std=-3.0,
+            critic_encoder="layers",
+        ),
+        predictor=PredictorSettings(units=16, horizons=(1, 2, 3, 5, 10)),
+        # its critic knows nothing when it begins, and its actor is good already
+        mappo=MappoSettings(
+            learning_rate=3e-4,
+            actor_start=0.2,
+            target_kl=0.01,
+            epochs=4,
+            minibatches=8,
+            step_subsampling=2,
+            clip_epsilon=0.2,
+            clip_epsilon_end=0.2,
+            discount=0.99,
+        ),
+        first_flights=FirstFlightsSettings(updates=1000),
+        # few tasks reach the archive in so short a run; drawn from too often, they'd be all that is learnt
+        generator=GeneratorSettings(capacity=500, expansion=0.3),
+        num_envs=640,
+        rollout_length=20,
+        total_steps=640_000,
+        validation_interval=10,
+        validation_episodes=64,
+    )
+
+
+def paper() -> TrainSettings:
+    """The paper's task on one large accelerator, in five minutes."""
+    return TrainSettings(
+        environment=PursuitSettings(
+            physics="rigid",
+            observe_position=True,
+            reward=RewardSettings(
+                collision=40.0, crash=20.0, first_crash=5000.0, margin=0.03, lookahead=0.15
+            ),
+        ),
+        network=NetworkSettings(heads=2, compute_type="bfloat16"),
+        mappo=MappoSettings(
+            learning_rate=1e-3, clip_epsilon=0.2, clip_epsilon_end=0.05, penalty_start=0.03, penalty_ramp=0.7
+        ),
+        generator=GeneratorSettings(
+            wall_distance=0.05, pillar_shift=0.1, row_share=0.25, collision_tolerance=0.002
+        ),
+        num_envs=5120,
+        total_steps=350_000_000,
+        restart_every=4,
+        restart_steps=80,
+        restart_close=0.5,
+        validation_interval=40,
+        validation_episodes=512,
+    )
+
+
+def flight() -> TrainSettings:
+    """Policies to be flown: no clamp on the speed, the rate loop at 500 Hz, every pursuer its own vehicle; at last half seconds
+    by the gradient through the simulation. Five minutes on one large accelerator."""
+    from openjax.vehicle.family import vehicle_family
+
+    return changed(
+        paper(),
+        environment=dict(
+            speed_limit="none",
+            substeps=5,
+            physics="stops",
+            vehicles=vehicle_family(),
+            rare_vehicles=0.5,
+            observe_history=12,
+            # Without the clamp, a first crash at 5,000 teaches to stay away from rows of pillars, and so does all that is dear
+            # near a pillar. The last stage sees to crashes, breaches and speeds over the limit
+            reward=dict(collision=15.0, margin=0.02, crash=40.0, first_crash=1000.0),
+        ),
+        network=dict(shared_encoder=True),
+        mappo=dict(penalty_ramp=0.75),
+        # Starts force collisions. If they counted against success, the archive would hold such starts instead of the
+        # tasks whose evader nobody reaches
+        generator=dict(row_share=0.6, success_low=0.25, collision_tolerance=1.0),
+        analytic=dict(updates=200),
+        # flown from the start, the whole family teaches to hover out of harm's way and nothing else
+        vehicles_start=0.18,
+        vehicles_ramp=0.14,
+        total_steps=400_000_000,
+        validation_interval=80,
+    )
+
+
+def evaders() -> TrainSettings:
+    """Policies to be flown after evaders that fight back, from `--start_from flight`: two thirds of the evaders are greedy or
+    run along the wall, slow ones first. Five minutes on one large accelerator."""
+    return changed(
+        flight(),
+        # who knows the whole penalties before clever evaders hovers far from these: cheaper ones lead past pillars once more,
+        # and the distance pays for going there
+        environment=dict(
+            evaders=("field", "field", "greedy", "greedy", "greedy", "wall_runner"),
+            min_pillars=0,
+            reward=dict(distance=0.5),
+        ),
+        mappo=dict(
+            actor_start=0.015,
+            target_kl=0.01,
+            penalty_start=0.15,
+            penalty_ramp=0.6,
+            entropy_coefficient=2e-3,
+        ),
+        analytic=dict(updates=0),
+        vehicles_start=0.0,
+        vehicles_ramp=0.0,
+        evaders_ramp=0.1,
+        evaders_validation=("field", "heavy", "pillar_hugger"),
+        total_steps=620_000_000,
+    )
+
+
+def mappo() -> TrainSettings:
+    """The paper's plain MAPPO, without predictor and generator, with penalties under which it learns to catch: where a
+    first crash costs 5,000, only the generator's tasks lead past hovering."""
+    return changed(
+        paper(),
+        environment=dict(reward=dict(first_crash=0.0)),
+        predictor=dict(enabled=False),
+        generator=dict(enabled=False),
+        restart_close=0.0,
+    )
+
+
+def dacoop() -> TrainSettings:
+    """DACOOP: plain MAPPO puts out the parameters of a potential field (`openjax.baselines.dacoop`)."""
+    return changed(mappo(), network=dict(output="field"), total_steps=100_000_000)
+
+
+PRESETS = {
+    "quick": quick,
+    "paper": paper,
+    "flight": flight,
+    "evaders": evaders,
+    "mappo": mappo,
+    "dacoop": dacoop,
+}
+
+
+def preset(name: str, **changes) -> TrainSettings:
+    """A preset's settings, with fields changed; those of settings within them by a dict, as in `changed`.
+
+    Raises:
+      UserError: no such preset.
+    """
+    if name not in PRESETS:
+        raise UserError(f"preset {name}: no such preset; {suggestion(name, PRESETS)}")
+    return changed(PRESETS[name](), **changes)
