@@ -29,7 +29,7 @@ import numpy as np
 import tyro
 
 from experiments.flying.faults import CAMERA, FOLLOWED, WILD, Fault, PoseDamage, draw_fault
-from experiments.table import RESULTS, Page, Table, facts, write_page
+from experiments.table import RESULTS, Page, Table, facts, made, write_page
 from openjax.files import read_json
 
 ROLES = ("loop", "links", "guard")
@@ -73,6 +73,8 @@ class Arguments:
     """Kinds that contain one of these."""
     seconds_left: float = 1e9
     """Begin no flight after this time (s)."""
+    go_on: bool = False
+    """Fly what an earlier run, whose result is in `out`, hasn't flown."""
     out: Path = RESULTS / "flying_real_time.json"
 
 
@@ -87,7 +89,10 @@ def main() -> None:
     """Share the flights out to workers, each with vehicles of its own."""
     arguments = tyro.cli(Arguments)
     names = [k for k in kinds() if not arguments.only or any(part in k for part in arguments.only)]
-    work = [(n, names[n % len(names)]) for n in range(arguments.seed, arguments.seed + arguments.flights)]
+    kept = read_json(arguments.out) if arguments.go_on else {"records": []}
+    flown = {row["number"] for row in kept["records"]}
+    numbers = [n for n in range(arguments.seed, arguments.seed + arguments.flights) if n not in flown]
+    work = [(n, names[n % len(names)]) for n in numbers]
     random.Random(arguments.seed).shuffle(work)  # whenever it stops, kinds were flown without favour
     context = multiprocessing.get_context("spawn")
     queue, done = context.Queue(), context.Queue()
@@ -97,7 +102,8 @@ def main() -> None:
     workers = [context.Process(target=worker, args=given) for _ in range(arguments.processes)]
     for process in workers:
         process.start()
-    records, begin, stands = [], time.time(), facts()
+    stands = {**facts(), "earlier": {k: kept[k] for k in ("command", "machine")}} if flown else facts()
+    records, begin = kept["records"], time.time()
     while any(w.is_alive() for w in workers) or not done.empty():
         with contextlib.suppress(Exception):
             records.append(done.get(timeout=1.0))
@@ -150,8 +156,9 @@ def page(results) -> Page:
         f"were. As they must: nobody more than {MARGIN:g} m out of the arena (.9 m), nobody armed at the end, no fall that "
         f"nobody asked for, no process left, down {ENDING:g} s after what ends the flight."
     )
+    earlier = [f"{made(results['earlier'])} Then:"] if "earlier" in results else []
     ill = [f"Not well: {r['kind']} (flight {r['number']}): {r['said']}" for r in records if not r["well"]]
-    return Page("Faults where they happen, in real time", prose, [Table(columns, rows), *ill])
+    return Page("Faults where they happen, in real time", prose, [Table(columns, rows), *ill, *earlier])
 
 
 def worker(arguments, queue, done, ends) -> None:
