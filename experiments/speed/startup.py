@@ -1,7 +1,7 @@
 """Seconds to a training run's first update: `python -m experiments.speed.startup [--preset paper] [--repeats 2]`.
 
-Once with an empty and some times with a filled cache of compiled programs; then how long the compiler takes for each program
-of the training step alone, for all of them side by side, and for the step as one. Writes experiments/results/startup.json, .md.
+Once with an empty and some times with a filled cache of compiled programs; then how long the compiler takes for all programs
+of the training step side by side, for the step as one, and for each program alone. Writes experiments/results/startup.json, .md.
 """
 
 import argparse
@@ -60,32 +60,41 @@ def start_once(options: argparse.Namespace, scratch: Path, name: str) -> dict:
     }
 
 
-def compile_programs(name: str) -> list[dict]:
-    """What the programs of a preset's training step cost until they're compiled, with nothing kept: a record for each."""
+def compile_programs(name: str, latest: float) -> list[dict]:
+    """What the programs of a preset's training step cost until they're compiled, with nothing kept: a record for each.
+
+    None is begun after `latest` (s, `time.monotonic`).
+    """
     jax.config.update("jax_threefry_gpu_kernel_lowering", True)  # as the command has it
     settings = preset(name)
     phases, carry = make_phases(settings), abstract_carry(settings)
     flown = jax.eval_shape(phases.fly, carry)[1]
     parts = [(phases.fly, carry), *((learn, carry, flown) for learn in phases.learn), (phases.renew, carry)]
-    cases = {part[0].__name__: [part] for part in parts}
-    cases |= {"these side by side": parts, "the step as one": [(make_training_step(settings), carry)]}
+    cases = {"all side by side": parts, "the step as one": [(make_training_step(settings), carry)]}
+    cases |= {part[0].__name__: [part] for part in parts}
     records = []
     for case, programs in cases.items():
+        if time.monotonic() > latest:
+            break
         jax.clear_caches()  # of what other cases traced
         started, processor = time.monotonic(), time.process_time()
         for wait in [compile_ahead(jax.jit(function), *arguments) for function, *arguments in programs]:
             wait()
         spent = {"seconds": time.monotonic() - started, "processor": time.process_time() - processor}
         records.append({"program": case, **spent})
+        print(records[-1], flush=True)
     return records
 
 
 def study(options: argparse.Namespace) -> dict:
     """All starts, and the programs."""
+    began = time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         names = ["cold", *(f"warm_{i + 1}" for i in range(options.repeats))]
         starts = [start_once(options, Path(folder), name) for name in names]
-    return {"preset": options.preset, "starts": starts, "programs": compile_programs(options.preset)}
+    print(starts, flush=True)
+    programs = compile_programs(options.preset, began + options.seconds)
+    return {"preset": options.preset, "starts": starts, "programs": programs}
 
 
 def page(results: dict) -> Page:
@@ -112,6 +121,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument(
         "--limit", type=float, default=300.0, help="longest time to wait for a first update, s"
     )
+    parser.add_argument("--seconds", type=float, default=600.0, help="no program is begun after")
     publish(parser.parse_args(arguments), study, page)
     return 0
 
