@@ -1,6 +1,5 @@
 """Every command of the package: `openjax NAME ...`, or `python -m openjax NAME ...`."""
 
-import functools
 import importlib
 import sys
 from collections.abc import Sequence
@@ -50,10 +49,7 @@ def main(arguments: Sequence[str]) -> int | None:
     command = name.replace("-", "_")
     if command not in COMMANDS:
         raise UserError(f"{name}: no such command; {suggestion(command, COMMANDS)}")
-    run = importlib.import_module(f"openjax.commands.{command}").main
-    if command == "train":  # a process of its own: nobody can have changed a function of the package
-        run = functools.partial(run, keep_traced=True)
-    return run(arguments[1:])
+    return importlib.import_module(f"openjax.commands.{command}").main(arguments[1:])
 
 
 def entry() -> None:

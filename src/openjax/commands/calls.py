@@ -59,6 +59,7 @@ def train(
         vehicle=None if vehicle is None else Path(vehicle),
         effects=None if effects is None else Path(effects),
         overwrite=overwrite,
+        traced_programs=False,  # a caller may have changed functions since they were loaded
         settings=settings,
     )
     with quiet_compiler():

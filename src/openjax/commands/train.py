@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from openjax.commands.command_line import parse, peek
 
 
-def main(arguments: Sequence[str], *, keep_traced: bool = False) -> int:
-    """The command; returns its exit status. `keep_traced`: keep traced programs, too, in a process of their own."""
+def main(arguments: Sequence[str]) -> int:
+    """The command; returns its exit status."""
     started = time.monotonic()
     if {"-h", "--help"} & set(arguments):
         return _help(arguments)
@@ -30,7 +30,7 @@ def main(arguments: Sequence[str], *, keep_traced: bool = False) -> int:
     if place is None and peek(arguments, "devices") != "all":
         make_cores_devices()
     with joined(place) as processes:
-        return start(read_command(arguments), arguments, started, processes, keep_traced=keep_traced)
+        return start(read_command(arguments), arguments, started, processes)
 
 
 def _help(arguments):

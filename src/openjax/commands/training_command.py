@@ -92,22 +92,12 @@ def default_preset() -> str:
     return "quick" if jax.default_backend() == "cpu" else "paper"
 
 
-def start(
-    command: TrainCommand,
-    arguments: Sequence[str],
-    started: float,
-    processes: Processes,
-    keep_traced: bool = False,
-) -> int:
-    """Make the run's directory, or open it, and train. Returns the exit status.
-
-    With `keep_traced` the cache may hold traced programs, too: only where nobody can have changed a function of the package
-    since it was loaded.
-    """
+def start(command: TrainCommand, arguments: Sequence[str], started: float, processes: Processes) -> int:
+    """Make the run's directory, or open it, and train. Returns the exit status."""
     _check_same(command, processes)
     cache = cache_programs() if command.compilation_cache else None
     job, directory, files = prepare(command, arguments, started, processes)
-    if keep_traced and command.traced_programs and cache is not None:
+    if command.traced_programs and cache is not None:
         job = dataclasses.replace(job, traced=cache / "traced")
     processes.everyone()  # a mistake shows before any process changes a file
     with locked(directory.path) if processes.is_first else contextlib.nullcontext():
