@@ -231,3 +231,16 @@ def test_a_case_that_cannot_be_used_is_one_line(case_folder, prepare, reason):
     with pytest.raises(UserError, match=reason) as caught:
         load_case(case_folder)
     assert "\n" not in str(caught.value)
+
+
+def test_held_poses_of_a_slower_camera_are_moved_to_their_rows(sample_columns):
+    columns = sample_columns["flight_a"]
+    time = columns["t"] - columns["t"][0]
+    taken = np.floor(time * 55.0 + 1e-9) / 55.0  # when the pose was taken that a row holds
+    pose, kept = "x y z qw qx qy qz".split(), np.random.default_rng(0).random(len(time)) > 0.04
+    held = {n: np.interp(taken, time, v) if n in pose else v for n, v in columns.items()}
+    flight, _ = check({n: v[kept] for n, v in without("vx", "vy", "vz")(held).items()})
+    truth, _ = check(columns)
+    expected = truth.interpolated("velocity", flight.time)
+    off = flight.interpolated("velocity") - expected
+    assert off.std() < 0.05 * expected.std() and flight.pose_age == 0.0

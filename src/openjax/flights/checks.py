@@ -16,6 +16,11 @@ SHORTEST = 2.0  # s airborne: windows of 0.5 s, and a few of them
 SLOWEST = 0.05  # s between rows
 FROZEN = 0.5  # s without a change of a sensor that has noise
 HELD = 0.1  # share of rows that repeat the one before, from which a sensor is slower than the rows
+IN_STEP, IN_PHASE = (
+    50,
+    0.25,
+)  # poses, and concentration of their phases (0 to 1), from which they have a clock of their own
+EDGE = 0.03  # cycles of that clock by which its phase may be wrong
 RATE_NOISE = 0.04  # rad/s of body rates that are derived: what gyroscopes of such vehicles have at most
 BESIDE_GAP, GAP, OUTSIDE = 4, 1.5, 6.0  # rows, usual steps, deviations: of a velocity that a gap has spoilt
 GROUND_CLEARANCE = 0.02  # m above the floor
@@ -43,7 +48,7 @@ def check_flight(
     try:
         _has_what_is_needed(flight, comparison)
         checked = _in_time(flight, note)
-        checked = _without_repeats(_clean(checked, note), note)
+        checked = _in_step(_without_repeats(_clean(checked, note), note), note)
         checked = _in_range(checked, note)
         checked = _derive_velocity(_velocity_at_gaps(checked, note), note)
         checked = _derive_rates(checked, note)
@@ -187,6 +192,52 @@ def _without_repeats(flight: Flight, note) -> Flight:
         if group[0] == "position":
             changes["pose_age"] = flight.row_period
     return dataclasses.replace(flight, **changes) if changes else flight
+
+
+def _in_step(flight: Flight, note) -> Flight:
+    """Poses at the times of their rows, where the camera is slower than the log: a row says only that a new pose came since the
+    last one, and the camera's own clock is regular. Poses are on a line through their rows; a held one is half a row late on
+    the mean."""
+    logged = [c for c in ("position", "quaternion", "velocity") if getattr(flight, c) is not None]
+    if not logged:
+        return flight
+    rows = np.flatnonzero(
+        np.all([np.isfinite(getattr(flight, c).reshape(len(flight), -1)).all(1) for c in logged], 0)
+    )
+    if len(rows) < IN_STEP or len(rows) > (1.0 - HELD) * len(flight):
+        return flight
+    seen = flight.time[rows]
+    own = _regular_clock(seen, flight.row_period)
+    if own is None:
+        return flight
+    own = own - 0.5 * flight.pose_age
+    changes = {"pose_age": 0.0}
+    for channel in logged:
+        values = getattr(flight, channel)
+        moved = np.full_like(values, np.nan)
+        moved[rows] = np.stack([np.interp(seen, own, column) for column in values[rows].T], 1)
+        changes[channel] = moved
+    rate = (len(own) - 1) / (own[-1] - own[0])
+    note("held", f"poses come at {rate:.0f} Hz of a clock of their own: moved from it to the rows' times")
+    return dataclasses.replace(flight, **changes)
+
+
+def _regular_clock(seen: np.ndarray, row: float) -> np.ndarray | None:
+    """Times (S,) of a regular clock whose ticks were seen at times (S,) up to a `row` s apart from it, later where rows are
+    missing; None where they have none. Its rate is where the phases of what was seen agree most (Rayleigh's periodogram)."""
+    since = seen - seen[0]
+    usual = (len(seen) - 1) / since[-1]
+    rates = np.arange(0.9 * usual, 1.15 * usual, 0.2 / since[-1])
+    turned = np.exp(2j * np.pi * rates[:, None] * since).mean(1)
+    best = int(np.argmax(np.abs(turned)))
+    if np.abs(turned[best]) < IN_PHASE:
+        return None
+    middle = np.angle(turned[best]) / (2.0 * np.pi)
+    late = rates[best] * since - middle + 0.5 * row * rates[best]  # cycles since a tick could first be seen
+    ticks = np.floor(late + EDGE)
+    usual = late - ticks < row * rates[best] + EDGE
+    slope, start = np.polyfit(ticks[usual], seen[usual], 1)
+    return start + slope * ticks
 
 
 def _frozen(table: np.ndarray, rows: np.ndarray, time: np.ndarray, together: bool) -> np.ndarray:
