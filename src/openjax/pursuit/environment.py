@@ -8,6 +8,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
+from openjax.errors import UserError
 from openjax.pursuit.collisions import breaches, crashed
 from openjax.pursuit.evaders import Around, draw_evader, evader_velocity
 from openjax.pursuit.info import StepInfo
@@ -311,8 +312,14 @@ def make(settings: PursuitSettings | None = None, evader: str | None = None, **c
       changes: fields of `PursuitSettings`: `make(num_pursuers=4, reward=dict(crash=20.0))`.
 
     Raises:
-      UserError: no such setting, a value that it can't have, or an evader that nobody knows.
+      UserError: no such setting, a value that it can't have, an evader that nobody knows, or the learned one, which is more
+        than a name.
     """
+    if evader == "learned":
+        raise UserError(
+            "evader learned: a name isn't enough; a file of openjax exploit is the opponent= of openjax.evaluate, "
+            "the --opponent of commands"
+        )
     if evader is not None:
         changes["evaders"] = (evader,)
     return Pursuit(changed(settings or PursuitSettings(), **changes))

@@ -49,7 +49,7 @@ def find_opponent(name_or_path: str | Path, game: PursuitSettings) -> tuple[Purs
             f"--opponent {str(name_or_path)[:60]}: no such evader or file; possible are {', '.join(SCRIPTED)} or a file "
             "written by openjax exploit"
         )
-    leaves, settings, _ = load_policy_file(path)
+    leaves, settings, _ = load_policy_file(path, "evader's file", "openjax exploit")
     if not any(name.startswith("evader/") for name in leaves):
         raise UserError(
             f"--opponent {path}: holds a policy of pursuers; an evader's file comes from openjax exploit"

@@ -52,8 +52,10 @@ def save_policy_file(
         np.savez_compressed(partial, **arrays)
 
 
-def load_policy_file(path: Path) -> tuple[dict[str, np.ndarray], dict, dict]:
-    """Leaves by path in their original dtype, the settings and the notes as plain values.
+def load_policy_file(
+    path: Path, kind: str = "policy file", writer: str = "openjax.train"
+) -> tuple[dict[str, np.ndarray], dict, dict]:
+    """Leaves by path in their original dtype, the settings and the notes as plain values; `kind` and `writer` for errors.
 
     Raises:
       UserError: no policy file, or one of another format.
@@ -71,8 +73,7 @@ def load_policy_file(path: Path) -> tuple[dict[str, np.ndarray], dict, dict]:
         raise UserError(f"{path} can't be read: {error.strerror or error}") from error
     except Exception as error:  # a damaged or foreign archive fails in every way that zipfile and NumPy know
         raise UserError(
-            f"{path} is no policy file, or it's damaged ({type(error).__name__}); expected one written by "
-            "openjax.train (.npz)"
+            f"{path} is no {kind}, or it's damaged ({type(error).__name__}); expected one written by {writer} (.npz)"
         ) from error
     broken = [name for name, leaf in leaves.items() if not np.isfinite(leaf.astype(np.float32)).all()]
     if broken:
