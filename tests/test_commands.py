@@ -44,11 +44,11 @@ ALONE = ["--compare_with", "none"]
 
 
 def start(arguments):
-    """A command in a process of its own, without waiting for a renderer; it says what it compiles.
+    """A command in a process of its own; it says what it compiles.
 
     Its output goes to a file: it's longer than a pipe holds that nobody reads while the run goes on.
     """
-    environment = {**os.environ, "MUJOCO_GL": "off", "JAX_LOG_COMPILES": "1"}
+    environment = {**os.environ, "JAX_LOG_COMPILES": "1"}
     output = tempfile.TemporaryFile("w+")
     command = [sys.executable, "-m", *arguments]
     process = subprocess.Popen(command, env=environment, stdout=output, stderr=subprocess.STDOUT)

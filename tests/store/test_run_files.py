@@ -15,7 +15,7 @@ from openjax.files import replacing
 from openjax.show.metrics import MetricsWriter, read_metrics
 from openjax.show.plots import plot_training, plot_trajectories
 from openjax.show.trajectory import Trajectory
-from openjax.show.videos import animate, caption
+from openjax.show.videos import AZIMUTH, DISTANCE, ELEVATION, HEIGHT, OPENING, WIDTH, animate, caption, draw
 from openjax.store.policy_files import fill, load_policy_file, save_policy_file
 from openjax.store.settings_files import from_plain, to_plain
 
@@ -110,18 +110,41 @@ def trajectory():
     )
 
 
-@pytest.mark.parametrize("renderer", ["auto", "matplotlib"])
-def test_animation_is_drawn_without_a_display(tmp_path, trajectory, renderer, monkeypatch):
+def test_animation_is_drawn_without_a_display(tmp_path, trajectory, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
-    animate(tmp_path / "chase.gif", trajectory, renderer=renderer)
-    with Image.open(tmp_path / "chase.gif") as image:
-        assert image.n_frames == 5
-    if renderer == "matplotlib":
-        animate(
-            tmp_path / "both.gif", trajectory, dataclasses.replace(trajectory, title="x"), renderer=renderer
+    longer = dataclasses.replace(trajectory, captured=np.zeros_like(trajectory.captured), time_step=0.04)
+    animate(tmp_path / "chase.gif", trajectory)
+    animate(tmp_path / "both.gif", trajectory, longer)
+    with Image.open(tmp_path / "chase.gif") as one, Image.open(tmp_path / "both.gif") as both:
+        assert one.n_frames == 5 and both.n_frames == 20 and both.size == (one.width, 2 * one.height)
+
+
+def test_what_is_near_hides_what_is_far_and_all_stands_on_the_floor(trajectory):
+    """By the pinhole camera's own formula: the evader's pixels are where its position is seen, unless a pillar is before it."""
+
+    def red(flight):
+        shown = np.asarray(draw(flight, 0)).astype(int)
+        return np.argwhere((shown[..., 0] > 150) & (shown[..., 1:].max(axis=-1) < 60))[:, ::-1]
+
+    def alone(place, pillar):
+        away = np.full_like(trajectory.pursuer_position, -50.0)
+        there = np.broadcast_to(place, trajectory.evader_position.shape)
+        return dataclasses.replace(
+            trajectory, pursuer_position=away, evader_position=there, pillar_position=np.array([pillar])
         )
-        with Image.open(tmp_path / "chase.gif") as one, Image.open(tmp_path / "both.gif") as both:
-            assert both.n_frames == 5 and both.size == (one.width, 2 * one.height)
+
+    towards = np.array([np.cos(AZIMUTH), np.sin(AZIMUTH)])  # away from the camera
+    for place in ((0.0, 0.0, 0.4), (0.4, -0.5, 0.1), (-0.6, 0.2, 1.0)):
+        seen = red(alone(place, place[:2] + 0.4 * towards))
+        camera = np.array([0, 0, 0.38 * 1.2]) - DISTANCE * 0.9 * np.array(
+            [*np.cos(ELEVATION) * towards, -np.sin(ELEVATION)]
+        )
+        ahead = (np.array([0, 0, 0.38 * 1.2]) - camera) / (DISTANCE * 0.9)
+        right = np.cross(ahead, (0, 0, 1)) / np.linalg.norm(np.cross(ahead, (0, 0, 1)))
+        off, zoom = np.array(place) - camera, HEIGHT / 2 / np.tan(OPENING / 2)
+        at = zoom * np.array([off @ right, -off @ np.cross(right, ahead)]) / (off @ ahead)
+        assert abs(seen.mean(axis=0) - at - (WIDTH / 2, HEIGHT / 2)).max() < 1.5
+        assert len(red(alone(place, place[:2] - 0.2 * towards))) < len(seen) / 4
 
 
 def test_animation_says_when_something_happened(trajectory):

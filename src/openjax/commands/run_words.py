@@ -70,7 +70,7 @@ def closing_words(settings: TrainSettings, run: Path, on_cpu: bool) -> list[str]
     steps.append(
         "openjax sample_flights flights, then openjax diagnose flights (from flight logs to a cause)"
     )
-    return [*lines, f"Next: {'; '.join(steps)}."]
+    return [*lines, "\n  ".join(["Next:", *steps])]
 
 
 def _differs(game):

@@ -403,13 +403,13 @@ def report(
         **job.facts,
     }
     write_json(directory.path / "layouts.json", {**rows, **facts})
-    drawn_by = _draw(directory, flights, their_flights)
-    progress.phase(f"done (animation by {drawn_by})")
+    _draw(directory, flights, their_flights)
+    progress.phase("done", announce=False)
     return before_after_table(rows["before"], rows["after"], job.compare_with, others)
 
 
 def _draw(directory, flights, their_flights):
-    """Curves, paths and the chase; who drew the latter."""
+    """Curves, paths and the chase."""
     from openjax.show.plots import plot_training, plot_trajectories
     from openjax.show.videos import animate
 
@@ -419,4 +419,4 @@ def _draw(directory, flights, their_flights):
     chosen = (captured or flights)[0]
     shown = [flight for flight in their_flights if flight.title.startswith(f"{chosen.title}, ")]
     shown.insert(0, dataclasses.replace(chosen, title=f"{chosen.title}, this run") if shown else chosen)
-    return animate(directory.path / "chase.gif", *shown)
+    animate(directory.path / "chase.gif", *shown)

@@ -53,8 +53,8 @@ def main(arguments: Sequence[str]) -> int:
     if command.gif is not None:
         from openjax.show.videos import animate
 
-        drawn_by = animate(command.gif, flights[0][1])
-        console.print(f"{command.gif}: {command.gif.stat().st_size / 1e6:.1f} MB, drawn by {drawn_by}")
+        animate(command.gif, flights[0][1])
+        console.print(f"{command.gif}: {command.gif.stat().st_size / 1e6:.1f} MB")
     if command.html is not None:
         from openjax.show.replay import write_replay
 

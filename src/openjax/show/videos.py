@@ -1,65 +1,48 @@
-"""Animations of an episode, also where there's no display.
+"""Animations of an episode, drawn in perspective by Pillow: the same on every machine, without display or OpenGL."""
 
-MuJoCo's renderer runs in a process of its own: an OpenGL driver that isn't there, or that crashes, can't take
-the run with it. Where no backend works, matplotlib draws the episode from above and from the side.
-"""
-
-import os
-import subprocess
-import sys
-import tempfile
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from PIL import Image, ImageDraw, ImageFont, ImageSequence
+from matplotlib.colors import to_rgb
+from PIL import Image, ImageDraw, ImageFont
+from scipy.spatial.transform import Rotation
 
 from openjax.files import replacing
-from openjax.show.plots import EVADER_COLOR, PURSUER_COLORS, draw_arena
+from openjax.show.plots import EVADER_COLOR, PURSUER_COLORS
 from openjax.show.trajectory import Trajectory
 
 FRAMES_PER_SECOND = 12.5
-_BACKENDS = ("egl", "osmesa", "glfw")
-_RENDER_LIMIT = 120  # s for one backend
+WIDTH, HEIGHT = 560, 400
+FINER = 2
+"""Frames are drawn so many times as large and then reduced, so that edges are smooth."""
+AZIMUTH, ELEVATION, OPENING = np.radians((60.0, 42.0, 45.0))
+"""Where the camera looks from, and its vertical field of view."""
+DISTANCE = 3.3
+"""Of the camera from the arena's middle, in radii of the arena."""
+TRAIL = 1.2
+"""Seconds of each path that are drawn behind a vehicle."""
+ARM, ROTOR, BALL = 0.065, 0.035, 0.045
+"""Metres from a vehicle's centre to a rotor, a rotor's radius, the evader's: larger than they are, to be seen."""
+_ROTORS = np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]]) / np.sqrt(2)
 _LETTERS = 20  # pixels
 
 
-def animate(path: Path, *trajectories: Trajectory, renderer: str = "auto") -> str:
+def animate(path: Path, *trajectories: Trajectory) -> None:
     """Write an animated GIF up to a second after the first capture; time, capture and crash stand above it.
 
     Args:
       path: the .gif file.
       trajectories: the episode; of several, each is drawn below the one before.
-      renderer: `mujoco`, `matplotlib` or `auto` (MuJoCo where an OpenGL backend works).
-
-    Returns:
-      The renderer that drew it: `mujoco` with the backend's name, or `matplotlib`.
     """
-    films = []
-    with tempfile.TemporaryDirectory() as directory:
-        for i, trajectory in enumerate(trajectories):
-            part = Path(directory) / f"{i}.gif"
-            drawn_by = _animate_one(part, trajectory, renderer)
-            films.append(_captioned(_frames_of(part), trajectory))
-    write_gif(Path(path), _stacked(films))
-    return drawn_by
+    write_gif(
+        Path(path), _stacked([[_frame(flight, i) for i in steps_shown(flight)] for flight in trajectories])
+    )
 
 
-def _animate_one(path, trajectory, renderer):
-    if renderer != "matplotlib":
-        backend = _animate_with_mujoco(path, trajectory)
-        if backend is not None:
-            return f"mujoco ({backend})"
-        if renderer == "mujoco":
-            raise RuntimeError("no OpenGL backend works here (tried MUJOCO_GL = egl, osmesa, glfw)")
-    _animate_with_matplotlib(path, trajectory)
-    return "matplotlib"
-
-
-def frame_indices(trajectory: Trajectory) -> np.ndarray:
+def steps_shown(trajectory: Trajectory) -> range:
     """Steps that are drawn."""
-    return np.arange(0, trajectory.end(), max(1, round(1.0 / (FRAMES_PER_SECOND * trajectory.time_step))))
+    return range(0, trajectory.end(), max(1, round(1.0 / (FRAMES_PER_SECOND * trajectory.time_step))))
 
 
 def write_gif(path: Path, frames: list[np.ndarray]) -> None:
@@ -67,10 +50,20 @@ def write_gif(path: Path, frames: list[np.ndarray]) -> None:
     sample = np.concatenate(frames[:: max(1, len(frames) // 6)])
     palette = Image.fromarray(sample).quantize(255, method=Image.Quantize.MAXCOVERAGE)
     images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    with replacing(path) as partial:
+    with replacing(path) as partial_file:
         images[0].save(
-            partial, save_all=True, append_images=images[1:], duration=round(1000 / FRAMES_PER_SECOND), loop=0
+            partial_file,
+            save_all=True,
+            append_images=images[1:],
+            duration=round(1000 / FRAMES_PER_SECOND),
+            loop=0,
         )
+
+
+def _stacked(films):
+    """Frames of films, each below the one before; those that end sooner keep their last frame."""
+    length = max(map(len, films))
+    return [np.concatenate([film[min(i, len(film) - 1)] for film in films]) for i in range(length)]
 
 
 def caption(trajectory: Trajectory, step: int) -> tuple[str, str]:
@@ -82,92 +75,131 @@ def caption(trajectory: Trajectory, step: int) -> tuple[str, str]:
     return f"{trajectory.title}: {(step + 1) * trajectory.time_step:.1f} s", ", ".join(events)
 
 
-def _captioned(frames, trajectory):
-    """Frames with a band above that says what one sees."""
-    font, band = ImageFont.load_default(_LETTERS), round(2.8 * _LETTERS)
-    captioned = []
-    for frame, step in zip(frames, frame_indices(trajectory), strict=True):
-        image = Image.new("RGB", (frame.shape[1], frame.shape[0] + band), "white")
-        image.paste(Image.fromarray(frame), (0, band))
-        pen = ImageDraw.Draw(image)
-        for line, text in enumerate(caption(trajectory, int(step))):
-            color = (190, 20, 20) if "crashed" in text else (0, 0, 0)
-            pen.text((8, 4 + 1.3 * line * _LETTERS), text, fill=color, font=font)
-        captioned.append(np.asarray(image))
-    return captioned
+def _frame(trajectory, step):
+    """(H, W, 3) uint8: the scene below a band that says what one sees."""
+    band, font = round(2.8 * _LETTERS), ImageFont.load_default(_LETTERS)
+    image = Image.new("RGB", (WIDTH, HEIGHT + band), "white")
+    image.paste(draw(trajectory, step), (0, band))
+    pen = ImageDraw.Draw(image)
+    for line, text in enumerate(caption(trajectory, step)):
+        color = (190, 20, 20) if "crashed" in text else (0, 0, 0)
+        pen.text((8, 4 + 1.3 * line * _LETTERS), text, fill=color, font=font)
+    return np.asarray(image)
 
 
-def _frames_of(path):
-    """The (H, W, 3) frames of a GIF."""
-    with Image.open(path) as image:
-        return [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(image)]
+def draw(trajectory: Trajectory, step: int) -> Image.Image:
+    """The scene of one step; the evader is golden while it's captured."""
+    image = Image.new("RGB", (FINER * WIDTH, FINER * HEIGHT), "white")
+    pen = _Pen(image, trajectory.arena_radius, trajectory.arena_height)
+    pen.arena()
+    things = list(_things(pen, trajectory, step))
+    for _, _, outlines in things:
+        for outline in outlines:
+            pen.fill(outline * (1, 1, 0), (60, 60, 60, 70))  # its shadow
+    for _, draw_it, _ in sorted(things, key=lambda thing: -pen.depth(thing[0])):
+        draw_it()
+    return image.reduce(FINER)
 
 
-def _stacked(films):
-    """Frames of films, each below the one before; those that end sooner keep their last frame."""
-    width, length = max(film[0].shape[1] for film in films), max(len(film) for film in films)
-
-    def wide(frame):
-        return np.pad(frame, ((0, 0), (0, width - frame.shape[1]), (0, 0)), constant_values=255)
-
-    return [np.concatenate([wide(film[min(i, len(film) - 1)]) for film in films]) for i in range(length)]
-
-
-def _animate_with_mujoco(path, trajectory):
-    chosen = os.environ.get("MUJOCO_GL")
-    # glfw needs a display; asking for a window without one only prints warnings.
-    usable = [name for name in _BACKENDS if name != "glfw" or os.environ.get("DISPLAY") or os.name == "nt"]
-    with tempfile.TemporaryDirectory() as directory:
-        flight, drawn = Path(directory) / "flight.npz", Path(directory) / "flight.gif"
-        trajectory.save(flight)
-        for backend in (chosen,) if chosen else usable:
-            command = [sys.executable, "-m", "openjax.show.mujoco_rendering", str(flight), str(drawn)]
-            environment = {**os.environ, "MUJOCO_GL": backend}
-            if backend in ("egl", "osmesa"):
-                environment["PYOPENGL_PLATFORM"] = backend
-            try:
-                done = subprocess.run(command, env=environment, capture_output=True, timeout=_RENDER_LIMIT)
-            except (OSError, subprocess.TimeoutExpired):
-                continue
-            if done.returncode == 0 and drawn.exists():
-                with replacing(path) as partial:
-                    partial.write_bytes(drawn.read_bytes())
-                return backend
-    return None
+def _things(pen, trajectory, step):
+    """(place, function that draws it, outlines of its shadow) of all that stands or flies in the scene."""
+    for place in trajectory.pillar_position:
+        yield place, partial(pen.pillar, place, trajectory.pillar_radius), ()
+    bodies = Rotation.from_quat(trajectory.pursuer_quaternion[step], scalar_first=True).as_matrix()
+    for i, body in enumerate(bodies):
+        color, path = _rgb(PURSUER_COLORS[i % len(PURSUER_COLORS)]), trajectory.pursuer_position[:, i]
+        rotors = path[step] + (ARM * _ROTORS[:, None] + ROTOR * _circle(12)) @ body.T
+        yield path[step], partial(pen.vehicle, rotors, color), rotors
+        yield from _trail(pen, path, step, color, trajectory.time_step)
+    color, path = _rgb(EVADER_COLOR), trajectory.evader_position
+    now = (255, 200, 25) if trajectory.captured[step].any() else color
+    yield path[step], partial(pen.ball, path[step], BALL, now), [path[step] + BALL * _circle(24)]
+    yield from _trail(pen, path, step, color, trajectory.time_step)
 
 
-def _animate_with_matplotlib(path, trajectory):
-    figure = Figure(figsize=(8, 4.2), dpi=80, layout="constrained")
-    canvas = FigureCanvasAgg(figure)
-    above, side = figure.subplots(1, 2)
-    draw_arena(above, trajectory)
-    limit = 1.08 * trajectory.arena_radius
-    side.set(
-        xlim=(-limit, limit),
-        ylim=(0, 1.05 * trajectory.arena_height),
-        xlabel="x [m]",
-        ylabel="z [m]",
-        aspect="equal",
-    )
-    for x in trajectory.pillar_position[:, 0]:
-        side.axvspan(x - trajectory.pillar_radius, x + trajectory.pillar_radius, color="0.85")
-    count = trajectory.pursuer_position.shape[1]
-    colors = [PURSUER_COLORS[i % len(PURSUER_COLORS)] for i in range(count)] + [EVADER_COLOR]
-    artists = [
-        (
-            above.plot([], [], color=c, linewidth=1)[0],
-            above.plot([], [], "o", color=c)[0],
-            side.plot([], [], "o", color=c)[0],
-        )
-        for c in colors
-    ]
-    bodies = np.concatenate([trajectory.pursuer_position, trajectory.evader_position[:, None]], axis=1)
-    frames = []
-    for i in frame_indices(trajectory):
-        for body, (trail, dot, height) in enumerate(artists):
-            trail.set_data(*bodies[max(0, i - 60) : i + 1, body, :2].T)
-            dot.set_data(bodies[i, body, :1], bodies[i, body, 1:2])
-            height.set_data(bodies[i, body, :1], bodies[i, body, 2:3])
-        canvas.draw()
-        frames.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
-    write_gif(path, frames)
+def _trail(pen, path, step, color, time_step):
+    """The last second of a path, fainter the longer ago it was."""
+    every, length = max(1, round(0.04 / time_step)), round(TRAIL / time_step)
+    for end in range(step, max(0, step - length), -every):
+        points, faint = path[[max(end - every, 0), end]], round(190 * (1 - (step - end) / length))
+        yield points.mean(axis=0), partial(pen.line, points, (*color, faint), 4), ()
+
+
+class _Pen:
+    """Draws into an image what is given in metres, as a camera above the arena's edge sees it."""
+
+    def __init__(self, image: Image.Image, radius: float, height: float):
+        self._draw, self._radius, self._height = ImageDraw.Draw(image, "RGBA"), radius, height
+        self._middle = np.array(image.size) / 2
+        (ca, ce), (sa, se) = (function((AZIMUTH, ELEVATION)) for function in (np.cos, np.sin))
+        self._axes = np.array(
+            [[sa, -ca, 0], [-se * ca, -se * sa, -ce], [ce * ca, ce * sa, -se]]
+        )  # right, down, on
+        self._camera = (0, 0, 0.38 * height) - DISTANCE * radius * self._axes[2]
+
+    def depth(self, place) -> float:
+        """What hides what: how far off along the floor, as pillars reach all the way up."""
+        return float(self._axes[2, :2] @ place[:2])
+
+    def _pixels(self, points):
+        seen = (np.asarray(points, float) - self._camera) @ self._axes.T
+        zoom = self._middle[1] / np.tan(OPENING / 2)
+        return [tuple(point) for point in self._middle + zoom * seen[:, :2] / seen[:, 2:]]
+
+    def fill(self, outline, color) -> None:
+        """A polygon (M, 3)."""
+        self._draw.polygon(self._pixels(outline), fill=color)
+
+    def line(self, points, color, width) -> None:
+        """A line through points (M, 3)."""
+        self._draw.line(self._pixels(points), fill=color, width=width, joint="curve")
+
+    def arena(self) -> None:
+        """The floor, and the wall's lower and upper edge."""
+        edge = self._radius * _circle(96)
+        self.fill(edge, (219, 224, 230))
+        for z, faint in ((0, 200), (self._height, 80)):
+            self.line(edge + np.array((0, 0, z)), (77, 77, 77, faint), 3)
+
+    def pillar(self, place, radius) -> None:
+        """A translucent cylinder up to the arena's height, lit from the right."""
+        foot = (*place, 0) + radius * _circle(24)
+        top = foot + np.array((0, 0, self._height))
+        for i, normal in enumerate(_circle(48)[1::2]):
+            if normal @ self._axes[2] < 0:  # towards the camera
+                self.fill(
+                    [foot[i], foot[i + 1], top[i + 1], top[i]], _wood(0.68 + 0.2 * normal @ self._axes[0])
+                )
+        self.fill(top, _wood(0.95))
+
+    def vehicle(self, rotors, color) -> None:
+        """Four rotors (4, M, 3) on their arms."""
+        hubs = rotors[:, 1:].mean(axis=1)
+        for arm in (hubs[::2], hubs[1::2]):
+            self.line(arm, (30, 30, 30), 6)
+        for rotor in rotors:
+            self.fill(rotor, (*color, 235))
+
+    def ball(self, place, radius, color) -> None:
+        """A ball, brighter above."""
+        for size, light in ((1.0, 0.75), (0.7, 1.0)):
+            outline = (
+                place
+                - 0.7 * (1 - size) * radius * self._axes[1]
+                + size * radius * _circle(24)[:, :2] @ self._axes[:2]
+            )
+            self.fill(outline, tuple(round(light * part) for part in color))
+
+
+def _circle(corners):
+    """(corners + 1, 3) points of a circle about the origin, closed."""
+    angles = np.linspace(0, 2 * np.pi, corners + 1)
+    return np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=-1)
+
+
+def _rgb(name):
+    return tuple(round(255 * part) for part in to_rgb(name))
+
+
+def _wood(light):
+    return (*(round(light * part) for part in (200, 184, 158)), 205)
