@@ -22,7 +22,7 @@ import tyro
 
 import openjax
 from experiments.flying.faults import FOLLOWED, KINDS, WILD, Fault, PoseDamage, draw_fault
-from experiments.table import RESULTS, Page, Table, facts, made, write_page
+from experiments.table import RESULTS, Page, Table, facts, write_page
 from openjax.files import read_json
 from openjax.flying.board import SILENCE
 from openjax.flying.controller import Pose
@@ -66,8 +66,6 @@ class Arguments:
     """Begin no batch that wouldn't be over by then (s)."""
     kinds: tuple[str, ...] = ()
     """Those that contain one of these; all by default."""
-    again: bool = False
-    """Of an earlier result in `out` these flights become the second part: some kinds flown again by later code."""
     out: Path = RESULTS / "flying_faults.json"
 
 
@@ -291,7 +289,6 @@ def main() -> None:
     seeds = [
         s for s in drawn if not arguments.kinds or any(k in KINDS[s % len(KINDS)] for k in arguments.kinds)
     ]
-    first = read_json(arguments.out) if arguments.again else {}
     jobs = []
     for k, layout in enumerate(arguments.layouts):
         mine = [s for s in seeds if (s // len(KINDS)) % len(arguments.layouts) == k]
@@ -311,7 +308,11 @@ def main() -> None:
             done = next(as_completed(running))
             running.discard(done)
             records += done.result()
-            write(arguments, first, records, time.time() - begin)
+            result = {
+                **facts(), "policy": arguments.policy, "seconds": round(time.time() - begin),
+                "summary": summary(records), "not_well": [r for r in records if not well(r)],
+            }  # fmt: skip
+            arguments.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     write_page(arguments.out, page, read_json(arguments.out))
 
 
@@ -328,20 +329,7 @@ def page(results) -> Page:
         "out by more than .1 m": "out:d", "farthest (m)": "farthest:.2f", "fell": "fell:d", "hard": "hard:d",
         "on at the end": "armed:d", "longest end (s)": "longest:.1f", "nearest two (m)": "nearest:.2f",
     }  # fmt: skip
-    tables = [Table(columns, results["summary"])]
-    if again := results.get("again"):
-        tables.append(Table(columns, again["summary"], "Some kinds again, by later code", made(again)))
-    return Page("Faults where they happen, in simulated time", prose, tables)
-
-
-def write(arguments, first, records, seconds) -> None:
-    """Write what there is until now."""
-    result = {
-        **facts(), "policy": arguments.policy, "seconds": round(seconds),
-        "summary": summary(records), "not_well": [r for r in records if not well(r)],
-    }  # fmt: skip
-    result = {**first, "again": result} if first else result
-    arguments.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    return Page("Faults where they happen, in simulated time", prose, Table(columns, results["summary"]))
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from openjax.flying.controller import Pose, nominal_airframe
+from openjax.flying.controller import Pose, accelerate, nominal_airframe
 from openjax.flying.judge import Track
 from openjax.flying.limits import (
     SafetySettings,
@@ -118,6 +118,32 @@ def test_what_is_out_of_limits_ends_the_game_for_all(pose, reason):
     state, _ = step(LIMITS, state, event(_1=PoseSample(seen, 0.01, 4.0)))
     assert state.drones[1].reason == reason
     assert not any(mode is Mode.PURSUIT for mode in state.modes)
+
+
+@pytest.mark.parametrize("error", [-0.35, 0.0, 0.05])
+def test_a_landing_is_soft_where_the_floor_isnt_where_it_is_thought(error):
+    """A point mass on the floor of closed form: the estimate's height is wrong by `error` (m) from the landing on."""
+    state, height, speed, touched = pursuing(), 0.5, 0.0, []
+    for k in range(1, 600):
+        time = 0.01 * k
+        seen = still(time, (*PLACES[1][:2], height + error * min(k / 100, 1.0)), (0.0, 0.0, speed))
+        request = Request.LAND if k == 1 else Request.NONE
+        state, out = step(LIMITS, state, event(time, request, _1=PoseSample(seen, time, 4.0)))
+        speed += 0.01 * 9.81 * (out[1].thrust / nominal_airframe().hover_thrust - 1.0)
+        height += 0.01 * speed
+        if height < 0.0:
+            touched.append(speed)
+            height = speed = 0.0
+    assert state.modes[1] is Mode.LANDED and -1.2 < touched[0] < -0.1
+
+
+def test_who_leans_the_wrong_way_turns_before_it_pushes():
+    """Leaning 45 degrees outwards and asked to brake, full thrust would drive it out."""
+    lean = (math.cos(math.pi / 8), 0.0, math.sin(math.pi / 8), 0.0)
+    hover = nominal_airframe().hover_thrust
+    thrust = [accelerate(q, (-5.0, 0.0, 0.0), nominal_airframe(), 0.0).thrust for q in (LEVEL, lean)]
+    assert thrust[0] == pytest.approx(hover)
+    assert thrust[1] == pytest.approx(hover * (9.81 - 5.0) / 9.81 * math.sqrt(0.5))
 
 
 def test_upside_down_for_long_its_motors_are_off_and_the_others_land():

@@ -191,7 +191,12 @@ def page(results: dict) -> Page:
             for layout, record in records.items():
                 rows.append({"world": world, "policy": policy, "layout": layout, **record})
             if records:
-                mean = _mean(list(records.values()))
+                mean = {
+                    name: (sum if name == "episodes" else np.mean)(
+                        [record[name] for record in records.values()]
+                    )
+                    for name in next(iter(records.values()))
+                }
                 for name in ("captured", "crashed"):
                     mean[name] = f"{mean[name]:.3f} {interval(mean[name], mean['episodes'])}"
                 rows.append({"world": world, "policy": policy, "layout": "**mean**", **mean})
@@ -224,13 +229,6 @@ def interval(share: float, number: int, z: float = 1.96) -> str:
     middle = (share + z * z / (2 * number)) / (1 + z * z / number)
     half = z / (1 + z * z / number) * math.sqrt(share * (1 - share) / number + (z / (2 * number)) ** 2)
     return f"[{max(middle - half, 0.0):.2f}, {min(middle + half, 1.0):.2f}]"
-
-
-def _mean(records):
-    return {
-        name: (sum if name == "episodes" else np.mean)([record[name] for record in records])
-        for name in records[0]
-    }
 
 
 def main() -> None:

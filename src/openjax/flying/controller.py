@@ -83,6 +83,12 @@ def roll_pitch_yaw(quaternion) -> Vector:
     )
 
 
+def body_axis(quaternion) -> Vector:
+    """The body's z axis, along which it pushes, in the world."""
+    w, x, y, z = quaternion
+    return 2.0 * (x * z + w * y), 2.0 * (y * z - w * x), up(quaternion)
+
+
 def up(quaternion) -> float:
     """World z component of the body's z axis."""
     _, x, y, _ = quaternion
@@ -96,9 +102,8 @@ def level_acceleration(quaternion) -> Vector:
 
 def lift_acceleration(quaternion, lift: float) -> Vector:
     """The acceleration (m/s^2, world) at an attitude (4,) with a thrust that is `lift` times the weight."""
-    w, x, y, z = quaternion
-    axis = (2 * (x * z + w * y), 2 * (y * z - w * x), up(quaternion) - 1.0 / lift)
-    return tuple(lift * GRAVITY * a for a in axis)
+    x, y, z = body_axis(quaternion)
+    return lift * GRAVITY * x, lift * GRAVITY * y, lift * GRAVITY * z - GRAVITY
 
 
 def moved_on(pose: Pose, now: float) -> Pose:
@@ -147,7 +152,9 @@ def accelerate(
 ) -> SetPoint:
     """The set-point for an acceleration (m/s^2, world) at an attitude, yaw to zero.
 
-    `trim` is added to the hover thrust. `mode` RATES tracks the angles here instead of on board.
+    The thrust is what of it the body's axis can do at present: a vehicle that still leans elsewhere first turns, then pushes
+    (Lee, Leok, McClamroch 2010, "Geometric tracking control of a quadrotor UAV on SE(3)"). `trim` is added to the hover
+    thrust. `mode` RATES tracks the angles here instead of on board.
     """
     ax, ay, az = acceleration
     roll, pitch, yaw = roll_pitch_yaw(quaternion)
@@ -156,7 +163,8 @@ def accelerate(
     lift = math.sqrt((GRAVITY + az) ** 2 + forward**2 + left**2)
     wanted_pitch = math.atan2(forward, GRAVITY + az)
     wanted_roll = math.asin(min(max(-left / lift, -1.0), 1.0))
-    thrust = (airframe.hover_thrust + trim) * lift / GRAVITY
+    along = sum(a * b for a, b in zip(body_axis(quaternion), (ax, ay, GRAVITY + az), strict=True))
+    thrust = (airframe.hover_thrust + trim) * max(along, 0.0) / GRAVITY
     yaw_rate = -YAW_GAIN * yaw
     if mode == RATES:
         return SetPoint(

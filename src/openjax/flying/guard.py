@@ -22,7 +22,7 @@ from openjax.flying import real_time
 from openjax.flying.board import Board, Role, say, stand_alone
 from openjax.flying.crtp import LOG_TYPES, Port, Supervisor, SupervisorCommand
 from openjax.flying.limits import SafetySettings, resting_places
-from openjax.flying.safety import FLYING, Event, Mode, PoseSample, Request, State, step
+from openjax.flying.safety import FLYING, LANDING, Event, Mode, PoseSample, Request, State, step
 from openjax.flying.set_point import SetPoint
 from openjax.flying.swarm import POSE_BLOCK, WATCHDOG_PERIOD, Member, Swarm, send_set_point
 
@@ -39,10 +39,10 @@ def take_over(settings: SafetySettings, state: State, now: float) -> State:
     drones = tuple(
         replace(
             d,
-            mode=Mode.LAND if d.mode in (Mode.LAND, Mode.LIFT) else Mode.HOLD,
+            mode=Mode.LAND if d.mode in (*LANDING, Mode.LIFT) else Mode.HOLD,
             since=now,
             seen=now,  # the estimate is as good as what the one before knew
-            landing_since=now if d.mode in (Mode.LAND, Mode.LIFT) else None,
+            landing_since=now if d.mode in (*LANDING, Mode.LIFT) else None,
             anchor=a,
             reason="another process took over",
         )

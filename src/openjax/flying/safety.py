@@ -45,8 +45,11 @@ BLIND_SINK = 0.4
 """A blind landing asks for this much less upward acceleration (m/s^2), so that it surely goes down."""
 BLIND_SPEED = 0.6
 """It sinks faster than a landing with poses (m/s): what it doesn't know grows with the square of the time."""
-BLIND_DEPTH = 0.15
-"""A blind landing stops the motors this far below the floor by its reckoning (m)."""
+LOW = 0.05
+"""Below this height (m) a landing settles."""
+SETTLING, SETTLING_LIFT = 0.75, 0.85
+"""A landing ends level, with this share of its weight, for so long (s): from .4 m it comes down at 1.1 m/s. So far may the
+floor be from where it is thought."""
 SPIN_UP = 0.3
 """A vehicle that lifts off may stand still for so long (s)."""
 ASIDE = 0.08
@@ -70,11 +73,13 @@ class Mode(StrEnum):
     HOLD = "hold"
     LAND = "land"
     BLIND = "blind landing"
+    SETTLE = "settling"  # the last of a landing
     LANDED = "landed"
     STOPPED = "stopped"
 
 
-FLYING = (Mode.LIFT, Mode.TRANSFER, Mode.READY, Mode.PURSUIT, Mode.HOLD, Mode.LAND, Mode.BLIND)
+LANDING = (Mode.LAND, Mode.BLIND, Mode.SETTLE)
+FLYING = (Mode.LIFT, Mode.TRANSFER, Mode.READY, Mode.PURSUIT, Mode.HOLD, *LANDING)
 _DOWN = (Mode.GROUND, Mode.LANDED)
 _UNTROUBLED = (Mode.LIFT, Mode.TRANSFER, Mode.READY, Mode.PURSUIT)
 
@@ -293,14 +298,13 @@ def decide(settings: SafetySettings, state: State, event: Event) -> tuple[State,
 
 def _to(drone, mode, now, anchor=None, reason="") -> Drone:
     """The drone in another mode."""
-    landing = mode in (Mode.LAND, Mode.BLIND)
     return replace(
         drone,
         mode=mode,
         since=now,
         anchor=drone.anchor if anchor is None else anchor,
         reason=reason or drone.reason,
-        landing_since=(drone.landing_since or now) if landing else None,
+        landing_since=(drone.landing_since or now) if mode in LANDING else None,
     )
 
 
@@ -367,6 +371,8 @@ def _trouble(settings, drone, sample, now) -> tuple[Mode, str] | None:
         return None
     if sample.supervisor & (Supervisor.LOCKED | Supervisor.CRASHED):
         return Mode.STOPPED, "stopped by its firmware"
+    if drone.mode is Mode.SETTLE:
+        return None
     lost = _lost(settings, drone, sample, now)
     if drone.mode is Mode.LIFT:  # from there it may fall
         fault = lost or lift_fault(settings, drone, now)
@@ -451,8 +457,12 @@ def _fly(settings, state, i, action, sample) -> Drone:
     )
     if drone.mode not in FLYING or drone.estimate is None:
         return drone
-    if _is_down(settings, drone, now):
+    if drone.mode is Mode.SETTLE and now - drone.since > SETTLING:
         return _to(drone, Mode.LANDED, now)
+    if _is_low(settings, drone, now):
+        drone = _to(drone, Mode.SETTLE, now)
+    if drone.mode is Mode.SETTLE:
+        return replace(drone, sent=_settling(state.airframe, drone))
     if drone.mode is Mode.PURSUIT and action is not None:
         return _pursue(settings, state, drone, i, action)
     wanted = _wanted(settings, state, drone, i)
@@ -470,12 +480,16 @@ def _fly(settings, state, i, action, sample) -> Drone:
     return replace(drone, sent=flown)
 
 
-def _is_down(settings, drone, now) -> bool:
-    """Whether a landing is over: on the floor, below it by reckoning, or long enough on the way."""
-    if drone.landing_since is None:
+def _is_low(settings, drone, now) -> bool:
+    """Whether a landing is near the floor, or long enough on the way."""
+    if drone.mode not in (Mode.LAND, Mode.BLIND):
         return False
-    floor = -BLIND_DEPTH if drone.doubtful else 0.05
-    return drone.estimate.position[2] < floor or now - drone.landing_since > settings.landing_time
+    return drone.estimate.position[2] < LOW or now - drone.landing_since > settings.landing_time
+
+
+def _settling(airframe, drone) -> SetPoint:
+    """The last set-point of a landing."""
+    return SetPoint(ANGLES, thrust=SETTLING_LIFT * (airframe.hover_thrust + drone.trim))
 
 
 def _pursue(settings, state, drone, i, action) -> Drone:
