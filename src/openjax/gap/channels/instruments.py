@@ -27,11 +27,13 @@ EDGE = 0.3  # s at either end that the filter spoils
 
 @dataclass(frozen=True, eq=False)
 class Feedback:
-    """Of one track: `acceleration` (T, 3) rad/s^2 that the feedback part of the motors makes, through their lag;
+    """Of one track: `acceleration` (T, 3) rad/s^2 that the feedback part of the motors makes, through their lag; `trim` the same
+    of what motors do slowly but for its mean, which holds what pushes the body slowly;
     `quick` (T, 3) the same of what motors do within QUICK s, whoever caused it; `caused` (T, 3) the same of what the
     commands caused."""
 
     acceleration: np.ndarray
+    trim: np.ndarray
     quick: np.ndarray
     caused: np.ndarray
 
@@ -67,6 +69,7 @@ def read_feedback(tracks, vehicles, by_commands) -> list[Feedback]:
     return [
         Feedback(
             _turning((r - smooth(r, TRIM, t.dt)) @ np.asarray(mixer(v), float).T, t, v),
+            _turning(smooth(t.motor, TRIM, t.dt) - t.motor.mean(0), t, v),
             _turning(t.motor - smooth(t.motor, QUICK, t.dt), t, v),
             _turning(g, t, v),
         )
