@@ -9,7 +9,7 @@ import tomllib
 import numpy as np
 
 from openjax.flights.track import Track, rotation, smooth
-from openjax.gap.model.library import CARDS, PLACE, STEP
+from openjax.gap.model.library import PLACE, STEP
 from openjax.gap.model.physics import Path
 from openjax.gap.model.prediction import FORCE, RATES, VELOCITY
 from openjax.vehicle.effects.airspeed import PROPELLER_RADIUS
@@ -47,9 +47,6 @@ def columns_of(
         " ".join(key[:2]): (m - nominal) * key[2] / STEP[k]
         for key, m, k in zip(numbers, moved, places, strict=False)
     }
-    for name in columns:
-        if CARDS[name.split()[0]].torque_axes:
-            _without_trim(columns[name], track)
     shift = (
         max(SIZE["motor_clock"], wander + (track.dt / 4 if at_once or wander else 0.0))
         if one_clock
@@ -110,13 +107,6 @@ def _sensor_nuisances(
         late += smooth(np.gradient(track.velocity, track.dt, axis=0), 0.05, track.dt)
         column("clock of the pose", VELOCITY, late, pose_shift)
     return columns
-
-
-def _without_trim(column: np.ndarray, track: Track) -> None:
-    """Take the slow part off the torques of a column (T, 9). Motors that hold a trim hold it against something, and the two
-    together turn a heavier body no less: inertia must not take what an offset or a weak rotor does."""
-    turning = np.diff(column[:, RATES], axis=0, prepend=column[:1, RATES])
-    column[:, RATES] = np.cumsum(turning - smooth(turning, TRIM, track.dt), 0)
 
 
 def _late_torques(name: str, track: Track, acceleration: np.ndarray, delays) -> dict[str, np.ndarray]:
