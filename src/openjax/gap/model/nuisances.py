@@ -22,7 +22,7 @@ SIZE = {
     ).items()
 }
 TRIM = 0.5  # s: what motors do more slowly is no answer to a gust, but what the vehicle needs
-FEEDBACK_ROWS, TRIM_ROWS, QUICK_ROWS = (0, 2), (0,), (0, 1, 2)  # rows of delay
+FEEDBACK_ROWS, QUICK_ROWS = (0, 2), (0, 1, 2)  # rows of delay
 WAKE_WIDTHS = (0.05, 0.1)  # m
 NEAR_OFFSET = 0.02  # m
 # Nuisances that belong to a track, not to the vehicle.
@@ -56,7 +56,7 @@ def columns_of(
     columns["clock of the motors"] = later * shift
     columns["delay of the motors"] = later * SIZE["motor_delay"]
     columns |= _late_torques("feedback", track, feedback.acceleration, FEEDBACK_ROWS)
-    columns |= _late_torques("trim", track, feedback.trim, TRIM_ROWS)
+    columns |= _late_torques("trim", track, feedback.trim, (0,))
     if at_once:
         columns |= _late_torques("motors within a row", track, feedback.quick, QUICK_ROWS)
     columns |= _sensor_nuisances(track, path, nominal, max(SIZE["pose_clock"], wander))
