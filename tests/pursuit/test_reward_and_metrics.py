@@ -11,9 +11,7 @@ import numpy as np
 import pytest
 
 from openjax.pursuit import Pursuit, PursuitSettings, RewardSettings, Task, hover_action
-from openjax.pursuit.collisions import Breaches, breaches, crashed
-from openjax.pursuit.info import StepInfo
-from openjax.pursuit.reward import reward as reward_of
+from openjax.pursuit.collisions import breaches, crashed
 
 SETTINGS = PursuitSettings(
     max_pillars=1,
@@ -88,17 +86,6 @@ def test_capture_bounds_pillar_and_speed(play):
     assert statistics.collision_rate == 0.5 and statistics.over_speed_rate == 1.0
     assert not statistics.crashed
     np.testing.assert_allclose(statistics.episode_return, expected.mean(axis=1).sum(), rtol=1e-5)
-
-
-def test_speed_counts_from_a_time_on():
-    settings = dataclasses.replace(SETTINGS, reward=RewardSettings(over_speed_after=0.02))
-    _, before = jax.jit(Pursuit(settings).reset_to)(jax.random.key(0), task(APART, (0, 0, 0.6)))
-    none = jnp.zeros(3, bool)
-    parts = Breaches(*[jnp.zeros(3)] * 3)
-    info = StepInfo(none, jnp.zeros((), bool), parts, jnp.array([True, True, False]), none, jnp.zeros(3))
-    for step, expected in ((2, [0, 0, 0]), (3, [-10, -10, 0])):
-        _, penalty = reward_of(settings, before, before.replace(step=jnp.asarray(step)), info)
-        np.testing.assert_array_equal(penalty, expected)
 
 
 def test_no_capture_through_a_pillar(play):

@@ -36,10 +36,7 @@ def reward(
     weights = settings.reward
     breach, crash = _counted(settings, state, info)
     first_crash = info.crashed & ~before.statistics.crashed
-    fast = info.over_speed
-    if weights.over_speed_after:
-        fast &= state.step * settings.time_step > weights.over_speed_after
-    penalty = -weights.collision * breach.total - weights.over_speed * fast
+    penalty = -weights.collision * breach.total - weights.over_speed * info.over_speed
     penalty = penalty - weights.crash * crash - weights.first_crash * first_crash
     distance = jnp.sqrt(jnp.sum((state.drones.position - state.evader_position) ** 2, axis=-1) + 1e-12)
     change = jnp.sqrt(jnp.sum((state.previous_action - before.previous_action) ** 2, axis=-1) + 1e-12)

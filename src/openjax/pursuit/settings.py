@@ -27,9 +27,6 @@ class RewardSettings:
     """Subtracted per breach of a safety distance or an arena bound."""
     over_speed: Annotated[float, Interval("[0, 1e6]")] = 10.0
     """Subtracted in each step above 1.01 times the maximal speed."""
-    over_speed_after: Annotated[float, Interval("[0, 1000]")] = 0.0
-    """Seconds of an episode before the speed counts: a dive saves some of those that start tilted towards something (not in the
-    paper)."""
     smoothness: Annotated[float, Interval("[0, 1e6]")] = 0.0
     """Weight of `exp(-|a_t - a_{t-1}|)`; 2.0 in the paper's second stage."""
     crash: Annotated[float, Interval("[0, 1e6]")] = 0.0

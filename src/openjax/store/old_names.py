@@ -1,5 +1,6 @@
 """Settings as earlier versions wrote them: old policies and runs keep loading."""
 
+import copy
 from typing import Any
 
 from openjax.learning import TrainSettings
@@ -18,7 +19,10 @@ _RENAMED = {
 }
 """Where a setting is now, and its old name in the same group."""
 
-_REMOVED = {"environment.observe_others_motion": False}
+_REMOVED = {
+    "environment.observe_others_motion": False,
+    "environment.reward.over_speed_after": 0.0,
+}
 """Settings that are gone, with the only value that means what is done today."""
 
 
@@ -38,7 +42,7 @@ def train_settings(stored: Any, where: str) -> TrainSettings:
 def _current_names(stored):
     if not isinstance(stored, dict):
         return stored
-    current = {name: dict(value) if isinstance(value, dict) else value for name, value in stored.items()}
+    current = copy.deepcopy(stored)
     for path, old in _RENAMED.items():
         group, name = _place(current, path)
         if old in group and name not in group:
@@ -52,6 +56,8 @@ def _current_names(stored):
 
 def _place(settings, path):
     """The group (dict) and the last name of a setting with dots."""
-    group, _, name = path.rpartition(".")
-    found = settings.get(group, {}) if group else settings
-    return found if isinstance(found, dict) else {}, name
+    *groups, name = path.split(".")
+    for group in groups:
+        settings = settings.get(group, {})
+        settings = settings if isinstance(settings, dict) else {}
+    return settings, name
