@@ -1,4 +1,4 @@
-"""The cache of compiled programs: damage, a death while loading, and folders that others can write to."""
+"""The cache of compiled programs: damage, and folders that others can write to."""
 
 import os
 import stat
@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from openjax.store.checked_cache import ASIDE, ENTRY, CheckedCache, set_fatal_entries_aside
+from openjax.store.checked_cache import ENTRY, CheckedCache
 
 FLIPS = """
 import os, sys
@@ -51,28 +51,6 @@ def test_flipped_bits_end_no_process_and_change_no_number(tmp_path):
     numbers = ran.stdout.split()
     assert len(numbers) == 5 and set(numbers) == {numbers[0]}
     assert ran.stderr.count("is damaged") == 4
-
-
-def test_an_entry_that_a_process_died_of_is_set_aside_and_no_other(tmp_path):
-    cache = CheckedCache(tmp_path)
-    for key in ("fatal", "fine"):
-        cache.put(key, b"program")
-    die = f"""
-import os, signal
-from pathlib import Path
-from openjax.store.checked_cache import CheckedCache
-cache = CheckedCache(Path({str(tmp_path)!r}))
-with cache.loading("fine"):
-    cache.get("fine")
-with cache.loading("fatal"):
-    cache.get("fatal")
-    os.kill(os.getpid(), signal.SIGILL)
-"""
-    with cache.loading("fine"):  # by a process that lives
-        assert subprocess.run([sys.executable, "-c", die]).returncode < 0
-        assert set_fatal_entries_aside(tmp_path) == ["fatal"]
-    assert cache.get("fatal") is None and cache.get("fine") == b"program"
-    assert (tmp_path / f"fatal{ASIDE}").exists() and set_fatal_entries_aside(tmp_path) == []
 
 
 def test_half_an_entry_is_none(tmp_path):

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import tyro
+from rich.panel import Panel
+from rich.text import Text
 
 from openjax.commands.command_line import one_line, output_console, parse
 from openjax.errors import UserError
@@ -60,7 +61,34 @@ def run(options: Options) -> int:
     bad options."""
     # Small matrices: more threads than one only wait for each other. Read when NumPy is loaded, below.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    console = output_console()
+    console, names = output_console(), _checked_names(options)
+    answer = _changes if options.reference else _diagnosis
+    if not options.reference:
+        from openjax.gap.model.library import library
+
+        library(options.without)  # is wrong now or never
+    predictions, failed = {}, 0
+    for i, (folder, name) in enumerate(zip(options.cases, names, strict=True)):
+        try:
+            with Steps("diagnosing", {case: SECONDS for case in names[i:]}, console) as steps:
+                steps.begin(name)
+                title, lines, prediction = answer(options, folder, name, partial(steps.begin, name))
+        except UserError as error:
+            failed += 1
+            print(f"error: {one_line(error)}", file=sys.stderr)
+        except Exception as error:  # a fault of the program in one case must not cost the others
+            failed += 1
+            print(f"error: {_unforeseen(name, error)}", file=sys.stderr)
+        else:
+            predictions[name] = prediction
+            console.print(Panel(Text("\n".join(lines)), title=f"{name}: {title}", title_align="left"))
+    if options.predictions is not None and predictions:
+        write_json(options.predictions, predictions)
+    return 2 if failed == len(names) else 0
+
+
+def _checked_names(options: Options) -> list[str]:
+    """What the cases are called; all that can be wrong with where they're written to is said before the work."""
     if not options.cases:
         raise UserError("no case given: name at least one folder of flight logs with a vehicle.toml")
     names = [c.resolve().name for c in options.cases]
@@ -70,44 +98,49 @@ def run(options: Options) -> int:
     for name in names:
         if (options.out / name).exists() and not options.overwrite:
             raise UserError(f"{options.out / name} already exists: choose another --out or give --overwrite")
-
     check_output_folder(options.out, "--out")
     if options.predictions is not None:
         check_output_folder(options.predictions.absolute().parent, "--predictions")
         if options.predictions.is_dir():
             raise UserError(f"--predictions {options.predictions}: is a folder; a file is needed")
+    return names
 
-    if options.reference:
-        return _compare(options, names, console)
 
+def _diagnosis(
+    options: Options, folder: Path, name: str, tell: Callable[[str], None]
+) -> tuple[str, list[str], dict]:
+    """Title, lines and prediction of what causes a case's gap, after its report was written whole."""
     from openjax.flights.case import load_case
     from openjax.gap.diagnosis import diagnose_case
-    from openjax.gap.model.library import library
+    from openjax.gap.report import write_report
 
-    library(options.without)
-    predictions, failed = {}, 0
-    for folder, name in zip(options.cases, names, strict=True):
-        try:
-            with _steps(names, name, console) as tell:
-                case = load_case(folder)
-                for issue in case.left_out():
-                    print(f"warning: {name}/{issue.flight} is left out: {issue.issue}", file=sys.stderr)
-                report = diagnose_case(case, options.without, tell)
-                tell("writing the report")
-                _write(report, options.out / name, options.html)
-        except UserError as error:
-            failed += 1
-            print(f"error: {one_line(error)}", file=sys.stderr)
-            continue
-        except Exception as error:  # a fault of the program in one case must not cost the others
-            failed += 1
-            print(f"error: {_unforeseen(name, error)}", file=sys.stderr)
-            continue
-        predictions[name] = report.prediction()
-        _show(console, report, options)
-    if options.predictions is not None and predictions:
-        write_json(options.predictions, predictions)
-    return 2 if failed == len(names) else 0
+    case = load_case(folder)
+    for issue in case.left_out():
+        print(f"warning: {name}/{issue.flight} is left out: {issue.issue}", file=sys.stderr)
+    report = diagnose_case(case, options.without, tell)
+    tell("writing the report")
+    with replacing(options.out / name) as partial_folder:
+        partial_folder.mkdir()
+        write_report(report, partial_folder, options.html)
+    written = options.out / name / ("report.html" if options.html else "report.json")
+    lines = [*report.in_words(), f"({report.seconds:.1f} s; {written})"]
+    return ", ".join(report.effects) or report.verdict, lines, report.prediction()
+
+
+def _changes(
+    options: Options, folder: Path, name: str, tell: Callable[[str], None]
+) -> tuple[str, list[str], dict]:
+    """As `_diagnosis`, of what changed since the reference."""
+    from openjax import comparison
+    from openjax.comparison import report
+
+    change = comparison.compare(folder, options.reference)
+    with replacing(options.out / name) as partial_folder:
+        partial_folder.mkdir()
+        report.write(change, partial_folder, options.html)
+    written = options.out / name / f"changes.{'html' if options.html else 'json'}"
+    title = "changed" if change.changed else "no change"
+    return title, [*report.in_words(change), f"({written})"], report.prediction(change)
 
 
 def _unforeseen(name: str, error: Exception) -> str:
@@ -116,69 +149,3 @@ def _unforeseen(name: str, error: Exception) -> str:
     where = f"{Path(place.filename).name}:{place.lineno}"
     text = " ".join(str(error).split())
     return f"{name}: {type(error).__name__} in {where} ({text}): a fault of the program, please report it"
-
-
-def _compare(options: Options, names: list[str], console) -> int:
-    """What changed in each case since the reference."""
-    from rich.panel import Panel
-    from rich.text import Text
-
-    from openjax import comparison
-    from openjax.comparison import report as changes_report
-
-    predictions, failed = {}, 0
-    for folder, name in zip(options.cases, names, strict=True):
-        try:
-            with _steps(names, name, console):
-                change = comparison.compare(folder, options.reference)
-                with replacing(options.out / name) as partial:
-                    partial.mkdir()
-                    changes_report.write(change, partial, options.html)
-        except UserError as error:
-            failed += 1
-            print(f"error: {one_line(error)}", file=sys.stderr)
-            continue
-        except Exception as error:  # as above
-            failed += 1
-            print(f"error: {_unforeseen(name, error)}", file=sys.stderr)
-            continue
-        predictions[name] = changes_report.prediction(change)
-        body = "\n".join(
-            [
-                *changes_report.in_words(change),
-                f"({options.out / name}/changes.{'html' if options.html else 'json'})",
-            ]
-        )
-        title = f"{name}: {'changed' if change.changed else 'no change'}"
-        console.print(Panel(Text(body), title=title, title_align="left"))
-    if options.predictions is not None and predictions:
-        write_json(options.predictions, predictions)
-    return 2 if failed == len(names) else 0
-
-
-@contextlib.contextmanager
-def _steps(names: list[str], name: str, console) -> Iterator[Callable[[str], None]]:
-    """Shows which case is worked on and about how long it and those after it still take; yields what hears the work."""
-    left = names[names.index(name) :]
-    with Steps("diagnosing", {case: SECONDS for case in left}, console) as steps:
-        steps.begin(name)
-        yield partial(steps.begin, name)
-
-
-def _write(report, folder: Path, pictures: bool) -> None:
-    """All files of a report, or none: written beside the place and moved there at the end."""
-    from openjax.gap.report import write_report
-
-    with replacing(folder) as partial:
-        partial.mkdir()
-        write_report(report, partial, pictures)
-
-
-def _show(console, report, options: Options) -> None:
-    from rich.panel import Panel
-    from rich.text import Text
-
-    title = f"{report.case}: {', '.join(report.effects) or report.verdict}"
-    written = options.out / report.case / ("report.html" if options.html else "report.json")
-    body = "\n".join([*report.in_words(), f"({report.seconds:.1f} s; {written})"])
-    console.print(Panel(Text(body), title=title, title_align="left"))

@@ -23,14 +23,14 @@ def cache_programs() -> Path | None:
 
     JAX itself knows a program again by its code, its compiler and its devices; the folder is this processor's, as code
     for one need not run on another that shares the home. Where JAX was already told of a folder
-    (JAX_COMPILATION_CACHE_DIR), that one is used. A program that an earlier process died of is compiled anew, and said.
+    (JAX_COMPILATION_CACHE_DIR), that one is used.
 
     Returns:
       the folder; None where no folder of the user's own can be written to, so that nothing is kept.
     """
     import jax
 
-    from openjax.store.checked_cache import set_fatal_entries_aside, use_checked_cache
+    from openjax.store.checked_cache import use_checked_cache
 
     given = jax.config.jax_compilation_cache_dir
     if given is not None and "://" in given:  # a bucket; JAX reads it by itself
@@ -40,10 +40,6 @@ def cache_programs() -> Path | None:
         return None
     if given is not None and folder.exists() and not _is_private(folder):
         _LOGGER.warning("others can write to %s, and so run what they like here: chmod go-w it", folder)
-    if fatal := set_fatal_entries_aside(folder):
-        _LOGGER.warning(
-            "an earlier start died while loading a compiled program (%s); it's compiled anew", fatal[0]
-        )
     use_checked_cache()
     jax.config.update("jax_compilation_cache_dir", str(folder))
     # XLA's own caches have no checksums
