@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from openjax.flying.controller import Pose
+from openjax.flying.limits import SafetySettings
 
 FOLLOWED = "camera drifts, the estimator follows"
 """A limit: with nothing on board that sees the floor, a slow drift looks like a tilt that is wrong by two degrees."""
@@ -40,6 +41,8 @@ OTHER = (
 KINDS = (*CAMERA, *RADIO, *OTHER)
 START = 0.2
 """Nothing goes wrong before (s)."""
+MARGIN, FALL, ENDING = 0.1, 0.3, 5.0
+"""Out of the arena by more (m) is out; motors off above (m) is a fall; a flight must be over so long (s) after what ends it."""
 
 
 @dataclass(frozen=True)
@@ -150,3 +153,24 @@ class PoseDamage:
 
 def _shifted(pose: Pose, away, share: float) -> Pose:
     return pose._replace(position=tuple(p + share * a for p, a in zip(pose.position, away, strict=True)))
+
+
+def outcome(fault: Fault, times, position, off, begin: float) -> dict:
+    """What became of the vehicles from `begin` (s) on; of one that is gone itself nothing is asked.
+
+    times (T,), position (T, N, 3) m and off (T, N), motors off, are the truth. `out`: farthest beyond arena or ceiling (m);
+    `seconds` until all stayed on the floor with their motors off, None if they didn't; `held`: (N,) whom one can hold.
+    """
+    held = np.array([not (fault.kind == "drone gone" and i == fault.vehicle) for i in range(off.shape[1])])
+    late = times >= begin
+    times, position, off = times[late], position[late][:, held], off[late][:, held]
+    height, limits = position[..., 2], SafetySettings()
+    sideways = np.linalg.norm(position[..., :2], axis=-1) - limits.arena_radius
+    up = np.flatnonzero(~(off & (height < 0.02)).all(1))
+    first = up[-1] + 1 if len(up) else 0
+    return {
+        "out": round(float(np.maximum(sideways, height - limits.arena_height).max(initial=-1.0)), 3),
+        "fell": bool((off & (height > FALL)).any()),
+        "seconds": float(times[first] - begin) if first < len(times) else None,
+        "held": held,
+    }

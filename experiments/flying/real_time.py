@@ -23,17 +23,31 @@ import threading
 import time
 import traceback
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 import tyro
 
-from experiments.flying.faults import CAMERA, FOLLOWED, WILD, Fault, PoseDamage, draw_fault
+from experiments.flying.faults import (
+    CAMERA,
+    ENDING,
+    FOLLOWED,
+    MARGIN,
+    RADIO,
+    WILD,
+    Fault,
+    PoseDamage,
+    draw_fault,
+    outcome,
+)
 from experiments.table import RESULTS, Page, Table, facts, made, write_page
 from openjax.files import read_json
 
 ROLES = ("loop", "links", "guard")
 SIGNALS = ("KILL", "STOP", "TERM", "HUP", "INT", "TSTP", "QUIT")
+UNSENT = ("poses: a number that is none", "poses: no attitude")
+"""No packet can say so."""
 KEYS = {
     "key l": "l", "key h, l a second later": "h…l", "h and l": "hl", "Ctrl-C": "\x03", "Ctrl-Z": "\x1a", "Ctrl-\\": "\x1c",
     "space": " ", "q": "q", "space and l": " l", "l and space": "l ", "x x space": "xx ", "an arrow and space": "\x1b[A ",
@@ -41,23 +55,30 @@ KEYS = {
 }  # fmt: skip
 STOPPED = ("space", "q")
 """In these keys' names: motors off at once."""
-THEN = (
-    "terminal closed", "policy fails", "KILL links then guard", "KILL loop then links", "KILL links then space",
-)  # fmt: skip
-PAIRS = ("loop+links", "loop+guard", "links+guard")
 START = ("start: y up", "start: millimetres", "start: yaw turned", "start: scaled", "start: beside the mark")
-POSES = (
-    *(kind for kind in CAMERA if kind != FOLLOWED), "poses lost", "poses lost for a while", "packets lost", "poses frozen",
-    "poses jump", "gyroscope: a number that is none",
-)  # fmt: skip
-POLICY = ("policy: a number that is none", *WILD)
-OTHER = ("strangers' packets", "drone gone", "none", "second fly", "none with camera")
+GROUPS = {
+    "a signal to one process": [f"{name} {role}" for name in SIGNALS for role in ROLES],
+    "to several processes": (
+        "TERM group", "HUP group", *(f"{name} {a}+{b}" for name in ("KILL", "STOP") for a, b in combinations(ROLES, 2)),
+        "KILL links then guard", "KILL loop then links", "KILL links then space",
+    ),
+    "keys, terminal closed": (*KEYS, "terminal closed"),
+    "motion capture": [kind for kind in CAMERA if kind != FOLLOWED],
+    "own estimates, links": [kind for kind in (*RADIO, "drone gone") if kind not in UNSENT],
+    "the policy": ("policy: a number that is none", *WILD, "policy fails"),
+    "wrong from the start": START,
+    "strangers, a second fly, nothing": ("strangers' packets", "none", "second fly", "none with camera"),
+}  # fmt: skip
+KINDS = [kind for kinds in GROUPS.values() for kind in kinds]
+DRAWN = (*GROUPS["motion capture"], *GROUPS["own estimates, links"], *GROUPS["the policy"][:-1])
+"""Faults as in simulated time."""
+ENDLESS = (*DRAWN, *GROUPS["strangers, a second fly, nothing"])
+"""These needn't end a flight."""
 LATEST = 6.0
 LONGEST = 25.0
 """A flight is given up this long (s) after its fault."""
 SETTLE = 1.0
 """What lands over is looked at for so long (s): processes must have ended by then."""
-MARGIN, FALL, ENDING = 0.1, 0.3, 5.0
 
 
 @dataclass(frozen=True)
@@ -78,17 +99,10 @@ class Arguments:
     out: Path = RESULTS / "flying_real_time.json"
 
 
-def kinds() -> list[str]:
-    """All kinds of faults, signals first."""
-    signals = [f"{name} {role}" for name in SIGNALS for role in ROLES] + ["TERM group", "HUP group"]
-    pairs = [f"{name} {pair}" for name in ("KILL", "STOP") for pair in PAIRS]
-    return [*signals, *pairs, *THEN, *KEYS, *POSES, *POLICY, *START, *OTHER]
-
-
 def main() -> None:
     """Share the flights out to workers, each with vehicles of its own."""
     arguments = tyro.cli(Arguments)
-    names = [k for k in kinds() if not arguments.only or any(part in k for part in arguments.only)]
+    names = [k for k in KINDS if not arguments.only or any(part in k for part in arguments.only)]
     kept = read_json(arguments.out) if arguments.go_on else {"records": []}
     flown = {row["number"] for row in kept["records"]}
     numbers = [n for n in range(arguments.seed, arguments.seed + arguments.flights) if n not in flown]
@@ -115,35 +129,17 @@ def main() -> None:
     write_page(arguments.out, page, read_json(arguments.out))
 
 
-GROUPS = {
-    "a signal to one process": lambda k: k.split()[0] in SIGNALS and "+" not in k and "then" not in k,
-    "to two processes": lambda k: k.split()[0] in SIGNALS and ("+" in k or "then" in k),
-    "keys, terminal closed": lambda k: k in KEYS or k == "terminal closed",
-    "motion capture": lambda k: k in CAMERA,
-    "own estimates, links": lambda k: (k in POSES and k not in CAMERA) or k == "drone gone",
-    "the policy": lambda k: k in POLICY or k == "policy fails",
-    "wrong from the start": lambda k: k in START,
-    "strangers, a second fly, nothing": lambda k: k in OTHER and k != "drone gone",
-    "all": lambda k: True,
-}
-
-
 def page(results) -> Page:
     """What became of the flights, by groups of kinds."""
     rows, records = [], results["records"]
-    for group, belongs in GROUPS.items():
-        mine = [r for r in records if belongs(r["kind"])]
-        if not mine:
-            continue
-        ends = [
-            r["seconds"]
-            for r in mine
-            if r["seconds"] is not None and r["kind"] not in (*POSES, *WILD, *OTHER)
-        ]
+    for group, kinds in {**GROUPS, "all": KINDS}.items():
+        mine = [r for r in records if r["kind"] in kinds]
+        ends = [r["seconds"] for r in mine if r["seconds"] is not None and r["kind"] not in ENDLESS]
+        asked = [any(name in r["kind"] for name in STOPPED) for r in mine]
         rows.append({
             "group": group, "flights": len(mine), "well": sum(r["well"] for r in mine),
-            "farthest": 0.9 + max(r["out"] for r in mine), "armed": sum(r["armed"] for r in mine),
-            "fell": sum(r["fell"] and not any(name in r["kind"] for name in STOPPED) for r in mine),
+            "farthest": 0.9 + max((r["out"] for r in mine), default=0.0), "armed": sum(r["armed"] for r in mine),
+            "fell": sum(r["fell"] and not a for r, a in zip(mine, asked, strict=True)),
             "left": sum(bool(r["left"]) for r in mine), "longest": max(ends, default=None),
         })  # fmt: skip
     columns = {
@@ -186,7 +182,7 @@ def fault_of(number: int, kind: str) -> Fault:
     """The fault with this number and kind."""
     rng = random.Random(number)
     time, vehicle = rng.uniform(0.3, LATEST), rng.randrange(3)
-    if kind in (*POSES, *POLICY, "drone gone"):
+    if kind in DRAWN:
         drawn = (draw_fault(seed, LATEST) for seed in range(1000 * number, 1000 * number + 1000))
         return replace(next(like for like in drawn if like.kind == kind), time=time)
     if kind in START:
@@ -419,21 +415,13 @@ class Flown:
 
     def _record(self, status, injected, begin) -> dict:
         track, fault = self._virtual.track(), self.fault
-        times, position, off = track["time"], track["position"], track["off"].astype(bool)
-        late = times >= (injected or begin)
-        held = np.array([not (fault.kind == "drone gone" and i == fault.vehicle) for i in range(3)])
-        beyond = np.maximum(np.linalg.norm(position[..., :2], axis=-1) - 0.9, position[..., 2] - 1.2)
-        out = beyond[late][:, held]
-        down = (off & (position[..., 2] < 0.02))[late][:, held].all(1)
-        over = next((k for k in range(len(down)) if down[k:].all()), None)
-        seconds = None if over is None or injected is None else float(times[late][over] - injected)
-        fell = bool((off & (position[..., 2] > FALL))[late][:, held].any())
-        armed = bool(track["armed"][-1][held].any())
+        seen = outcome(fault, track["time"], track["position"], track["off"].astype(bool), injected or begin)
+        held = seen.pop("held")
         said = [line for line in self._said.decode(errors="replace").splitlines() if line.strip()]
         row = {
             "number": self._number, "kind": self._kind, "time": round(min(max(fault.time, 0.0), 99.0), 2), "status": status,
-            "took_off": not math.isinf(self._virtual.truth.take_off), "out": round(float(out.max(initial=-1.0)), 3), "fell": fell,
-            "hard": bool(track["crashed"][held].any()), "armed": armed, "seconds": seconds, "left": self._find_left,
+            "took_off": not math.isinf(self._virtual.truth.take_off), **seen, "hard": bool(track["crashed"][held].any()),
+            "armed": bool(track["armed"][-1][held].any()), "left": self._find_left,
             "second": self._second, "said": " | ".join(said[1:])[-600:],
         }  # fmt: skip
         return row | {"well": self._well(row)}
@@ -451,7 +439,7 @@ class Flown:
         name, _, target = self._kind.partition(" ")
         deaf = name in SIGNALS[2:] and target in ("links", "guard")  # the flight goes on
         seconds = math.inf if row["seconds"] is None else row["seconds"]
-        in_time = deaf or self._kind in (*POSES, *WILD, *OTHER) or seconds <= ENDING
+        in_time = deaf or self._kind in ENDLESS or seconds <= ENDING
         return in_time and not row["fell"] and not row["hard"]
 
 

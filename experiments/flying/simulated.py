@@ -21,7 +21,18 @@ import numpy as np
 import tyro
 
 import openjax
-from experiments.flying.faults import FOLLOWED, KINDS, WILD, Fault, PoseDamage, draw_fault
+from experiments.flying.faults import (
+    ENDING,
+    FALL,
+    FOLLOWED,
+    KINDS,
+    MARGIN,
+    WILD,
+    Fault,
+    PoseDamage,
+    draw_fault,
+    outcome,
+)
 from experiments.table import RESULTS, Page, Table, facts, write_page
 from openjax.files import read_json
 from openjax.flying.board import SILENCE
@@ -39,16 +50,10 @@ from openjax.virtual_crazyflie.vehicles import VirtualVehicles
 
 LATEST, SECONDS = 4.0, 14.0
 """Nothing begins to go wrong after; flown in all (s)."""
-ENDING = 5.0
-"""A flight must be over this long (s) after its fault took effect."""
-FALL = 0.3
-"""Motors off above this height (m) is a fall."""
 PILLARS = 8
 """Room for as many in each layout, so that the game is compiled once."""
 LAIN = 50
 """A flight whose vehicles lay on the floor with their motors off for so many ticks is over."""
-MARGIN = 0.1
-"""Out of the arena by more than this (m) is out."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +154,7 @@ class Worlds:
                 samples[first : first + self.n] = [replace(s, captured=None) for s in seen]
             self.states[w] = see(self.safety, self.states[w], now, samples[first : first + self.n])
             for i, (drone, old) in enumerate(zip(self.states[w].drones, before, strict=True)):
-                if drone.captured.pose is not old.captured.pose:
+                if drone.captured.pose is not old.captured.pose and drone.told:
                     self.swarm.believed(first + i, drone.captured.pose)
         if any(Mode.PURSUIT in state.modes for state in self.states):
             self._play_on()
@@ -213,9 +218,7 @@ class Worlds:
         track = np.array(self._tracks).reshape(len(self._tracks), len(self.faults), self.n, 4)
         crashed = np.array([f.crashed for f in self.swarm.firmware]).reshape(-1, self.n)
         return [
-            record(
-                fault, seed, layout, self.states[w], track[:, w], crashed[w], self.safety, self.captured[w]
-            )
+            record(fault, seed, layout, self.states[w], track[:, w], crashed[w], self.captured[w])
             for w, (fault, seed) in enumerate(zip(self.faults, seeds, strict=True))
         ]
 
@@ -224,28 +227,19 @@ PILOTS = ("loop stopped", "links stopped", "loop and links stopped", "loop and g
 """Somebody else flies after a tenth of a second. (Which one takes over is for real processes: `experiments.flying.real_time`.)"""
 
 
-def record(fault, seed, layout, state, track, crashed, safety, caught) -> dict:
+def record(fault, seed, layout, state, track, crashed, caught) -> dict:
     """Where the vehicles were from the fault on. track (T, N, 4): true position (m), motors off."""
-    begin = min(int(min(fault.time, 1e6) / 0.01), len(track) - 1)
-    after = track[begin:]
-    height, off = after[..., 2], after[..., 3] > 0.0
-    out = np.maximum(
-        np.linalg.norm(after[..., :2], axis=-1) - safety.arena_radius, height - safety.arena_height
-    )
-    held = np.array([not (fault.kind == "drone gone" and i == fault.vehicle) for i in range(track.shape[1])])
-    ended = any(d.reason for d in state.drones)
-    down = off & (height < 0.02)
-    reaction = next((k for k in range(len(after)) if down[k:].all()), len(after)) * 0.01
-    pairs = [track[:, i, :3] - track[:, j, :3] for i in range(3) for j in range(i)]
-    nearest = float(np.linalg.norm(pairs, axis=-1).min())
+    position, off = track[..., :3], track[..., 3] > 0.0
+    begin = min(fault.time, 0.01 * (len(track) - 1))
+    seen = outcome(fault, 0.01 * np.arange(len(track)), position, off, begin)
+    held, ended = seen.pop("held"), any(d.reason for d in state.drones)
+    pairs = [position[:, i] - position[:, j] for i in range(3) for j in range(i)]
     return {
         "seed": seed, "kind": fault.kind, "layout": layout, "captured_by_camera": fault.captured,
         **{k: v for k, v in asdict(fault).items() if k in ("time", "vehicle", "duration", "amount")},
-        "ended": ended, "reasons": [d.reason for d in state.drones], "out": float(out[:, held].max()),
-        "out_gone": float(out[:, ~held].max()) if not held.all() else None,
-        "fell": bool((off & (height > FALL))[:, held].any()), "hard": bool(crashed[held].any()),
-        "armed": bool((~off[-1])[held].any()) and ended, "seconds": reaction if ended else None,
-        "nearest": nearest, "caught": caught,
+        "ended": ended, "reasons": [d.reason for d in state.drones], **seen, "seconds": seen["seconds"] if ended else None,
+        "hard": bool(crashed[held].any()), "armed": bool((~off[-1])[held].any()) and ended,
+        "nearest": float(np.linalg.norm(pairs, axis=-1).min()), "caught": caught,
     }  # fmt: skip
 
 

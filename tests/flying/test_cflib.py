@@ -254,7 +254,7 @@ def test_motion_capture_is_seen_here_and_on_board():
                 captured.update(0, (0.3 + 0.005 * k, 0.0, 0.5), (1.0, 0.0, 0.0, 0.0), at=100.0 + 0.01 * k)
                 (sample,) = captured.observe()
                 state = see(PATIENT, state, 100.0 + 0.01 * k, (sample,))
-                captured.believed(0, state.drones[0].captured.pose)
+                captured.believed(0, state.drones[0].captured.pose, told=True)
             assert captured.arrivals() == (100.0 + 0.01 * 39,)
             np.testing.assert_allclose(state.drones[0].estimate.velocity, (0.5, 0.0, 0.0), atol=1e-3)
             deadline = time.monotonic() + 60.0

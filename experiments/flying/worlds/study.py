@@ -1,10 +1,10 @@
 """Policies in worlds that aren't the simulator: six layouts, drawn starts, no clamp.
 
-    python -m experiments.flying.worlds [--policy open flight] [--world nominal plant ...] [--episodes 100] [--jobs N]
+    python -m experiments.flying.worlds [--policy open flight] [--world plant rotorpy ...] [--episodes 100] [--jobs N]
 
-Worlds: the nominal simulator (rate loop at 500 Hz); `table`, the same with the slower vehicle of VEHICLE; `plant`,
-the exam's plant, and with `plant:motor_lag` and so on each of its causes at three quarters of its range; `rotorpy`,
-RotorPy's own Crazyflie. Writes experiments/results/worlds.json and .md (--out).
+Worlds: `plant`, the exam's plant, and with `plant:motor_lag` and so on each of its causes at three quarters of its range;
+`rotorpy`, RotorPy's own Crazyflie. Beside them: the simulator itself, `experiments.flying.vehicles`. Writes
+experiments/results/worlds.json and .md (--out).
 """
 
 import argparse
@@ -22,21 +22,13 @@ from experiments.diagnosis import effects
 from experiments.flying.worlds.game import play
 from experiments.flying.worlds.plant import PlantWorld, rng_of
 from experiments.flying.worlds.rotorpy import RotorPyWorld
-from experiments.flying.worlds.simulator import SimulatorWorld
 from experiments.table import Page, Table, page_parser, publish
 from openjax.commands.evaluator import layout_slots
 from openjax.pursuit import SCENARIOS, scenario_task
 from openjax.store.policies import load_policy
 
-VEHICLE = {
-    "motor_lag": {"extra_up": 0.04, "extra_down": 0.04},
-    "command_latency": {"delay": 0.015},
-    "state_latency": {"delay": 0.01},
-    "rotor_drag": {"d_xy": 0.0125, "d_z": 0.0125},
-}
-"""A Crazyflie with motors 40 ms slower than the nominal, commands 15 ms and poses 10 ms late, and drag."""
 SEED = 500  # of the plant's and RotorPy's sensors; used for nothing else
-PLAIN = ("nominal", "table", "plant", "rotorpy")
+PLAIN = ("plant", "rotorpy")
 SIZES = {
     "motor_lag": 2.8,  # time constant 95 ms instead of 25
     "command_latency": 46.0,  # ms
@@ -75,10 +67,6 @@ class Job:
 def make_world(world: str, ticks: int, start: int, drones, tasks):
     """The world of that name for the drones (W, N, ...) of episodes `start` and on."""
     name, _, effect = world.partition(":")
-    if name == "nominal":
-        return SimulatorWorld(drones, tasks)
-    if name == "table":
-        return SimulatorWorld(drones, tasks, VEHICLE)
     if name == "rotorpy":
         return RotorPyWorld(drones, tasks, ticks, SEED, first=start)
     if name != "plant" or (effect and effect not in SIZES):

@@ -11,12 +11,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
-from openjax.flying.controller import Airframe, Pose, Vector, moved_on, turned_on
-
-MEMORY, MARKED = 0.2, 1.0
-"""See `Lag` (s): a turn of a pursuit; some of them."""
-STILL = 0.3
-"""Body rates (rad/s) below which an error of a degree or two, as estimators have, would look like an age."""
+from openjax.flying.controller import Airframe, Pose, moved_on
 
 
 class Verdict(StrEnum):
@@ -31,7 +26,6 @@ class Verdict(StrEnum):
     TOO_FAST = "velocity jumped"
     SPUN = "body rates jumped"
     APART = "motion capture and the vehicle's own estimate disagree"
-    LATE = "motion capture is late"
 
 
 @dataclass(frozen=True)
@@ -144,42 +138,6 @@ def follow(
     return Track(last, verdict) if verdict else Track(pose)
 
 
-class Lag(NamedTuple):
-    """How late motion capture is, told by the gyroscope: the slope of what its attitude lacks over the body rates.
-
-    The attitude that it lacks something of is its own, carried on by the gyroscope and drawn after it within `MARKED`
-    seconds: a body marked askew lacks nothing, one that is late lacks its age times the body rates. The slope is that of the
-    last `MEMORY` seconds. The estimator on board isn't asked: it is told motion capture's attitudes, too.
-    """
-
-    time: float = -math.inf  # s
-    attitude: tuple[float, ...] = ()  # wxyz
-    rates: Vector = (0.0, 0.0, 0.0)  # rad/s
-    product: float = 0.0  # rad^2/s
-    square: float = 0.0  # rad^2/s^2
-
-    @property
-    def age(self) -> float:
-        """s; towards zero where the vehicle hardly turns."""
-        return self.product / (self.square + STILL**2)
-
-    def after(self, captured: Pose, rates: Vector) -> Lag:
-        """With a pose of motion capture, and the gyroscope's `rates` (rad/s) at its time."""
-        dt = captured.time - self.time
-        if dt > MEMORY:
-            return Lag(captured.time, captured.quaternion, rates)
-        mean = tuple(0.5 * (old + new) for old, new in zip(self.rates, rates, strict=True))
-        attitude = turned_on(self.attitude, mean, dt)
-        lacks = turn_between(attitude, captured.quaternion)
-        share, slow = 1.0 - math.exp(-dt / MEMORY), 1.0 - math.exp(-dt / MARKED)
-        product = -sum(e * rate for e, rate in zip(lacks, rates, strict=True)) - self.product
-        square = sum(rate * rate for rate in rates) - self.square
-        attitude = turned_on(attitude, lacks, slow)
-        return Lag(
-            captured.time, attitude, rates, self.product + share * product, self.square + share * square
-        )
-
-
 def at_one_time(a: Pose, b: Pose) -> tuple[Pose, Pose]:
     """Both, moved on to the later one's time."""
     late = max(a.time, b.time)
@@ -193,16 +151,13 @@ def agree(captured: Pose, own: Pose, limits: PoseLimits) -> Verdict:
     return Verdict.GOOD if near and turned else Verdict.APART
 
 
-def turn_between(a, b) -> Vector:
-    """The rotation vector (rad, in a's frame, up to about one) that leads from attitude a to b, quaternions wxyz."""
-    w, x, y, z = a
-    p, q, r, s = b
-    size = math.copysign(2.0, w * p + x * q + y * r + z * s)
-    return (
-        size * (w * q - x * p - y * s + z * r),
-        size * (w * r + x * s - y * p - z * q),
-        size * (w * s - x * r + y * q - z * p),
-    )
+def follows(own: Pose, captured: Pose, limits: PoseLimits) -> bool:
+    """Whether the estimator on board may be told a pose of motion capture: they are no farther apart than errors explain.
+
+    An estimator that is told late or drifting poses takes their error for a velocity, by which it would have to land.
+    """
+    own, captured = at_one_time(own, captured)
+    return math.dist(own.position, captured.position) <= limits.position
 
 
 def angle_between(a, b) -> float:

@@ -204,7 +204,7 @@ class Links:
         with self._lock:
             self._control.send((0, "send_pose", (i, pose.position, pose.quaternion)))
 
-    def believed(self, vehicle: int, pose: Pose) -> None:
+    def believed(self, vehicle: int, pose: Pose, told: bool) -> None:
         """There is no motion capture here."""
 
     def arm(self) -> None:

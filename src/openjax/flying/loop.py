@@ -210,7 +210,7 @@ class Flight:
         self.state = see(self.safety, self.state, now, samples)
         for i, (drone, old) in enumerate(zip(self.state.drones, before, strict=True)):
             if drone.captured.pose is not old.captured.pose:
-                self.vehicles.believed(i, drone.captured.pose)
+                self.vehicles.believed(i, drone.captured.pose, drone.told)
         request = self._requests() or (Request.LAND if self._alarm else self._planned(now))
         actions = None
         if self._episode >= 0 or request is Request.PURSUE:

@@ -8,8 +8,8 @@ The adapter of a laboratory is one function that runs for as long as there are p
                 update(vehicle, body.position, body.quaternion)      # metres, wxyz, body to world
 
 and `openjax fly --motion_capture my_lab:poses`. Velocities are differences, smoothed; body rates come from the
-gyroscope on board. Each pose that was believed is also sent to its vehicle, for the estimator on board, by which the vehicle
-lands should motion capture fail, or the loop.
+gyroscope on board. Each pose that was believed, and is near what the vehicle knows, is also sent to it, for the estimator
+on board, by which the vehicle lands should motion capture fail, or the loop.
 """
 
 from __future__ import annotations
@@ -71,11 +71,12 @@ class MotionCaptured(Links):
         self._captured[vehicle] = Pose(at, position, (0.0, 0.0, 0.0), quaternion)
         self._arrived.set()
 
-    def believed(self, vehicle: int, pose: Pose) -> None:
-        """This pose of motion capture was judged good: it is kept, and told to the vehicle."""
+    def believed(self, vehicle: int, pose: Pose, told: bool) -> None:
+        """This pose of motion capture was judged good: it is kept, and `told` to the vehicle."""
         if self._recording:
             self._seen[vehicle].extend(numbers_of(pose))
-        self.send_pose(vehicle, pose)
+        if told:
+            self.send_pose(vehicle, pose)
 
     def record(self) -> None:
         """Keep all samples from now on."""

@@ -30,7 +30,15 @@ from openjax.flying.controller import (
     wanted_velocity,
 )
 from openjax.flying.crtp import Supervisor
-from openjax.flying.judge import Lag, PoseLimits, Track, Verdict, agree, at_one_time, follow, pose_limits
+from openjax.flying.judge import (
+    PoseLimits,
+    Track,
+    agree,
+    at_one_time,
+    follow,
+    follows,
+    pose_limits,
+)
 from openjax.flying.limits import (
     APART,
     SafetySettings,
@@ -59,7 +67,7 @@ RISEN = 0.04
 SMOOTHING = 0.02
 """Time constant of the low-pass of velocities from motion capture (s)."""
 TRIM_GAIN, TRIM_LIMIT = 0.25, 0.15
-_NOTHING_SEEN, _NO_LAG = Track(), Lag()
+_NOTHING_SEEN = Track()
 
 
 class Mode(StrEnum):
@@ -132,7 +140,7 @@ class Drone:
     estimate: Pose | None = None  # now; reckoned on where no pose is fresh
     own: Track = _NOTHING_SEEN  # its own estimates
     captured: Track = _NOTHING_SEEN  # motion capture, with velocity and rates
-    lag: Lag = _NO_LAG  # of motion capture
+    told: bool = True  # whether the estimator on board is to follow the newest of it
     seen: float = -math.inf  # s, when the pose that it is flown by was measured
     distrusted: str = ""  # why motion capture isn't believed any more in this flight
     stand: tuple[Vector | None, Vector | None] = (None, None)  # own and captured position before the lift
@@ -223,10 +231,12 @@ def _sense(settings, limits, drone, sample, now, dt) -> Drone:
     if by_capture:
         seen = _with_motion(sample.captured, captured.pose, sample.own)
         captured = source = follow(captured, seen, now, limits, moving, drone.estimate)
-        if captured.pose is seen and own.fresh(now, limits):
-            drone, verdict = _compared(drone, seen, own.pose, limits)
-            if moving and verdict:
-                captured = source = Track(drone.captured.pose, verdict)
+        if captured.pose is seen:
+            drone = replace(drone, told=not moving or own.pose is None or follows(own.pose, seen, limits))
+            if own.fresh(now, limits):
+                verdict = agree(*at_one_time(seen, own.pose), limits)
+                if moving and verdict:
+                    captured = source = Track(drone.captured.pose, verdict)
         if moving and not captured.fresh(now, limits):
             distrusted, source = captured.verdict or "pose lost", own
     drone = replace(drone, own=own, captured=captured, distrusted=distrusted)
@@ -244,14 +254,6 @@ def _sense(settings, limits, drone, sample, now, dt) -> Drone:
     velocity = tuple(v + dt * a for v, a in zip(old.velocity, drone.acceleration, strict=True))
     position = tuple(p + dt * v for p, v in zip(old.position, velocity, strict=True))
     return replace(drone, estimate=old._replace(time=now, position=position, velocity=velocity))
-
-
-def _compared(drone, seen, own, limits) -> tuple[Drone, Verdict]:
-    """The drone with what was learnt of motion capture's age, and whether it and the own estimate tell the same."""
-    seen, own = at_one_time(seen, own)
-    drone = replace(drone, lag=drone.lag.after(seen, own.body_rates))
-    late = Verdict.LATE if drone.lag.age > limits.horizon else Verdict.GOOD
-    return drone, agree(seen, own, limits) or late
 
 
 def _with_motion(pose, last, own) -> Pose:
