@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import gzip
 import hashlib
-import io
 import re
 import zlib
 from dataclasses import dataclass, field
@@ -36,9 +35,6 @@ WHOLE = ("quaternion", "motor_command")  # channels of which a part is a mistake
 LARGEST = 256 << 20  # bytes of text in one log: a quarter of an hour at 1 kHz; more is no flight log
 LARGEST_VALUE = 1e6  # no sensor's reading in SI units is larger; squares of what is would overflow
 
-_EMPTY_CELL = re.compile(r"(?<=,)[ \t]*(?=[,\n])|^[ \t]*(?=,)", re.MULTILINE)
-_NOT_A_NUMBER = re.compile(r"(?<=[,\n ])[-+]?(?:nan|na|n/a|null|none)(?=[,\n ])", re.IGNORECASE)
-
 
 class LogError(UserError):
     """This log can't be used; the message says why, without the log's name."""
@@ -61,48 +57,25 @@ def read_csv(path: str | Path, delimiter: str = ",", known: tuple[str, ...] | No
     Raises LogError if it isn't such a file: unreadable, no header, a cell that is no number.
     """
     path = Path(path)
-    text = _text(path)
-    header, _, body = text.partition("\n")
+    header, *lines = _text(path).split("\n")
     names = [name.strip().strip('"') for name in header.split(delimiter)]
-    if delimiter == "," and len(names) == 1 and ";" in header:
-        raise LogError(
-            "columns are separated by ';'; the log format wants ',' (or a columns.toml with its delimiter)"
-        )
-    if not any(re.search("[A-Za-z]", name) for name in names):
-        raise LogError("the first row holds no column names")
-    repeated = {name for name in names if name and names.count(name) > 1}
-    if repeated:
-        raise LogError(f"column {min(repeated)!r} occurs more than once")
-    if not body.strip():
-        raise LogError("no rows")
-    if delimiter != ",":
-        body = body.replace(delimiter, ",")
-    if not body.endswith("\n"):
-        body += "\n"
-    body, remarks = _without_last_if_cut(body, len(names))
-
-    text_columns = {"vehicle"} if known is not None else {"vehicle", *_text_columns(names, body)}
-    kept = [i for i, n in enumerate(names) if n and n not in text_columns and (known is None or n in known)]
+    _check_header(names, delimiter, known)
+    lines, remarks = _whole_lines(lines, delimiter, len(names))
+    first = lines[0].split(delimiter)
+    kept = [
+        i
+        for i, name in enumerate(names)
+        if name and name != "vehicle" and (name in known if known is not None else _is_number(first[i]))
+    ]
     unknown = [n for n in names if n and known is not None and n not in known]
     if unknown:
         remarks.append(f"unknown column{'s' * (len(unknown) > 1)} left out: {', '.join(unknown[:8])}")
-    if known is not None and "t" not in names:
-        raise LogError(
-            f"no column t; the log has {', '.join(n for n in names if n)}: say in columns.toml which is which"
-        )
-
-    if (_cells_per_line(body) != len(names)).any():
-        raise LogError(_why_not(body, names, kept, ValueError("rows of unequal length")))
-    # An empty cell becomes NaN; a written "nan" becomes infinite, so that the two can be told apart
-    # afterwards.
-    spelt = any(letter in body for letter in "nN") and _NOT_A_NUMBER.search(body) is not None
-    numbers = _NOT_A_NUMBER.sub("inf", body) if spelt else body
-    if any(empty in numbers for empty in (",,", ",\n", "\n,", " ", "\t")) or numbers.startswith(","):
-        numbers = _EMPTY_CELL.sub("nan", numbers)
     try:
-        values = np.loadtxt(io.StringIO(numbers), delimiter=",", usecols=kept, ndmin=2, comments=None)
+        values = np.loadtxt(
+            lines, delimiter=delimiter, usecols=kept, ndmin=2, comments=None, converters=_number
+        )
     except (ValueError, OverflowError) as error:
-        raise LogError(_why_not(body, names, kept, error)) from error
+        raise LogError(_why_not(lines, delimiter, names, kept, error)) from error
     columns = {}
     for i, column in zip(kept, values.T, strict=True):
         bad = np.isinf(column)
@@ -111,14 +84,10 @@ def read_csv(path: str | Path, delimiter: str = ",", known: tuple[str, ...] | No
             remarks.append(f"column {names[i]}: {bad.sum()} of {len(bad)} rows are NaN or infinite")
         if not np.isnan(column).all():
             columns[names[i]] = np.ascontiguousarray(column)
-        elif names[i] in ("t",):
-            raise LogError("column t is empty")
+    vehicle = np.full(len(values), "0")
     if "vehicle" in names:
         k = names.index("vehicle")
-        ids = [line.split(",", k + 1)[k].strip(' \t"') or "0" for line in body.split("\n") if line.strip()]
-        vehicle = np.array(ids)
-    else:
-        vehicle = np.full(len(values), "0")
+        vehicle = np.array([line.split(delimiter, k + 1)[k].strip(' \t"') or "0" for line in lines])
     return LogTable(path.name, columns, vehicle, tuple(remarks))
 
 
@@ -205,47 +174,64 @@ def _text(path: Path) -> str:
     return text.replace("\r\n", "\n").replace("\r", "\n").lstrip("\n")
 
 
-def _cells_per_line(body: str) -> np.ndarray:
-    """Cells in each line of `body` that isn't blank."""
-    data = np.frombuffer(body.encode(), np.uint8)
-    ends = np.flatnonzero(data == ord("\n"))
-    commas = np.searchsorted(np.flatnonzero(data == ord(",")), ends)
-    solid = np.searchsorted(np.flatnonzero(data > ord(" ")), ends)
-    return (np.diff(commas, prepend=0) + 1)[np.diff(solid, prepend=0) > 0]
+def _check_header(names: list[str], delimiter: str, known: tuple[str, ...] | None) -> None:
+    if delimiter == "," and len(names) == 1 and ";" in names[0]:
+        raise LogError(
+            "columns are separated by ';'; the log format wants ',' (or a columns.toml with its delimiter)"
+        )
+    if not any(re.search("[A-Za-z]", name) for name in names):
+        raise LogError("the first row holds no column names")
+    repeated = {name for name in names if name and names.count(name) > 1}
+    if repeated:
+        raise LogError(f"column {min(repeated)!r} occurs more than once")
+    if known is not None and "t" not in names:
+        raise LogError(
+            f"no column t; the log has {', '.join(n for n in names if n)}: say in columns.toml which is which"
+        )
 
 
-def _without_last_if_cut(body: str, cells: int) -> tuple[str, list[str]]:
-    """The body without its last line if that has too few cells: power was cut while it was written."""
-    lines = body.rstrip().rsplit("\n", 1)
-    if len(lines) == 2 and lines[1].count(",") + 1 < cells:
-        return lines[0] + "\n", ["the last line is cut off and left out"]
-    return body, []
+def _whole_lines(lines: list[str], delimiter: str, cells: int) -> tuple[list[str], list[str]]:
+    """The lines that aren't blank, and a remark where the last was cut off: power went while it was written."""
+    numbered = [(number, line) for number, line in enumerate(lines, 2) if line.strip()]
+    remarks = []
+    if len(numbered) > 1 and numbered[-1][1].count(delimiter) + 1 < cells:
+        del numbered[-1]
+        remarks.append("the last line is cut off and left out")
+    for number, line in numbered:
+        if (found := line.count(delimiter) + 1) != cells:
+            raise LogError(f"line {number} has {found} cells, the header {cells} (cut off or corrupt)")
+    if not numbered:
+        raise LogError("no rows")
+    return [line for _, line in numbered], remarks
 
 
-def _text_columns(names: list[str], body: str) -> list[str]:
-    """Columns whose first row is neither empty nor a number."""
-    first = body.split("\n", 1)[0].split(",")
-    return [n for n, cell in zip(names, first, strict=False) if cell.strip() and not _is_number(cell)]
+def _number(cell: str) -> float:
+    """A cell's number: NaN where it is empty, infinite where somebody wrote that it is none, so that the two can be told
+    apart. Raises ValueError for anything else."""
+    try:
+        value = float(cell)
+    except ValueError:
+        text = cell.strip().lower()
+        if text and text not in ("na", "n/a", "null", "none"):
+            raise
+        return np.inf if text else np.nan
+    return np.inf if np.isnan(value) else value
 
 
 def _is_number(cell: str) -> bool:
     try:
-        float(cell)
+        _number(cell)
     except ValueError:
-        return cell.strip().lower() in ("na", "n/a", "null", "none")
+        return False
     return True
 
 
-def _why_not(body: str, names: list[str], kept: list[int], error: ValueError) -> str:
-    """The first row that isn't like the header says, in words."""
-    for number, line in enumerate(body.split("\n"), 2):
-        cells = line.split(",")
-        if not line.strip():
-            continue
-        if len(cells) != len(names):
-            return f"line {number} has {len(cells)} cells, the header {len(names)} (cut off or corrupt)"
+def _why_not(lines: list[str], delimiter: str, names: list[str], kept: list[int], error: Exception) -> str:
+    """The first cell that is no number, in words. `lines` are those that aren't blank."""
+    for number, line in enumerate(lines, 2):
+        cells = line.split(delimiter)
         for i in kept:
-            if cells[i].strip() and not _is_number(cells[i]):
+            if not _is_number(cells[i]):
                 return f"line {number}, column {names[i]}: {cells[i].strip()!r} is no number"
     return f"not a table of numbers ({error})"
 
