@@ -44,11 +44,11 @@ REFUSED = {
     "commands in degrees": (
         scaled("cmd_wx cmd_wy cmd_wz", RADIANS),
         "units",
-        "cmd_wx, cmd_wy, cmd_wz are in deg/s",
+        "cmd_wx, cmd_wy, cmd_wz: in deg/s",
     ),
     "accelerometer in g": (scaled("ax ay az", 1 / 9.81), "units", "are in g"),
     "position in mm": (scaled("x y z", 1000), "units", "mm"),
-    "velocity in mm/s": (scaled("vx vy vz", 1000), "units", "vx, vy, vz are in mm/s"),
+    "velocity in mm/s": (scaled("vx vy vz", 1000), "units", "vx, vy, vz: in mm/s"),
     "time in ms": (scaled("t", 1000), "units", "t is in milliseconds"),
     "motors in counts": (scaled("m1 m2 m3 m4", 65535), "units", "16-bit counts"),
     "thrust command in counts": (scaled("cmd_thrust", 65535), "units", "cmd_thrust"),

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 
 from openjax.errors import UserError
+from openjax.flights.agreement import shown_right
 from openjax.flights.checks import check_flight, duplicates
-from openjax.flights.contradictions import SUBJECTS, accused_by, shown_right
 from openjax.flights.flight import Case, Flight, Issue
 from openjax.flights.importers import MAPPING_FILE, ColumnMapping, find_logs, load_mapping, read_log
 from openjax.flights.reading import LogError, flights_of
@@ -52,7 +53,7 @@ def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> 
         checked, found = _check(flight, vehicle_file, comparison)
         issues += found
         kept += [] if checked is None else [checked]
-    kept, found = _unproven(kept, issues, vehicle_file)
+    kept, found = _trusted(kept, issues, vehicle_file)
     issues += found
     if not kept:
         reasons = [i for i in issues if i.refused]
@@ -65,33 +66,23 @@ def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> 
     return Case(path.resolve().name, tuple(kept), vehicle_file, tuple(issues), path)
 
 
-def _unproven(
+def _trusted(
     kept: list[Flight], issues: list[Issue], vehicle_file: VehicleFile
 ) -> tuple[list[Flight], list[Issue]]:
-    """What most flights contradict, the others of the case must show to be right: columns are swapped, scaled or mixed
-    up for a whole case, and a calm flight only can't tell."""
-    accusing = [
-        i for i in issues if i.refused and i.kind in ("axes", "units", "motors", "quaternion", "garbage")
-    ]
-    accused = {subject: {i.flight for i in accusing if subject in accused_by(i)} for subject in SUBJECTS}
-    accused = {subject: flights for subject, flights in accused.items() if flights}
-    if not accused:
+    """The flights without those that are too calm to show what most others contradict: columns are mixed up for a case."""
+    failed = Counter(what for issue in issues for what in issue.against)
+    if not failed:
         return kept, []
-    right = {f.name: shown_right(f, vehicle_file.vehicle_of(f.vehicle)) for f in kept}
+    shown = [shown_right(f, vehicle_file.vehicle_of(f.vehicle)) for f in kept]
+    passed = Counter(what for flight in shown for what in flight)
     out, found = [], []
-    for flight in kept:
-        doubts = [
-            (subject, against)
-            for subject, against in accused.items()
-            if subject not in right[flight.name]
-            and len(against) > sum(subject in shown for shown in right.values())
-        ]
-        if not doubts:
+    for flight, right in zip(kept, shown, strict=True):
+        doubt = next((what for what in failed if what not in right and failed[what] > passed[what]), None)
+        if doubt is None:
             out.append(flight)
-            continue
-        subject, against = doubts[0]
-        text = f"{subject}: contradictory in {min(against)}, and too calm here to show that it is right"
-        found.append(Issue(flight.name, text, refused=True, kind="garbage"))
+        else:
+            text = f"too calm to show that it doesn't contradict {doubt}, as other flights of the case do"
+            found.append(Issue(flight.name, text, refused=True, kind="garbage"))
     return out, found
 
 

@@ -7,8 +7,7 @@ import dataclasses
 
 import numpy as np
 
-from openjax.flights.consistency import check_consistency
-from openjax.flights.contradictions import check_contradictions
+from openjax.flights.agreement import check_agreement
 from openjax.flights.flight import CHANNELS, Flight, Issue
 from openjax.flights.reading import CHANNEL_COLUMNS
 
@@ -56,7 +55,7 @@ def check_flight(
         _has_what_is_needed(checked, comparison)
     except _Refused as refused:
         return None, [*issues, Issue(flight.name, str(refused), refused=True, kind=refused.kind)]
-    found = check_consistency(checked, vehicle) or check_contradictions(checked, vehicle)
+    found = check_agreement(checked, vehicle)
     return (None if found else checked), issues + found
 
 

@@ -31,13 +31,15 @@ class Issue:
     """One finding about a flight's data.
 
     `flight` is the log's file name (with the vehicle's id where several flew), `issue` says in words what was
-    found, `refused` whether the flight can't be used because of it, and `kind` is a short name of the check.
+    found, `refused` whether the flight can't be used because of it, and `kind` is a short name of the check. `against`
+    names the comparisons of channels that failed.
     """
 
     flight: str
     issue: str
     refused: bool = False
     kind: str = ""
+    against: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
