@@ -1,8 +1,8 @@
 """Speed on this machine: `openjax benchmark [--envs 1024 4096] [--json FILE]`.
 
 Steps per second of the physics (rigid and MJX, each with and without solids), of the environment, of rollouts with the
-policy and of the whole training step, over a sweep of environment counts; and where a training step's time goes, beside
-what a limit would be. Same command on CPU and GPU.
+policy and of the whole training step, over a sweep of environment counts. Same command on CPU and GPU. Where a step's time
+goes is shown by JAX's own profiler (`jax.profiler.trace`).
 """
 
 import dataclasses
@@ -12,18 +12,16 @@ from pathlib import Path
 from typing import Annotated, Literal, get_args
 
 import tyro
-from rich.table import Table
 
-from openjax.commands.command_line import output_console, parse, peek
+from openjax.commands.command_line import parse, peek
 from openjax.files import check_output
 from openjax.learning.presets import preset
 from openjax.learning.settings import TrainSettings
 from openjax.ranges import Interval
-from openjax.show.number_tables import numbers_table
 
 PROGRAM = "openjax benchmark"
 PHYSICS = ("rigid_free", "rigid", "mjx_free", "mjx")
-Part = Literal["rigid_free", "rigid", "mjx_free", "mjx", "environment", "rollout", "training", "shares"]
+Part = Literal["rigid_free", "rigid", "mjx_free", "mjx", "environment", "rollout", "training"]
 PARTS = get_args(Part)
 
 
@@ -36,7 +34,7 @@ class BenchmarkCommand:
     envs: Annotated[tuple[int, ...], Interval("[1, 16777216]")] = ()
     """Environment counts; by default a sweep that fits the machine."""
     training_envs: Annotated[tuple[int, ...], Interval("[1, 16777216]")] = ()
-    """Environment counts of the training step and its shares; by default those that fit the machine."""
+    """Environment counts of the training step; by default those that fit the machine."""
     parts: tuple[Part, ...] = PARTS
     """What to measure."""
     steps: Annotated[int, Interval("[1, 100000]")] = 50
@@ -62,43 +60,25 @@ def main(arguments: Sequence[str]) -> int:
     check_output(command.json, "--json")
     import jax
 
-    from openjax.commands.benchmark_cases import cases, fitting_settings
+    from openjax.commands.benchmark_cases import cases
     from openjax.commands.machine import describe_machine
-    from openjax.commands.step_shares import measure, shares_table
     from openjax.commands.timing import time_compiled
     from openjax.store.settings_files import write_json
 
     machine = describe_machine()
     print(f"{machine['device']}, JAX {machine['versions']['jax']}, commit {machine['commit']}", flush=True)
-    rows, shares = [], []
+    rows = []
     facts = {"command": " ".join([PROGRAM, *arguments]), "machine": machine}
     facts["compilation_cache"] = jax.config.jax_compilation_cache_dir is not None
-
-    def write():
-        """After each measurement, so that an interrupted sweep leaves what it has."""
-        write_json(command.json, {**facts, "settings": command.settings, "rows": rows, "shares": shares})
-
-    console = output_console()
     for part, num_envs, steps, function, inputs in cases(
         command.settings, command.parts, command.envs, command.training_envs, command.steps
     ):
         timing = time_compiled(function, inputs, command.seconds)
         rows.append(_row(part, num_envs, steps, command.settings, timing))
         print(_line(rows[-1]), flush=True)
-        write()
-    if rows:
-        console.print(results_table(rows))
-    for num_envs in command.training_envs if "shares" in command.parts else ():
-        fitting = fitting_settings(command.settings, num_envs)
-        found = measure(fitting, lambda *program: time_compiled(*program, command.seconds).seconds)
-        if not found:
-            console.print(f"shares of {fitting.num_envs:,} environments: out of memory")
-            continue
-        console.print(shares_table(found, fitting))
-        parts = [dataclasses.asdict(share) | {"limit": share.limit} for share in found]
-        shares.append({"num_envs": fitting.num_envs, "parts": parts})
-        write()
-    console.print(f"written to {command.json}")
+        # after each measurement, so that an interrupted sweep leaves what it has
+        write_json(command.json, {**facts, "settings": command.settings, "rows": rows})
+    print(f"written to {command.json}")
     return 0
 
 
@@ -117,27 +97,8 @@ def _row(part, num_envs, steps, settings, timing) -> dict:
     }
 
 
-def results_table(rows: Sequence[dict]) -> Table:
-    """Measurements as a table."""
-    heads = ("envs", "env steps/s", "drone steps/s", "compile [s]", "memory [MB]")
-    table = numbers_table("Speed", "part", *heads)
-    for row in rows:
-        table.add_row(*_cells(row))
-    return table
-
-
-def _cells(row):
-    speed, drones, memory = row["env_steps_per_second"], row["drone_steps_per_second"], row["memory"]
-    return (
-        row["part"],
-        f"{row['num_envs']:,}",
-        "out of memory" if speed is None else f"{speed:,.0f}",
-        "" if drones is None else f"{drones:,.0f}",
-        f"{row['compile_seconds']:.1f}",
-        "" if memory is None else f"{memory / 1e6:,.0f}",
-    )
-
-
 def _line(row):
-    part, envs, speed, _, compiled, _ = _cells(row)
-    return f"{part:12} {envs:>10} environments: {speed} env steps/s (compiled in {compiled} s)"
+    speed, memory = row["env_steps_per_second"], row["memory"]
+    told = "out of memory" if speed is None else f"{speed:,.0f} env steps/s"
+    needs = "" if memory is None else f", {memory / 1e6:,.0f} MB"
+    return f"{row['part']:12} {row['num_envs']:>10,} environments: {told} (compiled in {row['compile_seconds']:.1f} s{needs})"

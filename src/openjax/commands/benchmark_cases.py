@@ -23,8 +23,6 @@ def cases(
 ) -> Iterator[tuple[str, int, int, Callable, tuple]]:
     """(part, environments, control steps per call, function, its arguments), made one at a time."""
     for part in parts:
-        if part == "shares":
-            continue
         for num_envs in training_envs if part == "training" else envs:
             if part == "training":
                 fitting = fitting_settings(settings, num_envs)
