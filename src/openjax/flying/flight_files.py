@@ -39,9 +39,9 @@ def write_case(folder: Path, samples, record: Record, vehicle: VehicleFile, abou
       vehicle: what flew, for all I know.
       about: what flight.json is to say beside timing and games.
     """
-    sent = np.array(record.sent)
-    commands = np.array([[(c.mode, c.thrust, *c.numbers()[:3]) for c in row] for row in record.set_points])
-    episode, files = np.array(record.episode), []
+    table, vehicles = record.table()
+    _, sent, episode = table.T
+    commands, files = vehicles[..., 2:], []
     for number in range(len(record.episodes)):
         ticks = np.flatnonzero(episode == number)
         if not len(ticks) or sent[ticks[-1]] - sent[ticks[0]] < SHORTEST:

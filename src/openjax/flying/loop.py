@@ -5,8 +5,9 @@ from __future__ import annotations
 import gc
 import itertools
 import math
+from array import array
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from time import perf_counter
 
 import numpy as np
@@ -16,7 +17,7 @@ from openjax.flying.game import Game
 from openjax.flying.limits import SafetySettings
 from openjax.flying.links import Links
 from openjax.flying.safety import Event, Mode, Request, State, decide, initial_state, see
-from openjax.flying.set_point import OFF, RATES, SetPoint, as_sent, from_action
+from openjax.flying.set_point import OFF, RATES, as_sent, from_action
 from openjax.pursuit.environment import THRUST_LIMIT
 
 PERIOD = 0.01
@@ -31,25 +32,31 @@ GONE = 0.1
 """A vehicle whose newest pose is older (s) isn't waited for."""
 
 
-@dataclass
 class Record:
-    """What happened at every tick of a flight."""
+    """What happened at every tick of a flight with `vehicles`; as numbers, since objects would take two kilobytes a tick.
 
-    due: list[float] = field(default_factory=list)  # s, host
-    sent: list[float] = field(default_factory=list)  # s, when the last set-point had left
-    age: list[tuple[float, ...]] = field(
-        default_factory=list
-    )  # s, from each vehicle's newest pose's arrival to `sent`
-    measured: list[tuple[float, ...]] = field(
-        default_factory=list
-    )  # s, the same from when it was measured on board
-    set_points: list[tuple[SetPoint, ...]] = field(default_factory=list)  # as they fit into their packets
-    modes: list[tuple[Mode, ...]] = field(default_factory=list)
-    fenced: list[tuple[bool, ...]] = field(default_factory=list)
-    episode: list[int] = field(default_factory=list)  # -1 outside of episodes
-    evader: list[tuple[float, ...]] = field(default_factory=list)  # m
-    episodes: list[dict] = field(default_factory=list)
-    skipped: int = 0  # ticks that were left out because the one before took too long
+    Attributes:
+      episodes: notes on each game.
+      skipped: ticks that were left out because the one before took too long.
+    """
+
+    def __init__(self, vehicles: int):
+        self._rows, self._width = array("d"), 3 + 7 * vehicles
+        self.episodes: list[dict] = []
+        self.skipped = 0
+
+    def keep(self, tick, arrivals, measured, set_points) -> None:
+        """A row: of the tick when it was due and its last set-point left (s), and the game (-1: none); of each vehicle when
+        its newest pose arrived and was measured (s), and its set-point."""
+        self._rows.extend(tick)
+        for arrival, seen, s in zip(arrivals, measured, set_points, strict=True):
+            s = s if s.mode == OFF else as_sent(s)
+            self._rows.extend((arrival, seen, s.mode, s.thrust, s.roll, s.pitch, s.yaw_rate))
+
+    def table(self) -> tuple[np.ndarray, np.ndarray]:
+        """(T, 3) due, sent, game; (T, N, 7) arrival, measured, mode, thrust, roll, pitch, yaw rate as they fit into packets."""
+        rows = np.array(self._rows).reshape(-1, self._width)
+        return rows[:, :3], rows[:, 3:].reshape(len(rows), -1, 7)
 
     def timing(self) -> dict:
         """Command age (ms) and missed deadlines of all ticks. A tick's deadline is the next tick's due
@@ -57,21 +64,22 @@ class Record:
 
         `measured_to_sent_ms` counts from the moment on board, as far as the fastest packet of the flight tells it.
         """
-        if not self.due:
+        ticks, vehicles = self.table()
+        if not len(ticks):
             return {"ticks": 0}
-        age, measured = (1e3 * np.array(ages).max(1) for ages in (self.age, self.measured))
-        work = 1e3 * (np.array(self.sent) - np.array(self.due))
-        gaps = 1e3 * np.diff(self.sent)
+        due, sent, _ = ticks.T
+        age, measured = 1e3 * (sent[:, None, None] - vehicles[..., :2]).max(1).T
+        work, gaps = 1e3 * (sent - due), 1e3 * np.diff(sent)
         missed = int((work > 1e3 * PERIOD).sum()) + self.skipped
         return {
-            "ticks": len(self.due),
-            "seconds": round(self.sent[-1] - self.due[0], 2),
+            "ticks": len(due),
+            "seconds": round(sent[-1] - due[0], 2),
             "command_age_ms": _percentiles(age),
             "measured_to_sent_ms": _percentiles(measured),
             "due_to_sent_ms": _percentiles(work),
             "between_set_points_ms": _percentiles(gaps) if len(gaps) else {},
             "missed_deadlines": missed,
-            "missed_share": missed / (len(self.due) + self.skipped),
+            "missed_share": missed / (len(due) + self.skipped),
         }
 
 
@@ -174,7 +182,7 @@ class Flight:
         self._pursuers = game.settings.num_pursuers
         self._evader_flies = number > self._pursuers
         self.state = flight_state(game, number, safety)
-        self.record = Record()
+        self.record = Record(number)
         self._play, self._episode, self._begun = None, -1, 0.0
         self._since = perf_counter()
         self._flown, self._alarm = 0, ""
@@ -219,7 +227,7 @@ class Flight:
         self.state, set_points = decide(self.safety, self.state, event)
         sent = self.vehicles.send(set_points)
         self._alarm = self._watched(now, self.state)
-        self._keep(due, sent, arrivals, samples, set_points)
+        self.record.keep((due, sent, self._episode), arrivals, measured_times(samples), set_points)
         if self._episode >= 0 and not any(m is Mode.PURSUIT for m in self.state.modes):
             self._end_episode("safety")
 
@@ -277,17 +285,3 @@ class Flight:
         self.record.episodes[-1]["end"] = why
         self._episode = -1
         self._flown += 1
-
-    def _keep(self, due, sent, arrivals, samples, set_points):
-        record = self.record
-        record.due.append(due)
-        record.sent.append(sent)
-        record.age.append(tuple(sent - a for a in arrivals))
-        record.measured.append(tuple(sent - t for t in measured_times(samples)))
-        record.set_points.append(tuple(s if s.mode == OFF else as_sent(s) for s in set_points))
-        record.modes.append(self.state.modes)
-        record.fenced.append(tuple(d.fenced for d in self.state.drones))
-        record.episode.append(self._episode)
-        record.evader.append(
-            tuple(self._play.evader_position.tolist()) if self._play is not None else (math.nan,) * 3
-        )

@@ -151,7 +151,6 @@ class Drone:
     over_since: float | None = None  # upside down
     landing_since: float | None = None
     reason: str = ""  # why it left the pursuit
-    fenced: bool = False  # the last set-point kept it in the arena, or off another, instead of doing what the policy wanted
     sent: SetPoint = MOTORS_OFF
 
     @property
@@ -454,7 +453,6 @@ def _fly(settings, state, i, action, sample) -> Drone:
         drone,
         low_since=(drone.low_since if drone.low_since is not None else now) if low else None,
         over_since=(drone.over_since if drone.over_since is not None else now) if over else None,
-        fenced=False,
         sent=MOTORS_OFF,
     )
     if drone.mode not in FLYING or drone.estimate is None:
@@ -513,7 +511,7 @@ def _pursue(settings, state, drone, i, action) -> Drone:
         return replace(drone, sent=within_reach(action, sent, state.airframe, state.dt))
     acceleration = wanted_acceleration(estimate.velocity, wanted)
     flown = accelerate(estimate.quaternion, acceleration, state.airframe, drone.trim, RATES)
-    return replace(drone, fenced=True, sent=flown)
+    return replace(drone, sent=flown)
 
 
 def _descend_blindly(settings, state, drone, acceleration) -> Drone:

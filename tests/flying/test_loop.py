@@ -1,0 +1,105 @@
+"""The loop without links: what its ticks leave behind, and what its record says of them."""
+
+import gc
+import tracemalloc
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from openjax.flying.controller import Pose, nominal_airframe
+from openjax.flying.game import Play
+from openjax.flying.limits import SafetySettings
+from openjax.flying.loop import Flight, Plan
+from openjax.flying.safety import Mode, PoseSample
+
+STARTS = ((0.5, 0.3, 0.5), (0.5, 0.0, 0.5), (0.5, -0.3, 0.5))
+
+
+class Hovering:
+    """Links to three vehicles that rise as soon as they are asked to, and a game whose policy hovers."""
+
+    airframe = nominal_airframe()
+    settings = SimpleNamespace(num_pursuers=3, pillar_radius=0.1, max_speed=1.0)
+    task = SimpleNamespace(
+        pursuer_position=np.array(STARTS), evader_position=np.zeros(3), pillar_position=np.zeros((1, 2)),
+        pillar_active=np.zeros(1, bool),
+    )  # fmt: skip
+
+    def __init__(self):
+        self.now, self.height = 0.0, 0.0
+        self._nothing = np.zeros(3)
+        self._action = np.array([[2 * self.airframe.hover_thrust - 1, 0.0, 0.0, 0.0]] * 3)
+
+    def observe(self):
+        shake = 1e-4 * np.sin(1e3 * self.now)
+        poses = [
+            Pose(self.now, (x + shake, y, self.height), (0.0,) * 3, (1.0, 0.0, 0.0, 0.0))
+            for x, y, _ in STARTS
+        ]
+        return tuple(PoseSample(pose, self.now, 4.0) for pose in poses)
+
+    def arrivals(self):
+        return (self.now,) * 3
+
+    def send(self, set_points):
+        self.height = min(self.height + 0.001 * any(s.mode for s in set_points), 0.5)
+        return self.now + 1e-3
+
+    def start(self, poses):
+        return self.step(poses)
+
+    def step(self, poses, evader=None):
+        return Play(
+            self._action,
+            self._nothing,
+            self._nothing,
+            False,
+            False,
+            self._nothing,
+            self._nothing.astype(bool),
+        )
+
+
+@pytest.fixture
+def flight():
+    """In the middle of a game, and a function that goes on for some ticks."""
+    links = Hovering()
+    flight = Flight(links, links, SafetySettings(), Plan())
+
+    def go_on(ticks):
+        for _ in range(ticks):
+            links.now += 0.01
+            flight.tick(links.now, links.now - 5e-4)
+
+    go_on(700)
+    assert flight.state.all_in(Mode.PURSUIT), [d.reason for d in flight.state.drones]
+    return flight, go_on
+
+
+def test_ticks_leave_half_a_kilobyte_each_and_nothing_to_collect(flight):
+    """The garbage collector is off in flight; two kilobytes a tick were 128 MB in eleven minutes."""
+    _, go_on = flight
+    gc.collect()
+    gc.disable()
+    tracemalloc.start()
+    try:
+        go_on(100)
+        before = tracemalloc.get_traced_memory()[0]
+        go_on(1000)
+        grown = tracemalloc.get_traced_memory()[0] - before
+        unreachable = gc.collect()
+    finally:
+        tracemalloc.stop()
+        gc.enable()
+    assert grown < 1000 * 512 and unreachable < 100
+
+
+def test_the_record_says_when_each_tick_was_due_and_done(flight):
+    flight, _ = flight
+    ticks, vehicles = flight.record.table()
+    assert ticks.shape == (700, 3) and vehicles.shape == (700, 3, 7)
+    timing = flight.record.timing()
+    assert timing["ticks"] == 700 and timing["missed_deadlines"] == 0
+    assert timing["command_age_ms"]["p50"] == timing["measured_to_sent_ms"]["max"] == 1.0
+    assert timing["due_to_sent_ms"]["p99"] == 1.5
