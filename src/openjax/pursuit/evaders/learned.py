@@ -27,7 +27,8 @@ def init_network(key: jax.Array) -> dict[str, Any]:
         "hidden": (WIDTH, WIDTH),
     }
     layers = {
-        name: {"kernel": jax.nn.initializers.orthogonal(2.0**0.5)(own, size), "bias": jnp.zeros(size[1])}
+        # no orthogonal ones: several decompositions at once may wait for each other for ever on a CPU of two cores
+        name: {"kernel": jax.nn.initializers.he_normal()(own, size), "bias": jnp.zeros(size[1])}
         for (name, size), own in zip(sizes.items(), jax.random.split(key, len(sizes)), strict=True)
     }
     return {**layers, "output": {"kernel": jnp.zeros((WIDTH, 4)), "bias": jnp.zeros(4)}}
