@@ -141,7 +141,13 @@ class _Run:
         job, settings = self.job, self.settings
         self.progress.phase("compiling the start: networks, first tasks")
         start, step, self.abstract = _programs(job)
-        step_ready = step.compile_ahead(self.abstract)  # takes longest, so it comes first
+        latest = self.checkpoints.latest()
+        if over := self.processes.of_first(latest is not None and latest.update >= settings.total_updates):
+            self.progress.message(
+                "all updates are done; --total_steps N goes on to more. Its report is made anew"
+            )
+        # takes longest, so it comes first
+        step_ready = (lambda _=None: True) if over else step.compile_ahead(self.abstract)
         self.first_flights = self._first_flights()
         carry, self.first_update, seconds = self._first_carry(start)
         if self.processes.is_first:

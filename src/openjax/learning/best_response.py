@@ -266,10 +266,10 @@ class BestResponse:
 def make_duel(
     environment: Pursuit, policy: Policy
 ) -> Callable[[PolicyParameters, Task, jax.Array, jax.Array, dict], EpisodeStatistics]:
-    """`duel(parameters, tasks (B, ...), kinds (B,), key, changes) -> statistics (B,)`: whole episodes of the mean policy.
+    """`duel(parameters, tasks (B, ...), kinds (B,) or (), key, changes) -> statistics (B,)`: whole episodes of the mean policy.
 
-    `kinds` are places in the settings' evaders; `changes` are fields of the environment that hold arrays: the learned evader's
-    `evader_network`, the `vehicle_bounds`.
+    `kinds` are places in the settings' evaders; where one is for all worlds, no other is worked out. `changes` are fields of
+    the environment that hold arrays: the learned evader's `evader_network`, the `vehicle_bounds`.
     """
 
     def duel(parameters, tasks, kinds, key, changes):
@@ -284,10 +284,15 @@ def make_duel(
         def one(world, _):
             observation, state = world
             action = policy.act(parameters, observation)
-            observation, state, *_ = jax.vmap(game.step, (None, 0, 0))(key, state, action)
+            observation, state, *_ = jax.vmap(step, (0, 0, of_worlds))(state, action, kinds)
             return (observation, state), None
 
-        world = jax.vmap(begin)(jax.random.split(key, kinds.shape[0]), tasks, kinds)
+        def step(state, action, kind):
+            return game.step(key, state.replace(evader=state.evader.replace(kind=kind)), action)
+
+        of_worlds = 0 if kinds.ndim else None
+        keys = jax.random.split(key, tasks.evader_position.shape[0])
+        world = jax.vmap(begin, (0, 0, of_worlds))(keys, tasks, kinds)
         return jax.lax.scan(one, world, length=game.settings.episode_length)[0][1].statistics
 
     return duel

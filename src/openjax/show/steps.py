@@ -13,8 +13,12 @@ from rich.text import Text
 from openjax.show.progress import duration
 
 
+LONG = 30.0
+"""Seconds from which a file is told, too."""
+
+
 class Steps:
-    """One line on a terminal; nothing where output goes into a file. Use as a context manager.
+    """One line on a terminal; into a file, how long it will take, if that is long. Use as a context manager.
 
     Args:
       title: what is done.
@@ -24,7 +28,7 @@ class Steps:
     """
 
     def __init__(self, title: str, expected: Mapping[str, float], console: Console):
-        self._title, self._expected = title, dict(expected)
+        self._title, self._expected, self._console = title, dict(expected), console
         self._total = sum(self._expected.values())
         self._done, self._step, self._note = 0.0, None, ""
         self._start = self._step_start = time.monotonic()
@@ -38,6 +42,8 @@ class Steps:
     def __enter__(self):
         if self._live is not None:
             self._live.start()
+        elif self._total > LONG:
+            self._console.print(f"{self._title}: about {duration(self._total)} ...", soft_wrap=True)
         return self
 
     def __exit__(self, *_):
