@@ -12,7 +12,6 @@ from rich.text import Text
 
 from openjax.show.progress import duration
 
-
 LONG = 30.0
 """Seconds from which a file is told, too."""
 
