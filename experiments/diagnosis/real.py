@@ -12,6 +12,7 @@ from experiments.diagnosis.vehicle import GRAVITY, MASS, MAX_SPEED, Told
 
 # The firmware's public map: U = A g^2 + B g volts for g grams of all four rotors.
 A, B = -0.0006239, 0.088
+SLOW_DOWN = 1.3  # times slower down than up: more than was measured is a lag that has a name
 HEAVIEST_ON_MAP = 0.034  # kg: beyond, the map's parabola ends below full thrust
 
 
@@ -50,7 +51,7 @@ def fine(errors, causes):
     names = ["state_latency", "rotor_drag"]
     if errors["pwm"]:  # the map isn't known, its scale least of all
         names += ["thrust_curve", "battery_sag", "mass", "thrust_scale"]
-    if errors["late"]:
+    if errors["late"] or errors["down"] > SLOW_DOWN:
         names.append("motor_lag")
     return [name for name in names if name not in causes]
 

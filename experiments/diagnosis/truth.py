@@ -76,8 +76,11 @@ def judge(truth: Truth, words: list[str]) -> dict:
 
 
 def top_probability(truth: Truth, probabilities: dict[str, float]) -> tuple[float, bool] | None:
-    """(probability of the most probable class, whether it is the true one); the names that are right count as one."""
-    right = frozenset().union(*truth.right) or {"unknown": {"unknown"}}.get(truth.category, {"none"})
+    """(probability of the most probable class, whether it is the true one); the names that are right count as one, and where
+    nothing need be named those that are no mistake count with "none", as in `judge`."""
+    right = frozenset().union(*truth.right) or {"unknown": {"unknown"}}.get(
+        truth.category, {"none"} | truth.fine
+    )
     if not probabilities:
         return None
     together = sum(p for name, p in probabilities.items() if name in right)
