@@ -15,6 +15,7 @@ class Decision:
     least_gap: float
     form_error: float
     unknown: float
+    temperature: float
     clock: float
     packet_loss: float
     rate_gain: float

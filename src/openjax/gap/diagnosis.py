@@ -58,7 +58,7 @@ def conclude(evidence: Evidence) -> Report:
     named = [e for e, p in acting.items() if p >= 0.5]
     parts = split(evidence, selection, np.zeros(6), named)
     named = [e for e in named if e in selection.effects or _matters(parts, e)]
-    check = check_residual(evidence.replay, selection.fit, bool(named))
+    check = check_residual(evidence, selection.fit)
     parts = split(evidence, selection, check.predicted, named)
     found = words(evidence, check, parts, not_testable(evidence))
     chances = probabilities(
@@ -138,7 +138,7 @@ def _report(
         sensors=tuple(evidence.sensors.findings.values()),
         contradictions=tuple(f"{i.flight}: {i.issue}" for i in evidence.case.quality if i.kind == "garbage"),
         nuisances=_nuisances(evidence, selection),
-        residual={"dependence": check.dependence, "p_value": check.p_value, "growth": check.growth},
+        residual={"p_value": check.p_value} | check.measures,
         plots={"evidence": evidence, "selection": selection},
     )
 

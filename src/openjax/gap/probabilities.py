@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from openjax.gap.decision import DECISION
 from openjax.gap.model.hypotheses import SetFit
 from openjax.gap.model.library import CARDS
 from openjax.vehicle.effects import EFFECTS
@@ -53,4 +54,12 @@ def probabilities(
     total = sum(shared.values())
     for name, weight in shared.items():
         chance[name] += left * weight / total
-    return chance
+    return tempered(chance, DECISION.temperature)
+
+
+def tempered(chance: dict[str, float], temperature: float) -> dict[str, float]:
+    """Probabilities as sure as they are right in cases with known answers: their logarithms over one temperature (Guo et al.
+    2017)."""
+    flat = {name: max(p, 0.0) ** (1.0 / temperature) for name, p in chance.items()}
+    total = sum(flat.values())
+    return {name: p / total for name, p in flat.items()}

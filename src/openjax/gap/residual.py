@@ -1,76 +1,75 @@
-"""What the chosen effects leave: one omnibus check whether it is noise.
+"""What the chosen effects leave: whether it is more than sensors, air and errors of form leave.
 
-On the whitened residual of each channel, a Gaussian process in random Fourier features (Rahimi, Recht 2007) of one group of the
-state - place, motion, attitude, thrust, battery, vehicles near, time - is weighed against white noise. The statistic is what the
-processes with very strong evidence make the gap grow by. Its p-value is conformal over cases of several worlds in which nothing
-was named, or something (Mondrian conformal prediction, Vovk et al. 2005; `residual.json`)."""
+Things that should agree are held against each other: measured motion and replay, attitude and gyroscope, path and
+accelerometer, position and velocity. How much is left of each, how unlike its seconds are, and how far two channels go together
+are told in standard deviations of cases of several worlds in which nothing unknown acts. The p-value of the largest is
+conformal over those (Vovk et al. 2005; `residual.json`)."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from scipy.signal import lfilter
+from scipy.stats import norm
 
-from openjax.flights.track import Track, rotation, smooth
+from openjax.flights.track import Track, rotation
 from openjax.gap.decision import DECISION
+from openjax.gap.evidence import Evidence
 from openjax.gap.model.hypotheses import SetFit, without_nuisances
 from openjax.gap.model.replay import FORCE, RATES, SKIP, VELOCITY, Replay
-from openjax.gap.model.table import HORIZONS
 
-FEATURES = 40  # of each group
-LENGTHS = (0.5, 1.0, 2.0)  # of the features, in standard deviations of what they are functions of
-STATE_FILTER = 0.1  # s over which the state is smoothed: sensors' noise isn't what anything depends on
-VARIANCES = 10.0 ** np.arange(-4.0, 4.5, 1.0)  # of the process, in units of the channel's noise
-VERY_STRONG = 5.0  # nats of a Bayes factor (Kass, Raftery 1995)
-WAKE = "the vehicle near"
+# s over which each residual is let add up, and what is said where it is large.
+HORIZONS = {
+    "velocity": (0.5, "forces are left over"),
+    "rates": (0.05, "torques are left over"),
+    "estimator": (0.1, "attitude and gyroscope disagree"),
+    "accelerometer": (0.1, "path and accelerometer disagree"),
+    "position": (0.1, "position and velocity disagree"),
+}
+EVEN, SECOND = 0.1, 1.0  # s: increments whose size is compared from second to second
+WORDS = {name: words for name, (_, words) in HORIZONS.items()} | {
+    "correlation": "what is left of one channel goes with another's",
+    "unevenness": "what is left comes and goes",
+}
 CALIBRATION = Path(__file__).with_name("residual.json")
 
 
 @dataclass(frozen=True)
 class Check:
-    """`dependence`, the largest log Bayes factor, and `where` it is; `growth` of the gap, in floors, by what was found, and its
-    `p_value`; `predicted` (6,): share of each motion channel's squared error that it is, where the check rejects."""
+    """`measures` {name: value} and the one that stands out most, `where`; its `p_value` among cases without an unknown cause;
+    `predicted` (6,): share of each motion channel's squared error beyond what such cases leave, where the check rejects."""
 
-    dependence: float
+    measures: dict[str, float]
     where: str
     p_value: float
-    growth: float
     predicted: np.ndarray
 
     @property
     def rejects(self) -> bool:
-        """Whether what is left isn't noise, and matters."""
-        return self.p_value <= DECISION.unknown and self.growth > DECISION.least_gap
+        """Whether what is left is more than noise."""
+        return self.p_value <= DECISION.unknown
 
     @property
     def probability(self) -> float:
-        """That something acts which no effect explains and matters: posterior odds are the prior's over the p-value."""
-        return DECISION.unknown / (
-            DECISION.unknown + (self.p_value if self.growth > DECISION.least_gap else 1.0)
-        )
+        """That something acts which no effect explains: posterior odds are the prior's over the p-value."""
+        return DECISION.unknown / (DECISION.unknown + self.p_value)
 
     def in_words(self) -> str:
         """What is left, in one sentence."""
-        if not self.rejects:
-            return ""
-        return f"What is left isn't noise (p = {self.p_value:.2g}): {self.where}."
+        return f"What is left isn't noise (p = {self.p_value:.2g}): {self.where}." if self.rejects else ""
 
 
-def check_residual(replay: Replay, fit: SetFit, named: bool) -> Check:
-    """Whether the residual of a fit is noise, as cases go in which effects are `named` or nothing is."""
-    found = dependence(replay, residuals_of(replay, fit))
-    predicted = np.zeros(6)
-    for gain, _, axis, share in found:
-        if gain > VERY_STRONG:
-            predicted[axis] = max(predicted[axis], share)
-    growth = float(np.sqrt((1.0 / (1.0 - predicted[replay.heard > 0])).mean()) - 1.0)
-    value, where, *_ = max(found)
-    check = Check(value, where, conformal_p(growth, named), growth, predicted)
-    return check if check.rejects else replace(check, predicted=np.zeros(6))
+def check_residual(evidence: Evidence, fit: SetFit) -> Check:
+    """Whether a fit leaves no more than what cases without an unknown cause leave."""
+    replay = evidence.replay
+    residuals = residuals_of(replay, fit)
+    measured, excess = measure(evidence, residuals)
+    p_value, name = conformal_p(measured)
+    predicted = excess if p_value <= DECISION.unknown else np.zeros(6)
+    return Check(measured, WORDS[name], p_value, predicted)
 
 
 def residuals_of(replay: Replay, fit: SetFit) -> list[np.ndarray]:
@@ -89,118 +88,100 @@ def disturbances(track: Track, residual: np.ndarray) -> np.ndarray:
     return out
 
 
-def conformal_p(value: float, named: bool) -> float:
-    """Share of the calibration's cases of the same kind, this one among them, whose statistic is as large. Beyond the largest
-    the tail is exponential, as long as that of the upper quarter (Pickands 1975)."""
-    known = np.array(_calibration()["named" if named else "none"]["growth"])
+def measure(evidence: Evidence, residuals: list[np.ndarray]) -> tuple[dict[str, float], np.ndarray]:
+    """{name: measure} of what is left, and (6,) by which share the motion channels' squares exceed what the calibration's cases
+    leave at most."""
+    replay, dt = evidence.replay, evidence.tracks[0].dt
+    skip, out, excess = int(SKIP / dt), {}, np.zeros(6)
+    series = _series(evidence, residuals)
+    for name, parts in series.items():
+        if name not in HORIZONS:
+            continue
+        size = np.concatenate(_increments(parts, HORIZONS[name][0], dt, skip)).std(0)
+        out[name] = float(size.max())
+        if name in ("rates", "velocity"):
+            usual = np.quantile([c[name] for c in calibration() if name in c], 1.0 - DECISION.unknown)
+            first = 0 if name == "rates" else 3
+            excess[first : first + 3] = 1.0 - np.minimum(usual / size, 1.0) ** 2
+    out["unevenness"] = float(np.mean([_unevenness(s, dt, skip) for s in series.values()]))
+    white = np.concatenate([replay.whiten(r, k) for k, r in enumerate(residuals)])[:, replay.usable > 0]
+    out["correlation"] = float(np.abs(np.triu(np.corrcoef(white.T), 1)).max())
+    return out, excess
+
+
+def _series(evidence: Evidence, residuals: list[np.ndarray]) -> dict[str, list[np.ndarray]]:
+    """{name: residual (T, 3) of each track} of what was logged, as sums of what is left."""
+    usable, tracks = evidence.replay.usable, evidence.replay.tracks
+    motion = {"rates": RATES, "velocity": VELOCITY, "specific force": FORCE}
+    out = {n: [r[:, axes] for r in residuals] for n, axes in motion.items() if usable[axes.start]}
+    if "specific force" in out:
+        out["specific force"] = [
+            np.cumsum(f, 0) * t.dt for f, t in zip(out["specific force"], tracks, strict=True)
+        ]
+    out |= {c.path: c.fit.residual for c in evidence.channels if c.path == "estimator"}
+    if all(t.position is not None and t.velocity is not None for t in tracks):
+        out["position"] = [t.position - _sum_of(t.velocity, t.dt) for t in tracks]
+        if all(t.specific_force is not None and t.quaternion is not None for t in tracks):
+            out["accelerometer"] = [_path_against_accelerometer(t) for t in tracks]
+    return out
+
+
+def _sum_of(rates: np.ndarray, dt: float) -> np.ndarray:
+    """Integral (T, 3) of rates, linear between rows."""
+    return np.cumsum(0.5 * (rates + np.concatenate([rates[:1], rates[:-1]])), 0) * dt
+
+
+def _path_against_accelerometer(track: Track) -> np.ndarray:
+    """Velocity (T, 3) body axes by which the accelerometer and the path's acceleration come apart, its bias aside."""
+    path = np.gradient(track.velocity, track.dt, axis=0) + np.array([0.0, 0.0, 9.81])
+    apart = track.specific_force - np.einsum("tji,tj->ti", rotation(track.quaternion), path)
+    return np.cumsum(apart - apart.mean(0), 0) * track.dt
+
+
+def _increments(parts: list[np.ndarray], horizon: float, dt: float, skip: int) -> list[np.ndarray]:
+    step = max(round(horizon / dt), 1)
+    return [(p[step:] - p[:-step])[skip:] for p in parts]
+
+
+def _unevenness(parts: list[np.ndarray], dt: float, skip: int) -> float:
+    """Standard deviation of the logarithm of a residual's size from second to second (Bartlett, Kendall 1946)."""
+    increments = _increments(parts, EVEN, dt, skip)
+    seconds = [b.std(0) for i in increments for b in np.array_split(i, max(int(len(i) * dt / SECOND), 1))]
+    usual = np.concatenate(increments).std(0)
+    return float(np.log(np.array(seconds) + 1e-3 * usual).std(0).mean())
+
+
+def conformal_p(measured: dict[str, float]) -> tuple[float, str]:
+    """Share of cases without an unknown cause, this one among them, that stand out as much, and by which measure this one does.
+    Beyond the largest the tail is exponential, as long as that of the upper quarter (Pickands 1975)."""
+    value, name = standing_out(measured)
+    known = np.array([standing_out(case)[0] for case in calibration()])
     share = float((1 + (known >= value).sum()) / (1 + len(known)))
-    start, largest = np.quantile(known, 0.75), known.max()
+    start = np.quantile(known, 0.75)
     scale = max(float((known[known >= start] - start).mean()), 1e-9)
-    return share * float(np.exp(-max(value - largest, 0.0) / scale))
+    return share * float(np.exp(-max(value - known.max(), 0.0) / scale)), name
+
+
+def standing_out(measured: dict[str, float]) -> tuple[float, str]:
+    """How far a case's measures stand out of the calibration's at most, in its upper standard deviations of their logarithm,
+    and by which one."""
+    far = {n: (np.log(max(v, 1e-12)) - usual()[n][0]) / usual()[n][1] for n, v in measured.items()}
+    name = max(far, key=far.get)
+    return float(far[name]), name
 
 
 @lru_cache(maxsize=1)
-def _calibration() -> dict[str, dict[str, list[float]]]:
-    return json.loads(CALIBRATION.read_text(encoding="utf-8"))["statistics"]
+def calibration() -> list[dict[str, float]]:
+    """The measures of cases without an unknown cause."""
+    return json.loads(CALIBRATION.read_text(encoding="utf-8"))["cases"]
 
 
-def state_groups(track: Track) -> dict[str, np.ndarray]:
-    """{group: (T, n)} of the state that a push may depend on."""
-    rows = len(track.time)
-    turn = rotation(track.quaternion) if track.quaternion is not None else np.tile(np.eye(3), (rows, 1, 1))
-    groups = {"the body rates": track.body_rates, "the thrust": track.motor.mean(1)[:, None]}
-    if track.quaternion is not None:
-        groups |= {"the attitude": turn[:, 2, :2], "the heading": turn[:, :2, 0]}
-    if track.position is not None:
-        groups["the place"] = track.position
-    if track.velocity is not None:
-        groups["the velocity"] = track.velocity
-        groups["the velocity in the body's frame"] = np.einsum("tji,tj->ti", turn, track.velocity)
-    if track.voltage is not None:
-        groups["the voltage"] = track.voltage[:, None]
-    groups |= {f"{WAKE} {k}": other - track.position for k, other in enumerate(track.neighbours)}
-    groups = {name: smooth(values, STATE_FILTER, track.dt) for name, values in groups.items()}
-    return groups | {"the time": (track.time - track.time[0])[:, None]}
-
-
-def dependence(replay: Replay, residuals: list[np.ndarray]) -> list[tuple[float, str, int, float]]:
-    """Of each motion channel and group of the state: log Bayes factor, words, axis (0 to 5) and the share that the process has
-    of the squared errors that make the gap."""
-    states, found = [state_groups(t) for t in replay.tracks], [(0.0, "", 0, 0.0)]
-    for group in (g for g in states[0] if all(g in s for s in states)):
-        features = _fourier_features([s[group] for s in states])
-        if features is None:
-            continue
-        for axis in np.flatnonzero(replay.heard > 0):
-            if group.startswith(WAKE) and axis < 3:
-                continue  # how wakes turn a vehicle is a nuisance
-            channel = int(axis) if axis < 3 or replay.usable[3] else int(axis) + 3
-            gain, weights = _log_bayes_factor(*_whitened_sums(replay, residuals, features, channel))
-            pushes = [
-                _done(f, channel, t.dt) @ weights[:, None]
-                for f, t in zip(features, replay.tracks, strict=True)
-            ]
-            share = _share_of_errors(replay, residuals, pushes, channel) if gain > 0.0 else 0.0
-            found.append((gain, f"{_name(channel)} depends on {group}", int(axis), share))
+@lru_cache(maxsize=1)
+def usual() -> dict[str, tuple[float, float]]:
+    """{measure: the median of its logarithm and how far its upper standard deviation (norm's quantile) lies above}."""
+    found = {}
+    for name in WORDS:
+        logs = np.log([max(c[name], 1e-12) for c in calibration() if name in c])
+        middle, upper = np.quantile(logs, [0.5, norm.cdf(1.0)])
+        found[name] = float(middle), float(upper - middle)
     return found
-
-
-def _fourier_features(states: list[np.ndarray]) -> list[np.ndarray] | None:
-    """Random Fourier features (T, FEATURES) of each track's state (T, n) in its standard deviations over all tracks."""
-    every = np.concatenate(states)
-    spread = every.std(0)
-    moving = spread > 1e-6 * (1.0 + np.abs(every).max(0))
-    if not moving.any():
-        return None
-    generator = np.random.default_rng(0)
-    weights = generator.standard_normal((int(moving.sum()), FEATURES)) / generator.choice(LENGTHS, FEATURES)
-    phases = generator.uniform(0.0, 2.0 * np.pi, FEATURES)
-    scaled = [(s - every.mean(0))[:, moving] / spread[moving] for s in states]
-    features = [np.cos(s @ weights + phases) * np.sqrt(2.0 / FEATURES) for s in scaled]
-    return [f - f.mean(0) for f in features]  # a trim is nobody's surprise
-
-
-def _done(push: np.ndarray, channel: int, dt: float) -> np.ndarray:
-    """What accelerations (T, n) do to a channel: rates and velocity add them up."""
-    return push if channel >= 6 else np.cumsum(push, 0) * dt
-
-
-def _share_of_errors(replay: Replay, residuals, shapes, channel: int) -> float:
-    """Share of a channel's squared errors over the gap's horizon that `shapes` [(T, n)], least squares, explain."""
-    gram, cross, square = 1e-12, 0.0, 1e-12
-    for track, residual, shape in zip(replay.tracks, residuals, shapes, strict=True):
-        both = np.concatenate([shape, residual[:, [channel]]], 1)
-        both = both if channel < 6 else np.cumsum(both, 0) * track.dt
-        step = max(round(HORIZONS["rates" if channel < 3 else "velocity"] / track.dt), 1)
-        moved = (both[step:] - both[:-step])[int(SKIP / track.dt) :]
-        gram, cross = gram + moved[:, :-1].T @ moved[:, :-1], cross + moved[:, :-1].T @ moved[:, -1]
-        square += float(moved[:, -1] @ moved[:, -1])
-    return float(np.clip(cross @ np.linalg.lstsq(gram, cross, rcond=None)[0] / square, 0.0, 0.99))
-
-
-def _whitened_sums(replay: Replay, residuals, features, channel: int) -> tuple[np.ndarray, np.ndarray]:
-    """Inner products of what the features would do in a channel, whitened, with each other and with the residual."""
-    noise = next(n for n in replay.noises if channel in n.axes)
-    gram, cross = 0.0, 0.0
-    for track, residual, push in zip(replay.tracks, residuals, features, strict=True):
-        both = np.concatenate([_done(push, channel, track.dt), residual[:, [channel]]], 1)
-        white = lfilter(noise.numerator / noise.deviation, noise.denominator, both, axis=0)
-        white = white[int(SKIP / track.dt) :]
-        white = white - white.mean(0)
-        gram, cross = gram + white[:, :-1].T @ white[:, :-1], cross + white[:, :-1].T @ white[:, -1]
-    return gram, cross
-
-
-def _log_bayes_factor(gram: np.ndarray, cross: np.ndarray) -> tuple[float, np.ndarray]:
-    """Of a linear model with independent normal coefficients against none, at the variance that fits best, and the
-    coefficients."""
-    values, vectors = np.linalg.eigh(gram)
-    values, along = np.maximum(values, 0.0), vectors.T @ cross
-    each = [0.5 * (v * along**2 / (1.0 + v * values) - np.log1p(v * values)).sum() for v in VARIANCES]
-    best = int(np.argmax(each))
-    taken = VARIANCES[best] * along / (1.0 + VARIANCES[best] * values)
-    return max(0.0, float(each[best])), vectors @ taken
-
-
-def _name(channel: int) -> str:
-    return f"{('torque', 'force', 'specific force')[channel // 3]} {'xyz'[channel % 3]}"
