@@ -1,9 +1,9 @@
 """What the chosen effects leave: whether it is more than sensors, air and errors of form leave.
 
 Things that should agree are held against each other: measured motion and replay, attitude and gyroscope, path and
-accelerometer, position and velocity. How much is left of each, how unlike its seconds are, and how far two channels go together
-are told in standard deviations of cases of several worlds in which nothing unknown acts. The p-value of the largest is
-conformal over those (Vovk et al. 2005; `residual.json`)."""
+accelerometer, position and velocity. How much is left of each, and how far what is left of two channels goes together, are told
+in standard deviations of cases of several worlds in which nothing unknown acts. The p-value of the largest is conformal over
+those (Vovk et al. 2005; `residual.json`)."""
 
 from __future__ import annotations
 
@@ -24,16 +24,13 @@ from openjax.gap.model.replay import FORCE, RATES, SKIP, VELOCITY, Replay
 # s over which each residual is let add up, and what is said where it is large.
 HORIZONS = {
     "velocity": (0.5, "forces are left over"),
-    "rates": (0.05, "torques are left over"),
+    "rates": (0.5, "torques are left over"),
+    "accelerometer": (0.5, "path and accelerometer disagree"),
     "estimator": (0.1, "attitude and gyroscope disagree"),
-    "accelerometer": (0.1, "path and accelerometer disagree"),
     "position": (0.1, "position and velocity disagree"),
 }
-EVEN, SECOND = 0.1, 1.0  # s: increments whose size is compared from second to second
-WORDS = {name: words for name, (_, words) in HORIZONS.items()} | {
-    "correlation": "what is left of one channel goes with another's",
-    "unevenness": "what is left comes and goes",
-}
+WORDS = {name: words for name, (_, words) in HORIZONS.items()}
+WORDS["correlation"] = "what is left of one channel goes with what is left of another"
 CALIBRATION = Path(__file__).with_name("residual.json")
 
 
@@ -93,32 +90,25 @@ def measure(evidence: Evidence, residuals: list[np.ndarray]) -> tuple[dict[str, 
     leave at most."""
     replay, dt = evidence.replay, evidence.tracks[0].dt
     skip, out, excess = int(SKIP / dt), {}, np.zeros(6)
-    series = _series(evidence, residuals)
-    for name, parts in series.items():
-        if name not in HORIZONS:
-            continue
-        size = np.concatenate(_increments(parts, HORIZONS[name][0], dt, skip)).std(0)
+    for name, parts in _series(evidence, residuals).items():
+        step = max(round(HORIZONS[name][0] / dt), 1)
+        size = np.concatenate([(p[step:] - p[:-step])[skip:] for p in parts]).std(0)
         out[name] = float(size.max())
         if name in ("rates", "velocity"):
-            usual = np.quantile([c[name] for c in calibration() if name in c], 1.0 - DECISION.unknown)
+            most = np.quantile([c[name] for c in calibration() if name in c], 1.0 - DECISION.unknown)
             first = 0 if name == "rates" else 3
-            excess[first : first + 3] = 1.0 - np.minimum(usual / size, 1.0) ** 2
-    out["unevenness"] = float(np.mean([_unevenness(s, dt, skip) for s in series.values()]))
+            excess[first : first + 3] = 1.0 - np.minimum(most / size, 1.0) ** 2
     white = np.concatenate([replay.whiten(r, k) for k, r in enumerate(residuals)])[:, replay.usable > 0]
     out["correlation"] = float(np.abs(np.triu(np.corrcoef(white.T), 1)).max())
     return out, excess
 
 
 def _series(evidence: Evidence, residuals: list[np.ndarray]) -> dict[str, list[np.ndarray]]:
-    """{name: residual (T, 3) of each track} of what was logged, as sums of what is left."""
+    """{name of HORIZONS: what is left (T, 3) of each track, added up} of what was logged."""
     usable, tracks = evidence.replay.usable, evidence.replay.tracks
-    motion = {"rates": RATES, "velocity": VELOCITY, "specific force": FORCE}
+    motion = {"rates": RATES, "velocity": VELOCITY}
     out = {n: [r[:, axes] for r in residuals] for n, axes in motion.items() if usable[axes.start]}
-    if "specific force" in out:
-        out["specific force"] = [
-            np.cumsum(f, 0) * t.dt for f, t in zip(out["specific force"], tracks, strict=True)
-        ]
-    out |= {c.path: c.fit.residual for c in evidence.channels if c.path == "estimator"}
+    out |= {c.path: c.fit.residual for c in evidence.channels if c.path in HORIZONS}
     if all(t.position is not None and t.velocity is not None for t in tracks):
         out["position"] = [t.position - _sum_of(t.velocity, t.dt) for t in tracks]
         if all(t.specific_force is not None and t.quaternion is not None for t in tracks):
@@ -136,19 +126,6 @@ def _path_against_accelerometer(track: Track) -> np.ndarray:
     path = np.gradient(track.velocity, track.dt, axis=0) + np.array([0.0, 0.0, 9.81])
     apart = track.specific_force - np.einsum("tji,tj->ti", rotation(track.quaternion), path)
     return np.cumsum(apart - apart.mean(0), 0) * track.dt
-
-
-def _increments(parts: list[np.ndarray], horizon: float, dt: float, skip: int) -> list[np.ndarray]:
-    step = max(round(horizon / dt), 1)
-    return [(p[step:] - p[:-step])[skip:] for p in parts]
-
-
-def _unevenness(parts: list[np.ndarray], dt: float, skip: int) -> float:
-    """Standard deviation of the logarithm of a residual's size from second to second (Bartlett, Kendall 1946)."""
-    increments = _increments(parts, EVEN, dt, skip)
-    seconds = [b.std(0) for i in increments for b in np.array_split(i, max(int(len(i) * dt / SECOND), 1))]
-    usual = np.concatenate(increments).std(0)
-    return float(np.log(np.array(seconds) + 1e-3 * usual).std(0).mean())
 
 
 def conformal_p(measured: dict[str, float]) -> tuple[float, str]:
