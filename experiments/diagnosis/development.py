@@ -66,7 +66,9 @@ def diagnose(job: tuple) -> dict:
     words = truth.words_of(report)
     line = {"set": place, "case": folder.name, "category": true.category, "truth": true.effects}
     line |= {"words": words} | truth.judge(true, words)
-    line |= {"top": truth.top_probability(true, (report or {}).get("probabilities", {}))}
+    right = truth.right_names(true)
+    line |= {"right_names": sorted(right)}
+    line |= {"top": truth.top_probability(right, (report or {}).get("probabilities", {}))}
     line |= {"severity": answer.get("severity"), "magnitudes": parameters(answer, report)}
     line |= {"seconds": seconds, "first": _done == 1, "error": error, "traceback": trace}
     kept = ("probabilities", "shares", "parameters", "gap", "not_testable", "rest", "quality", "residual")

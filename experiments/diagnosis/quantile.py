@@ -1,34 +1,42 @@
-"""The calibration of the engine's residual check: its statistics over cases in which nothing unknown acts.
+"""What the diagnosis is calibrated with: cases with known answers, of several worlds.
 
     python -m experiments.diagnosis.quantile CASES.jsonl … --source WORDS --out src/openjax/gap/residual.json
 
-Reads what `development` wrote. Nominal cases in which nothing was named, and cases whose effects were named rightly, whether or
-not the check then in use rejected them; the engine takes conformal p-values within each kind (Vovk, Gammerman, Shafer 2005).
+Reads what `development` wrote. Writes the residual check's measures over all cases in which nothing unknown acts, whatever was
+named: the engine takes conformal p-values among them (Vovk, Gammerman, Shafer 2005). Prints the temperature of the probabilities
+under which the right classes are likeliest (Guo et al. 2017), beside the one in use.
 """
 
 import argparse
 from pathlib import Path
 
+import numpy as np
+from scipy.optimize import minimize_scalar
+
 from experiments.diagnosis.development import read_lines
 from openjax.files import write_json
+from openjax.gap.decision import DECISION
+from openjax.gap.probabilities import tempered
 
-KINDS = {"none": ("none", "not_testable"), "named": ("single", "pair", "real")}
-STATISTICS = ("growth",)
+WITHOUT = ("unknown", "garbage")
+FLOOR = 1e-3  # probability of a class that was ruled out: one case must not decide alone
 
 
-def statistics_of(lines: list[dict]) -> dict[str, dict[str, list[float]]]:
-    """Kind -> statistic -> its sorted values over the cases of this kind that no wrong name blurs."""
+def measures_of(lines: list[dict]) -> list[dict[str, float]]:
+    """The residual's measures in the cases in which nothing unknown acts."""
+    good = [r["residual"] for r in lines if r["category"] not in WITHOUT and r.get("residual")]
+    return [{n: float(f"{v:.4g}") for n, v in r.items() if n != "p_value"} for r in good]
 
-    def clear(line: dict, kind: str) -> bool:
-        names = [w for w in line["words"] if w != "unknown"]
-        right = line["right"] if kind == "named" else not names
-        return right and not line["wrong_names"] and bool(line.get("residual"))
 
-    chosen = {
-        kind: [line["residual"] for line in lines if line["category"] in categories and clear(line, kind)]
-        for kind, categories in KINDS.items()
-    }
-    return {k: {s: sorted(round(r[s], 4) for r in chosen[k]) for s in STATISTICS} for k in KINDS}
+def best_temperature(lines: list[dict]) -> float:
+    """The temperature that makes the right classes likeliest, from probabilities made at the one in use."""
+    told = [(r["probabilities"], r["right_names"]) for r in lines if r.get("probabilities")]
+
+    def loss(logarithm: float) -> float:
+        cases = [(tempered(p, np.exp(logarithm) / DECISION.temperature), right) for p, right in told]
+        return -sum(np.log(max(sum(p.get(n, 0.0) for n in right), FLOOR)) for p, right in cases)
+
+    return float(np.exp(minimize_scalar(loss, bounds=(-1.0, 3.0), method="bounded").x))
 
 
 def main() -> None:
@@ -40,9 +48,11 @@ def main() -> None:
     parser.add_argument("--source", required=True, help="which cases these are, in words")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
-    found = statistics_of(read_lines(options.cases))
-    write_json(options.out, {"source": options.source, "statistics": found})
-    print({kind: len(values["growth"]) for kind, values in found.items()})
+    lines = read_lines(options.cases)
+    cases = measures_of(lines)
+    write_json(options.out, {"source": options.source, "cases": cases})
+    graded = [r for r in lines if r["category"] not in ("garbage", "real")]
+    print(f"{len(cases)} cases; temperature {best_temperature(graded):.2f}, in use {DECISION.temperature}")
 
 
 if __name__ == "__main__":

@@ -75,12 +75,15 @@ def judge(truth: Truth, words: list[str]) -> dict:
     return {"right": right, "wrong_names": wrong, "false_unknown": bool(truth.right) and "unknown" in words}
 
 
-def top_probability(truth: Truth, probabilities: dict[str, float]) -> tuple[float, bool] | None:
-    """(probability of the most probable class, whether it is the true one); the names that are right count as one, and where
-    nothing need be named those that are no mistake count with "none", as in `judge`."""
-    right = frozenset().union(*truth.right) or {"unknown": {"unknown"}}.get(
-        truth.category, {"none"} | truth.fine
-    )
+def right_names(truth: Truth) -> frozenset[str]:
+    """The classes of which the most probable one may be: those that are right count as one, and where nothing need be named
+    those that are no mistake count with "none", as in `judge`."""
+    unnamed = {"unknown"} if truth.category == "unknown" else {"none"} | truth.fine
+    return frozenset().union(*truth.right) or frozenset(unnamed)
+
+
+def top_probability(right, probabilities: dict[str, float]) -> tuple[float, bool] | None:
+    """(probability of the most probable class, whether it is the true one); the names that are `right` count as one."""
     if not probabilities:
         return None
     together = sum(p for name, p in probabilities.items() if name in right)
