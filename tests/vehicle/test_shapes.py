@@ -33,6 +33,8 @@ def is_array(kind):
 
 def example(kind, name):
     """Something of a type; drones are three where the argument's name says so."""
+    if typing.get_origin(kind) is tuple:
+        return tuple(example(part, name) for part in typing.get_args(kind))
     kinds = [kind, *typing.get_args(kind)]
     if arrays := [kind for kind in kinds if is_array(kind)]:
         shape = tuple(SIZES.get(size) or int(size) for size in arrays[0].dim_str.split())

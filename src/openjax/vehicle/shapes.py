@@ -25,3 +25,5 @@ Others = Float[Array, "others 3"]
 Things = Float[Array, "things 3"]
 """A vector of each solid thing: floor, pillars, other drones."""
 Gaps = Float[Array, "things"]
+Components = tuple[Gaps, Gaps, Gaps]
+"""x, y and z of a vector of each solid thing."""

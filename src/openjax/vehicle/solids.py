@@ -13,11 +13,12 @@ The same contacts are solved by MuJoCo MJX (`place_solids`, `mjx_body`) and, wri
 from __future__ import annotations
 
 import flax.struct
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from openjax.vehicle.arena import Arena
-from openjax.vehicle.shapes import Active, Gaps, Others, Pillars, Seconds, Team, Things, Vector
+from openjax.vehicle.shapes import Active, Components, Gaps, Others, Pillars, Seconds, Team, Things, Vector
 
 DRONE_RADIUS = 0.05  # m, the solid sphere of a drone
 PARKED = -100.0  # m, height of a pillar that isn't there
@@ -35,10 +36,13 @@ class Surroundings:
 
 @flax.struct.dataclass
 class Encounters:
-    """One drone beside its solid things: floor, P pillars, K other drones, in this order (M = 1 + P + K)."""
+    """One drone beside its solid things: floor, P pillars, K other drones, in this order (M = 1 + P + K).
 
-    origin: Things  # m, where each shape stands; the floor's below the drone
-    normal: Things  # unit vector from the nearest point of each thing to the drone
+    Vectors are their three components, each an array over the things: so a processor works on eight of them at once.
+    """
+
+    origin: Components  # m, where each shape stands; the floor's below the drone
+    normal: Components  # unit vector from the nearest point of each thing to the drone
     gap: Gaps  # m, between the surfaces now
     shown: Gaps  # m, the gap that the solver of contacts is shown; < 0: it acts
 
@@ -111,31 +115,32 @@ def encounters(
     """One drone at `position` (3,) m with `velocity` (3,) m/s beside its solid things, for a step of dt seconds."""
     dtype, half = position.dtype, arena.height / 2
     p, k = around.pillar_position.shape[0], around.other_position.shape[0]
-    height = jnp.where(around.pillar_active, half, PARKED).astype(dtype)[:, None]
-    below = (position * jnp.array([1, 1, 0], dtype))[None]
+    height = jnp.where(around.pillar_active, half, PARKED).astype(dtype)
     level = jnp.clip(position[2] - height, -half, half) + height
-    axis = jnp.concatenate([around.pillar_position, level], axis=1)
-    middle = jnp.concatenate([around.pillar_position, height], axis=1)
-    nearest = jnp.concatenate([below, axis, around.other_position])
-    moving = jnp.concatenate([jnp.zeros((1 + p, 3), dtype), around.other_velocity])
-    radius = np.r_[DRONE_RADIUS, np.full(p, arena.pillar_radius + DRONE_RADIUS), np.full(k, 2 * DRONE_RADIUS)]
-    away = position - nearest
-    distance = jnp.sqrt(jnp.sum(away * away, axis=-1) + 1e-12)
-    normal = away / distance[:, None]
-    gap = distance - jnp.asarray(radius, dtype)
-    gap_ahead = gap + dt * jnp.sum(normal * (velocity - moving), axis=-1)
-    hit = jnp.any(gap_ahead < 0.0)
-    return Encounters(
-        origin=jnp.concatenate([below, middle, around.other_position]),
-        normal=normal,
-        gap=gap,
-        shown=jnp.where(hit & (gap < _NEAR) & (gap_ahead >= 0.0), _TOUCHING, gap_ahead),
+    pillar = (*around.pillar_position.T, height)
+    below = (position[0], position[1], jnp.zeros((), dtype))
+    origin = tuple(
+        jnp.concatenate([one[None], *parts])
+        for one, *parts in zip(below, pillar, around.other_position.T, strict=True)
     )
+    nearest = (*origin[:2], jnp.concatenate([below[2][None], level, around.other_position[:, 2]]))
+    moving = (jnp.concatenate([jnp.zeros(1 + p, dtype), part]) for part in around.other_velocity.T)
+    radius = np.r_[DRONE_RADIUS, np.full(p, arena.pillar_radius + DRONE_RADIUS), np.full(k, 2 * DRONE_RADIUS)]
+    away = tuple(own - other for own, other in zip(position, nearest, strict=True))
+    distance = jnp.sqrt(sum(part * part for part in away) + 1e-12)
+    normal = tuple(part / distance for part in away)
+    gap = distance - jnp.asarray(radius, dtype)
+    approach = sum(n * (own - other) for n, own, other in zip(normal, velocity, moving, strict=True))
+    gap_ahead = gap + dt * approach
+    hit = jnp.any(gap_ahead < 0.0)
+    shown = jnp.where(hit & (gap < _NEAR) & (gap_ahead >= 0.0), _TOUCHING, gap_ahead)
+    return Encounters(origin, normal, gap, shown)
 
 
 def place_solids(met: Encounters) -> Things:
     """Where one drone's shapes are shown to it, (M, 3) m, in the order of `solids_xml`."""
-    return met.origin - met.normal * (met.shown - met.gap)[:, None]
+    shift = met.shown - met.gap
+    return jnp.stack([o - n * shift for o, n in zip(met.origin, met.normal, strict=True)], axis=-1)
 
 
 def contact_acceleration(
@@ -154,21 +159,35 @@ def contact_acceleration(
     met = encounters(arena, position, velocity, around, dt)
     contacts = _contacts(around.pillar_position.shape[0], around.other_position.shape[0])
     stiffness, damping, impedance = (jnp.asarray(column, velocity.dtype) for column in contacts.T)
-    approach = jnp.sum(met.normal * velocity, axis=-1)
-    reference = -(damping / dt * approach + stiffness / dt**2 * met.shown) / impedance
-    residual = jnp.sum(met.normal * acceleration, axis=-1) - reference
-    weight = jnp.where((met.shown < 0.0) & (residual < 0.0), impedance / (1.0 - impedance), 0.0)
-    push = -jnp.sum((weight * residual)[:, None] * met.normal, axis=0)
+    x, y, z = met.normal
 
-    # (1 + sum_i w_i n_i n_i^T) step = push, by an LDL^T factorisation
-    x, y, z = met.normal[:, 0], met.normal[:, 1], met.normal[:, 2]
-    xx, yy, zz = (1.0 + jnp.sum(weight * a * a) for a in (x, y, z))
-    xy, xz, yz = (jnp.sum(weight * a * b) for a, b in ((x, y), (x, z), (y, z)))
+    def along(vector):
+        return x * vector[0] + y * vector[1] + z * vector[2]
+
+    reference = -(damping / dt * along(velocity) + stiffness / dt**2 * met.shown) / impedance
+    residual = along(acceleration) - reference
+    weight = jnp.where((met.shown < 0.0) & (residual < 0.0), impedance / (1.0 - impedance), 0.0)
+    pulls = (weight * residual * part for part in (x, y, z))
+    terms = (*pulls, *(weight * a * b for a, b in ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))))
+    *pull, xx, yy, zz, xy, xz, yz = _sums(terms)
+
+    # (1 + sum_i w_i n_i n_i^T) step = -pull, by an LDL^T factorisation
+    xx, yy, zz = 1.0 + xx, 1.0 + yy, 1.0 + zz
     l_y, l_z = xy / xx, xz / xx
     d_y, e = yy - l_y * xy, yz - l_z * xy
     l_zy = e / d_y
     d_z = zz - l_z * xz - l_zy * e
-    f_y = push[1] - l_y * push[0]
-    step_z = (push[2] - l_z * push[0] - l_zy * f_y) / d_z
+    f_y = l_y * pull[0] - pull[1]
+    step_z = (l_z * pull[0] - pull[2] - l_zy * f_y) / d_z
     step_y = f_y / d_y - l_zy * step_z
-    return jnp.stack([push[0] / xx - l_y * step_y - l_z * step_z, step_y, step_z])
+    return jnp.stack([-pull[0] / xx - l_y * step_y - l_z * step_z, step_y, step_z])
+
+
+def _sums(terms):
+    """The sum of each over the things, by one loop: as many loops as sums would find the contacts anew in each. No gradient."""
+
+    def add(one, other):
+        return tuple(a + b for a, b in zip(one, other, strict=True))
+
+    zeros = tuple(jnp.zeros((), term.dtype) for term in terms)
+    return jax.lax.reduce(jax.lax.stop_gradient(tuple(terms)), zeros, add, (0,))
