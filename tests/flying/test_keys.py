@@ -10,7 +10,7 @@ import sys
 import pytest
 
 from openjax.flying.board import DEAF
-from openjax.flying.keys import LANDING, Operator
+from openjax.flying.keys import Operator
 from openjax.flying.safety import Request
 
 
@@ -44,6 +44,9 @@ def test_bytes_of_no_key_at_all_dont_hide_a_stop(terminal):
     with Operator(theirs) as operator:
         os.write(ours, b"\x1b[A\xff\xc3 \xf0")
         assert operator() is Request.STOP
+
+
+LANDING = ("SIGHUP", "SIGINT", "SIGTSTP", "SIGTERM", "SIGQUIT")
 
 
 @pytest.mark.parametrize("name", LANDING)

@@ -50,12 +50,12 @@ def test_the_policy_flies_while_all_is_well():
     assert state.all_in(Mode.PURSUIT)
 
 
-def test_a_lost_pose_lands_that_one_blindly_and_stops_the_others():
+def test_a_lost_pose_lands_that_one_by_reckoning_and_stops_the_others():
     state = pursuing((0.4, 0.0, 0.0))
     for k in range(1, 12):
         old = PoseSample(Pose(0.0, PLACES[1], (0.4, 0.0, 0.0), LEVEL), 0.01 * k, 4.0)
         state, out = step(LIMITS, state, event(0.01 * k, _1=old))
-    assert state.modes == (Mode.HOLD, Mode.BLIND, Mode.HOLD)
+    assert state.modes == (Mode.HOLD, Mode.LAND, Mode.HOLD)
     assert out[1].mode != RATES and out[1].thrust < nominal_airframe().hover_thrust
     assert out[1].pitch < 0.0  # it brakes
     k0 = state.time
@@ -65,7 +65,7 @@ def test_a_lost_pose_lands_that_one_blindly_and_stops_the_others():
     assert state.modes[0] is Mode.LAND and state.modes[2] is Mode.LAND
 
 
-@pytest.mark.parametrize(("ticks", "mode"), [(4, Mode.PURSUIT), (40, Mode.BLIND)])
+@pytest.mark.parametrize(("ticks", "mode"), [(4, Mode.PURSUIT), (40, Mode.LAND)])
 def test_a_pose_that_jumps_is_not_followed(ticks, mode):
     """Motion capture takes the vehicle for another: for a moment nothing happens, for longer it lands where it is."""
     state, away = pursuing(), (0.1, 0.0, 0.5)
@@ -78,11 +78,11 @@ def test_a_pose_that_jumps_is_not_followed(ticks, mode):
         )
     assert math.dist(state.drones[1].estimate.position[:2], PLACES[1][:2]) < 0.02
     assert state.modes[1] is mode
-    assert state.drones[1].reason == ("pose jumped" if mode is Mode.BLIND else "")
+    assert state.drones[1].reason == ("pose jumped" if mode is Mode.LAND else "")
     time = state.time + 0.01
     back = PoseSample(still(time, PLACES[1]), time, 4.0)
     state, _ = step(LIMITS, state, event(time, _1=back))
-    assert state.modes[1] is (Mode.LAND if mode is Mode.BLIND else Mode.PURSUIT)
+    assert state.modes[1] is mode
 
 
 @pytest.mark.parametrize("frames", [1, 4])

@@ -1,8 +1,8 @@
 """Safety of a flight as a pure state machine: what was seen in, set-points out.
 
 `see(settings, state, time, samples)` judges the poses and brings each vehicle's estimate to now; `decide` says who flies
-each vehicle: the policy, or the controller that lifts, waits, lands, or lands blindly. `step` is both. Nothing here reads a
-clock or touches a link, so that thousands of faults can be flown in simulated time.
+each vehicle: the policy, or the controller that lifts, waits and lands, at need by reckoning. `step` is both. Nothing here
+reads a clock or touches a link, so that thousands of faults can be flown in simulated time.
 
 A vehicle in trouble lands; all others stop where they are, wait a moment, and land too. Troubles: its pose is lost, its
 link is silent, its battery low, it is too fast, too tilted, or outside the arena; no action came in time; a key.
@@ -49,10 +49,6 @@ from openjax.flying.limits import (
 )
 from openjax.flying.set_point import ANGLES, LEAST_THRUST, MOTORS_OFF, RATES, SetPoint
 
-BLIND_SINK = 0.4
-"""A blind landing asks for this much less upward acceleration (m/s^2), so that it surely goes down."""
-BLIND_SPEED = 0.6
-"""It sinks faster than a landing with poses (m/s): what it doesn't know grows with the square of the time."""
 LOW = 0.05
 """Below this height (m) a landing settles."""
 SETTLING, SETTLING_LIFT = 0.75, 0.85
@@ -80,13 +76,12 @@ class Mode(StrEnum):
     PURSUIT = "pursuit"
     HOLD = "hold"
     LAND = "land"
-    BLIND = "blind landing"
     SETTLE = "settling"  # the last of a landing
     LANDED = "landed"
     STOPPED = "stopped"
 
 
-LANDING = (Mode.LAND, Mode.BLIND, Mode.SETTLE)
+LANDING = (Mode.LAND, Mode.SETTLE)
 FLYING = (Mode.LIFT, Mode.TRANSFER, Mode.READY, Mode.PURSUIT, Mode.HOLD, *LANDING)
 _DOWN = (Mode.GROUND, Mode.LANDED)
 _UNTROUBLED = (Mode.LIFT, Mode.TRANSFER, Mode.READY, Mode.PURSUIT)
@@ -152,11 +147,6 @@ class Drone:
     landing_since: float | None = None
     reason: str = ""  # why it left the pursuit
     sent: SetPoint = MOTORS_OFF
-
-    @property
-    def doubtful(self) -> bool:
-        """Whether it lands by reckoning, or by an own estimate that had followed what wasn't to be believed."""
-        return self.mode is Mode.BLIND or bool(self.distrusted)
 
 
 @dataclass(frozen=True)
@@ -380,10 +370,8 @@ def _trouble(settings, drone, sample, now) -> tuple[Mode, str] | None:
         return (Mode.STOPPED, fault) if fault else None
     if drone.over_since is not None and now - drone.over_since > settings.tumble_time:
         return Mode.STOPPED, "tumbled"
-    if drone.mode is Mode.BLIND:
-        return None if lost else (Mode.LAND, drone.reason)
     if lost:
-        return Mode.BLIND, lost
+        return Mode.LAND, lost
     if drone.mode is Mode.LAND:
         return None
     ill = drone.distrusted or _unfit(settings, drone, now)
@@ -425,8 +413,7 @@ def _react(settings, state, drones, troubles, now) -> list[Drone]:
     reacted = []
     for drone, trouble, anchor, start in zip(drones, troubles, anchors, state.starts, strict=True):
         if trouble is not None and trouble[0] is not drone.mode:
-            keep = drone.mode is Mode.LAND  # a landing that goes blind stays where it lands
-            drone = _to(drone, trouble[0], now, None if keep else anchor, trouble[1])
+            drone = _to(drone, trouble[0], now, anchor, trouble[1])
         elif drone.mode is Mode.LIFT and team:
             drone = _to(drone, Mode.STOPPED, now, reason="another is in trouble")
         elif drone.mode in _UNTROUBLED and team:
@@ -467,8 +454,14 @@ def _fly(settings, state, i, action, sample) -> Drone:
         return _pursue(settings, state, drone, i, action)
     wanted = _wanted(settings, state, drone, i)
     acceleration = wanted_acceleration(drone.estimate.velocity, wanted)
-    if drone.mode is Mode.BLIND:
-        return _descend_blindly(settings, state, drone, acceleration)
+    attitude = drone.estimate.quaternion
+    if (
+        now - drone.seen > settings.pose_timeout
+    ):  # by reckoning: the vehicle does what it is asked for, and is level else
+        share = min(state.dt / settings.reaction, 1.0)
+        lagged = tuple(a + share * (b - a) for a, b in zip(drone.acceleration, acceleration, strict=True))
+        flown = accelerate(_yaw_only(attitude), acceleration, state.airframe, drone.trim, ANGLES)
+        return replace(drone, acceleration=lagged, sent=flown)
     height, lifting = drone.estimate.position[2], drone.mode is Mode.LIFT
     if height > (0.02 if lifting else 0.1):
         error = min(max(wanted[2] - drone.estimate.velocity[2], -0.3), 0.3)
@@ -476,13 +469,13 @@ def _fly(settings, state, i, action, sample) -> Drone:
         drone = replace(drone, trim=trim)
     if drone.mode is Mode.TRANSFER and _arrived(drone.estimate, drone.anchor):
         drone = _to(drone, Mode.READY, now)
-    flown = accelerate(drone.estimate.quaternion, acceleration, state.airframe, drone.trim, ANGLES)
+    flown = accelerate(attitude, acceleration, state.airframe, drone.trim, ANGLES)
     return replace(drone, sent=flown)
 
 
 def _is_low(settings, drone, now) -> bool:
     """Whether a landing is near the floor, or long enough on the way."""
-    if drone.mode not in (Mode.LAND, Mode.BLIND):
+    if drone.mode is not Mode.LAND:
         return False
     return drone.estimate.position[2] < LOW or now - drone.landing_since > settings.landing_time
 
@@ -514,23 +507,11 @@ def _pursue(settings, state, drone, i, action) -> Drone:
     return replace(drone, sent=flown)
 
 
-def _descend_blindly(settings, state, drone, acceleration) -> Drone:
-    """The drone sinking by angles that it tracks itself: its attitude isn't known, so level but for what is asked for."""
-    share = min(state.dt / settings.reaction, 1.0)
-    lagged = tuple(a + share * (b - a) for a, b in zip(drone.acceleration, acceleration, strict=True))
-    x, y, z = acceleration
-    yaw_only = _yaw_only(drone.estimate.quaternion)
-    flown = accelerate(yaw_only, (x, y, z - BLIND_SINK), state.airframe, drone.trim, ANGLES)
-    return replace(drone, acceleration=lagged, sent=flown)
-
-
 def _wanted(settings, state, drone, i) -> Vector:
     """The velocity asked for by the controller's modes."""
     position = drone.estimate.position
-    if drone.mode in (Mode.LAND, Mode.BLIND):
+    if drone.mode is Mode.LAND:
         x, y, _ = wanted_velocity(position, (*drone.anchor[:2], position[2]), 0.5)
-        if drone.doubtful:
-            return x, y, -BLIND_SPEED
         return x, y, -(0.6 if position[2] < 0.2 else 1.0) * settings.landing_speed
     x, y, z = wanted_velocity(position, drone.anchor, settings.transfer_speed)
     if drone.mode is not Mode.TRANSFER:
