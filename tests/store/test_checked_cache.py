@@ -64,31 +64,19 @@ def test_half_an_entry_is_none(tmp_path):
         assert cache.get("key") == b"program"
 
 
-def folder_of(tmp_path, before=""):
-    """What `cache_programs` says in a process whose user has no home."""
-    code = f"""
-import os, pathlib
-def no_home(*_):
-    raise RuntimeError("Could not determine home directory.")
-pathlib.Path.home = no_home
-top = pathlib.Path({str(tmp_path)!r}) / f"openjax-{{os.geteuid()}}"
-{before}
-from openjax.store.compiled_programs import cache_programs
-print(cache_programs())
-"""
-    gone = ("JAX_COMPILATION_CACHE_DIR", "XDG_CACHE_HOME")
-    environment = {name: value for name, value in os.environ.items() if name not in gone}
-    environment["TMPDIR"] = str(tmp_path)
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
-    assert ran.returncode == 0, ran.stderr
-    return ran.stdout.strip()
-
-
 @pytest.mark.skipif(not hasattr(os, "geteuid"), reason="owners and modes are those of POSIX")
 def test_the_folder_is_the_users_own(tmp_path):
-    top = tmp_path / f"openjax-{os.geteuid()}"
-    assert folder_of(tmp_path, "top.mkdir(mode=0o777); top.chmod(0o777)").startswith(str(top))
-    assert stat.S_IMODE(top.stat().st_mode) == 0o700
-    elsewhere = tmp_path / "elsewhere"
-    elsewhere.mkdir()
-    assert folder_of(elsewhere, "top.symlink_to(top.parent)") == "None"
+    def folder(cache):
+        code = "from openjax.store.compiled_programs import cache_programs; print(cache_programs())"
+        environment = {**os.environ, "XDG_CACHE_HOME": str(cache)}
+        environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+        ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+        assert ran.returncode == 0, ran.stderr
+        return ran.stdout.strip()
+
+    assert folder(tmp_path).startswith(str(tmp_path / "openjax"))
+    assert stat.S_IMODE((tmp_path / "openjax").stat().st_mode) & 0o022 == 0
+    (tmp_path / "openjax").chmod(0o777)
+    assert folder(tmp_path) == "None"
+    (tmp_path / "file").write_text("")
+    assert folder(tmp_path / "file") == "None"

@@ -99,19 +99,6 @@ def test_a_damaged_best_checkpoint_gives_way_to_the_next_best(run):
     assert len(warnings) == 1 and "000000003 is damaged" in warnings[0]
 
 
-def test_scores_of_another_rule_are_not_compared(run):
-    """A run that goes on after the score was changed chooses by the new one, however high the old ones were."""
-    run.save(3, with_n(3), score=1.3)
-    run.wait()
-    again = Checkpoints(run.directory, score_rule=2)
-    assert again.best().update == 3
-    for update, score in ((4, 0.7), (5, 0.6), (6, 0.5), (7, 0.4)):
-        again.save(update, with_n(update), score=score)
-    again.wait()
-    assert again.best().update == 4 and again.load_best(only_n, print)[1].score == 0.7
-    assert [record.update for record in again.records()] == [4, 6, 7]
-
-
 def test_other_shape_is_named(run):
     def other():
         return {**init(), "actor": {"kernel": jnp.ones((3, 5))}}

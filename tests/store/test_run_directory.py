@@ -34,7 +34,7 @@ def test_a_directory_is_for_one_process_until_it_ends_or_is_killed(tmp_path):
         with pytest.raises(UserError, match="another process trains"), locked(run):
             pass
         create_run(run, overwrite=False)
-    assert os.listdir(run) == []
+    assert os.listdir(run) == ["run.lock"]
 
 
 def test_what_a_killed_start_left_is_taken_over_but_nothing_else(tmp_path):

@@ -7,7 +7,6 @@ adapt.json and adapt.html.
 
 import base64
 import dataclasses
-import html
 import io
 import os
 import shutil
@@ -287,34 +286,12 @@ def in_words(results: dict) -> list[str]:
 
 def page(results: dict) -> str:
     """One self-contained HTML page."""
-    rows = "".join(
-        f"<tr><td>{html.escape(row['parameter'])}</td><td>{row['value']:.4g}</td>"
-        f"<td>{row['low']:.4g} … {row['high']:.4g}</td></tr>"
-        for row in results["parameters"]
-        if row["value"] is not None
-    )
-    figures = "".join(
-        f"<tr><td>{name.replace('_', ' ')}</td>"
-        + "".join(f"<td>{results[which][name]:.4f}</td>" for which in WHICH)
-        + "</tr>"
-        for name in FIGURES
-    )
-    words = "".join(f"<p>{html.escape(line)}</p>" for line in in_words(results))
-    steps = "".join(f"<li>{name}: {seconds:.0f} s</li>" for name, seconds in results["seconds"].items())
-    return (
-        "<!doctype html><meta charset='utf-8'><title>Adapted policy</title>"
-        "<style>body{font:16px/1.5 sans-serif;max-width:56em;margin:2em auto;padding:0 1em}"
-        "table{border-collapse:collapse;margin:1em 0}td,th{border-bottom:1px solid #ccc;padding:.2em 1em;text-align:left}"
-        "img{max-width:100%}</style>"
-        f"<h1>From flights to a better policy</h1>{words}"
-        f"<h2>What it gained</h2><table><tr><th></th><th>nominal vehicle</th><th>before</th><th>after</th></tr>"
-        f"{figures}</table>"
-        f"<img alt='what is learnt, update by update' src='data:image/png;base64,{_picture(results)}'>"
-        f"<h2>The vehicle</h2><table><tr><th>parameter</th><th>found</th><th>drawn from</th></tr>{rows}</table>"
-        "<p>Of effects that weren't found, a third of the ranges that real flights justify was drawn as well: "
-        "flights can't rule them out.</p>"
-        f"<h2>Time since the start</h2><ul>{steps}</ul>"
-        f"<p><code>{html.escape(results['command'])}</code></p>"
+    import jinja2
+
+    template = Path(__file__).with_name("adapt.html.jinja").read_text(encoding="utf-8")
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
+    return environment.from_string(template).render(
+        results=results, words=in_words(results), figures=FIGURES, which=WHICH, picture=_picture(results)
     )
 
 

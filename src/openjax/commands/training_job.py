@@ -22,7 +22,7 @@ from openjax.commands.gradient_stages import compile_first_flights, compile_last
 from openjax.commands.run_words import closing_words, layouts_like
 from openjax.commands.step_programs import step_programs
 from openjax.commands.training_loop import Loop, NotFiniteError, Outcome, Plan, StopRequest
-from openjax.commands.validation import SCORE_RULE, Validation, flat_metrics, selection_score
+from openjax.commands.validation import Validation, flat_metrics, selection_score
 from openjax.learning import TrainSettings, build, make_start, summarise
 from openjax.learning.train_state import policy_leaf
 from openjax.policy import PolicyParameters
@@ -133,7 +133,7 @@ class _Run:
     def __init__(self, job: TrainingJob, directory: RunDirectory, stop: StopRequest, progress: Progress):
         self.job, self.directory, self.stop, self.progress = job, directory, stop, progress
         self.settings, self.processes = job.settings, job.processes
-        self.checkpoints = Checkpoints(directory.checkpoints, processes=job.processes, score_rule=SCORE_RULE)
+        self.checkpoints = Checkpoints(directory.checkpoints, processes=job.processes)
         self.processes.advice = f"go on with openjax train --resume {directory.path} --devices all"
 
     def train(self) -> Outcome:

@@ -153,8 +153,7 @@ class Loop:
         plan, update, pending = self.plan, self.first_update, None
         self._started = self._saved_at = time.monotonic()
         best = self.checkpoints.best()
-        comparable = best and best.score_rule == self.checkpoints.score_rule
-        self._best_score = best.score if comparable else -float("inf")
+        self._best_score = best.score if best else -float("inf")
         overlap = jax.devices()[0].platform != "cpu" if plan.overlap is None else plan.overlap
         names = list(float_leaves(carry))
         reason, _ = self._decide()

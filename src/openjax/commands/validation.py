@@ -62,10 +62,6 @@ class Validation:
         return self.evaluator.fly(parameters, self.tasks, jax.random.key(0))
 
 
-SCORE_RULE = 2
-"""Which `selection_score` it is: scores of another rule (1 held the return) can't be compared with it."""
-
-
 def selection_score(summary: dict, episode_length: int) -> float:
     """By which the best checkpoint is chosen, on the uniform validation tasks; at most 1.
 

@@ -29,10 +29,8 @@ class PursuitParallelEnv(ParallelEnv):
         self.render_mode = None
         self._observation_space = spaces.Box(-np.inf, np.inf, (flat_size(settings),), np.float32)
         self._action_space = spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
-        self._key = jax.random.key(0)
-        self._state = None
-        self._reset = jax.jit(self._pure_reset)
-        self._step = jax.jit(self._pure_step)
+        self._key, self._state = jax.random.key(0), None
+        self._reset, self._step = jax.jit(self.environment.reset), jax.jit(self.environment.step)
 
     def observation_space(self, agent: str) -> spaces.Box:
         """Of one agent."""
@@ -49,41 +47,26 @@ class PursuitParallelEnv(ParallelEnv):
         self._key, key = jax.random.split(self._key)
         self.agents = list(self.possible_agents)
         observation, self._state = self._reset(key)
-        return self._by_agent(observation), {agent: {} for agent in self.agents}
+        return self._by_agent(to_numpy(flat_observation(observation))), {agent: {} for agent in self.agents}
 
     def step(self, actions: dict[str, np.ndarray]):
         """One control step of all agents."""
         action = jnp.stack([jnp.asarray(actions[agent], jnp.float32) for agent in self.possible_agents])
-        observation, self._state, reward, terminated, truncated, info = self._step(self._state, action)
-        captured, crashed = to_numpy((info.captured, info.crashed))
-        agents = self.agents
-        everyone = range(len(agents))
-        infos = {
-            a: {"captured": bool(captured[i]), "crashed": bool(crashed[i])} for i, a in enumerate(agents)
-        }
-        result = (
-            self._by_agent(observation),
-            {agents[i]: float(reward[i]) for i in everyone},
-            {agents[i]: bool(terminated) for i in everyone},
-            {agents[i]: bool(truncated) for i in everyone},
-            infos,
-        )
+        # the game draws nothing after its reset: the key is for the interface only
+        observation, self._state, *told = self._step(jax.random.key(0), self._state, action)
+        reward, terminated, truncated, info = to_numpy(told)
+        infos = [
+            {"captured": bool(captured), "crashed": bool(crashed)}
+            for captured, crashed in zip(info.captured, info.crashed, strict=True)
+        ]
+        over = [bool(terminated)] * len(infos), [bool(truncated)] * len(infos)
+        rows = to_numpy(flat_observation(observation)), reward.tolist(), *over, infos
         if terminated or truncated:
             self.agents = []
-        return result
+        return tuple(self._by_agent(values) for values in rows)
 
     def close(self) -> None:
         """Nothing is held."""
 
-    def _by_agent(self, observation):
-        rows = to_numpy(observation)
-        return {agent: rows[i] for i, agent in enumerate(self.possible_agents)}
-
-    def _pure_reset(self, key):
-        observation, state = self.environment.reset(key)
-        return flat_observation(observation), state
-
-    def _pure_step(self, state, action):
-        # the game draws nothing after its reset: the key is for the interface only
-        observation, *rest = self.environment.step(jax.random.key(0), state, action)
-        return flat_observation(observation), *rest
+    def _by_agent(self, values):
+        return dict(zip(self.possible_agents, values, strict=True))

@@ -3,7 +3,6 @@
 import json
 import math
 import shutil
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -43,7 +42,8 @@ class MetricsWriter:
         self._file = open(path, "ab", buffering=0)
         self._events = None
         if tensorboard:
-            SummaryWriter = _summary_writer()
+            from tensorboardX import SummaryWriter
+
             purge_step = None if resumed_update is None else resumed_steps + 1
             self._events = SummaryWriter(str(directory / "tensorboard"), purge_step=purge_step, flush_secs=10)
 
@@ -71,20 +71,6 @@ class MetricsWriter:
         self._file.close()
         if self._events is not None:
             self._events.close()
-
-
-def _summary_writer():
-    """tensorboardX' writer. On its import it would also load torch, where that is installed, which takes seconds."""
-    missing = object()
-    torch = sys.modules.get("torch", missing)
-    if torch is missing:
-        sys.modules["torch"] = None  # an import of it fails, which tensorboardX takes for its absence
-    try:
-        from tensorboardX import SummaryWriter
-    finally:
-        if torch is missing:
-            del sys.modules["torch"]
-    return SummaryWriter
 
 
 class NoMetrics:

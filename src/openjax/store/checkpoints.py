@@ -38,8 +38,6 @@ class CheckpointRecord:
     """Score of the validation at this update; None where none was made."""
     notes: dict
     """Host-side facts that a resumed run goes on from (seconds so far and the like)."""
-    score_rule: int = 1
-    """How the score was made; only scores of one rule can be compared."""
 
 
 class Checkpoints:
@@ -51,15 +49,11 @@ class Checkpoints:
       directory: where they lie; made with the first of them.
       keep_last: how many of the newest are kept.
       processes: that share the directory; None: this one alone.
-      score_rule: of the scores that are handed in. In a run that began by an earlier rule, any of this one is better.
     """
 
-    def __init__(
-        self, directory: Path, keep_last: int = 2, processes: Processes | None = None, score_rule: int = 1
-    ):
+    def __init__(self, directory: Path, keep_last: int = 2, processes: Processes | None = None):
         self.directory = Path(directory).absolute()
         self.keep_last = keep_last
-        self.score_rule = score_rule
         self._processes = processes or Processes()
         self._pending: Future | None = None
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="checkpoint")
@@ -104,13 +98,9 @@ class Checkpoints:
         raise UserError(f"{self.directory} holds no checkpoint that can be read")
 
     def best(self) -> CheckpointRecord | None:
-        """The highest score by the newest rule, the later one of equals; None while nothing was evaluated."""
+        """The highest score, the later one of equals; None while nothing was evaluated."""
         scored = [record for record in self.records() if record.score is not None]
-        return (
-            max(scored, key=lambda record: (record.score_rule, record.score, record.update))
-            if scored
-            else None
-        )
+        return max(scored, key=lambda record: (record.score, record.update), default=None)
 
     def latest(self) -> CheckpointRecord | None:
         """The newest committed checkpoint."""
@@ -129,8 +119,7 @@ class Checkpoints:
         if self._processes.is_first:
             remove_state(path)
             self._known.pop(path.name, None), self._damaged.pop(path.name, None)
-        scored = {"score": score, "score_rule": self.score_rule}
-        started = start_save(path, carry, {**(notes or {}), **scored})
+        started = start_save(path, carry, {**(notes or {}), "score": score})
         self._pending = self._pool.submit(commit, path, started)
 
     def wait(self) -> None:
@@ -191,5 +180,4 @@ def _record(path):
         notes = dict(load_orbax().metadata(path.absolute()).custom_metadata or {})
     except Exception as error:  # orbax and tensorstore raise many kinds
         raise DamagedError(f"checkpoint {path} can't be read ({type(error).__name__})") from error
-    score, rule = notes.pop("score", None), notes.pop("score_rule", 1)
-    return CheckpointRecord(path, int(path.name), score, notes, rule)
+    return CheckpointRecord(path, int(path.name), notes.pop("score", None), notes)

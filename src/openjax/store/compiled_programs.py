@@ -7,7 +7,6 @@ import os
 import platform
 import stat
 import sys
-import tempfile
 from pathlib import Path
 
 CACHE_SIZE = 2 * 2**30
@@ -53,38 +52,22 @@ def _own_folder():
     """A folder that only this user can write to, as a program in it is run; None where none can be had."""
     import jax
 
-    for top in _candidates():
-        try:
-            top.mkdir(mode=0o700, parents=True, exist_ok=True)
-            if _is_own(top):
-                top.chmod(0o700)  # earlier versions left that to the umask
-            if not _is_private(top):
-                continue
+    with contextlib.suppress(OSError, RuntimeError):  # RuntimeError: a user without a home
+        top = _user_cache() / "openjax"
+        top.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if _is_private(top):
             folder = top / f"{jax.__version__}-{_processor_key()}"
             folder.mkdir(exist_ok=True)
             _bound(top, CACHE_SIZE)
-        except OSError:
-            continue
-        return folder
+            return folder
     return None
 
 
-def _candidates():
-    """Where the folder may be, the usual place first; a user without a home has only the last."""
-    with contextlib.suppress(RuntimeError):
-        yield _user_cache() / "openjax"
-    yield Path(tempfile.gettempdir()) / f"openjax-{os.geteuid() if hasattr(os, 'geteuid') else os.getlogin()}"
-
-
-def _is_own(folder):
-    """Whether it's a folder, no link to one, and this user's."""
-    status = folder.lstat()
-    return stat.S_ISDIR(status.st_mode) and (not hasattr(os, "geteuid") or status.st_uid == os.geteuid())
-
-
 def _is_private(folder):
-    """Whether nobody but its user can write to a folder that is this user's own."""
-    return _is_own(folder) and (os.name == "nt" or not folder.stat().st_mode & 0o022)
+    """Whether it's a folder, no link to one, this user's, and nobody else can write to it."""
+    status = folder.lstat()
+    mine = not hasattr(os, "geteuid") or status.st_uid == os.geteuid()
+    return stat.S_ISDIR(status.st_mode) and mine and (os.name == "nt" or not status.st_mode & 0o022)
 
 
 def _user_cache():

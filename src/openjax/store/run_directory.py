@@ -8,13 +8,12 @@ policy_start.npz, policy.npz  the policy before training and the best one
 layouts.json       before and after, per layout
 training.png, trajectories.png, chase.gif
 not_finite/        only after a NaN: the state that holds it
-run.lock           while a process trains here
+run.lock           held by the process that trains here
 """
 
 import contextlib
 import dataclasses
 import fcntl
-import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -159,29 +158,17 @@ def locked(path: Path) -> Iterator[None]:
     """
     path = Path(path)
     path.mkdir(parents=True, exist_ok=True)
-    file = path / _LOCK
-    while True:
-        descriptor = os.open(file, os.O_RDWR | os.O_CREAT, 0o644)
+    # the file stays: a process that opens it while another one removes it would hold nothing
+    with open(path / _LOCK, "a") as file:
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            os.close(descriptor)
             raise UserError(
                 f"another process trains in {path}; wait for it, or choose another --out"
             ) from None
         except OSError:  # a file system without locks
-            break
-        # Its last holder may have removed the file since it was opened here.
-        with contextlib.suppress(FileNotFoundError):
-            if os.stat(file).st_ino == os.fstat(descriptor).st_ino:
-                break
-        os.close(descriptor)
-    try:
+            pass
         yield
-    finally:
-        with contextlib.suppress(OSError):
-            file.unlink()
-        os.close(descriptor)
 
 
 def _is_ours(name):
