@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from openjax.learning.archive import empty_archive
-from openjax.learning.generator import generate_task, select, successes
+from openjax.learning.generator import generate_task, select, successes, task_like
 from openjax.learning.settings import GeneratorSettings
-from openjax.pursuit import PursuitSettings, Task, empty_task
+from openjax.pursuit import Pursuit, PursuitSettings, Task, empty_task
 from openjax.pursuit.statistics import empty_statistics
 
 GAME = PursuitSettings()
@@ -60,6 +60,19 @@ def test_archived_tasks_are_expanded_with_probability_p():
     assert np.abs(moved).max() <= 0.1 + 1e-6 and np.abs(moved).max(axis=(1, 2)).min() > 0
     np.testing.assert_array_equal(np.asarray(tasks.pillar_position)[local][:, 0], np.float32(0.05))
     assert (np.asarray(tasks.pursuer_position)[~local][..., 0] >= 0.1).all()
+
+
+def test_a_task_keeps_its_evader():
+    game = PursuitSettings(evaders=("field", "greedy", "frozen"))
+    archive = empty_archive(task_like(game), 8)
+    of_two = archive.tasks.replace(evader=archive.tasks.evader.at[0].set(2))
+    archive = archive.replace(tasks=of_two, size=jnp.int32(1))
+    for expansion, expected in ((0.0, {0, 1, 2}), (1.0, {2})):
+        how = dataclasses.replace(NOMINAL, expansion=expansion)
+        tasks = jax.vmap(lambda key, how=how: generate_task(how, game, archive, key))(KEYS[:64])
+        assert set(np.asarray(tasks.evader)) == expected
+    states = jax.vmap(Pursuit(game).reset_to)(KEYS[:64], tasks)[1]
+    np.testing.assert_array_equal(states.evader.kind, 2)
 
 
 def test_turned_uniform_tasks_come_from_all_sides():

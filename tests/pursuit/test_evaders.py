@@ -7,7 +7,7 @@ import pytest
 
 from openjax import UserError, make
 from openjax.pursuit import SCENARIOS, PursuitSettings, scenario_settings, scenario_task
-from openjax.pursuit.evaders import EVADERS, HELD_OUT, SCRIPTED, TRAINED, VALIDATED, draw_evader
+from openjax.pursuit.evaders import EVADERS, HELD_OUT, SCRIPTED, TRAINED, VALIDATED, draw_evader, init_network
 from openjax.pursuit.evaders.behaviours import DIRECTIONS, MARGIN, MEMORY, Scene, directions, greedy
 
 ALL = SCRIPTED
@@ -186,6 +186,16 @@ def test_draws_of_worlds():
 def test_the_papers_game_holds_nothing_more():
     environment = make(physics="stops")
     assert jax.eval_shape(environment.reset, jax.random.key(0))[1].evader is None
+
+
+def test_networks_of_several_seeds_start_at_once():
+    """A CPU of two cores once waited for ever for decompositions of several matrices."""
+
+    def start(key):
+        return [jax.vmap(init_network)(jax.random.split(own, 3)) for own in jax.random.split(key)]
+
+    for layers in jax.jit(start)(jax.random.key(0)):
+        np.testing.assert_allclose(np.std(layers["hidden"]["kernel"]), (2 / 64) ** 0.5, rtol=0.05)
 
 
 def test_sets_share_nobody_and_unknown_ones_are_refused():

@@ -10,6 +10,7 @@ from openjax.pursuit import (
     PursuitSettings,
     Task,
     close_starts,
+    empty_task,
     expand_task,
     line_up_pillars,
     shift_pillars,
@@ -17,6 +18,12 @@ from openjax.pursuit import (
     turn_task,
     uniform_task,
 )
+
+
+def task_like(environment: PursuitSettings) -> Task:
+    """A task of zeros, of the shapes of generated ones."""
+    task = empty_task(environment)
+    return task.replace(evader=jnp.zeros((), jnp.int32)) if len(set(environment.evaders)) > 1 else task
 
 
 def generate_task(
@@ -28,7 +35,8 @@ def generate_task(
 ) -> Task:
     """Draw one task: with probability p an archived one, expanded, else a uniform one.
 
-    A share `close` of its pursuers is put close to a pillar or to another one (not in the paper).
+    A share `close` of its pursuers is put close to a pillar or to another one (not in the paper). Where there are several
+    evaders it has one of them, as its success rate is that of a task and an evader.
     """
     task = _archived_or_uniform(settings, environment, archive, key)
     return task if close is None else close_starts(environment, jax.random.fold_in(key, 1), task, close)
@@ -38,6 +46,9 @@ def _archived_or_uniform(settings, environment, archive, key):
     uniform_key, turn_key, choice_key, draw_key, expand_key = jax.random.split(key, 5)
     uniform = uniform_task(environment, uniform_key)
     uniform = _vary_pillars(settings, environment, jax.random.fold_in(uniform_key, 1), uniform)
+    if len(set(environment.evaders)) > 1:
+        kind = jax.random.randint(jax.random.fold_in(uniform_key, 2), (), 0, len(environment.evaders))
+        uniform = uniform.replace(evader=kind)
     if settings.turn:
         uniform = turn_task(turn_key, uniform)
     if not settings.enabled:

@@ -12,14 +12,14 @@ from flax import struct
 from openjax.baselines import make_policy
 from openjax.learning.archive import TaskArchive, empty_archive
 from openjax.learning.collectives import gather_over_devices, mean_over_devices, own_keys
-from openjax.learning.generator import generate_task, select, successes
+from openjax.learning.generator import generate_task, select, successes, task_like
 from openjax.learning.mappo import ValueScale, initial_value_scale, make_optimiser, update_policy
 from openjax.learning.predictor_update import make_predictor_optimiser, update_predictor
 from openjax.learning.rollout import Rollout, collect
 from openjax.learning.settings import TrainSettings
 from openjax.learning.train_state import Optimisers, TrainState
 from openjax.policy import Policy, PolicyParameters
-from openjax.pursuit import Observation, Pursuit, PursuitState, empty_task
+from openjax.pursuit import Observation, Pursuit, PursuitState
 from openjax.vehicle.family import narrowed_bounds
 
 
@@ -99,7 +99,7 @@ def abstract_carry(settings: TrainSettings, environment: Pursuit | None = None) 
 def initial_carry(settings: TrainSettings, parts: Building, key: jax.Array) -> TrainCarry:
     """The carry of a run's start; `parts` are what `build` gives."""
     environment = _starting(settings, parts.environment, 0.0)
-    archive = empty_archive(empty_task(settings.environment), settings.generator.capacity)
+    archive = empty_archive(task_like(settings.environment), settings.generator.capacity)
     key, policy_key, task_key, reset_key = jax.random.split(key, 4)
     tasks = _tasks(
         settings, archive, jax.random.split(task_key, settings.num_envs // settings.episodes_per_task)
@@ -263,9 +263,8 @@ def _starting(settings, environment, progress):
     if family and (settings.vehicles_start or settings.vehicles_ramp):
         share = grown(settings.vehicles_start, settings.vehicles_ramp)
         environment = environment.with_bounds(narrowed_bounds(family, share))
-    if settings.evaders_start or settings.evaders_ramp:
-        share = grown(settings.evaders_start, settings.evaders_ramp)
-        environment = environment.with_evader_share(share)
+    if settings.evaders_ramp:
+        environment = environment.with_evader_share(grown(0.0, settings.evaders_ramp))
     return environment
 
 

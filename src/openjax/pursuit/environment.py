@@ -176,7 +176,7 @@ class Pursuit:
             evader_position=task.evader_position,
             evader_velocity=still,
             evader=draw_evader(
-                settings, jax.random.fold_in(key, 3), task.pursuer_position, self.evader_share
+                settings, jax.random.fold_in(key, 3), task.pursuer_position, self.evader_share, task.evader
             ),
             last_seen=jnp.where(seen, task.evader_position, middle),
             in_sight=in_sight,

@@ -37,6 +37,8 @@ class Task:
     evader_position: jax.Array  # (3,) m, world
     pillar_position: jax.Array  # (P, 2) m, axis of each pillar
     pillar_active: jax.Array  # (P,) bool, slots in use
+    evader: jax.Array | None = None
+    """() int32, the place of its evader in the settings' `evaders`; None: it is drawn at the reset."""
 
 
 def empty_task(settings: PursuitSettings) -> Task:
@@ -235,11 +237,10 @@ def turn_task(key: jax.Array, task: Task) -> Task:
         xy = jnp.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
         return jnp.concatenate([xy, position[..., 2:]], axis=-1)
 
-    return Task(
+    return task.replace(
         pursuer_position=turn(task.pursuer_position),
         evader_position=turn(task.evader_position),
         pillar_position=turn(task.pillar_position),
-        pillar_active=task.pillar_active,
     )
 
 

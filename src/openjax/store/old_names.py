@@ -22,6 +22,7 @@ _RENAMED = {
 _REMOVED = {
     "environment.observe_others_motion": False,
     "environment.reward.over_speed_after": 0.0,
+    "evaders_start": 0.0,
 }
 """Settings that are gone, with the only value that means what is done today."""
 
