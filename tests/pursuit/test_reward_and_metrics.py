@@ -22,7 +22,7 @@ SETTINGS = PursuitSettings(
     speed_limit="none",
     physics="rigid",
     contacts=False,
-    reward=RewardSettings(smoothness=2.0, crash=7.0, first_crash=5.0),
+    reward=RewardSettings(first_capture=20.0, smoothness=2.0, crash=7.0, first_crash=5.0),
 )
 STILL = ((0.0, 0.0, 0.0),) * 3
 APART = ((0.5, 0.0, 0.6), (-0.5, 0.0, 0.6), (0.0, 0.5, 0.6))
@@ -74,7 +74,7 @@ def test_capture_bounds_pillar_and_speed(play):
     ).T
     smooth = 2 * np.exp(-np.array([0, 0, 0.1, 0]))[:, None]
     penalty = np.array([[0, -10, 0], [0, -10, 0], [0, -20, 0], [0, -20, -10]])
-    capture = np.array([[0], [6], [6], [6]])
+    capture = np.array([[0], [26], [6], [6]])
     expected = capture - 0.1 * distance + smooth + penalty
     np.testing.assert_allclose(info.penalty, penalty, atol=1e-5)
     np.testing.assert_allclose(reward, expected, atol=1e-4)

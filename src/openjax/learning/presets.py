@@ -124,11 +124,11 @@ def evaders() -> TrainSettings:
     return changed(
         flight(),
         # who knows the whole penalties before clever evaders hovers far from these: cheaper ones lead past pillars once more,
-        # and the distance pays for going there
+        # the distance pays for going there, and the first capture for the last centimetres: a step of it alone costs too much
         environment=dict(
             evaders=("field", "field", "greedy", "greedy", "greedy", "wall_runner"),
             min_pillars=0,
-            reward=dict(distance=0.5),
+            reward=dict(distance=0.5, first_capture=500.0),
         ),
         mappo=dict(
             actor_start=0.015,

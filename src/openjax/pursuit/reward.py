@@ -40,7 +40,9 @@ def reward(
     penalty = penalty - weights.crash * crash - weights.first_crash * first_crash
     distance = jnp.sqrt(jnp.sum((state.drones.position - state.evader_position) ** 2, axis=-1) + 1e-12)
     change = jnp.sqrt(jnp.sum((state.previous_action - before.previous_action) ** 2, axis=-1) + 1e-12)
-    task = weights.capture * jnp.any(info.captured) - weights.distance * distance
+    captured = jnp.any(info.captured)
+    task = weights.capture * captured - weights.distance * distance
+    task = task + weights.first_capture * (captured & ~before.statistics.captured)
     return task + weights.smoothness * jnp.exp(-change) + penalty, penalty
 
 

@@ -21,6 +21,9 @@ class RewardSettings:
 
     capture: Annotated[float, Interval("[0, 1e6]")] = 6.0
     """To every pursuer, in each step in which any pursuer captures."""
+    first_capture: Annotated[float, Interval("[0, 1e6]")] = 0.0
+    """To every pursuer, once, at an episode's first capture: where the evader gets away again, a step in reach of it is worth
+    less than closing in costs (not in the paper)."""
     distance: Annotated[float, Interval("[0, 1e6]")] = 0.1
     """Subtracted per metre between pursuer and evader."""
     collision: Annotated[float, Interval("[0, 1e6]")] = 10.0
