@@ -80,3 +80,4 @@ def flying():
 def test_whatever_happens_all_are_down_inside_and_disarmed(flying, kind):
     record = flying(7, kind)
     assert record["well"], str(record)
+    assert kind != "KILL guard" or "the guard is gone" in record["said"]

@@ -1,6 +1,6 @@
 """The game around vehicles that fly elsewhere.
 
-It is `openjax.pursuit`'s own step, in which only the drones' step is replaced by poses from outside.
+It is `openjax.pursuit`'s own, without its physics.
 """
 
 import functools
@@ -14,38 +14,19 @@ from openjax.pursuit import EpisodeStatistics, Pursuit, PursuitSettings, Task, a
 from openjax.vehicle import DroneState
 
 
-class FlownElsewhere:
-    """Stands in for a drones' step: the next state and what is seen of it lie in the drones' memory."""
+class SeenElsewhere:
+    """Stands in for a drones' step: what is seen of the drones lies in their memory."""
 
     def reset(self, vehicle, drones: DroneState, key=None) -> DroneState:
-        """Drones that are where they are, and seen there."""
+        """Drones that are seen where they are."""
         del vehicle, key
-        return remember(drones, pose_of(drones), pose_of(drones))
-
-    def __call__(self, vehicle, drones: DroneState, *_) -> DroneState:
-        """The drones where they were flown to."""
-        del vehicle
-        return drones.replace(**drones.effect_memory["flown"])
+        seen = {name: getattr(drones, name) for name in ("position", "quaternion", "velocity")}
+        return drones.replace(effect_memory=seen)
 
     def seen(self, drones: DroneState, effect_parameters=None) -> DroneState:
         """The drones as they were measured."""
         del effect_parameters
-        return drones.replace(**drones.effect_memory["seen"])
-
-
-def pose_of(drones: DroneState) -> dict:
-    """What a world elsewhere says of drones."""
-    return {name: getattr(drones, name) for name in ("position", "quaternion", "velocity")}
-
-
-def remember(drones: DroneState, flown: dict, seen: dict) -> DroneState:
-    """The drones with their next state and what is seen of it in their memory."""
-    return drones.replace(effect_memory={"flown": flown, "seen": seen})
-
-
-def flown_pursuit(settings: PursuitSettings) -> Pursuit:
-    """The game of drones that fly elsewhere."""
-    return Pursuit(settings, dynamics=FlownElsewhere())
+        return drones.replace(**drones.effect_memory)
 
 
 def play(
@@ -85,18 +66,18 @@ def play(
 @functools.cache
 def _compiled(settings, policy, watch):
     """The game's start, its observation of measured poses, the policy, and the game's step with poses from outside."""
-    game = flown_pursuit(settings)
+    game = Pursuit(settings, dynamics=SeenElsewhere())
 
     def observe(state, seen):
-        return game.observe(state.replace(drones=remember(state.drones, seen, seen)))
+        return game.observe(state.replace(drones=state.drones.replace(effect_memory=seen)))
 
     def act(weights, observation):
         action = policy.act(weights, observation)
         return action, action_to_command(action)
 
     def advance(state, action, flown, seen):
-        state = state.replace(drones=remember(state.drones, flown, seen))
-        observation, state, *_ = game.step(None, state, action)
+        drones = state.drones.replace(**flown, effect_memory=seen)
+        observation, state, *_ = game.follow(state, action, drones)
         return observation, state, None if watch is None else watch(state, action)
 
     return (
