@@ -100,6 +100,17 @@ def test_wrong_frames_of_motion_capture_move_nothing(frames, off):
     assert state.all_in(Mode.PURSUIT)
 
 
+def test_the_estimator_on_board_is_told_what_is_near_it_and_no_more():
+    state, told = pursuing(), []
+    for k in range(1, 41):
+        time, place = 0.01 * k, PLACES[1]
+        seen = still(time, (place[0] + 0.0012 * k, *place[1:]))
+        sample = PoseSample(still(time, place), time, 4.0, captured=seen)
+        state, _ = step(LIMITS, state, event(time, _1=sample))
+        told.append(state.drones[1].told)
+    assert state.all_in(Mode.PURSUIT) and all(told[:15]) and not any(told[-10:])
+
+
 @pytest.mark.parametrize(
     ("pose", "reason"),
     [
