@@ -57,7 +57,7 @@ def conclude(evidence: Evidence) -> Report:
     acting |= evidence.acting()
     named = [e for e, p in acting.items() if p >= 0.5]
     parts = split(evidence, selection, np.zeros(6), named)
-    named = [e for e in named if e in selection.effects or _matters(parts, e)]
+    named = [e for e in named if _matters(parts, e)]
     check = check_residual(evidence, selection.fit)
     parts = split(evidence, selection, check.predicted, named)
     found = words(evidence, check, parts, not_testable(evidence))
@@ -102,7 +102,7 @@ def not_testable(evidence: Evidence) -> list[str]:
 
 
 def _matters(parts: Split, effect: str) -> bool:
-    """Whether an effect's share shrinks the gap by what matters: a gain may be read more finely than that."""
+    """Whether an effect's share shrinks the gap by what matters: it may be read more finely than that."""
     whole, share = max(parts.gap.before**2 - 1.0, 0.0), parts.effects[effect].value
     return share > DECISION.form_error and share * whole > (1.0 + DECISION.least_gap) ** 2 - 1.0
 
