@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from openjax.gap.decision import DECISION
 from openjax.gap.model.library import CARDS
 from openjax.gap.probabilities import beyond_form_error, probabilities
 from openjax.gap.shares import shares_of_squares
@@ -50,6 +51,9 @@ def test_probabilities_add_up_and_follow_the_words():
     found = probabilities({"mass": 0.9}, {}, {"mass": 1.0, "unexplained": 0.0}, 0.05, weights)
     assert sum(found.values()) == pytest.approx(1.0) and max(found, key=found.get) == "mass"
     nothing = probabilities({}, {}, {}, 0.05, {frozenset(): 1.0})
-    assert nothing["none"] == pytest.approx(0.95) and nothing["unknown"] == pytest.approx(0.05)
+    odds = (0.95 / 0.05) ** (1.0 / DECISION.temperature)
+    assert nothing["none"] / nothing["unknown"] == pytest.approx(odds) and sum(
+        nothing.values()
+    ) == pytest.approx(1.0)
     within = probabilities({}, {"inertia": 0.2}, {}, 0.05, {frozenset({"inertia"}): 1.0})
     assert max(within, key=within.get) == "none" and within["inertia"] < 0.25
