@@ -10,7 +10,7 @@ from openjax.gap.channels.sensors import corrected, read_kinematics
 from openjax.gap.decision import DECISION
 
 
-def _track(gain=1.0, tilt=0.0, seed=1, rows=1500):
+def _track(gain=1.0, tilt=0.0, scale=1.0, seed=1, rows=1500):
     """A made flight: smooth rates, attitude by integration, a path whose acceleration the accelerometer feels."""
     rng, dt = np.random.default_rng(seed), 0.01
     time = dt * np.arange(rows)
@@ -31,7 +31,7 @@ def _track(gain=1.0, tilt=0.0, seed=1, rows=1500):
     leaned = np.concatenate([w * np.cos(tilt / 2) - u @ half[:, None], u * np.cos(tilt / 2) + w * half
                              + np.cross(half, u)], 1)  # fmt: skip
     return Track(
-        name="a", flight="a", dt=dt, time=time, position=velocity @ lean.T, quaternion=leaned,
+        name="a", flight="a", dt=dt, time=time, position=scale * dt * np.cumsum(velocity, 0) @ lean.T, quaternion=leaned,
         velocity=velocity @ lean.T + 0.005 * rng.standard_normal((rows, 3)),
         body_rates=gain * rates + 0.02 * rng.standard_normal((rows, 3)) + 0.01,
         specific_force=force + 0.15 * rng.standard_normal((rows, 3)) + np.array([0.2, -0.1, 0.1]),
@@ -52,6 +52,12 @@ def test_a_gyroscope_with_another_gain_is_found_and_corrected(gain):
         found.gain == pytest.approx(gain, abs=0.01) and list(found.findings) == ["gyroscope gain"] * unusual
     )
     assert read_kinematics([corrected(t, found) for t in tracks]).gain == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize("scale", [0.8, 1.05, 1.2])
+def test_positions_in_another_scale_than_the_accelerometers_are_a_finding(scale):
+    unusual = abs(scale - 1.0) > DECISION.gyroscope_gain
+    assert list(read_kinematics([_track(scale=scale)]).findings) == ["scale"] * unusual
 
 
 def test_a_world_that_leans_is_found_and_put_upright():

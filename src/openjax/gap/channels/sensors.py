@@ -20,7 +20,7 @@ BAND = (0.3, 6.0)  # Hz: above drift, below most of the sensors' noise
 SLOW = 2.0  # Hz, below which path and accelerometer are compared
 GRAVITY = 9.81  # m/s^2
 CLEAR = 5.0  # jackknife standard errors by which a finding must exceed nothing
-LEAST_RATE = 0.1  # rad/s rms in the band: an axis that hardly turns shows no gain
+LEAST = 0.1  # rad/s or m/s^2 rms in the band: an axis that hardly moves shows no gain
 COHERENT = 0.97  # correlation below which the two streams don't fit well enough to compare gains
 ONE_CLOCK = 0.93  # below which they don't share a clock
 EDGE = 0.3  # s at either end that the filters spoil
@@ -62,17 +62,20 @@ class Kinematics:
 
 def read_kinematics(tracks: list[Track]) -> Kinematics:
     """Compare the sensors of all tracks of one case."""
-    streams = _streams(tracks)
-    gain, error, coherence, turning = _gyroscope(streams)
+    streams = _streams(tracks, _turning, BAND)
+    gain, error, coherence, turning = _gains(streams)
     tilt, tilt_error = _world(tracks)
-    findings = {}
-    # Two axes alike are a sensor; one alone may be an axis that the flights hardly turn about.
+    # One axis alone may be one that the flights hardly turn about: two alike are a sensor.
     clear = (np.abs(gain - 1.0) > CLEAR * error) & np.isfinite(gain)
     clear &= clear.sum() >= 2
-    off = clear & (np.abs(gain - 1.0) > DECISION.gyroscope_gain)
-    if off.sum() >= 2:
-        words = ", ".join(f"{a} {g:.3f}" for a, g, o in zip("xyz", gain, off, strict=True) if o)
+    findings = {}
+    if words := _unusual(gain, error):
         findings["gyroscope gain"] = f"the gyroscope reads {words} times the rate of the attitude"
+    scale = _gains(_streams(tracks, _accelerating, (BAND[0], SLOW)))
+    if words := _unusual(*scale[:2]):
+        findings["scale"] = (
+            f"positions change by {words} times what accelerometer and attitude feel: is their unit right?"
+        )
     if (turning & (coherence < ONE_CLOCK)).sum() >= 2:
         words = ", ".join(f"{a} {c:.2f}" for a, c in zip("xyz", coherence, strict=True))
         findings["clocks"] = (
@@ -92,6 +95,14 @@ def read_kinematics(tracks: list[Track]) -> Kinematics:
     return Kinematics(gain, tilt, tilt_error, coherence, turning, findings, _wander(streams))
 
 
+def _unusual(gain: np.ndarray, error: np.ndarray) -> str:
+    """The axes whose gain is clearly off by more than sensors usually are, where these are two or more."""
+    away = np.abs(gain - 1.0)  # NaN where it isn't known
+    off = (away > CLEAR * error) & (away > DECISION.gyroscope_gain)
+    words = ", ".join(f"{a} {g:.3f}" for a, g, o in zip("xyz", gain, off, strict=True) if o)
+    return words if off.sum() >= 2 else ""
+
+
 def corrected(track: Track, found: Kinematics) -> Track:
     """The track as it would read with sensors that agree."""
     changes = {}
@@ -109,27 +120,38 @@ def corrected(track: Track, found: Kinematics) -> Track:
     return dataclasses.replace(track, **changes) if changes else track
 
 
-def _streams(tracks) -> list[tuple[float, np.ndarray, np.ndarray]]:
-    """Row period (s), rate of the attitude (T, 3) and gyroscope (T, 3), rad/s in BAND without the ends, of each track that
-    has both and is long enough to be filtered."""
+def _turning(track: Track) -> tuple[np.ndarray, np.ndarray] | None:
+    """Rate of the attitude (T, 3) and gyroscope (T, 3), rad/s."""
+    if track.quaternion is None or track.body_rates is None:
+        return None
+    return turn_increments(track.quaternion) / track.dt, 0.5 * (track.body_rates[1:] + track.body_rates[:-1])
+
+
+def _accelerating(track: Track) -> tuple[np.ndarray, np.ndarray] | None:
+    """What the accelerometer feels (T, 3) and the acceleration of the position (T, 3), m/s^2 in the world."""
+    if track.quaternion is None or track.position is None or track.specific_force is None:
+        return None
+    felt = np.einsum("tij,tj->ti", rotation(track.quaternion), track.specific_force)
+    return felt, np.gradient(np.gradient(track.position, track.dt, axis=0), track.dt, axis=0)
+
+
+def _streams(tracks, signals_of, band) -> list[tuple[float, np.ndarray, np.ndarray]]:
+    """Row period (s) and two signals (T, 3) in `band` without the ends, of each track that has them and is long enough to be
+    filtered."""
     out = []
     for track in tracks:
-        if track.quaternion is None or track.body_rates is None:
+        signals, edge = signals_of(track), int(EDGE / track.dt)
+        if signals is None or len(signals[0]) < 4 * edge:
             continue
-        turned = turn_increments(track.quaternion) / track.dt
-        gyro = 0.5 * (track.body_rates[1:] + track.body_rates[:-1])
-        band = butter(2, BAND, "bandpass", fs=1.0 / track.dt, output="sos")
-        edge = int(EDGE / track.dt)
-        if len(gyro) < 4 * edge:
-            continue
-        out.append((track.dt, *(sosfiltfilt(band, v, axis=0)[edge:-edge] for v in (turned, gyro))))
+        passed = butter(2, band, "bandpass", fs=1.0 / track.dt, output="sos")
+        out.append((track.dt, *(sosfiltfilt(passed, v, axis=0)[edge:-edge] for v in signals)))
     return out
 
 
-def _gyroscope(streams) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Gain (3,), its error (3,) and the correlation (3,) of gyroscope and attitude's rate, axis by axis, in BAND; whether
-    an axis turns enough (3,)."""
-    sums = []  # per granule: (3, 3) sums of squares and products
+def _gains(streams) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Gain (3,) of the second signal over the first, its error (3,) and their correlation (3,), axis by axis; whether an axis
+    moves enough (3,)."""
+    sums = []  # per granule: (4, 3) sums of squares and products, and rows
     for dt, a, b in streams:
         size = max(int(SEGMENT / dt), 1)
         for k in range(0, len(a) - size // 2, size):
@@ -146,11 +168,16 @@ def _gyroscope(streams) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         return np.sqrt(s[2] / np.maximum(s[0], 1e-12)), s[1] / np.sqrt(np.maximum(s[0] * s[2], 1e-12))
 
     gain, coherence = gains(total)
-    spread = np.array([gains(total - s)[0] for s in sums])
-    error = np.sqrt((len(sums) - 1) / len(sums) * ((spread - spread.mean(0)) ** 2).sum(0))
+    error = _jackknife(sums, lambda s: gains(s)[0])
     # The quieter of the two: noise alone is no motion.
-    turning = np.sqrt(np.minimum(total[0], total[2]) / total[3]) > LEAST_RATE
-    return np.where(turning & (coherence > COHERENT), gain, np.nan), error, coherence, turning
+    moving = np.sqrt(np.minimum(total[0], total[2]) / total[3]) > LEAST
+    return np.where(moving & (coherence > COHERENT), gain, np.nan), error, coherence, moving
+
+
+def _jackknife(sums: np.ndarray, statistic) -> np.ndarray:
+    """Standard error of a statistic of the sum of `sums` (N, ...), by leaving each out."""
+    left_out = np.array([statistic(sums.sum(0) - s) for s in sums])
+    return np.sqrt((len(sums) - 1) / len(sums) * ((left_out - left_out.mean(0)) ** 2).sum(0))
 
 
 def _wander(streams) -> float:
@@ -221,7 +248,4 @@ def _world(tracks) -> tuple[np.ndarray | None, np.ndarray | None]:
     def solve(gram):
         return np.linalg.solve(gram[:-1, :-1] + np.diag(ridge), gram[:-1, -1])[:2]
 
-    tilt = solve(total)
-    spread = np.array([solve(total - g) for g in grams])
-    error = np.sqrt((len(grams) - 1) / len(grams) * ((spread - spread.mean(0)) ** 2).sum(0))
-    return tilt, error
+    return solve(total), _jackknife(grams, solve)

@@ -85,7 +85,7 @@ def _places(report: Report):
     _legend(axes)
     return (
         "Where the gap lies",
-        "Channel and part of the flight; at the right the error in its own unit.",
+        f"Forces and torques averaged over {CALM} s, by part of the flight; at the right the error before, in its own unit.",
         figure,
     )
 

@@ -10,6 +10,7 @@ import jinja2
 
 from openjax.gap.report import Report
 from openjax.gap.report.figures import figures
+from openjax.vehicle.effects import EFFECTS
 
 TEMPLATE = Path(__file__).with_name("page.html.jinja")
 LEAST_CHANCE = 5e-4
@@ -29,6 +30,7 @@ def page_of(report: Report) -> str:
         shares=shares(report),
         steps=next_steps(report),
         figures=figures(report),
+        meanings={e: EFFECTS[e].description for e in report.parameters if e in EFFECTS},
         ranked=[(name, p) for name, p in ranked[:8] if p > LEAST_CHANCE],
     )
     return re.sub(r"(?<=\d) %", "\u00a0%", page)  # a number and its sign stay on one line
