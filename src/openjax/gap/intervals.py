@@ -17,6 +17,7 @@ from openjax.vehicle.effects import EFFECTS
 REACH = 1.645  # standard deviations of a 90 % interval
 FORM = 0.05  # of an effect's size, one standard deviation: real effects don't have the library's form
 LEAST_ERROR = 0.01  # of a value that isn't zero without the effect
+MOST = 4.0  # times their errors by which flights of one vehicle may disagree about a parameter
 
 
 def estimates(evidence: Evidence, fit: SetFit, named) -> dict[str, dict[str, Estimate]]:
@@ -59,13 +60,23 @@ def _sizes(effect: str, theta: np.ndarray) -> dict[str, float]:
 def robust_deviation(fit: SetFit) -> np.ndarray:
     """Standard deviations (p,) of a fit's parameters: flight-wise sandwich where flights disagree more
     than they should."""
-    model = np.sqrt(np.diag(fit.covariance))
+    model, flights = np.sqrt(np.diag(fit.covariance)), _between_flights(fit)
+    # Few flights: Student's quantile instead of the normal one.
+    few = student.ppf(0.95, max(len(fit.grams) - 1, 1)) / REACH
+    return np.clip(few * flights, model, MOST * model)
+
+
+def disagreeing(fit: SetFit) -> list[str]:
+    """The parameters about which flights disagree far beyond their errors, in words."""
+    apart = fit.index[_between_flights(fit) > MOST * np.sqrt(np.diag(fit.covariance))]
+    return [" ".join(name).replace("_", " ") for name, place in PLACE.items() if place in apart]
+
+
+def _between_flights(fit: SetFit) -> np.ndarray:
+    """Standard deviations (p,) of a fit's parameters from how flights differ; zero for a single one."""
     count = len(fit.grams)
     if count < 2 or not len(fit.index):
-        return model
+        return np.zeros(len(fit.index))
     pushes = fit.grams[:, 1:, 0] - fit.grams[:, 1:, 0].mean(0)
     middle = pushes.T @ pushes * count / (count - 1)
-    sandwich = np.sqrt(np.maximum(np.diag(fit.covariance @ middle @ fit.covariance), 0.0))
-    # Few flights: Student's quantile instead of the normal one.
-    sandwich *= student.ppf(0.95, count - 1) / REACH
-    return np.clip(sandwich, model, 4.0 * model)
+    return np.sqrt(np.maximum(np.diag(fit.covariance @ middle @ fit.covariance), 0.0))

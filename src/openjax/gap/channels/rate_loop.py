@@ -96,16 +96,7 @@ def read_rate_loop(reading) -> RateLoop:
         demand = wanted @ outputs_of(vehicle)
         outputs.append(track.motor @ outputs_of(vehicle) - demand[0])
         tied.append((demand[1:] - demand[0]) / GAIN_STEP)
-    change, error = np.zeros(6), np.full(6, np.inf)
-    if reading.late is not None:
-        change, error = read_gains(
-            reading.tracks,
-            reading.vehicles,
-            reading.arrived,
-            reading.by_commands,
-            reading.at_once,
-            reading.late,
-        )
+    change, error = read_gains(reading)
     names = effects_of("rate_loop", reading.library)
     return RateLoop(change, error, outputs, tied, ticks, names, max(t.dt for t in reading.tracks))
 
@@ -143,16 +134,16 @@ def observed(track: Track, vehicle, link, gains, at_once=False):
     return np.asarray(wanted, float)[:, :rows], np.asarray(sent[0])[:rows]
 
 
-def read_gains(
-    tracks, vehicles, links, by_commands, at_once: bool, late: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Changes (6,) of p, i, d as shares - roll and pitch, then yaw - and their errors, infinite where flights say too little.
-    `late` s: by how much the motors' rows may be off against the gyroscope's."""
-    moments: dict[int, list] = {0: [], 1: [], 2: []}  # axis: [(moments (5, 1 + 5), track)] of every segment
-    for unit, of_track in enumerate(zip(tracks, vehicles, links, by_commands, strict=True)):
-        for axis, part in _segments(*of_track, at_once, late):
-            moments[axis].append((part, unit))
+def read_gains(reading) -> tuple[np.ndarray, np.ndarray]:
+    """Changes (6,) of p, i, d as shares - roll and pitch, then yaw - and their errors, infinite where flights say too little."""
     change, error = np.zeros(6), np.full(6, np.inf)
+    if reading.late is None:
+        return change, error
+    moments: dict[int, list] = {0: [], 1: [], 2: []}  # axis: [(moments (5, 1 + 5), track)] of every segment
+    of_tracks = zip(reading.tracks, reading.vehicles, reading.arrived, reading.by_commands, strict=True)
+    for unit, of_track in enumerate(of_tracks):
+        for axis, part in _segments(*of_track, reading.at_once, reading.late):
+            moments[axis].append((part, unit))
     for group, axes in enumerate(((0, 1), (2,))):
         found = np.array([m for a in axes for m, _ in moments[a]])
         units = np.array([(a, u) for a in axes for _, u in moments[a]])

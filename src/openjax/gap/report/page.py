@@ -102,31 +102,24 @@ def next_steps(report: Report) -> list[tuple[str, str]]:
     steps = []
     if report.parameters:
         names = ", ".join(effect.replace("_", " ") for effect in report.parameters)
-        steps.append(
-            (
-                f"Fine-tune shipped weights to a vehicle with {names}:",
-                "openjax adapt effects.toml --policy flight",
-            )
+        tune, train = (
+            "openjax adapt effects.toml --policy flight",
+            "openjax train --preset flight --effects effects.toml",
         )
-        steps.append(
-            (
-                "Or train from scratch in the corrected simulator:",
-                "openjax train --preset flight --effects effects.toml",
-            )
-        )
+        steps.append((f"Fine-tune shipped weights to a vehicle with {names}:", tune))
+        steps.append(("Or train from scratch in the corrected simulator:", train))
     for name, others in report.equivalent.items():
         steps.append((f"These flights can't tell {name} from {', '.join(others)}. {_fly(report)}", ""))
     if report.left_out:
-        steps.append(
-            ("Mend the logs that were left out, and diagnose again: each says above what is wrong.", "")
-        )
+        why = "Mend the logs that were left out, and diagnose again: each says above what is wrong."
+        steps.append((why, ""))
     if report.verdict == "none":
-        steps.append(("Nothing needs correcting. Keep these flights as the reference for later ones:",
-                      f"openjax diagnose NEW_FLIGHTS --reference {report.case}"))  # fmt: skip
+        why = "Nothing needs correcting. Keep these flights as the reference for later ones:"
+        steps.append((why, f"openjax diagnose NEW_FLIGHTS --reference {report.case}"))
     if "unknown" in report.effects:
         follows = f" {report.rest}" if report.rest else ""
-        steps.append((f"Look for what is not on the list of effects.{follows} Did anything change since it flew well?",
-                      f"openjax diagnose {report.case} --reference EARLIER_FLIGHTS"))  # fmt: skip
+        why = f"Look for what is not on the list of effects.{follows} Did anything change since it flew well?"
+        steps.append((why, f"openjax diagnose {report.case} --reference EARLIER_FLIGHTS"))
     if report.not_testable and not report.equivalent and report.next_flight:
         missing = ", ".join(effect.replace("_", " ") for effect in report.not_testable)
         steps.append((f"These flights wouldn't show {missing}. {_fly(report)}", ""))
