@@ -95,7 +95,7 @@ def test_drag_and_an_offset_centre_of_mass_are_not_taken_for_the_constants():
     effects = {"rotor_drag": {"d_xy": 0.02, "d_z": 0.01}, "com_offset": {"x": 0.002, "y": -0.001}}
     result = calibrate(fly_case(NOMINAL, effects))
     assert_recovered(result, dict.fromkeys(ALTERED, 1.0), 0.06, but=("motor_time_constant",))
-    assert result.nuisances["drag_lateral"][0] == pytest.approx(0.02 / 0.0321, rel=0.1)
+    assert result.nuisances["rotor_drag d_xy"][0] == pytest.approx(0.02, rel=0.1)
 
 
 def test_without_weighing_the_assumed_mass_carries_over(altered_case):

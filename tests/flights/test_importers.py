@@ -133,7 +133,7 @@ def test_the_controllers_variables_stand_for_motors_and_gyroscope(tmp_path, colu
     assert "mixer" in table.remarks[0]
     assert_same(table, {n: columns[n] for n in ("m1", "m2", "m3", "m4", "wx", "wy", "wz", "az", "x")})
     (flight,), _ = flights_of(table)
-    assert flight.specific_force is None and flight.vertical_force is not None
+    assert flight.specific_force is None
 
 
 def test_a_micro_sd_log_cut_off_is_read_as_far_as_it_goes(tmp_path, columns):

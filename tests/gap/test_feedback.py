@@ -1,5 +1,7 @@
 """The rate loop's gains and the motors' sampling, read from a loop written out in NumPy."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -71,8 +73,12 @@ def flown(seed, p=1.0, gust=0.0, noise=0.005, sampled=False):
 )
 def test_gains_are_what_the_loop_has_whatever_gusts_and_noise_do(p, sampled):
     flights = [flown(seed, p, gust=5.0, sampled=sampled) for seed in range(3)]
+    tracks, vehicles, links = zip(*flights, strict=True)
     commanded = [caused_by_commands(*f) for f in flights]
-    change, error = read_gains(*zip(*flights, strict=True), commanded, at_once=sampled, late=0.0005)
+    reading = SimpleNamespace(
+        tracks=tracks, vehicles=vehicles, arrived=links, by_commands=commanded, at_once=sampled, late=0.0005
+    )
+    change, error = read_gains(reading)
     assert change[0] == pytest.approx(p - 1.0, abs=0.12)
     assert bool(loop(change, error).acting()) == (p != 1.0)
 

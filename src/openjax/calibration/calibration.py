@@ -1,9 +1,8 @@
 """Calibration: the nominal vehicle's own constants from flights, with intervals and with what can't be told.
 
-Gauss-Newton on the equations of `calibration_model`, nuisances free within weak priors. Residuals of real
-flights are coloured, so errors come from blocks of time and from leaving flights out, never from counting
-rows.
-"""
+The constants are parameters of effects, fitted all at once by the diagnosis' replay: through the simulator, with its sensors'
+nuisances and its coloured noise, beside what usually acts as well. Errors come from that noise, or from what flights disagree by
+where that is more."""
 
 from __future__ import annotations
 
@@ -12,15 +11,30 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from openjax.calibration.fit import CalibrationFit
 from openjax.errors import UserError
 from openjax.flights.flight import Case
-from openjax.flights.track import tracks_of
+from openjax.gap.evidence import Evidence, gather
+from openjax.gap.intervals import REACH, robust_deviation
+from openjax.gap.model.hypotheses import UNEXPOSED, SetFit, fit_set
+from openjax.gap.model.library import CARDS, PLACE, library, prior
+from openjax.gap.residual import residuals_of
+from openjax.vehicle.effects import EFFECTS
 from openjax.vehicle.vehicle_file import CALIBRATED_UNITS, CalibratedValue
 
-Z90 = 1.645
-DETERMINED = 0.25  # standard deviation of the logarithm below which a quantity counts as determined
+FITTED = ("thrust_scale", "yaw_torque", "motor_lag", "inertia")  # whose parameters are the constants
+BESIDE = (
+    "rotor_drag",
+    "com_offset",
+    "ground_effect",
+    "ceiling_effect",
+    "downwash",
+)  # mustn't be taken for them
+ITERATIONS = 12
+DETERMINED = (
+    0.5  # of the prior's standard deviation: a constant with a larger one isn't told by these flights
+)
 LEAST_EXPLAINED = 0.75  # share of the rates' changes; below, no constant that they tell can be trusted
+HORIZON = 0.25  # s over which changes are explained
 YAW_INERTIA_RANGE = (0.7, 1.6)  # of nominal; what it may be where it is assumed
 # Relative error (standard deviation) that remains however long one flies: commands and states are known every
 # 10 ms only, and thrust differs by up to a per cent from flight to flight. Measured by closed loop.
@@ -30,7 +44,7 @@ MODEL_ERROR = {
     "motor_time_constant": 0.02,
     "inertia": 0.004,
 }
-
+TOLD_BY_RATES = ("torque_constant", "motor_time_constant", "inertia")
 
 # What flights can't tell, in words.
 _YAW_CLASS = (
@@ -42,7 +56,7 @@ _NOT_WEIGHED = (
 )
 _UNKNOWN_MAP = (
     "the thrust constant: the commands are duty cycles whose map to thrust isn't known. Against the public "
-    "map the flights' thrust per assumed mass is {scales}; torques were scaled alike"
+    "map the flights' thrust per assumed mass is {scale:.3g}; torques were scaled alike"
 )
 _NOT_EXPLAINED = (
     "inertia, torque constant, motor lag: motors explain only {share:.0%} of what the gyroscope shows. "
@@ -54,6 +68,7 @@ _ADVICE = {
     "motor_time_constant": "change thrust or rates sharply, with motors and IMU logged on one clock",
     "inertia": "roll and pitch sharply left and right",
 }
+_ASSUMED_MASS = "for the assumed mass, which wasn't weighed"
 
 
 @dataclass(frozen=True)
@@ -70,9 +85,9 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Result of a calibration. `cannot_tell` says in words what these flights leave open; `nuisances` what
-    the sensors' offsets took, {name: (value, unit)}; `explained` the share of each channel's variation that
-    the fitted vehicle explains, and with the nominal one."""
+    """Result of a calibration. `cannot_tell` says in words what these flights leave open; `nuisances` what was
+    fitted beside, {name: (value, unit)}; `explained` the share of each channel's changes that the nominal vehicle
+    explains, and the fitted one."""
 
     quantities: dict[str, Quantity]
     cannot_tell: tuple[str, ...]
@@ -95,143 +110,125 @@ def calibrate(case: Case) -> Calibration:
 
     Raises UserError if no flight holds motor commands and body rates.
     """
-    tracks = [t for t in tracks_of(case) if t.motor is not None and t.body_rates is not None]
-    if not tracks:
+    usable = tuple(f for f in case.flights if f.has_motors and f.body_rates is not None)
+    if not usable:
         raise UserError(
             f"{case.name}: no flight holds motor commands (m1..m4) and the gyroscope; calibration needs both"
         )
-    ids = {f.name: f.vehicle for f in case.flights}
-    vehicles = [case.vehicle_file.vehicle_of(ids[t.name.partition("#")[0]]) for t in tracks]
-    fit = CalibrationFit(case, tracks, vehicles)
-    fit.run()
-    return _result(case, fit)
-
-
-def _result(case: Case, fit: CalibrationFit) -> Calibration:
-    vehicle, file = fit.vehicles[0], case.vehicle_file
-    index = {n: i for i, n in enumerate(fit.names)}
-    thrust = [index[n] for n in fit.names if n.startswith("thrust")]
-    size = len(fit.names) + 1
-    weighed = file.mass_weighed
-
-    def combined(parts: dict[int, float]) -> tuple[float, float]:
-        """Log of a product of powers of parameters, and its standard deviation."""
-        gradient = np.zeros(size)
-        value = 0.0
-        for i, power in parts.items():
-            value += power * np.log(max(fit.beta[i], 1e-3))
-            gradient[i] = power / max(fit.beta[i], 1e-3)
-        return value, float(np.sqrt(gradient @ fit.covariance @ gradient))
-
-    share = {i: 1.0 / len(thrust) for i in thrust}
-    logs = {"thrust_constant": combined(share)}
-    for axis in ("roll", "pitch"):
-        logs[axis] = combined(share | {index[axis]: -1.0})
-    # With duty cycles the torque constant is that of a vehicle whose thrust constant stays nominal.
-    yaw = {index["yaw"]: 1.0}
-    logs["torque_constant"] = combined(yaw | {i: -p for i, p in share.items()} if fit.per_flight else yaw)
-    logs["motor_time_constant"] = (fit.lag - fit.log_nominal, float(np.sqrt(fit.covariance[-1, -1])))
-    # What the gyroscope's noise moves through the rate loop looks like motors that do little: with weak
-    # excitation the rates' constants are off by about the share of the rates that stays unexplained.
-    for name, channels in {
-        "roll": 0,
-        "pitch": 1,
-        "torque_constant": 2,
-        "motor_time_constant": (0, 1, 2),
-    }.items():
-        value, deviation = logs[name]
-        logs[name] = value, float(np.hypot(deviation, 1.0 - min(_share(fit, fit.residual, channels), 1.0)))
-
-    quantities = {}
-    for name in ("thrust_constant", "torque_constant", "motor_time_constant"):
-        quantities[name] = _quantity(
-            name, [float(getattr(vehicle, name))], [logs[name]], _notes(name, weighed)
-        )
-    nominal = np.asarray(vehicle.inertia, float).tolist()
-    low, high = YAW_INERTIA_RANGE
-    inertia = _quantity(
-        "inertia", nominal, [logs["roll"], logs["pitch"], (0.0, 0.0)], _notes("inertia", weighed)
+    evidence = gather(dataclasses.replace(case, flights=usable), library())
+    exposure = evidence.motion.exposure
+    effects = [e for e in CARDS if e in FITTED or (e in BESIDE and exposure[e] >= UNEXPOSED)]
+    # The vehicle's numbers are what is fitted, and no nuisances.
+    replay, own = evidence.replay, len(evidence.replay.numbers)
+    replay = dataclasses.replace(
+        replay,
+        nuisances=[n[own:] for n in replay.nuisances],
+        nuisance_names=replay.nuisance_names[own:],
+        numbers=(),
     )
-    pairs = (*inertia.interval90[:2], (low * nominal[2], high * nominal[2]))
-    value = (*inertia.value[:2], nominal[2])
-    quantities["inertia"] = dataclasses.replace(inertia, value=value, interval90=pairs)
-    explained = _explained(fit)
-    rates_fit = explained["body rates"][1] > LEAST_EXPLAINED
-    untold = ["thrust_constant"] if fit.per_flight else []
-    if not rates_fit:
-        untold += ["torque_constant", "motor_time_constant", "inertia"]
-    for name in untold:
-        quantities[name] = dataclasses.replace(quantities[name], determined=False)
-    cannot = []
-    if fit.per_flight:
-        scales = ", ".join(f"{fit.beta[i]:.3g}" for i in thrust)
-        cannot.append(_UNKNOWN_MAP.format(scales=scales))
-    if not weighed:
-        cannot.append(_NOT_WEIGHED.format(grams=float(vehicle.mass) * 1e3))
-    cannot.append(_YAW_CLASS)
-    if not rates_fit:
-        cannot.append(_NOT_EXPLAINED.format(share=max(explained["body rates"][1], 0.0)))
-    for name, advice in _ADVICE.items():
-        if name not in untold and not quantities[name].determined:
-            cannot.append(f"{name.replace('_', ' ')}: these flights hardly excite it; {advice}")
+    fit, nothing = fit_set(replay, effects, iterations=ITERATIONS), fit_set(replay, ())
+    explained = _explained(replay, nothing, fit)
+    quantities = _quantities(evidence, fit, explained["body rates"][1] > LEAST_EXPLAINED)
     return Calibration(
         quantities=quantities,
-        cannot_tell=tuple(cannot),
-        nuisances=_nuisances(fit),
+        cannot_tell=tuple(_cannot_tell(evidence, fit, quantities, explained["body rates"][1])),
+        nuisances={
+            f"{e} {p}": (value, EFFECTS[e].parameters[p].unit)
+            for e, found in fit.parameters().items()
+            if e in BESIDE
+            for p, (value, _) in found.items()
+        },
         explained=explained,
-        flights=tuple(fit.flights),
-        seconds=float(sum(len(t) * t.dt for t in fit.tracks)),
+        flights=tuple(dict.fromkeys(t.flight for t in evidence.tracks)),
+        seconds=float(sum(len(t) * t.dt for t in evidence.tracks)),
     )
 
 
-def _quantity(name: str, nominal: list[float], logs: list[tuple[float, float]], notes: str) -> Quantity:
-    logs = [(x, float(np.hypot(s, MODEL_ERROR[name]))) for x, s in logs]
-    value = tuple(n * np.exp(x) for n, (x, _) in zip(nominal, logs, strict=True))
-    pairs = tuple(
-        (float(v * np.exp(-Z90 * s)), float(v * np.exp(Z90 * s)))
-        for v, (_, s) in zip(value, logs, strict=True)
-    )
-    determined = all(s < DETERMINED for _, s in logs)
+def logarithms(theta: np.ndarray, vehicle, duty_cycles: bool) -> dict[str, np.ndarray]:
+    """{constant: logarithms of its values over the nominal ones, (1,) or (2,)} at parameters theta (P,). Yaw shows only the
+    ratio of torque to inertia, which is told for the nominal inertia; with duty cycles for the nominal thrust constant."""
+    at = {key: theta[place] for key, place in PLACE.items() if key[0] in FITTED}
+    thrust = 1.0 + at["thrust_scale", "scale"]
+    torque = (1.0 if duty_cycles else thrust) * at["yaw_torque", "ratio"] / at["inertia", "zz"]
+    lag = 0.5 * (at["motor_lag", "extra_up"] + at["motor_lag", "extra_down"])
+    found = {
+        "thrust_constant": [thrust],
+        "torque_constant": [torque],
+        "motor_time_constant": [1.0 + lag / float(vehicle.motor_time_constant)],
+        "inertia": [at["inertia", "xx"], at["inertia", "yy"]],
+    }
+    return {name: np.log(np.maximum(values, 1e-3)) for name, values in found.items()}
+
+
+def _quantities(evidence: Evidence, fit: SetFit, rates_fit: bool) -> dict[str, Quantity]:
+    file, vehicle = evidence.case.vehicle_file, evidence.vehicles[0]
+    duty_cycles = file.motor_command == "pwm"
+    wider = robust_deviation(fit) / np.sqrt(np.diag(fit.covariance))
+    covariance = fit.covariance * np.outer(wider, wider)
+    before = np.linalg.inv(prior(fit.effects)[2])
+    at = logarithms(fit.theta, vehicle, duty_cycles)
+    slopes = {name: [] for name in at}
+    for place in fit.index:
+        step = np.where(np.arange(len(fit.theta)) == place, 1e-5, 0.0)
+        for name, value in logarithms(fit.theta + step, vehicle, duty_cycles).items():
+            slopes[name].append((value - at[name]) / 1e-5)
+    out = {}
+    for name, value in at.items():
+        slope = np.array(slopes[name]).T
+        deviation, known = (np.sqrt(np.diag(slope @ c @ slope.T)) for c in (covariance, before))
+        told = bool((deviation < DETERMINED * known).all()) and (rates_fit or name not in TOLD_BY_RATES)
+        told &= not (duty_cycles and name == "thrust_constant")
+        out[name] = _quantity(name, vehicle, value, np.hypot(deviation, MODEL_ERROR[name]), told)
+        if name in ("thrust_constant", "inertia") and not file.mass_weighed:
+            notes = "; ".join(n for n in (out[name].notes, _ASSUMED_MASS) if n)
+            out[name] = dataclasses.replace(out[name], notes=notes)
+    return out
+
+
+def _quantity(name: str, vehicle, logs: np.ndarray, deviations: np.ndarray, determined: bool) -> Quantity:
+    nominal = np.atleast_1d(np.asarray(getattr(vehicle, name), float))
+    value = nominal.copy()
+    value[: len(logs)] *= np.exp(logs)
+    reach = np.exp(REACH * deviations)
+    pairs = [(float(v / r), float(v * r)) for v, r in zip(value, reach, strict=False)]
+    pairs += [
+        (low * nominal[2], high * nominal[2]) for low, high in [YAW_INERTIA_RANGE][: len(value) - len(logs)]
+    ]
+    notes = {"inertia": "zz is assumed nominal", "torque_constant": "for the nominal inertia about z"}
+    unit = CALIBRATED_UNITS[name]
     return Quantity(
-        tuple(map(float, value)), pairs, tuple(nominal), CALIBRATED_UNITS[name], determined, notes
+        tuple(value.tolist()), tuple(pairs), tuple(nominal.tolist()), unit, determined, notes.get(name, "")
     )
 
 
-def _notes(name: str, weighed: bool) -> str:
-    mass = "" if weighed else "for the assumed mass, which wasn't weighed"
-    extra = {"inertia": "zz is assumed nominal", "torque_constant": "for the nominal inertia about z"}.get(
-        name, ""
-    )
-    if name in ("motor_time_constant", "torque_constant"):
-        mass = ""
-    return "; ".join(n for n in (extra, mass) if n)
+def _cannot_tell(evidence: Evidence, fit: SetFit, quantities: dict[str, Quantity], share: float) -> list[str]:
+    """What these flights leave open, in words. `share` of the rates' changes that the fitted vehicle explains."""
+    file, out, untold = evidence.case.vehicle_file, [], []
+    if file.motor_command == "pwm":
+        out.append(_UNKNOWN_MAP.format(scale=1.0 + fit.theta[PLACE["thrust_scale", "scale"]]))
+        untold.append("thrust_constant")
+    if not file.mass_weighed:
+        out.append(_NOT_WEIGHED.format(grams=float(evidence.vehicles[0].mass) * 1e3))
+    out.append(_YAW_CLASS)
+    if share <= LEAST_EXPLAINED:
+        out.append(_NOT_EXPLAINED.format(share=max(share, 0.0)))
+        untold += TOLD_BY_RATES
+    hardly = [n for n in _ADVICE if n not in untold and not quantities[n].determined]
+    return out + [f"{n.replace('_', ' ')}: these flights hardly excite it; {_ADVICE[n]}" for n in hardly]
 
 
-def _nuisances(fit: CalibrationFit) -> dict[str, tuple[float, str]]:
-    units = {"clock": "s", "offset": "m", "drag": "1/s", "damping": "1/s", "tilt": "rad", "bias": "m/s^2"}
+def _explained(replay, nothing: SetFit, fit: SetFit) -> dict[str, tuple[float, float]]:
+    """Per kind of channel the share of its changes over HORIZON that the nominal vehicle explains, and the fitted one."""
+    kinds = {"body rates": slice(0, 3), "velocity": slice(3, 6), "specific force": slice(8, 9)}
+    steps = [max(round(HORIZON / t.dt), 1) for t in replay.tracks]
+
+    def square(values, channels) -> float:
+        changes = (v[n:, channels] - v[:-n, channels] for v, n in zip(values, steps, strict=True))
+        return float(sum((c**2).sum() for c in changes))
+
+    fits = residuals_of(replay, nothing), residuals_of(replay, fit)
     return {
-        name: (float(fit.beta[i]), units[name.partition("_")[0]])
-        for i, name in enumerate(fit.names)
-        if name.partition("_")[0] in units
+        kind: tuple(1.0 - square(left, channels) / square(replay.measured, channels) for left in fits)
+        for kind, channels in kinds.items()
+        if replay.usable[channels].all()
     }
-
-
-def _explained(fit: CalibrationFit) -> dict[str, tuple[float, float]]:
-    """Per kind of channel: the share of its changes explained by the nominal vehicle and by the fitted
-    one."""
-    equations = fit.equations_at(fit.log_nominal)
-    before = equations.y - equations.X @ fit.mean
-    kinds = {"body rates": (0, 1, 2), "velocity": (3, 4, 5), "specific force": (6,)}
-    logged = {
-        kind: channels for kind, channels in kinds.items() if np.isin(equations.channel, channels).any()
-    }
-    return {
-        kind: tuple(_share(fit, r, channels) for r in (before, fit.residual))
-        for kind, channels in logged.items()
-    }
-
-
-def _share(fit: CalibrationFit, residual: np.ndarray, channels) -> float:
-    """1 - mean square residual / variance of the channels' equations."""
-    rows = np.isin(fit.equations.channel, channels)
-    return float(1 - np.mean(residual[rows] ** 2) / np.var(fit.equations.y[rows]))

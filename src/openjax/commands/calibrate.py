@@ -20,7 +20,7 @@ from openjax.files import check_output
 from openjax.show.steps import Steps
 
 PROGRAM = "openjax calibrate"
-SECONDS = 8.0
+SECONDS = 15.0
 """That it takes on a laptop, about."""
 
 

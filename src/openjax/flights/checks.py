@@ -135,7 +135,7 @@ def _clean(flight: Flight, note) -> Flight:
         values = getattr(flight, channel)
         if values is None:
             continue
-        columns, table = CHANNEL_COLUMNS.get(channel, ("az",)), values.reshape(len(values), -1)
+        columns, table = CHANNEL_COLUMNS[channel], values.reshape(len(values), -1)
         rows = np.flatnonzero(np.isfinite(table).all(1))
         if len(rows) < 2:
             raise _Refused("corrupt", f"{', '.join(columns)}: hardly any row holds a number")

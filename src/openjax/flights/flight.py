@@ -22,7 +22,7 @@ Array = np.ndarray
 # Channels of a Flight in the order of the log format; each is None where it wasn't logged.
 CHANNELS = (
     "position", "quaternion", "velocity", "body_rates", "specific_force",
-    "command_thrust", "command_body_rates", "motor_command", "battery_voltage", "vertical_force",
+    "command_thrust", "command_body_rates", "motor_command", "battery_voltage",
 )  # fmt: skip
 
 
@@ -58,13 +58,10 @@ class Flight:
     velocity: Array | None = None  # (T, 3) m/s, world
     body_rates: Array | None = None  # (T, 3) rad/s, gyroscope
     specific_force: Array | None = None  # (T, 3) m/s^2, body, accelerometer (+9.81 on z at rest)
-    command_thrust: Array | None = (
-        None  # (T,) commanded collective thrust, 0..1 of 4x the maximal rotor thrust
-    )
+    command_thrust: Array | None = None  # (T,) commanded collective thrust, as a share of the largest
     command_body_rates: Array | None = None  # (T, 3) rad/s, commanded body rates
     motor_command: Array | None = None  # (T, 4) 0..1, meaning by the vehicle file's `motor_command`
     battery_voltage: Array | None = None  # (T,) V, under load
-    vertical_force: Array | None = None  # (T,) m/s^2, body z, where the accelerometer's z alone was logged
     velocity_derived: bool = False  # True: differentiated from position by the reader, not logged
     body_rates_derived: bool = False  # True: differentiated from the attitude by the reader, no gyroscope
     pose_age: float = 0.0  # s by which a pose may be older than its row, because the log held the last one

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import gzip
 import hashlib
+import math
 import re
 import zlib
 from dataclasses import dataclass, field
@@ -112,8 +113,6 @@ def flights_of(
             if np.isnan(values).all():
                 continue
             channels[channel] = values[:, 0] if len(names) == 1 else values
-        elif found == ["az"]:
-            channels["vertical_force"] = table.columns["az"]
         elif found:
             missing = ", ".join(n for n in names if n not in table.columns)
             if channel in WHOLE:
@@ -214,8 +213,8 @@ def _number(cell: str) -> float:
         text = cell.strip().lower()
         if text and text not in ("na", "n/a", "null", "none"):
             raise
-        return np.inf if text else np.nan
-    return np.inf if np.isnan(value) else value
+        return math.inf if text else math.nan
+    return math.inf if math.isnan(value) else value
 
 
 def _is_number(cell: str) -> bool:

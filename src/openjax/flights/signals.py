@@ -8,8 +8,10 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.signal import butter, lfilter, sosfiltfilt
 from scipy.signal.windows import tukey
+from scipy.spatial.transform import Rotation
 
 from openjax.flights.flight import Flight
+from openjax.flights.track import rotation
 
 RATE = 100.0  # Hz, common clock of the comparisons
 LONGEST = 30.0  # s, enough to tell
@@ -63,20 +65,9 @@ def _fade(rows: int) -> np.ndarray:
 
 def rates_of(quaternion: np.ndarray) -> np.ndarray:
     """Body rates (T, 3) rad/s of attitudes (T, 4) on the common clock, by central differences."""
-    before, after = np.roll(quaternion, 1, 0), np.roll(quaternion, -1, 0)
-    w = (before * after).sum(1)
-    vector = (
-        before[:, :1] * after[:, 1:] - after[:, :1] * before[:, 1:] - np.cross(before[:, 1:], after[:, 1:])
-    )
-    rates = 2.0 * np.arctan2(np.linalg.norm(vector, axis=1), np.abs(w))[:, None] * np.sign(w)[:, None]
-    rates = rates * vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-12) * RATE / 2
-    rates[[0, -1]] = rates[[1, -2]]
-    return rates
-
-
-def acceleration_of(position: np.ndarray) -> np.ndarray:
-    """Second differences (T, 3) of positions."""
-    return np.gradient(np.gradient(position, 1 / RATE, axis=0), 1 / RATE, axis=0)
+    attitude = Rotation.from_quat(quaternion, scalar_first=True)
+    rates = (attitude[:-2].inv() * attitude[2:]).as_rotvec() * RATE / 2
+    return np.concatenate([rates[:1], rates, rates[-1:]])
 
 
 def first_order(values: np.ndarray, time_constant: float) -> np.ndarray:
@@ -88,12 +79,9 @@ def first_order(values: np.ndarray, time_constant: float) -> np.ndarray:
 
 def up_of(quaternion: np.ndarray) -> np.ndarray:
     """Body z in the world (T, 3) of attitudes (T, 4)."""
-    w, x, y, z = quaternion.T
-    return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], 1)
+    return rotation(quaternion)[:, :, 2]
 
 
 def to_body(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
     """World vectors (T, 3) in the body frame of attitudes (T, 4)."""
-    w, u = quaternion[:, :1], -quaternion[:, 1:]
-    t = 2.0 * np.cross(u, vector)
-    return vector + w * t + np.cross(u, t)
+    return np.einsum("tji,tj->ti", rotation(quaternion), vector)

@@ -8,6 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import convolve1d
+from scipy.spatial.transform import Rotation
 
 from openjax.flights.flight import Case, Flight
 
@@ -179,22 +181,9 @@ def smooth(values: Array, width: float, dt: float) -> Array:
     if n < 2:
         return values
     window = np.hanning(n + 2)[1:-1]
-    window /= window.sum()
-    flat = values.reshape(len(values), -1)
-    left, right = n // 2, n - 1 - n // 2
-    padded = np.concatenate([np.repeat(flat[:1], left, 0), flat, np.repeat(flat[-1:], right, 0)])
-    out = np.stack([np.convolve(column, window, "valid") for column in padded.T], 1)
-    return out.reshape(values.shape)
+    return convolve1d(values, window / window.sum(), axis=0, mode="nearest", origin=n % 2 - 1)
 
 
 def rotation(quaternion: Array) -> Array:
     """Rotation matrices (T, 3, 3), body to world, of quaternions (T, 4) wxyz."""
-    w, x, y, z = np.moveaxis(quaternion, -1, 0)
-    return np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-        ],
-        -2,
-    )
+    return Rotation.from_quat(quaternion, scalar_first=True).as_matrix()

@@ -17,7 +17,7 @@ from openjax.vehicle.effects import EFFECTS
 REACH = 1.645  # standard deviations of a 90 % interval
 FORM = 0.05  # of an effect's size, one standard deviation: real effects don't have the library's form
 LEAST_ERROR = 0.01  # of a value that isn't zero without the effect
-MOST = 4.0  # times their errors by which flights of one vehicle may disagree about a parameter
+MOST = 4.0  # times its error by which flights of one vehicle may differ in a parameter
 
 
 def estimates(evidence: Evidence, fit: SetFit, named) -> dict[str, dict[str, Estimate]]:

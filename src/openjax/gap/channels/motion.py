@@ -20,9 +20,7 @@ from openjax.gap.model.observer import TICKS
 from openjax.gap.model.replay import Replay, make_replay
 
 FEW_ROWS = 2.4  # of a log in one of the grid's: if they are samples, their mean isn't what five ticks of the loop did
-SLOW_ROWS = (
-    1.2  # grid periods: rows as slow as this hide every other command of a loop that sends one each 10 ms
-)
+SLOW_ROWS = 1.2  # grid periods: rows as slow hide every other command of a loop that sends one each 10 ms
 MOST_GUSTS = 0.25  # of the torques that commands cause: from then on feedback is all that is seen of them
 
 
@@ -101,16 +99,8 @@ def read_motion(reading: Reading, loop: RateLoop | None) -> Motion:
     if loop is not None and reading.at_once:
         tracks = [dataclasses.replace(t, motor=m.mean(1)) for t, m in zip(tracks, ticks, strict=True)]
     feedback = read_feedback(tracks, reading.vehicles, reading.by_commands)
-    replay = make_replay(
-        tracks,
-        reading.vehicles,
-        ticks,
-        feedback,
-        reading.numbers,
-        sensors.one_clock,
-        reading.at_once,
-        sensors.wander,
-    )
+    clocks = sensors.one_clock, reading.at_once, sensors.wander
+    replay = make_replay(tracks, reading.vehicles, ticks, feedback, reading.numbers, *clocks)
     replay, floor, exposure = model_noise(replay, library)
     gusts = gustiness(tracks, feedback, floor)
     replay = replay.loosened(_gusty(replay, gusts))

@@ -187,9 +187,7 @@ def _follow(track: Track, delay: float, may_lose: bool):
     whole, part, given, clean = _link_rows(track, delay)
     error = np.abs(_late_error(track, delay)[clean])
     noise = float(np.median(error)) if len(error) else 0.0
-    telling = (
-        TOLERANCE + 2.0 * noise
-    ) / HELD  # the smallest change of thrust that shows whether a packet arrived
+    telling = (TOLERANCE + 2.0 * noise) / HELD  # least change of thrust that shows whether a packet arrived
     thrust, given, flags = track.command[:, 0].tolist(), given.tolist(), clean.tolist()
     held, in_force, error, counts = 0, np.zeros(len(track), int), np.zeros(len(track)), np.zeros(4, int)
     for row in range(len(track)):

@@ -14,12 +14,14 @@ from matplotlib.figure import Figure
 
 from openjax.flights.track import rotation, smooth
 from openjax.gap.model.library import CARDS
+from openjax.gap.model.replay import SKIP
 from openjax.gap.model.table import HORIZONS
 from openjax.gap.report import Report
 from openjax.gap.residual import disturbances, residuals_of
 from openjax.gap.where import CALM, CHANNELS, Place
 
 BEFORE, AFTER = "#d1495b", "#2e86ab"  # both stand out on white and on black
+GREY = "#8a8f98"
 INK = "#0a0b0c"  # becomes the page's text colour
 STYLE = {
     "svg.fonttype": "none",
@@ -33,7 +35,6 @@ STYLE = {
 SHOWN_PLACES = 8
 HORIZONS_SHOWN = (0.02, 0.05, 0.1, 0.25, 0.5, 1.0)  # s
 BINS = 15
-FIRST_ROWS = 20  # of a track: filters still settle
 
 
 def figures(report: Report) -> list[tuple[str, str, str]]:
@@ -66,28 +67,20 @@ def _places(report: Report):
     rows = np.arange(len(places))
     before = np.array([place.before for place in places])
     after = np.array([place.after for place in places])
-    axes.hlines(rows, after, before, color="#8a8f98", linewidth=2)
+    axes.hlines(rows, after, before, color=GREY, linewidth=2)
     axes.plot(before, rows, "o", color=BEFORE, markersize=7, label="nominal simulator")
     if report.parameters:
         axes.plot(after, rows, "o", color=AFTER, markersize=7, label="with the named effects")
-    axes.axvline(1.0, color="#8a8f98", linestyle=":", linewidth=1.2)
+    axes.axvline(1.0, color=GREY, linestyle=":", linewidth=1.2)
     axes.set_yticks(rows, [_place_name(place) for place in places])
     axes.set(xlabel="error, in units of the noise", xlim=(0, None), ylim=(-0.6, len(places) - 0.4))
     for row, place in zip(rows, places, strict=True):
         if (level := noise.get(place.channel)) is not None:
-            axes.annotate(
-                f"{level[0] * place.before:.2g} {level[1]}",
-                (1.01, row),
-                xycoords=("axes fraction", "data"),
-                va="center",
-                fontsize=10,
-            )
+            text = f"{level[0] * place.before:.2g} {level[1]}"
+            axes.annotate(text, (1.01, row), xycoords=("axes fraction", "data"), va="center", fontsize=10)
     _legend(axes)
-    return (
-        "Where the gap lies",
-        f"Forces and torques averaged over {CALM} s, by part of the flight; at the right the error before, in its own unit.",
-        figure,
-    )
+    told = "Forces and torques, averaged over {} s, by part of the flight; at the right the error before, in its unit."
+    return "Where the gap lies", told.format(CALM), figure
 
 
 def _place_name(place: Place) -> str:
@@ -101,7 +94,9 @@ def _noise_levels(report: Report) -> dict[str, tuple[float, str]]:
     left = []
     for track, residual in zip(evidence.tracks, _residuals(report)[1], strict=True):
         rest = disturbances(track, residual)
-        left.append(smooth(np.concatenate([rest[:, linear], rest[:, :3]], 1), CALM, track.dt)[FIRST_ROWS:])
+        left.append(
+            smooth(np.concatenate([rest[:, linear], rest[:, :3]], 1), CALM, track.dt)[int(SKIP / track.dt) :]
+        )
     levels = np.sqrt(np.mean(np.concatenate(left) ** 2, axis=0))
     units = ("m/s²",) * 3 + ("rad/s²",) * 3
     return dict(zip(CHANNELS, zip(levels, units, strict=True), strict=False))
@@ -137,18 +132,11 @@ def _course(report: Report):
     figure, axes = _figure(2.6)
     time = track.time[step:] - track.time[0]
     band = 1.645 * np.std(after[step:, axis] - after[:-step, axis])
-    axes.axhspan(
-        -band,
-        band,
-        color="#8a8f98",
-        alpha=0.25,
-        linewidth=0,
-        label="90 % of what is left" if report.parameters else "90 % of all errors",
-    )
+    label = "90 % of what is left" if report.parameters else "90 % of all errors"
+    axes.axhspan(-band, band, color=GREY, alpha=0.25, linewidth=0, label=label)
     for residual, colour, label in _lines(report, before, after):
-        axes.plot(
-            time, residual[step:, axis] - residual[:-step, axis], color=colour, linewidth=1.1, label=label
-        )
+        error = residual[step:, axis] - residual[:-step, axis]
+        axes.plot(time, error, color=colour, linewidth=1.1, label=label)
     axes.set(xlabel="time in the flight [s]", ylabel=f"error of {name} [{unit}]", xlim=(time[0], time[-1]))
     _legend(axes)
     return "One flight", f"{track.name}: error of predictions {HORIZONS['velocity']} s ahead.", figure
@@ -189,16 +177,13 @@ def _coordinate(report: Report):
         return None
     figure, axes = _figure(2.6)
     for residuals, (_, colour, label) in zip(_residuals(report), _lines(report, None, None), strict=False):
-        pairs = [
-            _pairs(track, residual, coordinate)
-            for track, residual in zip(evidence.tracks, residuals, strict=True)
-        ]
-        pairs = [pair for pair in pairs if pair is not None]
+        both = zip(evidence.tracks, residuals, strict=True)
+        pairs = [p for p in (_pairs(*of, coordinate) for of in both) if p is not None]
         if not pairs:
             return None
         axes.plot(*_binned(np.concatenate(pairs)).T, "o-", color=colour, markersize=5, label=label)
     units = {"body velocity": "forward speed [m/s]", "voltage": "voltage [V]", "thrust": "mean motor command"}
-    axes.axhline(0.0, color="#8a8f98", linestyle=":", linewidth=1.2)
+    axes.axhline(0.0, color=GREY, linestyle=":", linewidth=1.2)
     axes.set(xlabel=units.get(coordinate, f"{coordinate} [m]"), ylabel="missing acceleration [m/s²]")
     _legend(axes)
     return "The strongest effect", f"{named[0]}: what the simulator misses, against what drives it.", figure
@@ -219,7 +204,7 @@ def _pairs(track, residual, coordinate):
                 track.neighbours[0][:, 2] - track.position[:, 2] if len(track.neighbours) else None
             ),
         }.get(coordinate, lambda: None)()
-    return None if x is None else np.stack([x, y], 1)[FIRST_ROWS:]
+    return None if x is None else np.stack([x, y], 1)[int(SKIP / track.dt) :]
 
 
 def _binned(data: np.ndarray) -> np.ndarray:
@@ -239,14 +224,8 @@ def _figure(height: float) -> tuple[Figure, Axes]:
 
 def _legend(axes: Axes) -> None:
     """Above the axes, where it covers nothing."""
-    axes.legend(
-        loc="lower left",
-        bbox_to_anchor=(0.0, 1.0),
-        ncols=2,
-        fontsize=10,
-        borderaxespad=0.2,
-        columnspacing=1.2,
-    )
+    place = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.2}
+    axes.legend(ncols=2, fontsize=10, columnspacing=1.2, **place)
 
 
 def _svg(figure: Figure, salt: str) -> str:
