@@ -128,10 +128,12 @@ def calibrate(case: Case) -> Calibration:
     )
     fit, nothing = fit_set(replay, effects, iterations=ITERATIONS), fit_set(replay, ())
     explained = _explained(replay, nothing, fit)
-    quantities = _quantities(evidence, fit, explained["body rates"][1] > LEAST_EXPLAINED)
+    # Where gyroscope and attitude share no clock, the rates tell nothing.
+    share = explained.get("body rates", (0.0, 0.0))[1]
+    quantities = _quantities(evidence, fit, share > LEAST_EXPLAINED)
     return Calibration(
         quantities=quantities,
-        cannot_tell=tuple(_cannot_tell(evidence, fit, quantities, explained["body rates"][1])),
+        cannot_tell=tuple(_cannot_tell(evidence, fit, quantities, share)),
         nuisances={
             f"{e} {p}": (value, EFFECTS[e].parameters[p].unit)
             for e, found in fit.parameters().items()

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import base64
-import html
-import io
 import json
 from pathlib import Path
 
 import numpy as np
+from matplotlib import rc_context
+from matplotlib.figure import Figure
 
 from openjax.comparison.causes import CHANGES
 from openjax.comparison.figures import TRIMS
 from openjax.comparison.result import Change, Interval
+from openjax.gap.report.figures import AFTER, BEFORE, GREY, as_svg
+from openjax.gap.report.figures import STYLE as FIGURE_STYLE
+from openjax.gap.report.page import filled
 
 # figure: what it is, its unit, the factor to it; a logarithm's is a change in per cent
 _NAMES = {
@@ -33,10 +35,6 @@ _CHANGED = {
     "inertia": "the inertia changed",
     "gains": "the rate gains changed",
 }
-STYLE = """:root{color-scheme:light dark}body{font:16px/1.5 system-ui,sans-serif;max-width:62rem;margin:2rem auto;padding:0 1rem}
-h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2rem}table{border-collapse:collapse;margin:.6rem 0}
-td,th{border-bottom:1px solid #8885;padding:.2rem .7rem;text-align:left}img{max-width:100%;border-radius:8px}
-.verdict{background:#8882;padding:.8rem 1.2rem;border-left:4px solid #2e86ab}"""
 
 
 def prediction(change: Change) -> dict:
@@ -150,35 +148,18 @@ def write(change: Change, folder: Path, pictures: bool = True) -> None:
 
 def html_of(change: Change) -> str:
     """One page, nothing to fetch from elsewhere."""
-    buffer = io.BytesIO()
-    figure = draw(change)
-    figure.savefig(buffer, format="png", dpi=110)
-    image = base64.b64encode(buffer.getvalue()).decode()
-    lines = "".join(f"<p>{html.escape(line)}</p>" for line in in_words(change))
-    rows = [["figure", "difference [90 %]"]]
-    rows += [[_NAMES[name][0], _difference(name, d)] for name, d in change.figures.items()]
-    table = "".join("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in row) + "</tr>" for row in rows)
-    notes = "".join(
-        f"<tr><td>{html.escape(i.flight)}</td><td>{html.escape(i.issue)}</td></tr>" for i in change.quality
-    )
-    title = html.escape(f"What changed: {change.name}")
-    return (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
-        f'<meta name="viewport" content="width=device-width"><style>{STYLE}</style></head>'
-        f'<body><h1>{title}</h1><div class="verdict">{lines}</div><h2>Flights</h2>'
-        f'<img alt="trims of every flight" src="data:image/png;base64,{image}"><h2>What differs</h2>'
-        f"<table>{table}</table>"
-        + (f"<h2>Data</h2><table>{notes}</table>" if notes else "")
-        + "</body></html>\n"
-    )
+    with rc_context(FIGURE_STYLE):
+        picture = as_svg(draw(change), change.name)
+    differences = [(_NAMES[name][0], _difference(name, d)) for name, d in change.figures.items()]
+    told = {"lines": in_words(change), "picture": picture, "differences": differences}
+    return filled("changes.html.jinja", change=change, **told)
 
 
 def draw(change: Change):
     """Trims of every flight, day by day, beside what days differ by; and where the change would sit."""
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(11, 3.6), layout="constrained")
-    axes = figure.subplots(1, 5, width_ratios=(1, 1, 1, 1, 1.3))
+    figure.patch.set_alpha(0.0)
+    axes = figure.subplots(1, 5, width_ratios=(1, 1, 1, 1, 1.3), subplot_kw={"facecolor": "none"})
     level = np.mean([f.values["hover"][0] for f in change.reference])
     for axis, name in zip(axes, TRIMS, strict=False):
         for k, figures in enumerate((change.reference, change.flights)):
@@ -187,18 +168,16 @@ def draw(change: Change):
                 own = [f.values[name][0] for f in figures if f.day == day]
                 values = 100 * (np.array(own) / level - 1.0 if name == "hover" else np.array(own))
                 place = k + 0.6 * ((j + 0.5) / len(days) - 0.5)
-                axis.plot(
-                    np.full(len(values), place), values, "o", ms=5, color=("#777", "#c53030")[k], alpha=0.8
-                )
+                axis.plot(np.full(len(values), place), values, "o", ms=5, color=(GREY, BEFORE)[k], alpha=0.8)
         middle = 100 * np.mean([f.values[name][0] / level - 1 if name == "hover" else f.values[name][0]
                                 for f in change.reference])  # fmt: skip
         spread = 100 * change.spread[name]
-        axis.axhspan(middle - 1.645 * spread, middle + 1.645 * spread, color="#2b6cb0", alpha=0.12, lw=0)
+        axis.axhspan(middle - 1.645 * spread, middle + 1.645 * spread, color=AFTER, alpha=0.12, lw=0)
         axis.set(title=name, xticks=(0, 1), xticklabels=("reference", "new"), xlim=(-0.6, 1.6))
     axes[0].set_ylabel("% of hover (band: 90 % of normal days)")
     places = sorted(change.places.items(), key=lambda item: -item[1])[:6]
     names = ["all" if len(p) == 4 else "+".join(f"m{i}" for i in p) or "no rotor's" for p, _ in places]
     shares = [change.probability * share for _, share in places]
-    axes[4].barh(["no change", *names][::-1], [1 - change.probability, *shares][::-1], color="#2b6cb0")
+    axes[4].barh(["no change", *names][::-1], [1 - change.probability, *shares][::-1], color=AFTER)
     axes[4].set(title="probability", xlim=(0, 1))
     return figure

@@ -43,7 +43,7 @@ def figures(report: Report) -> list[tuple[str, str, str]]:
         return []
     with rc_context(STYLE):
         drawn = [draw(report) for draw in (_places, _course, _horizons, _coordinate)]
-        return [(title, text, _svg(figure, title)) for title, text, figure in filter(None, drawn)]
+        return [(title, text, as_svg(figure, title)) for title, text, figure in filter(None, drawn)]
 
 
 def _named(report: Report) -> list[str]:
@@ -228,7 +228,7 @@ def _legend(axes: Axes) -> None:
     axes.legend(ncols=2, fontsize=10, columnspacing=1.2, **place)
 
 
-def _svg(figure: Figure, salt: str) -> str:
+def as_svg(figure: Figure, salt: str) -> str:
     """The figure as an element for a page: text stays text, ink takes the page's colour, sizes are the page's."""
     FigureCanvasSVG(figure)
     data = io.StringIO()

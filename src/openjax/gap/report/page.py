@@ -12,18 +12,15 @@ from openjax.gap.report import Report
 from openjax.gap.report.figures import figures
 from openjax.vehicle.effects import EFFECTS
 
-TEMPLATE = Path(__file__).with_name("page.html.jinja")
 LEAST_CHANCE = 5e-4
 """Probabilities below are left out."""
 
 
 def page_of(report: Report) -> str:
     """The whole page as text: the answer and what to type next, figures, values, and folded what is rarely asked."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(TEMPLATE.parent), autoescape=True, undefined=jinja2.StrictUndefined
-    )
     ranked = sorted(report.probabilities.items(), key=lambda item: -item[1])
-    page = environment.get_template(TEMPLATE.name).render(
+    return filled(
+        "page.html.jinja",
         report=report,
         facts=facts(report),
         sentence=sentence(report),
@@ -33,6 +30,13 @@ def page_of(report: Report) -> str:
         meanings={e: EFFECTS[e].description for e in report.parameters if e in EFFECTS},
         ranked=[(name, p) for name, p in ranked[:8] if p > LEAST_CHANCE],
     )
+
+
+def filled(template: str, **values) -> str:
+    """A template of this folder with its values, as one page with nothing to fetch from elsewhere."""
+    loader = jinja2.FileSystemLoader(Path(__file__).parent)
+    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
+    page = environment.get_template(template).render(**values)
     return re.sub(r"(?<=\d) %", "\u00a0%", page)  # a number and its sign stay on one line
 
 
