@@ -146,11 +146,8 @@ def _report(
 
 def _disagreement(selection: Selection) -> str:
     apart = ", ".join(disagreeing(selection.fit))
-    return (
-        f"The flights disagree about {apart}: another vehicle, or something changed between them."
-        if apart
-        else ""
-    )
+    causes = "several vehicles, something that changed between them, or a wrong name"
+    return f"The flights disagree about {apart} by far more than their errors: {causes}." if apart else ""
 
 
 def _nuisances(evidence: Evidence, selection: Selection) -> dict[str, str]:

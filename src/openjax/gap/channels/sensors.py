@@ -74,7 +74,7 @@ def read_kinematics(tracks: list[Track]) -> Kinematics:
     scale = _gains(_streams(tracks, _accelerating, (BAND[0], SLOW)))
     if words := _unusual(*scale[:2]):
         findings["scale"] = (
-            f"positions change by {words} times what accelerometer and attitude feel: is their unit right?"
+            f"positions change by {words} times what accelerometer and attitude feel: check their scale"
         )
     if (turning & (coherence < ONE_CLOCK)).sum() >= 2:
         words = ", ".join(f"{a} {c:.2f}" for a, c in zip("xyz", coherence, strict=True))
