@@ -15,10 +15,8 @@ SHORTEST = 2.0  # s airborne: windows of 0.5 s, and a few of them
 SLOWEST = 0.05  # s between rows
 FROZEN = 0.5  # s without a change of a sensor that has noise
 HELD = 0.1  # share of rows that repeat the one before, from which a sensor is slower than the rows
-IN_STEP, IN_PHASE = (
-    50,
-    0.25,
-)  # poses, and concentration of their phases (0 to 1), from which they have a clock of their own
+IN_STEP = 50  # poses from which a clock of their own is looked for
+IN_PHASE = 0.25  # concentration of their phases (0 to 1) from which they have one
 EDGE = 0.03  # cycles of that clock by which its phase may be wrong
 RATE_NOISE = 0.04  # rad/s of body rates that are derived: what gyroscopes of such vehicles have at most
 BESIDE_GAP, GAP, OUTSIDE = 4, 1.5, 6.0  # rows, usual steps, deviations: of a velocity that a gap has spoilt
@@ -154,7 +152,7 @@ def _clean(flight: Flight, note) -> Flight:
                 if share > 0.5:
                     raise _Refused("corrupt", f"{words}: frozen for {share:.0%} of the flight")
                 note("corrupt", f"{words}; taken as not sampled there")
-                changes[channel] = np.where(frozen.reshape((-1,) + (1,) * (values.ndim - 1)), np.nan, values)
+                changes[channel] = _unsampled(values, frozen)
                 rows = rows[~frozen[rows]]
         if channel != "battery_voltage" and len(rows) > 1:
             at = flight.time[rows]
@@ -186,8 +184,7 @@ def _without_repeats(flight: Flight, note) -> Flight:
             f"{repeated.mean():.0%} of the rows repeat the last sample of {', '.join(logged)}: left out",
         )
         for channel in logged:
-            values = getattr(flight, channel)
-            changes[channel] = np.where(repeated.reshape((-1,) + (1,) * (values.ndim - 1)), np.nan, values)
+            changes[channel] = _unsampled(getattr(flight, channel), repeated)
         if group[0] == "position":
             changes["pose_age"] = flight.row_period
     return dataclasses.replace(flight, **changes) if changes else flight
@@ -239,6 +236,13 @@ def _regular_clock(seen: np.ndarray, row: float) -> np.ndarray | None:
     return start + slope * ticks
 
 
+def _unsampled(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Values (T, ...) without those of some rows (T,)."""
+    left = values.copy()
+    left[rows] = np.nan
+    return left
+
+
 def _frozen(table: np.ndarray, rows: np.ndarray, time: np.ndarray, together: bool) -> np.ndarray:
     """(T,) True in runs of at least FROZEN seconds in which a column (all columns if `together`) doesn't
     change though it does elsewhere. Runs at the column's extremes are saturation, not a frozen sensor."""
@@ -248,8 +252,7 @@ def _frozen(table: np.ndarray, rows: np.ndarray, time: np.ndarray, together: boo
     per_column = [still.all(1)] if together else [s & ~e for s, e in zip(still.T, extreme[1:].T, strict=True)]
     frozen = np.zeros(len(time), bool)
     for run in per_column:
-        edges = np.flatnonzero(np.diff(np.r_[0, run, 0]))
-        for start, stop in zip(edges[::2], edges[1::2], strict=True):
+        for start, stop in _runs(run):
             if time[rows[stop]] - time[rows[start]] >= FROZEN:
                 frozen[rows[start] + 1 : rows[stop] + 1] = True
     return frozen
@@ -304,13 +307,7 @@ def _share_of_one(values: np.ndarray, columns: str) -> None:
         hint = "16-bit counts; divide by 65535" if high > 2100 else "a pulse width in microseconds"
         raise _Refused("units", f"{columns} reach {high:.0f}: {hint}; the log format wants 0..1")
     if high > 1.02:
-        hint = (
-            "per cent"
-            if high > 2 and high <= 101
-            else "8-bit counts"
-            if high > 101
-            else "a wrong scale or corrupt"
-        )
+        hint = "8-bit counts" if high > 101 else "per cent" if high > 2 else "a wrong scale or corrupt"
         raise _Refused("units", f"{columns} reach {high:.3g}: {hint}; the log format wants 0..1")
     if low < -0.02:
         raise _Refused("corrupt", f"{columns} go down to {low:.3g}; commands lie in 0..1")
@@ -442,8 +439,7 @@ def _airborne(flight: Flight, floor_z: float | None, note, every: bool = False) 
         height = flight.interpolated("position")[:, 2] - floor
         speed = np.linalg.norm(flight.interpolated("velocity"), axis=1)
         on_ground |= (np.abs(height) < GROUND_CLEARANCE) & (speed < 0.05)
-    edges = np.flatnonzero(np.diff(np.r_[0, ~on_ground, 0]))
-    runs = list(zip(edges[::2], edges[1::2], strict=True))
+    runs = _runs(~on_ground)
     if not runs:
         raise _Refused("short", "never took off")
     start, stop = max(runs, key=lambda r: flight.time[r[1] - 1] - flight.time[r[0]])
@@ -463,11 +459,16 @@ def _airborne(flight: Flight, floor_z: float | None, note, every: bool = False) 
     return flight
 
 
+def _runs(flags: np.ndarray) -> list[tuple[int, int]]:
+    """First row and the one after the last of every stretch in which `flags` (T,) hold."""
+    edges = np.flatnonzero(np.diff(np.r_[0, flags, 0]))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
 def _long_runs(flags: np.ndarray, time: np.ndarray, shortest: float = 0.5) -> np.ndarray:
     """`flags` (T,) without runs of less than `shortest` s: a dip of thrust in the air is a manoeuvre."""
     kept = flags.copy()
-    edges = np.flatnonzero(np.diff(np.r_[0, flags, 0]))
-    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+    for start, stop in _runs(flags):
         if time[stop - 1] - time[start] < shortest:
             kept[start:stop] = False
     return kept
