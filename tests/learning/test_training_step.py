@@ -162,14 +162,31 @@ NO_PREDICTOR = dataclasses.replace(SETTINGS.predictor, enabled=False)
 NO_GENERATOR = dataclasses.replace(SETTINGS.generator, enabled=False)
 
 
-def test_the_step_without_predictor_and_generator_keeps_its_carry():
-    settings = dataclasses.replace(SETTINGS, predictor=NO_PREDICTOR, generator=NO_GENERATOR)
+def traced(settings):
+    """Shapes and types of a run's carry before and after a step, and the names of the step's metrics."""
     start = functools.partial(initial_carry, settings, build(settings))
     before = jax.eval_shape(start, jax.random.key(0))
     after, metrics = jax.eval_shape(make_training_step(settings), before)
-    kinds = [jax.tree.map(lambda x: (x.shape, x.dtype), carry) for carry in (before, after)]
-    assert kinds[0] == kinds[1] and "entropy" in metrics
-    assert not {"predictor_loss", "prediction_error"} & set(metrics) and before.policy.predictor == {}
+    return before, after, set(metrics)
+
+
+def test_the_step_without_predictor_and_generator_keeps_its_carry():
+    before, after, metrics = traced(
+        dataclasses.replace(SETTINGS, predictor=NO_PREDICTOR, generator=NO_GENERATOR)
+    )
+    assert before == after and "entropy" in metrics
+    assert not {"predictor_loss", "prediction_error"} & metrics and before.policy.predictor == {}
+
+
+@pytest.mark.parametrize("generator", [SETTINGS.generator, NO_GENERATOR])
+def test_the_step_with_several_evaders_keeps_its_carry_and_archives_them(generator):
+    before, after, _ = traced(
+        changed(
+            SETTINGS, environment=dict(evaders=("field", "greedy")), generator=generator, evaders_ramp=0.1
+        )
+    )
+    assert before == after
+    assert before.archive.tasks.evader.dtype == before.state.task.evader.dtype == jnp.int32
 
 
 def test_without_the_generator_every_world_flies_its_own_task():
