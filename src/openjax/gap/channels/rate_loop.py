@@ -140,9 +140,9 @@ def read_gains(reading) -> tuple[np.ndarray, np.ndarray]:
     if reading.late is None:
         return change, error
     moments: dict[int, list] = {0: [], 1: [], 2: []}  # axis: [(moments (5, 1 + 5), track)] of every segment
-    of_tracks = zip(reading.tracks, reading.vehicles, reading.arrived, reading.by_commands, strict=True)
-    for unit, of_track in enumerate(of_tracks):
-        for axis, part in _segments(*of_track, reading.at_once, reading.late):
+    by_track = zip(reading.tracks, reading.vehicles, reading.arrived, reading.by_commands, strict=True)
+    for unit, own in enumerate(by_track):
+        for axis, part in _segments(*own, reading.at_once, reading.late):
             moments[axis].append((part, unit))
     for group, axes in enumerate(((0, 1), (2,))):
         found = np.array([m for a in axes for m, _ in moments[a]])

@@ -86,19 +86,11 @@ def shares(report: Report) -> list[dict]:
     rows += [("sensors and clocks", report.shares.sensors, "nuisance")]
     rows += [("unexplained", report.shares.unexplained, "unexplained")]
 
-    def percent(value):
-        return min(max(100.0 * value, 0.0), 100.0)
+    def row(name, share, kind):
+        value, low, high = (min(max(100.0 * v, 0.0), 100.0) for v in (share.value, *share.interval90))
+        return {"name": name.replace("_", " "), "kind": kind, "value": value, "low": low, "high": high}
 
-    return [
-        {
-            "name": name.replace("_", " "),
-            "kind": kind,
-            "value": percent(share.value),
-            "low": percent(share.interval90[0]),
-            "high": percent(share.interval90[1]),
-        }
-        for name, share, kind in rows
-    ]
+    return [row(*entry) for entry in rows]
 
 
 def next_steps(report: Report) -> list[tuple[str, str]]:
