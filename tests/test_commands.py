@@ -268,7 +268,7 @@ def test_benchmark_writes_table_and_file(tmp_path, monkeypatch, capsys):
     printed = capsys.readouterr().out
     assert "env steps/s" in printed and "compile" in printed
     result = json.loads(file.read_text())
-    assert [row["part"] for row in result["rows"]] == ["rigid", "training"]
+    assert [row["part"] for row in result["rows"]] == ["rigid", "training", "- fly", "- renew"]
     assert all(row["env_steps_per_second"] > 0 and row["compile_seconds"] > 0 for row in result["rows"])
     assert {"device", "versions", "commit"} <= result["machine"].keys()
 

@@ -1,8 +1,8 @@
 """Speed on this machine: `openjax benchmark [--envs 1024 4096] [--json FILE]`.
 
 Steps per second of the physics (rigid and MJX, each with and without solids), of the environment, of rollouts with the
-policy and of the whole training step, over a sweep of environment counts. Same command on CPU and GPU. Where a step's time
-goes is shown by JAX's own profiler (`jax.profiler.trace`).
+policy and of the whole training step, over a sweep of environment counts; and of the programs that the step is made of, which
+say where its time goes. Same command on CPU and GPU.
 """
 
 import dataclasses
@@ -60,7 +60,7 @@ def main(arguments: Sequence[str]) -> int:
     check_output(command.json, "--json")
     import jax
 
-    from openjax.commands.benchmark_cases import cases
+    from openjax.commands.benchmark_cases import PHASE, cases
     from openjax.commands.machine import describe_machine
     from openjax.commands.timing import time_compiled
     from openjax.store.settings_files import write_json
@@ -78,6 +78,12 @@ def main(arguments: Sequence[str]) -> int:
         print(_line(rows[-1]), flush=True)
         # after each measurement, so that an interrupted sweep leaves what it has
         write_json(command.json, {**facts, "settings": command.settings, "rows": rows})
+    phases = [row["seconds"] for row in rows if row["part"].startswith(PHASE)]
+    if phases and None not in phases:
+        steps = sum(row["seconds"] for row in rows if row["part"] == "training")
+        print(
+            f"the training step's programs take {1e3 * sum(phases):,.1f} ms, the step as one {1e3 * steps:,.1f} ms"
+        )
     print(f"written to {command.json}")
     return 0
 
@@ -99,6 +105,6 @@ def _row(part, num_envs, steps, settings, timing) -> dict:
 
 def _line(row):
     speed, memory = row["env_steps_per_second"], row["memory"]
-    told = "out of memory" if speed is None else f"{speed:,.0f} env steps/s"
+    told = "out of memory" if speed is None else f"{speed:,.0f} env steps/s, {1e3 * row['seconds']:,.1f} ms"
     needs = "" if memory is None else f", {memory / 1e6:,.0f} MB"
     return f"{row['part']:12} {row['num_envs']:>10,} environments: {told} (compiled in {row['compile_seconds']:.1f} s{needs})"

@@ -7,11 +7,14 @@ import jax
 import jax.numpy as jnp
 
 from openjax.errors import UserError
-from openjax.learning import TrainSettings, build, init_carry, make_training_step
+from openjax.learning import TrainSettings, build, init_carry, training_step
 from openjax.learning.rollout import collect
 from openjax.pursuit import Pursuit, hover_action, uniform_task
 from openjax.pursuit.environment import action_to_command
 from openjax.vehicle import hover_state, load_vehicle, make_drones_step
+
+PHASE = "- "
+"""What the names of the training step's programs begin with."""
 
 
 def cases(
@@ -26,20 +29,26 @@ def cases(
         for num_envs in training_envs if part == "training" else envs:
             if part == "training":
                 fitting = fitting_settings(settings, num_envs)
-                step = make_training_step(fitting)
-                yield (
-                    part,
-                    fitting.num_envs,
-                    fitting.rollout_length,
-                    step,
-                    (init_carry(fitting, jax.random.key(0)),),
-                )
+                for name, function, inputs in _training(fitting):
+                    yield name, fitting.num_envs, fitting.rollout_length, function, inputs
             elif part == "rollout":
                 yield part, num_envs, steps, *_rollout(settings, num_envs, steps)
             elif part == "environment":
                 yield part, num_envs, steps, *_environment(settings, num_envs, steps)
             else:
                 yield part, num_envs, steps, *_physics(part, settings, num_envs, steps)
+
+
+def _training(settings):
+    """The whole training step, then the programs that it is made of: (name, function, its arguments)."""
+    carry, phases = init_carry(settings, jax.random.key(0)), training_step.make_phases(settings)
+    yield "training", training_step.make_training_step(settings), (carry,)
+    yield f"{PHASE}fly", phases.fly, (carry,)
+    flown = jax.eval_shape(phases.fly, carry)[1]
+    flown = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), flown)  # takes as long as any
+    for i, learn in enumerate(phases.learn):
+        yield f"{PHASE}learn_{i}", learn, (carry, flown)
+    yield f"{PHASE}renew", phases.renew, (carry,)
 
 
 def fitting_settings(settings: TrainSettings, num_envs: int) -> TrainSettings:
