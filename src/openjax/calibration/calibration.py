@@ -33,7 +33,7 @@ ITERATIONS = 12
 DETERMINED = (
     0.5  # of the prior's standard deviation: a constant with a larger one isn't told by these flights
 )
-LEAST_EXPLAINED = 0.75  # share of the rates' changes; below, no constant that they tell can be trusted
+LEAST_EXPLAINED = 0.9  # share of the rates' changes; below, no constant that they tell can be trusted
 HORIZON = 0.25  # s over which changes are explained
 YAW_INERTIA_RANGE = (0.7, 1.6)  # of nominal; what it may be where it is assumed
 # Relative error (standard deviation) that remains however long one flies: commands and states are known every
