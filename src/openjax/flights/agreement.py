@@ -31,11 +31,8 @@ from openjax.flights.signals import (
     up_of,
 )
 
-LOW, WIDE, TURNING = (
-    (0.3, 2.5),
-    (0.3, 4.0),
-    (0.7, 8.0),
-)  # Hz: above drift, below the noise of what is compared
+# Hz: above drift, below the noise of what is compared
+LOW, WIDE, TURNING = (0.3, 2.5), (0.3, 4.0), (0.7, 8.0)
 WINDOW = 8.0  # s in which a clock offset is constant
 LAG = 0.2  # s, largest clock offset and latency between honest streams
 AGREE = 0.5  # share of the correlation to be expected below which two channels contradict each other
@@ -47,7 +44,7 @@ LEAST_ROWS = 100
 FULL = 0.98  # motor command that counts as the largest
 # Motion (rms in the band) that is more than what else moves the channel that must follow: a pose that a filter makes is off by a
 # few cm/s and some hundredths of a radian; floor, wakes and a battery change the thrust by some per cent of hover; a loop at
-# rest opposes the air.
+# rest opposes the air. Commanded thrust and motors (per cent) are exact.
 MOVED = {
     "rate": 0.15,
     "velocity": 0.1,
@@ -143,8 +140,8 @@ class Signals:
 @dataclass(frozen=True, eq=False)
 class Pair:
     """`measured` (T, C) and what it must agree with, both in `unit`. `names` of the measured columns; `holds` the channel of
-    `Signals` that they are, where another labelling of it may be right; `derivatives`: how many times each was differentiated;
-    """
+    `Signals` that they are, where another labelling of it may be right; `derivatives`: how many times each was differentiated
+    from what its sensor gives, None for commands; `least`: rms of the reference in the band from which it tells."""
 
     names: tuple[str, ...]
     measured: np.ndarray
