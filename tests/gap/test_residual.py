@@ -14,11 +14,19 @@ ROWS, DT = 1500, 0.01
 def left_over(push):
     """Measures of two tracks whose replay leaves white noise, and `push` (T,) in the first channel's increments."""
     rng = np.random.default_rng(0)
-    tracks = [SimpleNamespace(dt=DT, position=None, velocity=None) for _ in range(2)]
+    tracks = [
+        SimpleNamespace(
+            dt=DT, time=DT * np.arange(ROWS), motor=0.6 + 0.05 * rng.standard_normal((ROWS, 4)), position=None,
+            body_rates=rng.standard_normal((ROWS, 3)), velocity=None, quaternion=None, voltage=None, neighbours=(),
+        )
+        for _ in range(2)
+    ]  # fmt: skip
     noises = [Noise(axes, np.ones(1), np.ones(1), 1.0) for axes in ((0, 1), (2,), (3, 4), (5,), (6, 7), (8,))]
     replay = SimpleNamespace(
         tracks=tracks,
         usable=np.ones(9),
+        heard=np.ones(6),
+        noises=noises,
         whiten=lambda r, k: np.concatenate([n.whiten(r[:, n.axes]) for n in noises], 1),
     )
     residuals = [1e-3 * rng.standard_normal((ROWS, 9)) for _ in tracks]
@@ -31,7 +39,8 @@ def test_a_push_is_left_in_its_channel_and_in_no_other():
     calm, small = left_over(np.zeros(ROWS))
     pushed, large = left_over(2.0 * np.sin(3.0 * DT * np.arange(ROWS)))
     assert pushed["velocity"] > 0.3 > 0.01 > calm["velocity"] and pushed["rates"] == calm["rates"]
-    assert small.max() == 0.0 and large[3] > 0.5 and large[[0, 1, 2, 4, 5]].max() == 0.0
+    assert pushed["dependence"] > 2.0 * calm["dependence"]
+    assert small.max() < 0.1 and large[3] > 0.5 and large[[0, 1, 2, 4, 5]].max() < 0.1
 
 
 @pytest.mark.parametrize("name", WORDS)
