@@ -14,7 +14,6 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from scipy.signal import lfilter
 from scipy.stats import norm
 
 from openjax.flights.track import Track, rotation, smooth
@@ -35,13 +34,12 @@ HORIZONS = {
 WORDS = {name: words for name, (_, words) in HORIZONS.items()}
 WORDS["correlation"] = "what is left of one channel goes with what is left of another"
 WORDS["dependence"] = "what is left follows the state"
-LEAST_GROWTH = 0.01  # of the gap, added: below, growths are alike
 FEATURES = 40  # of each group
 LENGTHS = (0.5, 1.0, 2.0)  # of the features, in standard deviations of what they are functions of
 STATE_FILTER = 0.1  # s over which the state is smoothed: sensors' noise isn't what anything depends on
 VARIANCES = 10.0 ** np.arange(-4.0, 4.5, 1.0)  # of the process, in units of the channel's noise
 VERY_STRONG = 5.0  # nats of a Bayes factor (Kass, Raftery 1995)
-WAKE = "the vehicle near"
+WAKE = "near"
 CALIBRATION = Path(__file__).with_name("residual.json")
 
 
@@ -111,11 +109,9 @@ def measure(evidence: Evidence, residuals: list[np.ndarray]) -> tuple[dict[str, 
             excess[first : first + 3] = 1.0 - np.minimum(most / size, 1.0) ** 2
     white = np.concatenate([replay.whiten(r, k) for k, r in enumerate(residuals)])[:, replay.usable > 0]
     out["correlation"] = float(np.abs(np.triu(np.corrcoef(white.T), 1)).max())
-    found, follows = dependence(replay, residuals), np.zeros(6)
-    for gain, _, axis, share in found:
-        if gain > VERY_STRONG:
-            follows[axis] = max(follows[axis], share)
-    out["dependence"] = float(np.sqrt((1.0 / (1.0 - follows[replay.heard > 0])).mean()) - 1.0) + LEAST_GROWTH
+    follows = followed(replay, residuals)
+    growth = np.sqrt((1.0 / (1.0 - follows[replay.heard > 0])).mean()) - 1.0
+    out["dependence"] = float(growth) + 0.01  # of the gap: growths below are alike
     return out, np.maximum(excess, follows)
 
 
@@ -180,45 +176,40 @@ def usual() -> dict[str, tuple[float, float]]:
     return found
 
 
-def state_groups(track: Track) -> dict[str, np.ndarray]:
-    """{group: (T, n)} of the state that a push may depend on."""
-    rows = len(track.time)
-    turn = rotation(track.quaternion) if track.quaternion is not None else np.tile(np.eye(3), (rows, 1, 1))
-    groups = {"the body rates": track.body_rates, "the thrust": track.motor.mean(1)[:, None]}
-    if track.quaternion is not None:
-        groups |= {"the attitude": turn[:, 2, :2], "the heading": turn[:, :2, 0]}
-    if track.position is not None:
-        groups["the place"] = track.position
-    if track.velocity is not None:
-        groups["the velocity"] = track.velocity
-        groups["the velocity in the body's frame"] = np.einsum("tji,tj->ti", turn, track.velocity)
-    if track.voltage is not None:
-        groups["the voltage"] = track.voltage[:, None]
-    groups |= {f"{WAKE} {k}": other - track.position for k, other in enumerate(track.neighbours)}
-    groups = {name: smooth(values, STATE_FILTER, track.dt) for name, values in groups.items()}
-    return groups | {"the time": (track.time - track.time[0])[:, None]}
-
-
-def dependence(replay: Replay, residuals: list[np.ndarray]) -> list[tuple[float, str, int, float]]:
-    """Of each motion channel and group of the state: log Bayes factor, words, axis (0 to 5) and the share that the process has
-    of the squared errors that make the gap."""
-    states, found = [state_groups(t) for t in replay.tracks], [(0.0, "", 0, 0.0)]
+def followed(replay: Replay, residuals: list[np.ndarray]) -> np.ndarray:
+    """(6,) share of each motion channel's squared errors over the gap's horizon that a Gaussian process of one group of the
+    state has, of those with very strong evidence the largest."""
+    states, shares = [_groups_of_state(t) for t in replay.tracks], np.zeros(6)
     for group in (g for g in states[0] if all(g in s for s in states)):
         features = _fourier_features([s[group] for s in states])
-        if features is None:
-            continue
-        for axis in np.flatnonzero(replay.heard > 0):
+        for axis in np.flatnonzero(replay.heard > 0) if features else ():
             if group.startswith(WAKE) and axis < 3:
                 continue  # how wakes turn a vehicle is a nuisance
             channel = int(axis) if axis < 3 or replay.usable[3] else int(axis) + 3
-            gain, weights = _log_bayes_factor(*_whitened_sums(replay, residuals, features, channel))
             pushes = [
-                _done(f, channel, t.dt) @ weights[:, None]
+                f if channel >= 6 else np.cumsum(f, 0) * t.dt
                 for f, t in zip(features, replay.tracks, strict=True)
             ]
-            share = _share_of_errors(replay, residuals, pushes, channel) if gain > 0.0 else 0.0
-            found.append((gain, f"{_name(channel)} depends on {group}", int(axis), share))
-    return found
+            gain, weights = _log_bayes_factor(*_whitened_sums(replay, residuals, pushes, channel))
+            if gain > VERY_STRONG:
+                share = _share_of_errors(replay, residuals, [p @ weights for p in pushes], channel)
+                shares[axis] = max(shares[axis], share)
+    return shares
+
+
+def _groups_of_state(track: Track) -> dict[str, np.ndarray]:
+    """{group: (T, n)} of the state that a push may depend on."""
+    groups = {"rates": track.body_rates, "thrust": track.motor.mean(1)[:, None]}
+    if track.quaternion is not None:
+        turn = rotation(track.quaternion)
+        groups |= {"attitude": turn[:, 2, :2], "heading": turn[:, :2, 0]}
+        if track.velocity is not None:
+            groups["air"] = np.einsum("tji,tj->ti", turn, track.velocity)
+    logged = {"place": track.position, "velocity": track.velocity, "voltage": track.voltage}
+    groups |= {n: v.reshape(len(v), -1) for n, v in logged.items() if v is not None}
+    groups |= {f"{WAKE} {k}": other - track.position for k, other in enumerate(track.neighbours)}
+    groups = {name: smooth(values, STATE_FILTER, track.dt) for name, values in groups.items()}
+    return groups | {"time": (track.time - track.time[0])[:, None]}
 
 
 def _fourier_features(states: list[np.ndarray]) -> list[np.ndarray] | None:
@@ -236,32 +227,24 @@ def _fourier_features(states: list[np.ndarray]) -> list[np.ndarray] | None:
     return [f - f.mean(0) for f in features]  # a trim is nobody's surprise
 
 
-def _done(push: np.ndarray, channel: int, dt: float) -> np.ndarray:
-    """What accelerations (T, n) do to a channel: rates and velocity add them up."""
-    return push if channel >= 6 else np.cumsum(push, 0) * dt
+def _share_of_errors(replay: Replay, residuals, pushes, channel: int) -> float:
+    """Share of a channel's squared errors over the gap's horizon that `pushes` [(T,)], at the best strength, explain."""
+    step = max(round(GAP["rates" if channel < 3 else "velocity"] / replay.tracks[0].dt), 1)
+    moved = []
+    for track, residual, push in zip(replay.tracks, residuals, pushes, strict=True):
+        both = np.stack([push, residual[:, channel]])
+        both = both if channel < 6 else np.cumsum(both, 1) * track.dt
+        moved.append((both[:, step:] - both[:, :-step])[:, int(SKIP / track.dt) :])
+    push, left = np.concatenate(moved, 1)
+    return float(np.clip((push @ left) ** 2 / (push @ push * (left @ left) + 1e-24), 0.0, 0.99))
 
 
-def _share_of_errors(replay: Replay, residuals, shapes, channel: int) -> float:
-    """Share of a channel's squared errors over the gap's horizon that `shapes` [(T, n)], least squares, explain."""
-    gram, cross, square = 1e-12, 0.0, 1e-12
-    for track, residual, shape in zip(replay.tracks, residuals, shapes, strict=True):
-        both = np.concatenate([shape, residual[:, [channel]]], 1)
-        both = both if channel < 6 else np.cumsum(both, 0) * track.dt
-        step = max(round(GAP["rates" if channel < 3 else "velocity"] / track.dt), 1)
-        moved = (both[step:] - both[:-step])[int(SKIP / track.dt) :]
-        gram, cross = gram + moved[:, :-1].T @ moved[:, :-1], cross + moved[:, :-1].T @ moved[:, -1]
-        square += float(moved[:, -1] @ moved[:, -1])
-    return float(np.clip(cross @ np.linalg.lstsq(gram, cross, rcond=None)[0] / square, 0.0, 0.99))
-
-
-def _whitened_sums(replay: Replay, residuals, features, channel: int) -> tuple[np.ndarray, np.ndarray]:
-    """Inner products of what the features would do in a channel, whitened, with each other and with the residual."""
+def _whitened_sums(replay: Replay, residuals, pushes, channel: int) -> tuple[np.ndarray, np.ndarray]:
+    """Inner products of columns (T, n) of a channel, whitened, with each other and with the residual."""
     noise = next(n for n in replay.noises if channel in n.axes)
     gram, cross = 0.0, 0.0
-    for track, residual, push in zip(replay.tracks, residuals, features, strict=True):
-        both = np.concatenate([_done(push, channel, track.dt), residual[:, [channel]]], 1)
-        white = lfilter(noise.numerator / noise.deviation, noise.denominator, both, axis=0)
-        white = white[int(SKIP / track.dt) :]
+    for track, residual, push in zip(replay.tracks, residuals, pushes, strict=True):
+        white = noise.whiten(np.concatenate([push, residual[:, [channel]]], 1))[int(SKIP / track.dt) :]
         white = white - white.mean(0)
         gram, cross = gram + white[:, :-1].T @ white[:, :-1], cross + white[:, :-1].T @ white[:, -1]
     return gram, cross
@@ -274,9 +257,4 @@ def _log_bayes_factor(gram: np.ndarray, cross: np.ndarray) -> tuple[float, np.nd
     values, along = np.maximum(values, 0.0), vectors.T @ cross
     each = [0.5 * (v * along**2 / (1.0 + v * values) - np.log1p(v * values)).sum() for v in VARIANCES]
     best = int(np.argmax(each))
-    taken = VARIANCES[best] * along / (1.0 + VARIANCES[best] * values)
-    return max(0.0, float(each[best])), vectors @ taken
-
-
-def _name(channel: int) -> str:
-    return f"{('torque', 'force', 'specific force')[channel // 3]} {'xyz'[channel % 3]}"
+    return float(each[best]), vectors @ (VARIANCES[best] * along / (1.0 + VARIANCES[best] * values))

@@ -24,7 +24,6 @@ from openjax.gap.model.table import Table, build, with_effects
 # Nats that an effect of usual size must promise: its gain is then expected at two standard errors, as the gain of a true effect
 # is half the square of what it does, and its standard error that square's root.
 DETECTABLE = 2.0 * DECISION.standard_errors**2
-MOST_EFFECTS = 6
 TRIED = 2  # neighbours of each kind that are fitted in full
 STARTS = 3  # effects alone from which the search climbs
 DRAWS = 400  # of the bootstrap
@@ -199,14 +198,14 @@ class Search:
     def neighbours(self, here: Hypothesis) -> list[Hypothesis]:
         """The most promising neighbours, screened by the model linearised here and fitted in full."""
         effects, table = frozenset(here.effects), build(self.evidence.replay, here.fit, self.singles)
-        more = {effects | {new}: ((new,), ()) for new in table.step if len(effects) < MOST_EFFECTS}
+        more = {effects | {new}: ((new,), ()) for new in table.step}
         instead = {effects - {old} | {new}: ((new,), (old,)) for new in table.step for old in effects}
         sets = []
         for kind in (more, instead):
             line = {s: promise(table, with_effects(table, *change)) for s, change in kind.items()}
             sets += sorted(line, key=lambda s: -line[s])[:TRIED]
         alone = sorted(table.step, key=lambda e: -self.singles[e].score)[:TRIED]
-        sets += [effects | {e} for e in alone if len(effects) < MOST_EFFECTS]
+        sets += [effects | {e} for e in alone]
         return [self.of_set(s, here.fit) for s in dict.fromkeys(sets)]
 
     def gap_growth(self, other: Hypothesis, best: Hypothesis) -> float:
