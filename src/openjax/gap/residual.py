@@ -122,15 +122,10 @@ def _series(evidence: Evidence, residuals: list[np.ndarray]) -> dict[str, list[n
     out = {n: [r[:, axes] for r in residuals] for n, axes in motion.items() if usable[axes.start]}
     out |= {c.path: c.fit.residual for c in evidence.channels if c.path in HORIZONS}
     if all(t.position is not None and t.velocity is not None for t in tracks):
-        out["position"] = [t.position - _sum_of(t.velocity, t.dt) for t in tracks]
+        out["position"] = [t.position - (np.cumsum(t.velocity, 0) - 0.5 * t.velocity) * t.dt for t in tracks]
         if all(t.specific_force is not None and t.quaternion is not None for t in tracks):
             out["accelerometer"] = [_path_against_accelerometer(t) for t in tracks]
     return out
-
-
-def _sum_of(rates: np.ndarray, dt: float) -> np.ndarray:
-    """Integral (T, 3) of rates, linear between rows."""
-    return np.cumsum(0.5 * (rates + np.concatenate([rates[:1], rates[:-1]])), 0) * dt
 
 
 def _path_against_accelerometer(track: Track) -> np.ndarray:
