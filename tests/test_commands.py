@@ -182,7 +182,7 @@ def test_nan_stops_the_run_and_leaves_the_state(tmp_path, monkeypatch, capsys, t
 
     monkeypatch.setattr(training_job, "make_device_phases", make_broken_phases)
     out = tmp_path / "broken"
-    options = [*train_arguments[1:], *ALONE, "--traced_programs", "False", "--out", out]
+    options = [*train_arguments[1:], *ALONE, "--no-traced_programs", "--out", out]
     status, _ = in_process(train.main, options, monkeypatch, capsys)
     assert status == 1
     report = json.loads((out / "not_finite" / "report.json").read_text())
