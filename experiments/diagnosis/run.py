@@ -17,7 +17,16 @@ from pathlib import Path
 from experiments.diagnosis import development, figures
 from experiments.table import Page, page_parser, publish
 
-LEFT_OUT = ("parameters", "quality", "gap", "probabilities", "not_testable", "rest", "false_unknown")
+LEFT_OUT = (
+    "parameters",
+    "quality",
+    "gap",
+    "probabilities",
+    "not_testable",
+    "rest",
+    "false_unknown",
+    "right_names",
+)
 ROOT = Path(__file__).resolve().parents[2]
 
 
