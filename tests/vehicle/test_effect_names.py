@@ -7,7 +7,7 @@ import openjax
 from openjax.vehicle.disturbances import DISTURBANCES
 from openjax.vehicle.family import known_effects
 
-ROOMS = "vehicle pursuit policy kernels learning baselines interfaces store show cluster calibration".split()
+ROOMS = "vehicle pursuit policy kernels learning baselines interfaces store show cluster".split()
 OWN = {"mass", "inertia"}
 """Effects that are called after what they change, a number of every vehicle."""
 
