@@ -52,7 +52,7 @@ def fit_set(replay: Replay, effects, start: np.ndarray | None = None, iterations
             start[places((effect,))] = start_of(effect)
     theta, best = ABSENT.copy(), None
     theta[index] = start[index]  # what isn't in the set is absent
-    reach = 3.0 / np.sqrt(np.diag(precision)) if len(index) else np.zeros(0)
+    reach = 3.0 * np.sqrt(np.diag(np.linalg.inv(precision))) if len(index) else np.zeros(0)
     for iteration in range(iterations + 1):
         columns = replay.linearised(theta, index)
         products = replay.products(columns)
