@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from openjax.flights.flight import Case, Flight
-from openjax.flights.signals import GRAVITY, RATE, clock_of, first_order, in_band, on_clock, to_body
-from openjax.flights.track import pwm_thrust
+from openjax.flights.signals import RATE, clock_of, first_order, in_band, on_clock, to_body
+from openjax.flights.track import GRAVITY, pwm_thrust
 
 TRIMS = ("hover", "roll", "pitch", "yaw")
 DYNAMICS = ("drag_x", "drag_y", "lag", "torque_gain", "loop_gain", "shaking")

@@ -20,7 +20,6 @@ import numpy as np
 from openjax.flights.flight import Flight, Issue
 from openjax.flights.reading import CHANNEL_COLUMNS
 from openjax.flights.signals import (
-    GRAVITY,
     RATE,
     clock_of,
     first_order,
@@ -30,6 +29,7 @@ from openjax.flights.signals import (
     to_body,
     up_of,
 )
+from openjax.flights.track import GRAVITY
 
 # Hz: above drift, below the noise of what is compared
 LOW, WIDE, TURNING = (0.3, 2.5), (0.3, 4.0), (0.7, 8.0)

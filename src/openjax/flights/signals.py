@@ -16,7 +16,6 @@ from openjax.flights.track import rotation
 RATE = 100.0  # Hz, common clock of the comparisons
 LONGEST = 30.0  # s, enough to tell
 FADE = 0.5  # s
-GRAVITY = 9.81  # m/s^2
 
 
 def clock_of(flight: Flight) -> np.ndarray | None:

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from openjax.flights.flight import Case, Flight
 
 Array = np.ndarray
+GRAVITY = 9.81  # m/s^2
 GRID_PERIOD = 0.01  # s, the step of the simulator
 MIN_DURATION = 2.0  # s, shorter stretches say next to nothing and are left out
 MAX_GAP = 0.05  # s, a longer step between rows splits the flight
@@ -171,7 +172,7 @@ def pwm_thrust(duty: Array, voltage: Array | None, vehicle) -> Array:
     of all four rotors."""
     volts = duty * (3.7 if voltage is None else voltage[:, None])
     grams = (0.088 - np.sqrt(np.maximum(0.088**2 - 4 * 0.0006239 * volts, 0.0))) / (2 * 0.0006239)
-    newtons = grams * 1e-3 * 9.81 / 4
+    newtons = grams * 1e-3 * GRAVITY / 4
     return newtons / float(vehicle.thrust_constant * vehicle.max_rotor_speed**2)
 
 

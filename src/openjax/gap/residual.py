@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import norm
 
-from openjax.flights.track import Track, rotation, smooth
+from openjax.flights.track import GRAVITY, Track, rotation, smooth
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
 from openjax.gap.model.hypotheses import SetFit, without_nuisances
@@ -130,7 +130,7 @@ def _series(evidence: Evidence, residuals: list[np.ndarray]) -> dict[str, list[n
 
 def _path_against_accelerometer(track: Track) -> np.ndarray:
     """Velocity (T, 3) body axes by which the accelerometer and the path's acceleration come apart, its bias aside."""
-    path = np.gradient(track.velocity, track.dt, axis=0) + np.array([0.0, 0.0, 9.81])
+    path = np.gradient(track.velocity, track.dt, axis=0) + np.array([0.0, 0.0, GRAVITY])
     apart = track.specific_force - np.einsum("tji,tj->ti", rotation(track.quaternion), path)
     return np.cumsum(apart - apart.mean(0), 0) * track.dt
 

@@ -12,13 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
-from openjax.flights.track import Track, rotation
+from openjax.flights.track import GRAVITY, Track, rotation
 from openjax.gap.channels.pose import turn_increments
 from openjax.gap.decision import DECISION
 
 BAND = (0.3, 6.0)  # Hz: above drift, below most of the sensors' noise
 SLOW = 2.0  # Hz, below which path and accelerometer are compared
-GRAVITY = 9.81  # m/s^2
 CLEAR = 5.0  # jackknife standard errors by which a finding must exceed nothing
 LEAST = 0.1  # rad/s or m/s^2 rms in the band: an axis that hardly moves shows no gain
 COHERENT = 0.97  # correlation below which the two streams don't fit well enough to compare gains

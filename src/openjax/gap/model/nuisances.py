@@ -8,7 +8,7 @@ import tomllib
 
 import numpy as np
 
-from openjax.flights.track import Track, rotation, smooth
+from openjax.flights.track import GRAVITY, Track, rotation, smooth
 from openjax.gap.model.library import PLACE, STEP
 from openjax.gap.model.physics import Path
 from openjax.gap.model.prediction import FORCE, RATES, VELOCITY
@@ -69,7 +69,7 @@ def _sensor_nuisances(
     """Mounting, biases and clocks of the sensors, and what a rigid body with small errors does: columns (T, 9)."""
     rows = len(track)
     turn = rotation(np.asarray(path.quaternion, float)[:rows])
-    specific = np.gradient(nominal[:, VELOCITY], track.dt, axis=0) + np.array([0.0, 0.0, 9.81])
+    specific = np.gradient(nominal[:, VELOCITY], track.dt, axis=0) + np.array([0.0, 0.0, GRAVITY])
     body = np.einsum("tji,tj->ti", turn, specific)
     columns: dict[str, np.ndarray] = {}
 
