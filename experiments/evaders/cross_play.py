@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.flying.vehicles import FLIGHT_FAMILY, vehicles
+from experiments.flying.vehicles import vehicles
 from experiments.table import Page, Table, page_parser, publish
 from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import layout_slots, repeat_task
@@ -30,6 +30,7 @@ from openjax.pursuit import (
 )
 from openjax.pursuit.evaders import EVADERS, HELD_OUT, SCRIPTED, VALIDATED
 from openjax.store.policies import LoadedPolicy, load_policy
+from openjax.vehicle.family import vehicle_family
 
 
 @functools.cache
@@ -45,7 +46,7 @@ def game_of(loaded: LoadedPolicy, game: str, physics: str) -> PursuitSettings:
         settings,
         evaders=SCRIPTED,
         physics=physics,
-        vehicles=FLIGHT_FAMILY,
+        vehicles=vehicle_family(),
         rare_vehicles=0.5,
         # of uniform tasks, which have four or five
         min_pillars=4,

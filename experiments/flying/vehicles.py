@@ -24,14 +24,13 @@ from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, RewardSettings,
 from openjax.store.policies import load_policy
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.family import family_bounds, find_parameter, vehicle_family
+from openjax.vehicle.parameters import AIRFRAMES, NOMINAL
 
 TABLE = {
     "motor_lag.extra_up": 0.04, "motor_lag.extra_down": 0.04, "command_latency.delay": 0.015, "state_latency.delay": 0.01,
     "rotor_drag.d_xy": 0.0125, "rotor_drag.d_z": 0.0125,
 }  # fmt: skip
-FLIGHT_FAMILY = vehicle_family()
-NAMES = [entry[0] for entry in FLIGHT_FAMILY]
-EFFECTS = sorted({name.partition(".")[0] for name in NAMES})
+EFFECTS = sorted({entry.parameter.partition(".")[0] for entry in vehicle_family()})
 WHOLE = "family"
 FIGURES = {
     "capture": "capture_rate:.3f", "step": "capture_step:.0f", "collision": "collision_rate:.4f",
@@ -39,17 +38,18 @@ FIGURES = {
 }  # fmt: skip
 
 
-def vehicles() -> dict[str, np.ndarray]:
-    """Bounds (R, 4) of each kind of vehicle; only the whole family has any that are rare."""
-    bounds = family_bounds(FLIGHT_FAMILY)
-    none = np.repeat([[find_parameter(name)[1].none] for name in NAMES], 4, axis=1).astype(np.float32)
+def vehicles(airframe: str = NOMINAL) -> dict[str, np.ndarray]:
+    """Bounds (R, 4) of each kind of an airframe's vehicles; only the whole family has any that are rare."""
+    family = vehicle_family(airframe)
+    bounds, names = family_bounds(family), [entry.parameter for entry in family]
+    none = np.repeat([[find_parameter(name)[1].none] for name in names], 4, axis=1).astype(np.float32)
     one = none.copy()
     for name, value in TABLE.items():
-        one[NAMES.index(name)] = value
+        one[names.index(name)] = value
     ordinary = np.tile(bounds[:, :2], 2)
     kinds = {"nominal": none, "table": one, "ordinary": ordinary, WHOLE: bounds}
     for effect in EFFECTS:
-        own = np.array([name.partition(".")[0] == effect for name in NAMES])
+        own = np.array([name.partition(".")[0] == effect for name in names])
         kinds[effect] = np.where(own[:, None], np.tile(bounds[:, 2:], 2), ordinary)
     return kinds
 
@@ -57,7 +57,7 @@ def vehicles() -> dict[str, np.ndarray]:
 @functools.cache
 def program(settings, policy):
     """The compiled evaluation: (parameters, tasks, key, bounds (R, 4)) -> Evaluation."""
-    vehicle = load_vehicle()
+    vehicle = load_vehicle(settings.airframe)
 
     def run(parameters, tasks, key, bounds):
         environment = Pursuit(settings, vehicle, vehicle_bounds=bounds)
@@ -66,18 +66,19 @@ def program(settings, policy):
     return jax.jit(run)
 
 
-def fly(
-    name: str, number: int, layouts: int, physics: str, chosen: list[str] | None = None, attitude: str = "drawn"
-) -> dict[str, dict[str, dict]]:  # fmt: skip
-    """Summaries by vehicle (all kinds, or those `chosen`) and kind of task."""
+def fly(name: str, options) -> dict[str, dict[str, dict]]:
+    """Summaries of a policy by kind of vehicle and kind of task. `options`: of the command."""
+    number, layouts = options.number, options.layouts
     loaded = load_policy(name)
+    airframe = options.airframe or loaded.settings.environment.airframe
     game = dataclasses.replace(
         loaded.settings.environment,
+        airframe=airframe,
         speed_limit="none",
         substeps=5,
-        physics=physics,
-        start_attitude=attitude,
-        vehicles=FLIGHT_FAMILY,
+        physics=options.physics,
+        start_attitude=options.attitude,
+        vehicles=vehicle_family(airframe),
         rare_vehicles=0.5,
         max_pillars=layout_slots(loaded.settings.environment),
         reward=RewardSettings(),  # counts for nothing here: the same program for policies that differ in it
@@ -97,8 +98,8 @@ def fly(
     flat = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *repeated)
     found: dict[str, dict[str, dict]] = {}
     run = program(game, loaded.policy)
-    for kind, bounds in vehicles().items():
-        if chosen and kind not in chosen:
+    for kind, bounds in vehicles(airframe).items():
+        if options.vehicles and kind not in options.vehicles:
             continue
         shown = tasks if kind in ("nominal", "table", "ordinary", WHOLE) else {"uniform": tasks["uniform"]}
         own = found.setdefault(kind, {})
@@ -130,11 +131,8 @@ def widened(tasks, slots: int):
 
 def study(options) -> dict:
     """Fly the policies."""
-    policies = {
-        name: fly(name, options.number, options.layouts, options.physics, options.vehicles, options.attitude)
-        for name in options.policy
-    }
-    drawn_by = {name: getattr(options, name) for name in ("number", "layouts", "attitude")}
+    policies = {name: fly(name, options) for name in options.policy}
+    drawn_by = {name: getattr(options, name) for name in ("number", "layouts", "attitude", "airframe")}
     return {**drawn_by, "policies": policies}
 
 
@@ -170,6 +168,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument(
         "--vehicles", nargs="+", choices=list(vehicles()), help="kinds of vehicles; default: all"
     )
+    parser.add_argument("--airframe", choices=list(AIRFRAMES), help="what flies; default: the policy's own")
     publish(parser.parse_args(arguments), study, page)
     return 0
 
