@@ -262,13 +262,31 @@ def test_benchmark_writes_table_and_file(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(training_step, "make_phases", phases_without)
     file = tmp_path / "speed.json"
     arguments = [*TINY, "--predictor.enabled", "False", "--generator.enabled", "False"]
-    arguments += ["--parts", "rigid", "training", "--envs", "8", "--training_envs", "16"]
+    arguments += [
+        "--parts",
+        "rigid",
+        "training",
+        "--envs",
+        "8",
+        "--training_envs",
+        "14",
+        "--devices",
+        "1",
+        "2",
+    ]
     arguments += ["--steps", "5", "--seconds", "0.1", "--json", file]
     assert benchmark.main([str(argument) for argument in arguments]) == 0
     printed = capsys.readouterr().out
     assert "env steps/s" in printed and "compile" in printed
     result = json.loads(file.read_text())
-    assert [row["part"] for row in result["rows"]] == ["rigid", "training", "- fly", "- renew"]
+    parts = [(row["part"], row["num_envs"]) for row in result["rows"]]
+    assert parts == [
+        ("rigid", 8),
+        ("training", 14),
+        ("- fly", 14),
+        ("- renew", 14),
+        ("training, 2 devices", 16),
+    ]
     assert all(row["env_steps_per_second"] > 0 and row["compile_seconds"] > 0 for row in result["rows"])
     assert {"device", "versions", "commit"} <= result["machine"].keys()
 

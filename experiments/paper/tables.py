@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.paper import behaviours, learning_curves, main_tables, sweeps
+from experiments.paper import behaviours, main_tables, sweeps
 from experiments.paper.flights import environment_of, fly
 from experiments.paper.roster import ABLATIONS, METHODS, seeds_of
 from experiments.table import RESULTS, facts, write_page
@@ -166,7 +166,6 @@ def main(arguments: list[str]) -> int:
     results = read_json(options.out / "tables.json")
     for name, (page, draw) in PAGES.items():
         write_page(options.out / name, page, results, draw)
-    learning_curves.main(["--out", str(options.out / "learning_curves")])
     return 0
 
 

@@ -2,7 +2,7 @@
 
 Steps per second of the physics (rigid and MJX, each with and without solids), of the environment, of rollouts with the
 policy and of the whole training step, over a sweep of environment counts; and of the programs that the step is made of, which
-say where its time goes. Same command on CPU and GPU.
+say where its time goes; the step on several devices, with `--devices 1 2 4`. Same command on CPU and GPU.
 """
 
 import dataclasses
@@ -14,6 +14,7 @@ from typing import Annotated, Literal, get_args
 import tyro
 
 from openjax.commands.command_line import parse, peek
+from openjax.errors import UserError
 from openjax.files import check_output
 from openjax.learning.presets import preset
 from openjax.learning.settings import TrainSettings
@@ -35,6 +36,8 @@ class BenchmarkCommand:
     """Environment counts; by default a sweep that fits the machine."""
     training_envs: Annotated[tuple[int, ...], Interval("[1, 16777216]")] = ()
     """Environment counts of the training step; by default those that fit the machine."""
+    devices: Annotated[tuple[int, ...], Interval("[1, 65536]")] = (1,)
+    """Numbers of devices on which the training step is measured; its worlds are shared out to them."""
     parts: tuple[Part, ...] = PARTS
     """What to measure."""
     steps: Annotated[int, Interval("[1, 100000]")] = 50
@@ -50,6 +53,10 @@ class BenchmarkCommand:
 
 def main(arguments: Sequence[str]) -> int:
     """The command; returns its exit status."""
+    if peek(arguments, "devices") is not None:
+        from openjax.platform import make_cores_devices
+
+        make_cores_devices()
     on_cpu = {"-h", "--help"} & set(arguments) or importlib.import_module("jax").default_backend() == "cpu"
     default = BenchmarkCommand(
         envs=(64, 512) if on_cpu else (2048, 8192, 32768, 131072, 1048576),
@@ -60,6 +67,8 @@ def main(arguments: Sequence[str]) -> int:
     check_output(command.json, "--json")
     import jax
 
+    if max(command.devices) > (available := len(jax.devices())):
+        raise UserError(f"--devices is {max(command.devices)}; {available} are here")
     from openjax.commands.benchmark_cases import PHASE, cases
     from openjax.commands.machine import describe_machine
     from openjax.commands.timing import time_compiled
@@ -70,9 +79,8 @@ def main(arguments: Sequence[str]) -> int:
     rows = []
     facts = {"command": " ".join([PROGRAM, *arguments]), "machine": machine}
     facts["compilation_cache"] = jax.config.jax_compilation_cache_dir is not None
-    for part, num_envs, steps, function, inputs in cases(
-        command.settings, command.parts, command.envs, command.training_envs, command.steps
-    ):
+    sizes = command.envs, command.training_envs, command.steps, command.devices
+    for part, num_envs, steps, function, inputs in cases(command.settings, command.parts, *sizes):
         timing = time_compiled(function, inputs, command.seconds)
         rows.append(_row(part, num_envs, steps, command.settings, timing))
         print(_line(rows[-1]), flush=True)

@@ -6,11 +6,13 @@ from collections.abc import Callable, Iterator, Sequence
 import jax
 import jax.numpy as jnp
 
+from openjax.cluster.devices import carry_shardings, check_devices, make_device_step
 from openjax.errors import UserError
 from openjax.learning import TrainSettings, build, init_carry, training_step
 from openjax.learning.rollout import collect
 from openjax.pursuit import Pursuit, hover_action, uniform_task
 from openjax.pursuit.environment import action_to_command
+from openjax.store.leaves import place
 from openjax.vehicle import hover_state, load_vehicle, make_drones_step
 
 PHASE = "- "
@@ -23,14 +25,16 @@ def cases(
     envs: Sequence[int],
     training_envs: Sequence[int],
     steps: int,
+    devices: Sequence[int] = (1,),
 ) -> Iterator[tuple[str, int, int, Callable, tuple]]:
     """(part, environments, control steps per call, function, its arguments), made one at a time."""
     for part in parts:
         for num_envs in training_envs if part == "training" else envs:
             if part == "training":
-                fitting = fitting_settings(settings, num_envs)
-                for name, function, inputs in _training(fitting):
-                    yield name, fitting.num_envs, fitting.rollout_length, function, inputs
+                for number in devices:
+                    fitting = fitting_settings(settings, num_envs, number)
+                    for name, function, inputs in _training(fitting, number):
+                        yield name, fitting.num_envs, fitting.rollout_length, function, inputs
             elif part == "rollout":
                 yield part, num_envs, steps, *_rollout(settings, num_envs, steps)
             elif part == "environment":
@@ -39,9 +43,14 @@ def cases(
                 yield part, num_envs, steps, *_physics(part, settings, num_envs, steps)
 
 
-def _training(settings):
-    """The whole training step, then the programs that it is made of: (name, function, its arguments)."""
-    carry, phases = init_carry(settings, jax.random.key(0)), training_step.make_phases(settings)
+def _training(settings, devices):
+    """The whole training step, then, of one device, the programs that it is made of: (name, function, its arguments)."""
+    carry = init_carry(settings, jax.random.key(0))
+    if devices > 1:
+        step = make_device_step(settings, Pursuit(settings.environment), devices)
+        yield f"training, {devices} devices", step, (place(carry, carry_shardings(devices)),)
+        return
+    phases = training_step.make_phases(settings)
     yield "training", training_step.make_training_step(settings), (carry,)
     yield f"{PHASE}fly", phases.fly, (carry,)
     flown = jax.eval_shape(phases.fly, carry)[1]
@@ -51,11 +60,13 @@ def _training(settings):
     yield f"{PHASE}renew", phases.renew, (carry,)
 
 
-def fitting_settings(settings: TrainSettings, num_envs: int) -> TrainSettings:
-    """The settings with the nearest number of environments from above that they allow."""
+def fitting_settings(settings: TrainSettings, num_envs: int, devices: int = 1) -> TrainSettings:
+    """The settings with the nearest number of environments from above that they and so many devices allow."""
     for number in range(num_envs, num_envs + 10_000):
         try:
-            return dataclasses.replace(settings, num_envs=number)
+            fitting = dataclasses.replace(settings, num_envs=number)
+            check_devices(fitting, devices)
+            return fitting
         except UserError:
             continue
     raise UserError(f"training_envs {num_envs}: no number of environments from there on fits the settings")
