@@ -69,7 +69,7 @@ def main(arguments: Sequence[str]) -> int:
 
     if max(command.devices) > (available := len(jax.devices())):
         raise UserError(f"--devices is {max(command.devices)}; {available} are here")
-    from openjax.commands.benchmark_cases import PHASE, cases
+    from openjax.commands.benchmark_cases import cases
     from openjax.commands.machine import describe_machine
     from openjax.commands.timing import time_compiled
     from openjax.store.settings_files import write_json
@@ -79,21 +79,25 @@ def main(arguments: Sequence[str]) -> int:
     rows = []
     facts = {"command": " ".join([PROGRAM, *arguments]), "machine": machine}
     facts["compilation_cache"] = jax.config.jax_compilation_cache_dir is not None
-    sizes = command.envs, command.training_envs, command.steps, command.devices
-    for part, num_envs, steps, function, inputs in cases(command.settings, command.parts, *sizes):
+    for part, num_envs, steps, function, inputs in cases(command):
         timing = time_compiled(function, inputs, command.seconds)
         rows.append(_row(part, num_envs, steps, command.settings, timing))
         print(_line(rows[-1]), flush=True)
         # after each measurement, so that an interrupted sweep leaves what it has
         write_json(command.json, {**facts, "settings": command.settings, "rows": rows})
-    phases = [row["seconds"] for row in rows if row["part"].startswith(PHASE)]
-    if phases and None not in phases:
-        steps = sum(row["seconds"] for row in rows if row["part"] == "training")
-        print(
-            f"the training step's programs take {1e3 * sum(phases):,.1f} ms, the step as one {1e3 * steps:,.1f} ms"
-        )
+    if told := _programs_and_step(rows):
+        print(told)
     print(f"written to {command.json}")
     return 0
+
+
+def _programs_and_step(rows) -> str | None:
+    """How long the step's programs take beside the step as one; None where one of them wasn't measured."""
+    phases = [row["seconds"] for row in rows if row["part"].startswith("- ")]
+    if not phases or None in phases:
+        return None
+    whole = sum(row["seconds"] for row in rows if row["part"] == "training")
+    return f"the training step's programs take {1e3 * sum(phases):,.1f} ms, the step as one {1e3 * whole:,.1f} ms"
 
 
 def _row(part, num_envs, steps, settings, timing) -> dict:

@@ -1,7 +1,8 @@
 """What `openjax benchmark` times: physics, environment, rollout and the training step, each as one function."""
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -15,23 +16,17 @@ from openjax.pursuit.environment import action_to_command
 from openjax.store.leaves import place
 from openjax.vehicle import hover_state, load_vehicle, make_drones_step
 
-PHASE = "- "
-"""What the names of the training step's programs begin with."""
+if TYPE_CHECKING:
+    from openjax.commands.benchmark import BenchmarkCommand
 
 
-def cases(
-    settings: TrainSettings,
-    parts: Sequence[str],
-    envs: Sequence[int],
-    training_envs: Sequence[int],
-    steps: int,
-    devices: Sequence[int] = (1,),
-) -> Iterator[tuple[str, int, int, Callable, tuple]]:
+def cases(command: "BenchmarkCommand") -> Iterator[tuple[str, int, int, Callable, tuple]]:
     """(part, environments, control steps per call, function, its arguments), made one at a time."""
-    for part in parts:
-        for num_envs in training_envs if part == "training" else envs:
+    settings, steps = command.settings, command.steps
+    for part in command.parts:
+        for num_envs in command.training_envs if part == "training" else command.envs:
             if part == "training":
-                for number in devices:
+                for number in command.devices:
                     fitting = fitting_settings(settings, num_envs, number)
                     for name, function, inputs in _training(fitting, number):
                         yield name, fitting.num_envs, fitting.rollout_length, function, inputs
@@ -52,12 +47,12 @@ def _training(settings, devices):
         return
     phases = training_step.make_phases(settings)
     yield "training", training_step.make_training_step(settings), (carry,)
-    yield f"{PHASE}fly", phases.fly, (carry,)
+    yield f"- fly", phases.fly, (carry,)
     flown = jax.eval_shape(phases.fly, carry)[1]
     flown = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), flown)  # takes as long as any
     for i, learn in enumerate(phases.learn):
-        yield f"{PHASE}learn_{i}", learn, (carry, flown)
-    yield f"{PHASE}renew", phases.renew, (carry,)
+        yield f"- learn_{i}", learn, (carry, flown)
+    yield f"- renew", phases.renew, (carry,)
 
 
 def fitting_settings(settings: TrainSettings, num_envs: int, devices: int = 1) -> TrainSettings:
