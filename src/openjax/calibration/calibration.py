@@ -4,8 +4,6 @@ The constants are parameters of effects, fitted all at once by the diagnosis' re
 nuisances and its coloured noise, beside what usually acts as well. Errors come from that noise, or from what flights disagree by
 where that is more."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass, field
 

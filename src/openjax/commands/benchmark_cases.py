@@ -47,12 +47,12 @@ def _training(settings, devices):
         return
     phases = training_step.make_phases(settings)
     yield "training", training_step.make_training_step(settings), (carry,)
-    yield f"- fly", phases.fly, (carry,)
+    yield "- fly", phases.fly, (carry,)
     flown = jax.eval_shape(phases.fly, carry)[1]
     flown = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), flown)  # takes as long as any
     for i, learn in enumerate(phases.learn):
         yield f"- learn_{i}", learn, (carry, flown)
-    yield f"- renew", phases.renew, (carry,)
+    yield "- renew", phases.renew, (carry,)
 
 
 def fitting_settings(settings: TrainSettings, num_envs: int, devices: int = 1) -> TrainSettings:

@@ -1,8 +1,6 @@
 """`openjax calibrate CASE_DIR`: fit the nominal vehicle's own constants to flights, with intervals
 and with what the flights can't tell, and write a `vehicle.toml` that trainer and diagnosis load."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections.abc import Sequence

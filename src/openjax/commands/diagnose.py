@@ -1,7 +1,5 @@
 """Diagnose the sim-to-real gap of flights: `openjax diagnose CASE_DIR [CASE_DIR ...]`."""
 
-from __future__ import annotations
-
 import os
 import sys
 import traceback

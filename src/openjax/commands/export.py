@@ -5,8 +5,6 @@ All formats hold the mean policy of a whole team, predictor included: from the o
 The result is compared with the policy itself before it is written.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from collections.abc import Callable, Sequence

@@ -1,8 +1,6 @@
 """`openjax sample_flights OUT`: make a case of three sample flights, to try calibration and
 diagnosis on."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ They answer CRTP over UDP as `cflib` expects (`udp://127.0.0.1:19850` and on); i
 time, rate loop at 500 Hz, with any effects, and a link with latency and loss to order.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

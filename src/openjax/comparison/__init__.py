@@ -4,8 +4,6 @@ simulator, so that what model and sensors share cancels.
 `figures` reads what each flight says about its vehicle; `days` takes a day as a random effect; `causes` says what each
 cause would do, `weigh` how well each explains what differs; `result` is what comes out, `report` tells it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -13,8 +13,6 @@
 A rotor that is weaker by e at the same command is given 1 / (1 - e) of it. What is cut, bent or taped on also shakes.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -6,8 +6,6 @@ shift them. The spread of days is learnt from the reference's days where it hold
 folder whose trims are far apart count as several days.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -3,8 +3,6 @@ brakes, how late torques follow the motors, how noisy the sensors are. Poor in a
 and the simulator's misfit are in them), good for comparing flights with flights, where what is shared cancels.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

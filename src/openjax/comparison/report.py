@@ -1,7 +1,5 @@
 """What changed, told: a few sentences, `changes.json`, a page with one figure."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

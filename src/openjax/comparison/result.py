@@ -1,7 +1,5 @@
 """What a comparison says, as plain data."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from openjax.comparison.figures import FlightFigures

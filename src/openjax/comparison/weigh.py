@@ -1,8 +1,6 @@
 """Causes weighed against each other and against no change, by how well each, with the spread of a day, predicts the
 difference of all figures: one Bayesian model selection."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

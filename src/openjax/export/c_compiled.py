@@ -1,7 +1,5 @@
 """A generated C program, compiled here and called from Python: to compare it with what it was made of."""
 
-from __future__ import annotations
-
 import ctypes
 import math
 import shutil

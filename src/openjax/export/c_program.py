@@ -4,8 +4,6 @@ The function is traced and what doesn't depend on its inputs is computed, as for
 workspace, which the caller provides.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Products of matrices become calls of one function; chains of operations element 
 (slices, transposes, broadcasts) become index arithmetic.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

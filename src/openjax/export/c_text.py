@@ -1,7 +1,5 @@
 """Pieces of C99 as text: operations, literals, loops and the product of matrices."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

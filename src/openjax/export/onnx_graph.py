@@ -4,8 +4,6 @@ The function is traced, what doesn't depend on its inputs is computed, and each 
 counterpart. So it follows the networks wherever they go, as long as they keep to the operations below.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

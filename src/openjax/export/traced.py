@@ -1,7 +1,5 @@
 """A traced JAX function, walked operation by operation: what the exports to other languages have in common."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

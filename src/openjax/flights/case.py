@@ -1,7 +1,5 @@
 """Loading a case: every log of a folder is read, checked and either kept or refused with the reason."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections import Counter
 from pathlib import Path

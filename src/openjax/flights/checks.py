@@ -1,8 +1,6 @@
 """Checks of flight logs: what can be mended is mended and named, what can't be used is refused with a
 reason."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -3,8 +3,6 @@
 Importers of other formats make the same table, so that everything behind it is shared.
 """
 
-from __future__ import annotations
-
 import gzip
 import hashlib
 import math

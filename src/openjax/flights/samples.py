@@ -6,8 +6,6 @@ averaged over the 10 ms that begin at t. Noise and biases are of the size of a C
 motion-capture system.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """Signals of a flight on one even clock, for the checks that compare channels with each other."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

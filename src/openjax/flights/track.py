@@ -3,8 +3,6 @@
 Replays step from row to row, so a flight is put on an even time grid once: rows between 100 Hz and 50 Hz
 are kept, faster logs are averaged down to 100 Hz, and a longer gap splits a flight into two tracks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ guard does, over links of its own; if both are gone the loop does. Whoever flies
 can go on from it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

@@ -4,8 +4,6 @@ A cascade of proportional loops; what it asks for beyond hovering is small, so i
 thrust at which it hovers. Plain numbers instead of arrays: it runs a few times per tick, where JAX would cost more.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from dataclasses import dataclass

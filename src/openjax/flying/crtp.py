@@ -4,8 +4,6 @@ Facts from Bitcraze's protocol documentation (https://www.bitcraze.io/documentat
 master/functional-areas/crtp/); a packet is one byte of header and up to 30 bytes of data.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 from enum import IntEnum, IntFlag

@@ -4,8 +4,6 @@ One log per game, with all vehicles in it: a row for each moment at which someth
 those in force at that moment, as sent: body rates and thrust.
 """
 
-from __future__ import annotations
-
 import json
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path

@@ -4,8 +4,6 @@ evader goes.
 The whole tick (the game's step, the observation, predictor and actor) is one function, compiled ahead.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import NamedTuple

@@ -4,8 +4,6 @@
 estimate. Both are pure. What they don't accept is a lost pose, whatever sent it.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from enum import StrEnum

@@ -1,7 +1,5 @@
 """The limits of a flight: what an action may ask for within them, where a vehicle may stop, turn back, part, wait."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ for all vehicles, which is answered with the time at which the last one had left
 samples at the end) is a call over a pipe.
 """
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import math

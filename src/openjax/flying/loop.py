@@ -1,7 +1,5 @@
 """The loop: a hundred times a second from poses to set-points, on time, with a record of how well that went."""
 
-from __future__ import annotations
-
 import gc
 import itertools
 import math

@@ -12,8 +12,6 @@ gyroscope on board. Each pose that was believed, and is near what the vehicle kn
 on board, by which the vehicle lands should motion capture fail, or the loop.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import importlib
 import math

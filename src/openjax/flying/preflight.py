@@ -1,7 +1,5 @@
 """Before take-off: what must be so, each failure a line that says what to do. And that nobody else commands."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import socket

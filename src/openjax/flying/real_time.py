@@ -1,7 +1,5 @@
 """Making a process fit for real time."""
 
-from __future__ import annotations
-
 import os
 
 PRIORITY = 10

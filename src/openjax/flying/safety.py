@@ -8,8 +8,6 @@ A vehicle in trouble lands; all others stop where they are, wait a moment, and l
 link is silent, its battery low, it is too fast, too tilted, or outside the arena; no action came in time; a key.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

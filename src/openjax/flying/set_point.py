@@ -1,7 +1,5 @@
 """Set-points: what a vehicle is asked for, and what of it fits into the packet that `cflib` sends."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

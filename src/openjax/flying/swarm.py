@@ -3,8 +3,6 @@
 `cflib` is GPLv3 and an extra: `pip install cflib`.
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import math

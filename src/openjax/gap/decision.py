@@ -1,7 +1,5 @@
 """The numbers that decide, read once from `decision.toml`: each with its meaning and its source."""
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import dataclass, fields
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The whole diagnosis of one case: evidence, selection, shares, words, report."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Everything that a case's flights say about causes, before any decision, channel by channel."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from openjax.errors import UserError

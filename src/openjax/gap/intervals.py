@@ -3,8 +3,6 @@
 An interval is the fit's, or what flights disagree by where that is more, and never narrower than what forms that aren't
 quite the library's and rows that show half of what happened leave: some per cent of the effect."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.stats import t as student
 

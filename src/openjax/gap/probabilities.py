@@ -4,8 +4,6 @@ Three uncertainties, each with a number of its own: whether an effect acts (how 
 what it takes is more than real vehicles without a fault have (`beyond_form_error`), and which part is the largest (the shares'
 bootstrap). What remains goes to the sets that were chosen otherwise, to nothing and to the unknown."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from openjax.gap.decision import DECISION

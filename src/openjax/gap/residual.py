@@ -6,8 +6,6 @@ Gaussian processes in random Fourier features (Rahimi, Recht 2007) of the state 
 deviations of cases of several worlds in which nothing unknown acts. The p-value of the largest is conformal over those (Vovk
 et al. 2005; `residual.json`)."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from functools import lru_cache

@@ -7,8 +7,6 @@ the difference is within two standard errors, or too small to matter (the one-st
 with a region of practical equivalence). How often each set is chosen when blocks of flight are weighed anew by a Bayesian
 bootstrap is its probability, so that words and probabilities can't disagree."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from functools import cached_property
 

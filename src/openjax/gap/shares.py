@@ -7,8 +7,6 @@ is left with all accepted effects once the residual check's model has taken what
 A share is what the gap's square grows by when one part goes and all others stay (its usefulness, Darlington 1968), in proportion
 to that of all parts, so that shares add up to one with what is unexplained."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Where the gap lies: channel by regime, in units of the noise floor, before and after the named effects."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -5,8 +5,6 @@ drone is traced, and its operations are done again on arrays of objects whose ev
 what only moves components (slices, stacks, transposes) costs nothing, and the kernel needs no second set of formulas.
 """
 
-from __future__ import annotations
-
 import functools
 import operator
 from collections.abc import Iterable, Sequence

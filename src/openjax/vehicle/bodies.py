@@ -5,8 +5,6 @@ gravity, torque (N, 3) N m in the body frame, pillars position (P, 2) m and acti
 those of all drones or, with a leading axis N, of each.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 

@@ -3,8 +3,6 @@
 Effects like those of `openjax.vehicle.effects`, for flying with only: they're random, so no diagnosis looks for them.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 

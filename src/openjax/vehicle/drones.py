@@ -1,7 +1,5 @@
 """The step of N drones in one world: controller, motors, effects, body."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Families of vehicles: ranges from which the parameters of effects are drawn, one vehicle per pursuer and episode."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """The vehicle's parameters, read from its MJCF: the one source of these numbers."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The body-rate PID and the mixer of the Crazyflie firmware (CTBR: collective thrust and body rates)."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 
 from openjax.vehicle.parameters import Vehicle

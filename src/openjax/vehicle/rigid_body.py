@@ -1,7 +1,5 @@
 """Free rigid-body flight written out: the same step as MuJoCo's Euler integrator (semi-implicit)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import jax

@@ -5,8 +5,6 @@ tens of thousands of drones most of the time is spent on starting them. Here eve
 once. One thread holds all drones of a world, which therefore know of each other without a detour through memory.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Rotors: from motor command to speed, thrust and wrench."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 
 from openjax.vehicle.parameters import Vehicle

@@ -10,8 +10,6 @@ through a gap narrower than itself.
 The same contacts are solved by MuJoCo MJX (`place_solids`, `mjx_body`) and, written out, by `contact_acceleration`.
 """
 
-from __future__ import annotations
-
 import flax.struct
 import jax
 import jax.numpy as jnp

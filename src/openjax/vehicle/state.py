@@ -1,7 +1,5 @@
 """The true state of one drone: all that a simulation carries from step to step."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import flax.struct

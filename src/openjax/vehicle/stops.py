@@ -3,8 +3,6 @@
 For learning, where a touch ends what the episode is worth anyhow; `mjx` stops a drone at the surface itself.
 """
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 
 from openjax.vehicle.arena import Arena

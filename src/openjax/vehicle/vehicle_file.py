@@ -4,8 +4,6 @@
 ignored silently; `[log]` is free. What the file leaves out is the nominal vehicle.
 """
 
-from __future__ import annotations
-
 import math
 import tomllib
 from collections.abc import Mapping

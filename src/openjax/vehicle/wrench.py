@@ -1,7 +1,5 @@
 """The wrench of the four rotors on the body."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 
 from openjax.vehicle.parameters import Vehicle

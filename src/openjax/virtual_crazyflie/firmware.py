@@ -4,8 +4,6 @@ One vehicle, without sockets or clock: packets in, packets out. Set-points of bo
 flown; position set-points, trajectories and memories are not there.
 """
 
-from __future__ import annotations
-
 import errno
 import struct
 

@@ -1,7 +1,5 @@
 """The link of a virtual Crazyflie: UDP, one packet a datagram, with latency, jitter and loss to order."""
 
-from __future__ import annotations
-
 import contextlib
 import heapq
 import random

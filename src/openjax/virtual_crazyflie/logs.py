@@ -1,7 +1,5 @@
 """The log blocks of a virtual Crazyflie's firmware: set up by packets, sent when they are due."""
 
-from __future__ import annotations
-
 import errno
 import struct
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Virtual Crazyflies in real time: links, firmware and vehicles of one process."""
 
-from __future__ import annotations
-
 import select
 import time
 from collections.abc import Callable

@@ -4,8 +4,6 @@ What `Swarm` is to the loop, for flights that must not wait for a clock. What th
 through two functions, in which an experiment can damage it at its source.
 """
 
-from __future__ import annotations
-
 import math
 import random
 from collections.abc import Callable, Sequence

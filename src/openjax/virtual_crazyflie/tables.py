@@ -1,7 +1,5 @@
 """What a virtual Crazyflie's firmware has names for: log variables and parameters, with their types and values."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass

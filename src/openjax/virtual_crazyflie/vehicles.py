@@ -1,7 +1,5 @@
 """The vehicles inside virtual Crazyflies: openjax's own, with any of its effects, advanced between packets."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import NamedTuple
 

@@ -4,8 +4,6 @@ A case folder may hold CSV logs, Bitcraze micro-SD logs and ROS 2 bags side by s
 folder says which of their columns is what, where the names aren't the usual ones.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from openjax.flights.importers.columns import MAPPING_FILE, ColumnMapping, load_mapping

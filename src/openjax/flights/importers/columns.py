@@ -15,8 +15,6 @@ Besides the columns of the log format, `roll`, `pitch`, `yaw` (z-y-x, body to wo
 quaternion.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from pathlib import Path

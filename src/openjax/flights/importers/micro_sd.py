@@ -6,8 +6,6 @@ with T a struct letter. Then records: uint16 event id, time stamp (version 1: ui
 us), the variables packed. The last four bytes are the CRC-32 of all before.
 """
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 from zlib import crc32

@@ -5,8 +5,6 @@ Without a column mapping, topics are recognised by their message types, and a to
 times.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

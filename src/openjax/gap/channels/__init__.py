@@ -1,7 +1,5 @@
 """What a log says by ways of its own: pose, radio, rate loop and motion, each a channel with the same few methods."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ as logged is biased: towards weak motors where they were logged as single sample
 follows. What body-rate commands caused is free of all that. It serves as an instrument (two-stage least squares): the
 first stage here tells the two parts apart; the second lets the feedback part do what it likes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The motion: motors to body rates, velocity and specific force. What each physics effect alone explains of it."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """The pose: the attitude against the integrated gyroscope. No dynamics are needed to see a late pose."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 

@@ -2,8 +2,6 @@
 
 The mean of the motor commands is the commanded thrust, so its delay and its lost packets show row by row."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ What the motors differ by is the rate controller's output. In closed loop it ans
 the generalised method of moments (Hansen 1982), with what the nominal loop would have done under the same commands as
 instruments: neither colour nor clocks need a model. An observer runs the same loop for the motor command of every tick."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 from functools import cached_property

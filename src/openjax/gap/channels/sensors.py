@@ -4,8 +4,6 @@ Attitude's rate against the gyroscope gives the gyroscope's gain; the path's acc
 turned into the world, gives the tilt of the world in which motion capture reports. A sensor that is off by more
 than sensors usually are is a finding about the sensors, is corrected before the physics is read, and is no cause."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 

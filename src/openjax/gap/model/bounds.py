@@ -1,7 +1,5 @@
 """Least squares with bounds: a nuisance may take twice its usual size, and one that wants more is a finding."""
 
-from __future__ import annotations
-
 import numpy as np
 
 BOUND = 2.0  # usual sizes that a nuisance may take

@@ -1,7 +1,5 @@
 """What a model of a table's columns is worth: fitted to all folds but one, judged on that one."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

@@ -5,8 +5,6 @@ Every set is fitted with the same nuisances and weighed by its marginal likeliho
 approximation), so that parameters cost what they are worth. Singles and the best sets are fitted in full;
 the other pairs are weighed by adding the linearised singles."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -3,8 +3,6 @@ plausible.
 
 Priors are weak: their spread is of the order of the effect's usual range."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

@@ -1,7 +1,5 @@
 """Linear models of a log that need no physics, with their own coloured noise."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,8 +1,6 @@
 """Nuisances of the replay: small errors that every vehicle and every log has, as columns of the channels in units of
 their standard deviations."""
 
-from __future__ import annotations
-
 import pathlib
 import tomllib
 

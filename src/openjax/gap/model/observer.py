@@ -6,8 +6,6 @@ nominal rate controller on body rates that the logged motors drive and the gyros
 motor command of every tick, which the physics needs, and the one that the controller would have sent, which shows whether
 the controller is the assumed one."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import jax

@@ -5,8 +5,6 @@ Nothing is rolled out: at every row the vehicle is where the log says, only the 
 from the motor commands through the motors' lag. So an error stays where it arises, and one call is a few
 milliseconds."""
 
-from __future__ import annotations
-
 from functools import lru_cache, partial
 
 import flax.struct

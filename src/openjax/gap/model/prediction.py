@@ -2,8 +2,6 @@
 
 Channels: body rates (3), velocity (3, world) - both integrated from the first row - and specific force (3, body)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

@@ -8,8 +8,6 @@ adding, dropping and swapping effects on stretches left out costs nothing but li
 Nuisances are bounded: numbers of the vehicle are shared by all flights of the case, biases and clocks belong to a track,
 and each stays within twice its usual size. One that ends there is a finding."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

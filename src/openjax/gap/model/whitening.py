@@ -7,8 +7,6 @@ taken out by a short autoregression. Everything acts on residuals and on their d
 causally: in closed loop the motors answer disturbances, so only a residual given its own past says
 something about causes."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """The report of one case: what was found, as plain data, as text and as files."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Figures of a report, as SVG that takes its colours from the page: light and dark."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The report as one HTML file, nothing to fetch from elsewhere."""
 
-from __future__ import annotations
-
 import datetime
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The evader of one world: which it is, its numbers and its memory, drawn at the start; and its velocity in each step."""
 
-from __future__ import annotations
-
 import functools
 from typing import Any
 

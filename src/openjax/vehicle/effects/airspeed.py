@@ -1,7 +1,5 @@
 """Where the hubs are and how they move: shared by the effects that act at each rotor."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 

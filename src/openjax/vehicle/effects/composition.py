@@ -1,7 +1,5 @@
 """Several effects at once. They act in the order of their names, whatever order they are given in."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import reduce
 from typing import Any

@@ -1,7 +1,5 @@
 """A delay by any fraction of a step, in a buffer of fixed length, differentiable in the delay."""
 
-from __future__ import annotations
-
 import math
 
 import jax

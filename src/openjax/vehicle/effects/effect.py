@@ -1,7 +1,5 @@
 """What an effect is: named parameters, and pure functions that hook into the step of one drone."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any

@@ -10,8 +10,6 @@ A parameter that is left out has no effect. `unit` and `interval90` are optional
 parameter's own is an error, so that nothing is converted silently.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 """All effects by name. Each module of this package that defines `EFFECT` is one: adding an effect takes one
 file."""
 
-from __future__ import annotations
-
 import importlib
 import pkgutil
 
