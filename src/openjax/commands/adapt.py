@@ -15,7 +15,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import tyro
 
@@ -26,6 +26,9 @@ from openjax.learning.settings import AdaptSettings
 from openjax.ranges import Interval, Seed
 from openjax.show.steps import Steps
 from openjax.store import DEFAULT_POLICY
+
+if TYPE_CHECKING:
+    import jax
 
 PROGRAM = "openjax adapt"
 STEPS = {"diagnosing and compiling": 60.0, "fine-tuning": 90.0, "measuring": 10.0}
@@ -80,67 +83,119 @@ def main(arguments: Sequence[str]) -> int:
 def adapt(command: AdaptCommand, tell: Callable[[str], None] = lambda step: None) -> dict:
     """Do all of it and write it down; `tell` hears the steps. Raises UserError for flights that can't be diagnosed or an
     unusable policy."""
-    started = time.monotonic()
+    started, seconds, steps = time.monotonic(), {}, iter(STEPS)
     _check_flights(command.flights)
     diagnosis = _Diagnosis(command)
-    begin = iter(STEPS)
-    tell(next(begin))
+    tell(next(steps))
     try:
-        import jax
-
-        from openjax.commands.machine import describe_machine
-        from openjax.commands.validation import uniform_tasks
-        from openjax.learning.adaptation import bounds_of, fine_tune, make_adaptation, starting_parameters
-        from openjax.store.policies import load_policy
-        from openjax.store.policy_files import save_policy_file
-        from openjax.store.settings_files import write_json
-        from openjax.vehicle.effects.effects_file import load_effects, load_intervals
-        from openjax.vehicle.family import adapted_family
-
-        loaded = load_policy(command.policy)
-        adaptation = make_adaptation(loaded.settings, command.training)
-        game, key = adaptation.game, jax.random.key(command.seed)
-        tasks = uniform_tasks(game, 2 * command.episodes, game.max_pillars)
-        chosen_by = jax.tree.map(lambda leaf: leaf[: command.episodes], tasks)
-        measured_on = jax.tree.map(lambda leaf: leaf[command.episodes :], tasks)
-        parameters = starting_parameters(loaded.parameters, loaded.settings)
-        nominal = bounds_of({}, {}, rest=0.0)
-        ready = compile_programs(adaptation, parameters, chosen_by, nominal)
-
-        effects = diagnosis()
-        names, values = load_effects(effects)
-        intervals = load_intervals(effects)
-        seconds = {"diagnosis": time.monotonic() - started}
-        bounds = bounds_of(values, intervals, airframe=game.airframe)
-        ready()
-        tell(next(begin))
-        seconds["compiled"] = time.monotonic() - started
-        score = scores_on(adaptation, parameters, chosen_by, jax.random.fold_in(key, 1), bounds)
-        tuned = fine_tune(adaptation, parameters, bounds, command.training, key, score)
-        tell(next(begin))
-        seconds["fine-tuned"] = time.monotonic() - started
-        flown = {
-            which: episodes(adaptation.evaluate(p, measured_on, jax.random.fold_in(key, 2), vehicles))
-            for which, p, vehicles in (
-                ("nominal", parameters, nominal),
-                ("before", parameters, bounds),
-                ("after", tuned.parameters, bounds),
-            )
-        }
-        seconds["measured"] = time.monotonic() - started
+        bench = _Bench(command)  # compiles meanwhile
+        found = _found(diagnosis(), bench.game.airframe)
+        seconds["diagnosis"] = time.monotonic() - started
     finally:
         diagnosis.stop()
-    family = adapted_family(values, intervals, airframe=game.airframe)
-    results = {
+    bench.ready()
+    seconds["compiled"] = time.monotonic() - started
+    tell(next(steps))
+    tuned = bench.fine_tune(found)
+    seconds["fine-tuned"] = time.monotonic() - started
+    tell(next(steps))
+    flown = bench.measure(found, tuned.parameters)
+    seconds["measured"] = time.monotonic() - started
+    results = {**_results(command, found, flown, tuned), "seconds": seconds}
+    _write(command, bench, found, tuned, results)
+    return results
+
+
+class _Found(NamedTuple):
+    """What flights said of a vehicle."""
+
+    values: dict[str, dict[str, float]]
+    family: tuple  # of `VehicleRange`, what vehicles are drawn from
+    bounds: "jax.Array"  # (R, 4) of it
+
+
+def _found(effects: Path, airframe: str) -> _Found:
+    """What an effects file says."""
+    from openjax.learning.adaptation import bounds_of
+    from openjax.vehicle.effects.effects_file import load_effects, load_intervals
+    from openjax.vehicle.family import adapted_family
+
+    (_, values), intervals = load_effects(effects), load_intervals(effects)
+    family = adapted_family(values, intervals, airframe=airframe)
+    return _Found(values, family, bounds_of(values, intervals, airframe=airframe))
+
+
+class _Bench:
+    """A policy, and the compiled programs that fine-tune and measure it."""
+
+    def __init__(self, command: AdaptCommand):
+        import jax
+
+        from openjax.commands.validation import uniform_tasks
+        from openjax.learning.adaptation import bounds_of, make_adaptation, starting_parameters
+        from openjax.store.policies import load_policy
+
+        self.loaded, self._training = load_policy(command.policy), command.training
+        self.adaptation = make_adaptation(self.loaded.settings, command.training)
+        self.game, self._key = self.adaptation.game, jax.random.key(command.seed)
+        tasks = uniform_tasks(self.game, 2 * command.episodes, self.game.max_pillars)
+        self._chosen_by = jax.tree.map(lambda leaf: leaf[: command.episodes], tasks)
+        self._measured_on = jax.tree.map(lambda leaf: leaf[command.episodes :], tasks)
+        self._parameters = starting_parameters(self.loaded.parameters, self.loaded.settings)
+        self._nominal = bounds_of({}, {}, rest=0.0)
+        self.ready = compile_programs(self.adaptation, self._parameters, self._chosen_by, self._nominal)
+
+    def _fly(self, parameters, tasks, number, bounds) -> dict:
+        """Figures (B,) of a policy's episodes; the same `number` draws the same ones."""
+        import jax
+
+        key = jax.random.fold_in(self._key, number)
+        return episodes(self.adaptation.evaluate(parameters, tasks, key, bounds))
+
+    def fine_tune(self, found: _Found):
+        """The best of the policy's updates (see `openjax.learning.adaptation.fine_tune`), by `selection_score`.
+
+        Speeds over the limit count as far as they are more than in the same episode of the policy as it was with the nominal
+        vehicle: to fly as fast with the diagnosed one is what is wanted, and a vehicle that made a policy slower did nothing
+        good by it.
+        """
+        import numpy as np
+
+        from openjax.commands.validation import selection_score
+        from openjax.learning.adaptation import fine_tune
+
+        usual = self._fly(self._parameters, self._chosen_by, 1, self._nominal)
+
+        def scores(policy):
+            flown = self._fly(policy, self._chosen_by, 1, found.bounds)
+            flown["over_speed_rate"] = np.maximum(flown["over_speed_rate"], usual["over_speed_rate"])
+            return selection_score(flown, self.game.episode_length)
+
+        return fine_tune(self.adaptation, self._parameters, found.bounds, self._training, self._key, scores)
+
+    def measure(self, found: _Found, tuned) -> dict[str, dict]:
+        """Figures (B,) of `WHICH` on tasks that no checkpoint was chosen by."""
+        cases = (self._parameters, self._nominal), (self._parameters, found.bounds), (tuned, found.bounds)
+        return {
+            which: self._fly(parameters, self._measured_on, 2, bounds)
+            for which, (parameters, bounds) in zip(WHICH, cases, strict=True)
+        }
+
+
+def _results(command, found, flown, tuned) -> dict:
+    """What adapt.json holds, but for the time that it took."""
+    from openjax.commands.machine import describe_machine
+
+    return {
         "command": f"{PROGRAM} {command.flights} --policy {command.policy} --out {command.out}",
         "machine": describe_machine(),
         "policy": command.policy,
-        "effects": list(names),
+        "effects": sorted(found.values),
         "parameters": [
-            {"parameter": name, "value": values.get(effect, {}).get(key), "low": low, "high": high}
-            for name, low, high, _, _ in family
+            {"parameter": name, "value": found.values[effect].get(key), "low": low, "high": high}
+            for name, low, high, *_ in found.family
             for effect, _, key in [name.partition(".")]
-            if effect in values
+            if effect in found.values
         ],
         "episodes": command.episodes,
         **{which: {name: float(own[name].mean()) for name in FIGURES} for which, own in flown.items()},
@@ -150,15 +205,21 @@ def adapt(command: AdaptCommand, tell: Callable[[str], None] = lambda step: None
         else "the policy as it was",
         "history": tuned.history,
         "looks": tuned.looks,
-        "seconds": seconds,
     }
-    own = dataclasses.replace(loaded.settings, environment=dataclasses.replace(game, vehicles=family))
+
+
+def _write(command, bench, found, tuned, results):
+    """The policy, the figures and the page."""
+    from openjax.store.policy_files import save_policy_file
+    from openjax.store.settings_files import write_json
+
+    game = dataclasses.replace(bench.game, vehicles=found.family)
+    settings = dataclasses.replace(bench.loaded.settings, environment=game)
     command.out.mkdir(parents=True, exist_ok=True)
-    notes = {"adapted_from": command.policy, "effects": values, "machine": results["machine"]}
-    save_policy_file(command.out / "policy.npz", tuned.parameters, own, notes, storage="float32")
+    notes = {"adapted_from": command.policy, "effects": found.values, "machine": results["machine"]}
+    save_policy_file(command.out / "policy.npz", tuned.parameters, settings, notes, storage="float32")
     write_json(command.out / "adapt.json", results)
     write_text(command.out / "adapt.html", page(results))
-    return results
 
 
 def episodes(evaluation) -> dict:
@@ -169,29 +230,6 @@ def episodes(evaluation) -> dict:
     names = {"capture_rate": of.captured, "crash_rate": of.crashed}
     names |= {name: getattr(of, name) for name in ("collision_rate", "over_speed_rate", "capture_step")}
     return {name: np.asarray(value, float) for name, value in names.items()}
-
-
-def scores_on(adaptation, parameters, tasks, key, bounds, hear=lambda figures: None):
-    """Scores (B,) of a policy's episodes on tasks (B, ...), policy -> scores, by which checkpoints are chosen, too.
-
-    Speeds over the limit count as far as they are more than in the same episode of `parameters` with the nominal vehicle:
-    to fly as fast with the diagnosed one is what is wanted, and a vehicle that made a policy slower did nothing good by it.
-    `hear` is told the mean of each figure, each time.
-    """
-    import numpy as np
-
-    from openjax.commands.validation import selection_score
-    from openjax.learning.adaptation import bounds_of
-
-    usual = episodes(adaptation.evaluate(parameters, tasks, key, bounds_of({}, {}, rest=0.0)))
-
-    def scores(policy):
-        found = episodes(adaptation.evaluate(policy, tasks, key, bounds))
-        hear({name: float(values.mean()) for name, values in found.items()})
-        found["over_speed_rate"] = np.maximum(found["over_speed_rate"], usual["over_speed_rate"])
-        return selection_score(found, adaptation.game.episode_length)
-
-    return scores
 
 
 def won_back(flown: dict) -> dict[str, float | None]:
