@@ -37,11 +37,12 @@ from experiments.table import RESULTS, Page, Table, facts, write_page
 from openjax.files import read_json
 from openjax.flying.board import SILENCE
 from openjax.flying.controller import Pose
+from openjax.flying.estimation import see
 from openjax.flying.game import game_functions, pose_array
 from openjax.flying.guard import take_over
-from openjax.flying.limits import SafetySettings
-from openjax.flying.safety import Drone, Event, Mode, Request, decide, initial_state, see
+from openjax.flying.safety import decide
 from openjax.flying.set_point import from_action
+from openjax.flying.state import Drone, Event, Mode, Request, initial_state
 from openjax.pursuit import find_scenario, scenario_task
 from openjax.pursuit.environment import THRUST_LIMIT
 from openjax.vehicle import load_vehicle
@@ -106,7 +107,6 @@ class Worlds:
         task_of, self.game, self.airframe, self._first, self._tick = compiled_game(policy_name)
         scenario, self._task = task_of(layout)
         self.faults, self.n = faults, len(scenario.pursuers)
-        self.safety = SafetySettings()
         starts = np.array(scenario.pursuers)
         self._damage = [PoseDamage(fault, self.n) for fault in faults]
         vehicles = VirtualVehicles(load_vehicle(), np.tile(starts, (len(faults), 1)), flying=True)
@@ -119,7 +119,7 @@ class Worlds:
             lambda *a: self._received("camera", *a),
         )
         pillars = [(x, y, self.game.pillar_radius) for x, y in scenario.pillars]
-        state = initial_state([tuple(s) for s in starts.tolist()], pillars, self.airframe, self.safety)
+        state = initial_state([tuple(s) for s in starts.tolist()], pillars, self.airframe)
         state = replace(state, drones=(Drone(Mode.PURSUIT),) * self.n)
         self.states = [state] * len(faults)
         self._landing = [False] * len(faults)
@@ -152,7 +152,7 @@ class Worlds:
             if self._landing[w]:  # who takes over knows no motion capture
                 seen = samples[first : first + self.n]
                 samples[first : first + self.n] = [replace(s, captured=None) for s in seen]
-            self.states[w] = see(self.safety, self.states[w], now, samples[first : first + self.n])
+            self.states[w] = see(self.states[w], now, samples[first : first + self.n])
             for i, (drone, old) in enumerate(zip(self.states[w].drones, before, strict=True)):
                 if drone.captured.pose is not old.captured.pose and drone.told:
                     self.swarm.believed(first + i, drone.captured.pose)
@@ -208,9 +208,9 @@ class Worlds:
         if on and fault.kind in PILOTS and not self._landing[w]:
             if now - fault.time < SILENCE:
                 return [None] * self.n
-            self.states[w], self._landing[w] = take_over(self.safety, self.states[w], now), True
+            self.states[w], self._landing[w] = take_over(self.states[w], now), True
         event = Event(now, samples, None if self._landing[w] else actions, request, reason)
-        self.states[w], wanted = decide(self.safety, self.states[w], event)
+        self.states[w], wanted = decide(self.states[w], event)
         return list(wanted)
 
     def records(self, seeds, layout) -> list[dict]:

@@ -22,13 +22,13 @@ from openjax.errors import UserError
 from openjax.flying.board import Board, Role
 from openjax.flying.controller import nominal_airframe
 from openjax.flying.crtp import Supervisor
+from openjax.flying.estimation import see
 from openjax.flying.flight_files import write_case
 from openjax.flying.guard import RawLinks, fly_down
 from openjax.flying.limits import SafetySettings
 from openjax.flying.links import Links
-from openjax.flying.loop import Flight, Plan
+from openjax.flying.loop import Flight, Plan, flight_state
 from openjax.flying.motion_capture import MotionCaptured
-from openjax.flying.safety import Mode, initial_state, see
 from openjax.flying.set_point import (
     ANGLES,
     LEAST_THRUST,
@@ -38,6 +38,7 @@ from openjax.flying.set_point import (
     as_sent,
     manual_arguments,
 )
+from openjax.flying.state import Mode, initial_state
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.vehicle_file import load_vehicle_file
 from openjax.virtual_crazyflie.firmware import VirtualFirmware
@@ -137,6 +138,11 @@ class Hovering:
         )  # fmt: skip
 
 
+def flight_of(links, seconds):
+    game = Hovering(links)
+    return Flight(links, game, flight_state(game, 3, PATIENT), Plan(episode_seconds=seconds))
+
+
 def fly_hovering(uris, folder, body_logs, seconds):
     """A short flight: the flight, what was recorded of the first vehicle, and the case as the diagnosis reads it."""
     from openjax.flights.case import load_case
@@ -144,7 +150,7 @@ def fly_hovering(uris, folder, body_logs, seconds):
     with connected(uris, body_logs) as links:
         links.arm()
         links.record()
-        flight = Flight(links, Hovering(links), PATIENT, Plan(episode_seconds=seconds))
+        flight = flight_of(links, seconds)
         flight.run()
         samples = links.samples()
     write_case(folder, samples, flight.record, load_vehicle_file(), {})
@@ -204,7 +210,7 @@ def test_the_log_tells_the_links_latency_and_loss(tmp_path, latency, loss):
 def test_another_process_lands_and_disarms_what_hangs_in_the_air(uris):
     with connected(uris, body_logs=0) as links:
         links.arm()
-        flight = Flight(links, Hovering(links), PATIENT, Plan(episode_seconds=60.0))
+        flight = flight_of(links, 60.0)
         deadline = time.monotonic() + 120.0
         while not flight.state.all_in(Mode.PURSUIT):
             assert time.monotonic() < deadline, [(d.mode, d.reason) for d in flight.state.drones]
@@ -217,7 +223,7 @@ def test_another_process_lands_and_disarms_what_hangs_in_the_air(uris):
         own = RawLinks(uris, links.pose_blocks())
         own.open()
         try:
-            last = fly_down(board, Role.GUARD, own, PATIENT, flight.state)
+            last = fly_down(board, Role.GUARD, own, flight.state)
             samples = own.observe()
         finally:
             own.close()
@@ -249,11 +255,11 @@ def test_motion_capture_is_seen_here_and_on_board():
     firmware = virtual.firmware[0]
     try:
         with connected(virtual.uris, 0, MotionCaptured) as captured:
-            state = initial_state([(0.4, 0.0, 0.5)])
+            state = initial_state([(0.4, 0.0, 0.5)], settings=PATIENT)
             for k in range(40):
                 captured.update(0, (0.3 + 0.005 * k, 0.0, 0.5), (1.0, 0.0, 0.0, 0.0), at=100.0 + 0.01 * k)
                 (sample,) = captured.observe()
-                state = see(PATIENT, state, 100.0 + 0.01 * k, (sample,))
+                state = see(state, 100.0 + 0.01 * k, (sample,))
                 captured.believed(0, state.drones[0].captured.pose, told=True)
             assert captured.arrivals() == (100.0 + 0.01 * 39,)
             np.testing.assert_allclose(state.drones[0].estimate.velocity, (0.5, 0.0, 0.0), atol=1e-3)

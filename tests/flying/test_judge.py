@@ -13,7 +13,6 @@ from openjax.flying.judge import (
     Verdict,
     agree,
     at_one_time,
-    follow,
     follows,
     judge,
     pose_limits,
@@ -88,17 +87,17 @@ def test_poses_out_of_order_late_or_from_the_future_change_nothing():
     track = Track(HERE._replace(time=1.0))
     for time in (0.99, 1.0, 0.5, 1.2, math.nan, math.inf):
         assert (
-            follow(track, HERE._replace(time=time, position=(0.401, 0.0, 0.5)), 1.01, LIMITS, True, None)
+            track.after(HERE._replace(time=time, position=(0.401, 0.0, 0.5)), 1.01, LIMITS, True, None)
             is track
         )
-    assert follow(Track(), None, 1.0, LIMITS, True, None) == Track()
+    assert Track().after(None, 1.0, LIMITS, True, None) == Track()
 
 
 def test_a_refused_pose_leaves_the_last_good_one():
     wrong = HERE._replace(time=0.01, position=(2.0, 0.0, 0.5))
-    assert follow(Track(HERE), wrong, 0.01, LIMITS, True, None) == Track(HERE, Verdict.JUMPED)
+    assert Track(HERE).after(wrong, 0.01, LIMITS, True, None) == Track(HERE, Verdict.JUMPED)
     assert (
-        follow(Track(HERE), wrong, 0.01, LIMITS, False, None).pose is wrong
+        Track(HERE).after(wrong, 0.01, LIMITS, False, None).pose is wrong
     )  # carried to another place by hand
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from openjax.flying.board import DEAF
 from openjax.flying.keys import Operator
-from openjax.flying.safety import Request
+from openjax.flying.state import Request
 
 
 @pytest.fixture

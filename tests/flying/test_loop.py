@@ -10,8 +10,8 @@ import pytest
 from openjax.flying.controller import Pose, nominal_airframe
 from openjax.flying.game import Play
 from openjax.flying.limits import SafetySettings
-from openjax.flying.loop import Flight, Plan
-from openjax.flying.safety import Mode, PoseSample
+from openjax.flying.loop import Flight, Plan, flight_state
+from openjax.flying.state import Mode, PoseSample
 
 STARTS = ((0.5, 0.3, 0.5), (0.5, 0.0, 0.5), (0.5, -0.3, 0.5))
 
@@ -65,7 +65,7 @@ class Hovering:
 def flight():
     """In the middle of a game, and a function that goes on for some ticks."""
     links = Hovering()
-    flight = Flight(links, links, SafetySettings(), Plan())
+    flight = Flight(links, links, flight_state(links, 3, SafetySettings()), Plan())
 
     def go_on(ticks):
         for _ in range(ticks):

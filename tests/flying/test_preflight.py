@@ -10,9 +10,8 @@ import pytest
 from openjax.errors import UserError
 from openjax.flying.controller import Pose
 from openjax.flying.crtp import Supervisor
-from openjax.flying.limits import SafetySettings
 from openjax.flying.preflight import faults, sole_command
-from openjax.flying.safety import PoseSample, initial_state
+from openjax.flying.state import PoseSample, initial_state
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 STARTS = ((0.4, 0.2, 0.5), (0.4, -0.2, 0.5))
@@ -29,7 +28,7 @@ def sample(x=0.4, y=0.2, z=0.0, quaternion=LEVEL, captured=None, voltage=4.1, bi
 
 def found(first, rates=(100.0, 100.0), guarded=True):
     second = sample(0.4, -0.2)
-    return faults(SafetySettings(), initial_state(STARTS), (first, second), rates, guarded)
+    return faults(initial_state(STARTS), (first, second), rates, guarded)
 
 
 def test_all_well_is_no_line():
@@ -95,5 +94,5 @@ def test_a_second_fly_is_refused_until_the_first_is_gone_however_it_went():
 
 def test_a_scaled_frame_is_told_by_the_vehicles_own():
     scaled = replace(sample(0.6, 0.3), captured=Pose(0.0, (0.72, 0.36, 0.0), (0.0,) * 3, LEVEL))
-    lines = faults(SafetySettings(), initial_state(((0.66, 0.33, 0.5),)), (scaled,), (100.0,), True)
+    lines = faults(initial_state(((0.66, 0.33, 0.5),)), (scaled,), (100.0,), True)
     assert len(lines) == 1 and "unit" in lines[0]

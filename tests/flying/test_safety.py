@@ -16,8 +16,9 @@ from openjax.flying.limits import (
     resting_places,
     stopping_point,
 )
-from openjax.flying.safety import Drone, Event, Mode, PoseSample, Request, initial_state, step
+from openjax.flying.safety import step
 from openjax.flying.set_point import OFF, RATES, SetPoint, from_action
+from openjax.flying.state import Drone, Event, Mode, PoseSample, Request, initial_state
 
 LIMITS = SafetySettings()
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -45,7 +46,7 @@ def event(time=0.01, request=Request.NONE, actions=(POLICY,) * 3, **changed):
 
 
 def test_the_policy_flies_while_all_is_well():
-    state, out = step(LIMITS, pursuing(), event())
+    state, out = step(pursuing(), event())
     assert out == (POLICY,) * 3
     assert state.all_in(Mode.PURSUIT)
 
@@ -54,14 +55,14 @@ def test_a_lost_pose_lands_that_one_by_reckoning_and_stops_the_others():
     state = pursuing((0.4, 0.0, 0.0))
     for k in range(1, 12):
         old = PoseSample(Pose(0.0, PLACES[1], (0.4, 0.0, 0.0), LEVEL), 0.01 * k, 4.0)
-        state, out = step(LIMITS, state, event(0.01 * k, _1=old))
+        state, out = step(state, event(0.01 * k, _1=old))
     assert state.modes == (Mode.HOLD, Mode.LAND, Mode.HOLD)
     assert out[1].mode != RATES and out[1].thrust < nominal_airframe().hover_thrust
     assert out[1].pitch < 0.0  # it brakes
     k0 = state.time
     for k in range(1, 130):
         old = PoseSample(Pose(0.0, PLACES[1], (0.4, 0.0, 0.0), LEVEL), k0 + 0.01 * k, 4.0)
-        state, _ = step(LIMITS, state, event(k0 + 0.01 * k, _1=old))
+        state, _ = step(state, event(k0 + 0.01 * k, _1=old))
     assert state.modes[0] is Mode.LAND and state.modes[2] is Mode.LAND
 
 
@@ -70,18 +71,16 @@ def test_a_pose_that_jumps_is_not_followed(ticks, mode):
     """Motion capture takes the vehicle for another: for a moment nothing happens, for longer it lands where it is."""
     state, away = pursuing(), (0.1, 0.0, 0.5)
     for k in range(1, 3):
-        state, _ = step(LIMITS, state, event(0.01 * k))
+        state, _ = step(state, event(0.01 * k))
     for k in range(3, 3 + ticks):
         time = 0.01 * k
-        state, _ = step(
-            LIMITS, state, event(time, _1=PoseSample(Pose(time, away, (0.0,) * 3, LEVEL), time, 4.0))
-        )
+        state, _ = step(state, event(time, _1=PoseSample(Pose(time, away, (0.0,) * 3, LEVEL), time, 4.0)))
     assert math.dist(state.drones[1].estimate.position[:2], PLACES[1][:2]) < 0.02
     assert state.modes[1] is mode
     assert state.drones[1].reason == ("pose jumped" if mode is Mode.LAND else "")
     time = state.time + 0.01
     back = PoseSample(still(time, PLACES[1]), time, 4.0)
-    state, _ = step(LIMITS, state, event(time, _1=back))
+    state, _ = step(state, event(time, _1=back))
     assert state.modes[1] is mode
 
 
@@ -94,7 +93,7 @@ def test_wrong_frames_of_motion_capture_move_nothing(frames, off):
         time, wrong = 0.01 * k, 10 <= k < 10 + frames
         seen = still(time, (place[0] + off * wrong, *place[1:]))
         sample = PoseSample(still(time, place), time, 4.0, captured=seen)
-        state, _ = step(LIMITS, state, event(time, _1=sample))
+        state, _ = step(state, event(time, _1=sample))
         assert math.dist(state.drones[1].estimate.position, place) < 0.01
         assert math.hypot(*state.drones[1].estimate.velocity) < 0.05
     assert state.all_in(Mode.PURSUIT)
@@ -106,7 +105,7 @@ def test_the_estimator_on_board_is_told_what_is_near_it_and_no_more():
         time, place = 0.01 * k, PLACES[1]
         seen = still(time, (place[0] + 0.0012 * k, *place[1:]))
         sample = PoseSample(still(time, place), time, 4.0, captured=seen)
-        state, _ = step(LIMITS, state, event(time, _1=sample))
+        state, _ = step(state, event(time, _1=sample))
         told.append(state.drones[1].told)
     assert state.all_in(Mode.PURSUIT) and all(told[:15]) and not any(told[-10:])
 
@@ -126,7 +125,7 @@ def test_what_is_out_of_limits_ends_the_game_for_all(pose, reason):
     seen = pose._replace(
         time=0.01, position=(pose.position[0] + 0.01 * pose.velocity[0] + 1e-4, *pose.position[1:])
     )
-    state, _ = step(LIMITS, state, event(_1=PoseSample(seen, 0.01, 4.0)))
+    state, _ = step(state, event(_1=PoseSample(seen, 0.01, 4.0)))
     assert state.drones[1].reason == reason
     assert not any(mode is Mode.PURSUIT for mode in state.modes)
 
@@ -139,7 +138,7 @@ def test_a_landing_is_soft_where_the_floor_isnt_where_it_is_thought(error):
         time = 0.01 * k
         seen = still(time, (*PLACES[1][:2], height + error * min(k / 100, 1.0)), (0.0, 0.0, speed))
         request = Request.LAND if k == 1 else Request.NONE
-        state, out = step(LIMITS, state, event(time, request, _1=PoseSample(seen, time, 4.0)))
+        state, out = step(state, event(time, request, _1=PoseSample(seen, time, 4.0)))
         speed += 0.01 * 9.81 * (out[1].thrust / nominal_airframe().hover_thrust - 1.0)
         height += 0.01 * speed
         if height < 0.0:
@@ -163,7 +162,7 @@ def test_upside_down_for_long_its_motors_are_off_and_the_others_land():
     state = replace(state, drones=(state.drones[0], drone, state.drones[2]))
     for k in range(1, 20):
         seen = PoseSample(still(0.01 * k, PLACES[1], quaternion=over), 0.01 * k, 4.0)
-        state, out = step(LIMITS, state, event(0.01 * k, _1=seen))
+        state, out = step(state, event(0.01 * k, _1=seen))
     assert state.modes[1] is Mode.STOPPED and state.drones[1].reason == "tumbled"
     assert out[1].mode == OFF and out[0].mode != OFF
 
@@ -173,7 +172,7 @@ def test_an_action_that_is_no_number_is_none(bad):
     state = pursuing()
     for k in range(1, 8):
         actions = (POLICY, from_action([0.0, bad, 0.0, 0.0], 1.0), POLICY)
-        state, out = step(LIMITS, state, event(0.01 * k, actions=actions))
+        state, out = step(state, event(0.01 * k, actions=actions))
         assert all(math.isfinite(x) for o in out for x in o.numbers())
     assert state.all_in(Mode.HOLD) and state.drones[0].reason == "action not finite"
 
@@ -205,7 +204,7 @@ def lift(rise, seconds=2.5):
         samples = [PoseSample(still(time, p), time, 4.0) for p in seen]
         samples[1] = PoseSample(still(time, place), time, 4.0, captured=captured and still(time, captured))
         request = Request.TRANSFER if k == 5 else Request.NONE
-        state, _ = step(LIMITS, state, Event(time, tuple(samples), None, request))
+        state, _ = step(state, Event(time, tuple(samples), None, request))
         if any(m is Mode.LIFT for m in state.modes):
             height = min(height + 0.002, 0.1)
         if state.modes[1] not in (Mode.GROUND, Mode.LIFT):
@@ -235,21 +234,21 @@ def test_a_battery_must_be_low_for_a_while():
     state = pursuing()
     for k in range(1, 70):
         low = PoseSample(still(0.01 * k, PLACES[0]), 0.01 * k, 3.0)
-        state, _ = step(LIMITS, state, event(0.01 * k, _0=low))
+        state, _ = step(state, event(0.01 * k, _0=low))
         assert (state.modes[0] is Mode.PURSUIT) == (0.01 * (k - 1) <= LIMITS.battery_time)
 
 
 def test_without_actions_all_wait_and_then_land():
     state = pursuing()
     for k in range(1, 8):
-        state, out = step(LIMITS, state, event(0.01 * k, actions=None))
+        state, out = step(state, event(0.01 * k, actions=None))
     assert state.all_in(Mode.HOLD) and all(o.mode != OFF for o in out)
 
 
 def test_the_stop_key_stops_all_for_good():
-    state, out = step(LIMITS, pursuing(), event(request=Request.STOP))
+    state, out = step(pursuing(), event(request=Request.STOP))
     assert out == (SetPoint(),) * 3
-    state, out = step(LIMITS, state, event(0.02, request=Request.TRANSFER))
+    state, out = step(state, event(0.02, request=Request.TRANSFER))
     assert out == (SetPoint(),) * 3 and state.all_in(Mode.STOPPED)
 
 
@@ -316,8 +315,8 @@ def test_any_events_give_finite_set_points_and_ends_are_ends(events):
         )
         over = [mode in (Mode.STOPPED,) for mode in state.modes]
         happened = Event(now, sightings, (POLICY,) * 3 if acts else None, request)
-        after, out = step(LIMITS, state, happened)
-        assert step(LIMITS, state, happened) == (after, out) or any(map(math.isnan, _numbers(after)))
+        after, out = step(state, happened)
+        assert step(state, happened) == (after, out) or any(map(math.isnan, _numbers(after)))
         state = after
         for i, o in enumerate(out):
             assert all(map(math.isfinite, (o.roll, o.pitch, o.yaw_rate, o.thrust)))

@@ -85,10 +85,10 @@ def fly(arguments: Arguments, prepared: Prepared | None = None):
     for line in flown.remarks:
         console.print(line, soft_wrap=True)
     console.print(f"connecting to {', '.join(flown.session.uris)} ...")
-    with Session(flown.session, arguments.safety, flown.state) as session:
+    with Session(flown.session, flown.state) as session:
         session.check()
         plan = Plan(arguments.episodes, arguments.episode_seconds or math.inf)
-        flight = Flight(session.links, flown.game, arguments.safety, plan, session.requests, session.watched)
+        flight = Flight(session.links, flown.game, flown.state, plan, session.requests, session.watched)
         console.print("flying: space or q stops all motors; l, Ctrl-C or Ctrl-Z land; h waits")
         samples, complaint = session.fly(flight)
     _show(console, flight)

@@ -12,7 +12,7 @@ from dataclasses import replace
 from enum import IntEnum
 
 from openjax.flying.controller import Pose
-from openjax.flying.safety import Mode, State
+from openjax.flying.state import Mode, State
 
 SILENCE = 0.1
 """Silence of a process after which the next one flies (s): ten ticks."""

@@ -21,9 +21,9 @@ from types import SimpleNamespace
 from openjax.flying import real_time
 from openjax.flying.board import Board, Role, say, stand_alone
 from openjax.flying.crtp import LOG_TYPES, Port, Supervisor, SupervisorCommand
-from openjax.flying.limits import SafetySettings, resting_places
-from openjax.flying.safety import FLYING, LANDING, Event, Mode, PoseSample, Request, State, step
+from openjax.flying.safety import step
 from openjax.flying.set_point import SetPoint
+from openjax.flying.state import FLYING, LANDING, Event, Mode, PoseSample, Request, State
 from openjax.flying.swarm import POSE_BLOCK, WATCHDOG_PERIOD, Member, Swarm, send_set_point
 
 CHECK = 0.004
@@ -33,46 +33,36 @@ DISARMING = 1.0
 TICK = 0.01
 
 
-def take_over(settings: SafetySettings, state: State, now: float) -> State:
+def take_over(state: State, now: float) -> State:
     """The state in which another process goes on flying: all stop where they are, wait, and land."""
-    anchors = resting_places(settings, state.pillars, [d.estimate for d in state.drones])
-    drones = tuple(
-        replace(
-            d,
-            mode=Mode.LAND if d.mode in (*LANDING, Mode.LIFT) else Mode.HOLD,
-            since=now,
-            seen=now,  # the estimate is as good as what the one before knew
-            landing_since=now if d.mode in (*LANDING, Mode.LIFT) else None,
-            anchor=a,
-            reason="another process took over",
-        )
-        if d.mode in FLYING
-        else d
-        for d, a in zip(state.drones, anchors, strict=True)
-    )
+
+    def taken(drone, anchor):
+        if drone.mode not in FLYING:
+            return drone
+        mode = Mode.LAND if drone.mode in (*LANDING, Mode.LIFT) else Mode.HOLD
+        # the estimate is as good as what the one before knew
+        drone = replace(drone, seen=now, landing_since=None)
+        return drone.to(mode, now, anchor, "another process took over")
+
+    drones = tuple(map(taken, state.drones, state.resting_places()))
     return replace(state, drones=drones, time=now, action_time=now)
 
 
-def fly_down(
-    board: Board, role: Role, vehicles: Swarm | RawLinks, settings: SafetySettings, state: State
-) -> State:
+def fly_down(board: Board, role: Role, vehicles: Swarm | RawLinks, state: State) -> State:
     """Wait and land from what stands on the board, disarm; the last state.
 
     Args:
       board: of the session.
       role: whose process this is; it gives up should another one take over.
       vehicles: links.
-      settings: limits.
-      state: any of this flight, for its starts, pillars and airframe.
+      state: any of this flight, for its settings, pillars and airframe.
     """
     board.pilot = role
     now = due = time.perf_counter()
-    state = take_over(settings, board.read(state, now), now)
+    state = take_over(board.read(state, now), now)
     while state.flying and board.pilot is role:
         request = Request.STOP if board.stopped else Request.NONE
-        state, set_points = step(
-            settings, state, Event(time.perf_counter(), vehicles.observe(), request=request)
-        )
+        state, set_points = step(state, Event(time.perf_counter(), vehicles.observe(), request=request))
         vehicles.send(set_points)
         board.write(role, time.perf_counter(), state)
         due = max(due + TICK, time.perf_counter() - TICK)
@@ -179,15 +169,14 @@ class Guard:
     Args:
       board: of the session.
       own: its links, not open yet.
-      safety: limits.
-      state: of the loop's state machine; starts, pillars and airframe are taken from it.
+      state: of the loop's state machine; settings, pillars and airframe are taken from it.
     """
 
-    def __init__(self, board: Board, own: RawLinks, safety: SafetySettings, state: State):
+    def __init__(self, board: Board, own: RawLinks, state: State):
         self._board = board
         context = multiprocessing.get_context("spawn")
         self._process = context.Process(
-            target=watch, args=(board, os.getpid(), own, safety, state), name="openjax guard"
+            target=watch, args=(board, os.getpid(), own, state), name="openjax guard"
         )
         self._process.start()
 
@@ -211,7 +200,7 @@ class Guard:
             self._process.join()
 
 
-def watch(board: Board, parent: int, own: RawLinks, safety: SafetySettings, state: State) -> None:
+def watch(board: Board, parent: int, own: RawLinks, state: State) -> None:
     """The guard's process."""
     stand_alone()
     own.open(udp_only=True)
@@ -230,7 +219,7 @@ def watch(board: Board, parent: int, own: RawLinks, safety: SafetySettings, stat
             board.end_process(Role.LINKS)
             say("openjax fly: nothing from the links' process, the guard lands all vehicles")
             own.open()
-            fly_down(board, Role.GUARD, own, safety, state)
+            fly_down(board, Role.GUARD, own, state)
         elif board.armed and not board.flying and links_silent:
             board.end_process(Role.LINKS)
             own.open()

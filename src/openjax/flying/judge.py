@@ -114,26 +114,25 @@ class Track(NamedTuple):
         """Whether its last good pose is new enough to fly by at `now` (s)."""
         return self.pose is not None and now - self.pose.time <= limits.horizon
 
+    def after(
+        self, pose: Pose | None, now: float, limits: PoseLimits, moving: bool, expected: Pose | None
+    ) -> Track:
+        """The track after its source's newest pose at `now` (s).
 
-def follow(
-    track: Track, pose: Pose | None, now: float, limits: PoseLimits, moving: bool, expected: Pose | None
-) -> Track:
-    """The track after its source's newest pose at `now` (s).
-
-    A pose that isn't newer than the last good one, or old, or from the future, changes nothing. Of a vehicle that isn't
-    `moving` any pose is believed that is one. `expected`: see `judge`; at any time.
-    """
-    last = track.pose
-    if pose is None or not abs(now - pose.time) <= limits.horizon:
-        return track
-    if last is None or not moving:
-        verdict = judge(pose, None, 0.0, limits)
-    elif pose.time <= last.time:
-        return track
-    else:
-        expected = None if expected is None else moved_on(expected, pose.time)
-        verdict = judge(pose, last, pose.time - last.time, limits, expected)
-    return Track(last, verdict) if verdict else Track(pose)
+        A pose that isn't newer than the last good one, or old, or from the future, changes nothing. Of a vehicle that isn't
+        `moving` any pose is believed that is one. `expected`: see `judge`; at any time.
+        """
+        last = self.pose
+        if pose is None or not abs(now - pose.time) <= limits.horizon:
+            return self
+        if last is None or not moving:
+            verdict = judge(pose, None, 0.0, limits)
+        elif pose.time <= last.time:
+            return self
+        else:
+            expected = None if expected is None else moved_on(expected, pose.time)
+            verdict = judge(pose, last, pose.time - last.time, limits, expected)
+        return Track(last, verdict) if verdict else Track(pose)
 
 
 def at_one_time(a: Pose, b: Pose) -> tuple[Pose, Pose]:

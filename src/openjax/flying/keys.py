@@ -9,7 +9,7 @@ import signal
 import sys
 
 from openjax.flying.board import DEAF
-from openjax.flying.safety import Request
+from openjax.flying.state import Request
 
 STOP, LAND, HOLD = b" qQ", b"lL", b"hH"
 LANDING = ("SIGHUP", "SIGINT", "SIGTSTP", "SIGTERM", "SIGQUIT")

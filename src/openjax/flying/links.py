@@ -26,9 +26,8 @@ from openjax.flying import real_time
 from openjax.flying.board import SILENCE, Board, Role, say, stand_alone
 from openjax.flying.controller import Pose
 from openjax.flying.guard import CHECK, disarm, fly_down
-from openjax.flying.limits import SafetySettings
-from openjax.flying.safety import PoseSample, State
 from openjax.flying.set_point import SetPoint
+from openjax.flying.state import PoseSample, State
 from openjax.flying.swarm import Member, Samples, Swarm, numbers_of
 
 STARTING = 20.0
@@ -51,7 +50,7 @@ class Links:
     """Crazyflies, real or virtual, over links in another process; to the loop what it flies.
 
     Args: as `openjax.flying.swarm.Swarm`, and
-      safety, state: by which the links' process lands all if the loop stops; without them it doesn't.
+      state: before the flight, from which the links' process lands all if the loop stops; without them it doesn't.
       silence: of the loop after which it does (s). If it doesn't pass on set-points for half as long again it is taken for
           dead: vehicles go on turning as they were told last.
     """
@@ -61,11 +60,10 @@ class Links:
         uris: Sequence[str],
         body_logs: int = 1,
         watchdog: bool = True,
-        safety: SafetySettings | None = None,
         state: State | None = None,
         silence: float = SILENCE,
     ):
-        self._uris, self._options, self._landing = tuple(uris), (body_logs, watchdog), (safety, state)
+        self._uris, self._options, self._state = tuple(uris), (body_logs, watchdog), state
         n = len(self._uris)
         self._context = multiprocessing.get_context("spawn")
         self.board = Board(n, self._context, silence)
@@ -96,7 +94,7 @@ class Links:
         self._commands.settimeout(1.5 * self.board.silence)
         ends = (stream, commands, control)
         options, given = (self._uris, *self._options), (self._contacts, *ends)
-        arguments = (options, timeout, given, self.board, os.getpid(), self._landing)
+        arguments = (options, timeout, given, self.board, os.getpid(), self._state)
         self._process = context.Process(target=_serve, args=arguments, name="openjax links")
         self._process.start()
         for end in ends:
@@ -242,7 +240,7 @@ class Links:
             end.close()
 
 
-def _serve(options, timeout, ends, board: Board, parent: int, landing) -> None:
+def _serve(options, timeout, ends, board: Board, parent: int, state) -> None:
     """The links' process. Should the loop stop, it lands the vehicles; with nothing in the air it ends with the loop."""
     contacts, stream, commands, control = ends
     stand_alone()
@@ -252,7 +250,7 @@ def _serve(options, timeout, ends, board: Board, parent: int, landing) -> None:
     real_time.hurry()
     stream.setblocking(False)
     swarm, lock = Swarm(*options), threading.Lock()
-    threading.Thread(target=_watch, args=(swarm, board, parent, landing), daemon=True, name="watch").start()
+    threading.Thread(target=_watch, args=(swarm, board, parent, state), daemon=True, name="watch").start()
 
     def pass_on(vehicle: int, member: Member, new_pose: bool) -> None:
         contacts[vehicle] = member.last_contact
@@ -301,7 +299,7 @@ def _send_on(swarm: Swarm, commands: socket.socket, board: Board) -> None:
             return
 
 
-def _watch(swarm: Swarm, board: Board, parent: int, landing) -> None:
+def _watch(swarm: Swarm, board: Board, parent: int, state: State | None) -> None:
     """Beat; land for a loop that is silent; end the process once the loop's has and nothing flies."""
     while True:
         time.sleep(CHECK)
@@ -309,9 +307,9 @@ def _watch(swarm: Swarm, board: Board, parent: int, landing) -> None:
         board.beat(Role.LINKS, now)
         silent = board.silent(Role.LOOP, now)
         left = board.pilot is Role.LINKS or (board.pilot is Role.LOOP and silent > board.silence)
-        if left and board.flying and landing[0] is not None:
+        if left and board.flying and state is not None:
             say(f"openjax fly: the loop, heard {silent:.2f} s ago, left all vehicles to the links' process")
-            fly_down(board, Role.LINKS, swarm, *landing)
+            fly_down(board, Role.LINKS, swarm, state)
         if os.getppid() != parent and not board.flying:
             if board.armed:
                 disarm(swarm, board, Role.LINKS)

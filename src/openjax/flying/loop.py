@@ -11,11 +11,13 @@ from time import perf_counter
 import numpy as np
 
 from openjax.flying.controller import accelerate, wanted_acceleration
+from openjax.flying.estimation import see
 from openjax.flying.game import Game
 from openjax.flying.limits import SafetySettings
 from openjax.flying.links import Links
-from openjax.flying.safety import Event, Mode, Request, State, decide, initial_state, see
+from openjax.flying.safety import decide
 from openjax.flying.set_point import OFF, RATES, as_sent, from_action
+from openjax.flying.state import Event, Mode, Request, State, initial_state
 from openjax.pursuit.environment import THRUST_LIMIT
 
 PERIOD = 0.01
@@ -159,7 +161,7 @@ class Flight:
     Args:
       vehicles: links to them; the pursuers first, then, where it's a vehicle, the evader.
       game: the policy and its game.
-      safety: limits.
+      state: before it, see `flight_state`.
       plan: what to fly.
       requests: asked at every tick for what the operator wants.
       watched: called after every tick with time and state; if it returns anything, all land for that reason.
@@ -169,18 +171,16 @@ class Flight:
         self,
         vehicles: Links,
         game: Game,
-        safety: SafetySettings,
+        state: State,
         plan: Plan,
         requests: Callable[[], Request] = lambda: Request.NONE,
         watched: Callable[[float, State], str] = lambda now, state: "",
     ):
-        self.vehicles, self.game, self.safety, self.plan = vehicles, game, safety, plan
+        self.vehicles, self.game, self.state, self.plan = vehicles, game, state, plan
         self._requests, self._watched = requests, watched
-        number = len(vehicles.observe())
         self._pursuers = game.settings.num_pursuers
-        self._evader_flies = number > self._pursuers
-        self.state = flight_state(game, number, safety)
-        self.record = Record(number)
+        self._evader_flies = len(state.drones) > self._pursuers
+        self.record = Record(len(state.drones))
         self._play, self._episode, self._begun = None, -1, 0.0
         self._since = perf_counter()
         self._flown, self._alarm = 0, ""
@@ -213,7 +213,7 @@ class Flight:
         arrivals = self.vehicles.arrivals()
         samples = self.vehicles.observe()
         before = self.state.drones
-        self.state = see(self.safety, self.state, now, samples)
+        self.state = see(self.state, now, samples)
         for i, (drone, old) in enumerate(zip(self.state.drones, before, strict=True)):
             if drone.captured.pose is not old.captured.pose:
                 self.vehicles.believed(i, drone.captured.pose, drone.told)
@@ -222,7 +222,7 @@ class Flight:
         if self._episode >= 0 or request is Request.PURSUE:
             actions = self._actions(now, request is Request.PURSUE)
         event = Event(now, samples, actions, request, self._alarm)
-        self.state, set_points = decide(self.safety, self.state, event)
+        self.state, set_points = decide(self.state, event)
         sent = self.vehicles.send(set_points)
         self._alarm = self._watched(now, self.state)
         self.record.keep((due, sent, self._episode), arrivals, measured_times(samples), set_points)

@@ -27,7 +27,7 @@ import numpy as np
 from openjax.errors import UserError
 from openjax.flying.controller import Pose
 from openjax.flying.links import Links
-from openjax.flying.safety import PoseSample
+from openjax.flying.state import PoseSample
 from openjax.flying.swarm import Samples, numbers_of
 
 

@@ -9,9 +9,8 @@ from collections.abc import Iterator, Sequence
 from openjax.errors import UserError
 from openjax.flying.controller import Vector, roll_pitch_yaw, up
 from openjax.flying.crtp import Supervisor
-from openjax.flying.judge import PoseLimits, agree, at_one_time, judge
-from openjax.flying.limits import SafetySettings
-from openjax.flying.safety import PoseSample, State
+from openjax.flying.judge import agree, at_one_time, judge
+from openjax.flying.state import PoseSample, State
 from openjax.flying.swarm import PERIOD_MS
 
 LOOK = 0.5
@@ -45,36 +44,26 @@ def sole_command(uris: Sequence[str]) -> Iterator[None]:
         yield
 
 
-def poses_arriving(links, duration: float = LOOK) -> list[float]:
-    """Each vehicle's own estimates a second of its own time (Hz), listened to for `duration` (s)."""
+def poses_arriving(links) -> list[float]:
+    """Each vehicle's own estimates a second of its own time (Hz)."""
     before = [s.own.time for s in links.observe()], list(links.counts)
-    time.sleep(duration)
+    time.sleep(LOOK)
     after = [s.own.time for s in links.observe()], list(links.counts)
-    return [(c - old) / max(t - since, duration) for t, c, since, old in zip(*after, *before, strict=True)]
+    return [(c - old) / max(t - since, LOOK) for t, c, since, old in zip(*after, *before, strict=True)]
 
 
-def faults(
-    settings: SafetySettings,
-    state: State,
-    samples: Sequence[PoseSample],
-    rates: Sequence[float],
-    guarded: bool,
-) -> list[str]:
+def faults(state: State, samples: Sequence[PoseSample], rates: Sequence[float], guarded: bool) -> list[str]:
     """What speaks against taking off, a line each; vehicles are counted from 0 in the order of --uri.
 
     Args:
-      settings: limits.
-      state: before the flight, for the starts.
+      state: before the flight, for starts and settings.
       samples: what is known of each vehicle.
       rates: of each vehicle's poses (Hz).
       guarded: whether a guard watches, or none is wanted.
     """
     lines = [] if guarded else ["the guard's process isn't there; try again, with fewer programs running"]
     for i, (sample, start, rate) in enumerate(zip(samples, state.starts, rates, strict=True)):
-        found = [
-            *_firmware_faults(settings, sample, rate),
-            *_pose_faults(settings, state.limits, sample, start),
-        ]
+        found = [*_firmware_faults(state.settings, sample, rate), *_pose_faults(state, sample, start)]
         lines += [f"vehicle {i}: {fault}" for fault in found]
     return lines
 
@@ -95,15 +84,15 @@ def _firmware_faults(settings, sample, rate) -> Iterator[str]:
         yield f"{rate:.0f} of {RATE:.0f} poses a second arrive; bring the antenna nearer or change the channel"
 
 
-def _pose_faults(settings, limits: PoseLimits, sample, start: Vector) -> Iterator[str]:
-    pose = sample.captured or sample.own
+def _pose_faults(state, sample, start: Vector) -> Iterator[str]:
+    pose, limits = sample.captured or sample.own, state.limits
     for source in (sample.own, sample.captured):
         if source is not None and (verdict := judge(source, None, 0.0, limits)):
             yield f"{verdict}; look at the positioning system"
             return
     x, y, z = pose.position
     where = f"({x:.2f}, {y:.2f}, {z:.2f})"
-    if math.dist((x, y), start[:2]) > settings.stand or abs(z) > FLOOR:
+    if math.dist((x, y), start[:2]) > state.settings.stand or abs(z) > FLOOR:
         yield (
             f"stands at {where} m, its start's mark is ({start[0]:.2f}, {start[1]:.2f}, 0): put it there, "
             "or mend the positioning system's axes, origin or unit"

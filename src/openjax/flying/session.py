@@ -13,17 +13,16 @@ from openjax.flying.board import SILENCE, Role, say
 from openjax.flying.crtp import Supervisor
 from openjax.flying.guard import Guard, RawLinks, fly_down
 from openjax.flying.keys import Operator
-from openjax.flying.limits import SafetySettings
 from openjax.flying.links import Links
 from openjax.flying.loop import Flight, measured_times
 from openjax.flying.motion_capture import MotionCaptured
 from openjax.flying.preflight import faults, poses_arriving, sole_command
-from openjax.flying.safety import Request, State
+from openjax.flying.state import Request, State
 
 FRESH = 0.05
 """No flight begins with poses older than this (s)."""
-ARMING = 1.0
-"""A vehicle has this long (s) to say that it is armed."""
+ARMING, POSES = 1.0, 5.0
+"""A vehicle has this long (s) to say that it is armed, and where it is."""
 
 
 @dataclass(frozen=True)
@@ -45,16 +44,13 @@ class Session:
 
     Args:
       settings: how.
-      safety: limits of the flight.
-      state: before the flight: starts, pillars, airframe.
+      state: before the flight.
     """
 
-    def __init__(self, settings: SessionSettings, safety: SafetySettings, state: State):
-        self._settings, self._safety, self._state = settings, safety, state
+    def __init__(self, settings: SessionSettings, state: State):
+        self._settings, self._state = settings, state
         kind = Links if settings.feed is None else MotionCaptured
-        self.links = kind(
-            settings.uris, settings.body_logs, settings.watchdog, safety, state, settings.silence
-        )
+        self.links = kind(settings.uris, settings.body_logs, settings.watchdog, state, settings.silence)
         self.requests = Operator()
         self._guard: Guard | None = None
         self.scheduler = "ordinary"
@@ -74,7 +70,7 @@ class Session:
             blocks = self.links.pose_blocks()
             self._own = RawLinks(settings.uris, blocks, settings.watchdog)
             if settings.guard:
-                self._guard = Guard(self.links.board, self._own, self._safety, self._state)
+                self._guard = Guard(self.links.board, self._own, self._state)
                 stack.callback(self._guard.close)
                 self._guard.wait()
             self._own.open(udp_only=True)
@@ -90,7 +86,7 @@ class Session:
         self._wait_for_poses()
         rates = poses_arriving(self.links)
         guarded = self._guard is None or self.links.board.guarded
-        found = faults(self._safety, self._state, self.links.observe(), rates, guarded)
+        found = faults(self._state, self.links.observe(), rates, guarded)
         if len(found) == 1:
             raise UserError(f"no take-off: {found[0]}")
         if found:
@@ -145,13 +141,13 @@ class Session:
                 for role in (Role.LINKS, Role.GUARD):
                     board.end_process(role)
                 self._own.open()
-                fly_down(board, Role.LOOP, self._own, self._safety, self._state)
+                fly_down(board, Role.LOOP, self._own, self._state)
         board.leave(Role.LOOP)
         return f"all vehicles were landed by the process of the {lander.name.lower()}"
 
-    def _wait_for_poses(self, timeout: float = 5.0):
+    def _wait_for_poses(self):
         """Return once each vehicle has a pose that is fresh. UserError: one has none."""
-        deadline = time.monotonic() + timeout
+        deadline = time.monotonic() + POSES
         while True:
             now = time.perf_counter()
             samples = self.links.observe()
@@ -162,5 +158,5 @@ class Session:
             if time.monotonic() > deadline:
                 uris: Sequence[str] = self._settings.uris
                 silent = ", ".join(uri for uri, missing in zip(uris, old, strict=True) if missing)
-                raise UserError(f"no pose from {silent} within {timeout:g} s; is its position known?")
+                raise UserError(f"no pose from {silent} within {POSES:g} s; is its position known?")
             self.links.wait(now + 0.02)

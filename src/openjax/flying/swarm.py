@@ -19,8 +19,8 @@ import numpy as np
 from openjax.errors import UserError
 from openjax.flying.controller import Pose
 from openjax.flying.crtp import expand_quaternion
-from openjax.flying.safety import PoseSample
 from openjax.flying.set_point import OFF, SetPoint, manual_arguments
+from openjax.flying.state import PoseSample
 
 PERIOD_MS = 10
 """Of the log blocks: the shortest that the protocol knows."""

@@ -13,8 +13,8 @@ import numpy as np
 
 from openjax.flying.controller import Pose
 from openjax.flying.crtp import compress_quaternion, expand_quaternion
-from openjax.flying.safety import PoseSample
 from openjax.flying.set_point import OFF, SetPoint, as_sent
+from openjax.flying.state import PoseSample
 from openjax.virtual_crazyflie.firmware import VirtualFirmware
 from openjax.virtual_crazyflie.vehicles import STEP, VirtualVehicles
 

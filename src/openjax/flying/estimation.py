@@ -1,0 +1,75 @@
+"""What is seen: each vehicle's estimate brought to now, by what of its poses can be believed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+from openjax.flying.controller import Pose, level_acceleration, moved_on
+from openjax.flying.judge import Track, agree, at_one_time, follows
+from openjax.flying.state import FLYING, SPIN_UP, Drone, Mode, PoseSample, State
+
+SMOOTHING = 0.02
+"""Time constant of the low-pass of velocities from motion capture (s)."""
+
+
+def see(state: State, time: float, samples: Sequence[PoseSample]) -> State:
+    """The state with each vehicle's estimate at `time` (s): the newest good pose moved on, or reckoned from the last one.
+
+    Motion capture is what a vehicle is flown by, until it is lost; from then on its own estimate is.
+    """
+    state = replace(state, time=time, dt=min(max(time - state.time, 0.0), 0.1))
+    drones = (_seen(state, drone, sample) for drone, sample in zip(state.drones, samples, strict=True))
+    return replace(state, drones=tuple(drones))
+
+
+def _seen(state, drone, sample) -> Drone:
+    now, limits = state.time, state.limits
+    moving = drone.mode in FLYING and not (drone.mode is Mode.LIFT and now - drone.since < SPIN_UP)
+    by_capture = sample.captured is not None and not drone.distrusted
+    reckoned = None if by_capture and drone.own.fresh(now, limits) else drone.estimate
+    drone = replace(drone, own=drone.own.after(sample.own, now, limits, moving, reckoned))
+    if by_capture:
+        drone = _captured(state, drone, sample, moving)
+    source = drone.captured if by_capture and not drone.distrusted else drone.own
+    if source.fresh(now, limits):
+        estimate = moved_on(source.pose, max(now, source.pose.time))
+        level = level_acceleration(estimate.quaternion)
+        return replace(drone, estimate=estimate, seen=source.pose.time, acceleration=level)
+    if drone.estimate is None:
+        return drone
+    old, dt = drone.estimate, state.dt
+    velocity = tuple(v + dt * a for v, a in zip(old.velocity, drone.acceleration, strict=True))
+    position = tuple(p + dt * v for p, v in zip(old.position, velocity, strict=True))
+    return replace(drone, estimate=old._replace(time=now, position=position, velocity=velocity))
+
+
+def _captured(state, drone, sample, moving) -> Drone:
+    """The drone after the newest of motion capture: whether it is believed, and told to the estimator on board."""
+    now, limits, own = state.time, state.limits, drone.own
+    seen = _with_motion(sample.captured, drone.captured.pose, sample.own)
+    captured, distrusted = drone.captured.after(seen, now, limits, moving, drone.estimate), ""
+    if captured.pose is seen:
+        told = not moving or own.pose is None or follows(own.pose, seen, limits)
+        drone = replace(drone, told=told)
+        if moving and own.fresh(now, limits) and (verdict := agree(*at_one_time(seen, own.pose), limits)):
+            captured = Track(drone.captured.pose, verdict)
+    if moving and not captured.fresh(now, limits):
+        distrusted = captured.verdict or "pose lost"
+    return replace(drone, captured=captured, distrusted=distrusted)
+
+
+def _with_motion(pose, last, own) -> Pose:
+    """A pose of motion capture with the velocity from differences, smoothed, and the body rates of the gyroscope."""
+    if last is None or pose.time <= last.time:
+        return pose if last is None else last
+    if (pose.position, pose.quaternion) == (last.position, last.quaternion):
+        return last._replace(time=pose.time)  # which is judged frozen
+    step = pose.time - last.time
+    share = 1.0 - math.exp(-step / SMOOTHING)
+    velocity = tuple(
+        v + share * ((p - q) / step - v)
+        for p, q, v in zip(pose.position, last.position, last.velocity, strict=True)
+    )
+    return pose._replace(velocity=velocity, body_rates=pose.body_rates if own is None else own.body_rates)
