@@ -84,29 +84,21 @@ def export(arguments: Arguments, tell: Callable[[str], None] = lambda step: None
     import jax
     import numpy as np
 
-    from openjax.pursuit import Observation, Pursuit
+    from openjax.pursuit import Observation
     from openjax.store.policies import load_policy
 
     check_output_folder(arguments.out, "--out")
     policy = load_policy(arguments.policy)
-    environment = Pursuit(dataclasses.replace(policy.settings.environment, vehicles=()))
-    kinds = jax.eval_shape(lambda key: environment.reset(key)[0], jax.random.key(0))
-    inputs = {field.name: getattr(kinds, field.name) for field in dataclasses.fields(kinds)}
-
-    def act(**fields):
-        return policy(Observation(**fields))
-
     tell(next(iter(STEPS)))
     seen = observations(policy, arguments.observations, arguments.seed)
     expected = np.asarray(jax.jit(jax.vmap(policy))(Observation(**seen)))
     if arguments.own:
         expected = expected[:, :1]
-        for name in EACH:
-            seen[name] = seen[name][:, :1]
-            inputs[name] = jax.ShapeDtypeStruct((1, *inputs[name].shape[1:]), inputs[name].dtype)
+        seen |= {name: seen[name][:, :1] for name in EACH}
+    inputs = {name: jax.ShapeDtypeStruct(array.shape[1:], array.dtype) for name, array in seen.items()}
     tell(list(STEPS)[1])
     write = {"onnx": _onnx, "jax": _jax, "c": _c}[arguments.format]
-    files, found, extra = write(act, inputs, seen, policy.source)
+    files, found, extra = write(lambda **fields: policy(Observation(**fields)), inputs, seen, policy.source)
     report = {
         "policy": policy.source,
         "format": arguments.format,
