@@ -1,8 +1,10 @@
 """The host loop on a toy carry: exact resume, one compilation, stops on a NaN, a signal, a time limit."""
 
+import gc
 import json
 import os
 import signal
+import tracemalloc
 
 import jax
 import jax.numpy as jnp
@@ -144,3 +146,24 @@ def test_time_limit_stops(tmp_path, compiled):
     outcome = run(tmp_path, compiled, 10**6, time_limit=0.3)
     assert outcome.stopped_by == "the time limit"
     assert 0 < outcome.update < 10**6
+
+
+def test_an_update_leaves_nothing_in_memory(compiled, tmp_path):
+    """A process of half a gigabyte may grow by 5 % in a hundred thousand updates: 250 bytes each."""
+    seen = []
+
+    def evaluate(stop):
+        def look(carry):
+            gc.collect()
+            seen.append((tracemalloc.get_traced_memory()[0], len(jax.live_arrays())))
+            return 0.0, {}
+
+        return look
+
+    tracemalloc.start()
+    try:
+        run(tmp_path, compiled, 3000, evaluate=evaluate, validation_interval=1000)
+    finally:
+        tracemalloc.stop()
+    _, (before, arrays), (after, same) = seen
+    assert after - before < 250 * 1000 and same == arrays
