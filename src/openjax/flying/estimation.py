@@ -1,7 +1,5 @@
 """What is seen: each vehicle's estimate brought to now, by what of its poses can be believed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

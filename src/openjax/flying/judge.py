@@ -116,7 +116,7 @@ class Track(NamedTuple):
 
     def after(
         self, pose: Pose | None, now: float, limits: PoseLimits, moving: bool, expected: Pose | None
-    ) -> Track:
+    ) -> "Track":
         """The track after its source's newest pose at `now` (s).
 
         A pose that isn't newer than the last good one, or old, or from the future, changes nothing. Of a vehicle that isn't

@@ -1,7 +1,5 @@
 """What is known and wanted of the vehicles of a flight: modes, requests, samples of poses, and the state of all."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -98,7 +96,7 @@ class Drone:
     reason: str = ""  # why it left the pursuit
     sent: SetPoint = MOTORS_OFF
 
-    def to(self, mode: Mode, now: float, anchor: Vector | None = None, reason: str = "") -> Drone:
+    def to(self, mode: Mode, now: float, anchor: Vector | None = None, reason: str = "") -> "Drone":
         """The drone in another mode from `now` (s) on; anchor and reason stay what they were unless given."""
         return replace(
             self,

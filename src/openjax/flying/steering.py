@@ -1,7 +1,5 @@
 """How a vehicle is flown in each mode: by the policy within its limits, or by the controller."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
