@@ -1,11 +1,11 @@
-"""Worlds that aren't the simulator: the same start, one tick at a time, and how smooth commands are."""
+"""Worlds that aren't the simulator: the same start, one tick at a time."""
 
 import jax
 import numpy as np
 import pytest
 
 from experiments.flying.worlds.rotorpy import Bodies, crazyflie
-from experiments.flying.worlds.study import make_world, smoothness
+from experiments.flying.worlds.study import make_world
 from openjax.pursuit import Pursuit, PursuitSettings
 
 pytestmark = pytest.mark.slow
@@ -65,13 +65,3 @@ def test_rotorpy_at_once_is_rotorpy_one_by_one():
         ]
     expected = [np.concatenate([state[name] for name in states]) for state in alone]
     np.testing.assert_allclose(bodies.state.T, expected, rtol=2e-6, atol=2e-6)
-
-
-def test_smoothness_of_known_commands():
-    time = 0.01 * np.arange(800)
-    slow, quick = np.sin(2 * np.pi * 2 * time), np.sin(2 * np.pi * 20 * time)
-    actions = np.zeros((800, 3, 1, 4))
-    actions[:, 0, 0, 1], actions[:, 1, 0, 1], actions[:, 2, 0, 1] = slow, quick, slow + quick
-    found = smoothness(actions, 0.01)
-    np.testing.assert_allclose(found["fast"], [0.0, 1.0, 0.5], atol=1e-3)
-    assert found["change"][1] > 5 * found["change"][0]

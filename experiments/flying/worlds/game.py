@@ -35,9 +35,8 @@ def play(
     tasks: Task,
     keys: jax.Array,
     make_world: Callable[[DroneState, Task], World],
-    watch: Callable | None = None,
-) -> tuple[EpisodeStatistics, list]:
-    """Episodes of a policy's mean in a world.
+) -> EpisodeStatistics:
+    """Episodes (W,) of a policy's mean in a world.
 
     Args:
       loaded: from `openjax.load_policy`.
@@ -45,26 +44,21 @@ def play(
       tasks: leading axis W.
       keys: (W,) draw the start attitudes.
       make_world: of the drones (W, N, ...) at the start and the tasks.
-      watch: (state, action) -> anything, after each step; mapped over worlds and compiled.
-
-    Returns:
-      statistics (W,), and what `watch` said of each step.
     """
-    reset, look, act, advance = _compiled(settings, loaded.policy, watch)
+    reset, look, act, advance = _compiled(settings, loaded.policy)
     state = reset(keys, tasks)
     world = make_world(state.drones, tasks)
     limit = settings.max_speed if settings.speed_limit == "clamp" else None
-    observation, watched = look(state, world.measure()), []
+    observation = look(state, world.measure())
     for _ in range(settings.episode_length):
         action, command = act(loaded.parameters, observation)
         world.fly(np.asarray(command, float), limit)
-        observation, state, said = advance(state, action, world.poses(), world.measure())
-        watched.append(said)
-    return state.statistics, watched
+        observation, state = advance(state, action, world.poses(), world.measure())
+    return state.statistics
 
 
 @functools.cache
-def _compiled(settings, policy, watch):
+def _compiled(settings, policy):
     """The game's start, its observation of measured poses, the policy, and the game's step with poses from outside."""
     game = Pursuit(settings, dynamics=SeenElsewhere())
 
@@ -77,8 +71,7 @@ def _compiled(settings, policy, watch):
 
     def advance(state, action, flown, seen):
         drones = state.drones.replace(**flown, effect_memory=seen)
-        observation, state, *_ = game.follow(state, action, drones)
-        return observation, state, None if watch is None else watch(state, action)
+        return game.follow(state, action, drones)[:2]
 
     return (
         jax.jit(jax.vmap(lambda key, task: game.reset_to(key, task)[1])),
