@@ -3,9 +3,11 @@
 import numpy as np
 
 from openjax.flights.track import Track
-from openjax.gap.model.library import ABSENT, STEP
+from openjax.gap.channels.instruments import Feedback
+from openjax.gap.model.library import ABSENT, PLACE, STEP
 from openjax.gap.model.observer import TICKS
-from openjax.gap.model.prediction import LANES, make_physics
+from openjax.gap.model.prediction import LANES, RATES, make_physics
+from openjax.gap.model.replay import make_replay
 from openjax.vehicle import load_vehicle
 
 
@@ -37,3 +39,22 @@ def test_tracks_and_parameters_that_share_a_call_are_not_mixed_up():
         assert together[number].shape == (len(theta), len(track), 9)
     assert len({channels[0, -1, 5] for channels in together}) == 3
     assert len(np.unique(together[0][:, -1, 5])) == len(theta)
+
+
+def test_a_wrong_moment_of_inertia_turns_nothing_that_motors_hold_against():
+    """Motors that always pull one way hold against something, known or not: their sum is zero, and nothing to be scaled."""
+    track, vehicle = track_of(300, 1), load_vehicle()
+    track.motor[:, :2] += 0.1  # against a centre of mass to the right, or whatever it is
+    still = np.zeros((300, 3))
+    numbers = (("inertia", "xx", 0.3),)
+    ticks = [np.repeat(track.motor[:, None], TICKS, 1)]
+    replay = make_replay([track], [vehicle], ticks, [Feedback(still, still, still)], numbers)
+    assert abs(replay.nominal[0][-1, 0]) > 1.0
+    assert abs(replay.nuisances[0][0, -1, RATES]).max() < 1e-6
+    aside = ABSENT.copy()
+    aside[PLACE["com_offset", "y"]] = 0.001
+    around, steps = replay.around(aside), np.array([0.0, 1e-2])
+    heavier = np.repeat(aside[None], 2, 0)
+    heavier[:, PLACE["inertia", "xx"]] += steps
+    light, heavy = replay.predict(heavier)[0][:, :, 0]
+    np.testing.assert_allclose(around.nuisances[0][0, 1:, 0] / 0.3, (heavy - light)[1:] / 1e-2, rtol=0.05)

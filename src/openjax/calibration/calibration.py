@@ -122,6 +122,7 @@ def calibrate(case: Case) -> Calibration:
         replay,
         nuisances=[n[own:] for n in replay.nuisances],
         nuisance_names=replay.nuisance_names[own:],
+        sizes=[s[own:] for s in replay.sizes],
         numbers=(),
     )
     fit, nothing = fit_set(replay, effects, iterations=ITERATIONS), fit_set(replay, ())
@@ -226,7 +227,7 @@ def _explained(replay, nothing: SetFit, fit: SetFit) -> dict[str, tuple[float, f
         changes = (v[n:, channels] - v[:-n, channels] for v, n in zip(values, steps, strict=True))
         return float(sum((c**2).sum() for c in changes))
 
-    fits = residuals_of(replay, nothing), residuals_of(replay, fit)
+    fits = residuals_of(nothing), residuals_of(fit)
     return {
         kind: tuple(1.0 - square(left, channels) / square(replay.measured, channels) for left in fits)
         for kind, channels in kinds.items()

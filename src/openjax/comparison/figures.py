@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from openjax.flights.flight import Case, Flight
-from openjax.flights.signals import RATE, clock_of, first_order, in_band, on_clock, to_body
-from openjax.flights.track import GRAVITY, pwm_thrust
+from openjax.flights.signals import RATE, clock_of, first_order, in_band, on_clock
+from openjax.flights.track import GRAVITY, pwm_thrust, specific_force_of, to_body
 
 TRIMS = ("hover", "roll", "pitch", "yaw")
 DYNAMICS = ("drag_x", "drag_y", "lag", "torque_gain", "loop_gain", "shaking")
@@ -145,7 +145,7 @@ def _drag(quaternion, velocity, force) -> dict:
     """Lateral specific force against velocity, both in the body frame and below LOW: -d/m, 1/s."""
     airspeed = to_body(quaternion, velocity)
     if force is None:
-        force = to_body(quaternion, np.gradient(velocity, 1 / RATE, axis=0) + np.array([0.0, 0.0, GRAVITY]))
+        force = specific_force_of(quaternion, velocity, 1 / RATE)
     out = {}
     for axis, name in enumerate(("drag_x", "drag_y")):
         v, f = (in_band(a[:, axis : axis + 1], (0.15, LOW))[:, 0] for a in (airspeed, force))

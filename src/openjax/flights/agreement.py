@@ -26,10 +26,9 @@ from openjax.flights.signals import (
     in_band,
     on_clock,
     rates_of,
-    to_body,
     up_of,
 )
-from openjax.flights.track import GRAVITY
+from openjax.flights.track import GRAVITY, to_body
 
 # Hz: above drift, below the noise of what is compared
 LOW, WIDE, TURNING = (0.3, 2.5), (0.3, 4.0), (0.7, 8.0)

@@ -77,8 +77,3 @@ def first_order(values: np.ndarray, time_constant: float) -> np.ndarray:
 def up_of(quaternion: np.ndarray) -> np.ndarray:
     """Body z in the world (T, 3) of attitudes (T, 4)."""
     return rotation(quaternion)[:, :, 2]
-
-
-def to_body(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """World vectors (T, 3) in the body frame of attitudes (T, 4)."""
-    return np.einsum("tji,tj->ti", rotation(quaternion), vector)

@@ -186,3 +186,18 @@ def smooth(values: Array, width: float, dt: float) -> Array:
 def rotation(quaternion: Array) -> Array:
     """Rotation matrices (T, 3, 3), body to world, of quaternions (T, 4) wxyz."""
     return Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+
+
+def to_body(quaternion: Array, vector: Array) -> Array:
+    """World vectors (T, 3) in the body frame of attitudes (T, 4)."""
+    return np.einsum("tji,tj->ti", rotation(quaternion), vector)
+
+
+def to_world(quaternion: Array, vector: Array) -> Array:
+    """Body vectors (T, 3) in the world."""
+    return np.einsum("tij,tj->ti", rotation(quaternion), vector)
+
+
+def specific_force_of(quaternion: Array, velocity: Array, period: float) -> Array:
+    """Force per mass (T, 3), m/s^2 in the body frame, that a path with velocities (T, 3) every `period` s needs."""
+    return to_body(quaternion, np.gradient(velocity, period, axis=0) + np.array([0.0, 0.0, GRAVITY]))

@@ -9,7 +9,7 @@ import numpy as np
 from openjax.flights.flight import Case, Flight, Issue
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence, gather
-from openjax.gap.intervals import disagreeing, estimates
+from openjax.gap.intervals import estimates
 from openjax.gap.model.bounds import BOUND
 from openjax.gap.model.library import CARDS, Library, library, path_of
 from openjax.gap.probabilities import beyond_form_error, probabilities
@@ -133,19 +133,12 @@ def _report(
         ],
         runner_up=f"{second} ({chances[second]:.2f})" if second and chances[second] > 0.01 else "",
         rest=check.in_words(),
-        disagreement=_disagreement(selection),
         sensors=tuple(evidence.sensors.findings.values()),
         contradictions=tuple(f"{i.flight}: {i.issue}" for i in evidence.case.quality if i.kind == "garbage"),
         nuisances=_nuisances(evidence, selection),
         residual={"p_value": check.p_value} | check.measures,
         plots={"evidence": evidence, "selection": selection},
     )
-
-
-def _disagreement(selection: Selection) -> str:
-    apart = ", ".join(disagreeing(selection.fit))
-    causes = "several vehicles, something that changed between them, or a wrong name"
-    return f"The flights disagree about {apart} by far more than their errors: {causes}." if apart else ""
 
 
 def _nuisances(evidence: Evidence, selection: Selection) -> dict[str, str]:

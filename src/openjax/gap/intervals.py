@@ -1,7 +1,7 @@
 """Parameters of the named effects with their 90 % intervals.
 
 An interval is the fit's, or what flights disagree by where that is more, and never narrower than what forms that aren't
-quite the library's and rows that show half of what happened leave: some per cent of the effect."""
+quite the library's leave: some per cent of the effect."""
 
 import numpy as np
 from scipy.stats import t as student
@@ -14,8 +14,6 @@ from openjax.vehicle.effects import EFFECTS
 
 REACH = 1.645  # standard deviations of a 90 % interval
 FORM = 0.05  # of an effect's size, one standard deviation: real effects don't have the library's form
-LEAST_ERROR = 0.01  # of a value that isn't zero without the effect
-MOST = 4.0  # times its error by which flights of one vehicle may differ in a parameter
 
 
 def estimates(evidence: Evidence, fit: SetFit, named) -> dict[str, dict[str, Estimate]]:
@@ -31,8 +29,9 @@ def estimates(evidence: Evidence, fit: SetFit, named) -> dict[str, dict[str, Est
             if physics:
                 place = PLACE[effect, fitted.name]
                 value = float(fit.theta[place])
-                own = (deviation[place], FORM * sizes[fitted.name], LEAST_ERROR * value, fitted.error)
-                low = high = float(np.linalg.norm(own))
+                low = high = float(
+                    np.linalg.norm((deviation[place], FORM * sizes[fitted.name], fitted.error))
+                )
             else:
                 told = evidence.channel_of(effect).estimate(effect, fitted.name)
                 value, low, high = told.value, told.below, told.above
@@ -61,13 +60,7 @@ def robust_deviation(fit: SetFit) -> np.ndarray:
     model, flights = np.sqrt(np.diag(fit.covariance)), _between_flights(fit)
     # Few flights: Student's quantile instead of the normal one.
     few = student.ppf(0.95, max(len(fit.grams) - 1, 1)) / REACH
-    return np.clip(few * flights, model, MOST * model)
-
-
-def disagreeing(fit: SetFit) -> list[str]:
-    """The parameters about which flights disagree far beyond their errors, in words."""
-    apart = fit.index[_between_flights(fit) > MOST * np.sqrt(np.diag(fit.covariance))]
-    return [" ".join(name).replace("_", " ") for name, place in PLACE.items() if place in apart]
+    return np.maximum(few * flights, model)
 
 
 def _between_flights(fit: SetFit) -> np.ndarray:

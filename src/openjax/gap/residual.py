@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import norm
 
-from openjax.flights.track import GRAVITY, Track, rotation, smooth
+from openjax.flights.track import Track, rotation, smooth, specific_force_of, to_body
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
 from openjax.gap.model.hypotheses import SetFit, without_nuisances
@@ -37,7 +37,6 @@ LENGTHS = (0.5, 1.0, 2.0)  # of the features, in standard deviations of what the
 STATE_FILTER = 0.1  # s over which the state is smoothed: sensors' noise isn't what anything depends on
 VARIANCES = 10.0 ** np.arange(-4.0, 4.5, 1.0)  # of the process, in units of the channel's noise
 VERY_STRONG = 5.0  # nats of a Bayes factor (Kass, Raftery 1995)
-WAKE = "near"
 CALIBRATION = Path(__file__).with_name("residual.json")
 
 
@@ -68,26 +67,25 @@ class Check:
 
 def check_residual(evidence: Evidence, fit: SetFit) -> Check:
     """Whether a fit leaves no more than what cases without an unknown cause leave."""
-    replay = evidence.replay
-    residuals = residuals_of(replay, fit)
+    residuals = residuals_of(fit)
     measured, excess = measure(evidence, residuals)
     p_value, name = conformal_p(measured)
     predicted = excess if p_value <= DECISION.unknown else np.zeros(6)
     return Check(measured, WORDS[name], p_value, predicted)
 
 
-def residuals_of(replay: Replay, fit: SetFit) -> list[np.ndarray]:
+def residuals_of(fit: SetFit) -> list[np.ndarray]:
     """Residual (T, 9) of each track under a fit, nuisances taken off."""
-    return [without_nuisances(replay, column[0], number) for number, column in enumerate(fit.columns)]
+    return [without_nuisances(fit.replay, column[0], number) for number, column in enumerate(fit.columns)]
 
 
 def disturbances(track: Track, residual: np.ndarray) -> np.ndarray:
     """A residual as accelerations (T, 9): angular (body), linear (body, from the velocity), specific force (body)."""
     out = np.zeros_like(residual)
     out[:, RATES] = np.gradient(residual[:, RATES], track.dt, axis=0)
-    world = np.gradient(residual[:, VELOCITY], track.dt, axis=0)
-    turn = np.eye(3)[None] if track.quaternion is None else rotation(track.quaternion)
-    out[:, VELOCITY] = np.einsum("tji,tj->ti", np.broadcast_to(turn, (len(track), 3, 3)), world)
+    out[:, VELOCITY] = np.gradient(residual[:, VELOCITY], track.dt, axis=0)
+    if track.quaternion is not None:
+        out[:, VELOCITY] = to_body(track.quaternion, out[:, VELOCITY])
     out[:, FORCE] = residual[:, FORCE]
     return out
 
@@ -128,8 +126,7 @@ def _series(evidence: Evidence, residuals: list[np.ndarray]) -> dict[str, list[n
 
 def _path_against_accelerometer(track: Track) -> np.ndarray:
     """Velocity (T, 3) body axes by which the accelerometer and the path's acceleration come apart, its bias aside."""
-    path = np.gradient(track.velocity, track.dt, axis=0) + np.array([0.0, 0.0, GRAVITY])
-    apart = track.specific_force - np.einsum("tji,tj->ti", rotation(track.quaternion), path)
+    apart = track.specific_force - specific_force_of(track.quaternion, track.velocity, track.dt)
     return np.cumsum(apart - apart.mean(0), 0) * track.dt
 
 
@@ -176,8 +173,6 @@ def followed(replay: Replay, residuals: list[np.ndarray]) -> np.ndarray:
     for group in (g for g in states[0] if all(g in s for s in states)):
         features = _fourier_features([s[group] for s in states])
         for axis in np.flatnonzero(replay.heard > 0) if features else ():
-            if group.startswith(WAKE) and axis < 3:
-                continue  # how wakes turn a vehicle is a nuisance
             channel = int(axis) if axis < 3 or replay.usable[3] else int(axis) + 3
             pushes = [
                 f if channel >= 6 else np.cumsum(f, 0) * t.dt
@@ -197,10 +192,10 @@ def _groups_of_state(track: Track) -> dict[str, np.ndarray]:
         turn = rotation(track.quaternion)
         groups |= {"attitude": turn[:, 2, :2], "heading": turn[:, :2, 0]}
         if track.velocity is not None:
-            groups["air"] = np.einsum("tji,tj->ti", turn, track.velocity)
+            groups["air"] = to_body(track.quaternion, track.velocity)
     logged = {"place": track.position, "velocity": track.velocity, "voltage": track.voltage}
     groups |= {n: v.reshape(len(v), -1) for n, v in logged.items() if v is not None}
-    groups |= {f"{WAKE} {k}": other - track.position for k, other in enumerate(track.neighbours)}
+    groups |= {f"near {k}": other - track.position for k, other in enumerate(track.neighbours)}
     groups = {name: smooth(values, STATE_FILTER, track.dt) for name, values in groups.items()}
     return groups | {"time": (track.time - track.time[0])[:, None]}
 

@@ -7,7 +7,7 @@ the difference is within two standard errors, or too small to matter (the one-st
 with a region of practical equivalence). How often each set is chosen when blocks of flight are weighed anew by a Bayesian
 bootstrap is its probability, so that words and probabilities can't disagree."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -16,15 +16,15 @@ from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
 from openjax.gap.model.cross_validation import Judged, judge, level, promise
 from openjax.gap.model.hypotheses import SetFit, fit_set
-from openjax.gap.model.library import ABSENT, CARDS, places, prior, start_of
+from openjax.gap.model.library import CARDS, places
 from openjax.gap.model.table import Table, build, with_effects
 
 # Nats that an effect of usual size must promise: its gain is then expected at two standard errors, as the gain of a true effect
 # is half the square of what it does, and its standard error that square's root.
 DETECTABLE = 2.0 * DECISION.standard_errors**2
 TRIED = 2  # neighbours of each kind that are fitted in full
-STARTS = 3  # effects alone from which the search climbs
 DRAWS = 400  # of the bootstrap
+ROUNDS = 10  # of the chosen set's last fit, between which nuisances are worked out anew
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,12 +68,13 @@ class Selection:
 def select(evidence: Evidence) -> Selection:
     """Choose among the physics effects that the flights can show."""
     search = Search(evidence, testable(evidence))
-    best = search.best()
+    best = search.climb(search.nothing)
     chosen = search.simplest(best)
     named = [e for e in chosen.effects if e not in evidence.confounded]
     gains = {e: search.gap_growth(search.without(chosen, e), chosen) for e in named}
     ordered = tuple(sorted(named, key=lambda e: -gains[e]))
-    table = build(evidence.replay, chosen.fit, {})
+    chosen = replace(chosen, fit=fit_set(chosen.fit.replay, chosen.effects, chosen.fit.theta, rounds=ROUNDS))
+    table = build(chosen.fit, {})
     return Selection(chosen, table, ordered, search.weights(), search.equivalents(chosen, ordered))
 
 
@@ -129,7 +130,7 @@ class Search:
         """The hypothesis of a fit. Effects that are confounded cost nothing, as they aren't named."""
         key = frozenset(fit.effects)
         if key not in self.visited:
-            table = build(self.evidence.replay, fit, None)
+            table = build(fit, None)
             odds = sum(CARDS[e].log_odds for e in key - self.evidence.confounded)
             self.visited[key] = Hypothesis(fit, judge(table, with_effects(table)), odds)
         return self.visited[key]
@@ -142,7 +143,7 @@ class Search:
         if len(key) == 1:
             return self.of_fit(self.singles[next(iter(key))])
         ordered = [e for e in CARDS if e in key]
-        return self.of_fit(fit_set(self.evidence.replay, ordered, self._start(near, ordered)))
+        return self.of_fit(fit_set(near.replay, ordered, self._start(near, ordered)))
 
     def named(self, h: Hypothesis) -> frozenset:
         """The effects of a hypothesis that it would name: not those that are confounded."""
@@ -153,36 +154,12 @@ class Search:
         return self.of_set(set(here.effects) - {effect}, here.fit)
 
     def _start(self, near: SetFit, ordered) -> np.ndarray:
-        """The best of a few starts: a new effect absent, as it was alone, at its usual start, all as in its fit."""
-        replay, base = self.evidence.replay, near.theta.copy()
-        gone = [e for e in near.effects if e not in ordered]
-        base[places(gone)] = ABSENT[places(gone)]
-        starts = [base]
-        for effect in (e for e in ordered if e not in near.effects):
-            own, alone = places((effect,)), self.singles[effect].theta
-            for values in (alone[own], start_of(effect)):
-                starts.append(base.copy())
-                starts[-1][own] = values
-            starts.append(alone)
-        if len(starts) == 1:
-            return base
-        starts = np.array(starts)
-        index, mean, precision = prior(ordered)
-        left = [y[None] - p for y, p in zip(replay.measured, replay.predict(starts), strict=True)]
-        off = starts[:, index] - mean
-        cost = np.diag(replay.grams(left).sum(0)) + np.einsum("ki,ij,kj->k", off, precision, off)
-        return starts[int(np.argmin(cost))]
-
-    def best(self) -> Hypothesis:
-        """Where climbing ends, from nothing and from the best effects alone: two effects together may look like a third."""
-        ends = [self.climb(self.nothing)]
-        alone = [f for f in sorted(self.singles.values(), key=lambda f: -f.score) if possible(f)][:STARTS]
-        if ends[0].effects:
-            gain = alone[0].score - self.nothing.fit.score if alone else 0.0
-            ends += [
-                self.climb(self.of_fit(f)) for f in alone if f.score - self.nothing.fit.score > 0.5 * gain
-            ]
-        return max(ends, key=lambda h: h.score)
+        """As it was near, new effects as they were alone."""
+        start = near.theta.copy()
+        for effect in ordered:
+            if effect not in near.effects:
+                start[places((effect,))] = self.singles[effect].theta[places((effect,))]
+        return start
 
     def climb(self, here: Hypothesis) -> Hypothesis:
         """Move to the best neighbour while the score rises and, where it names anything else, flights tell the two apart."""
@@ -195,7 +172,7 @@ class Search:
 
     def neighbours(self, here: Hypothesis) -> list[Hypothesis]:
         """The most promising neighbours, screened by the model linearised here and fitted in full."""
-        effects, table = frozenset(here.effects), build(self.evidence.replay, here.fit, self.singles)
+        effects, table = frozenset(here.effects), build(here.fit, self.singles)
         more = {effects | {new}: ((new,), ()) for new in table.step}
         instead = {effects - {old} | {new}: ((new,), (old,)) for new in table.step for old in effects}
         sets = []
@@ -225,24 +202,11 @@ class Search:
         """The hypothesis of the largest prior odds that isn't clearly worse than the best one."""
         chosen = best
         while True:
-            self._visit_likelier(chosen)
             simpler = [h for h in self.visited.values() if h.log_odds > chosen.log_odds and possible(h.fit)]
             simpler = [h for h in simpler if not self.clearly_worse(h, best)]
             if not simpler:
                 return chosen
             chosen = max(simpler, key=lambda h: (h.log_odds, h.score))
-
-    def _visit_likelier(self, here: Hypothesis) -> None:
-        """Visit sets of larger prior odds: without one of the effects, or with a commoner one in its place."""
-        if not here.effects:
-            return
-        table = build(self.evidence.replay, here.fit, self.singles)
-        for old in here.effects:
-            self.without(here, old)
-            others = [o for o in table.step if CARDS[o].log_odds >= CARDS[old].log_odds]
-            line = {o: promise(table, with_effects(table, (o,), (old,))) for o in others}
-            for o in sorted(others, key=lambda o: -line[o])[:TRIED]:
-                self.of_set({*here.effects, o} - {old}, here.fit)
 
     def equivalents(self, chosen: Hypothesis, named) -> dict[str, list[str]]:
         """For each named effect those in whose place, of the sets visited, flights don't tell the difference."""

@@ -78,7 +78,7 @@ def _motion_powers(evidence: Evidence, fit: SetFit) -> dict[str, list[np.ndarray
     both = []
     for of in (evidence.nothing, fit):
         rows = []
-        for track, residual in zip(evidence.tracks, residuals_of(evidence.replay, of), strict=True):
+        for track, residual in zip(evidence.tracks, residuals_of(of), strict=True):
             rest = disturbances(track, residual)
             force = rest[:, 3:6] if evidence.replay.usable[3] else rest[:, 6:9]
             calm = smooth(np.concatenate([force, rest[:, :3]], 1), CALM, track.dt)

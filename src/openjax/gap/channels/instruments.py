@@ -8,7 +8,7 @@ first stage here tells the two parts apart; the second lets the feedback part do
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import butter, lfilter, sosfiltfilt
+from scipy.signal import lfilter
 
 from openjax.flights.track import Track, smooth
 from openjax.gap.model.nuisances import TRIM
@@ -27,13 +27,11 @@ EDGE = 0.3  # s at either end that the filter spoils
 class Feedback:
     """Of one track: `acceleration` (T, 3) rad/s^2 that the feedback part of the motors makes, through their lag; `trim` the same
     of what motors do slowly but for its mean, which holds what pushes the body slowly;
-    `quick` (T, 3) the same of what motors do within QUICK s, whoever caused it; `caused` (T, 3) the same of what the
-    commands caused."""
+    `quick` (T, 3) the same of what motors do within QUICK s, whoever caused it."""
 
     acceleration: np.ndarray
     trim: np.ndarray
     quick: np.ndarray
-    caused: np.ndarray
 
 
 def outputs_of(vehicle) -> np.ndarray:
@@ -52,11 +50,10 @@ def in_force(track: Track, arrived) -> np.ndarray:
 
 def read_feedback(tracks, vehicles, by_commands) -> list[Feedback]:
     """The feedback part of every track's motors. `by_commands`: `caused_by_commands` of each."""
-    given, caused, made = [], [], []
+    caused, made = [], []
     for track, vehicle, (motors, _) in zip(tracks, vehicles, by_commands, strict=True):
         outputs = outputs_of(vehicle)
-        given.append(motors - motors.mean(0))
-        caused.append(given[-1] @ outputs)
+        caused.append((motors - motors.mean(0)) @ outputs)
         made.append(track.motor @ outputs)
     # First stage: as much of the outputs as is proportional to what commands would have caused, axis by axis. More freedom
     # (a filter) would let the outer loop's answers to gusts in.
@@ -69,25 +66,9 @@ def read_feedback(tracks, vehicles, by_commands) -> list[Feedback]:
             _turning((r - smooth(r, TRIM, t.dt)) @ np.asarray(mixer(v), float).T, t, v),
             _turning(smooth(t.motor, TRIM, t.dt) - t.motor.mean(0), t, v),
             _turning(t.motor - smooth(t.motor, QUICK, t.dt), t, v),
-            _turning(g, t, v),
         )
-        for r, g, t, v in zip(rest, given, tracks, vehicles, strict=True)
+        for r, t, v in zip(rest, tracks, vehicles, strict=True)
     ]
-
-
-def gustiness(tracks, feedback: list[Feedback], floor) -> np.ndarray:
-    """(3,) rms of the angular accelerations that nothing explains over those that commands caused, in BAND. Commands
-    answer gusts too, by way of the attitude, so this bounds how wrong torques may look. `floor` [(T, 9)]: residuals when
-    all effects may act."""
-    left, caused = np.zeros(3), np.full(3, 1e-12)
-    for track, part, rest in zip(tracks, feedback, floor, strict=True):
-        band = butter(2, BAND, "bandpass", fs=1.0 / track.dt, output="sos")
-        edge = int(EDGE / track.dt)
-        both = np.stack([np.gradient(rest[:, :3], track.dt, axis=0), part.caused])[:, edge:]
-        both = sosfiltfilt(band, both, axis=1)[:, edge:-edge]
-        left += (both[0] ** 2).sum(0)
-        caused += (both[1] ** 2).sum(0)
-    return np.sqrt(left / caused)
 
 
 def caused_by_commands(track: Track, vehicle, link) -> tuple[np.ndarray, np.ndarray]:

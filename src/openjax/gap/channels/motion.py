@@ -9,17 +9,16 @@ import numpy as np
 from openjax.errors import UserError
 from openjax.flights.flight import Case
 from openjax.flights.track import GRID_PERIOD, Track
-from openjax.gap.channels.instruments import caused_by_commands, gustiness, read_feedback
+from openjax.gap.channels.instruments import caused_by_commands, read_feedback
 from openjax.gap.channels.rate_loop import ROW_DELAY, RateLoop
 from openjax.gap.channels.sensors import Kinematics
-from openjax.gap.model.hypotheses import SetFit, fit_singles, model_noise, without_nuisances
+from openjax.gap.model.hypotheses import SetFit, fit_singles, model_noise
 from openjax.gap.model.library import CARDS, Library, numbers_of
 from openjax.gap.model.observer import TICKS
 from openjax.gap.model.replay import Replay, make_replay
 
 FEW_ROWS = 2.4  # of a log in one of the grid's: if they are samples, their mean isn't what five ticks of the loop did
 SLOW_ROWS = 1.2  # grid periods: rows as slow hide every other command of a loop that sends one each 10 ms
-MOST_GUSTS = 0.25  # of the torques that commands cause: from then on feedback is all that is seen of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,8 +79,8 @@ def make_reading(case: Case, library: Library, tracks, vehicles, arrived, sensor
 @dataclass(frozen=True, eq=False)
 class Motion:
     """`replay` of the flights; `singles` {effect: its fit alone} and the fit of `nothing`; `exposure` {effect: nats that it
-    would leave at its usual size}; `confounded`: effects that gusts or hidden samples look like: they take what they can, and
-    aren't named."""
+    would leave at its usual size}; `confounded`: effects that hidden samples look like: they take what they can, and aren't
+    named."""
 
     replay: Replay
     nothing: SetFit
@@ -99,34 +98,10 @@ def read_motion(reading: Reading, loop: RateLoop | None) -> Motion:
     feedback = read_feedback(tracks, reading.vehicles, reading.by_commands)
     clocks = sensors.one_clock, reading.at_once, sensors.wander
     replay = make_replay(tracks, reading.vehicles, ticks, feedback, reading.numbers, *clocks)
-    replay, floor, exposure = model_noise(replay, library)
-    gusts = gustiness(tracks, feedback, floor)
-    replay = replay.loosened(_gusty(replay, gusts))
+    replay, exposure = model_noise(replay, library)
     exposure |= {e: 0.0 for e in library.physics if _hidden(CARDS[e], tracks)}
-    nothing, singles = fit_singles(replay, library, exposure)
-
-    def remains(effect: str) -> bool:
-        """Whether an effect is confounded. A large one leaves more than a straight line takes, which looked like gusts: what is
-        left of its own fit tells."""
-        if not _confounded(CARDS[effect], reading.blind, gusts):
-            return False
-        if reading.blind or effect not in singles:
-            return True
-        left = [without_nuisances(replay, c[0], k) for k, c in enumerate(singles[effect].columns)]
-        return _confounded(CARDS[effect], False, gustiness(tracks, feedback, left))
-
-    return Motion(replay, nothing, singles, exposure, frozenset(e for e in library.physics if remains(e)))
-
-
-def _gusty(replay: Replay, gusts: np.ndarray) -> dict[str, float]:
-    """{nuisance: times} by which the vehicle's numbers may seem more wrong than usual: in closed loop commands answer gusts by
-    way of the attitude, so motors look weak and early."""
-    times = {}
-    for effect, parameter, usual in replay.numbers:
-        if parameter in CARDS[effect].gusts:
-            size, axes = CARDS[effect].gusts[parameter]
-            times[f"{effect} {parameter}"] = float(np.hypot(1.0, size * gusts[list(axes)].mean() / usual))
-    return times
+    confounded = frozenset(e for e in library.physics if reading.blind and CARDS[e].torque_axes)
+    return Motion(replay, *fit_singles(replay, library, exposure), exposure, confounded)
 
 
 def _hidden(card, tracks) -> bool:
@@ -134,9 +109,3 @@ def _hidden(card, tracks) -> bool:
     if card.needs and any(getattr(t, card.needs) is None for t in tracks):
         return True
     return card.impossible is not None and any(card.impossible(t.position) for t in tracks)
-
-
-def _confounded(card, blind: bool, gusts: np.ndarray) -> bool:
-    """Whether gusts, or what motors do between two rows, look like an effect."""
-    axes = list(card.torque_axes)
-    return bool(axes) and bool(blind or gusts[axes].mean() > MOST_GUSTS)

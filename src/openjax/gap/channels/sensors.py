@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
-from openjax.flights.track import GRAVITY, Track, rotation
+from openjax.flights.track import GRAVITY, Track, rotation, to_world
 from openjax.gap.channels.pose import turn_increments
 from openjax.gap.decision import DECISION
 
@@ -128,7 +128,7 @@ def _accelerating(track: Track) -> tuple[np.ndarray, np.ndarray] | None:
     """What the accelerometer feels (T, 3) and the acceleration of the position (T, 3), m/s^2 in the world."""
     if track.quaternion is None or track.position is None or track.specific_force is None:
         return None
-    felt = np.einsum("tij,tj->ti", rotation(track.quaternion), track.specific_force)
+    felt = to_world(track.quaternion, track.specific_force)
     return felt, np.gradient(np.gradient(track.position, track.dt, axis=0), track.dt, axis=0)
 
 
@@ -218,7 +218,7 @@ def _world(tracks) -> tuple[np.ndarray | None, np.ndarray | None]:
         if track.quaternion is None or track.velocity is None or track.specific_force is None:
             return None, None
         turn = rotation(track.quaternion)
-        rest = np.einsum("tij,tj->ti", turn, track.specific_force) - np.array([0.0, 0.0, GRAVITY])
+        rest = to_world(track.quaternion, track.specific_force) - np.array([0.0, 0.0, GRAVITY])
         low = butter(2, SLOW, fs=1.0 / track.dt, output="sos")
         edge, size = int(EDGE / track.dt), max(int(SEGMENT / track.dt), 1)
         rest = rest - np.gradient(track.velocity, track.dt, axis=0)

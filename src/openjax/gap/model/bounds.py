@@ -50,22 +50,3 @@ def normal_equations(precision: np.ndarray, push: np.ndarray, common: int, own: 
             right[:shared] += target[:shared]
             right[mine] += target[shared:]
     return hessian, right
-
-
-def held_objective(grams, shared: np.ndarray, off: np.ndarray, precision: np.ndarray) -> float:
-    """Least half square of whitened residuals, once columns may move from where they are - `off` (p,) from a prior of
-    `precision` - and nuisances of unit prior variance may take what their bounds allow: those of `shared` (N,) the same on
-    every track. `grams` (1 + p + N, 1 + p + N): inner products of each track's residual, columns and nuisances."""
-    first = 1 + len(off)
-    order = np.concatenate(
-        [np.arange(1, first), first + np.flatnonzero(shared), first + np.flatnonzero(~shared)]
-    )
-    parts = [(g[np.ix_(order, order)], g[order, 0]) for g in grams]
-    hessian, push = normal_equations(precision, -precision @ off, shared.sum(), (~shared).sum(), parts)
-    found, _ = bounded(hessian, push, len(off))
-    square = sum(float(g[0, 0]) for g in grams)
-    return (
-        0.5 * square
-        + 0.5 * float(off @ precision @ off)
-        - float(push @ found - 0.5 * found @ hessian @ found)
-    )

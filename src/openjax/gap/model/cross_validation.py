@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from openjax.gap.model.bounds import BOUND, bounded, normal_equations
+from openjax.gap.model.bounds import bounded, normal_equations
 from openjax.gap.model.library import prior
 from openjax.gap.model.table import Model, Table, with_effects
 
@@ -67,26 +67,8 @@ class Equations:
         return normal_equations(self.model.precision, push, *map(len, self.nuisances), parts)
 
     def solved(self, fold: int | None = None) -> np.ndarray:
-        """Solution over all folds but one, whose track has its own nuisances fitted to all of it."""
-        hessian, push = self.without(fold)
-        found, _ = bounded(hessian, push, len(self.model.free))
-        return found if fold is None else self.own_again(found[None], self.table.folds[1][fold])[0]
-
-    def own_again(self, found: np.ndarray, track: int) -> np.ndarray:
-        """Solutions (K, size) with a track's own nuisances fitted to all of it, everything else as it was `found`: they are of
-        its sensors and clocks, and what the rest of the track can't show of them isn't to be foretold."""
-        common, own = self.common, len(self.nuisances[1])
-        gram, target = self.tracks[track]
-        hessian, push = (
-            np.eye(own) + gram[common:, common:],
-            target[common:] - found[:, :common] @ gram[:common, common:],
-        )
-        free = np.linalg.solve(hessian, push.T).T
-        found, mine = found.copy(), slice(common + own * track, common + own * (track + 1))
-        for each, alone, right in zip(found, free, push, strict=True):
-            inside = (np.abs(alone) <= BOUND).all()
-            each[mine] = alone if inside else bounded(hessian, right)[0]
-        return found
+        """Solution over all folds but one."""
+        return bounded(*self.without(fold), len(self.model.free))[0]
 
     def coefficients(self, found: np.ndarray, track: int) -> np.ndarray:
         """Coefficients (..., C) of every column on one track, from solutions (..., size)."""

@@ -12,7 +12,7 @@ from scipy.linalg import solve_triangular
 
 from openjax.flights.track import Track
 from openjax.gap.model.library import ABSENT, PLACE, STEP
-from openjax.gap.model.nuisances import OF_A_TRACK, columns_of
+from openjax.gap.model.nuisances import OF_A_TRACK, SIZE, columns_of, motor_shift
 from openjax.gap.model.prediction import FORCE, RATES, VELOCITY, Physics, make_physics
 from openjax.gap.model.whitening import Noise, first_noise, whiten
 
@@ -32,7 +32,10 @@ class Replay:
     nominal: list[np.ndarray]  # (T, 9)
     nuisances: list[np.ndarray]  # (N, T, 9), in units of their standard deviations
     nuisance_names: tuple[str, ...]
-    numbers: tuple  # the vehicle's numbers among the nuisances, which come first
+    sizes: list[
+        np.ndarray
+    ]  # usual sizes of each track's first nuisances: the vehicle's numbers, its motors' clock and delay
+    numbers: tuple  # the vehicle's numbers
     usable: np.ndarray  # (9,) channels that were logged
     noises: tuple[Noise, ...]  # unlogged channels have one, but count nothing
 
@@ -81,10 +84,18 @@ class Replay:
     def with_noise(self, noises) -> Replay:
         return replace(self, noises=tuple(noises))
 
-    def loosened(self, usual: dict[str, float]) -> Replay:
-        """With nuisances `usual` {name: times} as large as they usually are."""
-        times = np.array([usual.get(n, 1.0) for n in self.nuisance_names])
-        return replace(self, nuisances=[n * times[:, None, None] for n in self.nuisances])
+    def around(self, theta: np.ndarray) -> Replay:
+        """With the derivatives of a vehicle that has the effects theta (P,): a wrong moment of inertia scales the torques that
+        are left once an effect is accounted for, not those of motors that hold against it."""
+        places = [PLACE[key[:2]] for key in self.numbers] + [len(theta) - 1]
+        steps, nuisances = STEP[places][:, None, None], []
+        for p, old, size in zip(
+            self.predict(stepped(theta, places)), self.nuisances, self.sizes, strict=True
+        ):
+            moved = (p[1:] - p[:1]) / steps
+            moved = np.concatenate([moved, moved[-1:]]) * size[:, None, None]
+            nuisances.append(np.concatenate([moved, old[len(moved) :]]))
+        return replace(self, nuisances=nuisances)
 
     def whiten(self, x: np.ndarray, track: int) -> np.ndarray:
         """x (..., T, 9) of a track -> (..., T', 9) in units of the noise, without the first moments."""
@@ -92,26 +103,15 @@ class Replay:
         out *= self.usable
         return out[..., int(SKIP / self.tracks[track].dt) :, :]
 
-    def products(self, columns: list[np.ndarray]) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Inner products of each track's whitened columns (C, T, 9) with each other (C, C) and with the nuisances (C, N)."""
-        out = []
-        for number, column in enumerate(columns):
-            w = self.whiten(column, number).reshape(len(column), -1)
-            n = self.whitened_nuisances[number]
-            out.append((w @ w.T, w @ n.reshape(len(n), -1).T))
-        return out
-
-    def marginal(self, products) -> np.ndarray:
-        """Inner products (F, C, C) per flight, nuisances marginalised."""
-        total = np.zeros((len(self.flights), *products[0][0].shape))
-        for flight, root, (gram, cross) in zip(self.flight_of, self._roots, products, strict=True):
-            taken = solve_triangular(root, cross.T, lower=True, check_finite=False)
-            total[flight] += gram - taken.T @ taken
-        return total
-
     def grams(self, columns: list[np.ndarray]) -> np.ndarray:
         """Inner products (F, C, C) per flight of columns [(C, T, 9) per track], nuisances marginalised."""
-        return self.marginal(self.products(columns))
+        total = np.zeros((len(self.flights), len(columns[0]), len(columns[0])))
+        for number, column in enumerate(columns):
+            w, n = self.whiten(column, number).reshape(len(column), -1), self.whitened_nuisances[number]
+            cross = n.reshape(len(n), -1) @ w.T
+            taken = solve_triangular(self._roots[number], cross, lower=True, check_finite=False)
+            total[self.flight_of[number]] += w @ w.T - taken.T @ taken
+        return total
 
     def taken(self, residual: np.ndarray, track: int) -> np.ndarray:
         """(N,) the nuisances' most likely sizes, given a residual (T, 9) of a track."""
@@ -162,27 +162,44 @@ def make_replay(
     if usable[3:].any() and not all(t.motors_logged for t in tracks):
         usable[RATES] = 0.0  # motors made from commands tell the thrust, not how a real loop shares it out
     physics = make_physics(tracks, vehicles, motor_ticks)
-    predicted = physics.predict(stepped(ABSENT, [PLACE[key[:2]] for key in numbers] + [len(ABSENT) - 1]))
+    nominal = [p[0] for p in physics.predict(ABSENT[None])]
     named = [
-        columns_of(track, path, p[0], p[1:], numbers, made, one_clock, at_once, wander)
-        for track, path, p, made in zip(tracks, physics.paths, predicted, feedback, strict=True)
+        columns_of(track, path, p, made, at_once, wander)
+        for track, path, p, made in zip(tracks, physics.paths, nominal, feedback, strict=True)
     ]
     # A track without a neighbour has no wake: nothing there.
     names = tuple(max(named, key=len))
-    nominal = [p[0] for p in predicted]
-    return Replay(
+    moving = (*(" ".join(key[:2]) for key in numbers), "clock of the motors", "delay of the motors")
+    sizes = [
+        np.array(
+            [*(key[2] for key in numbers), motor_shift(t, one_clock, at_once, wander), SIZE["motor_delay"]]
+        )
+        for t in tracks
+    ]
+    replay = Replay(
         physics,
         [_measured(t) for t in tracks],
         nominal,
         [
-            np.stack([columns.get(n, np.zeros_like(base)) for n in names])
+            np.stack([columns.get(n, np.zeros_like(base)) for n in (*moving, *names)])
             for columns, base in zip(named, nominal, strict=True)
         ],
-        names,
+        (*moving, *names),
+        sizes,
         numbers,
         usable,
         tuple(first_noise(a, i, d) for (a, i), d in zip(GROUPS, FIRST_NOISE, strict=True)),
     )
+    replay = replay.around(ABSENT)
+    return replace(replay, nuisances=[_balanced(n, len(numbers)) for n in replay.nuisances])
+
+
+def _balanced(nuisances: np.ndarray, count: int) -> np.ndarray:
+    """Nuisances (N, T, 9), the first `count` of them without their mean torque: as long as it isn't known what acts, motors that
+    pull one way all the time hold against something, and of a sum of torques that is zero no number can be wrong."""
+    out = nuisances.copy()
+    out[:count, :, RATES] -= np.linspace(0.0, 1.0, out.shape[1])[:, None] * out[:count, -1:, RATES]
+    return out
 
 
 def _measured(track: Track) -> np.ndarray:

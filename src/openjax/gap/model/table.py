@@ -15,7 +15,7 @@ import numpy as np
 
 from openjax.gap.model.hypotheses import SetFit, linearised_at
 from openjax.gap.model.library import ABSENT, CARDS, places, prior
-from openjax.gap.model.replay import SKIP, Replay
+from openjax.gap.model.replay import SKIP
 
 FOLD = 2.5  # s that are left out together
 BLOCK = 1.0  # s: gusts and sensors forget within less
@@ -74,10 +74,10 @@ class Model:
     precision: np.ndarray
 
 
-def build(replay: Replay, fit: SetFit, singles: dict[str, SetFit] | None) -> Table:
+def build(fit: SetFit, singles: dict[str, SetFit] | None) -> Table:
     """The table around a fitted set; `singles` {effect: its fit alone} are the effects that may come in; None: nothing may
     come in or go."""
-    own = fit.effects if singles is not None else ()
+    replay, own = fit.replay, fit.effects if singles is not None else ()
     others = [e for e in singles or () if e not in own]
     index = np.array(
         sorted({int(i) for e in (*own, *others) for i in places((e,))} | set(fit.index.tolist())), int
@@ -91,7 +91,7 @@ def build(replay: Replay, fit: SetFit, singles: dict[str, SetFit] | None) -> Tab
         point = fit.theta.copy()
         point[places((effect,))] = ABSENT[places((effect,))]
         points.append(point)
-    columns = linearised_at(replay, fit, index)
+    columns = linearised_at(fit, index)
     moved = replay.predict(np.array(points)) if points else [np.zeros((0, *y.shape)) for y in replay.measured]
     white, error, rows, track_of, fold_of, whole = [], [], [], [], [], []
     for number, (c, m, track) in enumerate(zip(columns, moved, replay.tracks, strict=True)):

@@ -54,7 +54,6 @@ class Report:
     rest: str = ""
     sensors: tuple[str, ...] = ()
     contradictions: tuple[str, ...] = ()
-    disagreement: str = ""
     nuisances: dict[str, str] = field(default_factory=dict)
     residual: dict[str, float] = field(default_factory=dict)
     seconds: float = 0.0
@@ -115,7 +114,6 @@ class Report:
             chance = self.probabilities["unknown"]
             lines.append(f"Something acts that no known effect explains (probability {chance:.2f}).")
         lines += [f"Sensors: {text}." for text in self.sensors]
-        lines += [self.disagreement] if self.disagreement else []
         lines += [self.rest] if self.rest else []
         lines.append(f"Where: {in_words(self.where)}.")
         for effect, values in self.parameters.items():

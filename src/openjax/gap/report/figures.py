@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from openjax.flights.track import rotation, smooth
+from openjax.flights.track import smooth, to_body
 from openjax.gap.model.library import CARDS
 from openjax.gap.model.replay import SKIP
 from openjax.gap.model.table import HORIZONS
@@ -50,9 +50,7 @@ def _named(report: Report) -> list[str]:
 
 def _residuals(report: Report) -> tuple[list, list]:
     """Residuals of each track of the nominal simulator, and with the named effects."""
-    replay = report.plots["evidence"].replay
-    fits = report.plots["evidence"].nothing, report.plots["selection"].fit
-    return tuple(residuals_of(replay, fit) for fit in fits)
+    return residuals_of(report.plots["evidence"].nothing), residuals_of(report.plots["selection"].fit)
 
 
 def _places(report: Report):
@@ -191,7 +189,7 @@ def _pairs(track, residual, coordinate):
     """(T', 2) of the coordinate and the missing acceleration along its axis; None where the track hasn't it."""
     missing = smooth(disturbances(track, residual), CALM, track.dt)[:, 3:6]
     if coordinate == "body velocity":
-        x, y = np.einsum("tji,tj->ti", rotation(track.quaternion), track.velocity)[:, 0], missing[:, 0]
+        x, y = to_body(track.quaternion, track.velocity)[:, 0], missing[:, 0]
     else:
         y = missing[:, 2]
         x = {

@@ -30,10 +30,9 @@ EFFECT = Effect(
     card=Card(
         path="physics",
         fitted=(
-            Fitted("strength", mean=0.0, spread=0.8, start=0.4, step=0.01, positive=True),
+            Fitted("strength", mean=0.0, spread=0.8, start=0.4, step=0.01),
             Fitted("offset", mean=0.012, spread=0.025, start=0.012, step=0.0005),
         ),
-        linear=True,
         others=((0.4, 0.0), (0.4, 0.025), (0.4, 0.05)),
         needs="position",
         coordinate="height",

@@ -39,12 +39,11 @@ EFFECT = Effect(
     card=Card(
         path="physics",
         fitted=(
-            Fitted("force", mean=0.0, spread=0.1, start=0.08, step=0.001, positive=True),
+            Fitted("force", mean=0.0, spread=0.1, start=0.08, step=0.001),
             Fitted("length", mean=0.5, spread=0.25, start=0.5, step=0.005),
             Fitted("width", mean=0.05, spread=0.03, start=0.045, step=0.0005),
             Fitted("spread", mean=0.1, spread=0.06, start=0.1, step=0.002),
         ),
-        linear=True,
         others=(
             (0.05, 0.8, 0.06, 0.15),
             (0.08, 0.3, 0.03, 0.08),

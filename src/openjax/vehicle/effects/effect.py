@@ -93,7 +93,7 @@ class Parameter:
 @dataclass(frozen=True)
 class Fitted:
     """How one parameter is fitted: prior mean and standard deviation, start of the search, step of the difference
-    quotient, all in the parameter's unit. `positive`: a value below the effect-free one is implausible. `error`: standard
+    quotient, all in the parameter's unit. `error`: standard
     deviation that rows of a log leave, whatever a fit says."""
 
     name: str
@@ -101,7 +101,6 @@ class Fitted:
     spread: float
     start: float
     step: float
-    positive: bool = False
     error: float = 0.0
 
 
@@ -115,17 +114,16 @@ class Card:
 
     path: by which way of the log it is read: "physics" (motors to motion), "radio", "rate_loop", "estimator".
     fitted: its parameters; `common` is the spread that all share, `balanced`: their mean belongs to another effect and is
-        held near zero, `linear`: the first scales the whole effect, `others`: more starts of the search.
+        held near zero, `others`: more starts of the search.
     needs: the channel without which it can't be told, though it leaves a trace in others.
     coordinate: the variable that its force follows, for pictures; none where it makes torques or delays.
     thrust_map: a map from duty cycles to thrust that isn't known can imitate it.
-    torque_axes: those of the torques by which it is told, which gusts can imitate, and what motors do between two rows.
+    torque_axes: those of the torques by which it is told, which what motors do between two rows can imitate.
     log_odds: log prior odds that it acts at a size that matters.
     possible({parameter: value}, {parameter: deviation}): whether fitted values lie within physical bounds.
     nuisance: {parameter: size, or a function of the vehicle that gives it} by which the vehicle's number is usually off: free in
         every hypothesis, never a cause.
     nuisance_duty, nuisance_samples: the same where motor commands are duty cycles, or single samples whose rows hide the rest.
-    gusts: {parameter: (size, torque axes)} by which a nuisance may be larger per share of gusts in those torques.
     weighed: whether a weighed vehicle rules it out.
     at_voltage(values, intervals, voltage): both as they are at one voltage, for simulators that know none.
     form_error: {parameter: spread} of what real vehicles without a fault seem to have: what lies within it isn't named.
@@ -138,7 +136,6 @@ class Card:
     fitted: tuple[Fitted, ...]
     common: float = 0.0
     balanced: bool = False
-    linear: bool = False
     others: tuple[tuple[float, ...], ...] = ()
     needs: str = ""
     coordinate: str = ""
@@ -150,7 +147,6 @@ class Card:
     nuisance_duty: Mapping[str, float] = field(default_factory=dict)
     nuisance_samples: Mapping[str, float] = field(default_factory=dict)
     form_error: Mapping[str, float] = field(default_factory=dict)
-    gusts: Mapping[str, tuple[float, tuple[int, ...]]] = field(default_factory=dict)
     weighed: bool = False
     at_voltage: Callable[[dict, dict, float], tuple[dict, dict]] | None = None
     impossible: Callable[[Any], bool] | None = None

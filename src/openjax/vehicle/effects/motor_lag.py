@@ -55,7 +55,6 @@ EFFECT = Effect(
         ),
         common=0.03,
         possible=lags,
-        gusts={"extra_up": (0.01, (0, 1)), "extra_down": (0.01, (0, 1))},
         nuisance={"extra_up": spin_up_error, "extra_down": spin_down_error},
         nuisance_duty={"extra_up": 0.01, "extra_down": 0.01},
         nuisance_samples={"extra_up": 0.01, "extra_down": 0.01},

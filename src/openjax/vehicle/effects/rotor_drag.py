@@ -34,8 +34,8 @@ EFFECT = Effect(
     card=Card(
         path="physics",
         fitted=(
-            Fitted("d_xy", mean=0.0, spread=0.015, start=0.01, step=0.0001, positive=True),
-            Fitted("d_z", mean=0.0, spread=0.012, start=0.005, step=0.0001, positive=True),
+            Fitted("d_xy", mean=0.0, spread=0.015, start=0.01, step=0.0001),
+            Fitted("d_z", mean=0.0, spread=0.012, start=0.005, step=0.0001),
         ),
         needs="velocity",
         coordinate="body velocity",

@@ -41,7 +41,7 @@ EFFECT = Effect(
         fitted=(
             Fitted("offset", mean=0.0, spread=0.08, start=0.02, step=0.001),
             Fitted("slope", mean=1.0, spread=0.2, start=0.95, step=0.001),
-            Fitted("curvature", mean=0.0, spread=0.25, start=0.02, step=0.001),
+            Fitted("curvature", mean=0.0, spread=0.25, start=0.02, step=0.001, error=0.1),
         ),
         thrust_map=True,
         log_odds=RARE,

@@ -43,7 +43,7 @@ EFFECT = Effect(
             Fitted("x", mean=0.0, spread=1.5, start=0.3, step=0.01),
             Fitted("y", mean=0.0, spread=1.5, start=0.3, step=0.01),
             Fitted("z", mean=0.0, spread=0.5, start=0.0, step=0.01),
-            Fitted("drag", mean=0.013, spread=0.006, start=0.013, step=0.0001, positive=True),
+            Fitted("drag", mean=0.013, spread=0.006, start=0.013, step=0.0001),
             Fitted("along", mean=0.8, spread=0.4, start=1.0, step=0.01),
         ),
         needs="velocity",
