@@ -128,42 +128,50 @@ def prepare(
     """
     resumed = None if command.resume is None else open_run(command.resume)
     known = {} if resumed is None else resumed.read_facts()
-    kept = (lambda name: None) if resumed is None else resumed.optional
-    vehicle, effects = command.vehicle or kept("vehicle.toml"), command.effects or kept("effects.toml")
-    opponent = command.opponent or kept("evader.npz")
-    start_from = _lasting(command.start_from) or known.get("start_from")
-    environment = make_environment(command.settings.environment, vehicle, effects, opponent)
+    files = _files(command, resumed)
+    environment = make_environment(command.settings.environment, *files.values())
+    if environment.evader_network is None:  # a scripted one is in the settings
+        files["evader.npz"] = None
     settings = dataclasses.replace(command.settings, environment=environment.settings)
-    compare_with = _comparison(command, known)
-    devices = _devices(command.devices, settings, known.get("devices"))
-    if resumed is None:
-        name = command.preset or default_preset()
-        out = command.out or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{name}"
-        out = Path(processes.of_first(str(out)))
-        check_free(out, command.overwrite)
+    directory = resumed or RunDirectory(_free_directory(command, processes))
+    started_from = _lasting(command.start_from) or known.get("start_from")
+    facts = {
+        "command": " ".join([PROGRAM, *arguments]),
+        "machine": describe_machine(),
+        "devices": _devices(command.devices, settings, known.get("devices")),
+        "start_from": started_from,
+        "compare_with": _comparison(command, known),
+    }
     job = TrainingJob(
         settings=settings,
         environment=environment,
         # what a run started from is needed again only where it was killed before its first checkpoint
-        start_from=None if resumed and Checkpoints(resumed.checkpoints).any_finished() else start_from,
-        devices=devices,
+        start_from=None if resumed and Checkpoints(resumed.checkpoints).any_finished() else started_from,
+        devices=facts["devices"],
         processes=processes,
         time_limit=float("inf") if command.minutes is None else 60.0 * command.minutes,
         layout_episodes=command.layout_episodes or _layout_episodes(environment),
-        compare_with=compare_with,
-        facts={
-            "command": " ".join([PROGRAM, *arguments]),
-            "machine": describe_machine(),
-            "devices": devices,
-            "start_from": start_from,
-            "compare_with": compare_with,
-        },
+        compare_with=facts["compare_with"],
+        facts=facts,
         started=started,
     )
     job.check()
-    learned = opponent if environment.evader_network is not None else None
-    files = {"vehicle.toml": vehicle, "effects.toml": effects, "evader.npz": learned}
-    return job, resumed or RunDirectory(out), {name: path for name, path in files.items() if path is not None}
+    return job, directory, {name: path for name, path in files.items() if path is not None}
+
+
+def _files(command, resumed):
+    """What the run flies with by its name in a run's directory: vehicle, effects, evader; None where there is none."""
+    kept = (lambda name: None) if resumed is None else resumed.optional
+    given = {"vehicle.toml": command.vehicle, "effects.toml": command.effects, "evader.npz": command.opponent}
+    return {name: path or kept(name) for name, path in given.items()}
+
+
+def _free_directory(command, processes):
+    """Where a new run is written, the same for all processes. Raises UserError where it can't be."""
+    name = f"{time.strftime('%Y%m%d-%H%M%S')}-{command.preset or default_preset()}"
+    out = Path(processes.of_first(str(command.out or Path("runs") / name)))
+    check_free(out, command.overwrite)
+    return out
 
 
 def _layout_episodes(environment):
