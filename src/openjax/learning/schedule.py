@@ -48,31 +48,27 @@ class Schedule:
 
         return jax.tree.map(take, worlds)
 
-    def with_members(self, worlds: Any, new: Any, group: jax.Array) -> Any:
-        """`worlds` with those of a group replaced by `new`."""
-
-        def put(x, new):
-            split = x.reshape(x.shape[0] // self.groups, self.groups, *x.shape[1:])
-            return jax.lax.dynamic_update_index_in_dim(split, new, group, axis=1).reshape(x.shape)
-
-        return jax.tree.map(put, worlds, new)
-
     def restarts(self, number: int) -> int:
         """How many of `number` worlds start anew in a training step, beside those whose episodes ended."""
         if not self.restart_every:
             return 0
         return number // self.groups // self.restart_every * len(self.restart_ages)
 
-    def with_restarts(self, worlds: Any, new: Any, ending: jax.Array) -> Any:
-        """`worlds` with those that start anew replaced by `new`, where the group `ending` ends its episodes."""
-        groups = (ending + np.array(self.restart_ages)) % self.groups
-
-        def put(x, new):
-            split = x.reshape(-1, self.restart_every, self.share, self.groups, *x.shape[1:])
-            new = jnp.swapaxes(new.reshape(split.shape[0], len(groups), self.share, *x.shape[1:]), 1, 2)
-            return split.at[:, 0].set(split[:, 0].at[:, :, groups].set(new)).reshape(x.shape)
-
-        return jax.tree.map(put, worlds, new)
+    def renewed(self, worlds: Any, fresh: Any, ending: jax.Array) -> Any:
+        """`worlds` (E, ...) with `fresh` ones in place of the group `ending`, and then of those that start anew."""
+        number = jax.tree.leaves(worlds)[0].shape[0]
+        member, group = np.divmod(np.arange(number), self.groups)
+        task, neighbour = np.divmod(member, self.share)
+        every = self.restart_every or 1
+        which = np.full(self.groups, -1)  # of the restarts, by how far a group is behind the one that ends
+        if self.restart_every:
+            which[list(self.restart_ages)] = np.arange(len(self.restart_ages))
+        behind = (group - ending) % self.groups
+        restart = jnp.where(task % every == 0, jnp.asarray(which)[behind], -1)
+        anew = (task // every * len(self.restart_ages) + restart) * self.share + neighbour
+        source = jnp.where(restart < 0, np.arange(number), number + number // self.groups + anew)
+        source = jnp.where(behind == 0, number + member, source)
+        return jax.tree.map(lambda x, new: jnp.concatenate([x, new])[source], worlds, fresh)
 
     def lasting(self, number: int) -> np.ndarray:
         """(number,) bool of a group's members: those that are never started anew within an episode."""

@@ -225,10 +225,8 @@ class _Step:
         # new worlds for those that end, and for those that are started anew within the episodes of other groups
         numbers = ended.step.shape[0], schedule.restarts(carry.state.step.shape[0])
         keys = self._key(carry, 4), self._key(carry, 5)
-        new, anew = _fresh(settings, starting, archive, *keys, numbers, axis)
-        worlds = schedule.with_members((carry.observation, carry.state), new, group)
-        if numbers[1]:
-            worlds = schedule.with_restarts(worlds, anew, group)
+        fresh = _fresh(settings, starting, archive, *keys, numbers, axis)
+        worlds = schedule.renewed((carry.observation, carry.state), fresh, group)
         carry = carry.replace(
             observation=worlds[0],
             state=worlds[1],
@@ -276,7 +274,7 @@ def _tasks(settings, archive, keys, close=None):
 
 
 def _fresh(settings, environment, archive, task_key, reset_key, numbers, axis):
-    """Observations and states of two `numbers` of worlds of this device at the start of newly drawn tasks.
+    """Observations and states of worlds of this device at the start of newly drawn tasks, of both `numbers` in one.
 
     Of the second ones some pursuers start close to something. All are drawn at once, by a program half as large.
     """
@@ -290,11 +288,7 @@ def _fresh(settings, environment, archive, task_key, reset_key, numbers, axis):
         return jnp.concatenate(list(parts))
 
     tasks = _tasks(settings, archive, keys(task_key, [number // share for number in numbers]), close)
-    fresh = jax.vmap(environment.reset_to)(keys(reset_key, numbers), tasks)
-    return tuple(
-        jax.tree.map(lambda x, part=part: x[part], fresh)
-        for part in (slice(numbers[0]), slice(numbers[0], None))
-    )
+    return jax.vmap(environment.reset_to)(keys(reset_key, numbers), tasks)
 
 
 def _selection(settings, archive, ended, penalty_share, axis):
