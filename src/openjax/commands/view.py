@@ -54,12 +54,12 @@ def main(arguments: Sequence[str]) -> int:
         from openjax.show.videos import animate
 
         animate(command.gif, flights[0][1])
-        console.print(f"{command.gif}: {command.gif.stat().st_size / 1e6:.1f} MB")
+        console.print(f"{command.gif}: {command.gif.stat().st_size / 1e3:,.0f} kB")
     if command.html is not None:
         from openjax.show.replay import write_replay
 
         write_replay(command.html, flights)
-        console.print(f"{command.html}: {command.html.stat().st_size / 1e6:.1f} MB, opens in any browser")
+        console.print(f"{command.html}: {command.html.stat().st_size / 1e3:,.0f} kB, opens in any browser")
     if command.gif is None and command.html is None:
         from openjax.show.replay import replay_page
 
