@@ -6,7 +6,6 @@ from openjax.flights.flight import Case, Flight, Issue
 
 _ELSEWHERE = {
     "load_case": "openjax.flights.case",
-    "diagnose": "openjax.gap.diagnosis",
     "diagnose_case": "openjax.gap.diagnosis",
     "Report": "openjax.gap.report",
 }

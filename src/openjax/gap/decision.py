@@ -1,7 +1,7 @@
 """The numbers that decide, read once from `decision.toml`: each with its meaning and its source."""
 
 import tomllib
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 
@@ -21,15 +21,5 @@ class Decision:
     world_tilt: float
 
 
-def read_decision(path: Path) -> Decision:
-    """The numbers of a file. Raises ValueError where one is missing, unknown or lacks its meaning or source."""
-    table = tomllib.loads(path.read_text(encoding="utf-8"))
-    if set(table) != {f.name for f in fields(Decision)}:
-        raise ValueError(f"{path}: holds {sorted(table)}")
-    for name, entry in table.items():
-        if set(entry) != {"value", "meaning", "source"}:
-            raise ValueError(f"{path}: [{name}] needs value, meaning and source")
-    return Decision(**{name: float(entry["value"]) for name, entry in table.items()})
-
-
-DECISION = read_decision(Path(__file__).with_name("decision.toml"))
+_TABLE = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+DECISION = Decision(**{name: float(entry["value"]) for name, entry in _TABLE.items()})

@@ -1,45 +1,28 @@
 """The whole diagnosis of one case: evidence, selection, shares, words, report."""
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from openjax.flights.flight import Case, Flight, Issue
+from openjax.flights.flight import Case
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence, gather
 from openjax.gap.intervals import estimates
 from openjax.gap.model.bounds import BOUND
-from openjax.gap.model.library import CARDS, Library, library, path_of
+from openjax.gap.model.library import CARDS, library, path_of
 from openjax.gap.probabilities import beyond_form_error, probabilities
 from openjax.gap.report import Report
 from openjax.gap.residual import Check, check_residual
 from openjax.gap.selection import DETECTABLE, Selection, select
 from openjax.gap.shares import Split, split
 from openjax.gap.where import locate
-from openjax.vehicle.vehicle_file import VehicleFile, load_vehicle_file
-
-
-def diagnose(
-    flights: Sequence[Flight],
-    vehicle: VehicleFile | None = None,
-    without: Iterable[str] = (),
-    name: str = "case",
-    quality: Sequence[Issue] = (),
-    progress=None,
-) -> Report:
-    """Diagnose flights of one vehicle (or of several of one build that flew together).
-
-    flights as `load_case` gives them, `vehicle` their vehicle file (default: the nominal vehicle),
-    `without` effects that the library must do without. Raises UserError where the flights are too short or
-    hold no commands."""
-    vehicle = load_vehicle_file() if vehicle is None else vehicle
-    return diagnose_case(Case(name, tuple(flights), vehicle, tuple(quality)), without, progress)
 
 
 def diagnose_case(case: Case, without: Iterable[str] = (), progress=None) -> Report:
-    """`diagnose` for a loaded case. `progress(text)` is called as the work goes on."""
+    """Diagnose the flights of a case, `without` effects that the library must do without; `progress(text)` is called as the work
+    goes on. Raises UserError where the flights are too short or hold no commands."""
     begin = time.perf_counter()
     evidence = gather(case, library(without), progress)
     if progress:
@@ -157,6 +140,3 @@ def _nuisances(evidence: Evidence, selection: Selection) -> dict[str, str]:
     if "motor_rows" not in evidence.case.vehicle_file.log:
         found["rows of motor commands"] = "taken for means over the row: [log] motor_rows doesn't say"
     return found
-
-
-__all__ = ["Library", "conclude", "diagnose", "diagnose_case", "library"]

@@ -52,20 +52,18 @@ class Gap:
     floor: float
     reduction: float
     interval90: tuple[float, float]
-    held_out: bool
 
 
 @dataclass(frozen=True)
 class Split:
     """`effects` {name: Share}; `sensors`: sensors and clocks; `unexplained`: what follows the state but no accepted
-    effect; `channels` {name: (before, after)} rms in units of its floor; `largest` {part: share of the bootstrap's draws in
+    effect; `largest` {part: share of the bootstrap's draws in
     which it is the largest}, of effects and "unexplained"."""
 
     gap: Gap
     effects: dict[str, Share]
     sensors: Share
     unexplained: Share
-    channels: dict[str, tuple[float, float]]
     largest: dict[str, float]
 
 
@@ -92,11 +90,10 @@ def split(evidence: Evidence, selection: Selection, predicted: np.ndarray, named
     first = np.argmax(values[1:][:, rows], 1)
     largest = {names[k]: float(np.mean(first == place)) for place, k in enumerate(rows)}
     return Split(
-        _gap(before, len(evidence.replay.flights) > 1),
+        _gap(before),
         {e: shares[e] for e in named},
         shares["sensors"],
         shares["unexplained"],
-        _by_channel(channels, squares, left),
         largest,
     )
 
@@ -119,21 +116,14 @@ def shares_of_squares(squares: np.ndarray, weights: np.ndarray, left: np.ndarray
     return np.concatenate([shares, unexplained[:, None]], 1), np.stack([before, after], 1)
 
 
-def _gap(square: np.ndarray, held_out: bool) -> Gap:
+def _gap(square: np.ndarray) -> Gap:
     """The gap from its square before and after (1 + draws, 2)."""
     reduction = 1.0 - np.sqrt(square[:, 1] / square[:, 0])
     low, high = np.quantile(reduction[1:], [0.05, 0.95])
     before, after = np.sqrt(square[0])
     value = float(reduction[0])
     interval = (min(float(low), value), max(float(high), value))
-    return Gap(METRIC, float(before), float(after), 1.0, value, interval, held_out)
-
-
-def _by_channel(channels, squares: np.ndarray, left: np.ndarray) -> dict[str, tuple[float, float]]:
-    """{channel: rms before and after, in units of its floor}."""
-    mean = squares.mean(1)
-    rms = np.sqrt(mean / (mean[0] * left + 1e-30))
-    return {n: (float(rms[2, k]), float(rms[0, k])) for k, n in enumerate(channels)}
+    return Gap(METRIC, float(before), float(after), 1.0, value, interval)
 
 
 def _squares_of_sets(evidence: Evidence, selection: Selection, named) -> tuple[list[str], np.ndarray]:

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from openjax.gap.model.library import ABSENT, CARDS, PLACE, STEP, Library, places, prior, start_of
-from openjax.gap.model.replay import GROUPS, SKIP, Replay, stepped
+from openjax.gap.model.library import ABSENT, CARDS, PLACE, Library, places, prior, start_of
+from openjax.gap.model.replay import GROUPS, SKIP, Replay
 from openjax.gap.model.whitening import Noise, fit_noise
 
 ITERATIONS = 6
@@ -34,7 +34,12 @@ class SetFit:
 
     def parameters(self) -> dict[str, dict[str, tuple[float, float]]]:
         """{effect: {parameter: (value, standard deviation)}} of the set's own effects."""
-        return _named(self.effects, self.theta, self.index, self.covariance)
+        deviation = dict(zip(self.index.tolist(), np.sqrt(np.diag(self.covariance)), strict=True))
+        own = {e: {p.name: PLACE[e, p.name] for p in CARDS[e].fitted} for e in self.effects}
+        return {
+            e: {p: (float(self.theta[k]), float(deviation[k])) for p, k in found.items()}
+            for e, found in own.items()
+        }
 
 
 def fit_set(
@@ -103,37 +108,6 @@ def _descend(point: _Point, mean, precision, iterations: int) -> _Point:
         if 0.0 < gain < SMALL_STEP:
             break
     return point
-
-
-def linearised_at(fit: SetFit, index) -> list[np.ndarray]:
-    """`Replay.linearised` at a fit; what the fit was made of isn't worked out again."""
-    replay = fit.replay
-    own = {int(i): 1 + k for k, i in enumerate(fit.index)}
-    new = [int(i) for i in index if int(i) not in own]
-    moved = (
-        replay.predict(stepped(fit.theta, new)[1:])
-        if new
-        else [np.zeros((0, *y.shape)) for y in replay.measured]
-    )
-    steps = STEP[new][:, None, None]
-    out = []
-    for column, y, m in zip(fit.columns, replay.measured, moved, strict=True):
-        further = dict(zip(new, (m - (y - column[0])) / steps, strict=True))
-        out.append(
-            np.stack([column[0], *(column[own[int(i)]] if int(i) in own else further[int(i)] for i in index)])
-        )
-    return out
-
-
-def _named(effects, theta, index, covariance) -> dict[str, dict[str, tuple[float, float]]]:
-    deviation = dict(zip(index.tolist(), np.sqrt(np.diag(covariance)), strict=True))
-    return {
-        e: {
-            p.name: (float(theta[PLACE[e, p.name]]), float(deviation[PLACE[e, p.name]]))
-            for p in CARDS[e].fitted
-        }
-        for e in effects
-    }
 
 
 def model_noise(replay: Replay, library: Library) -> tuple[Replay, dict[str, float]]:

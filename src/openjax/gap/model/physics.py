@@ -18,8 +18,6 @@ from openjax.vehicle.rigid_body import rotate
 from openjax.vehicle.rotors import commanded_rotor_speed, rotor_reaction, rotor_thrust
 from openjax.vehicle.wrench import total_wrench
 
-CHANNELS = 9  # angular acceleration (body), acceleration (world), specific force (body)
-
 
 @flax.struct.dataclass
 class Path:

@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from openjax.gap.model.hypotheses import SetFit, linearised_at
+from openjax.gap.model.hypotheses import SetFit
 from openjax.gap.model.library import ABSENT, CARDS, places, prior
 from openjax.gap.model.replay import SKIP
 
@@ -79,19 +79,13 @@ def build(fit: SetFit, singles: dict[str, SetFit] | None) -> Table:
     come in or go."""
     replay, own = fit.replay, fit.effects if singles is not None else ()
     others = [e for e in singles or () if e not in own]
-    index = np.array(
-        sorted({int(i) for e in (*own, *others) for i in places((e,))} | set(fit.index.tolist())), int
-    )
+    index = np.concatenate([fit.index, places(others)])
     points = []
-    for effect in others:
-        point = fit.theta.copy()
-        point[places((effect,))] = singles[effect].theta[places((effect,))]
+    for effect in (*others, *own):
+        point, at = fit.theta.copy(), places((effect,))
+        point[at] = ABSENT[at] if effect in own else singles[effect].theta[at]
         points.append(point)
-    for effect in own:
-        point = fit.theta.copy()
-        point[places((effect,))] = ABSENT[places((effect,))]
-        points.append(point)
-    columns = linearised_at(fit, index)
+    columns = fit.columns if singles is None else replay.linearised(fit.theta, index)
     moved = replay.predict(np.array(points)) if points else [np.zeros((0, *y.shape)) for y in replay.measured]
     white, error, rows, track_of, fold_of, whole = [], [], [], [], [], []
     for number, (c, m, track) in enumerate(zip(columns, moved, replay.tracks, strict=True)):
