@@ -13,7 +13,7 @@ def report(verdict, effects=(), parameters=(), **more):
     """A report with shares of .7 for the first effect and .2 for the others."""
     named = [effect for effect in effects if effect != "unknown"]
     found = {e: Share(0.2 if i else 0.7, (0.1, 0.8)) for i, e in enumerate(named)}
-    gap = Gap("rms", 4.0, 1.2, 1.0, 0.7, (0.6, 0.8), True)
+    gap = Gap("rms", 4.0, 1.2, 1.0, 0.7, (0.6, 0.8))
 
     fields = {name: {} for name in inspect.signature(Split).parameters}
     fields |= {
