@@ -1,13 +1,16 @@
 """The state machine: rules one by one, and properties under any events."""
 
 import math
+import multiprocessing
 from dataclasses import replace
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from openjax.flying.controller import Pose, accelerate, nominal_airframe
+from openjax.flying.board import Board, Role
+from openjax.flying.controller import Pose, accelerate, nominal_airframe, roll_pitch_yaw
+from openjax.flying.guard import take_over
 from openjax.flying.judge import Track
 from openjax.flying.limits import (
     SafetySettings,
@@ -49,6 +52,16 @@ def test_the_policy_flies_while_all_is_well():
     state, out = step(pursuing(), event())
     assert out == (POLICY,) * 3
     assert state.all_in(Mode.PURSUIT)
+
+
+def test_who_takes_over_knows_where_vehicles_have_got_to():
+    board, state = Board(3, multiprocessing.get_context("spawn")), pursuing((0.4, 0.0, 0.0))
+    turning = replace(state.drones[0], estimate=state.drones[0].estimate._replace(body_rates=(2.0, 0.0, 0.0)))
+    board.write(Role.LOOP, 0.0, replace(state, drones=(turning, *state.drones[1:])))
+    first, second, _ = take_over(board.read(initial_state(PLACES), 0.1), 0.1).drones
+    assert first.estimate.position[0] == second.estimate.position[0] == pytest.approx(PLACES[0][0] + 0.04)
+    assert roll_pitch_yaw(first.estimate.quaternion)[0] == pytest.approx(0.2, abs=1e-2)
+    assert first.mode is second.mode is Mode.HOLD
 
 
 def test_a_lost_pose_lands_that_one_by_reckoning_and_stops_the_others():

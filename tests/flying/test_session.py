@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("cflib", reason='the extra "fly" is not installed')
 
-from experiments.flying.real_time import Flown
+from experiments.flying.processes import Flown
 from experiments.flying.virtual import VirtualProcess
 from openjax.commands.fly import Arguments, Prepared
 from openjax.flying.controller import nominal_airframe

@@ -11,13 +11,13 @@ import signal
 from dataclasses import replace
 from enum import IntEnum
 
-from openjax.flying.controller import Pose
+from openjax.flying.controller import moved_on, numbers_of, pose_of
 from openjax.flying.state import Mode, State
 
 SILENCE = 0.1
 """Silence of a process after which the next one flies (s): ten ticks."""
 _MODES = tuple(Mode)
-_HEAD, _EACH = 12, 16  # see Board; per vehicle mode, trim, known, 13 numbers of its pose
+_HEAD, _EACH = 12, 17  # see Board; per vehicle mode, trim, known, 14 numbers of its pose
 _BEATS, _PIDS = 6, 9  # one each per role, after the six words
 DEAF = ("SIGHUP", "SIGINT", "SIGTSTP", "SIGTERM", "SIGQUIT", "SIGTTOU", "SIGTTIN", "SIGPIPE")
 """Signals that a terminal, or its end, sends to all that it started."""
@@ -96,19 +96,18 @@ class Board:
         numbers = []
         for drone in state.drones:
             e = drone.estimate
-            pose = (*e.position, *e.velocity, *e.quaternion, *e.body_rates) if e is not None else (0.0,) * 13
+            pose = numbers_of(e) if e is not None else (0.0,) * 14
             numbers += [float(_MODES.index(drone.mode)), drone.trim, float(e is not None), *pose]
         self._numbers[_HEAD:] = numbers
         self.flying = state.flying
         self.beat(role, now)
 
     def read(self, state: State, now: float) -> State:
-        """`state` with what was written last."""
+        """`state` with what was written last, moved on to `now` (s): vehicles go on turning as they were told."""
         drones = []
         for i, drone in enumerate(state.drones):
             mode, trim, known, *numbers = self._numbers[_HEAD + _EACH * i : _HEAD + _EACH * (i + 1)]
-            parts = (tuple(numbers[a:b]) for a, b in ((0, 3), (3, 6), (6, 10), (10, 13)))
-            pose = Pose(now, *parts) if known else None
+            pose = moved_on(pose_of(numbers), now) if known else None
             drones.append(replace(drone, mode=_MODES[int(mode)], trim=trim, estimate=pose))
         return replace(state, drones=tuple(drones), time=now, action_time=now)
 

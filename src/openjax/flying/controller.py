@@ -6,6 +6,7 @@ thrust at which it hovers. Plain numbers instead of arrays: it runs a few times 
 
 import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -33,6 +34,17 @@ class Pose(NamedTuple):
     velocity: Vector
     quaternion: tuple[float, float, float, float]
     body_rates: Vector = (0.0, 0.0, 0.0)
+
+
+def numbers_of(pose: Pose) -> tuple[float, ...]:
+    """The 14 numbers of a pose, in the order of its fields."""
+    return (pose.time, *pose.position, *pose.velocity, *pose.quaternion, *pose.body_rates)
+
+
+def pose_of(numbers: Sequence[float]) -> Pose:
+    """The pose of these 14 numbers."""
+    at, *rest = numbers
+    return Pose(at, *(tuple(rest[a:b]) for a, b in ((0, 3), (3, 6), (6, 10), (10, 13))))
 
 
 @dataclass(frozen=True)

@@ -24,11 +24,11 @@ import numpy as np
 from openjax.errors import UserError
 from openjax.flying import real_time
 from openjax.flying.board import SILENCE, Board, Role, say, stand_alone
-from openjax.flying.controller import Pose
+from openjax.flying.controller import Pose, numbers_of, pose_of
 from openjax.flying.guard import CHECK, disarm, fly_down
 from openjax.flying.set_point import SetPoint
 from openjax.flying.state import PoseSample, State
-from openjax.flying.swarm import Member, Samples, Swarm, numbers_of
+from openjax.flying.swarm import Member, Samples, Swarm
 
 STARTING = 20.0
 """s until its interpreter has loaded `cflib`, on a busy machine."""
@@ -152,9 +152,8 @@ class Links:
             data = self._rest + data
             whole = len(data) - len(data) % _POSE.size
             self._rest = data[whole:]
-            for vehicle, supervisor, arrival, voltage, at, *numbers in _POSE.iter_unpack(data[:whole]):
-                parts = (tuple(numbers[a:b]) for a, b in ((0, 3), (3, 6), (6, 10), (10, 13)))
-                self.poses[vehicle] = Pose(at, *parts)
+            for vehicle, supervisor, arrival, voltage, *numbers in _POSE.iter_unpack(data[:whole]):
+                self.poses[vehicle] = pose_of(numbers)
                 self._arrivals[vehicle], self._voltages[vehicle] = arrival, voltage
                 self._supervisors[vehicle] = supervisor
                 self.counts[vehicle] += 1

@@ -25,10 +25,10 @@ from pathlib import Path
 import numpy as np
 
 from openjax.errors import UserError
-from openjax.flying.controller import Pose
+from openjax.flying.controller import Pose, numbers_of
 from openjax.flying.links import Links
 from openjax.flying.state import PoseSample
-from openjax.flying.swarm import Samples, numbers_of
+from openjax.flying.swarm import Samples
 
 
 def find_feed(name: str) -> Callable:

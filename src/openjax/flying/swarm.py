@@ -17,7 +17,7 @@ from time import perf_counter, sleep
 import numpy as np
 
 from openjax.errors import UserError
-from openjax.flying.controller import Pose
+from openjax.flying.controller import Pose, numbers_of
 from openjax.flying.crtp import expand_quaternion
 from openjax.flying.set_point import OFF, SetPoint, manual_arguments
 from openjax.flying.state import PoseSample
@@ -72,11 +72,6 @@ class Samples:
     """(K, 8): when measured, m1..m4 0..1, the specific force (m/s^2)."""
     seen: np.ndarray
     """(K, 14) by motion capture, where there is one: when measured, position, velocity, quaternion, body rates."""
-
-
-def numbers_of(pose: Pose) -> tuple[float, ...]:
-    """The 14 numbers of a pose, in the order of its fields."""
-    return (pose.time, *pose.position, *pose.velocity, *pose.quaternion, *pose.body_rates)
 
 
 class Member:

@@ -1,0 +1,343 @@
+"""One flight of real processes with its fault: `openjax fly` on a terminal of its own, real cflib over UDP.
+
+At a drawn moment after the take-off a signal goes to a process, a key to the terminal, nonsense to a vehicle, or what motion
+capture or the vehicles send is damaged. JAX doesn't survive a fork: a flight is a fork of its worker that asks it for actions.
+"""
+
+import contextlib
+import math
+import multiprocessing
+import os
+import pty
+import random
+import select
+import signal
+import socket
+import sys
+import threading
+import time
+import traceback
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from experiments.flying.faults import (
+    CAMERA,
+    ENDING,
+    FOLLOWED,
+    MARGIN,
+    RADIO,
+    WILD,
+    Fault,
+    PoseDamage,
+    draw_fault,
+    outcome,
+)
+
+ROLES = ("loop", "links", "guard")
+SIGNALS = ("KILL", "STOP", "TERM", "HUP", "INT", "TSTP", "QUIT")
+UNSENT = ("poses: a number that is none", "poses: no attitude")
+"""No packet can say so."""
+KEYS = {
+    "key l": "l", "key h, l a second later": "h…l", "h and l": "hl", "Ctrl-C": "\x03", "Ctrl-Z": "\x1a", "Ctrl-\\": "\x1c",
+    "space": " ", "q": "q", "space and l": " l", "l and space": "l ", "x x space": "xx ", "an arrow and space": "\x1b[A ",
+    "Ctrl-C and space": "\x03 ", "Ctrl-C three times": "\x03\x03\x03",
+}  # fmt: skip
+STOPPED = ("space", "q")
+"""In these keys' names: motors off at once."""
+START = ("start: y up", "start: millimetres", "start: yaw turned", "start: scaled", "start: beside the mark")
+GROUPS = {
+    "a signal to one process": [f"{name} {role}" for name in SIGNALS for role in ROLES],
+    "to several processes": (
+        "TERM group", "HUP group", *(f"{name} {a}+{b}" for name in ("KILL", "STOP") for a, b in combinations(ROLES, 2)),
+        "KILL links then guard", "KILL loop then links", "KILL links then space",
+    ),
+    "keys, terminal closed": (*KEYS, "terminal closed"),
+    "motion capture": [kind for kind in CAMERA if kind != FOLLOWED],
+    "own estimates, links": [kind for kind in (*RADIO, "drone gone") if kind not in UNSENT],
+    "the policy": ("policy: a number that is none", *WILD, "policy fails"),
+    "wrong from the start": START,
+    "strangers, a second fly, nothing": ("strangers' packets", "none", "second fly", "none with camera"),
+}  # fmt: skip
+KINDS = [kind for kinds in GROUPS.values() for kind in kinds]
+DRAWN = (*GROUPS["motion capture"], *GROUPS["own estimates, links"], *GROUPS["the policy"][:-1])
+"""Faults as in simulated time."""
+ENDLESS = (*DRAWN, *GROUPS["strangers, a second fly, nothing"])
+"""These needn't end a flight."""
+LATEST = 6.0
+LONGEST = 25.0
+"""A flight is given up this long (s) after its fault."""
+SETTLE = 1.0
+"""What lands over is looked at for so long (s): processes must have ended by then."""
+
+
+def fault_of(number: int, kind: str) -> Fault:
+    """The fault with this number and kind."""
+    rng = random.Random(number)
+    time, vehicle = rng.uniform(0.3, LATEST), rng.randrange(3)
+    if kind in DRAWN:
+        drawn = (draw_fault(seed, LATEST) for seed in range(1000 * number, 1000 * number + 1000))
+        return replace(next(like for like in drawn if like.kind == kind), time=time)
+    if kind in START:
+        return Fault(kind, -math.inf, 1, direction=0.0)
+    return Fault(kind, time, vehicle, direction=0.0 if "camera" in kind else 4.0)
+
+
+def feed_of(fault: Fault, truth):
+    """What a laboratory's adapter would be: poses of a camera at 100 Hz, damaged."""
+    damage, noise = PoseDamage(fault, 3), np.random.default_rng(7)
+
+    def at_start(pose):
+        x, y, z = pose.position
+        w, qx, qy, qz = pose.quaternion
+        return {
+            "start: y up": pose._replace(position=(x, z, -y), quaternion=(w, qx, qz, -qy)),
+            "start: millimetres": pose._replace(position=(1e3 * x, 1e3 * y, 1e3 * z)),
+            "start: yaw turned": pose._replace(quaternion=(-qz, qy, -qx, w)),
+            "start: scaled": pose._replace(position=(1.3 * x, 1.3 * y, 1.3 * z)),
+            "start: beside the mark": pose._replace(position=(x + 0.3, y, z)),
+        }.get(fault.kind, pose)
+
+    def feed(update):
+        due = time.perf_counter()
+        while True:
+            now = time.perf_counter() - truth.take_off
+            poses = truth.poses()
+            for i, pose in enumerate(poses):
+                shaken = tuple((np.array(pose.position) + noise.normal(0, 5e-4, 3)).tolist())
+                seen = damage("camera", i, now, at_start(pose._replace(position=shaken)), poses)
+                if seen is not None:
+                    update(i, seen.position, seen.quaternion)
+            due += 0.01
+            time.sleep(max(due - time.perf_counter(), 0.0))
+
+    return feed
+
+
+class RemoteGame:
+    """The game of a flight, played by the worker; `spoil` makes of each play what the policy is said to have answered."""
+
+    def __init__(self, game, pipe, spoil):
+        self.task, self.settings, self.airframe = game.task, game.settings, game.airframe
+        self._pipe, self._spoil = pipe, spoil
+
+    def start(self, poses):
+        """See `openjax.flying.game.Game.start`."""
+        self._pipe.send(("start", (poses,)))
+        return self._pipe.recv()
+
+    def step(self, poses, evader=None):
+        """See `openjax.flying.game.Game.step`."""
+        self._pipe.send(("step", (poses, evader)))
+        return self._spoil(self._pipe.recv())
+
+
+def play(game, pipe) -> None:
+    """Answer a `RemoteGame` until its process ends."""
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            name, arguments = pipe.recv()
+            pipe.send(getattr(game, name)(*arguments))
+
+
+class Flown:
+    """One flight with its fault."""
+
+    def __init__(self, number, kind, virtual, arguments, prepared):
+        self.fault = fault_of(number, kind)
+        self._number, self._kind, self._virtual = number, kind, virtual
+        session = prepared.session
+        if self.fault.captured and kind not in ("none", "second fly"):
+            session = replace(session, feed=feed_of(self.fault, virtual.truth))
+        self._arguments, self._prepared = arguments, prepared._replace(session=session)
+        self._said, self._open, self._pids, self._second = b"", True, {}, ""
+
+    def fly(self) -> dict:
+        """What became of it."""
+        self._virtual.reset(self.fault)
+        ours, theirs = multiprocessing.Pipe()
+        game = self._prepared.game
+        pid, self._terminal = pty.fork()
+        if pid == 0:
+            self._prepared = self._prepared._replace(game=RemoteGame(game, theirs, self._spoil_play))
+            self._child()
+        theirs.close()
+        threading.Thread(target=play, args=(game, ours), daemon=True).start()
+        begin = time.perf_counter()
+        status, injected, settled = None, None, 0.0
+        while True:
+            now = time.perf_counter()
+            self._drain()
+            status = self._ended(pid) if status is None else status
+            if injected is None and now - self._virtual.truth.take_off >= max(self.fault.time, 0.0):
+                injected = now
+                self._find(pid)
+                self._inject(pid)
+            since = now - (injected or begin)
+            over = status is not None and (settled or since > 0.2) and self._landed()
+            settled = (settled or now) if over else 0.0
+            if (over and now - settled > SETTLE) or since > LONGEST + 25.0 * (injected is None):
+                break
+        self._clean(pid, status)
+        return self._record(status, injected, begin)
+
+    def _child(self):
+        """The flight itself, in a fork of the worker with a terminal of its own."""
+        from openjax.commands.command_line import run_command
+        from openjax.commands.fly import fly
+
+        # the worker's are others: what multiprocessing puts in their place, files
+        sys.stdin, sys.stdout, sys.stderr = open(0), open(1, "w", buffering=1), open(2, "w", buffering=1)
+
+        def main(_):
+            return 0 if fly(self._arguments, self._prepared) else 2
+
+        try:
+            run_command(main)
+        except SystemExit as stop:
+            os._exit(int(stop.code or 0))
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            os._exit(3)
+
+    def _spoil_play(self, play):
+        now, kind = time.perf_counter() - self._virtual.truth.take_off, self._kind
+        if now < self.fault.time or not kind.startswith("policy"):
+            return play
+        if kind == "policy fails":
+            raise ValueError("the policy failed")
+        action = np.array(play.action, np.float32)  # as networks answer: larger numbers are infinite
+        if kind in WILD:
+            action = WILD[kind](round(100 * now), self._number, action.shape)
+        else:
+            action[self.fault.vehicle, self._number % 4] = self.fault.number
+        return play._replace(action=action)
+
+    def _drain(self):
+        if self._open and select.select([self._terminal], [], [], 0.005)[0]:
+            try:
+                self._said += os.read(self._terminal, 4096)
+            except OSError:
+                self._open = False
+        elif not self._open:
+            time.sleep(0.005)
+
+    def _ended(self, pid):
+        done, status = os.waitpid(pid, os.WNOHANG)
+        return os.waitstatus_to_exitcode(status) if done else None
+
+    def _find(self, pid):
+        """Process ids by role: links and guard are the loop's children, in this order."""
+        self._pids = {"loop": pid}
+        with contextlib.suppress(OSError):
+            children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+            spawned = [int(c) for c in children if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()]
+            self._pids.update(zip(("links", "guard"), sorted(spawned), strict=False))
+
+    def _inject(self, pid):
+        kind = self._kind
+        name, _, target = kind.partition(" ")
+        if kind in KEYS:
+            for wait, keys in enumerate(KEYS[kind].split("…")):
+                time.sleep(wait)
+                os.write(self._terminal, keys.encode())
+        elif kind == "terminal closed":
+            os.close(self._terminal)
+            self._open = False
+        elif " then " in kind:
+            first, second = target.split(" then ")
+            self._kill("KILL", first)
+            time.sleep(0.3 if second in KEYS else 0.05)
+            if second in KEYS:
+                os.write(self._terminal, KEYS[second].encode())
+            else:
+                self._kill("KILL", second)
+        elif name in SIGNALS:
+            for role in target.split("+"):
+                self._kill(name, role)
+        elif kind == "strangers' packets":
+            self._strangers()
+        elif kind == "second fly":
+            self._try_second()
+
+    def _kill(self, name, role):
+        send, role = (os.killpg, "loop") if role == "group" else (os.kill, role)
+        with contextlib.suppress(ProcessLookupError, KeyError):
+            send(self._pids[role], getattr(signal, f"SIG{name}"))
+
+    def _strangers(self):
+        """Scans, echoes, requests and noise from another address; set-points aren't among them."""
+        rng = random.Random(self._number)
+        ports = [int(uri.rsplit(":", 1)[1]) for uri in self._virtual.uris]
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+            for _ in range(300):
+                head = rng.choice((0xFF, 0x2C, 0x0C, 0xFC, 0x4C, 0xDC, 0x1C))
+                noise = rng.randbytes(rng.randrange(20))
+                other.sendto(bytes([head, *noise]), ("127.0.0.1", rng.choice(ports)))
+
+    def _try_second(self):
+        from openjax.errors import UserError
+        from openjax.flying.preflight import sole_command
+
+        try:
+            with sole_command(self._virtual.uris):
+                self._second = "a second one had the vehicles"
+        except UserError as error:
+            self._second = str(error)
+
+    def _landed(self):
+        track = self._virtual.track()
+        return not track["armed"][-1].any() or math.isinf(self._virtual.truth.take_off)
+
+    def _clean(self, pid, status):
+        """End what is left of this flight, each by its own id."""
+        self._left = [r for r, p in self._pids.items() if r != "loop" and _lives(p)]
+        for process in self._pids.values():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(process, signal.SIGKILL)
+        if status is None:
+            with contextlib.suppress(ProcessLookupError, ChildProcessError):
+                os.kill(pid, signal.SIGKILL)
+                os.waitpid(pid, 0)
+        if self._open:
+            self._drain()
+            os.close(self._terminal)
+
+    def _record(self, status, injected, begin) -> dict:
+        track, fault = self._virtual.track(), self.fault
+        seen = outcome(fault, track["time"], track["position"], track["off"].astype(bool), injected or begin)
+        held = seen.pop("held")
+        said = [line for line in self._said.decode(errors="replace").splitlines() if line.strip()]
+        row = {
+            "number": self._number, "kind": self._kind, "time": round(min(max(fault.time, 0.0), 99.0), 2), "status": status,
+            "took_off": not math.isinf(self._virtual.truth.take_off), **seen, "hard": bool(track["crashed"][held].any()),
+            "armed": bool(track["armed"][-1][held].any()), "left": self._left,
+            "second": self._second, "said": " | ".join(said[1:])[-600:],
+        }  # fmt: skip
+        return row | {"well": self._well(row)}
+
+    def _well(self, row) -> bool:
+        """Whether all went as it must."""
+        if self._kind in START:
+            return not row["took_off"] and row["status"] == 2
+        if not row["took_off"] or row["out"] > MARGIN or row["armed"] or row["status"] is None or row["left"]:
+            return False
+        if any(name in self._kind for name in STOPPED):  # the operator wants them to fall
+            return row["seconds"] is not None and row["seconds"] < 1.5
+        if self._kind == "second fly" and "has this vehicle" not in row["second"]:
+            return False
+        name, _, target = self._kind.partition(" ")
+        deaf = name in SIGNALS[2:] and target in ("links", "guard")  # the flight goes on
+        seconds = math.inf if row["seconds"] is None else row["seconds"]
+        in_time = deaf or self._kind in ENDLESS or seconds <= ENDING
+        return in_time and not row["fell"] and not row["hard"]
+
+
+def _lives(pid) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] not in "ZX"
+    except OSError:
+        return False
