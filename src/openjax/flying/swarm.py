@@ -1,7 +1,4 @@
-"""The vehicles over `cflib`: connections, log blocks in, set-points out. The only module that imports it.
-
-`cflib` is GPLv3 and an extra: `pip install cflib`.
-"""
+"""The vehicles over `cflib`: connections, log blocks in, set-points out. `cflib` is GPLv3 and an extra."""
 
 import contextlib
 import logging
