@@ -17,6 +17,7 @@ __getattr__, __dir__, __all__ = lazy_names(
                 "empty_task",
                 "expand_task",
                 "line_up_pillars",
+                "scatter_starts",
                 "shift_pillars",
                 "task_descriptor",
                 "turn_task",

@@ -25,6 +25,8 @@ WALL_DISTANCE = 0.1
 """Local expansion keeps starts this far from the arena's wall (m): the released code's."""
 CLOSE = 0.05
 """Close starts are up to this much farther from a pillar or another pursuer than the safety distance (m)."""
+NEIGHBOURS = 0.75
+"""Scattered pursuers start at most this far from their middle along x and y (m)."""
 CANDIDATES = 8
 """Draws of a start among which the first good one is taken; more for more than three pursuers."""
 
@@ -173,6 +175,33 @@ def close_starts(settings: PursuitSettings, key: jax.Array, task: Task, share: f
         for i, key in enumerate(jax.random.split(place_key, n)):
             position = jnp.where(moved[i], place(position, i, key), position)
         return task.replace(pursuer_position=position)
+
+    return _first_clear(settings, draw, key, task)
+
+
+def scatter_starts(settings: PursuitSettings, key: jax.Array, task: Task) -> Task:
+    """Start evader and pursuers anywhere up to `WALL_DISTANCE` from the arena's wall, the pursuers more or less together.
+
+    Uniform tasks keep both within 0.76 m of the axis and 1.1 m of each other along x. Among a few draws the first that
+    starts clear is taken, else the task itself.
+    """
+    reach, n = settings.arena_radius - WALL_DISTANCE, task.pursuer_position.shape[0]
+
+    def draw(key):
+        middle_key, apart_key, offset_key, height_key = jax.random.split(key, 4)
+        radius, angle = jax.random.uniform(middle_key, (2, 2))
+        angle = 2.0 * np.pi * angle
+        xy = reach * jnp.sqrt(radius) * jnp.stack([jnp.cos(angle), jnp.sin(angle)])  # (2, 2), columns are places
+        offset = jax.random.uniform(offset_key, (n, 2), minval=-NEIGHBOURS, maxval=NEIGHBOURS)
+        pursuers = xy[:, 0] + offset * jax.random.uniform(apart_key)
+        from_axis = jnp.linalg.norm(pursuers, axis=-1, keepdims=True)
+        pursuers = pursuers * jnp.minimum(1.0, reach / jnp.maximum(from_axis, 1e-6))
+        middle = settings.arena_height / 2
+        z = jax.random.uniform(height_key, (n + 1, 1), minval=middle - START_Z, maxval=middle + START_Z)
+        return task.replace(
+            pursuer_position=jnp.concatenate([pursuers, z[1:]], axis=-1),
+            evader_position=jnp.append(xy[:, 1], z[0]),
+        )
 
     return _first_clear(settings, draw, key, task)
 
