@@ -35,7 +35,7 @@ def compile_first_flights(
     policy: Any,
     say: Callable[[str], None],
     over: Callable[[], bool],
-) -> Callable[[PolicyParameters, jax.Array], PolicyParameters]:
+) -> Callable[[PolicyParameters, jax.Array], PolicyParameters | None]:
     """Start to compile the stage before MAPPO for parameters of these shapes, in the background.
 
     Args:
@@ -45,7 +45,7 @@ def compile_first_flights(
       over: is asked every few seconds whether to stop.
 
     Returns:
-      the stage, which waits for the compiler: (fresh parameters, key) -> parameters.
+      the stage, which waits for the compiler: (fresh parameters, key) -> parameters; None where it was over before it began.
     """
     how = settings.first_flights
     flights = FirstFlights(how, first_game(environment, how), _exact(settings, environment))
@@ -60,10 +60,12 @@ def compile_first_flights(
 
     def learn(parameters, key):
         some, begin = (wait() for wait in ready)
+        if over():
+            return None
         started = time.monotonic()
         carry = begin(own_copy(parameters), key)
         for before in range(0, how.updates, TOGETHER):
-            if over():
+            if before and over():
                 break
             carry, parts = some(carry, key, jnp.int32(before))
             done = min(before + TOGETHER, how.updates)

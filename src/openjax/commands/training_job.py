@@ -29,7 +29,7 @@ from openjax.policy import PolicyParameters
 from openjax.policy.growth import with_longer_history
 from openjax.pursuit import Pursuit
 from openjax.show.metrics import METRICS_FILE, MetricsWriter, NoMetrics
-from openjax.show.progress import Progress
+from openjax.show.progress import Progress, duration
 from openjax.store.checkpoint_files import load_orbax
 from openjax.store.checkpoints import Checkpoints
 from openjax.store.leaves import abstract_like, named_leaves, place
@@ -116,7 +116,7 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
         except NotFiniteError as error:
             progress.message(f"stopped: {error}")
             return 1
-        table = run.finish(outcome)
+        table = None if outcome is None else run.finish(outcome)
     if table is not None:
         console.print(table)
         for line in closing_words(job.settings, directory.path, jax.default_backend() == "cpu"):
@@ -133,35 +133,44 @@ class _Run:
     def __init__(self, job: TrainingJob, directory: RunDirectory, stop: StopRequest, progress: Progress):
         self.job, self.directory, self.stop, self.progress = job, directory, stop, progress
         self.settings, self.processes = job.settings, job.processes
+        self.taught = False
         self.checkpoints = Checkpoints(directory.checkpoints, processes=job.processes)
         self.processes.advice = f"go on with openjax train --resume {directory.path} --devices all"
 
-    def train(self) -> Outcome:
-        """Compile and train. Raises NotFiniteError."""
+    def train(self) -> Outcome | None:
+        """Compile and train; None where a signal or the time limit came before anything was learnt. Raises NotFiniteError."""
         job, settings = self.job, self.settings
-        self.progress.phase("compiling the start: networks, first tasks")
-        start, step, self.abstract = _programs(job)
         latest = self.checkpoints.latest()
-        if over := self.processes.of_first(latest is not None and latest.update >= settings.total_updates):
+        done = self.processes.of_first(latest is not None and latest.update >= settings.total_updates)
+        if done:
             self.progress.message(
                 "all updates are done; --total_steps N goes on to more. Its report is made anew"
             )
+        self.progress.phase("compiling the start: networks, first tasks", announce=latest is None)
+        start, step, self.abstract = _programs(job)
         # takes longest, so it comes first
-        step_ready = (lambda _=None: True) if over else step.compile_ahead(self.abstract)
+        step_ready = (lambda _=None: True) if done else step.compile_ahead(self.abstract)
         self.first_flights = self._first_flights()
         carry, self.first_update, seconds = self._first_carry(start)
         if self.processes.is_first:
             self.directory.write_settings(settings, job.facts)
+        over = self._over()
+        if over and not self.first_update and not self.taught:
+            spent = f"{duration(time.monotonic() - job.started)} minutes went into compiling"
+            self.progress.message(
+                f"nothing was learnt: {spent}, and what is being compiled is kept for the next run"
+            )
+            return None
         with self._metrics() as metrics:
-            self.progress.phase("compiling the training step")
-            self._compile_beside(step_ready)
+            self.progress.phase("compiling the training step", announce=not (done or over))
+            self._compile_beside((lambda _=None: True) if over else step_ready)
             plan = Plan(
                 total_updates=settings.total_updates,
                 steps_per_update=settings.steps_per_update,
                 validation_interval=settings.validation_interval,
                 time_limit=seconds + job.time_limit,
                 # an accelerator would wait for the validation's program
-                validate_start=self.first_flights is not None and jax.default_backend() == "cpu",
+                validate_start=self.taught and jax.default_backend() == "cpu",
             )
             loop = Loop(
                 step,
@@ -186,9 +195,8 @@ class _Run:
             return None
         self._save_best(outcome)
         if outcome.update == self.first_update and settings.total_updates > outcome.update:
-            what = "MAPPO did not begin" if self.first_flights else "nothing was trained"
-            when = f"before the first update, {outcome.seconds:.0f} s after the start"
-            self.progress.message(f"{what}: {outcome.stopped_by} came {when}")
+            when = f"before its first update, {outcome.seconds:.0f} s after the start"
+            self.progress.message(f"MAPPO did not begin: {outcome.stopped_by} came {when}")
         if signals:
             advice = f"go on with openjax train --resume {path}"
             self.progress.message(f"{signals[0]}: saved at update {outcome.update}; {advice}")
@@ -235,7 +243,9 @@ class _Run:
         if self.first_flights is not None:
             self.progress.phase("learning to fly by the gradient through the simulation")
             key = jax.random.fold_in(jax.random.key(settings.seed), 1)
-            carry = carry.with_policy(self.first_flights(carry.policy, key))
+            policy = self.first_flights(carry.policy, key)
+            self.taught = policy is not None
+            carry = carry.with_policy(policy) if self.taught else carry
         return place(carry, carry_shardings(job.devices)), 0, 0.0
 
     def _metrics(self):

@@ -157,9 +157,10 @@ class Loop:
         overlap = jax.devices()[0].platform != "cpu" if plan.overlap is None else plan.overlap
         names = list(float_leaves(carry))
         reason, _ = self._decide()
-        if plan.validate_start and self.evaluate is not None and update == 0:
+        if plan.validate_start and self.evaluate is not None and update == 0 and reason is None:
             self._save(0, carry, validate=True)
-        self.progress.phase("compiling the training step", announce=False)
+        if reason is None:
+            self.progress.phase("compiling the training step", announce=False)
         try:
             while update < plan.total_updates and reason is None:
                 carry, *results = self.step(carry)

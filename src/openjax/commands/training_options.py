@@ -33,7 +33,8 @@ class TrainCommand:
     steps: Annotated[int | None, Interval("[1, 1e15]")] = None
     """Environment steps of the whole run, short for --total_steps."""
     minutes: Annotated[float | None, Interval("(0, 1000000]")] = None
-    """Stop after this time, compilation included; a resumed run has it anew."""
+    """Stop training after this time from the start; compiling isn't interrupted, and the report comes on top. A resumed run has
+    it anew."""
     resume: Path | None = None
     """Go on with the run in this directory, exactly where it stopped."""
     start_from: str | None = None

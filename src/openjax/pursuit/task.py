@@ -191,7 +191,9 @@ def scatter_starts(settings: PursuitSettings, key: jax.Array, task: Task) -> Tas
         middle_key, apart_key, offset_key, height_key = jax.random.split(key, 4)
         radius, angle = jax.random.uniform(middle_key, (2, 2))
         angle = 2.0 * np.pi * angle
-        xy = reach * jnp.sqrt(radius) * jnp.stack([jnp.cos(angle), jnp.sin(angle)])  # (2, 2), columns are places
+        xy = (
+            reach * jnp.sqrt(radius) * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+        )  # (2, 2), columns are places
         offset = jax.random.uniform(offset_key, (n, 2), minval=-NEIGHBOURS, maxval=NEIGHBOURS)
         pursuers = xy[:, 0] + offset * jax.random.uniform(apart_key)
         from_axis = jnp.linalg.norm(pursuers, axis=-1, keepdims=True)
