@@ -1,10 +1,9 @@
 """What the chosen effects leave: whether it is more than sensors, air and errors of form leave.
 
 Things that should agree are held against each other: measured motion and replay, attitude and gyroscope, path and
-accelerometer, position and velocity. How much is left of each, how far what is left of two channels goes together, and what
-Gaussian processes in random Fourier features (Rahimi, Recht 2007) of the state make the gap grow by, are told in standard
-deviations of cases of several worlds in which nothing unknown acts. The p-value of the largest is conformal over those (Vovk
-et al. 2005; `residual.json`)."""
+accelerometer, position and velocity. How much is left of each, and what Gaussian processes in random Fourier features (Rahimi,
+Recht 2007) of the state make the gap grow by, are told in standard deviations of cases of several worlds in which nothing
+unknown acts. The p-value of the largest is conformal over those (Vovk et al. 2005; `residual.json`)."""
 
 import json
 from dataclasses import dataclass
@@ -30,7 +29,6 @@ HORIZONS = {
     "position": (0.1, "position and velocity disagree"),
 }
 WORDS = {name: words for name, (_, words) in HORIZONS.items()}
-WORDS["correlation"] = "what is left of one channel goes with what is left of another"
 WORDS["dependence"] = "what is left follows the state"
 FEATURES = 40  # of each group
 LENGTHS = (0.5, 1.0, 2.0)  # of the features, in standard deviations of what they are functions of
@@ -103,8 +101,6 @@ def measure(evidence: Evidence, residuals: list[np.ndarray]) -> tuple[dict[str, 
             most = np.quantile([c[name] for c in calibration() if name in c], 1.0 - DECISION.unknown)
             first = 0 if name == "rates" else 3
             excess[first : first + 3] = 1.0 - np.minimum(most / size, 1.0) ** 2
-    white = np.concatenate([replay.whiten(r, k) for k, r in enumerate(residuals)])[:, replay.usable > 0]
-    out["correlation"] = float(np.abs(np.triu(np.corrcoef(white.T), 1)).max())
     follows = followed(replay, residuals)
     growth = np.sqrt((1.0 / (1.0 - follows[replay.heard > 0])).mean()) - 1.0
     out["dependence"] = float(growth) + 0.01  # of the gap: growths below are alike

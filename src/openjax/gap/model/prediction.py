@@ -42,48 +42,38 @@ class Physics:
         theta = np.asarray(theta, np.float32)
         run = compiled_physics(PHYSICS_EFFECTS, THETA)
         parts = [[] for _ in self.tracks]
+        lanes = [(number, k) for number in range(len(parts)) for k in range(len(theta))]
         # All of it is under way before any of it is waited for.
         running = []
-        for alike, nominal in self._alike:
-            lanes = [(place, k) for place in range(len(alike)) for k in range(len(theta))]
-            for begin in range(0, len(lanes), LANES):
-                places, vectors = np.array(lanes[begin : begin + LANES]).T
-                fill = np.minimum(np.arange(LANES), len(places) - 1)
-                vehicles, paths = jax.tree.map(lambda leaf, which=places[fill]: leaf[which], nominal)
-                running.append((alike[places], run(theta[vectors[fill]], vehicles, paths)))
+        for begin in range(0, len(lanes), LANES):
+            numbers, vectors = np.array(lanes[begin : begin + LANES]).T
+            fill = np.minimum(np.arange(LANES), len(numbers) - 1)
+            nominal = jax.tree.map(lambda leaf, which=numbers[fill]: leaf[which], self._nominal)
+            running.append((numbers, run(theta[vectors[fill]], *nominal)))
         for numbers, rows in running:
             for number, lane in zip(numbers, np.asarray(rows), strict=False):
                 parts[number].append(lane[: len(self.tracks[number])])
         return [_integrated(np.stack(p), t.dt) for p, t in zip(parts, self.tracks, strict=True)]
 
     @cached_property
-    def _alike(self) -> list[tuple[np.ndarray, tuple]]:
-        """Tracks by the shape of their paths: their numbers, vehicles and paths (leaves (tracks, ...))."""
-        shapes: dict[tuple, list[int]] = {}
-        for number, path in enumerate(self.paths):
-            shapes.setdefault(path.others.shape, []).append(number)
-        return [
-            (
-                np.array(own),
-                jax.tree.map(
-                    lambda *leaves: np.stack(leaves), *((self.vehicles[n], self.paths[n]) for n in own)
-                ),
-            )
-            for own in shapes.values()
-        ]
+    def _nominal(self) -> tuple:
+        """Vehicles and paths of all tracks, leaves (tracks, ...)."""
+        each = zip(self.vehicles, self.paths, strict=True)
+        return jax.tree.map(lambda *leaves: np.stack(leaves), *each)
 
 
 def make_physics(tracks, vehicles, motor_ticks) -> Physics:
     """Physics of tracks with their nominal vehicles and motor commands (T, TICKS, 4) of the rate loop's ticks."""
+    size, neighbours = bucket(max(map(len, tracks))), max(1, *(len(t.neighbours) for t in tracks))
     return Physics(
         tuple(tracks),
         tuple(jax.tree.map(np.float32, v) for v in vehicles),
-        tuple(_path(t, m) for t, m in zip(tracks, motor_ticks, strict=True)),
+        tuple(_path(t, m, size, neighbours) for t, m in zip(tracks, motor_ticks, strict=True)),
     )
 
 
-def _path(track: Track, ticks: np.ndarray) -> Path:
-    rows, size = len(track), bucket(len(track))
+def _path(track: Track, ticks: np.ndarray, size: int, neighbours: int) -> Path:
+    rows = len(track)
 
     def middle(values):
         return padded(0.5 * (values + np.concatenate([values[1:], values[-1:]])), size)
@@ -97,7 +87,9 @@ def _path(track: Track, ticks: np.ndarray) -> Path:
     # Neither floor nor ceiling can be entered: a log that says so has an offset in height.
     position = np.concatenate([position[:, :2], np.clip(position[:, 2:], 0.0, ARENA_CEILING)], 1)
     velocity = track.velocity if track.velocity is not None else unknown
-    others = [middle(p) for p in track.neighbours] or [np.tile(np.float32([50.0, 50.0, -50.0]), (size, 1))]
+    # Who didn't fly along is far away.
+    others = [middle(p) for p in track.neighbours]
+    others += [np.tile(np.float32([50.0, 50.0, -50.0]), (size, 1))] * (neighbours - len(others))
     voltage = np.full(size, np.nan, np.float32) if track.voltage is None else middle(track.voltage)
     return Path(
         middle(position),

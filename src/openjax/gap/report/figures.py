@@ -16,7 +16,7 @@ from openjax.gap.model.replay import SKIP
 from openjax.gap.model.table import HORIZONS
 from openjax.gap.report import Report
 from openjax.gap.residual import disturbances, residuals_of
-from openjax.gap.where import CALM, CHANNELS, Place
+from openjax.gap.where import CALM
 
 BEFORE, AFTER = "#d1495b", "#2e86ab"  # both stand out on white and on black
 GREY = "#8a8f98"
@@ -54,11 +54,10 @@ def _residuals(report: Report) -> tuple[list, list]:
 
 
 def _places(report: Report):
-    """The parts of the flights that hold most of the gap: error before and after, in noise and in units."""
+    """The parts of the flights that hold most of the gap: error before and after, in units of the noise."""
     places = [place for place in report.where if place.share > 0.01][:SHOWN_PLACES][::-1]
     if not report.effects or not places:
         return None
-    noise = _noise_levels(report)
     figure, axes = _figure(0.6 + 0.42 * len(places))
     rows = np.arange(len(places))
     before = np.array([place.before for place in places])
@@ -68,34 +67,10 @@ def _places(report: Report):
     if report.parameters:
         axes.plot(after, rows, "o", color=AFTER, markersize=7, label="with the named effects")
     axes.axvline(1.0, color=GREY, linestyle=":", linewidth=1.2)
-    axes.set_yticks(rows, [_place_name(place) for place in places])
+    axes.set_yticks(rows, [f"{p.channel}, {p.regime}".replace("_", " ") for p in places])
     axes.set(xlabel="error, in units of the noise", xlim=(0, None), ylim=(-0.6, len(places) - 0.4))
-    for row, place in zip(rows, places, strict=True):
-        if (level := noise.get(place.channel)) is not None:
-            text = f"{level[0] * place.before:.2g} {level[1]}"
-            axes.annotate(text, (1.01, row), xycoords=("axes fraction", "data"), va="center", fontsize=10)
     _legend(axes)
-    told = "Forces and torques, averaged over {} s, by part of the flight; at the right the error before, in its unit."
-    return "Where the gap lies", told.format(CALM), figure
-
-
-def _place_name(place: Place) -> str:
-    return f"{place.channel.replace('_', ' ')}, {place.regime.replace('_', ' ')}"
-
-
-def _noise_levels(report: Report) -> dict[str, tuple[float, str]]:
-    """{channel: (rms of what is left, unit)} of forces and torques, as accelerations."""
-    evidence = report.plots["evidence"]
-    linear = slice(3, 6) if evidence.replay.usable[3] else slice(6, 9)
-    left = []
-    for track, residual in zip(evidence.tracks, _residuals(report)[1], strict=True):
-        rest = disturbances(track, residual)
-        left.append(
-            smooth(np.concatenate([rest[:, linear], rest[:, :3]], 1), CALM, track.dt)[int(SKIP / track.dt) :]
-        )
-    levels = np.sqrt(np.mean(np.concatenate(left) ** 2, axis=0))
-    units = ("m/s²",) * 3 + ("rad/s²",) * 3
-    return dict(zip(CHANNELS, zip(levels, units, strict=True), strict=False))
+    return "Where the gap lies", f"Forces and torques, averaged over {CALM} s, by part of the flight.", figure
 
 
 def _worst(report: Report) -> tuple:
