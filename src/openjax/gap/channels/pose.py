@@ -4,6 +4,7 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from openjax.flights.track import Track, smooth
 from openjax.gap.channels import Channel, Estimated, effects_of
@@ -109,27 +110,19 @@ def _read_around(tracks: list[Track], delay: float) -> LinearPath:
 
 
 def _late(values: np.ndarray, delay: float, track: Track) -> np.ndarray:
-    """Rows (T, 3) as they were `delay` s earlier."""
+    """Rows (T, C) as they were `delay` s earlier."""
     return np.stack([np.interp(track.time - delay, track.time, column) for column in values.T], 1)
 
 
 def turn_increments(quaternion: np.ndarray) -> np.ndarray:
     """Rotation vectors (T - 1, 3), body frame, between successive attitudes (T, 4)."""
-    a, b = quaternion[:-1], quaternion[1:]
-    scalar = (a * b).sum(1)
-    vector = a[:, :1] * b[:, 1:] - b[:, :1] * a[:, 1:] - np.cross(a[:, 1:], b[:, 1:])
-    return 2.0 * vector * np.sign(scalar)[:, None]
+    attitude = Rotation.from_quat(quaternion, scalar_first=True)
+    return (attitude[:-1].inv() * attitude[1:]).as_rotvec()
 
 
 def undelayed(track: Track, delay: float) -> Track:
     """The track with its pose `delay` s younger than logged."""
-
-    def moved(values):
-        return np.stack([np.interp(track.time + delay, track.time, column) for column in values.T], 1)
-
-    quaternion = moved(track.quaternion)
-    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
-    velocity = None if track.velocity is None else moved(track.velocity)
-    return dataclasses.replace(
-        track, position=moved(track.position), quaternion=quaternion, velocity=velocity
-    )
+    pose = [n for n in ("position", "quaternion", "velocity") if getattr(track, n) is not None]
+    moved = {n: _late(getattr(track, n), -delay, track) for n in pose}
+    moved["quaternion"] /= np.linalg.norm(moved["quaternion"], axis=1, keepdims=True)
+    return dataclasses.replace(track, **moved)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
+from scipy.spatial.transform import Rotation
 
 from openjax.flights.track import GRAVITY, Track, rotation, to_world
 from openjax.gap.channels.pose import turn_increments
@@ -106,14 +107,10 @@ def corrected(track: Track, found: Kinematics) -> Track:
     if (found.gain != 1.0).any():
         changes["body_rates"] = track.body_rates / found.gain
     if found.upright is not None:
-        x, y = found.upright  # small rotation that puts the world upright
-        turn = np.array([[1.0, 0.0, y], [0.0, 1.0, -x], [-y, x, 1.0]])
-        changes["position"] = track.position @ turn.T
-        changes["velocity"] = track.velocity @ turn.T
-        half = 0.5 * np.array([x, y, 0.0])
-        w, u = track.quaternion[:, :1], track.quaternion[:, 1:]
-        quaternion = np.concatenate([w - u @ half[:, None], u + w * half + np.cross(half, u)], 1)
-        changes["quaternion"] = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
+        turn = Rotation.from_rotvec([*found.upright, 0.0])
+        changes |= {name: turn.apply(getattr(track, name)) for name in ("position", "velocity")}
+        attitude = turn * Rotation.from_quat(track.quaternion, scalar_first=True)
+        changes["quaternion"] = attitude.as_quat(scalar_first=True)
     return dataclasses.replace(track, **changes) if changes else track
 
 

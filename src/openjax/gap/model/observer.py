@@ -23,6 +23,25 @@ FOLLOWED = (
 )
 
 
+def _ticking(controller, vehicle, h):
+    """The tick of `h` s: (rates, previous, integral, speed), command, offset of the motors and angular acceleration beyond the
+    nominal -> the same, what the controller wanted and what the motors got."""
+    at_rest = jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0])
+
+    def tick(state, command, offset, push):
+        rates, previous, integral, speed = state
+        drone = DroneState(*at_rest, jnp.zeros(3), rates, speed, integral, previous, ())
+        wanted, integral = rate_controller(controller, drone, command, h)
+        given = jnp.clip(wanted + offset, 0.0, 1.0)
+        speed = rotor_speed_step(vehicle, speed, given, h)
+        _, torque = total_wrench(vehicle, rotor_thrust(vehicle, speed), rotor_reaction(vehicle, speed))
+        gyroscopic = jnp.cross(rates, vehicle.inertia * rates)
+        after = rates + h * ((torque - gyroscopic) / vehicle.inertia + push)
+        return (after, rates, integral, speed), (wanted, given)
+
+    return tick
+
+
 def _observe(gains, vehicle, command, motor, gyro, disturbance, dt, at_once):
     """One track. gains (3,) multiples of p, i, d; command (T, TICKS, 4), motor (T, 4), gyro (T, 3) rad/s,
     disturbance (T, 3) rad/s^2 of angular acceleration beyond the nominal; dt () s per row.
@@ -36,46 +55,33 @@ def _observe(gains, vehicle, command, motor, gyro, disturbance, dt, at_once):
         rate_ki=vehicle.rate_ki * gains[1],
         rate_kd=vehicle.rate_kd * gains[2],
     )
-    h = dt / TICKS
-    at_rest = jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0])
+    tick = _ticking(controller, vehicle, dt / TICKS)
 
-    def tick(carry, command):
-        rates, previous, integral, speed, offset, push = carry
-        state = DroneState(*at_rest, jnp.zeros(3), rates, speed, integral, previous, ())
-        wanted, integral = rate_controller(controller, state, command, h)
-        given = jnp.clip(wanted + offset, 0.0, 1.0)
-        speed = rotor_speed_step(vehicle, speed, given, h)
-        _, torque = total_wrench(vehicle, rotor_thrust(vehicle, speed), rotor_reaction(vehicle, speed))
-        gyroscopic = jnp.cross(rates, vehicle.inertia * rates)
-        after = rates + h * ((torque - gyroscopic) / vehicle.inertia + push)
-        return (after, rates, integral, speed, offset, push), (wanted, given)
+    def ticks(state, command, offset, push):
+        return jax.lax.scan(lambda s, c: tick(s, c, offset, push), state, command, unroll=True)
 
     def row(carry, inputs):
         command, logged, gyro_next, push = inputs
-        *carry, missed = carry
+        state, missed = carry
         if at_once:
-            (rates, previous, integral, speed, _, _), (wanted, sent) = jax.lax.scan(
-                tick, (*carry, missed, push), command, unroll=True
-            )
+            (rates, previous, *rest), (wanted, sent) = ticks(state, command, missed, push)
             missed = missed + FOLLOWED * (logged - wanted[0] - missed)
-            step = GYRO_GAIN * (gyro_next - rates)
-            return (rates + step, previous + step, integral, speed, missed), (wanted[0], sent, rates)
-        _, (wanted, _) = jax.lax.scan(tick, (*carry, jnp.zeros(4), push), command, unroll=True)
-        # The second pass follows the motors as logged: the controller's pattern in the row, the log's mean.
-        start = (*carry, logged - wanted.mean(0), push)
-        (rates, previous, integral, speed, _, _), (wanted, given) = jax.lax.scan(
-            tick, start, command, unroll=True
-        )
+            wanted = wanted[0]
+        else:
+            _, (wanted, _) = ticks(state, command, jnp.zeros(4), push)
+            wanted = wanted.mean(0)
+            # The second pass follows the motors as logged: the controller's pattern in the row, the log's mean.
+            (rates, previous, *rest), (again, sent) = ticks(state, command, logged - wanted, push)
+            wanted = again.mean(0)
+            # The log's mean, within a motor's limits: what a limit cuts off one tick, the others must have had.
+            for _ in range(3):
+                sent = jnp.clip(sent + (logged - sent.mean(0)), 0.0, 1.0)
         step = GYRO_GAIN * (gyro_next - rates)
-        # The log's mean, within a motor's limits: what a limit cuts off one tick, the others must have had.
-        sent = given
-        for _ in range(3):
-            sent = jnp.clip(sent + (logged - sent.mean(0)), 0.0, 1.0)
-        return (rates + step, previous + step, integral, speed, missed), (wanted.mean(0), sent, rates)
+        return ((rates + step, previous + step, *rest), missed), (wanted, sent, rates)
 
     speed = vehicle.max_rotor_speed * jnp.sqrt(jnp.clip(motor[0], 1e-4, 1.0))
     gyro_next = jnp.concatenate([gyro[1:], gyro[-1:]])
-    start = (gyro[0], gyro[0], jnp.zeros(3), speed, jnp.zeros(4))
+    start = (gyro[0], gyro[0], jnp.zeros(3), speed), jnp.zeros(4)
     return jax.lax.scan(row, start, (command, motor, gyro_next, disturbance))[1]
 
 
@@ -91,22 +97,11 @@ def observe(gains, vehicle, command, motor, gyro, disturbance, dt, at_once=False
 def commanded(vehicle, command, dt):
     """Mean motor commands (T, 4) and body rates (T, 3) amid the rows that the body-rate commands (T, 4) alone cause:
     the nominal loop around the nominal vehicle, without gyroscope noise and air."""
-    h = dt / TICKS
-    at_rest = jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0])
-
-    def tick(carry, command):
-        rates, previous, integral, speed = carry
-        state = DroneState(*at_rest, jnp.zeros(3), rates, speed, integral, previous, ())
-        given, integral = rate_controller(vehicle, state, command, h)
-        given = jnp.clip(given, 0.0, 1.0)
-        speed = rotor_speed_step(vehicle, speed, given, h)
-        _, torque = total_wrench(vehicle, rotor_thrust(vehicle, speed), rotor_reaction(vehicle, speed))
-        after = rates + h * (torque - jnp.cross(rates, vehicle.inertia * rates)) / vehicle.inertia
-        return (after, rates, integral, speed), given
+    tick = _ticking(vehicle, vehicle, dt / TICKS)
 
     def row(carry, command):
         start = carry[0]
-        carry, given = jax.lax.scan(lambda c, _: tick(c, command), carry, None, length=TICKS)
+        carry, (_, given) = jax.lax.scan(lambda c, _: tick(c, command, 0.0, 0.0), carry, None, length=TICKS)
         return carry, (given.mean(0), 0.5 * (start + carry[0]))
 
     speed = vehicle.max_rotor_speed * jnp.sqrt(jnp.clip(jnp.full(4, command[0, 0]), 1e-4, 1.0))
