@@ -27,12 +27,13 @@ class Arguments:
     flights: int = 100
     processes: int = 3
     policy: str = "flight"
-    scenario: str = "wall"
     seed: int = 0
     only: tuple[str, ...] = ()
     """Kinds that contain one of these."""
     seconds_left: float = 1e9
     """Begin no flight after this time (s)."""
+    go_on: bool = False
+    """Fly what isn't in `out` yet."""
     out: Path = RESULTS / "flying_real_time.json"
 
 
@@ -40,8 +41,9 @@ def main() -> None:
     """Share the flights out to workers, each with vehicles of its own."""
     arguments = tyro.cli(Arguments)
     names = [k for k in KINDS if not arguments.only or any(part in k for part in arguments.only)]
-    numbers = range(arguments.seed, arguments.seed + arguments.flights)
-    work = [(n, names[n % len(names)]) for n in numbers]
+    records = read_json(arguments.out)["records"] if arguments.go_on else []
+    left = set(range(arguments.seed, arguments.seed + arguments.flights)) - {r["number"] for r in records}
+    work = [(n, names[n % len(names)]) for n in sorted(left)]
     random.Random(arguments.seed).shuffle(work)  # whenever it stops, kinds were flown without favour
     context = multiprocessing.get_context("spawn")
     queue, done = context.Queue(), context.Queue()
@@ -51,14 +53,14 @@ def main() -> None:
     workers = [context.Process(target=worker, args=given) for _ in range(arguments.processes)]
     for process in workers:
         process.start()
-    stands, records, begin = facts(), [], time.time()
+    stands = facts()
     while any(w.is_alive() for w in workers) or not done.empty():
         with contextlib.suppress(Exception):
             records.append(done.get(timeout=1.0))
             row = records[-1]
             print("well" if row["well"] else "NOT WELL", json.dumps(row), flush=True)
             result = {**stands, "flights": len(records), "well": sum(r["well"] for r in records), "policy": arguments.policy,
-                      "seconds": round(time.time() - begin), "records": sorted(records, key=lambda r: r["number"])}  # fmt: skip
+                      "records": sorted(records, key=lambda r: r["number"])}  # fmt: skip
             arguments.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     write_page(arguments.out, page, read_json(arguments.out))
 
@@ -97,9 +99,8 @@ def worker(arguments, queue, done, ends) -> None:
     from openjax.commands.fly import prepare
     from openjax.flying import real_time
 
-    virtual = VirtualProcess(arguments.scenario)
-    of_both = {name: getattr(arguments, name) for name in ("policy", "scenario")}
-    fly = FlyArguments(**of_both, uri=tuple(virtual.uris), episode_seconds=8.0, body_logs=1)
+    virtual = VirtualProcess("wall")
+    fly = FlyArguments(policy=arguments.policy, uri=tuple(virtual.uris), episode_seconds=8.0, body_logs=1)
     prepared = prepare(fly)
     real_time.hurry()
     while time.time() < ends:

@@ -291,8 +291,7 @@ def main() -> None:
     jobs.sort(key=lambda job: job[0][0])  # whenever it stops, all kinds and layouts were flown as often
     records = []
     with ProcessPoolExecutor(arguments.processes, mp_context=get_context("spawn")) as pool:
-        waiting = iter(jobs)
-        running = set()
+        waiting, running = iter(jobs), set()
         while True:
             late = time.time() - begin > arguments.seconds_left
             while len(running) < arguments.processes and not late and (job := next(waiting, None)):
