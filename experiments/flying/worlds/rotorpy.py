@@ -118,40 +118,36 @@ class RotorPyWorld:
       ticks: control steps to be flown at most.
       seed: of the sensors' noise.
       first: number of the first episode, from which its noise is drawn.
-      changed: entries of RotorPy's parameters that differ from its Crazyflie.
     """
 
-    def __init__(
-        self,
-        drones: DroneState,
-        tasks: Task,
-        ticks: int,
-        seed: int,
-        first: int = 0,
-        changed: dict | None = None,
-    ):
-        from rotorpy.vehicles.multirotor import Multirotor
-
+    def __init__(self, drones: DroneState, tasks: Task, ticks: int, seed: int, first: int = 0):
         worlds, self.team = drones.position.shape[:2]
         count = worlds * self.team
-        self.parameters = crazyflie() | (changed or {})
-        hover = np.sqrt(self.parameters["mass"] * v.GRAVITY / (4 * self.parameters["k_eta"]))
         quaternion = np.asarray(drones.quaternion, float).reshape(count, 4).T
-        self.bodies = Bodies(
-            Multirotor(self.parameters, control_abstraction="cmd_motor_speeds", aero=True),
-            {
-                "x": np.asarray(drones.position, float).reshape(count, 3).T,
-                "v": np.zeros((3, count)),
-                "q": np.roll(quaternion, -1, axis=0),
-                "w": np.zeros((3, count)),
-                "rotor_speeds": np.full((4, count), hover),
-            },
-        )
+        start = {
+            "x": np.asarray(drones.position, float).reshape(count, 3).T,
+            "v": np.zeros((3, count)),
+            "q": np.roll(quaternion, -1, axis=0),
+            "w": np.zeros((3, count)),
+        }
+        firmware = v.nominal_parameters([v.Told()] * count)
+        self.bodies = self.make_bodies(start, firmware)
         drawn = sensors_of(seed, 0)
         self.air = air_of(drawn, seed, 0, ticks + 1, range(first, first + worlds), self.team)
-        nominal = v.nominal_parameters([v.Told()] * count)
-        self.firmware = Firmware(nominal, self.air["gyro_bias"].astype(float))
+        self.firmware = Firmware(firmware, self.air["gyro_bias"].astype(float))
         self.solids, self.tick = solids_of(tasks, self.team), 0
+
+    def make_bodies(self, start, firmware) -> Bodies:
+        """The bodies, which hover at `start`; another vehicle's gains are written into `firmware`."""
+        from rotorpy.vehicles.multirotor import Multirotor
+
+        model = Multirotor(crazyflie(), control_abstraction="cmd_motor_speeds", aero=True)
+        hover = np.sqrt(model.mass * v.GRAVITY / (4 * model.k_eta))
+        return Bodies(model, start | {"rotor_speeds": np.full((4, start["x"].shape[1]), hover)})
+
+    def speeds(self, motors) -> np.ndarray:
+        """The rotors' speeds at which motor commands (4, B) settle."""
+        return np.sqrt(motors * MOST_THRUST / self.bodies.model.k_eta)
 
     def poses(self) -> Poses:
         """Where the vehicles are."""
@@ -171,8 +167,8 @@ class RotorPyWorld:
         command = command.reshape(-1, 4).T
         for part in range(PER_TICK):
             noise = self.air["gyro_bias"] + self.air["gyro"][PER_TICK * self.tick + part]
-            motors = self.firmware(command, self.bodies.rates + noise)
-            self.bodies.step(np.sqrt(motors * MOST_THRUST / self.parameters["k_eta"]), SAMPLE)
+            self.motors = self.firmware(command, self.bodies.rates + noise)
+            self.bodies.step(self.speeds(self.motors), SAMPLE)
         self.solids.stop(self.bodies.position, self.bodies.velocity)
         limit_speed(self.bodies.velocity, max_speed)
         self.tick += 1
