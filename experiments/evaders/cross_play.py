@@ -12,6 +12,7 @@ from collections import defaultdict
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.stats import binomtest
 
 from experiments.flying.vehicles import vehicles
 from experiments.table import Page, Table, page_parser, publish
@@ -99,21 +100,12 @@ def summary(statistics: EpisodeStatistics) -> dict:
         "episodes": number,
         "captures": captures,
         "capture_rate": captures / number,
-        "interval": wilson(captures, number),
+        "interval": tuple(binomtest(captures, number).proportion_ci(method="wilson")),
         "crash_rate": float(statistics.crashed.mean()),
         "capture_step": float(statistics.capture_step.mean()),
         "collision_rate": float((statistics.collision_steps / statistics.steps).mean()),
         "over_speed_rate": float((statistics.over_speed_steps / statistics.steps).mean()),
     }
-
-
-def wilson(successes: int, number: int) -> tuple[float, float]:
-    """Wilson's 95 % interval of a share (Wilson 1927)."""
-    z = 1.959964
-    share = successes / number
-    middle = (share + z**2 / (2 * number)) / (1 + z**2 / number)
-    half = z / (1 + z**2 / number) * (share * (1 - share) / number + z**2 / (4 * number**2)) ** 0.5
-    return max(0.0, middle - half), min(1.0, middle + half)
 
 
 def study(options) -> dict:

@@ -26,6 +26,7 @@ from openjax.pursuit.evaders.behaviours import MARGIN
 STEP = 0.04
 """Seconds of a step of the value iteration."""
 HEADINGS = 32
+SEEDS = 3
 
 
 class Empty(Pursuit):
@@ -76,7 +77,7 @@ def stack_of(craft: Craft):
 
 def game(**changes) -> PursuitSettings:
     """Points in an arena without pillars."""
-    fixed = dict(physics="stops", speed_limit="none", evaders=("learned",), min_pillars=0)
+    fixed = dict(physics="stops", speed_limit="none", evaders=("learned",) * SEEDS, min_pillars=0)
     return PursuitSettings(**fixed, max_pillars=1, **changes)
 
 
@@ -140,17 +141,17 @@ def learn(environment: Pursuit, team: Team, how: BestResponseSettings):
         carry, _ = jax.block_until_ready(step({}, carry))
     keys = jax.random.split(jax.random.key(77), how.num_envs)
     tasks = jax.vmap(lambda key: uniform_task(settings, key))(keys)
-    networks = [jax.tree.map(lambda leaf, i=i: leaf[i], carry.evader.actor) for i in range(how.seeds)]
+    networks = [jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], carry.evader.actor) for i in range(how.seeds)]
     duel, kinds = jax.jit(make_duel(environment, team)), jnp.zeros(how.num_envs, jnp.int32)
     # without a network it is the greedy one
-    found = [duel({}, tasks, kinds, keys[0], {"evader_network": own}) for own in [*networks, None]]
+    found = [duel({}, tasks, kinds, keys[0], {"evader_networks": own}) for own in [*networks, None]]
     seconds = np.stack([np.asarray(s.capture_step) for s in found]) * settings.time_step
     return tasks, seconds, np.stack([np.asarray(s.captured) for s in found])
 
 
 def study(options) -> dict:
     """Values of the planar games, captures by stack."""
-    how = BestResponseSettings(total_steps=options.steps, seeds=3, num_envs=options.worlds, layouts=0.0)
+    how = BestResponseSettings(total_steps=options.steps, seeds=SEEDS, num_envs=options.worlds, layouts=0.0)
     planar, against_stack = [], []
     for number in options.pursuers:
         speed, radii = (0.8, 1.1)[number - 1], options.radii[number - 1]

@@ -1,14 +1,15 @@
-"""The last stage of a run keeps what it learns only where that validates better."""
+"""The last stage of a run keeps the best of what it learns, only where that validates better than what it had."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from openjax.commands.training_job import keep_if_better
+from openjax.commands.training_job import keep_best
 from openjax.files import read_json
 from openjax.learning import build, preset
 from openjax.pursuit import Pursuit
+from openjax.store.leaves import named_leaves
 from openjax.store.policy_files import load_policy_file, save_policy_file
 from openjax.store.run_directory import RunDirectory
 
@@ -21,8 +22,10 @@ GOOD = {
 }
 
 
-@pytest.mark.parametrize("better", [True, False])
-def test_last_stage_is_kept_where_it_validates_better(better, tmp_path):
+@pytest.mark.parametrize(
+    "crashes, kept", [([0.1, 0.0, 0.05], 1), ([0.1, 0.05, 0.0], 2), ([0.0, 0.1, 0.0], 0)]
+)
+def test_last_stage_keeps_what_validates_best(crashes, kept, tmp_path):
     settings = preset("quick", network=dict(features=8, heads=1), predictor=dict(enabled=False))
     environment = Pursuit(settings.environment)
     observation = jax.eval_shape(lambda key: environment.reset(key)[0], jax.random.key(0))
@@ -32,18 +35,22 @@ def test_last_stage_is_kept_where_it_validates_better(better, tmp_path):
     save_policy_file(directory.policy, before, settings, {"update": 7}, storage="float32")
 
     def learn(parameters, key):
-        return jax.tree.map(lambda leaf: leaf + 1.0, parameters), [{"crashes_from_starts": 0.1}]
+        for moved in (1.0, 2.0):
+            yield (
+                jax.tree.map(lambda leaf, by=moved: leaf + by, parameters),
+                [{"crashes_from_starts": 0.1}] * 5,
+            )
 
-    crashes = iter([0.1, 0.0] if better else [0.0, 0.1])
+    rates = iter(crashes)
 
     def validate(parameters):
-        return GOOD | {"crash_rate": next(crashes)}
+        return GOOD | {"crash_rate": next(rates)}
 
-    message = keep_if_better(directory, learn, validate, settings)
+    message = keep_best(directory, learn, validate, settings)
     leaves, _, notes = load_policy_file(directory.policy)
-    moved = [np.abs(np.asarray(leaf)).max() for leaf in jax.tree.leaves(leaves)]
-    first = [np.abs(np.asarray(leaf)).max() for leaf in jax.tree.leaves(before)]
-    assert (sum(moved) > sum(first) + 1) == better
-    assert notes["update"] == 7
-    assert ("not kept" in message) != better
-    assert read_json(tmp_path / "analytic.json")["kept"] == better
+    first = named_leaves(before)
+    for name, leaf in leaves.items():
+        np.testing.assert_allclose(leaf, first[name] + kept, atol=1e-6)
+    assert (notes["update"], notes.get("analytic_updates", 0)) == (7, 5 * kept)
+    assert ("not kept" in message) == (kept == 0)
+    assert read_json(tmp_path / "analytic.json")["kept"] == 5 * kept

@@ -182,7 +182,10 @@ def test_the_step_without_predictor_and_generator_keeps_its_carry():
 def test_the_step_with_several_evaders_keeps_its_carry_and_archives_them(generator):
     before, after, _ = traced(
         changed(
-            SETTINGS, environment=dict(evaders=("field", "greedy")), generator=generator, evaders_ramp=0.1
+            SETTINGS,
+            environment=dict(evaders=("field", "greedy", "learned")),
+            generator=generator,
+            evaders_ramp=0.1,
         )
     )
     assert before == after

@@ -59,7 +59,7 @@ def test_settings_of_an_earlier_version_keep_loading(tmp_path):
     run.write_settings(preset("quick"), {})
     text = run.settings_file.read_text()
     for new, old in (("clip_epsilon_end", "clip_end"), ("clip_epsilon", "clip"), ("gae_lambda", "trace")):
-        text = text.replace(f'"{new}"', f'"{old}"')
+        text = text.replace(f'"{new}"', f'"{old}"', 1)  # MAPPO's, which come first
     text = text.replace("validation_", "evaluation_").replace(
         '"observe_time"', '"observe_others_motion": false, "observe_time"'
     )

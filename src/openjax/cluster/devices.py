@@ -24,7 +24,7 @@ _FLOWN = Flown(PartitionSpec(None, AXIS), PartitionSpec(AXIS), PartitionSpec(AXI
 
 def can_share_out(settings: TrainSettings, number: int) -> bool:
     """Whether each of `number` devices gets the same share of the worlds, of every task and of every minibatch."""
-    group = int(np.lcm(settings.world_unit, settings.mappo.minibatches))
+    group = _group(settings)
     return number == 1 or settings.num_envs % (number * group) == 0
 
 
@@ -35,13 +35,18 @@ def check_devices(settings: TrainSettings, number: int) -> None:
       UserError: they can't, with the next number of worlds that could, and the numbers of devices that can.
     """
     if not can_share_out(settings, number):
-        unit = number * int(np.lcm(settings.world_unit, settings.mappo.minibatches))
+        unit = number * _group(settings)
         possible = -(-settings.num_envs // unit) * unit
         fewer = [n for n in range(1, number) if can_share_out(settings, n)]
         raise UserError(
             f"num_envs {settings.num_envs} can't be shared out to {number} devices; {possible} could, "
             f"or --devices {' or '.join(map(str, fewer))}"
         )
+
+
+def _group(settings):
+    """Worlds that can't be parted."""
+    return int(np.lcm.reduce([settings.world_unit, *settings.minibatches.values()]))
 
 
 def check_memory(settings: TrainSettings, number: int) -> None:

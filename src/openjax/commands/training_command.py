@@ -130,7 +130,7 @@ def prepare(
     known = {} if resumed is None else resumed.read_facts()
     files = _files(command, resumed)
     environment = make_environment(command.settings.environment, *files.values())
-    if environment.evader_network is None:  # a scripted one is in the settings
+    if environment.evader_networks is None:  # a scripted one is in the settings
         files["evader.npz"] = None
     settings = dataclasses.replace(command.settings, environment=environment.settings)
     directory = resumed or RunDirectory(_free_directory(command, processes))

@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import functools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import jax
@@ -74,7 +74,7 @@ class TrainingJob:
         game = self.environment
         arrays = [
             np.asarray(leaf).tolist()
-            for leaf in jax.tree.leaves((game.vehicle, game.effect_parameters, game.evader_network))
+            for leaf in jax.tree.leaves((game.vehicle, game.effect_parameters, game.evader_networks))
         ]
         names = jax.tree.structure(game.effect_parameters)
         return repr(
@@ -208,7 +208,7 @@ class _Run:
             def validate(parameters):
                 return summarise(validation(parameters)[0].evaluation)
 
-            self.progress.message(keep_if_better(self.directory, self.last_stage(), validate, settings))
+            self.progress.message(keep_best(self.directory, self.last_stage(), validate, settings))
         return report(self.job, self.directory, validation, outcome, self.progress)
 
     def _first_flights(self):
@@ -342,23 +342,23 @@ def _validation(job):
         environment.vehicle,
         environment.effects,
         environment.effect_parameters,
-        evader_network=environment.evader_network,
+        evader_networks=environment.evader_networks,
     )
     policy = build(settings, environment).policy
     return Validation(wide, settings.environment, policy, settings.validation_episodes)
 
 
-def keep_if_better(
+def keep_best(
     directory: RunDirectory,
-    learn: Callable[[PolicyParameters, jax.Array], tuple[PolicyParameters, list[dict]]],
+    learn: Callable[[PolicyParameters, jax.Array], Iterator[tuple[PolicyParameters, list[dict]]]],
     validate: Callable[[PolicyParameters], dict],
     settings: TrainSettings,
 ) -> str:
-    """Take a run's policy through the last stage, and keep what it becomes if that validates better.
+    """Take a run's policy through the last stage, and keep the best of what it becomes and what it was.
 
     Args:
       directory: the run's; `policy.npz` is what the stage starts from, and what it writes.
-      learn: (parameters, key) -> parameters after it, its history.
+      learn: (parameters, key) -> parameters on the way, and the history since the ones before.
       validate: parameters -> summary of the uniform validation tasks.
       settings: of the run.
 
@@ -370,19 +370,25 @@ def keep_if_better(
     abstract = abstract_parameters(Pursuit(settings.environment), build(settings).policy)
     # where the validation, too, was compiled for
     before = place(fill(abstract, before, str(directory.policy)))
-    after, history = learn(before, jax.random.key(settings.seed))
-    summaries = [validate(parameters) for parameters in (before, after)]
-    scores = [selection_score(summary, settings.environment.episode_length) for summary in summaries]
-    kept = scores[1] > scores[0]
-    facts = {"seconds": round(time.monotonic() - began, 1), "kept": kept, "validation_scores": scores}
+    length = settings.environment.episode_length
+    looks, history, best, kept = [{"update": 0, **validate(before)}], [], before, 0
+    scores = [selection_score(looks[0], length)]
+    for after, parts in learn(before, jax.random.key(settings.seed)):
+        history += parts
+        looks.append({"update": len(history), **validate(after)})
+        scores.append(selection_score(looks[-1], length))
+        if scores[-1] > scores[kept]:
+            best, kept = after, len(looks) - 1
+    seconds, updates = round(time.monotonic() - began, 1), looks[kept]["update"]
     if kept:
-        notes = {**notes, "validation_score": scores[1], "analytic_updates": len(history)}
-        save_policy_file(directory.policy, after, settings, notes, storage="float32")
-    write_json(directory.path / "analytic.json", {**facts, "validation": summaries, "history": history})
-    return (
-        f"by the gradient through the simulation: validation score {scores[0]:.4f} -> {scores[1]:.4f}"
-        f"{'' if kept else ', not kept'}, {facts['seconds']:.0f} s"
-    )
+        notes = {**notes, "validation_score": scores[kept], "analytic_updates": updates}
+        save_policy_file(directory.policy, best, settings, notes, storage="float32")
+    facts = {"seconds": seconds, "kept": updates, "validation_scores": scores}
+    write_json(directory.path / "analytic.json", {**facts, "validation": looks, "history": history})
+    told = f"{scores[0]:.4f} -> {scores[kept]:.4f} after {updates} of {len(history)} updates"
+    if not kept:
+        told = f"{scores[0]:.4f}, at most {max(scores[1:]):.4f} after it, not kept"
+    return f"by the gradient through the simulation: validation score {told}, {seconds:.0f} s"
 
 
 def report(

@@ -9,7 +9,7 @@ without the critic). All else is held to what it did.
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -235,7 +235,7 @@ def free_flight(environment: Pursuit) -> Pursuit:
         environment.vehicle,
         environment.effects,
         environment.effect_parameters,
-        evader_network=environment.evader_network,
+        evader_networks=environment.evader_networks,
     )
 
 
@@ -300,11 +300,12 @@ def _speed(drones):
 
 def compile_analytic(
     gradient: AnalyticGradient, parameters: PolicyParameters
-) -> Callable[[PolicyParameters, jax.Array], tuple[PolicyParameters, list[dict[str, float]]]]:
+) -> Callable[[PolicyParameters, jax.Array], Iterator[tuple[PolicyParameters, list[dict[str, float]]]]]:
     """Start to compile the stage for parameters of these shapes (or abstract ones), in the background.
 
     Returns:
-      the stage, which waits for the compiler: (parameters, key) -> parameters, metrics of each update.
+      the stage, which waits for the compiler: (parameters, key) -> after every `look_every` updates, and at the end, the
+      parameters and the metrics of each of these updates.
     """
     key = jax.eval_shape(lambda: jax.random.key(0))
     record = jax.jit(lambda parameters, key: gradient.flights(parameters, key, gradient.bounds()))
@@ -314,21 +315,22 @@ def compile_analytic(
     lowered = record.lower(parameters, key), update.lower(actor, state, parameters, flights, key)
     ready = [in_background(program.compile) for program in lowered]
 
-    def learn(parameters, key, look=None):
+    def learn(parameters, key):
         record, update = (wait() for wait in ready)
         flight_key, update_key = jax.random.split(key)
         actor, state = parameters.actor, gradient.optimiser.init(parameters.actor)
         flights, history = record(parameters, flight_key), []
-        for number in range(gradient.how.updates):
-            if look is not None:
-                look(number, actor)
+        for number in range(1, gradient.how.updates + 1):
             actor, state, parts = update(
-                actor, state, parameters, flights, jax.random.fold_in(update_key, number)
+                actor, state, parameters, flights, jax.random.fold_in(update_key, number - 1)
             )
             history.append(parts)
-        if look is not None:
-            look(gradient.how.updates, actor)
-        history = [{name: float(value) for name, value in parts.items()} for parts in jax.device_get(history)]
-        return parameters.replace(actor=actor), history
+            if number % gradient.how.look_every == 0 or number == gradient.how.updates:
+                parts = jax.device_get(history)
+                history = []
+                yield (
+                    parameters.replace(actor=actor),
+                    [{name: float(value) for name, value in update.items()} for update in parts],
+                )
 
     return learn

@@ -4,13 +4,15 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from openjax.errors import UserError
-from openjax.ranges import Interval, check_intervals
+from openjax.learning.settings import EvaderLearningSettings
+from openjax.ranges import Interval
 
 
 @dataclass(frozen=True)
-class BestResponseSettings:
-    """How an evader learns."""
+class BestResponseSettings(EvaderLearningSettings):
+    """How an evader learns against fixed pursuers."""
 
+    learning_rate_end: Annotated[float, Interval("[0, 1]")] = 0.0
     total_steps: Annotated[int, Interval("[1, 1e15]")] = 200_000_000
     """Environment steps of each seed."""
     seeds: Annotated[int, Interval("[1, 64]")] = 3
@@ -21,18 +23,9 @@ class BestResponseSettings:
     """Control steps per iteration; worlds whose evader was caught start anew after it."""
     layouts: Annotated[float, Interval("[0, 1]")] = 0.5
     """Share of the episodes on the six layouts, which the pursuers never learned on; the others are uniform tasks."""
-    learning_rate: Annotated[float, Interval("(0, 1]")] = 1e-3
-    """Adam step size at the start; falls linearly to zero."""
-    epochs: Annotated[int, Interval("[1, 1000]")] = 3
-    minibatches: Annotated[int, Interval("[1, 100000]")] = 4
-    clip_epsilon: Annotated[float, Interval("(0, 10]")] = 0.2
-    entropy_coefficient: Annotated[float, Interval("[0, 10]")] = 1e-3
-    discount: Annotated[float, Interval("[0, 1]")] = 0.995
-    gae_lambda: Annotated[float, Interval("[0, 1]")] = 0.95
-    initial_log_std: Annotated[float, Interval("[-10, 2]")] = -1.0
 
     def __post_init__(self):
-        check_intervals(self)
+        super().__post_init__()
         if self.num_envs % self.minibatches:
             raise UserError(f"num_envs {self.num_envs} must be a multiple of minibatches {self.minibatches}")
 

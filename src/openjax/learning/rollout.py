@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from openjax.learning.evader_learning import EvaderLearning, EvaderSamples, LearningEvaders
 from openjax.policy import Policy, PolicyParameters, gaussian_log_prob
 from openjax.pursuit import Observation, Pursuit, PursuitState
 
@@ -21,6 +22,7 @@ class Rollout:
     terminated: jax.Array  # (T, E) bool
     truncated: jax.Array  # (T, E) bool
     evader: jax.Array  # (T, E, 3) m, true position after the step
+    learning: EvaderSamples | None = None  # (T, E, ...), of the evaders that learn; None where none does
 
 
 def newest_frame(observation: Observation) -> Observation:
@@ -36,6 +38,7 @@ def collect(
     state: PursuitState,
     noise: jax.Array,
     penalty_share: jax.Array | float = 1.0,
+    learning: tuple[EvaderLearning, LearningEvaders, jax.Array] | None = None,
 ) -> tuple[Rollout, Observation, PursuitState]:
     """Act with exploration for T steps in E worlds.
 
@@ -47,36 +50,37 @@ def collect(
       state: (E, ...).
       noise: (T, E, N, A) standard normal, drawn ahead in one go.
       penalty_share: () share of the reward's penalties that counts.
+      learning: how evaders learn, who they are, and noise (T, E, 3) for them; None: none learns.
 
     Returns:
       the rollout, and observation and state after it.
     """
-    number, pursuers = noise.shape[1], environment.settings.num_pursuers
-    chex.assert_shape(noise, (None, None, pursuers, policy.sample_size))
-    chex.assert_tree_shape_prefix((observation, state), (number,))
-    step = jax.vmap(environment.step, in_axes=(None, 0, 0))
-    unused_key = jax.random.key(0)
+    chex.assert_shape(noise, (None, None, environment.settings.num_pursuers, policy.sample_size))
+    chex.assert_tree_shape_prefix((observation, state), noise.shape[1:2])
+    step = jax.vmap(environment.step, in_axes=(None, 0, 0, 0 if learning else None))
+    how, evaders, evader_noise = learning or (None, None, None)
 
     def one(carry, noise):
-        observation, state = carry
+        (observation, state), (noise, evader_noise) = carry, noise
+        wish, samples = how.act(evaders, state, evader_noise) if learning else (None, None)
         predicted = policy.predict(parameters, observation)
         mean, log_std = policy.distribution(parameters.actor, observation, predicted)
         action = mean + jnp.exp(log_std) * noise
         log_prob = gaussian_log_prob(action, mean, log_std)
-        following, state, reward, terminated, truncated, info = step(
-            unused_key, state, policy.action(action, observation)
-        )
+        acted = policy.action(action, observation)
+        following, state, reward, *ends, info = step(jax.random.key(0), state, acted, wish)
         record = Rollout(
             observation=newest_frame(observation),
             predicted=predicted,
             action=action,
             log_prob=log_prob,
             reward=reward - (1.0 - penalty_share) * info.penalty,
-            terminated=terminated,
-            truncated=truncated,
+            terminated=ends[0],
+            truncated=ends[1],
             evader=state.evader_position,
+            learning=samples,
         )
         return (following, state), record
 
-    (observation, state), rollout = jax.lax.scan(one, (observation, state), noise)
+    (observation, state), rollout = jax.lax.scan(one, (observation, state), (noise, evader_noise))
     return rollout, observation, state

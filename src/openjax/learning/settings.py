@@ -93,6 +93,26 @@ class GeneratorSettings:
 
 
 @dataclass(frozen=True)
+class EvaderLearningSettings:
+    """PPO of evaders that learn; see `openjax.learning.evader_learning`."""
+
+    learning_rate: Annotated[float, Interval("(0, 1]")] = 1e-3
+    """Adam step size at the start ..."""
+    learning_rate_end: Annotated[float, Interval("[0, 1]")] = 1e-4
+    """... which falls linearly to this."""
+    epochs: Annotated[int, Interval("[1, 1000]")] = 3
+    minibatches: Annotated[int, Interval("[1, 100000]")] = 4
+    clip_epsilon: Annotated[float, Interval("(0, 10]")] = 0.2
+    entropy_coefficient: Annotated[float, Interval("[0, 10]")] = 1e-3
+    discount: Annotated[float, Interval("[0, 1]")] = 0.995
+    gae_lambda: Annotated[float, Interval("[0, 1]")] = 0.95
+    initial_log_std: Annotated[float, Interval("[-10, 2]")] = -1.0
+
+    def __post_init__(self):
+        check_intervals(self)
+
+
+@dataclass(frozen=True)
 class FirstFlightsSettings:
     """The stage before MAPPO by the gradient through the simulation; see `openjax.learning.first_flights`."""
 
@@ -132,6 +152,8 @@ class AnalyticSettings:
 
     updates: Annotated[int, Interval("[0, 1000000]")] = 0
     """Updates of the actor; 0: there is no such stage."""
+    look_every: Annotated[int, Interval("[1, 1000000]")] = 200
+    """Updates between validations; the best of all is kept, what it was before among them."""
     worlds: Annotated[int, Interval("[1, 65536]")] = 640
     """Starts in an update, and as many moments of flights."""
     learning_rate: Annotated[float, Interval("(0, 1]")] = 3e-4
@@ -180,6 +202,7 @@ class TrainSettings:
     generator: GeneratorSettings = field(default_factory=GeneratorSettings)
     first_flights: FirstFlightsSettings = field(default_factory=FirstFlightsSettings)
     analytic: AnalyticSettings = field(default_factory=AnalyticSettings)
+    evader_learning: EvaderLearningSettings = field(default_factory=EvaderLearningSettings)
     num_envs: Annotated[int, Interval("[1, 16777216]")] = 2560
     """Worlds that are simulated at once."""
     rollout_length: Annotated[int, Interval("[1, 100000]")] = 80
@@ -242,10 +265,11 @@ class TrainSettings:
             self.total_updates < 2**31,
             f"total_steps {self.total_steps} are {self.total_updates} updates; fewer than 2^31 are possible",
         )
-        yield (
-            self.num_envs % self.mappo.minibatches == 0,
-            f"num_envs {self.num_envs} must be a multiple of mappo.minibatches {self.mappo.minibatches}",
-        )
+        for name, number in self.minibatches.items():
+            yield (
+                self.num_envs % number == 0,
+                f"num_envs {self.num_envs} must be a multiple of {name}.minibatches {number}",
+            )
         yield (
             rollout % self.mappo.step_subsampling == 0,
             f"mappo.step_subsampling {self.mappo.step_subsampling} must divide rollout_length {rollout}",
@@ -270,6 +294,16 @@ class TrainSettings:
     def world_unit(self) -> int:
         """Number of worlds that holds the same share of every start group, task and restart."""
         return self.start_groups * self.episodes_per_task * max(1, self.restart_every)
+
+    @property
+    def minibatches(self) -> dict[str, int]:
+        """Minibatches of the learners that part the worlds, by the group of their settings."""
+        evader = (
+            {"evader_learning": self.evader_learning.minibatches}
+            if "learned" in self.environment.evaders
+            else {}
+        )
+        return {"mappo": self.mappo.minibatches, **evader}
 
     @property
     def schedule(self) -> "Schedule":

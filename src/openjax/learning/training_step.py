@@ -12,6 +12,7 @@ from flax import struct
 from openjax.baselines import make_policy
 from openjax.learning.archive import TaskArchive, empty_archive
 from openjax.learning.collectives import gather_over_devices, mean_over_devices, own_keys
+from openjax.learning.evader_learning import EvaderLearning, LearningEvaders
 from openjax.learning.generator import generate_task, select, successes, task_like
 from openjax.learning.mappo import ValueScale, initial_value_scale, make_optimiser, update_policy
 from openjax.learning.predictor_update import make_predictor_optimiser, update_predictor
@@ -20,6 +21,7 @@ from openjax.learning.settings import TrainSettings
 from openjax.learning.train_state import Optimisers, TrainState
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Observation, Pursuit, PursuitState
+from openjax.pursuit.evaders import learned_place
 from openjax.vehicle.family import narrowed_bounds
 
 
@@ -33,6 +35,8 @@ class TrainCarry:
     value_scale: ValueScale
     observation: Observation  # (E, ...)
     state: PursuitState  # (E, ...)
+    evaders: LearningEvaders | None
+    """Those that learn; None where none does."""
     archive: TaskArchive
     key: jax.Array
     update: jax.Array  # () int32, training steps done
@@ -60,6 +64,7 @@ class Building:
     environment: Pursuit
     policy: Policy
     optimisers: Optimisers
+    evaders: EvaderLearning
 
 
 def build(settings: TrainSettings, environment: Pursuit | None = None) -> Building:
@@ -67,6 +72,7 @@ def build(settings: TrainSettings, environment: Pursuit | None = None) -> Buildi
     environment = environment or Pursuit(settings.environment)
     return Building(
         environment=environment,
+        evaders=EvaderLearning(settings.evader_learning, environment, settings.total_updates),
         policy=make_policy(environment, settings.network, settings.predictor),
         optimisers=Optimisers(
             *make_optimiser(settings.mappo, settings.total_updates),
@@ -114,6 +120,7 @@ def initial_carry(settings: TrainSettings, parts: Building, key: jax.Array) -> T
         value_scale=initial_value_scale(),
         observation=observation,
         state=state,
+        evaders=parts.evaders.start(jax.random.fold_in(policy_key, 1)) if parts.evaders.number else None,
         archive=archive,
         key=key,
         update=jnp.zeros((), jnp.int32),
@@ -159,6 +166,7 @@ def make_phases(
     """The parts of the training step; `axis` names the axis of devices when they run under `shard_map`."""
     step = _Step(settings, build(settings, environment), axis)
     learn = (step.learn_predictor,) if settings.predictor.enabled else ()
+    learn += (step.learn_evaders,) if step.parts.evaders.number else ()
     return Phases(step.fly, (*learn, step.learn_policy), step.renew)
 
 
@@ -189,8 +197,12 @@ class _Step:
         keys = own_keys(self._key(carry, 1), carry.state.step.shape[0], axis)
         noise = jax.vmap(lambda k: jax.random.normal(k, shape))(keys)
         world, share = (carry.observation, carry.state), penalty_share_at(settings, self._progress(carry))
+        learning = None
+        if carry.evaders is not None:
+            draws = jax.vmap(lambda k: jax.random.normal(jax.random.fold_in(k, 1), (shape[0], 3)))(keys)
+            learning = self.parts.evaders, carry.evaders, jnp.moveaxis(draws, 1, 0)
         rollout, observation, state = collect(
-            environment, policy, carry.policy, *world, jnp.moveaxis(noise, 1, 0), share
+            environment, policy, carry.policy, *world, jnp.moveaxis(noise, 1, 0), share, learning
         )
         flown = Flown(rollout, carry.state.frames, policy.predict(carry.policy, observation))
         metrics = {"reward": mean_over_devices(jnp.mean(rollout.reward), axis)}
@@ -212,6 +224,11 @@ class _Step:
             *how, *before, flown.rollout, *last, self._key(carry, 3), self.axis, self._progress(carry)
         )
         return carry.replace(actor=actor, critic=critic, value_scale=scale), metrics
+
+    def learn_evaders(self, carry, flown):
+        key = jax.random.fold_in(self._key(carry, 3), 1)
+        evaders = self.parts.evaders.learn(carry.evaders, flown.rollout.learning, carry.state, key, self.axis)
+        return carry.replace(evaders=evaders), {"evader_noise": jnp.mean(evaders.log_std)}
 
     def renew(self, carry):
         settings, schedule, axis = self.settings, self.settings.schedule, self.axis
@@ -310,7 +327,12 @@ def _selection(settings, archive, ended, penalty_share, axis):
         "episode_return": statistics.episode_return,
         "success_rate": solved.ravel(),
     }
+    if "learned" in settings.environment.evaders:
+        by_network = learned_place(settings.environment.evaders, ended.evader.kind) >= 0
+        counted |= {"learned": by_network, "learned_capture_rate": by_network & statistics.captured}
     lasting = settings.schedule.lasting(statistics.steps.shape[0])
     counted = {name: jnp.mean(value.astype(jnp.float32)[lasting]) for name, value in counted.items()}
     counted = mean_over_devices(counted, axis)
+    if "learned" in counted:
+        counted["learned_capture_rate"] /= jnp.maximum(counted["learned"], 1e-6)
     return archive, counted | {"archive_size": archive.size.astype(jnp.float32)}

@@ -78,9 +78,9 @@ class Pursuit:
     """(R, 4) bounds of `settings.vehicles` that go before those written there."""
     evader_share: jax.Array | None = None
     """() from 0 to 1, how far a curriculum over `settings.evaders` has come; None is 1. See `openjax.pursuit.evaders`."""
-    evader_network: Any = None
-    """Parameters of the learned evader (`openjax.pursuit.evaders.learned`), if the settings name it; None: it does as the
-    greedy one."""
+    evader_networks: Any = None
+    """Parameters of the learned evaders (`openjax.pursuit.evaders.learned`) that the settings name, with their axis first; None:
+    they do as the greedy one."""
     dynamics: Dynamics | None = None
     """What moves the pursuers; None: the physics that the settings name, with the effects."""
 
@@ -216,7 +216,7 @@ class Pursuit:
           key: for an interface like other environments'; the game itself draws nothing after its reset.
           state: of this step's start.
           action: (N, 4) in -1..1: collective thrust, roll, pitch and yaw rate; see `action_to_command`.
-          wish: (3,) where an evader from outside flies, as a share of its speed (at most length one); None: its own rule.
+          wish: (3,) where an evader from outside flies, as a share of its speed (at most length one); None or NaN: its own rule.
 
         Returns:
           observation, state, reward (N,), terminated (), truncated (), info.
@@ -260,7 +260,7 @@ class Pursuit:
         settings, task, before = self.settings, state.task, state
         pillars = (task.pillar_position, task.pillar_active)
         velocity, evader_state = evader_velocity(
-            settings, before.evader, self.around_evader(before), self.evader_network, wish
+            settings, before.evader, self.around_evader(before), self.evader_networks, wish
         )
         evader = before.evader_position + settings.time_step * velocity
         step = before.step + 1

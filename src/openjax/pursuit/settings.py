@@ -66,7 +66,7 @@ class PursuitSettings:
     """How the evader's force becomes a velocity; "axis" normalises by the largest component (up to 3**0.5 faster)."""
     evaders: tuple[str, ...] = ("field",)
     """Evaders, one of which is drawn for each episode with equal odds; a name that comes twice is drawn twice as often. "field"
-    is the paper's; see `openjax.pursuit.evaders`."""
+    is the paper's; each "learned" is a network of its own, which learns while the pursuers do; see `openjax.pursuit.evaders`."""
     max_speed: Annotated[float, Interval("(0, 100]")] = 1.0
     """Maximal speed of a pursuer (m/s)."""
     speed_limit: Literal["clamp", "none"] = "clamp"

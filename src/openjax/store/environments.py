@@ -3,6 +3,8 @@
 import dataclasses
 from pathlib import Path
 
+import jax
+
 from openjax.pursuit import Pursuit, PursuitSettings
 from openjax.store.evader_files import find_opponent
 from openjax.vehicle.effects import load_effects
@@ -43,5 +45,5 @@ def make_environment(
         vehicle=load_vehicle_file(vehicle).vehicle if vehicle else None,
         effects=names,
         effect_parameters=parameters,
-        evader_network=network,
+        evader_networks=None if network is None else jax.tree.map(lambda leaf: leaf[None], network),
     )

@@ -17,6 +17,7 @@ _HOMES = {
     "evader_velocity": "evader",
     "field_velocity": "field",
     "init_network": "learned",
+    "learned_place": "learned",
     "scene_of": "evader",
 }
 __getattr__, __dir__, __all__ = lazy_names(__name__, _HOMES)

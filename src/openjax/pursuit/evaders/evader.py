@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from openjax.pursuit.evaders.behaviours import BEHAVIOURS, MEMORY, Scene, greedy, into_free_space
+from openjax.pursuit.evaders.behaviours import BEHAVIOURS, MEMORY, Scene, into_free_space
 from openjax.pursuit.evaders.field import field_velocity
 from openjax.pursuit.evaders.kinds import EVADERS, NUMBERS, UNBOUNDED
-from openjax.pursuit.evaders.learned import STEPS, learned
+from openjax.pursuit.evaders.learned import STEPS, learned, learned_place, learning
 from openjax.pursuit.settings import PursuitSettings
 
 
@@ -92,7 +92,7 @@ def evader_velocity(
     settings: PursuitSettings,
     state: EvaderState | None,
     around: Around,
-    network: Any = None,
+    networks: Any = None,
     wish: jax.Array | None = None,
 ) -> tuple[jax.Array, EvaderState | None]:
     """(3,) velocity (m/s, world) of the evader in this step, and its state after it.
@@ -103,20 +103,22 @@ def evader_velocity(
       settings: the game.
       state: which evader it is, from `draw_evader`.
       around: where it and the others are.
-      network: parameters of the learned evader, if it is one of the settings'.
-      wish: (3,) a velocity, as a share of its speed, that is flown in place of its own; None is its own.
+      networks: parameters of the learned evaders among the settings', their axis first; None: they do as the greedy one.
+      wish: (3,) a velocity, as a share of its speed, that is flown in place of its own; None or NaN is its own.
     """
     if state is None and wish is None:
         return _field(settings, around), None
     around, state = jax.lax.stop_gradient((around, state))
     if state is None:
         return _flown(settings, around, settings.evader_speed, UNBOUNDED, wish), None
-    own, memory = _wish(settings, state, around, network)
+    own, memory = _wish(settings, state, around, networks)
+    is_own = jnp.ones((), bool) if wish is None else jnp.any(jnp.isnan(wish))
     speed = state.numbers["speed"] * settings.evader_speed
-    velocity = _flown(settings, around, speed, state.numbers["acceleration"], own if wish is None else wish)
+    wish = own if wish is None else jnp.where(is_own, own, wish)
+    velocity = _flown(settings, around, speed, state.numbers["acceleration"], wish)
     is_field = np.array([EVADERS[name].behaviour == "field" for name in settings.evaders])
-    if wish is None and is_field.any():
-        velocity = jnp.where(jnp.asarray(is_field)[state.kind], _field(settings, around), velocity)
+    if is_field.any():
+        velocity = jnp.where(is_own & jnp.asarray(is_field)[state.kind], _field(settings, around), velocity)
     return velocity, state.replace(memory=memory)
 
 
@@ -141,9 +143,11 @@ def _field(settings, around):
     return field_velocity(settings, around.position, around.pursuers, around.in_sight, *around.pillars)
 
 
-def _wish(settings, state, around, network):
+def _wish(settings, state, around, networks):
     """Wish (3,) and memory of an evader with a behaviour; of the paper's something finite."""
-    known = {**BEHAVIOURS, "learned": greedy if network is None else functools.partial(learned, network)}
+    which = learned_place(settings.evaders, state.kind)
+    by_network = learning if networks is None else functools.partial(learned, networks, which)
+    known = {**BEHAVIOURS, "learned": by_network}
     behaviours = [EVADERS[name].behaviour for name in settings.evaders]
     used = [name for name in known if name in behaviours]
     place = np.array([used.index(name) if name in used else 0 for name in behaviours], np.int32)

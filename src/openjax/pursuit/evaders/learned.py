@@ -11,11 +11,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from openjax.pursuit.evaders.behaviours import MEMORY, Scene, greedy
+from openjax.pursuit.evaders.kinds import EVADERS
 
 STEPS = 10
 """Steps that it remembers."""
 WIDTH = 64
 _OWN, _PURSUER, _PILLAR = 9, 10, 4
+
+
+def learned_place(names: tuple[str, ...], kind: jax.Array) -> jax.Array:
+    """The place among the learned evaders of those at the places `kind` (...) in `names`; -1 for others."""
+    is_learned = np.array([EVADERS[name].behaviour == "learned" for name in names])
+    return jnp.asarray(np.where(is_learned, np.cumsum(is_learned) - 1, -1))[kind]
 
 
 def init_network(key: jax.Array) -> dict[str, Any]:
@@ -48,7 +55,7 @@ def features(scene: Scene, memory: jax.Array) -> dict[str, jax.Array]:
     size = np.array([settings.arena_radius] * 2 + [settings.arena_height / 2], np.float32)
     middle = np.array(settings.middle, np.float32)
     wish = greedy(scene, memory)[0]
-    return {
+    seen = {
         "own": jnp.concatenate(
             [(scene.position - middle) / size, scene.velocity / settings.evader_speed, wish]
         ),
@@ -57,6 +64,8 @@ def features(scene: Scene, memory: jax.Array) -> dict[str, jax.Array]:
         "in_use": scene.pillar_active,
         "greedy": wish,
     }
+    # fused with what follows, the greedy evader in it takes a GPU's compiler minutes
+    return jax.lax.optimization_barrier(seen)
 
 
 def outputs(network: dict[str, Any], seen: dict[str, jax.Array]) -> tuple[jax.Array, jax.Array]:
@@ -78,8 +87,26 @@ def remember(scene: Scene, memory: jax.Array) -> jax.Array:
     return jnp.concatenate([memory[:MEMORY], memory[MEMORY + scene.pursuers.size :], scene.pursuers.ravel()])
 
 
-def learned(network: dict[str, Any], scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The behaviour of a network, without exploration."""
-    wish = outputs(network, features(scene, memory))[0]
+def outputs_of(
+    networks: dict[str, Any], which: jax.Array, seen: dict[str, jax.Array]
+) -> tuple[jax.Array, jax.Array]:
+    """`outputs` of the one of K networks, every leaf with their axis first, that `which` (...) names for each of the features."""
+    wishes, values = jax.vmap(outputs, (0, None))(
+        networks, seen
+    )  # all of them: cheaper than their parameters by world
+    chosen = jax.nn.one_hot(which, values.shape[0], axis=0)
+    return jnp.sum(chosen[..., None] * wishes, axis=0), jnp.sum(chosen * values, axis=0)
+
+
+def learning(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The behaviour without a network, whose wishes come from outside: the greedy one's, and the memory goes on."""
+    return greedy(scene, memory)[0], remember(scene, memory)
+
+
+def learned(
+    networks: dict[str, Any], which: jax.Array, scene: Scene, memory: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """The behaviour of the network that `which` () names, without exploration."""
+    wish = outputs_of(networks, which, features(scene, memory))[0]
     size = jnp.sqrt(jnp.sum(wish**2) + 1e-12)
     return wish / jnp.maximum(size, 1.0), remember(scene, memory)

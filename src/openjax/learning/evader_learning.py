@@ -1,0 +1,186 @@
+"""Evaders that learn, by PPO, to be caught as late as they can be.
+
+Payoff is the time to the capture and not whether there is one: where captures are forced, every evader would be as good as any
+other. A game names `learned` among its evaders as often as there are networks; the world of one of them is flown by its samples,
+and it learns from these until it is caught. `openjax.learning.training_step` has them learn while the pursuers do,
+`openjax.learning.best_response` against fixed ones.
+"""
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from openjax.learning.advantages import generalised_advantages
+from openjax.learning.collectives import mean_over_devices
+from openjax.learning.settings import EvaderLearningSettings
+from openjax.policy import gaussian_entropy, gaussian_log_prob
+from openjax.pursuit import Pursuit, PursuitState
+from openjax.pursuit.evaders import init_network, learned_place, scene_of
+from openjax.pursuit.evaders.learned import features, outputs, outputs_of
+
+REWARD = 0.01
+"""Of a step without a capture: values are of the order of one."""
+
+
+@struct.dataclass
+class LearningEvaders:
+    """K networks: every leaf has their axis first."""
+
+    actor: Any
+    critic: Any
+    log_std: jax.Array  # (K, 3)
+    optimiser: Any
+
+    @property
+    def networks(self) -> tuple[Any, Any, jax.Array]:
+        """What learns."""
+        return self.actor, self.critic, self.log_std
+
+
+@struct.dataclass
+class EvaderSamples:
+    """T steps of E worlds."""
+
+    seen: dict[str, jax.Array]  # (T, E, ...)
+    which: jax.Array  # (T, E) int32, the network; -1: an evader that learns nothing
+    sample: jax.Array  # (T, E, 3)
+    log_prob: jax.Array  # (T, E)
+    flying: jax.Array  # (T, E) bool, not caught before this step
+
+
+@dataclass(frozen=True, eq=False)
+class EvaderLearning:
+    """How the learned evaders of a game learn, as pure functions."""
+
+    how: EvaderLearningSettings
+    environment: Pursuit
+    updates: int
+    """Of the run."""
+
+    @property
+    def number(self) -> int:
+        """Networks; 0: none learns, as the game names none, or brings their networks with it."""
+        brought = self.environment.evader_networks is not None
+        return 0 if brought else self.environment.settings.evaders.count("learned")
+
+    @functools.cached_property
+    def optimiser(self) -> optax.GradientTransformation:
+        """Adam with clipped gradients, on one vector."""
+        how, steps = self.how, self.updates * self.how.epochs * self.how.minibatches
+        rate = optax.linear_schedule(how.learning_rate, how.learning_rate_end, steps)
+        return optax.flatten(optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate, eps=1e-5)))
+
+    def start(self, key: jax.Array) -> LearningEvaders:
+        """Evaders that do as the greedy one."""
+        keys = jax.vmap(lambda key: jax.random.split(key, self.number))(jax.random.split(key))
+        log_std = jnp.full((self.number, 3), self.how.initial_log_std, jnp.float32)
+        networks = *(jax.vmap(init_network)(own) for own in keys), log_std
+        return LearningEvaders(*networks, jax.vmap(self.optimiser.init)(networks))
+
+    def see(self, state: PursuitState) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """Of worlds (E, ...) which network acts, (E,), and what it sees."""
+        settings = self.environment.settings
+
+        def one(state):
+            around = self.environment.around_evader(state)
+            return features(scene_of(settings, state.evader, around), state.evader.memory)
+
+        return learned_place(settings.evaders, state.evader.kind), jax.vmap(one)(state)
+
+    def act(
+        self, evaders: LearningEvaders, state: PursuitState, noise: jax.Array
+    ) -> tuple[jax.Array, EvaderSamples]:
+        """Wishes (E, 3) in worlds (E, ...), NaN where none of the networks acts, and the samples; noise (E, 3)."""
+        which, seen = self.see(state)
+        mean = outputs_of(evaders.actor, which, seen)[0]
+        log_std = self._by_network(which) @ evaders.log_std
+        sample = mean + jnp.exp(log_std) * noise
+        log_prob = jax.vmap(gaussian_log_prob)(sample, mean, log_std)
+        samples = EvaderSamples(seen, which, sample, log_prob, ~state.statistics.captured)
+        return jax.lax.optimization_barrier(jnp.where((which >= 0)[:, None], sample, jnp.nan)), samples
+
+    def learn(
+        self,
+        evaders: LearningEvaders,
+        samples: EvaderSamples,
+        last: PursuitState,
+        key: jax.Array,
+        axis: str | None = None,
+    ) -> LearningEvaders:
+        """The evaders after all epochs on samples (T, E, ...), which ended in worlds `last` (E, ...).
+
+        `key` shuffles, the same on all devices; `axis` is the name of the devices' axis.
+        """
+        how, batch = self.how, self._batch(evaders, samples, last, axis)
+
+        def step(carry, index):
+            networks, state = carry
+            weight, *part = jax.tree.map(lambda leaf: leaf[index], batch)
+            gradient = jax.vmap(jax.grad(self._loss), (0, 0, None))(networks, weight, part)
+            gradient = mean_over_devices(gradient, axis)
+            change, state = jax.vmap(self.optimiser.update)(gradient, state, networks)
+            return (optax.apply_updates(networks, change), state), None
+
+        order = jax.vmap(lambda key: jax.random.permutation(key, how.minibatches))(
+            jax.random.split(key, how.epochs)
+        )
+        start = evaders.networks, evaders.optimiser
+        (networks, state), _ = jax.lax.scan(step, start, order.ravel())
+        return LearningEvaders(*networks, state)
+
+    def _by_network(self, which):
+        """(..., K) of (...,): one for the network, zero for the others."""
+        return jax.nn.one_hot(which, self.number)
+
+    def _loss(self, networks, weight, part):
+        """() of one network; weight (n,), part: seen, sample, log_prob, advantage, target, all (n, ...)."""
+        actor, critic, log_std = networks
+        seen, sample, log_prob, advantage, target = part
+        log_ratio = gaussian_log_prob(sample, outputs(actor, seen)[0], log_std) - log_prob
+        # samples of other networks count for nothing, and mustn't overflow
+        ratio = jnp.exp(jnp.where(weight > 0.0, log_ratio, 0.0))
+        clipped = jnp.clip(ratio, 1.0 - self.how.clip_epsilon, 1.0 + self.how.clip_epsilon)
+        surrogate = jnp.minimum(ratio * advantage, clipped * advantage)
+        error = (outputs(critic, seen)[1] - target) ** 2
+        mean = jnp.mean(weight * (0.5 * error - surrogate))
+        return mean - self.how.entropy_coefficient * gaussian_entropy(log_std)
+
+    def _batch(self, evaders, samples, last, axis):
+        """What a gradient step needs (see `_loss`): weights (M, K, n), all else (M, n, ...) for M minibatches."""
+        how, critic = self.how, evaders.critic
+        value = outputs_of(critic, samples.which, samples.seen)[1]
+        last_value = outputs_of(critic, *self.see(last))[1]
+        caught = jnp.concatenate([~samples.flying[1:], last.statistics.captured[None]])
+        advantage = generalised_advantages(
+            REWARD * (~caught).astype(jnp.float32),
+            value,
+            jnp.concatenate([value[1:], last_value[None]]),
+            caught,
+            jnp.zeros_like(caught),
+            how.discount,
+            how.gae_lambda,
+        )
+        own = self._by_network(samples.which)  # (T, E, K)
+        weight = own * samples.flying[..., None]
+        weight = weight / jnp.maximum(mean_over_devices(jnp.mean(weight, (0, 1)), axis), 1e-4)
+
+        def mean(x):
+            """Of what each sample's network met, (T, E)."""
+            return own @ mean_over_devices(jnp.mean(weight * x[..., None], (0, 1)), axis)
+
+        centred = advantage - mean(advantage)
+        normal = centred / (jnp.sqrt(mean(centred**2)) + 1e-8)
+        batch = samples.seen, samples.sample, samples.log_prob, normal, advantage + value
+        return [jnp.moveaxis(self._parts(weight), -1, 1), *jax.tree.map(self._parts, batch)]
+
+    def _parts(self, leaf):
+        """(T, E, ...) to (M, T * E / M, ...): world e goes to minibatch e mod M, as each device has its share of all."""
+        steps, worlds = leaf.shape[:2]
+        number = self.how.minibatches
+        leaf = jnp.moveaxis(leaf.reshape(steps, worlds // number, number, *leaf.shape[2:]), 2, 0)
+        return leaf.reshape(number, -1, *leaf.shape[3:])

@@ -1,0 +1,88 @@
+"""Evaders that learn: each from its own samples, in the direction that pays; and who flies what in a world."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from openjax import make
+from openjax.learning.evader_learning import EvaderLearning
+from openjax.learning.settings import EvaderLearningSettings
+from openjax.pursuit import uniform_task
+from openjax.pursuit.evaders import init_network
+from openjax.pursuit.evaders.learned import outputs, outputs_of
+
+WORLDS = 512
+ENVIRONMENT = make(evaders=("field", "learned", "greedy", "learned"), physics="stops", max_pillars=5)
+HOW = EvaderLearningSettings(epochs=4, learning_rate=3e-3, initial_log_std=0.0)
+
+
+@pytest.fixture(scope="module")
+def worlds():
+    """Worlds of all four evaders in turn, at their starts."""
+
+    def begin(key, kind):
+        task = uniform_task(ENVIRONMENT.settings, key).replace(evader=kind)
+        return ENVIRONMENT.reset_to(key, task)[1]
+
+    keys = jax.random.split(jax.random.key(0), WORLDS)
+    return jax.jit(jax.vmap(begin))(keys, jnp.arange(WORLDS) % 4)
+
+
+def test_each_learns_from_its_own_samples_what_pays(worlds):
+    """Network 1 is caught at once where it flies to the left, network 0 whatever it does."""
+    learning = EvaderLearning(HOW, ENVIRONMENT, updates=30)
+
+    @jax.jit
+    def improve(evaders, key):
+        noise_key, order_key = jax.random.split(key)
+
+        samples = learning.act(evaders, worlds, jax.random.normal(noise_key, (WORLDS, 3)))[1]
+        caught = (samples.which == 0) | (samples.sample[:, 0] < 0.0)
+        last = worlds.replace(statistics=worlds.statistics.replace(captured=caught))
+        samples = jax.tree.map(lambda leaf: leaf[None], samples)
+        return learning.learn(evaders, samples, last, order_key), caught
+
+    evaders = start = learning.start(jax.random.key(1))
+    for key in jax.random.split(jax.random.key(2), 30):
+        evaders, caught = improve(evaders, key)
+    which, seen = learning.see(worlds)
+    np.testing.assert_array_equal(which, np.tile([-1, 0, -1, 1], WORLDS // 4))
+    before, after = (outputs_of(e.actor, which, seen)[0][which == 1, 0] for e in (start, evaders))
+    moved = float(jnp.mean(after - before))
+    assert moved > 0.5
+    assert np.mean(np.asarray(caught)[which == 1]) < 0.2
+    # nothing that it does makes a difference: no advantage, so no change of what it does
+    still = jax.tree.map(lambda a, b: np.abs(a[0] - b[0]).max(), evaders.actor, start.actor)
+    assert max(jax.tree.leaves(still)) < 0.2 * moved
+
+
+def test_wishes_fly_only_where_a_network_acts(worlds):
+    learning = EvaderLearning(HOW, ENVIRONMENT, updates=1)
+    wish, samples = jax.jit(learning.act)(learning.start(jax.random.key(1)), worlds, jnp.ones((WORLDS, 3)))
+    acts = np.asarray(samples.which) >= 0
+    assert (np.isnan(np.asarray(wish)).any(-1) == ~acts).all()
+    step = jax.jit(jax.vmap(ENVIRONMENT.step, (None, 0, None, 0)))
+    hover, own = jnp.zeros((3, 4)), jnp.full((WORLDS, 3), jnp.nan)
+    flown, alone = (
+        np.asarray(step(jax.random.key(0), worlds, hover, w)[1].evader_position) for w in (wish, own)
+    )
+    plain = jax.jit(jax.vmap(ENVIRONMENT.step, (None, 0, None)))(jax.random.key(0), worlds, hover)[1]
+    np.testing.assert_array_equal(alone, plain.evader_position)
+    np.testing.assert_array_equal(flown[~acts], alone[~acts])
+    blank = worlds.replace(evader=worlds.evader.replace(memory=0.0 * worlds.evader.memory))
+    memory = step(jax.random.key(0), blank, hover, wish)[1].evader.memory
+    np.testing.assert_array_equal(memory[acts, -9:], worlds.drones.position[acts].reshape(-1, 9))
+    assert (np.abs(flown - alone)[acts].max(-1) > 1e-4).mean() > 0.9
+
+
+def test_every_place_flies_its_own_network(worlds):
+    learning = EvaderLearning(HOW, ENVIRONMENT, updates=1)
+    networks = jax.vmap(init_network)(jax.random.split(jax.random.key(3), 2))
+    networks["output"]["kernel"] = jax.random.normal(jax.random.key(4), networks["output"]["kernel"].shape)
+    which, seen = learning.see(worlds)
+    found = outputs_of(networks, which, seen)
+    for place in (0, 1):
+        alone = outputs(jax.tree.map(lambda leaf, i=place: leaf[i], networks), seen)
+        for mine, its in zip(found, alone, strict=True):
+            np.testing.assert_allclose(mine[which == place], its[which == place], rtol=1e-5, atol=1e-5)
