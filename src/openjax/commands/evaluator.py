@@ -205,33 +205,42 @@ def spread_table(results: Sequence[Sequence[dict]]) -> Table:
     return table
 
 
-_KINDS = {"validation": "new tasks", "validation_far": "from far"}
+_KINDS = {"validation": "new tasks", "validation_far": "far starts"}
 """What the rows that aren't layouts are called."""
 
 
 def before_after_table(
-    before: Sequence[dict], after: Sequence[dict], other: str | None = None, others: Sequence[dict] = ()
+    before: Sequence[dict],
+    after: Sequence[dict],
+    time_step: float,
+    other: str | None = None,
+    others: Sequence[dict] = (),
 ) -> Table:
-    """Captures, collisions and crashes before and after training; last what the policy `other` does in the same game."""
-    columns = (
-        *([("episode_return", "return", ".0f")] if other is None else []),
-        ("capture_rate", "capture rate", ".2f"),
-        ("capture_step", "capture step", ".0f"),
-        ("collision_rate", "collision rate", ".3f"),
-        ("crash_rate", "crash rate", ".2f"),
-    )
-    last = [] if other is None else [f"policy {other}:\nrate, step, crash"]
-    heads = [label if other is None else label.replace(" ", "\n") for _, label, _ in columns]
+    """Captures, collisions and crashes before and after training; last what the policy `other` does in the same game.
+
+    Capture steps are of `time_step` seconds in all records. Beside another policy there is no room for collisions.
+    """
+    columns = [
+        ("capture\nrate", "capture_rate", 1.0, ".2f"),
+        ("seconds to\nthe capture", "capture_step", time_step, ".1f"),
+        ("collision\nrate", "collision_rate", 1.0, ".3f"),
+        ("crash\nrate", "crash_rate", 1.0, ".2f"),
+    ]
+    last = []
+    if other is not None:
+        del columns[2]
+        last.append(f"policy {other}:\nrate, seconds, crash")
+    heads = [head for head, *_ in columns]
     table = numbers_table("Before and after training, in the game that was trained", "", *heads, *last)
     theirs = {row["scenario"]: row for row in others}
+
+    def shown(row):
+        return [f"{unit * row[name]:{style}}" for _, name, unit, style in columns]
+
     for old, new in zip(before, after, strict=True):
-        cells = [f"{old[name]:{style}} → {new[name]:{style}}" for name, _, style in columns]
-        if other is not None:
+        cells = [f"{was} → {is_now}" for was, is_now in zip(shown(old), shown(new), strict=True)]
+        if last:
             row = theirs.get(old["scenario"])
-            cells.append(
-                f"{row['capture_rate']:.2f}, {row['capture_step']:.0f}, {row['crash_rate']:.2f}"
-                if row
-                else "–"
-            )
+            cells.append(", ".join(shown(row)) if row else "–")
         table.add_row(_KINDS.get(old["scenario"], old["scenario"]), *cells)
     return table

@@ -19,7 +19,7 @@ from openjax.pursuit import Pursuit
 from openjax.show.progress import duration
 from openjax.store.leaves import abstract_like
 
-TOGETHER = 50
+TOGETHER = 100
 """Updates of the first stage in one call: some seconds on a CPU."""
 
 
@@ -72,8 +72,8 @@ def compile_first_flights(
             shown = {name: float(value) for name, value in parts.items()}  # waits for them
             left = (time.monotonic() - started) * (how.updates / done - 1.0)
             say(
-                f"{done} of {how.updates} updates, {duration(left)} left | evader not caught {shown['free']:.0%} of the time, "
-                f"pursuers {shown['distance']:.2f} m out of reach, crashing {shown['crashes']:.1%}"
+                f"{done} of {how.updates} updates, {duration(left)} left | evader out of reach {shown['free']:.0%} of the time, "
+                f"pursuers {shown['distance']:.2f} m too far, close to a crash {shown['crashes']:.1%}"
             )
         return parameters.replace(actor=carry[0].actor)
 

@@ -427,7 +427,9 @@ def report(
     write_json(directory.path / "layouts.json", {**rows, **facts})
     _draw(directory, flights, their_flights)
     progress.phase("done", announce=False)
-    return before_after_table(rows["before"], rows["after"], job.compare_with, others)
+    return before_after_table(
+        rows["before"], rows["after"], settings.environment.time_step, job.compare_with, others
+    )
 
 
 def _draw(directory, flights, their_flights):

@@ -12,9 +12,10 @@ from rich.text import Text
 
 _SHOWN = {
     "capture_rate": "capture rate",
+    "crash_rate": "crash rate",
     "collision_rate": "collision rate",
     "episode_return": "return",
-    "prediction_error": "prediction error [m]",
+    "prediction_error": "prediction off by [m]",
     "archive_size": "archive size",
 }
 _LINE_INTERVAL = 5.0  # s between plain lines
@@ -65,6 +66,7 @@ class Progress:
             return
         self._phase, self._phase_start = text, time.monotonic()
         self._last = None  # the speed is that of training alone
+        self._last_line = self._phase_start
         if self._live is None and announce:
             self._print(f"{text} ...")
 
@@ -127,7 +129,7 @@ class Progress:
 
 
 def _number(value):
-    return "–" if value is None or value != value else f"{value:.4g}"
+    return "–" if value is None or value != value else f"{value:.3g}"
 
 
 def _count(value):
