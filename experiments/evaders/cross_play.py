@@ -189,7 +189,7 @@ def learning_curve(validations: list[dict]) -> Table:
     """Captures and crashes over a training run."""
     columns = {"M steps": "millions:.0f", "s": "seconds:.0f", "capture": "capture_rate:.3f"}
     columns |= {"crash": "crash_rate:.3f"}
-    title = f"Training of evaders, on validation tasks against field, {', '.join(VALIDATED)}"
+    title = f"Training of evaders from evaders_scripted on, on validation tasks against field, {', '.join(VALIDATED)}"
     prose = "The checkpoint that scored best on these tasks is the one in the package; s counts compilation."
     return Table(columns, validations, title=title, prose=prose)
 

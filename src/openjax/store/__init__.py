@@ -1,4 +1,4 @@
 """What a run leaves on disk: its directory, settings, checkpoints and policies."""
 
-DEFAULT_POLICY = "flight"
+DEFAULT_POLICY = "evaders"
 """The shipped policy that is taken wherever none is named."""
