@@ -164,17 +164,9 @@ class _Run:
         with self._metrics() as metrics:
             self.progress.phase("compiling the training step", announce=not (done or over))
             self._compile_beside((lambda _=None: True) if over else step_ready)
-            plan = Plan(
-                total_updates=settings.total_updates,
-                steps_per_update=settings.steps_per_update,
-                validation_interval=settings.validation_interval,
-                time_limit=seconds + job.time_limit,
-                # an accelerator would wait for the validation's program
-                validate_start=self.taught and jax.default_backend() == "cpu",
-            )
             loop = Loop(
                 step,
-                plan,
+                self._plan(seconds),
                 checkpoints=self.checkpoints,
                 metrics=metrics,
                 progress=self.progress,
@@ -186,6 +178,18 @@ class _Run:
                 everyone=self.processes.everyone,
             )
             return loop.run(carry)
+
+    def _plan(self, seconds):
+        """What the loop is to do after so many seconds of earlier processes."""
+        settings = self.settings
+        return Plan(
+            total_updates=settings.total_updates,
+            steps_per_update=settings.steps_per_update,
+            validation_interval=settings.validation_interval,
+            time_limit=seconds + self.job.time_limit,
+            # an accelerator would wait for the validation's program
+            validate_start=self.taught and jax.default_backend() == "cpu",
+        )
 
     def finish(self, outcome: Outcome) -> Table | None:
         """Write the best policy, then the report, whose table it is; None where a signal ended the run."""
