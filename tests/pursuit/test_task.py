@@ -11,6 +11,7 @@ from openjax.pursuit import (
     close_starts,
     expand_task,
     line_up_pillars,
+    scatter_starts,
     shift_pillars,
     turn_task,
     uniform_task,
@@ -198,6 +199,22 @@ def test_close_starts_leave_little_room_beside_a_pillar_or_another_pursuer(unifo
     moved = np.asarray(close.pursuer_position != uniform.pursuer_position).any(axis=-1)
     assert not moved[:, 0].any() and moved[:, 1:].mean() > 0.9
     assert (distances(close)[0].reshape(DRAWS, 3, 2).min(axis=-1) < 0.14 + 0.05 + 1e-5)[moved].all()
+
+
+def test_scattered_starts_fill_the_arena_and_are_clear(uniform):
+    scattered = jax.jit(jax.vmap(lambda key, task: scatter_starts(SETTINGS, key, task)))(keys(35), uniform)
+    assert_clear(scattered)
+    pursuers, evader = np.asarray(scattered.pursuer_position), np.asarray(scattered.evader_position)
+    for points in (pursuers.reshape(-1, 3), evader):
+        radius = np.linalg.norm(points[:, :2], axis=-1)
+        assert 0.75 < radius.max() <= 0.8 + 1e-6 and radius.min() < 0.1
+        assert np.abs(points[:, 2] - 0.6).max() <= 0.1 + 1e-6
+    # all of the arena's sides, and from beside each other to farther apart than any uniform task
+    assert np.abs(evader[:, :2].mean(axis=0)).max() < 0.05
+    apart = np.linalg.norm(pursuers - evader[:, None], axis=-1)
+    assert apart.min() < 0.3 and apart.max() > 1.5
+    changed = np.any(pursuers != np.asarray(uniform.pursuer_position), axis=(1, 2))
+    assert changed.mean() > 0.9
 
 
 def test_start_attitudes():
