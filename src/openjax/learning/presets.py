@@ -48,7 +48,7 @@ def quick() -> TrainSettings:
             clip_epsilon_end=0.2,
             discount=0.99,
         ),
-        first_flights=FirstFlightsSettings(updates=850),
+        first_flights=FirstFlightsSettings(updates=1500),
         # few tasks reach the archive in so short a run; drawn from too often, they'd be all that is learnt
         generator=GeneratorSettings(capacity=500, expansion=0.3),
         num_envs=640,
