@@ -102,12 +102,6 @@ def own_copy(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: jax.device_put(leaf.addressable_data(0), device), tree)
 
 
-def make_device_step(settings: TrainSettings, environment: Pursuit, number: int):
-    """The training step `carry -> (carry, metrics)` on `number` devices, not yet compiled."""
-    phases = make_device_phases(settings, environment, number)
-    return lambda carry: phases(carry)
-
-
 def make_device_phases(settings: TrainSettings, environment: Pursuit, number: int) -> Phases:
     """The programs of the training step on `number` devices, not yet compiled."""
     if number == 1:

@@ -151,30 +151,26 @@ def resting_places(
     places = [(x, y, min(max(z, low), high)) for x, y, z in places]
     for _ in range(20):
         moved = []
-        for i, (x, y, z) in enumerate(places):
-            for px, py, radius in pillars:
-                x, y = _pushed(x, y, px, py, radius + 0.15)
-            for j, (ox, oy, _) in enumerate(places):
+        for i, place in enumerate(places):
+            for x, y, radius in pillars:
+                place = _pushed(place, (x, y), radius + 0.15)
+            for j, other in enumerate(places):
                 if j != i:
-                    x, y = _pushed(x, y, ox, oy, APART, 0.5)
-            out = math.hypot(x, y)
-            if out > reach:
-                x, y = x * reach / out, y * reach / out
-            moved.append((x, y, z))
+                    place = _pushed(place, other, APART, 0.5)
+            inside = min(1.0, reach / max(math.hypot(*place[:2]), 1e-6))
+            moved.append((place[0] * inside, place[1] * inside, place[2]))
         if all(math.dist(a, b) < 1e-4 for a, b in zip(moved, places, strict=True)):
             break
         places = moved
     return places
 
 
-def _pushed(x, y, from_x, from_y, distance, share=1.0):
-    """The point moved by a share of what it lacks of a distance from another."""
-    dx, dy = x - from_x, y - from_y
+def _pushed(place, other, distance, share=1.0) -> Vector:
+    """The place (x, y, z) moved on its level by a share of what it lacks of a distance from another."""
+    dx, dy = place[0] - other[0], place[1] - other[1]
     apart = math.hypot(dx, dy)
     if apart >= distance:
-        return x, y
-    if apart < 1e-6:
-        dx, dy, apart = 1.0, 0.0, 1.0
-        return x + share * distance, y
-    lack = share * (distance - apart) / apart
-    return x + lack * dx, y + lack * dy
+        return place
+    dx, dy = (dx / apart, dy / apart) if apart > 1e-6 else (1.0, 0.0)
+    lack = share * (distance - apart)
+    return place[0] + lack * dx, place[1] + lack * dy, place[2]

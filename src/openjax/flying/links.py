@@ -7,6 +7,7 @@ samples at the end) is a call over a pipe.
 """
 
 import contextlib
+import functools
 import gc
 import math
 import multiprocessing
@@ -94,7 +95,7 @@ class Links:
         self._commands.settimeout(1.5 * self.board.silence)
         ends = (stream, commands, control)
         options, given = (self._uris, *self._options), (self._contacts, *ends)
-        arguments = (options, timeout, given, self.board, os.getpid(), self._state)
+        arguments = ((options, timeout), given, self.board, os.getpid(), self._state)
         self._process = context.Process(target=_serve, args=arguments, name="openjax links")
         self._process.start()
         for end in ends:
@@ -239,30 +240,17 @@ class Links:
             end.close()
 
 
-def _serve(options, timeout, ends, board: Board, parent: int, state) -> None:
+def _serve(connecting, ends, board: Board, parent: int, state: State | None) -> None:
     """The links' process. Should the loop stop, it lands the vehicles; with nothing in the air it ends with the loop."""
-    contacts, stream, commands, control = ends
+    (options, timeout), (contacts, stream, commands, control) = connecting, ends
     stand_alone()
     board.enter(Role.LINKS)
     sys.setswitchinterval(5e-4)  # cflib's threads and the one that passes on set-points
     threading.excepthook = lambda _: None  # cflib's threads, when their socket goes
     real_time.hurry()
-    stream.setblocking(False)
-    swarm, lock = Swarm(*options), threading.Lock()
+    swarm = Swarm(*options)
     threading.Thread(target=_watch, args=(swarm, board, parent, state), daemon=True, name="watch").start()
-
-    def pass_on(vehicle: int, member: Member, new_pose: bool) -> None:
-        contacts[vehicle] = member.last_contact
-        if not new_pose:
-            return
-        pose = member.pose
-        packed = _POSE.pack(vehicle, member.supervisor, member.arrival, member.voltage, *numbers_of(pose))
-        # nobody reads any more: then there is no loop to tell
-        with lock, contextlib.suppress(OSError):
-            stream.send(packed)
-
-    for i, member in enumerate(swarm.members):
-        member.listener = lambda new_pose, i=i, member=member: pass_on(i, member, new_pose)
+    _pass_on(swarm, contacts, stream)
     try:
         swarm.connect(timeout)
     except Exception as error:  # whatever cflib raises, too
@@ -273,15 +261,37 @@ def _serve(options, timeout, ends, board: Board, parent: int, state) -> None:
     threading.Thread(target=_send_on, args=(swarm, commands, board), daemon=True, name="set-points").start()
     control.send((None, swarm.pose_blocks()))
     with contextlib.suppress(EOFError, OSError):
-        while True:
-            number, name, arguments = control.recv()
-            disarming = name in ("disarm", "close")
-            result = disarm(swarm, board, Role.LINKS) if disarming else getattr(swarm, name)(*arguments)
-            if number:
-                control.send((number, result))
-            if name == "close":
-                os._exit(0)
+        _answer(swarm, control, board)
     threading.Event().wait()  # the loop is gone: the watch ends the process
+
+
+def _pass_on(swarm: Swarm, contacts, stream: socket.socket) -> None:
+    """Have all poses go up the stream as they arrive, and when anything was heard of a vehicle into `contacts`."""
+    lock = threading.Lock()
+    stream.setblocking(False)
+
+    def pass_on(vehicle: int, member: Member, new_pose: bool) -> None:
+        contacts[vehicle] = member.last_contact
+        if new_pose:
+            seen = member.supervisor, member.arrival, member.voltage, *numbers_of(member.pose)
+            # nobody reads any more: then there is no loop to tell
+            with lock, contextlib.suppress(OSError):
+                stream.send(_POSE.pack(vehicle, *seen))
+
+    for i, member in enumerate(swarm.members):
+        member.listener = functools.partial(pass_on, i, member)
+
+
+def _answer(swarm: Swarm, control, board: Board) -> None:
+    """Answer the loop's calls until it closes the links, which ends the process."""
+    while True:
+        number, name, arguments = control.recv()
+        disarming = name in ("disarm", "close")
+        result = disarm(swarm, board, Role.LINKS) if disarming else getattr(swarm, name)(*arguments)
+        if number:
+            control.send((number, result))
+        if name == "close":
+            os._exit(0)
 
 
 def _send_on(swarm: Swarm, commands: socket.socket, board: Board) -> None:

@@ -25,13 +25,15 @@ from openjax.learning.analytic_gradient import (
 )
 from openjax.learning.settings import AnalyticSettings, FirstFlightsSettings
 from openjax.policy import Policy, PolicyParameters
-from openjax.pursuit import Pursuit, turn_task, uniform_task
+from openjax.pursuit import Pursuit, scatter_starts, turn_task, uniform_task
 from openjax.vehicle.family import narrowed_bounds
 
 OUTSIDE = 1.2
 """A world starts anew where a pursuer is farther out than this share of the arena's radius or height."""
 PHYSICS_STEP = 0.01
 """Seconds of a physics step: finer ones teach nothing more."""
+SCATTERED = 0.5
+"""Share of the tasks that start anywhere: who knows the uniform ones alone dives where the evader is far, into the floor."""
 LOW = 0.25
 """Height (m) below which the end of a moment costs: the gap to the floor is felt too late."""
 
@@ -65,10 +67,18 @@ class FirstFlights:
         return AnalyticGradient(AnalyticSettings(), self.environment, self.policy)
 
     def start(self, key: jax.Array):
-        """Worlds at the starts of uniform tasks, their vehicles nominal."""
+        """Worlds at the starts of uniform tasks and of scattered ones, their vehicles nominal."""
         game, number = self.environment.settings, self.how.worlds
-        task_key, turn_key, reset_key = (jax.random.split(k, number) for k in jax.random.split(key, 3))
-        tasks = jax.vmap(lambda k, turn: turn_task(turn, uniform_task(game, k)))(task_key, turn_key)
+
+        def draw(key):
+            task_key, turn_key, start_key, choice_key = jax.random.split(key, 4)
+            task = turn_task(turn_key, uniform_task(game, task_key))
+            scattered = jax.random.bernoulli(choice_key, SCATTERED)
+            anywhere = scatter_starts(game, start_key, task)
+            return jax.tree.map(lambda a, b: jnp.where(scattered, a, b), anywhere, task)
+
+        task_key, reset_key = (jax.random.split(k, number) for k in jax.random.split(key))
+        tasks = jax.vmap(draw)(task_key)
         environment = self.environment
         if game.vehicles:
             environment = environment.with_bounds(narrowed_bounds(game.vehicles, 0.0))
