@@ -18,7 +18,7 @@ def test_a_card_is_complete(name):
     )
     assert all(p.spread > 0 and p.step > 0 for p in card.fitted)
     assert all(len(start) == len(card.fitted) for start in card.others)
-    sizes = (card.nuisance, card.nuisance_duty, card.nuisance_samples, card.form_error)
+    sizes = (card.nuisance, card.nuisance_duty, card.nuisance_samples)
     assert all(
         set(s) <= set(effect.parameters) and all(callable(v) or v > 0 for v in s.values()) for s in sizes
     )

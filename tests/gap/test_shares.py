@@ -1,13 +1,10 @@
 """Shares against the definition of Shapley, and probabilities that add up."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 from openjax.gap.decision import DECISION
-from openjax.gap.model.library import CARDS
-from openjax.gap.probabilities import beyond_form_error, probabilities
+from openjax.gap.probabilities import probabilities
 from openjax.gap.shares import shares_of_squares
 
 RNG = np.random.default_rng(0)
@@ -34,26 +31,12 @@ def test_without_a_gap_all_there_is_are_the_sensors():
     assert values[0] == pytest.approx([1.0, 0.0]) and square == pytest.approx(np.ones((1, 2)))
 
 
-def fit(effect, value, error):
-    names = {f.name: (value, error) for f in CARDS[effect].fitted}
-    return SimpleNamespace(parameters=lambda: {effect: names})
-
-
-def test_what_real_vehicles_have_anyway_is_hardly_an_effect():
-    chances = [
-        beyond_form_error(fit("inertia", 1.0 + x, 0.01), "inertia") for x in (0.0, 0.05, 0.1, 0.2, 0.4)
-    ]
-    assert chances == sorted(chances) and chances[0] < 0.1 and chances[-1] > 0.99
-
-
 def test_probabilities_add_up_and_follow_the_words():
     weights = {frozenset({"mass"}): 0.9, frozenset(): 0.1}
-    found = probabilities({"mass": 0.9}, {}, {"mass": 1.0, "unexplained": 0.0}, 0.05, weights)
+    found = probabilities({"mass": 0.9}, {"mass": 1.0, "unexplained": 0.0}, 0.05, weights)
     assert sum(found.values()) == pytest.approx(1.0) and max(found, key=found.get) == "mass"
-    nothing = probabilities({}, {}, {}, 0.05, {frozenset(): 1.0})
+    nothing = probabilities({}, {}, 0.05, {frozenset(): 1.0})
     odds = (0.95 / 0.05) ** (1.0 / DECISION.temperature)
     assert nothing["none"] / nothing["unknown"] == pytest.approx(odds) and sum(
         nothing.values()
     ) == pytest.approx(1.0)
-    within = probabilities({}, {"inertia": 0.2}, {}, 0.05, {frozenset({"inertia"}): 1.0})
-    assert max(within, key=within.get) == "none" and within["inertia"] < 0.25

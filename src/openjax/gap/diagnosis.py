@@ -12,7 +12,7 @@ from openjax.gap.evidence import Evidence, gather
 from openjax.gap.intervals import estimates
 from openjax.gap.model.bounds import BOUND
 from openjax.gap.model.library import CARDS, library, path_of
-from openjax.gap.probabilities import beyond_form_error, probabilities
+from openjax.gap.probabilities import probabilities
 from openjax.gap.report import Report
 from openjax.gap.residual import Check, check_residual
 from openjax.gap.selection import DETECTABLE, Selection, select
@@ -33,18 +33,15 @@ def diagnose_case(case: Case, without: Iterable[str] = (), progress=None) -> Rep
 def conclude(evidence: Evidence) -> Report:
     """The report that the evidence supports."""
     selection = select(evidence)
-    beyond = {e: beyond_form_error(selection.fit, e) for e in selection.effects}
-    acting = {e: selection.probability(e) * beyond[e] for e in selection.effects}
-    acting |= evidence.acting()
+    acting = {e: selection.probability(e) for e in selection.effects} | evidence.acting()
     named = [e for e, p in acting.items() if p >= 0.5]
     parts = split(evidence, selection, np.zeros(6), named)
     named = [e for e in named if _matters(parts, e)]
     check = check_residual(evidence, selection.fit)
     parts = split(evidence, selection, check.predicted, named)
     found = words(evidence, check, parts, not_testable(evidence))
-    chances = probabilities(
-        {e: acting[e] for e in named}, beyond, parts.largest, check.probability, selection.weights
-    )
+    present = {e: acting[e] for e in named}
+    chances = probabilities(present, parts.largest, check.probability, selection.weights)
     return _report(evidence, selection, check, parts, found, chances)
 
 

@@ -89,5 +89,5 @@ def _sensors(tracks: list[Track], library: Library) -> tuple[list[Track], Pose |
     sensors = read_kinematics(tracks)
     tracks = [corrected(t, sensors) for t in tracks]
     if pose is not None and not moved:
-        pose = read_pose(tracks, library, sensors.wander)
+        pose = read_pose(tracks, library)
     return tracks, pose if sensors.one_clock else None, sensors

@@ -4,8 +4,8 @@ An interval is the fit's, or what flights disagree by where that is more, and ne
 quite the library's leave: some per cent of the effect."""
 
 import numpy as np
-from scipy.stats import t as student
 
+from openjax.gap.channels import few
 from openjax.gap.evidence import Evidence
 from openjax.gap.model.hypotheses import SetFit
 from openjax.gap.model.library import CARDS, PLACE, path_of
@@ -58,9 +58,7 @@ def robust_deviation(fit: SetFit) -> np.ndarray:
     """Standard deviations (p,) of a fit's parameters: flight-wise sandwich where flights disagree more
     than they should."""
     model, flights = np.sqrt(np.diag(fit.covariance)), _between_flights(fit)
-    # Few flights: Student's quantile instead of the normal one.
-    few = student.ppf(0.95, max(len(fit.grams) - 1, 1)) / REACH
-    return np.maximum(few * flights, model)
+    return np.maximum(few(len(fit.grams)) * flights, model)
 
 
 def _between_flights(fit: SetFit) -> np.ndarray:

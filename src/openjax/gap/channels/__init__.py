@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import norm
+from scipy.stats import t as student
 
 from openjax.gap.model.library import CARDS
 
@@ -41,3 +43,8 @@ class Channel:
 def effects_of(path: str, library) -> tuple[str, ...]:
     """Effects of a library that a channel reads."""
     return tuple(e for e in library.effects if CARDS[e].path == path)
+
+
+def few(count: int) -> float:
+    """By what an error from so many flights is widened: Student's quantile of a 90 % interval over the normal one."""
+    return float(student.ppf(0.95, max(count - 1, 1)) / norm.ppf(0.95))

@@ -64,13 +64,13 @@ def make_reading(case: Case, library: Library, tracks, vehicles, arrived, sensor
     """How the rows of a case are to be read."""
     shortest = min(f.row_period for f in case.flights)
     slow = shortest > 0.8 * GRID_PERIOD  # faster logs are averaged
-    drifts, seldom = sensors.wander > 0.0, max(t.dt for t in tracks) > SLOW_ROWS * GRID_PERIOD
-    known = arrived is not None and not seldom and not drifts
+    seldom = max(t.dt for t in tracks) > SLOW_ROWS * GRID_PERIOD
+    known = arrived is not None and not seldom
     at_once = rows_are_samples(case) and slow and all(t.motors_logged for t in tracks)
     hidden = (not slow and GRID_PERIOD / shortest < FEW_ROWS) or any(
         f.body_rates_derived for f in case.flights
     )
-    blind = (at_once and not known) or drifts or hidden
+    blind = (at_once and not known) or hidden
     late = None if blind or seldom else ROW_DELAY[0 if slow else 1]
     pwm = case.vehicle_file.motor_command == "pwm"
     return Reading(library, tracks, vehicles, arrived, sensors, pwm, at_once, blind, late)
@@ -96,7 +96,7 @@ def read_motion(reading: Reading, loop: RateLoop | None) -> Motion:
     if loop is not None and reading.at_once:
         tracks = [dataclasses.replace(t, motor=m.mean(1)) for t, m in zip(tracks, ticks, strict=True)]
     feedback = read_feedback(tracks, reading.vehicles, reading.by_commands)
-    clocks = sensors.one_clock, reading.at_once, sensors.wander
+    clocks = sensors.one_clock, reading.at_once
     replay = make_replay(tracks, reading.vehicles, ticks, feedback, reading.numbers, *clocks)
     replay, exposure = model_noise(replay, library)
     exposure |= {e: 0.0 for e in library.physics if _hidden(CARDS[e], tracks)}

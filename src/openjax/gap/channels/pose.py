@@ -64,11 +64,11 @@ class Pose(Channel):
         return {f"pose {axis}": [m[:, k] for m in moved] for k, axis in enumerate("xyz")}
 
 
-def read_pose(tracks: list[Track], library, wander: float = 0.0) -> Pose | None:
+def read_pose(tracks: list[Track], library) -> Pose | None:
     """The pose's channel; None without an attitude."""
     if any(t.quaternion is None for t in tracks):
         return None
-    clock = DECISION.clock + max(t.pose_age for t in tracks) + wander
+    clock = DECISION.clock + max(t.pose_age for t in tracks)
     steps = tuple(max(round(POSE_HORIZON / t.dt), 1) for t in tracks)
     return Pose(read_estimator(tracks), clock, effects_of("estimator", library), steps)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from openjax.flights.track import Track, held_means
-from openjax.gap.channels import Channel, Estimated, effects_of
+from openjax.gap.channels import Channel, Estimated, effects_of, few
 from openjax.gap.decision import DECISION
 from openjax.gap.model.library import CARDS
 
@@ -21,7 +21,6 @@ DEPENDENT = 3.0  # rows that count as one independent error
 FEWEST = 30  # changes of the command that tell what a link does
 CLEAR = 20.0  # nats that a delay or losses must gain: errors of a link aren't independent
 ROW_ERROR = (0.1, 0.29)  # of a row, by which a delay is known: rows that are means, single samples
-BURSTS = 3.0  # packets that are lost together
 
 DELAY, LOSS = "delay", "probability"  # the parameters of the effects that a radio tells
 
@@ -30,15 +29,15 @@ DELAY, LOSS = "delay", "probability"  # the parameters of the effects that a rad
 class Link:
     """The link under one hypothesis. `arrived` [(fraction, (T, 2) rows)]: of each track the command in force at the end and at
     the start of each row, and the share of the row that the older one rules; `error` (M,) of the collective thrust;
-    `informative` rows have a new command, `told` ones are so clear that they tell whether it arrived, in `lost` of them it
-    didn't, and `between` rows neither hold the old command nor follow the new one."""
+    (tracks,) numbers of rows: `informative` have a new command, `told` ones are so clear that they tell whether it arrived, in
+    `lost` of them it didn't, and `between` neither hold the old command nor follow the new one."""
 
     arrived: list
     error: np.ndarray
-    informative: int
-    told: int
-    lost: int
-    between: int
+    informative: np.ndarray
+    told: np.ndarray
+    lost: np.ndarray
+    between: np.ndarray
 
     @property
     def misfit(self) -> float:
@@ -65,7 +64,7 @@ class Radio(Channel):
     def loss(self) -> float:
         """Share of the packets that were lost."""
         used = self.links[frozenset({DELAY, LOSS} if self.delay > 0 else {LOSS})]
-        return used.lost / max(used.told, 1)
+        return float(used.lost.sum() / max(used.told.sum(), 1))
 
     @property
     def readable(self) -> bool:
@@ -82,7 +81,11 @@ class Radio(Channel):
         gain = {p: self.links[both].nats - self.links[both - {p}].nats for p in both}
         used = self.links[both if self.delay > 0 else frozenset({LOSS})]
         late = self.delay > DECISION.clock and gain[DELAY] > CLEAR
-        lost = self.loss > DECISION.packet_loss and gain[LOSS] > CLEAR and used.between < 0.5 * used.lost
+        lost = (
+            self.loss > DECISION.packet_loss
+            and gain[LOSS] > CLEAR
+            and used.between.sum() < 0.5 * used.lost.sum()
+        )
         return frozenset(p for p, on in ((DELAY, late), (LOSS, lost)) if on and p in self.names)
 
     @property
@@ -94,15 +97,18 @@ class Radio(Channel):
         return {self.names[p]: 1.0 - DECISION.unknown for p in sorted(self.found)}
 
     def undetectable(self) -> list[str]:
-        told = self.links[frozenset({DELAY, LOSS})].informative >= FEWEST
+        told = self.links[frozenset({DELAY, LOSS})].informative.sum() >= FEWEST
         return [] if self.readable and told else list(self.names.values())
 
     def estimate(self, effect: str, parameter: str) -> Estimated:
         if parameter == DELAY:
             error = float(np.hypot(DELAY_STEP, ROW_ERROR[self.sampled] * self.row))
             return Estimated(self.delay, error, error)
-        count = max(self.links[frozenset({DELAY, LOSS})].told / BURSTS, 1.0)
-        error = float(np.sqrt(self.loss * (1 - self.loss) / count) + 0.5 / count)
+        used = self.links[frozenset({DELAY, LOSS})]
+        told, each = max(used.told.sum(), 1), used.lost / np.maximum(used.told, 1)
+        # Packets are lost in bursts: how much flights differ tells more than how many there were.
+        apart = few(len(each)) * each.std(ddof=1) / np.sqrt(len(each)) if len(each) > 1 else 0.0
+        error = float(np.hypot(np.sqrt(self.loss * (1 - self.loss) / told), apart) + 0.5 / told)
         return Estimated(self.loss, error, error)
 
     def residuals(self, named) -> dict[str, list[np.ndarray]]:
@@ -168,15 +174,15 @@ def _link_rows(track: Track, delay: float) -> tuple[int, float, np.ndarray, np.n
 
 def _decode(tracks, delay: float, may_lose: bool) -> Link:
     """Row by row: did the command due in this row arrive, or is the one before still held?"""
-    errors, arrived, counts = [], [], np.zeros(4, int)
+    errors, arrived, counts = [], [], []
     for track in tracks:
         in_force, error, counted = _follow(track, delay, may_lose)
         errors.append(error)
-        counts += counted
+        counts.append(counted)
         whole, part = _rows_late(track, delay)
         in_force = in_force if track.fast_thrust is None else _late(in_force, whole)
         arrived.append((part, np.stack([in_force, _late(in_force, 1)], 1)))
-    return Link(arrived, np.concatenate(errors), *map(int, counts))
+    return Link(arrived, np.concatenate(errors), *np.array(counts).T)
 
 
 def _follow(track: Track, delay: float, may_lose: bool):

@@ -22,17 +22,14 @@ LEAST = 0.1  # rad/s or m/s^2 rms in the band: an axis that hardly moves shows n
 COHERENT = 0.97  # correlation below which the two streams don't fit well enough to compare gains
 ONE_CLOCK = 0.93  # below which they don't share a clock
 EDGE = 0.3  # s at either end that the filters spoil
-WANDER_SCALE = 0.002  # s: windows that tell more than this aren't told apart
-SEEN_WANDER, MOST_WANDER = 0.0015, 0.01  # s: below and above, it is noise
-SEGMENT = 1.0  # s, unit of the jackknife, over which a clock hardly moves
+SEGMENT = 1.0  # s, unit of the jackknife
 
 
 @dataclass(frozen=True)
 class Kinematics:
     """`gain` (3,) of the gyroscope, 1 where it isn't clearly another; `tilt` (2,) rad about the world's x and y axes with
     `tilt_error` (2,), None without path or accelerometer; `coherence` (3,) of attitude's rate and gyroscope, `turning` (3,)
-    whether the flights turn enough to tell; `findings`: what is off by more than usual, in words, by name;
-    `wander` s: by how much (rms) the clocks of gyroscope and pose drift apart and back within a flight."""
+    whether the flights turn enough to tell; `findings`: what is off by more than usual, in words, by name."""
 
     gain: np.ndarray
     tilt: np.ndarray | None
@@ -40,7 +37,6 @@ class Kinematics:
     coherence: np.ndarray
     turning: np.ndarray
     findings: dict[str, str]
-    wander: float = 0.0
 
     @property
     def upright(self) -> np.ndarray | None:
@@ -90,7 +86,7 @@ def read_kinematics(tracks: list[Track]) -> Kinematics:
             )
     # One chip: an axis about which the flights hardly turn reads as the others do.
     gain = np.where(clear, gain, np.mean(gain[clear]) if clear.any() else 1.0)
-    return Kinematics(gain, tilt, tilt_error, coherence, turning, findings, _wander(streams))
+    return Kinematics(gain, tilt, tilt_error, coherence, turning, findings)
 
 
 def _unusual(gain: np.ndarray, error: np.ndarray) -> str:
@@ -172,37 +168,6 @@ def _jackknife(sums: np.ndarray, statistic) -> np.ndarray:
     """Standard error of a statistic of the sum of `sums` (N, ...), by leaving each out."""
     left_out = np.array([statistic(sums.sum(0) - s) for s in sums])
     return np.sqrt((len(sums) - 1) / len(sums) * ((left_out - left_out.mean(0)) ** 2).sum(0))
-
-
-def _wander(streams) -> float:
-    """How far (s, rms) the delay between gyroscope and attitude's rate varies from window to window, beyond its errors."""
-    delays, errors = [], []
-    for dt, a, b in streams:
-        size = max(int(SEGMENT / dt), 1)
-        if len(a) < 2 * int(EDGE / dt) + size:
-            continue
-        slope = np.gradient(a, dt, axis=0)
-        of_track = []
-        for k in range(0, len(a) - size // 2, size):
-            x, y = slope[k : k + size].ravel(), (a - b)[k : k + size].ravel()
-            power = float(x @ x)
-            delay = float(x @ y) / max(power, 1e-12)
-            # Within the band some ten independent values a second and axis are left.
-            left = float(((y - delay * x) ** 2).mean()) * len(x) / (3 * SEGMENT * 2.0 * BAND[1])
-            of_track.append((delay, left / max(power, 1e-12)))
-        of_track = np.array(of_track)
-        delays.append(of_track[:, 0] - np.average(of_track[:, 0], weights=1.0 / of_track[:, 1]))
-        errors.append(of_track[:, 1])
-    if not delays:
-        return 0.0
-    delays, errors = np.concatenate(delays), np.concatenate(errors)
-    weights = 1.0 / (errors + WANDER_SCALE**2)
-    each = weights * (delays**2 - errors) / weights.sum()
-    excess = float(each.sum())
-    if excess < DECISION.standard_errors * float(np.sqrt((each**2).sum())):
-        return 0.0
-    found = float(np.sqrt(max(excess, 0.0)))
-    return min(found, MOST_WANDER) if found > SEEN_WANDER else 0.0
 
 
 def _world(tracks) -> tuple[np.ndarray | None, np.ndarray | None]:

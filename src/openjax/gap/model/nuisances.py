@@ -22,26 +22,21 @@ FEEDBACK_ROWS, QUICK_ROWS = (0, 2), (0, 1, 2)  # rows of delay
 OF_A_TRACK = ("clock of the motors", "accelerometer bias", "clock of the pose")
 
 
-def columns_of(
-    track: Track, path: Path, nominal, feedback, at_once: bool, wander: float
-) -> dict[str, np.ndarray]:
+def columns_of(track: Track, path: Path, nominal, feedback, at_once: bool) -> dict[str, np.ndarray]:
     """{name: column (T, 9)} of one track, of what doesn't depend on what acts; the arguments as in `make_replay`."""
     columns = _late_torques("feedback", track, feedback.acceleration, FEEDBACK_ROWS)
     columns |= _late_torques("trim", track, feedback.trim, (0,))
     if at_once:
         columns |= _late_torques("motors within a row", track, feedback.quick, QUICK_ROWS)
-    return columns | _sensor_nuisances(track, path, nominal, max(SIZE["pose_clock"], wander))
+    return columns | _sensor_nuisances(track, path, nominal)
 
 
-def motor_shift(track: Track, one_clock: bool, at_once: bool, wander: float) -> float:
+def motor_shift(track: Track, one_clock: bool, at_once: bool) -> float:
     """Usual size (s) of what a track's motors are off by in time."""
-    unseen = wander + (track.dt / 4 if at_once or wander else 0.0)
-    return max(SIZE["motor_clock"], unseen) if one_clock else SIZE["streams_apart"]
+    return max(SIZE["motor_clock"], track.dt / 4 if at_once else 0.0) if one_clock else SIZE["streams_apart"]
 
 
-def _sensor_nuisances(
-    track: Track, path: Path, nominal: np.ndarray, pose_shift: float
-) -> dict[str, np.ndarray]:
+def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> dict[str, np.ndarray]:
     """Mounting, biases and clocks of the sensors, and what a rigid body with small errors does: columns (T, 9)."""
     rows = len(track)
     attitude = np.asarray(path.quaternion, float)[:rows]
@@ -82,7 +77,7 @@ def _sensor_nuisances(
     if track.velocity is not None:
         late = -moved(np.cross(np.asarray(path.body_rates, float)[:rows], body))
         late += smooth(np.gradient(track.velocity, track.dt, axis=0), 0.05, track.dt)
-        column("clock of the pose", VELOCITY, late, pose_shift)
+        column("clock of the pose", VELOCITY, late, SIZE["pose_clock"])
     return columns
 
 

@@ -144,12 +144,10 @@ def marginal_gram(w: np.ndarray, nuisances: np.ndarray) -> np.ndarray:
     return w @ w.T - cross @ np.linalg.solve(np.eye(len(n)) + n @ n.T, cross.T)
 
 
-def make_replay(
-    tracks, vehicles, motor_ticks, feedback, numbers, one_clock=True, at_once=False, wander=0.0
-) -> Replay:
+def make_replay(tracks, vehicles, motor_ticks, feedback, numbers, one_clock=True, at_once=False) -> Replay:
     """Replay of tracks with their nominal vehicles and motor commands (T, TICKS, 4) of the rate loop's ticks. `feedback` of
     each track: what it made of the motors may be anything in strength and lag. `at_once`: motor commands are single
-    samples, whose quick part and time within a row aren't known. `wander` s: by how much clocks drift. Without `one_clock`
+    samples, whose quick part and time within a row aren't known. Without `one_clock`
     the IMU's stream and the motors' are apart by unknown times: the IMU counts nothing, and the motors may be off by
     tens of milliseconds."""
     usable = np.ones(9)
@@ -164,16 +162,14 @@ def make_replay(
     physics = make_physics(tracks, vehicles, motor_ticks)
     nominal = [p[0] for p in physics.predict(ABSENT[None])]
     named = [
-        columns_of(track, path, p, made, at_once, wander)
+        columns_of(track, path, p, made, at_once)
         for track, path, p, made in zip(tracks, physics.paths, nominal, feedback, strict=True)
     ]
     # A track without a neighbour has no wake: nothing there.
     names = tuple(max(named, key=len))
     moving = (*(" ".join(key[:2]) for key in numbers), "clock of the motors", "delay of the motors")
     sizes = [
-        np.array(
-            [*(key[2] for key in numbers), motor_shift(t, one_clock, at_once, wander), SIZE["motor_delay"]]
-        )
+        np.array([*(key[2] for key in numbers), motor_shift(t, one_clock, at_once), SIZE["motor_delay"]])
         for t in tracks
     ]
     replay = Replay(

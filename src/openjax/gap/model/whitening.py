@@ -2,20 +2,18 @@
 
 A residual is sensor noise and gusts. Sensor noise is white; a gust is a force or torque with a memory of
 some time, which integrated channels (rates, velocity, attitude) add up, beside small white steps from what
-the replay leaves out. The innovations of the Kalman filter of this model are white; what colour is left is
-taken out by a short autoregression. Everything acts on residuals and on their derivatives alike, and
-causally: in closed loop the motors answer disturbances, so only a residual given its own past says
-something about causes."""
+the replay leaves out. The innovations of the Kalman filter of this model are white. Everything acts on residuals
+and on their derivatives alike, and causally: in closed loop the motors answer disturbances, so only a residual
+given its own past says something about causes."""
 
 import itertools
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.linalg import solve_discrete_are, solve_toeplitz
+from scipy.linalg import solve_discrete_are
 from scipy.signal import lfilter
 
-ORDER = 6
 # The grid of models: memory of the gust (per row), its rms per row and that of the white steps over sensor
 # noise.
 MEMORIES = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.995)
@@ -54,16 +52,12 @@ def first_noise(axes, integrated: bool, deviation: float) -> Noise:
 def fit_noise(axes, residuals, integrated: bool, skip: int = 20) -> Noise:
     """Noise model of residuals [(T, C), ...], pooled over tracks and `axes`.
 
-    The model of the grid is chosen by Whittle's likelihood, the autoregression by Yule-Walker on its
-    innovations."""
+    The model of the grid is chosen by Whittle's likelihood."""
     axes = tuple(axes)
     chosen = _choose([r[skip:, list(axes)] for r in residuals], integrated)
     numerator, denominator = _kalman(*chosen, integrated)
-    series = []
-    for residual in residuals:
-        series += list(lfilter(numerator, denominator, residual[:, list(axes)], axis=0)[skip:].T)
-    regression, deviation = _autoregression(series)
-    return Noise(axes, np.convolve(numerator, np.r_[1.0, -regression]), denominator, deviation)
+    white = [lfilter(numerator, denominator, r[:, list(axes)], axis=0)[skip:].ravel() for r in residuals]
+    return Noise(axes, numerator, denominator, float(np.sqrt(np.mean(np.concatenate(white) ** 2))) + 1e-9)
 
 
 def _choose(parts, integrated: bool) -> tuple[float, float, float]:
@@ -112,17 +106,3 @@ def _kalman(memory: float, gust: float, step: float, integrated: bool) -> tuple[
     variance = solve_discrete_are(a.T, c.T, q, np.eye(1))
     gain = a @ variance @ c.T / (c @ variance @ c.T + 1.0)
     return np.poly(a), np.poly(a - gain @ c)
-
-
-def _autoregression(series) -> tuple[np.ndarray, float]:
-    """Yule-Walker on pooled series: coefficients (ORDER,) and the innovation's deviation."""
-    lags = np.zeros(ORDER + 1)
-    for z in series:
-        for k in range(ORDER + 1):
-            lags[k] += z[k:] @ z[: len(z) - k]
-    lags /= max(sum(len(z) for z in series), 1)
-    if lags[0] <= 0:
-        return np.zeros(ORDER), 1e-9
-    lags[0] *= 1 + 1e-6
-    coefficients = solve_toeplitz(lags[:-1], lags[1:])
-    return coefficients, float(np.sqrt(max(lags[0] - coefficients @ lags[1:], 1e-18)))

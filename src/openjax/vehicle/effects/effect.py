@@ -126,7 +126,6 @@ class Card:
     nuisance_duty, nuisance_samples: the same where motor commands are duty cycles, or single samples whose rows hide the rest.
     weighed: whether a weighed vehicle rules it out.
     at_voltage(values, intervals, voltage): both as they are at one voltage, for simulators that know none.
-    form_error: {parameter: spread} of what real vehicles without a fault seem to have: what lies within it isn't named.
     sample: a strength within its usual range to fly with, strong enough to see.
     impossible(position): whether a flight along position (T, 3), m, rules it out.
     next_flight: what would show it, in words.
@@ -146,7 +145,6 @@ class Card:
     nuisance: Mapping[str, float | Callable[[Vehicle], float]] = field(default_factory=dict)
     nuisance_duty: Mapping[str, float] = field(default_factory=dict)
     nuisance_samples: Mapping[str, float] = field(default_factory=dict)
-    form_error: Mapping[str, float] = field(default_factory=dict)
     weighed: bool = False
     at_voltage: Callable[[dict, dict, float], tuple[dict, dict]] | None = None
     impossible: Callable[[Any], bool] | None = None

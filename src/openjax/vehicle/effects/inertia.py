@@ -31,7 +31,6 @@ EFFECT = Effect(
         nuisance={"xx": 0.04, "yy": 0.04, "zz": 0.015},
         nuisance_duty={"xx": 0.2, "yy": 0.2, "zz": 0.2},
         nuisance_samples={"xx": 0.3, "yy": 0.3, "zz": 0.3},
-        form_error={"xx": 0.05, "yy": 0.05, "zz": 0.05},
         sample={"xx": 1.4, "yy": 1.4, "zz": 1.4},
         next_flight="roll, pitch and yaw doublets with the motor commands logged.",
     ),
