@@ -1,9 +1,8 @@
 """What the chosen effects leave: whether it is more than sensors, air and errors of form leave.
 
 Things that should agree are held against each other: measured motion and replay, attitude and gyroscope, path and
-accelerometer, position and velocity. How much is left of each, and what Gaussian processes in random Fourier features (Rahimi,
-Recht 2007) of the state make the gap grow by, are told in standard deviations of cases of several worlds in which nothing
-unknown acts. The p-value of the largest is conformal over those (Vovk et al. 2005; `residual.json`)."""
+accelerometer, position and velocity. How much is left of each is told in standard deviations of cases of several worlds in
+which nothing unknown acts. The p-value of the largest is conformal over those (Vovk et al. 2005; `residual.json`)."""
 
 import json
 from dataclasses import dataclass
@@ -13,12 +12,11 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import norm
 
-from openjax.flights.track import Track, rotation, smooth, specific_force_of, to_body
+from openjax.flights.track import Track, specific_force_of, to_body
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
 from openjax.gap.model.hypotheses import SetFit, without_nuisances
-from openjax.gap.model.replay import FORCE, RATES, SKIP, VELOCITY, Replay
-from openjax.gap.model.table import HORIZONS as GAP
+from openjax.gap.model.replay import FORCE, RATES, SKIP, VELOCITY
 
 # s over which each residual is let add up, and what is said where it is large.
 HORIZONS = {
@@ -29,12 +27,6 @@ HORIZONS = {
     "position": (0.1, "position and velocity disagree"),
 }
 WORDS = {name: words for name, (_, words) in HORIZONS.items()}
-WORDS["dependence"] = "what is left follows the state"
-FEATURES = 40  # of each group
-LENGTHS = (0.5, 1.0, 2.0)  # of the features, in standard deviations of what they are functions of
-STATE_FILTER = 0.1  # s over which the state is smoothed: sensors' noise isn't what anything depends on
-VARIANCES = 10.0 ** np.arange(-4.0, 4.5, 1.0)  # of the process, in units of the channel's noise
-VERY_STRONG = 5.0  # nats of a Bayes factor (Kass, Raftery 1995)
 CALIBRATION = Path(__file__).with_name("residual.json")
 
 
@@ -91,7 +83,7 @@ def disturbances(track: Track, residual: np.ndarray) -> np.ndarray:
 def measure(evidence: Evidence, residuals: list[np.ndarray]) -> tuple[dict[str, float], np.ndarray]:
     """{name: measure} of what is left, and (6,) by which share the motion channels' squares exceed what the calibration's cases
     leave at most."""
-    replay, dt = evidence.replay, evidence.tracks[0].dt
+    dt = evidence.tracks[0].dt
     skip, out, excess = int(SKIP / dt), {}, np.zeros(6)
     for name, parts in _series(evidence, residuals).items():
         step = max(round(HORIZONS[name][0] / dt), 1)
@@ -101,10 +93,7 @@ def measure(evidence: Evidence, residuals: list[np.ndarray]) -> tuple[dict[str, 
             most = np.quantile([c[name] for c in calibration() if name in c], 1.0 - DECISION.unknown)
             first = 0 if name == "rates" else 3
             excess[first : first + 3] = 1.0 - np.minimum(most / size, 1.0) ** 2
-    follows = followed(replay, residuals)
-    growth = np.sqrt((1.0 / (1.0 - follows[replay.heard > 0])).mean()) - 1.0
-    out["dependence"] = float(growth) + 0.01  # of the gap: growths below are alike
-    return out, np.maximum(excess, follows)
+    return out, excess
 
 
 def _series(evidence: Evidence, residuals: list[np.ndarray]) -> dict[str, list[np.ndarray]]:
@@ -160,85 +149,3 @@ def usual() -> dict[str, tuple[float, float]]:
         middle, upper = np.quantile(logs, [0.5, norm.cdf(1.0)])
         found[name] = float(middle), float(upper - middle)
     return found
-
-
-def followed(replay: Replay, residuals: list[np.ndarray]) -> np.ndarray:
-    """(6,) share of each motion channel's squared errors over the gap's horizon that a Gaussian process of one group of the
-    state has, of those with very strong evidence the largest."""
-    states, shares = [_groups_of_state(t) for t in replay.tracks], np.zeros(6)
-    for group in (g for g in states[0] if all(g in s for s in states)):
-        features = _fourier_features([s[group] for s in states])
-        for axis in np.flatnonzero(replay.heard > 0) if features else ():
-            channel = int(axis) if axis < 3 or replay.usable[3] else int(axis) + 3
-            pushes = [
-                f if channel >= 6 else np.cumsum(f, 0) * t.dt
-                for f, t in zip(features, replay.tracks, strict=True)
-            ]
-            gain, weights = _log_bayes_factor(*_whitened_sums(replay, residuals, pushes, channel))
-            if gain > VERY_STRONG:
-                share = _share_of_errors(replay, residuals, [p @ weights for p in pushes], channel)
-                shares[axis] = max(shares[axis], share)
-    return shares
-
-
-def _groups_of_state(track: Track) -> dict[str, np.ndarray]:
-    """{group: (T, n)} of the state that a push may depend on."""
-    groups = {"rates": track.body_rates, "thrust": track.motor.mean(1)[:, None]}
-    if track.quaternion is not None:
-        turn = rotation(track.quaternion)
-        groups |= {"attitude": turn[:, 2, :2], "heading": turn[:, :2, 0]}
-        if track.velocity is not None:
-            groups["air"] = to_body(track.quaternion, track.velocity)
-    logged = {"place": track.position, "velocity": track.velocity, "voltage": track.voltage}
-    groups |= {n: v.reshape(len(v), -1) for n, v in logged.items() if v is not None}
-    groups |= {f"near {k}": other - track.position for k, other in enumerate(track.neighbours)}
-    groups = {name: smooth(values, STATE_FILTER, track.dt) for name, values in groups.items()}
-    return groups | {"time": (track.time - track.time[0])[:, None]}
-
-
-def _fourier_features(states: list[np.ndarray]) -> list[np.ndarray] | None:
-    """Random Fourier features (T, FEATURES) of each track's state (T, n) in its standard deviations over all tracks."""
-    every = np.concatenate(states)
-    spread = every.std(0)
-    moving = spread > 1e-6 * (1.0 + np.abs(every).max(0))
-    if not moving.any():
-        return None
-    generator = np.random.default_rng(0)
-    weights = generator.standard_normal((int(moving.sum()), FEATURES)) / generator.choice(LENGTHS, FEATURES)
-    phases = generator.uniform(0.0, 2.0 * np.pi, FEATURES)
-    scaled = [(s - every.mean(0))[:, moving] / spread[moving] for s in states]
-    features = [np.cos(s @ weights + phases) * np.sqrt(2.0 / FEATURES) for s in scaled]
-    return [f - f.mean(0) for f in features]  # a trim is nobody's surprise
-
-
-def _share_of_errors(replay: Replay, residuals, pushes, channel: int) -> float:
-    """Share of a channel's squared errors over the gap's horizon that `pushes` [(T,)], at the best strength, explain."""
-    step = max(round(GAP["rates" if channel < 3 else "velocity"] / replay.tracks[0].dt), 1)
-    moved = []
-    for track, residual, push in zip(replay.tracks, residuals, pushes, strict=True):
-        both = np.stack([push, residual[:, channel]])
-        both = both if channel < 6 else np.cumsum(both, 1) * track.dt
-        moved.append((both[:, step:] - both[:, :-step])[:, int(SKIP / track.dt) :])
-    push, left = np.concatenate(moved, 1)
-    return float(np.clip((push @ left) ** 2 / (push @ push * (left @ left) + 1e-24), 0.0, 0.99))
-
-
-def _whitened_sums(replay: Replay, residuals, pushes, channel: int) -> tuple[np.ndarray, np.ndarray]:
-    """Inner products of columns (T, n) of a channel, whitened, with each other and with the residual."""
-    noise = next(n for n in replay.noises if channel in n.axes)
-    gram, cross = 0.0, 0.0
-    for track, residual, push in zip(replay.tracks, residuals, pushes, strict=True):
-        white = noise.whiten(np.concatenate([push, residual[:, [channel]]], 1))[int(SKIP / track.dt) :]
-        white = white - white.mean(0)
-        gram, cross = gram + white[:, :-1].T @ white[:, :-1], cross + white[:, :-1].T @ white[:, -1]
-    return gram, cross
-
-
-def _log_bayes_factor(gram: np.ndarray, cross: np.ndarray) -> tuple[float, np.ndarray]:
-    """Of a linear model with independent normal coefficients against none, at the variance that fits best, and the
-    coefficients."""
-    values, vectors = np.linalg.eigh(gram)
-    values, along = np.maximum(values, 0.0), vectors.T @ cross
-    each = [0.5 * (v * along**2 / (1.0 + v * values) - np.log1p(v * values)).sum() for v in VARIANCES]
-    best = int(np.argmax(each))
-    return float(each[best]), vectors @ (VARIANCES[best] * along / (1.0 + VARIANCES[best] * values))
