@@ -243,10 +243,11 @@ def test_shipped_policies_act_in_their_game_and_refuse_another():
             policy(jax.eval_shape(other.reset, jax.random.key(0))[0])
 
 
-def test_the_preset_evaders_is_what_the_shipped_weights_of_that_name_come_from():
-    shipped = openjax.load_policy("evaders").settings
+@pytest.mark.parametrize("name", ["evaders", "evaders_scripted"])
+def test_the_preset_is_what_the_shipped_weights_of_that_name_come_from(name):
+    shipped = openjax.load_policy(name).settings
     network = {"compute_type": shipped.network.compute_type}  # of this machine
-    preset = openjax.preset("evaders", network=network)
+    preset = openjax.preset(name, network=network)
     assert (
         preset.first_flights.updates == shipped.first_flights.updates == 0
     )  # so that the rest of it says nothing
