@@ -34,7 +34,11 @@ def train(options: argparse.Namespace, seed: int, cores: list[int]) -> dict:
     command = [sys.executable, "-m", "openjax.train", "--preset", "quick", "--seed", str(seed)]
     command += ["--out", str(run), "--overwrite", "--no-compilation_cache", *options.options.split()]
     environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
-    environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+    for name in (
+        "JAX_COMPILATION_CACHE_DIR",
+        "TF_CPP_MIN_LOG_LEVEL",
+    ):  # JAX sets the second one here, a user doesn't
+        environment.pop(name, None)
     started = time.monotonic()
     with open(f"{run}.txt", "w") as log:
         subprocess.run(
@@ -116,7 +120,7 @@ def page(results: dict) -> Page:
         "whole command, s": "whole_command",
         "new tasks": _column("after", "validation"),
         "... every 10 ms": lambda run: _three(run.get("every_physics_step"), 1.0),
-        "from far": _column("after", "validation_far"),
+        "far starts": _column("after", "validation_far"),
         **{f"`{name}`": _column("after", name) for name in SCENARIOS},
         "new tasks, `open`": _column("open", "validation"),
     }
