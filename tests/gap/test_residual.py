@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from openjax.gap.model.whitening import Noise
-from openjax.gap.residual import WORDS, calibration, conformal_p, measure, standing_out
+from openjax.gap.residual import HORIZONS, calibration, conformal_p, measure, standing_out
 
 ROWS, DT = 1500, 0.01
 
@@ -42,9 +42,9 @@ def test_a_push_is_left_in_its_channel_and_in_no_other():
     assert small.max() < 0.1 and large[3] > 0.5 and large[[0, 1, 2, 4, 5]].max() < 0.1
 
 
-@pytest.mark.parametrize("name", WORDS)
+@pytest.mark.parametrize("name", HORIZONS)
 def test_p_values_fall_with_each_measure_and_none_is_zero(name):
-    usual = {n: float(np.median([c[n] for c in calibration() if n in c])) for n in WORDS}
+    usual = {n: float(np.median([c[n] for c in calibration() if n in c])) for n in HORIZONS}
     values = [conformal_p(usual | {name: usual[name] * k}) for k in (1.0, 10.0, 1e3)]
     p_values = [p for p, _ in values]
     assert p_values[0] > 0.5 and p_values == sorted(p_values, reverse=True) and 0.0 < p_values[-1] < 0.01

@@ -37,7 +37,7 @@ def test_nuisances_of_the_vehicle_are_alike_on_all_tracks_and_bounded(columns):
     rows = [np.concatenate([x[2:3], x[5:]]) for x in columns]
     parts = [(x @ x.T, x @ r) for r, x in zip(left, rows, strict=True)]
     hessian, push = normal_equations(np.array([[4.0]]), np.array([-0.8]), 2, 1, parts)
-    found = bounded(hessian, push, 1)[0]
+    found = bounded(hessian, push, 1)
 
     def objective(z):
         step, common, own = z[:1], z[1:3], z[3:]

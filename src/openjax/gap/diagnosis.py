@@ -33,7 +33,8 @@ def diagnose_case(case: Case, without: Iterable[str] = (), progress=None) -> Rep
 def conclude(evidence: Evidence) -> Report:
     """The report that the evidence supports."""
     selection = select(evidence)
-    acting = {e: selection.probability(e) for e in selection.effects} | evidence.acting()
+    acting = {e: selection.probability(e) for e in selection.effects}
+    acting |= {e: p for channel in evidence.channels for e, p in channel.acting().items()}
     named = [e for e, p in acting.items() if p >= 0.5]
     parts = split(evidence, selection, np.zeros(6), named)
     named = [e for e in named if _matters(parts, e)]
@@ -47,7 +48,7 @@ def conclude(evidence: Evidence) -> Report:
 
 @dataclass(frozen=True)
 class Words:
-    """`verdict` of report.VERDICTS; `effects` by share, "unknown" among them where what is left isn't noise."""
+    """`verdict`: "effect" or one of report.VERDICTS; `effects` by share, "unknown" among them where what is left isn't noise."""
 
     verdict: str
     effects: tuple[str, ...]

@@ -11,8 +11,7 @@ from openjax.gap.channels.pose import Pose, read_pose, undelayed
 from openjax.gap.channels.radio import read_radio
 from openjax.gap.channels.rate_loop import read_rate_loop, with_motors
 from openjax.gap.channels.sensors import Kinematics, corrected, read_kinematics
-from openjax.gap.model.hypotheses import SetFit
-from openjax.gap.model.library import CARDS, Library, path_of
+from openjax.gap.model.library import CARDS, Library
 from openjax.gap.model.replay import Replay
 
 
@@ -31,22 +30,6 @@ class Evidence:
     @property
     def replay(self) -> Replay:
         return self.motion.replay
-
-    @property
-    def nothing(self) -> SetFit:
-        return self.motion.nothing
-
-    @property
-    def confounded(self) -> frozenset[str]:
-        return self.motion.confounded
-
-    def channel_of(self, effect: str) -> Channel:
-        """The channel that tells an effect which isn't the motion's."""
-        return next(c for c in self.channels if c.path == path_of(effect))
-
-    def acting(self) -> dict[str, float]:
-        """{effect: probability} of the effects that pose, radio and rate loop show."""
-        return {e: p for c in self.channels for e, p in c.acting().items()}
 
 
 def gather(case: Case, library: Library, progress=None) -> Evidence:

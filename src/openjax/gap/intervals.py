@@ -33,7 +33,8 @@ def estimates(evidence: Evidence, fit: SetFit, named) -> dict[str, dict[str, Est
                     np.linalg.norm((deviation[place], FORM * sizes[fitted.name], fitted.error))
                 )
             else:
-                told = evidence.channel_of(effect).estimate(effect, fitted.name)
+                channel = next(c for c in evidence.channels if c.path == path_of(effect))
+                told = channel.estimate(effect, fitted.name)
                 value, low, high = told.value, told.below, told.above
             out[effect][fitted.name] = Estimate(
                 value, parameter.unit, (value - REACH * low, value + REACH * high), parameter.prior
@@ -55,17 +56,10 @@ def _sizes(effect: str, theta: np.ndarray) -> dict[str, float]:
 
 
 def robust_deviation(fit: SetFit) -> np.ndarray:
-    """Standard deviations (p,) of a fit's parameters: flight-wise sandwich where flights disagree more
-    than they should."""
-    model, flights = np.sqrt(np.diag(fit.covariance)), _between_flights(fit)
-    return np.maximum(few(len(fit.grams)) * flights, model)
-
-
-def _between_flights(fit: SetFit) -> np.ndarray:
-    """Standard deviations (p,) of a fit's parameters from how flights differ; zero for a single one."""
-    count = len(fit.grams)
-    if count < 2 or not len(fit.index):
-        return np.zeros(len(fit.index))
+    """Standard deviations (p,) of a fit's parameters: the fit's, or the flight-wise sandwich's where flights differ more."""
+    model, count = np.sqrt(np.diag(fit.covariance)), len(fit.grams)
+    if count < 2 or not len(model):
+        return model
     pushes = fit.grams[:, 1:, 0] - fit.grams[:, 1:, 0].mean(0)
-    middle = pushes.T @ pushes * count / (count - 1)
-    return np.sqrt(np.maximum(np.diag(fit.covariance @ middle @ fit.covariance), 0.0))
+    between = fit.covariance @ pushes.T @ pushes @ fit.covariance * count / (count - 1)
+    return np.maximum(few(count) * np.sqrt(np.maximum(np.diag(between), 0.0)), model)

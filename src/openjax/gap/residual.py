@@ -26,7 +26,6 @@ HORIZONS = {
     "estimator": (0.1, "attitude and gyroscope disagree"),
     "position": (0.1, "position and velocity disagree"),
 }
-WORDS = {name: words for name, (_, words) in HORIZONS.items()}
 CALIBRATION = Path(__file__).with_name("residual.json")
 
 
@@ -61,7 +60,7 @@ def check_residual(evidence: Evidence, fit: SetFit) -> Check:
     measured, excess = measure(evidence, residuals)
     p_value, name = conformal_p(measured)
     predicted = excess if p_value <= DECISION.unknown else np.zeros(6)
-    return Check(measured, WORDS[name], p_value, predicted)
+    return Check(measured, HORIZONS[name][1], p_value, predicted)
 
 
 def residuals_of(fit: SetFit) -> list[np.ndarray]:
@@ -144,7 +143,7 @@ def calibration() -> list[dict[str, float]]:
 def usual() -> dict[str, tuple[float, float]]:
     """{measure: the median of its logarithm and how far its upper standard deviation (norm's quantile) lies above}."""
     found = {}
-    for name in WORDS:
+    for name in HORIZONS:
         logs = np.log([max(c[name], 1e-12) for c in calibration() if name in c])
         middle, upper = np.quantile(logs, [0.5, norm.cdf(1.0)])
         found[name] = float(middle), float(upper - middle)

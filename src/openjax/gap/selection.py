@@ -70,7 +70,7 @@ def select(evidence: Evidence) -> Selection:
     search = Search(evidence, testable(evidence))
     best = search.climb(search.nothing)
     chosen = search.simplest(best)
-    named = [e for e in chosen.effects if e not in evidence.confounded]
+    named = [e for e in chosen.effects if e not in evidence.motion.confounded]
     gains = {e: search.gap_growth(search.without(chosen, e), chosen) for e in named}
     ordered = tuple(sorted(named, key=lambda e: -gains[e]))
     chosen = replace(chosen, fit=fit_set(chosen.fit.replay, chosen.effects, chosen.fit.theta, rounds=ROUNDS))
@@ -84,7 +84,7 @@ def testable(evidence: Evidence) -> dict[str, SetFit]:
     known = evidence.case.vehicle_file.motor_command != "pwm"
     found = {}
     for effect, fit in evidence.motion.singles.items():
-        promised = max(evidence.motion.exposure[effect], fit.score - evidence.nothing.score)
+        promised = max(evidence.motion.exposure[effect], fit.score - evidence.motion.nothing.score)
         if (known or not CARDS[effect].thrust_map) and promised >= DETECTABLE:
             found[effect] = fit
     return found
@@ -124,14 +124,14 @@ class Search:
 
     @cached_property
     def nothing(self) -> Hypothesis:
-        return self.of_fit(self.evidence.nothing)
+        return self.of_fit(self.evidence.motion.nothing)
 
     def of_fit(self, fit: SetFit) -> Hypothesis:
         """The hypothesis of a fit. Effects that are confounded cost nothing, as they aren't named."""
         key = frozenset(fit.effects)
         if key not in self.visited:
             table = build(fit, None)
-            odds = sum(CARDS[e].log_odds for e in key - self.evidence.confounded)
+            odds = sum(CARDS[e].log_odds for e in key - self.evidence.motion.confounded)
             self.visited[key] = Hypothesis(fit, judge(table, with_effects(table)), odds)
         return self.visited[key]
 
@@ -147,7 +147,7 @@ class Search:
 
     def named(self, h: Hypothesis) -> frozenset:
         """The effects of a hypothesis that it would name: not those that are confounded."""
-        return frozenset(h.effects) - self.evidence.confounded
+        return frozenset(h.effects) - self.evidence.motion.confounded
 
     def without(self, here: Hypothesis, effect: str) -> Hypothesis:
         """The hypothesis without one of its effects."""

@@ -122,8 +122,9 @@ def _gap(square: np.ndarray) -> Gap:
     low, high = np.quantile(reduction[1:], [0.05, 0.95])
     before, after = np.sqrt(square[0])
     value = float(reduction[0])
-    interval = (min(float(low), value), max(float(high), value))
-    return Gap(METRIC, float(before), float(after), 1.0, value, interval)
+    return Gap(
+        METRIC, float(before), float(after), 1.0, value, (min(float(low), value), max(float(high), value))
+    )
 
 
 def _squares_of_sets(evidence: Evidence, selection: Selection, named) -> tuple[list[str], np.ndarray]:
@@ -131,7 +132,7 @@ def _squares_of_sets(evidence: Evidence, selection: Selection, named) -> tuple[l
     ablation, table = Ablation(selection.table), selection.table
     # Numbers of the vehicle and what feedback makes of gusts are no sensor's fault and no effect: they stay.
     sensors = np.array([n.startswith(SENSORS) for n in evidence.replay.nuisance_names])
-    never = [e for e in selection.fit.effects if e not in named and e not in evidence.confounded]
+    never = [e for e in selection.fit.effects if e not in named and e not in evidence.motion.confounded]
 
     def squares(there, off=None) -> dict[str, np.ndarray]:
         gone = [e for e in named if e not in there and e in selection.fit.effects]

@@ -76,7 +76,7 @@ def locate(evidence: Evidence, fit: SetFit, named=()) -> list[Place]:
 def _motion_powers(evidence: Evidence, fit: SetFit) -> dict[str, list[np.ndarray]]:
     """{channel: squared smoothed disturbances (rows,) before, after and at the floor}."""
     both = []
-    for of in (evidence.nothing, fit):
+    for of in (evidence.motion.nothing, fit):
         rows = []
         for track, residual in zip(evidence.tracks, residuals_of(of), strict=True):
             rest = disturbances(track, residual)
@@ -96,17 +96,11 @@ def _other_powers(evidence: Evidence, named) -> dict[str, list[np.ndarray]]:
         powers = []
         for errors in (channel.residuals(()), channel.residuals(named), floor):
             tracks = zip(evidence.tracks, *([v / scale[n] for v in errors[n]] for n in errors), strict=True)
-            powers.append(
-                np.concatenate([_rows(np.mean(np.square(own), 0), track) for track, *own in tracks])
-            )
+            means = [(np.mean(np.square(own), 0), t) for t, *own in tracks]  # (T,) or (1,)
+            powers.append(np.concatenate([np.broadcast_to(m, len(t))[int(SKIP / t.dt) :] for m, t in means]))
         name = "estimator" if channel.path == "estimator" else "firmware"
         found[name] = [a + b for a, b in zip(found[name], powers, strict=True)] if name in found else powers
     return found
-
-
-def _rows(power: np.ndarray, track) -> np.ndarray:
-    """A channel's power (T,) or (1,) at the rows of a track that count."""
-    return np.broadcast_to(power, len(track))[int(SKIP / track.dt) :]
 
 
 def in_words(places: list[Place]) -> str:

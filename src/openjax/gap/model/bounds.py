@@ -6,9 +6,8 @@ BOUND = 2.0  # usual sizes that a nuisance may take
 PATIENCE = 4
 
 
-def bounded(hessian, push, free: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Minimum of x'Hx/2 - push'x with |x| <= BOUND beyond the first `free` entries, H positive definite; and which entries
-    (size,) are inside the box.
+def bounded(hessian, push, free: int = 0) -> np.ndarray:
+    """Minimum of x'Hx/2 - push'x with |x| <= BOUND beyond the first `free` entries, H positive definite.
 
     Block principal pivoting (Judice, Pires 1994): entries that leave the box are fixed at its edge and those that would come
     back are let go, all at once as long as fewer are wrong each time, else the last of them alone, so that it ends."""
@@ -24,7 +23,7 @@ def bounded(hessian, push, free: int = 0) -> tuple[np.ndarray, np.ndarray]:
         beyond, back = np.abs(found) > limit * (1.0 + 1e-9), pull > 1e-9 * np.abs(push)
         wrong = np.flatnonzero(beyond | back)
         if not len(wrong):
-            return found, side == 0.0
+            return found
         patience = PATIENCE if len(wrong) < fewest else patience - 1
         fewest = min(fewest, len(wrong))
         changed = wrong if patience > 0 else wrong[-1:]

@@ -47,28 +47,16 @@ class Equations:
         sums = self.table.folds[0][:, columns]
         return sums[:, :, columns], sums[:, :, 0] + sums[:, :, list(self.model.parts)].sum(2)
 
-    def of_track(self, track: int, but: int | None = None) -> tuple[np.ndarray, np.ndarray] | None:
-        """Their sums over all folds of a track, or all but one; None where none is left."""
+    def of_track(self, track: int, but: int | None) -> tuple[np.ndarray, np.ndarray] | None:
+        """Their sums over all folds of a track but one; None where none is left."""
         used = [f for f in np.flatnonzero(self.table.folds[1] == track) if f != but]
         return tuple(of[used].sum(0) for of in self.folds) if used else None
 
-    @cached_property
-    def tracks(self) -> list:
-        """`of_track` of every track."""
-        return [self.of_track(k) for k in range(int(self.table.folds[1].max()) + 1)]
-
     def without(self, fold: int | None) -> tuple[np.ndarray, np.ndarray]:
         """Hessian and right side over all folds but one."""
-        parts = list(self.tracks)
-        if fold is not None:
-            track = self.table.folds[1][fold]
-            parts[track] = self.of_track(track, fold)
+        parts = [self.of_track(k, fold) for k in range(int(self.table.folds[1].max()) + 1)]
         push = self.model.precision @ self.model.mean
         return normal_equations(self.model.precision, push, *map(len, self.nuisances), parts)
-
-    def solved(self, fold: int | None = None) -> np.ndarray:
-        """Solution over all folds but one."""
-        return bounded(*self.without(fold), len(self.model.free))[0]
 
     def coefficients(self, found: np.ndarray, track: int) -> np.ndarray:
         """Coefficients (..., C) of every column on one track, from solutions (..., size)."""
@@ -86,7 +74,7 @@ def promise(table: Table, model: Model) -> float:
     """Log posterior of a model at its best, fitted to all folds, up to what all models of a table share: what screening needs."""
     equations, own = Equations(table, model), [0, *model.parts]
     hessian, push = equations.without(None)
-    found, _ = bounded(hessian, push, len(model.free))
+    found = bounded(hessian, push, len(model.free))
     square = table.folds[0].sum(0)[np.ix_(own, own)].sum()
     return float(push @ found - 0.5 * found @ hessian @ found - 0.5 * square)
 
@@ -95,7 +83,10 @@ def left_out(table: Table, model: Model):
     """Of every fold its blocks, and the coefficients (C,) of a model fitted to all others."""
     equations = Equations(table, model)
     for fold, track in enumerate(table.folds[1]):
-        yield table.blocks_of(fold), equations.coefficients(equations.solved(fold), track)
+        yield (
+            table.blocks_of(fold),
+            equations.coefficients(bounded(*equations.without(fold), len(model.free)), track),
+        )
 
 
 def judge(table: Table, model: Model) -> Judged:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from openjax.errors import UserError
 from openjax.vehicle.effects import EFFECTS, Card
@@ -82,10 +83,5 @@ def prior(effects) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         mean += [p.mean for p in card.fitted]
         block = np.diag([p.spread**2 for p in card.fitted]) + card.common**2
         blocks.append(block - BALANCE * block.mean() if card.balanced else block)
-    size = len(index)
-    covariance, at = np.zeros((size, size)), 0
-    for block in blocks:
-        covariance[at : at + len(block), at : at + len(block)] = block
-        at += len(block)
-    precision = np.linalg.inv(covariance) if size else covariance
+    precision = np.linalg.inv(block_diag(*blocks)) if blocks else np.zeros((0, 0))
     return np.array(index, int), np.array(mean), precision

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from openjax.gap.model.hypotheses import SetFit
 from openjax.gap.model.library import ABSENT, CARDS, places, prior
@@ -154,10 +155,5 @@ def with_effects(table: Table, add=(), drop=()) -> Model:
         free.append(np.array([table.derivative[int(places((effect,))[k])] for k in inside], int))
         means.append(np.zeros(len(inside)))
         blocks.append(np.diag(1.0 / spread[inside] ** 2))
-    free = np.concatenate(free)
-    size = len(free)
-    out, at = np.zeros((size, size)), 0
-    for block in blocks:
-        out[at : at + len(block), at : at + len(block)] = block
-        at += len(block)
-    return Model(tuple(table.part[e] for e in drop), free.astype(int), np.concatenate(means), out)
+    free = np.concatenate(free).astype(int)
+    return Model(tuple(table.part[e] for e in drop), free, np.concatenate(means), block_diag(*blocks))

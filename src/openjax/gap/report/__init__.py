@@ -11,7 +11,12 @@ from openjax.gap.shares import Gap, Split
 from openjax.gap.where import Place, in_words
 from openjax.vehicle.effects import EFFECTS, save_effects
 
-VERDICTS = ("effect", "none", "unknown", "not_testable")
+# What is said of each verdict that names nothing.
+VERDICTS = {
+    "none": "The simulator agrees with these flights to within the sensors' noise.",
+    "unknown": "The simulator misses something that no known effect explains.",
+    "not_testable": "No effect is seen, but these flights couldn't show most of those that are usual.",
+}
 
 
 @dataclass(frozen=True)
@@ -103,16 +108,11 @@ class Report:
         """The shares, then what they mean, in a few plain sentences."""
         lines = [f"Left out: {text}." for text in self.left_out]
         lines += [self.shares_in_words()] if self.effects or self.sensors else []
-        if self.verdict == "not_testable":
-            lines.append("No effect is seen, but these flights could not show most of those that are usual.")
-        elif self.verdict == "none":
-            chance = self.probabilities["none"]
+        if not self.parameters:
+            chance = self.probabilities.get(self.verdict)
             lines.append(
-                f"The simulator agrees with these flights to within the noise (probability {chance:.2f})."
+                VERDICTS[self.verdict] + (f" Probability {chance:.2f}." if chance is not None else "")
             )
-        elif self.effects == ("unknown",):
-            chance = self.probabilities["unknown"]
-            lines.append(f"Something acts that no known effect explains (probability {chance:.2f}).")
         lines += [f"Sensors: {text}." for text in self.sensors]
         lines += [self.rest] if self.rest else []
         lines.append(f"Where: {in_words(self.where)}.")

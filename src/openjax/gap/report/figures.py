@@ -30,7 +30,6 @@ STYLE = {
     "legend.frameon": False,
     **dict.fromkeys(("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), INK),
 }
-SHOWN_PLACES = 8
 HORIZONS_SHOWN = (0.02, 0.05, 0.1, 0.25, 0.5, 1.0)  # s
 BINS = 15
 
@@ -50,12 +49,12 @@ def _named(report: Report) -> list[str]:
 
 def _residuals(report: Report) -> tuple[list, list]:
     """Residuals of each track of the nominal simulator, and with the named effects."""
-    return residuals_of(report.plots["evidence"].nothing), residuals_of(report.plots["selection"].fit)
+    return residuals_of(report.plots["evidence"].motion.nothing), residuals_of(report.plots["selection"].fit)
 
 
 def _places(report: Report):
     """The parts of the flights that hold most of the gap: error before and after, in units of the noise."""
-    places = [place for place in report.where if place.share > 0.01][:SHOWN_PLACES][::-1]
+    places = [place for place in report.where if place.share > 0.01][:8][::-1]
     if not report.effects or not places:
         return None
     figure, axes = _figure(0.6 + 0.42 * len(places))

@@ -6,12 +6,9 @@ from pathlib import Path
 
 import jinja2
 
-from openjax.gap.report import Report
+from openjax.gap.report import VERDICTS, Report
 from openjax.gap.report.figures import figures
 from openjax.vehicle.effects import EFFECTS
-
-LEAST_CHANCE = 5e-4
-"""Probabilities below are left out."""
 
 
 def page_of(report: Report) -> str:
@@ -26,7 +23,7 @@ def page_of(report: Report) -> str:
         steps=next_steps(report),
         figures=figures(report),
         meanings={e: EFFECTS[e].description for e in report.parameters if e in EFFECTS},
-        ranked=[(name, p) for name, p in ranked[:8] if p > LEAST_CHANCE],
+        ranked=[(name, p) for name, p in ranked[:8] if p > 5e-4],
     )
 
 
@@ -58,12 +55,8 @@ def facts(report: Report) -> list[tuple[str, str]]:
 def sentence(report: Report) -> str:
     """What was found, in one plain sentence."""
     named = [effect for effect in report.effects if effect != "unknown"]
-    if report.verdict == "none":
-        return "The simulator agrees with these flights to within the sensors' noise."
-    if report.verdict == "not_testable":
-        return "No effect is seen, but these flights couldn't show most of those that are usual."
     if not named:
-        return "The simulator misses something that no known effect explains."
+        return VERDICTS[report.verdict]
     parts = " and ".join(
         f"{' or '.join([e, *report.equivalent.get(e, ())]).replace('_', ' ')} ({100 * report.shares.effects[e].value:.0f} %)"
         for e in named
