@@ -105,6 +105,18 @@ def test_evaders():
     assert len(SCRIPTED) == 10
 
 
+def test_best_response():
+    """The least captures by the default policy, of any evader, those that learned against it among them."""
+    (response,) = [r for r in read("evaders")["responses"] if r["policy"] == "evaders"]
+    least = {
+        kind: min(r["capture_rate"] for r in response["records"] if r["scenario"] == kind)
+        for kind in ("uniform", *SCENARIOS)
+    }
+    label = "... by `evaders`, the worst of these and of three that learned against it: uniform tasks, worst layout"
+    worst = min(least[kind] for kind in SCENARIOS)
+    assert cells(label)[0] == f"{short(least['uniform'], 2)}, {short(worst, 2)}"
+
+
 @pytest.mark.parametrize(
     ("label", "figure"),
     [

@@ -141,7 +141,9 @@ def learn(environment: Pursuit, team: Team, how: BestResponseSettings):
         carry, _ = jax.block_until_ready(step({}, carry))
     keys = jax.random.split(jax.random.key(77), how.num_envs)
     tasks = jax.vmap(lambda key: uniform_task(settings, key))(keys)
-    networks = [jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], carry.evaders.actor) for i in range(how.seeds)]
+    networks = [
+        jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], carry.evaders.actor) for i in range(how.seeds)
+    ]
     duel, kinds = jax.jit(make_duel(environment, team)), jnp.zeros(how.num_envs, jnp.int32)
     # without a network it is the greedy one
     found = [duel({}, tasks, kinds, keys[0], {"evader_networks": own}) for own in [*networks, None]]
