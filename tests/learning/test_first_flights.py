@@ -1,5 +1,8 @@
 """The stage before MAPPO: its game is the run's, and what it teaches brings pursuers nearer to the evader."""
 
+import dataclasses
+import functools
+
 import jax
 import jax.numpy as jnp
 import pytest
@@ -45,6 +48,34 @@ def test_pursuers_come_nearer():
     assert distances[-1] < 0.75 * distances[0]
     # nobody is caught yet: penalties wait
     assert carry[-1] == 0.0
+
+
+@pytest.mark.slow
+def test_two_devices_learn_what_one_does():
+    how = FirstFlightsSettings(updates=2, worlds=4, steps=2, anew=0.5)
+    environment = first_game(Pursuit(GAME), how)
+    networks = NetworkSettings(features=8, heads=1), PredictorSettings(enabled=False)
+    one = FirstFlights(how, environment, Policy.for_environment(environment, *networks))
+    two = dataclasses.replace(one, axis="devices")
+    observation, _ = jax.jit(environment.reset)(jax.random.key(0))
+    parameters, key = jax.jit(one.policy.init)(jax.random.key(1), observation), jax.random.key(2)
+
+    @jax.jit
+    def both(parameters, key):
+        shares = functools.partial(jax.vmap, axis_name="devices", axis_size=2)
+        mine = one.update(one.begin(parameters, key), key)
+        return mine, shares(lambda: two.update(two.begin(parameters, key), key), in_axes=())()
+
+    (carry, parts), (their_carry, their_parts) = both(parameters, key)
+    for leaf, theirs in zip(jax.tree.leaves(carry[2]), jax.tree.leaves(their_carry[2]), strict=True):
+        if leaf.dtype == jnp.float32:
+            assert jnp.allclose(leaf, theirs.reshape(leaf.shape), atol=1e-5)
+    for leaf, theirs in zip(
+        jax.tree.leaves((carry[0].actor, parts)),
+        jax.tree.leaves((their_carry[0].actor, their_parts)),
+        strict=True,
+    ):
+        assert jnp.allclose(theirs, leaf, atol=1e-5)
 
 
 def test_an_evader_within_reach_is_not_free():

@@ -4,7 +4,10 @@ The step sees its own device's worlds and averages over all where it must (`open
 that one device and many give the same result on the same worlds, up to the order of sums.
 """
 
+import dataclasses
+import functools
 import os
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -13,6 +16,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from openjax.errors import UserError
 from openjax.learning import TrainCarry, TrainSettings
+from openjax.learning.first_flights import FirstFlights, make_first_flights
 from openjax.learning.training_step import Flown, Phases, make_phases
 from openjax.pursuit import Pursuit
 
@@ -106,13 +110,8 @@ def make_device_phases(settings: TrainSettings, environment: Pursuit, number: in
     """The programs of the training step on `number` devices, not yet compiled."""
     if number == 1:
         return make_phases(settings, environment)
-    phases = make_phases(settings, environment, axis=AXIS)
+    phases, shared = make_phases(settings, environment, axis=AXIS), functools.partial(_shared_out, number)
     carry, same = _carry_of(PartitionSpec(AXIS), PartitionSpec()), PartitionSpec()
-
-    def shared(phase, takes, gives):
-        # The step averages gradients itself; with the check on, they'd be summed before that.
-        return jax.shard_map(phase, mesh=_mesh(number), in_specs=takes, out_specs=gives, check_vma=False)
-
     return Phases(
         fly=shared(phases.fly, (carry,), (carry, _FLOWN, same)),
         learn=tuple(shared(phase, (carry, _FLOWN), (carry, same)) for phase in phases.learn),
@@ -120,11 +119,39 @@ def make_device_phases(settings: TrainSettings, environment: Pursuit, number: in
     )
 
 
+def make_device_first_flights(
+    flights: FirstFlights, together: int, number: int
+) -> tuple[Callable, Callable, Any]:
+    """`flights.begin` and `make_first_flights` on `number` devices, by `jax.jit`; and where the leaves of their carry lie."""
+    compiled = functools.partial(jax.jit, compiler_options=compiler_options(number))
+    if number == 1:
+        some = make_first_flights(flights, together)
+        return compiled(flights.begin), compiled(some, donate_argnums=0), None
+    flights, same = dataclasses.replace(flights, axis=AXIS), PartitionSpec()
+    carry = same, same, PartitionSpec(AXIS), same
+    begin = _shared_out(number, flights.begin, (same, same), carry)
+    some = _shared_out(number, make_first_flights(flights, together), (carry, same, same), (carry, same))
+    at = tuple(NamedSharding(_mesh(number), spec) for spec in carry)
+    return compiled(begin), compiled(some, donate_argnums=0), at
+
+
+def compiler_options(number: int) -> dict:
+    """For programs on `number` devices: where these are cores, threads would get in their way."""
+    cores = number > 1 and jax.default_backend() == "cpu"
+    return {"xla_cpu_multi_thread_eigen": False} if cores else {}
+
+
 def flown_shardings(number: int) -> tuple[jax.sharding.Sharding, ...]:
     """Where the leaves of each part of what was flown lie."""
     if number == 1:
         return (everywhere(1),) * len(vars(_FLOWN))
     return tuple(NamedSharding(_mesh(number), spec) for spec in vars(_FLOWN).values())
+
+
+def _shared_out(number, function, takes, gives):
+    """A function of each device's share as one of the whole, as the specifications have it."""
+    # gradients are averaged in it; with the check on, they'd be summed before that
+    return jax.shard_map(function, mesh=_mesh(number), in_specs=takes, out_specs=gives, check_vma=False)
 
 
 def _mesh(number):

@@ -9,15 +9,15 @@ import jax
 import jax.numpy as jnp
 
 from openjax.background import in_background
-from openjax.cluster.devices import own_copy
+from openjax.cluster.devices import everywhere, make_device_first_flights, own_copy
 from openjax.learning import build
 from openjax.learning.analytic_gradient import AnalyticGradient, compile_analytic, free_flight
-from openjax.learning.first_flights import FirstFlights, first_game, make_first_flights
+from openjax.learning.first_flights import FirstFlights, first_game
 from openjax.learning.settings import TrainSettings
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Pursuit
 from openjax.show.progress import duration
-from openjax.store.leaves import abstract_like
+from openjax.store.leaves import abstract_like, place
 
 TOGETHER = 100
 """Updates of the first stage in one call: some seconds on a CPU."""
@@ -40,7 +40,7 @@ def compile_first_flights(
 
     Args:
       settings, environment: the run's.
-      policy: the parameters' shapes and dtypes.
+      policy: the parameters' shapes and dtypes; on several devices of one process, these share the worlds.
       say: hears how it goes.
       over: is asked every few seconds whether to stop.
 
@@ -49,12 +49,13 @@ def compile_first_flights(
     """
     how = settings.first_flights
     flights = FirstFlights(how, first_game(environment, how), _exact(settings, environment))
-    begin = jax.jit(flights.begin)
-    some = jax.jit(make_first_flights(flights, min(TOGETHER, how.updates)), donate_argnums=0)
-    key = jax.eval_shape(lambda: jax.random.key(0))
-    policy = abstract_like(policy)
-    carry = jax.eval_shape(begin, policy, key)
-    done = jax.ShapeDtypeStruct((), jnp.int32)
+    devices = _number_of_devices(policy, how.worlds)
+    begin, some, shardings = make_device_first_flights(flights, min(TOGETHER, how.updates), devices)
+    at = None if devices == 1 else everywhere(devices)
+    policy, key, done = abstract_like(
+        (policy, *jax.eval_shape(lambda: (jax.random.key(0), jnp.int32(0)))), at
+    )
+    carry = abstract_like(jax.eval_shape(begin, policy, key), shardings)
     lowered = some.lower(carry, key, done), begin.lower(policy, key)
     ready = [in_background(program.compile) for program in lowered]
 
@@ -63,11 +64,12 @@ def compile_first_flights(
         if over():
             return None
         started = time.monotonic()
-        carry = begin(own_copy(parameters), key)
+        parameters_there, key = place((own_copy(parameters), key), at)
+        carry = begin(parameters_there, key)
         for before in range(0, how.updates, TOGETHER):
             if before and over():
                 break
-            carry, parts = some(carry, key, jnp.int32(before))
+            carry, parts = some(carry, key, place(jnp.int32(before), at))
             done = min(before + TOGETHER, how.updates)
             shown = {name: float(value) for name, value in parts.items()}  # waits for them
             left = (time.monotonic() - started) * (how.updates / done - 1.0)
@@ -78,6 +80,13 @@ def compile_first_flights(
         return parameters.replace(actor=carry[0].actor)
 
     return learn
+
+
+def _number_of_devices(policy, worlds):
+    """How many devices share worlds whose policy lies on some of this process; 1 where they can't."""
+    places = {getattr(leaf, "sharding", None) for leaf in jax.tree.leaves(policy)} - {None}
+    number = max((len(at.device_set) for at in places if at.is_fully_addressable), default=1)
+    return number if worlds % number == 0 else 1
 
 
 def _exact(settings: TrainSettings, environment: Pursuit) -> Policy:

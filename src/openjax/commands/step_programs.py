@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import jax
 
 from openjax.background import compile_ahead
-from openjax.cluster.devices import carry_shardings, everywhere, flown_shardings
+from openjax.cluster.devices import carry_shardings, compiler_options, everywhere, flown_shardings
 from openjax.commands.training_loop import guarded
 from openjax.learning import TrainCarry
 from openjax.learning.training_step import Phases
@@ -61,10 +61,7 @@ def step_programs(
       keep: (name, program, its arguments) -> the program as an earlier run traced it.
     """
     shardings, same, at = carry_shardings(devices), everywhere(devices), flown_shardings(devices)
-    options = {}
-    if devices > 1 and jax.default_backend() == "cpu":
-        options["xla_cpu_multi_thread_eigen"] = False  # devices are cores: threads would get in their way
-    compiled = functools.partial(jax.jit, donate_argnums=0, compiler_options=options)
+    compiled = functools.partial(jax.jit, donate_argnums=0, compiler_options=compiler_options(devices))
     fly_tree = jax.jit(phases.fly)
 
     @functools.cache

@@ -33,12 +33,18 @@ def gather_over_devices(tree, axis: str | None):
     return tree if axis is None else jax.tree.map(lambda x: jax.lax.all_gather(x, axis, tiled=True), tree)
 
 
+def own_share(x: jax.Array, axis: str | None) -> jax.Array:
+    """This device's part of an array that all devices have whole."""
+    if axis is None:
+        return x
+    number = x.shape[0] // jax.lax.axis_size(axis)
+    return jax.lax.dynamic_slice_in_dim(x, jax.lax.axis_index(axis) * number, number)
+
+
 def own_keys(key: jax.Array, number: int, axis: str | None) -> jax.Array:
     """This device's (number,) keys out of one split for all devices: the same ones however many devices there are."""
-    if axis is None:
-        return jax.random.split(key, number)
-    keys = jax.random.split(key, number * jax.lax.axis_size(axis))
-    return jax.lax.dynamic_slice_in_dim(keys, jax.lax.axis_index(axis) * number, number)
+    devices = 1 if axis is None else jax.lax.axis_size(axis)
+    return own_share(jax.random.split(key, number * devices), axis)
 
 
 def joint_moments(x: jax.Array, axis: str | None) -> tuple[jax.Array, jax.Array]:

@@ -23,6 +23,7 @@ from openjax.learning.analytic_gradient import (
     nearest_gap,
     tip_share,
 )
+from openjax.learning.collectives import mean_over_devices, own_share
 from openjax.learning.settings import AnalyticSettings, FirstFlightsSettings
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Pursuit, scatter_starts, turn_task, uniform_task
@@ -54,12 +55,14 @@ def first_game(environment: Pursuit, how: FirstFlightsSettings) -> Pursuit:
 
 @dataclass(frozen=True)
 class FirstFlights:
-    """How a fresh actor learns to fly. `World`s are observations and states (B, ...)."""
+    """How a fresh actor learns to fly. `World`s are observations and states (B, ...), a device's share of them all."""
 
     how: FirstFlightsSettings
     environment: Pursuit
     """See `first_game`."""
     policy: Policy
+    axis: str | None = None
+    """Of the devices, where there are several."""
 
     @property
     def stage(self) -> AnalyticGradient:
@@ -68,7 +71,7 @@ class FirstFlights:
 
     def start(self, key: jax.Array):
         """Worlds at the starts of uniform tasks and of scattered ones, their vehicles nominal."""
-        game, number = self.environment.settings, self.how.worlds
+        game = self.environment.settings
 
         def draw(key):
             task_key, turn_key, start_key, choice_key = jax.random.split(key, 4)
@@ -77,7 +80,9 @@ class FirstFlights:
             anywhere = scatter_starts(game, start_key, task)
             return jax.tree.map(lambda a, b: jnp.where(scattered, a, b), anywhere, task)
 
-        task_key, reset_key = (jax.random.split(k, number) for k in jax.random.split(key))
+        task_key, reset_key = (
+            own_share(jax.random.split(k, self.how.worlds), self.axis) for k in jax.random.split(key)
+        )
         tasks = jax.vmap(draw)(task_key)
         environment = self.environment
         if game.vehicles:
@@ -105,12 +110,14 @@ class FirstFlights:
         """The carry (parameters, optimiser's state, worlds, share of the penalties' rise) after an update, and the parts."""
         parameters, state, world, risen = carry
         gradient, (end, parts) = jax.grad(self.loss, has_aux=True)(parameters.actor, parameters, world, risen)
+        gradient, parts = mean_over_devices((gradient, parts), self.axis)
         step = 1.0 / (self.how.penalty_ramp * max(self.how.updates, 1))
         risen = jnp.minimum(risen + jnp.where(parts["free"] < self.how.penalty_free, step, 0.0), 1.0)
         change, state = self.optimiser.update(finite_or_zero(gradient), state)
         parameters = parameters.replace(actor=optax.apply_updates(parameters.actor, change))
         start_key, choice_key = jax.random.split(key)
-        over = self._over(end[1]) | (jax.random.uniform(choice_key, (self.how.worlds,)) < self.how.anew)
+        anew = jax.random.uniform(choice_key, (self.how.worlds,)) < self.how.anew
+        over = self._over(end[1]) | own_share(anew, self.axis)
 
         def chosen(old, new):
             return jnp.where(over.reshape(-1, *[1] * (old.ndim - 1)), new, old)
