@@ -20,7 +20,7 @@ from openjax.commands import benchmark, evaluate, train, training_job
 from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import FIELDS
 from openjax.learning import training_step
-from openjax.learning.training_step import Flown, Phases, make_phases
+from openjax.learning.training_step import make_phases
 from openjax.pursuit import SCENARIOS
 from openjax.show.metrics import read_metrics
 from openjax.store.checkpoint_files import is_checkpoint, load_arrays
@@ -170,16 +170,16 @@ def test_signal_saves_and_exits_cleanly(whole_run, tmp_path, train_arguments):
 
 
 def test_nan_stops_the_run_and_leaves_the_state(tmp_path, monkeypatch, capsys, train_arguments):
-    def make_broken_phases(settings, environment, devices):
-        def renew(carry):
+    def make_broken_step(settings, environment, devices):
+        def step(carry):
             update = carry.update + 1
             broken = jax.tree.map(lambda leaf: leaf + (0.0 / (update != 4)), carry.policy.actor)
             carry = carry.with_policy(carry.policy.replace(actor=broken))
             return carry.replace(update=update), {"reward": 0.0 * update}
 
-        return Phases(lambda carry: (carry, Flown((), (), ()), {}), (), renew)
+        return step
 
-    monkeypatch.setattr(training_job, "make_device_phases", make_broken_phases)
+    monkeypatch.setattr(training_job, "make_device_step", make_broken_step)
     out = tmp_path / "broken"
     options = [*train_arguments[1:], *ALONE, "--no-traced_programs", "--out", out]
     status, _ = in_process(train.main, options, monkeypatch, capsys)

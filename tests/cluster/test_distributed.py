@@ -42,7 +42,7 @@ from openjax.pursuit import Pursuit
 from openjax.store.checkpoint_files import load_arrays
 from openjax.store.checkpoints import Checkpoints
 from openjax.store.leaves import named_leaves, place
-from openjax.cluster.devices import carry_shardings, everywhere, make_device_phases
+from openjax.cluster.devices import carry_shardings, everywhere, make_device_step
 from openjax.commands.training_loop import guarded
 from openjax.store.run_directory import RunDirectory
 
@@ -59,7 +59,7 @@ jax.monitoring.register_event_duration_secs_listener(
 
 def step_on(number):
     return guarded(
-        make_device_phases(settings, environment, number), carry_shardings(number), everywhere(number)
+        make_device_step(settings, environment, number), carry_shardings(number), everywhere(number)
     )
 
 

@@ -15,15 +15,13 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from openjax.errors import UserError
-from openjax.learning import TrainCarry, TrainSettings
+from openjax.learning import TrainCarry, TrainSettings, make_training_step
 from openjax.learning.first_flights import FirstFlights, make_first_flights
-from openjax.learning.training_step import Flown, Phases, make_phases
 from openjax.pursuit import Pursuit
 
 AXIS = "devices"
 _SHARED_OUT = ("observation", "state")
 """Fields of the carry whose leading axis is the worlds."""
-_FLOWN = Flown(PartitionSpec(None, AXIS), PartitionSpec(AXIS), PartitionSpec(AXIS))
 
 
 def can_share_out(settings: TrainSettings, number: int) -> bool:
@@ -106,17 +104,13 @@ def own_copy(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: jax.device_put(leaf.addressable_data(0), device), tree)
 
 
-def make_device_phases(settings: TrainSettings, environment: Pursuit, number: int) -> Phases:
-    """The programs of the training step on `number` devices, not yet compiled."""
+def make_device_step(settings: TrainSettings, environment: Pursuit, number: int) -> Callable:
+    """The training step `carry -> (carry, metrics)` on `number` devices, not yet compiled."""
     if number == 1:
-        return make_phases(settings, environment)
-    phases, shared = make_phases(settings, environment, axis=AXIS), functools.partial(_shared_out, number)
+        return make_training_step(settings, environment)
+    step = make_training_step(settings, environment, axis=AXIS)
     carry, same = _carry_of(PartitionSpec(AXIS), PartitionSpec()), PartitionSpec()
-    return Phases(
-        fly=shared(phases.fly, (carry,), (carry, _FLOWN, same)),
-        learn=tuple(shared(phase, (carry, _FLOWN), (carry, same)) for phase in phases.learn),
-        renew=shared(phases.renew, (carry,), (carry, same)),
-    )
+    return _shared_out(number, step, (carry,), (carry, same))
 
 
 def make_device_first_flights(
@@ -136,16 +130,12 @@ def make_device_first_flights(
 
 
 def compiler_options(number: int) -> dict:
-    """For programs on `number` devices: where these are cores, threads would get in their way."""
-    cores = number > 1 and jax.default_backend() == "cpu"
-    return {"xla_cpu_multi_thread_eigen": False} if cores else {}
-
-
-def flown_shardings(number: int) -> tuple[jax.sharding.Sharding, ...]:
-    """Where the leaves of each part of what was flown lie."""
-    if number == 1:
-        return (everywhere(1),) * len(vars(_FLOWN))
-    return tuple(NamedSharding(_mesh(number), spec) for spec in vars(_FLOWN).values())
+    """For programs on `number` devices."""
+    if jax.default_backend() != "cpu":
+        # trying each matrix product in dozens of ways takes two thirds of the compiler's time, and the step isn't faster
+        return {"xla_gpu_autotune_level": 0} if jax.default_backend() == "gpu" else {}
+    # where devices are cores, threads would get in their way
+    return {"xla_cpu_multi_thread_eigen": False} if number > 1 else {}
 
 
 def _shared_out(number, function, takes, gives):

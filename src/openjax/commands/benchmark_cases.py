@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import jax
 import jax.numpy as jnp
 
-from openjax.cluster.devices import carry_shardings, check_devices, make_device_phases
+from openjax.cluster.devices import carry_shardings, check_devices, make_device_step
 from openjax.errors import UserError
 from openjax.learning import TrainSettings, build, init_carry, training_step
 from openjax.learning.rollout import collect
@@ -42,7 +42,7 @@ def _training(settings, devices):
     """The whole training step, then, of one device, the programs that it is made of: (name, function, its arguments)."""
     carry = init_carry(settings, jax.random.key(0))
     if devices > 1:
-        step = make_device_phases(settings, Pursuit(settings.environment), devices)
+        step = make_device_step(settings, Pursuit(settings.environment), devices)
         yield f"training, {devices} devices", step, (place(carry, carry_shardings(devices)),)
         return
     phases = training_step.make_phases(settings)

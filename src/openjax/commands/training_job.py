@@ -13,15 +13,22 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from openjax.background import in_background
-from openjax.cluster.devices import carry_shardings, check_devices, check_memory, make_device_phases, own_copy
+from openjax.background import compile_ahead, in_background
+from openjax.cluster.devices import (
+    carry_shardings,
+    check_devices,
+    check_memory,
+    compiler_options,
+    everywhere,
+    make_device_step,
+    own_copy,
+)
 from openjax.cluster.processes import Processes
 from openjax.commands.before_and_after import compare, game_for
 from openjax.commands.evaluator import before_after_table, layout_slots, layout_tasks
 from openjax.commands.gradient_stages import compile_first_flights, compile_last_stage
 from openjax.commands.run_words import closing_words, layouts_like
-from openjax.commands.step_programs import step_programs
-from openjax.commands.training_loop import Loop, NotFiniteError, Outcome, Plan, StopRequest
+from openjax.commands.training_loop import Loop, NotFiniteError, Outcome, Plan, StopRequest, guarded
 from openjax.commands.validation import Validation, flat_metrics, selection_score
 from openjax.learning import TrainSettings, build, make_start, summarise
 from openjax.learning.train_state import policy_leaf
@@ -149,7 +156,7 @@ class _Run:
         self.progress.phase("compiling the start: networks, first tasks", announce=latest is None)
         start, step, self.abstract = _programs(job)
         # takes longest, so it comes first
-        step_ready = (lambda _=None: True) if done else step.compile_ahead(self.abstract)
+        step_ready = (lambda _=None: True) if done else compile_ahead(step, self.abstract)
         self.first_flights = self._first_flights()
         carry, self.first_update, seconds = self._first_carry(start)
         if self.processes.is_first:
@@ -311,16 +318,22 @@ def _programs(job):
     settings, shardings = job.settings, carry_shardings(job.devices)
     start = make_start(settings, job.environment)
     abstract = abstract_like(jax.eval_shape(start, jax.random.key(settings.seed)), shardings)
-    phases = make_device_phases(settings, job.environment, job.devices)
+    same = everywhere(job.devices)
+    step = guarded(make_device_step(settings, job.environment, job.devices), shardings, same)
     tried = job.devices == 1 or (jax.default_backend() == "cpu" and jax.process_count() == 1)
-    if job.traced is None or not tried:
-        return start, step_programs(phases, job.devices, abstract), abstract
-    keep = functools.partial(recalled, carry=abstract, made_from=job.made_from, folder=job.traced)
+    if job.traced is not None and tried:
+        keep = functools.partial(recalled, carry=abstract, made_from=job.made_from, folder=job.traced)
+        step = keep("step", step, lambda: (abstract,))
+        fresh, arguments = start, lambda: (jax.random.key(settings.seed),)
 
-    def kept_start(key):
-        return jax.jit(keep("start", start, lambda: (key,)), out_shardings=shardings)(key)
+        def start(key):
+            return jax.jit(keep("start", fresh, arguments), out_shardings=shardings)(key)
 
-    return kept_start, step_programs(phases, job.devices, abstract, keep), abstract
+    options = {
+        "out_shardings": (shardings, same, same),
+        "compiler_options": compiler_options(job.devices),
+    }
+    return start, jax.jit(step, donate_argnums=0, **options), abstract
 
 
 def _start_parameters(job, fresh: PolicyParameters) -> PolicyParameters:

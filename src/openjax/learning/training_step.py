@@ -138,7 +138,7 @@ class Flown:
 
 @dataclass(frozen=True)
 class Phases:
-    """The training step in parts, one after the other: a compiler is done sooner with several at once than with the whole.
+    """The training step in parts, one after the other.
 
     Metrics are () by name, counted over the rollout or over the episodes that ended with it.
     """
