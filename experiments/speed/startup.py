@@ -1,7 +1,6 @@
 """Seconds to a training run's first update: `python -m experiments.speed.startup [--preset paper] [--repeats 2]`.
 
-Once with an empty and some times with a filled cache of compiled programs; then how long the compiler takes for all programs
-of the training step side by side, for the step as one, and for each program alone. Writes experiments/results/startup.json, .md.
+Once with an empty and some times with a filled cache of compiled programs. Writes experiments/results/startup.json, .md.
 """
 
 import argparse
@@ -13,14 +12,9 @@ import threading
 import time
 from pathlib import Path
 
-import jax
-
 from experiments.table import Page, Table, page_parser, publish
-from openjax.background import compile_ahead
 from openjax.commands.command_line import run_command
 from openjax.errors import UserError
-from openjax.learning import abstract_carry, make_training_step, preset
-from openjax.learning.training_step import make_phases
 from openjax.show.metrics import METRICS_FILE, read_metrics
 
 
@@ -60,56 +54,21 @@ def start_once(options: argparse.Namespace, scratch: Path, name: str) -> dict:
     }
 
 
-def compile_programs(name: str, latest: float) -> list[dict]:
-    """What the programs of a preset's training step cost until they're compiled, with nothing kept: a record for each.
-
-    None is begun after `latest` (s, `time.monotonic`).
-    """
-    jax.config.update("jax_threefry_gpu_kernel_lowering", True)  # as the command has it
-    settings = preset(name)
-    phases, carry = make_phases(settings), abstract_carry(settings)
-    flown = jax.eval_shape(phases.fly, carry)[1]
-    parts = [(phases.fly, carry), *((learn, carry, flown) for learn in phases.learn), (phases.renew, carry)]
-    cases = {"all side by side": parts, "the step as one": [(make_training_step(settings), carry)]}
-    cases |= {part[0].__name__: [part] for part in parts}
-    records = []
-    for case, programs in cases.items():
-        if time.monotonic() > latest:
-            break
-        jax.clear_caches()  # of what other cases traced
-        started, processor = time.monotonic(), time.process_time()
-        for wait in [compile_ahead(jax.jit(function), *arguments) for function, *arguments in programs]:
-            wait()
-        spent = {"seconds": time.monotonic() - started, "processor": time.process_time() - processor}
-        records.append({"program": case, **spent})
-        print(records[-1], flush=True)
-    return records
-
-
 def study(options: argparse.Namespace) -> dict:
-    """All starts, and the programs."""
-    began = time.monotonic()
+    """All starts."""
     with tempfile.TemporaryDirectory() as folder:
         names = ["cold", *(f"warm_{i + 1}" for i in range(options.repeats))]
         starts = [start_once(options, Path(folder), name) for name in names]
-    print(starts, flush=True)
-    programs = compile_programs(options.preset, began + options.seconds)
-    return {"preset": options.preset, "starts": starts, "programs": programs}
+    return {"preset": options.preset, "starts": starts}
 
 
 def page(results: dict) -> Page:
-    """A row per start, and one per program."""
+    """A row per start."""
     phases = dict.fromkeys(name for start in results["starts"] for name in start.get("phases", ()))
     columns = {"cache": "cache"} | {f"{phase}, from s": f"phases.{phase}" for phase in phases}
     columns |= {"first update done, s": "first_update:.1f", "of processor, s": "processor:.0f"}
     prose = f"Preset `{results['preset']}` on {results['machine']['cpu_cores']} CPU cores."
-    programs = {"program": "program", "compiled, s": "seconds:.1f", "of processor, s": "processor:.0f"}
-    compiled = Table(programs, results["programs"], "What the compiler takes", results.get("note", ""))
-    return Page(
-        "Seconds to the first update",
-        results.get("prose", prose),
-        [Table(columns, results["starts"]), compiled],
-    )
+    return Page("Seconds to the first update", prose, [Table(columns, results["starts"])])
 
 
 def main(arguments: list[str]) -> int:
@@ -121,7 +80,6 @@ def main(arguments: list[str]) -> int:
     parser.add_argument(
         "--limit", type=float, default=300.0, help="longest time to wait for a first update, s"
     )
-    parser.add_argument("--seconds", type=float, default=600.0, help="no program is begun after")
     publish(parser.parse_args(arguments), study, page)
     return 0
 
