@@ -63,12 +63,21 @@ def study(options: argparse.Namespace) -> dict:
 
 
 def page(results: dict) -> Page:
-    """A row per start."""
+    """A row per start, and one per program where somebody compiled them alone."""
     phases = dict.fromkeys(name for start in results["starts"] for name in start.get("phases", ()))
     columns = {"cache": "cache"} | {f"{phase}, from s": f"phases.{phase}" for phase in phases}
     columns |= {"first update done, s": "first_update:.1f", "of processor, s": "processor:.0f"}
     prose = f"Preset `{results['preset']}` on {results['machine']['cpu_cores']} CPU cores."
-    return Page("Seconds to the first update", prose, [Table(columns, results["starts"])])
+    tables = [Table(columns, results["starts"])]
+    if "programs" in results:
+        programs = {
+            name: f"{key}:.1f"
+            for name, key in (("compiled, s", "seconds"), ("of processor, s", "processor"), ("run, ms", "ms"))
+        }
+        tables.append(
+            Table({"program": "program"} | programs, results["programs"], "Programs", results["note"])
+        )
+    return Page("Seconds to the first update", results.get("prose", prose), tables)
 
 
 def main(arguments: list[str]) -> int:

@@ -169,9 +169,13 @@ def update_policy(
     """
     mean, std = scale.moments
     parameters = actor.parameters, critic.parameters
-    value = mean + std * policy.value(*parameters, rollout.observation, rollout.predicted)
-    last_value = mean + std * policy.value(*parameters, last, last_predicted)
-    next_value = jnp.concatenate([value[1:], last_value[None]])
+    # the history's frames are the predictor's; the policy sees the prediction
+    flown = rollout.observation.replace(frames=None), rollout.predicted
+    end = last.replace(frames=None), last_predicted
+    # before and after all steps by one program: one for what comes last would be as large
+    seen = jax.tree.map(lambda x, last: jnp.concatenate([x, last[None]]), flown, end)
+    values = mean + std * policy.value(*parameters, *seen)
+    value, next_value = values[:-1], values[1:]
     per_pursuer = value.shape
     advantage = generalised_advantages(
         settings.reward_scale * rollout.reward,
@@ -195,8 +199,8 @@ def update_policy(
     mean, std = scale.moments
     advantage_mean, advantage_std = joint_moments(advantage, axis)
     batch = Batch(
-        observation=rollout.observation,
-        predicted=rollout.predicted,
+        observation=flown[0],
+        predicted=flown[1],
         action=rollout.action,
         log_prob=rollout.log_prob,
         advantage=(advantage - advantage_mean) / (advantage_std + 1e-8),
@@ -248,6 +252,4 @@ def _partition(batch: Batch, minibatches: int) -> Batch:
         x = jnp.moveaxis(x, 0, 1)
         return jnp.moveaxis(x.reshape(x.shape[0] // minibatches, minibatches, *x.shape[1:]), 1, 0)
 
-    # the history's frames are the predictor's; the policy sees the prediction
-    batch = batch.replace(observation=batch.observation.replace(frames=None))
     return jax.tree.map(split, batch)
