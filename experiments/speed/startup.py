@@ -70,13 +70,8 @@ def page(results: dict) -> Page:
     prose = f"Preset `{results['preset']}` on {results['machine']['cpu_cores']} CPU cores."
     tables = [Table(columns, results["starts"])]
     if "programs" in results:
-        programs = {
-            name: f"{key}:.1f"
-            for name, key in (("compiled, s", "seconds"), ("of processor, s", "processor"), ("run, ms", "ms"))
-        }
-        tables.append(
-            Table({"program": "program"} | programs, results["programs"], "Programs", results["note"])
-        )
+        columns = {"program": "program", "compiled, s": "seconds:.1f", "of processor, s": "processor:.1f"}
+        tables.append(Table(columns, results["programs"], "What the compiler takes", results["note"]))
     return Page("Seconds to the first update", results.get("prose", prose), tables)
 
 

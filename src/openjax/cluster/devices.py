@@ -132,7 +132,7 @@ def make_device_first_flights(
 def compiler_options(number: int) -> dict:
     """For programs on `number` devices."""
     if jax.default_backend() != "cpu":
-        # trying each matrix product in dozens of ways takes two thirds of the compiler's time, and the step isn't faster
+        # trying each matrix product in dozens of ways is half of what the compiler does (experiments/results/startup.md)
         return {"xla_gpu_autotune_level": 0} if jax.default_backend() == "gpu" else {}
     # where devices are cores, threads would get in their way
     return {"xla_cpu_multi_thread_eigen": False} if number > 1 else {}
