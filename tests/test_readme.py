@@ -63,7 +63,7 @@ def test_links_lead_somewhere():
 
 def test_the_table_of_experiments_names_them_all():
     page = (ROOT / "experiments" / "README.md").read_text(encoding="utf-8")
-    named = set(re.findall(r"`((?:\w+\.)?\w+)`", page))
+    named = set(re.findall(r"`((?:\w+\.)*\w+)`", page))
     commands = {
         path.relative_to(ROOT / "experiments")
         .with_suffix("")
