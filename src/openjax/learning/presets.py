@@ -48,7 +48,8 @@ def quick() -> TrainSettings:
             clip_epsilon_end=0.2,
             discount=0.99,
         ),
-        first_flights=FirstFlightsSettings(updates=1500),
+        # where breaches weigh more, ways through a row of pillars aren't taken
+        first_flights=FirstFlightsSettings(updates=1500, crash=30.0, breach=1.0),
         # few tasks reach the archive in so short a run; drawn from too often, they'd be all that is learnt
         generator=GeneratorSettings(capacity=500, expansion=0.3),
         num_envs=640,
