@@ -269,9 +269,6 @@ def test_benchmark_writes_table_and_file(tmp_path, monkeypatch, capsys):
         "8",
         "--training_envs",
         "14",
-        "--devices",
-        "1",
-        "2",
     ]
     arguments += ["--steps", "5", "--seconds", "0.1", "--json", file]
     assert benchmark.main([str(argument) for argument in arguments]) == 0
@@ -284,7 +281,6 @@ def test_benchmark_writes_table_and_file(tmp_path, monkeypatch, capsys):
         ("training", 14),
         ("- fly", 14),
         ("- renew", 14),
-        ("training, 2 devices", 16),
     ]
     assert all(row["env_steps_per_second"] > 0 and row["compile_seconds"] > 0 for row in result["rows"])
     assert {"device", "versions", "commit"} <= result["machine"].keys()

@@ -27,9 +27,9 @@ def test_a_training_step_simulates_exactly_the_steps_that_are_counted():
     calls = []
 
     class Watched(Pursuit):
-        def step(self, key, state, action):
+        def step(self, key, state, action, wish=None):
             calls.append(key)
-            return super().step(key, state, action)
+            return super().step(key, state, action, wish)
 
     environment = Watched(TINY.environment)
     parts = build(TINY, environment)

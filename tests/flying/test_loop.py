@@ -10,7 +10,7 @@ import pytest
 from openjax.flying.controller import Pose, nominal_airframe
 from openjax.flying.game import Play
 from openjax.flying.limits import SafetySettings
-from openjax.flying.loop import Flight, Plan, flight_state
+from openjax.flying.loop import Flight, Plan, Record, flight_state
 from openjax.flying.state import Mode, PoseSample
 
 STARTS = ((0.5, 0.3, 0.5), (0.5, 0.0, 0.5), (0.5, -0.3, 0.5))
@@ -93,6 +93,10 @@ def test_ticks_leave_half_a_kilobyte_each_and_nothing_to_collect(flight):
         tracemalloc.stop()
         gc.enable()
     assert grown < 1000 * 512 and unreachable < 100
+
+
+def test_a_flight_may_end_before_its_first_tick():
+    assert Record(3).timing() == {"ticks": 0}
 
 
 def test_the_record_says_when_each_tick_was_due_and_done(flight):

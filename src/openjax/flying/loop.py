@@ -56,7 +56,8 @@ class Record:
     def table(self) -> tuple[np.ndarray, np.ndarray]:
         """(T, 3) due, sent, game; (T, N, 7) arrival, measured, mode, thrust, roll, pitch, yaw rate as they fit into packets."""
         rows = np.array(self._rows).reshape(-1, self._width)
-        return rows[:, :3], rows[:, 3:].reshape(len(rows), -1, 7)
+        # the number of vehicles is spelt out: a flight may end before its first tick
+        return rows[:, :3], rows[:, 3:].reshape(len(rows), self._width // 7, 7)
 
     def timing(self) -> dict:
         """Command age (ms) and missed deadlines of all ticks. A tick's deadline is the next tick's due
