@@ -1,6 +1,7 @@
 """The loop without links: what its ticks leave behind, and what its record says of them."""
 
 import gc
+import time
 import tracemalloc
 from types import SimpleNamespace
 
@@ -97,6 +98,16 @@ def test_ticks_leave_half_a_kilobyte_each_and_nothing_to_collect(flight):
 
 def test_a_flight_may_end_before_its_first_tick():
     assert Record(3).timing() == {"ticks": 0}
+
+
+def test_poses_that_are_never_of_now_end_a_flight_that_hasnt_begun():
+    """A motion capture that stamps them by another clock: nothing flies, and the flight says why."""
+    links = Hovering()
+    flight = Flight(links, links, flight_state(links, 3, SafetySettings()), Plan())
+    begin = time.perf_counter()
+    for k in range(0, 2200, 100):
+        flight.tick(begin + 0.01 * k, begin)
+    assert flight.over and "starts" in flight.state.drones[0].reason
 
 
 def test_the_record_says_when_each_tick_was_due_and_done(flight):

@@ -49,6 +49,7 @@ def test_all_well_is_no_line():
         (sample(quaternion=(0.0,) * 4), "attitude"),
         (sample(captured=(0.28, 0.2, 0.0)), "motion capture"),
         (sample(voltage=3.5), "charge"),
+        (sample(voltage=math.nan), "charge"),
         (sample(bits=Supervisor.TUMBLED), "upright"),
         (sample(bits=Supervisor.LOCKED), "locked"),
         (sample(bits=Supervisor.ARMED | Supervisor.CAN_FLY), "already"),

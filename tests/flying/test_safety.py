@@ -2,6 +2,9 @@
 
 import math
 import multiprocessing
+import socket
+import sys
+import time
 from dataclasses import replace
 
 import pytest
@@ -10,7 +13,7 @@ from hypothesis import strategies as st
 
 from openjax.flying.board import Board, Role
 from openjax.flying.controller import Pose, accelerate, nominal_airframe, roll_pitch_yaw
-from openjax.flying.guard import take_over
+from openjax.flying.guard import fly_down, take_over
 from openjax.flying.judge import Track
 from openjax.flying.limits import (
     SafetySettings,
@@ -62,6 +65,67 @@ def test_who_takes_over_knows_where_vehicles_have_got_to():
     assert first.estimate.position[0] == second.estimate.position[0] == pytest.approx(PLACES[0][0] + 0.04)
     assert roll_pitch_yaw(first.estimate.quaternion)[0] == pytest.approx(0.2, abs=1e-2)
     assert first.mode is second.mode is Mode.HOLD
+
+
+class Still:
+    """Links to vehicles that stay where they are, whatever they are told."""
+
+    def __init__(self):
+        self.sent = []
+
+    def observe(self):
+        now = time.perf_counter()
+        return tuple(PoseSample(still(now, p), now, 4.0, supervisor=0) for p in PLACES)
+
+    def send(self, set_points):
+        self.sent.append([s.mode for s in set_points])
+
+    def arm(self, on):
+        assert not on
+
+
+@pytest.mark.parametrize("role", Role)
+def test_a_stop_is_heard_by_whoever_lands(role):
+    """By the loop, too: it has the keys, and once it lands by itself nobody else asks for them."""
+    board, links = Board(3, multiprocessing.get_context("spawn"), silence=0.01), Still()
+    board.write(Role.LOOP, time.perf_counter(), pursuing())
+
+    def listen():
+        board.stopped = len(links.sent) == 5
+
+    last = fly_down(board, role, links, initial_state(PLACES), listen)
+    assert last.all_in(Mode.STOPPED)
+    assert all(OFF not in modes for modes in links.sent[:5]) and links.sent[5] == [OFF] * 3
+
+
+DONGLE = "\0openjax test of a dongle"
+
+
+def hold(board, ready):
+    """Have what only one process can have, until killed, which takes a while with so much memory to give back."""
+    held = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    held.bind(DONGLE)
+    board.enter(Role.LINKS)
+    memory = b"x" * (1 << 28)
+    ready.set()
+    time.sleep(60.0 + len(memory))
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux's abstract names, and pidfd")
+def test_what_an_ended_process_held_is_free():
+    """A radio dongle is one process's: who takes over opens it right after."""
+    context = multiprocessing.get_context("spawn")
+    board, ready = Board(1, context, silence=5.0), context.Event()
+    holder = context.Process(target=hold, args=(board, ready))
+    holder.start()
+    try:
+        assert ready.wait(60.0)
+        board.end_process(Role.LINKS)
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as free:
+            free.bind(DONGLE)
+    finally:
+        holder.kill()
+        holder.join()
 
 
 def test_a_lost_pose_lands_that_one_by_reckoning_and_stops_the_others():
@@ -256,6 +320,31 @@ def test_without_actions_all_wait_and_then_land():
     for k in range(1, 8):
         state, out = step(state, event(0.01 * k, actions=None))
     assert state.all_in(Mode.HOLD) and all(o.mode != OFF for o in out)
+
+
+def test_who_waits_because_it_was_asked_to_lands_with_one_in_trouble():
+    state, _ = step(pursuing(), event(request=Request.HOLD))
+    assert state.all_in(Mode.HOLD)
+    for k in range(2, 130):
+        low = PoseSample(still(0.01 * k, PLACES[0]), 0.01 * k, 3.0)
+        state, _ = step(state, event(0.01 * k, _0=low))
+    assert state.all_in(Mode.LAND)
+
+
+@pytest.mark.parametrize("ceiling", [0.6, 1.2, 3.0])
+def test_a_landing_by_reckoning_has_the_time_that_its_height_takes(ceiling):
+    """With motors off before they would fall, in a high room from metres."""
+    high = initial_state(PLACES, settings=SafetySettings(arena_height=ceiling))
+    drones = tuple(
+        Drone(Mode.PURSUIT, estimate=Pose(0.0, (*p[:2], ceiling), (0.0,) * 3, LEVEL), seen=0.0)
+        for p in PLACES
+    )
+    state, now = replace(high, drones=drones), 0.0
+    while not state.all_in(Mode.SETTLE):
+        now += 0.01
+        assert now < 20.0
+        state, _ = step(state, Event(now, (PoseSample(None, now, 4.0),) * 3))
+    assert all(drone.estimate.position[2] < 0.2 for drone in state.drones)
 
 
 def test_the_stop_key_stops_all_for_good():

@@ -7,6 +7,7 @@ can go on from it.
 
 import contextlib
 import os
+import select
 import signal
 from dataclasses import replace
 from enum import IntEnum
@@ -85,11 +86,16 @@ class Board:
         self._numbers[_PIDS + role] = 0.0
 
     def end_process(self, role: Role) -> None:
-        """Kill the process of `role`, should there be one: if it woke up, two would fly."""
+        """Kill the process of `role`, should there be one: if it woke up, two would fly. Returns once it has given back all
+        that it held, a radio dongle above all.
+        """
         pid = int(self._numbers[_PIDS + role])
         if pid:
-            with contextlib.suppress(ProcessLookupError):
+            with contextlib.suppress(OSError, AttributeError):  # it has gone; only Linux tells when one goes
                 os.kill(pid, signal.SIGKILL)
+                process = os.pidfd_open(pid)
+                select.select([process], [], [], self.silence)
+                os.close(process)
 
     def write(self, role: Role, now: float, state: State) -> None:
         """`role` flew a tick at `now` (s), and this is what it knows."""

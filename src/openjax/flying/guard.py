@@ -14,7 +14,7 @@ import multiprocessing
 import os
 import struct
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -24,12 +24,14 @@ from openjax.flying.crtp import LOG_TYPES, Port, Supervisor, SupervisorCommand
 from openjax.flying.safety import step
 from openjax.flying.set_point import SetPoint
 from openjax.flying.state import FLYING, LANDING, Event, Mode, PoseSample, Request, State
-from openjax.flying.swarm import POSE_BLOCK, WATCHDOG_PERIOD, Member, Swarm, send_set_point
+from openjax.flying.swarm import POSE_BLOCK, WATCHDOG_PERIOD, Member, Swarm, never_wait, send_set_point
 
 CHECK = 0.004
 """s between two looks."""
 DISARMING = 1.0
 """A vehicle is asked to disarm until it says that it has, for so long (s)."""
+OPENING = 0.5
+"""s that nobody takes over from the guard while it opens a dongle: half of what the firmware's watchdog waits."""
 TICK = 0.01
 
 
@@ -48,7 +50,13 @@ def take_over(state: State, now: float) -> State:
     return replace(state, drones=drones, time=now, action_time=now)
 
 
-def fly_down(board: Board, role: Role, vehicles: Swarm | RawLinks, state: State) -> State:
+def fly_down(
+    board: Board,
+    role: Role,
+    vehicles: Swarm | RawLinks,
+    state: State,
+    listen: Callable[[], None] = lambda: None,
+) -> State:
     """Wait and land from what stands on the board, disarm; the last state.
 
     Args:
@@ -56,11 +64,13 @@ def fly_down(board: Board, role: Role, vehicles: Swarm | RawLinks, state: State)
       role: whose process this is; it gives up should another one take over.
       vehicles: links.
       state: any of this flight, for its settings, pillars and airframe.
+      listen: called at each tick; has the board say so if the operator wants all motors off.
     """
     board.pilot = role
     now = due = time.perf_counter()
     state = take_over(board.read(state, now), now)
     while state.flying and board.pilot is role:
+        listen()
         request = Request.STOP if board.stopped else Request.NONE
         state, set_points = step(state, Event(time.perf_counter(), vehicles.observe(), request=request))
         vehicles.send(set_points)
@@ -119,6 +129,7 @@ class RawLinks:
         for uri, link in self._links.items():
             if link is None and (uri.startswith("udp:") or not udp_only):
                 self._links[uri] = cflib.crtp.get_link_driver(uri, lambda *_: None, lambda *_: None)
+                never_wait(self._links[uri])
 
     def observe(self) -> tuple[PoseSample, ...]:
         """What is known of each vehicle, after what has arrived."""
@@ -216,6 +227,7 @@ def watch(board: Board, parent: int, own: RawLinks, state: State) -> None:
         loop_silent = board.pilot is Role.LOOP and board.silent(Role.LOOP, now) > 3.0 * board.silence
         if board.flying and (links_silent or loop_silent):
             board.pilot = Role.GUARD
+            board.beat(Role.GUARD, now + OPENING)
             board.end_process(Role.LINKS)
             say("openjax fly: nothing from the links' process, the guard lands all vehicles")
             own.open()

@@ -8,6 +8,7 @@ from typing import Annotated
 from openjax.flying.controller import Airframe, Pose, Vector, level_acceleration
 from openjax.flying.set_point import RATES, SetPoint
 from openjax.ranges import Interval, check_intervals
+from openjax.vehicle.arena import Arena
 
 APART = 0.35
 """Waiting vehicles keep this distance (m)."""
@@ -17,9 +18,9 @@ APART = 0.35
 class SafetySettings:
     """Limits of a flight."""
 
-    arena_radius: Annotated[float, Interval("(0, 1000]")] = 0.9
+    arena_radius: Annotated[float, Interval("[0.3, 1000]")] = Arena.radius
     """No vehicle is let out of a cylinder of this radius (m)."""
-    arena_height: Annotated[float, Interval("(0, 1000]")] = 1.2
+    arena_height: Annotated[float, Interval("[0.6, 1000]")] = Arena.height
     """Nor above this (m)."""
     floor: Annotated[float, Interval("[0, 100]")] = 0.12
     """Nor, in pursuit, below this (m)."""
@@ -60,11 +61,15 @@ class SafetySettings:
     """On the way to the start (m/s)."""
     landing_speed: Annotated[float, Interval("(0, 10]")] = 0.4
     """m/s."""
-    landing_time: Annotated[float, Interval("(0, 600]")] = 4.0
-    """A landing that takes longer (s) ends with the motors off: by then a vehicle is near the floor, whatever its pose says."""
 
     def __post_init__(self):
         check_intervals(self, "safety.")
+
+    @property
+    def landing_time(self) -> float:
+        """A landing that takes longer (s) ends with the motors off: by then a vehicle that began at the highest place that is
+        allowed is near the floor, whatever its pose says."""
+        return (self.arena_height + self.outside) / self.landing_speed
 
 
 def stopping_point(settings: SafetySettings, pose: Pose, acceleration: Vector | None = None) -> Vector:

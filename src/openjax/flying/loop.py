@@ -242,7 +242,8 @@ class Flight:
             if self._flown >= plan.episodes:
                 return Request.LAND
             return Request.PURSUE
-        if any(m in (Mode.TRANSFER, Mode.READY) for m in state.modes) and waited > TRANSFER:
+        if any(m in (Mode.GROUND, Mode.TRANSFER, Mode.READY) for m in state.modes) and waited > TRANSFER:
+            self._alarm = f"not all at their starts after {TRANSFER:g} s"
             return Request.LAND
         if self._episode >= 0 and (self._play.over or now - self._begun > plan.episode_seconds):
             self._end_episode("over")

@@ -78,7 +78,7 @@ def _firmware_faults(settings, sample, rate) -> Iterator[str]:
         yield "it is armed or flies already; end the program that commands it"
     elif not bits & (Supervisor.CAN_BE_ARMED | Supervisor.CAN_FLY):
         yield "its firmware can't be armed; look at its console"
-    if sample.voltage < settings.battery_start:
+    if not sample.voltage >= settings.battery_start:
         yield f"battery at {sample.voltage:.2f} V; charge it to {settings.battery_start:g} V or more"
     if rate < SHARE * RATE:
         yield f"{rate:.0f} of {RATE:.0f} poses a second arrive; bring the antenna nearer or change the channel"

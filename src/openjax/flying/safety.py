@@ -170,7 +170,7 @@ def _react(state, drones, troubles) -> tuple[Drone, ...]:
             drone = drone.to(trouble[0], now, anchor, trouble[1])
         elif drone.mode is Mode.LIFT and team:
             drone = drone.to(Mode.STOPPED, now, reason="another is in trouble")
-        elif drone.mode in _UNTROUBLED and team:
+        elif team and not drone.reason and drone.mode in (*_UNTROUBLED, Mode.HOLD):
             drone = drone.to(Mode.HOLD, now, anchor, "another is in trouble")
         elif drone.mode is Mode.HOLD and drone.reason and now - drone.since > state.settings.hold_time:
             drone = drone.to(Mode.LAND, now)

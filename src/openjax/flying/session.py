@@ -117,12 +117,14 @@ class Session:
         return ""
 
     def _arm(self):
-        self.links.arm()
         deadline = time.monotonic() + ARMING
-        while not all(s.supervisor & Supervisor.ARMED for s in self.links.observe()):
+        while True:
+            self.links.arm()  # a packet may be lost
+            time.sleep(0.03)
+            if all(s.supervisor & Supervisor.ARMED for s in self.links.observe()):
+                return
             if time.monotonic() > deadline:
                 raise UserError("a vehicle can't be armed; look at its console")
-            time.sleep(0.01)
 
     def _left_to_others(self) -> str:
         """Return once the vehicles are down; land them here if nobody else does. What happened."""
@@ -133,17 +135,21 @@ class Session:
             time.sleep(0.005)
             now = time.perf_counter()
             board.beat(Role.LOOP, now)
-            if self.requests() is Request.STOP:
-                board.stopped = True
+            self._listen()
             lander = max(lander, board.pilot)
             if all(board.silent(role, now) > board.silence for role in (Role.LINKS, Role.GUARD)):
                 lander = Role.LOOP
                 for role in (Role.LINKS, Role.GUARD):
                     board.end_process(role)
                 self._own.open()
-                fly_down(board, Role.LOOP, self._own, self._state)
+                fly_down(board, Role.LOOP, self._own, self._state, self._listen)
         board.leave(Role.LOOP)
         return f"all vehicles were landed by the process of the {lander.name.lower()}"
+
+    def _listen(self):
+        """Tell whoever flies that the operator wants all motors off, if so."""
+        if self.requests() is Request.STOP:
+            self.links.board.stopped = True
 
     def _wait_for_poses(self):
         """Return once each vehicle has a pose that is fresh. UserError: one has none."""
@@ -152,7 +158,7 @@ class Session:
             now = time.perf_counter()
             samples = self.links.observe()
             newest = zip(measured_times(samples), samples, strict=True)
-            old = [now - t > FRESH or s.own is None for t, s in newest]
+            old = [not abs(now - t) <= FRESH or s.own is None for t, s in newest]
             if not any(old):
                 return
             if time.monotonic() > deadline:

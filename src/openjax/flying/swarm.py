@@ -3,6 +3,7 @@
 import contextlib
 import logging
 import math
+import queue
 import struct
 import threading
 import warnings
@@ -131,6 +132,24 @@ def send_set_point(crazyflie, set_point: SetPoint) -> None:
         commander.send_setpoint_manual(*manual_arguments(set_point))
 
 
+def never_wait(link) -> None:
+    """Have a link leave out packets that it has no room for.
+
+    A radio's has room for one, until its vehicle acknowledges; `cflib` would wait two seconds for a vehicle that doesn't, and
+    meanwhile send the others nothing. Over UDP there is always room.
+    """
+    room = getattr(link, "out_queue", None)
+
+    def send_packet(packet) -> bool:
+        with contextlib.suppress(queue.Full):
+            room.put(packet, block=False)
+            return True
+        return False
+
+    if room is not None:
+        link.send_packet = send_packet
+
+
 def _restart(uri: str, crazyflie) -> None:
     """Restart a vehicle whose firmware is locked: its motors are off."""
     from cflib.utils.power_switch import PowerSwitch
@@ -176,6 +195,8 @@ class Swarm:
             for member in self.members:
                 self._open(member, Crazyflie, timeout)
             self._start_logs(timeout)
+            for member in self.members:
+                never_wait(member.crazyflie.link)
         except BaseException:
             self.close()
             raise
