@@ -25,7 +25,8 @@ from openjax.pursuit import SCENARIOS
 from openjax.show.metrics import read_metrics
 from openjax.store.checkpoint_files import is_checkpoint, load_arrays
 from openjax.store.checkpoints import Checkpoints
-from openjax.store.policy_files import shipped_policies
+from openjax.store.old_names import train_settings
+from openjax.store.policy_files import WEIGHTS, load_policy_file, shipped_policies
 
 pytestmark = pytest.mark.slow
 
@@ -244,9 +245,8 @@ def test_shipped_policies_act_in_their_game_and_refuse_another():
 
 @pytest.mark.parametrize("name", ["evaders", "evaders_scripted"])
 def test_the_preset_is_what_the_shipped_weights_of_that_name_come_from(name):
-    shipped = openjax.load_policy(name).settings
-    network = {"compute_type": shipped.network.compute_type}  # of this machine
-    preset = openjax.preset(name, network=network)
+    shipped = train_settings(load_policy_file(WEIGHTS / f"{name}.npz")[1], name)
+    preset = openjax.preset(name)
     assert (
         preset.first_flights.updates == shipped.first_flights.updates == 0
     )  # so that the rest of it says nothing
@@ -331,6 +331,11 @@ def wrong_layout(change):
         (evaluate, "--policy {run} --scenario {folder}/outside.toml", "outside the arena"),
         (evaluate, "--policy {run} --scenario {folder}/over.toml", "over the start"),
         (evaluate, "--policy {run} --json {folder}/no/where.json", "doesn't exist"),
+        (
+            evaluate,
+            "--policy {run} --environment.evaders learned",
+            "a name isn't enough; --opponent takes a file",
+        ),
         (evaluate, "--policy {run} --episode 3", "unknown setting --episode; did you mean --episodes?"),
         (benchmark, "--envs 0", "--envs is 0; it must be a whole number in"),
     ],

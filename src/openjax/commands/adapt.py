@@ -72,6 +72,7 @@ def main(arguments: Sequence[str]) -> int:
 
     console, on_cpu = output_console(), jax.default_backend() == "cpu"
     command = dataclasses.replace(command, episodes=command.episodes or (128 if on_cpu else 1024))
+    _check(command)
     with Steps(f"adapting {command.policy}", ON_CPU if on_cpu else STEPS, console) as steps:
         results = adapt(command, steps.begin)
     for line in in_words(results):
@@ -84,7 +85,6 @@ def adapt(command: AdaptCommand, tell: Callable[[str], None] = lambda step: None
     """Do all of it and write it down; `tell` hears the steps. Raises UserError for flights that can't be diagnosed or an
     unusable policy."""
     started, seconds, steps = time.monotonic(), {}, iter(STEPS)
-    _check_flights(command.flights)
     diagnosis = _Diagnosis(command)
     tell(next(steps))
     try:
@@ -246,12 +246,14 @@ def won_back(flown: dict) -> dict[str, float | None]:
     return shares
 
 
-def _check_flights(path):
-    """What can be wrong with them is told before anything is compiled. Raises UserError."""
+def _check(command):
+    """What can be wrong with flights and policy is told before anything is compiled. Raises UserError."""
     from openjax.flights.case import load_case
+    from openjax.store.policies import load_policy
     from openjax.vehicle.effects.effects_file import load_effects
 
-    (load_case if path.is_dir() else load_effects)(path)
+    (load_case if command.flights.is_dir() else load_effects)(command.flights)
+    load_policy(command.policy)
 
 
 class _Diagnosis:

@@ -35,7 +35,7 @@ def train(
     Args:
       settings: of the run; None is the preset for this machine (`openjax.preset`).
       out: directory of the run; None is runs/DATE.
-      minutes: stop after this time.
+      minutes: of learning; compiling comes before, the report after.
       start_from: policy whose networks the run starts with.
       compare_with: policy that the final table and the animation show beside the trained one.
       devices: how many, or "all".

@@ -69,7 +69,9 @@ def main(arguments: Sequence[str]) -> int:
         cache_programs()
     evaluators: dict = {}
     policies = prepare(command, arguments)
-    _show(command, [(loaded.source, fly_scenarios(own, loaded, evaluators)[0]) for own, loaded in policies])
+    _show(
+        command, [(own, loaded.source, fly_scenarios(own, loaded, evaluators)[0]) for own, loaded in policies]
+    )
     return 0
 
 
@@ -133,6 +135,10 @@ def _game(command, loaded):
     from openjax.store.environments import make_environment
 
     settings = command.environment
+    if "learned" in settings.evaders and command.opponent is None:
+        raise UserError(
+            "--environment.evaders learned: a name isn't enough; --opponent takes a file of openjax exploit"
+        )
     if command.scenario == "all":
         scenarios = list(SCENARIOS.values())
     else:
@@ -146,14 +152,17 @@ def _game(command, loaded):
 def _show(command, results):
     """Print the tables and write the file: a record, a list of them, or such a list by policy."""
     from openjax.commands.evaluator import results_table, spread_table
+    from openjax.commands.run_words import unlike_the_papers
     from openjax.store.settings_files import write_json
 
     console = output_console()
-    for source, rows in results:
-        console.print(results_table(f"{source}, mean policy, seed {command.seed}", rows))
+    for own, source, rows in results:
+        evaders = (own.opponent,) if own.opponent else own.environment.evaders
+        game = unlike_the_papers(dataclasses.replace(own.environment, evaders=evaders))
+        console.print(results_table(f"{source}, mean policy, seed {command.seed}", rows, game))
     if len(results) > 1:
-        console.print(spread_table([rows for _, rows in results]))
+        console.print(spread_table([rows for *_, rows in results]))
     if command.json is not None:
-        plain = [rows if command.scenario == "all" else rows[0] for _, rows in results]
-        sources = [source for source, _ in results]
+        plain = [rows if command.scenario == "all" else rows[0] for *_, rows in results]
+        sources = [source for _, source, _ in results]
         write_json(command.json, plain[0] if len(plain) == 1 else dict(zip(sources, plain, strict=True)))

@@ -168,10 +168,11 @@ def record_of(scenario: str, episodes: int, summary: dict, extra: tuple[str, ...
     return {name: clean(values[name]) for name in (*FIELDS, *extra)}
 
 
-def results_table(title: str, rows: Sequence[dict]) -> Table:
-    """Records as a table."""
+def results_table(title: str, rows: Sequence[dict], game: str) -> Table:
+    """Records as a table, below it a sentence on the game."""
     heads = ("epi-\nsodes", "capture\nrate", "capture\nstep", "colli-\nsions", "pillar/drone/\nbounds")
-    table = numbers_table(title, "scenario", *heads, "crash\nrate", "over-\nspeed", "predicted\noff by, m")
+    heads += ("crash\nrate", "over-\nspeed", "predicted\noff by, m")
+    table = numbers_table(title, "scenario", *heads, caption=game)
     for row in rows:
         parts = row["collision_parts"]
         table.add_row(

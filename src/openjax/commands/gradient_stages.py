@@ -35,7 +35,7 @@ def compile_first_flights(
     policy: Any,
     say: Callable[[str], None],
     over: Callable[[], bool],
-) -> Callable[[PolicyParameters, jax.Array], PolicyParameters | None]:
+) -> tuple[Callable[[], Any], Callable[[PolicyParameters, jax.Array], PolicyParameters | None]]:
     """Start to compile the stage before MAPPO for parameters of these shapes, in the background.
 
     Args:
@@ -45,7 +45,8 @@ def compile_first_flights(
       over: is asked every few seconds whether to stop.
 
     Returns:
-      the stage, which waits for the compiler: (fresh parameters, key) -> parameters; None where it was over before it began.
+      a function that waits for the compiler, and the stage: (fresh parameters, key) -> parameters; None where it was over
+      before it began.
     """
     how = settings.first_flights
     flights = FirstFlights(how, first_game(environment, how), _exact(settings, environment))
@@ -57,10 +58,10 @@ def compile_first_flights(
     )
     carry = abstract_like(jax.eval_shape(begin, policy, key), shardings)
     lowered = some.lower(carry, key, done), begin.lower(policy, key)
-    ready = [in_background(program.compile) for program in lowered]
+    some_ready, begin_ready = (in_background(program.compile) for program in lowered)
 
     def learn(parameters, key):
-        some, begin = (wait() for wait in ready)
+        some, begin = some_ready(), begin_ready()
         if over():
             return None
         started = time.monotonic()
@@ -79,7 +80,7 @@ def compile_first_flights(
             )
         return parameters.replace(actor=carry[0].actor)
 
-    return learn
+    return lambda: (some_ready(), begin_ready()), learn
 
 
 def _number_of_devices(policy, worlds):

@@ -59,8 +59,8 @@ def closing_words(settings: TrainSettings, run: Path, on_cpu: bool) -> list[str]
         "A crash: any drone touches the floor, a pillar or another drone, or tips over, at any time of "
         f"the {seconds:.0f} s, after the capture, too."
     ]
-    if differs := _differs(game):
-        lines.append(f"Unlike the paper's game: {', '.join(differs)}.")
+    if differs := unlike_the_papers(game):
+        lines.append(differs)
     view = f"openjax view --policy {run}"
     if layouts := layouts_like(game):
         view += f" --scenario {layouts[-1].name}"
@@ -73,10 +73,16 @@ def closing_words(settings: TrainSettings, run: Path, on_cpu: bool) -> list[str]
     return [*lines, "\n  ".join(["Next:", *steps])]
 
 
-def _differs(game):
-    """How a game differs from the paper's, in words; empty where it doesn't."""
+def unlike_the_papers(game: PursuitSettings) -> str:
+    """How a game differs from the paper's, as a sentence; empty where it doesn't."""
     paper = PursuitSettings()
     words = []
+    if game.evaders != paper.evaders:
+        words.append(f"the evader is {' or '.join(dict.fromkeys(game.evaders))}")
+    if game.vehicles:
+        words.append("every pursuer is another vehicle")
+    if game.speed_limit != paper.speed_limit:
+        words.append("no clamp of the speed")
     if game.evader_speed < paper.evader_speed:
         words.append(f"the evader flies {game.evader_speed:g} m/s instead of {paper.evader_speed:g}")
     if (game.min_pillars, game.max_pillars) != (paper.min_pillars, paper.max_pillars):
@@ -87,4 +93,4 @@ def _differs(game):
         words.append("level starts instead of tilted ones")
     if game.time_step > paper.time_step:
         words.append(f"{1 / game.time_step:.0f} commands a second instead of {1 / paper.time_step:.0f}")
-    return words
+    return f"Unlike the paper's game: {', '.join(words)}." if words else ""

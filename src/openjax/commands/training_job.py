@@ -36,7 +36,7 @@ from openjax.policy import PolicyParameters
 from openjax.policy.growth import with_longer_history
 from openjax.pursuit import Pursuit
 from openjax.show.metrics import METRICS_FILE, MetricsWriter, NoMetrics
-from openjax.show.progress import Progress, duration
+from openjax.show.progress import Progress
 from openjax.store.checkpoint_files import load_orbax
 from openjax.store.checkpoints import Checkpoints
 from openjax.store.leaves import abstract_like, named_leaves, place
@@ -64,7 +64,7 @@ class TrainingJob:
     """Of all processes together."""
     processes: Processes
     time_limit: float
-    """Seconds of training after which to stop."""
+    """Seconds of learning after which to stop; compiling comes before."""
     layout_episodes: int
     compare_with: str | None
     """Policy that the report shows beside the trained one."""
@@ -140,7 +140,7 @@ class _Run:
     def __init__(self, job: TrainingJob, directory: RunDirectory, stop: StopRequest, progress: Progress):
         self.job, self.directory, self.stop, self.progress = job, directory, stop, progress
         self.settings, self.processes = job.settings, job.processes
-        self.taught = False
+        self.taught, self.began = False, float("inf")
         self.checkpoints = Checkpoints(directory.checkpoints, processes=job.processes)
         self.processes.advice = f"go on with openjax train --resume {directory.path} --devices all"
 
@@ -163,14 +163,12 @@ class _Run:
             self.directory.write_settings(settings, job.facts)
         over = self._over()
         if over and not self.first_update and not self.taught:
-            spent = f"{duration(time.monotonic() - job.started)} minutes went into compiling"
-            self.progress.message(
-                f"nothing was learnt: {spent}, and what is being compiled is kept for the next run"
-            )
+            self.progress.message("nothing was learnt yet; ending as soon as the compiler does")
             return None
         with self._metrics() as metrics:
             self.progress.phase("compiling the training step", announce=not (done or over))
             self._compile_beside((lambda _=None: True) if over else step_ready)
+            self.began = min(self.began, time.monotonic())
             loop = Loop(
                 step,
                 self._plan(seconds),
@@ -193,7 +191,7 @@ class _Run:
             total_updates=settings.total_updates,
             steps_per_update=settings.steps_per_update,
             validation_interval=settings.validation_interval,
-            time_limit=seconds + self.job.time_limit,
+            time_limit=seconds + self.began - self.job.started + self.job.time_limit,
             # an accelerator would wait for the validation's program
             validate_start=self.taught and jax.default_backend() == "cpu",
         )
@@ -232,7 +230,7 @@ class _Run:
 
     def _over(self):
         """Whether the run is to end: a signal to any process counts, and the first one's clock."""
-        late = time.monotonic() - self.job.started >= self.job.time_limit
+        late = time.monotonic() - self.began >= self.job.time_limit
         asked = self.processes.everyone([self.stop.name, late])
         return any(name is not None for name, _ in asked) or asked[0][1]
 
@@ -252,9 +250,12 @@ class _Run:
                 self.directory.start_policy, carry.policy, settings, {"update": 0}, storage="float32"
             )
         if self.first_flights is not None:
+            ready, learn = self.first_flights
+            self.progress.phase("compiling the first flights")
+            ready()
+            self.began = time.monotonic()
             self.progress.phase("learning to fly by the gradient through the simulation")
-            key = jax.random.fold_in(jax.random.key(settings.seed), 1)
-            policy = self.first_flights(carry.policy, key)
+            policy = learn(carry.policy, jax.random.fold_in(jax.random.key(settings.seed), 1))
             self.taught = policy is not None
             carry = carry.with_policy(policy) if self.taught else carry
         return place(carry, carry_shardings(job.devices)), 0, 0.0

@@ -33,8 +33,7 @@ class TrainCommand:
     steps: Annotated[int | None, Interval("[1, 1e15]")] = None
     """Environment steps of the whole run, short for --total_steps."""
     minutes: Annotated[float | None, Interval("(0, 1000000]")] = None
-    """Stop training after this time from the start; compiling isn't interrupted, and the report comes on top. A resumed run has
-    it anew."""
+    """Learn for so long: compiling comes before it, the report after. A resumed run has it anew."""
     resume: Path | None = None
     """Go on with the run in this directory, exactly where it stopped."""
     start_from: str | None = None

@@ -99,7 +99,7 @@ def in_words(change: Change) -> list[str]:
             if n in change.figures
         ]
     differences = ", ".join(
-        f"{n} {100 * v.value:+.1f} % [{100 * v.low:+.1f}, {100 * v.high:+.1f}]"
+        f"{n} {100 * v.value:+z.1f} % [{100 * v.low:+z.1f}, {100 * v.high:+z.1f}]"
         for n, v in change.figures.items()
         if n in TRIMS
     )

@@ -26,7 +26,8 @@ def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> 
     """
     path = Path(path)
     if not path.is_dir():
-        raise UserError(f"{path}: no such folder; a case is a folder of flight logs with a vehicle.toml")
+        what = "is a file" if path.exists() else "no such folder"
+        raise UserError(f"{path}: {what}; a case is a folder of flight logs with a vehicle.toml")
     logs = find_logs(path)
     if not logs:
         raise UserError(f"{path}: holds no flight log (.csv, .csv.gz, micro-SD log or ROS 2 bag)")

@@ -14,6 +14,7 @@ from openjax.learning import TrainSettings
 from openjax.learning.train_state import policy_leaf
 from openjax.policy import NetworkSettings, Policy, PolicyParameters, PredictorSettings
 from openjax.pursuit import Observation, Pursuit, PursuitSettings
+from openjax.pursuit.evaders import SCRIPTED
 from openjax.store import DEFAULT_POLICY
 from openjax.store.checkpoint_files import is_checkpoint, load_arrays
 from openjax.store.checkpoints import Checkpoints
@@ -45,10 +46,10 @@ class LoadedPolicy:
             policy = Heuristic.for_environment(self.policy.name, environment)
             return dataclasses.replace(self, policy=policy)
         game, own = environment.settings, self.settings.environment
-        for name in ("self_size", "observed_pillars", "history_length", "frame_size"):
+        for name in ("num_pursuers", "self_size", "observed_pillars", "history_length", "frame_size"):
             if getattr(game, name) != getattr(own, name):
                 raise UserError(
-                    f"the policy was trained with {name} {getattr(own, name)}, here it's "
+                    f"policy {self.source} was trained with {name} {getattr(own, name)}, here it's "
                     f"{getattr(game, name)}: pursuers, observation and history must stay as in training"
                 )
         if isinstance(self.policy, CraftPolicy):  # its controller flies another arena, or vehicle
@@ -136,6 +137,10 @@ def _from_run(run, source):
 
 
 def _build(settings, leaves, source):
+    game = settings.environment
+    # learned evaders' networks aren't in a policy's file
+    scripted = tuple(name for name in game.evaders if name in SCRIPTED) or PursuitSettings().evaders
+    settings = dataclasses.replace(settings, environment=dataclasses.replace(game, evaders=scripted))
     if jax.default_backend() == "cpu":  # CPUs emulate bfloat16, slowly
         settings = dataclasses.replace(
             settings, network=dataclasses.replace(settings.network, compute_type="float32")

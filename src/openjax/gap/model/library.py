@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import block_diag
 
-from openjax.errors import UserError
+from openjax.errors import UserError, suggestion
 from openjax.vehicle.effects import EFFECTS, Card
 
 # {effect: its card}: what can be diagnosed.
@@ -59,7 +59,7 @@ def library(without=()) -> Library:
     """All effects but those in `without`. Raises UserError for unknown names."""
     for name in without:
         if name not in EFFECTS:
-            raise UserError(f"--without {name}: no such effect; known: {', '.join(EFFECTS)}")
+            raise UserError(f"--without {name}: no such effect; {suggestion(name, EFFECTS)}")
     return Library(tuple(e for e in EFFECTS if e in CARDS and e not in without))
 
 

@@ -61,7 +61,8 @@ def sentence(report: Report) -> str:
         f"{' or '.join([e, *report.equivalent.get(e, ())]).replace('_', ' ')} ({100 * report.shares.effects[e].value:.0f} %)"
         for e in named
     )
-    text = f"What the simulator misses is mostly {parts}"
+    whole = sum(report.shares.effects[e].value for e in named) > 0.995  # 100 %, as it is shown
+    text = f"What the simulator misses is {'' if whole else 'mostly '}{parts}"
     if report.parameters:
         those = "it" if len(named) == 1 else "them"
         text += f"; with {those}, errors on held-out flights shrink by {100 * report.gap.reduction:.0f} %"

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from openjax.errors import UserError
+from openjax.errors import UserError, suggestion
 
 UNBOUNDED = 1e6
 """An acceleration (m/s^2) that bounds nothing."""
@@ -68,4 +68,4 @@ def check_evaders(names: tuple[str, ...]) -> None:
         raise UserError("environment.evaders is empty; it names at least one evader, for example field")
     for name in names:
         if name not in EVADERS:
-            raise UserError(f"evader {str(name)[:60]}: unknown; possible are {', '.join(SCRIPTED)}")
+            raise UserError(f"evader {str(name)[:60]}: unknown; {suggestion(str(name), SCRIPTED)}")
