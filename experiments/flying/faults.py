@@ -17,14 +17,22 @@ from openjax.flying.limits import SafetySettings
 
 FOLLOWED = "camera drifts, the estimator follows"
 """A limit: with nothing on board that sees the floor, a slow drift looks like a tilt that is wrong by two degrees."""
+ASLEEP = "all processes stand still for a while"
+"""Another: meanwhile vehicles turn on as they were told last, then level, then stop."""
+BEYOND = (FOLLOWED, ASLEEP)
+"""What nothing in these processes can mend."""
+GONE = ("drone gone", "drone restarts")
+"""That vehicle is lost; the others mustn't be."""
 CAMERA = (
     "camera lost", "camera lost for a while", "camera frozen", "camera frozen, all", "camera: one frame wrong",
     "camera: four frames wrong", "camera moved", "camera: a number that is none", "camera: no attitude",
-    "camera: yaw turned", "camera: bodies swapped", "camera scaled", "camera late", "camera drifts", FOLLOWED,
+    "camera: yaw turned", "camera: bodies swapped", "camera scaled", "camera late", "camera restarts", "camera: clock steps",
+    "camera drifts", FOLLOWED,
 )  # fmt: skip
 RADIO = (
     "poses lost", "poses lost for a while", "packets lost", "poses frozen", "poses jump",
-    "poses: a number that is none", "gyroscope: a number that is none", "poses: no attitude",
+    "poses: a number that is none", "gyroscope: a number that is none", "poses: no attitude", "poses out of order",
+    "poses: clock steps",
 )  # fmt: skip
 WILD = {
     "policy wild": lambda tick, n, shape: np.random.default_rng(10 * tick + n).uniform(-1.0, 1.0, shape),
@@ -36,7 +44,7 @@ WILD = {
 """The policy's action (N, 4) at a tick of flight n: drawn anew; one extreme for good; from one to the other."""
 OTHER = (
     "loop stopped", "links stopped", "guard stopped", "loop and links stopped", "loop and guard stopped",
-    "policy silent", "policy: a number that is none", *WILD, "battery low", "drone gone", "key",
+    "policy silent", "policy: a number that is none", *WILD, "battery low", "battery unknown", *GONE, "key", ASLEEP,
 )  # fmt: skip
 KINDS = (*CAMERA, *RADIO, *OTHER)
 START = 0.2
@@ -61,6 +69,11 @@ class Fault:
     def captured(self) -> bool:
         """Whether there is motion capture in this flight."""
         return self.kind in CAMERA or self.direction < math.pi
+
+    @property
+    def unheld(self) -> int | None:
+        """The vehicle that nobody can hold, if there is one."""
+        return self.vehicle if self.kind in GONE else None
 
     def on(self, now: float) -> bool:
         """Whether it is there at `now` (s)."""
@@ -99,17 +112,17 @@ class PoseDamage:
     def __init__(self, fault: Fault, vehicles: int):
         self._fault, self._random = fault, random.Random(fault.time)
         self._held: dict[tuple, Pose] = {}
-        self._past = [deque(maxlen=50) for _ in range(vehicles)]
+        self._past = {
+            (source, i): deque(maxlen=50) for source in ("camera", "radio") for i in range(vehicles)
+        }
         self._field = self._random.randrange(100)
 
     def __call__(self, source: str, i: int, now: float, pose: Pose, others) -> Pose | None:
         """The pose received from `source`, "camera" or "radio"; `others`: true poses of all."""
         fault = self._fault
-        past = self._past[i]
-        if source == "camera":
-            past.append(pose)
+        self._past[source, i].append(pose)
         mine = i == fault.vehicle or fault.kind.endswith("all")
-        if fault.kind == "drone gone" and mine and fault.on(now) and source == "radio":
+        if fault.kind in GONE and mine and fault.on(now) and source == "radio":
             return None
         names = CAMERA if source == "camera" else RADIO
         if fault.kind not in names or not mine or not fault.on(now):
@@ -142,13 +155,21 @@ class PoseDamage:
             other = others[(i + 1) % len(others)]
             return pose._replace(position=other.position, quaternion=other.quaternion)
         if what == "late":
-            return self._past[i][max(len(self._past[i]) - 1 - round(100 * fault.amount), 0)]._replace(
-                time=now
-            )
+            return self._earlier(source, i, round(100 * fault.amount))._replace(time=now)
+        if what == "restarts":
+            return None if since < 0.5 * fault.amount else _shifted(pose, away, 1.0)
+        if what == "clock steps":
+            return pose._replace(time=pose.time + math.copysign(fault.amount, math.cos(fault.direction)))
+        if what == "out of order":
+            return self._earlier(source, i, self._random.randrange(4))
         name = "body_rates" if kind.startswith("gyroscope") else ("position", "quaternion")[self._field % 2]
         values = list(getattr(pose, name))
         values[self._field % len(values)] = fault.number
         return pose._replace(**{name: tuple(values)})
+
+    def _earlier(self, source, i, ticks) -> Pose:
+        past = self._past[source, i]
+        return past[max(len(past) - 1 - ticks, 0)]
 
 
 def _shifted(pose: Pose, away, share: float) -> Pose:
@@ -161,7 +182,7 @@ def outcome(fault: Fault, times, position, off, begin: float) -> dict:
     times (T,), position (T, N, 3) m and off (T, N), motors off, are the truth. `out`: farthest beyond arena or ceiling (m);
     `seconds` until all stayed on the floor with their motors off, None if they didn't; `held`: (N,) whom one can hold.
     """
-    held = np.array([not (fault.kind == "drone gone" and i == fault.vehicle) for i in range(off.shape[1])])
+    held = np.arange(off.shape[1]) != fault.unheld
     late = times >= begin
     times, position, off = times[late], position[late][:, held], off[late][:, held]
     height, limits = position[..., 2], SafetySettings()

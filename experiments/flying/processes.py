@@ -24,9 +24,10 @@ from pathlib import Path
 import numpy as np
 
 from experiments.flying.faults import (
+    BEYOND,
     CAMERA,
     ENDING,
-    FOLLOWED,
+    GONE,
     MARGIN,
     RADIO,
     WILD,
@@ -38,8 +39,13 @@ from experiments.flying.faults import (
 
 ROLES = ("loop", "links", "guard")
 SIGNALS = ("KILL", "STOP", "TERM", "HUP", "INT", "TSTP", "QUIT")
-UNSENT = ("poses: a number that is none", "poses: no attitude")
-"""No packet can say so."""
+UNSENT = (
+    *BEYOND,
+    "poses: a number that is none",
+    "poses: no attitude",
+    *(k for k in (*CAMERA, *RADIO) if "clock" in k or "order" in k),
+)
+"""No packet, or adapter, can say so; or nothing mends it."""
 KEYS = {
     "key l": "l", "key h, l a second later": "h…l", "h and l": "hl", "Ctrl-C": "\x03", "Ctrl-Z": "\x1a", "Ctrl-\\": "\x1c",
     "space": " ", "q": "q", "space and l": " l", "l and space": "l ", "x x space": "xx ", "an arrow and space": "\x1b[A ",
@@ -52,11 +58,12 @@ GROUPS = {
     "a signal to one process": [f"{name} {role}" for name in SIGNALS for role in ROLES],
     "to several processes": (
         "TERM group", "HUP group", *(f"{name} {a}+{b}" for name in ("KILL", "STOP") for a, b in combinations(ROLES, 2)),
-        "KILL links then guard", "KILL loop then links", "KILL links then space",
+        "KILL links then guard", "KILL loop then links", "KILL links then space", "KILL links+guard then space",
+        *(f"STOP {role} then CONT" for role in (*ROLES, "loop+links+guard")),
     ),
     "keys, terminal closed": (*KEYS, "terminal closed"),
-    "motion capture": [kind for kind in CAMERA if kind != FOLLOWED],
-    "own estimates, links": [kind for kind in (*RADIO, "drone gone") if kind not in UNSENT],
+    "motion capture": [kind for kind in CAMERA if kind not in UNSENT],
+    "own estimates, links": [kind for kind in (*RADIO, *GONE) if kind not in UNSENT],
     "the policy": ("policy: a number that is none", *WILD, "policy fails"),
     "wrong from the start": START,
     "strangers, a second fly, nothing": ("strangers' packets", "none", "second fly", "none with camera"),
@@ -249,24 +256,24 @@ class Flown:
             self._open = False
         elif " then " in kind:
             first, second = target.split(" then ")
-            self._kill("KILL", first)
-            time.sleep(0.3 if second in KEYS else 0.05)
+            self._kill(name, first)
+            time.sleep(0.05 if second in ROLES else 0.3)
             if second in KEYS:
                 os.write(self._terminal, KEYS[second].encode())
             else:
-                self._kill("KILL", second)
+                self._kill(*(("CONT", first) if second == "CONT" else ("KILL", second)))
         elif name in SIGNALS:
-            for role in target.split("+"):
-                self._kill(name, role)
+            self._kill(name, target)
         elif kind == "strangers' packets":
             self._strangers()
         elif kind == "second fly":
             self._try_second()
 
-    def _kill(self, name, role):
-        send, role = (os.killpg, "loop") if role == "group" else (os.kill, role)
-        with contextlib.suppress(ProcessLookupError, KeyError):
-            send(self._pids[role], getattr(signal, f"SIG{name}"))
+    def _kill(self, name, target):
+        send, roles = (os.killpg, "loop") if target == "group" else (os.kill, target)
+        for role in roles.split("+"):
+            with contextlib.suppress(ProcessLookupError, KeyError):
+                send(self._pids[role], getattr(signal, f"SIG{name}"))
 
     def _strangers(self):
         """Scans, echoes, requests and noise from another address; set-points aren't among them."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
@@ -22,9 +23,12 @@ import tyro
 
 import openjax
 from experiments.flying.faults import (
+    ASLEEP,
+    BEYOND,
     ENDING,
     FALL,
     FOLLOWED,
+    GONE,
     KINDS,
     MARGIN,
     WILD,
@@ -143,10 +147,11 @@ class Worlds:
         """10 ms of all flights; whether any goes on."""
         now, samples = self.swarm.now, list(self.swarm.observe())
         flown = np.flatnonzero(self._down < LAIN).tolist()
+        awake = [w for w in flown if not (self.faults[w].kind == ASLEEP and self.faults[w].on(now))]
         self.swarm.asleep = {
             w * self.n + i for w in set(range(len(self.faults))) - set(flown) for i in range(self.n)
         }
-        for w in flown:
+        for w in awake:
             first = w * self.n
             before = self.states[w].drones
             if self._landing[w]:  # who takes over knows no motion capture
@@ -159,7 +164,7 @@ class Worlds:
         if any(Mode.PURSUIT in state.modes for state in self.states):
             self._play_on()
         set_points = [None] * len(samples)
-        for w in flown:
+        for w in awake:
             mine = slice(w * self.n, (w + 1) * self.n)
             set_points[mine] = self._flown(w, now, samples[mine])
         self.swarm.send(set_points)
@@ -189,9 +194,11 @@ class Worlds:
         """The set-points of flight w at this tick; None where none is sent."""
         fault, on = self.faults[w], self.faults[w].on(now)
         uplink = self.swarm.uplinks[w * self.n + fault.vehicle]
-        lost = {"packets lost": fault.amount, "drone gone": 1.0}.get(fault.kind, 0.0)
+        lost = {"packets lost": fault.amount, **dict.fromkeys(GONE, 1.0)}.get(fault.kind, 0.0)
         uplink.loss = lost if on else 0.0
-        uplink.voltage = 3.0 if on and fault.kind == "battery low" else None
+        uplink.voltage = {"battery low": 3.0, "battery unknown": math.nan}.get(fault.kind) if on else None
+        if on and fault.kind == "drone restarts":
+            self.swarm.firmware[w * self.n + fault.vehicle].restart()
         actions = tuple(from_action(a, THRUST_LIMIT) for a in self._actions[w])
         request, reason = Request.NONE, ""
         if on and fault.kind == "policy silent":
@@ -249,11 +256,9 @@ def well(row: dict) -> bool:
     return row["out"] <= MARGIN and not (row["fell"] or row["hard"] or row["armed"]) and in_time
 
 
-SLOW = ("packets lost", "camera scaled", "camera late", "camera drifts", FOLLOWED)
+SLOW = ("packets lost", "poses out of order", "camera scaled", "camera late", "camera drifts", FOLLOWED)
 """These may take effect long after they begin."""
-
-
-ALL = "all faults but the estimator that follows"
+ALL = "all but drifts that the estimator follows, and processes that stand still"
 
 
 def summary(records) -> list[dict]:
@@ -261,7 +266,7 @@ def summary(records) -> list[dict]:
     rows = []
     for kind in (*KINDS, "none", ALL):
         mine = [
-            r for r in records if kind == r["kind"] or (kind == ALL and r["kind"] not in (FOLLOWED, "none"))
+            r for r in records if kind == r["kind"] or (kind == ALL and r["kind"] not in (*BEYOND, "none"))
         ]
         if not mine:
             continue

@@ -1,6 +1,7 @@
 """Real processes, a real terminal, real cflib: whatever is killed, stopped or typed, true vehicles come down and are disarmed."""
 
 import sys
+import threading
 from types import SimpleNamespace
 
 import pytest
@@ -15,6 +16,7 @@ from openjax.flying.game import Play
 from openjax.flying.limits import SafetySettings
 from openjax.flying.loop import flight_state
 from openjax.flying.session import SessionSettings
+from openjax.vehicle.vehicle_file import load_vehicle_file
 
 pytestmark = [
     pytest.mark.slow,
@@ -59,10 +61,14 @@ def flying():
     game, uris = Level(starts), tuple(virtual.uris)
     state = flight_state(game, 3, SafetySettings())
     prepared = Prepared(
-        game, state, SessionSettings(uris), None, {"policy": "level", "scenario": "wall", "uris": uris}
+        game,
+        state,
+        SessionSettings(uris),
+        load_vehicle_file(),
+        {"policy": "level", "scenario": "wall", "uris": uris},
     )
-    yield lambda number, kind: Flown(
-        number, kind, virtual, Arguments(uri=uris, episode_seconds=8.0), prepared
+    yield lambda number, kind, out=None: Flown(
+        number, kind, virtual, Arguments(uri=uris, episode_seconds=8.0, out=out), prepared
     ).fly()
     virtual.close()
 
@@ -71,7 +77,8 @@ def flying():
     "kind",
     [
         "KILL loop", "STOP loop", "KILL links", "STOP guard", "KILL loop+links", "KILL loop+guard", "KILL links+guard",
-        "KILL links then guard", "KILL links then space", "STOP links+guard", "policy fails",
+        "KILL links then guard", "KILL links then space", "KILL links+guard then space", "STOP links+guard",
+        "STOP loop then CONT", "STOP guard then CONT", "drone restarts", "camera restarts", "policy fails",
         "TERM links", "TERM group", "HUP loop", "terminal closed", "Ctrl-Z", "Ctrl-C three times", "l and space",
         "camera frozen", "camera: yaw turned", "camera drifts", "gyroscope: a number that is none", "start: millimetres",
         "KILL guard", "policy: a number that is none", "policy alternating", "camera late", "strangers' packets", "second fly",
@@ -81,3 +88,17 @@ def test_whatever_happens_all_are_down_inside_and_disarmed(flying, kind):
     record = flying(7, kind)
     assert record["well"], str(record)
     assert kind != "KILL guard" or "the guard is gone" in record["said"]
+
+
+def test_a_closed_terminal_doesnt_cost_the_log(flying, tmp_path):
+    record = flying(7, "terminal closed", tmp_path / "log")
+    assert record["well"], str(record)
+    assert (tmp_path / "log" / "flight.json").exists()
+
+
+def test_a_log_that_cant_be_written_is_a_line(flying, tmp_path):
+    """Its folder was there, or could be made, before the flight, and not after it."""
+    threading.Timer(1.0, (tmp_path / "folder").touch).start()
+    record = flying(7, "key l", tmp_path / "folder" / "log")
+    assert record["well"] and record["status"] == 2, str(record)
+    assert "error: no log: " in record["said"] and "Traceback" not in record["said"]

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
-from openjax.commands.command_line import output_console, parse
+from openjax.commands.command_line import one_line, output_console, parse
 from openjax.errors import UserError
 from openjax.files import check_new_folder, replacing
 from openjax.flying.limits import SafetySettings
@@ -91,14 +91,18 @@ def fly(arguments: Arguments, prepared: Prepared | None = None):
         flight = Flight(session.links, flown.game, flown.state, plan, session.requests, session.watched)
         console.print("flying: space or q stops all motors; l, Ctrl-C or Ctrl-Z land; h waits")
         samples, complaint = session.fly(flight)
+    if arguments.out is not None and samples:  # before a word is said: the terminal may be gone
+        try:
+            _write(arguments.out, flown, flight, samples, session.scheduler)
+        except OSError as error:
+            complaint = "; ".join(filter(None, (complaint, f"no log: {one_line(error)}")))
     _show(console, flight)
     if session.scheduler != "real time":
         console.print("no real-time scheduler: on a busy machine deadlines are missed (docs/flying.md)")
-    if arguments.out is not None and samples:
-        _write(arguments.out, flown, flight, samples, session.scheduler)
-        console.print(f"{arguments.out}: next, openjax diagnose {arguments.out}")
     if complaint:
         raise UserError(complaint)
+    if arguments.out is not None and samples:
+        console.print(f"{arguments.out}: next, openjax diagnose {arguments.out}")
     return flight.record
 
 
