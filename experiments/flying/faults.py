@@ -21,8 +21,8 @@ ASLEEP = "all processes stand still for a while"
 """Another: meanwhile vehicles turn on as they were told last, then level, then stop."""
 BEYOND = (FOLLOWED, ASLEEP)
 """What nothing in these processes can mend."""
-GONE = ("drone gone", "drone restarts")
-"""That vehicle is lost; the others mustn't be."""
+GONE = ("drone gone", "link lost for a while", "drone restarts")
+"""Nothing reaches that vehicle nor comes from it, which may cost it; the others it mustn't."""
 CAMERA = (
     "camera lost", "camera lost for a while", "camera frozen", "camera frozen, all", "camera: one frame wrong",
     "camera: four frames wrong", "camera moved", "camera: a number that is none", "camera: no attitude",

@@ -57,12 +57,23 @@ def test_one_wrong_frame(changes, verdict):
     assert judge(HERE._replace(time=0.01, **changes), HERE, 0.01, LIMITS) is verdict
 
 
+@pytest.mark.parametrize(
+    ("x", "unseen", "verdict"),
+    [(1.2, 0.01, Verdict.JUMPED), (1.2, 0.3, Verdict.GOOD), (3.0, 0.3, Verdict.JUMPED)],
+)
+def test_a_vehicle_gets_farther_while_nothing_is_heard_than_while_it_is_landed_by_reckoning(
+    x, unseen, verdict
+):
+    """.8 m away after .3 s: the last of many wrong poses, or the first one after a radio's outage."""
+    assert judge(HERE._replace(time=0.3, position=(x, 0.0, 0.5)), HERE, unseen, LIMITS) is verdict
+
+
 unit = st.floats(-1.0, 1.0)
 
 
-@given(st.tuples(unit, unit, unit), st.tuples(unit, unit, unit), st.floats(0.001, 0.06))
+@given(st.tuples(unit, unit, unit), st.tuples(unit, unit, unit), st.floats(0.001, 0.5))
 def test_what_a_vehicle_can_do_is_believed(push, spin, dt):
-    """Any acceleration of thrust and gravity, any angular acceleration of its rotors, for any time without poses."""
+    """Any acceleration of thrust and gravity, any angular acceleration of its rotors, for any time in which nothing is heard."""
     thrust = tuple(9.81 / nominal_airframe().hover_thrust * a / max(math.hypot(*push), 1.0) for a in push)
     acceleration = (*thrust[:2], thrust[2] - 9.81)
     alpha = [nominal_airframe().angular_acceleration * a / max(math.hypot(*spin), 1.0) for a in spin]
@@ -95,7 +106,7 @@ def test_poses_out_of_order_late_or_from_the_future_change_nothing():
 
 def test_a_refused_pose_leaves_the_last_good_one():
     wrong = HERE._replace(time=0.01, position=(2.0, 0.0, 0.5))
-    assert Track(HERE).after(wrong, 0.01, LIMITS, True, None) == Track(HERE, Verdict.JUMPED)
+    assert Track(HERE).after(wrong, 0.01, LIMITS, True, None) == Track(HERE, Verdict.JUMPED, 0.01)
     assert (
         Track(HERE).after(wrong, 0.01, LIMITS, False, None).pose is wrong
     )  # carried to another place by hand

@@ -52,7 +52,7 @@ def _captured(state, drone, sample, moving) -> Drone:
         told = not moving or own.pose is None or follows(own.pose, seen, limits)
         drone = replace(drone, told=told)
         if moving and own.fresh(now, limits) and (verdict := agree(*at_one_time(seen, own.pose), limits)):
-            captured = Track(drone.captured.pose, verdict)
+            captured = captured._replace(pose=drone.captured.pose, verdict=verdict)
     if moving and not captured.fresh(now, limits):
         distrusted = captured.verdict or "pose lost"
     return replace(drone, captured=captured, distrusted=distrusted)

@@ -30,8 +30,9 @@ class Verdict(StrEnum):
 class PoseLimits:
     """Bounds of a believable pose. The first four are physics, the others accuracies of measurements.
 
-    A bound is an accuracy plus the most that can have happened since the last good pose. What can happen grows for
-    `horizon` seconds only: by then the vehicle lands by itself, level and slow, and `drift` is what reckoning may lose.
+    A bound is an accuracy plus the most that can have happened since the last good pose. While its source tells something,
+    however wrong, what can happen grows for `horizon` seconds only: by then the vehicle is landed by reckoning, level and
+    slow, and `drift` is what that may lose. While nothing is heard, anything can happen.
     """
 
     acceleration: float
@@ -66,14 +67,14 @@ def pose_limits(airframe: Airframe, horizon: float) -> PoseLimits:
 
 
 def judge(
-    pose: Pose, last: Pose | None, dt: float, limits: PoseLimits, expected: Pose | None = None
+    pose: Pose, last: Pose | None, unseen: float, limits: PoseLimits, expected: Pose | None = None
 ) -> Verdict:
     """What is wrong with a pose.
 
     Args:
-      pose: measured `dt` after `last`.
+      pose: the newest.
       last: the last good one of the same source; None if there is none, as on the ground.
-      dt: s.
+      unseen: for how long its source told nothing before it (s).
       limits: bounds.
       expected: where reckoning has the vehicle by now; without it, where `last` leads.
     """
@@ -87,8 +88,8 @@ def judge(
         return Verdict.GOOD
     if pose[1:] == last[1:]:  # a measurement has noise: identical numbers are one measurement sent again
         return Verdict.FROZEN
-    expected = expected or moved_on(last, last.time + dt)
-    sudden = min(dt, limits.horizon)
+    expected, dt = expected or moved_on(last, pose.time), pose.time - last.time
+    sudden = min(dt, max(unseen, limits.horizon))
     if math.dist(pose.position, expected.position) > (
         limits.position + limits.drift * dt + 0.5 * limits.acceleration * sudden**2
     ):
@@ -109,6 +110,7 @@ class Track(NamedTuple):
 
     pose: Pose | None = None  # the last good one
     verdict: Verdict = Verdict.GOOD  # on the newest
+    heard: float = -math.inf  # s, when that was measured
 
     def fresh(self, now: float, limits: PoseLimits) -> bool:
         """Whether its last good pose is new enough to fly by at `now` (s)."""
@@ -131,8 +133,8 @@ class Track(NamedTuple):
             return self
         else:
             expected = None if expected is None else moved_on(expected, pose.time)
-            verdict = judge(pose, last, pose.time - last.time, limits, expected)
-        return Track(last, verdict) if verdict else Track(pose)
+            verdict = judge(pose, last, pose.time - max(self.heard, last.time), limits, expected)
+        return Track(last if verdict else pose, verdict, pose.time)
 
 
 def at_one_time(a: Pose, b: Pose) -> tuple[Pose, Pose]:
