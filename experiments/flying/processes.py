@@ -80,6 +80,13 @@ SETTLE = 1.0
 """What lands over is looked at for so long (s): processes must have ended by then."""
 
 
+def ends_flight(kind: str) -> bool:
+    """Whether a fault of this kind must end its flight; links and guard are deaf to a terminal's signals."""
+    name, _, target = kind.partition(" ")
+    deaf = name in SIGNALS[2:] and target in ("links", "guard")
+    return not (deaf or kind in ENDLESS or kind in START)
+
+
 def fault_of(number: int, kind: str) -> Fault:
     """The fault with this number and kind."""
     rng = random.Random(number)
@@ -336,10 +343,8 @@ class Flown:
             return row["seconds"] is not None and row["seconds"] < 1.5
         if self._kind == "second fly" and "has this vehicle" not in row["second"]:
             return False
-        name, _, target = self._kind.partition(" ")
-        deaf = name in SIGNALS[2:] and target in ("links", "guard")  # the flight goes on
         seconds = math.inf if row["seconds"] is None else row["seconds"]
-        in_time = deaf or self._kind in ENDLESS or seconds <= ENDING
+        in_time = not ends_flight(self._kind) or seconds <= ENDING
         return in_time and not row["fell"] and not row["hard"]
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import tyro
 
 from experiments.flying.faults import ENDING, MARGIN
-from experiments.flying.processes import ENDLESS, GROUPS, KINDS, STOPPED, Flown
+from experiments.flying.processes import GROUPS, KINDS, STOPPED, Flown, ends_flight
 from experiments.table import RESULTS, Page, Table, facts, write_page
 from openjax.files import read_json
 
@@ -70,7 +70,7 @@ def page(results) -> Page:
     rows, records = [], results["records"]
     for group, kinds in {**GROUPS, "all": KINDS}.items():
         mine = [r for r in records if r["kind"] in kinds]
-        ends = [r["seconds"] for r in mine if r["seconds"] is not None and r["kind"] not in ENDLESS]
+        ends = [r["seconds"] for r in mine if r["seconds"] is not None and ends_flight(r["kind"])]
         asked = [any(name in r["kind"] for name in STOPPED) for r in mine]
         rows.append({
             "group": group, "flights": len(mine), "well": sum(r["well"] for r in mine),
@@ -86,7 +86,7 @@ def page(results) -> Page:
     prose = (
         "`openjax fly` in processes and on a terminal of its own, real `cflib` over UDP; where the virtual vehicles truly "
         f"were. As they must: nobody more than {MARGIN:g} m out of the arena (.9 m), nobody armed at the end, no fall that "
-        f"nobody asked for, no process left, down {ENDING:g} s after what ends the flight."
+        f"nobody asked for, no process left, down {ENDING:g} s after what must end the flight."
     )
     ill = [f"Not well: {r['kind']} (flight {r['number']}): {r['said']}" for r in records if not r["well"]]
     return Page("Faults where they happen, in real time", prose, [Table(columns, rows), *ill])

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from openjax.flying.controller import Pose, level_acceleration, moved_on
-from openjax.flying.judge import Track, agree, at_one_time, follows
+from openjax.flying.judge import agree, at_one_time, follows
 from openjax.flying.state import FLYING, SPIN_UP, Drone, Mode, PoseSample, State
 
 SMOOTHING = 0.02
