@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import jax
 
-from openjax.export.c_statements import Buffer, Readers, Writer, dense_array
-from openjax.export.c_text import PRODUCT, dims, indented, index_names, loops, number_rows
+from openjax.export.c_statements import Buffer, Writer, dense_array
+from openjax.export.c_text import PRODUCT, dims, indented, number_rows
 from openjax.export.traced import trace
 
 
@@ -92,17 +92,11 @@ def c_program(
 
 def _written(function, inputs, output):
     """The statements of a function, the floats of workspace that they need, and the shape of its result."""
-    traced = trace(function, inputs)
-    writer = Writer(Readers().count(traced, len(inputs)))
+    traced, writer = trace(function, inputs), Writer()
     given = [dense_array(f"in->{name}", kind.shape) for name, kind in inputs.items()]
     (result,) = writer.run(traced.jaxpr, traced.consts, given)
-    result, shape = writer.value(result), tuple(traced.out_avals[0].shape)
-    indices = index_names(shape)
-    writer.statements.append(
-        loops(shape, indices, f"{dense_array(output, shape).at(indices)} = {result.at(indices)};")
-    )
-    for buffer in result.reads:
-        writer.buffers[buffer].read = len(writer.statements)
+    shape = tuple(traced.out_avals[0].shape)
+    writer.write(dense_array(output, shape), "{}", writer.array(result))
     return writer, _placed(writer.buffers), shape
 
 

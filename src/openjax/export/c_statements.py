@@ -1,40 +1,24 @@
 """Statements of a C program, written operation by operation: what `openjax.export.c_program` puts into a file.
 
-Products of matrices become calls of one function; chains of operations element by element become one loop nest; views
-(slices, transposes, broadcasts) become index arithmetic.
+Products of matrices become calls of one function, other operations a loop nest each. Transposes, slices and broadcasts are
+arrays with other strides, as in NumPy, and cost nothing.
 """
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from openjax.errors import UserError
-from openjax.export.c_text import BINARY, UNARY, index_names, literal, loops, offset_by
+from openjax.export.c_text import BINARY, UNARY, index_names, literal, loops
 from openjax.export.traced import Walk, outer_padding
 
-_SAME = ("stop_gradient", "copy", "copy_p", "optimization_barrier", "convert_element_type")
 _REDUCE = {
     "reduce_sum": ("0.0f", "{} + {}"),
     "reduce_max": ("-INFINITY", "fmaxf({}, {})"),
     "reduce_min": ("INFINITY", "fminf({}, {})"),
 }
-
-
-@dataclass(frozen=True)
-class Value:
-    """An array as it is read: a dense one, a view of one, or a computation that isn't done yet."""
-
-    shape: tuple[int, ...]
-    at: Callable[[Sequence[str]], str]
-    """Indices to the expression of an element."""
-    reads: frozenset[int]
-    """Buffers that the expression reads."""
-    dense: str | None = None
-    """The C name of a dense array that holds it."""
-    computes: bool = False
-    """Whether an element costs more than to read it."""
 
 
 @dataclass
@@ -47,115 +31,128 @@ class Buffer:
     offset: int = 0
 
 
-class _Token:
-    """A value of which only its readers are counted."""
+@dataclass(frozen=True)
+class Array:
+    """An array of the program, or a part of one: entry (i, j) is name[offset + i * strides[0] + j * strides[1]], and so on."""
 
-    def __init__(self):
-        self.readers = 0
+    name: str
+    shape: tuple[int, ...]
+    strides: tuple[int, ...]
+    offset: int = 0
+    buffer: Buffer | None = None
+    """Where it lies in the workspace; None for inputs, results and constants."""
+    number: str = ""
+    """The value of all entries, where it is known and the same."""
+
+    @property
+    def dense(self) -> bool:
+        """Whether its entries follow one another row by row."""
+        axes = zip(self.shape, self.strides, row_by_row(self.shape), strict=True)
+        return not self.number and all(size == 1 or own == whole for size, own, whole in axes)
+
+    @property
+    def start(self) -> str:
+        """A pointer to its first entry."""
+        return f"{self.name} + {self.offset}" if self.offset else self.name
+
+    def at(self, indices: Sequence[str]) -> str:
+        """The expression of an entry; a single number's is the same for all indices."""
+        if self.number:
+            return self.number
+        terms = [str(self.offset)] * (self.offset > 0)
+        for index, size, stride in zip(indices, self.shape, self.strides, strict=False):
+            if index != "0" and size > 1 and stride:  # an axis of length one is repeated
+                terms.append(index if stride == 1 else f"{index} * {stride}")
+        return f"{self.name}[{' + '.join(terms) or '0'}]"
+
+    def part(
+        self, starts: Sequence[int], shape: Sequence[int], steps: Sequence[int] | None = None
+    ) -> "Array":
+        """Entries from `starts` on, every `steps`-th of each axis."""
+        steps = steps or [1] * len(shape)
+        offset = self.offset + sum(start * own for start, own in zip(starts, self.strides, strict=True))
+        strides = tuple(step * own for step, own in zip(steps, self.strides, strict=True))
+        return replace(self, shape=tuple(shape), strides=strides, offset=int(offset))
 
 
-class Readers(Walk):
-    """Counts the readers of each operation's result, in the order of the operations."""
+def row_by_row(shape: Sequence[int]) -> tuple[int, ...]:
+    """The strides of a dense array."""
+    return tuple(math.prod(shape[axis + 1 :]) for axis in range(len(shape)))
 
-    def __init__(self):
-        self.found: list[list[_Token]] = []
 
-    def node(self, operation):
-        """See `Walk`."""
-        if operation.name in _SAME:
-            self.found.append([])
-            return operation.inputs[0]
-        for value in operation.inputs:
-            if isinstance(value, _Token):
-                value.readers += 1
-        self.found.append([_Token() for _ in operation.equation.outvars])
-        return self.found[-1]
-
-    def count(self, traced, number: int) -> list[int]:
-        """The most readers of any result of each operation."""
-        for result in self.run(traced.jaxpr, traced.consts, [_Token() for _ in range(number)]):
-            result.readers += 1
-        return [max((token.readers for token in tokens), default=0) for tokens in self.found]
+def dense_array(name: str, shape: Sequence[int], buffer: Buffer | None = None) -> Array:
+    """A whole array of the program."""
+    return Array(name, tuple(shape), row_by_row(shape), buffer=buffer)
 
 
 class Writer(Walk):
-    """Statements and constants of a program under construction.
-
-    Args:
-      readers: how often the result of each operation is read.
-    """
+    """Statements and constants of a program under construction."""
 
     language = "C"
     elementwise = frozenset((*BINARY, *UNARY))
 
-    def __init__(self, readers: list[int]):
-        self._readers, self._operation = readers, -1
+    def __init__(self):
         self.statements: list[str] = []
         self.buffers: list[Buffer] = []
         self.constants: list[np.ndarray] = []
         self.multiply_adds, self.functions = 0, 0
         self._names: dict[bytes, int] = {}
 
-    # -- values
+    # -- arrays
 
-    def constant(self, value) -> Value:
-        """A known array; single numbers are written where they are used."""
+    def array(self, value) -> Array:
+        """A value as it is read; one number is written where it is used, rows that are alike are kept once."""
+        if isinstance(value, Array):
+            return value
         value = np.asarray(value, np.float32)
-        whole, same = value.shape, []
-        for axis in range(value.ndim):  # copies of a row aren't written out
+        shape, strides = value.shape, list(row_by_row(value.shape))
+        for axis in range(value.ndim):
             one = value.take([0], axis)
             if value.shape[axis] > 1 and np.array_equal(np.broadcast_to(one, value.shape), value):
-                value = one
-                same.append(axis)
+                value, strides = one, [s // shape[axis] if a < axis else s for a, s in enumerate(strides)]
+                strides[axis] = 0
         if value.size == 1:
-            number = literal(value.item())
-            return Value(whole, lambda _: number, frozenset())
-        key = np.ascontiguousarray(value).tobytes()
+            return Array("", shape, tuple(strides), number=literal(value.item()))
+        kept = np.ascontiguousarray(value).reshape(-1)
+        key = kept.tobytes()
         if key not in self._names:
             self._names[key] = len(self.constants)
-            self.constants.append(np.ascontiguousarray(value).reshape(-1))
-        array = dense_array(f"c{self._names[key]}", value.shape)
-        if not same:
-            return array
-        return Value(
-            whole, lambda at: array.at(["0" if a in same else i for a, i in enumerate(at)]), array.reads
-        )
+            self.constants.append(kept)
+        return Array(f"c{self._names[key]}", shape, tuple(strides))
 
-    def value(self, value) -> Value:
-        """A value as it is read."""
-        return value if isinstance(value, Value) else self.constant(value)
-
-    def emit(self, text: str, writes: int, reads: frozenset[int]) -> None:
-        """Append a statement that writes one buffer and reads others."""
-        now = len(self.statements)
-        for buffer in reads:
-            self.buffers[buffer].read = now
-        self.buffers[writes].read = max(self.buffers[writes].read, now)
-        self.statements.append(text)
-
-    def buffer(self, shape) -> tuple[int, Value]:
-        """A new array in the workspace."""
+    def new(self, shape: Sequence[int]) -> Array:
+        """An array in the workspace."""
         now = len(self.statements)
         self.buffers.append(Buffer(math.prod(shape), now, now))
-        number = len(self.buffers) - 1
-        return number, dense_array(f"t{number}", shape, frozenset([number]))
+        return dense_array(f"t{len(self.buffers) - 1}", shape, self.buffers[-1])
 
-    def stored(self, value: Value) -> Value:
-        """The value as a dense array."""
-        if value.dense is not None:
-            return value
-        number, stored = self.buffer(value.shape)
-        indices = index_names(value.shape)
-        body = f"{stored.at(indices)} = {value.at(indices)};"
-        self.emit(loops(value.shape, indices, body), number, value.reads)
-        return stored
+    def emit(self, text: str, *arrays: Array) -> None:
+        """Append a statement that reads or writes these."""
+        for array in arrays:
+            if array.buffer is not None:
+                array.buffer.read = len(self.statements)
+        self.statements.append(text)
+
+    def write(self, out: Array, form: str, *values: Array) -> Array:
+        """Write every entry of an array, which is the form of those of `values`."""
+        if all(value.number or (value.dense and value.shape == out.shape) for value in (out, *values)):
+            whole = (math.prod(out.shape),)  # one loop
+            out, *values = (replace(value, shape=whole, strides=(1,)) for value in (out, *values))
+        indices = index_names(out.shape)
+        body = f"{out.at(indices)} = {form.format(*(value.at(indices) for value in values))};"
+        self.emit(loops(out.shape, indices, body), out, *values)
+        return out
+
+    def stored(self, value: Array) -> Array:
+        """The same as a dense array."""
+        return value if value.dense else self._made("{}", [value], value.shape)
+
+    def _made(self, form, values, shape):
+        out = self.new(shape)
+        self.write(out, form, *map(self.array, values))
+        return out
 
     # -- operations
-
-    def node(self, operation):
-        """See `Walk`."""
-        self._operation += 1
-        return super().node(operation)
 
     def _op_stop_gradient(self, operation):
         before, after = (
@@ -170,183 +167,115 @@ class Writer(Walk):
     def _op_elementwise(self, operation):
         name, shape = operation.name, operation.shape
         self.functions += math.prod(shape) * (name in UNARY and name not in ("neg", "abs", "not", "floor"))
-        return self._elementwise({**BINARY, **UNARY}[name], operation.inputs, shape)
+        return self._made({**BINARY, **UNARY}[name], operation.inputs, shape)
 
     def _op_select_n(self, operation):
-        return self._elementwise("({0} != 0.0f ? {2} : {1})", operation.inputs, operation.shape)
+        return self._made("({0} != 0.0f ? {2} : {1})", operation.inputs, operation.shape)
 
     def _op_clamp(self, operation):
-        return self._elementwise("fminf(fmaxf({1}, {0}), {2})", operation.inputs, operation.shape)
+        return self._made("fminf(fmaxf({1}, {0}), {2})", operation.inputs, operation.shape)
 
-    def _op_transpose(self, operation):
-        order = operation.parameters["permutation"]
-        back = [order.index(axis) for axis in range(len(order))]
-        return self._view(operation.inputs[0], operation.shape, lambda at: [at[axis] for axis in back])
-
-    def _op_slice(self, operation):
-        starts = operation.parameters["start_indices"]
-        steps = operation.parameters["strides"] or [1] * len(starts)
-        return self._view(
-            operation.inputs[0],
-            operation.shape,
-            lambda at: [offset_by(i, k, s) for i, k, s in zip(at, starts, steps, strict=True)],
-        )
-
-    def _elementwise(self, form, values, shape):
-        values = [self.value(v) for v in values]
-        # an axis of length one is repeated; what costs anything is computed once, not for each repetition
-        repeated = [math.prod(v.shape) < math.prod(shape) for v in values]
-        values = [self.stored(v) if v.computes and r else v for v, r in zip(values, repeated, strict=True)]
-
-        def element(value, indices):
-            return value.at(["0" if n == 1 else i for i, n in zip(indices, value.shape, strict=False)])
-
-        def at(indices):
-            return form.format(*(element(v, indices) for v in values))
-
-        value = Value(shape, at, frozenset().union(*(v.reads for v in values)), computes=True)
-        # what only one operation reads is computed there
-        return self.stored(value) if self._readers[self._operation] > 1 else value
-
-    def power(self, base, exponent, operation):
+    def power(self, value, exponent, operation):
         """See `Walk`."""
-        base = self.stored(base) if base.computes else base
         factors = " * ".join(["{0}"] * abs(exponent)) or "1.0f"
         form = f"({factors})" if exponent >= 0 else f"(1.0f / ({factors}))"
-        return self._elementwise(form, [base], operation.shape)
+        return self._made(form, [value], operation.shape)
 
-    def _view(self, value, shape, back):
-        if value.computes and self._readers[self._operation] > 1:
-            value = self.stored(value)
-        return Value(shape, lambda indices: value.at(back(indices)), value.reads, computes=value.computes)
+    def _op_transpose(self, operation):
+        value, order = operation.inputs[0], operation.parameters["permutation"]
+        return replace(value, shape=operation.shape, strides=tuple(value.strides[axis] for axis in order))
+
+    def _op_slice(self, operation):
+        starts, steps = operation.parameters["start_indices"], operation.parameters["strides"]
+        return operation.inputs[0].part(starts, operation.shape, steps)
 
     def _op_broadcast_in_dim(self, operation):
-        value, shape, axes = (
-            operation.inputs[0],
-            operation.shape,
-            operation.parameters["broadcast_dimensions"],
-        )
-        if value.computes and math.prod(shape) > math.prod(value.shape):  # computed once, not for each copy
-            value = self.stored(value)
-        kept = [(axis, size) for axis, size in zip(axes, value.shape, strict=True)]
-        return self._view(value, shape, lambda at: ["0" if size == 1 else at[axis] for axis, size in kept])
+        value, strides = operation.inputs[0], [0] * len(operation.shape)
+        for axis, size, own in zip(
+            operation.parameters["broadcast_dimensions"], value.shape, value.strides, strict=True
+        ):
+            strides[axis] = own if size > 1 else 0
+        return replace(value, shape=operation.shape, strides=tuple(strides))
 
     def reshape(self, value, shape):
         """See `Walk`."""
-        value = self.value(value)
-        if value.dense is not None:
-            return dense_array(value.dense, shape, value.reads)
+        value = self.array(value)
         if [n for n in value.shape if n > 1] == [n for n in shape if n > 1]:  # only axes of length one
-
-            def back(at):
-                left = iter(i for i, n in zip(at, shape, strict=True) if n > 1)
-                return ["0" if n == 1 else next(left) for n in value.shape]
-
-            return self._view(value, shape, back)
-        return self.reshape(self.stored(value), shape)
+            left = iter(own for own, size in zip(value.strides, value.shape, strict=True) if size > 1)
+            return replace(value, shape=shape, strides=tuple(next(left) if size > 1 else 0 for size in shape))
+        return replace(self.stored(value), shape=shape, strides=row_by_row(shape))
 
     def _op_split(self, operation):
         value, axis, start, parts = operation.inputs[0], operation.parameters["axis"], 0, []
         for size in operation.parameters["sizes"]:
-            shape = (*value.shape[:axis], size, *value.shape[axis + 1 :])
-            parts.append(
-                self._view(
-                    value,
-                    shape,
-                    lambda at, start=start: [
-                        offset_by(i, start if a == axis else 0, 1) for a, i in enumerate(at)
-                    ],
-                )
-            )
+            parts.append(value.part(*_within(value.shape, axis, start, size)))
             start += size
         return parts
 
     def join(self, values, shape, axis):
         """See `Walk`."""
-        number, joined = self.buffer(shape)
-        start = 0
-        for value in map(self.value, values):
-            indices = index_names(value.shape)
-            there = [offset_by(i, start if a == axis else 0, 1) for a, i in enumerate(indices)]
-            body = f"{joined.at(there)} = {value.at(indices)};"
-            self.emit(loops(value.shape, indices, body), number, value.reads)
+        joined, start = self.new(shape), 0
+        for value in map(self.array, values):
+            self.write(joined.part(*_within(shape, axis, start, value.shape[axis])), "{}", value)
             start += value.shape[axis]
         return joined
 
     def _op_pad(self, operation):
-        (value, filling), shape = map(self.value, operation.inputs), operation.shape
-        low, _ = outer_padding(operation)
-        number, padded = self.buffer(shape)
-        indices = index_names(shape)
-        body = f"{padded.at(indices)} = {filling.at(())};"
-        self.emit(loops(shape, indices, body), number, filling.reads)
-        indices = index_names(value.shape)
-        there = [offset_by(i, start, 1) for i, start in zip(indices, low, strict=True)]
-        body = f"{padded.at(there)} = {value.at(indices)};"
-        self.emit(loops(value.shape, indices, body), number, value.reads)
+        value, filling = map(self.array, operation.inputs)
+        padded = self.new(operation.shape)
+        self.write(padded, "{}", filling)
+        self.write(padded.part(outer_padding(operation)[0], value.shape), "{}", value)
         return padded
 
     def _op_reduce_sum(self, operation):
         value, shape, axes = operation.inputs[0], operation.shape, operation.parameters["axes"]
         start, form = _REDUCE[operation.name]
-        number, reduced = self.buffer(shape)
-        every = index_names(value.shape)
-        outer = [i for a, i in enumerate(every) if a not in axes]
-        inner = [i for a, i in enumerate(every) if a in axes]
-        body = f"sum = {form.format('sum', value.at(every))};"
+        reduced, every = self.new(shape), index_names(value.shape)
+        outer = [index for axis, index in enumerate(every) if axis not in axes]
+        inner = [index for axis, index in enumerate(every) if axis in axes]
+        added = f"sum = {form.format('sum', value.at(every))};"
         body = (
-            f"float sum = {start};\n{loops([value.shape[a] for a in axes], inner, body)}\n"
+            f"float sum = {start};\n{loops([value.shape[axis] for axis in axes], inner, added)}\n"
             f"{reduced.at(outer)} = sum;"
         )
-        self.emit(loops(shape, outer, body), number, value.reads)
+        self.emit(loops(shape, outer, body), reduced, value)
         return reduced
 
     _op_reduce_max = _op_reduce_min = _op_reduce_sum
 
     def _op_dot_general(self, operation):
         (left_sum, right_sum), (left_batch, right_batch) = operation.parameters["dimension_numbers"]
-        inputs, shapes = operation.inputs, operation.shapes
+        shapes = operation.shapes
         left_free = [a for a in range(len(shapes[0])) if a not in (*left_sum, *left_batch)]
         right_free = [a for a in range(len(shapes[1])) if a not in (*right_sum, *right_batch)]
-        left = self._ordered(inputs[0], shapes[0], (*left_batch, *left_free, *left_sum))
-        right = self._ordered(inputs[1], shapes[1], (*right_batch, *right_sum, *right_free))
+        left = self._ordered(operation.inputs[0], (*left_batch, *left_free, *left_sum))
+        right = self._ordered(operation.inputs[1], (*right_batch, *right_sum, *right_free))
         batch = math.prod(shapes[0][a] for a in left_batch)
         rows = math.prod(shapes[0][a] for a in left_free)
         inner = math.prod(shapes[0][a] for a in left_sum)
         columns = math.prod(shapes[1][a] for a in right_free)
-        number, out = self.buffer(operation.shape)
+        out = self.new(operation.shape)
         for k in range(batch):
-            call = (
-                f"product({left.dense} + {k * rows * inner}, {right.dense} + {k * inner * columns}, "
-                f"{out.dense} + {k * rows * columns}, {rows}, {inner}, {columns});"
-            )
-            self.emit(call.replace(" + 0,", ","), number, left.reads | right.reads)
+            sizes = (rows * inner, inner * columns, rows * columns)
+            places = [
+                replace(v, offset=v.offset + k * n).start
+                for v, n in zip((left, right, out), sizes, strict=True)
+            ]
+            self.emit(f"product({', '.join(places)}, {rows}, {inner}, {columns});", left, right, out)
         self.multiply_adds += batch * rows * inner * columns
         return out
 
-    def _ordered(self, value, shape, order):
+    def _ordered(self, value, order):
         """A factor as a dense array with its axes in `order`."""
-        if not isinstance(value, Value):
-            return self._named(self.constant(np.transpose(np.asarray(value), order)))
-        if list(order) == sorted(order):
-            return self.stored(value)
-        back = [order.index(axis) for axis in range(len(order))]
-        moved = tuple(shape[axis] for axis in order)
-        return self.stored(self._view(value, moved, lambda at: [at[axis] for axis in back]))
-
-    def _named(self, value):
-        return value if value.dense is not None else self.stored(value)
+        if isinstance(value, np.ndarray):
+            value = self.array(np.transpose(value, order))
+        else:
+            shape, strides = zip(*((value.shape[axis], value.strides[axis]) for axis in order), strict=True)
+            value = replace(value, shape=shape, strides=strides)
+        return self.stored(value)
 
 
-def dense_array(name, shape, reads=frozenset()) -> Value:
-    """The value of an array of that name."""
-    shape = tuple(shape)
-    strides = [math.prod(shape[a + 1 :]) for a in range(len(shape))]
-
-    def at(indices):
-        terms = [
-            i if s == 1 else f"{i} * {s}" for i, s in zip(indices, strides, strict=True) if str(i) != "0"
-        ]
-        return f"{name}[{' + '.join(terms) or '0'}]"
-
-    return Value(shape, at, reads, dense=name)
+def _within(shape, axis, start, size):
+    """Starts and shape of `size` entries along one axis."""
+    starts = [start if a == axis else 0 for a in range(len(shape))]
+    return starts, [size if a == axis else whole for a, whole in enumerate(shape)]

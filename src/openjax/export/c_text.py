@@ -67,14 +67,6 @@ def indented(text: str, times: int = 1) -> str:
     return "\n".join(4 * " " * times + line for line in text.splitlines())
 
 
-def offset_by(index, start, step) -> str:
-    """The index of a slice as an index of the whole axis."""
-    moved = index if step == 1 or index == "0" else f"{index} * {step}"
-    if start == 0:
-        return moved
-    return str(start) if index == "0" else f"({moved} + {start})"
-
-
 def literal(number: float) -> str:
     """A float32 constant; negative ones in brackets."""
     if math.isinf(number):

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import jax
 import numpy as np
+from jax.extend.core import JaxprEqn
 
 from openjax.errors import UserError
 
@@ -27,7 +28,7 @@ class Operation:
     parameters: dict
     inputs: list
     """Values of which at least one isn't an array."""
-    equation: jax.extend.core.JaxprEqn
+    equation: JaxprEqn
 
     @property
     def shape(self) -> tuple[int, ...]:

@@ -115,7 +115,7 @@ class Report:
             )
         lines += [f"Sensors: {text}." for text in self.sensors]
         lines += [self.rest] if self.rest else []
-        lines.append(f"Where: {in_words(self.where)}.")
+        lines += [f"Where: {in_words(self.where)}."] if self.effects else []
         for effect, values in self.parameters.items():
             shown = ", ".join(v.in_words(p) + (" (unusual)" if v.unusual else "") for p, v in values.items())
             lines.append(f"{effect}: {shown}.")
