@@ -5,9 +5,7 @@ through the simulation, and measures both policies on tasks and vehicles that ne
 adapt.json and adapt.html.
 """
 
-import base64
 import dataclasses
-import io
 import os
 import shutil
 import subprocess
@@ -310,7 +308,7 @@ def in_words(results: dict) -> list[str]:
     """What was found and gained."""
     effects = ", ".join(results["effects"]) or "no effect: the simulator is right to within the noise"
     changes = "; ".join(
-        f"{name.replace('_', ' ')} " + " → ".join(f"{results[which][name]:.4g}" for which in WHICH)
+        f"{name.replace('_', ' ')} " + " → ".join(f"{results[which][name]:.3g}" for which in WHICH)
         for name in FIGURES
     )
     shares = {name: share for name, share in results["won_back"].items() if share is not None}
@@ -326,30 +324,27 @@ def in_words(results: dict) -> list[str]:
 
 def page(results: dict) -> str:
     """One self-contained HTML page."""
-    import jinja2
+    from openjax.gap.report.page import filled
 
-    template = Path(__file__).with_name("adapt.html.jinja").read_text(encoding="utf-8")
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
-    return environment.from_string(template).render(
-        results=results, words=in_words(results), figures=FIGURES, which=WHICH, picture=_picture(results)
-    )
+    values = {"words": in_words(results), "figures": FIGURES, "which": WHICH, "picture": _picture(results)}
+    return filled("adapt.html.jinja", Path(__file__).parent, results=results, **values)
 
 
 def _picture(results):
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11, 3.2), layout="constrained")
+    from openjax.gap.report.figures import STYLE, as_svg
+
     shown = {
         "crashes_from_starts": "crashes from leaning starts (smooth)",
         "crashes_in_flight": "crashes within flights (smooth)",
-        "off_the_nominal_flight": "distance from the nominal vehicle's flight",
+        "off_the_nominal_flight": "distance from nominal flights",
     }
-    for axes, (name, title) in zip(figure.subplots(1, len(shown)), shown.items(), strict=True):
-        course = [row[name] for row in results["history"]]
-        axes.plot(range(1, len(course) + 1), course)
-        axes.set(title=title, xlabel="update", ylim=(0, None))
-    FigureCanvasAgg(figure)
-    data = io.BytesIO()
-    figure.savefig(data, dpi=110)
-    return base64.b64encode(data.getvalue()).decode()
+    with rc_context(STYLE):
+        figure = Figure(figsize=(11, 3.2), layout="constrained")
+        for axes, (name, title) in zip(figure.subplots(1, len(shown)), shown.items(), strict=True):
+            course = [row[name] for row in results["history"]]
+            axes.plot(range(1, len(course) + 1), course)
+            axes.set(title=title, xlabel="update", ylim=(0, None))
+        return as_svg(figure, results["policy"])

@@ -156,8 +156,7 @@ def html_of(change: Change) -> str:
 def draw(change: Change):
     """Trims of every flight, day by day, beside what days differ by; and where the change would sit."""
     figure = Figure(figsize=(11, 3.6), layout="constrained")
-    figure.patch.set_alpha(0.0)
-    axes = figure.subplots(1, 5, width_ratios=(1, 1, 1, 1, 1.3), subplot_kw={"facecolor": "none"})
+    axes = figure.subplots(1, 5, width_ratios=(1, 1, 1, 1, 1.3))
     level = np.mean([f.values["hover"][0] for f in change.reference])
     for axis, name in zip(axes, TRIMS, strict=False):
         for k, figures in enumerate((change.reference, change.flights)):

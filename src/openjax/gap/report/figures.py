@@ -23,6 +23,7 @@ GREY = "#8a8f98"
 INK = "#0a0b0c"  # becomes the page's text colour
 STYLE = {
     "svg.fonttype": "none",
+    "savefig.transparent": True,
     "font.family": "sans-serif",
     "font.size": 11,
     "axes.spines.top": False,
@@ -186,10 +187,7 @@ def _binned(data: np.ndarray) -> np.ndarray:
 
 def _figure(height: float) -> tuple[Figure, Axes]:
     figure = Figure(figsize=(5.8, height + 0.4), layout="constrained")
-    figure.patch.set_alpha(0.0)
-    axes = figure.subplots()
-    axes.patch.set_alpha(0.0)
-    return figure, axes
+    return figure, figure.subplots()
 
 
 def _legend(axes: Axes) -> None:

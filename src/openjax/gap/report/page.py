@@ -27,9 +27,9 @@ def page_of(report: Report) -> str:
     )
 
 
-def filled(template: str, **values) -> str:
-    """A template of this folder with its values, as one page with nothing to fetch from elsewhere."""
-    loader = jinja2.FileSystemLoader(Path(__file__).parent)
+def filled(template: str, folder: Path = Path(__file__).parent, **values) -> str:
+    """A template of a folder with its values and this one's looks, as one page with nothing to fetch from elsewhere."""
+    loader = jinja2.FileSystemLoader([folder, Path(__file__).parent])
     environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
     page = environment.get_template(template).render(**values)
     return re.sub(r"(?<=\d) %", "\u00a0%", page)  # a number and its sign stay on one line
