@@ -79,6 +79,9 @@ def _apply(equation, inputs):
         "add"
     }:  # several sums at once
         return [_total(operator.add, array, parameters["dimensions"]) for array in inputs[: len(inputs) // 2]]
+    if name == "unstack":
+        axis, array = parameters["axis"], inputs[0]
+        return [np.squeeze(part, axis) for part in np.split(array, array.shape[axis], axis)]
     if name not in _MOVES:
         raise NotImplementedError(f"component by component: {name}")
     return [_MOVES[name](inputs, parameters)]
