@@ -80,7 +80,7 @@ def test_gains_are_what_the_loop_has_whatever_gusts_and_noise_do(p, sampled):
     )
     change, error = read_gains(reading)
     assert change[0] == pytest.approx(p - 1.0, abs=0.12)
-    assert bool(loop(change, error).acting()) == (p != 1.0)
+    assert bool(loop(change, error, p - 1.0).acting()) == (p != 1.0)
 
 
 def test_calm_flights_leave_all_of_the_motors_to_feedback():
@@ -94,8 +94,10 @@ def test_calm_flights_leave_all_of_the_motors_to_feedback():
     assert made.std() > 0.01
 
 
-def loop(change, error):
-    return RateLoop(np.array(change), np.array(error), [], [], [], ("rate_gains",))
+def loop(change, error, shown=0.4):
+    """A rate loop whose motors show `shown` more of p, whatever was read."""
+    tied = np.random.default_rng(0).standard_normal((3, 200, 3))
+    return RateLoop(np.array(change), np.array(error), [shown * tied[0]], [tied], [], ("rate_gains",))
 
 
 def test_gains_of_all_axes_are_one_reading_that_covers_what_they_disagree_by():
@@ -105,6 +107,7 @@ def test_gains_of_all_axes_are_one_reading_that_covers_what_they_disagree_by():
     assert apart.gain[1][0] > 0.35
     assert loop([0.4, 0, 0, 0.0, 0, 0], [0.05] * 3 + [np.inf] * 3).acting()
     assert not loop([0.1, 0, 0, 0.1, 0, 0], [0.01] * 6).acting()  # filters of a firmware do as much
+    assert not loop([0.4, 0, 0, 0.4, 0, 0], [0.05] * 6, shown=0.1).acting()  # the motors don't follow
 
 
 def test_without_enough_flight_gains_cannot_be_told():

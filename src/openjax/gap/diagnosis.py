@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from openjax.flights.flight import Case
-from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence, gather
 from openjax.gap.intervals import estimates
 from openjax.gap.model.bounds import BOUND
@@ -36,8 +35,6 @@ def conclude(evidence: Evidence) -> Report:
     acting = {e: selection.probability(e) for e in selection.effects}
     acting |= {e: p for channel in evidence.channels for e, p in channel.acting().items()}
     named = [e for e, p in acting.items() if p >= 0.5]
-    parts = split(evidence, selection, np.zeros(6), named)
-    named = [e for e in named if _matters(parts, e)]
     check = check_residual(evidence, selection.fit)
     parts = split(evidence, selection, check.predicted, named)
     found = words(evidence, check, parts, not_testable(evidence))
@@ -78,12 +75,6 @@ def not_testable(evidence: Evidence) -> list[str]:
     logged = {c.path for c in evidence.channels} | {"physics"}
     missing += [e for e in evidence.library.effects if path_of(e) not in logged]
     return missing + [e for c in evidence.channels for e in c.undetectable()]
-
-
-def _matters(parts: Split, effect: str) -> bool:
-    """Whether an effect's share shrinks the gap by what matters: it may be read more finely than that."""
-    whole, share = max(parts.gap.before**2 - 1.0, 0.0), parts.effects[effect].value
-    return share > DECISION.form_error and share * whole > (1.0 + DECISION.least_gap) ** 2 - 1.0
 
 
 def _report(

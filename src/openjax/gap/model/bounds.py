@@ -28,24 +28,3 @@ def bounded(hessian, push, free: int = 0) -> np.ndarray:
         fewest = min(fewest, len(wrong))
         changed = wrong if patience > 0 else wrong[-1:]
         side[changed] = np.where(beyond[changed], np.sign(found[changed]), 0.0)
-
-
-def normal_equations(precision: np.ndarray, push: np.ndarray, common: int, own: int, parts) -> tuple:
-    """Hessian and right side of least squares over tracks: of columns with a prior (`precision` (p, p), `push` (p,)), of
-    `common` nuisances that all tracks share and of `own` ones that each track has for itself, all of unit prior variance.
-    `parts` [(gram, target)] of each track's p + common + own columns in that order; None: nothing is known of it."""
-    free, shared = len(push), len(push) + common
-    size = shared + own * len(parts)
-    hessian, right = np.eye(size), np.zeros(size)
-    hessian[:free, :free], right[:free] = precision, push
-    for k, part in enumerate(parts):
-        if part is not None:
-            gram, target = part
-            mine = slice(shared + own * k, shared + own * (k + 1))
-            hessian[:shared, :shared] += gram[:shared, :shared]
-            hessian[:shared, mine] += gram[:shared, shared:]
-            hessian[mine, :shared] += gram[shared:, :shared]
-            hessian[mine, mine] += gram[shared:, shared:]
-            right[:shared] += target[:shared]
-            right[mine] += target[shared:]
-    return hessian, right

@@ -4,8 +4,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import block_diag
 
-from openjax.gap.model.bounds import bounded, normal_equations
+from openjax.gap.model.bounds import bounded
 from openjax.gap.model.library import prior
 from openjax.gap.model.table import Model, Table, with_effects
 
@@ -24,69 +25,47 @@ class Judged:
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """Normal equations of a model on a table: of its free columns, the case's nuisances and each track's, in that order."""
+    """Normal equations of a model on a table: of its free columns and the nuisances that all flights share. What belongs to a
+    fold alone is marginalised already."""
 
     table: Table
     model: Model
 
     @cached_property
-    def nuisances(self) -> tuple[np.ndarray, np.ndarray]:
-        """Columns of the nuisances that the model uses: the case's and a track's."""
-        every, shared = self.table.nuisances, self.table.shared
-        return every[shared], every[~shared]
+    def columns(self) -> np.ndarray:
+        return np.concatenate([self.model.free, self.table.nuisances[self.table.shared]])
 
-    @property
-    def common(self) -> int:
-        """Number of unknowns that all tracks share."""
-        return len(self.model.free) + len(self.nuisances[0])
+    def solve(self, fold: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Hessian, right side and solution over all folds but one."""
+        sums = self.table.folds.sum(0) - (0.0 if fold is None else self.table.folds[fold])
+        hessian, free = sums[np.ix_(self.columns, self.columns)], len(self.model.free)
+        push = sums[self.columns][:, [0, *self.model.parts]].sum(1)
+        hessian += block_diag(self.model.precision, np.eye(len(push) - free))
+        push[:free] += self.model.precision @ self.model.mean
+        return hessian, push, bounded(hessian, push, free)
 
-    @cached_property
-    def folds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Of every fold inner products (folds, c, c) of the columns, and (folds, c) with what the model has to explain."""
-        columns = np.concatenate([self.model.free, *self.nuisances])
-        sums = self.table.folds[0][:, columns]
-        return sums[:, :, columns], sums[:, :, 0] + sums[:, :, list(self.model.parts)].sum(2)
-
-    def of_track(self, track: int, but: int | None) -> tuple[np.ndarray, np.ndarray] | None:
-        """Their sums over all folds of a track but one; None where none is left."""
-        used = [f for f in np.flatnonzero(self.table.folds[1] == track) if f != but]
-        return tuple(of[used].sum(0) for of in self.folds) if used else None
-
-    def without(self, fold: int | None) -> tuple[np.ndarray, np.ndarray]:
-        """Hessian and right side over all folds but one."""
-        parts = [self.of_track(k, fold) for k in range(int(self.table.folds[1].max()) + 1)]
-        push = self.model.precision @ self.model.mean
-        return normal_equations(self.model.precision, push, *map(len, self.nuisances), parts)
-
-    def coefficients(self, found: np.ndarray, track: int) -> np.ndarray:
-        """Coefficients (..., C) of every column on one track, from solutions (..., size)."""
-        free, (shared, own) = len(self.model.free), self.nuisances
-        out = np.zeros((*found.shape[:-1], self.table.size))
-        out[..., 0] = 1.0
-        out[..., list(self.model.parts)] = 1.0
-        out[..., self.model.free] -= found[..., :free]
-        out[..., shared] = -found[..., free : self.common]
-        out[..., own] = -found[..., self.common + len(own) * track :][..., : len(own)]
+    def coefficients(self, found: np.ndarray, fold: int) -> np.ndarray:
+        """Coefficients (C,) of every column on a fold, whose own nuisances are the most likely ones."""
+        out = np.zeros(self.table.size)
+        out[[0, *self.model.parts]] = 1.0
+        out[self.columns] -= found
+        out[self.table.own] = -self.table.taken[fold] @ out
         return out
 
 
 def promise(table: Table, model: Model) -> float:
     """Log posterior of a model at its best, fitted to all folds, up to what all models of a table share: what screening needs."""
-    equations, own = Equations(table, model), [0, *model.parts]
-    hessian, push = equations.without(None)
-    found = bounded(hessian, push, len(model.free))
-    square = table.folds[0].sum(0)[np.ix_(own, own)].sum()
+    hessian, push, found = Equations(table, model).solve(None)
+    own = [0, *model.parts]
+    square = table.folds.sum(0)[np.ix_(own, own)].sum()
     return float(push @ found - 0.5 * found @ hessian @ found - 0.5 * square)
 
 
 def left_out(table: Table, model: Model):
     """Of every fold its blocks, and the coefficients (C,) of a model fitted to all others."""
     equations = Equations(table, model)
-    for fold, track in enumerate(table.folds[1]):
-        yield (
-            table.blocks_of(fold),
-            equations.coefficients(bounded(*equations.without(fold), len(model.free)), track),
-        )
+    for fold in range(len(table.folds)):
+        yield table.blocks_of(fold), equations.coefficients(equations.solve(fold)[2], fold)
 
 
 def judge(table: Table, model: Model) -> Judged:

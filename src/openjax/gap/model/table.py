@@ -27,9 +27,9 @@ ERRORS = tuple((f"{kind} {axis}", 3 * number + k) for number, kind in enumerate(
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """`white` (B, C, C) and `error` (B, 6, C, C) by block; `rows` (B,) that count; `track_of`, `fold_of` (B,). Columns: 0 is
+    """`white` (B, C, C) and `error` (B, 6, C, C) by block; `rows` (B,) that count; `fold_of` (B,). Columns: 0 is
     what is left; `derivative` {place: column}; `step` {effect: column}; `part` {effect: column}; the last are nuisances, of
-    which `shared` (N,) are the case's and the others a track's."""
+    which `shared` (N,) are the case's and the others a fold's."""
 
     fit: SetFit
     white: np.ndarray
@@ -52,11 +52,26 @@ class Table:
     def nuisances(self) -> np.ndarray:
         return np.arange(self.size - len(self.shared), self.size)
 
+    @property
+    def own(self) -> np.ndarray:
+        """Columns of the nuisances that belong to a fold."""
+        return self.nuisances[~self.shared]
+
     @cached_property
-    def folds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Whitened sums (folds, C, C), and the track (folds,) that each belongs to."""
-        own = [self.blocks_of(k) for k in range(int(self.fold_of.max()) + 1)]
-        return np.stack([self.white[b].sum(0) for b in own]), np.array([self.track_of[b.start] for b in own])
+    def whole_folds(self) -> np.ndarray:
+        """Whitened sums (folds, C, C)."""
+        return np.stack([self.white[self.blocks_of(k)].sum(0) for k in range(int(self.fold_of.max()) + 1)])
+
+    @cached_property
+    def taken(self) -> np.ndarray:
+        """(folds, own, C): what each column has of a fold's own nuisances, of unit prior variance."""
+        inside = self.whole_folds[:, self.own][:, :, self.own]
+        return np.linalg.solve(inside + np.eye(len(self.own)), self.whole_folds[:, self.own])
+
+    @cached_property
+    def folds(self) -> np.ndarray:
+        """Whitened sums (folds, C, C) with a fold's own nuisances marginalised (Frisch, Waugh, Lovell)."""
+        return self.whole_folds - self.whole_folds[:, :, self.own] @ self.taken
 
     def blocks_of(self, fold: int) -> slice:
         """The blocks of a fold, which follow one another."""
