@@ -171,12 +171,15 @@ class Search:
             here = max(better, key=lambda h: h.score)
 
     def neighbours(self, here: Hypothesis) -> list[Hypothesis]:
-        """The most promising neighbours, screened by the model linearised here and fitted in full."""
+        """The most promising neighbours, screened by the model linearised here and fitted in full: sets with one effect more,
+        with another in one's place, and of those the ones of larger prior odds, which need not score as high."""
         effects, table = frozenset(here.effects), build(here.fit, self.singles)
         more = {effects | {new}: ((new,), ()) for new in table.step}
         instead = {effects - {old} | {new}: ((new,), (old,)) for new in table.step for old in effects}
+        odds = {s: sum(CARDS[e].log_odds for e in s) for s in (effects, *instead)}
+        simpler = {s: change for s, change in instead.items() if odds[s] > odds[effects]}
         sets = []
-        for kind in (more, instead):
+        for kind in (more, instead, simpler):
             line = {s: promise(table, with_effects(table, *change)) for s, change in kind.items()}
             sets += sorted(line, key=lambda s: -line[s])[:TRIED]
         alone = sorted(table.step, key=lambda e: -self.singles[e].score)[:TRIED]
