@@ -75,6 +75,26 @@ class Fault:
         """The vehicle that nobody can hold, if there is one."""
         return self.vehicle if self.kind in GONE else None
 
+    def losses(self, now: float) -> tuple[float, float]:
+        """Shares of a vehicle's set-points, and of what it sends, that are lost at `now` (s)."""
+        gone = float(self.kind in GONE)
+        up, down = {
+            "packets lost": (self.amount,) * 2,
+            "poses lost": (0.0, 1.0),
+            "poses lost for a while": (0.0, 1.0),
+        }.get(self.kind, (gone, gone))
+        return up * self.on(now), down * self.on(now)
+
+    def answered(self, action: np.ndarray, now: float) -> np.ndarray | None:
+        """What the policy is said to have answered (N, 4) at `now` (s) in place of `action`; None: nothing."""
+        if not self.on(now) or not self.kind.startswith("policy"):
+            return action
+        if self.kind in WILD:
+            return WILD[self.kind](round(100 * now), self.vehicle + round(100 * self.time), action.shape)
+        action = np.array(action, np.float32)  # as networks answer: larger numbers are infinite
+        action[self.vehicle, round(100 * self.time) % 4] = self.number
+        return None if self.kind == "policy silent" else action
+
     def on(self, now: float) -> bool:
         """Whether it is there at `now` (s)."""
         return 0.0 <= now - self.time < self.duration

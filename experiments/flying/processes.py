@@ -218,17 +218,10 @@ class Flown:
             os._exit(3)
 
     def _spoil_play(self, play):
-        now, kind = time.perf_counter() - self._virtual.truth.take_off, self._kind
-        if now < self.fault.time or not kind.startswith("policy"):
-            return play
-        if kind == "policy fails":
+        now = time.perf_counter() - self._virtual.truth.take_off
+        if self._kind == "policy fails" and self.fault.on(now):
             raise ValueError("the policy failed")
-        action = np.array(play.action, np.float32)  # as networks answer: larger numbers are infinite
-        if kind in WILD:
-            action = WILD[kind](round(100 * now), self._number, action.shape)
-        else:
-            action[self.fault.vehicle, self._number % 4] = self.fault.number
-        return play._replace(action=action)
+        return play._replace(action=self.fault.answered(play.action, now))
 
     def _drain(self):
         if self._open and select.select([self._terminal], [], [], 0.005)[0]:

@@ -28,10 +28,8 @@ from experiments.flying.faults import (
     ENDING,
     FALL,
     FOLLOWED,
-    GONE,
     KINDS,
     MARGIN,
-    WILD,
     Fault,
     PoseDamage,
     draw_fault,
@@ -50,7 +48,7 @@ from openjax.flying.state import Drone, Event, Mode, Request, initial_state
 from openjax.pursuit import find_scenario, scenario_task
 from openjax.pursuit.environment import THRUST_LIMIT
 from openjax.vehicle import load_vehicle
-from openjax.virtual_crazyflie.simulated import SimulatedSwarm
+from openjax.virtual_crazyflie.simulated import SimulatedSwarm, Uplink
 from openjax.virtual_crazyflie.vehicles import VirtualVehicles
 
 LATEST, SECONDS = 4.0, 14.0
@@ -192,31 +190,20 @@ class Worlds:
 
     def _flown(self, w, now, samples):
         """The set-points of flight w at this tick; None where none is sent."""
-        fault, on = self.faults[w], self.faults[w].on(now)
-        uplink = self.swarm.uplinks[w * self.n + fault.vehicle]
-        lost = {"packets lost": fault.amount, **dict.fromkeys(GONE, 1.0)}.get(fault.kind, 0.0)
-        uplink.loss = lost if on else 0.0
-        uplink.voltage = {"battery low": 3.0, "battery unknown": math.nan}.get(fault.kind) if on else None
+        fault, since = self.faults[w], now - self.faults[w].time
+        on, vehicle = fault.on(now), w * self.n + fault.vehicle
+        voltages = {"battery low": 3.0, "battery unknown": math.nan}
+        self.swarm.uplinks[vehicle] = Uplink(fault.losses(now)[0], voltages.get(fault.kind) if on else None)
         if on and fault.kind == "drone restarts":
-            self.swarm.firmware[w * self.n + fault.vehicle].restart()
-        actions = tuple(from_action(a, THRUST_LIMIT) for a in self._actions[w])
-        request, reason = Request.NONE, ""
-        if on and fault.kind == "policy silent":
-            actions = None
-        elif on and fault.kind == "policy: a number that is none":
-            actions = (replace(actions[0], thrust=fault.number), *actions[1:])
-        elif on and fault.kind in WILD:
-            wild = WILD[fault.kind](round(100 * now), w, (self.n, 4))
-            actions = tuple(from_action(a, THRUST_LIMIT) for a in wild)
-        elif on and fault.kind == "key":
-            request = Request.LAND
-        elif on and fault.kind == "guard stopped" and now - fault.time > 2.0 * SILENCE:
-            request, reason = Request.LAND, "the guard is gone"
+            self.swarm.firmware[vehicle].restart()
         if on and fault.kind in PILOTS and not self._landing[w]:
-            if now - fault.time < SILENCE:
+            if since < SILENCE:
                 return [None] * self.n
             self.states[w], self._landing[w] = take_over(self.states[w], now), True
-        event = Event(now, samples, None if self._landing[w] else actions, request, reason)
+        action = None if self._landing[w] else fault.answered(self._actions[w], now)
+        actions = None if action is None else tuple(from_action(a, THRUST_LIMIT) for a in action)
+        landing = fault.kind == "key" or (fault.kind == "guard stopped" and since > 2.0 * SILENCE)
+        event = Event(now, samples, actions, Request.LAND if on and landing else Request.NONE, "")
         self.states[w], wanted = decide(self.states[w], event)
         return list(wanted)
 

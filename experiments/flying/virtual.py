@@ -8,7 +8,7 @@ import time
 
 import numpy as np
 
-from experiments.flying.faults import GONE, Fault, PoseDamage
+from experiments.flying.faults import Fault, PoseDamage
 from openjax.flying.controller import Pose
 
 _POSE = 14  # time, position, velocity, quaternion, body rates
@@ -141,11 +141,7 @@ class _Flown:
     def _spoil(self, now):
         """Do to a vehicle's link what the fault does."""
         fault = self._fault
-        gone = fault.kind in (*GONE, "poses lost", "poses lost for a while")
-        share = fault.amount if fault.kind == "packets lost" else float(gone)
-        share *= fault.on(now)
-        uplink = share if fault.kind in ("packets lost", *GONE) else 0.0
-        link = self._virtual.links[fault.vehicle]
+        link, (up, down) = self._virtual.links[fault.vehicle], fault.losses(now)
         if fault.kind == "drone restarts" and fault.on(now):
             self._virtual.firmware[fault.vehicle].restart()
-        link.faults = link.faults.__class__(loss=uplink, pose_loss=share)
+        link.faults = link.faults.__class__(loss=up, pose_loss=down)

@@ -78,11 +78,11 @@ class CrazyflowWorld(RotorPyWorld):
         self._seen = super().measure()
         return self._seen
 
-    def fly(self, command, max_speed=None):
+    def fly(self, command):
         """See `RotorPyWorld`."""
         row = {name: value.reshape(-1, value.shape[-1]) for name, value in self._seen.items()}
         row["body_rates"] = (self.bodies.rates + self.air["gyro_bias"] + self.air["gyro"][5 * self.tick]).T
-        super().fly(command, max_speed)
+        super().fly(command)
         thrust, rates = np.split(command.reshape(-1, 4), (1,), axis=1)
         told = {"command_thrust": thrust, "command_body_rates": rates, "motor_command": self.motors.T}
         self.rows.append(row | told)

@@ -48,11 +48,10 @@ def play(
     reset, look, act, advance = _compiled(settings, loaded.policy)
     state = reset(keys, tasks)
     world = make_world(state.drones, tasks)
-    limit = settings.max_speed if settings.speed_limit == "clamp" else None
     observation = look(state, world.measure())
     for _ in range(settings.episode_length):
         action, command = act(loaded.parameters, observation)
-        world.fly(np.asarray(command, float), limit)
+        world.fly(np.asarray(command, float))
         observation, state = advance(state, action, world.poses(), world.measure())
     return state.statistics
 

@@ -41,13 +41,6 @@ def air_of(drawn: dict, seed: int, number: int, ticks: int, worlds: range, team:
     return sensors.stack(bodies)
 
 
-def limit_speed(velocity: np.ndarray, most: float | None) -> None:
-    """Cut the norm of each velocity (3, B) to `most` m/s, in place, if there is a limit."""
-    if most is not None:
-        speed = np.sqrt((velocity * velocity).sum(axis=0)) + 1e-12
-        velocity *= np.minimum(1.0, most / speed)
-
-
 @dataclass
 class Solids:
     """What can't be flown through: floor, pillars, and the other bodies of the same world.
@@ -142,16 +135,12 @@ class PlantWorld:
         """Where the motion capture sees them."""
         return per_world(self.team, *self.flight.seen())
 
-    def fly(self, command, max_speed=None) -> None:
+    def fly(self, command) -> None:
         """One tick."""
-        flight = self.flight
-        flight.send(command.reshape(-1, 4).T)
-        for _ in range(plant.PER_TICK - 1):
-            flight.step()
-            flight.look()
-        flight.step()
-        limit_speed(flight.body.velocity, max_speed)
-        flight.look()
+        self.flight.send(command.reshape(-1, 4).T)
+        for _ in range(plant.PER_TICK):
+            self.flight.step()
+            self.flight.look()
 
 
 def solids_of(tasks: Task, team: int) -> Solids:

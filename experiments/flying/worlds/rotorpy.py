@@ -12,7 +12,7 @@ import numpy as np
 from experiments.diagnosis import vehicle as v
 from experiments.diagnosis.plant import PER_TICK, SAMPLE, Firmware
 from experiments.diagnosis.vehicle import matrix_of
-from experiments.flying.worlds.plant import air_of, limit_speed, sensors_of, solids_of
+from experiments.flying.worlds.plant import air_of, sensors_of, solids_of
 from experiments.flying.worlds.world import Poses, per_world
 from openjax.pursuit import Task
 from openjax.vehicle import DroneState
@@ -162,7 +162,7 @@ class RotorPyWorld:
         position = bodies.position - late * bodies.velocity + air["seen_position"][k]
         return per_world(self.team, position, quaternion, bodies.velocity + air["seen_velocity"][k])
 
-    def fly(self, command, max_speed=None) -> None:
+    def fly(self, command) -> None:
         """One tick: five times the rate loop and RotorPy's equations, then solid things."""
         command = command.reshape(-1, 4).T
         for part in range(PER_TICK):
@@ -170,5 +170,4 @@ class RotorPyWorld:
             self.motors = self.firmware(command, self.bodies.rates + noise)
             self.bodies.step(self.speeds(self.motors), SAMPLE)
         self.solids.stop(self.bodies.position, self.bodies.velocity)
-        limit_speed(self.bodies.velocity, max_speed)
         self.tick += 1

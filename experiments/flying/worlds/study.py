@@ -14,6 +14,7 @@ import math
 import multiprocessing
 import os
 import time
+from collections import defaultdict
 
 import jax
 import numpy as np
@@ -122,32 +123,24 @@ def study(options: argparse.Namespace) -> dict:
         for layout in options.layout
         for start in range(0, options.episodes, options.chunk)
     ]
-    found: dict[str, dict] = {}
+    found, records = defaultdict(lambda: defaultdict(list)), {}
     with multiprocessing.get_context("spawn").Pool(min(options.jobs, len(jobs))) as pool:
         for done, result in enumerate(pool.imap_unordered(do, jobs), 1):
             if result is None:
                 continue
             job, figures, seconds = result
-            place = found.setdefault(job.policy, {}).setdefault(job.world, {}).setdefault(job.layout, {})
+            place = found[job.policy, job.world, job.layout]
+            places = records.setdefault(job.policy, {}).setdefault(job.world, {})
             for name, values in figures.items():
-                place.setdefault(name, []).extend(values)
+                place[name] += values
             means = " ".join(f"{name} {np.mean(values):.3f}" for name, values in figures.items())
             print(
                 f"{done}/{len(jobs)} {job.policy} {job.world} {job.layout} {job.start} {means} ({seconds:.0f} s, "
                 f"{time.monotonic() - started:.0f} s in all)",
                 flush=True,
             )
-    records = {
-        policy: {
-            world: {
-                layout: {"episodes": len(figures["crashed"])}
-                | {name: float(np.mean(values)) for name, values in figures.items()}
-                for layout, figures in layouts.items()
-            }
-            for world, layouts in worlds.items()
-        }
-        for policy, worlds in found.items()
-    }
+            record = {"episodes": len(place["crashed"])}
+            places[job.layout] = record | {name: float(np.mean(place[name])) for name in FIGURES}
     return {"records": records}
 
 
@@ -160,12 +153,8 @@ def page(results: dict) -> Page:
             for layout, record in records.items():
                 rows.append({"world": world, "policy": policy, "layout": layout, **record})
             if records:
-                mean = {
-                    name: (sum if name == "episodes" else np.mean)(
-                        [record[name] for record in records.values()]
-                    )
-                    for name in next(iter(records.values()))
-                }
+                mean = {name: np.mean([record[name] for record in records.values()]) for name in FIGURES}
+                mean["episodes"] = sum(record["episodes"] for record in records.values())
                 for name in ("captured", "crashed"):
                     hits = binomtest(round(mean[name] * mean["episodes"]), mean["episodes"])
                     low, high = hits.proportion_ci(method="wilson")

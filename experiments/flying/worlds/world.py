@@ -17,11 +17,8 @@ class World(Protocol):
     def measure(self) -> Poses:
         """Where the vehicles are seen at this tick: late, noisy, as the world has it."""
 
-    def fly(self, command: np.ndarray, max_speed: float | None = None) -> None:
-        """One tick after sending `command` (W, N, 4): collective thrust in 0..1, body rates in rad/s.
-
-        The norm of each velocity is cut to `max_speed` (m/s) at the end, where given.
-        """
+    def fly(self, command: np.ndarray) -> None:
+        """One tick after sending `command` (W, N, 4): collective thrust in 0..1, body rates in rad/s."""
 
 
 def per_world(team: int, position, quaternion, velocity) -> Poses:
