@@ -8,14 +8,34 @@ import numpy as np
 import pytest
 
 from openjax.baselines import Heuristic
-from openjax.baselines.stack import Points, StackParameters, stack, stack_bound
-from openjax.baselines.surroundings import Craft, surroundings
+from openjax.baselines.stack import StackParameters, stack, stack_bound
+from openjax.baselines.surroundings import Craft, length, surroundings
 from openjax.pursuit import Pursuit, PursuitSettings, uniform_task
 from openjax.pursuit.evaders import draw_evader
 from openjax.pursuit.evaders.behaviours import MARGIN
+from openjax.vehicle import DroneState
 
 STEP = 0.01
 EVADERS = ("field", "greedy", "greedy_near", "wall_runner", "way_points")
+
+
+@dataclasses.dataclass(frozen=True)
+class Points:
+    """Dynamics in which pursuers are points: the last three numbers of an action are a velocity, as shares of `speed` (m/s)."""
+
+    speed: float
+    time_step: float
+
+    def reset(self, vehicle, drones: DroneState, key=None) -> DroneState:
+        return drones
+
+    def __call__(self, vehicle, drones: DroneState, command: jax.Array, *_) -> DroneState:
+        share = command[:, 1:] / jnp.pi
+        velocity = self.speed * share / jnp.maximum(length(share), 1.0)
+        return drones.replace(velocity=velocity, position=drones.position + self.time_step * velocity)
+
+    def seen(self, drones: DroneState, effect_parameters=None) -> DroneState:
+        return drones
 
 
 def round_the_wall(settings, place):

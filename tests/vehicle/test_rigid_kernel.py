@@ -142,7 +142,9 @@ def test_derivatives_are_those_of_the_step(argument):
 
 def test_componentwise_moves_sums_and_compares():
     def function(x, y):
-        first, second = jax.lax.unstack(jnp.stack([x, y]))  # what newer versions of JAX make of `first, second = ...`
+        first, second = jax.lax.unstack(
+            jnp.stack([x, y])
+        )  # what newer versions of JAX make of `first, second = ...`
         table = jnp.stack([first, second[::-1], jnp.where(x > 0.1, x, y)]).T
         return jnp.sum(table * jnp.array([1.0, -2.0, 0.5]), axis=1), jnp.concatenate(
             [table[1], x[:1]]

@@ -34,13 +34,39 @@ METHODS = {
 }
 
 
+class WithoutNetwork:
+    """What isn't learnt, with the interface of `openjax.policy.Policy`; a subclass has `mean`."""
+
+    predictor = PredictorSettings(enabled=False)
+
+    def mean(self, actor: Any, observation: Observation) -> jax.Array:
+        """Action (..., N, 4) in -1..1."""
+        raise NotImplementedError
+
+    def predict(self, parameters: PolicyParameters, observation: Observation) -> None:
+        """It predicts nothing."""
+
+    def distribution(
+        self, actor: Any, observation: Observation, predicted: None
+    ) -> tuple[jax.Array, jax.Array]:
+        """Action (..., N, 4) in -1..1 and log standard deviation (4,): none, as nothing explores."""
+        return self.mean(actor, observation), jnp.full(4, -jnp.inf)
+
+    def action(self, sample: jax.Array, observation: Observation) -> jax.Array:
+        """The sample is the action."""
+        return sample
+
+    def act(self, parameters: PolicyParameters, observation: Observation) -> jax.Array:
+        """Action (..., N, 4) in -1..1."""
+        return self.mean(parameters.actor, observation)
+
+
 @dataclasses.dataclass(frozen=True)
-class Heuristic:
-    """A method of `METHODS` with the interface of `openjax.policy.Policy`; its parameters stand in the actor's place."""
+class Heuristic(WithoutNetwork):
+    """A method of `METHODS` as a policy; its parameters stand in the actor's place."""
 
     name: str
     craft: Craft = dataclasses.field(default_factory=Craft)
-    predictor: PredictorSettings = dataclasses.field(default_factory=lambda: PredictorSettings(enabled=False))
 
     @classmethod
     def for_environment(cls, name: str, environment: Pursuit) -> "Heuristic":
@@ -57,20 +83,7 @@ class Heuristic:
         """The parameters that the search found."""
         return PolicyParameters(actor=best(self.name, METHODS[self.name].kind), critic={}, predictor={})
 
-    def predict(self, parameters: PolicyParameters, observation: Observation) -> None:
-        """No method here predicts by a network."""
-
-    def distribution(
-        self, actor: Any, observation: Observation, predicted: None
-    ) -> tuple[jax.Array, jax.Array]:
-        """Action (..., N, 4) in -1..1 and log standard deviation (4,): none, heuristics don't explore."""
-        desired = METHODS[self.name].rule(self.craft, actor, surroundings(self.craft, observation))
-        return velocity_action(self.craft, observation, desired), jnp.full(4, -jnp.inf)
-
-    def action(self, sample: jax.Array, observation: Observation) -> jax.Array:
-        """The sample is the action."""
-        return sample
-
-    def act(self, parameters: PolicyParameters, observation: Observation) -> jax.Array:
+    def mean(self, actor: Any, observation: Observation) -> jax.Array:
         """Action (..., N, 4) in -1..1."""
-        return self.distribution(parameters.actor, observation, None)[0]
+        desired = METHODS[self.name].rule(self.craft, actor, surroundings(self.craft, observation))
+        return velocity_action(self.craft, observation, desired)

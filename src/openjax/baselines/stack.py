@@ -10,8 +10,6 @@ v_p y >= v_e x; the worst is the wall, y = R, up to x = R - s. So a capture is f
 1.331 for three pursuers, r = .3 m, R = .9 m, H = 1.2 m. (An evader between axis and pursuer has crossed s before.)
 """
 
-from dataclasses import dataclass
-
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -19,7 +17,6 @@ from flax import struct
 from openjax.baselines.parameters import parameter
 from openjax.baselines.surroundings import Craft, Surroundings, length
 from openjax.pursuit.settings import PursuitSettings
-from openjax.vehicle import DroneState
 
 
 def stack_bound(settings: PursuitSettings) -> float:
@@ -68,28 +65,3 @@ def stack(craft: Craft, parameters: StackParameters, known: Surroundings) -> jax
     rise = parameters.gain * height * jnp.minimum(1.0, craft.speed / size)
     level = jnp.where(ready[..., None], forwards, gather)
     return jnp.concatenate([level, jnp.where(ready, up, rise)[..., None]], axis=-1)
-
-
-@dataclass(frozen=True)
-class Points:
-    """Dynamics in which pursuers are points: the last three numbers of an action are a velocity, as shares of `speed` (m/s)."""
-
-    speed: float
-    time_step: float
-
-    def reset(self, vehicle, drones: DroneState, key=None) -> DroneState:
-        """The points where they are."""
-        del vehicle, key
-        return drones
-
-    def __call__(self, vehicle, drones: DroneState, command: jax.Array, *_) -> DroneState:
-        """The points a step later."""
-        del vehicle
-        share = command[:, 1:] / jnp.pi
-        velocity = self.speed * share / jnp.maximum(length(share), 1.0)
-        return drones.replace(velocity=velocity, position=drones.position + self.time_step * velocity)
-
-    def seen(self, drones: DroneState, effect_parameters=None) -> DroneState:
-        """The points as they are."""
-        del effect_parameters
-        return drones

@@ -1,11 +1,8 @@
 """One flown episode as host arrays, for pictures and animations."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
-
-from openjax.files import replacing
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,17 +47,3 @@ class Trajectory:
         if self.capture_index is None:
             return steps
         return min(steps, self.capture_index + round(after / self.time_step))
-
-    def save(self, path: Path) -> None:
-        """Write as .npz."""
-        with replacing(path) as partial:
-            known = {name: np.asarray(value) for name, value in vars(self).items() if value is not None}
-            np.savez_compressed(partial, **known)
-
-    @classmethod
-    def load(cls, path: Path) -> "Trajectory":
-        """Read what `save` wrote."""
-        with np.load(path, allow_pickle=False) as stored:
-            values = {name: stored[name] for name in stored.files}
-        plain = {name: value.item() if value.ndim == 0 else value for name, value in values.items()}
-        return cls(**plain)
