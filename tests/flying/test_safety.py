@@ -296,6 +296,7 @@ def lift(rise, seconds=2.5):
         (lambda p, h: ((*p[:2], h), (*p[:2], h)), ""),
         (lambda p, h: ((p[0] + h, p[1], 0.0), None), "sideways"),  # y up
         (lambda p, h: ((*p[:2], 0.2 * h), None), "up after"),  # scale, weight
+        (lambda p, h: ((*p[:2], 2.5 * h), None), "too high"),
         (lambda p, h: ((*p[:2], h), (*p[:2], 0.4 * h)), "differently"),
     ],
 )

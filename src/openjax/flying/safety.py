@@ -95,7 +95,7 @@ def _transfer(state, event, drone, start) -> Drone:
 def lift_fault(state: State, drone: Drone) -> str:
     """What speaks against a vehicle's poses in its test lift; empty while nothing does.
 
-    Each source must rise and stay above its stand, and both by the same.
+    Each source must rise, stay above its stand, and not rise past where a fall still does no harm; both by the same.
     """
     settings = state.settings
     moves = [
@@ -103,6 +103,8 @@ def lift_fault(state: State, drone: Drone) -> str:
         for track, stand in zip((drone.own, drone.captured), drone.stand, strict=True)
         if stand is not None
     ]
+    if any(z > 2.0 * settings.lift for *_, z in moves):
+        return "the test lift went too high: is it lighter, or another, than --vehicle says?"
     if any(math.hypot(x, y) > ASIDE for x, y, _ in moves):
         return "the test lift went sideways: do the poses' axes and yaw agree with the vehicle's?"
     if len(moves) == 2 and math.dist(*moves) > ASIDE / 2:
