@@ -12,7 +12,7 @@ from openjax.flights.track import GRID_PERIOD, Track
 from openjax.gap.channels.instruments import caused_by_commands, read_feedback
 from openjax.gap.channels.rate_loop import ROW_DELAY, RateLoop
 from openjax.gap.channels.sensors import Kinematics
-from openjax.gap.model.hypotheses import SetFit, fit_singles, model_noise
+from openjax.gap.model.hypotheses import SetFit, fit_set, fit_singles, model_noise
 from openjax.gap.model.library import CARDS, Library, numbers_of
 from openjax.gap.model.observer import TICKS
 from openjax.gap.model.replay import Replay, make_replay
@@ -78,19 +78,27 @@ def make_reading(case: Case, library: Library, tracks, vehicles, arrived, sensor
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """`replay` of the flights; `singles` {effect: its fit alone} and the fit of `nothing`; `exposure` {effect: nats that it
-    would leave at its usual size}; `confounded`: effects that hidden samples look like: they take what they can, and aren't
-    named."""
+    """`replay` of the flights; `exposure` {effect: nats that it would leave at its usual size}; `confounded`: effects that hidden
+    samples look like: they take what they can, and aren't named."""
 
     replay: Replay
-    nothing: SetFit
-    singles: dict[str, SetFit]
+    library: Library
     exposure: dict[str, float]
     confounded: frozenset[str]
 
+    @cached_property
+    def nothing(self) -> SetFit:
+        """The fit of no effect."""
+        return fit_set(self.replay, ())
+
+    @cached_property
+    def singles(self) -> dict[str, SetFit]:
+        """The fit of each effect alone; a calibration asks for none."""
+        return fit_singles(self.replay, self.library, self.exposure)
+
 
 def read_motion(reading: Reading, loop: RateLoop | None) -> Motion:
-    """Replay the flights and fit every effect alone; `loop` knows what the motors did within a row."""
+    """Replay the flights; `loop` knows what the motors did within a row."""
     tracks, sensors, library = reading.tracks, reading.sensors, reading.library
     ticks = [np.repeat(t.motor[:, None], TICKS, 1) for t in tracks] if loop is None else loop.ticks
     if loop is not None and reading.at_once:
@@ -101,7 +109,7 @@ def read_motion(reading: Reading, loop: RateLoop | None) -> Motion:
     replay, exposure = model_noise(replay, library)
     exposure |= {e: 0.0 for e in library.physics if _hidden(CARDS[e], tracks)}
     confounded = frozenset(e for e in library.physics if reading.blind and CARDS[e].torque_axes)
-    return Motion(replay, *fit_singles(replay, library, exposure), exposure, confounded)
+    return Motion(replay, library, exposure, confounded)
 
 
 def _hidden(card, tracks) -> bool:

@@ -158,13 +158,10 @@ def without_nuisances(replay: Replay, residual: np.ndarray, track: int) -> np.nd
     return residual - np.tensordot(replay.taken(residual, track), replay.nuisances[track], 1)
 
 
-def fit_singles(replay: Replay, library: Library, exposure) -> tuple[SetFit, dict[str, SetFit]]:
-    """Fits of no effect and of every effect alone that the flights could show."""
-    found = {}
-    for effect in library.physics:
-        if exposure[effect] >= UNEXPOSED:
-            found[effect] = fit_set(replay, (effect,), _best_start(replay, effect))
-    return fit_set(replay, ()), found
+def fit_singles(replay: Replay, library: Library, exposure) -> dict[str, SetFit]:
+    """The fit of every effect alone that the flights could show."""
+    shown = [effect for effect in library.physics if exposure[effect] >= UNEXPOSED]
+    return {effect: fit_set(replay, (effect,), _best_start(replay, effect)) for effect in shown}
 
 
 def _best_start(replay: Replay, effect: str) -> np.ndarray:
