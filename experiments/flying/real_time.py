@@ -4,11 +4,10 @@ Each worker compiles the policy once and has virtual Crazyflies of its own, in a
 goes wrong is in `experiments.flying.processes`.
 """
 
-import contextlib
+import atexit
+import functools
 import json
-import multiprocessing
 import random
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,8 +15,10 @@ import tyro
 
 from experiments.flying.faults import ENDING, MARGIN
 from experiments.flying.processes import GROUPS, KINDS, STOPPED, Flown, ends_flight
+from experiments.flying.single_thread import share_out
 from experiments.table import RESULTS, Page, Table, facts, write_page
-from openjax.files import read_json
+from openjax.files import read_json, write_json
+from openjax.store.settings_files import to_plain
 
 
 @dataclass(frozen=True)
@@ -45,23 +46,17 @@ def main() -> None:
     left = set(range(arguments.seed, arguments.seed + arguments.flights)) - {r["number"] for r in records}
     work = [(n, names[n % len(names)]) for n in sorted(left)]
     random.Random(arguments.seed).shuffle(work)  # whenever it stops, kinds were flown without favour
-    context = multiprocessing.get_context("spawn")
-    queue, done = context.Queue(), context.Queue()
-    for item in work:
-        queue.put(item)
-    given = (arguments, queue, done, time.time() + arguments.seconds_left)
-    workers = [context.Process(target=worker, args=given) for _ in range(arguments.processes)]
-    for process in workers:
-        process.start()
-    stands = facts()
-    while any(w.is_alive() for w in workers) or not done.empty():
-        with contextlib.suppress(Exception):
-            records.append(done.get(timeout=1.0))
-            row = records[-1]
-            print("well" if row["well"] else "NOT WELL", json.dumps(row), flush=True)
-            result = {**stands, "flights": len(records), "well": sum(r["well"] for r in records), "policy": arguments.policy,
-                      "records": sorted(records, key=lambda r: r["number"])}  # fmt: skip
-            arguments.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    stands, jobs = facts(), [(number, kind, arguments.policy) for number, kind in work]
+    for row in share_out(fly, jobs, arguments.processes, arguments.seconds_left):
+        records.append(row)
+        print("well" if row["well"] else "NOT WELL", json.dumps(row), flush=True)
+        counts = {
+            "flights": len(records),
+            "well": sum(r["well"] for r in records),
+            "policy": arguments.policy,
+        }
+        in_order = sorted(records, key=lambda r: r["number"])
+        write_json(arguments.out, to_plain({**stands, **counts, "records": in_order}))
     write_page(arguments.out, page, read_json(arguments.out))
 
 
@@ -92,24 +87,25 @@ def page(results) -> Page:
     return Page("Faults where they happen, in real time", prose, [Table(columns, rows), *ill])
 
 
-def worker(arguments, queue, done, ends) -> None:
-    """Fly what is in the queue."""
+def fly(number: int, kind: str, policy: str) -> dict:
+    """What became of a flight."""
+    return Flown(number, kind, *_made_once(policy)).fly()
+
+
+@functools.cache
+def _made_once(policy):
+    """This process' virtual Crazyflies, how to fly them, and all that is compiled for it."""
     from experiments.flying.virtual import VirtualProcess
     from openjax.commands.fly import Arguments as FlyArguments
     from openjax.commands.fly import prepare
     from openjax.flying import real_time
 
     virtual = VirtualProcess("wall")
-    fly = FlyArguments(policy=arguments.policy, uri=tuple(virtual.uris), episode_seconds=8.0, body_logs=1)
-    prepared = prepare(fly)
+    atexit.register(virtual.close)
+    arguments = FlyArguments(policy=policy, uri=tuple(virtual.uris), episode_seconds=8.0, body_logs=1)
+    prepared = prepare(arguments)
     real_time.hurry()
-    while time.time() < ends:
-        try:
-            number, kind = queue.get(timeout=10.0)
-        except Exception:
-            break
-        done.put(Flown(number, kind, virtual, fly, prepared).fly())
-    virtual.close()
+    return virtual, arguments, prepared
 
 
 if __name__ == "__main__":

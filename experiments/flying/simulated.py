@@ -9,12 +9,9 @@ flights there is motion capture, which the estimators on board follow as far as 
 from __future__ import annotations
 
 import functools
-import json
 import math
 import time
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
-from multiprocessing import get_context
 from pathlib import Path
 
 import jax
@@ -35,8 +32,9 @@ from experiments.flying.faults import (
     draw_fault,
     outcome,
 )
+from experiments.flying.single_thread import share_out
 from experiments.table import RESULTS, Page, Table, facts, write_page
-from openjax.files import read_json
+from openjax.files import read_json, write_json
 from openjax.flying.board import SILENCE
 from openjax.flying.controller import Pose
 from openjax.flying.estimation import see
@@ -47,6 +45,7 @@ from openjax.flying.set_point import from_action
 from openjax.flying.state import Drone, Event, Mode, Request, initial_state
 from openjax.pursuit import find_scenario, scenario_task
 from openjax.pursuit.environment import THRUST_LIMIT
+from openjax.store.settings_files import to_plain
 from openjax.vehicle import load_vehicle
 from openjax.virtual_crazyflie.simulated import SimulatedSwarm, Uplink
 from openjax.virtual_crazyflie.vehicles import VirtualVehicles
@@ -279,25 +278,19 @@ def main() -> None:
     for k, layout in enumerate(arguments.layouts):
         mine = [s for s in seeds if (s // len(KINDS)) % len(arguments.layouts) == k]
         mine += [-1] * (-len(mine) % arguments.batch)  # all batches are of one size: compiled once
-        jobs += [(mine[i : i + arguments.batch], layout) for i in range(0, len(mine), arguments.batch)]
+        batches = [mine[i : i + arguments.batch] for i in range(0, len(mine), arguments.batch)]
+        jobs += [(batch, layout, arguments.policy) for batch in batches]
     jobs.sort(key=lambda job: job[0][0])  # whenever it stops, all kinds and layouts were flown as often
-    records = []
-    with ProcessPoolExecutor(arguments.processes, mp_context=get_context("spawn")) as pool:
-        waiting, running = iter(jobs), set()
-        while True:
-            late = time.time() - begin > arguments.seconds_left
-            while len(running) < arguments.processes and not late and (job := next(waiting, None)):
-                running.add(pool.submit(fly, *job, arguments.policy))
-            if not running:
-                break
-            done = next(as_completed(running))
-            running.discard(done)
-            records += done.result()
-            result = {
-                **facts(), "policy": arguments.policy, "seconds": round(time.time() - begin),
-                "summary": summary(records), "not_well": [r for r in records if not well(r)],
-            }  # fmt: skip
-            arguments.out.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    records, stands = [], facts()
+    for flown in share_out(fly, jobs, arguments.processes, arguments.seconds_left):
+        records += flown
+        ill = [r for r in records if not well(r)]
+        result = {
+            "policy": arguments.policy,
+            "seconds": round(time.time() - begin),
+            "summary": summary(records),
+        }
+        write_json(arguments.out, {**to_plain(stands), **result, "not_well": ill})
     write_page(arguments.out, page, read_json(arguments.out))
 
 

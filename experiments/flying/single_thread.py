@@ -1,6 +1,12 @@
-"""One thread per process, for programs whose processes are the parallel part."""
+"""One thread per process, for programs whose processes are the parallel part; and work shared out to them."""
 
+import math
 import os
+import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from typing import Any
 
 SINGLE_THREAD = {
     "JAX_PLATFORMS": "cpu",
@@ -15,3 +21,18 @@ def use_single_thread() -> None:
     """For this process, if NumPy and JAX aren't imported yet, and for those that it starts."""
     for name, value in SINGLE_THREAD.items():
         os.environ.setdefault(name, value)
+
+
+def share_out(
+    do: Callable, jobs: Iterable[tuple], processes: int, seconds: float = math.inf
+) -> Iterator[Any]:
+    """What `do(*job)` gives in one of so many processes, as it comes; none is begun after `seconds`."""
+    latest = time.time() + seconds
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+        for done in as_completed([pool.submit(_in_time, do, job, latest) for job in jobs]):
+            if (result := done.result()) is not None:
+                yield result
+
+
+def _in_time(do, job, latest):
+    return do(*job) if time.time() < latest else None

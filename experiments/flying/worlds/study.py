@@ -11,7 +11,6 @@ import argparse
 import dataclasses
 import functools
 import math
-import multiprocessing
 import os
 import time
 from collections import defaultdict
@@ -21,6 +20,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 from experiments.diagnosis import effects
+from experiments.flying.single_thread import share_out
 from experiments.flying.worlds.game import play
 from experiments.flying.worlds.plant import PlantWorld, rng_of
 from experiments.flying.worlds.rotorpy import RotorPyWorld
@@ -61,8 +61,6 @@ class Job:
     layout: str
     start: int
     number: int
-    latest: float = math.inf
-    """Time (s since the epoch) after which it isn't begun."""
 
 
 def make_world(world: str, ticks: int, start: int, drones, tasks):
@@ -96,10 +94,8 @@ def loaded_policy(name: str):
     return loaded, settings
 
 
-def do(job: Job) -> tuple[Job, dict[str, list[float]], float] | None:
-    """Figures of each episode of a job; None where it is too late to begin."""
-    if time.time() > job.latest:
-        return None
+def do(job: Job) -> tuple[Job, dict[str, list[float]], float]:
+    """Figures of each episode of a job, and how long they took (s)."""
     begin = time.perf_counter()
     loaded, settings = loaded_policy(job.policy)
     task = scenario_task(settings, SCENARIOS[job.layout])
@@ -115,32 +111,26 @@ def do(job: Job) -> tuple[Job, dict[str, list[float]], float] | None:
 
 def study(options: argparse.Namespace) -> dict:
     """Fly all policies in all layouts of all worlds."""
-    started, latest = time.monotonic(), time.time() + options.seconds
+    started = time.monotonic()
     jobs = [
-        Job(policy, world, layout, start, min(options.chunk, options.episodes - start), latest)
+        Job(policy, world, layout, start, min(options.chunk, options.episodes - start))
         for world in sorted(options.world, key=lambda name: name != "rotorpy")  # the slowest first
         for policy in options.policy
         for layout in options.layout
         for start in range(0, options.episodes, options.chunk)
     ]
     found, records = defaultdict(lambda: defaultdict(list)), {}
-    with multiprocessing.get_context("spawn").Pool(min(options.jobs, len(jobs))) as pool:
-        for done, result in enumerate(pool.imap_unordered(do, jobs), 1):
-            if result is None:
-                continue
-            job, figures, seconds = result
-            place = found[job.policy, job.world, job.layout]
-            places = records.setdefault(job.policy, {}).setdefault(job.world, {})
-            for name, values in figures.items():
-                place[name] += values
-            means = " ".join(f"{name} {np.mean(values):.3f}" for name, values in figures.items())
-            print(
-                f"{done}/{len(jobs)} {job.policy} {job.world} {job.layout} {job.start} {means} ({seconds:.0f} s, "
-                f"{time.monotonic() - started:.0f} s in all)",
-                flush=True,
-            )
-            record = {"episodes": len(place["crashed"])}
-            places[job.layout] = record | {name: float(np.mean(place[name])) for name in FIGURES}
+    flown = share_out(do, [(job,) for job in jobs], min(options.jobs, len(jobs)), options.seconds)
+    for done, (job, figures, seconds) in enumerate(flown, 1):
+        place = found[job.policy, job.world, job.layout]
+        places = records.setdefault(job.policy, {}).setdefault(job.world, {})
+        for name, values in figures.items():
+            place[name] += values
+        means = " ".join(f"{name} {np.mean(values):.3f}" for name, values in figures.items())
+        of = f"{done}/{len(jobs)} {job.policy} {job.world} {job.layout} {job.start}"
+        print(f"{of} {means} ({seconds:.0f} s, {time.monotonic() - started:.0f} s in all)", flush=True)
+        record = {"episodes": len(place["crashed"])}
+        places[job.layout] = record | {name: float(np.mean(place[name])) for name in FIGURES}
     return {"records": records}
 
 
