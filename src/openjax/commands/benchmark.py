@@ -119,4 +119,4 @@ def _line(row):
     speed, memory = row["env_steps_per_second"], row["memory"]
     told = "out of memory" if speed is None else f"{speed:,.0f} env steps/s, {1e3 * row['seconds']:,.1f} ms"
     needs = "" if memory is None else f", {memory / 1e6:,.0f} MB"
-    return f"{row['part']:12} {row['num_envs']:>10,} environments: {told} (compiled in {row['compile_seconds']:.1f} s{needs})"
+    return f"{row['part']:17} {row['num_envs']:>9,} environments: {told} (compiled in {row['compile_seconds']:.1f} s{needs})"

@@ -50,8 +50,8 @@ def _training(settings, devices):
     yield "- fly", phases.fly, (carry,)
     flown = jax.eval_shape(phases.fly, carry)[1]
     flown = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), flown)  # takes as long as any
-    for i, learn in enumerate(phases.learn):
-        yield f"- learn_{i}", learn, (carry, flown)
+    for learn in phases.learn:
+        yield f"- {learn.__name__}", learn, (carry, flown)
     yield "- renew", phases.renew, (carry,)
 
 
