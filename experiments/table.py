@@ -23,8 +23,7 @@ from typing import Any
 import numpy as np
 
 from openjax.commands.machine import describe_machine
-from openjax.files import read_json, write_json, write_text
-from openjax.store.settings_files import to_plain
+from openjax.files import read_json, to_plain, write_json, write_text
 
 RESULTS = Path(__file__).parent / "results"
 PLACES = ("--out", "--work", "--results", "--flights", "--commit")

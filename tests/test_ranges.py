@@ -16,6 +16,7 @@ from openjax.commands.evaluate import EvaluateCommand
 from openjax.commands.training_command import TrainCommand
 from openjax.commands.view import ViewCommand
 from openjax.errors import UserError
+from openjax.files import to_plain
 from openjax.flying.limits import SafetySettings
 from openjax.learning import GeneratorSettings, MappoSettings, TrainSettings
 from openjax.learning.settings import AdaptSettings
@@ -23,7 +24,6 @@ from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import PursuitSettings, RewardSettings
 from openjax.ranges import Interval, check_intervals, ranged_fields
 from openjax.store.old_names import train_settings
-from openjax.store.settings_files import to_plain
 from openjax.virtual_crazyflie.link import LinkFaults
 
 SETTINGS = (

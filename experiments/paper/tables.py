@@ -23,11 +23,10 @@ from openjax.background import compile_ahead
 from openjax.baselines import METHODS as HEURISTICS
 from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import layout_slots, record_of, repeat_task
-from openjax.files import read_json, write_text
+from openjax.files import read_json, to_plain, write_text
 from openjax.learning import summarise
 from openjax.pursuit import SCENARIOS, Pursuit, RewardSettings, scenario_task
 from openjax.store.policies import LoadedPolicy, load_policy
-from openjax.store.settings_files import to_plain
 
 PAGES = {
     "tab_main": (main_tables.page, None),

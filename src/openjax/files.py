@@ -1,6 +1,7 @@
 """Files that people hand in, read strictly; files that openjax writes, whole or not at all."""
 
 import contextlib
+import dataclasses
 import hashlib
 import json
 import os
@@ -144,9 +145,24 @@ def write_text(path: str | Path, text: str) -> None:
         partial.write_text(text, encoding="utf-8")
 
 
+def to_plain(value: Any) -> Any:
+    """Dataclasses, tuples and paths as JSON values (dict, list, str, numbers, None)."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: to_plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, dict):
+        return {str(key): to_plain(entry) for key, entry in value.items()}
+    if isinstance(value, tuple | list):
+        return [to_plain(entry) for entry in value]
+    if isinstance(value, Path):
+        return str(value)
+    if hasattr(value, "item") and getattr(value, "ndim", 0) == 0:
+        return value.item()
+    return value
+
+
 def write_json(path: str | Path, value: Any) -> None:
-    """Write plain values (no NaN) as JSON, in one piece."""
-    write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
+    """Write settings and results (see `to_plain`; no NaN) as JSON, in one piece."""
+    write_text(path, json.dumps(to_plain(value), indent=2, allow_nan=False) + "\n")
 
 
 def check_output(path: str | Path | None, option: str) -> None:

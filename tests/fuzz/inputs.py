@@ -60,9 +60,9 @@ def fuzz_benchmark(rng: random.Random, folder: Path):
 
 
 def fuzz_settings(rng: random.Random, folder: Path):
+    from openjax.files import to_plain
     from openjax.learning import preset
     from openjax.store.run_directory import RunDirectory
-    from openjax.store.settings_files import to_plain
 
     stored = {
         "format": "openjax run 1",

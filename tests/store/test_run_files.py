@@ -11,13 +11,13 @@ import pytest
 from PIL import Image
 
 from openjax.errors import UserError
-from openjax.files import replacing
+from openjax.files import replacing, to_plain
 from openjax.show.metrics import MetricsWriter, read_metrics
 from openjax.show.plots import plot_training, plot_trajectories
 from openjax.show.trajectory import Trajectory
 from openjax.show.videos import AZIMUTH, DISTANCE, ELEVATION, HEIGHT, OPENING, WIDTH, animate, caption, draw
 from openjax.store.policy_files import fill, load_policy_file, save_policy_file
-from openjax.store.settings_files import from_plain, to_plain
+from openjax.store.settings_files import from_plain
 
 
 @dataclasses.dataclass(frozen=True)

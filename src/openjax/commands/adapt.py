@@ -19,7 +19,7 @@ import tyro
 
 from openjax.commands.command_line import output_console, parse
 from openjax.errors import UserError
-from openjax.files import check_output_folder, write_text
+from openjax.files import check_output_folder, write_json, write_text
 from openjax.learning.settings import AdaptSettings
 from openjax.ranges import Interval, Seed
 from openjax.show.steps import Steps
@@ -209,7 +209,6 @@ def _results(command, found, flown, tuned) -> dict:
 def _write(command, bench, found, tuned, results):
     """The policy, the figures and the page."""
     from openjax.store.policy_files import save_policy_file
-    from openjax.store.settings_files import write_json
 
     game = dataclasses.replace(bench.game, vehicles=found.family)
     settings = dataclasses.replace(bench.loaded.settings, environment=game)

@@ -15,7 +15,7 @@ import tyro
 
 from openjax.commands.command_line import parse, peek
 from openjax.errors import UserError
-from openjax.files import check_output
+from openjax.files import check_output, write_json
 from openjax.learning.presets import preset
 from openjax.learning.settings import TrainSettings
 from openjax.ranges import Interval
@@ -72,7 +72,6 @@ def main(arguments: Sequence[str]) -> int:
     from openjax.commands.benchmark_cases import cases
     from openjax.commands.machine import describe_machine
     from openjax.commands.timing import time_compiled
-    from openjax.store.settings_files import write_json
 
     machine = describe_machine()
     print(f"{machine['device']}, JAX {machine['versions']['jax']}, commit {machine['commit']}", flush=True)

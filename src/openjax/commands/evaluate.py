@@ -14,7 +14,7 @@ import tyro
 
 from openjax.commands.command_line import output_console, parse
 from openjax.errors import UserError
-from openjax.files import check_output
+from openjax.files import check_output, write_json
 from openjax.pursuit.settings import PursuitSettings
 from openjax.ranges import Interval, Seed
 from openjax.show.steps import Steps
@@ -153,7 +153,6 @@ def _show(command, results):
     """Print the tables and write the file: a record, a list of them, or such a list by policy."""
     from openjax.commands.evaluator import results_table, spread_table
     from openjax.commands.run_words import unlike_the_papers
-    from openjax.store.settings_files import write_json
 
     console = output_console()
     for own, source, rows in results:

@@ -3,10 +3,10 @@
 from pathlib import Path
 from typing import Any
 
+from openjax.files import to_plain
 from openjax.learning import TrainSettings
 from openjax.learning.presets import PRESETS
 from openjax.pursuit import SCENARIOS, PursuitSettings, Scenario
-from openjax.store.settings_files import to_plain
 
 NAMED = 3
 """Most changed settings that are named."""

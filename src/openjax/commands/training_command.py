@@ -18,14 +18,13 @@ from openjax.commands.run_words import opening_words
 from openjax.commands.training_job import TrainingJob, run_job
 from openjax.commands.training_options import MAY_CHANGE, PROGRAM, TrainCommand
 from openjax.errors import UserError
-from openjax.files import remove_unfinished
+from openjax.files import remove_unfinished, to_plain
 from openjax.learning import TrainSettings, preset
 from openjax.store.checkpoints import Checkpoints
 from openjax.store.compiled_programs import cache_programs
 from openjax.store.environments import make_environment, with_airframe
 from openjax.store.policies import known_policies
 from openjax.store.run_directory import RunDirectory, check_free, create_run, locked, open_run
-from openjax.store.settings_files import to_plain
 from openjax.vehicle.vehicle_file import copy_vehicle_file, load_vehicle_file
 
 

@@ -30,6 +30,7 @@ from openjax.commands.gradient_stages import compile_first_flights, compile_last
 from openjax.commands.run_words import closing_words, layouts_like
 from openjax.commands.training_loop import Loop, NotFiniteError, Outcome, Plan, StopRequest, guarded
 from openjax.commands.validation import Validation, flat_metrics, selection_score
+from openjax.files import write_json
 from openjax.learning import TrainSettings, build, make_start, summarise
 from openjax.learning.train_state import policy_leaf
 from openjax.policy import PolicyParameters
@@ -43,7 +44,6 @@ from openjax.store.leaves import abstract_like, named_leaves, place
 from openjax.store.policies import abstract_parameters, load_policy
 from openjax.store.policy_files import fill, load_policy_file, save_policy_file
 from openjax.store.run_directory import RunDirectory
-from openjax.store.settings_files import write_json
 from openjax.store.traced_programs import recalled
 
 _SOON = 3.0

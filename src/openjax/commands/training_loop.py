@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from openjax.files import write_json
 from openjax.show.metrics import MetricsWriter
 from openjax.show.progress import Progress
 from openjax.store.checkpoint_files import save_state
 from openjax.store.checkpoints import Checkpoints
 from openjax.store.leaves import named_leaves
-from openjax.store.settings_files import write_json
 
 NOT_FINITE = "not_finite"
 

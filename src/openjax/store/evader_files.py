@@ -7,10 +7,10 @@ from typing import Any
 import jax
 
 from openjax.errors import UserError
+from openjax.files import to_plain
 from openjax.pursuit import PursuitSettings
 from openjax.pursuit.evaders import SCRIPTED, init_network
 from openjax.store.policy_files import fill, load_policy_file, save_policy_file
-from openjax.store.settings_files import to_plain
 
 SAME = (
     "num_pursuers",

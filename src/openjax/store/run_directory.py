@@ -20,10 +20,10 @@ from pathlib import Path
 from typing import Any
 
 from openjax.errors import UserError
-from openjax.files import WRITING, check_output_folder, read_json, remove_unfinished
+from openjax.files import WRITING, check_output_folder, read_json, remove_unfinished, write_json
 from openjax.learning import TrainSettings
 from openjax.store.old_names import train_settings
-from openjax.store.settings_files import SETTINGS_FILE, write_json
+from openjax.store.settings_files import SETTINGS_FILE
 
 _FORMAT = "openjax run 1"
 _FILES = (

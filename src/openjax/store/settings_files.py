@@ -1,4 +1,4 @@
-"""Settings as JSON: nested frozen dataclasses to plain values and back, strictly."""
+"""Settings from JSON: plain values back to nested frozen dataclasses, strictly; `openjax.files.to_plain` is the way there."""
 
 import dataclasses
 import types
@@ -6,25 +6,9 @@ import typing
 from pathlib import Path
 from typing import Any
 
-from openjax import files
 from openjax.errors import UserError
 
 SETTINGS_FILE = "settings.json"
-
-
-def to_plain(value: Any) -> Any:
-    """Dataclasses, tuples and paths as JSON values (dict, list, str, numbers, None)."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: to_plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    if isinstance(value, dict):
-        return {str(key): to_plain(entry) for key, entry in value.items()}
-    if isinstance(value, tuple | list):
-        return [to_plain(entry) for entry in value]
-    if isinstance(value, Path):
-        return str(value)
-    if hasattr(value, "item") and getattr(value, "ndim", 0) == 0:
-        return value.item()
-    return value
 
 
 def from_plain(kind: Any, value: Any, where: str = "settings") -> Any:
@@ -91,8 +75,3 @@ def _union_from_plain(arguments, value, where):
         except UserError as error:
             reasons.append(str(error))
     raise UserError(reasons[0])
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write settings and results (see `to_plain`) as JSON, whole or not at all."""
-    files.write_json(path, to_plain(value))
