@@ -67,9 +67,11 @@ def vehicles(monkeypatch):
 
 
 def send(links, seconds=2.0):
-    """Set-points at 100 Hz; the longest time (s) that they took."""
+    """Set-points at 100 Hz, and poses of motion capture where they can be sent; the longest time (s) that they took."""
     longest, end = 0.0, time.perf_counter() + seconds
     while (begin := time.perf_counter()) < end:
+        for i in range(3 * hasattr(links, "send_pose")):
+            links.send_pose(i, (begin, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
         links.send([HOVER] * 3)
         longest = max(longest, time.perf_counter() - begin)
         time.sleep(0.01)
@@ -79,10 +81,12 @@ def send(links, seconds=2.0):
 def check_the_others_fly_on(links, vehicles):
     first, _, last = vehicles.values()
     before = [v.firmware.set_points for v in (first, last)]
-    longest = send(links)
+    longest, end = send(links), time.perf_counter()
     assert longest < 0.1
     for vehicle, count in zip((first, last), before, strict=True):
         assert vehicle.firmware.set_points - count > 50
+        if hasattr(links, "send_pose"):  # neither keeps the other out
+            assert end - vehicle.firmware.external_pose[0] < 0.2
         assert vehicle.firmware.set_point(time.perf_counter()).mode != OFF
 
 

@@ -3,7 +3,6 @@
 import contextlib
 import logging
 import math
-import queue
 import struct
 import threading
 import warnings
@@ -133,18 +132,22 @@ def send_set_point(crazyflie, set_point: SetPoint) -> None:
 
 
 def never_wait(link) -> None:
-    """Have a link leave out packets that it has no room for.
+    """Have packets wait for a link, and never who sends them: the newest of each kind, in the place of an older one.
 
-    A radio's has room for one, until its vehicle acknowledges; `cflib` would wait two seconds for a vehicle that doesn't, and
-    meanwhile send the others nothing. Over UDP there is always room.
+    A radio's link has room for one until its vehicle acknowledges; `cflib` waits two seconds for a vehicle that doesn't, and
+    meanwhile sends the others nothing. Over UDP nothing waits.
     """
     room = getattr(link, "out_queue", None)
 
     def send_packet(packet) -> bool:
-        with contextlib.suppress(queue.Full):
-            room.put(packet, block=False)
-            return True
-        return False
+        with room.mutex:
+            waiting = [old.header for old in room.queue]
+            if packet.header in waiting:
+                room.queue[waiting.index(packet.header)] = packet
+            else:
+                room.queue.append(packet)
+                room.not_empty.notify()
+        return True
 
     if room is not None:
         link.send_packet = send_packet
