@@ -58,7 +58,8 @@ def observations(policy, number: int, seed: int) -> dict:
     settings = dataclasses.replace(policy.settings.environment, physics="rigid", vehicles=())
     environment = Pursuit(settings)
     worlds, steps = 64, -(-number // 64)
-    observation, state = jax.vmap(environment.reset)(jax.random.split(jax.random.key(seed), worlds))
+    reset = jax.jit(jax.vmap(environment.reset))
+    observation, state = reset(jax.random.split(jax.random.key(seed), worlds))
 
     @jax.jit
     def play(observation, state, key):
