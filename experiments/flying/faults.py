@@ -26,8 +26,8 @@ GONE = ("drone gone", "link lost for a while", "drone restarts")
 CAMERA = (
     "camera lost", "camera lost for a while", "camera frozen", "camera frozen, all", "camera: one frame wrong",
     "camera: four frames wrong", "camera moved", "camera: a number that is none", "camera: no attitude",
-    "camera: yaw turned", "camera: bodies swapped", "camera scaled", "camera late", "camera restarts", "camera: clock steps",
-    "camera drifts", FOLLOWED,
+    "camera: yaw turned", "camera: y up", "camera: bodies swapped", "camera scaled", "camera late", "camera restarts",
+    "camera: clock steps", "camera drifts", FOLLOWED,
 )  # fmt: skip
 RADIO = (
     "poses lost", "poses lost for a while", "packets lost", "poses frozen", "poses jump",
@@ -168,9 +168,12 @@ class PoseDamage:
             return pose._replace(position=tuple(fault.amount * p for p in pose.position))
         if what == "no attitude":
             return pose._replace(quaternion=(0.0,) * 4)
+        w, x, y, z = pose.quaternion
         if what == "yaw turned":
-            w, x, y, z = pose.quaternion
             return pose._replace(quaternion=(-z, y, -x, w))
+        if what == "y up":
+            right, ahead, up = pose.position
+            return pose._replace(position=(right, up, -ahead), quaternion=(w, x, z, -y))
         if what == "bodies swapped":
             other = others[(i + 1) % len(others)]
             return pose._replace(position=other.position, quaternion=other.quaternion)

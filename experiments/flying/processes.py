@@ -53,7 +53,11 @@ KEYS = {
 }  # fmt: skip
 STOPPED = ("space", "q")
 """In these keys' names: motors off at once."""
-START = ("start: y up", "start: millimetres", "start: yaw turned", "start: scaled", "start: beside the mark")
+START = {
+    "start: y up": ("camera: y up", 1.0), "start: millimetres": ("camera scaled", 1e3), "start: scaled": ("camera scaled", 1.3),
+    "start: yaw turned": ("camera: yaw turned", 1.0), "start: beside the mark": ("camera moved", 0.3),
+}  # fmt: skip
+"""What is wrong with motion capture before anything flies, and by how much."""
 GROUPS = {
     "a signal to one process": [f"{name} {role}" for name in SIGNALS for role in ROLES],
     "to several processes": (
@@ -65,7 +69,7 @@ GROUPS = {
     "motion capture": [kind for kind in CAMERA if kind not in UNSENT],
     "own estimates, links": [kind for kind in (*RADIO, *GONE) if kind not in UNSENT],
     "the policy": ("policy: a number that is none", *WILD, "policy fails"),
-    "wrong from the start": START,
+    "wrong from the start": tuple(START),
     "strangers, a second fly, nothing": ("strangers' packets", "none", "second fly", "none with camera"),
 }  # fmt: skip
 KINDS = [kind for kinds in GROUPS.values() for kind in kinds]
@@ -95,7 +99,8 @@ def fault_of(number: int, kind: str) -> Fault:
         drawn = (draw_fault(seed, LATEST) for seed in range(1000 * number, 1000 * number + 1000))
         return replace(next(like for like in drawn if like.kind == kind), time=time)
     if kind in START:
-        return Fault(kind, -math.inf, 1, direction=0.0)
+        kind, amount = START[kind]
+        return Fault(kind, -2.0, vehicle, math.inf, amount)
     return Fault(kind, time, vehicle, direction=0.0 if "camera" in kind else 4.0)
 
 
@@ -103,25 +108,14 @@ def feed_of(fault: Fault, truth):
     """What a laboratory's adapter would be: poses of a camera at 100 Hz, damaged."""
     damage, noise = PoseDamage(fault, 3), np.random.default_rng(7)
 
-    def at_start(pose):
-        x, y, z = pose.position
-        w, qx, qy, qz = pose.quaternion
-        return {
-            "start: y up": pose._replace(position=(x, z, -y), quaternion=(w, qx, qz, -qy)),
-            "start: millimetres": pose._replace(position=(1e3 * x, 1e3 * y, 1e3 * z)),
-            "start: yaw turned": pose._replace(quaternion=(-qz, qy, -qx, w)),
-            "start: scaled": pose._replace(position=(1.3 * x, 1.3 * y, 1.3 * z)),
-            "start: beside the mark": pose._replace(position=(x + 0.3, y, z)),
-        }.get(fault.kind, pose)
-
     def feed(update):
         due = time.perf_counter()
         while True:
-            now = time.perf_counter() - truth.take_off
+            now = max(time.perf_counter() - truth.take_off, -1.0)  # before the take-off, too
             poses = truth.poses()
             for i, pose in enumerate(poses):
                 shaken = tuple((np.array(pose.position) + noise.normal(0, 5e-4, 3)).tolist())
-                seen = damage("camera", i, now, at_start(pose._replace(position=shaken)), poses)
+                seen = damage("camera", i, now, pose._replace(position=shaken), poses)
                 if seen is not None:
                     update(i, seen.position, seen.quaternion)
             due += 0.01

@@ -17,8 +17,7 @@ from experiments.flying.faults import ENDING, MARGIN
 from experiments.flying.processes import GROUPS, KINDS, STOPPED, Flown, ends_flight
 from experiments.flying.single_thread import share_out
 from experiments.table import RESULTS, Page, Table, facts, write_page
-from openjax.files import read_json, write_json
-from openjax.store.settings_files import to_plain
+from openjax.files import read_json, to_plain, write_json
 
 
 @dataclass(frozen=True)

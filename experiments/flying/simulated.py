@@ -34,7 +34,7 @@ from experiments.flying.faults import (
 )
 from experiments.flying.single_thread import share_out
 from experiments.table import RESULTS, Page, Table, facts, write_page
-from openjax.files import read_json, write_json
+from openjax.files import read_json, to_plain, write_json
 from openjax.flying.board import SILENCE
 from openjax.flying.controller import Pose
 from openjax.flying.estimation import see
@@ -45,7 +45,6 @@ from openjax.flying.set_point import from_action
 from openjax.flying.state import Drone, Event, Mode, Request, initial_state
 from openjax.pursuit import find_scenario, scenario_task
 from openjax.pursuit.environment import THRUST_LIMIT
-from openjax.store.settings_files import to_plain
 from openjax.vehicle import load_vehicle
 from openjax.virtual_crazyflie.simulated import SimulatedSwarm, Uplink
 from openjax.virtual_crazyflie.vehicles import VirtualVehicles

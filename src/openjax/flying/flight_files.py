@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from openjax.flights.reading import CHANNEL_COLUMNS, LogTable, write_csv
+from openjax.flights.samples import log_of
 from openjax.flying.loop import Record
 from openjax.flying.set_point import RATES
 from openjax.flying.swarm import Samples
@@ -67,12 +68,8 @@ def _table(name: str, samples, sent: np.ndarray, commands: np.ndarray) -> LogTab
       sent: (T,) s, when the set-points of each tick had left.
       commands: (T, N, 5) of them: mode, thrust, body rates.
     """
-    vehicles = [_rows(vehicle, sent, commands[:, i]) for i, vehicle in enumerate(samples)]
-    ids = np.repeat([str(i) for i in range(len(vehicles))], [len(rows["t"]) for rows in vehicles])
-    columns = {n: np.concatenate([rows[n] for rows in vehicles]) for n in vehicles[0]}
-    order = np.lexsort((ids, columns["t"]))
-    columns = {n: c[order] for n, c in columns.items() if not np.isnan(c).all()}
-    return LogTable(name, columns, ids[order])
+    log = log_of([_rows(vehicle, sent, commands[:, i]) for i, vehicle in enumerate(samples)], name)
+    return LogTable(name, {n: c for n, c in log.columns.items() if not np.isnan(c).all()}, log.vehicle)
 
 
 def _rows(vehicle: Samples, sent, commands) -> dict[str, np.ndarray]:
