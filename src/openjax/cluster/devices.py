@@ -117,7 +117,7 @@ def make_device_first_flights(
     flights: FirstFlights, together: int, number: int
 ) -> tuple[Callable, Callable, Any]:
     """`flights.begin` and `make_first_flights` on `number` devices, by `jax.jit`; and where the leaves of their carry lie."""
-    compiled = functools.partial(jax.jit, compiler_options=compiler_options(number))
+    compiled = functools.partial(jax.jit, compiler_options=compiler_options(number, brief=True))
     if number == 1:
         some = make_first_flights(flights, together)
         return compiled(flights.begin), compiled(some, donate_argnums=0), None
@@ -129,13 +129,16 @@ def make_device_first_flights(
     return compiled(begin), compiled(some, donate_argnums=0), at
 
 
-def compiler_options(number: int) -> dict:
-    """For programs on `number` devices."""
-    if jax.default_backend() != "cpu":
-        # trying each matrix product in dozens of ways is half of what the compiler does (experiments/results/startup.md)
-        return {"xla_gpu_autotune_level": 0} if jax.default_backend() == "gpu" else {}
+def compiler_options(number: int, brief: bool = False) -> dict:
+    """For programs on `number` devices; a `brief` one runs for seconds alone.
+
+    On a GPU XLA tries each matrix product in dozens of ways. That is half of its work, and where it doesn't, a training step
+    takes three times as long.
+    """
+    if jax.default_backend() == "gpu":
+        return {"xla_gpu_autotune_level": 0} if brief else {}
     # where devices are cores, threads would get in their way
-    return {"xla_cpu_multi_thread_eigen": False} if number > 1 else {}
+    return {"xla_cpu_multi_thread_eigen": False} if number > 1 and jax.default_backend() == "cpu" else {}
 
 
 def _shared_out(number, function, takes, gives):
