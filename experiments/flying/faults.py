@@ -92,7 +92,8 @@ class Fault:
         if self.kind in WILD:
             return WILD[self.kind](round(100 * now), self.vehicle + round(100 * self.time), action.shape)
         action = np.array(action, np.float32)  # as networks answer: larger numbers are infinite
-        action[self.vehicle, round(100 * self.time) % 4] = self.number
+        with np.errstate(over="ignore"):
+            action[self.vehicle, round(100 * self.time) % 4] = self.number
         return None if self.kind == "policy silent" else action
 
     def on(self, now: float) -> bool:
@@ -141,7 +142,9 @@ class PoseDamage:
         """The pose received from `source`, "camera" or "radio"; `others`: true poses of all."""
         fault = self._fault
         self._past[source, i].append(pose)
-        mine = i == fault.vehicle or fault.kind.endswith("all")
+        mine = (
+            i == fault.vehicle or fault.kind.endswith("all") or fault.time < 0.0
+        )  # from the start the whole system
         if fault.kind in GONE and mine and fault.on(now) and source == "radio":
             return None
         names = CAMERA if source == "camera" else RADIO
