@@ -30,7 +30,7 @@ def test_without_a_pose_the_accelerometer_says_what_the_velocity_became():
     assert not _errors(x, 0.01, np.ones(9)).any()
 
 
-def test_nuisances_of_the_vehicle_are_alike_on_all_folds_and_bounded_and_a_folds_own_are_marginalised(
+def test_nuisances_of_the_vehicle_are_alike_on_all_blocks_and_bounded_and_a_blocks_own_are_marginalised(
     columns,
 ):
     left = [
@@ -40,7 +40,7 @@ def test_nuisances_of_the_vehicle_are_alike_on_all_folds_and_bounded_and_a_folds
     rows = [np.concatenate([r[None], x[2:3], x[5:]]) for r, x in zip(left, columns, strict=True)]
     shared, order = np.array([True, True, False]), np.arange(2)
     white = np.array([x @ x.T for x in rows])
-    table = Table(None, white, None, None, order, order, {}, {}, {}, shared, None, rows)
+    table = Table(None, white, None, None, order, {}, {}, {}, shared, None, rows)
     model = Model((), np.array([1]), np.array([-0.2]), np.array([[4.0]]))
     equations = Equations(table, model)
     found = equations.solve(None)[2]

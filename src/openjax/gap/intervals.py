@@ -6,6 +6,7 @@ quite the library's leave: some per cent of the effect."""
 import numpy as np
 
 from openjax.gap.channels import few
+from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
 from openjax.gap.model.hypotheses import SetFit
 from openjax.gap.model.library import CARDS, PLACE, path_of
@@ -13,7 +14,6 @@ from openjax.gap.report import Estimate
 from openjax.vehicle.effects import EFFECTS
 
 REACH = 1.645  # standard deviations of a 90 % interval
-FORM = 0.05  # of an effect's size, one standard deviation: real effects don't have the library's form
 
 
 def estimates(evidence: Evidence, fit: SetFit, named) -> dict[str, dict[str, Estimate]]:
@@ -30,7 +30,7 @@ def estimates(evidence: Evidence, fit: SetFit, named) -> dict[str, dict[str, Est
                 place = PLACE[effect, fitted.name]
                 value = float(fit.theta[place])
                 low = high = float(
-                    np.linalg.norm((deviation[place], FORM * sizes[fitted.name], fitted.error))
+                    np.linalg.norm((deviation[place], DECISION.form_error * sizes[fitted.name], fitted.error))
                 )
             else:
                 channel = next(c for c in evidence.channels if c.path == path_of(effect))

@@ -1,4 +1,4 @@
-"""What a model of a table's columns is worth: fitted to all folds but one, judged on that one."""
+"""What a model of a table's columns is worth: fitted to all blocks but one, judged on that one."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,7 +14,7 @@ from openjax.gap.model.table import Model, Table, with_effects
 @dataclass(frozen=True, eq=False)
 class Judged:
     """A model on stretches left out: `nats` (B,) minus half the whitened sum of squares, `squares` (B, 6) of the
-    errors, `taken` (folds, N) of the shared nuisances."""
+    errors, `taken` (B, N) of the shared nuisances."""
 
     nats: np.ndarray
     squares: np.ndarray
@@ -26,7 +26,7 @@ class Judged:
 @dataclass(frozen=True, eq=False)
 class Equations:
     """Normal equations of a model on a table: of its free columns and the nuisances that all flights share. What belongs to a
-    fold alone is marginalised already."""
+    block alone is marginalised already."""
 
     table: Table
     model: Model
@@ -35,73 +35,73 @@ class Equations:
     def columns(self) -> np.ndarray:
         return np.concatenate([self.model.free, self.table.nuisances[self.table.shared]])
 
-    def solve(self, fold: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Hessian, right side and solution over all folds but one."""
-        sums = self.table.folds.sum(0) - (0.0 if fold is None else self.table.folds[fold])
+    def solve(self, block: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Hessian, right side and solution over all blocks but one."""
+        sums = self.table.marginal.sum(0) - (0.0 if block is None else self.table.marginal[block])
         hessian, free = sums[np.ix_(self.columns, self.columns)], len(self.model.free)
         push = sums[self.columns][:, [0, *self.model.parts]].sum(1)
         hessian += block_diag(self.model.precision, np.eye(len(push) - free))
         push[:free] += self.model.precision @ self.model.mean
         return hessian, push, bounded(hessian, push, free)
 
-    def coefficients(self, found: np.ndarray, fold: int) -> np.ndarray:
-        """Coefficients (C,) of every column on a fold, whose own nuisances are the most likely ones."""
+    def coefficients(self, found: np.ndarray, block: int) -> np.ndarray:
+        """Coefficients (C,) of every column on a block, whose own nuisances are the most likely ones."""
         out = np.zeros(self.table.size)
         out[[0, *self.model.parts]] = 1.0
         out[self.columns] -= found
-        out[self.table.own] = -self.table.taken[fold] @ out
+        out[self.table.own] = -self.table.taken[block] @ out
         return out
 
 
 def promise(table: Table, model: Model) -> float:
-    """Log posterior of a model at its best, fitted to all folds, up to what all models of a table share: what screening needs."""
+    """Log posterior of a model at its best, fitted to all blocks, up to what all of a table share: what screening needs."""
     hessian, push, found = Equations(table, model).solve(None)
     own = [0, *model.parts]
-    square = table.folds.sum(0)[np.ix_(own, own)].sum()
+    square = table.marginal.sum(0)[np.ix_(own, own)].sum()
     return float(push @ found - 0.5 * found @ hessian @ found - 0.5 * square)
 
 
-def left_out(table: Table, model: Model):
-    """Of every fold its blocks, and the coefficients (C,) of a model fitted to all others."""
+def left_out(table: Table, model: Model) -> np.ndarray:
+    """Coefficients (B, C) of a model on each block, fitted to all others."""
     equations = Equations(table, model)
-    for fold in range(len(table.folds)):
-        yield table.blocks_of(fold), equations.coefficients(equations.solve(fold)[2], fold)
+    return np.array([equations.coefficients(equations.solve(k)[2], k) for k in range(len(table.white))])
 
 
 def judge(table: Table, model: Model) -> Judged:
-    """The model on each fold, fitted to all others."""
-    nats, squares = np.zeros(len(table.white)), np.zeros((len(table.white), 6))
-    taken, left = [], [np.zeros(0)] * len(table.white)
-    for blocks, u in left_out(table, model):
-        for k in range(blocks.start, blocks.stop):
-            left[k] = u @ table.columns[k]
-        nats[blocks] = -0.5 * (table.white[blocks] @ u) @ u
-        squares[blocks] = (table.error[blocks] @ u) @ u
-        taken.append(-u[table.nuisances[table.shared]])
-    starts = np.cumsum([0, *map(len, left)])[:-1]
-    return Judged(nats, squares, np.array(taken), np.concatenate(left), starts)
+    """The model on each block, fitted to all others."""
+    found = left_out(table, model)
+    left = [u @ columns for u, columns in zip(found, table.columns, strict=True)]
+    return Judged(
+        np.array([-0.5 * (r @ r) for r in left]),
+        _squares(table, found),
+        -found[:, table.nuisances[table.shared]],
+        np.concatenate(left),
+        np.cumsum([0, *map(len, left)])[:-1],
+    )
+
+
+def _squares(table: Table, found: np.ndarray) -> np.ndarray:
+    """Squared errors (B, 6) with coefficients (B, C)."""
+    return np.einsum("bkc,bc->bk", np.einsum("bkcd,bd->bkc", table.error, found), found)
 
 
 class Ablation:
-    """A table's set fitted to all folds but one, whose effects and nuisances may go while everything else stays as fitted."""
+    """A table's set fitted to all blocks but one, whose effects and nuisances may go while everything else stays as fitted."""
 
     def __init__(self, table: Table):
         self.table = table
-        self.left_out = list(left_out(table, with_effects(table)))
+        self.left_out = left_out(table, with_effects(table))
 
     def squares(self, drop=(), off: np.ndarray | None = None) -> np.ndarray:
-        """Squared errors (B, 6) on each fold without the effects `drop` and the nuisances `off` (N,)."""
-        table, squares = self.table, np.zeros((len(self.table.white), 6))
+        """Squared errors (B, 6) on each block without the effects `drop` and the nuisances `off` (N,)."""
+        table, found = self.table, self.left_out.copy()
         kept = {int(i) for e in table.fit.effects if e not in drop for i in prior((e,))[0]}
-        for blocks, solution in self.left_out:
-            u = solution.copy()
-            for effect in drop:
-                u[[table.derivative[int(i)] for i in prior((effect,))[0] if int(i) not in kept]] = 0.0
-                u[table.part[effect]] = 1.0
-            if off is not None:
-                u[table.nuisances[off]] = 0.0
-            squares[blocks] = (table.error[blocks] @ u) @ u
-        return squares
+        for effect in drop:
+            found[:, [table.derivative[int(i)] for i in prior((effect,))[0] if int(i) not in kept]] = 0.0
+            found[:, table.part[effect]] = 1.0
+        if off is not None:
+            found[:, table.nuisances[off]] = 0.0
+        return _squares(table, found)
 
 
 def level(squares: np.ndarray, floor: np.ndarray) -> float:

@@ -18,8 +18,8 @@ SIZE = {
 }
 TRIM = 0.5  # s: what motors do more slowly is no answer to a gust, but what the vehicle needs
 FEEDBACK_ROWS, QUICK_ROWS = (0, 2), (0, 1, 2)  # rows of delay
-# Nuisances that belong to a track, not to the vehicle.
-OF_A_TRACK = ("clock of the motors", "accelerometer bias", "clock of the pose", "feedback")
+# Nuisances that belong to a block of flight, not to the vehicle: noise of the gyroscope weakens feedback where little else moves.
+OF_A_BLOCK = ("feedback",)
 
 
 def columns_of(track: Track, path: Path, nominal, feedback, at_once: bool) -> dict[str, np.ndarray]:

@@ -12,7 +12,7 @@ from scipy.linalg import solve_triangular
 
 from openjax.flights.track import Track
 from openjax.gap.model.library import ABSENT, PLACE, STEP
-from openjax.gap.model.nuisances import OF_A_TRACK, SIZE, columns_of, motor_shift
+from openjax.gap.model.nuisances import OF_A_BLOCK, SIZE, columns_of, motor_shift
 from openjax.gap.model.prediction import FORCE, RATES, VELOCITY, Physics, make_physics
 from openjax.gap.model.whitening import Noise, first_noise, whiten
 
@@ -59,8 +59,8 @@ class Replay:
 
     @cached_property
     def shared(self) -> np.ndarray:
-        """(N,) whether a nuisance belongs to the vehicle (all flights) or to a track."""
-        return np.array([not n.startswith(OF_A_TRACK) for n in self.nuisance_names])
+        """(N,) whether a nuisance belongs to the vehicle (all flights) or to a block."""
+        return np.array([not n.startswith(OF_A_BLOCK) for n in self.nuisance_names])
 
     @cached_property
     def whitened_nuisances(self) -> list[np.ndarray]:

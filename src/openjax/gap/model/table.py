@@ -5,8 +5,8 @@ its derivatives with respect to every parameter, what each further effect would 
 effect of the set does, and the nuisances - once whitened (likelihood) and once as errors of short predictions (gap). So
 adding, dropping and swapping effects on stretches left out costs nothing but linear algebra.
 
-Nuisances are bounded: numbers of the vehicle are shared by all flights of the case, biases and clocks belong to a track,
-and each stays within twice its usual size. One that ends there is a finding."""
+Nuisances of the vehicle and its sensors are shared by all flights of the case and bounded: each stays within twice its usual
+size, and one that ends there is a finding. How strong feedback is depends on what the vehicle does, block by block."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,8 +18,7 @@ from openjax.gap.model.hypotheses import SetFit
 from openjax.gap.model.library import ABSENT, CARDS, places, prior
 from openjax.gap.model.replay import SKIP
 
-FOLD = 2.5  # s that are left out together
-BLOCK = 1.0  # s: gusts and sensors forget within less
+BLOCK = 1.0  # s that are left out together: gusts and sensors forget within less
 HORIZONS = {"velocity": 0.25, "rates": 0.05}  # s of the predictions whose errors are the gap
 ERRORS = tuple((f"{kind} {axis}", 3 * number + k) for number, kind in enumerate(("rates", "velocity"))
                for k, axis in enumerate("xyz"))  # fmt: skip
@@ -27,16 +26,15 @@ ERRORS = tuple((f"{kind} {axis}", 3 * number + k) for number, kind in enumerate(
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """`white` (B, C, C) and `error` (B, 6, C, C) by block; `rows` (B,) that count; `fold_of` (B,). Columns: 0 is
+    """`white` (B, C, C) and `error` (B, 6, C, C) by block; `rows` (B,) that count; `track_of` (B,). Columns: 0 is
     what is left; `derivative` {place: column}; `step` {effect: column}; `part` {effect: column}; the last are nuisances, of
-    which `shared` (N,) are the case's and the others a fold's."""
+    which `shared` (N,) are the case's and the others a block's."""
 
     fit: SetFit
     white: np.ndarray
     error: np.ndarray
     rows: np.ndarray
     track_of: np.ndarray
-    fold_of: np.ndarray
     derivative: dict[int, int]
     step: dict[str, int]
     part: dict[str, int]
@@ -54,29 +52,19 @@ class Table:
 
     @property
     def own(self) -> np.ndarray:
-        """Columns of the nuisances that belong to a fold."""
+        """Columns of the nuisances that belong to a block."""
         return self.nuisances[~self.shared]
 
     @cached_property
-    def whole_folds(self) -> np.ndarray:
-        """Whitened sums (folds, C, C)."""
-        return np.stack([self.white[self.blocks_of(k)].sum(0) for k in range(int(self.fold_of.max()) + 1)])
-
-    @cached_property
     def taken(self) -> np.ndarray:
-        """(folds, own, C): what each column has of a fold's own nuisances, of unit prior variance."""
-        inside = self.whole_folds[:, self.own][:, :, self.own]
-        return np.linalg.solve(inside + np.eye(len(self.own)), self.whole_folds[:, self.own])
+        """(B, own, C): what each column has of a block's own nuisances, of unit prior variance."""
+        inside = self.white[:, self.own][:, :, self.own]
+        return np.linalg.solve(inside + np.eye(len(self.own)), self.white[:, self.own])
 
     @cached_property
-    def folds(self) -> np.ndarray:
-        """Whitened sums (folds, C, C) with a fold's own nuisances marginalised (Frisch, Waugh, Lovell)."""
-        return self.whole_folds - self.whole_folds[:, :, self.own] @ self.taken
-
-    def blocks_of(self, fold: int) -> slice:
-        """The blocks of a fold, which follow one another."""
-        own = np.flatnonzero(self.fold_of == fold)
-        return slice(int(own[0]), int(own[-1]) + 1)
+    def marginal(self) -> np.ndarray:
+        """`white` with a block's own nuisances marginalised (Frisch, Waugh, Lovell)."""
+        return self.white - self.white[:, :, self.own] @ self.taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +91,7 @@ def build(fit: SetFit, singles: dict[str, SetFit] | None) -> Table:
         points.append(point)
     columns = fit.columns if singles is None else replay.linearised(fit.theta, index)
     moved = replay.predict(np.array(points)) if points else [np.zeros((0, *y.shape)) for y in replay.measured]
-    white, error, rows, track_of, fold_of, whole = [], [], [], [], [], []
+    white, error, rows, track_of, whole = [], [], [], [], []
     for number, (c, m, track) in enumerate(zip(columns, moved, replay.tracks, strict=True)):
         now = replay.measured[number] - c[0]
         nuisances = replay.nuisances[number]
@@ -112,19 +100,16 @@ def build(fit: SetFit, singles: dict[str, SetFit] | None) -> Table:
         w = np.concatenate([replay.whiten(x[: -len(nuisances)], number), replay.whitened_nuisances[number]])
         e = _errors(x, track.dt, replay.usable)
         count = max(w.shape[1] // size, 1)
-        for k, (a, b) in enumerate(zip(np.array_split(w, count, 1), _split(e, skip, count), strict=True)):
+        for a, b in zip(np.array_split(w, count, 1), _split(e, skip, count), strict=True):
             flat = a.reshape(len(x), -1)
             whole.append(flat)
             white.append(flat @ flat.T)
             error.append(np.einsum("ctk,dtk->kcd", b, b, optimize=True))
             rows.append(b.shape[1])
             track_of.append(number)
-            fold_of.append(1000 * number + k * max(round(count * BLOCK / FOLD), 1) // count)
-    track_of = np.array(track_of)
     at = 1 + len(index)
     return Table(
-        fit, np.array(white), np.array(error), np.array(rows), track_of,
-        np.unique(fold_of, return_inverse=True)[1],
+        fit, np.array(white), np.array(error), np.array(rows), np.array(track_of),
         {int(i): 1 + k for k, i in enumerate(index)},
         {e: at + k for k, e in enumerate(others)},
         {e: at + len(others) + k for k, e in enumerate(own)},
