@@ -48,7 +48,7 @@ def test_a_wrong_moment_of_inertia_turns_nothing_that_motors_hold_against():
     still = np.zeros((300, 3))
     numbers = (("inertia", "xx", 0.3),)
     ticks = [np.repeat(track.motor[:, None], TICKS, 1)]
-    replay = make_replay([track], [vehicle], ticks, [Feedback(still, still, still)], numbers)
+    replay = make_replay([track], [vehicle], ticks, [Feedback(*[still] * 4)], numbers)
     assert abs(replay.nominal[0][-1, 0]) > 1.0
     assert abs(replay.nuisances[0][0, -1, RATES]).max() < 1e-6
     aside = ABSENT.copy()

@@ -12,8 +12,10 @@ from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
 from openjax.flights.track import GRAVITY, Track, rotation, to_world
+from openjax.gap.channels.instruments import EDGE
 from openjax.gap.channels.pose import turn_increments
 from openjax.gap.decision import DECISION
+from openjax.gap.model.table import BLOCK
 
 BAND = (0.3, 6.0)  # Hz: above drift, below most of the sensors' noise
 SLOW = 2.0  # Hz, below which path and accelerometer are compared
@@ -21,8 +23,6 @@ CLEAR = 5.0  # jackknife standard errors by which a finding must exceed nothing
 LEAST = 0.1  # rad/s or m/s^2 rms in the band: an axis that hardly moves shows no gain
 COHERENT = 0.97  # correlation below which the two streams don't fit well enough to compare gains
 ONE_CLOCK = 0.93  # below which they don't share a clock
-EDGE = 0.3  # s at either end that the filters spoil
-SEGMENT = 1.0  # s, unit of the jackknife
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ def _gains(streams) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     moves enough (3,)."""
     sums = []  # per granule: (4, 3) sums of squares and products, and rows
     for dt, a, b in streams:
-        size = max(int(SEGMENT / dt), 1)
+        size = max(int(BLOCK / dt), 1)
         for k in range(0, len(a) - size // 2, size):
             p, q = a[k : k + size], b[k : k + size]
             sums.append(np.stack([(p * p).sum(0), (p * q).sum(0), (q * q).sum(0), np.full(3, len(p))]))
@@ -182,7 +182,7 @@ def _world(tracks) -> tuple[np.ndarray | None, np.ndarray | None]:
         turn = rotation(track.quaternion)
         rest = to_world(track.quaternion, track.specific_force) - np.array([0.0, 0.0, GRAVITY])
         low = butter(2, SLOW, fs=1.0 / track.dt, output="sos")
-        edge, size = int(EDGE / track.dt), max(int(SEGMENT / track.dt), 1)
+        edge, size = int(EDGE / track.dt), max(int(BLOCK / track.dt), 1)
         rest = rest - np.gradient(track.velocity, track.dt, axis=0)
         if len(rest) < 4 * edge:
             continue
