@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from experiments.diagnosis import effects, plant, sensors, vehicle
-from experiments.flying.worlds.world import Poses, per_world
+from experiments.flying.worlds.game import Poses, per_world
 from openjax.pursuit import Task
 from openjax.vehicle import DroneState
 

@@ -12,8 +12,8 @@ import numpy as np
 from experiments.diagnosis import vehicle as v
 from experiments.diagnosis.plant import PER_TICK, SAMPLE, Firmware
 from experiments.diagnosis.vehicle import matrix_of
+from experiments.flying.worlds.game import Poses, per_world
 from experiments.flying.worlds.plant import air_of, sensors_of, solids_of
-from experiments.flying.worlds.world import Poses, per_world
 from openjax.pursuit import Task
 from openjax.vehicle import DroneState
 
