@@ -10,11 +10,11 @@ from typing import Annotated
 
 import tyro
 from rich.console import Console
-from rich.table import Table
 
-from openjax.commands.command_line import output_console, parse
+from openjax.commands.command_line import one_thread_for_matrices, output_console, parse
 from openjax.errors import UserError
 from openjax.files import check_output
+from openjax.show.number_tables import numbers_table
 from openjax.show.steps import Steps
 
 PROGRAM = "openjax calibrate"
@@ -36,6 +36,7 @@ class Arguments:
 
 def run(arguments: Arguments, console: Console):
     """Calibrate, print and write; returns the Calibration. Raises UserError; writes nothing then."""
+    one_thread_for_matrices()
     from openjax.calibration.calibration import calibrate
     from openjax.flights.case import load_case
     from openjax.vehicle.vehicle_file import load_vehicle_file, save_vehicle_file
@@ -66,15 +67,8 @@ def run(arguments: Arguments, console: Console):
 
 
 def _print(result, console: Console) -> None:
-    table = Table(title=f"Calibrated on {len(result.flights)} flights, {result.seconds:.0f} s")
-    for name, justify in (
-        ("quantity", "left"),
-        ("value", "right"),
-        ("90 % interval", "right"),
-        ("of nominal", "right"),
-    ):
-        table.add_column(name, justify=justify)
-    table.add_column("")
+    title = f"Calibrated on {len(result.flights)} flights, {result.seconds:.0f} s"
+    table = numbers_table(title, "quantity", "value", "90 % interval", "of nominal", "")
     for name, quantity in result.quantities.items():
         for i, value in enumerate(quantity.value):
             label = name.replace("_", " ") + (f" {('xx', 'yy', 'zz')[i]}" if len(quantity.value) > 1 else "")

@@ -107,6 +107,11 @@ def peek(arguments: Sequence[str], name: str) -> str | None:
     return value
 
 
+def one_thread_for_matrices() -> None:
+    """Small matrices: more threads than one only wait for each other. It is read when NumPy is loaded, so call it before."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
 def output_console() -> Console:
     """Standard output as it is on a terminal; into a file, tables get the width that they need."""
     console = Console(highlight=False)

@@ -1,6 +1,5 @@
 """Diagnose the sim-to-real gap of flights: `openjax diagnose CASE_DIR [CASE_DIR ...]`."""
 
-import os
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -13,7 +12,7 @@ import tyro
 from rich.panel import Panel
 from rich.text import Text
 
-from openjax.commands.command_line import one_line, output_console, parse
+from openjax.commands.command_line import one_line, one_thread_for_matrices, output_console, parse
 from openjax.errors import UserError
 from openjax.files import check_output_folder, replacing, write_json
 from openjax.show.steps import Steps
@@ -57,8 +56,7 @@ def main(arguments: Sequence[str]) -> int:
 def run(options: Options) -> int:
     """Diagnose every case; a case that can't be used is named and the rest goes on. Raises UserError for
     bad options."""
-    # Small matrices: more threads than one only wait for each other. Read when NumPy is loaded, below.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    one_thread_for_matrices()
     console, names = output_console(), _checked_names(options)
     answer = _changes if options.reference else _diagnosis
     if not options.reference:
