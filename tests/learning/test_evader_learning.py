@@ -43,10 +43,10 @@ def test_each_learns_from_its_own_samples_what_pays(worlds):
         samples = jax.tree.map(lambda leaf: leaf[None], samples)
         return learning.learn(evaders, samples, last, order_key), caught
 
-    evaders = start = learning.start(jax.random.key(1))
+    evaders = start = jax.jit(learning.start)(jax.random.key(1))
     for key in jax.random.split(jax.random.key(2), 30):
         evaders, caught = improve(evaders, key)
-    which, seen = learning.see(worlds)
+    which, seen = jax.jit(learning.see)(worlds)
     np.testing.assert_array_equal(which, np.tile([-1, 0, -1, 1], WORLDS // 4))
     before, after = (outputs_of(e.actor, which, seen)[0][which == 1, 0] for e in (start, evaders))
     moved = float(jnp.mean(after - before))

@@ -69,9 +69,10 @@ def test_a_task_keeps_its_evader():
     archive = archive.replace(tasks=of_two, size=jnp.int32(1))
     for expansion, expected in ((0.0, {0, 1, 2}), (1.0, {2})):
         how = dataclasses.replace(NOMINAL, expansion=expansion)
-        tasks = jax.vmap(lambda key, how=how: generate_task(how, game, archive, key))(KEYS[:64])
+        generate = jax.jit(jax.vmap(lambda key, how=how: generate_task(how, game, archive, key)))
+        tasks = generate(KEYS[:64])
         assert set(np.asarray(tasks.evader)) == expected
-    states = jax.vmap(Pursuit(game).reset_to)(KEYS[:64], tasks)[1]
+    states = jax.jit(jax.vmap(Pursuit(game).reset_to))(KEYS[:64], tasks)[1]
     np.testing.assert_array_equal(states.evader.kind, 2)
 
 

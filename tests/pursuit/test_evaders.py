@@ -151,10 +151,11 @@ def test_one_that_knows_of_no_pursuer_waits():
     environment = make(settings, physics="stops", start_attitude="level")
     _, state = jax.jit(environment.reset_to)(jax.random.key(0), scenario_task(settings, SCENARIOS["hidden"]))
     assert not state.in_sight.any()
+    step = jax.jit(environment.step)
     for sees_all in (0.0, 1.0):
         numbers = state.evader.numbers | {"sees_all": jnp.float32(sees_all)}
         own = state.replace(evader=state.evader.replace(numbers=numbers))
-        after = environment.step(jax.random.key(0), own, jnp.zeros((3, 4)))[1]
+        after = step(jax.random.key(0), own, jnp.zeros((3, 4)))[1]
         moved = np.linalg.norm(after.evader_position - state.evader_position)
         np.testing.assert_allclose(moved, sees_all * settings.evader_speed * settings.time_step, rtol=1e-3)
 
@@ -202,7 +203,7 @@ def test_sets_share_nobody_and_unknown_ones_are_refused():
     assert sorted([*TRAINED, *VALIDATED, *HELD_OUT]) == sorted(ALL)
     assert make(evader="greedy").settings.evaders == ("greedy",)
     for given, text in (
-        ({"evader": "nobody"}, "nobody: unknown; possible are field"),
+        ({"evader": "nobody"}, "nobody: unknown; there are field"),
         ({"evaders": ()}, "is empty"),
     ):
         with pytest.raises(UserError, match=text):
