@@ -203,13 +203,9 @@ class Search:
 
     def simplest(self, best: Hypothesis) -> Hypothesis:
         """The hypothesis of the largest prior odds that isn't clearly worse than the best one."""
-        chosen = best
-        while True:
-            simpler = [h for h in self.visited.values() if h.log_odds > chosen.log_odds and possible(h.fit)]
-            simpler = [h for h in simpler if not self.clearly_worse(h, best)]
-            if not simpler:
-                return chosen
-            chosen = max(simpler, key=lambda h: (h.log_odds, h.score))
+        simpler = [h for h in self.visited.values() if h.log_odds > best.log_odds and possible(h.fit)]
+        simpler = [h for h in simpler if not self.clearly_worse(h, best)]
+        return max(simpler, key=lambda h: (h.log_odds, h.score), default=best)
 
     def equivalents(self, chosen: Hypothesis, named) -> dict[str, list[str]]:
         """For each named effect those in whose place, of the sets visited, flights don't tell the difference."""

@@ -13,9 +13,9 @@ import numpy as np
 
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
-from openjax.gap.model.cross_validation import Ablation
+from openjax.gap.model.cross_validation import ablated, left_out
 from openjax.gap.model.replay import SKIP
-from openjax.gap.model.table import ERRORS
+from openjax.gap.model.table import ERRORS, with_effects
 from openjax.gap.selection import DRAWS, Selection
 
 METRIC = (
@@ -129,14 +129,15 @@ def _gap(square: np.ndarray) -> Gap:
 
 def _squares_of_sets(evidence: Evidence, selection: Selection, named) -> tuple[list[str], np.ndarray]:
     """Channels, and their squared errors (sets, blocks, channels) by set of parts, as `shares_of_squares` takes them."""
-    ablation, table = Ablation(selection.table), selection.table
+    table = selection.table
+    found = left_out(table, with_effects(table))
     # Numbers of the vehicle and what feedback makes of gusts are no sensor's fault and no effect: they stay.
     sensors = np.array([n.startswith(SENSORS) for n in evidence.replay.nuisance_names])
     never = [e for e in selection.fit.effects if e not in named and e not in evidence.motion.confounded]
 
     def squares(there, off=None) -> dict[str, np.ndarray]:
         gone = [e for e in named if e not in there and e in selection.fit.effects]
-        motion = ablation.squares((*never, *gone), off) / table.rows[:, None]
+        motion = ablated(table, found, (*never, *gone), off) / table.rows[:, None]
         heard = {n: motion[:, k] for k, (n, _) in enumerate(ERRORS) if table.usable[k] > 0}
         return heard | _other_squares(evidence, [e for e in there if e not in selection.fit.effects], table)
 

@@ -8,7 +8,7 @@ from scipy.linalg import block_diag
 
 from openjax.gap.model.bounds import bounded
 from openjax.gap.model.library import prior
-from openjax.gap.model.table import Model, Table, with_effects
+from openjax.gap.model.table import Model, Table
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,23 +85,17 @@ def _squares(table: Table, found: np.ndarray) -> np.ndarray:
     return np.einsum("bkc,bc->bk", np.einsum("bkcd,bd->bkc", table.error, found), found)
 
 
-class Ablation:
-    """A table's set fitted to all blocks but one, whose effects and nuisances may go while everything else stays as fitted."""
-
-    def __init__(self, table: Table):
-        self.table = table
-        self.left_out = left_out(table, with_effects(table))
-
-    def squares(self, drop=(), off: np.ndarray | None = None) -> np.ndarray:
-        """Squared errors (B, 6) on each block without the effects `drop` and the nuisances `off` (N,)."""
-        table, found = self.table, self.left_out.copy()
-        kept = {int(i) for e in table.fit.effects if e not in drop for i in prior((e,))[0]}
-        for effect in drop:
-            found[:, [table.derivative[int(i)] for i in prior((effect,))[0] if int(i) not in kept]] = 0.0
-            found[:, table.part[effect]] = 1.0
-        if off is not None:
-            found[:, table.nuisances[off]] = 0.0
-        return _squares(table, found)
+def ablated(table: Table, found: np.ndarray, drop=(), off: np.ndarray | None = None) -> np.ndarray:
+    """Squared errors (B, 6) of a table's set with the coefficients `found` (B, C) of `left_out`, without the effects `drop` and
+    the nuisances `off` (N,); everything else stays as fitted."""
+    found = found.copy()
+    kept = {int(i) for e in table.fit.effects if e not in drop for i in prior((e,))[0]}
+    for effect in drop:
+        found[:, [table.derivative[int(i)] for i in prior((effect,))[0] if int(i) not in kept]] = 0.0
+        found[:, table.part[effect]] = 1.0
+    if off is not None:
+        found[:, table.nuisances[off]] = 0.0
+    return _squares(table, found)
 
 
 def level(squares: np.ndarray, floor: np.ndarray) -> float:
