@@ -117,6 +117,22 @@ def test_train_shows_progress_and_leaves_what_the_readme_says(whole_run):
     assert layouts["machine"]["versions"]["jax"] == jax.__version__
 
 
+def test_minutes_are_of_learning_however_long_the_compiler_takes(tmp_path):
+    arguments = [
+        *TINY,
+        "--first_flights.updates",
+        "0",
+        "--steps",
+        "100000000",
+        "--layout_episodes",
+        "1",
+        *ALONE,
+    ]
+    finish(start(["openjax.train", *arguments, "--minutes", "0.02", "--out", str(tmp_path / "run")]))
+    learnt = list(read_metrics(tmp_path / "run" / "metrics.jsonl", "train"))
+    assert learnt and learnt[-1]["seconds"] - learnt[0]["seconds"] < 1.2 + 5.0
+
+
 def test_killed_in_the_middle_of_a_checkpoint_and_resumed_equals_whole(whole_run, tmp_path, train_arguments):
     out = tmp_path / "killed"
     process, _ = start([*train_arguments, *ALONE, "--out", str(out)])
