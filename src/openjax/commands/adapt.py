@@ -55,6 +55,8 @@ class AdaptCommand:
     seed: Seed = 0
     overwrite: bool = False
     """Replace what --out already holds."""
+    compilation_cache: bool = True
+    """Keep compiled programs in the user's cache folder."""
     training: AdaptSettings = dataclasses.field(default_factory=AdaptSettings)
 
 
@@ -68,6 +70,10 @@ def main(arguments: Sequence[str]) -> int:
     check_output_folder(command.out, "--out")
     import jax
 
+    if command.compilation_cache:
+        from openjax.store.compiled_programs import cache_programs
+
+        cache_programs()
     console, on_cpu = output_console(), jax.default_backend() == "cpu"
     command = dataclasses.replace(command, episodes=command.episodes or (128 if on_cpu else 1024))
     _check(command)

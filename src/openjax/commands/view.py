@@ -33,6 +33,8 @@ class ViewCommand:
     opponent: str | None = None
     """Evader to fly against: field, greedy, wall_runner, heavy, pillar_hugger, greedy_far, greedy_near, two_step, way_points,
     frozen, or a file that openjax exploit wrote; by default those of the policy's game."""
+    compilation_cache: bool = True
+    """Keep compiled programs in the user's cache folder."""
     html: Path | None = None
     """Write the page to this file, to send to somebody, instead of serving it."""
     gif: Path | None = None
@@ -48,6 +50,10 @@ def main(arguments: Sequence[str]) -> int:
     command = parse(ViewCommand, ViewCommand(), arguments, PROGRAM)
     check_output(command.html, "--html")
     check_output(command.gif, "--gif")
+    if command.compilation_cache:
+        from openjax.store.compiled_programs import cache_programs
+
+        cache_programs()
     flights = fly_all(command)
     console = output_console()
     if command.gif is not None:
