@@ -22,7 +22,7 @@ def test_the_first_flights_stop_when_asked_to():
     environment = build(SETTINGS).environment
     fresh = make_start(SETTINGS)(jax.random.key(0)).policy
     said, asked = [], iter([False, True])
-    learn = compile_first_flights(
+    _, learn = compile_first_flights(
         SETTINGS, environment, jax.eval_shape(lambda: fresh), said.append, lambda: next(asked)
     )
     learnt = learn(fresh, jax.random.key(1))

@@ -140,7 +140,7 @@ class _Run:
     def __init__(self, job: TrainingJob, directory: RunDirectory, stop: StopRequest, progress: Progress):
         self.job, self.directory, self.stop, self.progress = job, directory, stop, progress
         self.settings, self.processes = job.settings, job.processes
-        self.taught, self.began = False, float("inf")
+        self.taught, self.began, self.validation = False, float("inf"), None
         self.checkpoints = Checkpoints(directory.checkpoints, processes=job.processes)
         self.processes.advice = f"go on with openjax train --resume {directory.path} --devices all"
 
@@ -192,8 +192,7 @@ class _Run:
             steps_per_update=settings.steps_per_update,
             validation_interval=settings.validation_interval,
             time_limit=seconds + self.began - self.job.started + self.job.time_limit,
-            # an accelerator would wait for the validation's program
-            validate_start=self.taught and jax.default_backend() == "cpu",
+            validate_start=self.taught,
         )
 
     def finish(self, outcome: Outcome) -> Table | None:
@@ -252,6 +251,8 @@ class _Run:
         if self.first_flights is not None:
             ready, learn = self.first_flights
             self.progress.phase("compiling the first flights")
+            if jax.default_backend() != "cpu":  # whose cores have enough to do
+                self._prepare_validation()
             ready()
             self.began = time.monotonic()
             self.progress.phase("learning to fly by the gradient through the simulation")
@@ -273,15 +274,18 @@ class _Run:
         first, settings = self.processes.is_first, self.settings
         # while an accelerator's compiler works for long, validation is made beside it; else its tracing would
         # only hold up the first update, and on a CPU both would share the same cores
-        beside = first and jax.default_backend() != "cpu" and not step_ready(_SOON)
-        if beside:
-            self.validation = in_background(self._ready_validation)
+        if jax.default_backend() != "cpu" and not step_ready(_SOON):
+            self._prepare_validation()
         step_ready()
-        if first and not beside:
-            self.validation = in_background(self._ready_validation)
+        self._prepare_validation()
         if first and settings.analytic.updates:
             kinds = settings, self.job.environment, self.abstract.policy
             self.last_stage = in_background(functools.partial(compile_last_stage, *kinds))
+
+    def _prepare_validation(self):
+        """Start to make the validation, once, where it is to be."""
+        if self.processes.is_first and self.validation is None:
+            self.validation = in_background(self._ready_validation)
 
     def _ready_validation(self):
         """The validation, compiled; and what else is needed soon after the first update is loaded."""
