@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from openjax.commands.gradient_stages import TOGETHER, compile_first_flights
+from openjax.commands.gradient_stages import TOGETHER, compile_first_flights, first_flights
 from openjax.learning import build, make_start, preset
 
 SETTINGS = preset(
@@ -23,7 +23,7 @@ def test_the_first_flights_stop_when_asked_to():
     fresh = make_start(SETTINGS)(jax.random.key(0)).policy
     said, asked = [], iter([False, True])
     _, learn = compile_first_flights(
-        SETTINGS, environment, jax.eval_shape(lambda: fresh), said.append, lambda: next(asked)
+        first_flights(SETTINGS, environment), jax.eval_shape(lambda: fresh), said.append, lambda: next(asked)
     )
     learnt = learn(fresh, jax.random.key(1))
     assert len(said) == 1 and said[0].startswith(f"{TOGETHER} of {2 * TOGETHER} updates, ")

@@ -47,7 +47,7 @@ def test_pursuers_come_nearer():
         distances.append(float(parts["distance"]))
     assert distances[-1] < 0.75 * distances[0]
     # nobody is caught yet: penalties wait
-    assert carry[-1] == 0.0
+    assert carry.risen == 0.0
 
 
 @pytest.mark.slow
@@ -67,12 +67,12 @@ def test_two_devices_learn_what_one_does():
         return mine, shares(lambda: two.update(two.begin(parameters, key), key), in_axes=())()
 
     (carry, parts), (their_carry, their_parts) = both(parameters, key)
-    for leaf, theirs in zip(jax.tree.leaves(carry[2]), jax.tree.leaves(their_carry[2]), strict=True):
+    for leaf, theirs in zip(jax.tree.leaves(carry.world), jax.tree.leaves(their_carry.world), strict=True):
         if leaf.dtype == jnp.float32:
             assert jnp.allclose(leaf, theirs.reshape(leaf.shape), atol=1e-5)
     for leaf, theirs in zip(
-        jax.tree.leaves((carry[0].actor, parts)),
-        jax.tree.leaves((their_carry[0].actor, their_parts)),
+        jax.tree.leaves((carry.parameters.actor, parts)),
+        jax.tree.leaves((their_carry.parameters.actor, their_parts)),
         strict=True,
     ):
         assert jnp.allclose(theirs, leaf, atol=1e-5)

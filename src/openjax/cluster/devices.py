@@ -5,7 +5,6 @@ that one device and many give the same result on the same worlds, up to the orde
 """
 
 import dataclasses
-import functools
 import os
 from collections.abc import Callable
 from typing import Any
@@ -16,7 +15,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from openjax.errors import UserError
 from openjax.learning import TrainCarry, TrainSettings, make_training_step
-from openjax.learning.first_flights import FirstFlights, make_first_flights
+from openjax.learning.first_flights import FirstCarry, FirstFlights, make_first_flights
 from openjax.pursuit import Pursuit
 
 AXIS = "devices"
@@ -116,17 +115,15 @@ def make_device_step(settings: TrainSettings, environment: Pursuit, number: int)
 def make_device_first_flights(
     flights: FirstFlights, together: int, number: int
 ) -> tuple[Callable, Callable, Any]:
-    """`flights.begin` and `make_first_flights` on `number` devices, by `jax.jit`; and where the leaves of their carry lie."""
-    compiled = functools.partial(jax.jit, compiler_options=compiler_options(number, brief=True))
+    """`flights.begin` and `make_first_flights` on `number` devices, not yet compiled; where the leaves of their carry lie."""
     if number == 1:
-        some = make_first_flights(flights, together)
-        return compiled(flights.begin), compiled(some, donate_argnums=0), None
+        return flights.begin, make_first_flights(flights, together), None
     flights, same = dataclasses.replace(flights, axis=AXIS), PartitionSpec()
-    carry = same, same, PartitionSpec(AXIS), same
+    carry = FirstCarry(same, same, PartitionSpec(AXIS), same)
     begin = _shared_out(number, flights.begin, (same, same), carry)
     some = _shared_out(number, make_first_flights(flights, together), (carry, same, same), (carry, same))
-    at = tuple(NamedSharding(_mesh(number), spec) for spec in carry)
-    return compiled(begin), compiled(some, donate_argnums=0), at
+    at = {name: NamedSharding(_mesh(number), spec) for name, spec in vars(carry).items()}
+    return begin, some, FirstCarry(**at)
 
 
 def compiler_options(number: int, brief: bool = False) -> dict:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from openjax.background import in_background
-from openjax.cluster.devices import everywhere, make_device_first_flights, own_copy
+from openjax.cluster.devices import compiler_options, everywhere, make_device_first_flights, own_copy
 from openjax.learning import build
 from openjax.learning.analytic_gradient import AnalyticGradient, compile_analytic, free_flight
 from openjax.learning.first_flights import FirstFlights, first_game
@@ -29,27 +29,33 @@ def compile_last_stage(settings: TrainSettings, environment: Pursuit, policy: An
     return compile_analytic(stage, abstract_like(policy))
 
 
+def first_flights(settings: TrainSettings, environment: Pursuit) -> FirstFlights:
+    """The stage before MAPPO of a run with these settings."""
+    how = settings.first_flights
+    return FirstFlights(how, first_game(environment, how), _exact(settings, environment))
+
+
 def compile_first_flights(
-    settings: TrainSettings,
-    environment: Pursuit,
+    flights: FirstFlights,
     policy: Any,
     say: Callable[[str], None],
     over: Callable[[], bool],
+    keep: Callable | None = None,
 ) -> tuple[Callable[[], Any], Callable[[PolicyParameters, jax.Array], PolicyParameters | None]]:
     """Start to compile the stage before MAPPO for parameters of these shapes, in the background.
 
     Args:
-      settings, environment: the run's.
+      flights: the stage.
       policy: the parameters' shapes and dtypes; on several devices of one process, these share the worlds.
       say: hears how it goes.
       over: is asked every few seconds whether to stop.
+      keep: `recalled` for the run, where traces are kept.
 
     Returns:
       a function that waits for the compiler, and the stage: (fresh parameters, key) -> parameters; None where it was over
       before it began.
     """
-    how = settings.first_flights
-    flights = FirstFlights(how, first_game(environment, how), _exact(settings, environment))
+    how = flights.how
     devices = _number_of_devices(policy, how.worlds)
     begin, some, shardings = make_device_first_flights(flights, min(TOGETHER, how.updates), devices)
     at = None if devices == 1 else everywhere(devices)
@@ -57,7 +63,11 @@ def compile_first_flights(
         (policy, *jax.eval_shape(lambda: (jax.random.key(0), jnp.int32(0)))), at
     )
     carry = abstract_like(jax.eval_shape(begin, policy, key), shardings)
-    lowered = some.lower(carry, key, done), begin.lower(policy, key)
+    if keep is not None and devices == 1:
+        some = keep("first_flights", jax.jit(some), lambda: (carry, key, done), carry=carry)
+    options = compiler_options(devices, brief=True)
+    some = jax.jit(some, donate_argnums=0, compiler_options=options)
+    lowered = some.lower(carry, key, done), jax.jit(begin, compiler_options=options).lower(policy, key)
     some_ready, begin_ready = (in_background(program.compile) for program in lowered)
 
     def learn(parameters, key):
@@ -78,7 +88,7 @@ def compile_first_flights(
                 f"{done} of {how.updates} updates, {duration(left)} left | evader out of reach {shown['free']:.0%} of the time, "
                 f"pursuers {shown['distance']:.2f} m too far, close to a crash {shown['crashes']:.1%}"
             )
-        return parameters.replace(actor=carry[0].actor)
+        return parameters.replace(actor=carry.parameters.actor)
 
     return lambda: (some_ready(), begin_ready()), learn
 

@@ -26,7 +26,7 @@ from openjax.cluster.devices import (
 from openjax.cluster.processes import Processes
 from openjax.commands.before_and_after import compare, game_for
 from openjax.commands.evaluator import before_after_table, layout_slots, layout_tasks
-from openjax.commands.gradient_stages import compile_first_flights, compile_last_stage
+from openjax.commands.gradient_stages import compile_first_flights, compile_last_stage, first_flights
 from openjax.commands.run_words import closing_words, layouts_like
 from openjax.commands.training_loop import Loop, NotFiniteError, Outcome, Plan, StopRequest, guarded
 from openjax.commands.validation import Validation, flat_metrics, selection_score
@@ -223,9 +223,11 @@ class _Run:
         """The stage before MAPPO, of a run that has it still to come; else None."""
         if not self.settings.first_flights.updates or self.job.start_from or self.checkpoints.any_finished():
             return None
-        return compile_first_flights(
-            self.settings, self.job.environment, self.abstract.policy, self.progress.message, self._over
-        )
+        job, keep = self.job, None
+        if job.traced is not None:
+            keep = functools.partial(recalled, made_from=job.made_from, folder=job.traced)
+        flights = first_flights(self.settings, job.environment)
+        return compile_first_flights(flights, self.abstract.policy, self.progress.message, self._over, keep)
 
     def _over(self):
         """Whether the run is to end: a signal to any process counts, and the first one's clock."""

@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
+from flax import struct
 
 from openjax.learning.analytic_gradient import (
     AnalyticGradient,
@@ -51,6 +52,18 @@ def first_game(environment: Pursuit, how: FirstFlightsSettings) -> Pursuit:
         episode_length=max(how.steps, game.episode_length // ratio),
     )
     return dataclasses.replace(free, settings=game, dynamics=None)
+
+
+@struct.dataclass
+class FirstCarry:
+    """What the stage is between two updates."""
+
+    parameters: PolicyParameters
+    optimiser: Any
+    """The state of the actor's."""
+    world: Any  # (B, ...)
+    risen: jax.Array
+    """() how far the penalties have risen, 0 to 1"""
 
 
 @dataclass(frozen=True)
@@ -106,14 +119,14 @@ class FirstFlights:
         means = {name: jnp.mean(value) for name, (_, value) in parts.items()}
         return sum(weight * means[name] for name, (weight, _) in parts.items()), (end, means)
 
-    def update(self, carry, key: jax.Array):
-        """The carry (parameters, optimiser's state, worlds, share of the penalties' rise) after an update, and the parts."""
-        parameters, state, world, risen = carry
+    def update(self, carry: FirstCarry, key: jax.Array) -> tuple[FirstCarry, dict[str, jax.Array]]:
+        """The carry after an update, and the parts of the loss."""
+        parameters, world, risen = carry.parameters, carry.world, carry.risen
         gradient, (end, parts) = jax.grad(self.loss, has_aux=True)(parameters.actor, parameters, world, risen)
         gradient, parts = mean_over_devices((gradient, parts), self.axis)
         step = 1.0 / (self.how.penalty_ramp * max(self.how.updates, 1))
         risen = jnp.minimum(risen + jnp.where(parts["free"] < self.how.penalty_free, step, 0.0), 1.0)
-        change, state = self.optimiser.update(finite_or_zero(gradient), state)
+        change, state = self.optimiser.update(finite_or_zero(gradient), carry.optimiser)
         parameters = parameters.replace(actor=optax.apply_updates(parameters.actor, change))
         start_key, choice_key = jax.random.split(key)
         anew = jax.random.uniform(choice_key, (self.how.worlds,)) < self.how.anew
@@ -122,7 +135,8 @@ class FirstFlights:
         def chosen(old, new):
             return jnp.where(over.reshape(-1, *[1] * (old.ndim - 1)), new, old)
 
-        return (parameters, state, jax.tree.map(chosen, end, self.start(start_key)), risen), parts
+        world = jax.tree.map(chosen, end, self.start(start_key))
+        return FirstCarry(parameters, state, world, risen), parts
 
     def _over(self, state):
         """(B,) worlds that end: crashed, far outside, or too late for another moment."""
@@ -138,9 +152,9 @@ class FirstFlights:
         schedule = optax.cosine_decay_schedule(self.how.learning_rate, max(self.how.updates, 1), 0.05)
         return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
 
-    def begin(self, parameters: PolicyParameters, key: jax.Array):
+    def begin(self, parameters: PolicyParameters, key: jax.Array) -> FirstCarry:
         """The carry of `update` before the first one."""
-        return parameters, self.optimiser.init(parameters.actor), self.start(key), jnp.zeros(())
+        return FirstCarry(parameters, self.optimiser.init(parameters.actor), self.start(key), jnp.zeros(()))
 
 
 def make_first_flights(flights: FirstFlights, together: int) -> Callable:
