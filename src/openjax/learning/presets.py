@@ -94,9 +94,9 @@ def paper() -> TrainSettings:
         _from_scratch(),
         network=dict(initial_log_std=-2.0),
         # who flies already would forget it by larger steps or more noise, and doesn't learn to hover where crashes are dear
-        mappo=dict(step_subsampling=2, target_kl=0.02, actor_start=0.01, penalty_start=0.3, penalty_ramp=0.5),
+        mappo=dict(step_subsampling=2, target_kl=0.02, actor_start=0.03, penalty_start=0.3, penalty_ramp=0.5),
         first_flights=dict(updates=400, worlds=1024, learning_rate=1e-3, crash=30.0, breach=10.0),
-        total_steps=100_000_000,
+        total_steps=80_000_000,
         validation_interval=20,
     )
 
