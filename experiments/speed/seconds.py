@@ -1,103 +1,121 @@
 """Seconds to a policy that catches: `python -m experiments.speed.seconds --seeds 171 172 173 [--preset paper] [--options "..."]`.
 
-Whole runs of `openjax train`, one after the other; the first of them once more before, with nothing kept, so that the others find
-compiled programs and traces. Writes experiments/results/seconds.json and .md.
+Runs of `openjax train`, one after the other. The first seed's has nothing kept and goes to its end. Then each seed's finds
+compiled programs and traces, and is stopped once two validations are what is asked for. Then whole runs, while there is time.
+Writes experiments/results/seconds.json and .md after each run.
 """
 
 import argparse
 import os
+import signal
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from experiments.paper.summarise_runs import summary
-from experiments.table import Page, Table, page_parser, publish
+from experiments.table import Page, Table, facts, page_parser, publish, write_page
 from openjax.commands.command_line import run_command
-from openjax.errors import UserError
+from openjax.files import read_json, write_json
+from openjax.show.metrics import METRICS_FILE, read_metrics
+from openjax.store.settings_files import to_plain
 
 CAPTURED, CRASHED = 0.99, 0.01
-"""Rates of the uniform validation tasks that count as reached."""
+"""Rates of the uniform validation tasks that are asked for."""
+SURE = 2
+"""Validations after which a run is stopped that needn't go to its end."""
 
 
-def train(options: argparse.Namespace, scratch: Path, name: str, seed: int, *more: str) -> dict:
-    """A run's curve, and its table of the layouts.
+def good(validation: dict) -> bool:
+    """Whether a validation is what is asked for."""
+    return validation["capture_rate"] >= CAPTURED and validation["crash_rate"] <= CRASHED
 
-    Raises:
-      UserError: it ended without one.
-    """
-    run = scratch / name
+
+def fly(options: argparse.Namespace, scratch: Path, seed: int, whole: bool) -> dict:
+    """A run's curve; of a whole one the layouts' table, too."""
+    run = scratch / f"run_{len(list(scratch.iterdir()))}_seed_{seed}"
     environment = {**os.environ, "XDG_CACHE_HOME": str(scratch / "cache")}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
     command = [sys.executable, "-m", "openjax.train", "--preset", options.preset, "--seed", str(seed)]
-    command += ["--compare_with", "none", "--out", str(run), *options.options.split(), *more]
-    ended = subprocess.run(command, env=environment, capture_output=True, text=True)
-    if not (run / "layouts.json").exists():
-        raise UserError(f"run {name} ended with status {ended.returncode}: {ended.stderr[-300:].strip()}")
-    told = summary(run)
-    told.pop("settings")
-    return {"name": name, "seed": seed, **told}
+    command += ["--compare_with", "none", "--out", str(run), *options.options.split()]
+    with open(f"{run}.log", "w") as log:
+        process = subprocess.Popen(command, env=environment, stdout=log, stderr=subprocess.STDOUT)
+    began, file = time.monotonic(), run / METRICS_FILE
+    validations: list[dict] = []
+    while process.poll() is None:
+        time.sleep(0.5)
+        validations = list(read_metrics(file, "validation")) if file.exists() else []
+        late = time.monotonic() - began > options.longest
+        if not whole and (sum(map(good, validations)) >= SURE or late):
+            process.send_signal(signal.SIGTERM)
+            process.wait()
+    trained = list(read_metrics(file, "train")) if file.exists() else []
+    steps, seconds = (trained[-1][k] - trained[0][k] if trained else 0.0 for k in ("steps", "seconds"))
+    layouts = run / "layouts.json"
+    return {
+        "seed": seed,
+        "first_update": trained[0]["seconds"] if trained else None,
+        "steps_per_second": steps / seconds if seconds else None,
+        "evaluations": list(read_metrics(file, "validation")) if file.exists() else [],
+        "layouts": read_json(layouts)["after"] if layouts.exists() else [],
+    }
+
+
+def runs(options: argparse.Namespace, scratch: Path) -> Iterator[dict]:
+    """All runs, until there is no time for another."""
+    began, first = time.monotonic(), options.seeds[0]
+    wanted = [(first, "nothing", True), *((seed, "all", False) for seed in options.seeds)]
+    for seed, kept, whole in wanted + [(seed, "all", True) for seed in options.seeds[1:]]:
+        if time.monotonic() - began < options.limit:
+            yield {"kept": kept, "whole": whole, **fly(options, scratch, seed, whole)}
 
 
 def study(options: argparse.Namespace) -> dict:
-    """All runs."""
-    started = time.monotonic()
+    """All runs; the page is written after each."""
+    results = {"preset": options.preset, "note": options.note, "runs": []}
     with tempfile.TemporaryDirectory() as folder:
-        scratch, first = Path(folder), options.seeds[0]
-        runs = [train(options, scratch, f"{first}, nothing kept", first, *options.cold.split())]
-        for seed in options.seeds:
-            if time.monotonic() - started < options.limit:
-                runs.append(train(options, scratch, str(seed), seed))
-    return {"preset": options.preset, "note": options.note, "runs": runs}
-
-
-def reached(run: dict) -> dict | None:
-    """The first validation with the captures and the crashes that are asked for."""
-    fit = (v for v in run["evaluations"] if v["capture_rate"] >= CAPTURED and v["crash_rate"] <= CRASHED)
-    return next(fit, None)
+        for run in runs(options, Path(folder)):
+            results["runs"].append(run)
+            stored = to_plain({**facts(options.commit), **results})
+            write_json(options.out.with_suffix(".json"), stored)
+            write_page(options.out, page, stored)
+    return results
 
 
 def page(results: dict) -> Page:
-    """A row per run, and its layouts."""
-    runs = [{**run, "reached": reached(run), "last": run["evaluations"][-1]} for run in results["runs"]]
-    captured = {"≥ .99 caught after, s": lambda run: _first(run, lambda v: v["capture_rate"] >= CAPTURED)}
-    columns = {"seed": "name", "first update, s": "first_update_seconds:.1f"} | captured
-    columns |= {
-        "... and ≤ .01 crash, s": "reached.seconds:.0f",
-        "after steps, M": lambda run: f"{run['reached']['steps'] / 1e6:.0f}" if run["reached"] else "–",
-        "steps/s, M": lambda run: f"{run['steps_per_second'] / 1e6:.2f}",
-        "end, s": "last.seconds:.0f",
-        "capture, crash, collision rate": lambda run: _rates(run["last"]),
+    """A row per run; the layouts of the whole ones."""
+    rows = [{**run, "reached": next(filter(good, run["evaluations"]), None)} for run in results["runs"]]
+    columns = {
+        "seed": "seed",
+        "kept": "kept",
+        "first update of MAPPO, s": "first_update:.1f",
+        "≥ .99 caught, ≤ .01 crash after, s": "reached.seconds:.1f",
+        "steps of MAPPO until then": "reached.steps:,",
+        "then collisions": "reached.collision_rate:.4f",
+        "env steps/s, evaluations included": "steps_per_second:,.0f",
     }
-    kept = [run["reached"]["seconds"] for run in runs[1:] if run["reached"]]
-    prose = f"Preset `{results['preset']}`. {results['note']} "
-    if len(kept) == len(runs) - 1:
-        prose += f"With all kept, the median of {len(kept)} seeds is {np.median(kept):.0f} s, the slowest {max(kept):.0f} s."
-    names = [row["scenario"] for row in runs[0]["layouts"]["after"]]
-    by_layout = {"seed": "name"} | {
-        f"`{name}`": lambda run, i=i: _rates(run["layouts"]["after"][i], "capture_step")
-        for i, name in enumerate(names)
-    }
-    flown = Table(
-        by_layout, runs, "After the training", "Capture rate, crash rate, collision rate, capture step."
-    )
-    return Page("Seconds to a policy that catches", prose, (Table(columns, runs), flown))
-
-
-def _first(run, fits):
-    return next((f"{entry['seconds']:.0f}" for entry in run["evaluations"] if fits(entry)), "–")
-
-
-def _rates(record, *more):
-    parts = [
-        f"{record['capture_rate']:.2f}",
-        f"{record['crash_rate']:.2f}",
-        f"{record['collision_rate']:.4f}",
+    kept = [
+        run["reached"]["seconds"]
+        for run in rows
+        if run["reached"] and run["kept"] == "all" and not run["whole"]
     ]
-    return ", ".join([*parts, *(f"{record[name]:.0f}" for name in more)])
+    prose = f"Preset `{results['preset']}`, validation tasks. {results['note']}"
+    if kept:
+        prose += f" With all kept, the median of {len(kept)} seeds is {np.median(kept):.1f} s, the slowest {max(kept):.1f} s."
+    parts = [Table(columns, rows)]
+    flown = [{"of seed": run["seed"], **layout} for run in rows for layout in run["layouts"]]
+    if flown:
+        columns = {"seed": "of seed", "tasks": "scenario", "capture rate": "capture_rate:.2f"}
+        columns |= {
+            "capture step": "capture_step:.0f",
+            "collision rate": "collision_rate:.4f",
+            "crash rate": "crash_rate:.2f",
+        }
+        parts.append(Table(columns, flown, "After the whole run"))
+    return Page("Seconds to a policy that catches", prose, parts)
 
 
 def main(arguments: list[str]) -> int:
@@ -106,9 +124,9 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--preset", default="paper")
     parser.add_argument("--seeds", type=int, nargs="+", default=[171, 172, 173, 174, 175])
     parser.add_argument("--options", default="", help="more options of openjax.train")
-    parser.add_argument("--cold", default="", help="more options of the run with nothing kept")
+    parser.add_argument("--limit", type=float, default=float("inf"), help="s after which no run begins")
     parser.add_argument(
-        "--limit", type=float, default=float("inf"), help="s after which no further run begins"
+        "--longest", type=float, default=120.0, help="s that a run may take which isn't whole"
     )
     parser.add_argument("--note", default="")
     publish(parser.parse_args(arguments), study, page)
