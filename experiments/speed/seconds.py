@@ -19,9 +19,8 @@ import numpy as np
 
 from experiments.table import Page, Table, facts, page_parser, publish, write_page
 from openjax.commands.command_line import run_command
-from openjax.files import read_json, write_json
+from openjax.files import read_json, to_plain, write_json
 from openjax.show.metrics import METRICS_FILE, read_metrics
-from openjax.store.settings_files import to_plain
 
 CAPTURED, CRASHED = 0.99, 0.01
 """Rates of the uniform validation tasks that are asked for."""
