@@ -57,18 +57,8 @@ def compile_first_flights(
     """
     how = flights.how
     devices = _number_of_devices(policy, how.worlds)
-    begin, some, shardings = make_device_first_flights(flights, min(TOGETHER, how.updates), devices)
     at = None if devices == 1 else everywhere(devices)
-    policy, key, done = abstract_like(
-        (policy, *jax.eval_shape(lambda: (jax.random.key(0), jnp.int32(0)))), at
-    )
-    carry = abstract_like(jax.eval_shape(begin, policy, key), shardings)
-    if keep is not None and devices == 1:
-        some = keep("first_flights", jax.jit(some), lambda: (carry, key, done), carry=carry)
-    options = compiler_options(devices, brief=True)
-    some = jax.jit(some, donate_argnums=0, compiler_options=options)
-    lowered = some.lower(carry, key, done), jax.jit(begin, compiler_options=options).lower(policy, key)
-    some_ready, begin_ready = (in_background(program.compile) for program in lowered)
+    some_ready, begin_ready = _compiling(flights, policy, devices, keep)
 
     def learn(parameters, key):
         some, begin = some_ready(), begin_ready()
@@ -91,6 +81,22 @@ def compile_first_flights(
         return parameters.replace(actor=carry.parameters.actor)
 
     return lambda: (some_ready(), begin_ready()), learn
+
+
+def _compiling(flights, policy, devices, keep):
+    """Some updates and the start of the stage, as the background compiles them."""
+    begin, some, shardings = make_device_first_flights(flights, min(TOGETHER, flights.how.updates), devices)
+    at = None if devices == 1 else everywhere(devices)
+    policy, key, done = abstract_like(
+        (policy, *jax.eval_shape(lambda: (jax.random.key(0), jnp.int32(0)))), at
+    )
+    carry = abstract_like(jax.eval_shape(begin, policy, key), shardings)
+    if keep is not None and devices == 1:
+        some = keep("first_flights", jax.jit(some), lambda: (carry, key, done), carry=carry)
+    options = compiler_options(devices, brief=True)
+    some = jax.jit(some, donate_argnums=0, compiler_options=options)
+    lowered = some.lower(carry, key, done), jax.jit(begin, compiler_options=options).lower(policy, key)
+    return [in_background(program.compile) for program in lowered]
 
 
 def _number_of_devices(policy, worlds):
