@@ -60,8 +60,8 @@ def quick() -> TrainSettings:
     )
 
 
-def _from_scratch() -> TrainSettings:
-    """The paper's task by MAPPO and the generator alone, in five minutes."""
+def paper() -> TrainSettings:
+    """The paper's task on one large accelerator, in five minutes."""
     return TrainSettings(
         environment=PursuitSettings(
             physics="rigid",
@@ -87,27 +87,13 @@ def _from_scratch() -> TrainSettings:
     )
 
 
-def paper() -> TrainSettings:
-    """The paper's task on one large accelerator, in two minutes: the gradient through the simulation teaches to fly and to chase,
-    MAPPO what has no gradient."""
-    return changed(
-        _from_scratch(),
-        network=dict(initial_log_std=-2.0),
-        # who flies already would forget it by larger steps or more noise, and doesn't learn to hover where crashes are dear
-        mappo=dict(step_subsampling=2, target_kl=0.02, actor_start=0.03, penalty_start=0.3, penalty_ramp=0.5),
-        first_flights=dict(updates=400, worlds=1024, learning_rate=1e-3, crash=30.0, breach=10.0),
-        total_steps=80_000_000,
-        validation_interval=20,
-    )
-
-
 def flight() -> TrainSettings:
     """Policies to be flown: no clamp on the speed, the rate loop at 500 Hz, every pursuer its own vehicle; at last half seconds
     by the gradient through the simulation. Five minutes on one large accelerator."""
     from openjax.vehicle.family import vehicle_family
 
     return changed(
-        _from_scratch(),
+        paper(),
         environment=dict(
             speed_limit="none",
             substeps=5,
@@ -182,7 +168,7 @@ def mappo() -> TrainSettings:
     """The paper's plain MAPPO, without predictor and generator, with penalties under which it learns to catch: where a
     first crash costs 5,000, only the generator's tasks lead past hovering."""
     return changed(
-        _from_scratch(),
+        paper(),
         environment=dict(reward=dict(first_crash=0.0)),
         predictor=dict(enabled=False),
         generator=dict(enabled=False),
