@@ -11,6 +11,7 @@ from openjax.learning import preset
 from openjax.learning.analytic_gradient import crash_share, evader_distance, free_share, tip_share
 from openjax.learning.first_flights import FirstFlights, first_game, make_first_flights
 from openjax.learning.settings import FirstFlightsSettings
+from openjax.learning.ways import ways_of
 from openjax.policy import NetworkSettings, Policy, PredictorSettings
 from openjax.pursuit import Pursuit, PursuitSettings
 
@@ -82,8 +83,11 @@ def test_an_evader_within_reach_is_not_free():
     state = jax.jit(jax.vmap(Pursuit(GAME).reset))(jax.random.split(jax.random.key(0), 4))[1]
     near = state.drones.position.at[:, 0].set(state.evader_position + jnp.array([0.1, 0.0, 0.0]))
     near = state.replace(drones=state.drones.replace(position=near))
-    assert evader_distance(near)[:, 0] == pytest.approx(0.1, abs=1e-3)
-    assert (free_share(GAME, near) < 0.2).all() and (free_share(GAME, near) < free_share(GAME, state)).all()
+    far, near = (
+        evader_distance(GAME, s, jax.vmap(functools.partial(ways_of, GAME))(s.task)) for s in (state, near)
+    )
+    assert near[:, 0] == pytest.approx(0.1, abs=1e-3)
+    assert (free_share(GAME, near) < 0.2).all() and (free_share(GAME, near) < free_share(GAME, far)).all()
 
 
 def test_a_tip_over_counts_as_a_touch_does():

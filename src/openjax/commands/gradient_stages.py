@@ -32,7 +32,8 @@ def compile_last_stage(settings: TrainSettings, environment: Pursuit, policy: An
 def first_flights(settings: TrainSettings, environment: Pursuit) -> FirstFlights:
     """The stage before MAPPO of a run with these settings."""
     how = settings.first_flights
-    return FirstFlights(how, first_game(environment, how), _exact(settings, environment))
+    game, exact = first_game(environment, how), _exact(settings, environment)
+    return FirstFlights(how, game, exact, settings.generator)
 
 
 def compile_first_flights(

@@ -89,6 +89,8 @@ def unlike_the_papers(game: PursuitSettings) -> str:
         words.append(
             f"{game.min_pillars} to {game.max_pillars} pillars instead of {paper.min_pillars} to {paper.max_pillars}"
         )
+    if game.observed_pillars != paper.observed_pillars:
+        words.append(f"{game.observed_pillars} pillars in view instead of {paper.observed_pillars}")
     if game.start_attitude != paper.start_attitude:
         words.append("level starts instead of tilted ones")
     if game.time_step > paper.time_step:

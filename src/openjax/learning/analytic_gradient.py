@@ -19,6 +19,7 @@ import optax
 
 from openjax.background import in_background
 from openjax.learning.settings import AnalyticSettings
+from openjax.learning.ways import Ways, way_length, ways_of
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import (
     Pursuit,
@@ -103,7 +104,7 @@ class Way(NamedTuple):
     excess: jax.Array
     """mean excess of speed, in units of `FAST`"""
     distance: jax.Array
-    """m, mean distance to the evader beyond where a pursuer may rest"""
+    """m, mean length of the way to the evader beyond where a pursuer may rest"""
     free: jax.Array
     """(B,) share of the steps in which nobody has caught the evader"""
 
@@ -134,27 +135,34 @@ class AnalyticGradient:
     def fly(self, actor: Any, parameters: PolicyParameters, world, steps: int) -> tuple[Any, "Way"]:
         """Worlds some steps later, and what their pursuers met on the way."""
         step = jax.vmap(self.environment.step, in_axes=(None, 0, 0))
-        limit = self.how.speed_from * self.game.max_speed
+        limit, rest = self.how.speed_from * self.game.max_speed, REST * self.game.capture_radius
+        ways = jax.vmap(functools.partial(ways_of, self.game))(world[1].task)
 
-        def one(carry, _):
-            (observation, state), way = carry
+        @jax.checkpoint
+        def moved(world):
+            observation, state = world
             inputs = self.inputs(parameters, observation)
             action = self.policy.action(self.policy.distribution(actor, *inputs)[0], observation)
-            observation, state, *_ = step(jax.random.key(0), state, action)
+            return step(jax.random.key(0), state, action)[:2]
+
+        def one(carry, _):
+            world, way = carry
+            world = moved(world)
+            state = world[1]
+            distance = evader_distance(self.game, state, ways)
             way = Way(
                 jnp.minimum(way.least, nearest_gap(self.game, state)),
                 jnp.minimum(way.upright, rotation_axes(state.drones.quaternion)[1][..., 2]),
                 way.breach + breach_share(self.game, state) / steps,
                 way.excess + jax.nn.relu(_speed(state.drones) - limit) / FAST / steps,
-                way.distance + jax.nn.relu(evader_distance(state) - rest) / steps,
-                way.free + free_share(self.game, state) / steps,
+                way.distance + jax.nn.relu(distance - rest) / steps,
+                way.free + free_share(self.game, distance) / steps,
             )
-            return ((observation, state), way), None
+            return (world, way), None
 
-        rest = REST * self.game.capture_radius
         zeros = jnp.zeros(world[1].drones.position.shape[:2])
         first = world, Way(zeros + jnp.inf, zeros + 1.0, zeros, zeros, zeros, zeros[:, 0])
-        return jax.lax.scan(jax.checkpoint(one), first, None, length=steps)[0]
+        return jax.lax.scan(one, first, None, length=steps)[0]
 
     def starts(self, key: jax.Array, bounds: jax.Array):
         """Worlds to learn from, at their starts; bounds (B, R, 4)."""
@@ -282,16 +290,16 @@ def breach_share(game: PursuitSettings, state: PursuitState) -> jax.Array:
     return total + near(to_wall) + near(to_ceiling)
 
 
-def evader_distance(state: PursuitState) -> jax.Array:
-    """(W, N) m, from each pursuer of worlds (W, ...) to its evader, whose flight has no gradient: what it answers is a cliff."""
-    evader = jax.lax.stop_gradient(state.evader_position)[:, None]
-    return jnp.sqrt(jnp.sum((state.drones.position - evader) ** 2, axis=-1) + 1e-9)
+def evader_distance(game: PursuitSettings, state: PursuitState, ways: Ways) -> jax.Array:
+    """(W, N) m, way from each pursuer of worlds (W, ...) to its evader, whose flight has no gradient: what it answers is a
+    cliff."""
+    evader = jax.lax.stop_gradient(state.evader_position)
+    return jax.vmap(functools.partial(way_length, game))(state.task, ways, state.drones.position, evader)
 
 
-def free_share(game: PursuitSettings, state: PursuitState) -> jax.Array:
-    """(W,) how free the evader of worlds (W, ...) is, from 0 to 1: smooth, and felt from afar."""
-    nearest = jnp.min(evader_distance(state), axis=-1)
-    return jax.nn.sigmoid((nearest - 0.95 * game.capture_radius) / SMOOTH_CAPTURE)
+def free_share(game: PursuitSettings, distance: jax.Array) -> jax.Array:
+    """(W,) how free the evader at distances (W, N) is, from 0 to 1: smooth, and felt from afar."""
+    return jax.nn.sigmoid((jnp.min(distance, axis=-1) - 0.95 * game.capture_radius) / SMOOTH_CAPTURE)
 
 
 def _speed(drones):

@@ -8,7 +8,7 @@ What has none, waiting, cutting off, going round, is left to MAPPO.
 import dataclasses
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import jax
@@ -25,7 +25,8 @@ from openjax.learning.analytic_gradient import (
     tip_share,
 )
 from openjax.learning.collectives import mean_over_devices, own_share
-from openjax.learning.settings import AnalyticSettings, FirstFlightsSettings
+from openjax.learning.generator import vary_pillars
+from openjax.learning.settings import AnalyticSettings, FirstFlightsSettings, GeneratorSettings
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Pursuit, scatter_starts, turn_task, uniform_task
 from openjax.vehicle.family import narrowed_bounds
@@ -74,6 +75,8 @@ class FirstFlights:
     environment: Pursuit
     """See `first_game`."""
     policy: Policy
+    tasks: GeneratorSettings = field(default_factory=GeneratorSettings)
+    """How the generator's uniform tasks differ from the paper's; these do, too."""
     axis: str | None = None
     """Of the devices, where there are several."""
 
@@ -87,8 +90,9 @@ class FirstFlights:
         game = self.environment.settings
 
         def draw(key):
-            task_key, turn_key, start_key, choice_key = jax.random.split(key, 4)
-            task = turn_task(turn_key, uniform_task(game, task_key))
+            task_key, pillar_key, turn_key, start_key, choice_key = jax.random.split(key, 5)
+            task = vary_pillars(self.tasks, game, pillar_key, uniform_task(game, task_key))
+            task = turn_task(turn_key, task)
             scattered = jax.random.bernoulli(choice_key, SCATTERED)
             anywhere = scatter_starts(game, start_key, task)
             return jax.tree.map(lambda a, b: jnp.where(scattered, a, b), anywhere, task)

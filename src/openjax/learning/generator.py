@@ -45,7 +45,7 @@ def generate_task(
 def _archived_or_uniform(settings, environment, archive, key):
     uniform_key, turn_key, choice_key, draw_key, expand_key = jax.random.split(key, 5)
     uniform = uniform_task(environment, uniform_key)
-    uniform = _vary_pillars(settings, environment, jax.random.fold_in(uniform_key, 1), uniform)
+    uniform = vary_pillars(settings, environment, jax.random.fold_in(uniform_key, 1), uniform)
     if len(set(environment.evaders)) > 1:
         kind = jax.random.randint(jax.random.fold_in(uniform_key, 2), (), 0, len(environment.evaders))
         uniform = uniform.replace(evader=kind)
@@ -85,7 +85,7 @@ def select(
     return insert(archive, tasks, success, unsolved & complete, task_descriptor)
 
 
-def _vary_pillars(settings, environment, key, task):
+def vary_pillars(settings, environment, key, task):
     """Other pillars than the paper's uniform tasks have: some of them in a row, all off the grid."""
     choice_key, row_key, shift_key = jax.random.split(key, 3)
     if settings.row_share:

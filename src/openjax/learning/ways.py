@@ -1,0 +1,83 @@
+"""How far it is to the evader for who can't fly through pillars: shortest ways in the plane, by a visibility graph.
+
+A shortest way round discs is straight but for where it bends about one. Here the discs, pillars with their safety distance,
+are polygons, and a way bends at their corners (Lozano-Perez and Wesley 1979, An algorithm for planning collision-free paths).
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from openjax.pursuit import PursuitSettings, Task
+
+CORNERS = 6
+"""Of the polygon about each pillar."""
+TOLL = 3.0
+"""What a way through a pillar costs (m): more than any way round."""
+
+
+@struct.dataclass
+class Ways:
+    """The ways of a task with P pillar slots, between the C = P * CORNERS corners."""
+
+    corner: jax.Array  # (C, 2) m
+    toll: (
+        jax.Array
+    )  # (C,) m, of corners that no way may pass: outside the arena, in another pillar's reach, of no pillar
+    length: jax.Array  # (C, C) m, of the shortest way from one to another
+
+
+def ways_of(settings: PursuitSettings, task: Task) -> Ways:
+    """All corners and the shortest ways between them."""
+    reach = _reach(settings)
+    angle = 2.0 * np.pi * np.arange(CORNERS) / CORNERS
+    # where edges touch the circle, and a thousandth beyond it
+    around = 1.001 * reach / np.cos(np.pi / CORNERS) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    corner = (task.pillar_position[:, None] + around).reshape(-1, 2)
+    to_axis = jnp.sum((corner[:, None] - task.pillar_position) ** 2, axis=-1)
+    closed = jnp.any((to_axis < reach**2) & task.pillar_active, axis=-1)
+    closed |= jnp.sum(corner**2, axis=-1) > settings.arena_radius**2
+    toll = TOLL * (closed | ~jnp.repeat(task.pillar_active, CORNERS))
+    direct = _straight(settings, task, corner[:, None], corner[None]) + toll
+
+    def through(k, length):
+        return jnp.minimum(length, length[:, k, None] + length[k])
+
+    # Floyd and Warshall
+    return Ways(corner, toll, jax.lax.fori_loop(0, corner.shape[0], through, direct))
+
+
+def way_length(
+    settings: PursuitSettings, task: Task, ways: Ways, position: jax.Array, target: jax.Array
+) -> jax.Array:
+    """(N,) m, of the shortest way from each of (N, 3) positions to (3,) a target; its gradient points along the way."""
+    from_corner = _straight(settings, task, ways.corner, target[:2])
+    rest = jnp.append(ways.toll + jnp.min(ways.length + from_corner, axis=-1), 0.0)
+    first = jnp.concatenate([ways.corner, target[None, :2]])
+    here = jax.lax.stop_gradient(position[:, None, :2])
+    best = jnp.argmin(_straight(settings, task, here, first) + rest, axis=-1)
+    first, rest = jax.lax.stop_gradient((first[best], rest[best]))
+    level = jnp.sqrt(jnp.sum((position[:, :2] - first) ** 2, axis=-1) + 1e-9) + rest
+    return jnp.sqrt(level**2 + (position[:, 2] - target[2]) ** 2)
+
+
+def _reach(settings):
+    return settings.pillar_radius + settings.pillar_clearance
+
+
+def _straight(settings, task, start, end):
+    """(...,) m, from (..., 2) to (..., 2), with the toll of each pillar that is nearer on the way than at both its ends."""
+    along = end - start
+    square = jnp.sum(along**2, axis=-1)
+
+    def crosses(pillar, active):
+        to_axis = pillar - start
+        share = jnp.sum(to_axis * along, axis=-1) / jnp.maximum(square, 1e-12)
+        across = jnp.sum((to_axis - share[..., None] * along) ** 2, axis=-1)
+        return active & (share > 0.0) & (share < 1.0) & (across < _reach(settings) ** 2)
+
+    crossed = map(crosses, task.pillar_position, task.pillar_active)
+    return jnp.sqrt(square + 1e-12) + TOLL * functools.reduce(jnp.add, crossed, jnp.zeros(square.shape))

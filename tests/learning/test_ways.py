@@ -1,0 +1,89 @@
+"""Ways round pillars, against closed forms and against Dijkstra's algorithm on a fine grid."""
+
+import functools
+import heapq
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from openjax.learning.ways import TOLL, way_length, ways_of
+from openjax.pursuit import PursuitSettings, line_up_pillars, uniform_task
+
+GAME = PursuitSettings(min_pillars=5)
+REACH = GAME.pillar_radius + GAME.pillar_clearance
+CELL = 0.02
+
+
+def length(task, position, target):
+    position, target = jnp.asarray(position), jnp.asarray(target)
+    return way_length(GAME, task, ways_of(GAME, task), position, target)
+
+
+def one_pillar():
+    task = uniform_task(GAME, jax.random.key(0))
+    return task.replace(pillar_position=jnp.zeros_like(task.pillar_position), pillar_active=jnp.arange(5) < 1)
+
+
+def test_round_one_pillar_it_is_two_tangents_and_an_arc():
+    far, bent = 0.6, math.acos(REACH / 0.6)
+    tangent = math.sqrt(far**2 - REACH**2)
+    way = length(one_pillar(), [[far, 0.0, 0.5], [far, far, 0.5]], [-far, 0.0, 0.5])
+    assert way[0] == pytest.approx(2 * tangent + REACH * (math.pi - 2 * bent), rel=0.01)
+    assert way[1] == pytest.approx(math.hypot(2 * far, far), rel=1e-4)  # nothing is between them
+
+
+def test_who_is_too_near_a_pillar_leaves_it():
+    gradient = jax.grad(lambda p: length(one_pillar(), p[None], [-0.6, 0.0, 0.5])[0])
+    assert (
+        gradient(jnp.array([0.12, 0.01, 0.5]))[0] < 0.1
+    )  # not through the pillar, as the straight line would have it
+    assert length(one_pillar(), [[0.12, 0.01, 0.5]], [-0.6, 0.0, 0.5])[0] < TOLL
+
+
+def on_a_grid(task, source):
+    """The lengths (m) of ways from a place to all cells; a step leads to any cell at most three away in x and y."""
+    places = np.arange(-0.9, 0.9 + CELL / 2, CELL)
+    x, y = np.meshgrid(places, places, indexing="ij")
+    free = x**2 + y**2 < GAME.arena_radius**2
+    for (a, b), active in zip(np.asarray(task.pillar_position), np.asarray(task.pillar_active), strict=True):
+        free &= ~active | ((x - a) ** 2 + (y - b) ** 2 >= REACH**2)
+    steps = [(i, j) for i in range(-3, 4) for j in range(-3, 4) if math.gcd(i, j) == 1]
+    start = cell(source)
+    best, queue = {start: 0.0}, [(0.0, start)]
+    while queue:
+        way, (i, j) = heapq.heappop(queue)
+        if way > best[i, j]:
+            continue
+        for di, dj in steps:
+            there = i + di, j + dj
+            inside = 0 <= there[0] < len(places) and 0 <= there[1] < len(places)
+            longer = way + CELL * math.hypot(di, dj)
+            if inside and free[there] and longer < best.get(there, math.inf):
+                best[there] = longer
+                heapq.heappush(queue, (longer, there))
+    return best
+
+
+def cell(place):
+    return tuple(round((float(coordinate) + 0.9) / CELL) for coordinate in place[:2])
+
+
+def test_round_rows_it_is_as_long_as_on_a_grid():
+    keys = jax.random.split(jax.random.key(1), 6)
+    tasks = jax.vmap(lambda key: line_up_pillars(GAME, key, uniform_task(GAME, key)))(keys)
+    ways = jax.vmap(functools.partial(ways_of, GAME))(tasks)
+    lengths = jax.vmap(functools.partial(way_length, GAME))(
+        tasks, ways, tasks.pursuer_position, tasks.evader_position
+    )
+    height = tasks.pursuer_position[..., 2] - tasks.evader_position[:, None, 2]
+    differences = []
+    for b, own in enumerate(np.sqrt(np.asarray(lengths**2 - height**2))):
+        grid = on_a_grid(jax.tree.map(lambda leaf, b=b: leaf[b], tasks), tasks.evader_position[b])
+        theirs = [grid.get(cell(place), math.inf) for place in tasks.pursuer_position[b]]
+        differences += list(own - np.array(theirs))
+    # polygons are longer ways than circles; a grid's cells stand aside of the places
+    assert min(differences) > -1.5 * CELL
+    assert np.median(differences) < 0.05
