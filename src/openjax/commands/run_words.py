@@ -85,10 +85,9 @@ def unlike_the_papers(game: PursuitSettings) -> str:
         words.append("no clamp of the speed")
     if game.evader_speed < paper.evader_speed:
         words.append(f"the evader flies {game.evader_speed:g} m/s instead of {paper.evader_speed:g}")
-    if (game.min_pillars, game.max_pillars) != (paper.min_pillars, paper.max_pillars):
-        words.append(
-            f"{game.min_pillars} to {game.max_pillars} pillars instead of {paper.min_pillars} to {paper.max_pillars}"
-        )
+    pillars, theirs = (f"{own.min_pillars} to {own.max_pillars}" for own in (game, paper))
+    if pillars != theirs:
+        words.append(f"{pillars} pillars instead of {theirs}")
     if game.observed_pillars != paper.observed_pillars:
         words.append(f"{game.observed_pillars} pillars in view instead of {paper.observed_pillars}")
     if game.start_attitude != paper.start_attitude:

@@ -146,8 +146,7 @@ class AnalyticGradient:
             return step(jax.random.key(0), state, action)[:2]
 
         def one(carry, _):
-            world, way = carry
-            world = moved(world)
+            way, world = carry[1], moved(carry[0])
             state = world[1]
             distance = evader_distance(self.game, state, ways)
             way = Way(
@@ -291,8 +290,7 @@ def breach_share(game: PursuitSettings, state: PursuitState) -> jax.Array:
 
 
 def evader_distance(game: PursuitSettings, state: PursuitState, ways: Ways) -> jax.Array:
-    """(W, N) m, way from each pursuer of worlds (W, ...) to its evader, whose flight has no gradient: what it answers is a
-    cliff."""
+    """(W, N) m, ways from pursuers of worlds (W, ...) to the evader, whose flight has no gradient: its answers are a cliff."""
     evader = jax.lax.stop_gradient(state.evader_position)
     return jax.vmap(functools.partial(way_length, game))(state.task, ways, state.drones.position, evader)
 

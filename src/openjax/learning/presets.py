@@ -31,11 +31,7 @@ def quick() -> TrainSettings:
         ),
         # in so short a run the mean policy learns faster this way; over longer ones the other is better
         network=NetworkSettings(
-            features=64,
-            heads=2,
-            squash="sample",
-            initial_log_std=-3.0,
-            critic_encoder="layers",
+            features=64, heads=2, squash="sample", initial_log_std=-3.0, critic_encoder="layers"
         ),
         predictor=PredictorSettings(units=16, horizons=(1, 2, 3, 5, 10)),
         # its critic knows nothing when it begins, and its actor is good already
@@ -43,7 +39,6 @@ def quick() -> TrainSettings:
             learning_rate=3e-4,
             actor_start=0.2,
             target_kl=0.01,
-            epochs=4,
             minibatches=8,
             step_subsampling=2,
             clip_epsilon=0.2,
@@ -135,11 +130,7 @@ def evaders_scripted() -> TrainSettings:
             reward=dict(distance=0.5, first_capture=500.0),
         ),
         mappo=dict(
-            actor_start=0.015,
-            target_kl=0.01,
-            penalty_start=0.15,
-            penalty_ramp=0.6,
-            entropy_coefficient=2e-3,
+            actor_start=0.015, target_kl=0.01, penalty_start=0.15, penalty_ramp=0.6, entropy_coefficient=2e-3
         ),
         analytic=dict(updates=0),
         vehicles_start=0.0,

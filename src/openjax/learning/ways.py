@@ -4,8 +4,6 @@ A shortest way round discs is straight but for where it bends about one. Here th
 are polygons, and a way bends at their corners (Lozano-Perez and Wesley 1979, An algorithm for planning collision-free paths).
 """
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,7 +30,7 @@ class Ways:
 
 def ways_of(settings: PursuitSettings, task: Task) -> Ways:
     """All corners and the shortest ways between them."""
-    reach = _reach(settings)
+    reach = settings.pillar_radius + settings.pillar_clearance
     angle = 2.0 * np.pi * np.arange(CORNERS) / CORNERS
     # where edges touch the circle, and a thousandth beyond it
     around = 1.001 * reach / np.cos(np.pi / CORNERS) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -42,12 +40,9 @@ def ways_of(settings: PursuitSettings, task: Task) -> Ways:
     closed |= jnp.sum(corner**2, axis=-1) > settings.arena_radius**2
     toll = TOLL * (closed | ~jnp.repeat(task.pillar_active, CORNERS))
     direct = _straight(settings, task, corner[:, None], corner[None]) + toll
-
-    def through(k, length):
-        return jnp.minimum(length, length[:, k, None] + length[k])
-
     # Floyd and Warshall
-    return Ways(corner, toll, jax.lax.fori_loop(0, corner.shape[0], through, direct))
+    shorter = lambda k, length: jnp.minimum(length, length[:, k, None] + length[k])  # noqa: E731
+    return Ways(corner, toll, jax.lax.fori_loop(0, corner.shape[0], shorter, direct))
 
 
 def way_length(
@@ -64,20 +59,16 @@ def way_length(
     return jnp.sqrt(level**2 + (position[:, 2] - target[2]) ** 2)
 
 
-def _reach(settings):
-    return settings.pillar_radius + settings.pillar_clearance
-
-
 def _straight(settings, task, start, end):
     """(...,) m, from (..., 2) to (..., 2), with the toll of each pillar that is nearer on the way than at both its ends."""
     along = end - start
-    square = jnp.sum(along**2, axis=-1)
+    square, reach = jnp.sum(along**2, axis=-1), settings.pillar_radius + settings.pillar_clearance
 
     def crosses(pillar, active):
         to_axis = pillar - start
         share = jnp.sum(to_axis * along, axis=-1) / jnp.maximum(square, 1e-12)
         across = jnp.sum((to_axis - share[..., None] * along) ** 2, axis=-1)
-        return active & (share > 0.0) & (share < 1.0) & (across < _reach(settings) ** 2)
+        return active & (share > 0.0) & (share < 1.0) & (across < reach**2)
 
     crossed = map(crosses, task.pillar_position, task.pillar_active)
-    return jnp.sqrt(square + 1e-12) + TOLL * functools.reduce(jnp.add, crossed, jnp.zeros(square.shape))
+    return jnp.sqrt(square + 1e-12) + TOLL * sum(crossed, jnp.zeros(square.shape))
