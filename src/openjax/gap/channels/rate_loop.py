@@ -60,13 +60,13 @@ class RateLoop(Channel):
         return mean, np.maximum(apart, 1.0) / np.sqrt(total)
 
     def acting(self) -> dict[str, float]:
-        """Either group of axes may be retuned alone: the surer one tells. Gains that don't predict the motors better by what
-        matters aren't read from a rate loop like ours."""
+        """Either group of axes may be retuned alone: the surer one tells. Gains that don't predict the motors better by as
+        much as they must differ aren't read from a rate loop like ours."""
         squares = [
             np.array([np.mean(np.concatenate(v) ** 2) for v in self.residuals(named).values()])
             for named in ((), self.names)
         ]
-        if np.sqrt((squares[0] / squares[1]).mean()) < 1.0 + DECISION.least_gap:
+        if np.sqrt((squares[0] / squares[1]).mean()) < 1.0 + DECISION.rate_gain:
             return {}
         change, error = np.abs(self.change[[0, 3]]), self.error[[0, 3]]
         told = change > DECISION.standard_errors * error
