@@ -25,8 +25,7 @@ from openjax.pursuit import SCENARIOS
 from openjax.show.metrics import read_metrics
 from openjax.store.checkpoint_files import is_checkpoint, load_arrays
 from openjax.store.checkpoints import Checkpoints
-from openjax.store.old_names import train_settings
-from openjax.store.policy_files import WEIGHTS, load_policy_file, shipped_policies
+from openjax.store.policy_files import shipped_policies
 
 pytestmark = pytest.mark.slow
 
@@ -257,16 +256,6 @@ def test_shipped_policies_act_in_their_game_and_refuse_another():
         other = openjax.make(policy.settings.environment, **changes)
         with pytest.raises(openjax.UserError, match="make its game with"):
             policy(jax.eval_shape(other.reset, jax.random.key(0))[0])
-
-
-@pytest.mark.parametrize("name", ["evaders", "evaders_scripted"])
-def test_the_preset_is_what_the_shipped_weights_of_that_name_come_from(name):
-    shipped = train_settings(load_policy_file(WEIGHTS / f"{name}.npz")[1], name)
-    preset = openjax.preset(name)
-    assert (
-        preset.first_flights.updates == shipped.first_flights.updates == 0
-    )  # so that the rest of it says nothing
-    assert dataclasses.replace(shipped, first_flights=preset.first_flights) == preset
 
 
 def test_benchmark_writes_table_and_file(tmp_path, monkeypatch, capsys):

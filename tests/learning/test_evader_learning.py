@@ -57,6 +57,22 @@ def test_each_learns_from_its_own_samples_what_pays(worlds):
     assert max(jax.tree.leaves(still)) < 0.2 * moved
 
 
+def test_a_network_without_a_world_stays_as_it_is(worlds):
+    """Evaders that come in late haven't more noise by then than they begin with."""
+    learning = EvaderLearning(HOW, ENVIRONMENT, updates=1)
+    start = learning.start(jax.random.key(1))
+    samples = learning.act(start, worlds, jnp.ones((WORLDS, 3)))[1]
+    samples = jax.tree.map(
+        lambda leaf: leaf[None], samples.replace(which=jnp.where(samples.which == 0, 0, -1))
+    )
+    end = jax.jit(learning.learn)(start, samples, worlds, jax.random.key(2))
+    changed = [
+        np.any(np.asarray(a != b), axis=tuple(range(1, a.ndim)))
+        for a, b in zip(*map(jax.tree.leaves, (start.networks, end.networks)), strict=True)
+    ]
+    np.testing.assert_array_equal(np.any(changed, axis=0), [True, False])
+
+
 def test_wishes_fly_only_where_a_network_acts(worlds):
     learning = EvaderLearning(HOW, ENVIRONMENT, updates=1)
     wish, samples = jax.jit(learning.act)(learning.start(jax.random.key(1)), worlds, jnp.ones((WORLDS, 3)))

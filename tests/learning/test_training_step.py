@@ -185,6 +185,7 @@ def test_the_step_with_several_evaders_keeps_its_carry_and_archives_them(generat
             SETTINGS,
             environment=dict(evaders=("field", "greedy", "learned")),
             generator=generator,
+            evaders_start=0.1,
             evaders_ramp=0.1,
         )
     )

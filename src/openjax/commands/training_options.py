@@ -25,9 +25,8 @@ class TrainCommand:
 
     preset: str | None = None
     """quick: minutes on two CPU cores, coarser steps; paper: the paper's task on an accelerator; flight: policies to be flown,
-    every pursuer another vehicle; evaders_scripted (--start_from flight), then evaders (--start_from evaders_scripted): against
-    evaders that fight back; mappo: without predictor and generator; dacoop: parameters of a potential field. By default quick
-    without an accelerator, else paper."""
+    every pursuer another vehicle; evaders: the same against evaders that fight back; mappo: without predictor and generator;
+    dacoop: parameters of a potential field. By default quick without an accelerator, else paper."""
     out: Path | None = None
     """Directory of the run; by default runs/DATE-PRESET."""
     steps: Annotated[int | None, Interval("[1, 1e15]")] = None

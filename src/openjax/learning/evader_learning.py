@@ -147,8 +147,9 @@ class EvaderLearning:
         clipped = jnp.clip(ratio, 1.0 - self.how.clip_epsilon, 1.0 + self.how.clip_epsilon)
         surrogate = jnp.minimum(ratio * advantage, clipped * advantage)
         error = (outputs(critic, seen)[1] - target) ** 2
-        mean = jnp.mean(weight * (0.5 * error - surrogate))
-        return mean - self.how.entropy_coefficient * gaussian_entropy(log_std)
+        # weighted too: before the first of its worlds begins, a network's noise stays as it is
+        entropy = self.how.entropy_coefficient * gaussian_entropy(log_std)
+        return jnp.mean(weight * (0.5 * error - surrogate - entropy))
 
     def _batch(self, evaders, samples, last, axis):
         """What a gradient step needs (see `_loss`): weights (M, K, n), all else (M, n, ...) for M minibatches."""

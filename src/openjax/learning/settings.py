@@ -220,9 +220,10 @@ class TrainSettings:
     """Share of the run in which all vehicles are nominal; after it, the family `environment.vehicles` grows about them ..."""
     vehicles_ramp: Annotated[float, Interval("[0, 1]")] = 0.0
     """... to its whole size over this share of the run."""
+    evaders_start: Annotated[float, Interval("[0, 1]")] = 0.0
+    """Share of the run in which all evaders are the first of `environment.evaders`; then the others come in, slow ones ..."""
     evaders_ramp: Annotated[float, Interval("[0, 1]")] = 0.0
-    """At first all evaders are the first of `environment.evaders`; the others come in, slow ones, and have their whole odds and
-    speed after this share of the run."""
+    """... and have their whole odds and speed after this share of the run."""
     evaders_validation: tuple[str, ...] = ()
     """Evaders of the validation; none: those of the training."""
     validation_interval: Annotated[int, Interval("[1, 1000000]")] = 50

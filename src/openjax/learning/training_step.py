@@ -278,8 +278,9 @@ def _starting(settings, environment, progress):
     if family and (settings.vehicles_start or settings.vehicles_ramp):
         share = grown(settings.vehicles_start, settings.vehicles_ramp)
         environment = environment.with_bounds(narrowed_bounds(family, share))
-    if settings.evaders_ramp:
-        environment = environment.with_evader_share(grown(0.0, settings.evaders_ramp))
+    if settings.evaders_start or settings.evaders_ramp:
+        share = grown(settings.evaders_start, settings.evaders_ramp)
+        environment = environment.with_evader_share(share)
     return environment
 
 
