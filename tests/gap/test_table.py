@@ -43,7 +43,7 @@ def test_nuisances_of_the_vehicle_are_alike_on_all_blocks_and_bounded_and_a_bloc
     table = Table(None, white, None, None, order, {}, {}, {}, shared, None, rows)
     model = Model((), np.array([1]), np.array([-0.2]), np.array([[4.0]]))
     equations = Equations(table, model)
-    found = equations.solve(None)[2]
+    found = equations.solve(table.marginal.sum(0))[2]
     own = [equations.coefficients(found, k)[4] for k in range(2)]
 
     def objective(z):

@@ -59,7 +59,7 @@ def compile_first_flights(
     how = flights.how
     devices = _number_of_devices(policy, how.worlds)
     at = None if devices == 1 else everywhere(devices)
-    some_ready, begin_ready = _compiling(flights, policy, devices, keep)
+    some_ready, begin_ready = _compiling(flights, policy, devices, at, keep)
 
     def learn(parameters, key):
         some, begin = some_ready(), begin_ready()
@@ -84,10 +84,9 @@ def compile_first_flights(
     return lambda: (some_ready(), begin_ready()), learn
 
 
-def _compiling(flights, policy, devices, keep):
-    """Some updates and the start of the stage, as the background compiles them."""
+def _compiling(flights, policy, devices, at, keep):
+    """Some updates and the start of the stage, as the background compiles them for arguments that lie `at` a sharding."""
     begin, some, shardings = make_device_first_flights(flights, min(TOGETHER, flights.how.updates), devices)
-    at = None if devices == 1 else everywhere(devices)
     policy, key, done = abstract_like(
         (policy, *jax.eval_shape(lambda: (jax.random.key(0), jnp.int32(0)))), at
     )

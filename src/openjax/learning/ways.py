@@ -22,9 +22,8 @@ class Ways:
     """The ways of a task with P pillar slots, between the C = P * CORNERS corners."""
 
     corner: jax.Array  # (C, 2) m
-    toll: (
-        jax.Array
-    )  # (C,) m, of corners that no way may pass: outside the arena, in another pillar's reach, of no pillar
+    toll: jax.Array  # (C,) m
+    """Of corners that no way may pass: outside the arena, in another pillar's reach, of no pillar."""
     length: jax.Array  # (C, C) m, of the shortest way from one to another
 
 

@@ -35,9 +35,8 @@ class Equations:
     def columns(self) -> np.ndarray:
         return np.concatenate([self.model.free, self.table.nuisances[self.table.shared]])
 
-    def solve(self, block: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Hessian, right side and solution over all blocks but one."""
-        sums = self.table.marginal.sum(0) - (0.0 if block is None else self.table.marginal[block])
+    def solve(self, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Hessian, right side and solution from `table.marginal` summed (C, C) over the blocks to fit."""
         hessian, free = sums[np.ix_(self.columns, self.columns)], len(self.model.free)
         push = sums[self.columns][:, [0, *self.model.parts]].sum(1)
         hessian += block_diag(self.model.precision, np.eye(len(push) - free))
@@ -55,16 +54,17 @@ class Equations:
 
 def promise(table: Table, model: Model) -> float:
     """Log posterior of a model at its best, fitted to all blocks, up to what all of a table share: what screening needs."""
-    hessian, push, found = Equations(table, model).solve(None)
-    own = [0, *model.parts]
-    square = table.marginal.sum(0)[np.ix_(own, own)].sum()
+    sums, own = table.marginal.sum(0), [0, *model.parts]
+    hessian, push, found = Equations(table, model).solve(sums)
+    square = sums[np.ix_(own, own)].sum()
     return float(push @ found - 0.5 * found @ hessian @ found - 0.5 * square)
 
 
 def left_out(table: Table, model: Model) -> np.ndarray:
     """Coefficients (B, C) of a model on each block, fitted to all others."""
-    equations = Equations(table, model)
-    return np.array([equations.coefficients(equations.solve(k)[2], k) for k in range(len(table.white))])
+    equations, sums = Equations(table, model), table.marginal.sum(0)
+    others = (equations.solve(sums - block)[2] for block in table.marginal)
+    return np.array([equations.coefficients(found, k) for k, found in enumerate(others)])
 
 
 def judge(table: Table, model: Model) -> Judged:
