@@ -206,7 +206,8 @@ def outcome(fault: Fault, times, position, off, begin: float) -> dict:
     """What became of the vehicles from `begin` (s) on; of one that is gone itself nothing is asked.
 
     times (T,), position (T, N, 3) m and off (T, N), motors off, are the truth. `out`: farthest beyond arena or ceiling (m);
-    `seconds` until all stayed on the floor with their motors off, None if they didn't; `held`: (N,) whom one can hold.
+    infinite where a position is no number. `seconds` until all stayed on the floor with their motors off, None if they
+    didn't; `held`: (N,) whom one can hold.
     """
     held = np.arange(off.shape[1]) != fault.unheld
     late = times >= begin
@@ -215,9 +216,16 @@ def outcome(fault: Fault, times, position, off, begin: float) -> dict:
     sideways = np.linalg.norm(position[..., :2], axis=-1) - limits.arena_radius
     up = np.flatnonzero(~(off & (height < 0.02)).all(1))
     first = up[-1] + 1 if len(up) else 0
+    out = np.maximum(sideways, height - limits.arena_height).max(initial=-1.0)
     return {
-        "out": round(float(np.maximum(sideways, height - limits.arena_height).max(initial=-1.0)), 3),
+        "out": round(math.inf if np.isnan(position).any() else float(out), 3),
         "fell": bool((off & (height > FALL)).any()),
         "seconds": float(times[first] - begin) if first < len(times) else None,
         "held": held,
     }
+
+
+def finite(row: dict) -> dict:
+    """A row as JSON has it: null for what is no finite number, and in `not_finite` what that was."""
+    odd = {name: str(x) for name, x in row.items() if isinstance(x, float) and not math.isfinite(x)}
+    return {**row, **dict.fromkeys(odd), "not_finite": odd} if odd else row

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import tyro
 
-from experiments.flying.faults import ENDING, MARGIN
+from experiments.flying.faults import ENDING, MARGIN, finite
 from experiments.flying.processes import GROUPS, KINDS, STOPPED, Flown, ends_flight
 from experiments.flying.single_thread import share_out
 from experiments.table import RESULTS, Page, Table, facts, write_page
-from openjax.files import read_json, to_plain, write_json
+from openjax.files import read_json, write_json
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ def main() -> None:
     random.Random(arguments.seed).shuffle(work)  # whenever it stops, kinds were flown without favour
     stands, jobs = facts(), [(number, kind, arguments.policy) for number, kind in work]
     for row in share_out(fly, jobs, arguments.processes, arguments.seconds_left):
-        records.append(row)
+        records.append(finite(row))
         print("well" if row["well"] else "NOT WELL", json.dumps(row), flush=True)
         counts = {
             "flights": len(records),
@@ -55,7 +55,7 @@ def main() -> None:
             "policy": arguments.policy,
         }
         in_order = sorted(records, key=lambda r: r["number"])
-        write_json(arguments.out, to_plain({**stands, **counts, "records": in_order}))
+        write_json(arguments.out, {**stands, **counts, "records": in_order})
     write_page(arguments.out, page, read_json(arguments.out))
 
 

@@ -30,11 +30,12 @@ from experiments.flying.faults import (
     Fault,
     PoseDamage,
     draw_fault,
+    finite,
     outcome,
 )
 from experiments.flying.single_thread import share_out
 from experiments.table import RESULTS, Page, Table, facts, write_page
-from openjax.files import read_json, to_plain, write_json
+from openjax.files import read_json, write_json
 from openjax.flying.board import SILENCE
 from openjax.flying.controller import Pose
 from openjax.flying.estimation import see
@@ -281,16 +282,18 @@ def main() -> None:
         jobs += [(batch, layout, arguments.policy) for batch in batches]
     jobs.sort(key=lambda job: job[0][0])  # whenever it stops, all kinds and layouts were flown as often
     records, stands = [], facts()
-    for flown in share_out(fly, jobs, arguments.processes, arguments.seconds_left):
-        records += flown
-        ill = [r for r in records if not well(r)]
-        result = {
-            "policy": arguments.policy,
-            "seconds": round(time.time() - begin),
-            "summary": summary(records),
-        }
-        write_json(arguments.out, {**to_plain(stands), **result, "not_well": ill})
-    write_page(arguments.out, page, read_json(arguments.out))
+    try:
+        for flown in share_out(fly, jobs, arguments.processes, arguments.seconds_left):
+            records += flown
+            result = {
+                **stands, "policy": arguments.policy, "seconds": round(time.time() - begin),
+                "summary": [finite(row) for row in summary(records)],
+                "not_well": [finite(r) for r in records if not well(r)],
+            }  # fmt: skip
+            write_json(arguments.out, result)
+    finally:  # of what was flown, also where something failed
+        if records:
+            write_page(arguments.out, page, read_json(arguments.out))
 
 
 def page(results) -> Page:

@@ -2,6 +2,7 @@
 
 import math
 import os
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -26,12 +27,24 @@ def use_single_thread() -> None:
 def share_out(
     do: Callable, jobs: Iterable[tuple], processes: int, seconds: float = math.inf
 ) -> Iterator[Any]:
-    """What `do(*job)` gives in one of so many processes, as it comes; none is begun after `seconds`."""
-    latest = time.time() + seconds
+    """What `do(*job)` gives in one of so many processes, as it comes; none is begun after `seconds`.
+
+    A job that fails is a line on standard error, and the others go on; RuntimeError at the end says how many did.
+    """
+    latest, failed = time.time() + seconds, 0
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        for done in as_completed([pool.submit(_in_time, do, job, latest) for job in jobs]):
-            if (result := done.result()) is not None:
-                yield result
+        try:
+            given = {pool.submit(_in_time, do, job, latest): job for job in jobs}
+            for done in as_completed(given):
+                if error := done.exception():
+                    failed += 1
+                    print(f"{str(given[done])[:200]}: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
+                elif done.result() is not None:
+                    yield done.result()
+        finally:  # also where who asks has failed: nobody waits for what isn't begun
+            pool.shutdown(cancel_futures=True)
+    if failed:
+        raise RuntimeError(f"{failed} of {len(given)} jobs failed")
 
 
 def _in_time(do, job, latest):
