@@ -47,6 +47,7 @@ from openjax.flying.state import Drone, Event, Mode, Request, initial_state
 from openjax.pursuit import find_scenario, scenario_task
 from openjax.pursuit.environment import THRUST_LIMIT
 from openjax.vehicle import load_vehicle
+from openjax.virtual_crazyflie.firmware import LEVEL_AFTER
 from openjax.virtual_crazyflie.simulated import SimulatedSwarm, Uplink
 from openjax.virtual_crazyflie.vehicles import VirtualVehicles
 
@@ -73,13 +74,17 @@ class Arguments:
     """Begin no batch that wouldn't be over by then (s)."""
     kinds: tuple[str, ...] = ()
     """Those that contain one of these; all by default."""
+    level_after: float = LEVEL_AFTER
+    """A firmware of one's own levels out so long (s) after the last set-point."""
     out: Path = RESULTS / "flying_faults.json"
 
 
-def fly(seeds: list[int], layout: str, policy_name: str, latest=LATEST, seconds=SECONDS) -> list[dict]:
+def fly(seeds: list[int], layout: str, policy_name: str, level_after: float = LEVEL_AFTER) -> list[dict]:
     """Fly one fault per seed, side by side; a record of each. A seed below zero is a flight without fault."""
-    worlds = Worlds([draw_fault(seed, latest) for seed in seeds], layout, policy_name)
-    for _ in range(round(seconds / 0.01)):
+    worlds = Worlds([draw_fault(seed, LATEST) for seed in seeds], layout, policy_name)
+    for firmware in worlds.swarm.firmware:
+        firmware.level_after = level_after
+    for _ in range(round(SECONDS / 0.01)):
         if not worlds.tick():
             break
     return worlds.records(seeds, layout)
@@ -279,7 +284,7 @@ def main() -> None:
         mine = [s for s in seeds if (s // len(KINDS)) % len(arguments.layouts) == k]
         mine += [-1] * (-len(mine) % arguments.batch)  # all batches are of one size: compiled once
         batches = [mine[i : i + arguments.batch] for i in range(0, len(mine), arguments.batch)]
-        jobs += [(batch, layout, arguments.policy) for batch in batches]
+        jobs += [(batch, layout, arguments.policy, arguments.level_after) for batch in batches]
     jobs.sort(key=lambda job: job[0][0])  # whenever it stops, all kinds and layouts were flown as often
     records, stands = [], facts()
     try:

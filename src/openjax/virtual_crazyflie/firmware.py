@@ -33,7 +33,7 @@ from openjax.virtual_crazyflie.tables import (
 )
 
 LEVEL_AFTER = 0.5
-"""Set-points older than this (s) are replaced by a level attitude at the same thrust (firmware: supervisor.c)."""
+"""Set-points older than this (s) are replaced by a level attitude at the same thrust (firmware: supervisor.c, a constant)."""
 STOP_AFTER = 2.0
 """Set-points older than this (s) stop the motors and disarm."""
 WATCHDOG = 1.0
@@ -47,7 +47,7 @@ class VirtualFirmware:
 
     def __init__(self, needs_arming: bool = True):
         """`needs_arming`: motors stay off until armed; otherwise armed from the start, as on brushed Crazyflies."""
-        self.auto_arm = not needs_arming
+        self.auto_arm, self.level_after = not needs_arming, LEVEL_AFTER
         self.restart()
 
     def restart(self) -> None:
@@ -87,7 +87,7 @@ class VirtualFirmware:
         if age > STOP_AFTER:
             self._disarm()
             return SetPoint()
-        if age > LEVEL_AFTER:
+        if age > self.level_after:
             return SetPoint(ANGLES, 0.0, 0.0, 0.0, self._set_point.thrust)
         return self._set_point
 
