@@ -151,13 +151,17 @@ class Phases:
     """carry -> carry whose worlds have new tasks where their episodes have just ended, metrics of these episodes"""
 
     def __call__(self, carry: TrainCarry) -> tuple[TrainCarry, dict[str, jax.Array]]:
-        """The whole step."""
-        carry, flown, metrics = self.fly(carry)
+        """The whole step; its operations bear the parts' names, by which a profile tells them apart."""
+        carry, flown, metrics = _named(self.fly)(carry)
         for learn in self.learn:
-            carry, watched = learn(carry, flown)
+            carry, watched = _named(learn)(carry, flown)
             metrics |= watched
-        carry, counted = self.renew(carry)
+        carry, counted = _named(self.renew)(carry)
         return carry, metrics | counted
+
+
+def _named(phase):
+    return jax.named_scope(phase.__name__)(phase)
 
 
 def make_phases(
