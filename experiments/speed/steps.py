@@ -1,8 +1,8 @@
 """Where a training step's time goes: `python -m experiments.speed.steps --cases paper:5120 paper:20480:formulas [--raw FOLDER]`.
 
-A case is a preset, its worlds, and what is done otherwise than usual. Each is compiled in a process of its own, all side by side; then,
-one after the other, steps are timed and one is profiled. A phase's time is the sum of its kernels' (`openjax.learning.training_step.Phases`).
-Writes experiments/results/steps.json and .md.
+A case is a preset, its worlds, and what is done otherwise than usual. Each is compiled in a process of its own, all side by
+side; then, one after the other, steps are timed and one is profiled. A phase (`openjax.learning.training_step.Phases`) takes the
+sum of its kernels. Writes experiments/results/steps.json and .md.
 """
 
 import argparse
@@ -61,13 +61,13 @@ def measure(case: str, raw: Path | None) -> dict:
     from openjax.learning import init_carry, make_training_step, preset
     from openjax.store.leaves import abstract_like
 
-    name, worlds, otherwise = (case.split(":") + [""])[:3]
+    name, worlds, otherwise = [*case.split(":"), ""][:3]
     settings = dataclasses.replace(preset(name), num_envs=int(worlds))
     if otherwise == "shared":
         network = dataclasses.replace(settings.network, shared_encoder=True)
         settings = dataclasses.replace(settings, network=network)
     _without_kernels(otherwise)
-    began, used = time.monotonic(), _processor_seconds()
+    began = time.monotonic()
     carry = init_carry(settings, jax.random.key(0))
     lowered = guarded(make_training_step(settings)).lower(abstract_like(carry))
     traced, used_by_trace = time.monotonic(), _processor_seconds()
