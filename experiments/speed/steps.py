@@ -179,7 +179,7 @@ def _kernels(profile) -> Iterator[tuple[str, str, float]]:
 def study(options: argparse.Namespace) -> dict:
     """All cases: compiled side by side, timed one by one as they are given, those first that are ready when time is short."""
     began = time.monotonic()
-    workers = [_Worker(case, options.raw) for case in options.cases]
+    workers = [_Worker(case, options.raw, place) for place, case in enumerate(options.cases)]
     while any(not worker.answered.is_set() for worker in workers) and time.monotonic() - began < options.wait:
         time.sleep(0.2)
     records = []
@@ -193,10 +193,10 @@ def study(options: argparse.Namespace) -> dict:
 
 
 class _Worker:
-    """A process that measures one case."""
+    """A process that measures one case; the first ones' compilers come first."""
 
-    def __init__(self, case: str, raw: Path | None):
-        command = [sys.executable, "-m", "experiments.speed.steps", "--one", case]
+    def __init__(self, case: str, raw: Path | None, place: int):
+        command = ["nice", "-n", str(place), sys.executable, "-m", "experiments.speed.steps", "--one", case]
         command += ["--raw", str(raw)] if raw else []
         self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         self.answered = threading.Event()
