@@ -21,6 +21,7 @@ FUNCTION = {"lines": 40, "branches": 10, "arguments": 5}
 FLOORS = (
     "errors lazy platform background",
     "files ranges kernels",
+    "plain",
     "vehicle show",
     "pursuit flights",
     "policy gap flying interfaces export",

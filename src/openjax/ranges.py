@@ -24,6 +24,7 @@ class Interval:
     """The numbers that a setting may have, in the notation of mathematics: "[1, 8]", "(0, 1]". Always bounded."""
 
     notation: str
+    unit: str = ""
 
     def __post_init__(self):
         if not (
@@ -50,7 +51,7 @@ class Interval:
         return bool(above and (value < self.high if self._parts[4] == ")" else value <= self.high))
 
     def __str__(self) -> str:
-        return self.notation
+        return f"{self.notation} {self.unit}".rstrip()
 
 
 Seed = Annotated[int, Interval("[0, 4294967295]")]
@@ -103,14 +104,12 @@ def check_intervals(settings: Any, group: str = "") -> None:
         if given is None and field.optional:
             continue
         if field.several and not isinstance(given, tuple | list):
-            raise UserError(f"{group}{field.name} is {_shown(given)}; it must be a list of numbers")
+            raise UserError(f"{group}{field.name} is {shown(given)}; it must be a list of numbers")
         kind = numbers.Integral if field.kind is int else numbers.Real
         for value in given if field.several else (given,):
             if isinstance(value, bool) or not isinstance(value, kind) or value not in field.interval:
                 whole = "a whole number in" if field.kind is int else "in"
-                raise UserError(
-                    f"{group}{field.name} is {_shown(value)}; it must be {whole} {field.interval}"
-                )
+                raise UserError(f"{group}{field.name} is {shown(value)}; it must be {whole} {field.interval}")
 
 
 def changed(settings: Any, **changes) -> Any:
@@ -133,7 +132,7 @@ def changed(settings: Any, **changes) -> Any:
     return dataclasses.replace(settings, **given)
 
 
-def _shown(value):
+def shown(value: Any) -> str:
     """A value as it may stand in one line."""
     if isinstance(value, int) and abs(value) >= 10**20:
         return "a number of more than 20 digits"

@@ -18,7 +18,7 @@ from openjax.flights.flight import Case
 from openjax.flights.reading import flights_of
 from openjax.flights.samples import fly, log_of, references
 from openjax.vehicle import load_vehicle
-from openjax.vehicle.vehicle_file import VehicleFile, load_vehicle_file
+from openjax.vehicle.vehicle_file import Motor, VehicleFile, load_vehicle_file
 
 NOMINAL = load_vehicle()
 # Relative to nominal: thrust, inertia xx, yy, torque per thrust's share, motor time constant.
@@ -132,7 +132,7 @@ def test_with_duty_cycles_the_thrust_map_is_a_nuisance():
         return columns | motors
 
     scale = ALTERED | {"thrust_constant": 1.0}
-    result = calibrate(fly_case(altered(**scale), change=duty_cycles, motor_command="pwm"))
+    result = calibrate(fly_case(altered(**scale), change=duty_cycles, motor=Motor(command="pwm")))
     assert "thrust_constant" not in result.calibrated()
     assert any(
         "Against the public map the flights' thrust per assumed mass is 1.2" in t for t in result.cannot_tell

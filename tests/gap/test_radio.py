@@ -11,7 +11,9 @@ from openjax.gap.channels.radio import read_radio
 from openjax.gap.model.library import library
 
 BOTH = ("command_latency", "packet_loss")
-CASE = SimpleNamespace(vehicle_file=SimpleNamespace(motor_command="thrust"), others=lambda flight: ())
+CASE = SimpleNamespace(
+    vehicle_file=SimpleNamespace(motor=SimpleNamespace(command="thrust")), others=lambda flight: ()
+)
 
 
 def flown(latency, loss, jitter=0.0005, phase=0.004, seed=0, seconds=16.0):

@@ -68,5 +68,5 @@ def test_settings_of_an_earlier_version_keep_loading(tmp_path):
     run.settings_file.write_text(
         text.replace('"observe_others_motion": false', '"observe_others_motion": true')
     )
-    with pytest.raises(UserError, match="unknown setting 'observe_others_motion'"):
+    with pytest.raises(UserError, match="unknown key 'observe_others_motion'"):
         run.read_settings()

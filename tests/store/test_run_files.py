@@ -12,12 +12,12 @@ from PIL import Image
 
 from openjax.errors import UserError
 from openjax.files import replacing, to_plain
+from openjax.plain import from_plain
 from openjax.show.metrics import MetricsWriter, read_metrics
 from openjax.show.plots import plot_training, plot_trajectories
 from openjax.show.trajectory import Trajectory
 from openjax.show.videos import AZIMUTH, DISTANCE, ELEVATION, HEIGHT, OPENING, WIDTH, animate, caption, draw
 from openjax.store.policy_files import fill, load_policy_file, save_policy_file
-from openjax.store.settings_files import from_plain
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,9 +49,9 @@ def test_settings_round_trip_and_are_strict():
     settings = Outer(Inner("b", (4,), 2.0), 1.0, 7)
     assert from_plain(Outer, to_plain(settings)) == settings
     for wrong, message in (
-        ({"inner": {"kinds": "a"}}, r"settings\.inner has the unknown setting 'kinds'"),
+        ({"inner": {"kinds": "a"}}, r"settings\.inner has the unknown key 'kinds'; did you mean kind"),
         ({"inner": {"kind": "c"}}, r"settings\.inner\.kind is 'c'; expected one of 'a', 'b'"),
-        ({"count": 2.5}, r"settings\.count is 2\.5; expected int"),
+        ({"count": 2.5}, r"settings\.count is 2\.5; expected a whole number"),
     ):
         with pytest.raises(UserError, match=message):
             from_plain(Outer, wrong)

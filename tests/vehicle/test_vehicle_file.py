@@ -10,6 +10,7 @@ from openjax.vehicle import load_vehicle
 from openjax.vehicle.parameters import assets_directory
 from openjax.vehicle.vehicle_file import (
     CalibratedValue,
+    Motor,
     VehicleFile,
     copy_vehicle_file,
     load_vehicle_file,
@@ -58,7 +59,7 @@ def write(tmp_path, text):
 
 def test_what_the_file_says_is_applied(tmp_path):
     file = load_vehicle_file(write(tmp_path, FULL))
-    assert (file.name, file.mass_weighed, file.motor_command) == ("cf-07", True, "pwm")
+    assert (file.name, file.mass_weighed, file.motor.command) == ("cf-07", True, "pwm")
     assert file.motor_permutation == (2, 3, 0, 1)  # the nominal m1, front right, is logged as m3
     vehicle = file.vehicle
     assert float(vehicle.mass) == pytest.approx(0.0335)
@@ -83,7 +84,7 @@ def test_spin_follows_the_place_and_can_be_reversed(tmp_path):
         write(tmp_path, '[motor]\norder = ["rear_right", "front_right", "front_left", "rear_left"]\n')
     )
     np.testing.assert_array_equal(moved.vehicle.rotor_spin, nominal.rotor_spin)
-    assert moved.motor_spin == ("cw", "ccw", "cw", "ccw")
+    assert moved.motor.spin == ("cw", "ccw", "cw", "ccw")
     reversed_ = load_vehicle_file(write(tmp_path, '[motor]\nspin = ["cw", "ccw", "cw", "ccw"]\n'))
     np.testing.assert_array_equal(reversed_.vehicle.rotor_spin, -nominal.rotor_spin)
 
@@ -103,10 +104,10 @@ def test_saving_keeps_text_and_comments_and_replaces_the_calibration(tmp_path):
 
 
 def test_a_file_made_from_nothing_reads_back(tmp_path):
-    file = VehicleFile(vehicle=load_vehicle(), name="new", motor_command="pwm", mass_weighed=True)
+    file = VehicleFile(vehicle=load_vehicle(), name="new", motor=Motor(command="pwm"), mass_weighed=True)
     save_vehicle_file(tmp_path / "vehicle.toml", file)
     again = load_vehicle_file(tmp_path)
-    assert (again.name, again.motor_command, again.mass_weighed) == ("new", "pwm", True)
+    assert (again.name, again.motor.command, again.mass_weighed) == ("new", "pwm", True)
     np.testing.assert_allclose(again.vehicle.mass, file.vehicle.mass, rtol=1e-5)
 
 
@@ -135,19 +136,19 @@ def test_an_mjcf_of_ones_own_goes_where_its_vehicle_file_goes(tmp_path):
     [
         ("[vehicle]\nairframe = 'none.xml'", "it must be crazyflie, brushless, or"),
         ("[vehicle]\nairframe = '../none.xml'", "name of an MJCF file beside it"),
-        ("[vehicle]\nairframe = ['brushless']", "it must be crazyflie, brushless, or"),
-        ("[vehicle]\nmas = 0.03", "unknown key 'mas' in \\[vehicle\\]"),
+        ("[vehicle]\nairframe = ['brushless']", "expected text"),
+        ("[vehicle]\nmas = 0.03", "vehicle has the unknown key 'mas'; did you mean mass"),
         ("[vehicles.1]\ninertia = 1", "unknown key 'inertia'"),
-        ("[motors]\ncommand = 'pwm'", "unknown key 'motors'"),
-        ("[motor]\ncommand = 'rpm'", "motor.command is 'rpm'"),
+        ("[motors]\ncommand = 'pwm'", "unknown key 'motors'; did you mean motor"),
+        ("[motor]\ncommand = 'rpm'", "motor.command is 'rpm'; expected one of"),
         ("[motor]\norder = ['front_right', 'front_right', 'rear_left', 'front_left']", "motor.order"),
         ("[motor]\nspin = ['cw', 'cw', 'cw', 'ccw']", "motor.spin"),
-        ("[vehicle]\nmass = 32.1", "in grams"),
-        ("[vehicle]\nmass = -1", "positive number"),
-        ("[vehicle]\nmass = nan", "positive number"),
-        ("[vehicle]\nmass_weighed = 'yes'", "true or false"),
-        ("[calibrated.drag]\nvalue = 1", "unknown key 'drag'"),
-        ("[calibrated.mass]\nvalue = 0.03", "interval90"),
+        ("[vehicle]\nmass = 32.1", "it must be in .0.005, 1. kg"),
+        ("[vehicle]\nmass = -1", "it must be in"),
+        ("[vehicle]\nmass = nan", "finite number"),
+        ("[vehicle]\nmass_weighed = 'yes'", "expected true or false"),
+        ("[calibrated.drag]\nvalue = 1", "calibrated: a key is 'drag'; expected one of 'mass'"),
+        ("[calibrated.mass]\nvalue = 0.03", "calibrated.mass lacks interval90"),
         ("[calibrated.mass]\nvalue = 30\ninterval90 = [29, 31]\nunit = 'g'", "must be in 'kg'"),
         ("[calibrated.inertia]\nvalue = 1e-5\ninterval90 = [1e-5, 2e-5]", "3 numbers"),
         ("[calibrated.mass]\nvalue = 1e-9\ninterval90 = [0, 1]", "far from the nominal"),

@@ -163,7 +163,7 @@ def logarithms(theta: np.ndarray, vehicle, duty_cycles: bool) -> dict[str, np.nd
 
 def _quantities(evidence: Evidence, fit: SetFit, rates_fit: bool) -> dict[str, Quantity]:
     file, vehicle = evidence.case.vehicle_file, evidence.vehicles[0]
-    duty_cycles = file.motor_command == "pwm"
+    duty_cycles = file.motor.command == "pwm"
     wider = robust_deviation(fit) / np.sqrt(np.diag(fit.covariance))
     covariance = fit.covariance * np.outer(wider, wider)
     before = np.linalg.inv(prior(fit.effects)[2])
@@ -205,7 +205,7 @@ def _quantity(name: str, vehicle, logs: np.ndarray, deviations: np.ndarray, dete
 def _cannot_tell(evidence: Evidence, fit: SetFit, quantities: dict[str, Quantity], share: float) -> list[str]:
     """What these flights leave open, in words. `share` of the rates' changes that the fitted vehicle explains."""
     file, out, untold = evidence.case.vehicle_file, [], []
-    if file.motor_command == "pwm":
+    if file.motor.command == "pwm":
         out.append(_UNKNOWN_MAP.format(scale=1.0 + fit.theta[PLACE["thrust_scale", "scale"]]))
         untold.append("thrust_constant")
     if not file.mass_weighed:

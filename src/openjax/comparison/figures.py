@@ -68,7 +68,7 @@ def figures_of(flight: Flight, case: Case, day: str) -> FlightFigures | str:
     full = float((motor[rows] > FULL).any(1).mean())
     if full > 0.3:
         return f"a motor is at its limit in {full:.0%} of the rows: no trim can be told"
-    if case.vehicle_file.motor_command == "pwm":
+    if case.vehicle_file.motor.command == "pwm":
         motor = pwm_thrust(motor, voltage, vehicle)
     values = _trims(flight, motor, rows, mixer_of(vehicle)) | _dynamics(flight, case, vehicle)
     mean = None if voltage is None else float(voltage[rows].mean())

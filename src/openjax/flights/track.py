@@ -90,7 +90,7 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
     motor = take("motor_command", ahead=True)
     voltage = take("battery_voltage")
     fast_thrust = None
-    if motor is not None and case.vehicle_file.motor_command == "pwm":
+    if motor is not None and case.vehicle_file.motor.command == "pwm":
         motor = pwm_thrust(motor, voltage, case.vehicle_of(flight))
     elif motor is not None and faster:
         at, values = part.sampled("motor_command")

@@ -81,7 +81,7 @@ def select(evidence: Evidence) -> Selection:
 def testable(evidence: Evidence) -> dict[str, SetFit]:
     """{effect: its fit alone} of the physics effects that would show at their usual size. Where motor commands are duty
     cycles, what the unknown map to thrust can imitate isn't among them."""
-    known = evidence.case.vehicle_file.motor_command != "pwm"
+    known = evidence.case.vehicle_file.motor.command != "pwm"
     found = {}
     for effect, fit in evidence.motion.singles.items():
         promised = max(evidence.motion.exposure[effect], fit.score - evidence.motion.nothing.score)

@@ -1,6 +1,8 @@
 """The six test layouts, and a user's own as a TOML file."""
 
 import dataclasses
+import itertools
+import math
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -8,12 +10,14 @@ import numpy as np
 
 from openjax.errors import UserError, suggestion
 from openjax.files import read_toml
+from openjax.plain import from_plain
 from openjax.pursuit.settings import PursuitSettings
 from openjax.pursuit.task import Task
 from openjax.vehicle.solids import DRONE_RADIUS
 
 MOST_PILLARS = 32
 """Of a layout; each costs time in every step."""
+LONGEST_NAME = 80
 
 FLIGHT_HEIGHT = 0.5
 """All vehicles of the six layouts start at this height (m)."""
@@ -126,72 +130,48 @@ def find_scenario(name_or_path: str, settings: PursuitSettings) -> Scenario:
         raise UserError(
             f"scenario {name_or_path}: no such layout, nor a .toml file; {suggestion(str(name_or_path), SCENARIOS)}"
         )
-    data = read_toml(path, "layout")
-    unknown = sorted(set(data) - {"name", "pillars", "pursuers", "evader"})
-    if unknown:
-        raise UserError(
-            f"scenario {path}: unknown key {unknown[0]}; possible are name, pillars, pursuers, evader"
-        )
-    scenario = Scenario(
-        name=str(data.get("name", path.stem))[:80],
-        pillars=_points(path, data, "pillars", 2, ()),
-        pursuers=_points(path, data, "pursuers", 3, None),
-        evader=_points(path, {"evader": [data.get("evader")]}, "evader", 3, None)[0],
-    )
-    _check(path, scenario, settings)
+    told = {"name": path.stem, "pillars": [], **read_toml(path, "layout")}
+    scenario = from_plain(Scenario, told, f"{path}: ")
+    if faults := _faults(scenario, settings):
+        raise UserError(f"{path}: {faults[0]}")
     return scenario
 
 
-def _points(path, data, key, size, default):
-    values = data.get(key, default)
-    if values is None:
-        raise UserError(f"scenario {path}: {key} is missing; it lists points of {size} numbers in metres")
-    if not isinstance(values, list | tuple):
-        raise UserError(
-            f"scenario {path}: {key} is {str(values)[:60]}; it lists points of {size} numbers in metres"
-        )
-    points = []
-    for value in values:
-        good = isinstance(value, list) and len(value) == size
-        good = good and all(
-            isinstance(x, int | float) and not isinstance(x, bool) and np.isfinite(x) for x in value
-        )
-        if not good:
-            raise UserError(
-                f"scenario {path}: {key} holds {str(value)[:60]}; a point is {size} numbers in metres"
-            )
-        points.append(tuple(float(x) for x in value))
-    return tuple(points)
-
-
-def _check(path, scenario, settings):
-    if not 1 <= len(scenario.pursuers) <= 8:
-        raise UserError(f"scenario {path}: has {len(scenario.pursuers)} pursuers; 1 to 8 are possible")
-    if len(scenario.pillars) > MOST_PILLARS:
-        raise UserError(
-            f"scenario {path}: has {len(scenario.pillars)} pillars; up to {MOST_PILLARS} are possible"
-        )
-    radius, height = settings.arena_radius, settings.arena_height
-    for x, y in scenario.pillars:
-        if np.hypot(x, y) > radius:
-            raise UserError(
-                f"scenario {path}: pillar ({x}, {y}) stands outside the arena of radius {radius} m"
-            )
-    starts = {f"pursuer {i + 1}": p for i, p in enumerate(scenario.pursuers)} | {
-        "the evader": scenario.evader
-    }
-    for who, (x, y, z) in starts.items():
-        if np.hypot(x, y) > radius or not 0.0 < z < height:
-            raise UserError(
-                f"scenario {path}: {who} starts at ({x}, {y}, {z}), outside the arena of {radius} m by {height} m"
-            )
-        for px, py in scenario.pillars:
-            reach = settings.pillar_radius + DRONE_RADIUS
-            if np.hypot(x - px, y - py) < reach:
-                raise UserError(
-                    f"scenario {path}: pillar ({px}, {py}) stands over the start of {who} (within {reach} m)"
-                )
-    for i, a in enumerate(scenario.pursuers):
-        for b in scenario.pursuers[:i]:
-            if np.linalg.norm(np.subtract(a, b)) < 2 * DRONE_RADIUS:
-                raise UserError(f"scenario {path}: two pursuers start inside each other at {a} and {b}")
+def _faults(layout: Scenario, settings: PursuitSettings) -> list[str]:
+    """What can't be about a layout."""
+    pursuers, pillars, radius, height = (
+        layout.pursuers,
+        layout.pillars,
+        settings.arena_radius,
+        settings.arena_height,
+    )
+    starts = [*((f"pursuer {i + 1}", p) for i, p in enumerate(pursuers)), ("the evader", layout.evader)]
+    reach = settings.pillar_radius + DRONE_RADIUS
+    faults = []
+    if not 1 <= len(pursuers) <= 8:
+        faults.append(f"has {len(pursuers)} pursuers; 1 to 8 are possible")
+    if len(pillars) > MOST_PILLARS:
+        faults.append(f"has {len(pillars)} pillars; up to {MOST_PILLARS} are possible")
+    if len(layout.name) > LONGEST_NAME:
+        faults.append(f"its name is longer than {LONGEST_NAME} characters")
+    faults += [
+        f"pillar {pillar} stands outside the arena of radius {radius} m"
+        for pillar in pillars
+        if math.hypot(*pillar) > radius
+    ]
+    faults += [
+        f"{who} starts at {(x, y, z)}, outside the arena of {radius} m by {height} m"
+        for who, (x, y, z) in starts
+        if math.hypot(x, y) > radius or not 0.0 < z < height
+    ]
+    faults += [
+        f"pillar {pillar} stands over the start of {who} (within {reach} m)"
+        for who, start in starts
+        for pillar in pillars
+        if math.dist(start[:2], pillar) < reach
+    ]
+    return faults + [
+        f"two pursuers start inside each other at {a} and {b}"
+        for a, b in itertools.combinations(pursuers, 2)
+        if math.dist(a, b) < 2 * DRONE_RADIUS
+    ]

@@ -4,7 +4,7 @@ import copy
 from typing import Any
 
 from openjax.learning import TrainSettings
-from openjax.store.settings_files import from_plain
+from openjax.plain import from_plain
 
 _RENAMED = {
     "validation_interval": "evaluation_interval",

@@ -123,7 +123,7 @@ def abstract_parameters(environment: Pursuit, policy: Policy) -> PolicyParameter
 
 def _from_file(path, source):
     leaves, settings, _ = load_policy_file(path)
-    return _build(train_settings(settings, f"the settings of {path}"), leaves, source)
+    return _build(train_settings(settings, f"{path}: "), leaves, source)
 
 
 def _from_run(run, source):

@@ -23,9 +23,9 @@ from openjax.errors import UserError
 from openjax.files import WRITING, check_output_folder, read_json, remove_unfinished, write_json
 from openjax.learning import TrainSettings
 from openjax.store.old_names import train_settings
-from openjax.store.settings_files import SETTINGS_FILE
 
 _FORMAT = "openjax run 1"
+SETTINGS_FILE = "settings.json"
 _FILES = (
     SETTINGS_FILE,
     "vehicle.toml",
@@ -90,7 +90,7 @@ class RunDirectory:
         stored = read_json(self.settings_file)
         if not isinstance(stored, dict) or stored.get("format") != _FORMAT:
             raise UserError(f"{self.settings_file} isn't of the format {_FORMAT!r}")
-        return train_settings(stored.get("settings"), str(self.settings_file))
+        return train_settings(stored.get("settings"), f"{self.settings_file}: ")
 
 
 def is_run(path: Path) -> bool:

@@ -72,7 +72,7 @@ def make_reading(case: Case, library: Library, tracks, vehicles, arrived, sensor
     )
     blind = (at_once and not known) or hidden
     late = None if blind or seldom else ROW_DELAY[0 if slow else 1]
-    pwm = case.vehicle_file.motor_command == "pwm"
+    pwm = case.vehicle_file.motor.command == "pwm"
     return Reading(library, tracks, vehicles, arrived, sensors, pwm, at_once, blind, late)
 
 

@@ -10,21 +10,29 @@ A parameter that is left out has no effect. `unit` and `interval90` are optional
 parameter's own is an error, so that nothing is converted silently.
 """
 
+import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
 import tomlkit
 
-from openjax.errors import UserError
+from openjax.errors import UserError, suggestion
 from openjax.files import read_toml, write_text
-from openjax.vehicle.effects.effect import Parameter
+from openjax.plain import from_plain
+from openjax.vehicle.effects.effect import Effect
 from openjax.vehicle.effects.registry import EFFECTS
 
 FAR = 100.0
 """Values may lie outside of a parameter's usual range by this many of its widths."""
 
-_KEYS = {"value", "unit", "interval90"}
+
+@dataclasses.dataclass(frozen=True)
+class _Entry:
+    """A parameter of an effect."""
+
+    value: float
+    unit: str | None = None
+    interval90: tuple[float, float] | None = None
 
 
 def load_effects(path: str | Path) -> tuple[tuple[str, ...], dict[str, dict[str, float]]]:
@@ -33,37 +41,59 @@ def load_effects(path: str | Path) -> tuple[tuple[str, ...], dict[str, dict[str,
     Raises UserError for a missing or unreadable file, unknown names, wrong units and values that aren't
     numbers.
     """
-    path = Path(path)
+    entries = _read(Path(path))
+    return tuple(sorted(entries)), {
+        name: {key: entry.value for key, entry in own.items()} for name, own in entries.items()
+    }
+
+
+def load_intervals(path: str | Path) -> dict[str, dict[str, tuple[float, float]]]:
+    """90 % intervals {effect: {parameter: (low, high)}} of an effects file, of those that have any."""
+    found = {
+        name: {key: entry.interval90 for key, entry in own.items() if entry.interval90 is not None}
+        for name, own in _read(Path(path)).items()
+    }
+    return {name: own for name, own in found.items() if own}
+
+
+def _read(path: Path) -> dict[str, dict[str, _Entry]]:
+    """The entries of an effects file."""
     table = read_toml(path, "effects file")
     table.pop("notes", None)
-    parameters = {}
     for name, entries in table.items():
-        if name not in EFFECTS:
-            raise UserError(f"{path}: effect {name!r} is unknown; known: {', '.join(EFFECTS)}")
         if not isinstance(entries, dict):
             raise UserError(f"{path}: [{name}] must be a table of its parameters")
-        known = EFFECTS[name].parameters
-        for parameter in entries:
-            if parameter not in known:
-                raise UserError(f"{path}: [{name}] has no parameter {parameter!r}; it has {', '.join(known)}")
-        parameters[name] = {key: _value(path, name, key, entry, known[key]) for key, entry in entries.items()}
-    return tuple(sorted(parameters)), parameters
+        for key in [None, *entries]:
+            _find(name, key, f"{path}: ")
+    return {
+        name: {key: _entry(path, name, key, entry) for key, entry in entries.items()}
+        for name, entries in table.items()
+    }
 
 
-def _value(path: Path, name: str, key: str, entry, parameter: Parameter) -> float:
-    where = f"{path}: [{name}] {key}"
-    if isinstance(entry, dict):
-        if strangers := sorted(set(entry) - _KEYS):
-            raise UserError(f"{where} has an unknown key {strangers[0]!r}; known: {', '.join(sorted(_KEYS))}")
-        if entry.get("unit", parameter.unit) != parameter.unit:
-            raise UserError(f"{where} is in {entry['unit']!r}; {parameter.unit!r} would be right")
-        entry = entry.get("value")
-    if isinstance(entry, bool) or not isinstance(entry, int | float) or not np.isfinite(entry):
-        raise UserError(f"{where} must be a finite number in {parameter.unit}")
+def _find(effect: str, parameter: str | None, where: str = "") -> Effect:
+    """The effect of that name. Raises UserError where there is none, or it hasn't that parameter."""
+    if effect not in EFFECTS:
+        raise UserError(f"{where}effect {effect!r} is unknown; {suggestion(effect, EFFECTS)}")
+    known = EFFECTS[effect].parameters
+    if parameter is not None and parameter not in known:
+        raise UserError(f"{where}effect {effect!r} has no parameter {parameter!r}; it has {', '.join(known)}")
+    return EFFECTS[effect]
+
+
+def _entry(path: Path, name: str, key: str, told) -> _Entry:
+    where, parameter = f"{path}: {name}.{key}", EFFECTS[name].parameters[key]
+    entry = from_plain(_Entry, told if isinstance(told, dict) else {"value": told}, where)
+    if entry.unit not in (None, parameter.unit):
+        raise UserError(f"{where} is in {entry.unit!r}; {parameter.unit!r} would be right")
     low, high = parameter.prior
-    if not low - FAR * (high - low) <= entry <= high + FAR * (high - low):
-        raise UserError(f"{where} = {entry:g} {parameter.unit} is far from what occurs, {low:g} to {high:g}")
-    return float(entry)
+    if not low - FAR * (high - low) <= entry.value <= high + FAR * (high - low):
+        raise UserError(
+            f"{where} = {entry.value:g} {parameter.unit} is far from what occurs, {low:g} to {high:g}"
+        )
+    if entry.interval90 is not None and entry.interval90[0] > entry.interval90[1]:
+        raise UserError(f"{where}: interval90 is {list(entry.interval90)}; low must not exceed high")
+    return entry
 
 
 def save_effects(
@@ -80,16 +110,10 @@ def save_effects(
     if notes:
         document.add("notes", notes)
     for name in sorted(parameters):
-        if name not in EFFECTS:
-            raise UserError(f"effect {name!r} is unknown; known: {', '.join(EFFECTS)}")
-        effect = EFFECTS[name]
-        table = tomlkit.table()
+        effect, table = _find(name, None), tomlkit.table()
         table.comment(effect.description)
         for key, value in parameters[name].items():
-            if key not in effect.parameters:
-                raise UserError(
-                    f"effect {name!r} has no parameter {key!r}; it has {', '.join(effect.parameters)}"
-                )
+            _find(name, key)
             entry = tomlkit.inline_table()
             entry.append("value", float(value))
             entry.append("unit", effect.parameters[key].unit)
@@ -99,15 +123,3 @@ def save_effects(
             table.append(key, entry)
         document.append(name, table)
     write_text(path, tomlkit.dumps(document))
-
-
-def load_intervals(path: str | Path) -> dict[str, dict[str, tuple[float, float]]]:
-    """90 % intervals {effect: {parameter: (low, high)}} of an effects file that `load_effects` accepts."""
-    table = read_toml(path, "effects file")
-    found: dict[str, dict[str, tuple[float, float]]] = {}
-    for name, entries in table.items():
-        for key, entry in entries.items() if isinstance(entries, dict) else ():
-            interval = entry.get("interval90") if isinstance(entry, dict) else None
-            if interval is not None and len(interval) == 2 and interval[0] <= interval[1]:
-                found.setdefault(name, {})[key] = (float(interval[0]), float(interval[1]))
-    return found

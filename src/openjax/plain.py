@@ -1,0 +1,107 @@
+"""Plain values, as TOML and JSON hold them, to nested frozen dataclasses, strictly; `openjax.files.to_plain` is the way back."""
+
+import dataclasses
+import math
+import types
+import typing
+from pathlib import Path
+from typing import Any
+
+from openjax.errors import UserError, suggestion
+from openjax.ranges import check_intervals, shown
+
+ROOT = ": "
+"""What the name of a place ends in that is a file, and no setting: `a.toml: `, then `a.toml: motor.order`."""
+
+WORDS = {int: "a whole number", float: "a number", str: "text", bool: "true or false"}
+
+
+def from_plain(kind: Any, value: Any, where: str = "settings") -> Any:
+    """The inverse of `to_plain` for the annotated type `kind`; numbers are finite and lie in their intervals.
+
+    Raises:
+      UserError: an unknown key, a missing one, or a value that doesn't fit its annotation; `where` names the place.
+    """
+    if dataclasses.is_dataclass(kind):
+        return _dataclass_from_plain(kind, value, where)
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is typing.Annotated:
+        return from_plain(arguments[0], value, where)
+    if origin in (typing.Union, types.UnionType):
+        return _union_from_plain(arguments, value, where)
+    if origin is tuple:
+        return _tuple_from_plain(arguments, value, where)
+    if origin is dict:
+        return {
+            from_plain(arguments[0], key, f"{where}: a key"): from_plain(
+                arguments[1], entry, _place(where, key)
+            )
+            for key, entry in _table(value, where).items()
+        }
+    if origin is typing.Literal and value not in arguments:
+        raise UserError(f"{where} is {shown(value)}; expected one of {', '.join(map(repr, arguments))}")
+    return value if origin is typing.Literal else _leaf_from_plain(kind, value, where)
+
+
+def _place(where, key):
+    return f"{where}{key}" if where.endswith(ROOT) else f"{where}.{key}"
+
+
+def _table(value, where):
+    if not isinstance(value, dict):
+        raise UserError(f"{where.removesuffix(ROOT)} is {shown(value)}; expected a table")
+    return value
+
+
+def _tuple_from_plain(arguments, value, where):
+    if not isinstance(value, list | tuple):
+        raise UserError(f"{where} is {shown(value)}; expected a list")
+    if len(arguments) == 2 and arguments[1] is Ellipsis:
+        arguments = arguments[:1] * len(value)
+    if len(arguments) != len(value):
+        raise UserError(f"{where} has {len(value)} entries; expected {len(arguments)}")
+    places = (f"{where}[{i}]" for i in range(len(value)))
+    return tuple(map(from_plain, arguments, value, places))
+
+
+def _leaf_from_plain(kind, value, where):
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if kind is Path and isinstance(value, str):
+        return Path(value)
+    if kind in WORDS and (not isinstance(value, kind) or (kind is int and isinstance(value, bool))):
+        raise UserError(f"{where} is {shown(value)}; expected {WORDS[kind]}")
+    if kind is float and not math.isfinite(value):
+        raise UserError(f"{where} is {value}; expected a finite number")
+    if kind is type(None) and value is not None:
+        raise UserError(f"{where} is {shown(value)}; expected nothing")
+    return value
+
+
+def _dataclass_from_plain(kind, value, where):
+    fields = {field.name: field for field in dataclasses.fields(kind) if field.init}
+    root, given = where.removesuffix(ROOT), _table(value, where)
+    for key in given:
+        if key not in fields:
+            raise UserError(
+                f"{root} has the unknown key {shown(key)}; {suggestion(str(key), sorted(fields))}"
+            )
+    for name, field in fields.items():
+        none = field.default is field.default_factory is dataclasses.MISSING
+        if none and name not in given:
+            raise UserError(f"{root} lacks {name}")
+    hints = typing.get_type_hints(kind, include_extras=True)
+    made = kind(**{key: from_plain(hints[key], entry, _place(where, key)) for key, entry in given.items()})
+    check_intervals(made, _place(where, ""))
+    return made
+
+
+def _union_from_plain(arguments, value, where):
+    reasons = []
+    # The exact match first: True is not 1, and 1 must not become 1.0 when int stands in the union.
+    for argument in sorted(arguments, key=lambda kind: kind is not type(value)):
+        try:
+            return from_plain(argument, value, where)
+        except UserError as error:
+            reasons.append(str(error))
+    raise UserError(reasons[0])
