@@ -126,7 +126,7 @@ class Worlds:
         )
         pillars = [(x, y, self.game.pillar_radius) for x, y in scenario.pillars]
         state = initial_state([tuple(s) for s in starts.tolist()], pillars, self.airframe)
-        state = replace(state, drones=(Drone(Mode.PURSUIT),) * self.n)
+        state = state._replace(drones=(Drone(Mode.PURSUIT),) * self.n)
         self.states = [state] * len(faults)
         self._landing = [False] * len(faults)
         self._measured, self._play, self._tracks = None, None, []
@@ -158,7 +158,7 @@ class Worlds:
             before = self.states[w].drones
             if self._landing[w]:  # who takes over knows no motion capture
                 seen = samples[first : first + self.n]
-                samples[first : first + self.n] = [replace(s, captured=None) for s in seen]
+                samples[first : first + self.n] = [s._replace(captured=None) for s in seen]
             self.states[w] = see(self.states[w], now, samples[first : first + self.n])
             for i, (drone, old) in enumerate(zip(self.states[w].drones, before, strict=True)):
                 if drone.captured.pose is not old.captured.pose and drone.told:

@@ -66,7 +66,7 @@ def test_a_set_point_arrives_on_board_as_it_was_meant(mode, roll, pitch, yaw_rat
     Commander(SimpleNamespace(send_packet=send)).send_setpoint_manual(*manual_arguments(wanted))
     got = firmware.set_point(0.0)
     assert got.mode == wanted.mode
-    np.testing.assert_allclose(got.array()[1:4], wanted.array()[1:4], atol=1e-5)
+    np.testing.assert_allclose(got[1:4], wanted[1:4], atol=1e-5)
     assert abs(got.thrust - as_sent(wanted).thrust) < 3e-5
 
 

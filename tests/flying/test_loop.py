@@ -85,7 +85,7 @@ def test_ticks_leave_half_a_kilobyte_each_and_nothing_to_collect(flight):
     gc.disable()
     tracemalloc.start()
     try:
-        go_on(100)
+        go_on(1000)  # by then the interpreter keeps as many tuples for later as it will
         before = tracemalloc.get_traced_memory()[0]
         go_on(1000)
         grown = tracemalloc.get_traced_memory()[0] - before

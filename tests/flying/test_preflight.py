@@ -3,7 +3,6 @@
 import math
 import subprocess
 import sys
-from dataclasses import replace
 
 import pytest
 
@@ -94,6 +93,6 @@ def test_a_second_fly_is_refused_until_the_first_is_gone_however_it_went():
 
 
 def test_a_scaled_frame_is_told_by_the_vehicles_own():
-    scaled = replace(sample(0.6, 0.3), captured=Pose(0.0, (0.72, 0.36, 0.0), (0.0,) * 3, LEVEL))
+    scaled = sample(0.6, 0.3)._replace(captured=Pose(0.0, (0.72, 0.36, 0.0), (0.0,) * 3, LEVEL))
     lines = faults(initial_state(((0.66, 0.33, 0.5),)), (scaled,), (100.0,), True)
     assert len(lines) == 1 and "unit" in lines[0]

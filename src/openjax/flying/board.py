@@ -9,7 +9,6 @@ import contextlib
 import os
 import select
 import signal
-from dataclasses import replace
 from enum import IntEnum
 
 from openjax.flying.controller import moved_on, numbers_of, pose_of
@@ -114,8 +113,8 @@ class Board:
         for i, drone in enumerate(state.drones):
             mode, trim, known, *numbers = self._numbers[_HEAD + _EACH * i : _HEAD + _EACH * (i + 1)]
             pose = moved_on(pose_of(numbers), now) if known else None
-            drones.append(replace(drone, mode=_MODES[int(mode)], trim=trim, estimate=pose))
-        return replace(state, drones=tuple(drones), time=now, action_time=now)
+            drones.append(drone._replace(mode=_MODES[int(mode)], trim=trim, estimate=pose))
+        return state._replace(drones=tuple(drones), time=now, action_time=now)
 
 
 def stand_alone() -> None:

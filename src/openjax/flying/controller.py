@@ -118,7 +118,8 @@ def lift_acceleration(quaternion, lift: float) -> Vector:
 
 def moved_on(pose: Pose, now: float) -> Pose:
     """The pose at `now` (s) if velocity and body rates have stayed what they were."""
-    age = now - pose.time
+    if (age := now - pose.time) == 0.0:
+        return pose
     position = tuple(p + age * v for p, v in zip(pose.position, pose.velocity, strict=True))
     return pose._replace(
         time=now, position=position, quaternion=turned_on(pose.quaternion, pose.body_rates, age)

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 from openjax.flying.controller import Pose, level_acceleration, moved_on
 from openjax.flying.judge import agree, at_one_time, follows
@@ -17,9 +16,9 @@ def see(state: State, time: float, samples: Sequence[PoseSample]) -> State:
 
     Motion capture is what a vehicle is flown by, until it is lost; from then on its own estimate is.
     """
-    state = replace(state, time=time, dt=min(max(time - state.time, 0.0), 0.1))
+    state = state._replace(time=time, dt=min(max(time - state.time, 0.0), 0.1))
     drones = (_seen(state, drone, sample) for drone, sample in zip(state.drones, samples, strict=True))
-    return replace(state, drones=tuple(drones))
+    return state._replace(drones=tuple(drones))
 
 
 def _seen(state, drone, sample) -> Drone:
@@ -27,20 +26,20 @@ def _seen(state, drone, sample) -> Drone:
     moving = drone.mode in FLYING and not (drone.mode is Mode.LIFT and now - drone.since < SPIN_UP)
     by_capture = sample.captured is not None and not drone.distrusted
     reckoned = None if by_capture and drone.own.fresh(now, limits) else drone.estimate
-    drone = replace(drone, own=drone.own.after(sample.own, now, limits, moving, reckoned))
+    drone = drone._replace(own=drone.own.after(sample.own, now, limits, moving, reckoned))
     if by_capture:
         drone = _captured(state, drone, sample, moving)
     source = drone.captured if by_capture and not drone.distrusted else drone.own
     if source.fresh(now, limits):
         estimate = moved_on(source.pose, max(now, source.pose.time))
         level = level_acceleration(estimate.quaternion)
-        return replace(drone, estimate=estimate, seen=source.pose.time, acceleration=level)
+        return drone._replace(estimate=estimate, seen=source.pose.time, acceleration=level)
     if drone.estimate is None:
         return drone
     old, dt = drone.estimate, state.dt
     velocity = tuple(v + dt * a for v, a in zip(old.velocity, drone.acceleration, strict=True))
     position = tuple(p + dt * v for p, v in zip(old.position, velocity, strict=True))
-    return replace(drone, estimate=old._replace(time=now, position=position, velocity=velocity))
+    return drone._replace(estimate=old._replace(time=now, position=position, velocity=velocity))
 
 
 def _captured(state, drone, sample, moving) -> Drone:
@@ -49,13 +48,13 @@ def _captured(state, drone, sample, moving) -> Drone:
     seen = _with_motion(sample.captured, drone.captured.pose, sample.own)
     captured, distrusted = drone.captured.after(seen, now, limits, moving, drone.estimate), ""
     if captured.pose is seen:
-        told = not moving or own.pose is None or follows(own.pose, seen, limits)
-        drone = replace(drone, told=told)
-        if moving and own.fresh(now, limits) and (verdict := agree(*at_one_time(seen, own.pose), limits)):
+        both = at_one_time(seen, own.pose) if moving and own.pose is not None else None
+        drone = drone._replace(told=both is None or follows(*both, limits))
+        if both and own.fresh(now, limits) and (verdict := agree(*both, limits)):
             captured = captured._replace(pose=drone.captured.pose, verdict=verdict)
     if moving and not captured.fresh(now, limits):
         distrusted = captured.verdict or "pose lost"
-    return replace(drone, captured=captured, distrusted=distrusted)
+    return drone._replace(captured=captured, distrusted=distrusted)
 
 
 def _with_motion(pose, last, own) -> Pose:

@@ -15,7 +15,6 @@ import os
 import struct
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from types import SimpleNamespace
 
 from openjax.flying import real_time
@@ -43,11 +42,11 @@ def take_over(state: State, now: float) -> State:
             return drone
         mode = Mode.LAND if drone.mode in (*LANDING, Mode.LIFT) else Mode.HOLD
         # the estimate is as good as what the one before knew
-        drone = replace(drone, seen=now, landing_since=None)
+        drone = drone._replace(seen=now, landing_since=None)
         return drone.to(mode, now, anchor, "another process took over")
 
     drones = tuple(map(taken, state.drones, state.resting_places()))
-    return replace(state, drones=drones, time=now, action_time=now)
+    return state._replace(drones=drones, time=now, action_time=now)
 
 
 def fly_down(

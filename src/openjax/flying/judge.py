@@ -150,12 +150,11 @@ def agree(captured: Pose, own: Pose, limits: PoseLimits) -> Verdict:
     return Verdict.GOOD if near and turned else Verdict.APART
 
 
-def follows(own: Pose, captured: Pose, limits: PoseLimits) -> bool:
-    """Whether the estimator on board may be told a pose of motion capture: they are no farther apart than errors explain.
+def follows(captured: Pose, own: Pose, limits: PoseLimits) -> bool:
+    """Whether the estimator on board may be told a pose of motion capture, both of one time: errors explain the distance.
 
     An estimator that is told late or drifting poses takes their error for a velocity, by which it would have to land.
     """
-    own, captured = at_one_time(own, captured)
     return math.dist(own.position, captured.position) <= limits.position
 
 

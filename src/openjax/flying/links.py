@@ -185,9 +185,8 @@ class Links:
         if self.board.pilot is not Role.LOOP:
             raise LinksGone("another process flies")
         self._count += 1
-        packed = [_SET_POINT.pack(s.mode, *s.numbers()) for s in set_points]
         try:
-            self._commands.send(_NUMBER.pack(self._count) + b"".join(packed))
+            self._commands.send(_NUMBER.pack(self._count) + b"".join(_SET_POINT.pack(*s) for s in set_points))
             number = 0
             while number != self._count:
                 number, sent = _SENT.unpack(self._commands.recv(_SENT.size))

@@ -94,7 +94,7 @@ class MotionCaptured(Links):
     def observe(self) -> tuple[PoseSample, ...]:
         """What is known of each vehicle now."""
         own = super().observe()
-        return tuple(dataclasses.replace(s, captured=p) for p, s in zip(self._captured, own, strict=True))
+        return tuple(s._replace(captured=p) for p, s in zip(self._captured, own, strict=True))
 
     def arrivals(self) -> tuple[float, ...]:
         """When each vehicle's newest pose of motion capture arrived (s, host)."""

@@ -9,7 +9,6 @@ link is silent, its battery low, it is too fast, too tilted, or outside the aren
 """
 
 import math
-from dataclasses import replace
 
 from openjax.flying.controller import up
 from openjax.flying.crtp import Supervisor
@@ -34,7 +33,7 @@ def step(state: State, event: Event) -> tuple[State, tuple[SetPoint, ...]]:
 def decide(state: State, event: Event) -> tuple[State, tuple[SetPoint, ...]]:
     """The state after a tick whose poses were seen already, and the set-point of each vehicle."""
     now, actions = event.time, event.actions
-    finite = actions is not None and all(math.isfinite(x) for a in actions for x in a.numbers())
+    finite = actions is not None and all(math.isfinite(x) for action in actions for x in action)
     action_time = now if finite else state.action_time
     drones = _requested(state, event)
     troubles = [_trouble(state, *of) for of in zip(drones, event.samples, strict=True)]
@@ -44,11 +43,11 @@ def decide(state: State, event: Event) -> tuple[State, tuple[SetPoint, ...]]:
             troubles = [t or (Mode.HOLD, reason) for t in troubles]
     else:
         action_time = now
-    state = replace(state, drones=_react(state, drones, troubles), action_time=action_time)
+    state = state._replace(drones=_react(state, drones, troubles), action_time=action_time)
     moved = tuple(
         steer(state, i, actions[i] if finite else None, sample) for i, sample in enumerate(event.samples)
     )
-    return replace(state, drones=moved), tuple(drone.sent for drone in moved)
+    return state._replace(drones=moved), tuple(drone.sent for drone in moved)
 
 
 def _requested(state, event) -> tuple[Drone, ...]:
@@ -89,7 +88,7 @@ def _transfer(state, event, drone, start) -> Drone:
         return drone.to(Mode.TRANSFER, event.time, start)
     x, y, z = drone.estimate.position
     stand = tuple(None if t.pose is None else t.pose.position for t in (drone.own, drone.captured))
-    return replace(drone.to(Mode.LIFT, event.time, (x, y, z + state.settings.lift)), stand=stand)
+    return drone.to(Mode.LIFT, event.time, (x, y, z + state.settings.lift))._replace(stand=stand)
 
 
 def lift_fault(state: State, drone: Drone) -> str:

@@ -1,9 +1,7 @@
 """Set-points: what a vehicle is asked for, and what of it fits into the packet that `cflib` sends."""
 
 import math
-from dataclasses import dataclass, replace
-
-import numpy as np
+from typing import NamedTuple
 
 OFF, RATES, ANGLES = 0, 1, 2
 """Modes of a set-point: motors off; roll and pitch as body rates; as angles."""
@@ -16,8 +14,7 @@ LEAST_THRUST, MOST_THRUST = _LEAST / _COUNTS, _MOST / _COUNTS
 """No set-point but "off" asks for less, none for more."""
 
 
-@dataclass(frozen=True)
-class SetPoint:
+class SetPoint(NamedTuple):
     """Roll, pitch (rad or, by `mode`, rad/s; body frame, pitch positive nose down), yaw rate (rad/s), thrust 0..1 of
     the four rotors' maximum."""
 
@@ -26,14 +23,6 @@ class SetPoint:
     pitch: float = 0.0
     yaw_rate: float = 0.0
     thrust: float = 0.0
-
-    def numbers(self) -> tuple[float, ...]:
-        """All but the mode."""
-        return self.roll, self.pitch, self.yaw_rate, self.thrust
-
-    def array(self) -> np.ndarray:
-        """(5,) float32 in the order of the fields."""
-        return np.array([self.mode, self.roll, self.pitch, self.yaw_rate, self.thrust], np.float32)
 
 
 MOTORS_OFF = SetPoint()
@@ -56,7 +45,7 @@ def manual_arguments(set_point: SetPoint) -> tuple[float, float, float, float, b
 
 def as_sent(set_point: SetPoint) -> SetPoint:
     """The set-point with the thrust that is left of it in a packet: that is what a log should hold."""
-    return replace(set_point, thrust=min(max(set_point.thrust, LEAST_THRUST), MOST_THRUST))
+    return set_point._replace(thrust=min(max(set_point.thrust, LEAST_THRUST), MOST_THRUST))
 
 
 def from_action(action, thrust_limit: float) -> SetPoint:

@@ -2,8 +2,8 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import NamedTuple
 
 from openjax.flying.controller import Airframe, Pose, Vector, nominal_airframe
 from openjax.flying.crtp import Supervisor
@@ -46,8 +46,7 @@ class Request(StrEnum):
     STOP = "stop"
 
 
-@dataclass(frozen=True)
-class PoseSample:
+class PoseSample(NamedTuple):
     """What is known of one vehicle at a tick, however old."""
 
     own: Pose | None
@@ -61,8 +60,7 @@ class PoseSample:
     """The newest of motion capture, whose velocity and body rates mean nothing; None where there is no motion capture."""
 
 
-@dataclass(frozen=True)
-class Event:
+class Event(NamedTuple):
     """One tick."""
 
     time: float
@@ -74,8 +72,7 @@ class Event:
     """Why it is requested, where nobody asked."""
 
 
-@dataclass(frozen=True)
-class Drone:
+class Drone(NamedTuple):
     """One vehicle's part of the state."""
 
     mode: Mode = Mode.GROUND
@@ -98,8 +95,7 @@ class Drone:
 
     def to(self, mode: Mode, now: float, anchor: Vector | None = None, reason: str = "") -> "Drone":
         """The drone in another mode from `now` (s) on; anchor and reason stay what they were unless given."""
-        return replace(
-            self,
+        return self._replace(
             mode=mode,
             since=now,
             anchor=self.anchor if anchor is None else anchor,
@@ -108,8 +104,7 @@ class Drone:
         )
 
 
-@dataclass(frozen=True)
-class State:
+class State(NamedTuple):
     """The state machine's state."""
 
     drones: tuple[Drone, ...]

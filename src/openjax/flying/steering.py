@@ -1,7 +1,6 @@
 """How a vehicle is flown in each mode: by the policy within its limits, or by the controller."""
 
 import math
-from dataclasses import replace
 
 from openjax.flying.controller import (
     Vector,
@@ -26,7 +25,7 @@ TRIM_GAIN, TRIM_LIMIT = 0.25, 0.15
 
 def steer(state: State, i: int, action: SetPoint | None, sample: PoseSample) -> Drone:
     """Vehicle i after this tick, with its set-point. `action`: the policy's, where there is one."""
-    drone, now = replace(_watched(state, state.drones[i], sample), sent=MOTORS_OFF), state.time
+    drone, now = _watched(state, state.drones[i], sample)._replace(sent=MOTORS_OFF), state.time
     if drone.mode not in FLYING or drone.estimate is None:
         return drone
     if drone.mode is Mode.SETTLE and now - drone.since > SETTLING:
@@ -35,9 +34,9 @@ def steer(state: State, i: int, action: SetPoint | None, sample: PoseSample) -> 
         drone = drone.to(Mode.SETTLE, now)
     if drone.mode is Mode.SETTLE:
         lift = SETTLING_LIFT * (state.airframe.hover_thrust + drone.trim)
-        return replace(drone, sent=SetPoint(ANGLES, thrust=lift))
+        return drone._replace(sent=SetPoint(ANGLES, thrust=lift))
     if drone.mode is Mode.PURSUIT and action is not None:
-        return replace(drone, sent=_pursue(state, drone, i, action))
+        return drone._replace(sent=_pursue(state, drone, i, action))
     return _go(state, drone, i)
 
 
@@ -49,7 +48,7 @@ def _watched(state, drone, sample) -> Drone:
 
     low = sample.voltage < state.settings.battery_low  # an unknown voltage is not low
     over = drone.estimate is not None and up(drone.estimate.quaternion) < 0.0
-    return replace(drone, low_since=since(drone.low_since, low), over_since=since(drone.over_since, over))
+    return drone._replace(low_since=since(drone.low_since, low), over_since=since(drone.over_since, over))
 
 
 def _is_low(state, drone) -> bool:
@@ -87,15 +86,15 @@ def _go(state, drone, i) -> Drone:
         # by reckoning: the vehicle does what it is asked for, and is level else
         share = min(state.dt / state.settings.reaction, 1.0)
         lagged = tuple(a + share * (b - a) for a, b in zip(drone.acceleration, acceleration, strict=True))
-        drone, attitude = replace(drone, acceleration=lagged), _yaw_only(attitude)
+        drone, attitude = drone._replace(acceleration=lagged), _yaw_only(attitude)
     else:
         if estimate.position[2] > (0.02 if drone.mode is Mode.LIFT else 0.1):
             error = min(max(wanted[2] - estimate.velocity[2], -0.3), 0.3)
             trim = min(max(drone.trim + TRIM_GAIN * state.dt * error, -TRIM_LIMIT), TRIM_LIMIT)
-            drone = replace(drone, trim=trim)
+            drone = drone._replace(trim=trim)
         if drone.mode is Mode.TRANSFER and _arrived(estimate, drone.anchor):
             drone = drone.to(Mode.READY, state.time)
-    return replace(drone, sent=accelerate(attitude, acceleration, airframe, drone.trim, ANGLES))
+    return drone._replace(sent=accelerate(attitude, acceleration, airframe, drone.trim, ANGLES))
 
 
 def _wanted(state, drone, i) -> Vector:

@@ -92,7 +92,7 @@ class VirtualCrazyflies:
         if steps < 1:
             return
         self.late += steps * STEP > LATE + LONGEST_WAIT
-        set_points = np.stack([firmware.set_point(self.time).array() for firmware in self.firmware])
+        set_points = np.array([firmware.set_point(self.time) for firmware in self.firmware], np.float32)
         report = self.vehicles.advance(set_points, steps)
         self._steps += steps
         for i, firmware in enumerate(self.firmware):

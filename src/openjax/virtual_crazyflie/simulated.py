@@ -88,7 +88,7 @@ class SimulatedSwarm:
 
     def advance(self) -> None:
         """One tick of 10 ms."""
-        wanted = np.stack([f.set_point(self.now).array() for f in self.firmware])
+        wanted = np.array([f.set_point(self.now) for f in self.firmware], np.float32)
         steps = round(TICK / STEP)
         report = self.vehicles.advance(wanted, steps)
         self._steps += steps

@@ -97,7 +97,7 @@ class VirtualVehicles:
         self.report = self.advance(np.zeros((self.number, 5), np.float32), 0)
 
     def advance(self, set_points: np.ndarray, steps: int) -> Report:
-        """What is sensed after `steps` steps under constant set-points (N, 5), see `SetPoint.array`."""
+        """What is sensed after `steps` steps under constant set-points (N, 5) float32, see `SetPoint`."""
         self._state, report = self._advance(self._state, set_points, np.int32(steps))
         self.report = Report(*(np.asarray(leaf, np.float64) for leaf in report))
         share = self.report.motor_command.mean(1) / self._hover
