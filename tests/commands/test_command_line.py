@@ -2,11 +2,13 @@
 
 import io
 import os
+import re
 import sys
 
 import pytest
 
-from openjax.commands.command_line import LONGEST, run_command
+from openjax.commands.command_line import LONGEST, parse, run_command
+from openjax.commands.exploit import ExploitCommand
 from openjax.errors import UserError
 
 
@@ -58,3 +60,30 @@ def test_a_terminal_that_lacks_characters_and_a_full_disk_for_the_output(monkeyp
             monkeypatch.undo()
         assert stop.value.code == 2
         assert "no space left on device" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("typed", "told"),
+    [
+        ("--num_envs abc", "--num_envs is 'abc'; expected a whole number"),
+        ("--minutes soon", "--minutes is 'soon'; expected a number"),
+        ("--learning.seeds 2", "unknown setting --learning.seeds; did you mean --seeds?"),
+        ("--capture_radius 1", "did you mean --environment.capture_radius?"),
+        ("--environment.physics bullet", "Expected one of"),
+        ("--seeds 65", "seeds is 65; it must be a whole number in"),
+    ],
+)
+def test_a_mistyped_option_is_told_what_would_be_right(typed, told):
+    with pytest.raises(UserError, match=re.escape(told)) as error:
+        parse(ExploitCommand, ExploitCommand(), typed.split(), "openjax exploit")
+    assert "\n" not in str(error.value)
+
+
+def test_numbers_and_truths_may_be_written_as_people_do():
+    typed = "--total_steps 2e6 --environment.observe_position true --minutes 1e1".split()
+    command = parse(ExploitCommand, ExploitCommand(), typed, "openjax exploit")
+    assert (command.learning.total_steps, command.compilation_cache, command.minutes) == (
+        2_000_000,
+        False,
+        10.0,
+    )

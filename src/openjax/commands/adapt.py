@@ -65,9 +65,9 @@ def main(arguments: Sequence[str]) -> int:
     command = parse(AdaptCommand, AdaptCommand(), arguments, PROGRAM)
     if not command.flights.exists():
         raise UserError(f"{command.flights}: no such folder of flights, nor effects.toml")
+    check_output_folder(command.out, "--out")
     if command.out.exists() and not command.overwrite:
         raise UserError(f"{command.out} already exists: choose another --out or give --overwrite")
-    check_output_folder(command.out, "--out")
     import jax
 
     if command.compilation_cache:
@@ -251,12 +251,14 @@ def won_back(flown: dict) -> dict[str, float | None]:
 
 def _check(command):
     """What can be wrong with flights and policy is told before anything is compiled. Raises UserError."""
+    from openjax.baselines import Heuristic
     from openjax.flights.case import load_case
     from openjax.store.policies import load_policy
     from openjax.vehicle.effects.effects_file import load_effects
 
+    if isinstance(load_policy(command.policy).policy, Heuristic):
+        raise UserError(f"--policy {command.policy}: a heuristic has no networks that could learn")
     (load_case if command.flights.is_dir() else load_effects)(command.flights)
-    load_policy(command.policy)
 
 
 class _Diagnosis:

@@ -13,17 +13,20 @@ from typing import Annotated, Literal, get_args
 
 import tyro
 
-from openjax.commands.command_line import parse, peek
+from openjax.commands.command_line import output_console, parse, peek
 from openjax.errors import UserError
 from openjax.files import check_output, write_json
 from openjax.learning.presets import preset
 from openjax.learning.settings import TrainSettings
 from openjax.ranges import Interval
+from openjax.show.steps import Steps
 
 PROGRAM = "openjax benchmark"
 PHYSICS = ("rigid_free", "rigid", "mjx_free", "mjx")
 Part = Literal["rigid_free", "rigid", "mjx_free", "mjx", "environment", "rollout", "training"]
 PARTS = get_args(Part)
+SECONDS = dict(zip(PARTS, (2.0, 3.0, 8.0, 15.0, 15.0, 20.0, 150.0), strict=True))
+"""That each part takes to compile on two cores, about."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,21 +76,33 @@ def main(arguments: Sequence[str]) -> int:
     from openjax.commands.machine import describe_machine
     from openjax.commands.timing import time_compiled
 
-    machine = describe_machine()
+    machine, console = describe_machine(), output_console()
     print(f"{machine['device']}, JAX {machine['versions']['jax']}, commit {machine['commit']}", flush=True)
     rows = []
     facts = {"command": " ".join([PROGRAM, *arguments]), "machine": machine}
     facts["compilation_cache"] = jax.config.jax_compilation_cache_dir is not None
-    for part, num_envs, steps, function, inputs in cases(command):
-        timing = time_compiled(function, inputs, command.seconds)
-        rows.append(_row(part, num_envs, steps, command.settings, timing))
-        print(_line(rows[-1]), flush=True)
-        # after each measurement, so that an interrupted sweep leaves what it has
-        write_json(command.json, {**facts, "settings": command.settings, "rows": rows})
+    with Steps("measuring", _expected(command), console) as steps:
+        for part, num_envs, length, function, inputs in cases(command, steps.begin):
+            timing = time_compiled(function, inputs, command.seconds)
+            rows.append(_row(part, num_envs, length, command.settings, timing))
+            console.print(_line(rows[-1]), soft_wrap=True)
+            # after each measurement, so that an interrupted sweep leaves what it has
+            write_json(command.json, {**facts, "settings": command.settings, "rows": rows})
     if told := _programs_and_step(rows):
         print(told)
     print(f"written to {command.json}")
     return 0
+
+
+def _expected(command) -> dict[str, float]:
+    """Seconds that each part takes on two cores, about, by its name and number of environments."""
+    expected = {}
+    for part in command.parts:
+        training = part == "training"
+        for number in command.training_envs if training else command.envs:
+            programs = 5 * len(command.devices) if training else 1
+            expected[f"{part}, {number:,} environments"] = SECONDS[part] + programs * command.seconds
+    return expected
 
 
 def _programs_and_step(rows) -> str | None:

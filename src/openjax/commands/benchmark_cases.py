@@ -20,11 +20,14 @@ if TYPE_CHECKING:
     from openjax.commands.benchmark import BenchmarkCommand
 
 
-def cases(command: "BenchmarkCommand") -> Iterator[tuple[str, int, int, Callable, tuple]]:
-    """(part, environments, control steps per call, function, its arguments), made one at a time."""
+def cases(
+    command: "BenchmarkCommand", tell: Callable[[str], None]
+) -> Iterator[tuple[str, int, int, Callable, tuple]]:
+    """(part, environments, control steps per call, function, its arguments), made one at a time; `tell` hears of what."""
     settings, steps = command.settings, command.steps
     for part in command.parts:
         for num_envs in command.training_envs if part == "training" else command.envs:
+            tell(f"{part}, {num_envs:,} environments")
             if part == "training":
                 for number in command.devices:
                     fitting = fitting_settings(settings, num_envs, number)

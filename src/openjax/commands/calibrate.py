@@ -42,6 +42,8 @@ def run(arguments: Arguments, console: Console):
     from openjax.vehicle.vehicle_file import load_vehicle_file, save_vehicle_file
 
     out = arguments.case / "vehicle_calibrated.toml" if arguments.out is None else arguments.out
+    if arguments.out is not None:  # else it lies in the case, of which more is said below
+        check_output(out, "--out")
     if out.exists() and not arguments.overwrite:
         raise UserError(f"{out}: exists already; use --overwrite to replace it or --out for another file")
     start = time.perf_counter()

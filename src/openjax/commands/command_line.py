@@ -9,6 +9,7 @@ import logging
 import os
 import re
 import sys
+import typing
 import warnings
 from collections.abc import Callable, Sequence
 from typing import TypeVar
@@ -25,6 +26,9 @@ _OF_THE_DISK = ("No space left on device", "Disk quota exceeded", "Read-only fil
 LONGEST = 500
 """Characters of an error's line."""
 
+KINDS = {"INT": "a whole number", "int()": "a whole number", "FLOAT": "a number", "float": "a number"}
+"""What an option wants, by what tyro says where it gets something else."""
+
 
 def parse(command: type[Command], default: Command, arguments: Sequence[str], program: str) -> Command:
     """The dataclass `command` filled from command-line arguments.
@@ -40,7 +44,7 @@ def parse(command: type[Command], default: Command, arguments: Sequence[str], pr
     """
     import tyro
 
-    arguments = [_bool_like_python(argument) for argument in arguments]
+    arguments = [_like_python(argument) for argument in arguments]
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
@@ -181,19 +185,22 @@ def quiet_libraries() -> None:
 
 
 def option_names(settings, prefix: str = "") -> list[str]:
-    """All option names of a dataclass instance, nested ones with dots; a field `settings` adds no prefix."""
-    names = []
+    """All option names of a dataclass instance, nested ones with dots; a group of `tyro.conf.arg(name="")` adds no prefix."""
+    names, hints = [], typing.get_type_hints(type(settings), include_extras=True)
     for field in dataclasses.fields(settings):
         value = getattr(settings, field.name)
         if dataclasses.is_dataclass(value):
-            names += option_names(value, prefix if field.name == "settings" else f"{prefix}{field.name}.")
+            named = [getattr(entry, "name", None) for entry in getattr(hints[field.name], "__metadata__", ())]
+            names += option_names(value, prefix if "" in named else f"{prefix}{field.name}.")
         else:
             names.append(f"--{prefix}{field.name}")
     return names
 
 
-def _bool_like_python(argument):
-    """tyro wants True and False; people and TOML write true and false."""
+def _like_python(argument):
+    """tyro wants True, False and 1000000; people and TOML write true, false and 1e6, too."""
+    if re.fullmatch(r"\d+(\.\d+)?e\d{1,2}", argument) and float(argument).is_integer():
+        return str(int(float(argument)))
     return argument.capitalize() if argument in ("true", "false") else argument
 
 
@@ -203,7 +210,10 @@ def _one_line(box: str) -> str:
     parts = itertools.groupby(lines, key=lambda line: bool(line.strip("─-")))
     parts = [" ".join(part) for says_something, part in parts if says_something]
     message = " ".join(next(iter(parts if "╭" in box else parts[1:] or parts), "").split())
-    message = re.sub(r"Error parsing (\S+): .*?(\[?'[^']*'\]?)\.?$", r"\1 can't be \2", message)
+    if wrong := re.match(r"Error parsing (--\S+): (.*?)\[?('[^']*')\]?\.?$", message):
+        option, reason, value = wrong.groups()
+        kind = next((word for part, word in KINDS.items() if part in reason), "another value")
+        return f"{option.replace('-', '_').replace('__', '--', 1)} is {value}; expected {kind}, see --help"
     return f"{message.rstrip('.')}; see --help"
 
 
@@ -212,8 +222,9 @@ def _unknown(argument, default, program):
         return f"unexpected argument {argument!r}; options are written --name value, see {program} --help"
     name = argument.split("=", 1)[0].replace("-", "_").replace("__", "--", 1)
     known = option_names(default)
-    close = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
-    # A setting's own name often comes without its group: --n_pursuers for --environment.n_pursuers.
-    close = close or [option for option in known if option.split(".")[-1] == name.removeprefix("--")]
+    # a setting's own name often comes without its group, or with another: --n_pursuers for --environment.n_pursuers
+    own = re.split(r"\.|--", name)[-1]
+    close = [option for option in known if re.split(r"\.|--", option)[-1] == own]
+    close = close or difflib.get_close_matches(name, known, n=1, cutoff=0.6)
     hint = f"did you mean {close[0]}?" if close else f"see {program} --help"
     return f"unknown setting {argument.split('=', 1)[0]}; {hint}"

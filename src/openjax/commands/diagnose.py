@@ -14,7 +14,7 @@ from rich.text import Text
 
 from openjax.commands.command_line import one_line, one_thread_for_matrices, output_console, parse
 from openjax.errors import UserError
-from openjax.files import check_output_folder, replacing, write_json
+from openjax.files import check_output, check_output_folder, replacing, write_json
 from openjax.show.steps import Steps
 from openjax.vehicle.effect_names import effect_names
 
@@ -91,14 +91,11 @@ def _checked_names(options: Options) -> list[str]:
     twice = next((n for n in names if names.count(n) > 1), None)
     if twice is not None:
         raise UserError(f"two cases are called {twice!r}: their reports would overwrite each other")
+    check_output_folder(options.out, "--out")
     for name in names:
         if (options.out / name).exists() and not options.overwrite:
             raise UserError(f"{options.out / name} already exists: choose another --out or give --overwrite")
-    check_output_folder(options.out, "--out")
-    if options.predictions is not None:
-        check_output_folder(options.predictions.absolute().parent, "--predictions")
-        if options.predictions.is_dir():
-            raise UserError(f"--predictions {options.predictions}: is a folder; a file is needed")
+    check_output(options.predictions, "--predictions")
     return names
 
 
@@ -119,7 +116,10 @@ def _diagnosis(
         partial_folder.mkdir()
         write_report(report, partial_folder, options.html)
     written = options.out / name / ("report.html" if options.html else "report.json")
-    lines = [*report.in_words(), f"({report.seconds:.1f} s; {written})"]
+    noted = [f"{issue.flight}: {issue.issue}" for issue in case.quality if not issue.refused]
+    more = f" (and {len(noted) - 1} more in the report)" if len(noted) > 1 else ""
+    remark = [f"Noted in the logs: {noted[0]}{more}."] if noted else []
+    lines = [*remark, *report.in_words(), f"({report.seconds:.1f} s; {written})"]
     return ", ".join(report.effects) or report.verdict, lines, report.prediction()
 
 

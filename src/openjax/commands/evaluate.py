@@ -143,8 +143,13 @@ def _game(command, loaded):
         scenarios = list(SCENARIOS.values())
     else:
         scenarios = [find_scenario(command.scenario, settings)]
+    wanted, there = settings.num_pursuers, len(scenarios[0].pursuers)
+    if wanted not in (loaded.settings.environment.num_pursuers, there):
+        raise UserError(
+            f"--environment.num_pursuers {wanted}: layout {scenarios[0].name} has {there} pursuers"
+        )
     slots = max(layout_slots(settings), *(len(scenario.pillars) for scenario in scenarios))
-    settings = dataclasses.replace(settings, max_pillars=slots, num_pursuers=len(scenarios[0].pursuers))
+    settings = dataclasses.replace(settings, max_pillars=slots, num_pursuers=there)
     environment = make_environment(settings, command.vehicle, command.effects, command.opponent)
     return environment, loaded.in_game(environment), scenarios
 

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from openjax.background import compile_ahead, in_background
+from openjax.baselines import Heuristic
 from openjax.cluster.devices import (
     carry_shardings,
     check_devices,
@@ -30,6 +31,7 @@ from openjax.commands.gradient_stages import compile_first_flights, compile_last
 from openjax.commands.run_words import closing_words, layouts_like
 from openjax.commands.training_loop import Loop, NotFiniteError, Outcome, Plan, StopRequest, guarded
 from openjax.commands.validation import Validation, flat_metrics, selection_score
+from openjax.errors import UserError
 from openjax.files import write_json
 from openjax.learning import TrainSettings, build, make_start, summarise
 from openjax.learning.train_state import policy_leaf
@@ -346,6 +348,8 @@ def _programs(job):
 def _start_parameters(job, fresh: PolicyParameters) -> PolicyParameters:
     """Those of the policy that the run starts from; `fresh` ones where it has no critic, or one of another game."""
     loaded = load_policy(job.start_from)
+    if isinstance(loaded.policy, Heuristic):
+        raise UserError(f"--start_from {job.start_from}: a heuristic has no networks to start from")
     settings = loaded.settings
     own = with_longer_history(
         loaded.parameters, settings.predictor, settings.environment, job.settings.environment

@@ -45,7 +45,7 @@ class Arguments:
     """End after this time; by default only when interrupted."""
     seed: Seed = 0
     """Draws losses and jitter."""
-    link: tyro.conf.OmitArgPrefixes[LinkFaults] = field(default_factory=LinkFaults)
+    link: Annotated[LinkFaults, tyro.conf.arg(name="")] = field(default_factory=LinkFaults)
 
 
 def make(arguments: Arguments):

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import tomlkit
 
-from openjax.errors import UserError
+from openjax.errors import UserError, suggestion
 from openjax.files import read_toml, to_plain, write_text
 from openjax.plain import from_plain
 from openjax.ranges import Interval
@@ -151,6 +151,8 @@ def load_vehicle_file(path: str | Path | None = None, dtype=jnp.float32) -> Vehi
     path = Path(NOMINAL if path is None else path)
     if str(path) in AIRFRAMES and not path.exists():
         return VehicleFile(load_vehicle(str(path), dtype), _usual_name(str(path)), str(path))
+    if not path.exists() and not path.suffix:
+        raise UserError(f"{path}: no such vehicle file, nor airframe; {suggestion(str(path), AIRFRAMES)}")
     if path.is_dir():
         path = path / "vehicle.toml"
     return _from_tables(read_toml(path, "vehicle file"), path, dtype)
