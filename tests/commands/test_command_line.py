@@ -82,8 +82,5 @@ def test_a_mistyped_option_is_told_what_would_be_right(typed, told):
 def test_numbers_and_truths_may_be_written_as_people_do():
     typed = "--total_steps 2e6 --environment.observe_position true --minutes 1e1".split()
     command = parse(ExploitCommand, ExploitCommand(), typed, "openjax exploit")
-    assert (command.learning.total_steps, command.compilation_cache, command.minutes) == (
-        2_000_000,
-        False,
-        10.0,
-    )
+    settings, game = command.learning, command.environment
+    assert (settings.total_steps, game.observe_position, command.minutes) == (2_000_000, True, 10.0)
