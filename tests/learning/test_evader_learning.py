@@ -73,6 +73,26 @@ def test_a_network_without_a_world_stays_as_it_is(worlds):
     np.testing.assert_array_equal(np.any(changed, axis=0), [True, False])
 
 
+def test_a_network_that_flies_all_worlds_learns_as_if_alone(worlds):
+    """Beside another one it gets its worlds some at a time."""
+    alone = EvaderLearning(HOW, make(evaders=("learned",), physics="stops", max_pillars=5), updates=1)
+    beside = EvaderLearning(HOW, ENVIRONMENT, updates=1)
+    ended = worlds.replace(statistics=worlds.statistics.replace(captured=jnp.ones(WORLDS, bool)))
+    start = alone.start(jax.random.key(1))
+    kinds = jnp.zeros(WORLDS, jnp.int32)
+    samples = alone.act(
+        start, worlds.replace(evader=worlds.evader.replace(kind=kinds)), jnp.ones((WORLDS, 3))
+    )[1]
+    samples = jax.tree.map(lambda leaf: leaf[None], samples)
+    two = jax.tree.map(lambda leaf: jnp.repeat(leaf, 2, axis=0), start)
+    ends = [
+        jax.jit(learning.learn)(first, samples, ended, jax.random.key(2))
+        for learning, first in ((alone, start), (beside, two))
+    ]
+    for mine, its in zip(*(jax.tree.leaves(end.networks) for end in ends), strict=True):
+        np.testing.assert_allclose(its[0], mine[0], atol=1e-5)
+
+
 def test_wishes_fly_only_where_a_network_acts(worlds):
     learning = EvaderLearning(HOW, ENVIRONMENT, updates=1)
     wish, samples = jax.jit(learning.act)(learning.start(jax.random.key(1)), worlds, jnp.ones((WORLDS, 3)))

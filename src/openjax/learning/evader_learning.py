@@ -116,12 +116,11 @@ class EvaderLearning:
 
         `key` shuffles, the same on all devices; `axis` is the name of the devices' axis.
         """
-        how, batch = self.how, self._batch(evaders, samples, last, axis)
+        how, (worlds, batch) = self.how, self._batch(evaders, samples, last, axis)
 
         def step(carry, index):
             networks, state = carry
-            weight, *part = jax.tree.map(lambda leaf: leaf[index], batch)
-            gradient = jax.vmap(jax.grad(self._loss), (0, 0, None))(networks, weight, part)
+            gradient = self._gradient(networks, *jax.tree.map(lambda leaf: leaf[index], (worlds, batch)))
             gradient = mean_over_devices(gradient, axis)
             change, state = jax.vmap(self.optimiser.update)(gradient, state, networks)
             return (optax.apply_updates(networks, change), state), None
@@ -137,10 +136,29 @@ class EvaderLearning:
         """(..., K) of (...,): one for the network, zero for the others."""
         return jax.nn.one_hot(which, self.number)
 
-    def _loss(self, networks, weight, part):
-        """() of one network; weight (n,), part: seen, sample, log_prob, advantage, target, all (n, ...)."""
+    def _gradient(self, networks, worlds, part):
+        """Of the networks' losses, each from its own worlds alone: some of them at a time, as often as the busiest one needs.
+
+        worlds: the networks' numbers of worlds (K,) and all worlds (K, W), each network's own ones first; part: see `_loss`.
+        """
+        (number, order), kinds = worlds, len(self.environment.settings.evaders)
+        some = order.shape[1] // max(n for n in range(1, kinds + 1) if order.shape[1] % n == 0)
+
+        def add(i, total):
+            place = i * some + jnp.arange(some)
+            own = jax.tree.map(lambda leaf: leaf[order[:, place]], part)
+            gradient = jax.vmap(jax.grad(self._loss))(networks, place < number[:, None], own)
+            return jax.tree.map(lambda total, some: total + some / order.shape[1], total, gradient)
+
+        rounds = jnp.max(-(-number // some))
+        return jax.lax.fori_loop(0, rounds, add, jax.tree.map(jnp.zeros_like, networks))
+
+    def _loss(self, networks, own, part):
+        """() of one network, the sum over worlds of the mean over steps; own (n,) whether a world is the network's; part: seen,
+        sample, log_prob, weight, advantage, target, all (n, T, ...)."""
         actor, critic, log_std = networks
-        seen, sample, log_prob, advantage, target = part
+        seen, sample, log_prob, weight, advantage, target = part
+        weight = own[:, None] * weight
         log_ratio = gaussian_log_prob(sample, outputs(actor, seen)[0], log_std) - log_prob
         # samples of other networks count for nothing, and mustn't overflow
         ratio = jnp.exp(jnp.where(weight > 0.0, log_ratio, 0.0))
@@ -149,10 +167,10 @@ class EvaderLearning:
         error = (outputs(critic, seen)[1] - target) ** 2
         # weighted too: before the first of its worlds begins, a network's noise stays as it is
         entropy = self.how.entropy_coefficient * gaussian_entropy(log_std)
-        return jnp.mean(weight * (0.5 * error - surrogate - entropy))
+        return jnp.sum(jnp.mean(weight * (0.5 * error - surrogate - entropy), axis=1))
 
     def _batch(self, evaders, samples, last, axis):
-        """What a gradient step needs (see `_loss`): weights (M, K, n), all else (M, n, ...) for M minibatches."""
+        """What gradient steps need, minibatch by minibatch: see `_gradient` and `_loss`."""
         how, critic = self.how, evaders.critic
         value = outputs_of(critic, samples.which, samples.seen)[1]
         last_value = outputs_of(critic, *self.see(last))[1]
@@ -166,22 +184,26 @@ class EvaderLearning:
             how.discount,
             how.gae_lambda,
         )
-        own = self._by_network(samples.which)  # (T, E, K)
-        weight = own * samples.flying[..., None]
-        weight = weight / jnp.maximum(mean_over_devices(jnp.mean(weight, (0, 1)), axis), 1e-4)
+        # a world keeps its evader until the rollout's end
+        flying = samples.flying[..., None] * self._by_network(samples.which[0])  # (T, E, K)
+        scale = 1.0 / jnp.maximum(mean_over_devices(jnp.mean(flying, (0, 1)), axis), 1e-4)
+        weight = jnp.sum(scale * flying, axis=-1)
 
         def mean(x):
             """Of what each sample's network met, (T, E)."""
-            return own @ mean_over_devices(jnp.mean(weight * x[..., None], (0, 1)), axis)
+            by_network = mean_over_devices(jnp.mean(scale * flying * x[..., None], (0, 1)), axis)
+            return self._by_network(samples.which[0]) @ by_network
 
         centred = advantage - mean(advantage)
         normal = centred / (jnp.sqrt(mean(centred**2)) + 1e-8)
-        batch = samples.seen, samples.sample, samples.log_prob, normal, advantage + value
-        return [jnp.moveaxis(self._parts(weight), -1, 1), *jax.tree.map(self._parts, batch)]
+        batch = samples.seen, samples.sample, samples.log_prob, weight, normal, advantage + value
+        which = self._parts(samples.which[:1])[..., 0]  # (M, W)
+        own = which[:, None] == jnp.arange(self.number)[:, None]
+        worlds = jnp.sum(own, axis=-1), jnp.argsort(~own, axis=-1)
+        return worlds, jax.tree.map(self._parts, batch)
 
     def _parts(self, leaf):
-        """(T, E, ...) to (M, T * E / M, ...): world e goes to minibatch e mod M, as each device has its share of all."""
-        steps, worlds = leaf.shape[:2]
-        number = self.how.minibatches
-        leaf = jnp.moveaxis(leaf.reshape(steps, worlds // number, number, *leaf.shape[2:]), 2, 0)
-        return leaf.reshape(number, -1, *leaf.shape[3:])
+        """(T, E, ...) to (M, E / M, T, ...): world e goes to minibatch e mod M, as each device has its share of all."""
+        leaf = jnp.moveaxis(leaf, 0, 1)
+        leaf = leaf.reshape(-1, self.how.minibatches, *leaf.shape[1:])
+        return jnp.moveaxis(leaf, 1, 0)
