@@ -1,8 +1,8 @@
 """Where a training step's time goes: `python -m experiments.speed.steps --cases paper:5120 paper:20480:formulas [--raw FOLDER]`.
 
-A case is a preset, its worlds, and what is done otherwise than usual. Each is compiled in a process of its own, all side by
-side; then, one after the other, steps are timed and one is profiled. A phase (`openjax.learning.training_step.Phases`) takes the
-sum of its kernels. Writes experiments/results/steps.json and .md.
+A case is a preset, its worlds, and what is done otherwise than usual; `@FOLDER` after it names another tree of sources. Each is
+compiled in a process of its own, all side by side; then, one after the other, steps are timed and one is profiled. A phase
+(`openjax.learning.training_step.Phases`) takes the sum of its kernels. Writes experiments/results/steps.json and .md.
 """
 
 import argparse
@@ -10,6 +10,7 @@ import collections
 import dataclasses
 import gzip
 import json
+import os
 import re
 import resource
 import subprocess
@@ -38,6 +39,7 @@ OTHERWISE = {
     "level_1": "trials unchecked",
     "untuned": "nothing tried",
     "shared": "one encoder",
+    "graphs": "loops as CUDA graphs",
 }
 COMPILER = {
     "cublas": {"xla_gpu_enable_triton_gemm": False},
@@ -49,12 +51,15 @@ COMPILER = {
     "level_1": {"xla_gpu_autotune_level": 1},
     "untuned": {"xla_gpu_autotune_level": 0},
 }
-SECONDS = 1.0
+GRAPHS = "--xla_gpu_enable_command_buffer=FUSION,CUBLAS,CUBLASLT,CUDNN,CUSTOM_CALL,DYNAMIC_SLICE_FUSION,WHILE,CONDITIONAL"
+SECONDS = 0.6
 """Of timed steps in each case."""
 
 
 def measure(case: str, raw: Path | None) -> dict:
     """Compile a case, wait for a line on the standard input, time and profile it."""
+    if case.endswith(":graphs"):
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {GRAPHS}"
     import jax
 
     from openjax.commands.training_loop import guarded
@@ -96,8 +101,9 @@ def measure(case: str, raw: Path | None) -> dict:
     median = float(np.median(times))
     record |= {"ms": 1e3 * median, "fastest_ms": 1e3 * min(times), "calls": len(times)}
     record["steps_per_second"] = settings.steps_per_update / median
-    record |= _profiled(step, carry, case, raw)
-    return record
+    events = _profiled(step, carry)
+    print("timed", flush=True)
+    return record | _by_phase(events, step.as_text(), case, raw)
 
 
 def _without_kernels(otherwise):
@@ -129,16 +135,20 @@ def _counted(text):
     return {"instructions": sum(kinds.values()), "fusions": kinds["fusion"], "library_calls": dict(calls)}
 
 
-def _profiled(step, carry, case, raw):
-    """Milliseconds of each phase and of the longest kernels in one step; empty where the device tells nothing."""
+def _profiled(step, carry):
+    """The kernels of one step; none where the device tells nothing."""
     import jax
 
     with tempfile.TemporaryDirectory() as folder:
         with jax.profiler.trace(folder):
             jax.block_until_ready(step(carry))
         [file] = Path(folder).rglob("*.xplane.pb")
-        events = list(_kernels(jax.profiler.ProfileData.from_file(str(file))))
-    text = step.as_text()
+        return jax.profiler.ProfileData.from_file(str(file))
+
+
+def _by_phase(profile, text, case, raw):
+    """Milliseconds of each phase and of the longest kernels; empty where the device tells nothing."""
+    events = list(_kernels(profile))
     names = dict(re.findall(r'%?([\w.\-]+) = [^\n]*metadata={[^}]*op_name="([^"]*)"', text))
     by_kernel = {name.replace(".", "_").replace("-", "_"): path for name, path in names.items()}
     phases, kernels, phase = collections.Counter(), collections.defaultdict(lambda: [0, 0.0]), "other"
@@ -187,23 +197,32 @@ def study(options: argparse.Namespace) -> dict:
     workers = [_Worker(case, options.raw, place) for place, case in enumerate(options.cases)]
     while any(not worker.answered.is_set() for worker in workers) and time.monotonic() - began < options.wait:
         time.sleep(0.2)
-    records = []
+    timed = []
     for worker in workers:
         if time.monotonic() - began > options.limit or not worker.answered.is_set():
             worker.process.kill()
-        elif record := worker.go():
-            records.append(record)
-            print(json.dumps({k: v for k, v in record.items() if k != "longest"}), flush=True)
-    return {"records": records}
+        elif worker.time():
+            timed.append(worker)
+    return {"records": [record for worker in timed if (record := worker.told())]}
 
 
 class _Worker:
     """A process that measures one case; the first ones' compilers come first."""
 
     def __init__(self, case: str, raw: Path | None, place: int):
+        case, _, tree = case.partition("@")
+        self.tree = Path(tree).resolve()
+        environment = {**os.environ, "PYTHONPATH": f"{self.tree / 'src'}:{self.tree}"}
         command = ["nice", "-n", str(place), sys.executable, "-m", "experiments.speed.steps", "--one", case]
-        command += ["--raw", str(raw)] if raw else []
-        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        command += ["--raw", str(raw.resolve() / self.tree.name)] if raw else []
+        self.process = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=self.tree,
+            env=environment,
+        )
         self.answered = threading.Event()
         threading.Thread(target=self._wait, daemon=True).start()
 
@@ -211,10 +230,22 @@ class _Worker:
         self.process.stdout.readline()
         self.answered.set()
 
-    def go(self) -> dict | None:
-        """Time it; None where the case failed."""
-        out, _ = self.process.communicate("go\n")
-        return json.loads(out) if self.process.returncode == 0 else None
+    def time(self) -> bool:
+        """Have it timed, and wait; whether it was."""
+        if self.process.poll() is not None:
+            return False
+        self.process.stdin.write("go\n")
+        self.process.stdin.flush()
+        return self.process.stdout.readline() != ""
+
+    def told(self) -> dict | None:
+        """What it found; None where it failed."""
+        out, _ = self.process.communicate()
+        if self.process.returncode != 0:
+            return None
+        record = {"sources": self.tree.name, **json.loads(out)}
+        print(json.dumps({key: value for key, value in record.items() if key != "longest"}), flush=True)
+        return record
 
 
 def page(results: dict) -> Page:
