@@ -68,7 +68,7 @@ def _sensors(tracks: list[Track], library: Library) -> tuple[list[Track], Pose |
     pose = read_pose(tracks, library)
     moved = pose is not None and pose.names and pose.late
     if moved:
-        tracks = [undelayed(t, pose.delay[0]) for t in tracks]
+        tracks = [undelayed(t, pose.fit.value) for t in tracks]
     sensors = read_kinematics(tracks)
     tracks = [corrected(t, sensors) for t in tracks]
     if pose is not None and not moved:

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from openjax.flights.track import Track, smooth
 from openjax.gap.channels import Channel, Estimated, effects_of
 from openjax.gap.decision import DECISION
-from openjax.gap.model.linear_path import LinearPath, fit_linear_path
 from openjax.gap.model.nuisances import SIZE
+from openjax.gap.model.whitening import fit_noise, whiten
 
 DELAY_SPREAD = 0.02  # s
 LONGEST = 0.15  # s
@@ -19,42 +19,48 @@ SMALL_STEP = 2e-4  # s
 GYRO_BIAS = 0.1  # rad/s
 POSE_HORIZON = 0.1  # s
 GYROSCOPE_LATE = 0.0017  # s, standard deviation of how late a low-pass at 80 Hz makes a gyroscope
+PASSES = 3  # of fitting the noise model and the delay in turn
+START = 20  # rows at the start of a track that the noise model needs
+
+
+@dataclass(frozen=True, eq=False)
+class Delay:
+    """`value`, `error`: how late the pose is, s, and the standard error; `nats`: log Bayes factor against no delay; `before` and
+    `residual` [(T, 3)]: attitude less integrated gyroscope, rad, without the delay, all else as fitted, and after the fit."""
+
+    value: float
+    error: float
+    nats: float
+    before: list[np.ndarray]
+    residual: list[np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
 class Pose(Channel):
-    """`path`: the fit of the delay; `clock` s by which pose and gyroscope may be apart in these logs; `names`: the effects that
-    it tells; `steps`: rows of POSE_HORIZON on each track."""
+    """`clock` s by which pose and gyroscope may be apart in these logs; `names`: the effects that it tells; `steps`: rows of
+    POSE_HORIZON on each track."""
 
-    fit: LinearPath
+    fit: Delay
     clock: float
     names: tuple[str, ...]
     steps: tuple[int, ...]
     path = "estimator"
 
     @property
-    def delay(self) -> tuple[float, float]:
-        """How late the pose is, s, and the standard error."""
-        _, delay, covariance = self.fit.score()
-        return float(delay[0]), float(np.sqrt(covariance[0, 0]))
-
-    @property
     def late(self) -> bool:
         """Whether the pose clearly is late, be it by little."""
-        delay, error = self.delay
-        return delay > DECISION.standard_errors * error and self.fit.score()[0] > 0.0
+        return self.fit.value > DECISION.standard_errors * self.fit.error and self.fit.nats > 0.0
 
     def acting(self) -> dict[str, float]:
-        shown = self.late and self.delay[0] > self.clock
+        shown = self.late and self.fit.value > self.clock
         return dict.fromkeys(self.names, 1.0 - DECISION.unknown) if shown else {}
 
     def undetectable(self) -> list[str]:
         return []
 
     def estimate(self, effect: str, parameter: str) -> Estimated:
-        delay, error = self.delay
         # The delay is against the gyroscope, and a gyroscope may be late itself.
-        return Estimated(delay, error, error + GYROSCOPE_LATE)
+        return Estimated(self.fit.value, self.fit.error, self.fit.error + GYROSCOPE_LATE)
 
     def residuals(self, named) -> dict[str, list[np.ndarray]]:
         used = self.fit.residual if set(named) & set(self.names) else self.fit.before
@@ -70,25 +76,25 @@ def read_pose(tracks: list[Track], library) -> Pose | None:
         return None
     clock = DECISION.clock + max(t.pose_age for t in tracks)
     steps = tuple(max(round(POSE_HORIZON / t.dt), 1) for t in tracks)
-    return Pose(read_estimator(tracks), clock, effects_of("estimator", library), steps)
+    return Pose(read_delay(tracks), clock, effects_of("estimator", library), steps)
 
 
-def read_estimator(tracks: list[Track]) -> LinearPath:
-    """How late the attitude is against the gyroscope (s, one coefficient); a clock offset of a few ms is a
-    nuisance. The delay is found by Gauss-Newton steps: the body turns on meanwhile."""
+def read_delay(tracks: list[Track]) -> Delay:
+    """How late the attitude is against the gyroscope; a clock offset of a few ms is a nuisance. The delay is found by
+    Gauss-Newton steps: the body turns on meanwhile."""
     delay = 0.0
     for _ in range(STEPS):
-        path = _read_around(tracks, delay)
-        found = float(np.clip(path.score()[1][0], 0.0 if delay else -LONGEST, LONGEST))
+        fit = _read_around(tracks, delay)
+        found = float(np.clip(fit.value, 0.0 if delay else -LONGEST, LONGEST))
         if abs(found - delay) < SMALL_STEP or found <= delay == 0.0:
             break
         delay = max(found, 0.0)
-    return path
+    return fit
 
 
-def _read_around(tracks: list[Track], delay: float) -> LinearPath:
-    """The path linearised at a delay; its coefficient is the whole delay."""
-    y, columns, nuisances = [], [], []
+def _read_around(tracks: list[Track], delay: float) -> Delay:
+    """The model linearised at a delay: the attitude, what a second of delay does, and the nuisances as columns."""
+    data = []
     for track in tracks:
         turned = turn_increments(track.quaternion)
         gyro, calm = (
@@ -97,16 +103,38 @@ def _read_around(tracks: list[Track], delay: float) -> LinearPath:
         between = 0.5 * (gyro[1:] + gyro[:-1]) * track.dt
         start = np.zeros((1, 3))
         late = -(calm - calm[:1])
-        y.append(np.concatenate([start, np.cumsum(turned - between, 0)]) + delay * late)
-        columns.append(late[None])
+        y = np.concatenate([start, np.cumsum(turned - between, 0)]) + delay * late
         time = (track.time - track.time[0])[:, None]
         drift = [GYRO_BIAS * axis * time for axis in np.eye(3)]
         tilted = [
             SIZE["imu_tilt"] * np.concatenate([start, np.cumsum(np.cross(axis, between), 0)])
             for axis in np.eye(3)
         ]
-        nuisances.append(np.stack([*drift, *tilted, SIZE["pose_clock"] * late]))
-    return fit_linear_path(y, columns, nuisances, (DELAY_SPREAD,), (((0, 1, 2), True),))
+        data.append(np.stack([y, late, *drift, *tilted, SIZE["pose_clock"] * late]))
+    return _fit(data)
+
+
+def _fit(data: list[np.ndarray]) -> Delay:
+    """Fit y = delay x column + nuisances of unit prior variance + coloured noise to tracks (2 + N, T, 3) of all these."""
+    residual = [d[0] - d[0].mean(0) for d in data]
+    for _ in range(PASSES):
+        noise = fit_noise((0, 1, 2), residual, True, START)
+        white = [whiten((noise,), d)[:, START:].reshape(len(d), -1) for d in data]
+        cross = [w[2:] @ w[:2].T for w in white]
+        taken = [
+            np.linalg.solve(np.eye(len(c)) + w[2:] @ w[2:].T, c) for w, c in zip(white, cross, strict=True)
+        ]
+        gram = sum(w[:2] @ w[:2].T - c.T @ t for w, c, t in zip(white, cross, taken, strict=True))
+        precision = gram[1, 1] + 1.0 / DELAY_SPREAD**2
+        value = gram[1, 0] / precision
+        left = np.array([1.0, -value])
+        residual = [
+            np.tensordot(np.concatenate([left, -t @ left]), d, 1) for d, t in zip(data, taken, strict=True)
+        ]
+    # Nuisances stay as they are beside the delay: set free, a clock of a few ms would take any.
+    before = [r + value * d[1] for r, d in zip(residual, data, strict=True)]
+    nats = 0.5 * (gram[1, 0] * value - np.log(precision * DELAY_SPREAD**2))
+    return Delay(float(value), float(precision**-0.5), float(nats), before, residual)
 
 
 def _late(values: np.ndarray, delay: float, track: Track) -> np.ndarray:

@@ -137,13 +137,6 @@ def stepped(theta: np.ndarray, index) -> np.ndarray:
     return batch
 
 
-def marginal_gram(w: np.ndarray, nuisances: np.ndarray) -> np.ndarray:
-    """w w' (C, C) of whitened columns (C, M), nuisances (N, ...) of unit prior variance marginalised."""
-    n = nuisances.reshape(len(nuisances), -1)
-    cross = w @ n.T
-    return w @ w.T - cross @ np.linalg.solve(np.eye(len(n)) + n @ n.T, cross.T)
-
-
 def make_replay(tracks, vehicles, motor_ticks, feedback, numbers, one_clock=True, at_once=False) -> Replay:
     """Replay of tracks with their nominal vehicles and motor commands (T, TICKS, 4) of the rate loop's ticks. `feedback` of
     each track: what it made of the motors may be anything in strength and lag. `at_once`: motor commands are single
