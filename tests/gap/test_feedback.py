@@ -12,7 +12,8 @@ from openjax.gap.channels.instruments import (
     outputs_of,
     read_feedback,
 )
-from openjax.gap.channels.rate_loop import RateLoop, read_gains
+from openjax.gap.channels.rate_loop import RateLoop, read_rate_loop
+from openjax.gap.model.library import Library
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.rate_controller import mixer
 
@@ -76,10 +77,18 @@ def test_gains_are_what_the_loop_has_whatever_gusts_and_noise_do(p, sampled):
     tracks, vehicles, links = zip(*flights, strict=True)
     commanded = [caused_by_commands(*f) for f in flights]
     reading = SimpleNamespace(
-        tracks=tracks, vehicles=vehicles, arrived=links, by_commands=commanded, at_once=sampled, late=0.0005
+        heard=tracks,
+        vehicles=vehicles,
+        arrived=links,
+        by_commands=commanded,
+        at_once=sampled,
+        late=0.0005,
+        library=Library(),
     )
-    change, error = read_gains(reading)
-    assert change[0] == pytest.approx(p - 1.0, abs=0.12)
+    found = read_rate_loop(reading)
+    change, error = found.change, found.error
+    assert change[0] == pytest.approx(p - 1.0, abs=2.0 * error[0])
+    assert change[3] == pytest.approx(p - 1.0, abs=0.03)
     assert bool(loop(change, error, p - 1.0).acting()) == (p != 1.0)
 
 
@@ -121,8 +130,8 @@ def test_gains_of_all_axes_are_one_reading_that_covers_what_they_disagree_by():
     apart = loop([0.4, 0, 0, -0.4, 0, 0], [0.05] * 6)
     assert apart.gain[1][0] > 0.35
     assert loop([0.4, 0, 0, 0.0, 0, 0], [0.05] * 3 + [np.inf] * 3).acting()
-    assert not loop([0.1, 0, 0, 0.1, 0, 0], [0.01] * 6).acting()  # filters of a firmware do as much
-    assert not loop([0.4, 0, 0, 0.4, 0, 0], [0.05] * 6, shown=0.1).acting()  # the motors don't follow
+    assert not loop([0.04, 0, 0, 0.04, 0, 0], [0.01] * 6).acting()  # forms are wrong by as much
+    assert not loop([0.4, 0, 0, 0.4, 0, 0], [0.05] * 6, shown=0.01).acting()  # the motors don't follow
 
 
 def test_without_enough_flight_gains_cannot_be_told():

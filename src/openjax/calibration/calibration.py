@@ -11,8 +11,9 @@ import numpy as np
 
 from openjax.errors import UserError
 from openjax.flights.flight import Case
+from openjax.gap.channels import robust_deviation
 from openjax.gap.evidence import Evidence, gather
-from openjax.gap.intervals import REACH, robust_deviation
+from openjax.gap.intervals import REACH
 from openjax.gap.model.hypotheses import UNEXPOSED, SetFit, fit_set
 from openjax.gap.model.library import CARDS, PLACE, library, prior
 from openjax.gap.residual import residuals_of
@@ -164,7 +165,7 @@ def logarithms(theta: np.ndarray, vehicle, duty_cycles: bool) -> dict[str, np.nd
 def _quantities(evidence: Evidence, fit: SetFit, rates_fit: bool) -> dict[str, Quantity]:
     file, vehicle = evidence.case.vehicle_file, evidence.vehicles[0]
     duty_cycles = file.motor.command == "pwm"
-    wider = robust_deviation(fit) / np.sqrt(np.diag(fit.covariance))
+    wider = robust_deviation(fit.covariance, fit.grams[:, 1:, 0]) / np.sqrt(np.diag(fit.covariance))
     covariance = fit.covariance * np.outer(wider, wider)
     before = np.linalg.inv(prior(fit.effects)[2])
     at = logarithms(fit.theta, vehicle, duty_cycles)

@@ -5,7 +5,7 @@ quite the library's leave: some per cent of the effect."""
 
 import numpy as np
 
-from openjax.gap.channels import few
+from openjax.gap.channels import robust_deviation
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
 from openjax.gap.model.hypotheses import SetFit
@@ -19,7 +19,9 @@ REACH = 1.645  # standard deviations of a 90 % interval
 def estimates(evidence: Evidence, fit: SetFit, named) -> dict[str, dict[str, Estimate]]:
     """{effect: {parameter: its estimate}} of the named effects."""
     out = {}
-    deviation = dict(zip(fit.index.tolist(), robust_deviation(fit), strict=True))
+    deviation = dict(
+        zip(fit.index.tolist(), robust_deviation(fit.covariance, fit.grams[:, 1:, 0]), strict=True)
+    )
     for effect in named:
         out[effect] = {}
         physics = path_of(effect) == "physics"
@@ -53,13 +55,3 @@ def _sizes(effect: str, theta: np.ndarray) -> dict[str, float]:
         name: max(v for other, v in away.items() if parameters[other].unit == parameters[name].unit)
         for name in away
     }
-
-
-def robust_deviation(fit: SetFit) -> np.ndarray:
-    """Standard deviations (p,) of a fit's parameters: the fit's, or the flight-wise sandwich's where flights differ more."""
-    model, count = np.sqrt(np.diag(fit.covariance)), len(fit.grams)
-    if count < 2 or not len(model):
-        return model
-    pushes = fit.grams[:, 1:, 0] - fit.grams[:, 1:, 0].mean(0)
-    between = fit.covariance @ pushes.T @ pushes @ fit.covariance * count / (count - 1)
-    return np.maximum(few(count) * np.sqrt(np.maximum(np.diag(between), 0.0)), model)

@@ -48,3 +48,14 @@ def effects_of(path: str, library) -> tuple[str, ...]:
 def few(count: int) -> float:
     """By what an error from so many flights is widened: Student's quantile of a 90 % interval over the normal one."""
     return float(student.ppf(0.95, max(count - 1, 1)) / norm.ppf(0.95))
+
+
+def robust_deviation(covariance: np.ndarray, pushes: np.ndarray) -> np.ndarray:
+    """Standard deviations (p,) of parameters: those of `covariance` (p, p), or what flights differ by where that is more: the
+    sandwich of their gradients `pushes` (F, p), widened where they are few (Liang, Zeger 1986)."""
+    model, count = np.sqrt(np.diag(covariance)), len(pushes)
+    if count < 2 or not len(model):
+        return model
+    apart = pushes - pushes.mean(0)
+    between = covariance @ apart.T @ apart @ covariance * count / (count - 1)
+    return np.maximum(few(count) * np.sqrt(np.maximum(np.diag(between), 0.0)), model)

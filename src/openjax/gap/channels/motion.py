@@ -43,6 +43,11 @@ class Reading:
         situation = "nuisance_duty" if self.pwm else "nuisance_samples" if self.blind else "nuisance"
         return numbers_of(situation, self.vehicles[0])
 
+    @property
+    def heard(self) -> list[Track]:
+        """The tracks as the firmware hears them: its gyroscope as it is, whatever was found to be its gain."""
+        return [dataclasses.replace(t, body_rates=t.body_rates * self.sensors.gain) for t in self.tracks]
+
     @cached_property
     def by_commands(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """`caused_by_commands` of each track."""

@@ -9,21 +9,22 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.signal import butter, detrend, sosfiltfilt
+from scipy.interpolate import CubicSpline
+from scipy.signal import butter, detrend, lfilter, sosfiltfilt
 from scipy.stats import norm
-from scipy.stats import t as student
 
 from openjax.flights.track import Track, smooth
-from openjax.gap.channels import Channel, Estimated, effects_of
+from openjax.gap.channels import Channel, Estimated, effects_of, robust_deviation
 from openjax.gap.channels.instruments import BAND, COUNT, EDGE, in_force, outputs_of
 from openjax.gap.decision import DECISION
-from openjax.gap.model.observer import GYRO_GAIN, observe
+from openjax.gap.model.observer import GYRO_GAIN, TICKS, observe
 from openjax.gap.model.prediction import bucket, padded
-from openjax.vehicle.rate_controller import mixer
 
 GAIN_STEP = 0.05
-PRIOR = np.array([0.4, 0.4, 0.4, 1.0, 1.0])  # spreads of the gains and of the delays of P and D
-FILTER_DELAY = 0.004  # s, usual size of what low-passes do to the derivative
+PRIOR = np.array(
+    [0.4, 0.4, 0.4, 1.0, 1.0]
+)  # spreads of the gains, of P's delay and of the share of the derivative that is filtered
+FILTER = 30.0  # Hz of the low-pass of the derivative that the firmware of the Crazyflie may have
 # s by which motors may be off, where rows are the log's own and where they are means of its rows.
 ROW_DELAY = (0.0005, 0.0025)
 MARGIN = 0.05  # of a motor command: nearer to its limits some tick of the row was cut
@@ -60,21 +61,22 @@ class RateLoop(Channel):
         return mean, np.maximum(apart, 1.0) / np.sqrt(total)
 
     def acting(self) -> dict[str, float]:
-        """Either group of axes may be retuned alone: the surer one tells. Gains that don't predict the motors better by as
-        much as they must differ aren't read from a rate loop like ours."""
-        squares = [
+        """Either group of axes may be retuned alone: the surer one tells. Gains that change by no more than forms are wrong by,
+        or predict the motors no better than by that, aren't told from a loop of another form."""
+        before, after = (
             np.array([np.mean(np.concatenate(v) ** 2) for v in self.residuals(named).values()])
             for named in ((), self.names)
-        ]
-        if np.sqrt((squares[0] / squares[1]).mean()) < 1.0 + DECISION.rate_gain:
+        )
+        if np.sqrt((before / after).mean()) < 1.0 + DECISION.form_error:
             return {}
         change, error = np.abs(self.change[[0, 3]]), self.error[[0, 3]]
         told = change > DECISION.standard_errors * error
-        chance = norm.cdf((change - DECISION.rate_gain) / error) * told * (1.0 - DECISION.unknown)
+        chance = norm.cdf((change - DECISION.form_error) / error) * told * (1.0 - DECISION.unknown)
         return {e: float(chance.max()) for e in self.names if chance.max() > 0.5}
 
     def undetectable(self) -> list[str]:
-        return [] if self.error[[0, 3]].min() < DECISION.rate_gain else list(self.names)
+        shown = PRIOR[0] > 2.0 * DECISION.standard_errors * self.error[[0, 3]].min()
+        return [] if shown else list(self.names)
 
     def estimate(self, effect: str, parameter: str) -> Estimated:
         place = GAINS.index(parameter)
@@ -95,15 +97,15 @@ def read_rate_loop(reading) -> RateLoop:
     """Read the rate controllers of all tracks of a `motion.Reading`."""
     gains = (1.0 + np.concatenate([np.zeros((1, 3)), GAIN_STEP * np.eye(3)])).astype(np.float32)
     outputs, tied, ticks = [], [], []
-    for track, vehicle, link in zip(reading.tracks, reading.vehicles, reading.arrived, strict=True):
+    for track, vehicle, link in zip(reading.heard, reading.vehicles, reading.arrived, strict=True):
         wanted, sent = observed(track, vehicle, link, gains, reading.at_once)
         ticks.append(sent)
         demand = wanted @ outputs_of(vehicle)
         outputs.append(track.motor @ outputs_of(vehicle) - demand[0])
         tied.append((demand[1:] - demand[0]) / GAIN_STEP)
-    change, error = read_gains(reading)
+    change, error = read_gains(reading, ticks)
     names = effects_of("rate_loop", reading.library)
-    return RateLoop(change, error, outputs, tied, ticks, names, max(t.dt for t in reading.tracks))
+    return RateLoop(change, error, outputs, tied, ticks, names, max(t.dt for t in reading.heard))
 
 
 def with_motors(track: Track, vehicle) -> Track:
@@ -139,108 +141,86 @@ def observed(track: Track, vehicle, link, gains, at_once=False):
     return np.asarray(wanted, float)[:, :rows], np.asarray(sent[0])[:rows]
 
 
-def read_gains(reading) -> tuple[np.ndarray, np.ndarray]:
-    """Changes (6,) of p, i, d as shares - roll and pitch, then yaw - and their errors, infinite where flights say too little."""
+def read_gains(reading, ticks) -> tuple[np.ndarray, np.ndarray]:
+    """Changes (6,) of p, i, d as shares - roll and pitch, then yaw - and their errors, infinite where flights say too little.
+    `ticks`: as in `RateLoop`."""
     change, error = np.zeros(6), np.full(6, np.inf)
     if reading.late is None:
         return change, error
     moments: dict[int, list] = {0: [], 1: [], 2: []}  # axis: [(moments (5, 1 + 5), track)] of every segment
-    by_track = zip(reading.tracks, reading.vehicles, reading.arrived, reading.by_commands, strict=True)
-    for unit, own in enumerate(by_track):
-        for axis, part in _segments(*own, reading.at_once, reading.late):
+    tracks = zip(reading.heard, reading.vehicles, reading.arrived, reading.by_commands, ticks, strict=True)
+    for unit, (track, vehicle, link, (_, drawn), sent) in enumerate(tracks):
+        series = _series(track, vehicle, in_force(track, link), drawn, reading)
+        for axis, part in _segments(series, sent, track.dt):
             moments[axis].append((part, unit))
     for group, axes in enumerate(((0, 1), (2,))):
         found = np.array([m for a in axes for m, _ in moments[a]])
-        units = np.array([(a, u) for a in axes for _, u in moments[a]])
-        if len(found) * SEGMENT < LEAST_SECONDS * len(axes):
-            continue
-        theta, spread = _moments(found)
-        own = slice(3 * group, 3 * group + 3)
-        change[own], error[own] = theta[:3], np.maximum(spread, _between(found, units, theta))[:3]
+        units = np.array([3 * u + a for a in axes for _, u in moments[a]])
+        if len(found) * SEGMENT >= LEAST_SECONDS * len(axes):
+            own = slice(3 * group, 3 * group + 3)
+            theta, deviation = _moments(found, units)
+            change[own], error[own] = theta[:3], deviation[:3]
     return change, error
 
 
-def _segments(track: Track, vehicle, link, by_commands, at_once: bool, late: float):
-    """(axis, moments (5, 1 + 5)) of every segment without a motor at its limit: of instruments with outputs and regressors."""
-    _, drawn = by_commands
-    ruling, rates = in_force(track, link), track.body_rates
-    sent = ruling[:, 0, 1:] if at_once else ruling[..., 1:].mean(1)
-    after = np.concatenate([rates[1:], rates[-1:]])
-    slope = (after - rates) / track.dt
-    if at_once:
-        slope = 0.5 * (slope + np.concatenate([slope[:1], slope[:-1]]))
-    gain = [np.asarray(getattr(vehicle, n), float) * COUNT for n in ("rate_kp", "rate_ki", "rate_kd")]
+def _series(track: Track, vehicle, ruling: np.ndarray, drawn: np.ndarray, reading) -> np.ndarray:
+    """(11, T, 3): outputs beyond the nominal ones, what P, I and D make of the rates, what a delay does to P and a low-pass to D,
+    and the last five again of the rates `drawn` (T, 3) that commands alone cause: the instruments.
 
-    def tied(rates, slope):
-        error = sent - rates
-        return np.stack([gain[0] * error, gain[1] * np.cumsum(error, 0) * track.dt, -gain[2] * slope])
-
-    x, z = (
-        tied(rates if at_once else 0.5 * (rates + after), slope),
-        tied(drawn, np.gradient(drawn, track.dt, axis=0)),
+    The rates at the ticks of a row lie on a smooth curve through those of the rows; the derivative is of the tick before."""
+    pick = 0 if reading.at_once else slice(None) if track.fast_thrust is None else TICKS // 2  # means already
+    at = np.arange(len(track))[:, None] + np.arange(TICKS) / TICKS
+    curve = CubicSpline(np.arange(len(track)), track.body_rates)
+    rates, slopes = curve(at), (curve(at) - curve(at - 1.0 / TICKS)) * TICKS / track.dt
+    low = butter(2, FILTER, fs=TICKS / track.dt)
+    filtered = lfilter(*low, slopes.reshape(-1, 3), axis=0).reshape(slopes.shape)
+    sent, rates, slope, filtered = (
+        (v[:, pick] if pick != slice(None) else v.mean(1)) for v in (ruling[..., 1:], rates, slopes, filtered)
     )
+    x = _terms(track, vehicle, sent - rates, slope)
+    z = _terms(track, vehicle, sent - drawn, np.gradient(drawn, track.dt, axis=0))
+    off = [
+        reading.late * np.gradient(x[0], track.dt, axis=0),
+        _terms(track, vehicle, sent, filtered - slope)[2],
+    ]
+    late = [reading.late * np.gradient(v, track.dt, axis=0) for v in z[[0, 2]]]
     y = track.motor @ outputs_of(vehicle) - x.sum(0)
-    edge, size = int(EDGE / track.dt), max(int(SEGMENT / track.dt), 1)
-    if len(track) < 4 * edge + size:
+    return np.stack([y, *x, *off, *z, *late])
+
+
+def _terms(track: Track, vehicle, error: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """(3, T, 3): outputs of P, I and D for an error of the body rates and their slope (T, 3)."""
+    p, i, d = (np.asarray(getattr(vehicle, n), float) * COUNT for n in ("rate_kp", "rate_ki", "rate_kd"))
+    return np.stack([p * error, i * np.cumsum(error, 0) * track.dt, -d * slope])
+
+
+def _segments(series: np.ndarray, ticks: np.ndarray, dt: float):
+    """(axis, moments (5, 1 + 5)) of each segment of a series (11, T, 3) without a motor near its limits, which obeys no gains."""
+    edge, size = int(EDGE / dt), max(int(SEGMENT / dt), 1)
+    if series.shape[1] < 4 * edge + size:
         return
-    times = np.array([late, FILTER_DELAY])[:, None, None]
-    delayed = [times * np.gradient(v[[0, 2]], track.dt, axis=1) for v in (x, z)]
-    band = butter(2, (BAND[0], min(BAND[1], 0.4 / track.dt)), "bandpass", fs=1.0 / track.dt, output="sos")
-    both = sosfiltfilt(band, np.concatenate([y[None], x, delayed[0], z, delayed[1]]), axis=1)[:, edge:-edge]
-    limited = _limited(track, ruling, gain[0] * (sent - rates) - gain[2] * slope, vehicle, edge)
-    for k in range(0, both.shape[1] - size // 2, size):
+    band = butter(2, (BAND[0], min(BAND[1], 0.4 / dt)), "bandpass", fs=1.0 / dt, output="sos")
+    passed = sosfiltfilt(band, series, axis=1)[:, edge:-edge]
+    limited = (np.abs(ticks - 0.5) > 0.5 - MARGIN).any((1, 2))
+    limited = np.convolve(limited, np.ones(2 * edge // 3 + 1), "same")[edge:-edge] > 0
+    for k in range(0, passed.shape[1] - size // 2, size):
         if not limited[k : k + size].any():
             for axis in range(3):
-                part = both[:, k : k + size, axis]
+                part = passed[:, k : k + size, axis]
                 yield axis, part[6:] @ part[:6].T
 
 
-def _limited(track: Track, ruling, kick: np.ndarray, vehicle, edge: int) -> np.ndarray:
-    """Rows near one whose motors were at a limit: they obey no gains, be it for the first tick after a jump of the command, and
-    the filter carries that on."""
-    asked = ruling[:, -1, :1] + kick @ np.asarray(mixer(vehicle), float).T
-    limited = ((np.abs(track.motor - 0.5) > 0.5 - MARGIN) | (np.abs(asked - 0.5) > 0.5 - MARGIN)).any(1)
-    return np.convolve(limited, np.ones(2 * edge // 3 + 1), "same")[edge:-edge] > 0
-
-
-def _between(found: np.ndarray, units: np.ndarray, theta: np.ndarray) -> np.ndarray:
-    """Errors (5,) from how much flights and axes differ, widened where they are few. A unit alone is held near the whole
-    by the priors, so that what it can't tell doesn't count."""
-    each = found[:, :, 0] - found[:, :, 1:] @ theta
-    spread = each.T @ each / len(found)
-    spread += 1e-9 * np.trace(spread) * np.eye(5)
-    precision = np.diag(1.0 / PRIOR**2)
-    alone, weights = [], []
-    for unit in np.unique(units, axis=0):
-        of_unit = (units == unit).all(1)
-        own = found[of_unit].sum(0)
-        weight = np.linalg.inv(spread * of_unit.sum())
-        hessian = own[:, 1:].T @ weight @ own[:, 1:]
-        push = own[:, 1:].T @ weight @ (own[:, 0] - own[:, 1:] @ theta)
-        alone.append(np.linalg.solve(hessian + precision, push))
-        weights.append(1.0 - np.diag(np.linalg.inv(hessian + precision)) / PRIOR**2)
-    count = len(alone)
-    if count < 2:
-        return np.full(5, np.inf)
-    alone, weights = np.array(alone), np.array(weights)
-    weights = weights / np.maximum(weights.sum(0), 1e-30)
-    return (
-        np.sqrt((weights * alone**2).sum(0) / (count - 1))
-        * student.ppf(norm.cdf(DECISION.standard_errors), count - 1)
-        / DECISION.standard_errors
-    )
-
-
-def _moments(found: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients (5,) and errors (5,) that bring the moments (B, 5, 1 + 5) to zero, with weak priors."""
+def _moments(found: np.ndarray, units: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients (5,) and errors (5,) that bring the moments (B, 5, 1 + 5) to zero, with weak priors. Errors are what segments
+    or, where that is more, `units` (B,) differ by."""
     precision = np.diag(1.0 / PRIOR**2)
     total = found.sum(0)
     theta = np.zeros(5)
     for _ in range(4):
         each = found[:, :, 0] - found[:, :, 1:] @ theta
         spread = each.T @ each * len(found) / max(len(found) - 5, 1)
-        spread += 1e-9 * np.trace(spread) * np.eye(5)
-        weight = np.linalg.inv(spread)
-        hessian = total[:, 1:].T @ weight @ total[:, 1:] + precision
-        theta = np.linalg.solve(hessian, total[:, 1:].T @ weight @ total[:, 0])
-    return theta, np.sqrt(np.diag(np.linalg.inv(hessian)))
+        weight = np.linalg.inv(spread + 1e-9 * np.trace(spread) * np.eye(5))
+        covariance = np.linalg.inv(total[:, 1:].T @ weight @ total[:, 1:] + precision)
+        theta = covariance @ total[:, 1:].T @ weight @ total[:, 0]
+    pushes = np.array([each[units == u].sum(0) for u in np.unique(units)]) @ weight @ total[:, 1:]
+    return theta, robust_deviation(covariance, pushes)
