@@ -33,18 +33,19 @@ class Compiled:
             self._function = getattr(ctypes.CDLL(str(library)), name)
         self._function.restype = None
         self._inputs = tuple(program.inputs)
-        self._observation = np.zeros((), np.dtype({"names": list(program.inputs), **_layout(program)}))
-        workspace = np.full(program.workspace, np.nan, np.float32)  # nobody clears it
+        observation = _struct(program)()
+        self._observation = {name: np.ctypeslib.as_array(getattr(observation, name)) for name in self._inputs}
+        self._workspace = np.full(program.workspace, np.nan, np.float32)  # nobody clears it
         self._output = np.zeros(program.shape, np.float32)
-        self._arrays = (self._observation, workspace, self._output)
-        self._pointers = [ctypes.c_void_p(array.ctypes.data) for array in self._arrays]
+        arrays = (self._workspace, self._output)
+        self._pointers = [ctypes.byref(observation), *(ctypes.c_void_p(a.ctypes.data) for a in arrays)]
 
     def __call__(self, seen: dict) -> np.ndarray:
         """Outputs (number, ...) for {input: array (number, ...)}."""
         found = []
         for i in range(len(seen[self._inputs[0]])):
             for name in self._inputs:
-                self._observation[name] = seen[name][i].reshape(-1)
+                self._observation[name][:] = seen[name][i].reshape(-1)
             self._function(*self._pointers)
             found.append(self._output.copy())
         return np.stack(found)
@@ -66,13 +67,13 @@ def compiled(program: CProgram, name: str) -> Compiled | None:
     return None if compiler is None else Compiled(program, name, compiler)
 
 
-def _layout(program: CProgram) -> dict:
-    """Formats, offsets and size of the observation's struct: floats and flags, each aligned to itself."""
-    formats, offsets, end = [], [], 0
-    for name, shape in program.inputs.items():
-        size = 1 if program.flags[name] else 4
-        end = -(-end // size) * size
-        formats.append(((np.uint8 if size == 1 else np.float32), (math.prod(shape),)))
-        offsets.append(end)
-        end += size * math.prod(shape)
-    return {"formats": formats, "offsets": offsets, "itemsize": -(-end // 4) * 4}
+def _struct(program: CProgram) -> type[ctypes.Structure]:
+    """The observation's struct: floats and flags."""
+
+    class Observation(ctypes.Structure):
+        _fields_ = [
+            (name, (ctypes.c_ubyte if program.flags[name] else ctypes.c_float) * math.prod(shape))
+            for name, shape in program.inputs.items()
+        ]
+
+    return Observation

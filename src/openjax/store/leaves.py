@@ -23,24 +23,15 @@ def place(carry: Any, shardings: Any = None) -> Any:
     shardings = first_device() if shardings is None else shardings
     if all(sharding.is_fully_addressable for sharding in jax.tree.leaves(shardings)):
         return jax.device_put(carry, shardings)
-    # Devices of other processes: each process has the whole carry and hands in its own devices' share.
-    is_key = jax.tree.map(lambda leaf: jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key), carry)
-    arrays = jax.tree.map(
-        lambda leaf, key: np.asarray(jax.random.key_data(leaf) if key else leaf), carry, is_key
-    )
-    implementations = jax.tree.map(
-        lambda leaf, key: jax.random.key_impl(leaf) if key else None, carry, is_key
-    )
 
-    def whole(arrays):
-        return jax.tree.map(
-            lambda leaf, key, kind: jax.random.wrap_key_data(leaf, impl=kind) if key else leaf,
-            arrays,
-            is_key,
-            implementations,
-        )
+    def put(leaf, sharding):
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            numbers = put(jax.random.key_data(leaf), sharding)
+            return jax.random.wrap_key_data(numbers, impl=jax.random.key_impl(leaf))
+        # each process has the whole carry, and hands in its own devices' share
+        return jax.make_array_from_callback(leaf.shape, sharding, np.asarray(leaf).__getitem__)
 
-    return jax.jit(whole, out_shardings=shardings)(arrays)
+    return jax.tree.map(put, carry, jax.tree.broadcast(shardings, carry))
 
 
 def abstract_like(carry: Any, shardings: Any = None) -> Any:
