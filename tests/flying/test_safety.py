@@ -175,6 +175,18 @@ def test_wrong_frames_of_motion_capture_move_nothing(frames, off):
     assert state.all_in(Mode.PURSUIT)
 
 
+def test_an_own_estimate_that_is_elsewhere_is_not_believed_for_having_waited():
+    """With time it might have drifted there by reckoning; motion capture sees that it hasn't."""
+    state, away = pursuing(), (0.5, 0.6, 0.5)
+    for k in range(1, 150):
+        now = 0.01 * k
+        own = still(now, PLACES[0] if k < 5 else away)
+        sample = PoseSample(own, now, 4.0, captured=still(now, PLACES[0]))
+        state, _ = step(state, event(now, s0=sample))
+        estimate = state.drones[0].estimate
+        assert math.dist(estimate.position, PLACES[0]) < 0.05 and not state.drones[0].distrusted
+
+
 def test_the_estimator_on_board_is_told_what_is_near_it_and_no_more():
     state, told = pursuing(), []
     for k in range(1, 41):

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 
 from openjax.flying.controller import Pose, level_acceleration, moved_on
-from openjax.flying.judge import agree, at_one_time, follows
+from openjax.flying.judge import Track, Verdict, agree, at_one_time, follows
 from openjax.flying.state import FLYING, SPIN_UP, Drone, Mode, PoseSample, State
 
 SMOOTHING = 0.02
@@ -25,8 +25,7 @@ def _seen(state, drone, sample) -> Drone:
     now, limits = state.time, state.limits
     moving = drone.mode in FLYING and not (drone.mode is Mode.LIFT and now - drone.since < SPIN_UP)
     by_capture = sample.captured is not None and not drone.distrusted
-    reckoned = None if by_capture and drone.own.fresh(now, limits) else drone.estimate
-    drone = drone._replace(own=drone.own.after(sample.own, now, limits, moving, reckoned))
+    drone = drone._replace(own=_own(state, drone, sample, by_capture, moving))
     if by_capture:
         drone = _captured(state, drone, sample, moving)
     source = drone.captured if by_capture and not drone.distrusted else drone.own
@@ -40,6 +39,18 @@ def _seen(state, drone, sample) -> Drone:
     velocity = tuple(v + dt * a for v, a in zip(old.velocity, drone.acceleration, strict=True))
     position = tuple(p + dt * v for p, v in zip(old.position, velocity, strict=True))
     return drone._replace(estimate=old._replace(time=now, position=position, velocity=velocity))
+
+
+def _own(state, drone, sample, by_capture, moving) -> Track:
+    """The drone's own estimates after the newest one, which motion capture must confirm if it comes after none or wrong ones."""
+    now, limits, before = state.time, state.limits, drone.own
+    if by_capture and before.fresh(now, limits):
+        return before.after(sample.own, now, limits, moving, None)
+    own, seen = before.after(sample.own, now, limits, moving, drone.estimate), drone.captured
+    confirmed = own.pose is before.pose or not (moving and by_capture and seen.fresh(now, limits))
+    if confirmed or not agree(*at_one_time(seen.pose, own.pose), limits):
+        return own
+    return own._replace(pose=before.pose, verdict=Verdict.JUMPED)
 
 
 def _captured(state, drone, sample, moving) -> Drone:
