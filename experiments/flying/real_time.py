@@ -7,6 +7,7 @@ goes wrong is in `experiments.flying.processes`.
 import atexit
 import functools
 import json
+import math
 import random
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +29,7 @@ class Arguments:
     processes: int = 3
     policy: str = "flight"
     seed: int = 0
-    only: tuple[str, ...] = ()
+    only: tuple[str, ...] = ("",)
     """Kinds that contain one of these."""
     seconds_left: float = 1e9
     """Begin no flight after this time (s)."""
@@ -40,7 +41,7 @@ class Arguments:
 def main() -> None:
     """Share the flights out to workers, each with vehicles of its own."""
     arguments = tyro.cli(Arguments)
-    names = [k for k in KINDS if not arguments.only or any(part in k for part in arguments.only)]
+    names = [kind for kind in KINDS if any(part in kind for part in arguments.only)]
     records = read_json(arguments.out)["records"] if arguments.go_on else []
     left = set(range(arguments.seed, arguments.seed + arguments.flights)) - {r["number"] for r in records}
     work = [(n, names[n % len(names)]) for n in sorted(left)]
@@ -49,12 +50,8 @@ def main() -> None:
     for row in share_out(fly, jobs, arguments.processes, arguments.seconds_left):
         records.append(finite(row))
         print("well" if row["well"] else "NOT WELL", json.dumps(row), flush=True)
-        counts = {
-            "flights": len(records),
-            "well": sum(r["well"] for r in records),
-            "policy": arguments.policy,
-        }
-        in_order = sorted(records, key=lambda r: r["number"])
+        well, in_order = sum(r["well"] for r in records), sorted(records, key=lambda r: r["number"])
+        counts = {"flights": len(records), "well": well, "policy": arguments.policy}
         write_json(arguments.out, {**stands, **counts, "records": in_order})
     write_page(arguments.out, page, read_json(arguments.out))
 
@@ -68,7 +65,7 @@ def page(results) -> Page:
         asked = [any(name in r["kind"] for name in STOPPED) for r in mine]
         rows.append({
             "group": group, "flights": len(mine), "well": sum(r["well"] for r in mine),
-            "farthest": 0.9 + max((r["out"] for r in mine), default=0.0), "armed": sum(r["armed"] for r in mine),
+            "farthest": 0.9 + max((r["out"] for r in mine), default=math.nan), "armed": sum(r["armed"] for r in mine),
             "fell": sum(r["fell"] and not a for r, a in zip(mine, asked, strict=True)),
             "left": sum(bool(r["left"]) for r in mine), "longest": max(ends, default=None),
         })  # fmt: skip

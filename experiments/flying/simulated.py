@@ -72,7 +72,7 @@ class Arguments:
     processes: int = 4
     seconds_left: float = 1e9
     """Begin no batch that wouldn't be over by then (s)."""
-    kinds: tuple[str, ...] = ()
+    kinds: tuple[str, ...] = ("",)
     """Those that contain one of these; all by default."""
     level_after: float = LEVEL_AFTER
     """A firmware of one's own levels out so long (s) after the last set-point."""
@@ -273,13 +273,9 @@ def summary(records) -> list[dict]:
 
 
 def main() -> None:
-    arguments = tyro.cli(Arguments)
-    begin = time.time()
+    arguments, begin, jobs = tyro.cli(Arguments), time.time(), []
     drawn = range(arguments.seed, arguments.seed + arguments.faults)
-    seeds = [
-        s for s in drawn if not arguments.kinds or any(k in KINDS[s % len(KINDS)] for k in arguments.kinds)
-    ]
-    jobs = []
+    seeds = [s for s in drawn if any(part in KINDS[s % len(KINDS)] for part in arguments.kinds)]
     for k, layout in enumerate(arguments.layouts):
         mine = [s for s in seeds if (s // len(KINDS)) % len(arguments.layouts) == k]
         mine += [-1] * (-len(mine) % arguments.batch)  # all batches are of one size: compiled once
@@ -290,12 +286,10 @@ def main() -> None:
     try:
         for flown in share_out(fly, jobs, arguments.processes, arguments.seconds_left):
             records += flown
-            result = {
+            write_json(arguments.out, {
                 **stands, "policy": arguments.policy, "seconds": round(time.time() - begin),
-                "summary": [finite(row) for row in summary(records)],
-                "not_well": [finite(r) for r in records if not well(r)],
-            }  # fmt: skip
-            write_json(arguments.out, result)
+                "summary": list(map(finite, summary(records))), "not_well": [finite(r) for r in records if not well(r)],
+            })  # fmt: skip
     finally:  # of what was flown, also where something failed
         if records:
             write_page(arguments.out, page, read_json(arguments.out))

@@ -1,8 +1,6 @@
 """With the real cflib over loopback: its packets mean what we mean, a flight from take-off to its log, the guard."""
 
 import multiprocessing
-import os
-import signal
 import subprocess
 import sys
 import threading
@@ -238,7 +236,7 @@ def test_another_process_lands_and_disarms_what_hangs_in_the_air(uris):
 @pytest.mark.real_time
 def test_a_broken_link_process_is_an_error_and_not_a_wait(uris):
     with connected(uris, body_logs=0) as links:
-        os.kill(links.pid, signal.SIGKILL)
+        next(p for p in multiprocessing.active_children() if p.name == "openjax links").kill()
         with pytest.raises(UserError, match="links' process"):
             for _ in range(3):
                 links.send([SetPoint()] * 3)

@@ -5,7 +5,7 @@ import math
 import shutil
 import subprocess
 import tempfile
-import time
+import timeit
 from pathlib import Path
 
 import numpy as np
@@ -52,13 +52,8 @@ class Compiled:
 
     def seconds(self, repeats: int = 500) -> float:
         """Of one call; the best of five batches."""
-        best = math.inf
-        for _ in range(5):
-            begin = time.perf_counter()
-            for _ in range(repeats):
-                self._function(*self._pointers)
-            best = min(best, (time.perf_counter() - begin) / repeats)
-        return best
+        batches = timeit.repeat(lambda: self._function(*self._pointers), number=repeats, repeat=5)
+        return min(batches) / repeats
 
 
 def compiled(program: CProgram, name: str) -> Compiled | None:

@@ -120,11 +120,6 @@ class Links:
             self._process.join()
             self._process = None
 
-    @property
-    def pid(self) -> int:
-        """Of the links' process."""
-        return self._process.pid
-
     def _call(self, name: str, *arguments, timeout: float = 30.0):
         """The result of a method of the swarm over there. UserError: there is no answer."""
         try:

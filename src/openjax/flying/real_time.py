@@ -1,5 +1,6 @@
 """Making a process fit for real time."""
 
+import contextlib
 import os
 
 PRIORITY = 10
@@ -40,18 +41,16 @@ def hurry() -> str:
     Linux grants the real-time scheduler to root and to users with `rtprio` in /etc/security/limits.conf. All threads:
     JAX computes in several, and the loop would wait for one that waits for its turn.
     """
-    try:
-        for thread in _threads():
-            os.sched_setscheduler(thread, os.SCHED_RR, os.sched_param(PRIORITY))
-        return "real time"
-    except (AttributeError, OSError):  # not on this system, or not ours to ask
-        pass
-    try:
-        for thread in _threads():  # Linux's nice values are threads', too
-            os.setpriority(os.PRIO_PROCESS, thread, NICE)
-        return "nice"
-    except (AttributeError, OSError):
-        return "ordinary"
+    ways = {
+        "real time": lambda thread: os.sched_setscheduler(thread, os.SCHED_RR, os.sched_param(PRIORITY)),
+        "nice": lambda thread: os.setpriority(os.PRIO_PROCESS, thread, NICE),  # threads', too, on Linux
+    }
+    for name, ask in ways.items():
+        with contextlib.suppress(AttributeError, OSError):  # not on this system, or not ours to ask
+            for thread in _threads():
+                ask(thread)
+            return name
+    return "ordinary"
 
 
 def _threads() -> list[int]:
