@@ -127,11 +127,10 @@ def evaders() -> TrainSettings:
             min_pillars=0,
             # The distance pays for going near a pillar, the first capture for the last centimetres: a step of it alone costs too
             # much. Breaches that count .02 m early make a way between pillars .4 m apart cost as much as a capture pays
-            reward=dict(
-                distance=0.5, first_capture=500.0, collision=10.0, margin=0.01, crash=60.0, first_crash=2000.0
-            ),
+            reward=dict(distance=0.5, first_capture=500.0, margin=0.01, crash=60.0, first_crash=2000.0),
         ),
-        mappo=dict(target_kl=0.02, step_subsampling=2, entropy_coefficient=2e-3),
+        # as long as a breach costs less than a step in reach pays, pursuers learn to hold an evader from beyond the wall
+        mappo=dict(target_kl=0.02, step_subsampling=2, entropy_coefficient=2e-3, penalty_ramp=0.5),
         # of starts alone: more that changes in flight costs captures
         analytic=dict(updates=150, look_every=15, hold=0.4, breach=0.3, speed=0.2),
         vehicles_start=0.08,
