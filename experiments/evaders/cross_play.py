@@ -136,8 +136,8 @@ def page(results: dict) -> Page:
         parts.append(by_evader(own, f"{name[0]}, {name[1]} game, {name[2]} vehicle"))
     if "responses" in results:
         parts.append(learned_ones(results["responses"]))
-    if "training" in results:
-        parts.append(learning_curve(results["training"]))
+    if "runs" in results:
+        parts.append(whole_runs(results["runs"]))
     if "tried" in results:
         parts.append("\n".join(["## What else was tried", "", *(f"* {line}" for line in results["tried"])]))
     prose = (
@@ -185,13 +185,18 @@ def by_evader(records: list[dict], title: str) -> Table:
     return Table(columns | {"least lower end": "low:.3f"}, rows, title=title)
 
 
-def learning_curve(validations: list[dict]) -> Table:
-    """Captures and crashes over a training run."""
-    columns = {"M steps": "millions:.0f", "s": "seconds:.0f", "capture": "capture_rate:.3f"}
-    columns |= {"crash": "crash_rate:.3f"}
-    title = f"Training of evaders from evaders_scripted on, on validation tasks against field, {', '.join(VALIDATED)}"
-    prose = "The checkpoint that scored best on these tasks is the one in the package; s counts compilation."
-    return Table(columns, validations, title=title, prose=prose)
+def whole_runs(runs: list[dict]) -> Table:
+    """What training runs scored on their validation tasks, where best and at the end."""
+    rows = []
+    for run in runs:
+        best = max(run["validations"], key=lambda row: row["score"])
+        last = run["validations"][-1]
+        rows += [{"run": run["run"], **row} for row in ([best] if best is last else [best, last])]
+    columns = {"run": "run", "M steps": "millions:.0f", "s": "seconds:.0f", "score": "score:.3f"}
+    columns |= {"capture": "capture_rate:.3f", "crash": "crash_rate:.3f", "breaches": "collision_rate:.4f"}
+    prose = "Tasks of the validation, never trained on, with drawn vehicles: a run's best and its last. s counts compilation."
+    title = f"Training, validated against field, {', '.join(VALIDATED)}"
+    return Table(columns, rows, title=title, prose=prose)
 
 
 def learned_ones(responses: list[dict]) -> Table:
