@@ -38,8 +38,6 @@ from openjax.vehicle.solids import DRONE_RADIUS
 
 HORIZON = 0.5
 """Seconds that are learnt at once."""
-SEGMENTS = 8
-"""A flight is looked at after each of so many times `HORIZON`."""
 SMOOTH, SMOOTH_BREACH = 0.012, 0.008
 """Distances (m) over which a crash and a breach go from sure to none in what is learnt; ways through rows aren't wide."""
 SMOOTH_TILT = 0.05
@@ -128,6 +126,11 @@ class AnalyticGradient:
         """Control steps that are learnt at once."""
         return max(1, round(HORIZON / self.game.time_step))
 
+    @property
+    def moments(self) -> int:
+        """How often a flight is looked at: after each `HORIZON` but the episode's last."""
+        return max(1, self.game.episode_length // self.steps - 1)
+
     def inputs(self, parameters: PolicyParameters, observation):
         """What the actor acts on: observations and predictions, without a gradient through the predictor."""
         return observation, jax.lax.stop_gradient(self.policy.predict(parameters, observation))
@@ -172,13 +175,13 @@ class AnalyticGradient:
         return jax.vmap(one)(*(jax.random.split(k, bounds.shape[0]) for k in jax.random.split(key)), bounds)
 
     def flights(self, parameters: PolicyParameters, key: jax.Array, bounds: jax.Array):
-        """Worlds (SEGMENTS * B, ...) at moments of the policy's flights."""
+        """Worlds (`moments` * B, ...) along the policy's flights."""
 
         def segment(world, _):
             world = self.fly(parameters.actor, parameters, world, self.steps)[0]
             return world, world
 
-        worlds = jax.lax.scan(segment, self.starts(key, bounds), None, length=SEGMENTS)[1]
+        worlds = jax.lax.scan(segment, self.starts(key, bounds), None, length=self.moments)[1]
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), worlds)
 
     def loss(self, actor: Any, parameters: PolicyParameters, starts, flying):
