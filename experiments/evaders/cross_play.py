@@ -189,9 +189,8 @@ def whole_runs(runs: list[dict]) -> Table:
     """What training runs scored on their validation tasks, where best and at the end."""
     rows = []
     for run in runs:
-        best = max(run["validations"], key=lambda row: row["score"])
-        last = run["validations"][-1]
-        rows += [{"run": run["run"], **row} for row in ([best] if best is last else [best, last])]
+        shown = max(run["validations"], key=lambda row: row["score"]), run["validations"][-1]
+        rows += [{"run": run["run"], **row} for row in shown]
     columns = {"run": "run", "M steps": "millions:.0f", "s": "seconds:.0f", "score": "score:.3f"}
     columns |= {"capture": "capture_rate:.3f", "crash": "crash_rate:.3f", "breaches": "collision_rate:.4f"}
     prose = "Tasks of the validation, never trained on, with drawn vehicles: a run's best and its last. s counts compilation."
