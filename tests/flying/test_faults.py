@@ -1,9 +1,13 @@
 """Faults at their source, flown in simulated time by the true vehicles: one of each kind; vehicles of another weight."""
 
+import json
+import math
+
 import pytest
 
-from experiments.flying.faults import BEYOND, FALL, KINDS
+from experiments.flying.faults import BEYOND, FALL, KINDS, finite
 from experiments.flying.simulated import fly, well
+from experiments.flying.single_thread import share_out
 from openjax.flying.safety import step
 from openjax.flying.state import Event, Mode, Request, initial_state
 from openjax.vehicle import load_vehicle
@@ -35,3 +39,17 @@ def test_a_vehicle_of_another_weight_flies_or_is_stopped_before_it_could_fall(sh
         highest = max(highest, vehicles.report.position[0, 2])
     stopped = state.modes == (Mode.STOPPED,)
     assert stopped == (share != 1.0) and (highest < FALL if stopped else highest > 0.4)
+
+
+def test_a_job_that_fails_costs_no_other(capsys):
+    done = []
+    with pytest.raises(RuntimeError, match="1 of 3"):
+        for root in share_out(math.sqrt, [(4.0,), (-1.0,), (9.0,)], 2):
+            done.append(root)
+    assert sorted(done) == [2.0, 3.0] and "(-1.0,): ValueError" in capsys.readouterr().err
+
+
+def test_what_is_infinite_is_written_as_null_and_named():
+    row = {"kind": "camera drifts", "duration": math.inf, "out": math.nan, "time": 1.5, "seconds": None}
+    read = json.loads(json.dumps(finite(row), allow_nan=False))
+    assert read == {**row, "duration": None, "out": None, "not_finite": {"duration": "inf", "out": "nan"}}
