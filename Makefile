@@ -33,7 +33,7 @@ docs: $(READY)
 	$(BIN)/python -m sphinx -W --keep-going -q docs docs/_build/html
 
 benchmark: $(READY)
-	$(BIN)/python -m openjax.benchmark $(ARGS)
+	$(BIN)/python -m openjax benchmark $(ARGS)
 
 evaluate: $(READY)
 	$(BIN)/python -m openjax.evaluate --policy open open_seed_1 open_seed_2 --scenario all $(ARGS)

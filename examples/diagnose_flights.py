@@ -11,7 +11,7 @@ from pathlib import Path
 from openjax.gap import diagnose_case, load_case
 
 folder = Path(tempfile.mkdtemp()) / "drag"
-sample = [sys.executable, "-m", "openjax.sample_flights", str(folder), "--effect", "rotor_drag"]
+sample = [sys.executable, "-m", "openjax", "sample_flights", str(folder), "--effect", "rotor_drag"]
 subprocess.run(sample, check=True)
 
 case = load_case(folder)  # flight logs (CSV, micro-SD, ROS 2 bags) and a vehicle.toml

@@ -17,7 +17,7 @@ from scipy.stats import binomtest
 from experiments.flying.vehicles import vehicles
 from experiments.table import Page, Table, page_parser, publish
 from openjax.commands.command_line import run_command
-from openjax.commands.evaluator import layout_slots, repeat_task
+from openjax.commands.evaluator import layout_slots, layout_tasks, stacked
 from openjax.commands.validation import uniform_tasks
 from openjax.learning.best_response import make_duel
 from openjax.pursuit import (
@@ -27,7 +27,6 @@ from openjax.pursuit import (
     PursuitSettings,
     RewardSettings,
     Task,
-    scenario_task,
 )
 from openjax.pursuit.evaders import EVADERS, HELD_OUT, SCRIPTED, VALIDATED
 from openjax.store.policies import LoadedPolicy, load_policy
@@ -59,22 +58,20 @@ def game_of(loaded: LoadedPolicy, game: str, physics: str) -> PursuitSettings:
     return dataclasses.replace(settings, speed_limit="none", substeps=5)
 
 
-def tasks_of(settings: PursuitSettings, layouts: int, uniform: int) -> tuple[list[str], list[int], Task]:
-    """Names of the kinds of tasks, how many of each, and all of them one after the other."""
-    parts = [repeat_task(scenario_task(settings, scenario), layouts) for scenario in SCENARIOS.values()]
+def kinds_of(settings: PursuitSettings, layouts: int, uniform: int) -> dict[str, Task]:
+    """Each kind of tasks by name."""
     drawn = dataclasses.replace(settings, max_pillars=5)
-    parts.append(uniform_tasks(drawn, uniform, settings.max_pillars))
-    counts = [layouts] * len(SCENARIOS) + [uniform]
-    return [*SCENARIOS, "uniform"], counts, jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+    tasks = layout_tasks(settings, SCENARIOS.values(), layouts)
+    return {**tasks, "uniform": uniform_tasks(drawn, uniform, settings.max_pillars)}
 
 
 def fly(name: str, options) -> list[dict]:
     """A record for each vehicle, evader and kind of task."""
     loaded = load_policy(name)
     settings = game_of(loaded, options.game, options.physics)
-    kinds, counts, tasks = tasks_of(settings, options.episodes, options.uniform)
+    tasks, part = stacked(kinds_of(settings, options.episodes, options.uniform))
     run = program(settings, loaded.in_game(Pursuit(settings)).policy)
-    number = sum(counts)
+    number = tasks.evader_position.shape[0]
     repeated = jax.tree.map(lambda leaf: jnp.tile(leaf, (len(SCRIPTED), *[1] * (leaf.ndim - 1))), tasks)
     evaders = jnp.repeat(jnp.arange(len(SCRIPTED)), number)
     records = []
@@ -83,13 +80,11 @@ def fly(name: str, options) -> list[dict]:
         found = run(loaded.parameters, repeated, evaders, jax.random.key(0), changes)
         found = jax.tree.map(np.asarray, found)
         for i, evader in enumerate(SCRIPTED):
-            start = i * number
-            for kind, count in zip(kinds, counts, strict=True):
-                part = jax.tree.map(lambda leaf, s=start, n=count: leaf[s : s + n], found)
-                start += count
+            flown = jax.tree.map(lambda leaf, s=i * number: leaf[s : s + number], found)
+            for kind, own in part(flown).items():
                 case = {"policy": name, "game": options.game, "vehicle": vehicle, "evader": evader}
                 case |= {"tasks": kind, "of": EVADERS[evader].of}
-                records.append(case | summary(part))
+                records.append(case | summary(own))
     return records
 
 

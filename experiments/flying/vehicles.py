@@ -9,15 +9,14 @@ import dataclasses
 import functools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from experiments.table import Page, Table, cell, page_parser, publish
 from openjax.commands.command_line import run_command
-from openjax.commands.evaluator import layout_slots, repeat_task
+from openjax.commands.evaluator import layout_slots, layout_tasks, stacked
 from openjax.commands.validation import uniform_tasks
 from openjax.learning import make_evaluate, summarise
-from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, RewardSettings, scenario_task
+from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, RewardSettings
 from openjax.store.policies import load_policy
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.family import family_bounds, find_parameter, vehicle_family
@@ -80,20 +79,19 @@ def fly(name: str, options) -> dict[str, dict[str, dict]]:
     own = loaded.settings.environment
     game = game_of(own, options.airframe or own.airframe, options.physics)
     drawn_from = dataclasses.replace(game, max_pillars=PursuitSettings().max_pillars)
-    parts = {"uniform": uniform_tasks(drawn_from, options.number, game.max_pillars)}
+    kinds = {"uniform": uniform_tasks(drawn_from, options.number, game.max_pillars)}
     if options.layouts:
-        layouts = SCENARIOS.items()
-        parts |= {name: repeat_task(scenario_task(game, layout), options.layouts) for name, layout in layouts}
-    tasks = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts.values())
-    ends = np.cumsum([part.pillar_active.shape[0] for part in parts.values()])
-    run, found = program(game, loaded.policy), {}
+        kinds |= layout_tasks(game, SCENARIOS.values(), options.layouts)
+    (tasks, part), (run, found) = stacked(kinds), (program(game, loaded.policy), {})
     for kind, bounds in vehicles(game.airframe).items():
         if kind in options.vehicles:
             flown = jax.tree.map(np.asarray, run(loaded.parameters, tasks, jax.random.key(0), bounds))
-            for part, begin, end in zip(parts, [0, *ends], ends, strict=False):
-                summary = summarise(jax.tree.map(lambda leaf, a=begin, b=end: leaf[a:b], flown))
-                found.setdefault(kind, {})[part] = finite(summary)
-                print(name, kind, part, *(cell(summary, column) for column in FIGURES.values()), flush=True)
+            for tasks_of, own in part(flown).items():
+                summary = summarise(own)
+                found.setdefault(kind, {})[tasks_of] = finite(summary)
+                print(
+                    name, kind, tasks_of, *(cell(summary, column) for column in FIGURES.values()), flush=True
+                )
     return found
 
 

@@ -22,10 +22,10 @@ from experiments.table import RESULTS, facts, write_page
 from openjax.background import compile_ahead
 from openjax.baselines import METHODS as HEURISTICS
 from openjax.commands.command_line import run_command
-from openjax.commands.evaluator import layout_slots, record_of, repeat_task
+from openjax.commands.evaluator import layout_slots, record_of, repeat_task, stacked
 from openjax.files import read_json, to_plain, write_text
 from openjax.learning import summarise
-from openjax.pursuit import SCENARIOS, Pursuit, RewardSettings, scenario_task
+from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, RewardSettings, Task, scenario_task
 from openjax.store.policies import LoadedPolicy, load_policy
 
 PAGES = {
@@ -58,18 +58,22 @@ def cells_of(evader_speed: float, episodes: int) -> list[tuple[str, float, int]]
     return cells + [(layout, speed, max(1, episodes // 2)) for layout, speed in sweeps.CELLS]
 
 
+def tasks_of(game: PursuitSettings, cells: list[tuple[str, float, int]]) -> dict[int, Task]:
+    """The tasks of each cell, by its place."""
+    return {i: repeat_task(scenario_task(game, SCENARIOS[name]), n) for i, (name, _, n) in enumerate(cells)}
+
+
 def call_of(name: str, seed: int, limit: str, physics: str, episodes: int) -> tuple:
     """The arguments of `fly`."""
     loaded, environment = game_of(name, limit, physics)
     game = environment.settings
     cells = cells_of(game.evader_speed, episodes)
-    tasks = [repeat_task(scenario_task(game, SCENARIOS[layout]), number) for layout, _, number in cells]
     return (
         environment,
         loaded.policy,
         sweeps.RADII,
         loaded.parameters,
-        jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *tasks),
+        stacked(tasks_of(game, cells))[0],
         jnp.concatenate([jnp.full(number, speed, jnp.float32) for _, speed, number in cells]),
         jax.random.key(seed),
     )
@@ -80,13 +84,8 @@ def of_policy(name: str, seed: int, limit: str, physics: str, episodes: int) -> 
     call = call_of(name, seed, limit, physics, episodes)
     game = call[0].settings
     cells = cells_of(game.evader_speed, episodes)
-    flown = fly(*call)
-    flown = jax.tree.map(np.asarray, flown)
-    ends = np.cumsum([number for *_, number in cells])
-    parts = [
-        jax.tree.map(lambda leaf, end=end, number=number: leaf[end - number : end], flown)
-        for end, (*_, number) in zip(ends, cells, strict=True)
-    ]
+    _, part = stacked(tasks_of(game, cells))
+    parts = list(part(jax.tree.map(np.asarray, fly(*call))).values())
     layouts = {}
     for layout, part in zip(LAYOUTS, parts, strict=False):
         row = record_of(layout, episodes, summarise(part.evaluation), ("last_seen_error",))

@@ -176,7 +176,7 @@ def test_the_command_writes_a_file_that_loads(case_folder, tmp_path, capsys):
 
 
 def test_as_a_command_a_bad_case_exits_with_status_2(tmp_path):
-    command = [sys.executable, "-m", "openjax.calibrate", str(tmp_path / "nowhere")]
+    command = [sys.executable, "-m", "openjax", "calibrate", str(tmp_path / "nowhere")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2 and done.stdout == ""
     assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1

@@ -64,16 +64,12 @@ class Evaluator:
                 tell(name)
                 flown.append(Flown(self, name, tasks, *self._fly(parameters, tasks, key)))
             return flown
-        packed = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *kinds.values())
+        packed, part = stacked(kinds)
         evaluation, records = self._fly(parameters, packed, key)
-        ends = np.cumsum(numbers)
-        parts = [
-            jax.tree.map(lambda leaf, start=end - number, end=end: leaf[start:end], evaluation)
-            for number, end in zip(numbers, ends, strict=True)
-        ]
+        first = np.cumsum([0, *numbers])
         return [
-            Flown(self, *kind, part, records, int(end - number))
-            for kind, part, number, end in zip(kinds.items(), parts, numbers, ends, strict=True)
+            Flown(self, name, kinds[name], own, records, int(first[i]))
+            for i, (name, own) in enumerate(part(evaluation).items())
         ]
 
     def _fly(self, parameters, tasks, key):
@@ -149,6 +145,17 @@ def layout_slots(settings: PursuitSettings) -> int:
 def repeat_task(task: Task, number: int) -> Task:
     """`number` copies along a new leading axis."""
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (number, *leaf.shape)), task)
+
+
+def stacked(kinds: Mapping[str, Task]) -> tuple[Task, Callable[[Any], dict[str, Any]]]:
+    """Tasks of several kinds one after the other, and what parts a tree of results (B, ...) by their names again."""
+    ends = np.cumsum([tasks.evader_position.shape[0] for tasks in kinds.values()]).tolist()
+    places = dict(zip(kinds, map(slice, [0, *ends], ends), strict=False))
+
+    def part(results):
+        return {name: jax.tree.map(lambda leaf, own=own: leaf[own], results) for name, own in places.items()}
+
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *kinds.values()), part
 
 
 def layout_tasks(settings: PursuitSettings, scenarios: Sequence[Scenario], episodes: int) -> dict[str, Task]:
