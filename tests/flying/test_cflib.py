@@ -71,7 +71,7 @@ def test_a_set_point_arrives_on_board_as_it_was_meant(mode, roll, pitch, yaw_rat
 @contextmanager
 def virtual(*options):
     """Three virtual Crazyflies, by the command that a user gives; their URIs."""
-    command = [sys.executable, "-m", "openjax.virtual_crazyflie", "--port", "0", *options]
+    command = [sys.executable, "-m", "openjax", "virtual_crazyflie", "--port", "0", *options]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         yield process.stdout.readline().split("--uri ")[1].split()
