@@ -42,15 +42,15 @@ def _seen(state, drone, sample) -> Drone:
 
 
 def _own(state, drone, sample, by_capture, moving) -> Track:
-    """The drone's own estimates after the newest one, which motion capture must confirm if it comes after none or wrong ones."""
+    """The drone's own estimates after the newest one, which motion capture must confirm where they were lost or wrong."""
     now, limits, before = state.time, state.limits, drone.own
     if by_capture and before.fresh(now, limits):
         return before.after(sample.own, now, limits, moving, None)
     own, seen = before.after(sample.own, now, limits, moving, drone.estimate), drone.captured
-    confirmed = own.pose is before.pose or not (moving and by_capture and seen.fresh(now, limits))
-    if confirmed or not agree(*at_one_time(seen.pose, own.pose), limits):
-        return own
-    return own._replace(pose=before.pose, verdict=Verdict.JUMPED)
+    to_confirm = moving and by_capture and own.pose is not before.pose and seen.fresh(now, limits)
+    if to_confirm and agree(*at_one_time(seen.pose, own.pose), limits) is Verdict.APART:
+        return own._replace(pose=before.pose, verdict=Verdict.JUMPED)
+    return own
 
 
 def _captured(state, drone, sample, moving) -> Drone:
