@@ -305,7 +305,7 @@ def wrong_layout(change):
         ),
         (train, "--environment.num_pursuers 9", "num_pursuers is 9; it must be a whole number in [1, 8]"),
         (train, "--environment.pillar_radius 5", "leaves no room in an arena of radius 0.9: less than 0.83"),
-        (train, "--mappo.epochs two", "--mappo.epochs can't be 'two'"),
+        (train, "--mappo.epochs two", "--mappo.epochs is 'two'; expected a whole number"),
         (train, "--network.heads 0", "network.heads is 0; it must be a whole number in"),
         (train, "--mappo.learning_rate nan", "mappo.learning_rate is nan; it must be in (0, 1]"),
         (train, "--restart_close 0.5", "restart_close 0.5 needs restart_every"),
