@@ -18,6 +18,8 @@ MOST_LINES = {"src": 31_900, "experiments": 8_600}
 """Of Python; the goals are 26,000 and 8,000."""
 FUNCTION = {"lines": 40, "branches": 10, "arguments": 5}
 """The most of a function: lines without its docstring, branches and arguments without those of functions inside it."""
+OVER = {"lines": 32, "branches": 18, "arguments": 81}
+"""Functions that are still over each limit; too many branches have some of `flights`, `gap` and the experiments alone."""
 FLOORS = (
     "errors lazy platform background",
     "files ranges kernels",
@@ -133,6 +135,8 @@ def test_functions_do_one_thing():
     over = over_the_limits()
     assert not over - listed, "split them, or hand one object down"
     assert not listed - over, "no longer over: take them off the list (python -m tests.test_house)"
+    for limit, most in OVER.items():
+        assert sum(limit in line.rpartition(":")[2] for line in listed) <= most, limit
 
 
 def test_rooms_import_downwards_only():
