@@ -31,7 +31,7 @@ class Estimate:
     def in_words(self, name: str) -> str:
         """The value of the parameter `name` with its interval and unit."""
         low, high = self.interval90
-        return f"{name} = {self.value:.4g} [{low:.4g}, {high:.4g}] {self.unit}"
+        return f"{name} = {self.value:.4g} [{low:.4g}, {high:.4g}] {self.unit}".removesuffix(" 1")
 
     @property
     def unusual(self) -> bool:
