@@ -136,6 +136,7 @@ def test_an_mjcf_of_ones_own_goes_where_its_vehicle_file_goes(tmp_path):
     [
         ("[vehicle]\nairframe = 'none.xml'", "it must be crazyflie, brushless, or"),
         ("[vehicle]\nairframe = '../none.xml'", "name of an MJCF file beside it"),
+        ("[vehicle]\nairframe = ''", "it must be crazyflie, brushless, or"),
         ("[vehicle]\nairframe = ['brushless']", "expected text"),
         ("[vehicle]\nmas = 0.03", "vehicle has the unknown key 'mas'; did you mean mass"),
         ("[vehicles.1]\ninertia = 1", "unknown key 'inertia'"),

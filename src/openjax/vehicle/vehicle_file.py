@@ -200,10 +200,9 @@ def _usual_name(airframe):
 
 def _own_mjcf(name, path):
     """The MJCF file that `[vehicle] airframe` of the file at `path` names; None for one of `AIRFRAMES`."""
-    if isinstance(name, str) and name in AIRFRAMES:
+    if name in AIRFRAMES:
         return None
-    plain = isinstance(name, str) and Path(name).name == name
-    if not plain or not path.with_name(name).is_file():
+    if not name or Path(name).name != name or not path.with_name(name).is_file():
         raise UserError(
             f"{path}: [vehicle] airframe is {name!r}; it must be {', '.join(AIRFRAMES)}, or the name of an MJCF file beside it"
         )
