@@ -399,18 +399,18 @@ def keep_best(
     # where the validation, too, was compiled for
     before = place(fill(abstract, before, str(directory.policy)))
     length = settings.environment.episode_length
-    looks, history, best, kept = [{"update": 0, **validate(before)}], [], before, 0
+    looks, history, kept = [{"update": 0, **validate(before)}], [], 0
     scores = [selection_score(looks[0], length)]
     for after, parts in learn(before, jax.random.key(settings.seed)):
         history += parts
         looks.append({"update": len(history), **validate(after)})
         scores.append(selection_score(looks[-1], length))
         if scores[-1] > scores[kept]:
-            best, kept = after, len(looks) - 1
+            kept = len(looks) - 1
+            better = {"validation_score": scores[kept], "analytic_updates": len(history)}
+            # at once: a stage that is ended early leaves the best of what it was
+            save_policy_file(directory.policy, after, settings, {**notes, **better}, storage="float32")
     seconds, updates = round(time.monotonic() - began, 1), looks[kept]["update"]
-    if kept:
-        notes = {**notes, "validation_score": scores[kept], "analytic_updates": updates}
-        save_policy_file(directory.policy, best, settings, notes, storage="float32")
     facts = {"seconds": seconds, "kept": updates, "validation_scores": scores}
     write_json(directory.path / "analytic.json", {**facts, "validation": looks, "history": history})
     told = f"{scores[0]:.4f} -> {scores[kept]:.4f} after {updates} of {len(history)} updates"
