@@ -148,11 +148,7 @@ class Body:
         if self.gyroscopes:  # what speeds a rotor up turns the body; spinning rotors resist being tilted
             spun = (spinning * self.rotor).sum(0)
             torque = torque + np.stack(
-                [
-                    self.rates[1] * spun,
-                    -self.rates[0] * spun,
-                    (spinning * (self.rotor - before)).sum(0) / DT,
-                ]
+                [self.rates[1] * spun, -self.rates[0] * spun, (spinning * (self.rotor - before)).sum(0) / DT]
             )
         specific = force / p["mass"]
         accel = vehicle.rotate(self.q, specific)
@@ -314,14 +310,7 @@ def fly(batch):
     half = 0.5 * reference["yaw"][0]
     q = np.stack([np.cos(half), np.zeros(count), np.zeros(count), np.sin(half)])
     flight = Flight(
-        batch.told,
-        p,
-        batch.air,
-        batch.arrival,
-        reference["position"][0],
-        q,
-        [batch.partner],
-        batch.unknowns,
+        batch.told, p, batch.air, batch.arrival, reference["position"][0], q, [batch.partner], batch.unknowns
     )
     body, samples = flight.body, PER_TICK * ticks
     out = {name: np.zeros((samples, size, count), np.float32) for name, size in KEPT.items()}

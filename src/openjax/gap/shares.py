@@ -53,6 +53,15 @@ class Gap:
     reduction: float
     interval90: tuple[float, float]
 
+    def in_words(self) -> str:
+        """How far the gap shrinks, and a warning where it doesn't."""
+        low, high = (100 * v for v in self.interval90)
+        careful = " Careful: with these effects the held-out predictions got worse." * (self.reduction < 0)
+        return (
+            f"Gap on held-out flights: {self.before:.2f} before, {self.after:.2f} after, floor {self.floor:.2f}: "
+            f"{100 * self.reduction:.0f} % smaller [{low:.0f}, {high:.0f}].{careful}"
+        )
+
 
 @dataclass(frozen=True)
 class Split:
@@ -90,11 +99,7 @@ def split(evidence: Evidence, selection: Selection, predicted: np.ndarray, named
     first = np.argmax(values[1:][:, rows], 1)
     largest = {names[k]: float(np.mean(first == place)) for place, k in enumerate(rows)}
     return Split(
-        _gap(before),
-        {e: shares[e] for e in named},
-        shares["sensors"],
-        shares["unexplained"],
-        largest,
+        _gap(before), {e: shares[e] for e in named}, shares["sensors"], shares["unexplained"], largest
     )
 
 

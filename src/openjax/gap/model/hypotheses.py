@@ -6,6 +6,7 @@ approximation), so that parameters cost what they are worth. Singles and the bes
 the other pairs are weighed by adding the linearised singles."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -21,16 +22,30 @@ UNEXPOSED = 0.5  # nats that a typical effect would leave: below, the effect isn
 @dataclass(frozen=True, eq=False)
 class SetFit:
     """A fitted set of effects. `replay`: with nuisances as they are there; `grams` (F, 1 + p, 1 + p) of residual and derivatives
-    at the optimum, by flight; `score` the log marginal likelihood; `index` (p,) places in `theta` (P,)."""
+    at the optimum, by flight, and their `columns`; `index` (p,) places in `theta` (P,); `precision` (p, p) of the prior."""
 
     replay: Replay
     effects: tuple[str, ...]
     theta: np.ndarray
     index: np.ndarray
-    grams: np.ndarray
+    precision: np.ndarray
     columns: list
-    covariance: np.ndarray
-    score: float
+    grams: np.ndarray
+    objective: float
+
+    @property
+    def hessian(self) -> np.ndarray:
+        return self.grams.sum(0)[1:, 1:] + self.precision
+
+    @cached_property
+    def covariance(self) -> np.ndarray:
+        return np.linalg.inv(self.hessian)
+
+    @cached_property
+    def score(self) -> float:
+        """The log marginal likelihood."""
+        volume = np.linalg.slogdet(self.hessian)[1] - np.linalg.slogdet(self.precision)[1]
+        return float(-self.objective - 0.5 * volume)
 
     def parameters(self) -> dict[str, dict[str, tuple[float, float]]]:
         """{effect: {parameter: (value, standard deviation)}} of the set's own effects."""
@@ -48,66 +63,45 @@ def fit_set(
     """Gauss-Newton from `start` (P,), by default the effects' first starts. After each of so many `rounds` nuisances of the
     vehicle's numbers, which depend on what acts, are worked out anew."""
     effects = tuple(effects)
-    index, mean, precision = prior(effects)
     theta = ABSENT.copy()  # what isn't in the set is absent
     for effect in effects:
         own = places((effect,))
         theta[own] = start_of(effect) if start is None else start[own]
-    point = _point(replay, theta, index, mean, precision)
+    fit = _at(replay, effects, theta)
     for _ in range(rounds if effects else 0):
-        before, point = point, _around(_descend(point, mean, precision, iterations), mean, precision)
-        if np.allclose(before.theta, point.theta, rtol=1e-3, atol=0.0):
+        before, fit = fit, _descend(fit, iterations)
+        fit = _at(fit.replay.around(fit.theta), effects, fit.theta, fit.columns)
+        if np.allclose(before.theta, fit.theta, rtol=1e-3, atol=0.0):
             break
-    hessian = point.grams.sum(0)[1:, 1:] + precision
-    covariance = np.linalg.inv(hessian) if effects else np.zeros((0, 0))
-    volume = np.linalg.slogdet(hessian)[1] - np.linalg.slogdet(precision)[1] if effects else 0.0
-    score = float(-point.objective - 0.5 * volume)
-    return SetFit(point.replay, effects, point.theta, index, point.grams, point.columns, covariance, score)
+    return fit
 
 
-@dataclass(frozen=True, eq=False)
-class _Point:
-    """A set's parameters with what the data say around them."""
-
-    replay: Replay
-    theta: np.ndarray
-    index: np.ndarray
-    columns: list
-    grams: np.ndarray
-    objective: float
-
-
-def _point(replay: Replay, theta, index, mean, precision, columns=None) -> _Point:
+def _at(replay: Replay, effects, theta: np.ndarray, columns=None) -> SetFit:
+    """The set with these parameters (P,), linearised there."""
+    index, mean, precision = prior(effects)
     columns = replay.linearised(theta, index) if columns is None else columns
     grams, off = replay.grams(columns), theta[index] - mean
     objective = 0.5 * float(grams[:, 0, 0].sum() + off @ precision @ off)
-    return _Point(replay, theta, index, columns, grams, objective)
+    return SetFit(replay, effects, theta, index, precision, columns, grams, objective)
 
 
-def _around(point: _Point, mean, precision) -> _Point:
-    """The same with nuisances as they are there."""
-    replay = point.replay.around(point.theta)
-    return _point(replay, point.theta, point.index, mean, precision, point.columns)
-
-
-def _descend(point: _Point, mean, precision, iterations: int) -> _Point:
+def _descend(fit: SetFit, iterations: int) -> SetFit:
     """Steps of Gauss and Newton, half of one that overshoots, while they gain anything."""
-    reach = 3.0 * np.sqrt(np.diag(np.linalg.inv(precision)))
-    share = 1.0
+    index, mean, precision = prior(fit.effects)
+    reach, share = 3.0 * np.sqrt(np.diag(np.linalg.inv(precision))), 1.0
     for _ in range(iterations):
-        gram, off = point.grams.sum(0), point.theta[point.index] - mean
-        push = gram[1:, 0] - precision @ off
-        step = np.linalg.solve(gram[1:, 1:] + precision, push)
+        push = fit.grams.sum(0)[1:, 0] - precision @ (fit.theta[index] - mean)
+        step = np.linalg.solve(fit.hessian, push)
         if 0.5 * push @ step < SMALL_STEP:
             break
-        theta = point.theta.copy()
-        theta[point.index] += share * np.clip(step, -reach, reach)
-        ahead = _point(point.replay, theta, point.index, mean, precision)
-        gain = point.objective - ahead.objective
-        point, share = (ahead, 1.0) if gain > 0.0 else (point, 0.5 * share)
+        theta = fit.theta.copy()
+        theta[index] += share * np.clip(step, -reach, reach)
+        ahead = _at(fit.replay, fit.effects, theta)
+        gain = fit.objective - ahead.objective
+        fit, share = (ahead, 1.0) if gain > 0.0 else (fit, 0.5 * share)
         if 0.0 < gain < SMALL_STEP:
             break
-    return point
+    return fit
 
 
 def model_noise(replay: Replay, library: Library) -> tuple[Replay, dict[str, float]]:

@@ -29,9 +29,10 @@ class Estimate:
     usual: tuple[float, float]
 
     def in_words(self, name: str) -> str:
-        """The value of the parameter `name` with its interval and unit."""
+        """The value of the parameter `name` with its interval and unit, and whether it is unusual."""
         low, high = self.interval90
-        return f"{name} = {self.value:.4g} [{low:.4g}, {high:.4g}] {self.unit}".removesuffix(" 1")
+        value = f"{name} = {self.value:.4g} [{low:.4g}, {high:.4g}] {self.unit}".removesuffix(" 1")
+        return value + " (unusual)" * self.unusual
 
     @property
     def unusual(self) -> bool:
@@ -106,37 +107,29 @@ class Report:
 
     def in_words(self) -> list[str]:
         """The shares, then what they mean, in a few plain sentences."""
-        lines = [f"Left out: {text}." for text in self.left_out]
-        lines += [self.shares_in_words()] if self.effects or self.sensors else []
-        if not self.parameters:
-            chance = self.probabilities.get(self.verdict)
-            lines.append(
-                VERDICTS[self.verdict] + (f" Probability {chance:.2f}." if chance is not None else "")
-            )
-        lines += [f"Sensors: {text}." for text in self.sensors]
-        lines += [self.rest] if self.rest else []
-        lines += [f"Where: {in_words(self.where)}."] if self.effects else []
-        for effect, values in self.parameters.items():
-            shown = ", ".join(v.in_words(p) + (" (unusual)" if v.unusual else "") for p, v in values.items())
-            lines.append(f"{effect}: {shown}.")
-        for name, others in self.equivalent.items():
-            lines.append(f"These flights can't tell {name} from {', '.join(others)}.")
-        if self.parameters:
-            low, high = self.gap.interval90
-            lines.append(
-                f"Gap on held-out flights: {self.gap.before:.2f} before, {self.gap.after:.2f} after, floor "
-                f"{self.gap.floor:.2f}: {100 * self.gap.reduction:.0f} % smaller "
-                f"[{100 * low:.0f}, {100 * high:.0f}]."
-            )
-            if self.gap.reduction < 0:
-                lines.append("Careful: with these effects the held-out predictions got worse.")
-        if self.runner_up:
-            lines.append(f"Runner-up: {self.runner_up}.")
-        if self.not_testable:
-            lines.append(f"Not testable with these flights: {', '.join(self.not_testable)}.")
-        if self.next_flight:
-            lines.append(f"Fly next: {self.next_flight}")
-        return lines
+        sure = self.probabilities.get(self.verdict)
+        verdict = VERDICTS.get(self.verdict, "") + (f" Probability {sure:.2f}." if sure is not None else "")
+        lines = [
+            *(f"Left out: {text}." for text in self.left_out),
+            self.shares_in_words() if self.effects or self.sensors else "",
+            verdict if not self.parameters else "",
+            *(f"Sensors: {text}." for text in self.sensors),
+            self.rest,
+            f"Where: {in_words(self.where)}." if self.effects else "",
+            *(
+                f"{e}: {', '.join(v.in_words(p) for p, v in of.items())}."
+                for e, of in self.parameters.items()
+            ),
+            *(
+                f"These flights can't tell {e} from {', '.join(others)}."
+                for e, others in self.equivalent.items()
+            ),
+            self.gap.in_words() if self.parameters else "",
+            f"Runner-up: {self.runner_up}." if self.runner_up else "",
+            f"Not testable with these flights: {', '.join(self.not_testable)}." if self.not_testable else "",
+            f"Fly next: {self.next_flight}" if self.next_flight else "",
+        ]
+        return [line for line in lines if line]
 
 
 def _plain(value):
