@@ -36,24 +36,7 @@ def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> 
         raise UserError(f"{path}: no vehicle.toml; an empty one there means the nominal Crazyflie")
     vehicle_file = load_vehicle_file(path / "vehicle.toml" if described else None, dtype)
     mapping = load_mapping(path / MAPPING_FILE) if (path / MAPPING_FILE).exists() else None
-    flights, issues = [], []
-    for log in logs:
-        read, found = _read(log, vehicle_file, mapping)
-        flights += read
-        issues += found
-    copies = duplicates(flights)
-    for name, original in copies.items():
-        issues.append(
-            Issue(name, f"the same values as {original}: a copy, left out", refused=True, kind="duplicate")
-        )
-    flights = [f for f in flights if f.log not in copies]
-    kept = []
-    for flight in flights:
-        checked, found = _check(flight, vehicle_file, comparison)
-        issues += found
-        kept += [] if checked is None else [checked]
-    kept, found = _trusted(kept, issues, vehicle_file)
-    issues += found
+    kept, issues = _usable([_read(log, vehicle_file, mapping) for log in logs], vehicle_file, comparison)
     if not kept:
         reasons = [i for i in issues if i.refused]
         first = f"{reasons[0].flight}: {reasons[0].issue}" if reasons else "no vehicle in any log"
@@ -63,6 +46,19 @@ def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> 
     weighed = all(vehicle_file.mass_weighed_of(flight.vehicle) for flight in kept)
     vehicle_file = dataclasses.replace(vehicle_file, mass_weighed=weighed)
     return Case(path.resolve().name, tuple(kept), vehicle_file, tuple(issues), path)
+
+
+def _usable(read, vehicle_file: VehicleFile, comparison: bool) -> tuple[list[Flight], list[Issue]]:
+    """Of what was `read` of all logs the flights that can be used, checked and mended, and what was found."""
+    flights, issues = ([entry for log in read for entry in log[k]] for k in (0, 1))
+    copies = duplicates(flights)
+    for name, original in copies.items():
+        text = f"the same values as {original}: a copy, left out"
+        issues.append(Issue(name, text, refused=True, kind="duplicate"))
+    checked = [_check(f, vehicle_file, comparison) for f in flights if f.log not in copies]
+    issues += [issue for _, found in checked for issue in found]
+    kept, found = _trusted([f for f, _ in checked if f is not None], issues, vehicle_file)
+    return kept, issues + found
 
 
 def _trusted(

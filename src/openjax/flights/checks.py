@@ -89,32 +89,16 @@ def _in_time(flight: Flight, note) -> Flight:
         time = flight.time
     if len(time) < 20:
         raise _Refused("short", f"only {len(time)} rows")
-    steps = np.diff(time)
-    backwards = int((steps < 0).sum())
-    if backwards:
-        if (steps < -1.0).any() or backwards > 0.05 * len(time):
-            at = time[int(np.argmin(steps))]
-            raise _Refused(
-                "time", f"time runs backwards (after t = {at:g}): unsorted, or several recordings in one file"
-            )
-        note("time", f"{backwards} rows out of order in time were sorted")
-        flight = flight.rows(np.argsort(time, kind="stable"))
+    flight = _sorted(flight, note)
     repeated = np.diff(flight.time) == 0
     if repeated.mean() > 0.2:
-        raise _Refused(
-            "time", f"{repeated.mean():.0%} of the rows repeat the time of the row before (frozen clock)"
-        )
+        text = f"{repeated.mean():.0%} of the rows repeat the time of the row before (frozen clock)"
+        raise _Refused("time", text)
     if repeated.any():
         note("time", f"{repeated.sum()} rows repeat the time of the row before and are left out")
         flight = flight.rows(np.r_[True, ~repeated])
     step = flight.row_period
-    if step > SLOWEST:
-        for unit, factor in (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)):
-            if 5e-4 <= step / factor <= SLOWEST:
-                raise _Refused("units", f"t is in {unit} (rows {step:g} apart); the log format wants seconds")
-        raise _Refused("time", f"rows are {step:g} s apart; at least 20 rows per second are needed")
-    if step < 2e-4:
-        raise _Refused("units", f"rows are {step:g} s apart: t is not in seconds, or the clock is corrupt")
+    _refuse_units(step)
     steps = np.diff(flight.time)
     gaps = np.flatnonzero(steps > max(5 * step, 0.05))
     if len(gaps):
@@ -124,45 +108,75 @@ def _in_time(flight: Flight, note) -> Flight:
     return flight
 
 
+def _sorted(flight: Flight, note) -> Flight:
+    """A few rows out of order are sorted; more are several recordings."""
+    steps = np.diff(flight.time)
+    backwards = int((steps < 0).sum())
+    if not backwards:
+        return flight
+    if (steps < -1.0).any() or backwards > 0.05 * len(flight.time):
+        at = flight.time[int(np.argmin(steps))]
+        text = f"time runs backwards (after t = {at:g}): unsorted, or several recordings in one file"
+        raise _Refused("time", text)
+    note("time", f"{backwards} rows out of order in time were sorted")
+    return flight.rows(np.argsort(flight.time, kind="stable"))
+
+
+def _refuse_units(step: float) -> None:
+    """Refuse rows that are too far apart or too close, in seconds."""
+    if step > SLOWEST:
+        for unit, factor in (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)):
+            if 5e-4 <= step / factor <= SLOWEST:
+                raise _Refused("units", f"t is in {unit} (rows {step:g} apart); the log format wants seconds")
+        raise _Refused("time", f"rows are {step:g} s apart; at least 20 rows per second are needed")
+    if step < 2e-4:
+        raise _Refused("units", f"rows are {step:g} s apart: t is not in seconds, or the clock is corrupt")
+
+
 def _clean(flight: Flight, note) -> Flight:
     """Constant columns refuse or drop their channel; frozen stretches become not sampled; holes are named."""
     changes = {}
-    for channel in CHANNELS:
-        values = getattr(flight, channel)
-        if values is None:
-            continue
-        columns, table = CHANNEL_COLUMNS[channel], values.reshape(len(values), -1)
-        rows = np.flatnonzero(np.isfinite(table).all(1))
+    for channel in (c for c in CHANNELS if getattr(flight, c) is not None):
+        values, names = getattr(flight, channel), ", ".join(CHANNEL_COLUMNS[channel])
+        rows = np.flatnonzero(np.isfinite(values.reshape(len(values), -1)).all(1))
         if len(rows) < 2:
-            raise _Refused("corrupt", f"{', '.join(columns)}: hardly any row holds a number")
+            raise _Refused("corrupt", f"{names}: hardly any row holds a number")
         if channel in SENSORS or channel == "motor_command":
-            changed = np.diff(table[rows], axis=0) != 0
-            together = channel in ("position", "quaternion", "velocity")
-            dead = [] if together and changed.any() else np.flatnonzero(~changed.any(0))
-            if len(dead):
-                names = ", ".join(columns[i] for i in dead)
-                raise _Refused("corrupt", f"{names}: the same value {table[rows[0], dead[0]]:g} in every row")
-            frozen = _frozen(table, rows, flight.time, together)
+            frozen = _standing_still(flight, channel, rows, note)
             if frozen.any():
-                share, start = frozen.mean(), flight.time[np.argmax(frozen)]
-                length = share * flight.duration
-                words = f"{', '.join(columns)} stand still for {length:.1f} s from t = {start:.2f}"
-                if share > 0.5:
-                    raise _Refused("corrupt", f"{words}: frozen for {share:.0%} of the flight")
-                note("corrupt", f"{words}; taken as not sampled there")
                 changes[channel] = _unsampled(values, frozen)
                 rows = rows[~frozen[rows]]
         if channel != "battery_voltage" and len(rows) > 1:
-            at = flight.time[rows]
-            steps = np.diff(at)
-            hole = int(np.argmax(steps))
-            missing = rows[hole + 1] - rows[hole] > 1  # else it is a gap in time, named already
-            if missing and steps[hole] > max(0.2, 10 * np.median(steps)):
-                note(
-                    "gaps",
-                    f"{', '.join(columns)}: not sampled for {steps[hole]:.2f} s after t = {at[hole]:.2f}",
-                )
+            _name_hole(flight.time, rows, names, note)
     return dataclasses.replace(flight, **changes) if changes else flight
+
+
+def _standing_still(flight: Flight, channel: str, rows, note) -> np.ndarray:
+    """(T,) rows in which a sensor is frozen; of columns that never change nothing can be used."""
+    columns, values = CHANNEL_COLUMNS[channel], getattr(flight, channel)
+    table = values.reshape(len(values), -1)
+    changed = np.diff(table[rows], axis=0) != 0
+    together = channel in ("position", "quaternion", "velocity")
+    dead = [] if together and changed.any() else np.flatnonzero(~changed.any(0))
+    if len(dead):
+        names = ", ".join(columns[i] for i in dead)
+        raise _Refused("corrupt", f"{names}: the same value {table[rows[0], dead[0]]:g} in every row")
+    frozen = _frozen(table, rows, flight.time, together)
+    if frozen.any():
+        share, start = frozen.mean(), flight.time[np.argmax(frozen)]
+        words = f"{', '.join(columns)} stand still for {share * flight.duration:.1f} s from t = {start:.2f}"
+        if share > 0.5:
+            raise _Refused("corrupt", f"{words}: frozen for {share:.0%} of the flight")
+        note("corrupt", f"{words}; taken as not sampled there")
+    return frozen
+
+
+def _name_hole(time, rows, names: str, note) -> None:
+    """Say where the longest stretch without samples is, if rows are there meanwhile: else it is a gap in time, named already."""
+    steps = np.diff(time[rows])
+    hole = int(np.argmax(steps))
+    if rows[hole + 1] - rows[hole] > 1 and steps[hole] > max(0.2, 10 * np.median(steps)):
+        note("gaps", f"{names}: not sampled for {steps[hole]:.2f} s after t = {time[rows][hole]:.2f}")
 
 
 def _without_repeats(flight: Flight, note) -> Flight:
@@ -256,6 +270,24 @@ def _frozen(table: np.ndarray, rows: np.ndarray, time: np.ndarray, together: boo
     return frozen
 
 
+def _of_unit_length(quaternion: np.ndarray, note) -> np.ndarray:
+    """Quaternions (T, 4) normalised, without flips; those far from unit length are not sampled."""
+    norm = np.linalg.norm(quaternion, axis=1)
+    off = np.abs(norm - 1.0)
+    if np.nanmedian(off) > 0.05:
+        text = f"quaternions aren't unit (norm {np.nanmedian(norm):.3g}): wrong columns or corrupt"
+        raise _Refused("quaternion", text)
+    unit, bad = quaternion / norm[:, None], off > 0.05
+    if bad.any():
+        note("quaternion", f"{bad.sum()} quaternions far from unit length are taken as not sampled")
+        unit[bad] = np.nan
+    elif np.nanmax(off) > 2e-3:
+        note(
+            "quaternion", f"quaternions were off unit length by up to {np.nanmax(off):.1g} and are normalised"
+        )
+    return _without_flips(unit)
+
+
 def _in_range(flight: Flight, note) -> Flight:
     """Values that no flight of such a vehicle has: units and corrupt columns that show by their size
     alone."""
@@ -266,21 +298,7 @@ def _in_range(flight: Flight, note) -> Flight:
     if flight.command_thrust is not None:
         _share_of_one(flight.command_thrust, "cmd_thrust")
     if flight.quaternion is not None:
-        norm = np.linalg.norm(flight.quaternion, axis=1)
-        off = np.nanmax(np.abs(norm - 1.0))
-        if np.nanmedian(np.abs(norm - 1.0)) > 0.05:
-            raise _Refused(
-                "quaternion",
-                f"quaternions aren't unit (norm {np.nanmedian(norm):.3g}): wrong columns or corrupt",
-            )
-        unit = flight.quaternion / norm[:, None]
-        bad = np.abs(norm - 1.0) > 0.05
-        if bad.any():
-            note("quaternion", f"{bad.sum()} quaternions far from unit length are taken as not sampled")
-            unit[bad] = np.nan
-        elif off > 2e-3:
-            note("quaternion", f"quaternions were off unit length by up to {off:.1g} and are normalised")
-        changes["quaternion"] = _without_flips(unit)
+        changes["quaternion"] = _of_unit_length(flight.quaternion, note)
     if flight.position is not None and np.nanmax(np.abs(flight.position)) > 100.0:
         span = np.nanmax(np.ptp(flight.position[np.isfinite(flight.position).all(1)], axis=0))
         if span > 20.0:

@@ -97,25 +97,9 @@ def flights_of(
     nominal order; and remarks on columns that couldn't be used. Raises LogError without time."""
     if "t" not in table.columns:
         raise LogError(f"no column t; the log has {', '.join(table.columns)}: name it in columns.toml")
-    channels, remarks = {}, list(table.remarks)
-    for channel, names in CHANNEL_COLUMNS.items():
-        found = [n for n in names if n in table.columns]
-        if len(found) == len(names):
-            values = np.stack([table.columns[n] for n in names], 1)
-            absurd = np.abs(values) > LARGEST_VALUE
-            if absurd.any():
-                remarks.append(
-                    f"{', '.join(names)}: {absurd.sum()} values beyond 1e6 are taken as not sampled"
-                )
-                values = np.where(absurd, np.nan, values)
-            if np.isnan(values).all():
-                continue
-            channels[channel] = values[:, 0] if len(names) == 1 else values
-        elif found:
-            missing = ", ".join(n for n in names if n not in table.columns)
-            if channel in WHOLE:
-                raise LogError(f"{', '.join(found)} without {missing}: log {missing}, or none of them")
-            remarks.append(f"{', '.join(found)} without {missing}: {channel} is left out; log {missing}")
+    remarks = list(table.remarks)
+    read = {c: _channel(table, c, names, remarks) for c, names in CHANNEL_COLUMNS.items()}
+    channels = {c: v for c, v in read.items() if v is not None}
     if "motor_command" in channels:
         channels["motor_command"] = channels["motor_command"][:, list(motor_permutation)]
     fingerprint = _fingerprint(channels)
@@ -129,6 +113,26 @@ def flights_of(
             Flight(name, table.name, vehicle_id, table.columns["t"][rows], fingerprint=fingerprint, **own)
         )
     return flights, remarks
+
+
+def _channel(table: LogTable, channel: str, names, remarks: list[str]) -> np.ndarray | None:
+    """(T,) or (T, columns) of one channel; None where it wasn't logged."""
+    found = [n for n in names if n in table.columns]
+    if len(found) < len(names):
+        missing = ", ".join(n for n in names if n not in table.columns)
+        if found and channel in WHOLE:
+            raise LogError(f"{', '.join(found)} without {missing}: log {missing}, or none of them")
+        if found:
+            remarks.append(f"{', '.join(found)} without {missing}: {channel} is left out; log {missing}")
+        return None
+    values = np.stack([table.columns[n] for n in names], 1)
+    absurd = np.abs(values) > LARGEST_VALUE
+    if absurd.any():
+        remarks.append(f"{', '.join(names)}: {absurd.sum()} values beyond 1e6 are taken as not sampled")
+        values = np.where(absurd, np.nan, values)
+    if np.isnan(values).all():
+        return None
+    return values[:, 0] if len(names) == 1 else values
 
 
 def write_csv(path: str | Path, table: LogTable, decimals: dict[str, int] | None = None) -> None:

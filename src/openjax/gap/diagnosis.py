@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from openjax.gap.intervals import estimates
 from openjax.gap.model.bounds import BOUND
 from openjax.gap.model.library import CARDS, library, path_of
 from openjax.gap.probabilities import probabilities
-from openjax.gap.report import Report
+from openjax.gap.report import VERDICTS, Report
 from openjax.gap.residual import Check, check_residual
 from openjax.gap.selection import DETECTABLE, Selection, select
 from openjax.gap.shares import Split, split
@@ -37,33 +37,18 @@ def conclude(evidence: Evidence) -> Report:
     named = [e for e, p in acting.items() if p >= 0.5]
     check = check_residual(evidence, selection.fit)
     parts = split(evidence, selection, check.predicted, named)
-    found = words(evidence, check, parts, not_testable(evidence))
     present = {e: acting[e] for e in named}
     chances = probabilities(present, parts.largest, check.probability, selection.weights)
-    return _report(evidence, selection, check, parts, found, chances)
+    return _report(evidence, selection, check, parts, chances)
 
 
-@dataclass(frozen=True)
-class Words:
-    """`verdict`: "effect" or one of report.VERDICTS; `effects` by share, "unknown" among them where what is left isn't noise."""
-
-    verdict: str
-    effects: tuple[str, ...]
-    missing: list[str]
-
-
-def words(evidence: Evidence, check: Check, parts: Split, missing: list[str]) -> Words:
-    """What is said first: the effects by their shares, and whether anything unknown acts."""
+def words(check: Check, parts: Split) -> tuple[str, ...]:
+    """The effects by share, and "unknown" among them where what is left isn't noise."""
     effects = sorted(parts.effects, key=lambda e: -parts.effects[e].value)
     if check.rejects:
         larger = sum(parts.effects[e].value > parts.unexplained.value for e in effects)
         effects.insert(larger, "unknown")
-    if effects:
-        verdict = "unknown" if effects[0] == "unknown" else "effect"
-    else:
-        hidden = len(missing) >= len(evidence.library.effects) // 2
-        verdict = "not_testable" if hidden else "none"
-    return Words(verdict, tuple(effects), missing)
+    return tuple(effects)
 
 
 def not_testable(evidence: Evidence) -> list[str]:
@@ -77,28 +62,26 @@ def not_testable(evidence: Evidence) -> list[str]:
     return missing + [e for c in evidence.channels for e in c.undetectable()]
 
 
-def _report(
-    evidence: Evidence, selection: Selection, check: Check, parts: Split, found: Words, chances
-) -> Report:
-    named = [e for e in found.effects if e != "unknown"]
+def _report(evidence: Evidence, selection: Selection, check: Check, parts: Split, chances) -> Report:
+    effects, missing = words(check, parts), not_testable(evidence)
+    hidden = len(missing) >= len(evidence.library.effects) // 2
+    first = effects or ("not_testable" if hidden else "none",)
+    named = [e for e in effects if e != "unknown"]
     equivalent = {e: selection.equivalent[e] for e in named if e in selection.equivalent}
     ranked = sorted(chances, key=lambda e: -chances[e])
-    first = found.effects or ("none",)
-    second = next((e for e in ranked if e not in first), "")
-    splitter = next(
-        (o for e in named for o in equivalent.get(e, ())), found.missing[0] if found.missing else second
-    )
+    second = next((e for e in ranked if e not in (effects or ("none",))), "")
+    splitter = next((o for e in named for o in equivalent.get(e, ())), missing[0] if missing else second)
     return Report(
         case=evidence.case.name,
-        verdict=found.verdict,
-        effects=found.effects,
+        verdict=first[0] if first[0] in VERDICTS else "effect",
+        effects=effects,
         probabilities=chances,
         shares=parts,
         equivalent=equivalent,
         parameters=estimates(evidence, selection.fit, named),
         where=locate(evidence, selection.fit, named),
         gap=parts.gap,
-        not_testable=found.missing,
+        not_testable=missing,
         next_flight=CARDS[splitter].next_flight if splitter in CARDS else "",
         quality=[
             {"flight": i.flight, "issue": i.issue, "left_out": i.refused} for i in evidence.case.quality
