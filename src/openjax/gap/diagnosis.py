@@ -12,7 +12,7 @@ from openjax.gap.intervals import estimates
 from openjax.gap.model.bounds import BOUND
 from openjax.gap.model.library import CARDS, library, path_of
 from openjax.gap.probabilities import probabilities
-from openjax.gap.report import VERDICTS, Report
+from openjax.gap.report import Report
 from openjax.gap.residual import Check, check_residual
 from openjax.gap.selection import DETECTABLE, Selection, select
 from openjax.gap.shares import Split, split
@@ -64,8 +64,7 @@ def not_testable(evidence: Evidence) -> list[str]:
 
 def _report(evidence: Evidence, selection: Selection, check: Check, parts: Split, chances) -> Report:
     effects, missing = words(check, parts), not_testable(evidence)
-    hidden = len(missing) >= len(evidence.library.effects) // 2
-    first = effects or ("not_testable" if hidden else "none",)
+    nothing = "not_testable" if len(missing) >= len(evidence.library.effects) // 2 else "none"
     named = [e for e in effects if e != "unknown"]
     equivalent = {e: selection.equivalent[e] for e in named if e in selection.equivalent}
     ranked = sorted(chances, key=lambda e: -chances[e])
@@ -73,7 +72,7 @@ def _report(evidence: Evidence, selection: Selection, check: Check, parts: Split
     splitter = next((o for e in named for o in equivalent.get(e, ())), missing[0] if missing else second)
     return Report(
         case=evidence.case.name,
-        verdict=first[0] if first[0] in VERDICTS else "effect",
+        verdict=nothing if not effects else "unknown" if effects[0] == "unknown" else "effect",
         effects=effects,
         probabilities=chances,
         shares=parts,
