@@ -12,6 +12,7 @@ import math
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 from experiments.diagnosis import development, figures
@@ -47,12 +48,14 @@ def fly(column: str, count: int, options) -> str:
 
 def study(options) -> dict:
     """Fly, diagnose and judge all columns."""
-    wanted = dict(entry.split("=") for entry in options.columns)
+    begin, wanted = time.perf_counter(), dict(entry.split("=") for entry in options.columns)
     digests = {column: fly(column, int(count), options) for column, count in wanted.items()}
     out = options.work / "cases.jsonl"
     sets = [str(options.work / column) for column in wanted] + options.sets
     arguments = ["--sets", *sets, "--cores", str(options.cores), "--out", str(out)]
-    development.main(arguments + (["--seconds", str(options.seconds)] if options.seconds else []))
+    if options.seconds:
+        arguments += ["--seconds", str(options.seconds - (time.perf_counter() - begin))]
+    development.main(arguments)
     lines = [{k: v for k, v in line.items() if k not in LEFT_OUT} for line in development.read_lines([out])]
     columns = {
         name: {"figures": stored_figures([x for x in lines if x["set"] == name])}
@@ -98,7 +101,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--cores", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--note", default="", help="a sentence for the page")
-    parser.add_argument("--seconds", type=float, help="for the diagnoses; what is done by then counts")
+    parser.add_argument("--seconds", type=float, help="for flights and diagnoses; what is done by then counts")
     parser.add_argument(
         "--work", type=Path, default=Path("runs/exam"), help="logs and answers; not committed"
     )
