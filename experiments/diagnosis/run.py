@@ -101,7 +101,9 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--cores", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--note", default="", help="a sentence for the page")
-    parser.add_argument("--seconds", type=float, help="for flights and diagnoses; what is done by then counts")
+    parser.add_argument(
+        "--seconds", type=float, help="for flights and diagnoses; what is done by then counts"
+    )
     parser.add_argument(
         "--work", type=Path, default=Path("runs/exam"), help="logs and answers; not committed"
     )
