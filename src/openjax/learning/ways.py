@@ -13,6 +13,9 @@ from openjax.pursuit import PursuitSettings, Task
 
 CORNERS = 6
 """Of the polygon about each pillar."""
+ROOM = 0.03
+"""How much farther from a pillar than the safety distance a way keeps (m). Nearer, the shares of crashes and breaches that a
+first flight counts early cost more than a way through saves: pursuers then stand before it."""
 TOLL = 3.0
 """What a way through a pillar costs (m): more than any way round."""
 
@@ -29,7 +32,7 @@ class Ways:
 
 def ways_of(settings: PursuitSettings, task: Task) -> Ways:
     """All corners and the shortest ways between them."""
-    reach = settings.pillar_radius + settings.pillar_clearance
+    reach = _reach(settings)
     angle = 2.0 * np.pi * np.arange(CORNERS) / CORNERS
     # where edges touch the circle, and a thousandth beyond it
     around = 1.001 * reach / np.cos(np.pi / CORNERS) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
@@ -61,7 +64,7 @@ def way_length(
 def _straight(settings, task, start, end):
     """(...,) m, from (..., 2) to (..., 2), with the toll of each pillar that is nearer on the way than at both its ends."""
     along = end - start
-    square, reach = jnp.sum(along**2, axis=-1), settings.pillar_radius + settings.pillar_clearance
+    square, reach = jnp.sum(along**2, axis=-1), _reach(settings)
 
     def crosses(pillar, active):
         to_axis = pillar - start
@@ -71,3 +74,8 @@ def _straight(settings, task, start, end):
 
     crossed = map(crosses, task.pillar_position, task.pillar_active)
     return jnp.sqrt(square + 1e-12) + TOLL * sum(crossed, jnp.zeros(square.shape))
+
+
+def _reach(settings):
+    """How far from the axis of a pillar a way keeps (m)."""
+    return settings.pillar_radius + settings.pillar_clearance + ROOM
