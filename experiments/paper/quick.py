@@ -26,6 +26,8 @@ from openjax.pursuit import SCENARIOS, Pursuit
 from openjax.store.policies import LoadedPolicy, load_policy
 
 CORES = 2
+ROWS = ("row_20", "row_24", "row_27", "row_30", "row_32", "row_34", "row_36")
+"""Rows of pillars by the least distance of neighbours (cm), as the results name them."""
 
 
 def train(options: argparse.Namespace, seed: int, cores: list[int]) -> dict:
@@ -124,10 +126,16 @@ def page(results: dict) -> Page:
         **{f"`{name}`": _column("after", name) for name in SCENARIOS},
         "new tasks, `open`": _column("open", "validation"),
     }
+    rows = {f"from .{name[4:]} m": f"rows.{name}:.2f" for name in ROWS}
     return Page(
         "The quick preset: what two CPU cores learn",
         f"{results['preset']} Each cell: capture rate, seconds to the capture, crash rate. {results.get('note', '')}",
-        [Table(columns, results["runs"]), "\n".join(f"* {found}" for found in results.get("findings", ()))],
+        [
+            Table(columns, results["runs"]),
+            "Captures in rows of four pillars, by how far apart they stand:",
+            Table({"seed": "seed", **rows}, [run for run in results["runs"] if "rows" in run]),
+            "\n".join(f"* {found}" for found in results.get("findings", ())),
+        ],
     )
 
 
