@@ -55,3 +55,7 @@ def test_a_case_of_the_calibration_stands_out_as_often_as_it_should():
     p_values = np.array([conformal_p(case)[0] for case in calibration()])
     assert (p_values <= 0.05).mean() <= 0.06
     assert standing_out(calibration()[0])[0] < 20.0
+
+
+def test_a_log_with_nothing_to_hold_against_each_other_stands_out_nowhere():
+    assert conformal_p({}) == (1.0, "")

@@ -60,7 +60,7 @@ def check_residual(evidence: Evidence, fit: SetFit) -> Check:
     measured, excess = measure(evidence, residuals)
     p_value, name = conformal_p(measured)
     predicted = excess if p_value <= DECISION.unknown else np.zeros(6)
-    return Check(measured, HORIZONS[name][1], p_value, predicted)
+    return Check(measured, HORIZONS.get(name, (0.0, ""))[1], p_value, predicted)
 
 
 def residuals_of(fit: SetFit) -> list[np.ndarray]:
@@ -127,10 +127,10 @@ def conformal_p(measured: dict[str, float]) -> tuple[float, str]:
 
 def standing_out(measured: dict[str, float]) -> tuple[float, str]:
     """How far a case's measures stand out of the calibration's at most, in its upper standard deviations of their logarithm,
-    and by which one."""
+    and by which one; logs without anything to hold against each other stand out nowhere."""
     far = {n: (np.log(max(v, 1e-12)) - usual()[n][0]) / usual()[n][1] for n, v in measured.items()}
-    name = max(far, key=far.get)
-    return float(far[name]), name
+    name = max(far, key=far.get, default="")
+    return far.get(name, -np.inf), name
 
 
 @lru_cache(maxsize=1)
