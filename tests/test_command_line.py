@@ -1,5 +1,6 @@
 """`openjax`: every command has help that needs no JAX; mistyped names are mended; editors see the public functions."""
 
+import importlib.util
 import subprocess
 import sys
 
@@ -46,6 +47,14 @@ def test_every_command_is_told(capsys):
     assert main([]) == 0
     told = capsys.readouterr().out
     assert all(f"  {name} " in told for name in COMMANDS)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_is_a_module_of_the_package(command):
+    found = importlib.util.find_spec(f"openjax.{command}")
+    if found.submodule_search_locations:
+        found = importlib.util.find_spec(f"openjax.{command}.__main__")
+    assert found is not None
 
 
 def test_names_of_effects_without_their_code():

@@ -32,7 +32,7 @@ FLOORS = (
     "cluster",
     "store",
     "commands",
-    "diagnose evaluate train",
+    "adapt benchmark calibrate diagnose evaluate exploit fly sample_flights train view",
 )
 """Rooms from the ground up: each may import those below it."""
 TWICE = {
