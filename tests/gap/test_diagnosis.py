@@ -53,12 +53,19 @@ def _held(columns):
     return {n: v[rows] if n in pose else v for n, v in columns.items()}
 
 
+def _late(columns):
+    """The pose is 4 ms older than its row says."""
+    pose, t = ("x", "y", "z", "qw", "qx", "qy", "qz", "vx", "vy", "vz"), columns["t"]
+    return {n: np.interp(t - 0.004, t, v) if n in pose else v for n, v in columns.items()}
+
+
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory):
     root = tmp_path_factory.mktemp("cases")
     return {
         "none": _case(root / "none", {}),
         "drag": _case(root / "drag", {"rotor_drag": DRAG}),
+        "late": _case(root / "late", {"rotor_drag": {n: 3.0 * v for n, v in DRAG.items()}}, logged=_late),
         "mass": _case(root / "mass", {"mass": {"extra": 0.003}}),
         "weighed": _case(root / "weighed", {"thrust_scale": {"scale": -0.08}}, weighed=True),
         "held": _case(root / "held", {}, logged=_held),
@@ -68,6 +75,12 @@ def folders(tmp_path_factory):
 @pytest.fixture(scope="module")
 def reports(folders):
     return {name: diagnose_case(load_case(folder)) for name, folder in folders.items()}
+
+
+def test_what_has_no_share_worth_naming_is_not_named(reports):
+    """A pose that is late by more than clocks may be apart, beside a drag next to which that is nothing."""
+    assert reports["late"].effects == ("rotor_drag",)
+    assert sum(reports["late"].probabilities.values()) == pytest.approx(1.0)
 
 
 def test_a_known_cause_is_named_with_its_size(reports):

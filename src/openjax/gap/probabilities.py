@@ -1,31 +1,29 @@
 """How sure the words are: the probability of each cause to be the strongest.
 
 Two uncertainties, each with a number of its own: whether an effect acts (how often its set is chosen, `selection`), and which
-part is the largest (the shares' bootstrap). What remains goes to the sets that were chosen otherwise, to nothing and to the
-unknown."""
+part is the largest (the shares' bootstrap). What remains goes to sets chosen otherwise, to nothing and to the unknown."""
 
 from openjax.gap.decision import DECISION
 from openjax.vehicle.effects import EFFECTS
 
 
-def probabilities(
-    present: dict[str, float], largest: dict[str, float], unknown: float, weights
-) -> dict[str, float]:
+def probabilities(present, largest, unknown: float, weights, small=frozenset()) -> dict[str, float]:
     """{cause, "none", "unknown": probability of being the strongest}, whose sum is one.
 
     present: {named effect: probability that it acts}. largest: {effect or "unexplained": how often it is the largest part}.
-    unknown: probability that what is unexplained is real. weights: {effects: how often that set was chosen}."""
+    unknown: probability that what is unexplained is real. weights: {effects: how often that set was chosen}. small: effects of
+    no size."""
     chance = dict.fromkeys((*EFFECTS, "none", "unknown"), 0.0)
     sure = (1.0 - unknown) if present else 1.0
     for effect, p in present.items():
         chance[effect] = p * sure * largest.get(effect, 0.0)
     chance["unknown"] = unknown * (largest.get("unexplained", 0.0) if present else 1.0)
     left = 1.0 - sum(chance.values())
-    others = {effects: w for effects, w in weights.items() if not effects & set(present)}
     shared = {"none": 1e-3, **dict.fromkeys(present, 1e-3)}
-    for effects, w in others.items():
-        for effect in effects or ("none",):
-            shared[effect] = shared.get(effect, 0.0) + w / max(len(effects), 1)
+    for effects, w in weights.items():
+        if not effects & set(present):
+            others = effects - small or {"none"}
+            shared |= {e: shared.get(e, 0.0) + w / len(others) for e in others}
     total = sum(shared.values())
     for name, weight in shared.items():
         chance[name] += left * weight / total
@@ -33,8 +31,7 @@ def probabilities(
 
 
 def tempered(chance: dict[str, float], temperature: float) -> dict[str, float]:
-    """Probabilities as sure as they are right in cases with known answers: their logarithms over one temperature (Guo et al.
-    2017)."""
+    """Probabilities as sure as they are right in known cases: their logarithms over one temperature (Guo et al. 2017)."""
     flat = {name: max(p, 0.0) ** (1.0 / temperature) for name, p in chance.items()}
     total = sum(flat.values())
     return {name: p / total for name, p in flat.items()}

@@ -21,9 +21,8 @@ from openjax.gap.model.observer import GYRO_GAIN, TICKS, observe
 from openjax.gap.model.prediction import bucket, padded
 
 GAIN_STEP = 0.05
-PRIOR = np.array(
-    [0.4, 0.4, 0.4, 1.0, 1.0]
-)  # spreads of the gains, of P's delay and of the share of the derivative that is filtered
+# Spreads of the gains, of P's delay and of the share of the derivative that is filtered.
+PRIOR = np.array([0.4, 0.4, 0.4, 1.0, 1.0])
 FILTER = 30.0  # Hz of the low-pass of the derivative that the firmware of the Crazyflie may have
 # s by which motors may be off, where rows are the log's own and where they are means of its rows.
 ROW_DELAY = (0.0005, 0.0025)
