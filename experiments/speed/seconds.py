@@ -1,18 +1,21 @@
-"""Seconds to a policy that catches: `python -m experiments.speed.seconds --seeds 171 172 173 [--preset paper] [--options "..."]`.
+"""Seconds to the first update, and to a policy that catches: `python -m experiments.speed.seconds [--starts paper] [--seeds 1]`.
 
-Runs of `openjax train`, one after the other. The first seed's has nothing kept and goes to its end. Then each seed's finds
-compiled programs and traces, and is stopped once two validations are what is asked for. Then whole runs, while there is time.
-Writes experiments/results/seconds.json and .md after each run.
+Runs of `openjax train`, one after the other, none to its end. Each of `--starts`, a preset and its options in quotes, is run
+twice, until its first validation: first with nothing kept, then with compiled programs and traces kept. Then each of `--seeds`
+flies the first of them, all kept, until a validation is what is asked for. Results are written after each run; `--go_on` adds to
+those that are there, and finds what was kept in the same `--cache`.
 """
 
 import argparse
 import os
-import signal
+import re
+import shlex
+import shutil
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +27,8 @@ from openjax.show.metrics import METRICS_FILE, read_metrics
 
 CAPTURED, CRASHED = 0.99, 0.01
 """Rates of the uniform validation tasks that are asked for."""
-SURE = 2
-"""Validations after which a run is stopped that needn't go to its end."""
+LEAVES = 10.0
+"""Seconds that a run has to save what it has, when it is asked to end."""
 
 
 def good(validation: dict) -> bool:
@@ -33,100 +36,130 @@ def good(validation: dict) -> bool:
     return validation["capture_rate"] >= CAPTURED and validation["crash_rate"] <= CRASHED
 
 
-def fly(options: argparse.Namespace, scratch: Path, seed: int, whole: bool) -> dict:
-    """A run's curve; of a whole one the layouts' table, too."""
-    run = scratch / f"run_{len(list(scratch.iterdir()))}_seed_{seed}"
-    environment = {**os.environ, "XDG_CACHE_HOME": str(scratch / "cache")}
+class Runner:
+    """Flies runs, until there is no time left."""
+
+    def __init__(self, options: argparse.Namespace):
+        self.cache, self.longest = options.cache, options.longest
+        self.ends = time.monotonic() + options.limit
+
+    def all(self, starts: list[str], seeds: list[int]) -> Iterator[dict]:
+        """The runs that are still to be had, the most telling first."""
+        first = seeds or [0]
+        for start in starts:
+            times = 1 if seeds and start == starts[0] else 2
+            for _ in range(times):
+                yield from self.fly(start, first[0], lambda validation: True)
+        for seed in seeds:
+            yield from self.fly(starts[0], seed, good)
+
+    def fly(self, start: str, seed: int, enough: Callable[[dict], bool]) -> Iterator[dict]:
+        """One run's curve, until a validation is enough; nothing where the time is over."""
+        if time.monotonic() >= self.ends:
+            return
+        cache = self.cache / re.sub(r"\W+", "_", start)
+        kept = "all" if cache.exists() else "nothing"
+        with tempfile.TemporaryDirectory() as folder:
+            out = Path(folder) / "run"
+            process, file = begin(start, seed, out, cache), out / METRICS_FILE
+            ends = min(self.ends, time.monotonic() + self.longest)
+            while (
+                process.poll() is None and time.monotonic() < ends and not any(map(enough, validations(file)))
+            ):
+                time.sleep(0.2)
+            if process.poll():
+                raise RuntimeError(out.with_suffix(".log").read_text()[-2000:])
+            end(process)
+            if not validations(file):  # what was kept isn't all
+                shutil.rmtree(cache, ignore_errors=True)
+            yield {"start": start, "seed": seed, "kept": kept, **curve(file)}
+
+
+def begin(start: str, seed: int, out: Path, cache: Path) -> subprocess.Popen:
+    """A run as a process, which keeps programs in a folder of its own."""
+    environment = {**os.environ, "XDG_CACHE_HOME": str(cache)}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
-    command = [sys.executable, "-m", "openjax.train", "--preset", options.preset, "--seed", str(seed)]
-    command += ["--compare_with", "none", "--out", str(run), *options.options.split()]
-    with open(f"{run}.log", "w") as log:
-        process = subprocess.Popen(command, env=environment, stdout=log, stderr=subprocess.STDOUT)
-    began, file = time.monotonic(), run / METRICS_FILE
-    validations: list[dict] = []
-    while process.poll() is None:
-        time.sleep(0.5)
-        validations = list(read_metrics(file, "validation")) if file.exists() else []
-        late = time.monotonic() - began > options.longest
-        if not whole and (sum(map(good, validations)) >= SURE or late):
-            process.send_signal(signal.SIGTERM)
-            process.wait()
+    command = [sys.executable, "-m", "openjax.train", "--preset", *shlex.split(start), "--seed", str(seed)]
+    command += ["--compare_with", "none", "--out", str(out)]
+    with open(out.with_suffix(".log"), "w") as log:
+        return subprocess.Popen(command, env=environment, stdout=log, stderr=subprocess.STDOUT)
+
+
+def end(process: subprocess.Popen) -> None:
+    """Ask a process to save and end; what it compiles in the background isn't waited for."""
+    process.terminate()
+    try:
+        process.wait(LEAVES)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def validations(file: Path) -> list[dict]:
+    """What a run's validations have said so far."""
+    return list(read_metrics(file, "validation")) if file.exists() else []
+
+
+def curve(file: Path) -> dict:
+    """First update, updates a second and validations of a run, from its metrics."""
     trained = list(read_metrics(file, "train")) if file.exists() else []
-    steps, seconds = (trained[-1][k] - trained[0][k] if trained else 0.0 for k in ("steps", "seconds"))
-    layouts = run / "layouts.json"
+    steps, seconds = (np.diff([update[name] for update in trained]) for name in ("steps", "seconds"))
     return {
-        "seed": seed,
         "first_update": trained[0]["seconds"] if trained else None,
-        "steps_per_second": steps / seconds if seconds else None,
-        "evaluations": list(read_metrics(file, "validation")) if file.exists() else [],
-        "layouts": read_json(layouts)["after"] if layouts.exists() else [],
+        "update": float(np.median(seconds)) if len(seconds) else None,
+        "steps_per_second": float(np.median(steps) / np.median(seconds)) if len(seconds) else None,
+        "validations": validations(file),
     }
-
-
-def runs(options: argparse.Namespace, scratch: Path) -> Iterator[dict]:
-    """All runs, until there is no time for another."""
-    began, first = time.monotonic(), options.seeds[0]
-    wanted = [(first, "nothing", True), *((seed, "all", False) for seed in options.seeds)]
-    for seed, kept, whole in wanted + [(seed, "all", True) for seed in options.seeds[1:]]:
-        if time.monotonic() - began < options.limit:
-            yield {"kept": kept, "whole": whole, **fly(options, scratch, seed, whole)}
 
 
 def study(options: argparse.Namespace) -> dict:
     """All runs; the page is written after each."""
-    results = {"preset": options.preset, "note": options.note, "runs": []}
+    stored = options.out.with_suffix(".json")
+    runs = read_json(stored)["runs"] if options.go_on else []
+    results = {"note": options.note, "runs": runs}
     with tempfile.TemporaryDirectory() as folder:
-        for run in runs(options, Path(folder)):
-            results["runs"].append(run)
-            stored = to_plain({**facts(options.commit), **results})
-            write_json(options.out.with_suffix(".json"), stored)
-            write_page(options.out, page, stored)
+        options.cache = options.cache or Path(folder)
+        for run in Runner(options).all(options.starts, options.seeds):
+            runs.append(run)
+            plain = to_plain({**facts(options.commit), **results})
+            write_json(stored, plain)
+            write_page(options.out, page, plain)
     return results
 
 
 def page(results: dict) -> Page:
-    """A row per run; the layouts of the whole ones."""
-    rows = [{**run, "reached": next(filter(good, run["evaluations"]), None)} for run in results["runs"]]
+    """A row per run, and the median of those that found all kept."""
+    rows = [{**run, "reached": next(filter(good, run["validations"]), None)} for run in results["runs"]]
     columns = {
+        "preset and options": "start",
         "seed": "seed",
         "kept": "kept",
-        "first update of MAPPO, s": "first_update:.1f",
+        "first update, s": "first_update:.1f",
+        "an update, s": "update:.3f",
+        "env steps/s of updates": "steps_per_second:,.0f",
         "≥ .99 caught, ≤ .01 crash after, s": "reached.seconds:.1f",
-        "steps of MAPPO until then": "reached.steps:,",
+        "env steps until then": "reached.steps:,",
         "then collisions": "reached.collision_rate:.4f",
-        "env steps/s, evaluations included": "steps_per_second:,.0f",
+        "caught in the last validation": lambda run: (
+            run["validations"][-1]["capture_rate"] if run["validations"] else None
+        ),
     }
-    kept = [
-        run["reached"]["seconds"]
-        for run in rows
-        if run["reached"] and run["kept"] == "all" and not run["whole"]
-    ]
-    prose = f"Preset `{results['preset']}`, validation tasks. {results['note']}"
+    kept = [run["reached"]["seconds"] for run in rows if run["reached"] and run["kept"] == "all"]
+    prose = f"Uniform validation tasks. An update is the median of a run's. {results['note']}"
     if kept:
-        prose += f" With all kept, the median of {len(kept)} seeds is {np.median(kept):.1f} s, the slowest {max(kept):.1f} s."
-    parts = [Table(columns, rows)]
-    flown = [{"of seed": run["seed"], **layout} for run in rows for layout in run["layouts"]]
-    if flown:
-        columns = {"seed": "of seed", "tasks": "scenario", "capture rate": "capture_rate:.2f"}
-        columns |= {
-            "capture step": "capture_step:.0f",
-            "collision rate": "collision_rate:.4f",
-            "crash rate": "crash_rate:.2f",
-        }
-        parts.append(Table(columns, flown, "After the whole run"))
-    return Page("Seconds to a policy that catches", prose, parts)
+        prose += f" With all kept, {len(kept)} runs take {np.median(kept):.1f} s (median), the slowest {max(kept):.1f} s."
+    return Page("Seconds to a policy that catches", prose, Table(columns, rows))
 
 
 def main(arguments: list[str]) -> int:
     """Fly the runs, write both files."""
     parser = page_parser(__doc__, "seconds")
-    parser.add_argument("--preset", default="paper")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[171, 172, 173, 174, 175])
-    parser.add_argument("--options", default="", help="more options of openjax.train")
-    parser.add_argument("--limit", type=float, default=float("inf"), help="s after which no run begins")
-    parser.add_argument(
-        "--longest", type=float, default=120.0, help="s that a run may take which isn't whole"
-    )
+    parser.add_argument("--starts", nargs="+", default=["paper"], help="presets, each with its options")
+    parser.add_argument("--seeds", type=int, nargs="*", default=[], help="of runs until they catch")
+    parser.add_argument("--limit", type=float, default=float("inf"), help="s after which all is over")
+    parser.add_argument("--longest", type=float, default=200.0, help="s that one run may take")
+    parser.add_argument("--cache", type=Path, help="where programs are kept; by default for these runs alone")
+    parser.add_argument("--go_on", action="store_true", help="add to the results that are there")
     parser.add_argument("--note", default="")
     publish(parser.parse_args(arguments), study, page)
     return 0
