@@ -33,7 +33,7 @@ from experiments.flying.faults import (
     finite,
     outcome,
 )
-from experiments.flying.single_thread import share_out
+from experiments.flying.single_thread import share_out, use_single_thread
 from experiments.table import RESULTS, Page, Table, facts, write_page
 from openjax.files import read_json, write_json
 from openjax.flying.board import SILENCE
@@ -77,6 +77,8 @@ class Arguments:
     level_after: float = LEVEL_AFTER
     """A firmware of one's own levels out so long (s) after the last set-point."""
     out: Path = RESULTS / "flying_faults.json"
+    commit: str | None = None
+    """Where git can't tell it."""
 
 
 def fly(seeds: list[int], layout: str, policy_name: str, level_after: float = LEVEL_AFTER) -> list[dict]:
@@ -274,6 +276,7 @@ def summary(records) -> list[dict]:
 
 def main() -> None:
     arguments, begin, jobs = tyro.cli(Arguments), time.time(), []
+    use_single_thread()  # before a worker imports JAX
     drawn = range(arguments.seed, arguments.seed + arguments.faults)
     seeds = [s for s in drawn if any(part in KINDS[s % len(KINDS)] for part in arguments.kinds)]
     for k, layout in enumerate(arguments.layouts):
@@ -282,7 +285,7 @@ def main() -> None:
         batches = [mine[i : i + arguments.batch] for i in range(0, len(mine), arguments.batch)]
         jobs += [(batch, layout, arguments.policy, arguments.level_after) for batch in batches]
     jobs.sort(key=lambda job: job[0][0])  # whenever it stops, all kinds and layouts were flown as often
-    records, stands = [], facts()
+    records, stands = [], facts(arguments.commit)
     try:
         for flown in share_out(fly, jobs, arguments.processes, arguments.seconds_left):
             records += flown

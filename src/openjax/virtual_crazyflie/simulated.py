@@ -101,30 +101,23 @@ class SimulatedSwarm:
 
     def _look(self):
         report, noise = self.vehicles.report, self._random.gauss
+        # in the packets' units: millimetres
+        own = np.round(np.stack([report.position, report.velocity], 1) + self._offsets, 3).tolist()
+        position, quaternion = report.position.tolist(), report.quaternion.tolist()
+        rates, voltage = report.body_rates.tolist(), self.vehicles.voltage().tolist()
         for i, old in enumerate(self._samples):
             if i in self.asleep:
                 continue
-            quaternion, rates = report.quaternion[i], tuple(report.body_rates[i].tolist())
-            shaken = tuple(q + noise(0.0, CAMERA_NOISE) for q in quaternion.tolist())
+            shaken = [q + noise(0.0, CAMERA_NOISE) for q in quaternion[i]]
             size = math.sqrt(sum(q * q for q in shaken))
-            seen = Pose(
-                self.now,
-                tuple(p + noise(0.0, CAMERA_NOISE) for p in report.position[i].tolist()),
-                (0.0, 0.0, 0.0),
-                tuple(q / size for q in shaken),
-            )
-            # in the packets' units: millimetres
-            position, velocity = np.round(
-                [report.position[i], report.velocity[i]] + self._offsets[i], 3
-            ).tolist()
-            on_board = expand_quaternion(compress_quaternion(quaternion.tolist()))
-            own = self._radio(i, self.now, Pose(self.now, tuple(position), tuple(velocity), on_board, rates))
-            captured = self._camera(i, self.now, seen)
-            voltage = self.uplinks[i].voltage
+            place = tuple(p + noise(0.0, CAMERA_NOISE) for p in position[i])
+            seen = Pose(self.now, place, (0.0, 0.0, 0.0), tuple(q / size for q in shaken))
+            on_board = expand_quaternion(compress_quaternion(quaternion[i]))
+            told = self._radio(i, self.now, Pose(self.now, *map(tuple, own[i]), on_board, tuple(rates[i])))
             self._samples[i] = PoseSample(
-                own or old.own,
-                self.now if own else old.last_contact,
-                self.vehicles.sensors(i).voltage if voltage is None else voltage,
-                self.firmware[i].supervisor_info if own else old.supervisor,
-                captured or old.captured,
+                told or old.own,
+                self.now if told else old.last_contact,
+                voltage[i] if self.uplinks[i].voltage is None else self.uplinks[i].voltage,
+                self.firmware[i].supervisor_info if told else old.supervisor,
+                self._camera(i, self.now, seen) or old.captured,
             )

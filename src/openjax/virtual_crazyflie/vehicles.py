@@ -104,12 +104,14 @@ class VirtualVehicles:
         self.battery = np.maximum(self.battery - steps * STEP * share / self._endurance, 0.0)
         return self.report
 
+    def voltage(self) -> np.ndarray:
+        """(N,) V, of the batteries under their loads."""
+        return FULL_VOLTAGE - SPENT * (1.0 - self.battery) - SAG * self.report.motor_command.mean(1)
+
     def sensors(self, i: int) -> Sensors:
         """What vehicle i senses."""
         r = self.report
-        motor = r.motor_command[i]
-        voltage = FULL_VOLTAGE - SPENT * (1.0 - self.battery[i]) - SAG * motor.mean()
-        return Sensors(*(array[i] for array in r[:5]), motor, voltage)
+        return Sensors(*(array[i] for array in r[:5]), r.motor_command[i], self.voltage()[i])
 
 
 def commands(quaternion, set_points):
