@@ -51,6 +51,19 @@ def test_pursuers_come_nearer():
     assert carry.risen == 0.0
 
 
+def test_a_game_without_pillars_can_be_learnt():
+    how = FirstFlightsSettings(updates=1, worlds=2, steps=2)
+    environment = first_game(Pursuit(dataclasses.replace(GAME, max_pillars=0)), how)
+    networks = NetworkSettings(features=8, heads=1), PredictorSettings(enabled=False)
+    flights = FirstFlights(how, environment, Policy.for_environment(environment, *networks))
+
+    def learn(key):
+        observation, _ = environment.reset(key)
+        return flights.update(flights.begin(flights.policy.init(key, observation), key), key)[1]
+
+    assert "distance" in jax.eval_shape(learn, jax.random.key(0))
+
+
 @pytest.mark.slow
 def test_two_devices_learn_what_one_does():
     how = FirstFlightsSettings(updates=2, worlds=4, steps=2, anew=0.5)

@@ -259,7 +259,8 @@ def nearest_gap(game: PursuitSettings, state: PursuitState) -> jax.Array:
     """(W, N) m, from each pursuer of worlds (W, ...) to the nearest solid thing: pillar, pursuer or floor."""
     position, task = state.drones.position, state.task
     to_pillar = jax.vmap(lambda p, q: pillar_distance(game, p, q))(position, task.pillar_position)
-    gap = jnp.min(jnp.where(task.pillar_active[:, None], to_pillar, jnp.inf), axis=-1) - DRONE_RADIUS
+    active = task.pillar_active[:, None]
+    gap = jnp.min(to_pillar, axis=-1, where=active, initial=jnp.inf) - DRONE_RADIUS
     if game.num_pursuers > 1:
         others = jnp.min(jax.vmap(drone_distance)(position), axis=-1)
         gap = jnp.minimum(gap, others - 2 * DRONE_RADIUS)

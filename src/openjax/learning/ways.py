@@ -42,6 +42,8 @@ def ways_of(settings: PursuitSettings, task: Task) -> Ways:
     closed |= jnp.sum(corner**2, axis=-1) > settings.arena_radius**2
     toll = TOLL * (closed | ~jnp.repeat(task.pillar_active, CORNERS))
     direct = _straight(settings, task, corner[:, None], corner[None]) + toll
+    if not corner.shape[0]:
+        return Ways(corner, toll, direct)
     # Floyd and Warshall
     shorter = lambda k, length: jnp.minimum(length, length[:, k, None] + length[k])  # noqa: E731
     return Ways(corner, toll, jax.lax.fori_loop(0, corner.shape[0], shorter, direct))
@@ -52,7 +54,7 @@ def way_length(
 ) -> jax.Array:
     """(N,) m, of the shortest way from each of (N, 3) positions to (3,) a target; its gradient points along the way."""
     from_corner = _straight(settings, task, ways.corner, target[:2])
-    rest = jnp.append(ways.toll + jnp.min(ways.length + from_corner, axis=-1), 0.0)
+    rest = jnp.append(ways.toll + jnp.min(ways.length + from_corner, axis=-1, initial=jnp.inf), 0.0)
     first = jnp.concatenate([ways.corner, target[None, :2]])
     here = jax.lax.stop_gradient(position[:, None, :2])
     best = jnp.argmin(_straight(settings, task, here, first) + rest, axis=-1)
