@@ -12,7 +12,10 @@ import pytest
 import openjax
 from openjax.__main__ import COMMANDS
 from openjax.commands import calibrate, diagnose, sample_flights
+from openjax.store import DEFAULT_POLICY
 from openjax.store.environments import make_environment
+from openjax.store.old_names import train_settings
+from openjax.store.policy_files import WEIGHTS, load_policy_file
 from openjax.vehicle.vehicle_file import load_vehicle_file
 
 ROOT = Path(__file__).parents[1]
@@ -134,3 +137,9 @@ def test_from_sample_flights_to_a_corrected_simulator(tmp_path):
 
     # the same commands fly slower against the drag that was found
     assert speed_after_a_second(corrected) < 0.97 * speed_after_a_second(openjax.Pursuit(settings))
+
+
+def test_the_default_policy_comes_from_todays_preset_of_its_name():
+    """What ships was trained by the recipe that its card names."""
+    shipped = train_settings(load_policy_file(WEIGHTS / f"{DEFAULT_POLICY}.npz")[1], DEFAULT_POLICY)
+    assert shipped == openjax.preset(DEFAULT_POLICY)

@@ -197,8 +197,10 @@ def learned_ones(responses: list[dict]) -> Table:
     """What `openjax exploit --json` wrote of each policy: the least captures of a scripted and of a learned evader."""
     rows = []
     for response in responses:
-        row = {"policy": response["policy"], "millions": response["curve"][-1]["steps"] / 1e6}
-        for kind in dict.fromkeys(record["scenario"] for record in response["records"]):
+        last = response["curve"][-1]
+        row = {"policy": response["policy"], "millions": last["steps"] / 1e6}
+        row["own"] = ", ".join(f"{rate:.3f}" for rate in last["capture_rate"])
+        for kind in dict.fromkeys(record["scenario"] for record in response.get("records", ())):
             own = [record for record in response["records"] if record["scenario"] == kind]
             least = [
                 min(r["capture_rate"] for r in own if r["evader"].startswith("learned") == learned)
@@ -206,11 +208,12 @@ def learned_ones(responses: list[dict]) -> Table:
             ]
             row[kind] = ", ".join(f"{rate:.3f}" for rate in least)
         rows.append(row)
-    columns = {"policy": "policy", "M steps a seed": "millions:.0f"}
+    columns = {"policy": "policy", "M steps a seed": "millions:.0f", "at last, while they learned": "own"}
     columns |= {name: name for name in [*SCENARIOS, "uniform"]}
     prose = (
-        "Captures of the worst scripted evader, of the best of three learned ones (`openjax exploit`), with the vehicles that "
-        "the policy was trained on. A learned evader that is caught more often than a scripted one is no best response."
+        "Captures of each of three evaders in the last episodes of their training, half of them on the layouts (`openjax "
+        "exploit`); then of the worst scripted evader, of the best of the learned ones, with the vehicles that the policy was "
+        "trained on. A learned evader that is caught more often than a scripted one is no best response."
     )
     return Table(columns, rows, title="Against evaders that learned", prose=prose)
 

@@ -129,7 +129,14 @@ def study(options: argparse.Namespace) -> dict:
 
 def page(results: dict) -> Page:
     """A row per run, and the median of those that found all kept."""
-    rows = [{**run, "reached": next(filter(good, run["validations"]), None)} for run in results["runs"]]
+    rows = [
+        {
+            **run,
+            "reached": next(filter(good, run["validations"]), None),
+            "last": (run["validations"] or [None])[-1],
+        }
+        for run in results["runs"]
+    ]
     columns = {
         "preset and options": "start",
         "seed": "seed",
@@ -140,13 +147,11 @@ def page(results: dict) -> Page:
         "≥ .99 caught, ≤ .01 crash after, s": "reached.seconds:.1f",
         "env steps until then": "reached.steps:,",
         "then collisions": "reached.collision_rate:.4f",
-        "caught in the last validation": lambda run: (
-            run["validations"][-1]["capture_rate"] if run["validations"] else None
-        ),
+        "caught in the last validation": "last.capture_rate:.3f",
     }
     kept = [run["reached"]["seconds"] for run in rows if run["reached"] and run["kept"] == "all"]
     prose = f"Uniform validation tasks. An update is the median of a run's. {results['note']}"
-    if kept:
+    if len(kept) > 1:
         prose += f" With all kept, {len(kept)} runs take {np.median(kept):.1f} s (median), the slowest {max(kept):.1f} s."
     return Page("Seconds to a policy that catches", prose, Table(columns, rows))
 
