@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from openjax.errors import UserError
-from openjax.export.c_text import BINARY, UNARY, index_names, literal, loops
+from openjax.export.c_text import ELEMENTWISE, FUNCTIONS, index_names, literal, loops
 from openjax.export.traced import Walk, outer_padding
 
 _REDUCE = {
@@ -89,7 +89,7 @@ class Writer(Walk):
     """Statements and constants of a program under construction."""
 
     language = "C"
-    elementwise = frozenset((*BINARY, *UNARY))
+    elementwise = frozenset(ELEMENTWISE)
 
     def __init__(self):
         self.statements: list[str] = []
@@ -165,25 +165,17 @@ class Writer(Walk):
     _op_copy = _op_copy_p = _op_optimization_barrier = _op_convert_element_type = _op_stop_gradient
 
     def _op_elementwise(self, operation):
-        name, shape = operation.name, operation.shape
-        self.functions += math.prod(shape) * (name in UNARY and name not in ("neg", "abs", "not", "floor"))
-        return self._made({**BINARY, **UNARY}[name], operation.inputs, shape)
+        self.functions += math.prod(operation.shape) * (operation.name in FUNCTIONS)
+        return self._made(ELEMENTWISE[operation.name], operation.inputs, operation.shape)
 
-    def _op_select_n(self, operation):
-        return self._made("({0} != 0.0f ? {2} : {1})", operation.inputs, operation.shape)
-
-    def _op_clamp(self, operation):
-        return self._made("fminf(fmaxf({1}, {0}), {2})", operation.inputs, operation.shape)
-
-    def power(self, value, exponent, operation):
-        """See `Walk`."""
+    def _power(self, value, exponent, operation):
         factors = " * ".join(["{0}"] * abs(exponent)) or "1.0f"
         form = f"({factors})" if exponent >= 0 else f"(1.0f / ({factors}))"
         return self._made(form, [value], operation.shape)
 
-    def _op_transpose(self, operation):
-        value, order = operation.inputs[0], operation.parameters["permutation"]
-        return replace(value, shape=operation.shape, strides=tuple(value.strides[axis] for axis in order))
+    def _transpose(self, value, order):
+        shape, strides = zip(*((value.shape[axis], value.strides[axis]) for axis in order), strict=True)
+        return replace(value, shape=shape, strides=strides)
 
     def _op_slice(self, operation):
         starts, steps = operation.parameters["start_indices"], operation.parameters["strides"]
@@ -197,8 +189,7 @@ class Writer(Walk):
             strides[axis] = own if size > 1 else 0
         return replace(value, shape=operation.shape, strides=tuple(strides))
 
-    def reshape(self, value, shape):
-        """See `Walk`."""
+    def _reshape(self, value, shape):
         value = self.array(value)
         if [n for n in value.shape if n > 1] == [n for n in shape if n > 1]:  # only axes of length one
             left = iter(own for own, size in zip(value.strides, value.shape, strict=True) if size > 1)
@@ -212,8 +203,7 @@ class Writer(Walk):
             start += size
         return parts
 
-    def join(self, values, shape, axis):
-        """See `Walk`."""
+    def _join(self, values, shape, axis):
         joined, start = self.new(shape), 0
         for value in map(self.array, values):
             self.write(joined.part(*_within(shape, axis, start, value.shape[axis])), "{}", value)
@@ -243,36 +233,19 @@ class Writer(Walk):
 
     _op_reduce_max = _op_reduce_min = _op_reduce_sum
 
-    def _op_dot_general(self, operation):
-        (left_sum, right_sum), (left_batch, right_batch) = operation.parameters["dimension_numbers"]
-        shapes = operation.shapes
-        left_free = [a for a in range(len(shapes[0])) if a not in (*left_sum, *left_batch)]
-        right_free = [a for a in range(len(shapes[1])) if a not in (*right_sum, *right_batch)]
-        left = self._ordered(operation.inputs[0], (*left_batch, *left_free, *left_sum))
-        right = self._ordered(operation.inputs[1], (*right_batch, *right_sum, *right_free))
-        batch = math.prod(shapes[0][a] for a in left_batch)
-        rows = math.prod(shapes[0][a] for a in left_free)
-        inner = math.prod(shapes[0][a] for a in left_sum)
-        columns = math.prod(shapes[1][a] for a in right_free)
-        out = self.new(operation.shape)
-        for k in range(batch):
+    def _product(self, left, right, shape):
+        left, right = self.stored(self.array(left)), self.stored(self.array(right))
+        rows, inner, columns = *left.shape[-2:], shape[-1]
+        out, batches = self.new(shape), math.prod(shape[:-2])
+        for k in range(batches):
             sizes = (rows * inner, inner * columns, rows * columns)
             places = [
                 replace(v, offset=v.offset + k * n).start
                 for v, n in zip((left, right, out), sizes, strict=True)
             ]
             self.emit(f"product({', '.join(places)}, {rows}, {inner}, {columns});", left, right, out)
-        self.multiply_adds += batch * rows * inner * columns
+        self.multiply_adds += batches * rows * inner * columns
         return out
-
-    def _ordered(self, value, order):
-        """A factor as a dense array with its axes in `order`."""
-        if isinstance(value, np.ndarray):
-            value = self.array(np.transpose(value, order))
-        else:
-            shape, strides = zip(*((value.shape[axis], value.strides[axis]) for axis in order), strict=True)
-            value = replace(value, shape=shape, strides=strides)
-        return self.stored(value)
 
 
 def _within(shape, axis, start, size):

@@ -4,17 +4,18 @@ import math
 
 import numpy as np
 
-BINARY = {
+FUNCTIONS = {
+    "tanh": "tanhf({})", "exp": "expf({})", "log": "logf({})", "sqrt": "sqrtf({})", "rsqrt": "(1.0f / sqrtf({}))",
+    "logistic": "(1.0f / (1.0f + expf(-{})))", "sin": "sinf({})", "cos": "cosf({})", "erf": "erff({})",
+}  # fmt: skip
+"""Operations that take a processor a function of the library."""
+ELEMENTWISE = {
     "add": "({} + {})", "sub": "({} - {})", "mul": "({} * {})", "div": "({} / {})", "add_any": "({} + {})",
-    "max": "fmaxf({}, {})", "min": "fminf({}, {})", "pow": "powf({}, {})",
+    "max": "fmaxf({}, {})", "min": "fminf({}, {})", "pow": "powf({}, {})", "neg": "(-{})", "abs": "fabsf({})",
     "lt": "(float)({} < {})", "le": "(float)({} <= {})", "gt": "(float)({} > {})", "ge": "(float)({} >= {})",
     "eq": "(float)({} == {})", "ne": "(float)({} != {})", "and": "(float)({} != 0.0f && {} != 0.0f)",
-    "or": "(float)({} != 0.0f || {} != 0.0f)",
-}  # fmt: skip
-UNARY = {
-    "tanh": "tanhf({})", "exp": "expf({})", "log": "logf({})", "neg": "(-{})", "abs": "fabsf({})", "sqrt": "sqrtf({})",
-    "rsqrt": "(1.0f / sqrtf({}))", "logistic": "(1.0f / (1.0f + expf(-{})))", "sin": "sinf({})", "cos": "cosf({})",
-    "floor": "floorf({})", "erf": "erff({})", "not": "(float)({} == 0.0f)",
+    "or": "(float)({} != 0.0f || {} != 0.0f)", "not": "(float)({} == 0.0f)", "floor": "floorf({})",
+    "select_n": "({0} != 0.0f ? {2} : {1})", "clamp": "fminf(fmaxf({1}, {0}), {2})", **FUNCTIONS,
 }  # fmt: skip
 PRODUCT = """
 /* out (rows, columns) = a (rows, inner) times b (inner, columns), all of them dense. Eight columns at a time: their sums

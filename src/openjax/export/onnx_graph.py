@@ -14,7 +14,6 @@ from openjax.errors import UserError
 from openjax.export.traced import Walk, outer_padding, trace
 
 OPSET = 18
-_LETTERS = "abcdefghijklmnopqrstuvwxyz"
 _ELEMENTWISE = {
     "add": "Add", "sub": "Sub", "mul": "Mul", "div": "Div", "max": "Max", "min": "Min", "tanh": "Tanh", "exp": "Exp",
     "log": "Log", "logistic": "Sigmoid", "neg": "Neg", "abs": "Abs", "sqrt": "Sqrt", "sin": "Sin", "cos": "Cos",
@@ -53,16 +52,19 @@ class _Graph(Walk):
         self.nodes.append(self.helper.make_node(kind, inputs, names, **attributes))
         return names[0] if outputs == 1 else names
 
-    def reshape(self, value, shape):
-        """See `Walk`."""
+    def _reshape(self, value, shape):
         return self.add("Reshape", value, _whole(shape))
 
-    def join(self, values, shape, axis):
-        """See `Walk`."""
+    def _transpose(self, value, order):
+        return self.add("Transpose", value, perm=list(order))
+
+    def _product(self, left, right, shape):
+        return self.add("MatMul", left, right)
+
+    def _join(self, values, shape, axis):
         return self.add("Concat", *values, axis=axis)
 
-    def power(self, value, exponent, operation):
-        """See `Walk`."""
+    def _power(self, value, exponent, operation):
         if exponent == 2:
             return self.add("Mul", value, value)
         return self.add("Pow", value, np.array(exponent, operation.equation.invars[0].aval.dtype))
@@ -92,11 +94,8 @@ class _Graph(Walk):
         ones = [1] * len(operation.shape)
         for axis, size in zip(operation.parameters["broadcast_dimensions"], operation.shapes[0], strict=True):
             ones[axis] = size
-        value = self.reshape(operation.inputs[0], ones)
+        value = self._reshape(operation.inputs[0], ones)
         return value if tuple(ones) == operation.shape else self.add("Expand", value, _whole(operation.shape))
-
-    def _op_transpose(self, operation):
-        return self.add("Transpose", operation.inputs[0], perm=list(operation.parameters["permutation"]))
 
     def _op_split(self, operation):
         sizes, axis = operation.parameters["sizes"], operation.parameters["axis"]
@@ -123,27 +122,9 @@ class _Graph(Walk):
 
     _op_reduce_max = _op_reduce_min = _op_reduce_sum
 
-    def _op_dot_general(self, operation):
-        return self.add("Einsum", *operation.inputs, equation=_einsum(operation))
-
 
 def _whole(numbers):
     return np.array(list(numbers), np.int64)
-
-
-def _einsum(operation) -> str:
-    """A product of two arrays in Einstein's notation."""
-    (left_sum, right_sum), (left_batch, right_batch) = operation.parameters["dimension_numbers"]
-    letters = iter(_LETTERS)
-    left = [next(letters) for _ in operation.shapes[0]]
-    right = [""] * len(operation.shapes[1])
-    for a, b in (*zip(left_sum, right_sum, strict=True), *zip(left_batch, right_batch, strict=True)):
-        right[b] = left[a]
-    right = [letter or next(letters) for letter in right]
-    out = [left[a] for a in left_batch]
-    out += [letter for a, letter in enumerate(left) if a not in (*left_sum, *left_batch)]
-    out += [letter for b, letter in enumerate(right) if b not in (*right_sum, *right_batch)]
-    return f"{''.join(left)},{''.join(right)}->{''.join(out)}"
 
 
 def onnx_model(function: Callable, inputs: dict[str, jax.ShapeDtypeStruct], output: str):

@@ -1,5 +1,6 @@
 """A traced JAX function, walked operation by operation: what the exports to other languages have in common."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -42,55 +43,60 @@ class Operation:
 
 
 class Walk:
-    """Goes through a jaxpr. What doesn't depend on its inputs is computed; each operation left is a call of `node`.
+    """Goes through a jaxpr. What doesn't depend on its inputs is computed; each operation left is a call of a method that is
+    named after the primitive: `_op_pad` and so on, or `_op_elementwise` for the primitives in `elementwise`.
 
-    A value is a NumPy array, or whatever `node` makes and `inputs` give. By default `node` is the method that is named after
-    the primitive: `_op_transpose` and so on, or `_op_elementwise` for the primitives in `elementwise`.
+    A value is a NumPy array, or whatever those methods make and `inputs` give. A language says how it writes the parts of
+    which the operations below are made: `_reshape(value, shape)`, `_transpose(value, order)`, `_join(values, shape, axis)`,
+    `_power(value, exponent, operation)`, and `_product(left, right, shape)` of matrices, or of as many batches of them.
     """
 
     language = ""
     elementwise: frozenset[str] = frozenset()
 
-    def node(self, operation: Operation):
-        """The output of an operation, or a list of its outputs. Raises UserError where it has no counterpart."""
-        name = "elementwise" if operation.name in self.elementwise else operation.name
-        rule = getattr(self, f"_op_{name}", None)
-        if rule is None:
-            raise UserError(
-                f"the policy uses the operation {operation.name!r}, which has no counterpart in the {self.language} export yet"
-            )
-        return rule(operation)
-
-    def reshape(self, value, shape: tuple[int, ...]):
-        """A value in another shape."""
-        raise NotImplementedError
-
-    def join(self, values: list, shape: tuple[int, ...], axis: int):
-        """Values one after the other along an axis, which together have this shape."""
-        raise NotImplementedError
-
-    def power(self, value, exponent: int, operation: Operation):
-        """A value to a whole power."""
-        raise NotImplementedError
-
     def _op_reshape(self, operation: Operation):
-        return self.reshape(operation.inputs[0], operation.shape)
+        return self._reshape(operation.inputs[0], operation.shape)
 
     _op_squeeze = _op_expand_dims = _op_reshape
 
+    def _op_transpose(self, operation: Operation):
+        return self._transpose(operation.inputs[0], operation.parameters["permutation"])
+
     def _op_concatenate(self, operation: Operation):
-        return self.join(operation.inputs, operation.shape, operation.parameters["dimension"])
+        return self._join(operation.inputs, operation.shape, operation.parameters["dimension"])
 
     def _op_stack(self, operation: Operation):
         shape, axis = operation.shape, operation.parameters["axis"]
         apart = (*shape[:axis], 1, *shape[axis + 1 :])
-        return self.join([self.reshape(value, apart) for value in operation.inputs], shape, axis)
+        return self._join([self._reshape(value, apart) for value in operation.inputs], shape, axis)
 
     def _op_integer_pow(self, operation: Operation):
-        return self.power(operation.inputs[0], operation.parameters["y"], operation)
+        return self._power(operation.inputs[0], operation.parameters["y"], operation)
 
     def _op_square(self, operation: Operation):
-        return self.power(operation.inputs[0], 2, operation)
+        return self._power(operation.inputs[0], 2, operation)
+
+    def _op_dot_general(self, operation: Operation):
+        sums, batches = operation.parameters["dimension_numbers"]
+        sizes, factors = [], []
+        for side, (value, shape) in enumerate(zip(operation.inputs, operation.shapes, strict=True)):
+            batch, summed = batches[side], sums[side]
+            free = [axis for axis in range(len(shape)) if axis not in (*batch, *summed)]
+            groups = (batch, summed, free) if side else (batch, free, summed)
+            matrix = [math.prod(shape[axis] for axis in group) for group in groups]
+            matrix, order = (
+                tuple(matrix if batch else matrix[1:]),
+                [axis for group in groups for axis in group],
+            )
+            if order != sorted(order):
+                value = np.transpose(value, order) if _known(value) else self._transpose(value, order)
+            if matrix != tuple(shape[axis] for axis in order):
+                value = np.reshape(value, matrix) if _known(value) else self._reshape(value, matrix)
+            sizes.append(matrix)
+            factors.append(value)
+        shape = (*sizes[0][:-1], sizes[1][-1])
+        found = self._product(*factors, shape)
+        return found if shape == operation.shape else self._reshape(found, operation.shape)
 
     def run(self, jaxpr, consts, inputs) -> list:
         """The outputs of a jaxpr for input values."""
@@ -109,19 +115,29 @@ class Walk:
         name, parameters = equation.primitive.name, equation.params
         if name == "platform_index":  # what is not for a platform of its own comes last
             return [np.int32(len(parameters["platforms"]) - 1)]
-        if name == "cond" and isinstance(inputs[0], np.ndarray | np.generic):
+        if name == "cond" and _known(inputs[0]):
             branch = parameters["branches"][int(inputs[0])]
             return self.run(branch.jaxpr, branch.consts, inputs[1:])
         if name in _INLINE:
             inner = next(parameters[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in parameters)
             consts = getattr(inner, "consts", ())
             return self.run(getattr(inner, "jaxpr", inner), consts, inputs)
-        if all(isinstance(value, np.ndarray | np.generic) for value in inputs):
+        if all(map(_known, inputs)):
             found = equation.primitive.bind(*inputs, **parameters)
             found = found if equation.primitive.multiple_results else [found]
             return [np.asarray(value) for value in found]
-        found = self.node(Operation(name, parameters, inputs, equation))
+        rule = getattr(self, f"_op_{'elementwise' if name in self.elementwise else name}", None)
+        if rule is None:
+            raise UserError(
+                f"the policy uses the operation {name!r}, which has no counterpart in the {self.language} export yet"
+            )
+        found = rule(Operation(name, parameters, inputs, equation))
         return found if isinstance(found, list) else [found]
+
+
+def _known(value) -> bool:
+    """Whether a value is known here already."""
+    return isinstance(value, np.ndarray | np.generic)
 
 
 def outer_padding(operation: Operation) -> tuple[list[int], list[int]]:

@@ -17,8 +17,6 @@ from openjax.flying.controller import Pose, airframe_of
 from openjax.flying.real_time import compile_in_line
 from openjax.pursuit import Pursuit, Task
 
-FIELDS = (("position", 3), ("quaternion", 4), ("velocity", 3), ("body_rates", 3))
-
 
 class Play(NamedTuple):
     """What came of one tick; NumPy."""
@@ -44,12 +42,14 @@ def game_functions(policy):
     environment = Pursuit(settings)
 
     def drones_of(poses):
-        drones, start = {}, 0
-        for name, size in FIELDS:
-            drones[name] = poses[:, start : start + size]
-            start += size
-        size = jnp.linalg.norm(drones["quaternion"], axis=1, keepdims=True)
-        return drones | {"quaternion": drones["quaternion"] / size}
+        position, quaternion, velocity, body_rates = jnp.split(poses, (3, 7, 10), axis=1)
+        quaternion = quaternion / jnp.linalg.norm(quaternion, axis=1, keepdims=True)
+        return {
+            "position": position,
+            "quaternion": quaternion,
+            "velocity": velocity,
+            "body_rates": body_rates,
+        }
 
     def first(task: Task, poses):
         drones = drones_of(poses)
@@ -95,12 +95,8 @@ class Game:
         example = pose_array(poses)
         kinds = jax.eval_shape(first, task, example)
         nothing = jax.tree.map(lambda kind: jnp.zeros(kind.shape, kind.dtype), kinds)
-        flat, unflatten = ravel_pytree(nothing)
+        self._flat, unflatten = ravel_pytree(nothing)
         nowhere = (np.zeros(3, np.float32), np.zeros((), bool))
-        results = jax.eval_shape(tick, *kinds, example, *nowhere)[1:]
-        shapes = [leaf.shape for leaf in results]
-        self._ends = np.cumsum([math.prod(shape) for shape in shapes])[:-1]
-        self._shapes = shapes
 
         # the state as one array: as a tree of some thirty the call takes half as long again
 
@@ -108,14 +104,12 @@ class Game:
             state, action = first(task, poses)
             return ravel_pytree((state, action))[0], action
 
-        def move(flat, poses, evader, evader_measured):
-            state, *results = tick(*unflatten(flat), poses, evader, evader_measured)
-            together = jnp.concatenate([jnp.ravel(leaf).astype(jnp.float32) for leaf in results])
-            return ravel_pytree((state, results[0]))[0], together
+        def move(flat, *seen):
+            state, *results = tick(*unflatten(flat), *seen)
+            return ravel_pytree((state, results[0]))[0], results
 
         self._first = compile_in_line(jax.jit(begin).lower(example))
-        self._tick = compile_in_line(jax.jit(move).lower(flat, example, *nowhere))
-        self._flat = flat
+        self._tick = compile_in_line(jax.jit(move).lower(self._flat, example, *nowhere))
         self.start(poses)  # the first calls take tens of milliseconds: not in flight
         self.step(poses)
 
@@ -130,10 +124,9 @@ class Game:
         """One control step later the pursuers are at `poses`, the evader, if it is measured, at (3,) `evader`."""
         measured = np.asarray(evader is not None)
         place = np.zeros(3, np.float32) if evader is None else np.asarray(evader, np.float32)
-        self._flat, together = self._tick(self._flat, pose_array(poses), place, measured)
-        parts = zip(np.split(np.asarray(together), self._ends), self._shapes, strict=True)
-        action, position, velocity, captured, over, breaches, crashed = (p.reshape(s) for p, s in parts)
-        return Play(action, position, velocity, bool(captured), bool(over), breaches, crashed > 0)
+        self._flat, results = self._tick(self._flat, pose_array(poses), place, measured)
+        action, position, velocity, captured, over, breaches, crashed = map(np.asarray, results)
+        return Play(action, position, velocity, bool(captured), bool(over), breaches, crashed)
 
 
 def pose_array(poses) -> np.ndarray:
