@@ -89,7 +89,7 @@ def fly(seeds: list[int], layout: str, policy_name: str, level_after: float = LE
     for _ in range(round(SECONDS / 0.01)):
         if not worlds.tick():
             break
-    return worlds.records(seeds, layout)
+    return worlds.records(seeds)
 
 
 @functools.cache
@@ -114,10 +114,10 @@ class Worlds:
     def __init__(self, faults: list[Fault], layout: str, policy_name: str):
         task_of, self.game, self.airframe, self._first, self._tick = compiled_game(policy_name)
         scenario, self._task = task_of(layout)
-        self.faults, self.n = faults, len(scenario.pursuers)
+        self.faults, self.n, self._layout = faults, len(scenario.pursuers), layout
         starts = np.array(scenario.pursuers)
         self._damage = [PoseDamage(fault, self.n) for fault in faults]
-        vehicles = VirtualVehicles(load_vehicle(), np.tile(starts, (len(faults), 1)), flying=True)
+        vehicles = VirtualVehicles(load_vehicle(), np.tile(starts, (len(faults), 1)))
         self._vehicles = vehicles
         following = [fault.kind != "camera drifts" for fault in faults for _ in range(self.n)]
         self.swarm = SimulatedSwarm(
@@ -213,34 +213,31 @@ class Worlds:
         self.states[w], wanted = decide(self.states[w], event)
         return list(wanted)
 
-    def records(self, seeds, layout) -> list[dict]:
+    def records(self, seeds) -> list[dict]:
         """What became of each flight."""
         track = np.array(self._tracks).reshape(len(self._tracks), len(self.faults), self.n, 4)
-        crashed = np.array([f.crashed for f in self.swarm.firmware]).reshape(-1, self.n)
-        return [
-            record(fault, seed, layout, self.states[w], track[:, w], crashed[w], self.captured[w])
-            for w, (fault, seed) in enumerate(zip(self.faults, seeds, strict=True))
-        ]
+        return [{"seed": seed, **self._record(w, track[:, w])} for w, seed in enumerate(seeds)]
+
+    def _record(self, w, track) -> dict:
+        """Where the vehicles of flight w were from its fault on. track (T, N, 4): true position (m), motors off."""
+        fault, drones = self.faults[w], self.states[w].drones
+        position, off = track[..., :3], track[..., 3] > 0.0
+        begin = min(fault.time, 0.01 * (len(track) - 1))
+        seen = outcome(fault, 0.01 * np.arange(len(track)), position, off, begin)
+        held, ended = seen.pop("held"), any(d.reason for d in drones)
+        crashed = np.array([f.crashed for f in self.swarm.firmware[w * self.n : (w + 1) * self.n]])
+        pairs = [position[:, i] - position[:, j] for i in range(3) for j in range(i)]
+        return {
+            "kind": fault.kind, "layout": self._layout, "captured_by_camera": fault.captured,
+            **{k: v for k, v in asdict(fault).items() if k in ("time", "vehicle", "duration", "amount")},
+            "ended": ended, "reasons": [d.reason for d in drones], **seen, "seconds": seen["seconds"] if ended else None,
+            "hard": bool(crashed[held].any()), "armed": bool((~off[-1])[held].any()) and ended,
+            "nearest": float(np.linalg.norm(pairs, axis=-1).min()), "caught": self.captured[w],
+        }  # fmt: skip
 
 
 PILOTS = ("loop stopped", "links stopped", "loop and links stopped", "loop and guard stopped")
 """Somebody else flies after a tenth of a second. (Which one takes over is for real processes: `experiments.flying.real_time`.)"""
-
-
-def record(fault, seed, layout, state, track, crashed, caught) -> dict:
-    """Where the vehicles were from the fault on. track (T, N, 4): true position (m), motors off."""
-    position, off = track[..., :3], track[..., 3] > 0.0
-    begin = min(fault.time, 0.01 * (len(track) - 1))
-    seen = outcome(fault, 0.01 * np.arange(len(track)), position, off, begin)
-    held, ended = seen.pop("held"), any(d.reason for d in state.drones)
-    pairs = [position[:, i] - position[:, j] for i in range(3) for j in range(i)]
-    return {
-        "seed": seed, "kind": fault.kind, "layout": layout, "captured_by_camera": fault.captured,
-        **{k: v for k, v in asdict(fault).items() if k in ("time", "vehicle", "duration", "amount")},
-        "ended": ended, "reasons": [d.reason for d in state.drones], **seen, "seconds": seen["seconds"] if ended else None,
-        "hard": bool(crashed[held].any()), "armed": bool((~off[-1])[held].any()) and ended,
-        "nearest": float(np.linalg.norm(pairs, axis=-1).min()), "caught": caught,
-    }  # fmt: skip
 
 
 def well(row: dict) -> bool:

@@ -10,6 +10,7 @@ from openjax import comparison
 from openjax.commands.diagnose import main
 from openjax.comparison.figures import FlightFigures, mixer_of
 from openjax.comparison.report import in_words, prediction, to_dict
+from openjax.errors import UserError
 from openjax.flights.case import load_case
 from openjax.flights.reading import LogTable, write_csv
 from openjax.flights.samples import fly, log_of, references
@@ -102,6 +103,15 @@ def test_poor_logs_tell_as_much_about_trims(folders, tmp_path, kept):
 @pytest.fixture(scope="module")
 def case(folders):
     return load_case(folders / "monday", comparison=True)
+
+
+def test_a_folder_of_several_vehicles_is_refused(case, tmp_path):
+    for number, flight in enumerate(case.flights):
+        columns = {"t": flight.time} | {f"m{i + 1}": flight.motor_command[:, i] for i in range(4)}
+        vehicle = np.full(len(flight), str(number % 2))
+        write_csv(tmp_path / flight.log, LogTable(flight.log, columns, vehicle))
+    with pytest.raises(UserError, match="several vehicles"):
+        comparison.compare(tmp_path, [tmp_path])
 
 
 def trims(day, factors=(1, 1, 1, 1), offset=(0, 0, 0, 0), seed=0, flights=3):

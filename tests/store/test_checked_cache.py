@@ -4,10 +4,13 @@ import os
 import stat
 import subprocess
 import sys
+from pathlib import Path
 
+import jax
 import pytest
 
 from openjax.store.checked_cache import ENTRY, CheckedCache
+from openjax.store.compiled_programs import cache_programs
 
 FLIPS = """
 import os, sys
@@ -80,3 +83,17 @@ def test_the_folder_is_the_users_own(tmp_path):
     assert folder(tmp_path) == "None"
     (tmp_path / "file").write_text("")
     assert folder(tmp_path / "file") == "None"
+
+
+def test_a_user_without_a_home_has_nothing_kept(monkeypatch):
+    def home():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(Path, "home", home)
+    before = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", None)
+    try:
+        assert cache_programs() is None
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)

@@ -184,7 +184,7 @@ def _c(act, inputs, seen, source):
     name = Path(NAMES["c"]).stem
     program = c_program(act, inputs, "action", name, f"The policy {_in_ascii(Path(source).name)}")
     extra = {
-        "inputs": _described({n: inputs[n] for n in program.inputs}),
+        "inputs": _described(program.inputs),
         "numbers": program.numbers,
         "workspace_floats": program.workspace,
         "multiply_adds": program.multiply_adds,

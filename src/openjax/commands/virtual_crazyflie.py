@@ -13,7 +13,7 @@ from typing import Annotated
 import tyro
 
 from openjax.commands.command_line import output_console, parse
-from openjax.ranges import Interval, Seed
+from openjax.ranges import Interval
 from openjax.virtual_crazyflie.link import BASE_PORT, LinkFaults
 
 PROGRAM = "openjax virtual_crazyflie"
@@ -43,8 +43,6 @@ class Arguments:
     """Motors stay off until armed; False: armed from the start, as brushed Crazyflies are."""
     seconds: Annotated[float | None, Interval("(0, 1e9]")] = None
     """End after this time; by default only when interrupted."""
-    seed: Seed = 0
-    """Draws losses and jitter."""
     link: Annotated[LinkFaults, tyro.conf.arg(name="")] = field(default_factory=LinkFaults)
 
 
@@ -59,12 +57,10 @@ def make(arguments: Arguments):
     scenario = find_scenario(arguments.scenario, PursuitSettings())
     stands = [start[:2] for start in scenario.pursuers][: arguments.number]
     stands += [(0.2 * i, -1.4) for i in range(arguments.number - len(stands))]
-    effects, parameters = load_effects(arguments.effects) if arguments.effects else ((), {})
-    vehicle, charge = load_vehicle_file(arguments.vehicle).vehicle, (arguments.battery, arguments.endurance)
-    vehicles = VirtualVehicles(vehicle, stands, effects, parameters, *charge)
-    return VirtualCrazyflies(
-        vehicles, arguments.host, arguments.port, arguments.link, arguments.seed, arguments.needs_arming
-    )
+    effects = load_effects(arguments.effects)[1] if arguments.effects else {}
+    vehicle = load_vehicle_file(arguments.vehicle).vehicle
+    vehicles = VirtualVehicles(vehicle, stands, effects, arguments.battery, arguments.endurance)
+    return VirtualCrazyflies(vehicles, arguments.host, arguments.port, arguments.link, arguments.needs_arming)
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -33,7 +33,11 @@ class Compiled:
             self._function = getattr(ctypes.CDLL(str(library)), name)
         self._function.restype = None
         self._inputs = tuple(program.inputs)
-        observation = _struct(program)()
+        fields = [
+            (name, (ctypes.c_ubyte if kind.dtype == bool else ctypes.c_float) * math.prod(kind.shape))
+            for name, kind in program.inputs.items()
+        ]
+        observation = type("Observation", (ctypes.Structure,), {"_fields_": fields})()
         self._observation = {name: np.ctypeslib.as_array(getattr(observation, name)) for name in self._inputs}
         self._workspace = np.full(program.workspace, np.nan, np.float32)  # nobody clears it
         self._output = np.zeros(program.shape, np.float32)
@@ -60,15 +64,3 @@ def compiled(program: CProgram, name: str) -> Compiled | None:
     """The program, compiled; None where there is no C compiler."""
     compiler = shutil.which("cc")
     return None if compiler is None else Compiled(program, name, compiler)
-
-
-def _struct(program: CProgram) -> type[ctypes.Structure]:
-    """The observation's struct: floats and flags."""
-
-    class Observation(ctypes.Structure):
-        _fields_ = [
-            (name, (ctypes.c_ubyte if program.flags[name] else ctypes.c_float) * math.prod(shape))
-            for name, shape in program.inputs.items()
-        ]
-
-    return Observation

@@ -21,9 +21,8 @@ class CProgram:
 
     header: str
     source: str
-    inputs: dict[str, tuple[int, ...]]
-    flags: dict[str, bool]
-    """Which of the inputs are flags: unsigned char."""
+    inputs: dict[str, jax.ShapeDtypeStruct]
+    """Flags are unsigned char, all others float."""
     shape: tuple[int, ...]
     numbers: int
     """In const arrays."""
@@ -80,8 +79,7 @@ def c_program(
     return CProgram(
         header=f"{about}\n{_header(prefix, read, workspace)}\n{result}\n{signature};\n\n#endif\n",
         source=f'{about}\n#include <math.h>\n#include "{prefix}.h"\n{_body(writer, signature, text)}',
-        inputs={name: tuple(kind.shape) for name, kind in read.items()},
-        flags={name: kind.dtype == bool for name, kind in read.items()},
+        inputs=read,
         shape=shape,
         numbers=sum(value.size for value in writer.constants),
         workspace=workspace,

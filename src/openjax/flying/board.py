@@ -17,8 +17,8 @@ from openjax.flying.state import Mode, State
 SILENCE = 0.1
 """Silence of a process after which the next one flies (s): ten ticks."""
 _MODES = tuple(Mode)
-_HEAD, _EACH = 12, 17  # see Board; per vehicle mode, trim, known, 14 numbers of its pose
-_BEATS, _PIDS = 6, 9  # one each per role, after the six words
+_HEAD, _EACH = 11, 17  # see Board; per vehicle mode, trim, known, 14 numbers of its pose
+_BEATS, _PIDS = 5, 8  # one each per role, after the five words
 DEAF = ("SIGHUP", "SIGINT", "SIGTSTP", "SIGTERM", "SIGQUIT", "SIGTTOU", "SIGTTIN", "SIGPIPE")
 """Signals that a terminal, or its end, sends to all that it started."""
 
@@ -56,13 +56,12 @@ class Board:
       flying: whether any motor may be on.
       pilot: the `Role` that flies.
       over: whether the session has ended.
-      guarded: whether the guard watches.
       armed: whether any vehicle may be armed.
       stopped: whether the operator wants all motors off, whoever flies.
     """
 
     flying, pilot, over = _Word(0), _Word(1, Role), _Word(2)
-    guarded, armed, stopped = _Word(3), _Word(4), _Word(5)
+    armed, stopped = _Word(3), _Word(4)
 
     def __init__(self, number: int, context, silence: float = SILENCE):
         self._numbers = context.RawArray("d", _HEAD + _EACH * number)

@@ -87,13 +87,11 @@ def _rows(vehicle: Samples, sent, commands) -> dict[str, np.ndarray]:
         when = np.round(when, 4)
         during = (when >= sent[0]) & (when <= sent[-1])
         inside.append((when[during], names, values[during]))
-    times, row_of = np.unique(np.concatenate([when for when, _, _ in inside]), return_inverse=True)
+    times = np.unique(np.concatenate([when for when, _, _ in inside]))
     rows = {n: np.full(len(times), np.nan) for n in ("t", *_POSE, *_BODY, *_COMMAND, "vbat")}
     rows["t"] = times - sent[0]
-    begin = 0
     for when, names, values in inside:
-        at = row_of[begin : begin + len(when)]
-        begin += len(when)
+        at = np.searchsorted(times, when)
         for n, column in zip(names, values.T, strict=True):
             rows[n][at] = column
     command = commands[np.maximum(np.searchsorted(sent, times, side="right") - 1, 0)]

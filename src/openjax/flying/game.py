@@ -5,7 +5,6 @@ The whole tick (the game's step, the observation, predictor and actor) is one fu
 """
 
 import dataclasses
-import math
 from typing import NamedTuple
 
 import jax

@@ -15,7 +15,6 @@ import os
 import struct
 import time
 from collections.abc import Callable, Sequence
-from types import SimpleNamespace
 
 from openjax.flying import real_time
 from openjax.flying.board import Board, Role, say, stand_alone
@@ -42,7 +41,7 @@ def take_over(state: State, now: float) -> State:
             return drone
         mode = Mode.LAND if drone.mode in (*LANDING, Mode.LIFT) else Mode.HOLD
         # the estimate is as good as what the one before knew
-        drone = drone._replace(seen=now, landing_since=None)
+        drone = drone._replace(seen=now)
         return drone.to(mode, now, anchor, "another process took over")
 
     drones = tuple(map(taken, state.drones, state.resting_places()))
@@ -146,7 +145,7 @@ class RawLinks:
     def send(self, set_points: Sequence[SetPoint]) -> float:
         """Send each vehicle its set-point; returns when the last one left (s)."""
         for link, set_point in zip(self._links.values(), set_points, strict=True):
-            send_set_point(SimpleNamespace(send_packet=link.send_packet), set_point)
+            send_set_point(link, set_point)
         now = time.perf_counter()
         if self._watchdog and now - self._fed > WATCHDOG_PERIOD:
             self._fed = now
@@ -190,16 +189,15 @@ class Guard:
         )
         self._process.start()
 
-    def wait(self, timeout: float = 20.0) -> bool:
-        """Whether it's watching; it takes a second to start."""
+    def wait(self, timeout: float = 20.0) -> None:
+        """Return once it watches, which takes a second, or doesn't by then (s)."""
         deadline = time.monotonic() + timeout
-        while not self._board.guarded and time.monotonic() < deadline and self._process.is_alive():
+        while not self.lives() and time.monotonic() < deadline and self._process.is_alive():
             time.sleep(0.02)
-        return self._board.guarded
 
-    def lives(self, now: float) -> bool:
+    def lives(self) -> bool:
         """Whether anything was heard of it lately."""
-        return self._board.silent(Role.GUARD, now) < 2.0 * self._board.silence
+        return self._board.silent(Role.GUARD, time.perf_counter()) < 2.0 * self._board.silence
 
     def close(self) -> None:
         """End it; the vehicles are down or someone else's."""
@@ -216,7 +214,6 @@ def watch(board: Board, parent: int, own: RawLinks, state: State) -> None:
     own.open(udp_only=True)
     real_time.hurry()
     board.enter(Role.GUARD)
-    board.guarded = True
     while not board.over:
         time.sleep(CHECK)
         now = time.perf_counter()

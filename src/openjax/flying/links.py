@@ -68,9 +68,8 @@ class Links:
         n = len(self._uris)
         self._context = multiprocessing.get_context("spawn")
         self.board = Board(n, self._context, silence)
-        self.poses: list[Pose | None] = [None] * n
-        self._arrivals, self._voltages = [-math.inf] * n, [math.nan] * n
-        self._supervisors = [0] * n
+        self._samples = [PoseSample(None, -math.inf, supervisor=0)] * n
+        self._arrivals = [-math.inf] * n
         self.counts = [0] * n
         """Poses of each vehicle that have arrived."""
         self._rest, self._count, self._calls = b"", 0, 0
@@ -149,9 +148,8 @@ class Links:
             whole = len(data) - len(data) % _POSE.size
             self._rest = data[whole:]
             for vehicle, supervisor, arrival, voltage, *numbers in _POSE.iter_unpack(data[:whole]):
-                self.poses[vehicle] = pose_of(numbers)
-                self._arrivals[vehicle], self._voltages[vehicle] = arrival, voltage
-                self._supervisors[vehicle] = supervisor
+                self._samples[vehicle] = PoseSample(pose_of(numbers), arrival, voltage, supervisor)
+                self._arrivals[vehicle] = arrival
                 self.counts[vehicle] += 1
 
     def wait(self, until: float) -> None:
@@ -163,8 +161,8 @@ class Links:
     def observe(self) -> tuple[PoseSample, ...]:
         """What is known of each vehicle now."""
         self._drain()
-        known = zip(self.poses, self._contacts, self._voltages, self._supervisors, strict=True)
-        return tuple(PoseSample(*sample) for sample in known)
+        known = zip(self._samples, self._contacts, strict=True)
+        return tuple(sample._replace(last_contact=contact) for sample, contact in known)
 
     def arrivals(self) -> tuple[float, ...]:
         """When each vehicle's newest pose arrived (s, host)."""

@@ -184,7 +184,7 @@ class Flight:
         self.record = Record(len(state.drones))
         self._play, self._episode, self._begun = None, -1, 0.0
         self._since = perf_counter()
-        self._flown, self._alarm = 0, ""
+        self._alarm = ""
 
     def run(self) -> Record:
         """Fly it. Returns when all motors are off."""
@@ -239,7 +239,7 @@ class Flight:
         if state.all_in(Mode.READY) and self._episode < 0:
             if now - max(d.since for d in state.drones) < SETTLE:
                 return Request.NONE
-            if self._flown >= plan.episodes:
+            if len(self.record.episodes) >= plan.episodes:
                 return Request.LAND
             return Request.PURSUE
         if any(m in (Mode.GROUND, Mode.TRANSFER, Mode.READY) for m in state.modes) and waited > TRANSFER:
@@ -256,7 +256,7 @@ class Flight:
         poses = [drone.estimate for drone in self.state.drones]
         if first:
             self._play = self.game.start(poses[: self._pursuers])
-            self._episode, self._begun = self._flown, now
+            self._episode, self._begun = len(self.record.episodes), now
             self.record.episodes.append(
                 {"capture_step": None, "breaches": 0, "crash": False, "steps": 0, "end": "", "over_speed": 0}
             )
@@ -284,4 +284,3 @@ class Flight:
     def _end_episode(self, why):
         self.record.episodes[-1]["end"] = why
         self._episode = -1
-        self._flown += 1

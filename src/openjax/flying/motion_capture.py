@@ -13,8 +13,8 @@ on board, by which the vehicle lands should motion capture fail, or the loop.
 """
 
 import dataclasses
-import importlib
 import math
+import pkgutil
 import sys
 import threading
 import time
@@ -33,10 +33,9 @@ from openjax.flying.swarm import Samples
 
 def find_feed(name: str) -> Callable:
     """The function MODULE:FUNCTION; modules in the present folder are found too. Raises UserError."""
-    module, _, function = name.partition(":")
     sys.path.insert(0, str(Path.cwd()))
     try:
-        found = getattr(importlib.import_module(module), function)
+        found = pkgutil.resolve_name(name)
     except (ImportError, AttributeError, ValueError) as error:
         raise UserError(f"--motion_capture {name}: no such MODULE:FUNCTION ({error})") from error
     finally:
@@ -51,8 +50,8 @@ class MotionCaptured(Links):
 
     def __init__(self, *arguments, **options):
         super().__init__(*arguments, **options)
-        self._captured: list[Pose | None] = [None] * len(self.poses)
-        self._seen = [array("d") for _ in self.poses]
+        self._captured: list[Pose | None] = [None] * len(self.counts)
+        self._seen = [array("d") for _ in self.counts]
         self._recording, self._arrived = False, threading.Event()
 
     def feed(self, function: Callable) -> None:

@@ -85,7 +85,7 @@ class Session:
         """All that must be so before take-off. UserError: something isn't; where there is more, each stands in a line."""
         self._wait_for_poses()
         rates = poses_arriving(self.links)
-        guarded = self._guard is None or self.links.board.guarded
+        guarded = self._guard is None or self._guard.lives()
         found = faults(self._state, self.links.observe(), rates, guarded)
         if len(found) == 1:
             raise UserError(f"no take-off: {found[0]}")
@@ -112,7 +112,7 @@ class Session:
     def watched(self, now: float, state: State) -> str:
         """Tell the others that the loop lives and what it knows; why it must land, if it must."""
         self.links.board.write(Role.LOOP, now, state)
-        if self._guard is not None and not self._guard.lives(now):
+        if self._guard is not None and not self._guard.lives():
             return "the guard is gone"
         return ""
 

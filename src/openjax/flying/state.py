@@ -89,7 +89,6 @@ class Drone(NamedTuple):
     trim: float = 0.0  # of the hover thrust
     low_since: float | None = None  # battery
     over_since: float | None = None  # upside down
-    landing_since: float | None = None
     reason: str = ""  # why it left the pursuit
     sent: SetPoint = MOTORS_OFF
 
@@ -100,7 +99,6 @@ class Drone(NamedTuple):
             since=now,
             anchor=self.anchor if anchor is None else anchor,
             reason=reason or self.reason,
-            landing_since=(self.landing_since or now) if mode in LANDING else None,
         )
 
 

@@ -53,7 +53,7 @@ def _watched(state, drone, sample) -> Drone:
 
 def _is_low(state, drone) -> bool:
     """Whether a landing is near the floor, or long enough on the way."""
-    late = state.time - drone.landing_since > state.settings.landing_time
+    late = state.time - drone.since > state.settings.landing_time
     return late or drone.estimate.position[2] < LOW
 
 

@@ -121,7 +121,7 @@ class Member:
 
 
 def send_set_point(crazyflie, set_point: SetPoint) -> None:
-    """Send one vehicle its set-point. `crazyflie` needs no more than `send_packet`."""
+    """Send one vehicle its set-point. `crazyflie`: its own, or its link: it needs no more than `send_packet`."""
     from cflib.crazyflie.commander import Commander
 
     commander = Commander(crazyflie)

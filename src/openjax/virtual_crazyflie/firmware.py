@@ -195,10 +195,10 @@ class VirtualFirmware:
         return []
 
     def _commander(self, packet, now):
-        roll, pitch, yaw_rate, thrust = struct.unpack("<fffH", packet.data[:14])
+        *degrees, thrust = struct.unpack("<fffH", packet.data[:14])
         thrust = 0 if thrust < 1000 else min(thrust, THRUST_CUT)
         rates = self.parameters["flightmode.stabModeRoll"] == 0
-        self._accept(RATES if rates else ANGLES, roll, pitch, yaw_rate, thrust, now)
+        self._accept(RATES if rates else ANGLES, degrees, thrust, now)
         return []
 
     def _generic(self, packet, now):
@@ -208,14 +208,14 @@ class VirtualFirmware:
             self._set_point, self._set_point_time = SetPoint(), now
             self.set_points += 1
         elif packet.data[0] == 11:
-            roll, pitch, yaw_rate, thrust, rate = struct.unpack("<fffHB", packet.data[1:16])
-            self._accept(RATES if rate else ANGLES, roll, pitch, yaw_rate, thrust, now)
+            *degrees, thrust, rates = struct.unpack("<fffHB", packet.data[1:16])
+            self._accept(RATES if rates else ANGLES, degrees, thrust, now)
         return []
 
-    def _accept(self, mode, roll, pitch, yaw_rate, thrust, now):
-        """Degrees in the firmware's frame, where pitch points the other way."""
-        if all(map(np.isfinite, (roll, pitch, yaw_rate))):
-            angles = np.radians((roll, -pitch, yaw_rate)).tolist()
+    def _accept(self, mode, degrees, thrust, now):
+        """Roll, pitch, yaw rate in the firmware's frame, where pitch points the other way."""
+        if np.isfinite(degrees).all():
+            angles = (np.radians(degrees) * (1.0, -1.0, 1.0)).tolist()
             self.accept(SetPoint(mode, *angles, thrust / (FULL_SCALE + 1)), now)
 
     def accept(self, set_point: SetPoint, now: float) -> None:

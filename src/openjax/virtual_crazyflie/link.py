@@ -9,7 +9,7 @@ from typing import Annotated
 
 from openjax.errors import UserError
 from openjax.flying.crtp import Port
-from openjax.ranges import Interval, check_intervals
+from openjax.ranges import Interval, Seed, check_intervals
 
 BASE_PORT = 19850
 """`cflib` scans this port and the nine after it."""
@@ -29,15 +29,17 @@ class LinkFaults:
     """Log data arrive this much later (ms)."""
     pose_loss: Annotated[float, Interval("[0, 1]")] = 0.0
     """Share of the log data that never arrive."""
+    seed: Seed = 0
+    """Draws losses and jitter."""
 
     def __post_init__(self):
         check_intervals(self, "--")
 
 
 class VirtualLink:
-    """One vehicle's socket. Times are those of the caller's clock, in seconds."""
+    """The socket of vehicle `i`. Times are those of the caller's clock, in seconds."""
 
-    def __init__(self, host: str, port: int, faults: LinkFaults, seed: int):
+    def __init__(self, host: str, port: int, faults: LinkFaults, i: int):
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self.socket.bind((host, port))
@@ -48,7 +50,7 @@ class VirtualLink:
                 f"UDP port {port} of {host} can't be had ({reason}); choose another --port"
             ) from error
         self.socket.setblocking(False)
-        self.faults, self._random, self._listener = faults, random.Random(seed), None
+        self.faults, self._random, self._listener = faults, random.Random(1000 * faults.seed + i), None
         self._incoming: list = []
         self._outgoing: list = []
         self._count = 0

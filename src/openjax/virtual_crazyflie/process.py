@@ -24,7 +24,6 @@ class VirtualCrazyflies:
       host: address to listen at.
       port: first port; 0 takes any free ones.
       faults: what the links do.
-      seed: draws losses and jitter.
       needs_arming: see `VirtualFirmware`.
     """
 
@@ -34,7 +33,6 @@ class VirtualCrazyflies:
         host: str = "127.0.0.1",
         port: int = 19850,
         faults: LinkFaults | None = None,
-        seed: int = 0,
         needs_arming: bool = True,
     ):
         self.vehicles, self.late = vehicles, 0
@@ -42,8 +40,7 @@ class VirtualCrazyflies:
         self.links: list[VirtualLink] = []
         try:
             for i in range(vehicles.number):
-                link = VirtualLink(host, port + i if port else 0, faults or LinkFaults(), 1000 * seed + i)
-                self.links.append(link)
+                self.links.append(VirtualLink(host, port + i if port else 0, faults or LinkFaults(), i))
         except BaseException:
             self.close()
             raise

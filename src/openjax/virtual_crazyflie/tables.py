@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from openjax.flying.controller import roll_pitch_yaw
 from openjax.flying.crtp import FULL_SCALE, compress_quaternion
 
 
@@ -22,13 +23,9 @@ class Sensors:
     voltage: float = 4.1  # V
 
 
-def _roll_pitch_yaw(q):
-    """Degrees; pitch with the firmware's inverted sign."""
-    w, x, y, z = q
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return np.degrees(roll), -np.degrees(pitch), np.degrees(yaw)
+def _angles(quaternion):
+    """Roll, pitch, yaw in degrees; pitch with the firmware's inverted sign."""
+    return np.degrees(roll_pitch_yaw(quaternion)) * (1.0, -1.0, 1.0)
 
 
 def _log_variables() -> dict[str, tuple[str, Callable]]:
@@ -43,7 +40,7 @@ def _log_variables() -> dict[str, tuple[str, Callable]]:
         table[f"gyro.{axis}"] = ("float", lambda f, s, i=i: np.degrees(s.body_rates[i]))
         table[f"locSrv.{axis}"] = ("float", lambda f, s, i=i: f.external_pose[i])
     for i, name in enumerate(("roll", "pitch", "yaw")):
-        table[f"stateEstimate.{name}"] = ("float", lambda f, s, i=i: _roll_pitch_yaw(s.quaternion)[i])
+        table[f"stateEstimate.{name}"] = ("float", lambda f, s, i=i: _angles(s.quaternion)[i])
     for i, name in enumerate(("qw", "qx", "qy", "qz")):
         table[f"stateEstimate.{name}"] = ("float", lambda f, s, i=i: s.quaternion[i])
         table[f"locSrv.{name}"] = ("float", lambda f, s, i=i: f.external_pose[3 + i])

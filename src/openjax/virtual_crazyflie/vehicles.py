@@ -1,6 +1,6 @@
 """The vehicles inside virtual Crazyflies: openjax's own, with any of its effects, advanced between packets."""
 
-from functools import partial
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax
@@ -9,6 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from openjax.errors import UserError
+from openjax.flying.controller import airframe_of
 from openjax.flying.real_time import compile_in_line
 from openjax.flying.set_point import ANGLES, OFF
 from openjax.vehicle import Vehicle, hover_state, make_drones_step, rotate, rotate_inverse
@@ -42,16 +43,14 @@ class Report(NamedTuple):
 
 
 class VirtualVehicles:
-    """N vehicles in one air. They start on the floor, level, and each step takes 2 ms.
+    """N vehicles in one air. Each step takes 2 ms.
 
     Args:
       vehicle: their parameters.
-      position: (N, 2) m, where they stand; (N, 3) where they hover if `flying`.
-      effects: names of effects; those that delay or lose commands belong to the link instead.
-      effect_parameters: {effect: {parameter: value}}.
+      position: (N, 2) m, where they stand on the floor, level; or (N, 3), where they hover.
+      effects: {effect: {parameter: value}}; those that delay or lose commands belong to the link instead.
       battery: charge at the start, 0..1.
       endurance: s of hover that empty a full battery.
-      flying: they begin hovering in the air instead.
 
     Raises:
       UserError: an unknown effect, or one that acts on commands.
@@ -61,34 +60,30 @@ class VirtualVehicles:
         self,
         vehicle: Vehicle,
         position,
-        effects=(),
-        effect_parameters=None,
+        effects: Mapping[str, Mapping[str, float]] | None = None,
         battery: float = 1.0,
         endurance: float = 420.0,
-        flying: bool = False,
     ):
-        self._step = make_drones_step("rigid", dt=STEP, effects=effects, contacts=False)
+        self._vehicle, self._parameters = vehicle, dict(effects or {})
+        names = tuple(sorted(self._parameters))
+        self._step = make_drones_step("rigid", dt=STEP, effects=names, contacts=False)
         for effect in self._step.effects:
             if effect.command is not None:
                 raise UserError(
                     f"effect {effect.name} acts on commands: order it from the link, with --latency_ms or --loss"
                 )
         position = np.atleast_2d(np.asarray(position, np.float32))
-        self.number = len(position)
-        height = position[:, 2:] if flying else np.zeros((self.number, 1), np.float32)
-        drones = hover_state(vehicle, np.concatenate([position[:, :2], height], 1))
+        self.number, dimensions = position.shape
+        flying = dimensions == 3
+        drones = hover_state(vehicle, np.pad(position, ((0, 0), (0, 3 - dimensions))))
         drones = drones.replace(rotor_speed=drones.rotor_speed * flying)
         drones = self._step.reset(vehicle, drones, jax.random.key(0))
-        flat, unflatten = ravel_pytree(drones)
-        self._state = np.asarray(flat)
-        advance = jax.jit(partial(_advance, self._step, vehicle, effect_parameters or {}, unflatten))
+        flat, self._unflatten = ravel_pytree(drones)
         nothing = np.zeros((self.number, 5), np.float32)
-        self._advance = compile_in_line(advance.lower(flat, nothing, np.int32(1)))
+        self._advance = compile_in_line(jax.jit(self._advanced).lower(flat, nothing, np.int32(1)))
         self._charge, self._endurance = float(battery), float(endurance)
-        self._begin = self._state
-        self._hover = float(vehicle.mass * vehicle.gravity) / float(
-            4 * vehicle.thrust_constant * vehicle.max_rotor_speed**2
-        )
+        self._begin = np.asarray(flat)
+        self._hover = airframe_of(vehicle).hover_thrust
         self.reset()
 
     def reset(self) -> None:
@@ -103,6 +98,35 @@ class VirtualVehicles:
         share = self.report.motor_command.mean(1) / self._hover
         self.battery = np.maximum(self.battery - steps * STEP * share / self._endurance, 0.0)
         return self.report
+
+    def _advanced(self, flat, set_points, steps):
+        """The flat state after `steps` steps, and what is sensed then."""
+        vehicle, effects = self._vehicle, self._step.effects
+        no_pillars = (jnp.zeros((1, 2)), jnp.zeros(1, bool))
+        complete = composition.complete_parameters(effects, self._parameters, jnp.float32)
+        flown = composition.change_body(effects, complete, vehicle)
+
+        def step(_, carry):
+            drones, _, crashed = carry
+            command = commands(drones.quaternion, set_points)
+            motor, _ = jax.vmap(lambda d, c: rate_controller(flown, d, c, STEP))(drones, command)
+            moved = self._step(vehicle, drones, command, *no_pillars, self._parameters)
+            acceleration = (moved.velocity - drones.velocity) / STEP
+            moved, on_floor, hit = _stand(moved)
+            gravity = vehicle.gravity * jnp.array([0.0, 0.0, 1.0])
+            acceleration = jnp.where(on_floor[:, None], 0.0, acceleration)
+            force = jax.vmap(rotate_inverse)(moved.quaternion, acceleration + gravity)
+            return moved, (motor, force, on_floor), crashed | hit
+
+        drones = self._unflatten(flat)
+        gravity = jnp.zeros((self.number, 3)).at[:, 2].set(vehicle.gravity)
+        no_one = jnp.zeros(self.number, bool)
+        nothing = (jnp.zeros((self.number, 4)), gravity, no_one)
+        drones, (motor, force, on_floor), crashed = jax.lax.fori_loop(
+            0, steps, step, (drones, nothing, no_one)
+        )
+        moved = (drones.position, drones.velocity, drones.quaternion, drones.body_rates)
+        return ravel_pytree(drones)[0], Report(*moved, force, motor, on_floor, crashed)
 
     def voltage(self) -> np.ndarray:
         """(N,) V, of the batteries under their loads."""
@@ -133,35 +157,6 @@ def commands(quaternion, set_points):
         ],
         axis=-1,
     )
-
-
-def _advance(drones_step, vehicle, parameters, unflatten, flat, set_points, steps):
-    """The flat state after `steps` steps, and what is sensed then."""
-    no_pillars = (jnp.zeros((1, 2)), jnp.zeros(1, bool))
-    complete = composition.complete_parameters(drones_step.effects, parameters, jnp.float32)
-    flown = composition.change_body(drones_step.effects, complete, vehicle)
-
-    def step(_, carry):
-        drones, _, crashed = carry
-        command = commands(drones.quaternion, set_points)
-        motor, _ = jax.vmap(lambda d, c: rate_controller(flown, d, c, STEP))(drones, command)
-        moved = drones_step(vehicle, drones, command, *no_pillars, parameters)
-        acceleration = (moved.velocity - drones.velocity) / STEP
-        moved, on_floor, hit = _stand(moved)
-        gravity = vehicle.gravity * jnp.array([0.0, 0.0, 1.0])
-        acceleration = jnp.where(on_floor[:, None], 0.0, acceleration)
-        force = jax.vmap(rotate_inverse)(moved.quaternion, acceleration + gravity)
-        return moved, (motor, force, on_floor), crashed | hit
-
-    drones = unflatten(flat)
-    number = drones.position.shape[0]
-    gravity = jnp.zeros((number, 3)).at[:, 2].set(vehicle.gravity)
-    nothing = (jnp.zeros((number, 4)), gravity, jnp.zeros(number, bool))
-    drones, (motor, force, on_floor), crashed = jax.lax.fori_loop(
-        0, steps, step, (drones, nothing, jnp.zeros(number, bool))
-    )
-    moved = (drones.position, drones.velocity, drones.quaternion, drones.body_rates)
-    return ravel_pytree(drones)[0], Report(*moved, force, motor, on_floor, crashed)
 
 
 def _stand(drones):
