@@ -46,9 +46,7 @@ def find_membership(
     by_hand = any(value is not None for value in given)
     if not by_hand and not all_devices:
         return None
-    detection = _BY_HAND
-    if None in given:
-        detection, given = _detected(given)
+    detection, given = _detected(given) if None in given else (_BY_HAND, given)
     if None in given:
         if not by_hand:
             return None

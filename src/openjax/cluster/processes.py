@@ -22,8 +22,6 @@ SILENCE = 30.0
 GRACE = 5.0
 """Seconds that a process has to end by itself when another one failed."""
 
-_FAREWELL = "farewell"
-
 
 class Processes:
     """This process among all of its job. One alone has no connections and loses nobody.
@@ -37,14 +35,10 @@ class Processes:
         """`connections`: (socket, its reader, host) by process: to all others on process 0, to process 0 elsewhere."""
         self.number, self.index = number, index
         self.advice = "start it again"
-        self._links = {
-            other: _Link(connection, reader, other, host, self._receive, self._gone)
-            for other, (connection, reader, host) in (connections or {}).items()
-        }
+        self._links = {other: _Link(self, other, *link) for other, link in (connections or {}).items()}
         self._asked = {other: queue.Queue() for other in self._links}
         self._answers: queue.Queue = queue.Queue()
-        self._closing = threading.Event()
-        self._ending = threading.Lock()
+        self._ending = threading.Lock()  # taken once, by what ends this process first
         for link in self._links.values():
             link.start()
 
@@ -61,7 +55,6 @@ class Processes:
             self._links[0].send({"value": value})
             return self._answers.get()
         values = [value] + [self._asked[other].get() for other in sorted(self._asked)]
-        self._note_farewell(values)
         self._send_all({"values": values})
         return values
 
@@ -71,14 +64,16 @@ class Processes:
 
     def leave(self) -> None:
         """End in good order, together with all others."""
-        self.everyone(_FAREWELL)
+        self.everyone()
+        self._send_all({"leaves": True})
         for link in self._links.values():
             link.close(GRACE)
 
     def fail(self, status: int, text: str) -> None:
         """Tell the others that this process ends with an exit status, and why; they end too."""
-        self._closing.set()
-        self._send_all({"status": status, "failed": f"process {self.index} ended: {text}"})
+        self._ending.acquire(blocking=False)
+        # what all did wrong, each reports by itself in the meantime
+        self._send_all({"error": f"process {self.index} ended: {text}", "status": status, "after": GRACE})
         for link in self._links.values():
             link.close(2 * GRACE)
 
@@ -86,42 +81,24 @@ class Processes:
         """After an error that a lost process may have caused: time for that news, which ends this process."""
         threading.Event().wait(GRACE if self._links else 0.0)
 
-    def _receive(self, other: int, message: dict) -> None:
+    def receive(self, other: int, message: dict) -> None:
+        """What another process sent."""
         if "value" in message:
             self._asked[other].put(message["value"])
         elif "values" in message:
-            self._note_farewell(message["values"])
             self._answers.put(message["values"])
-        elif "lost" in message:
-            self._end(1, message["lost"], {})
-        elif "failed" in message and not self._closing.is_set():
-            self._closing.set()
-            if self.is_first:
-                self._send_all(message, but=other)
-            # What all did wrong, this process reports by itself in the meantime.
-            arguments = (message["status"], message["failed"], {})
-            late = threading.Timer(GRACE, self._end, arguments)
-            late.daemon = True
-            late.start()
+        elif "error" in message:
+            self.end(other, message)
 
-    def _note_farewell(self, values: list) -> None:
-        if all(value == _FAREWELL for value in values):
-            self._closing.set()
-
-    def _gone(self, other: int, host: str, why: str) -> None:
-        if not self._closing.is_set():
-            text = f"process {other} of {self.number} (on {host}) was lost: {why}; {self.advice}"
-            self._end(1, text, {"lost": text}, but=other)
-
-    def _end(self, status: int, text: str, message: dict, but: int | None = None) -> None:
-        """Say it once and end at once: the main thread may wait for the lost process for ever."""
+    def end(self, source: int, message: dict) -> None:
+        """Pass on what went wrong, say it and end: the main thread may wait for the lost process for ever."""
         if not self._ending.acquire(blocking=False):
             return
-        if self.is_first and message:
-            self._send_all(message, but)
-        show_cursor = "\x1b[?25h\n" if sys.stdout.isatty() else ""  # a live display hides it
-        os.write(2, f"{show_cursor}error: {text}\n".encode())
-        os._exit(status)
+        if self.is_first:
+            self._send_all(message, but=source)
+        timer = threading.Timer(message["after"], _exit, (message["status"], message["error"]))
+        timer.daemon = True
+        timer.start()
 
     def _send_all(self, message, but=None):
         for other, link in self._links.items():
@@ -132,10 +109,9 @@ class Processes:
 class _Link:
     """A connection to another process: lines of JSON, and signs of life in both directions."""
 
-    def __init__(self, connection: socket.socket, reader: BinaryIO, other: int, host: str, receive, gone):
-        """receive(other, message) and gone(other, host, why) are called by its reader's thread."""
-        self._socket, self._reader, self._other, self._host = connection, reader, other, host
-        self._receive, self._gone = receive, gone
+    def __init__(self, job: Processes, other: int, connection: socket.socket, reader: BinaryIO, host: str):
+        self._job, self._other, self._host = job, other, host
+        self._socket, self._reader = connection, reader
         self._sending = threading.Lock()
         self._closed = threading.Event()
         connection.settimeout(SILENCE)
@@ -156,12 +132,12 @@ class _Link:
         self._closed.wait(seconds)
 
     def _read(self):
-        why = "its connection closed"
+        why, leaves = "its connection closed", False
         try:
             for line in self._reader:
                 message = json.loads(line)
-                if message:
-                    self._receive(self._other, message)
+                leaves = leaves or "leaves" in message
+                self._job.receive(self._other, message)
         except TimeoutError:
             why = f"no sign of life for {SILENCE:.0f} s"
         except OSError as error:
@@ -169,11 +145,19 @@ class _Link:
         except ValueError:
             why = "it sent half a message"
         self._closed.set()
-        self._gone(self._other, self._host, why)
+        if not leaves:
+            job, who = self._job, f"process {self._other} of {self._job.number} (on {self._host})"
+            job.end(self._other, {"error": f"{who} was lost: {why}; {job.advice}", "status": 1, "after": 0.0})
 
     def _beat(self):
         while not self._closed.wait(BEAT):
             self.send({})
+
+
+def _exit(status, error):
+    show_cursor = "\x1b[?25h\n" if sys.stdout.isatty() else ""  # a live display hides it
+    os.write(2, f"{show_cursor}error: {error}\n".encode())
+    os._exit(status)
 
 
 def encoded(message: dict) -> bytes:
