@@ -22,7 +22,7 @@ def count(carry):
 
 def test_call_finds_what_was_compiled_ahead():
     device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    step = guarded(count, device, device)
+    step = jax.jit(guarded(count), donate_argnums=0, out_shardings=device)
     carry = place(start())
     compile_ahead(step, abstract_like(jax.eval_shape(start)))()
     compiled = []

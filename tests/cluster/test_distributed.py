@@ -58,9 +58,8 @@ jax.monitoring.register_event_duration_secs_listener(
 
 
 def step_on(number):
-    return guarded(
-        make_device_step(settings, environment, number), carry_shardings(number), everywhere(number)
-    )
+    same, step = everywhere(number), guarded(make_device_step(settings, environment, number))
+    return jax.jit(step, donate_argnums=0, out_shardings=(carry_shardings(number), same, same))
 
 
 def restored(checkpoints, number):

@@ -56,7 +56,7 @@ def broken_step(carry):
 
 @pytest.fixture(scope="module")
 def compiled():
-    return guarded(step)
+    return jax.jit(guarded(step), donate_argnums=0)
 
 
 def run(directory, compiled_step, updates, resume=False, evaluate=None, **plan):
@@ -120,7 +120,7 @@ def test_best_and_last_checkpoints_are_kept(tmp_path, compiled):
 @pytest.mark.parametrize("overlap", [False, True])
 def test_nan_stops_and_leaves_both_states(tmp_path, overlap):
     with pytest.raises(NotFiniteError, match=r"update 5 in parameters; .*000000004"):
-        run(tmp_path, guarded(broken_step), 20, overlap=overlap)
+        run(tmp_path, jax.jit(guarded(broken_step)), 20, overlap=overlap)
     assert Checkpoints(tmp_path / "checkpoints").latest().update == 4
     report = json.loads((tmp_path / "not_finite" / "report.json").read_text())
     assert report["update"] == 5 and report["leaves"] == ["parameters"]

@@ -38,7 +38,7 @@ from openjax.learning.train_state import policy_leaf
 from openjax.policy import PolicyParameters
 from openjax.policy.growth import with_longer_history
 from openjax.pursuit import Pursuit
-from openjax.show.metrics import METRICS_FILE, MetricsWriter, NoMetrics
+from openjax.show.metrics import METRICS_FILE, MetricsWriter
 from openjax.show.progress import Progress
 from openjax.store.checkpoint_files import load_orbax
 from openjax.store.checkpoints import Checkpoints
@@ -80,22 +80,11 @@ class TrainingJob:
     @property
     def made_from(self) -> str:
         """What the run's programs depend on, beside the package's sources; the seed comes in as a key."""
-        game = self.environment
-        arrays = [
-            np.asarray(leaf).tolist()
-            for leaf in jax.tree.leaves((game.vehicle, game.effect_parameters, game.evader_networks))
-        ]
-        names = jax.tree.structure(game.effect_parameters)
-        return repr(
-            (
-                self.devices,
-                dataclasses.replace(self.settings, seed=0),
-                game.settings,
-                game.effects,
-                str(names),
-                arrays,
-            )
-        )
+        game, settings = self.environment, dataclasses.replace(self.settings, seed=0)
+        arrays = jax.tree.leaves((game.vehicle, game.effect_parameters, game.evader_networks))
+        arrays = [np.asarray(leaf).tolist() for leaf in arrays]
+        names = str(jax.tree.structure(game.effect_parameters))
+        return repr((self.devices, settings, game.settings, game.effects, names, arrays))
 
     def check(self) -> None:
         """Raises UserError for what doesn't fit together, before any directory is touched."""
@@ -203,7 +192,7 @@ class _Run:
         signals = [name for name in self.processes.everyone(self.stop.name) if name is not None]
         if not self.processes.is_first:
             return None
-        self._save_best(outcome)
+        self._save_best()
         if outcome.update == self.first_update and settings.total_updates > outcome.update:
             when = f"before its first update, {outcome.seconds:.0f} s after the start"
             self.progress.message(f"MAPPO did not begin: {outcome.stopped_by} came {when}")
@@ -268,7 +257,7 @@ class _Run:
     def _metrics(self):
         """Where this process writes metrics, as a context manager."""
         if not self.processes.is_first:
-            return contextlib.closing(NoMetrics())
+            return contextlib.nullcontext()
         steps = self.first_update * self.settings.steps_per_update
         writer = MetricsWriter(self.directory.path, self.first_update or None, resumed_steps=steps)
         return contextlib.closing(writer)
@@ -307,10 +296,9 @@ class _Run:
         score = selection_score(uniform, self.settings.environment.episode_length)
         return self.processes.of_first((score, {**flat_metrics(uniform, far), "score": score}))
 
-    def _save_best(self, outcome):
+    def _save_best(self):
         """Write the policy of the best checkpoint, or of the latest where none was evaluated."""
         leaves, record = self.checkpoints.load_best(policy_leaf, self.progress.message)
-        abstract = jax.eval_shape(lambda: outcome.carry.policy)
         notes = {
             "update": record.update,
             "steps": record.update * self.settings.steps_per_update,
@@ -318,7 +306,7 @@ class _Run:
             "seconds": record.notes.get("seconds"),
             **self.job.facts,
         }
-        parameters = fill(abstract, leaves, str(record.path))
+        parameters = fill(self.abstract.policy, leaves, str(record.path))
         save_policy_file(self.directory.policy, parameters, self.settings, notes, storage="float32")
 
 
@@ -328,7 +316,7 @@ def _programs(job):
     start = make_start(settings, job.environment)
     abstract = abstract_like(jax.eval_shape(start, jax.random.key(settings.seed)), shardings)
     same = everywhere(job.devices)
-    step = guarded(make_device_step(settings, job.environment, job.devices), shardings, same)
+    step = guarded(make_device_step(settings, job.environment, job.devices))
     tried = job.devices == 1 or (jax.default_backend() == "cpu" and jax.process_count() == 1)
     if job.traced is not None and tried:
         keep = functools.partial(recalled, carry=abstract, made_from=job.made_from, folder=job.traced)
@@ -338,10 +326,8 @@ def _programs(job):
         def start(key):
             return jax.jit(keep("start", fresh, arguments), out_shardings=shardings)(key)
 
-    options = {
-        "out_shardings": (shardings, same, same),
-        "compiler_options": compiler_options(job.devices),
-    }
+    # without shardings, the compiler may move a leaf, and the next call would compile again; all processes can read the rest
+    options = {"out_shardings": (shardings, same, same), "compiler_options": compiler_options(job.devices)}
     return start, jax.jit(step, donate_argnums=0, **options), abstract
 
 
@@ -365,13 +351,8 @@ def _validation(job):
     settings, environment = job.settings, job.environment
     evaders = settings.evaders_validation or settings.environment.evaders
     slots = layout_slots(settings.environment)
-    wide = Pursuit(
-        dataclasses.replace(settings.environment, max_pillars=slots, evaders=evaders),
-        environment.vehicle,
-        environment.effects,
-        environment.effect_parameters,
-        evader_networks=environment.evader_networks,
-    )
+    game = dataclasses.replace(settings.environment, max_pillars=slots, evaders=evaders)
+    wide = dataclasses.replace(environment, settings=game, dynamics=None)
     policy = build(settings, environment).policy
     return Validation(wide, settings.environment, policy, settings.validation_episodes)
 

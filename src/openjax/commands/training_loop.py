@@ -28,10 +28,6 @@ class NotFiniteError(Exception):
     """A NaN appeared; the message is one line that says where and what is left to look at."""
 
 
-class _Broken(Exception):
-    """Update, names of the leaves that hold a NaN, metrics of that update."""
-
-
 @dataclasses.dataclass(frozen=True)
 class Plan:
     """What a run is to do."""
@@ -86,17 +82,8 @@ class StopRequest:
         signal.signal(signal.SIGINT, self._previous[signal.SIGINT])
 
 
-def guarded(
-    step: Callable[[Any], tuple[Any, dict]],
-    shardings: Any = None,
-    everywhere: jax.sharding.Sharding | None = None,
-) -> Callable:
-    """`step` compiled, with its carry donated, and a check of the result for NaN in the same program.
-
-    Args:
-      step: pure function carry -> (carry, metrics by name).
-      shardings: where the carry's leaves lie, before and after; see `place`.
-      everywhere: where the other results go; with several processes, to all devices, so that all can read them.
+def guarded(step: Callable[[Any], tuple[Any, dict]]) -> Callable:
+    """`step`, a pure function carry -> (carry, metrics by name), with a check of its result for NaN in the same program.
 
     Returns:
       carry -> (carry, metrics, (L,) bool: which of the leaves of `float_leaves(carry)` hold a NaN).
@@ -108,8 +95,7 @@ def guarded(
         broken = [jnp.any(jnp.isnan(leaf)) for leaf in float_leaves(carry).values()]
         return carry, metrics, jnp.stack(broken) if broken else jnp.zeros((0,), bool)
 
-    # Without saying so, the compiler may move a leaf, and the next call would compile again.
-    return jax.jit(checked, donate_argnums=0, out_shardings=(shardings, everywhere, everywhere))
+    return checked
 
 
 def float_leaves(carry: Any) -> dict[str, jax.Array]:
@@ -127,10 +113,11 @@ class Loop:
     """
 
     step: Callable
-    """From `guarded`; takes the carry's buffers."""
+    """From `guarded`, compiled; may take the carry's buffers."""
     plan: Plan
     checkpoints: Checkpoints
-    metrics: MetricsWriter
+    metrics: MetricsWriter | None
+    """None: another process writes them."""
     progress: Progress
     directory: Path
     """The run's; the state with a NaN is left in `not_finite` there."""
@@ -155,28 +142,24 @@ class Loop:
         best = self.checkpoints.best()
         self._best_score = best.score if best else -float("inf")
         overlap = jax.devices()[0].platform != "cpu" if plan.overlap is None else plan.overlap
-        names = list(float_leaves(carry))
         reason, _ = self._decide()
         if plan.validate_start and self.evaluate is not None and update == 0 and reason is None:
             self._save(0, carry, validate=True)
         if reason is None:
             self.progress.phase("compiling the training step", announce=False)
-        try:
-            while update < plan.total_updates and reason is None:
-                carry, *results = self.step(carry)
-                update += 1
-                if pending is not None:
-                    self._finish(names, *pending)
-                pending = (update, *results)
-                due = update % plan.validation_interval == 0 or update == plan.total_updates
-                reason, late = self._decide()
-                if not overlap or due or late or reason:
-                    self._finish(names, *pending)
-                    pending = None
-                if due or late:
-                    self._save(update, carry, validate=due)
-        except _Broken as broken:
-            raise self._leave_broken_state(carry, update, *broken.args) from None
+        while update < plan.total_updates and reason is None:
+            carry, *results = self.step(carry)
+            update += 1
+            if pending is not None:
+                self._finish(carry, update, *pending)
+            pending = (update, *results)
+            due = update % plan.validation_interval == 0 or update == plan.total_updates
+            reason, late = self._decide()
+            if not overlap or due or late or reason:
+                self._finish(carry, update, *pending)
+                pending = None
+            if due or late:
+                self._save(update, carry, validate=due)
         self._save(update, carry)  # does nothing where it's saved already
         self.checkpoints.wait()
         return Outcome(carry, update, self._elapsed(), reason if update < plan.total_updates else None)
@@ -184,15 +167,24 @@ class Loop:
     def _elapsed(self):
         return self.seconds + time.monotonic() - self._started
 
-    def _finish(self, names, update, values, broken):
-        """Read, write and show the metrics of an update. Raises _Broken for a NaN in the carry."""
-        broken, steps = np.asarray(broken), update * self.plan.steps_per_update
+    def _log(self, event, update, values):
+        if self.metrics is not None:
+            steps = update * self.plan.steps_per_update
+            self.metrics.write(event, update, steps, self._elapsed(), values)
+
+    def _finish(self, carry, reached, update, values, broken):
+        """Read, write and show the metrics of an update.
+
+        Raises NotFiniteError for a NaN, and leaves the carry, which `reached` one update more where updates overlap.
+        """
+        broken = np.asarray(broken)
         values = {name: float(value) for name, value in jax.device_get(values).items()}
-        self.metrics.write("train", update, steps, self._elapsed(), values)
+        self._log("train", update, values)
         if broken.any():
-            raise _Broken(update, [name for name, bad in zip(names, broken, strict=True) if bad], values)
+            leaves = [name for name, bad in zip(float_leaves(carry), broken, strict=True) if bad]
+            raise self._leave_broken_state(carry, reached, update, leaves, values)
         self.progress.phase("training", announce=update == self.first_update + 1)
-        self.progress.update(steps, values)
+        self.progress.update(update * self.plan.steps_per_update, values)
 
     def _decide(self):
         """Why to stop, and whether a checkpoint is late: a signal to any process counts, and the first one's clock."""
@@ -208,15 +200,14 @@ class Loop:
         if validate and self.evaluate is not None:
             self.progress.phase("evaluating on validation tasks", announce=False)
             score, validation = self.evaluate(carry)
-            steps = update * self.plan.steps_per_update
-            self.metrics.write("validation", update, steps, self._elapsed(), validation)
+            self._log("validation", update, validation)
             self.progress.validation(validation, is_best=score >= self._best_score)
             self._best_score = max(score, self._best_score)
         self.checkpoints.save(update, carry, score, {"seconds": self._elapsed()})
         self._saved_at = time.monotonic()
 
     def _leave_broken_state(self, carry, reached, update, leaves, values):
-        """Save the carry, which `reached` one update more than the broken one where updates overlap."""
+        """Save what there is to look at; the error that says where."""
         self.checkpoints.wait()
         place = Path(self.directory) / NOT_FINITE
         save_state(place / f"{reached:09d}", carry, {"update": reached})

@@ -73,16 +73,6 @@ class MetricsWriter:
             self._events.close()
 
 
-class NoMetrics:
-    """In the place of a `MetricsWriter` where another process writes."""
-
-    def write(self, *_) -> None:
-        """Nothing."""
-
-    def close(self) -> None:
-        """Nothing."""
-
-
 def read_metrics(path: Path, event: str | None = None) -> Iterator[dict]:
     """Records of a metrics file, optionally of one event only; a half-written last line is passed over."""
     with open(path, "rb") as lines:

@@ -1,6 +1,7 @@
 """What a run shows on the terminal from its first second on: a live panel, or plain lines into a file."""
 
 import time
+from collections.abc import Callable
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -19,6 +20,13 @@ _SHOWN = {
     "archive_size": "archive size",
 }
 _LINE_INTERVAL = 5.0  # s between plain lines
+
+
+def live_display(render: Callable, console: Console, stays: bool) -> Live:
+    """What `render` returns, drawn again and again on a terminal; into a file it draws nothing."""
+    terminal = console.is_terminal
+    transient = not (stays and terminal)
+    return Live(get_renderable=render, console=console, auto_refresh=terminal, transient=transient)
 
 
 class Progress:
@@ -41,21 +49,16 @@ class Progress:
         self._values: dict[str, float] = {}
         self._validation: dict[str, float] = {}
         self._last_line = 0.0
-        self._live = None
+        self._lines = not self._console.is_terminal
         self._spinner = Spinner("dots", text="")
+        self._live = live_display(self._render, self._console, stays=True)
 
     def __enter__(self):
-        if self._console.is_terminal:
-            self._live = Live(
-                get_renderable=self._render, console=self._console, refresh_per_second=4, transient=False
-            )
-            self._live.start()
+        self._live.start()
         return self
 
     def __exit__(self, *_):
-        if self._live is not None:
-            self._live.stop()
-            self._live = None
+        self._live.stop()
 
     def phase(self, text: str, announce: bool = True) -> None:
         """Say what is going on now, for example what is being compiled.
@@ -67,12 +70,13 @@ class Progress:
         self._phase, self._phase_start = text, time.monotonic()
         self._last = None  # the speed is that of training alone
         self._last_line = self._phase_start
-        if self._live is None and announce:
-            self._print(f"{text} ...")
+        if self._lines and announce:
+            self.message(f"{text} ...")
 
     def message(self, text: str) -> None:
         """A line that stays."""
-        self._print(text)
+        self._console.print(Text(text), soft_wrap=True)
+        self._console.file.flush()
 
     def update(self, steps: int, values: dict[str, float]) -> None:
         """One training update is done.
@@ -87,19 +91,17 @@ class Progress:
             self._rate = rate if self._rate == 0.0 else 0.9 * self._rate + 0.1 * rate
         self._last = (now, steps)
         self._steps, self._values = steps, values
-        if self._live is None and now - self._last_line > _LINE_INTERVAL:
+        if self._lines and now - self._last_line > _LINE_INTERVAL:
             self._last_line = now
-            self._print(f"{self._speed()} | " + ", ".join(f"{k} {v}" for k, v in self._shown(values)))
+            shown = ", ".join(f"{label} {value}" for label, value in _shown(values).items())
+            self.message(f"{self._speed()} | {shown}")
 
     def validation(self, values: dict[str, float], is_best: bool) -> None:
         """Result of an evaluation on the validation tasks."""
         self._validation = values
-        if self._live is None:
-            shown = ", ".join(f"{k} {v}" for k, v in self._shown(values))
-            self._print(f"validation tasks: {shown}{' (best so far)' if is_best else ''}")
-
-    def _shown(self, values):
-        return [(label, _number(values[name])) for name, label in _SHOWN.items() if name in values]
+        if self._lines:
+            shown = ", ".join(f"{label} {value}" for label, value in _shown(values).items())
+            self.message(f"validation tasks: {shown}{' (best so far)' if is_best else ''}")
 
     def _speed(self):
         done = f"{100 * min(self._steps / self._total, 1):.0f} %, {_count(self._steps)} steps"
@@ -108,10 +110,6 @@ class Progress:
         left = max(self._total - self._steps, 0) / self._rate
         return f"{done}, {_count(self._rate)} steps/s, {duration(left)} left"
 
-    def _print(self, text):
-        self._console.print(Text(text), soft_wrap=True)
-        self._console.file.flush()
-
     def _render(self):
         seconds = time.monotonic() - self._phase_start
         self._spinner.update(text=Text(f"{self._phase}  {seconds:.0f} s"))
@@ -119,8 +117,7 @@ class Progress:
         if self._values or self._validation:
             table = Table.grid(padding=(0, 3))
             table.add_row("", Text("training", style="bold"), Text("validation tasks", style="bold"))
-            validation = dict(self._shown(self._validation))
-            training = dict(self._shown(self._values))
+            training, validation = _shown(self._values), _shown(self._validation)
             for label in _SHOWN.values():
                 if label in training or label in validation:
                     table.add_row(Text(label), training.get(label, ""), validation.get(label, ""))
@@ -128,8 +125,12 @@ class Progress:
         return Panel(Group(*rows), title=self._title, title_align="left")
 
 
-def _number(value):
-    return "–" if value is None or value != value else f"{value:.3g}"
+def _shown(values):
+    """Those that are shown, as text by their labels."""
+    known = {label: values[name] for name, label in _SHOWN.items() if name in values}
+    return {
+        label: "–" if value is None or value != value else f"{value:.3g}" for label, value in known.items()
+    }
 
 
 def _count(value):
@@ -140,9 +141,7 @@ def _count(value):
 
 
 def duration(seconds: float) -> str:
-    """Minutes and seconds, 3:02, and hours where there are any; a dash where it isn't known."""
-    if seconds != seconds:
-        return "–"
+    """Minutes and seconds, 3:02, and hours where there are any."""
     minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"

@@ -4,13 +4,12 @@ import time
 from collections.abc import Mapping
 
 from rich.console import Console
-from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.spinner import Spinner
 from rich.table import Table
 from rich.text import Text
 
-from openjax.show.progress import duration
+from openjax.show.progress import duration, live_display
 
 LONG = 30.0
 """Seconds from which a file is told, too."""
@@ -32,22 +31,16 @@ class Steps:
         self._done, self._step, self._note = 0.0, None, ""
         self._start = self._step_start = time.monotonic()
         self._spinner = Spinner("dots")
-        self._live = (
-            Live(get_renderable=self._render, console=console, refresh_per_second=4, transient=True)
-            if console.is_terminal
-            else None
-        )
+        self._live = live_display(self._render, console, stays=False)
 
     def __enter__(self):
-        if self._live is not None:
-            self._live.start()
-        elif self._total > LONG:
+        self._live.start()
+        if self._total > LONG and not self._console.is_terminal:
             self._console.print(f"{self._title}: about {duration(self._total)} ...", soft_wrap=True)
         return self
 
     def __exit__(self, *_):
-        if self._live is not None:
-            self._live.stop()
+        self._live.stop()
 
     def begin(self, step: str, note: str = "") -> None:
         """The step before is done, and `step` begins; one that isn't in `expected` takes no time of its own."""
