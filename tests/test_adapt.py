@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from openjax.commands import adapt
+from openjax.commands import adapt, adapting
 from openjax.errors import UserError
 from openjax.learning import TrainSettings, build
 from openjax.learning.adaptation import (
@@ -102,10 +102,10 @@ def test_the_best_step_on_the_way_is_kept():
 
 def test_what_is_won_back_is_the_share_of_a_loss_beyond_chance():
     chance = np.random.default_rng(0).normal(0.0, 0.1, 400)
-    nominal = {name: np.ones(400) for name in adapt.LOSSES}
+    nominal = {name: np.ones(400) for name in adapting.LOSSES}
     before = nominal | {"crash_rate": 1.5 + chance, "capture_step": 1.0 + chance - chance.mean()}
     after = nominal | {"crash_rate": 1.1 + chance}
-    shares = adapt.won_back({"nominal": nominal, "before": before, "after": after})
+    shares = adapting.won_back({"nominal": nominal, "before": before, "after": after})
     assert shares["crash_rate"] == pytest.approx(0.8, abs=0.01)
     assert shares["capture_step"] is None and shares["collision_rate"] is None
 
@@ -155,7 +155,7 @@ def test_a_policy_is_fine_tuned_measured_and_written(policy_file, tmp_path, monk
     save_effects(effects, VALUES, INTERVALS)
     training = AdaptSettings(worlds=2, updates=1)
     command = adapt.AdaptCommand(effects, str(policy_file), tmp_path / "out", episodes=2, training=training)
-    results = adapt.adapt(command)
+    results = adapting.adapt(command)
     assert json.loads((command.out / "adapt.json").read_text())["effects"] == ["motor_lag"]
     assert "motor_lag.extra_up" in (command.out / "adapt.html").read_text()
     before, after = load_policy(policy_file), load_policy(command.out / "policy.npz")
@@ -167,7 +167,9 @@ def test_a_policy_is_fine_tuned_measured_and_written(policy_file, tmp_path, monk
     )
     assert changed == results["kept"].startswith("fine-tuned")
     assert len(results["looks"]) == 2  # before and after its one step
-    assert set(results["nominal"]) == set(adapt.FIGURES) and set(results["won_back"]) == set(adapt.LOSSES)
+    assert set(results["nominal"]) == set(adapting.FIGURES) and set(results["won_back"]) == set(
+        adapting.LOSSES
+    )
     with pytest.raises(UserError, match="already exists"):
         adapt.main([str(effects), "--policy", str(policy_file), "--out", str(command.out)])
 

@@ -1,0 +1,275 @@
+"""What `openjax adapt` does: a diagnosis beside the compiler, vehicles drawn from it, fine-tuning, figures of both policies."""
+
+import contextlib
+import dataclasses
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax
+import numpy as np
+
+from openjax.background import compile_ahead
+from openjax.baselines import Heuristic
+from openjax.commands.machine import describe_machine
+from openjax.commands.validation import selection_score, uniform_tasks
+from openjax.errors import UserError
+from openjax.files import write_json, write_text
+from openjax.flights.case import load_case
+from openjax.learning.adaptation import bounds_of, fine_tune, make_adaptation, starting_parameters
+from openjax.store.policies import load_policy
+from openjax.store.policy_files import save_policy_file
+from openjax.vehicle.effects.effects_file import load_effects, load_intervals
+from openjax.vehicle.family import adapted_family
+
+if TYPE_CHECKING:
+    from openjax.commands.adapt import AdaptCommand
+
+STEPS = {"diagnosing and compiling": 60.0, "fine-tuning": 90.0, "measuring": 10.0}
+ON_CPU = {"diagnosing and compiling": 80.0, "fine-tuning": 240.0, "measuring": 25.0}
+"""Seconds of each, about, with an accelerator and without."""
+FIGURES = ("capture_rate", "capture_step", "collision_rate", "crash_rate", "over_speed_rate")
+WHICH = ("nominal", "before", "after")
+LOSSES = ("crash_rate", "collision_rate", "capture_step")
+"""Figures that a vehicle can make worse, of which adapting is to win back what it can."""
+ERRORS = 2.0
+"""A loss is one that is larger than so many standard errors of the differences of single episodes."""
+
+
+def check(command: "AdaptCommand") -> None:
+    """What can be wrong with flights and policy is told before anything is compiled. Raises UserError."""
+    if isinstance(load_policy(command.policy).policy, Heuristic):
+        raise UserError(f"--policy {command.policy}: a heuristic has no networks that could learn")
+    (load_case if command.flights.is_dir() else load_effects)(command.flights)
+
+
+def adapt(command: "AdaptCommand", tell: Callable[[str], None] = lambda step: None) -> dict:
+    """Do all of it and write it down; `tell` hears the steps. Raises UserError for flights that can't be diagnosed or an
+    unusable policy."""
+    started, seconds, steps = time.monotonic(), {}, iter(STEPS)
+    tell(next(steps))
+    with _diagnosis(command) as effects:
+        bench = _Bench(command)  # compiles meanwhile
+        found = _found(effects(), bench.game.airframe)
+        seconds["diagnosis"] = time.monotonic() - started
+    bench.ready()
+    seconds["compiled"] = time.monotonic() - started
+    tell(next(steps))
+    tuned = bench.fine_tune(found)
+    seconds["fine-tuned"] = time.monotonic() - started
+    tell(next(steps))
+    flown = bench.measure(found, tuned.parameters)
+    seconds["measured"] = time.monotonic() - started
+    results = {**_results(command, found, flown, tuned), "seconds": seconds}
+    _write(command, bench, found, tuned, results)
+    return results
+
+
+class _Found(NamedTuple):
+    """What flights said of a vehicle."""
+
+    values: dict[str, dict[str, float]]
+    family: tuple  # of `VehicleRange`, what vehicles are drawn from
+    bounds: jax.Array  # (R, 4) of it
+
+
+def _found(effects: Path, airframe: str) -> _Found:
+    """What an effects file says."""
+    (_, values), intervals = load_effects(effects), load_intervals(effects)
+    family = adapted_family(values, intervals, airframe=airframe)
+    return _Found(values, family, bounds_of(values, intervals, airframe=airframe))
+
+
+class _Bench:
+    """A policy, and the compiled programs that fine-tune and measure it."""
+
+    def __init__(self, command: "AdaptCommand"):
+        self.loaded, self._training = load_policy(command.policy), command.training
+        self.adaptation = make_adaptation(self.loaded.settings, command.training)
+        self.game, self._key = self.adaptation.game, jax.random.key(command.seed)
+        tasks = uniform_tasks(self.game, 2 * command.episodes, self.game.max_pillars)
+        self._chosen_by = jax.tree.map(lambda leaf: leaf[: command.episodes], tasks)
+        self._measured_on = jax.tree.map(lambda leaf: leaf[command.episodes :], tasks)
+        self._parameters = starting_parameters(self.loaded.parameters, self.loaded.settings)
+        self._nominal = bounds_of({}, {}, rest=0.0)
+        self.ready = compile_programs(self.adaptation, self._parameters, self._chosen_by, self._nominal)
+
+    def _fly(self, parameters, tasks, number, bounds) -> dict:
+        """Figures (B,) of a policy's episodes; the same `number` draws the same ones."""
+        key = jax.random.fold_in(self._key, number)
+        return episodes(self.adaptation.evaluate(parameters, tasks, key, bounds))
+
+    def fine_tune(self, found: _Found):
+        """The best of the policy's updates (see `openjax.learning.adaptation.fine_tune`), by `selection_score`.
+
+        Speeds over the limit count as far as they are more than in the same episode of the policy as it was with the nominal
+        vehicle: to fly as fast with the diagnosed one is what is wanted, and a vehicle that made a policy slower did nothing
+        good by it.
+        """
+        usual = self._fly(self._parameters, self._chosen_by, 1, self._nominal)
+
+        def scores(policy):
+            flown = self._fly(policy, self._chosen_by, 1, found.bounds)
+            flown["over_speed_rate"] = np.maximum(flown["over_speed_rate"], usual["over_speed_rate"])
+            return selection_score(flown, self.game.episode_length)
+
+        return fine_tune(self.adaptation, self._parameters, found.bounds, self._training, self._key, scores)
+
+    def measure(self, found: _Found, tuned) -> dict[str, dict]:
+        """Figures (B,) of `WHICH` on tasks that no checkpoint was chosen by."""
+        cases = (self._parameters, self._nominal), (self._parameters, found.bounds), (tuned, found.bounds)
+        return {
+            which: self._fly(parameters, self._measured_on, 2, bounds)
+            for which, (parameters, bounds) in zip(WHICH, cases, strict=True)
+        }
+
+
+def _results(command, found, flown, tuned) -> dict:
+    """What adapt.json holds, but for the time that it took."""
+    return {
+        "command": f"openjax adapt {command.flights} --policy {command.policy} --out {command.out}",
+        "machine": describe_machine(),
+        "policy": command.policy,
+        "effects": sorted(found.values),
+        "parameters": [
+            {"parameter": name, "value": found.values[effect].get(key), "low": low, "high": high}
+            for name, low, high, *_ in found.family
+            for effect, _, key in [name.partition(".")]
+            if effect in found.values
+        ],
+        "episodes": command.episodes,
+        **{which: {name: float(own[name].mean()) for name in FIGURES} for which, own in flown.items()},
+        "won_back": won_back(flown),
+        "kept": f"fine-tuned, as it was after step {tuned.update}"
+        if tuned.update
+        else "the policy as it was",
+        "history": tuned.history,
+        "looks": tuned.looks,
+    }
+
+
+def _write(command, bench, found, tuned, results):
+    """The policy, the figures and the page."""
+    game = dataclasses.replace(bench.game, vehicles=found.family)
+    settings = dataclasses.replace(bench.loaded.settings, environment=game)
+    command.out.mkdir(parents=True, exist_ok=True)
+    notes = {"adapted_from": command.policy, "effects": found.values, "machine": results["machine"]}
+    save_policy_file(command.out / "policy.npz", tuned.parameters, settings, notes, storage="float32")
+    write_json(command.out / "adapt.json", results)
+    write_text(command.out / "adapt.html", page(results))
+
+
+def episodes(evaluation) -> dict:
+    """Figures (B,) of single episodes."""
+    of = evaluation.statistics
+    names = {"capture_rate": of.captured, "crash_rate": of.crashed}
+    names |= {name: getattr(of, name) for name in ("collision_rate", "over_speed_rate", "capture_step")}
+    return {name: np.asarray(value, float) for name, value in names.items()}
+
+
+def won_back(flown: dict) -> dict[str, float | None]:
+    """Of each loss, before against nominal, the share that is none any more after; None where there was none beyond chance.
+
+    Args:
+      flown: {"nominal", "before", "after": figures (B,) of the same episodes}.
+    """
+    shares = {}
+    for name in LOSSES:
+        loss, left = (flown[which][name] - flown["nominal"][name] for which in ("before", "after"))
+        seen = loss.mean() > ERRORS * loss.std() / len(loss) ** 0.5
+        shares[name] = float(1.0 - left.mean() / loss.mean()) if seen else None
+    return shares
+
+
+@contextlib.contextmanager
+def _diagnosis(command: "AdaptCommand") -> Iterator[Callable[[], Path]]:
+    """A diagnosis that runs beside the compiler; what is given waits for the effects file that it writes."""
+    if not command.flights.is_dir():
+        yield lambda: command.flights
+        return
+    out, name = command.out / "diagnosis", command.flights.resolve().name
+    shutil.rmtree(out, ignore_errors=True)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "openjax.diagnose", str(command.flights), "--out", str(out)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"JAX_PLATFORMS": "cpu"},  # the accelerator is the trainer's
+    )
+
+    def effects():
+        complaint = process.communicate()[1].strip()
+        if process.returncode != 0:
+            last = complaint.splitlines()[-1] if complaint else "it ended without a word"
+            raise UserError(f"{name}: no diagnosis: {last.removeprefix('error: ')}")
+        return out / name / "effects.toml"
+
+    try:
+        yield effects
+    finally:
+        process.terminate()
+        process.wait()
+
+
+def compile_programs(adaptation, parameters, tasks, bounds):
+    """Start to compile flights, update and evaluation; a function that waits for all."""
+    key = jax.random.key(0)
+    flights = jax.eval_shape(adaptation.fly, parameters, key, bounds)
+    state = jax.eval_shape(adaptation.optimiser.init, parameters.actor)
+    waits = [
+        compile_ahead(adaptation.update, parameters.actor, state, parameters, flights, key, bounds),
+        compile_ahead(adaptation.evaluate, parameters, tasks, key, bounds),
+        compile_ahead(adaptation.fly, parameters, key, bounds),
+    ]
+    return lambda: [wait() for wait in waits]
+
+
+def in_words(results: dict) -> list[str]:
+    """What was found and gained."""
+    effects = ", ".join(results["effects"]) or "no effect: the simulator is right to within the noise"
+    changes = "; ".join(
+        f"{name.replace('_', ' ')} " + " → ".join(f"{results[which][name]:.3g}" for which in WHICH)
+        for name in FIGURES
+    )
+    shares = {name: share for name, share in results["won_back"].items() if share is not None}
+    won = ", ".join(f"{name.replace('_', ' ')} {share:.0%}" for name, share in shares.items())
+    return [
+        f"Found: {effects}.",
+        f"On {results['episodes']} tasks that neither was trained on, with the nominal vehicle → with vehicles drawn from what "
+        f"was found, before → after: {changes}.",
+        f"Won back of what the vehicle costs: {won}." if won else "The vehicle costs nothing beyond chance.",
+        f"Kept: {results['kept']}. {results['seconds']['measured']:.0f} s.",
+    ]
+
+
+def page(results: dict) -> str:
+    """One self-contained HTML page."""
+    from openjax.gap.report.page import filled  # with matplotlib: not before the compiler has begun
+
+    values = {"words": in_words(results), "figures": FIGURES, "which": WHICH, "picture": _picture(results)}
+    return filled("adapt.html.jinja", Path(__file__).parent, results=results, **values)
+
+
+def _picture(results):
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    from openjax.gap.report.figures import STYLE, as_svg
+
+    shown = {
+        "crashes_from_starts": "crashes from leaning starts (smooth)",
+        "crashes_in_flight": "crashes within flights (smooth)",
+        "off_the_nominal_flight": "distance from nominal flights",
+    }
+    with rc_context(STYLE):
+        figure = Figure(figsize=(11, 3.2), layout="constrained")
+        for axes, (name, title) in zip(figure.subplots(1, len(shown)), shown.items(), strict=True):
+            course = [row[name] for row in results["history"]]
+            axes.plot(range(1, len(course) + 1), course)
+            axes.set(title=title, xlabel="update", ylim=(0, None))
+        return as_svg(figure, results["policy"])
