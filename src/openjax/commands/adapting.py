@@ -16,6 +16,7 @@ import numpy as np
 
 from openjax.background import compile_ahead
 from openjax.baselines import Heuristic
+from openjax.commands.evaluator import episode_figures
 from openjax.commands.machine import describe_machine
 from openjax.commands.validation import selection_score, uniform_tasks
 from openjax.errors import UserError
@@ -102,7 +103,7 @@ class _Bench:
     def _fly(self, parameters, tasks, number, bounds) -> dict:
         """Figures (B,) of a policy's episodes; the same `number` draws the same ones."""
         key = jax.random.fold_in(self._key, number)
-        return episodes(self.adaptation.evaluate(parameters, tasks, key, bounds))
+        return episode_figures(self.adaptation.evaluate(parameters, tasks, key, bounds).statistics)
 
     def fine_tune(self, found: _Found):
         """The best of the policy's updates (see `openjax.learning.adaptation.fine_tune`), by `selection_score`.
@@ -162,14 +163,6 @@ def _write(command, bench, found, tuned, results):
     save_policy_file(command.out / "policy.npz", tuned.parameters, settings, notes, storage="float32")
     write_json(command.out / "adapt.json", results)
     write_text(command.out / "adapt.html", page(results))
-
-
-def episodes(evaluation) -> dict:
-    """Figures (B,) of single episodes."""
-    of = evaluation.statistics
-    names = {"capture_rate": of.captured, "crash_rate": of.crashed}
-    names |= {name: getattr(of, name) for name in ("collision_rate", "over_speed_rate", "capture_step")}
-    return {name: np.asarray(value, float) for name, value in names.items()}
 
 
 def won_back(flown: dict) -> dict[str, float | None]:

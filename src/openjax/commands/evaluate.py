@@ -8,7 +8,7 @@ From Python: `openjax.evaluate(policy, scenario)`, see `openjax.commands.calls.e
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -19,6 +19,10 @@ from openjax.pursuit.settings import PursuitSettings
 from openjax.ranges import Interval, Seed
 from openjax.show.steps import Steps
 from openjax.store import DEFAULT_POLICY
+from openjax.store.compiled_programs import cache_programs
+
+if TYPE_CHECKING:
+    from openjax.store.policies import LoadedPolicy
 
 PROGRAM = "openjax evaluate"
 COMPILING = 15.0
@@ -26,35 +30,50 @@ COMPILING = 15.0
 
 
 @dataclasses.dataclass(frozen=True)
-class EvaluateCommand:
+class FlightOptions:
+    """What is flown: policies on layouts, against an evader."""
+
+    policy: tuple[str, ...] = (DEFAULT_POLICY,)
+    """Runs' directories, policy files (.npz), checkpoints, or names of policies in the package (flight, open ...) or of
+    heuristics: angelani, janosov, apf."""
+    scenario: str = "all"
+    """wall, narrow_gap, random, passage, empty, hidden, a TOML file with an own layout, or all six."""
+    seed: Seed = 0
+    """Draws the start attitudes."""
+    opponent: str | None = None
+    """Evader to fly against: field, greedy, wall_runner, heavy, pillar_hugger, greedy_far, greedy_near, two_step, way_points,
+    frozen, or a file that openjax exploit wrote; by default those of the policy's game."""
+    compilation_cache: bool = True
+    """Keep compiled programs in the user's cache folder."""
+
+    def start(self) -> list["LoadedPolicy"]:
+        """The policies, loaded, after JAX was told where it keeps programs. Raises UserError where there are none."""
+        if self.compilation_cache:
+            cache_programs()
+        from openjax.store.policies import load_policy
+
+        if not self.policy:
+            raise UserError("--policy needs at least one policy")
+        return [load_policy(name) for name in self.policy]
+
+
+@dataclasses.dataclass(frozen=True)
+class EvaluateCommand(FlightOptions):
     """Fly a policy's mean on a layout and count captures, collisions and crashes.
 
     The game is the one that the policy was trained in; any --environment.setting can be changed, for example
-    --environment.speed_limit none or --environment.start_attitude level.
+    --environment.speed_limit none or --environment.start_attitude level. Of several policies, for example one per training
+    seed, mean and standard deviation are shown too.
     """
 
-    policy: tuple[str, ...] = (DEFAULT_POLICY,)
-    """A run's directory, a policy file (.npz), a checkpoint, or the name of a policy in the package or of a heuristic:
-    angelani, janosov, apf.
-
-    Of several, for example one per training seed, mean and standard deviation are shown too."""
-    scenario: str = "all"
-    """wall, narrow_gap, random, passage, empty, hidden, a TOML file with an own layout, or all six."""
     episodes: Annotated[int, Interval("[1, 1000000]")] = 100
     """Episodes per scenario."""
-    seed: Seed = 0
-    """Draws the start attitudes."""
-    compilation_cache: bool = True
-    """Keep compiled programs in the user's cache folder."""
     json: Path | None = None
     """File to write the records to: an object for one scenario, a list for all."""
     vehicle: Path | None = None
     """Vehicle to fly: crazyflie, brushless, or a vehicle.toml; by default the airframe that the policy was trained for."""
     effects: Path | None = None
     """Physical effects to fly with (effects.toml)."""
-    opponent: str | None = None
-    """Evader to fly against: field, greedy, wall_runner, heavy, pillar_hugger, greedy_far, greedy_near, two_step, way_points,
-    frozen, or a file that openjax exploit wrote; by default those of the policy's game."""
     environment: tyro.conf.FlagConversionOff[PursuitSettings] = dataclasses.field(
         default_factory=PursuitSettings
     )
@@ -62,12 +81,7 @@ class EvaluateCommand:
 
 def main(arguments: Sequence[str]) -> int:
     """The command; returns its exit status."""
-    command = parse(EvaluateCommand, EvaluateCommand(), arguments, PROGRAM)
-    if command.compilation_cache:
-        from openjax.store.compiled_programs import cache_programs
-
-        cache_programs()
-    evaluators: dict = {}
+    command, evaluators = parse(EvaluateCommand, EvaluateCommand(), arguments, PROGRAM), {}
     policies = prepare(command, arguments)
     _show(
         command, [(own, loaded.source, fly_scenarios(own, loaded, evaluators)[0]) for own, loaded in policies]
@@ -81,13 +95,9 @@ def prepare(command: EvaluateCommand, arguments: Sequence[str]) -> list[tuple]:
     Raises:
       UserError: an unusable file or layout, or a game that a policy can't play.
     """
-    from openjax.store.policies import load_policy
-
-    if not command.policy:
-        raise UserError("--policy needs at least one policy")
     check_output(command.json, "--json")
     policies = []
-    for loaded in [load_policy(name) for name in command.policy]:
+    for loaded in command.start():
         default = dataclasses.replace(EvaluateCommand(), environment=loaded.settings.environment)
         own = parse(EvaluateCommand, default, arguments, PROGRAM)
         _game(own, loaded)

@@ -14,6 +14,7 @@ from openjax.background import compile_ahead
 from openjax.learning import Evaluation, make_evaluate, summarise
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, Scenario, Task, scenario_task
+from openjax.pursuit.statistics import EpisodeStatistics
 from openjax.show.number_tables import numbers_table
 from openjax.show.trajectory import Trajectory
 
@@ -135,6 +136,18 @@ class Flown:
             seen=record.seen,
             predicted=record.predicted,
         )
+
+
+def episode_figures(statistics: EpisodeStatistics) -> dict[str, np.ndarray]:
+    """Figures (B,) of single episodes, whose means are the rates of `summarise`."""
+    rates = {
+        "capture_rate": statistics.captured,
+        "capture_step": statistics.capture_step,
+        "crash_rate": statistics.crashed,
+        "collision_rate": statistics.collision_rate,
+        "over_speed_rate": statistics.over_speed_rate,
+    }
+    return {name: np.asarray(values, float) for name, values in rates.items()}
 
 
 def layout_slots(settings: PursuitSettings) -> int:

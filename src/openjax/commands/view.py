@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Annotated
 
 from openjax.commands.command_line import output_console, parse
-from openjax.commands.evaluate import EvaluateCommand, fly_scenarios
+from openjax.commands.evaluate import EvaluateCommand, FlightOptions, fly_scenarios
 from openjax.errors import UserError
 from openjax.files import check_output
-from openjax.ranges import Interval, Seed
+from openjax.ranges import Interval
 from openjax.show.trajectory import Trajectory
-from openjax.store import DEFAULT_POLICY
 
 PROGRAM = "openjax view"
 OWN_NAMES = ("localhost", "127.0.0.1")
@@ -21,20 +20,9 @@ OWN_NAMES = ("localhost", "127.0.0.1")
 
 
 @dataclasses.dataclass(frozen=True)
-class ViewCommand:
+class ViewCommand(FlightOptions):
     """Fly one episode of each layout with each policy, and show them in a browser: the page has all in it."""
 
-    policy: tuple[str, ...] = (DEFAULT_POLICY,)
-    """Runs' directories, policy files (.npz), checkpoints, or names of policies in the package: flight, open ..."""
-    scenario: str = "all"
-    """wall, narrow_gap, random, passage, empty, hidden, a TOML file with an own layout, or all six."""
-    seed: Seed = 0
-    """Draws the start attitudes."""
-    opponent: str | None = None
-    """Evader to fly against: field, greedy, wall_runner, heavy, pillar_hugger, greedy_far, greedy_near, two_step, way_points,
-    frozen, or a file that openjax exploit wrote; by default those of the policy's game."""
-    compilation_cache: bool = True
-    """Keep compiled programs in the user's cache folder."""
     html: Path | None = None
     """Write the page to this file, to send to somebody, instead of serving it."""
     gif: Path | None = None
@@ -50,10 +38,6 @@ def main(arguments: Sequence[str]) -> int:
     command = parse(ViewCommand, ViewCommand(), arguments, PROGRAM)
     check_output(command.html, "--html")
     check_output(command.gif, "--gif")
-    if command.compilation_cache:
-        from openjax.store.compiled_programs import cache_programs
-
-        cache_programs()
     flights = fly_all(command)
     console = output_console()
     if command.gif is not None:
@@ -84,20 +68,10 @@ def fly_all(command: ViewCommand) -> list[tuple[str, Trajectory]]:
     Raises:
       UserError: an unusable policy or layout.
     """
-    from openjax.store.policies import load_policy
-
-    if not command.policy:
-        raise UserError("--policy needs at least one policy")
     flights, evaluators = [], {}
-    for loaded in [load_policy(name) for name in command.policy]:
-        own = EvaluateCommand(
-            policy=(loaded.source,),
-            scenario=command.scenario,
-            episodes=1,
-            seed=command.seed,
-            opponent=command.opponent,
-            environment=loaded.settings.environment,
-        )
+    shared = {field.name: getattr(command, field.name) for field in dataclasses.fields(FlightOptions)}
+    for loaded in command.start():
+        own = EvaluateCommand(**shared, episodes=1, environment=loaded.settings.environment)
         flights += [(loaded.source, flight) for flight in fly_scenarios(own, loaded, evaluators)[1]]
     return flights
 
