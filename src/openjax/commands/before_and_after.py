@@ -1,15 +1,30 @@
-"""Another policy in a run's layouts and validation tasks: what a table needs to show how much is left to learn."""
+"""A run's report: its first and its best policy, and another one, in layouts and validation tasks; table and pictures."""
 
 import dataclasses
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import jax
+from rich.table import Table
 
 from openjax.commands.evaluator import Evaluator, layout_slots, layout_tasks
-from openjax.commands.validation import uniform_tasks
+from openjax.commands.run_words import layouts_like
+from openjax.commands.training_loop import Outcome
+from openjax.commands.validation import Validation, uniform_tasks
+from openjax.files import write_json
 from openjax.pursuit import Pursuit, PursuitSettings, Scenario
+from openjax.show.metrics import METRICS_FILE
+from openjax.show.number_tables import numbers_table
+from openjax.show.progress import Progress
 from openjax.show.trajectory import Trajectory
-from openjax.store.policies import LoadedPolicy
+from openjax.store.policies import LoadedPolicy, load_policy
+from openjax.store.policy_files import fill, load_policy_file
+from openjax.store.run_directory import RunDirectory
+
+if TYPE_CHECKING:
+    from openjax.commands.training_job import TrainingJob
+
+_BESIDE_RECORD = ("episode_return", "last_seen_error")
 
 _OF_THE_POLICY = (
     "time_step",
@@ -65,3 +80,99 @@ def compare(
     longer = settings.time_step / environment.settings.time_step
     rows = [row | {"capture_step": longer * row["capture_step"]} for row in (kind.record() for kind in flown)]
     return rows, [kind.trajectory(0, f"{kind.name}, {policy.source}") for kind in flown]
+
+
+def report(
+    job: "TrainingJob", directory: RunDirectory, validation: Validation, outcome: Outcome, progress: Progress
+) -> Table:
+    """Evaluate the first and the best policy on the layouts, draw the best one's flights; the table of both."""
+    settings = job.settings
+    fitting = layouts_like(settings.environment)
+    abstract = jax.eval_shape(lambda: outcome.carry.policy)
+    rows = {}
+    for moment, path in (("before", directory.start_policy), ("after", directory.policy)):
+        progress.phase(f"evaluating the policy {moment} training on the layouts")
+        parameters = fill(abstract, load_policy_file(path)[0], str(path))
+        flown = validation(parameters)
+        shown = [(flown[0], i, f"validation task {i + 1}") for i in range(min(3, validation.number))]
+        if fitting:
+            tasks = layout_tasks(validation.evaluator.settings, fitting, job.layout_episodes)
+            layouts = validation.evaluator.fly(parameters, tasks, jax.random.key(0))
+            flown, shown = [*flown, *layouts], [(layout, 0, layout.name) for layout in layouts]
+        rows[moment] = [kind.record(_BESIDE_RECORD) for kind in flown]
+    flights = [kind.trajectory(episode, title) for kind, episode, title in shown]
+    others, their_flights = [], []
+    if job.compare_with is not None:
+        progress.phase(f"evaluating {job.compare_with} in the same game")
+        # its networks may be large, and these are minutes on a small machine
+        number = min(job.layout_episodes, 8), min(validation.number, 32)
+        others, their_flights = compare(load_policy(job.compare_with), job.environment, fitting, *number)
+    progress.phase("drawing")
+    facts = {
+        **({job.compare_with: others} if others else {}),
+        "updates": outcome.update,
+        "steps": outcome.update * settings.steps_per_update,
+        "seconds": round(outcome.seconds, 1),
+        **job.facts,
+    }
+    write_json(directory.path / "layouts.json", {**rows, **facts})
+    _draw(directory, flights, their_flights)
+    progress.phase("done", announce=False)
+    return before_after_table(
+        rows["before"], rows["after"], settings.environment.time_step, job.compare_with, others
+    )
+
+
+def _draw(directory, flights, their_flights):
+    """Curves, paths and the chase."""
+    from openjax.show.plots import plot_training, plot_trajectories
+    from openjax.show.videos import animate
+
+    plot_training(directory.path / "training.png", directory.path / METRICS_FILE)
+    plot_trajectories(directory.path / "trajectories.png", flights)
+    captured = [flight for flight in flights if flight.capture_index is not None]
+    chosen = (captured or flights)[0]
+    shown = [flight for flight in their_flights if flight.title.startswith(f"{chosen.title}, ")]
+    shown.insert(0, dataclasses.replace(chosen, title=f"{chosen.title}, this run") if shown else chosen)
+    animate(directory.path / "chase.gif", *shown)
+
+
+_KINDS = {"validation": "new tasks", "validation_far": "far starts"}
+"""What the rows that aren't layouts are called."""
+
+
+def before_after_table(
+    before: Sequence[dict],
+    after: Sequence[dict],
+    time_step: float,
+    other: str | None = None,
+    others: Sequence[dict] = (),
+) -> Table:
+    """Captures, collisions and crashes before and after training; last what the policy `other` does in the same game.
+
+    Capture steps are of `time_step` seconds in all records. Beside another policy there is no room for collisions.
+    """
+    columns = [
+        ("capture\nrate", "capture_rate", 1.0, ".2f"),
+        ("seconds to\nthe capture", "capture_step", time_step, ".1f"),
+        ("collision\nrate", "collision_rate", 1.0, ".3f"),
+        ("crash\nrate", "crash_rate", 1.0, ".2f"),
+    ]
+    last = []
+    if other is not None:
+        del columns[2]
+        last.append(f"policy {other}:\nrate, seconds, crash")
+    heads = [head for head, *_ in columns]
+    table = numbers_table("Before and after training, in the game that was trained", "", *heads, *last)
+    theirs = {row["scenario"]: row for row in others}
+
+    def shown(row):
+        return [f"{unit * row[name]:{style}}" for _, name, unit, style in columns]
+
+    for old, new in zip(before, after, strict=True):
+        cells = [f"{was} → {is_now}" for was, is_now in zip(shown(old), shown(new), strict=True)]
+        if last:
+            row = theirs.get(old["scenario"])
+            cells.append(", ".join(shown(row)) if row else "–")
+        table.add_row(_KINDS.get(old["scenario"], old["scenario"]), *cells)
+    return table

@@ -1,14 +1,17 @@
 """The commands as functions: what `openjax.train(...)` and `openjax.evaluate(...)` do in Python."""
 
+import dataclasses
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from openjax.background import quiet_compiler
+from openjax.baselines.heuristic import WithoutNetwork
 from openjax.cluster.processes import Processes
-from openjax.commands.own_controller import OwnController
 from openjax.commands.training_command import TrainCommand, default_preset, start
 from openjax.errors import UserError
 from openjax.learning import TrainSettings, preset
@@ -119,3 +122,17 @@ def evaluate(
     )
     records, _ = fly_scenarios(command, policy, {})
     return records if scenario == "all" else records[0]
+
+
+@dataclasses.dataclass(frozen=True)
+class OwnController(WithoutNetwork):
+    """A pure function from an `Observation` to actions (N, 4). It is mapped over worlds, so it sees the observation of one."""
+
+    function: Callable[[Observation], jax.Array]
+
+    def mean(self, actor: Any, observation: Observation) -> jax.Array:
+        """Actions (..., N, 4) in -1..1."""
+        function = self.function
+        for _ in range(observation.position.ndim - 2):
+            function = jax.vmap(function)
+        return jnp.clip(function(observation), -1.0, 1.0)

@@ -1,13 +1,15 @@
 """What a result was measured on: devices, versions, commit."""
 
-import importlib.metadata
 import os
 import platform
 import subprocess
 from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 
-_PACKAGES = ("openjax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
+import openjax
+
+_PACKAGES = ("jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
 
 
 def describe_machine() -> dict:
@@ -22,7 +24,7 @@ def describe_machine() -> dict:
         "processes": jax.process_count(),
         "cpu_cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "python": platform.python_version(),
-        "versions": {name: version for name in _PACKAGES if (version := _version(name))},
+        "versions": {"openjax": openjax.__version__} | {name: version(name) for name in _PACKAGES},
         **commit(),
         "date": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
     }
@@ -48,13 +50,6 @@ def _git(directory, *arguments):
     except (OSError, subprocess.SubprocessError):
         return None
     return found.stdout.strip()
-
-
-def _version(name):
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return None
 
 
 def _processor():

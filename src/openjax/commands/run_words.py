@@ -14,11 +14,9 @@ NAMED = 3
 
 def opening_words(settings: TrainSettings) -> str:
     """Which preset this is, or comes nearest to, and what that is: nobody should take another game for the paper's."""
-    own = _leaves(to_plain(settings))
-    others = {name: _leaves(to_plain(make())) for name, make in PRESETS.items()}
     changed = {
-        name: [leaf for leaf in own if own[leaf] != other.get(leaf) and leaf != "seed"]
-        for name, other in others.items()
+        name: [leaf for leaf in different_settings(settings, make()) if leaf != "seed"]
+        for name, make in PRESETS.items()
     }
     name = min(changed, key=lambda name: len(changed[name]))
     words = changed[name][:NAMED]
@@ -28,6 +26,12 @@ def opening_words(settings: TrainSettings) -> str:
         f"preset {name}{', changed in ' if words else ''}{', '.join(words)}: "
         f"{' '.join(PRESETS[name].__doc__.split())}"
     )
+
+
+def different_settings(own: TrainSettings, other: TrainSettings) -> list[str]:
+    """The dotted names of settings that have another value."""
+    theirs = _leaves(to_plain(other))
+    return [name for name, value in _leaves(to_plain(own)).items() if value != theirs.get(name)]
 
 
 def _leaves(plain: Any, path: str = "") -> dict[str, Any]:

@@ -14,7 +14,7 @@ from openjax.cluster.joining import Membership, find_membership
 from openjax.cluster.processes import Processes
 from openjax.commands.command_line import output_console, parse, peek
 from openjax.commands.machine import describe_machine
-from openjax.commands.run_words import opening_words
+from openjax.commands.run_words import different_settings, opening_words
 from openjax.commands.training_job import TrainingJob, run_job
 from openjax.commands.training_options import MAY_CHANGE, PROGRAM, TrainCommand
 from openjax.errors import UserError
@@ -22,7 +22,7 @@ from openjax.files import remove_unfinished, to_plain
 from openjax.learning import TrainSettings, preset
 from openjax.store.checkpoints import Checkpoints
 from openjax.store.compiled_programs import cache_programs
-from openjax.store.environments import make_environment, with_airframe
+from openjax.store.environments import make_environment
 from openjax.store.policies import known_policies
 from openjax.store.run_directory import RunDirectory, check_free, create_run, locked, open_run
 from openjax.vehicle.vehicle_file import copy_vehicle_file, load_vehicle_file
@@ -48,20 +48,7 @@ def read_command(arguments: Sequence[str]) -> TrainCommand:
         settings = dataclasses.replace(command.settings, total_steps=command.steps)
         command = dataclasses.replace(command, settings=settings)
     _check(command)
-    return _with_vehicle(command)
-
-
-def _with_vehicle(command):
-    """The command with its vehicle's airframe in the settings; one that is known by name needs no file."""
-    if command.vehicle is None:
-        return command
-    environment = with_airframe(command.settings.environment, command.vehicle)
-    named = load_vehicle_file(command.vehicle).path is None
-    return dataclasses.replace(
-        command,
-        settings=dataclasses.replace(command.settings, environment=environment),
-        vehicle=None if named else command.vehicle,
-    )
+    return command
 
 
 def membership(arguments: Sequence[str]) -> Membership | None:
@@ -129,8 +116,11 @@ def prepare(
     known = {} if resumed is None else resumed.read_facts()
     files = _files(command, resumed)
     environment = make_environment(command.settings.environment, *files.values())
-    if environment.evader_networks is None:  # a scripted one is in the settings
+    # a scripted evader, or a vehicle that is known by name, is in the settings
+    if environment.evader_networks is None:
         files["evader.npz"] = None
+    if files["vehicle.toml"] and load_vehicle_file(files["vehicle.toml"]).path is None:
+        files["vehicle.toml"] = None
     settings = dataclasses.replace(command.settings, environment=environment.settings)
     directory = resumed or RunDirectory(_free_directory(command, processes))
     started_from = _lasting(command.start_from) or known.get("start_from")
@@ -211,15 +201,7 @@ def _check_same(command, processes):
 
 def _check_kept(stored, given):
     """Raises UserError for settings beside --resume that the run can't take up in its middle."""
-
-    def differing(stored, given, prefix=""):
-        for name, value in stored.items():
-            if isinstance(value, dict):
-                yield from differing(value, given[name], f"{prefix}{name}.")
-            elif given[name] != value:
-                yield f"{prefix}{name}"
-
-    for name in differing(to_plain(stored), to_plain(given)):
+    for name in different_settings(given, stored):
         if name not in MAY_CHANGE:
             raise UserError(
                 f"--{name} can't change when a run is resumed; {', '.join(MAY_CHANGE)} can, or start another run "

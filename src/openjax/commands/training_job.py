@@ -25,10 +25,10 @@ from openjax.cluster.devices import (
     own_copy,
 )
 from openjax.cluster.processes import Processes
-from openjax.commands.before_and_after import compare, game_for
-from openjax.commands.evaluator import before_after_table, layout_slots, layout_tasks
+from openjax.commands.before_and_after import game_for, report
+from openjax.commands.evaluator import layout_slots
 from openjax.commands.gradient_stages import compile_first_flights, compile_last_stage, first_flights
-from openjax.commands.run_words import closing_words, layouts_like
+from openjax.commands.run_words import closing_words
 from openjax.commands.training_loop import Loop, NotFiniteError, Outcome, Plan, StopRequest, guarded
 from openjax.commands.validation import Validation, flat_metrics, selection_score
 from openjax.errors import UserError
@@ -38,7 +38,7 @@ from openjax.learning.train_state import policy_leaf
 from openjax.policy import PolicyParameters
 from openjax.policy.growth import with_longer_history
 from openjax.pursuit import Pursuit
-from openjax.show.metrics import METRICS_FILE, MetricsWriter
+from openjax.show.metrics import MetricsWriter
 from openjax.show.progress import Progress
 from openjax.store.checkpoint_files import load_orbax
 from openjax.store.checkpoints import Checkpoints
@@ -50,8 +50,6 @@ from openjax.store.traced_programs import recalled
 
 _SOON = 3.0
 """Seconds after which a training step that isn't ready doesn't come from the cache."""
-
-_BESIDE_RECORD = ("episode_return", "last_seen_error")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -398,58 +396,3 @@ def keep_best(
     if not kept:
         told = f"{scores[0]:.4f}, at most {max(scores[1:]):.4f} after it, not kept"
     return f"by the gradient through the simulation: validation score {told}, {seconds:.0f} s"
-
-
-def report(
-    job: TrainingJob, directory: RunDirectory, validation: Validation, outcome: Outcome, progress: Progress
-) -> Table:
-    """Evaluate the first and the best policy on the layouts, draw the best one's flights; the table of both."""
-    settings = job.settings
-    fitting = layouts_like(settings.environment)
-    abstract = jax.eval_shape(lambda: outcome.carry.policy)
-    rows = {}
-    for moment, path in (("before", directory.start_policy), ("after", directory.policy)):
-        progress.phase(f"evaluating the policy {moment} training on the layouts")
-        parameters = fill(abstract, load_policy_file(path)[0], str(path))
-        flown = validation(parameters)
-        shown = [(flown[0], i, f"validation task {i + 1}") for i in range(min(3, validation.number))]
-        if fitting:
-            tasks = layout_tasks(validation.evaluator.settings, fitting, job.layout_episodes)
-            layouts = validation.evaluator.fly(parameters, tasks, jax.random.key(0))
-            flown, shown = [*flown, *layouts], [(layout, 0, layout.name) for layout in layouts]
-        rows[moment] = [kind.record(_BESIDE_RECORD) for kind in flown]
-    flights = [kind.trajectory(episode, title) for kind, episode, title in shown]
-    others, their_flights = [], []
-    if job.compare_with is not None:
-        progress.phase(f"evaluating {job.compare_with} in the same game")
-        # its networks may be large, and these are minutes on a small machine
-        number = min(job.layout_episodes, 8), min(validation.number, 32)
-        others, their_flights = compare(load_policy(job.compare_with), job.environment, fitting, *number)
-    progress.phase("drawing")
-    facts = {
-        **({job.compare_with: others} if others else {}),
-        "updates": outcome.update,
-        "steps": outcome.update * settings.steps_per_update,
-        "seconds": round(outcome.seconds, 1),
-        **job.facts,
-    }
-    write_json(directory.path / "layouts.json", {**rows, **facts})
-    _draw(directory, flights, their_flights)
-    progress.phase("done", announce=False)
-    return before_after_table(
-        rows["before"], rows["after"], settings.environment.time_step, job.compare_with, others
-    )
-
-
-def _draw(directory, flights, their_flights):
-    """Curves, paths and the chase."""
-    from openjax.show.plots import plot_training, plot_trajectories
-    from openjax.show.videos import animate
-
-    plot_training(directory.path / "training.png", directory.path / METRICS_FILE)
-    plot_trajectories(directory.path / "trajectories.png", flights)
-    captured = [flight for flight in flights if flight.capture_index is not None]
-    chosen = (captured or flights)[0]
-    shown = [flight for flight in their_flights if flight.title.startswith(f"{chosen.title}, ")]
-    shown.insert(0, dataclasses.replace(chosen, title=f"{chosen.title}, this run") if shown else chosen)
-    animate(directory.path / "chase.gif", *shown)

@@ -66,15 +66,12 @@ def _own_folder():
 def _is_private(folder):
     """Whether it's a folder, no link to one, this user's, and nobody else can write to it."""
     status = folder.lstat()
-    mine = not hasattr(os, "geteuid") or status.st_uid == os.geteuid()
-    return stat.S_ISDIR(status.st_mode) and mine and (os.name == "nt" or not status.st_mode & 0o022)
+    return stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid() and not status.st_mode & 0o022
 
 
 def _user_cache():
     if sys.platform == "darwin":
         return Path.home() / "Library" / "Caches"
-    if os.name == "nt" and os.environ.get("LOCALAPPDATA"):
-        return Path(os.environ["LOCALAPPDATA"])
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
 
 
@@ -93,14 +90,8 @@ def _processor_key():
 
 def _bound(folder, size):
     """Delete the files of a folder that were used longest ago, until they take at most `size` bytes."""
-    files = []
-    for path in folder.rglob("*"):
-        if path.is_file():
-            status = path.stat()
-            files.append((max(status.st_atime, status.st_mtime), status.st_size, path))
-    total = sum(entry[1] for entry in files)
-    for _, bytes_, path in sorted(files, key=lambda entry: entry[0]):
-        if total <= size:
-            return
-        path.unlink(missing_ok=True)
-        total -= bytes_
+    files, total = [(path.stat(), path) for path in folder.rglob("*") if path.is_file()], 0
+    for status, path in sorted(files, key=lambda file: max(file[0].st_atime, file[0].st_mtime), reverse=True):
+        total += status.st_size
+        if total > size:
+            path.unlink(missing_ok=True)

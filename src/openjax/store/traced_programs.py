@@ -16,7 +16,6 @@ from openjax.vehicle.parameters import assets_directory
 _KERNELS = ("__gpu$xla.gpu.triton", "triton_kernel_call", "triton_kernel_call_ffi")
 """Calls whose text JAX doesn't promise to read in other versions; kept programs are read by the same version only."""
 _LIBRARIES = ("jax", "jaxlib", "flax", "optax", "mujoco")
-_DIGEST = hashlib.sha256
 
 
 def recalled(
@@ -94,7 +93,7 @@ def _read(file):
 
 def _key(name, carry, made_from):
     """What a program depends on, in short."""
-    digest = _DIGEST()
+    digest = hashlib.sha256()
     sources = [*Path(openjax.__file__).parent.rglob("*.py"), *assets_directory().iterdir()]
     for path in sorted(path for path in sources if path.is_file()):
         digest.update(path.name.encode() + path.read_bytes())
