@@ -81,28 +81,31 @@ def main(arguments: Sequence[str]) -> int:
     rows = []
     facts = {"command": " ".join([PROGRAM, *arguments]), "machine": machine}
     facts["compilation_cache"] = jax.config.jax_compilation_cache_dir is not None
-    with Steps("measuring", _expected(command), console) as steps:
-        for part, num_envs, length, function, inputs in cases(command, steps.begin):
-            timing = time_compiled(function, inputs, command.seconds)
-            rows.append(_row(part, num_envs, length, command.settings, timing))
-            console.print(_line(rows[-1]), soft_wrap=True)
-            # after each measurement, so that an interrupted sweep leaves what it has
-            write_json(command.json, {**facts, "settings": command.settings, "rows": rows})
+    sweep = _sweep(command)
+    with Steps("measuring", {name: seconds for name, *_, seconds in sweep}, console) as steps:
+        for name, part, number, _ in sweep:
+            steps.begin(name)
+            for *case, function, inputs in cases(command, part, number):
+                rows.append(_row(*case, command.settings, time_compiled(function, inputs, command.seconds)))
+                console.print(_line(rows[-1]), soft_wrap=True)
+                # after each measurement, so that an interrupted sweep leaves what it has
+                write_json(command.json, {**facts, "settings": command.settings, "rows": rows})
     if told := _programs_and_step(rows):
         print(told)
     print(f"written to {command.json}")
     return 0
 
 
-def _expected(command) -> dict[str, float]:
-    """Seconds that each part takes on two cores, about, by its name and number of environments."""
-    expected = {}
+def _sweep(command) -> list[tuple[str, str, int, float]]:
+    """(name, part, environments, seconds that it takes on two cores, about) of all that is measured."""
+    sweep = []
     for part in command.parts:
-        training = part == "training"
-        for number in command.training_envs if training else command.envs:
-            programs = 5 * len(command.devices) if training else 1
-            expected[f"{part}, {number:,} environments"] = SECONDS[part] + programs * command.seconds
-    return expected
+        numbers, programs = command.envs, 1
+        if part == "training":
+            numbers, programs = command.training_envs, 5 * len(command.devices)
+        seconds = SECONDS[part] + programs * command.seconds
+        sweep += [(f"{part}, {number:,} environments", part, number, seconds) for number in numbers]
+    return sweep
 
 
 def _programs_and_step(rows) -> str | None:

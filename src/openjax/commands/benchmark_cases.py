@@ -21,24 +21,21 @@ if TYPE_CHECKING:
 
 
 def cases(
-    command: "BenchmarkCommand", tell: Callable[[str], None]
+    command: "BenchmarkCommand", part: str, num_envs: int
 ) -> Iterator[tuple[str, int, int, Callable, tuple]]:
-    """(part, environments, control steps per call, function, its arguments), made one at a time; `tell` hears of what."""
+    """(name, environments, control steps per call, function, its arguments) of a part, made one at a time."""
     settings, steps = command.settings, command.steps
-    for part in command.parts:
-        for num_envs in command.training_envs if part == "training" else command.envs:
-            tell(f"{part}, {num_envs:,} environments")
-            if part == "training":
-                for number in command.devices:
-                    fitting = fitting_settings(settings, num_envs, number)
-                    for name, function, inputs in _training(fitting, number):
-                        yield name, fitting.num_envs, fitting.rollout_length, function, inputs
-            elif part == "rollout":
-                yield part, num_envs, steps, *_rollout(settings, num_envs, steps)
-            elif part == "environment":
-                yield part, num_envs, steps, *_environment(settings, num_envs, steps)
-            else:
-                yield part, num_envs, steps, *_physics(part, settings, num_envs, steps)
+    if part == "training":
+        for number in command.devices:
+            fitting = fitting_settings(settings, num_envs, number)
+            for name, function, inputs in _training(fitting, number):
+                yield name, fitting.num_envs, fitting.rollout_length, function, inputs
+    elif part == "rollout":
+        yield part, num_envs, steps, *_rollout(settings, num_envs, steps)
+    elif part == "environment":
+        yield part, num_envs, steps, *_environment(settings, num_envs, steps)
+    else:
+        yield part, num_envs, steps, *_physics(part, settings, num_envs, steps)
 
 
 def _training(settings, devices):

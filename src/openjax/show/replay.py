@@ -41,7 +41,7 @@ def _plain(policy: str, flight: Trajectory) -> dict:
         return np.rint(1000.0 * np.asarray(values, float)).astype(int).ravel().tolist()
 
     def frame(index):
-        return None if index is None else index // every
+        return None if index is None or index // every >= len(poses) else index // every
 
     poses = np.concatenate([flight.pursuer_position, flight.pursuer_quaternion], axis=-1)[steps]
     plain = {
@@ -57,18 +57,13 @@ def _plain(policy: str, flight: Trajectory) -> dict:
         "pursuers": [thousandths(pose) for pose in np.moveaxis(poses, 1, 0)],
         "evader": thousandths(flight.evader_position[steps]),
         "capture": frame(flight.capture_index),
-        "crashes": [_before(frame(flight.crash_of(i)), len(poses)) for i in range(poses.shape[1])],
+        "crashes": [frame(flight.crash_of(i)) for i in range(poses.shape[1])],
         "seen": [] if flight.seen is None else _spans(flight.seen[steps]),
     }
     if flight.predicted is not None:
         horizons = np.linspace(0, flight.predicted.shape[1] - 1, AHEAD).round().astype(int)
         plain |= {"predicted": thousandths(flight.predicted[steps][:, horizons]), "ahead": AHEAD}
     return plain
-
-
-def _before(index: int | None, end: int) -> int | None:
-    """An index, if it lies before the end."""
-    return None if index is None or index >= end else index
 
 
 def _spans(flags: np.ndarray) -> list[list[int]]:

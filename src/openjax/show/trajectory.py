@@ -27,19 +27,16 @@ class Trajectory:
     @property
     def capture_index(self) -> int | None:
         """Index of the first step with a capture."""
-        steps = np.flatnonzero(self.captured.any(axis=-1))
-        return int(steps[0]) if steps.size else None
+        return _first(self.captured.any(axis=-1))
 
     @property
     def crash_index(self) -> int | None:
         """Index of the first step with a crash."""
-        steps = np.flatnonzero(self.crashed.any(axis=-1))
-        return int(steps[0]) if steps.size else None
+        return _first(self.crashed.any(axis=-1))
 
     def crash_of(self, pursuer: int) -> int | None:
         """Index of the first step in which this pursuer crashes."""
-        steps = np.flatnonzero(self.crashed[:, pursuer])
-        return int(steps[0]) if steps.size else None
+        return _first(self.crashed[:, pursuer])
 
     def end(self, after: float = 1.0) -> int:
         """Number of steps worth showing: up to `after` seconds after the first capture, or all."""
@@ -47,3 +44,8 @@ class Trajectory:
         if self.capture_index is None:
             return steps
         return min(steps, self.capture_index + round(after / self.time_step))
+
+
+def _first(flags):
+    steps = np.flatnonzero(flags)
+    return int(steps[0]) if steps.size else None
