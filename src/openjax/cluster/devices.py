@@ -25,8 +25,7 @@ _SHARED_OUT = ("observation", "state")
 
 def can_share_out(settings: TrainSettings, number: int) -> bool:
     """Whether each of `number` devices gets the same share of the worlds, of every task and of every minibatch."""
-    group = _group(settings)
-    return number == 1 or settings.num_envs % (number * group) == 0
+    return number == 1 or settings.num_envs % (number * _group(settings)) == 0
 
 
 def check_devices(settings: TrainSettings, number: int) -> None:
@@ -74,20 +73,15 @@ def check_memory(settings: TrainSettings, number: int) -> None:
 def _memory():
     """Bytes of one device; for a CPU those of the whole machine."""
     device = jax.local_devices()[0]
-    statistics = None if device.platform == "cpu" else device.memory_stats()
-    if statistics and "bytes_limit" in statistics:
-        return statistics["bytes_limit"]
-    try:
+    if device.platform == "cpu":
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):
-        return float("inf")
+    return (device.memory_stats() or {}).get("bytes_limit", float("inf"))
 
 
 def carry_shardings(number: int) -> TrainCarry | jax.sharding.Sharding:
     """Where the leaves of a carry lie, as a prefix of its tree."""
-    if number == 1:
-        return jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    return _carry_of(NamedSharding(_mesh(number), PartitionSpec(AXIS)), everywhere(number))
+    same = everywhere(number)
+    return same if number == 1 else _carry_of(NamedSharding(_mesh(number), PartitionSpec(AXIS)), same)
 
 
 def everywhere(number: int) -> jax.sharding.Sharding:

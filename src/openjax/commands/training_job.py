@@ -84,6 +84,13 @@ class TrainingJob:
         names = str(jax.tree.structure(game.effect_parameters))
         return repr((self.devices, settings, game.settings, game.effects, names, arrays))
 
+    @property
+    def keep(self) -> Callable | None:
+        """`recalled` for the run's programs; None where traces aren't kept."""
+        if self.traced is None:
+            return None
+        return functools.partial(recalled, made_from=self.made_from, folder=self.traced)
+
     def check(self) -> None:
         """Raises UserError for what doesn't fit together, before any directory is touched."""
         check_devices(self.settings, self.devices)
@@ -212,11 +219,9 @@ class _Run:
         """The stage before MAPPO, of a run that has it still to come; else None."""
         if not self.settings.first_flights.updates or self.job.start_from or self.checkpoints.any_finished():
             return None
-        job, keep = self.job, None
-        if job.traced is not None:
-            keep = functools.partial(recalled, made_from=job.made_from, folder=job.traced)
-        flights = first_flights(self.settings, job.environment)
-        return compile_first_flights(flights, self.abstract.policy, self.progress.message, self._over, keep)
+        flights = first_flights(self.settings, self.job.environment)
+        say, policy = self.progress.message, self.abstract.policy
+        return compile_first_flights(flights, policy, say, self._over, self.job.keep)
 
     def _over(self):
         """Whether the run is to end: a signal to any process counts, and the first one's clock."""
@@ -316,13 +321,12 @@ def _programs(job):
     same = everywhere(job.devices)
     step = guarded(make_device_step(settings, job.environment, job.devices))
     tried = job.devices == 1 or (jax.default_backend() == "cpu" and jax.process_count() == 1)
-    if job.traced is not None and tried:
-        keep = functools.partial(recalled, carry=abstract, made_from=job.made_from, folder=job.traced)
-        step = keep("step", step, lambda: (abstract,))
+    if tried and (keep := job.keep):
+        step = keep("step", step, lambda: (abstract,), carry=abstract)
         fresh, arguments = start, lambda: (jax.random.key(settings.seed),)
 
         def start(key):
-            return jax.jit(keep("start", fresh, arguments), out_shardings=shardings)(key)
+            return jax.jit(keep("start", fresh, arguments, carry=abstract), out_shardings=shardings)(key)
 
     # without shardings, the compiler may move a leaf, and the next call would compile again; all processes can read the rest
     options = {"out_shardings": (shardings, same, same), "compiler_options": compiler_options(job.devices)}
