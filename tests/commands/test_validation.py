@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from openjax.commands.evaluator import Evaluator
 from openjax.commands.validation import Validation, far_tasks, selection_score, uniform_tasks
-from openjax.learning import summarise
-from openjax.policy import NetworkSettings, Policy, PredictorSettings
+from openjax.learning import TrainSettings, build, summarise
+from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import Pursuit, PursuitSettings, RewardSettings
 from openjax.pursuit.task import START_X, starts_clear
 
@@ -50,18 +50,24 @@ def test_fewer_tasks_are_the_first_of_more(far):
 def test_uniform_tasks_fly_as_they_would_alone():
     """The far tasks beside them change nothing that a checkpoint is chosen by, nor does what the reward weighs."""
     game = PursuitSettings(physics="rigid", episode_length=3)
-    environment = Pursuit(game)
-    policy = Policy.for_environment(
-        environment, NetworkSettings(features=8, heads=2), PredictorSettings(units=4)
+    run = TrainSettings(
+        environment=game,
+        network=NetworkSettings(features=8, heads=2),
+        predictor=PredictorSettings(units=4, windows=1, steps=1, horizons=(1, 2)),
+        rollout_length=3,
+        restart_steps=3,
+        validation_episodes=4,
     )
+    environment = Pursuit(game)
+    policy = build(run, environment).policy
     key = jax.random.key(1)
     parameters = jax.jit(lambda key: policy.init(key, environment.reset(key)[0]))(key)
-    validation = Validation(environment, game, policy, 4)
+    validation = Validation(run, environment)
     uniform, far = (kind.evaluation for kind in validation(parameters))
     rewarded = dataclasses.replace(
-        game, reward=RewardSettings(smoothness=2.0, first_crash=5000.0, distance=3.0)
+        game, max_pillars=6, reward=RewardSettings(smoothness=2.0, first_crash=5000.0, distance=3.0)
     )
-    evaluator, tasks = Evaluator(Pursuit(rewarded), policy, 4), {"alone": uniform_tasks(game, 4, 5)}
+    evaluator, tasks = Evaluator(Pursuit(rewarded), policy, 4), {"alone": uniform_tasks(game, 4, 6)}
     alone = evaluator.fly(parameters, tasks, jax.random.key(0))[0].evaluation
     together, by_itself = summarise(uniform), summarise(alone)
     assert abs(together.pop("episode_return") - by_itself.pop("episode_return")) > 1.0

@@ -150,9 +150,8 @@ def prepare(
 
 def _files(command, resumed):
     """What the run flies with by its name in a run's directory: vehicle, effects, evader; None where there is none."""
-    kept = (lambda name: None) if resumed is None else resumed.optional
     given = {"vehicle.toml": command.vehicle, "effects.toml": command.effects, "evader.npz": command.opponent}
-    return {name: path or kept(name) for name, path in given.items()}
+    return {name: path or (resumed and resumed.optional(name)) for name, path in given.items()}
 
 
 def _free_directory(command, processes):

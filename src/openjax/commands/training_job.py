@@ -26,7 +26,6 @@ from openjax.cluster.devices import (
 )
 from openjax.cluster.processes import Processes
 from openjax.commands.before_and_after import game_for, report
-from openjax.commands.evaluator import layout_slots
 from openjax.commands.gradient_stages import compile_first_flights, compile_last_stage, first_flights
 from openjax.commands.run_words import closing_words
 from openjax.commands.training_loop import Loop, NotFiniteError, Outcome, Plan, StopRequest, guarded
@@ -286,7 +285,7 @@ class _Run:
     def _ready_validation(self):
         """The validation, compiled; and what else is needed soon after the first update is loaded."""
         load_orbax()
-        validation = _validation(self.job)
+        validation = Validation(self.settings, self.job.environment)
         tasks = validation.tasks["validation"]
         validation.evaluator.compile_ahead(abstract_like(self.abstract.policy), tasks)()
         return validation
@@ -346,17 +345,6 @@ def _start_parameters(job, fresh: PolicyParameters) -> PolicyParameters:
     kept = fill(kept, named_leaves(own.replace(critic={})), f"--start_from {job.start_from}")
     fits = jax.tree.map(jnp.shape, own.critic) == jax.tree.map(jnp.shape, fresh.critic)
     return kept.replace(critic=own.critic if fits else fresh.critic)
-
-
-def _validation(job):
-    """The validation tasks and their evaluation, which has room for the layouts' pillars."""
-    settings, environment = job.settings, job.environment
-    evaders = settings.evaders_validation or settings.environment.evaders
-    slots = layout_slots(settings.environment)
-    game = dataclasses.replace(settings.environment, max_pillars=slots, evaders=evaders)
-    wide = dataclasses.replace(environment, settings=game, dynamics=None)
-    policy = build(settings, environment).policy
-    return Validation(wide, settings.environment, policy, settings.validation_episodes)
 
 
 def keep_best(

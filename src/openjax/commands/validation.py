@@ -1,10 +1,13 @@
 """Validation tasks, never trained on: the same in every run, to watch it and to choose its best checkpoint. Never the layouts."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 
-from openjax.commands.evaluator import Evaluator, Flown
-from openjax.policy import Policy, PolicyParameters
+from openjax.commands.evaluator import Evaluator, Flown, layout_slots
+from openjax.learning import TrainSettings, build
+from openjax.policy import PolicyParameters
 from openjax.pursuit import Pursuit, PursuitSettings, Task, expand_task, turn_task, uniform_task
 
 VALIDATION_KEY = 20_000_003
@@ -39,22 +42,22 @@ def far_tasks(settings: PursuitSettings, number: int, slots: int) -> Task:
 
 
 class Validation:
-    """`number` uniform and as many far tasks, flown in one call of one compiled evaluation.
+    """A run's uniform and as many far tasks, flown in one call of one compiled evaluation; it has room for layouts' pillars.
 
     Args:
-      environment: its settings say how many pillar slots the tasks have.
-      drawn: settings of the training, from which the tasks are drawn.
-      policy: the networks.
-      number: tasks of each kind.
+      settings: of the run; from its game the tasks are drawn.
+      environment: the run's.
     """
 
-    def __init__(self, environment: Pursuit, drawn: PursuitSettings, policy: Policy, number: int):
-        slots = environment.settings.max_pillars
-        self.number = number
-        self.evaluator = Evaluator(environment, policy, 2 * number)
+    def __init__(self, settings: TrainSettings, environment: Pursuit):
+        drawn, self.number = settings.environment, settings.validation_episodes
+        slots, evaders = layout_slots(drawn), settings.evaders_validation or drawn.evaders
+        game = dataclasses.replace(drawn, max_pillars=slots, evaders=evaders)
+        wide = dataclasses.replace(environment, settings=game, dynamics=None)
+        self.evaluator = Evaluator(wide, build(settings, environment).policy, 2 * self.number)
         self.tasks: dict[str, Task] = {
-            "validation": uniform_tasks(drawn, number, slots),
-            "validation_far": far_tasks(drawn, number, slots),
+            "validation": uniform_tasks(drawn, self.number, slots),
+            "validation_far": far_tasks(drawn, self.number, slots),
         }
 
     def __call__(self, parameters: PolicyParameters) -> list[Flown]:

@@ -85,15 +85,13 @@ def load_arrays(
     alone.multiprocessing.primary_host = jax.process_index()
     alone.multiprocessing.active_processes = {jax.process_index()}
     with alone:
-        loaded = {
-            names[name]: leaf
-            for name, leaf in load_orbax().load(path, wanted).items()
-            if names[name] is not None
-        }
-    is_key = {name: jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) for name, leaf in loaded.items()}
-    return {
-        name: np.asarray(jax.random.key_data(leaf) if is_key[name] else leaf) for name, leaf in loaded.items()
-    }
+        loaded = load_orbax().load(path, wanted)
+
+    def plain(leaf):
+        is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        return np.asarray(jax.random.key_data(leaf) if is_key else leaf)
+
+    return {names[name]: plain(leaf) for name, leaf in loaded.items() if names[name] is not None}
 
 
 def is_checkpoint(path: Path) -> bool:
@@ -126,13 +124,8 @@ def check_state(path: Path) -> None:
     try:
         lines = _checksums_file(path).read_text(encoding="utf-8").splitlines()
         expected = {name: checksum for checksum, _, name in (line.partition("  ") for line in lines)}
-        found = {file.relative_to(path).as_posix(): file for file in _files(path)}
-        different = sorted(expected.keys() ^ found.keys())
-        different += [
-            name
-            for name in sorted(expected.keys() & found.keys())
-            if _checksum(found[name]) != expected[name]
-        ]
+        found = {file.relative_to(path).as_posix(): _checksum(file) for file in _files(path)}
+        different = sorted(dict(expected.items() ^ found.items()))
     except (OSError, UnicodeDecodeError) as error:
         raise DamagedError(f"checkpoint {path} is damaged ({error})") from error
     if different or not expected:
