@@ -8,15 +8,18 @@ from typing import Any
 import jax
 
 
-def in_background(make: Callable[[], Any]) -> Callable[[], Any]:
-    """Start to make something in a thread of its own; a function that waits for it and returns it, or raises its error."""
+def in_background(make: Callable[[], Any]) -> Callable[..., Any]:
+    """Start to make something in a thread of its own; a function that waits for it and returns it, or raises its error.
+
+    Given seconds, it waits no longer and then raises `TimeoutError`.
+    """
     pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="background")
     future = pool.submit(make)
     pool.shutdown(wait=False)
     return future.result
 
 
-def compile_ahead(function: Callable, *arguments) -> Callable[..., bool]:
+def compile_ahead(function: Callable, *arguments) -> Callable[..., Any]:
     """Start to compile a function of `jax.jit` for arguments of these shapes, dtypes and shardings.
 
     It's traced before this returns, as two threads that trace hold each other up; only the compiler runs beside.
@@ -27,21 +30,9 @@ def compile_ahead(function: Callable, *arguments) -> Callable[..., bool]:
       arguments: arrays, or `jax.ShapeDtypeStruct`s in their place.
 
     Returns:
-      a function that waits for the end, for at most as many seconds as it is given, and raises what went wrong in the
-      compiler; it returns whether the end was reached.
+      a function that waits for the end, see `in_background`.
     """
-    ready = in_background(function.lower(*arguments).compile)
-
-    def wait(seconds: float | None = None) -> bool:
-        try:
-            ready(seconds)
-        except TimeoutError:
-            if seconds is None:  # the compiler's own
-                raise
-            return False
-        return True
-
-    return wait
+    return in_background(function.lower(*arguments).compile)
 
 
 @contextlib.contextmanager

@@ -151,7 +151,7 @@ class _Run:
         self.progress.phase("compiling the start: networks, first tasks", announce=latest is None)
         start, step, self.abstract = _programs(job)
         # takes longest, so it comes first
-        step_ready = (lambda _=None: True) if done else compile_ahead(step, self.abstract)
+        step_ready = (lambda *_: None) if done else compile_ahead(step, self.abstract)
         self.first_flights = self._first_flights()
         carry, self.first_update, seconds = self._first_carry(start)
         if self.processes.is_first:
@@ -162,7 +162,7 @@ class _Run:
             return None
         with self._metrics() as metrics:
             self.progress.phase("compiling the training step", announce=not (done or over))
-            self._compile_beside((lambda _=None: True) if over else step_ready)
+            self._compile_beside((lambda *_: None) if over else step_ready)
             self.began = min(self.began, time.monotonic())
             loop = Loop(
                 step,
@@ -269,8 +269,11 @@ class _Run:
         first, settings = self.processes.is_first, self.settings
         # while an accelerator's compiler works for long, validation is made beside it; else its tracing would
         # only hold up the first update, and on a CPU both would share the same cores
-        if jax.default_backend() != "cpu" and not step_ready(_SOON):
-            self._prepare_validation()
+        if jax.default_backend() != "cpu":
+            try:
+                step_ready(_SOON)
+            except TimeoutError:
+                self._prepare_validation()
         step_ready()
         self._prepare_validation()
         if first and settings.analytic.updates:
