@@ -1,11 +1,16 @@
-"""The last stage of a run keeps the best of what it learns, only where that validates better than what it had."""
+"""What a run flies with, and its last stage, which keeps what validates best."""
+
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from openjax.cluster.processes import Processes
+from openjax.commands.training_command import prepare
 from openjax.commands.training_job import keep_best
+from openjax.commands.training_options import TrainCommand
 from openjax.files import read_json
 from openjax.learning import build, preset
 from openjax.pursuit import Pursuit
@@ -54,3 +59,10 @@ def test_last_stage_keeps_what_validates_best(crashes, kept, tmp_path):
     assert (notes["update"], notes.get("analytic_updates", 0)) == (7, 5 * kept)
     assert ("not kept" in message) == (kept == 0)
     assert read_json(tmp_path / "analytic.json")["kept"] == 5 * kept
+
+
+def test_a_vehicle_that_is_known_by_name_needs_no_file_in_the_run(tmp_path):
+    settings = preset("quick")
+    command = TrainCommand(vehicle=Path("brushless"), out=tmp_path / "run", devices="1", settings=settings)
+    job, _, files = prepare(command, [], 0.0, Processes())
+    assert job.settings.environment.airframe == "brushless" and files == {}
