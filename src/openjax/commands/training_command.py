@@ -80,12 +80,11 @@ def default_preset() -> str:
 
 def start(command: TrainCommand, arguments: Sequence[str], started: float, processes: Processes) -> int:
     """Make the run's directory, or open it, and train. Returns the exit status."""
-    _check_same(command, processes)
     cache = cache_programs() if command.compilation_cache else None
     job, directory, files = prepare(command, arguments, started, processes)
     if command.traced_programs and cache is not None:
         job = dataclasses.replace(job, traced=cache / "traced")
-    processes.everyone()  # a mistake shows before any process changes a file
+    _check_same(job.settings, processes)  # a mistake shows before any process changes a file
     with locked(directory.path) if processes.is_first else contextlib.nullcontext():
         if command.resume is None and processes.is_first:
             create_run(directory.path, command.overwrite)
@@ -187,9 +186,9 @@ def _lasting(start_from):
     return str(Path(start_from).absolute())
 
 
-def _check_same(command, processes):
+def _check_same(settings, processes):
     """Raises UserError where processes were started with different settings: their results would drift apart."""
-    own = {"settings": to_plain(command.settings), "JAX": jax.__version__}
+    own = {"settings": to_plain(settings), "JAX": jax.__version__}
     for other, theirs in enumerate(processes.everyone(own)):
         different = [name for name in own if own[name] != theirs[name]]
         if different:
