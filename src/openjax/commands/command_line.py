@@ -1,5 +1,6 @@
 """Command lines from frozen dataclasses (tyro): help from docstrings, one-line errors, exit status 2."""
 
+import argparse
 import contextlib
 import dataclasses
 import difflib
@@ -99,16 +100,10 @@ def _showing_intervals():
 
 def peek(arguments: Sequence[str], name: str) -> str | None:
     """The value of `--name` before the real parsing, which needs it to choose its defaults."""
-    value = None
-    for i, argument in enumerate(arguments):
-        option, equals, given = argument.partition("=")
-        if option.replace("-", "_") != f"__{name}":  # dashes and underscores alike, as in the real parsing
-            continue
-        if equals:
-            value = given
-        elif i + 1 < len(arguments):
-            value = arguments[i + 1]
-    return value
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    # with underscores or dashes, as in the real parsing, which also says if the value is missing
+    parser.add_argument(f"--{name}", f"--{name.replace('_', '-')}", nargs="?")
+    return getattr(parser.parse_known_args(arguments)[0], name)
 
 
 def one_thread_for_matrices() -> None:
