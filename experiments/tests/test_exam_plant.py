@@ -9,9 +9,10 @@ from experiments.diagnosis import answer_key, cases, effects, fleet, sensors, ve
 from openjax.vehicle import (
     load_vehicle,
     rigid_step,
+    rotor_reaction,
     rotor_speed_step,
     rotor_thrust,
-    rotor_wrench,
+    total_wrench,
 )
 from openjax.vehicle.rate_controller import rate_controller
 from openjax.vehicle.state import DroneState
@@ -61,27 +62,12 @@ def _replay(vehicle, start, motors, commands, from_commands):
             m, integral = rate_controller(vehicle, state, command, dt)
             m = m if from_commands else m_logged
             rotor = rotor_speed_step(vehicle, state.rotor_speed, m, dt)
-            force, torque = rotor_wrench(vehicle, rotor_thrust(vehicle, rotor), rotor)
-            p, q, v, w = rigid_step(
-                vehicle,
-                state.position,
-                state.quaternion,
-                state.velocity,
-                state.body_rates,
-                _world(state.quaternion, force),
-                torque,
-                dt,
+            force, torque = total_wrench(
+                vehicle, rotor_thrust(vehicle, rotor), rotor_reaction(vehicle, rotor)
             )
-            new = state.replace(
-                position=p,
-                quaternion=q,
-                velocity=v,
-                body_rates=w,
-                rotor_speed=rotor,
-                rate_integral=integral,
-                previous_body_rates=state.body_rates,
-            )
-            return new, None
+            new = rigid_step(vehicle, state, _world(state.quaternion, force), torque, dt)
+            rotors = {"rotor_speed": rotor, "rate_integral": integral}
+            return new.replace(**rotors, previous_body_rates=state.body_rates), None
 
         carry, _ = jax.lax.scan(step, carry, inputs)
         return carry, (carry.velocity, carry.body_rates)

@@ -15,7 +15,6 @@ from openjax.vehicle import (
     rotor_reaction,
     rotor_speed_step,
     rotor_thrust,
-    rotor_wrench,
     total_wrench,
 )
 from openjax.vehicle.effects import EFFECTS, Effect, Parameter, make_context
@@ -106,7 +105,7 @@ def test_com_offset_and_imbalance_trim_differently(vehicle):
     """Both turn the body about roll and pitch in proportion to thrust, only imbalance about yaw."""
     moved = EFFECTS["com_offset"].body(given("com_offset", x=0.002, y=-0.001), vehicle)
     speed = state_at(vehicle).rotor_speed
-    force, torque = rotor_wrench(moved, rotor_thrust(moved, speed), speed)
+    force, torque = total_wrench(moved, rotor_thrust(moved, speed), rotor_reaction(moved, speed))
     np.testing.assert_allclose(torque, [0.001 * force[2], 0.002 * force[2], 0], rtol=1e-3, atol=1e-8)
     _, torque = rotors(vehicle, "motor_imbalance", {"m1": 0.1})
     assert torque[0] < 0 and torque[1] < 0 and torque[2] < 0  # front right, counter-clockwise

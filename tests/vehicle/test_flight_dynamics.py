@@ -51,25 +51,28 @@ def fly(vehicle):
 def test_momentum_and_energy_without_forces():
     with jax.enable_x64(True):
         vehicle = load_vehicle(dtype=jnp.float64)
-        start = (jnp.zeros(3), jnp.array([1.0, 0, 0, 0]), jnp.array([1.0, -2, 3]), jnp.array([4.0, -3, 6]))
+        start = hover_state(vehicle, jnp.zeros(3), velocity=jnp.array([1.0, -2, 3]))
+        start = start.replace(body_rates=jnp.array([4.0, -3, 6]))
         zero = jnp.zeros(3)
         dt = 1e-4
 
-        def advance(body, _):
-            return rigid_step(vehicle, *body, zero, zero, dt), None
+        def advance(drone, _):
+            return rigid_step(vehicle, drone, zero, zero, dt), None
 
-        end = jax.jit(lambda body: jax.lax.scan(advance, body, None, length=10_000)[0])(start)
+        end = jax.jit(lambda drone: jax.lax.scan(advance, drone, None, length=10_000)[0])(start)
 
-        def spin(body):
-            angular = vehicle.inertia * body[3]
-            return rotate(body[1], angular), 0.5 * jnp.sum(body[3] * angular)
+        def spin(drone):
+            angular = vehicle.inertia * drone.body_rates
+            return rotate(drone.quaternion, angular), 0.5 * jnp.sum(drone.body_rates * angular)
 
         (momentum0, energy0), (momentum1, energy1) = spin(start), spin(end)
-    assert np.linalg.norm(end[3] - start[3]) > 1, "the body must tumble for this to mean anything"
+    assert np.linalg.norm(end.body_rates - start.body_rates) > 1, (
+        "the body must tumble for this to mean anything"
+    )
     np.testing.assert_allclose(momentum1, momentum0, atol=2e-3 * np.linalg.norm(momentum0))
     np.testing.assert_allclose(energy1, energy0, rtol=2e-3)
-    np.testing.assert_allclose(end[2], [1, -2, 3 - 9.81], rtol=1e-9)  # a free fall
-    np.testing.assert_allclose(end[0], [1, -2, 3 - 0.5 * 9.81 * (1 + dt)], rtol=1e-9)
+    np.testing.assert_allclose(end.velocity, [1, -2, 3 - 9.81], rtol=1e-9)  # a free fall
+    np.testing.assert_allclose(end.position, [1, -2, 3 - 0.5 * 9.81 * (1 + dt)], rtol=1e-9)
 
 
 def test_hover_holds_for_eight_seconds(vehicle, fly):

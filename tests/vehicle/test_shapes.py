@@ -19,12 +19,11 @@ from openjax.vehicle import (
     rotors,
     solids,
     stops,
-    wrench,
 )
 from openjax.vehicle.arena import Arena
 
 SIZES = {"drones": 3, "pillars": 2, "others": 2, "things": 5}
-MODULES = (parameters, inspect.getmodule(rate_controller), rigid_body, rotors, solids, stops, wrench)
+MODULES = (parameters, inspect.getmodule(rate_controller), rigid_body, rotors, solids, stops)
 
 
 def is_array(kind):

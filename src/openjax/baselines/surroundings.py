@@ -8,6 +8,8 @@ from flax import struct
 
 from openjax.pursuit import Observation, Pursuit
 from openjax.pursuit.settings import HIDDEN
+from openjax.vehicle import hover_share
+from openjax.vehicle.solids import others
 
 QUATERNION = slice(3, 7)
 VELOCITY = slice(7, 10)
@@ -35,10 +37,9 @@ class Craft:
     @classmethod
     def of(cls, environment: Pursuit) -> "Craft":
         """The craft of an environment's pursuers."""
-        settings, vehicle = environment.settings, environment.vehicle
+        settings = environment.settings
         with jax.ensure_compile_time_eval():  # an environment may be made inside a compiled program
-            most = 4 * vehicle.thrust_constant * vehicle.max_rotor_speed**2
-            hover = round(float(vehicle.mass * vehicle.gravity / most), 6)
+            hover = round(float(hover_share(environment.vehicle)), 6)
         return cls(
             arena_radius=settings.arena_radius,
             arena_height=settings.arena_height,
@@ -84,9 +85,7 @@ def surroundings(craft: Craft, observation: Observation) -> Surroundings:
 
     moved = newest[..., 7:] - observation.frames[..., 0, 7:]
     velocities = moved.reshape(per_pursuer) / max(craft.history_seconds, 1e-6)
-    index = jnp.array([[j for j in range(number) if j != i] for i in range(number)], jnp.int32)
-    index = index.reshape(number, number - 1)
-    apart_velocity = velocities[..., :, None, :] - velocities[..., index, :]
+    apart_velocity = velocities[..., :, None, :] - velocities[..., others(number), :]
     target_velocity = for_all(jnp.where(seen, newest[..., 4:7], 0.0))
 
     normal, distance = _obstacles(craft, observation)

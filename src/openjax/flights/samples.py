@@ -27,6 +27,7 @@ from openjax.vehicle import (
 )
 from openjax.vehicle.effects import composition, make_context
 from openjax.vehicle.rate_controller import rate_controller
+from openjax.vehicle.solids import others
 
 PERIOD = 0.01  # s, rows and off-board commands
 RATE_LOOPS = 5  # per row: 500 Hz
@@ -143,9 +144,6 @@ def _fly(plant: Vehicle, assumed: Vehicle, wanted, voltage, parameters, key, nam
         drones, jax.random.split(memory_key, count)
     )
     drones = drones.replace(effect_memory=memory)
-    others = np.array([[j for j in range(count) if j != i] for i in range(count)], int).reshape(
-        count, count - 1
-    )
 
     def contexts(drones, load, air_time, dt):
         """Of every drone. The cell gives less with charge (0.02 V/s is a short, hard flight) and with
@@ -155,7 +153,7 @@ def _fly(plant: Vehicle, assumed: Vehicle, wanted, voltage, parameters, key, nam
         def build(d, near, v):
             return make_context(flown, d, others_position=near, battery_voltage=v, air_time=air_time, dt=dt)
 
-        return jax.vmap(build)(drones, drones.position[others], under_load), under_load
+        return jax.vmap(build)(drones, drones.position[others(count)], under_load), under_load
 
     def row(carry, inputs):
         drones, integral, force, load, key = carry
@@ -211,14 +209,8 @@ def _physics(vehicle, effects, parameters, drone: DroneState, motor_command, con
     motor_command = composition.change_motor_command(effects, parameters, motor_command, context)
     speed = rotor_speed_step(vehicle, drone.rotor_speed, motor_command, context.dt)
     force, torque = composition.wrench(effects, parameters, vehicle, speed, context)
-    body = (drone.position, drone.quaternion, drone.velocity, drone.body_rates)
-    position, quaternion, velocity, body_rates = rigid_step(
-        vehicle, *body, rotate(drone.quaternion, force), torque, context.dt
-    )
-    drone = drone.replace(
-        position=position, quaternion=quaternion, velocity=velocity, body_rates=body_rates, rotor_speed=speed
-    )
-    return drone, force
+    drone = rigid_step(vehicle, drone, rotate(drone.quaternion, force), torque, context.dt)
+    return drone.replace(rotor_speed=speed), force
 
 
 def _position_controller(assumed: Vehicle, state: DroneState, integral, wanted):

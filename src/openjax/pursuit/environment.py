@@ -21,7 +21,7 @@ from openjax.pursuit.state import PursuitState
 from openjax.pursuit.statistics import count, empty_statistics
 from openjax.pursuit.task import Task, start_attitude, uniform_task
 from openjax.ranges import changed
-from openjax.vehicle import DroneState, Vehicle, hover_state, load_vehicle, make_drones_step
+from openjax.vehicle import DroneState, Vehicle, hover_share, hover_state, load_vehicle, make_drones_step
 from openjax.vehicle.family import draw_vehicles, family_effects
 
 THRUST_LIMIT = 0.9
@@ -30,8 +30,7 @@ THRUST_LIMIT = 0.9
 
 def hover_action(vehicle: Vehicle) -> jax.Array:
     """(4,) action [thrust, roll, pitch, yaw rate] in -1..1 that hovers."""
-    hover = vehicle.mass * vehicle.gravity / (4 * vehicle.thrust_constant * vehicle.max_rotor_speed**2)
-    return jnp.concatenate([(2.0 * hover - 1.0)[None], jnp.zeros(3, jnp.float32)]).astype(jnp.float32)
+    return jnp.zeros(4, jnp.float32).at[0].set(2.0 * hover_share(vehicle) - 1.0)
 
 
 def action_to_command(action: jax.Array) -> jax.Array:

@@ -6,15 +6,17 @@ __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
         **dict.fromkeys(("DronesStep", "make_drones_step"), "drones"),
-        **dict.fromkeys(("Vehicle", "hover_rotor_speed", "load_vehicle", "max_rotor_thrust"), "parameters"),
+        **dict.fromkeys(
+            ("Vehicle", "hover_rotor_speed", "hover_share", "load_vehicle", "max_rotor_thrust"), "parameters"
+        ),
         **dict.fromkeys(
             ("quaternion_integrate", "quaternion_multiply", "rigid_step", "rotate", "rotate_inverse"),
             "rigid_body",
         ),
         **dict.fromkeys(
-            ("commanded_rotor_speed", "rotor_reaction", "rotor_speed_step", "rotor_thrust"), "rotors"
+            ("commanded_rotor_speed", "rotor_reaction", "rotor_speed_step", "rotor_thrust", "total_wrench"),
+            "rotors",
         ),
         **dict.fromkeys(("DroneState", "hover_state"), "state"),
-        **dict.fromkeys(("rotor_wrench", "total_wrench"), "wrench"),
     },
 )

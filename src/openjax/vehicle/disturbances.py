@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from openjax.vehicle.effects.effect import Effect, Parameter
-from openjax.vehicle.parameters import max_rotor_thrust
+from openjax.vehicle.parameters import hover_command
 from openjax.vehicle.rigid_body import quaternion_multiply, rotate_inverse
 
 LONGEST_JITTER = 0.01  # s, one control step
@@ -19,10 +19,7 @@ def _draw(memory):
 
 
 def _jitter_memory(vehicle, state, dt, key):
-    del dt
-    hover = vehicle.mass * vehicle.gravity / (4 * max_rotor_thrust(vehicle))
-    held = jnp.zeros(4, state.position.dtype).at[0].set(hover)
-    return {"previous": held, "key": jax.random.key_data(key)}
+    return {"previous": hover_command(vehicle, state.position.dtype), "key": jax.random.key_data(key)}
 
 
 def _jitter_command(parameters, memory, command, context):
@@ -72,13 +69,11 @@ GUST = Effect(
 
 
 def _noise_memory(vehicle, state, dt, key):
-    del vehicle, dt
     dtype = state.position.dtype
     return {"noise": jnp.zeros(9, dtype), "late": jnp.zeros((), dtype), "key": jax.random.key_data(key)}
 
 
 def _noise_record(memory, state):
-    del state
     draw, key = _draw(memory)
     dtype = memory["noise"].dtype
     normal_key, late_key = jax.random.split(draw)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from openjax.errors import UserError
 from openjax.vehicle.arena import Arena
-from openjax.vehicle.bodies import make_body, rigid_drone, vehicles_axis
+from openjax.vehicle.bodies import Bodies, vehicles_axis
 from openjax.vehicle.effects import composition
 from openjax.vehicle.effects.effect import Context, Effect, make_context
 from openjax.vehicle.mjx_body import make_world
@@ -132,6 +132,11 @@ class DronesStep:
         see = functools.partial(composition.seen_state, self.effects)
         return jax.vmap(see, (_drones_axis(parameters), 0))(parameters, drones)
 
+    @property
+    def _bodies(self) -> Bodies:
+        """What moves in a substep."""
+        return Bodies(self.physics, self.contacts, self.arena, self.dt / self.substeps)
+
     def _parameters(self, given, drones):
         """Parameters of every effect, all () where all drones share them, else all (N,)."""
         parameters = composition.complete_parameters(self.effects, given, drones.position.dtype)
@@ -177,14 +182,12 @@ class DronesStep:
             (vehicles_axis(vehicle), _drones_axis(parameters), 0, 0, 0),
         )
         drones, force, torque = turn(vehicle, parameters, drones, command, contexts)
-        body = make_body(self.physics, self.contacts, self.arena, dt)
-        return body(vehicle, drones, force, torque, pillars)
+        return self._bodies(vehicle, drones, force, torque, pillars)
 
     def _plain_substep(self, vehicle, drone, command, around):
         """One drone after a substep of `rigid` without effects."""
-        dt = self.dt / self.substeps
-        drone, force, torque = motors((), vehicle, {}, drone, command, None, dt)
-        return rigid_drone(self.arena, dt, vehicle, drone, force, torque, around)
+        drone, force, torque = motors((), vehicle, {}, drone, command, None, self._bodies.dt)
+        return self._bodies.rigid(vehicle, drone, force, torque, around)
 
     def _remember(self, drones):
         """The drones with the effects' memory at the end of a step."""

@@ -22,9 +22,10 @@ import numpy as np
 
 from openjax.vehicle.arena import Arena
 from openjax.vehicle.parameters import NOMINAL, Vehicle, find_mjcf, read_mjcf
-from openjax.vehicle.rigid_body import Pose, euler_step
-from openjax.vehicle.shapes import Quaternion, Seconds, Things, Vector
+from openjax.vehicle.rigid_body import euler_step
+from openjax.vehicle.shapes import Seconds, Things, Vector
 from openjax.vehicle.solids import DRONE_RADIUS, solids_xml
+from openjax.vehicle.state import DroneState
 
 if TYPE_CHECKING:
     from mujoco import mjx
@@ -115,21 +116,18 @@ def mjx_step(
     world: World,
     vehicle: Vehicle,
     shapes: Things | None,
-    position: Vector,
-    quaternion: Quaternion,
-    velocity: Vector,
-    body_rates: Vector,
+    drone: DroneState,
     force_world: Vector,
     torque_body: Vector,
     dt: Seconds,
-) -> Pose:
+) -> DroneState:
     """`rigid_step` by MJX among `shapes` of `place_solids`, (n, 3) m (None: contact-free); dt must be the
     world's.
 
     MJX gives the accelerations; velocities and positions are advanced as its Euler integrator does it.
     Gradients are those of free flight: what contacts add is a constant to them.
     """
-    dtype = position.dtype
+    dtype = drone.position.dtype
     model, data = _as_dtype(world, dtype)
     gravity = jnp.zeros(3, dtype).at[2].set(-vehicle.gravity)
     model = model.replace(
@@ -143,8 +141,8 @@ def mjx_step(
     if shapes is not None:
         model = model.replace(geom_pos=jnp.concatenate([shapes, jnp.zeros((1, 3), dtype)]))
     data = data.replace(
-        qpos=jnp.concatenate([position, quaternion]),
-        qvel=jnp.concatenate([velocity, body_rates]),
+        qpos=jnp.concatenate([drone.position, drone.quaternion]),
+        qvel=jnp.concatenate([drone.velocity, drone.body_rates]),
         qfrc_applied=jnp.concatenate([force_world, torque_body]),
     )
     data = _forward(model, data, shapes is not None)
@@ -154,4 +152,4 @@ def mjx_step(
         contact = jnp.where(jnp.any(data.qfrc_constraint != 0), data.qacc - data.qacc_smooth, 0.0)
         qacc = qacc + jax.lax.stop_gradient(contact)
     qacc = qacc.astype(dtype)
-    return euler_step(position, quaternion, velocity, body_rates, qacc[:3], qacc[3:], dt)
+    return euler_step(drone, qacc[:3], qacc[3:], dt)

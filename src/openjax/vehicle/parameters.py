@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from openjax.errors import UserError
-from openjax.vehicle.shapes import Hubs, Rotors, Scalar, Vector
+from openjax.vehicle.shapes import Command, Hubs, Rotors, Scalar, Vector
 
 NOMINAL = "crazyflie"
 AIRFRAMES = {NOMINAL: "crazyflie.xml", "brushless": "crazyflie_brushless.xml"}
@@ -138,3 +138,13 @@ def hover_rotor_speed(vehicle: Vehicle) -> Scalar:
 def max_rotor_thrust(vehicle: Vehicle) -> Scalar:
     """Largest thrust of one rotor, () N."""
     return vehicle.thrust_constant * vehicle.max_rotor_speed**2
+
+
+def hover_share(vehicle: Vehicle) -> Scalar:
+    """Collective thrust that carries the level vehicle, () as a share of the largest."""
+    return vehicle.mass * vehicle.gravity / (4 * max_rotor_thrust(vehicle))
+
+
+def hover_command(vehicle: Vehicle, dtype=jnp.float32) -> Command:
+    """The command that carries the level vehicle and doesn't turn it."""
+    return jnp.zeros(4, dtype).at[0].set(hover_share(vehicle))

@@ -7,9 +7,7 @@ import jax.numpy as jnp
 
 from openjax.vehicle.parameters import Vehicle
 from openjax.vehicle.shapes import Quaternion, Seconds, Vector
-
-Pose = tuple[Vector, Quaternion, Vector, Vector]
-"""Position, quaternion, velocity, body rates."""
+from openjax.vehicle.state import DroneState
 
 
 def rotate(quaternion: Quaternion, vector: Vector) -> Vector:
@@ -54,41 +52,37 @@ def quaternion_integrate(quaternion: Quaternion, body_rates: Vector, dt: Seconds
 
 
 def euler_step(
-    position: Vector,
-    quaternion: Quaternion,
-    velocity: Vector,
-    body_rates: Vector,
-    acceleration: Vector,
-    angular_acceleration: Vector,
-    dt: Seconds,
-) -> Pose:
+    drone: DroneState, acceleration: Vector, angular_acceleration: Vector, dt: Seconds
+) -> DroneState:
     """Advance velocities by the accelerations (3,) m/s^2 world and (3,) rad/s^2 body, then positions by the
-    new velocities: MuJoCo's Euler integrator. Returns position, quaternion, velocity, body rates."""
-    velocity = velocity + dt * acceleration
-    body_rates = body_rates + dt * angular_acceleration
-    return position + dt * velocity, quaternion_integrate(quaternion, body_rates, dt), velocity, body_rates
+    new velocities: MuJoCo's Euler integrator."""
+    velocity = drone.velocity + dt * acceleration
+    body_rates = drone.body_rates + dt * angular_acceleration
+    return drone.replace(
+        position=drone.position + dt * velocity,
+        quaternion=quaternion_integrate(drone.quaternion, body_rates, dt),
+        velocity=velocity,
+        body_rates=body_rates,
+    )
 
 
 def rigid_step(
     vehicle: Vehicle,
-    position: Vector,
-    quaternion: Quaternion,
-    velocity: Vector,
-    body_rates: Vector,
+    drone: DroneState,
     force_world: Vector,
     torque_body: Vector,
     dt: Seconds,
     contact: Callable[[Vector], Vector] | None = None,
-) -> Pose:
-    """Position, quaternion, velocity and body rates of one drone after dt seconds, frames as in `DroneState`.
+) -> DroneState:
+    """One drone after dt seconds, its rotors and controller as they are.
 
     force_world (3,) N without gravity, torque_body (3,) N m about the centre of mass. Newton-Euler equations.
     `contact`, if any, maps the acceleration (3,) m/s^2 that the drone would have in free flight to what contacts add.
     """
-    acceleration = force_world / vehicle.mass - vehicle.gravity * jnp.array([0, 0, 1], position.dtype)
+    acceleration = force_world / vehicle.mass - vehicle.gravity * jnp.array([0, 0, 1], force_world.dtype)
     if contact is not None:
         # as by MJX, gradients are those of free flight: what contacts add is a constant to them
         acceleration = acceleration + jax.lax.stop_gradient(contact(acceleration))
-    momentum = vehicle.inertia * body_rates
-    angular_acceleration = (torque_body - cross(body_rates, momentum)) / vehicle.inertia
-    return euler_step(position, quaternion, velocity, body_rates, acceleration, angular_acceleration, dt)
+    momentum = vehicle.inertia * drone.body_rates
+    angular_acceleration = (torque_body - cross(drone.body_rates, momentum)) / vehicle.inertia
+    return euler_step(drone, acceleration, angular_acceleration, dt)

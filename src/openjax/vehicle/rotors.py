@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from openjax.vehicle.parameters import Vehicle
-from openjax.vehicle.shapes import Rotors, Seconds
+from openjax.vehicle.shapes import Rotors, Seconds, Vector
 
 # Below this motor command a rotor is asked to stand still: keeps the slope of the square root finite.
 _SMALLEST_COMMAND = 1e-8
@@ -35,3 +35,15 @@ def rotor_thrust(vehicle: Vehicle, rotor_speed: Rotors) -> Rotors:
 def rotor_reaction(vehicle: Vehicle, rotor_speed: Rotors) -> Rotors:
     """Reaction torque of each rotor on the body along body z, signed, (4,) N m."""
     return vehicle.rotor_spin * vehicle.torque_constant * jnp.square(rotor_speed)
+
+
+def total_wrench(vehicle: Vehicle, thrust: Rotors, reaction: Rotors) -> tuple[Vector, Vector]:
+    """Force (3,) N and torque about the centre of mass (3,) N m of the rotors, body frame.
+
+    thrust (4,) N acts along body z at the hubs; reaction (4,) N m are the signed torques of `rotor_reaction`.
+    """
+    x, y = vehicle.rotor_position[:, 0], vehicle.rotor_position[:, 1]
+    zero = jnp.zeros_like(thrust[0])
+    force = jnp.stack([zero, zero, jnp.sum(thrust)])
+    torque = jnp.stack([jnp.sum(y * thrust), -jnp.sum(x * thrust), jnp.sum(reaction)])
+    return force, torque

@@ -13,8 +13,7 @@ import jax.numpy as jnp
 
 from openjax.vehicle import DroneState
 from openjax.vehicle.rate_controller import rate_controller
-from openjax.vehicle.rotors import rotor_reaction, rotor_speed_step, rotor_thrust
-from openjax.vehicle.wrench import total_wrench
+from openjax.vehicle.rotors import rotor_reaction, rotor_speed_step, rotor_thrust, total_wrench
 
 TICKS = 5  # of the rate loop per row
 GYRO_GAIN = 0.3  # share of a gyro innovation that corrects the observer, near the optimum for usual noise

@@ -15,8 +15,7 @@ from openjax.vehicle import DroneState
 from openjax.vehicle.effects import make_context, resolve
 from openjax.vehicle.effects.composition import added_wrench, change_body, change_motor_command, change_thrust
 from openjax.vehicle.rigid_body import rotate
-from openjax.vehicle.rotors import commanded_rotor_speed, rotor_reaction, rotor_thrust
-from openjax.vehicle.wrench import total_wrench
+from openjax.vehicle.rotors import commanded_rotor_speed, rotor_reaction, rotor_thrust, total_wrench
 
 
 @flax.struct.dataclass

@@ -43,7 +43,6 @@ EFFECT = Effect(
     },
     motor=motor,
     card=Card(
-        path="physics",
         fitted=(
             Fitted("exponent", mean=0.0, spread=1.0, start=0.5, step=0.01),
             Fitted("reference", mean=3.85, spread=0.15, start=3.85, step=0.01),

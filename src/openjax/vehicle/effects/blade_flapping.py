@@ -39,7 +39,6 @@ EFFECT = Effect(
     },
     wrench=wrench,
     card=Card(
-        path="physics",
         fitted=(
             Fitted("tilt", mean=0.0, spread=0.02, start=0.005, step=0.0001),
             Fitted("stiffness", mean=0.0, spread=0.0002, start=3e-05, step=1e-06),

@@ -24,7 +24,6 @@ EFFECT = Effect(
     },
     body=body,
     card=Card(
-        path="physics",
         fitted=(
             Fitted("x", mean=0.0, spread=0.002, start=0.0003, step=2e-05),
             Fitted("y", mean=0.0, spread=0.002, start=0.0003, step=2e-05),

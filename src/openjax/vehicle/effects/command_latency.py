@@ -1,17 +1,13 @@
 """Commands arrive late."""
 
-import jax.numpy as jnp
-
 from openjax.vehicle.effects.delay import fill, look_back, push
 from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
-from openjax.vehicle.parameters import max_rotor_thrust
+from openjax.vehicle.parameters import hover_command
 
 
 def initial_memory(vehicle, state, dt, key):
     """As if hover had been commanded before."""
-    del key
-    hover = vehicle.mass * vehicle.gravity / (4 * max_rotor_thrust(vehicle))
-    return fill(jnp.zeros(4, state.position.dtype).at[0].set(hover), dt)
+    return fill(hover_command(vehicle, state.position.dtype), dt)
 
 
 def command(parameters, memory, command, context):

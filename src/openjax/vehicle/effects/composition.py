@@ -11,9 +11,8 @@ from openjax.errors import UserError
 from openjax.vehicle.effects.effect import Context, Effect
 from openjax.vehicle.effects.registry import EFFECTS
 from openjax.vehicle.parameters import Vehicle
-from openjax.vehicle.rotors import rotor_reaction, rotor_thrust
+from openjax.vehicle.rotors import rotor_reaction, rotor_thrust, total_wrench
 from openjax.vehicle.state import DroneState
-from openjax.vehicle.wrench import total_wrench
 
 AIR_TIME = "air_time"  # beside the effects' own memories
 

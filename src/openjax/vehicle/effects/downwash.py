@@ -37,7 +37,6 @@ EFFECT = Effect(
     },
     wrench=wrench,
     card=Card(
-        path="physics",
         fitted=(
             Fitted("force", mean=0.0, spread=0.1, start=0.08, step=0.001),
             Fitted("length", mean=0.5, spread=0.25, start=0.5, step=0.005),

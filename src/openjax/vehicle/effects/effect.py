@@ -112,9 +112,9 @@ UNCOMMON, RARE, VERY_RARE = -3.0, -5.0, -6.0
 class Card:
     """How an effect is told from flights.
 
-    path: by which way of the log it is read: "physics" (motors to motion), "radio", "rate_loop", "estimator".
     fitted: its parameters; `common` is the spread that all share, `balanced`: their mean belongs to another effect and is
         held near zero, `others`: more starts of the search.
+    path: by which way of the log it is read: "physics" (motors to motion), "radio", "rate_loop", "estimator".
     needs: the channel without which it can't be told, though it leaves a trace in others.
     coordinate: the variable that its force follows, for pictures; none where it makes torques or delays.
     thrust_map: a map from duty cycles to thrust that isn't known can imitate it.
@@ -131,8 +131,8 @@ class Card:
     next_flight: what would show it, in words.
     """
 
-    path: str
     fitted: tuple[Fitted, ...]
+    path: str = "physics"
     common: float = 0.0
     balanced: bool = False
     others: tuple[tuple[float, ...], ...] = ()

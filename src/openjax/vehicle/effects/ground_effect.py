@@ -34,7 +34,6 @@ EFFECT = Effect(
     },
     thrust=thrust,
     card=Card(
-        path="physics",
         fitted=(
             Fitted("strength", mean=0.0, spread=0.8, start=0.4, step=0.01),
             Fitted("offset", mean=0.012, spread=0.01, start=0.012, step=0.0005),

@@ -4,11 +4,11 @@ import jax.numpy as jnp
 
 from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
+AXES = ("xx", "yy", "zz")
+
 
 def body(parameters, vehicle):
-    return vehicle.replace(
-        inertia=vehicle.inertia * jnp.stack([parameters[axis] for axis in ("xx", "yy", "zz")])
-    )
+    return vehicle.replace(inertia=vehicle.inertia * jnp.stack([parameters[axis] for axis in AXES]))
 
 
 _SOURCE = "published values for the Crazyflie, with and without decks: 0.7-1.6 of nominal"
@@ -17,21 +17,16 @@ EFFECT = Effect(
     name="inertia",
     description="moments of inertia as multiples of the assumed ones",
     formula=r"J' = \mathrm{diag}(k_{xx}, k_{yy}, k_{zz})\,J",
-    parameters={axis: Parameter("1", 1.0, (0.7, 1.6), _SOURCE) for axis in ("xx", "yy", "zz")},
+    parameters={axis: Parameter("1", 1.0, (0.7, 1.6), _SOURCE) for axis in AXES},
     body=body,
     card=Card(
-        path="physics",
         torque_axes=(0, 1),
-        fitted=(
-            Fitted("xx", mean=1.0, spread=0.12, start=1.1, step=0.005),
-            Fitted("yy", mean=1.0, spread=0.12, start=1.1, step=0.005),
-            Fitted("zz", mean=1.0, spread=0.12, start=1.1, step=0.005),
-        ),
+        fitted=tuple(Fitted(axis, mean=1.0, spread=0.12, start=1.1, step=0.005) for axis in AXES),
         common=0.3,
         nuisance={"xx": 0.04, "yy": 0.04, "zz": 0.015},
-        nuisance_duty={"xx": 0.2, "yy": 0.2, "zz": 0.2},
-        nuisance_samples={"xx": 0.3, "yy": 0.3, "zz": 0.3},
-        sample={"xx": 1.4, "yy": 1.4, "zz": 1.4},
+        nuisance_duty=dict.fromkeys(AXES, 0.2),
+        nuisance_samples=dict.fromkeys(AXES, 0.3),
+        sample=dict.fromkeys(AXES, 1.4),
         next_flight="roll, pitch and yaw doublets with the motor commands logged.",
     ),
 )

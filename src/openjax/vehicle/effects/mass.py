@@ -23,7 +23,6 @@ EFFECT = Effect(
     },
     body=body,
     card=Card(
-        path="physics",
         coordinate="thrust",
         fitted=(Fitted("extra", mean=0.0, spread=0.005, start=0.001, step=2e-05),),
         thrust_map=True,

@@ -6,7 +6,6 @@ from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
 
 def thrust(parameters, thrust, reaction, context):
-    del context
     factor = 1.0 + jnp.stack([parameters[name] for name in ("m1", "m2", "m3", "m4")])
     return thrust * factor, reaction * factor
 
@@ -20,7 +19,6 @@ EFFECT = Effect(
     parameters={name: Parameter("1", 0.0, (-0.15, 0.15), _SOURCE) for name in ("m1", "m2", "m3", "m4")},
     thrust=thrust,
     card=Card(
-        path="physics",
         fitted=(
             Fitted("m1", mean=0.0, spread=0.05, start=0.02, step=0.001),
             Fitted("m2", mean=0.0, spread=0.05, start=-0.01, step=0.001),

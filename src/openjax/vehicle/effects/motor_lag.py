@@ -18,7 +18,6 @@ def body(parameters, vehicle):
 def lags(value, deviation):
     """Whether motors lag. That they are early is what gusts look like, which the rate controller answers, and single
     samples of the motors; a motor's time constant is known better than that."""
-    del deviation
     return -EARLY < max(value["extra_up"], value["extra_down"]) < _SLOWEST
 
 
@@ -48,7 +47,6 @@ EFFECT = Effect(
     },
     body=body,
     card=Card(
-        path="physics",
         fitted=(
             Fitted("extra_up", mean=0.0, spread=0.03, start=0.01, step=0.0005, error=0.001),
             Fitted("extra_down", mean=0.0, spread=0.03, start=0.01, step=0.0005, error=0.001),

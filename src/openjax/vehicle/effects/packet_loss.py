@@ -9,14 +9,11 @@ import jax
 import jax.numpy as jnp
 
 from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
-from openjax.vehicle.parameters import max_rotor_thrust
+from openjax.vehicle.parameters import hover_command
 
 
 def initial_memory(vehicle, state, dt, key):
-    del dt
-    hover = vehicle.mass * vehicle.gravity / (4 * max_rotor_thrust(vehicle))
-    held = jnp.zeros(4, state.position.dtype).at[0].set(hover)
-    return {"held": held, "key": jax.random.key_data(key)}
+    return {"held": hover_command(vehicle, state.position.dtype), "key": jax.random.key_data(key)}
 
 
 def command(parameters, memory, command, context):

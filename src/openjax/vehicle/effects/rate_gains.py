@@ -2,6 +2,8 @@
 
 from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
+GAINS = ("p", "i", "d")
+
 
 def body(parameters, vehicle):
     return vehicle.replace(
@@ -17,16 +19,12 @@ EFFECT = Effect(
     name="rate_gains",
     description="gains of the rate controller as multiples of the assumed ones",
     formula=r"K_P' = k_p K_P,\quad K_I' = k_i K_I,\quad K_D' = k_d K_D",
-    parameters={gain: Parameter("1", 1.0, (0.5, 2.0), _SOURCE) for gain in ("p", "i", "d")},
+    parameters={gain: Parameter("1", 1.0, (0.5, 2.0), _SOURCE) for gain in GAINS},
     body=body,
     card=Card(
         path="rate_loop",
-        fitted=(
-            Fitted("p", mean=1.0, spread=0.4, start=1.0, step=0.05),
-            Fitted("i", mean=1.0, spread=0.4, start=1.0, step=0.05),
-            Fitted("d", mean=1.0, spread=0.4, start=1.0, step=0.05),
-        ),
-        sample={"p": 0.65, "i": 0.65, "d": 0.65},
+        fitted=tuple(Fitted(gain, mean=1.0, spread=0.4, start=1.0, step=0.05) for gain in GAINS),
+        sample=dict.fromkeys(GAINS, 0.65),
         next_flight="roll, pitch and yaw doublets with commands and motor commands logged.",
     ),
 )

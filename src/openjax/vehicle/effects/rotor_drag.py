@@ -32,7 +32,6 @@ EFFECT = Effect(
     },
     wrench=wrench,
     card=Card(
-        path="physics",
         fitted=(
             Fitted("d_xy", mean=0.0, spread=0.015, start=0.01, step=0.0001),
             Fitted("d_z", mean=0.0, spread=0.012, start=0.005, step=0.0001),

@@ -7,7 +7,6 @@ from openjax.vehicle.effects.effect import RARE, Card, Effect, Fitted, Parameter
 
 def motor(parameters, motor_command, context):
     """offset + slope m + curvature m^2, of which thrust is a linear function."""
-    del context
     square = parameters["curvature"] * motor_command * motor_command
     return parameters["offset"] + parameters["slope"] * motor_command + square
 
@@ -20,7 +19,6 @@ _STEEPNESS = 0.4, 2.2  # of the curve, where a straight line has 1: powers of th
 
 def rises(value, deviation):
     """Whether a fitted curve rises over the usual commands as a motor's does; if not, the motors don't make this force."""
-    del deviation
     steepness = value["slope"] + 2.0 * value["curvature"] * np.array([0.45, 0.85])
     return bool(_STEEPNESS[0] < steepness.min() and steepness.max() < _STEEPNESS[1])
 
@@ -36,7 +34,6 @@ EFFECT = Effect(
     },
     motor=motor,
     card=Card(
-        path="physics",
         coordinate="thrust",
         fitted=(
             Fitted("offset", mean=0.0, spread=0.08, start=0.02, step=0.001),

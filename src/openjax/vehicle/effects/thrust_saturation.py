@@ -17,7 +17,6 @@ def motor(parameters, motor_command, context):
 
 def tops_out(value, deviation):
     """Whether the limit is one that full commands reach; above 1 it is a thrust curve's form."""
-    del deviation
     return value["limit"] < 1.0
 
 
@@ -50,7 +49,6 @@ EFFECT = Effect(
     },
     motor=motor,
     card=Card(
-        path="physics",
         coordinate="thrust",
         fitted=(
             Fitted("limit", mean=0.8, spread=0.12, start=0.8, step=0.002),

@@ -19,7 +19,6 @@ _SOURCE = "indoor draughts and fans, 0.3-3 m/s"
 
 def drags(value, deviation):
     """Whether air that moves drags the vehicle along, along the rotors' axes too."""
-    del deviation
     return bool(value["drag"] > 0.0 and value["along"] > 0.0)
 
 
@@ -38,7 +37,6 @@ EFFECT = Effect(
     },
     wrench=wrench,
     card=Card(
-        path="physics",
         fitted=(
             Fitted("x", mean=0.0, spread=1.5, start=0.3, step=0.01),
             Fitted("y", mean=0.0, spread=1.5, start=0.3, step=0.01),

@@ -21,7 +21,6 @@ EFFECT = Effect(
     },
     body=body,
     card=Card(
-        path="physics",
         torque_axes=(2,),
         nuisance={"ratio": 0.01},
         nuisance_duty={"ratio": 0.5},
