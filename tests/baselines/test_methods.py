@@ -1,7 +1,5 @@
 """The methods in situations made by hand, and what must hold for all of them."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +10,7 @@ from openjax.baselines.angelani import AngelaniParameters, angelani
 from openjax.baselines.apf import ApfParameters, apf, forces
 from openjax.baselines.dacoop import LEARNED, field_parameters
 from openjax.baselines.janosov import JanosovParameters, janosov
-from openjax.baselines.parameters import best, draw, ranges
+from openjax.baselines.parameters import best, ranges
 from openjax.baselines.surroundings import Craft, Surroundings, surroundings
 from openjax.pursuit import Pursuit, PursuitSettings, Task, turn_task
 
@@ -177,16 +175,11 @@ def test_turning_the_world_turns_the_velocities(name):
     np.testing.assert_allclose(other[:, 2], plain[:, 2], atol=1e-4)
 
 
-def test_sets_are_drawn_within_their_ranges_and_the_found_ones_lie_there():
+def test_the_found_sets_lie_within_their_ranges():
     for name, method in METHODS.items():
-        sets = draw(method.kind, jax.random.key(0), 200)
         found = best(name, method.kind)
-        for field in dataclasses.fields(method.kind):
-            low, high = ranges(method.kind)[field.name]
-            values = np.asarray(getattr(sets, field.name))
-            assert values.min() >= 0.999 * low and values.max() <= 1.001 * high
-            assert np.median(values) == pytest.approx(np.sqrt(low * high), rel=0.5)
-            assert 0.999 * low <= float(getattr(found, field.name)) <= 1.001 * high
+        for field, (low, high) in ranges(method.kind).items():
+            assert 0.999 * low <= float(getattr(found, field)) <= 1.001 * high
 
 
 def test_dacoops_outputs_span_the_ranges_of_the_field():

@@ -36,7 +36,7 @@ ONE_PROCESS = """
 import sys
 from pathlib import Path
 import jax, numpy as np
-from openjax.learning import TrainSettings, build, init_carry
+from openjax.learning import TrainSettings, build, make_start
 from openjax.learning.training_step import initial_carry
 from openjax.pursuit import Pursuit
 from openjax.store.checkpoint_files import load_arrays
@@ -82,7 +82,7 @@ def assert_close(path, other):
 
 last = f"{UPDATES:09d}"
 one, four = (Checkpoints(directory / name, keep_last=UPDATES) for name in ("one", "four"))
-step_one, carry = step_on(1), place(init_carry(settings, jax.random.key(settings.seed), environment))
+step_one, carry = step_on(1), place(make_start(settings, environment)(jax.random.key(settings.seed)))
 for update in range(1, UPDATES + 1):
     carry, metrics, broken = step_one(carry)
     one.save(update, carry)

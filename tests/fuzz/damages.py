@@ -21,13 +21,13 @@ def make_checkpoints(folder: Path) -> None:
     """Two checkpoints of a tiny training carry in `folder`/checkpoints, and all their bits in `folder`/UPDATE.npz."""
     import jax
 
-    from openjax.learning import init_carry
+    from openjax.learning import make_start
     from openjax.store.checkpoints import Checkpoints
     from openjax.store.leaves import named_leaves, place
 
     checkpoints = Checkpoints(folder / "checkpoints")
     for update in (1, 2):
-        carry = place(init_carry(_tiny_settings(), jax.random.key(update)))
+        carry = place(make_start(_tiny_settings())(jax.random.key(update)))
         np.savez(
             folder / f"{update}.npz", **{name: _plain(leaf) for name, leaf in named_leaves(carry).items()}
         )
@@ -43,14 +43,16 @@ def _tiny_settings():
 
 def try_damages(folder: Path, seeds: range) -> list[str]:
     """Damage the newest checkpoint (now and then either) and restore: `same`, `before`, `refused` or what went wrong."""
+    import jax
+
     from openjax.errors import UserError
-    from openjax.learning import abstract_carry
+    from openjax.learning import make_start
     from openjax.learning.train_state import policy_leaf
     from openjax.store.checkpoints import Checkpoints
     from openjax.store.leaves import abstract_like, named_leaves
 
     saved = {update: dict(np.load(folder / f"{update}.npz")) for update in (1, 2)}
-    abstract = abstract_like(abstract_carry(_tiny_settings()))
+    abstract = abstract_like(jax.eval_shape(make_start(_tiny_settings()), jax.random.key(0)))
     outcomes = []
     for seed in seeds:
         rng = random.Random(f"damage {seed}")

@@ -20,10 +20,12 @@ from tests.fuzz.mutations import VALUES, changed_bytes, changed_text, changed_va
 
 
 def fuzz_train(rng: random.Random, folder: Path):
+    import jax
+
     from openjax.cluster.processes import Processes
     from openjax.commands.command_line import option_names
     from openjax.commands.training_command import TrainCommand, membership, prepare, read_command
-    from openjax.learning import abstract_carry
+    from openjax.learning import make_start
 
     names = _cached("train options", lambda: option_names(TrainCommand()))
     chosen = rng.choices(names, k=rng.randint(1, 3))
@@ -34,7 +36,8 @@ def fuzz_train(rng: random.Random, folder: Path):
         if membership(arguments) is not None:
             return None  # of several processes; whether they meet is not asked here
         job, _, _ = prepare(read_command(arguments), arguments, 0.0, Processes())
-        abstract_carry(job.settings, job.environment)  # what was accepted can be built
+        start = make_start(job.settings, job.environment)
+        jax.eval_shape(start, jax.random.key(0))  # what was accepted can be built
     return job.settings
 
 

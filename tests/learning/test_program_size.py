@@ -3,7 +3,7 @@
 import jax
 import pytest
 
-from openjax.learning import abstract_carry, preset
+from openjax.learning import make_start, preset
 from openjax.learning.training_step import make_phases
 
 MOST = {"fly": 6100, "learn_predictor": 2550, "learn_policy": 9800, "renew": 8900}
@@ -13,7 +13,7 @@ MOST = {"fly": 6100, "learn_predictor": 2550, "learn_policy": 9800, "renew": 890
 @pytest.mark.slow
 def test_the_programs_of_a_training_step_have_not_grown():
     settings = preset("paper")
-    phases, carry = make_phases(settings), abstract_carry(settings)
+    phases, carry = make_phases(settings), jax.eval_shape(make_start(settings), jax.random.key(0))
     flown = jax.eval_shape(phases.fly, carry)[1]
     programs = [
         (phases.fly, (carry,)),

@@ -16,8 +16,8 @@ from openjax.learning import (
     TrainSettings,
     build,
     changed,
-    init_carry,
     make_evaluate,
+    make_start,
     make_training_step,
     preset,
     summarise,
@@ -45,7 +45,7 @@ SETTINGS = TrainSettings(
 @pytest.fixture(scope="module")
 def run():
     """(start, carries after each of UPDATES steps, their metrics, the compiled step); carries as NumPy."""
-    carry = init_carry(SETTINGS, jax.random.key(0))
+    carry = make_start(SETTINGS)(jax.random.key(0))
     step = jax.jit(make_training_step(SETTINGS), donate_argnums=0)
     start, carries, metrics, donated = _numpy(carry), [], [], carry
     for _ in range(UPDATES):
@@ -143,7 +143,7 @@ def test_what_an_update_changes(run):
 
 def test_same_seed_same_run(run):
     _, carries, _, step, *_ = run
-    carry, _ = step(init_carry(SETTINGS, jax.random.key(0)))
+    carry, _ = step(make_start(SETTINGS)(jax.random.key(0)))
     chex.assert_trees_all_equal(_numpy(carry), carries[0])
 
 
@@ -196,7 +196,7 @@ def test_the_step_with_several_evaders_keeps_its_carry_and_archives_them(generat
 def test_without_the_generator_every_world_flies_its_own_task():
     plain = dataclasses.replace(SETTINGS, predictor=NO_PREDICTOR, generator=NO_GENERATOR)
     assert plain.episodes_per_task == 1
-    evader = np.asarray(init_carry(plain, jax.random.key(0)).state.task.evader_position)
+    evader = np.asarray(make_start(plain)(jax.random.key(0)).state.task.evader_position)
     assert len(np.unique(evader, axis=0)) == plain.num_envs
 
 
@@ -299,7 +299,7 @@ def test_the_worlds_of_every_second_task_start_anew_within_the_episode(no_learni
     settings = dataclasses.replace(
         SETTINGS, restart_every=2, restart_steps=rollouts * ROLLOUT, predictor=NO_PREDICTOR
     )
-    carry = init_carry(settings, jax.random.key(0))
+    carry = make_start(settings)(jax.random.key(0))
     step = jax.jit(make_training_step(settings))
     world = np.arange(settings.num_envs)
     group, brief = world % GROUPS, world // GROUPS // settings.episodes_per_task % 2 == 0

@@ -34,11 +34,5 @@ class CraftPolicy(Policy):
         """
         craft = Craft.of(environment)
         check_flyable(cls.NAME, craft, environment.settings.time_step)
-        return cls(
-            network=network,
-            predictor=predictor,
-            arena_radius=environment.settings.arena_radius,
-            arena_height=environment.settings.arena_height,
-            initial_action=cls.start(),
-            craft=craft,
-        )
+        plain = super().for_environment(environment, network, predictor)
+        return dataclasses.replace(plain, initial_action=cls.start(), craft=craft)

@@ -2,11 +2,9 @@
 
 import dataclasses
 import json
-from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
-import jax
 import jax.numpy as jnp
 from flax import struct
 
@@ -26,22 +24,8 @@ def ranges(kind: type) -> dict[str, tuple[float, float]]:
     return {field.name: field.metadata["range"] for field in dataclasses.fields(kind)}
 
 
-def draw(kind: type[Parameters], key: jax.Array, number: int) -> Parameters:
-    """`number` sets (leading axis), each parameter log-uniform in its range and independent of the others."""
-    values = {}
-    for name, own in zip(ranges(kind), jax.random.split(key, len(ranges(kind))), strict=True):
-        low, high = jnp.log(jnp.array(ranges(kind)[name], jnp.float32))
-        values[name] = jnp.exp(jax.random.uniform(own, (number,), jnp.float32, low, high))
-    return kind(**values)
-
-
-@cache
-def found() -> dict[str, dict[str, float]]:
-    """What the search found, by method."""
-    return json.loads(FOUND.read_text(encoding="utf-8")) if FOUND.exists() else {}
-
-
 def best(method: str, kind: type[Parameters]) -> Parameters:
     """A method's parameters as the search found them; the literature's where there is no result of it."""
-    values = {field.name: field.default for field in dataclasses.fields(kind)} | found().get(method, {})
+    found = json.loads(FOUND.read_text(encoding="utf-8"))
+    values = {field.name: field.default for field in dataclasses.fields(kind)} | found.get(method, {})
     return kind(**{name: jnp.float32(value) for name, value in values.items()})

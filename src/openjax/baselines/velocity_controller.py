@@ -5,8 +5,6 @@ there: the translational half of the geometric controller of Lee, Leok and McCla
 to the vehicle's own rate controller. A function of the observation alone, without memory.
 """
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 
@@ -15,20 +13,12 @@ from openjax.errors import UserError
 from openjax.pursuit import Observation
 from openjax.pursuit.observation import rotation_axes
 
-
-@dataclasses.dataclass(frozen=True)
-class Gains:
-    """Of the controller."""
-
-    velocity: float | jax.Array = 6.0
-    """1/s, velocity error to acceleration: slower than the attitude, whose lag is that of the motors (25 ms) and of the
-    turn."""
-    attitude: float | jax.Array = 15.0
-    """1/s, error of the body's z axis (rad) to body rates."""
-    tilt: float | jax.Array = 0.7
-    """Tangent of the largest tilt that is commanded (35 degrees)."""
-
-
+VELOCITY_GAIN = 6.0
+"""1/s, velocity error to acceleration: slower than the attitude, whose lag is that of the motors (25 ms) and of the turn."""
+ATTITUDE_GAIN = 15.0
+"""1/s, error of the body's z axis (rad) to body rates."""
+LARGEST_TILT = 0.7
+"""Tangent of the largest tilt that is commanded (35 degrees)."""
 YAW_GAIN = 2.0
 """1/s, yaw (rad) to yaw rate: the nose is turned to the world's x axis."""
 CLIMB_LIMITS = (-0.5, 0.3)
@@ -55,19 +45,17 @@ def check_flyable(name: str, craft: Craft, time_step: float) -> None:
         )
 
 
-def velocity_action(
-    craft: Craft, observation: Observation, desired: jax.Array, gains: Gains = Gains()
-) -> jax.Array:
+def velocity_action(craft: Craft, observation: Observation, desired: jax.Array) -> jax.Array:
     """(..., N, 4) action in -1..1 (thrust, body rates) that flies the desired velocities (..., N, 3) in m/s, world."""
     own = observation.self_state
     body_x, body_z = rotation_axes(own[..., QUATERNION])
-    thrust = gains.velocity / GRAVITY * (desired - own[..., VELOCITY])  # in units of the weight
+    thrust = VELOCITY_GAIN / GRAVITY * (desired - own[..., VELOCITY])  # in units of the weight
     rise = 1.0 + jnp.clip(thrust[..., 2:], *CLIMB_LIMITS)
     lean = thrust[..., :2]
-    lean = lean * jnp.minimum(1.0, gains.tilt * rise / length(lean))
+    lean = lean * jnp.minimum(1.0, LARGEST_TILT * rise / length(lean))
     thrust = jnp.concatenate([lean, rise], axis=-1)
     share = craft.hover_thrust * jnp.sum(thrust * body_z, axis=-1)
-    turn = gains.attitude * jnp.cross(body_z, unit(thrust))
+    turn = ATTITUDE_GAIN * jnp.cross(body_z, unit(thrust))
     yaw = jnp.arctan2(body_x[..., 1], body_x[..., 0])
     roll_rate, pitch_rate = _dot(turn, body_x), _dot(turn, jnp.cross(body_z, body_x))
     rates = jnp.stack([roll_rate, pitch_rate, -YAW_GAIN * yaw], axis=-1)

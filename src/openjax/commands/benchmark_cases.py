@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from openjax.cluster.devices import carry_shardings, check_devices, make_device_step
 from openjax.errors import UserError
-from openjax.learning import TrainSettings, build, init_carry, training_step
+from openjax.learning import TrainSettings, build, make_start, training_step
 from openjax.learning.rollout import collect
 from openjax.pursuit import Pursuit, hover_action, uniform_task
 from openjax.pursuit.environment import action_to_command
@@ -40,7 +40,7 @@ def cases(
 
 def _training(settings, devices):
     """The whole training step, then, of one device, the programs that it is made of: (name, function, its arguments)."""
-    carry = init_carry(settings, jax.random.key(0))
+    carry = make_start(settings)(jax.random.key(0))
     if devices > 1:
         step = make_device_step(settings, Pursuit(settings.environment), devices)
         yield f"training, {devices} devices", step, (place(carry, carry_shardings(devices)),)

@@ -60,6 +60,7 @@ class Layout(NamedTuple):
         return sum(kind.count * kind.size for kind in self.kinds)
 
 
+@functools.partial(jax.custom_vjp, nondiff_argnums=(5,))
 def attend(
     query: jax.Array,
     own: jax.Array,
@@ -86,7 +87,7 @@ def attend(
     Returns:
       (B, heads * features) in the type of `query`.
     """
-    return _attend(query, own, inputs, inverse, weights, layout)
+    return on_platform(_reference, forward_by_kernel, layout)(query, own, inputs, inverse, weights)
 
 
 def attend_one_by_one(
@@ -118,14 +119,9 @@ def attend_one_by_one(
     return means
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(5,))
-def _attend(query, own, inputs, inverse, weights, layout):
-    return on_platform(_reference, forward_by_kernel, layout)(query, own, inputs, inverse, weights)
-
-
 def _attend_forward(query, own, inputs, inverse, weights, layout):
     saved = (query, own, inputs, inverse, weights)
-    return _attend(*saved, layout), saved
+    return attend(*saved, layout), saved
 
 
 def _attend_backward(layout, saved, gradient):
@@ -135,7 +131,7 @@ def _attend_backward(layout, saved, gradient):
     return dquery, down, jnp.zeros_like(saved[2]), dinverse, dweights
 
 
-_attend.defvjp(_attend_forward, _attend_backward)
+attend.defvjp(_attend_forward, _attend_backward)
 
 
 def _reference(layout, query, own, inputs, inverse, weights):

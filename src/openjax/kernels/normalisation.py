@@ -24,6 +24,7 @@ EPSILON = 1e-6
 """Added to the variance (Ba et al., 2016; the value of flax)."""
 
 
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
 def normalise(x: jax.Array, affine: jax.Array, activate: bool = True) -> jax.Array:
     """activation(scale * LayerNorm(x + bias) + shift), or without the activation.
 
@@ -35,7 +36,7 @@ def normalise(x: jax.Array, affine: jax.Array, activate: bool = True) -> jax.Arr
     Returns:
       (B, features) in the type of `x`.
     """
-    return _normalise(x, affine, activate)
+    return on_platform(_reference, forward_by_kernel, activate)(x, affine)
 
 
 def normalised_layer(x: jax.Array, kernel: jax.Array, affine: jax.Array) -> jax.Array:
@@ -56,20 +57,15 @@ def normalised_layer(x: jax.Array, kernel: jax.Array, affine: jax.Array) -> jax.
     return activation(affine[1] * (y * inverse) + affine[2]).astype(x.dtype)
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
-def _normalise(x, affine, activate):
-    return on_platform(_reference, forward_by_kernel, activate)(x, affine)
-
-
 def _forward(x, affine, activate):
-    return _normalise(x, affine, activate), (x, affine)
+    return normalise(x, affine, activate), (x, affine)
 
 
 def _backward(activate, saved, gradient):
     return on_platform(_reference_backward, backward_by_kernel, activate)(*saved, gradient)
 
 
-_normalise.defvjp(_forward, _backward)
+normalise.defvjp(_forward, _backward)
 
 
 def _standardised(x, bias):

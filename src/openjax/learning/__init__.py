@@ -11,7 +11,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         ),
         **dict.fromkeys(("PRESETS", "changed", "preset"), "presets"),
         **dict.fromkeys(
-            ("TrainCarry", "abstract_carry", "build", "init_carry", "make_start", "make_training_step"),
+            ("TrainCarry", "build", "make_start", "make_training_step"),
             "training_step",
         ),
     },

@@ -6,26 +6,18 @@ nothing. Everything else (parameters, archive, keys) is the same on every device
 
 import jax
 import jax.numpy as jnp
-import numpy as np
+from jax.flatten_util import ravel_pytree
 
 
 def mean_over_devices(tree, axis: str | None):
-    """Mean of every leaf over all devices, by one collective for each dtype.
+    """Mean of every leaf over all devices, by one collective.
 
-    A collective for every leaf would cost its latency some thirty times per gradient step.
+    One for every leaf would cost its latency some thirty times per gradient step.
     """
     if axis is None:
         return tree
-    leaves, structure = jax.tree.flatten(tree)
-    leaves = [jnp.asarray(leaf) for leaf in leaves]
-    means: list = [None] * len(leaves)
-    for dtype in sorted({str(leaf.dtype) for leaf in leaves}):
-        same = [i for i, leaf in enumerate(leaves) if str(leaf.dtype) == dtype]
-        flat = jax.lax.pmean(jnp.concatenate([leaves[i].ravel() for i in same]), axis)
-        ends = np.cumsum([leaves[i].size for i in same])[:-1]
-        for i, part in zip(same, jnp.split(flat, ends), strict=True):
-            means[i] = part.reshape(leaves[i].shape)
-    return structure.unflatten(means)
+    flat, unflatten = ravel_pytree(tree)
+    return unflatten(jax.lax.pmean(flat, axis))
 
 
 def gather_over_devices(tree, axis: str | None):
@@ -45,6 +37,19 @@ def own_keys(key: jax.Array, number: int, axis: str | None) -> jax.Array:
     """This device's (number,) keys out of one split for all devices: the same ones however many devices there are."""
     devices = 1 if axis is None else jax.lax.axis_size(axis)
     return own_share(jax.random.split(key, number * devices), axis)
+
+
+def minibatches(tree, number: int):
+    """Leaves (T, E, ...) as (number, E / number, T, ...): whole trajectories of world e in minibatch e mod `number`.
+
+    So each device of several holds its share of every minibatch.
+    """
+
+    def split(x):
+        x = jnp.moveaxis(x, 0, 1)
+        return jnp.moveaxis(x.reshape(x.shape[0] // number, number, *x.shape[1:]), 1, 0)
+
+    return jax.tree.map(split, tree)
 
 
 def joint_moments(x: jax.Array, axis: str | None) -> tuple[jax.Array, jax.Array]:

@@ -16,8 +16,9 @@ import optax
 from flax import struct
 
 from openjax.learning.advantages import generalised_advantages
-from openjax.learning.collectives import mean_over_devices
+from openjax.learning.collectives import mean_over_devices, minibatches
 from openjax.learning.settings import EvaderLearningSettings
+from openjax.learning.train_state import clipped_adam, shuffled
 from openjax.policy import gaussian_entropy, gaussian_log_prob
 from openjax.pursuit import Pursuit, PursuitState
 from openjax.pursuit.evaders import init_network, learned_place, scene_of
@@ -70,10 +71,10 @@ class EvaderLearning:
 
     @functools.cached_property
     def optimiser(self) -> optax.GradientTransformation:
-        """Adam with clipped gradients, on one vector."""
+        """Of each network."""
         how, steps = self.how, self.updates * self.how.epochs * self.how.minibatches
         rate = optax.linear_schedule(how.learning_rate, how.learning_rate_end, steps)
-        return optax.flatten(optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate, eps=1e-5)))
+        return clipped_adam(1.0, rate)
 
     def start(self, key: jax.Array) -> LearningEvaders:
         """Evaders that do as the greedy one."""
@@ -87,8 +88,7 @@ class EvaderLearning:
         settings = self.environment.settings
 
         def one(state):
-            around = self.environment.around_evader(state)
-            return features(scene_of(settings, state.evader, around), state.evader.memory)
+            return features(scene_of(settings, state), state.evader.memory)
 
         return learned_place(settings.evaders, state.evader.kind), jax.vmap(one)(state)
 
@@ -125,11 +125,9 @@ class EvaderLearning:
             change, state = jax.vmap(self.optimiser.update)(gradient, state, networks)
             return (optax.apply_updates(networks, change), state), None
 
-        order = jax.vmap(lambda key: jax.random.permutation(key, how.minibatches))(
-            jax.random.split(key, how.epochs)
-        )
         start = evaders.networks, evaders.optimiser
-        (networks, state), _ = jax.lax.scan(step, start, order.ravel())
+        order = shuffled(key, how.epochs, how.minibatches)
+        (networks, state), _ = jax.lax.scan(step, start, order)
         return LearningEvaders(*networks, state)
 
     def _by_network(self, which):
@@ -197,13 +195,7 @@ class EvaderLearning:
         centred = advantage - mean(advantage)
         normal = centred / (jnp.sqrt(mean(centred**2)) + 1e-8)
         batch = samples.seen, samples.sample, samples.log_prob, weight, normal, advantage + value
-        which = self._parts(samples.which[:1])[..., 0]  # (M, W)
+        which = minibatches(samples.which[:1], how.minibatches)[..., 0]  # (M, W)
         own = which[:, None] == jnp.arange(self.number)[:, None]
         worlds = jnp.sum(own, axis=-1), jnp.argsort(~own, axis=-1)
-        return worlds, jax.tree.map(self._parts, batch)
-
-    def _parts(self, leaf):
-        """(T, E, ...) to (M, E / M, T, ...): world e goes to minibatch e mod M, as each device has its share of all."""
-        leaf = jnp.moveaxis(leaf, 0, 1)
-        leaf = leaf.reshape(-1, self.how.minibatches, *leaf.shape[1:])
-        return jnp.moveaxis(leaf, 1, 0)
+        return worlds, minibatches(batch, how.minibatches)

@@ -9,10 +9,10 @@ from flax import struct
 from jax.flatten_util import ravel_pytree
 
 from openjax.learning.advantages import generalised_advantages
-from openjax.learning.collectives import joint_moments, mean_over_devices
+from openjax.learning.collectives import joint_moments, mean_over_devices, minibatches
 from openjax.learning.rollout import Rollout
 from openjax.learning.settings import MappoSettings
-from openjax.learning.train_state import Optimisers, TrainState
+from openjax.learning.train_state import Optimisers, TrainState, clipped_adam, shuffled
 from openjax.policy import Policy, gaussian_entropy, gaussian_log_prob
 from openjax.pursuit import Observation
 
@@ -102,13 +102,9 @@ def make_optimiser(
     def late(count):
         return jnp.where(count < settings.actor_start * steps, 0.0, schedule(count))
 
-    def one(schedule, *after):
-        parts = optax.clip_by_global_norm(settings.max_grad_norm), optax.adam(schedule, eps=1e-5), *after
-        # one vector instead of dozens of small arrays: on a GPU their updates cost by number, not by size
-        return optax.flatten(optax.chain(*parts))
-
-    after = (follow_kl(settings.target_kl),) if settings.target_kl else ()
-    return one(late if settings.actor_start else schedule, *after), one(schedule)
+    after, most = (follow_kl(settings.target_kl),) if settings.target_kl else (), settings.max_grad_norm
+    actor = clipped_adam(most, late if settings.actor_start else schedule, *after)
+    return actor, clipped_adam(most, schedule)
 
 
 def loss(
@@ -209,7 +205,7 @@ def update_policy(
         advantage=(advantage - advantage_mean) / (advantage_std + 1e-8),
         target=(returns - mean) / std,
     )
-    batch = _partition(batch, settings.minibatches)
+    batch = minibatches(batch, settings.minibatches)
     clip = settings.clip_epsilon + (settings.clip_epsilon_end - settings.clip_epsilon) * progress
 
     # each network as one vector while it learns: leaf by leaf, a step on a GPU is forty kernels more
@@ -230,9 +226,7 @@ def update_policy(
         critic = critic.updated(optimisers.critic, critic_gradient)
         return (actor, critic), jnp.stack([watch[name] for name in WATCHED])
 
-    order = jax.vmap(lambda k: jax.random.permutation(k, settings.minibatches))(
-        jax.random.split(key, settings.epochs)
-    ).ravel()
+    order = shuffled(key, settings.epochs, settings.minibatches)
     first = None
     if settings.step_subsampling > 1:
         first = jax.random.randint(jax.random.fold_in(key, 1), order.shape, 0, settings.step_subsampling)
@@ -250,16 +244,3 @@ def every_nth(x, first, number):
         return x
     x = x.reshape(x.shape[0], -1, number, *x.shape[2:])
     return jax.lax.dynamic_index_in_dim(x, first, axis=2, keepdims=False)
-
-
-def _partition(batch: Batch, minibatches: int) -> Batch:
-    """(T, E, ...) to (M, E / M, T, ...): whole trajectories, one contiguous block per minibatch.
-
-    Environment e goes to minibatch e mod M, so that each device of several holds its share of every minibatch.
-    """
-
-    def split(x):
-        x = jnp.moveaxis(x, 0, 1)
-        return jnp.moveaxis(x.reshape(x.shape[0] // minibatches, minibatches, *x.shape[1:]), 1, 0)
-
-    return jax.tree.map(split, batch)

@@ -92,16 +92,6 @@ def make_start(
     return jax.jit(functools.partial(initial_carry, settings, parts))
 
 
-def init_carry(settings: TrainSettings, key: jax.Array, environment: Pursuit | None = None) -> TrainCarry:
-    """The carry at the start of a run; see `make_start`."""
-    return make_start(settings, environment)(key)
-
-
-def abstract_carry(settings: TrainSettings, environment: Pursuit | None = None) -> TrainCarry:
-    """Shapes and dtypes of a run's carry, without computing one."""
-    return jax.eval_shape(make_start(settings, environment), jax.random.key(0))
-
-
 def initial_carry(settings: TrainSettings, parts: Building, key: jax.Array) -> TrainCarry:
     """The carry of a run's start; `parts` are what `build` gives."""
     environment = _starting(settings, parts.environment, 0.0)

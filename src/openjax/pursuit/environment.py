@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from openjax.errors import UserError
 from openjax.pursuit.collisions import breaches, crashed
-from openjax.pursuit.evaders import Around, draw_evader, evader_velocity
+from openjax.pursuit.evaders import draw_evader, evader_velocity
 from openjax.pursuit.info import StepInfo
 from openjax.pursuit.observation import Observation, frame, observe, own_frame, rotation_axes
 from openjax.pursuit.reward import captures, over_speed, reward
@@ -237,17 +237,6 @@ class Pursuit:
             drones = drones.replace(velocity=drones.velocity * jnp.minimum(1.0, settings.max_speed / speed))
         return self.follow(state, action, drones, wish)
 
-    def around_evader(self, state: PursuitState) -> Around:
-        """What is around the evader in `state`."""
-        return Around(
-            position=state.evader_position,
-            velocity=state.evader_velocity,
-            pursuers=state.drones.position,
-            in_sight=state.in_sight,
-            pillar_position=state.task.pillar_position,
-            pillar_active=state.task.pillar_active,
-        )
-
     def follow(
         self, state: PursuitState, action: jax.Array, drones: DroneState, wish: jax.Array | None = None
     ) -> tuple[Observation, PursuitState, jax.Array, jax.Array, jax.Array, StepInfo]:
@@ -258,9 +247,7 @@ class Pursuit:
         """
         settings, task, before = self.settings, state.task, state
         pillars = (task.pillar_position, task.pillar_active)
-        velocity, evader_state = evader_velocity(
-            settings, before.evader, self.around_evader(before), self.evader_networks, wish
-        )
+        velocity, evader_state = evader_velocity(settings, before, self.evader_networks, wish)
         evader = before.evader_position + settings.time_step * velocity
         step = before.step + 1
         position = drones.position

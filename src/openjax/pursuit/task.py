@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from openjax.pursuit.collisions import breaches
+from openjax.pursuit.collisions import breaches, drone_distance
 from openjax.pursuit.settings import PursuitSettings
 
 START_X = (0.1, 0.536)
@@ -92,7 +92,7 @@ def uniform_task(settings: PursuitSettings, key: jax.Array) -> Task:
     # each further pursuer about halves the chance that all are apart
     draws = CANDIDATES * 2 ** max(0, n - 3)
     candidates = jax.random.uniform(position_key, (draws, n, 3), jnp.float32, low, high)
-    apart = jax.vmap(lambda p: _closest_pair(p) >= settings.drone_clearance)(candidates)
+    apart = jax.vmap(lambda p: jnp.all(drone_distance(p) >= settings.drone_clearance))(candidates)
     pursuers = candidates[jnp.argmax(apart)]
     mirrored = jnp.array([-1.0, 1.0, 1.0], jnp.float32)
     evader = jax.random.uniform(evader_key, (3,), jnp.float32, low, high) * mirrored
@@ -295,10 +295,3 @@ def start_attitude(settings: PursuitSettings, key: jax.Array) -> jax.Array:
         ],
         axis=-1,
     )
-
-
-def _closest_pair(position: jax.Array) -> jax.Array:
-    """Smallest distance (m) between two of (N, 3) positions; infinite for one."""
-    n = position.shape[0]
-    distance = jnp.linalg.norm(position[:, None] - position[None] + 1e-12, axis=-1)
-    return jnp.min(jnp.where(jnp.eye(n, dtype=bool), jnp.inf, distance))

@@ -130,7 +130,7 @@ class DronesStep:
             return drones
         parameters = self._parameters(effect_parameters, drones)
         see = functools.partial(composition.seen_state, self.effects)
-        return jax.vmap(see, (_drones_axis(parameters), 0))(parameters, drones)
+        return jax.vmap(see)(parameters, drones)
 
     @property
     def _bodies(self) -> Bodies:
@@ -138,18 +138,15 @@ class DronesStep:
         return Bodies(self.physics, self.contacts, self.arena, self.dt / self.substeps)
 
     def _parameters(self, given, drones):
-        """Parameters of every effect, all () where all drones share them, else all (N,)."""
+        """Parameters (N,) of every effect."""
         parameters = composition.complete_parameters(self.effects, given, drones.position.dtype)
-        if all(leaf.ndim == 0 for leaf in jax.tree.leaves(parameters)):
-            return parameters
         number = drones.position.shape[0]
         return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (number,)), parameters)
 
     def _body(self, vehicle, parameters):
-        """The vehicle that really flies; with parameters of each drone, every leaf has their axis first."""
+        """The vehicles that really fly: with effects, every leaf has the drones' axis first."""
         change = functools.partial(composition.change_body, self.effects)
-        each = _drones_axis(parameters) is not None
-        return jax.vmap(change, (0, None))(parameters, vehicle) if each else change(parameters, vehicle)
+        return jax.vmap(change, (0, None))(parameters, vehicle) if self.effects else vehicle
 
     def _contexts(self, vehicle, drones, dt) -> Context:
         neighbours = drones.position[others(drones.position.shape[0])]
@@ -170,17 +167,14 @@ class DronesStep:
         """The commands that reach the rate controllers, and the drones with the memory of it."""
         contexts = self._contexts(vehicle, drones, self.dt)
         change = functools.partial(composition.change_command, self.effects)
-        axes = (_drones_axis(parameters), 0, 0, 0)
-        command, memory = jax.vmap(change, axes)(parameters, drones.effect_memory, command, contexts)
+        command, memory = jax.vmap(change)(parameters, drones.effect_memory, command, contexts)
         return command, drones.replace(effect_memory=memory)
 
     def _substep(self, vehicle, parameters, command, pillars, drones):
         dt = self.dt / self.substeps
         contexts = self._contexts(vehicle, drones, dt)
-        turn = jax.vmap(
-            functools.partial(motors, self.effects, dt=dt),
-            (vehicles_axis(vehicle), _drones_axis(parameters), 0, 0, 0),
-        )
+        turn = functools.partial(motors, self.effects, dt=dt)
+        turn = jax.vmap(turn, (vehicles_axis(vehicle), 0, 0, 0, 0))
         drones, force, torque = turn(vehicle, parameters, drones, command, contexts)
         return self._bodies(vehicle, drones, force, torque, pillars)
 
@@ -200,11 +194,6 @@ def _repeated(substep, drones, number):
     if number == 1:
         return substep(drones)
     return jax.lax.scan(lambda drones, _: (substep(drones), None), drones, None, length=number)[0]
-
-
-def _drones_axis(parameters):
-    """0 where the effects' parameters are those of each drone, None where all drones share them."""
-    return 0 if any(leaf.ndim for leaf in jax.tree.leaves(parameters)) else None
 
 
 def make_drones_step(

@@ -12,7 +12,7 @@ from openjax.errors import UserError
 from openjax.files import read_toml
 from openjax.vehicle.disturbances import DISTURBANCES
 from openjax.vehicle.effects.effect import Effect, Parameter
-from openjax.vehicle.effects.registry import EFFECTS
+from openjax.vehicle.effects.registry import EFFECTS, find_effect
 from openjax.vehicle.parameters import NOMINAL, find_mjcf
 
 
@@ -36,13 +36,7 @@ def known_effects() -> dict[str, Effect]:
 def find_parameter(name: str) -> tuple[Effect, Parameter]:
     """The effect and the parameter behind `effect.parameter`. Raises UserError if there is none."""
     effect_name, _, parameter = name.partition(".")
-    effect = known_effects().get(effect_name)
-    if effect is None:
-        raise UserError(f"vehicles: effect {effect_name!r} is unknown; known: {', '.join(known_effects())}")
-    if parameter not in effect.parameters:
-        raise UserError(
-            f"vehicles: effect {effect_name!r} has no parameter {parameter!r}; it has {', '.join(effect.parameters)}"
-        )
+    effect = find_effect(effect_name, parameter, "vehicles: ", known_effects())
     return effect, effect.parameters[parameter]
 
 

@@ -9,7 +9,6 @@ _HOMES = {
     "SCRIPTED": "kinds",
     "TRAINED": "kinds",
     "VALIDATED": "kinds",
-    "Around": "evader",
     "EvaderKind": "kinds",
     "EvaderState": "evader",
     "check_evaders": "kinds",

@@ -1,7 +1,7 @@
 """The evader of one world: which it is, its numbers and its memory, drawn at the start; and its velocity in each step."""
 
 import functools
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,9 @@ from openjax.pursuit.evaders.kinds import EVADERS, NUMBERS, UNBOUNDED
 from openjax.pursuit.evaders.learned import STEPS, learned, learned_place, learning
 from openjax.pursuit.settings import PursuitSettings
 
+if TYPE_CHECKING:
+    from openjax.pursuit.state import PursuitState
+
 
 @struct.dataclass
 class EvaderState:
@@ -22,23 +25,6 @@ class EvaderState:
     kind: jax.Array  # () int32, place in `settings.evaders`
     numbers: dict[str, jax.Array]  # those of `EvaderKind`, () each, float32
     memory: jax.Array  # (M,)
-
-
-@struct.dataclass
-class Around:
-    """What is around an evader."""
-
-    position: jax.Array  # (3,) m, its own
-    velocity: jax.Array  # (3,) m/s, its own in the last step
-    pursuers: jax.Array  # (N, 3) m
-    in_sight: jax.Array  # (N,) bool
-    pillar_position: jax.Array  # (P, 2) m
-    pillar_active: jax.Array  # (P,) bool
-
-    @property
-    def pillars(self) -> tuple[jax.Array, jax.Array]:
-        """Positions and which are in use."""
-        return self.pillar_position, self.pillar_active
 
 
 def draw_evader(
@@ -89,62 +75,64 @@ def _drawn(values, kind, draw):
 
 
 def evader_velocity(
-    settings: PursuitSettings,
-    state: EvaderState | None,
-    around: Around,
-    networks: Any = None,
-    wish: jax.Array | None = None,
+    settings: PursuitSettings, world: "PursuitState", networks: Any = None, wish: jax.Array | None = None
 ) -> tuple[jax.Array, EvaderState | None]:
-    """(3,) velocity (m/s, world) of the evader in this step, and its state after it.
+    """(3,) velocity (m/s, world) of the evader of a world in this step, and its state after it.
 
     Evaders other than the paper's neither leave the arena nor enter a pillar, and no gradient goes through what they decide.
 
     Args:
       settings: the game.
-      state: which evader it is, from `draw_evader`.
-      around: where it and the others are.
+      world: before this step.
       networks: parameters of the learned evaders among the settings', their axis first; None: they do as the greedy one.
       wish: (3,) a velocity, as a share of its speed, that is flown in place of its own; None or NaN is its own.
     """
-    if state is None and wish is None:
-        return _field(settings, around), None
-    around, state = jax.lax.stop_gradient((around, state))
+    if world.evader is None and wish is None:
+        return _field(settings, world), None
+    world = jax.lax.stop_gradient(world)
+    state = world.evader
     if state is None:
-        return _flown(settings, around, settings.evader_speed, UNBOUNDED, wish), None
-    own, memory = _wish(settings, state, around, networks)
+        return _flown(settings, world, settings.evader_speed, UNBOUNDED, wish), None
+    own, memory = _wish(settings, world, networks)
     is_own = jnp.ones((), bool) if wish is None else jnp.any(jnp.isnan(wish))
     speed = state.numbers["speed"] * settings.evader_speed
     wish = own if wish is None else jnp.where(is_own, own, wish)
-    velocity = _flown(settings, around, speed, state.numbers["acceleration"], wish)
+    velocity = _flown(settings, world, speed, state.numbers["acceleration"], wish)
     is_field = np.array([EVADERS[name].behaviour == "field" for name in settings.evaders])
     if is_field.any():
-        velocity = jnp.where(is_own & jnp.asarray(is_field)[state.kind], _field(settings, around), velocity)
+        velocity = jnp.where(is_own & jnp.asarray(is_field)[state.kind], _field(settings, world), velocity)
     return velocity, state.replace(memory=memory)
 
 
-def scene_of(settings: PursuitSettings, state: EvaderState, around: Around) -> Scene:
-    """What an evader knows of what is around it."""
-    numbers = state.numbers
+def scene_of(settings: PursuitSettings, world: "PursuitState") -> Scene:
+    """What the evader of a world knows of it."""
+    numbers = world.evader.numbers
     return Scene(
         settings=settings,
-        position=around.position,
-        velocity=around.velocity,
-        pursuers=around.pursuers,
-        known=around.in_sight | (numbers["sees_all"] > 0.5),
-        pillar_position=around.pillar_position,
-        pillar_active=around.pillar_active,
+        position=world.evader_position,
+        velocity=world.evader_velocity,
+        pursuers=world.drones.position,
+        known=world.in_sight | (numbers["sees_all"] > 0.5),
+        pillar_position=world.task.pillar_position,
+        pillar_active=world.task.pillar_active,
         look_ahead=numbers["look_ahead"],
         hiding=numbers["hiding"],
         reach=numbers["speed"] * settings.evader_speed,
     )
 
 
-def _field(settings, around):
-    return field_velocity(settings, around.position, around.pursuers, around.in_sight, *around.pillars)
+def _pillars(world):
+    return world.task.pillar_position, world.task.pillar_active
 
 
-def _wish(settings, state, around, networks):
+def _field(settings, world):
+    places = world.evader_position, world.drones.position
+    return field_velocity(settings, *places, world.in_sight, *_pillars(world))
+
+
+def _wish(settings, world, networks):
     """Wish (3,) and memory of an evader with a behaviour; of the paper's something finite."""
+    state = world.evader
     which = learned_place(settings.evaders, state.kind)
     by_network = learning if networks is None else functools.partial(learned, networks, which)
     known = {**BEHAVIOURS, "learned": by_network}
@@ -155,24 +143,23 @@ def _wish(settings, state, around, networks):
     return jax.lax.switch(
         jnp.asarray(place)[state.kind],
         [known[name] for name in used],
-        scene_of(settings, state, around),
+        scene_of(settings, world),
         state.memory,
     )
 
 
-def _flown(settings, around, speed, acceleration, wish):
+def _flown(settings, world, speed, acceleration, wish):
     """(3,) m/s, what is flown of a wish: bounded in speed and acceleration, and past what is solid."""
 
     def at_most(vector, limit):
         return vector * jnp.minimum(1.0, limit / jnp.sqrt(jnp.sum(vector**2) + 1e-12))
 
-    dt, start = settings.time_step, around.position
-    velocity = around.velocity + at_most(speed * wish - around.velocity, acceleration * dt)
-    velocity = at_most(velocity, speed)
-    moved = into_free_space(settings, start + dt * velocity, *around.pillars)
+    dt, start, before = settings.time_step, world.evader_position, world.evader_velocity
+    velocity = at_most(before + at_most(speed * wish - before, acceleration * dt), speed)
+    moved = into_free_space(settings, start + dt * velocity, *_pillars(world))
     velocity = at_most((moved - start) / dt, speed)
     # between pillars that touch, what leads out of one may lead into another
-    free = _is_free(settings, start + dt * velocity, *around.pillars)
+    free = _is_free(settings, start + dt * velocity, *_pillars(world))
     return jnp.where(free, velocity, 0.0)
 
 

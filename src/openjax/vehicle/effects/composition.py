@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from openjax.errors import UserError
 from openjax.vehicle.effects.effect import Context, Effect
-from openjax.vehicle.effects.registry import EFFECTS
+from openjax.vehicle.effects.registry import find_effect
 from openjax.vehicle.parameters import Vehicle
 from openjax.vehicle.rotors import rotor_reaction, rotor_thrust, total_wrench
 from openjax.vehicle.state import DroneState
@@ -21,10 +21,7 @@ def resolve(effects) -> tuple[Effect, ...]:
     """Effects from names or `Effect`s, in the order in which they act. Raises UserError for unknown names."""
     found = {}
     for effect in effects:
-        if not isinstance(effect, Effect):
-            if effect not in EFFECTS:
-                raise UserError(f"effect {effect!r} is unknown; known: {', '.join(EFFECTS)}")
-            effect = EFFECTS[effect]
+        effect = effect if isinstance(effect, Effect) else find_effect(effect)
         found[effect.name] = effect
     return tuple(found[name] for name in sorted(found))
 
@@ -35,19 +32,14 @@ def complete_parameters(effects, given: Mapping[str, Mapping[str, Any]] | None, 
     Raises UserError for effects or parameters that aren't known.
     """
     given = given or {}
-    names = {effect.name for effect in effects}
-    if strangers := sorted(set(given) - names):
-        raise UserError(f"parameters for {strangers[0]!r}, which is not among the effects {sorted(names)}")
-    complete = {}
-    for effect in effects:
-        values = given.get(effect.name, {})
-        if strangers := sorted(set(values) - set(effect.parameters)):
-            known = ", ".join(effect.parameters)
-            raise UserError(f"effect {effect.name!r} has no parameter {strangers[0]!r}; it has {known}")
-        complete[effect.name] = {
-            name: jnp.asarray(values.get(name, none), dtype) for name, none in effect.none().items()
-        }
-    return complete
+    known = {effect.name: effect for effect in effects}
+    for name, values in given.items():
+        if name not in known:
+            raise UserError(f"parameters for {name!r}, which is not among the effects {sorted(known)}")
+        for parameter in values:
+            find_effect(name, parameter, known=known)
+    complete = {name: {**effect.none(), **given.get(name, {})} for name, effect in known.items()}
+    return jax.tree.map(lambda value: jnp.asarray(value, dtype), complete)
 
 
 def initial_memory(effects, vehicle: Vehicle, state: DroneState, dt: float, key=None):

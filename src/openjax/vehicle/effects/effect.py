@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from openjax.vehicle.arena import Arena
 from openjax.vehicle.parameters import Vehicle
+from openjax.vehicle.rotors import rotor_thrust
 from openjax.vehicle.state import DroneState
 
 ARENA_CEILING = Arena.height  # m
@@ -35,44 +36,29 @@ class Context:
     dt: jax.Array  # () s, time until the next call
 
 
-def make_context(
-    vehicle: Vehicle,
-    state: DroneState,
-    thrust=None,
-    others_position=None,
-    battery_voltage=jnp.nan,
-    packet_lost=jnp.nan,
-    air_time=0.0,
-    floor_height=0.0,
-    ceiling_height=ARENA_CEILING,
-    dt=0.01,
-) -> Context:
-    """The context of one drone in `state`; `thrust` (4,) N defaults to that of its rotor speeds.
+def make_context(vehicle: Vehicle, state: DroneState, **known) -> Context:
+    """The context of one drone in `state`, of which `known` are fields; others are usual, or not known.
 
     For logged flights: map it over the samples, `jax.vmap(lambda state, v: make_context(vehicle, state,
     battery_voltage=v))(states, voltages)`, and map an effect's hooks over the result.
     """
-    dtype = state.position.dtype
-    if thrust is None:
-        thrust = vehicle.thrust_constant * jnp.square(state.rotor_speed)
-    if others_position is None:
-        others_position = jnp.zeros((0, 3), dtype)
-    return Context(
+    usual = Context(
         position=state.position,
         quaternion=state.quaternion,
         velocity=state.velocity,
         body_rates=state.body_rates,
         rotor_position=vehicle.rotor_position,
         rotor_speed=state.rotor_speed,
-        thrust=thrust,
-        others_position=others_position,
-        battery_voltage=jnp.asarray(battery_voltage, dtype),
-        packet_lost=jnp.asarray(packet_lost, dtype),
-        air_time=jnp.asarray(air_time, dtype),
-        floor_height=jnp.asarray(floor_height, dtype),
-        ceiling_height=jnp.asarray(ceiling_height, dtype),
-        dt=jnp.asarray(dt, dtype),
+        thrust=rotor_thrust(vehicle, state.rotor_speed),
+        others_position=jnp.zeros((0, 3)),
+        battery_voltage=jnp.nan,
+        packet_lost=jnp.nan,
+        air_time=0.0,
+        floor_height=0.0,
+        ceiling_height=ARENA_CEILING,
+        dt=0.01,
     )
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, state.position.dtype), usual.replace(**known))
 
 
 @dataclass(frozen=True)

@@ -16,11 +16,10 @@ from pathlib import Path
 
 import tomlkit
 
-from openjax.errors import UserError, suggestion
+from openjax.errors import UserError
 from openjax.files import read_toml, write_text
 from openjax.plain import from_plain
-from openjax.vehicle.effects.effect import Effect
-from openjax.vehicle.effects.registry import EFFECTS
+from openjax.vehicle.effects.registry import find_effect
 
 FAR = 100.0
 """Values may lie outside of a parameter's usual range by this many of its widths."""
@@ -58,31 +57,18 @@ def load_intervals(path: str | Path) -> dict[str, dict[str, tuple[float, float]]
 
 def _read(path: Path) -> dict[str, dict[str, _Entry]]:
     """The entries of an effects file."""
-    table = read_toml(path, "effects file")
+    table, read = read_toml(path, "effects file"), {}
     table.pop("notes", None)
     for name, entries in table.items():
         if not isinstance(entries, dict):
             raise UserError(f"{path}: [{name}] must be a table of its parameters")
-        for key in [None, *entries]:
-            _find(name, key, f"{path}: ")
-    return {
-        name: {key: _entry(path, name, key, entry) for key, entry in entries.items()}
-        for name, entries in table.items()
-    }
-
-
-def _find(effect: str, parameter: str | None, where: str = "") -> Effect:
-    """The effect of that name. Raises UserError where there is none, or it hasn't that parameter."""
-    if effect not in EFFECTS:
-        raise UserError(f"{where}effect {effect!r} is unknown; {suggestion(effect, EFFECTS)}")
-    known = EFFECTS[effect].parameters
-    if parameter is not None and parameter not in known:
-        raise UserError(f"{where}effect {effect!r} has no parameter {parameter!r}; it has {', '.join(known)}")
-    return EFFECTS[effect]
+        find_effect(name, where=f"{path}: ")
+        read[name] = {key: _entry(path, name, key, entry) for key, entry in entries.items()}
+    return read
 
 
 def _entry(path: Path, name: str, key: str, told) -> _Entry:
-    where, parameter = f"{path}: {name}.{key}", EFFECTS[name].parameters[key]
+    where, parameter = f"{path}: {name}.{key}", find_effect(name, key, f"{path}: ").parameters[key]
     entry = from_plain(_Entry, told if isinstance(told, dict) else {"value": told}, where)
     if entry.unit not in (None, parameter.unit):
         raise UserError(f"{where} is in {entry.unit!r}; {parameter.unit!r} would be right")
@@ -110,10 +96,10 @@ def save_effects(
     if notes:
         document.add("notes", notes)
     for name in sorted(parameters):
-        effect, table = _find(name, None), tomlkit.table()
+        effect, table = find_effect(name), tomlkit.table()
         table.comment(effect.description)
         for key, value in parameters[name].items():
-            _find(name, key)
+            find_effect(name, key)
             entry = tomlkit.inline_table()
             entry.append("value", float(value))
             entry.append("unit", effect.parameters[key].unit)
