@@ -52,7 +52,9 @@ from openjax.virtual_crazyflie.simulated import SimulatedSwarm, Uplink
 from openjax.virtual_crazyflie.vehicles import VirtualVehicles
 
 LATEST, SECONDS = 4.0, 14.0
-"""Nothing begins to go wrong after; flown in all (s)."""
+"""Nothing begins to go wrong after; who flies then is asked to land (s)."""
+OVER = "time is over"
+"""The reason of these landings."""
 PILLARS = 8
 """Room for as many in each layout, so that the game is compiled once."""
 LAIN = 50
@@ -86,7 +88,7 @@ def fly(seeds: list[int], layout: str, policy_name: str, level_after: float = LE
     worlds = Worlds([draw_fault(seed, LATEST) for seed in seeds], layout, policy_name)
     for firmware in worlds.swarm.firmware:
         firmware.level_after = level_after
-    for _ in range(round(SECONDS / 0.01)):
+    for _ in range(round((SECONDS + ENDING) / 0.01)):
         if not worlds.tick():
             break
     return worlds.records(seeds)
@@ -208,8 +210,10 @@ class Worlds:
             self.states[w], self._landing[w] = take_over(self.states[w], now), True
         action = None if self._landing[w] else fault.answered(self._actions[w], now)
         actions = None if action is None else tuple(from_action(a, THRUST_LIMIT) for a in action)
-        landing = fault.kind == "key" or (fault.kind == "guard stopped" and since > 2.0 * SILENCE)
-        event = Event(now, samples, actions, Request.LAND if on and landing else Request.NONE, "")
+        landing = on and (fault.kind == "key" or (fault.kind == "guard stopped" and since > 2.0 * SILENCE))
+        over = not landing and now >= SECONDS
+        request = Request.LAND if landing or over else Request.NONE
+        event = Event(now, samples, actions, request, OVER if over else "")
         self.states[w], wanted = decide(self.states[w], event)
         return list(wanted)
 
@@ -224,14 +228,14 @@ class Worlds:
         position, off = track[..., :3], track[..., 3] > 0.0
         begin = min(fault.time, 0.01 * (len(track) - 1))
         seen = outcome(fault, 0.01 * np.arange(len(track)), position, off, begin)
-        held, ended = seen.pop("held"), any(d.reason for d in drones)
+        held, ended = seen.pop("held"), any(d.reason not in ("", OVER) for d in drones)
         crashed = np.array([f.crashed for f in self.swarm.firmware[w * self.n : (w + 1) * self.n]])
         pairs = [position[:, i] - position[:, j] for i in range(3) for j in range(i)]
         return {
             "kind": fault.kind, "layout": self._layout, "captured_by_camera": fault.captured,
             **{k: v for k, v in asdict(fault).items() if k in ("time", "vehicle", "duration", "amount")},
             "ended": ended, "reasons": [d.reason for d in drones], **seen, "seconds": seen["seconds"] if ended else None,
-            "hard": bool(crashed[held].any()), "armed": bool((~off[-1])[held].any()) and ended,
+            "hard": bool(crashed[held].any()), "armed": bool((~off[-1])[held].any()),
             "nearest": float(np.linalg.norm(pairs, axis=-1).min()), "caught": self.captured[w],
         }  # fmt: skip
 
