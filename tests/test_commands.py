@@ -8,7 +8,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -361,14 +360,3 @@ def test_bad_input_is_one_line_and_status_2(
     assert len(error.strip().splitlines()) == 1 and message in error
     assert {path: path.stat().st_mtime_ns for path in [*run.rglob("*"), *folder.rglob("*")]} == before
     assert os.listdir(tmp_path) == ["folder"]
-
-
-def test_overwrite_replaces_the_run_and_keeps_foreign_files(tmp_path):
-    from openjax.store.run_directory import create_run
-
-    run = create_run(tmp_path / "run", overwrite=False)
-    run.write_settings({}, {})
-    (run.checkpoints / "000000001").mkdir(parents=True)
-    (run.path / "notes.txt").write_text("mine")
-    create_run(run.path, overwrite=True)
-    assert [path.name for path in Path(run.path).iterdir()] == ["notes.txt"]

@@ -54,6 +54,15 @@ def test_what_a_killed_start_left_is_taken_over_but_nothing_else(tmp_path):
             check_free(run, overwrite)
 
 
+def test_overwrite_replaces_the_run_and_keeps_foreign_files(tmp_path):
+    run = create_run(tmp_path / "run", overwrite=False)
+    run.write_settings({}, {})
+    (run.checkpoints / "000000001").mkdir(parents=True)
+    (run.path / "notes.txt").write_text("mine")
+    create_run(run.path, overwrite=True)
+    assert [path.name for path in run.path.iterdir()] == ["notes.txt"]
+
+
 def test_settings_of_an_earlier_version_keep_loading(tmp_path):
     run = create_run(tmp_path, overwrite=False)
     run.write_settings(preset("quick"), {})
