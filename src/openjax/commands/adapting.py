@@ -242,7 +242,7 @@ def in_words(results: dict) -> list[str]:
 
 def page(results: dict) -> str:
     """One self-contained HTML page."""
-    from openjax.gap.report.page import filled  # with matplotlib: not before the compiler has begun
+    from openjax.show.pages import filled  # with matplotlib: not before the compiler has begun
 
     values = {"words": in_words(results), "figures": FIGURES, "which": WHICH, "picture": _picture(results)}
     return filled("adapt.html.jinja", Path(__file__).parent, results=results, **values)
@@ -252,7 +252,7 @@ def _picture(results):
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    from openjax.gap.report.figures import STYLE, as_svg
+    from openjax.show.pages import STYLE, as_svg
 
     shown = {
         "crashes_from_starts": "crashes from leaning starts (smooth)",

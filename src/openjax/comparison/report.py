@@ -10,9 +10,7 @@ from matplotlib.figure import Figure
 from openjax.comparison.causes import CHANGES
 from openjax.comparison.figures import TRIMS
 from openjax.comparison.result import Change, Interval
-from openjax.gap.report.figures import AFTER, BEFORE, GREY, as_svg
-from openjax.gap.report.figures import STYLE as FIGURE_STYLE
-from openjax.gap.report.page import filled
+from openjax.show.pages import AFTER, BEFORE, GREY, STYLE, as_svg, filled
 
 # figure: what it is, its unit, the factor to it; a logarithm's is a change in per cent
 _NAMES = {
@@ -146,11 +144,11 @@ def write(change: Change, folder: Path, pictures: bool = True) -> None:
 
 def html_of(change: Change) -> str:
     """One page, nothing to fetch from elsewhere."""
-    with rc_context(FIGURE_STYLE):
+    with rc_context(STYLE):
         picture = as_svg(draw(change), change.name)
     differences = [(_NAMES[name][0], _difference(name, d)) for name, d in change.figures.items()]
     told = {"lines": in_words(change), "picture": picture, "differences": differences}
-    return filled("changes.html.jinja", change=change, **told)
+    return filled("changes.html.jinja", Path(__file__).parent, change=change, **told)
 
 
 def draw(change: Change):

@@ -201,3 +201,9 @@ def to_world(quaternion: Array, vector: Array) -> Array:
 def specific_force_of(quaternion: Array, velocity: Array, period: float) -> Array:
     """Force per mass (T, 3), m/s^2 in the body frame, that a path with velocities (T, 3) every `period` s needs."""
     return to_body(quaternion, np.gradient(velocity, period, axis=0) + np.array([0.0, 0.0, GRAVITY]))
+
+
+def turn_increments(quaternion: np.ndarray) -> np.ndarray:
+    """Rotation vectors (T - 1, 3), body frame, between successive attitudes (T, 4)."""
+    attitude = Rotation.from_quat(quaternion, scalar_first=True)
+    return (attitude[:-1].inv() * attitude[1:]).as_rotvec()

@@ -4,13 +4,14 @@ from dataclasses import dataclass
 
 from openjax.errors import UserError
 from openjax.flights.flight import Case
+from openjax.flights.kinematics import Kinematics, corrected, read_kinematics
 from openjax.flights.track import Track, tracks_of
 from openjax.gap.channels import Channel
 from openjax.gap.channels.motion import Motion, make_reading, read_motion, rows_are_samples
 from openjax.gap.channels.pose import Pose, read_pose, undelayed
 from openjax.gap.channels.radio import read_radio
 from openjax.gap.channels.rate_loop import read_rate_loop, with_motors
-from openjax.gap.channels.sensors import Kinematics, corrected, read_kinematics
+from openjax.gap.decision import DECISION
 from openjax.gap.model.library import CARDS, Library
 from openjax.gap.model.replay import Replay
 
@@ -69,7 +70,7 @@ def _sensors(tracks: list[Track], library: Library) -> tuple[list[Track], Pose |
     moved = pose is not None and pose.names and pose.late
     if moved:
         tracks = [undelayed(t, pose.fit.value) for t in tracks]
-    sensors = read_kinematics(tracks)
+    sensors = read_kinematics(tracks, DECISION)
     tracks = [corrected(t, sensors) for t in tracks]
     if pose is not None and not moved:
         pose = read_pose(tracks, library)

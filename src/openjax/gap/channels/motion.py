@@ -8,10 +8,10 @@ import numpy as np
 
 from openjax.errors import UserError
 from openjax.flights.flight import Case
+from openjax.flights.kinematics import Kinematics
 from openjax.flights.track import GRID_PERIOD, Track
 from openjax.gap.channels.instruments import caused_by_commands, read_feedback
 from openjax.gap.channels.rate_loop import ROW_DELAY, RateLoop
-from openjax.gap.channels.sensors import Kinematics
 from openjax.gap.model.hypotheses import SetFit, fit_set, fit_singles, model_noise
 from openjax.gap.model.library import CARDS, Library, numbers_of
 from openjax.gap.model.observer import TICKS

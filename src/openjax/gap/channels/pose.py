@@ -4,9 +4,8 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from openjax.flights.track import Track, smooth
+from openjax.flights.track import Track, smooth, turn_increments
 from openjax.gap.channels import Channel, Estimated, effects_of
 from openjax.gap.decision import DECISION
 from openjax.gap.model.nuisances import SIZE
@@ -140,12 +139,6 @@ def _fit(data: list[np.ndarray]) -> Delay:
 def _late(values: np.ndarray, delay: float, track: Track) -> np.ndarray:
     """Rows (T, C) as they were `delay` s earlier."""
     return np.stack([np.interp(track.time - delay, track.time, column) for column in values.T], 1)
-
-
-def turn_increments(quaternion: np.ndarray) -> np.ndarray:
-    """Rotation vectors (T - 1, 3), body frame, between successive attitudes (T, 4)."""
-    attitude = Rotation.from_quat(quaternion, scalar_first=True)
-    return (attitude[:-1].inv() * attitude[1:]).as_rotvec()
 
 
 def undelayed(track: Track, delay: float) -> Track:

@@ -1,14 +1,9 @@
-"""Figures of a report, as SVG that takes its colours from the page: light and dark."""
+"""Figures of a report."""
 
-import io
-import re
 from collections.abc import Sequence
 
 import numpy as np
 from matplotlib import rc_context
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_svg import FigureCanvasSVG
-from matplotlib.figure import Figure
 
 from openjax.flights.track import smooth, to_body
 from openjax.gap.model.library import CARDS
@@ -17,20 +12,8 @@ from openjax.gap.model.table import HORIZONS
 from openjax.gap.report import Report
 from openjax.gap.residual import disturbances, residuals_of
 from openjax.gap.where import CALM
+from openjax.show.pages import AFTER, BEFORE, GREY, STYLE, add_legend, as_svg, small_figure
 
-BEFORE, AFTER = "#d1495b", "#2e86ab"  # both stand out on white and on black
-GREY = "#8a8f98"
-INK = "#0a0b0c"  # becomes the page's text colour
-STYLE = {
-    "svg.fonttype": "none",
-    "savefig.transparent": True,
-    "font.family": "sans-serif",
-    "font.size": 11,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "legend.frameon": False,
-    **dict.fromkeys(("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), INK),
-}
 HORIZONS_SHOWN = (0.02, 0.05, 0.1, 0.25, 0.5, 1.0)  # s
 BINS = 15
 
@@ -58,7 +41,7 @@ def _places(report: Report):
     places = [place for place in report.where if place.share > 0.01][:8][::-1]
     if not report.effects or not places:
         return None
-    figure, axes = _figure(0.6 + 0.42 * len(places))
+    figure, axes = small_figure(0.6 + 0.42 * len(places))
     rows = np.arange(len(places))
     before = np.array([place.before for place in places])
     after = np.array([place.after for place in places])
@@ -69,7 +52,7 @@ def _places(report: Report):
     axes.axvline(1.0, color=GREY, linestyle=":", linewidth=1.2)
     axes.set_yticks(rows, [f"{p.channel}, {p.regime}".replace("_", " ") for p in places])
     axes.set(xlabel="error, in units of the noise", xlim=(0, None), ylim=(-0.6, len(places) - 0.4))
-    _legend(axes)
+    add_legend(axes)
     return "Where the gap lies", f"Forces and torques, averaged over {CALM} s, by part of the flight.", figure
 
 
@@ -100,7 +83,7 @@ def _course(report: Report):
     track, before, after, axis = _worst(report)
     step = max(round(HORIZONS["velocity"] / track.dt), 1)
     name, unit = _axis_name(axis)
-    figure, axes = _figure(2.6)
+    figure, axes = small_figure(2.6)
     time = track.time[step:] - track.time[0]
     band = 1.645 * np.std(after[step:, axis] - after[:-step, axis])
     label = "90 % of what is left" if report.parameters else "90 % of all errors"
@@ -109,7 +92,7 @@ def _course(report: Report):
         error = residual[step:, axis] - residual[:-step, axis]
         axes.plot(time, error, color=colour, linewidth=1.1, label=label)
     axes.set(xlabel="time in the flight [s]", ylabel=f"error of {name} [{unit}]", xlim=(time[0], time[-1]))
-    _legend(axes)
+    add_legend(axes)
     return "One flight", f"{track.name}: error of predictions {HORIZONS['velocity']} s ahead.", figure
 
 
@@ -125,7 +108,7 @@ def _horizons(report: Report):
     track, before, after, axis = _worst(report)
     name, unit = _axis_name(axis)
     rows = sorted({max(round(horizon / track.dt), 1) for horizon in HORIZONS_SHOWN})
-    figure, axes = _figure(2.6)
+    figure, axes = small_figure(2.6)
     most = 0.0
     for residual, colour, label in _lines(report, before, after):
         errors = [np.std(residual[r:, axis] - residual[:-r, axis]) for r in rows]
@@ -134,7 +117,7 @@ def _horizons(report: Report):
     axes.set(xlabel="time ahead [s]", ylabel=f"rms error of {name} [{unit}]", ylim=(0, 1.1 * most))
     axes.set_xticks(HORIZONS_SHOWN, [f"{horizon:g}" for horizon in HORIZONS_SHOWN])
     axes.minorticks_off()
-    _legend(axes)
+    add_legend(axes)
     return "How far ahead", f"{track.name}: the error grows with the time that is predicted.", figure
 
 
@@ -146,7 +129,7 @@ def _coordinate(report: Report):
     coordinate = CARDS[named[0]].coordinate
     if not coordinate:  # its force follows none, or it makes torques or delays
         return None
-    figure, axes = _figure(2.6)
+    figure, axes = small_figure(2.6)
     for residuals, (_, colour, label) in zip(_residuals(report), _lines(report, None, None), strict=False):
         both = zip(evidence.tracks, residuals, strict=True)
         pairs = [p for p in (_pairs(*of, coordinate) for of in both) if p is not None]
@@ -156,7 +139,7 @@ def _coordinate(report: Report):
     units = {"body velocity": "forward speed [m/s]", "voltage": "voltage [V]", "thrust": "mean motor command"}
     axes.axhline(0.0, color=GREY, linestyle=":", linewidth=1.2)
     axes.set(xlabel=units.get(coordinate, f"{coordinate} [m]"), ylabel="missing acceleration [m/s²]")
-    _legend(axes)
+    add_legend(axes)
     return "The strongest effect", f"{named[0]}: what the simulator misses, against what drives it.", figure
 
 
@@ -183,25 +166,3 @@ def _binned(data: np.ndarray) -> np.ndarray:
     edges = np.quantile(data[:, 0], np.linspace(0, 1, BINS + 1))
     bins = np.clip(np.searchsorted(edges, data[:, 0]) - 1, 0, BINS - 1)
     return np.array([data[bins == b].mean(0) for b in range(BINS) if (bins == b).any()])
-
-
-def _figure(height: float) -> tuple[Figure, Axes]:
-    figure = Figure(figsize=(5.8, height + 0.4), layout="constrained")
-    return figure, figure.subplots()
-
-
-def _legend(axes: Axes) -> None:
-    """Above the axes, where it covers nothing."""
-    place = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.2}
-    axes.legend(ncols=2, fontsize=10, columnspacing=1.2, **place)
-
-
-def as_svg(figure: Figure, salt: str) -> str:
-    """The figure as an element for a page: text stays text, ink takes the page's colour, sizes are the page's."""
-    FigureCanvasSVG(figure)
-    data = io.StringIO()
-    with rc_context({"svg.hashsalt": salt}):
-        figure.savefig(data, format="svg", metadata={"Date": None, "Creator": None})
-    text = data.getvalue()
-    text = text[text.index("<svg") :].replace(INK, "currentColor")
-    return re.sub(r'<svg ([^>]*?)height="[^"]*"([^>]*?)width="[^"]*"', r"<svg \1\2", text, count=1)

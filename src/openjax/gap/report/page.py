@@ -1,13 +1,11 @@
 """The report as one HTML file, nothing to fetch from elsewhere."""
 
 import datetime
-import re
 from pathlib import Path
-
-import jinja2
 
 from openjax.gap.report import VERDICTS, Report
 from openjax.gap.report.figures import figures
+from openjax.show.pages import filled
 from openjax.vehicle.effects import EFFECTS
 
 
@@ -16,6 +14,7 @@ def page_of(report: Report) -> str:
     ranked = sorted(report.probabilities.items(), key=lambda item: -item[1])
     return filled(
         "page.html.jinja",
+        Path(__file__).parent,
         report=report,
         facts=facts(report),
         sentence=sentence(report),
@@ -25,14 +24,6 @@ def page_of(report: Report) -> str:
         meanings={e: EFFECTS[e].description for e in report.parameters if e in EFFECTS},
         ranked=[(name, p) for name, p in ranked[:8] if p > 5e-4],
     )
-
-
-def filled(template: str, folder: Path = Path(__file__).parent, **values) -> str:
-    """A template of a folder with its values and this one's looks, as one page with nothing to fetch from elsewhere."""
-    loader = jinja2.FileSystemLoader([folder, Path(__file__).parent])
-    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
-    page = environment.get_template(template).render(**values)
-    return re.sub(r"(?<=\d) %", "\u00a0%", page)  # a number and its sign stay on one line
 
 
 def facts(report: Report) -> list[tuple[str, str]]:

@@ -11,13 +11,11 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
-from openjax.flights.track import GRAVITY, Track, rotation, to_world
-from openjax.gap.channels.instruments import EDGE
-from openjax.gap.channels.pose import turn_increments
-from openjax.gap.decision import DECISION
-from openjax.gap.model.table import BLOCK
+from openjax.flights.track import GRAVITY, Track, rotation, to_world, turn_increments
 
 BAND = (0.3, 6.0)  # Hz: above drift, below most of the sensors' noise
+BLOCK = 1.0  # s that are left out together for an error
+EDGE = 0.3  # s at either end that a filter spoils
 SLOW = 2.0  # Hz, below which path and accelerometer are compared
 CLEAR = 5.0  # jackknife standard errors by which a finding must exceed nothing
 LEAST = 0.1  # rad/s or m/s^2 rms in the band: an axis that hardly moves shows no gain
@@ -27,72 +25,59 @@ ONE_CLOCK = 0.93  # below which they don't share a clock
 
 @dataclass(frozen=True)
 class Kinematics:
-    """`gain` (3,) of the gyroscope, 1 where it isn't clearly another; `tilt` (2,) rad about the world's x and y axes with
-    `tilt_error` (2,), None without path or accelerometer; `coherence` (3,) of attitude's rate and gyroscope, `turning` (3,)
-    whether the flights turn enough to tell; `findings`: what is off by more than usual, in words, by name."""
+    """`gain` (3,) of the gyroscope, 1 where it isn't clearly another; `tilt` (2,) rad by which the world leans about its x and y
+    axes, None where that isn't clear; `one_clock`: whether attitude and gyroscope can be compared sample by sample: what their
+    streams leave of each other is noise, not time; `findings`: what is off by more than usual, in words, by name."""
 
     gain: np.ndarray
     tilt: np.ndarray | None
-    tilt_error: np.ndarray | None
-    coherence: np.ndarray
-    turning: np.ndarray
+    one_clock: bool
     findings: dict[str, str]
 
-    @property
-    def upright(self) -> np.ndarray | None:
-        """Rotation (2,) rad about x and y that puts the world upright, where its tilt is clear, however small."""
-        if self.tilt is None or float(np.hypot(*self.tilt)) < DECISION.standard_errors * float(
-            np.hypot(*self.tilt_error)
-        ):
-            return None
-        return -self.tilt
 
-    @property
-    def one_clock(self) -> bool:
-        """Whether attitude and gyroscope can be compared sample by sample: what their streams leave of each other is
-        noise, not time."""
-        return int((self.turning & (self.coherence < ONE_CLOCK)).sum()) < 2
-
-
-def read_kinematics(tracks: list[Track]) -> Kinematics:
-    """Compare the sensors of all tracks of one case."""
-    streams = _streams(tracks, _turning, BAND)
-    gain, error, coherence, turning = _gains(streams)
-    tilt, tilt_error = _world(tracks)
-    # One axis alone may be one that the flights hardly turn about: two alike are a sensor.
-    clear = (np.abs(gain - 1.0) > CLEAR * error) & np.isfinite(gain)
-    clear &= clear.sum() >= 2
-    findings = {}
-    if words := _unusual(gain, error):
+def read_kinematics(tracks: list[Track], limits) -> Kinematics:
+    """Compare the sensors of all tracks of one case. `limits`: `gyroscope_gain` that a sensor may be off by, `world_tilt` in
+    degrees, and the `standard_errors` from which a tilt is clear."""
+    gain, error, coherence, turning = _gains(_streams(tracks, _turning, BAND))
+    apart = turning & (coherence < ONE_CLOCK)
+    one_clock, tilt, findings = int(apart.sum()) < 2, None, {}
+    if words := _unusual(gain, error, limits.gyroscope_gain):
         findings["gyroscope gain"] = f"the gyroscope reads {words} times the rate of the attitude"
     scale = _gains(_streams(tracks, _accelerating, (BAND[0], SLOW)))
-    if words := _unusual(*scale[:2]):
+    if words := _unusual(*scale[:2], limits.gyroscope_gain):
         findings["scale"] = (
             f"positions change by {words} times what accelerometer and attitude feel: check their scale"
         )
-    if (turning & (coherence < ONE_CLOCK)).sum() >= 2:
+    if not one_clock:
         words = ", ".join(f"{a} {c:.2f}" for a, c in zip("xyz", coherence, strict=True))
         findings["clocks"] = (
             f"gyroscope and attitude don't share a clock (correlation {words} between {BAND[0]} and {BAND[1]:g} Hz): "
             "torques and lags can't be told from these logs"
         )
-    if tilt is not None:
-        size = float(np.hypot(*tilt))
-        along = tilt / max(size, 1e-12)
-        if size > max(np.radians(DECISION.world_tilt), CLEAR * float(np.sqrt(along**2 @ tilt_error**2))):
+    if (world := _world(tracks)) is not None:
+        lean, lean_error = world
+        size = float(np.hypot(*lean))
+        tilt = lean if size >= limits.standard_errors * float(np.hypot(*lean_error)) else None
+        along = lean / max(size, 1e-12)
+        if size > max(np.radians(limits.world_tilt), CLEAR * float(np.sqrt(along**2 @ lean_error**2))):
             findings["world tilt"] = (
                 f"motion capture's world leans by {np.degrees(size):.1f} degrees against gravity "
-                f"({np.degrees(tilt[0]):+.1f} about x, {np.degrees(tilt[1]):+.1f} about y)"
+                f"({np.degrees(lean[0]):+.1f} about x, {np.degrees(lean[1]):+.1f} about y)"
             )
-    # One chip: an axis about which the flights hardly turn reads as the others do.
-    gain = np.where(clear, gain, np.mean(gain[clear]) if clear.any() else 1.0)
-    return Kinematics(gain, tilt, tilt_error, coherence, turning, findings)
+    return Kinematics(_of_one_chip(gain, error), tilt, one_clock, findings)
 
 
-def _unusual(gain: np.ndarray, error: np.ndarray) -> str:
+def _of_one_chip(gain: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """Gains (3,) that are clear on two axes - one alone may be one that the flights hardly turn about - and their mean on the
+    third; else 1."""
+    clear = (np.abs(gain - 1.0) > CLEAR * error) & np.isfinite(gain)
+    return np.where(clear, gain, np.mean(gain[clear])) if clear.sum() >= 2 else np.ones(3)
+
+
+def _unusual(gain: np.ndarray, error: np.ndarray, usual: float) -> str:
     """The axes whose gain is clearly off by more than sensors usually are, where these are two or more."""
     away = np.abs(gain - 1.0)  # NaN where it isn't known
-    off = (away > CLEAR * error) & (away > DECISION.gyroscope_gain)
+    off = (away > CLEAR * error) & (away > usual)
     words = ", ".join(f"{a} {g:.3f}" for a, g, o in zip("xyz", gain, off, strict=True) if o)
     return words if off.sum() >= 2 else ""
 
@@ -102,8 +87,8 @@ def corrected(track: Track, found: Kinematics) -> Track:
     changes = {}
     if (found.gain != 1.0).any():
         changes["body_rates"] = track.body_rates / found.gain
-    if found.upright is not None:
-        turn = Rotation.from_rotvec([*found.upright, 0.0])
+    if found.tilt is not None:
+        turn = Rotation.from_rotvec([*-found.tilt, 0.0])
         changes |= {name: turn.apply(getattr(track, name)) for name in ("position", "velocity")}
         attitude = turn * Rotation.from_quat(track.quaternion, scalar_first=True)
         changes["quaternion"] = attitude.as_quat(scalar_first=True)
@@ -170,7 +155,7 @@ def _jackknife(sums: np.ndarray, statistic) -> np.ndarray:
     return np.sqrt((len(sums) - 1) / len(sums) * ((left_out - left_out.mean(0)) ** 2).sum(0))
 
 
-def _world(tracks) -> tuple[np.ndarray | None, np.ndarray | None]:
+def _world(tracks) -> tuple[np.ndarray, np.ndarray] | None:
     """Tilt (2,) rad of the world about x and y and its error: the accelerometer, turned into the world, less the
     path's acceleration and gravity, is fixed in the world; the accelerometer's bias (per flight) is fixed in the
     body."""
@@ -178,7 +163,7 @@ def _world(tracks) -> tuple[np.ndarray | None, np.ndarray | None]:
     flights = list(dict.fromkeys(t.flight for t in tracks))
     for track in tracks:
         if track.quaternion is None or track.velocity is None or track.specific_force is None:
-            return None, None
+            return None
         turn = rotation(track.quaternion)
         rest = to_world(track.quaternion, track.specific_force) - np.array([0.0, 0.0, GRAVITY])
         low = butter(2, SLOW, fs=1.0 / track.dt, output="sos")
@@ -197,7 +182,7 @@ def _world(tracks) -> tuple[np.ndarray | None, np.ndarray | None]:
             part = both[k : k + size].reshape(-1, both.shape[2])
             grams.append(part.T @ part)
     if len(grams) < 4:
-        return None, None
+        return None
     grams = np.array(grams)
     total = grams.sum(0)
     rows = sum(len(t) for t in tracks)

@@ -5,9 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
+from openjax.flights import kinematics
+from openjax.flights.kinematics import corrected
 from openjax.flights.track import Track, rotation
-from openjax.gap.channels.sensors import corrected, read_kinematics
 from openjax.gap.decision import DECISION
+
+
+def read_kinematics(tracks):
+    return kinematics.read_kinematics(tracks, DECISION)
 
 
 def _track(gain=1.0, tilt=0.0, scale=1.0, seed=1, rows=1500):

@@ -1,0 +1,56 @@
+"""Pages in one file, nothing to fetch from elsewhere, with figures in SVG that take their colours from the page."""
+
+import io
+import re
+from pathlib import Path
+
+import jinja2
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+
+BEFORE, AFTER = "#d1495b", "#2e86ab"  # both stand out on white and on black
+GREY = "#8a8f98"
+INK = "#0a0b0c"  # becomes the page's text colour
+STYLE = {
+    "svg.fonttype": "none",
+    "savefig.transparent": True,
+    "font.family": "sans-serif",
+    "font.size": 11,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "legend.frameon": False,
+    **dict.fromkeys(("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), INK),
+}
+
+
+def filled(template: str, folder: Path, **values) -> str:
+    """A template of a folder with its values and the pages' looks."""
+    loader = jinja2.FileSystemLoader([folder, Path(__file__).parent])
+    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
+    page = environment.get_template(template).render(**values)
+    return re.sub(r"(?<=\d) %", "\u00a0%", page)  # a number and its sign stay on one line
+
+
+def small_figure(height: float) -> tuple[Figure, Axes]:
+    """A figure of one panel as wide as a column of a page."""
+    figure = Figure(figsize=(5.8, height + 0.4), layout="constrained")
+    return figure, figure.subplots()
+
+
+def add_legend(axes: Axes) -> None:
+    """Above the axes, where it covers nothing."""
+    place = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.2}
+    axes.legend(ncols=2, fontsize=10, columnspacing=1.2, **place)
+
+
+def as_svg(figure: Figure, salt: str) -> str:
+    """The figure as an element for a page: text stays text, ink takes the page's colour, sizes are the page's."""
+    FigureCanvasSVG(figure)
+    data = io.StringIO()
+    with rc_context({"svg.hashsalt": salt}):
+        figure.savefig(data, format="svg", metadata={"Date": None, "Creator": None})
+    text = data.getvalue()
+    text = text[text.index("<svg") :].replace(INK, "currentColor")
+    return re.sub(r'<svg ([^>]*?)height="[^"]*"([^>]*?)width="[^"]*"', r"<svg \1\2", text, count=1)
