@@ -27,7 +27,7 @@ def test_a_card_is_complete(name):
 
 def test_every_fitted_parameter_has_its_own_place():
     physics = [e for e in CARDS if CARDS[e].path == "physics"]
-    assert sorted(places(physics)) == list(range(len(THETA))) and len(ABSENT) == len(STEP) == len(THETA) + 1
+    assert sorted(places(physics)) == list(range(len(THETA))) and len(ABSENT) == len(STEP) == len(THETA) + 2
     for effect in physics:
         index, mean, precision = prior((effect,))
         assert len(index) == len(set(index)) == len(mean) and np.linalg.eigvalsh(precision).min() > 0

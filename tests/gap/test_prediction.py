@@ -48,7 +48,7 @@ def test_a_wrong_moment_of_inertia_turns_nothing_that_motors_hold_against():
     still = np.zeros((300, 3))
     numbers = (("inertia", "xx", 0.3),)
     ticks = [np.repeat(track.motor[:, None], TICKS, 1)]
-    replay = make_replay([track], [vehicle], ticks, [Feedback(*[still] * 4)], numbers)
+    replay = make_replay([track], [vehicle], ticks, [Feedback(*[still] * 3)], numbers)
     assert abs(replay.nominal[0][-1, 0]) > 1.0
     assert abs(replay.nuisances[0][0, -1, RATES]).max() < 1e-6
     aside = ABSENT.copy()
@@ -58,3 +58,17 @@ def test_a_wrong_moment_of_inertia_turns_nothing_that_motors_hold_against():
     heavier[:, PLACE["inertia", "xx"]] += steps
     light, heavy = replay.predict(heavier)[0][:, :, 0]
     np.testing.assert_allclose(around.nuisances[0][0, 1:, 0] / 0.3, (heavy - light)[1:] / 1e-2, rtol=0.05)
+
+
+def test_a_propeller_that_spins_up_turns_the_body_by_its_angular_momentum():
+    """Whatever the motors' lag does on the way: the sum over time is what the rotors' speeds changed by."""
+    track, vehicle = track_of(300, 1), load_vehicle()
+    harder = np.arange(300)[:, None] >= 150
+    track.motor[:] = np.where(harder, 0.4 + 0.2 * np.array([1.0, 0.0, 1.0, 0.0]), 0.4)
+    with_propellers = np.repeat(ABSENT[None], 2, 0)
+    with_propellers[1, -2] = 0.002
+    physics = make_physics([track], [vehicle], [np.repeat(track.motor[:, None], TICKS, 1)])
+    without, turned = physics.predict(with_propellers)[0][:, -1, RATES]
+    gained = np.sqrt([0.6, 0.4, 0.6, 0.4]) - np.sqrt(0.4)
+    gained = float(vehicle.max_rotor_speed) * gained @ np.asarray(vehicle.rotor_spin, float)
+    np.testing.assert_allclose(turned - without, [0.0, 0.0, 0.002 * gained], atol=1e-3 * abs(gained) * 0.002)

@@ -58,9 +58,7 @@ def words(check: Check, parts: Split) -> tuple[str, ...]:
 def not_testable(evidence: Evidence) -> list[str]:
     """Effects of the library that, at a usual size, these flights would not show."""
     motion = evidence.motion
-    missing = [
-        e for e in evidence.library.physics if e in motion.confounded or motion.exposure[e] < DETECTABLE
-    ]
+    missing = [e for e in evidence.library.physics if motion.exposure[e] < DETECTABLE]
     logged = {c.path for c in evidence.channels} | {"physics"}
     missing += [e for e in evidence.library.effects if path_of(e) not in logged]
     return missing + [e for c in evidence.channels for e in c.undetectable()]

@@ -70,9 +70,8 @@ def select(evidence: Evidence) -> Selection:
     search = Search(evidence, testable(evidence))
     best = search.climb(search.nothing)
     chosen = search.simplest(best)
-    named = [e for e in chosen.effects if e not in evidence.motion.confounded]
-    gains = {e: search.gap_growth(search.without(chosen, e), chosen) for e in named}
-    ordered = tuple(sorted(named, key=lambda e: -gains[e]))
+    gains = {e: search.gap_growth(search.without(chosen, e), chosen) for e in chosen.effects}
+    ordered = tuple(sorted(gains, key=lambda e: -gains[e]))
     chosen = replace(chosen, fit=fit_set(chosen.fit.replay, chosen.effects, chosen.fit.theta, rounds=ROUNDS))
     table = build(chosen.fit, {})
     return Selection(chosen, table, ordered, search.weights(), search.equivalents(chosen, ordered))
@@ -127,11 +126,11 @@ class Search:
         return self.of_fit(self.evidence.motion.nothing)
 
     def of_fit(self, fit: SetFit) -> Hypothesis:
-        """The hypothesis of a fit. Effects that are confounded cost nothing, as they aren't named."""
+        """The hypothesis of a fit."""
         key = frozenset(fit.effects)
         if key not in self.visited:
             table = build(fit, None)
-            odds = sum(CARDS[e].log_odds for e in key - self.evidence.motion.confounded)
+            odds = sum(CARDS[e].log_odds for e in key)
             self.visited[key] = Hypothesis(fit, judge(table, with_effects(table)), odds)
         return self.visited[key]
 
@@ -144,10 +143,6 @@ class Search:
             return self.of_fit(self.singles[next(iter(key))])
         ordered = [e for e in CARDS if e in key]
         return self.of_fit(fit_set(near.replay, ordered, self._start(near, ordered)))
-
-    def named(self, h: Hypothesis) -> frozenset:
-        """The effects of a hypothesis that it would name: not those that are confounded."""
-        return frozenset(h.effects) - self.evidence.motion.confounded
 
     def without(self, here: Hypothesis, effect: str) -> Hypothesis:
         """The hypothesis without one of its effects."""
@@ -162,10 +157,10 @@ class Search:
         return start
 
     def climb(self, here: Hypothesis) -> Hypothesis:
-        """Move to the best neighbour while the score rises and, where it names anything else, flights tell the two apart."""
+        """Move to the best neighbour while the score rises and flights tell the two apart."""
         while True:
             better = [h for h in self.neighbours(here) if h.score > here.score and possible(h.fit)]
-            better = [h for h in better if self.named(h) == self.named(here) or self.clearly_worse(here, h)]
+            better = [h for h in better if self.clearly_worse(here, h)]
             if not better:
                 return here
             here = max(better, key=lambda h: h.score)
@@ -239,8 +234,4 @@ class Search:
             matters = growth > max(DECISION.least_gap, DECISION.form_error * growth[nothing])
             worse = (nats[best] - nats > DECISION.standard_errors * error[best]) & matters
             count[int(np.argmax(np.where(worse, -np.inf, odds + 1e-6 * (nats - nats[best]))))] += 1
-        out: dict[frozenset, float] = {}
-        for h, share in zip(sets, count / DRAWS, strict=True):
-            if share:
-                out[self.named(h)] = out.get(self.named(h), 0.0) + float(share)
-        return out
+        return {frozenset(h.effects): float(n / DRAWS) for h, n in zip(sets, count, strict=True) if n}

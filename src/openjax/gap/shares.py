@@ -138,7 +138,7 @@ def _squares_of_sets(evidence: Evidence, selection: Selection, named) -> tuple[l
     found = left_out(table, with_effects(table))
     # Numbers of the vehicle and what feedback makes of gusts are no sensor's fault and no effect: they stay.
     sensors = np.array([n.startswith(SENSORS) for n in evidence.replay.nuisance_names])
-    never = [e for e in selection.fit.effects if e not in named and e not in evidence.motion.confounded]
+    never = [e for e in selection.fit.effects if e not in named]
 
     def squares(there, off=None) -> dict[str, np.ndarray]:
         gone = [e for e in named if e not in there and e in selection.fit.effects]

@@ -27,13 +27,11 @@ EDGE = 0.3  # s at either end that the filter spoils
 class Feedback:
     """Of one track: `acceleration` (T, 3) rad/s^2 that the feedback part of the motors makes, through their lag; `trim` the same
     of what motors do slowly but for its mean, which holds what pushes the body slowly;
-    `quick` (T, 3) the same of what motors do within QUICK s, whoever caused it; `spinning_up` (T, 3) rad/s^2 that a kg m^2 of
-    the propellers' inertia makes of all that motors do."""
+    `quick` (T, 3) the same of what motors do within QUICK s, whoever caused it."""
 
     acceleration: np.ndarray
     trim: np.ndarray
     quick: np.ndarray
-    spinning_up: np.ndarray
 
 
 def outputs_of(vehicle) -> np.ndarray:
@@ -68,7 +66,6 @@ def read_feedback(tracks, vehicles, by_commands) -> list[Feedback]:
             _turning((r - smooth(r, TRIM, t.dt)) @ np.asarray(mixer(v), float).T, t, v),
             _turning(smooth(t.motor, TRIM, t.dt) - t.motor.mean(0), t, v),
             _turning(t.motor - smooth(t.motor, QUICK, t.dt), t, v),
-            _spinning_up(t, v),
         )
         for r, t, v in zip(rest, tracks, vehicles, strict=True)
     ]
@@ -89,25 +86,11 @@ def caused_by_commands(track: Track, vehicle, link) -> tuple[np.ndarray, np.ndar
     return np.asarray(motors, float)[: len(track)], np.asarray(rates, float)[: len(track)]
 
 
-def _lagging(motors: np.ndarray, track: Track, vehicle) -> np.ndarray:
-    """(T, 4) through the motors' lag."""
-    blend = -np.expm1(-track.dt / float(vehicle.motor_time_constant))
-    return lfilter([blend], [1.0, blend - 1.0], motors, axis=0)
-
-
-def _spinning_up(track: Track, vehicle) -> np.ndarray:
-    """Angular acceleration (T, 3) for a kg m^2 of inertia of each propeller: what spins it up turns the body."""
-    given = track.motor[0] + _lagging(track.motor - track.motor[0], track, vehicle)
-    speed = float(vehicle.max_rotor_speed) * np.sqrt(np.maximum(given, 0.0))
-    out = np.zeros((len(track), 3))
-    turn = np.gradient(speed, track.dt, axis=0) @ np.asarray(vehicle.rotor_spin, float)
-    out[:, 2] = turn / float(vehicle.inertia[2])
-    return out
-
-
 def _turning(motors: np.ndarray, track: Track, vehicle) -> np.ndarray:
     """Angular acceleration (T, 3) that changes of the motor commands (T, 4) make, through the motors' lag."""
-    thrust = _lagging(motors, track, vehicle) * float(vehicle.thrust_constant * vehicle.max_rotor_speed**2)
+    blend = -np.expm1(-track.dt / float(vehicle.motor_time_constant))
+    thrust = lfilter([blend], [1.0, blend - 1.0], motors, axis=0)
+    thrust *= float(vehicle.thrust_constant * vehicle.max_rotor_speed**2)
     place, spin = np.asarray(vehicle.rotor_position, float), np.asarray(vehicle.rotor_spin, float)
     ratio = float(vehicle.torque_constant / vehicle.thrust_constant)
     torque = np.stack([thrust @ place[:, 1], -thrust @ place[:, 0], ratio * (thrust @ spin)], 1)

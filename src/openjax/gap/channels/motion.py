@@ -83,13 +83,11 @@ def make_reading(case: Case, library: Library, tracks, vehicles, arrived, sensor
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """`replay` of the flights; `exposure` {effect: nats that it would leave at its usual size}; `confounded`: effects that hidden
-    samples look like: they take what they can, and aren't named."""
+    """`replay` of the flights; `exposure` {effect: nats that it would leave at its usual size}, none where it can't be told."""
 
     replay: Replay
     library: Library
     exposure: dict[str, float]
-    confounded: frozenset[str]
 
     @cached_property
     def nothing(self) -> SetFit:
@@ -112,13 +110,14 @@ def read_motion(reading: Reading, loop: RateLoop | None) -> Motion:
     clocks = sensors.one_clock, reading.at_once
     replay = make_replay(tracks, reading.vehicles, ticks, feedback, reading.numbers, *clocks)
     replay, exposure = model_noise(replay, library)
-    exposure |= {e: 0.0 for e in library.physics if _hidden(CARDS[e], tracks)}
-    confounded = frozenset(e for e in library.physics if reading.blind and CARDS[e].torque_axes)
-    return Motion(replay, library, exposure, confounded)
+    exposure |= {e: 0.0 for e in library.physics if _hidden(CARDS[e], reading)}
+    return Motion(replay, library, exposure)
 
 
-def _hidden(card, tracks) -> bool:
+def _hidden(card, reading: Reading) -> bool:
     """Whether an effect can't be told from these logs, however large it is."""
-    if card.needs and any(getattr(t, card.needs) is None for t in tracks):
+    if card.needs and any(getattr(t, card.needs) is None for t in reading.tracks):
         return True
-    return card.impossible is not None and any(card.impossible(t.position) for t in tracks)
+    if reading.blind and card.torque_axes:  # what motors do unseen looks like it: `nuisance_samples`
+        return True
+    return card.impossible is not None and any(card.impossible(t.position) for t in reading.tracks)

@@ -20,7 +20,6 @@ from openjax.gap.decision import DECISION
 from openjax.gap.model.observer import GYRO_GAIN, TICKS, observe
 from openjax.gap.model.prediction import bucket, padded
 
-GAIN_STEP = 0.05
 # Spreads of the gains, of P's delay and of the share of the derivative that is filtered.
 PRIOR = np.array([0.4, 0.4, 0.4, 1.0, 1.0])
 FILTER = 30.0  # Hz of the low-pass of the derivative that the firmware of the Crazyflie may have
@@ -35,14 +34,13 @@ GAINS = ("p", "i", "d")
 
 @dataclass(frozen=True, eq=False)
 class RateLoop(Channel):
-    """`change` (6,) and `error` (6,) of p, i, d as shares, roll and pitch first and then yaw; `outputs` [(T, 3)]: logged less
-    nominal outputs of each track; `tied` [(3, T, 3)]: what one more of p, i, d would give; `ticks` [(T, TICKS, 4)]: the motor
-    commands of the rate loop's ticks; `names`: the effects that it tells."""
+    """`change` (6,) and `error` (6,) of p, i, d as shares, roll and pitch first and then yaw; `outputs` [(4, T, 3)]: logged less
+    nominal outputs of each track, and what one more of p, i, d would give; `ticks` [(T, TICKS, 4)]: the motor commands of the
+    rate loop's ticks; `names`: the effects that it tells."""
 
     change: np.ndarray
     error: np.ndarray
     outputs: list[np.ndarray]
-    tied: list[np.ndarray]
     ticks: list[np.ndarray]
     names: tuple[str, ...]
     dt: float = 0.01
@@ -83,10 +81,10 @@ class RateLoop(Channel):
         return Estimated(1.0 + change, error, error)
 
     def residuals(self, named) -> dict[str, list[np.ndarray]]:
-        changed = self.gain[0] if set(named) & set(self.names) else np.zeros(3)
+        changed = np.append(1.0, -self.gain[0] if set(named) & set(self.names) else np.zeros(3))
         out: dict[str, list[np.ndarray]] = {f"motors {axis}": [] for axis in ("roll", "pitch", "yaw")}
-        for outputs, tied in zip(self.outputs, self.tied, strict=True):
-            left = detrend(outputs - np.tensordot(changed, tied, 1), axis=0)
+        for outputs in self.outputs:
+            left = detrend(np.tensordot(changed, outputs, 1), axis=0)
             for column, series in zip(left.T, out.values(), strict=True):
                 series.append(smooth(column, SMOOTH, self.dt))
         return out
@@ -94,17 +92,14 @@ class RateLoop(Channel):
 
 def read_rate_loop(reading) -> RateLoop:
     """Read the rate controllers of all tracks of a `motion.Reading`."""
-    gains = (1.0 + np.concatenate([np.zeros((1, 3)), GAIN_STEP * np.eye(3)])).astype(np.float32)
-    outputs, tied, ticks = [], [], []
-    for track, vehicle, link in zip(reading.heard, reading.vehicles, reading.arrived, strict=True):
-        wanted, sent = observed(track, vehicle, link, gains, reading.at_once)
-        ticks.append(sent)
-        demand = wanted @ outputs_of(vehicle)
-        outputs.append(track.motor @ outputs_of(vehicle) - demand[0])
-        tied.append((demand[1:] - demand[0]) / GAIN_STEP)
-    change, error = read_gains(reading, ticks)
+    ticks, series = [], []
+    tracks = zip(reading.heard, reading.vehicles, reading.arrived, reading.by_commands, strict=True)
+    for track, vehicle, link, (_, drawn) in tracks:
+        ticks.append(observed(track, vehicle, link, reading.at_once)[1])
+        series.append(_series(track, vehicle, in_force(track, link), drawn, reading))
+    change, error = read_gains(reading, series, ticks)
     names = effects_of("rate_loop", reading.library)
-    return RateLoop(change, error, outputs, tied, ticks, names, max(t.dt for t in reading.heard))
+    return RateLoop(change, error, [s[:4] for s in series], ticks, names, max(t.dt for t in reading.heard))
 
 
 def with_motors(track: Track, vehicle) -> Track:
@@ -115,16 +110,14 @@ def with_motors(track: Track, vehicle) -> Track:
     rows = np.arange(len(track))
     link = (0.0, np.stack([rows, np.maximum(rows - 1, 0)], 1))
     track = dataclasses.replace(track, motor=np.repeat(track.command[:, :1], 4, 1))
-    gains = np.ones((1, 3), np.float32)
     for _ in range(2):
-        wanted, _ = observed(track, vehicle, link, gains)
-        track = dataclasses.replace(track, motor=wanted[0], motors_logged=False)
+        wanted, _ = observed(track, vehicle, link)
+        track = dataclasses.replace(track, motor=wanted, motors_logged=False)
     return track
 
 
-def observed(track: Track, vehicle, link, gains, at_once=False):
-    """The observer's output: mean motor commands wanted (B, T, 4), and the commands sent in the ticks (T, TICKS, 4) with the
-    first gains.
+def observed(track: Track, vehicle, link, at_once=False):
+    """The observer's output: mean motor commands wanted (T, 4), and the commands sent in the ticks (T, TICKS, 4).
 
     What pushed the body beyond the nominal physics in a first run is given to a second, so that the rates
     inside a row are right whatever the physics."""
@@ -132,25 +125,23 @@ def observed(track: Track, vehicle, link, gains, at_once=False):
     inputs = [padded(v, size) for v in (in_force(track, link), track.motor, track.body_rates)]
     push = padded(np.zeros((rows, 3)), size)
     for _ in range(2):
-        wanted, sent, rates = observe(gains, vehicle, *inputs, push, np.float32(track.dt), at_once)
-        miss = track.body_rates[1:] - np.asarray(rates[0], float)[: rows - 1]
+        wanted, sent, rates = observe(vehicle, *inputs, push, np.float32(track.dt), at_once)
+        miss = track.body_rates[1:] - np.asarray(rates, float)[: rows - 1]
         step = miss.copy()  # undo the observer's own correction of what it missed before
         step[1:] -= (1.0 - GYRO_GAIN) * miss[:-1]
         push = push + padded(smooth(np.concatenate([step, step[-1:]]), 0.06, track.dt) / track.dt, size)
-    return np.asarray(wanted, float)[:, :rows], np.asarray(sent[0])[:rows]
+    return np.asarray(wanted, float)[:rows], np.asarray(sent)[:rows]
 
 
-def read_gains(reading, ticks) -> tuple[np.ndarray, np.ndarray]:
+def read_gains(reading, series, ticks) -> tuple[np.ndarray, np.ndarray]:
     """Changes (6,) of p, i, d as shares - roll and pitch, then yaw - and their errors, infinite where flights say too little.
-    `ticks`: as in `RateLoop`."""
+    `series`: `_series` of each track; `ticks`: as in `RateLoop`."""
     change, error = np.zeros(6), np.full(6, np.inf)
     if reading.late is None:
         return change, error
     moments: dict[int, list] = {0: [], 1: [], 2: []}  # axis: [(moments (5, 1 + 5), track)] of every segment
-    tracks = zip(reading.heard, reading.vehicles, reading.arrived, reading.by_commands, ticks, strict=True)
-    for unit, (track, vehicle, link, (_, drawn), sent) in enumerate(tracks):
-        series = _series(track, vehicle, in_force(track, link), drawn, reading)
-        for axis, part in _segments(series, sent, track.dt):
+    for unit, (track, of, sent) in enumerate(zip(reading.heard, series, ticks, strict=True)):
+        for axis, part in _segments(of, sent, track.dt):
             moments[axis].append((part, unit))
     for group, axes in enumerate(((0, 1), (2,))):
         found = np.array([m for a in axes for m, _ in moments[a]])
@@ -178,11 +169,12 @@ def _series(track: Track, vehicle, ruling: np.ndarray, drawn: np.ndarray, readin
     )
     x = _terms(track, vehicle, sent - rates, slope)
     z = _terms(track, vehicle, sent - drawn, np.gradient(drawn, track.dt, axis=0))
+    apart = reading.late or 0.0
     off = [
-        reading.late * np.gradient(x[0], track.dt, axis=0),
+        apart * np.gradient(x[0], track.dt, axis=0),
         _terms(track, vehicle, sent, filtered - slope)[2],
     ]
-    late = [reading.late * np.gradient(v, track.dt, axis=0) for v in z[[0, 2]]]
+    late = [apart * np.gradient(v, track.dt, axis=0) for v in z[[0, 2]]]
     y = track.motor @ outputs_of(vehicle) - x.sum(0)
     return np.stack([y, *x, *off, *z, *late])
 

@@ -41,13 +41,13 @@ class Library:
         return tuple(e for e in self.effects if path_of(e) == "physics")
 
 
-# Every physics parameter has a fixed place in theta, whatever is left out of a library: one compiled
-# function.
+# Every physics parameter has a fixed place in theta, whatever is left out of a library: one compiled function. The last two are
+# no effect's: the propellers' inertia and the motors' shift in time, see `physics`.
 PHYSICS_EFFECTS = tuple(e for e in CARDS if CARDS[e].path == "physics")
 THETA = tuple((e, p.name) for e in PHYSICS_EFFECTS for p in CARDS[e].fitted)
 PLACE = {key: number for number, key in enumerate(THETA)}
-ABSENT = np.array([EFFECTS[e].parameters[p].none for e, p in THETA] + [0.0])
-STEP = np.array([p.step for e in PHYSICS_EFFECTS for p in CARDS[e].fitted] + [2e-4])
+ABSENT = np.array([EFFECTS[e].parameters[p].none for e, p in THETA] + [0.0, 0.0])
+STEP = np.array([p.step for e in PHYSICS_EFFECTS for p in CARDS[e].fitted] + [1e-3, 2e-4])
 
 
 def path_of(effect: str) -> str:

@@ -28,7 +28,6 @@ def columns_of(track: Track, path: Path, nominal, feedback, at_once: bool) -> di
     columns |= _late_torques("trim", track, feedback.trim, (0,))
     if at_once:
         columns |= _late_torques("motors within a row", track, feedback.quick, QUICK_ROWS)
-    columns["propellers' inertia"] = torque_channels(feedback.spinning_up, track.dt) * SIZE["propeller"]
     return columns | _sensor_nuisances(track, path, nominal)
 
 

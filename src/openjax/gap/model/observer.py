@@ -22,7 +22,7 @@ FOLLOWED = (
 )
 
 
-def _ticking(controller, vehicle, h):
+def _ticking(vehicle, h):
     """The tick of `h` s: (rates, previous, integral, speed), command, offset of the motors and angular acceleration beyond the
     nominal -> the same, what the controller wanted and what the motors got."""
     at_rest = jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0])
@@ -30,7 +30,7 @@ def _ticking(controller, vehicle, h):
     def tick(state, command, offset, push):
         rates, previous, integral, speed = state
         drone = DroneState(*at_rest, jnp.zeros(3), rates, speed, integral, previous, ())
-        wanted, integral = rate_controller(controller, drone, command, h)
+        wanted, integral = rate_controller(vehicle, drone, command, h)
         given = jnp.clip(wanted + offset, 0.0, 1.0)
         speed = rotor_speed_step(vehicle, speed, given, h)
         _, torque = total_wrench(vehicle, rotor_thrust(vehicle, speed), rotor_reaction(vehicle, speed))
@@ -41,20 +41,16 @@ def _ticking(controller, vehicle, h):
     return tick
 
 
-def _observe(gains, vehicle, command, motor, gyro, disturbance, dt, at_once):
-    """One track. gains (3,) multiples of p, i, d; command (T, TICKS, 4), motor (T, 4), gyro (T, 3) rad/s,
-    disturbance (T, 3) rad/s^2 of angular acceleration beyond the nominal; dt () s per row.
+@partial(jax.jit, static_argnames="at_once")
+def observe(vehicle, command, motor, gyro, disturbance, dt, at_once=False):
+    """One track: command (T, TICKS, 4), motor (T, 4), gyro (T, 3) rad/s, disturbance (T, 3) rad/s^2 of angular acceleration
+    beyond the nominal; dt () s per row.
 
     `at_once`: a row's motor is its first tick's, not the mean.
 
     Returns the controller's motor command as it would be logged (T, 4), the motor commands of the ticks (T, TICKS, 4) that
     suit the log, and the rates at the end of each row as predicted (T, 3)."""
-    controller = vehicle.replace(
-        rate_kp=vehicle.rate_kp * gains[0],
-        rate_ki=vehicle.rate_ki * gains[1],
-        rate_kd=vehicle.rate_kd * gains[2],
-    )
-    tick = _ticking(controller, vehicle, dt / TICKS)
+    tick = _ticking(vehicle, dt / TICKS)
 
     def ticks(state, command, offset, push):
         return jax.lax.scan(lambda s, c: tick(s, c, offset, push), state, command, unroll=True)
@@ -84,19 +80,11 @@ def _observe(gains, vehicle, command, motor, gyro, disturbance, dt, at_once):
     return jax.lax.scan(row, start, (command, motor, gyro_next, disturbance))[1]
 
 
-@partial(jax.jit, static_argnames="at_once")
-def observe(gains, vehicle, command, motor, gyro, disturbance, dt, at_once=False):
-    """`_observe` for gains (B, 3); everything else is shared."""
-    return jax.vmap(partial(_observe, at_once=at_once), in_axes=(0, None, None, None, None, None, None))(
-        gains, vehicle, command, motor, gyro, disturbance, dt
-    )
-
-
 @jax.jit
 def commanded(vehicle, command, dt):
     """Mean motor commands (T, 4) and body rates (T, 3) amid the rows that the body-rate commands (T, 4) alone cause:
     the nominal loop around the nominal vehicle, without gyroscope noise and air."""
-    tick = _ticking(vehicle, vehicle, dt / TICKS)
+    tick = _ticking(vehicle, dt / TICKS)
 
     def row(carry, command):
         start = carry[0]

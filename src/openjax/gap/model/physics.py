@@ -38,7 +38,8 @@ def compiled_physics(names: tuple[str, ...], parameters: tuple[tuple[str, str], 
     (B, T, 9).
 
     `parameters` says which (effect, parameter) each entry of theta is; parameters not named stay without
-    effect. A last entry of theta beyond them shifts the motors in time (s, later is positive)."""
+    effect. Beyond them stand the propellers' inertia, each a share of the body's about z, and a shift of the motors in time (s,
+    later is positive)."""
     return jax.jit(jax.vmap(partial(_channels, resolve(names), parameters)))
 
 
@@ -68,21 +69,21 @@ def _channels(effects, parameters, theta, vehicle, path: Path):
     slower = -jnp.expm1(-step / (flown.motor_time_constant * flown.motor_slowdown_ratio))
 
     def row(speed, targets):
-        total = 0.0
+        total, before = 0.0, speed
         for tick in range(len(targets)):
             target = targets[tick]
             after = speed + (target - speed) * jnp.where(target < speed, slower, faster)
             # Mean of the square over a tick, in which the speed is nearly straight.
             total = total + (speed * speed + speed * after + after * after) / 3.0
             speed = after
-        return speed, total / len(targets)
+        return speed, (total / len(targets), (speed - before) / path.dt)
 
     start = jnp.sqrt(jnp.clip(given[0, 0], 1e-6, None)) * flown.max_rotor_speed
-    _, square = jax.lax.scan(row, start, wanted)
-    square = square - theta[-1] * jnp.gradient(square, path.dt, axis=0)
-    speed = jnp.sqrt(jnp.maximum(square, 0.0))
+    _, driven = jax.lax.scan(row, start, wanted)
+    square, sped_up = (v - theta[-1] * jnp.gradient(v, path.dt, axis=0) for v in driven)
+    speed, spun_up = jnp.sqrt(jnp.maximum(square, 0.0)), theta[-2] * (sped_up @ flown.rotor_spin)
 
-    def wrench(position, quaternion, velocity, rates, voltage, others, speed):
+    def wrench(position, quaternion, velocity, rates, voltage, others, speed, spun_up):
         around = context(position, quaternion, velocity, rates, voltage, others, speed)
         thrust, reaction = rotor_thrust(flown, speed), rotor_reaction(flown, speed)
         thrust, reaction = change_thrust(effects, values, thrust, reaction, around)
@@ -91,8 +92,9 @@ def _channels(effects, parameters, theta, vehicle, path: Path):
         more_force, more_torque = added_wrench(effects, values, around)
         force, torque = force + more_force, torque + more_torque
         angular = (torque - jnp.cross(rates, flown.inertia * rates)) / flown.inertia
+        angular = angular.at[2].add(spun_up)  # what speeds a rotor up turns the body
         specific = force / flown.mass
         gravity = jnp.array([0.0, 0.0, 1.0], force.dtype) * flown.gravity
         return jnp.concatenate([angular, rotate(quaternion, specific) - gravity, specific])
 
-    return jax.vmap(wrench)(*along, speed)
+    return jax.vmap(wrench)(*along, speed, spun_up)

@@ -19,6 +19,7 @@ from openjax.gap.model.whitening import Noise, first_noise, whiten
 # Groups of channels that share a noise model: axes, whether integrated.
 GROUPS = (((0, 1), True), ((2,), True), ((3, 4), True), ((5,), True), ((6, 7), False), ((8,), False))
 FIRST_NOISE = (0.03, 0.03, 0.006, 0.006, 0.25, 0.25)
+MOTORS_LATE = ("clock of the motors", "delay of the motors")
 SKIP = 0.2  # s left out at the start of a track: rotor speeds are not known there
 
 
@@ -34,7 +35,7 @@ class Replay:
     nuisance_names: tuple[str, ...]
     sizes: list[
         np.ndarray
-    ]  # usual sizes of each track's first nuisances: the vehicle's numbers, its motors' clock and delay
+    ]  # usual sizes of each track's first nuisances: the vehicle's numbers, its propellers' inertia, its motors' clock and delay
     numbers: tuple  # the vehicle's numbers
     usable: np.ndarray  # (9,) channels that were logged
     noises: tuple[Noise, ...]  # unlogged channels have one, but count nothing
@@ -87,7 +88,7 @@ class Replay:
     def around(self, theta: np.ndarray) -> Replay:
         """With the derivatives of a vehicle that has the effects theta (P,): a wrong moment of inertia scales the torques that
         are left once an effect is accounted for, not those of motors that hold against it."""
-        places = [PLACE[key[:2]] for key in self.numbers] + [len(theta) - 1]
+        places = [PLACE[key[:2]] for key in self.numbers] + [len(theta) - 2, len(theta) - 1]
         steps, nuisances = STEP[places][:, None, None], []
         for p, old, size in zip(
             self.predict(stepped(theta, places)), self.nuisances, self.sizes, strict=True
@@ -160,9 +161,10 @@ def make_replay(tracks, vehicles, motor_ticks, feedback, numbers, one_clock=True
     ]
     # A track without a neighbour has no wake: nothing there.
     names = tuple(max(named, key=len))
-    moving = (*(" ".join(key[:2]) for key in numbers), "clock of the motors", "delay of the motors")
+    moving = (*(" ".join(key[:2]) for key in numbers), "propellers' inertia", *MOTORS_LATE)
+    own = [key[2] for key in numbers]
     sizes = [
-        np.array([*(key[2] for key in numbers), motor_shift(t, one_clock, at_once), SIZE["motor_delay"]])
+        np.array([*own, SIZE["propeller"], motor_shift(t, one_clock, at_once), SIZE["motor_delay"]])
         for t in tracks
     ]
     replay = Replay(
