@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from openjax.gap.model.bounds import BOUND, bounded
-from openjax.gap.model.library import ABSENT, CARDS, STEP, THETA, places, prior, start_of
+from openjax.gap.model.library import ABSENT, CARDS, STEP, THETA, places, prior
 from openjax.vehicle.effects import EFFECTS
 
 
@@ -31,7 +31,6 @@ def test_every_fitted_parameter_has_its_own_place():
     for effect in physics:
         index, mean, precision = prior((effect,))
         assert len(index) == len(set(index)) == len(mean) and np.linalg.eigvalsh(precision).min() > 0
-        assert len(start_of(effect)) == len(CARDS[effect].fitted)
 
 
 def test_bounded_least_squares_agree_with_scipy():

@@ -13,12 +13,13 @@ from openjax.commands.command_line import one_line
 from openjax.errors import UserError
 from openjax.flights.case import load_case
 from openjax.flights.reading import write_csv
+from openjax.flights.regimes import REGIMES
 from openjax.flights.samples import fly, log_of, references
 from openjax.gap.diagnosis import diagnose_case, not_testable
 from openjax.gap.evidence import gather
 from openjax.gap.model.library import library
 from openjax.gap.report import VERDICTS
-from openjax.gap.where import CHANNELS, REGIMES
+from openjax.gap.where import CHANNELS
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.effects import EFFECTS, load_effects
 

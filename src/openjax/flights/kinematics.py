@@ -25,11 +25,11 @@ ONE_CLOCK = 0.93  # below which they don't share a clock
 
 @dataclass(frozen=True)
 class Kinematics:
-    """`gain` (3,) of the gyroscope, 1 where it isn't clearly another; `tilt` (2,) rad by which the world leans about its x and y
+    """`gain` of the gyroscope, 1 where it isn't clearly another; `tilt` (2,) rad by which the world leans about its x and y
     axes, None where that isn't clear; `one_clock`: whether attitude and gyroscope can be compared sample by sample: what their
     streams leave of each other is noise, not time; `findings`: what is off by more than usual, in words, by name."""
 
-    gain: np.ndarray
+    gain: float
     tilt: np.ndarray | None
     one_clock: bool
     findings: dict[str, str]
@@ -64,14 +64,20 @@ def read_kinematics(tracks: list[Track], limits) -> Kinematics:
                 f"motion capture's world leans by {np.degrees(size):.1f} degrees against gravity "
                 f"({np.degrees(lean[0]):+.1f} about x, {np.degrees(lean[1]):+.1f} about y)"
             )
-    return Kinematics(_of_one_chip(gain, error), tilt, one_clock, findings)
+    return Kinematics(_of_one_chip(gain, error, limits.standard_errors), tilt, one_clock, findings)
 
 
-def _of_one_chip(gain: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Gains (3,) that are clear on two axes - one alone may be one that the flights hardly turn about - and their mean on the
-    third; else 1."""
-    clear = (np.abs(gain - 1.0) > CLEAR * error) & np.isfinite(gain)
-    return np.where(clear, gain, np.mean(gain[clear])) if clear.sum() >= 2 else np.ones(3)
+def _of_one_chip(gain: np.ndarray, error: np.ndarray, standard_errors: float) -> float:
+    """The gain of all axes (3,) by their precision, where it differs from 1 by more than so many standard errors, which cover
+    what the axes disagree by (Birge 1932); else 1."""
+    known = np.isfinite(gain)
+    if not known.any():
+        return 1.0
+    gain, weight = gain[known], 1.0 / np.maximum(error[known], 1e-6) ** 2
+    mean = float((weight * gain).sum() / weight.sum())
+    apart = (weight * (gain - mean) ** 2).sum() / max(len(gain) - 1, 1)
+    clear = abs(mean - 1.0) > standard_errors * np.sqrt(max(apart, 1.0) / weight.sum())
+    return mean if clear else 1.0
 
 
 def _unusual(gain: np.ndarray, error: np.ndarray, usual: float) -> str:
@@ -85,7 +91,7 @@ def _unusual(gain: np.ndarray, error: np.ndarray, usual: float) -> str:
 def corrected(track: Track, found: Kinematics) -> Track:
     """The track as it would read with sensors that agree."""
     changes = {}
-    if (found.gain != 1.0).any():
+    if found.gain != 1.0:
         changes["body_rates"] = track.body_rates / found.gain
     if found.tilt is not None:
         turn = Rotation.from_rotvec([*-found.tilt, 0.0])

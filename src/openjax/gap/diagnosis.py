@@ -57,8 +57,7 @@ def words(check: Check, parts: Split) -> tuple[str, ...]:
 
 def not_testable(evidence: Evidence) -> list[str]:
     """Effects of the library that, at a usual size, these flights would not show."""
-    motion = evidence.motion
-    missing = [e for e in evidence.library.physics if motion.exposure[e] < DETECTABLE]
+    missing = [e for e in evidence.library.physics if evidence.motion.exposure[e] < DETECTABLE]
     logged = {c.path for c in evidence.channels} | {"physics"}
     missing += [e for e in evidence.library.effects if path_of(e) not in logged]
     return missing + [e for c in evidence.channels for e in c.undetectable()]
@@ -106,10 +105,8 @@ def _nuisances(evidence: Evidence, selection: Selection) -> dict[str, str]:
         return ", at its bound" if abs(v) > 0.99 * BOUND else ""
 
     found = {n: f"{v:+.2f} of its usual size{at(v)}" for n, v in zip(names, taken, strict=True)}
-    if (evidence.sensors.gain != 1.0).any():
-        found["gyroscope gain"] = ", ".join(
-            f"{a} {g:.3f}" for a, g in zip("xyz", evidence.sensors.gain, strict=True)
-        )
+    if evidence.sensors.gain != 1.0:
+        found["gyroscope gain"] = f"{evidence.sensors.gain:.3f}"
     if "motor_rows" not in evidence.case.vehicle_file.log:
         found["rows of motor commands"] = "taken for means over the row: [log] motor_rows doesn't say"
     return found

@@ -5,7 +5,7 @@ quite the library's leave: some per cent of the effect."""
 
 import numpy as np
 
-from openjax.gap.channels import robust_deviation
+from openjax.gap.channels import Estimated, robust_deviation
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
 from openjax.gap.model.hypotheses import SetFit
@@ -18,40 +18,36 @@ REACH = 1.645  # standard deviations of a 90 % interval
 
 def estimates(evidence: Evidence, fit: SetFit, named) -> dict[str, dict[str, Estimate]]:
     """{effect: {parameter: its estimate}} of the named effects."""
+    channels = {c.path: c for c in evidence.channels}
     out = {}
-    deviation = dict(
-        zip(fit.index.tolist(), robust_deviation(fit.covariance, fit.grams[:, 1:, 0]), strict=True)
-    )
     for effect in named:
-        out[effect] = {}
-        physics = path_of(effect) == "physics"
-        sizes = _sizes(effect, fit.theta) if physics else {}
-        for fitted in CARDS[effect].fitted:
-            parameter = EFFECTS[effect].parameters[fitted.name]
-            if physics:
-                place = PLACE[effect, fitted.name]
-                value = float(fit.theta[place])
-                low = high = float(
-                    np.linalg.norm((deviation[place], DECISION.form_error * sizes[fitted.name], fitted.error))
-                )
-            else:
-                channel = next(c for c in evidence.channels if c.path == path_of(effect))
-                told = channel.estimate(effect, fitted.name)
-                value, low, high = told.value, told.below, told.above
-            out[effect][fitted.name] = Estimate(
-                value, parameter.unit, (value - REACH * low, value + REACH * high), parameter.prior
+        channel = channels.get(path_of(effect))
+        told = {
+            p.name: channel.estimate(effect, p.name) if channel else _of_physics(fit, effect, p)
+            for p in CARDS[effect].fitted
+        }
+        parameters = EFFECTS[effect].parameters
+        out[effect] = {
+            p: Estimate(
+                v.value,
+                parameters[p].unit,
+                (v.value - REACH * v.below, v.value + REACH * v.above),
+                parameters[p].prior,
             )
+            for p, v in told.items()
+        }
     return out
 
 
-def _sizes(effect: str, theta: np.ndarray) -> dict[str, float]:
-    """{parameter: how far the effect's parameters of its unit are from absent, the furthest of them}."""
-    parameters = EFFECTS[effect].parameters
-    away = {
-        f.name: abs(float(theta[PLACE[effect, f.name]]) - parameters[f.name].none)
-        for f in CARDS[effect].fitted
-    }
-    return {
-        name: max(v for other, v in away.items() if parameters[other].unit == parameters[name].unit)
-        for name in away
-    }
+def _of_physics(fit: SetFit, effect: str, parameter) -> Estimated:
+    """A parameter of the fit. Forms may be wrong by a share of the effect's largest parameter of that unit."""
+    known = EFFECTS[effect].parameters
+    deviation = robust_deviation(fit.covariance, fit.grams[:, 1:, 0])
+    deviation = float(deviation[fit.index.tolist().index(PLACE[effect, parameter.name])])
+    away = [
+        abs(float(fit.theta[PLACE[effect, p.name]]) - known[p.name].none)
+        for p in CARDS[effect].fitted
+        if known[p.name].unit == known[parameter.name].unit
+    ]
+    error = float(np.linalg.norm((deviation, DECISION.form_error * max(away), parameter.error)))
+    return Estimated(float(fit.theta[PLACE[effect, parameter.name]]), error, error)

@@ -78,15 +78,13 @@ def select(evidence: Evidence) -> Selection:
 
 
 def testable(evidence: Evidence) -> dict[str, SetFit]:
-    """{effect: its fit alone} of the physics effects that would show at their usual size. Where motor commands are duty
-    cycles, what the unknown map to thrust can imitate isn't among them."""
-    known = evidence.case.vehicle_file.motor.command != "pwm"
-    found = {}
-    for effect, fit in evidence.motion.singles.items():
-        promised = max(evidence.motion.exposure[effect], fit.score - evidence.motion.nothing.score)
-        if (known or not CARDS[effect].thrust_map) and promised >= DETECTABLE:
-            found[effect] = fit
-    return found
+    """{effect: its fit alone} of the physics effects that show, or would at their usual size."""
+    motion = evidence.motion
+    return {
+        e: fit
+        for e, fit in motion.singles.items()
+        if max(motion.exposure[e], fit.score - motion.nothing.score) >= DETECTABLE
+    }
 
 
 def difference(better: Judged, other: Judged) -> tuple[float, float]:
@@ -141,20 +139,14 @@ class Search:
             return self.visited[key]
         if len(key) == 1:
             return self.of_fit(self.singles[next(iter(key))])
-        ordered = [e for e in CARDS if e in key]
-        return self.of_fit(fit_set(near.replay, ordered, self._start(near, ordered)))
+        start = near.theta.copy()
+        for new in key - set(near.effects):  # as it was alone
+            start[places((new,))] = self.singles[new].theta[places((new,))]
+        return self.of_fit(fit_set(near.replay, [e for e in CARDS if e in key], start))
 
     def without(self, here: Hypothesis, effect: str) -> Hypothesis:
         """The hypothesis without one of its effects."""
         return self.of_set(set(here.effects) - {effect}, here.fit)
-
-    def _start(self, near: SetFit, ordered) -> np.ndarray:
-        """As it was near, new effects as they were alone."""
-        start = near.theta.copy()
-        for effect in ordered:
-            if effect not in near.effects:
-                start[places((effect,))] = self.singles[effect].theta[places((effect,))]
-        return start
 
     def climb(self, here: Hypothesis) -> Hypothesis:
         """Move to the best neighbour while the score rises and flights tell the two apart."""

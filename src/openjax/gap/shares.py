@@ -3,7 +3,7 @@ parameter was fitted to.
 
 The gap is the rms over channels of each channel's prediction error over its floor: velocity over 0.25 s, body rates
 over 0.05 s, the pose against the gyroscope over 0.1 s, the motor commands from the body-rate commands. The floor is what
-is left with all accepted effects once the residual check's model has taken what follows the state: sensor noise and gusts.
+is left with all accepted effects, less what the residual check finds in excess of noise.
 A share is what the gap's square grows by when one part goes and all others stay (its usefulness, Darlington 1968), in proportion
 to that of all parts, so that shares add up to one with what is unexplained."""
 
@@ -65,9 +65,8 @@ class Gap:
 
 @dataclass(frozen=True)
 class Split:
-    """`effects` {name: Share}; `sensors`: sensors and clocks; `unexplained`: what follows the state but no accepted
-    effect; `largest` {part: share of the bootstrap's draws in
-    which it is the largest}, of effects and "unexplained"."""
+    """`effects` {name: Share}; `sensors`: sensors and clocks; `unexplained`: more than noise, and no accepted effect; `largest`
+    {part: share of the bootstrap's draws in which it is the largest}, of effects and "unexplained"."""
 
     gap: Gap
     effects: dict[str, Share]
@@ -78,9 +77,7 @@ class Split:
 
 def split(evidence: Evidence, selection: Selection, predicted: np.ndarray, named) -> Split:
     """Shares of the `named` effects, of all paths. `predicted` (6,): share of each motion channel's squared error that the
-    residual check's model explains."""
-    named = tuple(named)
-    parts = (*named, "sensors")
+    residual check finds in excess of noise."""
     channels, squares = _squares_of_sets(evidence, selection, named)  # (sets, blocks, channels)
     known = dict(zip((n for n, _ in ERRORS), predicted, strict=True))
     left = 1.0 - np.array([known.get(n, 0.0) for n in channels])
@@ -89,7 +86,7 @@ def split(evidence: Evidence, selection: Selection, predicted: np.ndarray, named
     values, before = shares_of_squares(
         squares, np.concatenate([np.full((1, blocks), 1.0 / blocks), drawn]), left
     )
-    names = (*parts, "unexplained")
+    names = (*named, "sensors", "unexplained")
     low, high = np.quantile(values[1:], [0.05, 0.95], axis=0)
     shares = {
         n: Share(float(v), (float(min(a, v)), float(max(b, v))))

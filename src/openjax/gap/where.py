@@ -4,7 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from openjax.flights.track import Track, smooth
+from openjax.flights.regimes import REGIMES, regimes_of
+from openjax.flights.track import smooth
 from openjax.gap.evidence import Evidence
 from openjax.gap.model.hypotheses import SetFit
 from openjax.gap.model.library import path_of
@@ -12,7 +13,6 @@ from openjax.gap.model.replay import SKIP
 from openjax.gap.residual import disturbances, residuals_of
 
 CHANNELS = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z", "estimator", "firmware")
-REGIMES = tuple("hover fast climb low high under_neighbour low_battery high_thrust transient".split())
 LEAST_TIME = 0.5  # s in a regime, or it isn't judged
 CALM = 0.12  # s over which the rest is smoothed: sensor noise out, causes in
 
@@ -28,33 +28,6 @@ class Place:
     before: float
     after: float
     seconds: float
-
-
-def regimes_of(track: Track) -> dict[str, np.ndarray]:
-    """Masks (T,) of the regimes; a row may be in several."""
-    rows = len(track)
-    never = np.zeros(rows, bool)
-    collective = smooth(track.motor.mean(1), 0.05, track.dt)
-    change = np.abs(np.gradient(smooth(track.motor, 0.03, track.dt), track.dt, axis=0)).max(1)
-    masks = {r: never for r in REGIMES}
-    masks["high_thrust"] = track.motor.max(1) > 0.8
-    masks["transient"] = change > max(1.0, float(np.quantile(change, 0.8)))
-    if track.velocity is not None:
-        speed = np.linalg.norm(track.velocity[:, :2], axis=1)
-        masks["hover"] = (speed < 0.3) & (np.abs(track.velocity[:, 2]) < 0.2)
-        masks["fast"] = speed > 0.7
-        masks["climb"] = np.abs(track.velocity[:, 2]) > 0.3
-    if track.position is not None:
-        masks["low"] = track.position[:, 2] < 0.15
-        masks["high"] = track.position[:, 2] > 1.05
-        for other in track.neighbours:
-            gap = other - track.position
-            near = (gap[:, 2] > 0.05) & (np.hypot(gap[:, 0], gap[:, 1]) < 0.2)
-            masks["under_neighbour"] = masks["under_neighbour"] | near
-    if track.voltage is not None:
-        masks["low_battery"] = track.voltage < 3.5
-    masks["high_thrust"] = masks["high_thrust"] | (collective > 0.8)
-    return masks
 
 
 def locate(evidence: Evidence, fit: SetFit, named=()) -> list[Place]:

@@ -29,7 +29,7 @@ class Channel:
 
     def undetectable(self) -> list[str]:
         """The channel's effects that these flights would not show at their usual size."""
-        raise NotImplementedError
+        return []
 
     def estimate(self, effect: str, parameter: str) -> Estimated:
         """A parameter of an acting effect."""

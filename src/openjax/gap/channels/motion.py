@@ -70,12 +70,11 @@ def make_reading(case: Case, library: Library, tracks, vehicles, arrived, sensor
     shortest = min(f.row_period for f in case.flights)
     slow = shortest > 0.8 * GRID_PERIOD  # faster logs are averaged
     seldom = max(t.dt for t in tracks) > SLOW_ROWS * GRID_PERIOD
-    known = arrived is not None and not seldom
     at_once = rows_are_samples(case) and slow and all(t.motors_logged for t in tracks)
     hidden = (not slow and GRID_PERIOD / shortest < FEW_ROWS) or any(
         f.body_rates_derived for f in case.flights
     )
-    blind = (at_once and not known) or hidden
+    blind = hidden or (at_once and (arrived is None or seldom))
     late = None if blind or seldom else ROW_DELAY[0 if slow else 1]
     pwm = case.vehicle_file.motor.command == "pwm"
     return Reading(library, tracks, vehicles, arrived, sensors, pwm, at_once, blind, late)
@@ -115,9 +114,10 @@ def read_motion(reading: Reading, loop: RateLoop | None) -> Motion:
 
 
 def _hidden(card, reading: Reading) -> bool:
-    """Whether an effect can't be told from these logs, however large it is."""
+    """Whether an effect can't be told from these logs, however large it is: its channel is missing, or it looks like a nuisance,
+    what motors do unseen or the map from duty cycles to thrust."""
     if card.needs and any(getattr(t, card.needs) is None for t in reading.tracks):
         return True
-    if reading.blind and card.torque_axes:  # what motors do unseen looks like it: `nuisance_samples`
+    if (reading.blind and card.torque_axes) or (reading.pwm and card.thrust_map):
         return True
     return card.impossible is not None and any(card.impossible(t.position) for t in reading.tracks)

@@ -54,9 +54,6 @@ class Pose(Channel):
         shown = self.late and self.fit.value > self.clock
         return dict.fromkeys(self.names, 1.0 - DECISION.unknown) if shown else {}
 
-    def undetectable(self) -> list[str]:
-        return []
-
     def estimate(self, effect: str, parameter: str) -> Estimated:
         # The delay is against the gyroscope, and a gyroscope may be late itself.
         return Estimated(self.fit.value, self.fit.error, self.fit.error + GYROSCOPE_LATE)

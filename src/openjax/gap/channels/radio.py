@@ -61,10 +61,14 @@ class Radio(Channel):
     path = "radio"
 
     @property
+    def losing(self) -> Link:
+        """The link that loses packets, at the delay found."""
+        return self.links[frozenset({DELAY, LOSS} if self.delay > 0 else {LOSS})]
+
+    @property
     def loss(self) -> float:
         """Share of the packets that were lost."""
-        used = self.links[frozenset({DELAY, LOSS} if self.delay > 0 else {LOSS})]
-        return float(used.lost.sum() / max(used.told.sum(), 1))
+        return float(self.losing.lost.sum() / max(self.losing.told.sum(), 1))
 
     @property
     def readable(self) -> bool:
@@ -79,12 +83,11 @@ class Radio(Channel):
             return frozenset()
         both = frozenset({DELAY, LOSS})
         gain = {p: self.links[both].nats - self.links[both - {p}].nats for p in both}
-        used = self.links[both if self.delay > 0 else frozenset({LOSS})]
         late = self.delay > DECISION.clock and gain[DELAY] > CLEAR
         lost = (
             self.loss > DECISION.packet_loss
             and gain[LOSS] > CLEAR
-            and used.between.sum() < 0.5 * used.lost.sum()
+            and self.losing.between.sum() < 0.5 * self.losing.lost.sum()
         )
         return frozenset(p for p, on in ((DELAY, late), (LOSS, lost)) if on and p in self.names)
 

@@ -5,14 +5,14 @@ Every set is fitted with the same nuisances and weighed by its marginal likeliho
 approximation), so that parameters cost what they are worth. Singles and the best sets are fitted in full;
 the other pairs are weighed by adding the linearised singles."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from openjax.gap.model.library import ABSENT, CARDS, PLACE, Library, places, prior, start_of
+from openjax.gap.model.library import ABSENT, CARDS, PLACE, Library, places, prior
 from openjax.gap.model.replay import GROUPS, SKIP, Replay
-from openjax.gap.model.whitening import Noise, fit_noise
+from openjax.gap.model.whitening import fit_noise
 
 ITERATIONS = 6
 SMALL_STEP = 0.05  # nats: an improvement below this ends the search
@@ -50,11 +50,11 @@ class SetFit:
     def parameters(self) -> dict[str, dict[str, tuple[float, float]]]:
         """{effect: {parameter: (value, standard deviation)}} of the set's own effects."""
         deviation = dict(zip(self.index.tolist(), np.sqrt(np.diag(self.covariance)), strict=True))
-        own = {e: {p.name: PLACE[e, p.name] for p in CARDS[e].fitted} for e in self.effects}
-        return {
-            e: {p: (float(self.theta[k]), float(deviation[k])) for p, k in found.items()}
-            for e, found in own.items()
-        }
+
+        def told(key):
+            return float(self.theta[PLACE[key]]), float(deviation[PLACE[key]])
+
+        return {e: {p.name: told((e, p.name)) for p in CARDS[e].fitted} for e in self.effects}
 
 
 def fit_set(
@@ -66,7 +66,7 @@ def fit_set(
     theta = ABSENT.copy()  # what isn't in the set is absent
     for effect in effects:
         own = places((effect,))
-        theta[own] = start_of(effect) if start is None else start[own]
+        theta[own] = (_starts(effect)[0] if start is None else start)[own]
     fit = _at(replay, effects, theta)
     for _ in range(rounds if effects else 0):
         before, fit = fit, _descend(fit, iterations)
@@ -107,44 +107,37 @@ def _descend(fit: SetFit, iterations: int) -> SetFit:
 def model_noise(replay: Replay, library: Library) -> tuple[Replay, dict[str, float]]:
     """The replay with noise models that fit what is left when all effects of the library may act at once, and what each effect
     would show if it acted as at its start (nats, nuisances marginalised): its exposure."""
-    theta = ABSENT.copy()
-    ahead, firsts = [], []
-    for effect in library.physics:
-        for number in range(1 + len(CARDS[effect].others)):
-            firsts.append(effect)
-            point = ABSENT.copy()
-            point[places((effect,))] = start_of(effect, number)
-            ahead.append(point)
+    starts = [(effect, theta) for effect in library.physics for theta in _starts(effect)]
     index, _, precision = prior(library.physics)
-    columns = replay.linearised(theta, index)
-    moved = replay.predict(np.array(ahead)) if ahead else [np.zeros((0, *n.shape)) for n in replay.nominal]
+    columns = replay.linearised(ABSENT, index)
+    ahead = np.array([theta for _, theta in starts])
+    moved = replay.predict(ahead) if starts else [np.zeros((0, *n.shape)) for n in replay.nominal]
     columns = [
         np.concatenate([c, m - n[None]]) for c, m, n in zip(columns, moved, replay.nominal, strict=True)
     ]
     size = len(index)
-    penalty = np.eye(size + len(ahead))
+    penalty = np.eye(size + len(starts))
     penalty[:size, :size] = precision
     for weighed in (False, False, True, True):
         gram = replay.grams(columns).sum(0)
         taken = np.linalg.solve(gram[1:, 1:] + penalty, gram[1:, 0]) if weighed else np.zeros(len(penalty))
         left = [c[0] - np.tensordot(taken, c[1:], 1) for c in columns]
-        replay = replay.with_noise(
-            noise_of(replay, [without_nuisances(replay, r, k) for k, r in enumerate(left)])
-        )
+        replay = with_noise_of(replay, [without_nuisances(replay, r, k) for k, r in enumerate(left)])
     shown = np.diag(replay.grams(columns).sum(0))[1 + size :]
     exposure = {e: 0.0 for e in library.physics}
-    for effect, square in zip(firsts, shown, strict=True):
+    for (effect, _), square in zip(starts, shown, strict=True):
         exposure[effect] = max(exposure[effect], 0.5 * float(square))
     return replay, exposure
 
 
-def noise_of(replay: Replay, residuals: list[np.ndarray]) -> list[Noise]:
-    """Noise models of residuals; channels that weren't logged keep the present ones."""
+def with_noise_of(replay: Replay, residuals: list[np.ndarray]) -> Replay:
+    """The replay with noise models of residuals; channels that weren't logged keep the present ones."""
     skip = int(SKIP / replay.tracks[0].dt)
-    return [
+    noises = tuple(
         fit_noise(axes, residuals, integrated, skip=skip) if replay.usable[axes[0]] else old
         for (axes, integrated), old in zip(GROUPS, replay.noises, strict=True)
-    ]
+    )
+    return replace(replay, noises=noises)
 
 
 def without_nuisances(replay: Replay, residual: np.ndarray, track: int) -> np.ndarray:
@@ -158,11 +151,16 @@ def fit_singles(replay: Replay, library: Library, exposure) -> dict[str, SetFit]
     return {effect: fit_set(replay, (effect,), _best_start(replay, effect)) for effect in shown}
 
 
+def _starts(effect: str) -> np.ndarray:
+    """The starts (S, P) of an effect's search."""
+    starts = np.repeat(ABSENT[None], 1 + len(CARDS[effect].others), 0)
+    starts[:, places((effect,))] = [[p.start for p in CARDS[effect].fitted], *CARDS[effect].others]
+    return starts
+
+
 def _best_start(replay: Replay, effect: str) -> np.ndarray:
     """Of an effect's starts the one that explains most by itself."""
-    starts = np.repeat(ABSENT[None], 1 + len(CARDS[effect].others), 0)
-    for number, start in enumerate(starts):
-        start[places((effect,))] = start_of(effect, number)
+    starts = _starts(effect)
     if len(starts) == 1:
         return starts[0]
     left = [y[None] - p for y, p in zip(replay.measured, replay.predict(starts), strict=True)]

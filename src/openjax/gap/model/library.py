@@ -68,12 +68,6 @@ def places(effects) -> np.ndarray:
     return np.array([PLACE[e, p.name] for e in effects for p in CARDS[e].fitted], int)
 
 
-def start_of(effect: str, number: int = 0) -> np.ndarray:
-    """A start of the search: the first, or one of the `others`."""
-    card = CARDS[effect]
-    return np.array([p.start for p in card.fitted]) if number == 0 else np.array(card.others[number - 1])
-
-
 def prior(effects) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Indices (p,), mean (p,) and precision (p, p) of the parameters of a set of physics effects."""
     index, mean, blocks = [], [], []

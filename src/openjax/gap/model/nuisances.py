@@ -31,11 +31,6 @@ def columns_of(track: Track, path: Path, nominal, feedback, at_once: bool) -> di
     return columns | _sensor_nuisances(track, path, nominal)
 
 
-def motor_shift(track: Track, one_clock: bool, at_once: bool) -> float:
-    """Usual size (s) of what a track's motors are off by in time."""
-    return max(SIZE["motor_clock"], track.dt / 4 if at_once else 0.0) if one_clock else SIZE["streams_apart"]
-
-
 def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> dict[str, np.ndarray]:
     """Mounting, biases and clocks of the sensors, and what a rigid body with small errors does: columns (T, 9)."""
     rows = len(track)

@@ -12,7 +12,7 @@ from scipy.linalg import solve_triangular
 
 from openjax.flights.track import Track
 from openjax.gap.model.library import ABSENT, PLACE, STEP
-from openjax.gap.model.nuisances import OF_A_BLOCK, SIZE, columns_of, motor_shift
+from openjax.gap.model.nuisances import OF_A_BLOCK, SIZE, columns_of
 from openjax.gap.model.prediction import FORCE, RATES, VELOCITY, Physics, make_physics
 from openjax.gap.model.whitening import Noise, first_noise, whiten
 
@@ -82,20 +82,14 @@ class Replay:
         """Channels (B, T, 9) of each track for parameter vectors theta (B, P)."""
         return self.physics.predict(theta)
 
-    def with_noise(self, noises) -> Replay:
-        return replace(self, noises=tuple(noises))
-
     def around(self, theta: np.ndarray) -> Replay:
         """With the derivatives of a vehicle that has the effects theta (P,): a wrong moment of inertia scales the torques that
         are left once an effect is accounted for, not those of motors that hold against it."""
-        places = [PLACE[key[:2]] for key in self.numbers] + [len(theta) - 2, len(theta) - 1]
-        steps, nuisances = STEP[places][:, None, None], []
-        for p, old, size in zip(
-            self.predict(stepped(theta, places)), self.nuisances, self.sizes, strict=True
-        ):
-            moved = (p[1:] - p[:1]) / steps
-            moved = np.concatenate([moved, moved[-1:]]) * size[:, None, None]
-            nuisances.append(np.concatenate([moved, old[len(moved) :]]))
+        places, nuisances = [PLACE[key[:2]] for key in self.numbers] + [len(theta) - 2, len(theta) - 1], []
+        moved = (column[1:] for column in self.linearised(theta, places))
+        for m, old, size in zip(moved, self.nuisances, self.sizes, strict=True):
+            own = np.concatenate([m, m[-1:]]) * size[:, None, None]
+            nuisances.append(np.concatenate([own, old[len(own) :]]))
         return replace(self, nuisances=nuisances)
 
     def whiten(self, x: np.ndarray, track: int) -> np.ndarray:
@@ -123,19 +117,13 @@ class Replay:
 
     def linearised(self, theta: np.ndarray, index: np.ndarray) -> list[np.ndarray]:
         """Residual and derivatives (1 + p, T, 9) of each track at theta (P,) with respect to theta[index]."""
-        index = np.asarray(index, int)
-        steps = STEP[index][:, None, None]
+        count, steps = len(index), STEP[np.asarray(index, int)]
+        batch = np.repeat(theta[None], count + 1, 0)
+        batch[np.arange(count) + 1, index] += steps
         return [
-            np.concatenate([(y - p[0])[None], (p[1:] - p[:1]) / steps])
-            for y, p in zip(self.measured, self.predict(stepped(theta, index)), strict=True)
+            np.concatenate([(y - p[0])[None], (p[1:] - p[:1]) / steps[:, None, None]])
+            for y, p in zip(self.measured, self.predict(batch), strict=True)
         ]
-
-
-def stepped(theta: np.ndarray, index) -> np.ndarray:
-    """(1 + p, P): theta (P,), and theta a step further in each of its entries `index`."""
-    batch = np.repeat(theta[None], len(index) + 1, 0)
-    batch[np.arange(len(index)) + 1, index] += STEP[index]
-    return batch
 
 
 def make_replay(tracks, vehicles, motor_ticks, feedback, numbers, one_clock=True, at_once=False) -> Replay:
@@ -159,12 +147,11 @@ def make_replay(tracks, vehicles, motor_ticks, feedback, numbers, one_clock=True
         columns_of(track, path, p, made, at_once)
         for track, path, p, made in zip(tracks, physics.paths, nominal, feedback, strict=True)
     ]
-    # A track without a neighbour has no wake: nothing there.
-    names = tuple(max(named, key=len))
+    names = tuple(max(named, key=len))  # without a velocity a track has fewer
     moving = (*(" ".join(key[:2]) for key in numbers), "propellers' inertia", *MOTORS_LATE)
-    own = [key[2] for key in numbers]
+    own, apart = [key[2] for key in numbers], SIZE["motor_clock" if one_clock else "streams_apart"]
     sizes = [
-        np.array([*own, SIZE["propeller"], motor_shift(t, one_clock, at_once), SIZE["motor_delay"]])
+        np.array([*own, SIZE["propeller"], max(apart, t.dt / 4 if at_once else 0.0), SIZE["motor_delay"]])
         for t in tracks
     ]
     replay = Replay(

@@ -66,6 +66,11 @@ class Report:
     plots: dict = field(default_factory=dict, repr=False)
 
     @property
+    def named(self) -> list[str]:
+        """The effects without "unknown"."""
+        return [e for e in self.effects if e != "unknown"]
+
+    @property
     def left_out(self) -> list[str]:
         """Logs that weren't used, each with the reason."""
         return [f"{q['flight']}: {q['issue']}" for q in self.quality if q.get("left_out")]
@@ -98,7 +103,7 @@ class Report:
 
     def shares_in_words(self) -> str:
         """Every named effect's share with its interval, then sensors and clocks, then what is unexplained."""
-        named = [(e, self.shares.effects[e]) for e in self.effects if e != "unknown"]
+        named = [(e, self.shares.effects[e]) for e in self.named]
         parts = ", ".join(
             f"{e} {_short(v.value)} [{_short(v.interval90[0])}, {_short(v.interval90[1])}]" for e, v in named
         )

@@ -27,10 +27,6 @@ def figures(report: Report) -> list[tuple[str, str, str]]:
         return [(title, text, as_svg(figure, title)) for title, text, figure in filter(None, drawn)]
 
 
-def _named(report: Report) -> list[str]:
-    return [effect for effect in report.effects if effect != "unknown"]
-
-
 def _residuals(report: Report) -> tuple[list, list]:
     """Residuals of each track of the nominal simulator, and with the named effects."""
     return residuals_of(report.plots["evidence"].motion.nothing), residuals_of(report.plots["selection"].fit)
@@ -123,7 +119,7 @@ def _horizons(report: Report):
 
 def _coordinate(report: Report):
     """What the nominal simulator misses, against the variable that the first named effect follows."""
-    evidence, named = report.plots["evidence"], _named(report)
+    evidence, named = report.plots["evidence"], report.named
     if not named or not evidence.replay.usable[3] or evidence.tracks[0].quaternion is None:
         return None
     coordinate = CARDS[named[0]].coordinate

@@ -45,7 +45,7 @@ def facts(report: Report) -> list[tuple[str, str]]:
 
 def sentence(report: Report) -> str:
     """What was found, in one plain sentence."""
-    named = [effect for effect in report.effects if effect != "unknown"]
+    named = report.named
     if not named:
         return VERDICTS[report.verdict]
     parts = " and ".join(
