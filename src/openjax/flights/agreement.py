@@ -1,58 +1,25 @@
 """Do a flight's channels agree with each other? What one says, another must show: attitude and gyroscope, position and
 velocity, the path's acceleration and the attitude's thrust, the accelerometer and the path, motors, commands and what follows
 them. A log whose channels contradict each other isn't diagnosed, whatever made it: swapped axes, a wrong convention, unit or
-motor order, rows out of order, columns of another flight, noise in place of data.
-
-Each pair is compared in a low band, with a clock offset free for every few seconds, and speaks only where the one that leads
-moves by more than sensors, latencies and the air explain. Where another labelling or convention mends the pair, that is
-what is said."""
-
-from __future__ import annotations
+motor order, rows out of order, columns of another flight, noise in place of data. Where another labelling or convention mends
+a pair, that is what is said."""
 
 import dataclasses
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from openjax.flights.flight import Flight, Issue
+from openjax.flights.pairs import AGREE, Pair, Signals, pairs_of
 from openjax.flights.reading import CHANNEL_COLUMNS
-from openjax.flights.signals import (
-    RATE,
-    clock_of,
-    first_order,
-    in_band,
-    on_clock,
-    rates_of,
-    up_of,
-)
-from openjax.flights.track import GRAVITY, to_body
+from openjax.flights.signals import RATE, clock_of, first_order, in_band
+from openjax.flights.track import to_body
 
-# Hz: above drift, below the noise of what is compared
-LOW, WIDE, TURNING = (0.3, 2.5), (0.3, 4.0), (0.7, 8.0)
-WINDOW = 8.0  # s in which a clock offset is constant
-LAG = 0.2  # s, largest clock offset and latency between honest streams
-AGREE = 0.5  # share of the correlation to be expected below which two channels contradict each other
-FITS = 0.75  # share above which another labelling is what was meant
-TELLS = 0.5  # correlation that the sensors' noise must leave for a comparison to tell anything
+TURNING = (0.7, 8.0)  # Hz, where motors turn the vehicle
 UNIT = 2.5  # factor about a unit's, within which a gain is that unit
 RANDOM = 0.5  # share of the variance from row to row at which a continuous signal has no order
 LEAST_ROWS = 100
-FULL = 0.98  # motor command that counts as the largest
-# Motion (rms in the band) that is more than what else moves the channel that must follow: a pose that a filter makes is off by a
-# few cm/s and some hundredths of a radian; floor, wakes and a battery change the thrust by some per cent of hover; a loop at
-# rest opposes the air. Commanded thrust and motors (per cent) are exact.
-MOVED = {
-    "rate": 0.15,
-    "velocity": 0.1,
-    "tilt": 0.4,
-    "force": 0.1,
-    "thrust": 0.5,
-    "command": 0.4,
-    "share": 0.3,
-}
 # Standard deviation above which the rows of a continuous channel can't be its sensor's noise, in its unit.
 CONTINUOUS = {"position": 0.05, "quaternion": 0.03, "velocity": 0.25}
 UNITS = {"rad/s": (("deg/s", 180 / np.pi),), "m/s": (("mm/s", 1e3),), "m/s^2": (("mm", 1e3), ("cm", 1e2))}
@@ -71,6 +38,7 @@ QUATERNIONS = {
     "from world to body": lambda q: q * [1.0, -1.0, -1.0, -1.0],
     "in the order x, y, z, w and from world to body": lambda q: q[:, [3, 0, 1, 2]] * [1.0, -1.0, -1.0, -1.0],
 }
+Finding = tuple[str, str, Sequence[str]]  # kind, words and the comparisons that fail
 
 
 def check_agreement(flight: Flight, vehicle) -> list[Issue]:
@@ -93,201 +61,6 @@ def shown_right(flight: Flight, vehicle) -> set[str]:
     shown = {pair.what for pair in pairs_of(signals) if pair.tells.sum() >= min(2, len(pair.tells))}
     torques = _torques(signals, vehicle)
     return shown | ({MOTORS} if torques and torques[IDENTITY][:2].min() > 0.4 else set())
-
-
-@dataclass(frozen=True, eq=False)
-class Signals:
-    """A flight's channels (T, C) on the common clock; None where they weren't logged."""
-
-    position: np.ndarray | None
-    quaternion: np.ndarray | None
-    velocity: np.ndarray | None
-    body_rates: np.ndarray | None
-    force: np.ndarray | None
-    motor: np.ndarray | None
-    thrust: np.ndarray | None
-    commands: np.ndarray | None
-
-    @classmethod
-    def of(cls, flight: Flight, grid: np.ndarray) -> Signals:
-        """The logged channels; what the reader derived says nothing of its own."""
-        derived = {"velocity": flight.velocity_derived, "body_rates": flight.body_rates_derived}
-        channels = ("position", "quaternion", "velocity", "body_rates", "specific_force")
-        channels += ("motor_command", "command_thrust", "command_body_rates")
-        return cls(*(None if derived.get(c) else on_clock(flight, c, grid) for c in channels))
-
-    @cached_property
-    def rates(self) -> np.ndarray | None:
-        """The gyroscope, or else the attitude's rate."""
-        return self.attitude_rates if self.body_rates is None else self.body_rates
-
-    @cached_property
-    def attitude_rates(self) -> np.ndarray | None:
-        """Body rates (T, 3) rad/s by differences of the attitude."""
-        return None if self.quaternion is None else rates_of(self.quaternion)
-
-    @cached_property
-    def acceleration(self) -> tuple[np.ndarray | None, int]:
-        """Of the path, m/s^2 in the world, and how many times what was logged of it was differentiated."""
-        if self.velocity is not None:
-            return np.gradient(self.velocity, 1 / RATE, axis=0), 1
-        if self.position is None:
-            return None, 2
-        return np.gradient(np.gradient(self.position, 1 / RATE, axis=0), 1 / RATE, axis=0), 2
-
-
-@dataclass(frozen=True, eq=False)
-class Pair:
-    """`measured` (T, C) and what it must agree with, both in `unit`. `names` of the measured columns; `holds` the channel of
-    `Signals` that they are, where another labelling of it may be right; `derivatives`: how many times each was differentiated
-    from what its sensor gives, None for commands; `least`: rms of the reference in the band from which it tells."""
-
-    names: tuple[str, ...]
-    measured: np.ndarray
-    what: str
-    reference: np.ndarray
-    band: tuple[float, float]
-    least: float
-    unit: str
-    derivatives: tuple[int | None, int | None] = (0, 0)
-    holds: str = ""
-
-    @cached_property
-    def agreement(self) -> Agreement:
-        """How well the two follow each other."""
-        return agreement(self.measured, self.reference, self.band, self.derivatives)
-
-    @property
-    def tells(self) -> np.ndarray:
-        """(C,) whether the reference moves enough for a column to contradict it."""
-        return (self.agreement.reference > self.least) & (self.agreement.expected > TELLS)
-
-    @property
-    def bad(self) -> np.ndarray:
-        """(C,) whether a column contradicts its reference."""
-        return self.tells & (self.agreement.correlation < AGREE * self.agreement.expected)
-
-    @property
-    def fits(self) -> bool:
-        """Whether all columns that could contradict their reference clearly follow it."""
-        followed = self.agreement.correlation[self.tells] / self.agreement.expected[self.tells]
-        return bool(len(followed) and followed.min() > FITS)
-
-    def in_words(self) -> str:
-        """Which columns contradict what, with the numbers."""
-        found = self.agreement
-        worst = int(np.argmin(np.where(self.bad, found.correlation, np.inf)))
-        columns = ", ".join(n for n, b in zip(self.names, self.bad, strict=True) if b)
-        return (
-            f"contradictory: {columns} against {self.what}: correlation {found.correlation[worst]:.2f} where sensors "
-            f"allow {found.expected[worst]:.2f} ({found.measured[worst]:.2g} against {found.reference[worst]:.2g} "
-            f"{self.unit} from {self.band[0]:g} to {self.band[1]:g} Hz)"
-        )
-
-
-def pairs_of(s: Signals) -> Iterator[Pair]:
-    """All pairs that were logged."""
-    turned, (acceleration, order) = s.attitude_rates, s.acceleration
-    rates, velocity, commands = (CHANNEL_COLUMNS[c] for c in ("body_rates", "velocity", "command_body_rates"))
-    if turned is not None and s.body_rates is not None:
-        least, what = MOVED["rate"], "the attitude's rate"
-        yield Pair(rates, s.body_rates, what, turned, WIDE, least, "rad/s", (0, 1), "body_rates")
-    if s.position is not None and s.velocity is not None:
-        path, what = np.gradient(s.position, 1 / RATE, axis=0), "the position's rate"
-        yield Pair(velocity, s.velocity, what, path, LOW, MOVED["velocity"], "m/s", (0, 1), "velocity")
-    along = None
-    if acceleration is not None and s.quaternion is not None:
-        size = np.full(len(acceleration), GRAVITY) if s.force is None else s.force[:, 2]
-        lift = up_of(s.quaternion) * np.median(size)
-        names, what = ("the path's acceleration in x", "in y"), "the attitude's thrust"
-        yield Pair(
-            names, acceleration[:, :2], what, lift[:, :2], LOW, MOVED["tilt"], "m/s^2", (order, 0), "position"
-        )
-        # Sideways a late or tilted attitude feels accelerations that aren't there: the vertical alone tells.
-        along = to_body(s.quaternion, acceleration + np.array([0.0, 0.0, GRAVITY]))[:, 2:]
-        if s.force is not None:
-            # Sideways the attitude tells how wrong the path's acceleration is.
-            off = in_band(acceleration[:, :2] - lift[:, :2], LOW).std(0).mean()
-            least, what = max(MOVED["force"], 2.0 * float(off)), "the path's acceleration"
-            yield Pair(("az",), s.force[:, 2:], what, along, LOW, least, "m/s^2", (0, order))
-    yield from _caused(s, along, order)
-    # A saturated vehicle has nothing left to follow commands with.
-    helpless = s.motor is not None and float((s.motor > FULL).any(1).mean()) > 0.2
-    if s.commands is not None and s.rates is not None and not helpless:
-        least, what = MOVED["command"], "the body rates"
-        yield Pair(commands, s.commands, what, s.rates, LOW, least, "rad/s", (None, 0), "commands")
-
-
-def _caused(s: Signals, along: np.ndarray | None, order: int) -> Iterator[Pair]:
-    """Motors with the force that they make and the thrust that was asked for. What the accelerometer or else the path feels
-    is moved by floor, wakes and gusts, too: it must follow where the motors do much."""
-    if s.motor is None:
-        return
-    collective = s.motor.mean(1, keepdims=True)
-    felt, order = (along, order) if s.force is None else (s.force[:, 2:], 0)
-    if felt is not None:
-        asked = collective * np.median(felt) / max(float(np.median(collective)), 1e-3)
-        what, least = "what the motors would make", MOVED["thrust"]
-        yield Pair(("the force felt",), felt, what, asked, LOW, least, "m/s^2", (order, None))
-    if s.thrust is not None:
-        what = "m1 + m2 + m3 + m4"
-        yield Pair(
-            ("cmd_thrust",), 100 * s.thrust, what, 100 * collective, WIDE, MOVED["share"], "%", (None, None)
-        )
-
-
-@dataclass(frozen=True)
-class Agreement:
-    """How well `measured` follows `reference`, axis by axis, in the band of the comparison."""
-
-    correlation: np.ndarray  # (C,) at the best clock offset of each window, pooled
-    expected: np.ndarray  # (C,) what the white part of the measured signal leaves of a perfect one
-    reference: np.ndarray  # (C,) rms of the reference in the band
-    measured: np.ndarray  # (C,) rms of the measured signal in the band
-
-
-def agreement(
-    measured: np.ndarray,
-    reference: np.ndarray,
-    band: tuple[float, float],
-    derivatives: tuple[int | None, int | None] = (0, 0),
-) -> Agreement:
-    """Compare (T, C) with (T, C) on the common clock in `band` Hz. `derivatives` says how many times each was
-    differentiated from what its sensor gives; None: a command, which has no noise."""
-    y, x = in_band(measured, band), in_band(reference, band)
-    width, shift = int(WINDOW * RATE), int(LAG * RATE)
-    products, powers = np.zeros(y.shape[1]), np.zeros((2, y.shape[1]))
-    for part in np.array_split(np.arange(len(y)), max(len(y) // width, 1)):
-        own, other = y[part], x[part]
-        scale = np.sqrt((own**2).sum(0) * (other**2).sum(0)) + 1e-12
-        inner = slice(shift, len(part) - shift)
-        each = [(own[inner] * np.roll(other, lag, 0)[inner]).sum(0) for lag in range(-shift, shift + 1)]
-        best = int(np.argmax((np.array(each) / scale).sum(1)))
-        moved = np.roll(other, best - shift, 0)[inner]
-        products += each[best]
-        powers += [(own[inner] ** 2).sum(0), (moved**2).sum(0)]
-    rms_y, rms_x = y.std(0), x.std(0)
-    noise_y = _noise(measured, band, derivatives[0])
-    noise_x = np.minimum(_noise(reference, band, derivatives[1]), rms_x)
-    moved = np.sqrt(rms_x**2 - noise_x**2)
-    expected = moved**2 / (np.maximum(rms_x, 1e-12) * np.sqrt(moved**2 + noise_y**2 + 1e-24))
-    correlation = products / np.sqrt(np.maximum(powers.prod(0), 1e-24))
-    return Agreement(correlation, expected, moved, rms_y)
-
-
-def _noise(values: np.ndarray, band: tuple[float, float], derivatives: int | None) -> np.ndarray:
-    """Noise (C,) in the band, if all above 20 Hz is the white noise of what was differentiated."""
-    if derivatives is None:
-        return np.zeros(values.shape[1])
-    high = (20.0, 45.0)
-    power = [
-        np.mean(np.sin(2 * np.pi * np.linspace(*b, 50) / RATE) ** (2 * derivatives)) * (b[1] - b[0])
-        for b in (band, high)
-    ]
-    return in_band(values, high).std(0) * np.sqrt(power[0] / power[1])
-
-
-Finding = tuple[str, str, Sequence[str]]  # kind, words and the comparisons that fail
 
 
 def _contradictions(signals: Signals) -> list[Finding]:

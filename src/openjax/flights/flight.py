@@ -157,3 +157,11 @@ class Case:
     def vehicle_of(self, flight: Flight):
         """The nominal `Vehicle` of this flight: the vehicle file's, with `[vehicles.<id>]` applied."""
         return self.vehicle_file.vehicle_of(flight.vehicle)
+
+
+class Refused(Exception):
+    """A flight that can't be used: of which kind the reason is, and the reason."""
+
+    def __init__(self, kind: str, reason: str):
+        super().__init__(reason)
+        self.kind = kind

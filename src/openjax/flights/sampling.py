@@ -1,0 +1,158 @@
+"""When a sensor was sampled: rows that hold no new sample of it, and clocks of its own."""
+
+import dataclasses
+
+import numpy as np
+
+from openjax.flights.flight import CHANNELS, Flight, Refused
+from openjax.flights.reading import CHANNEL_COLUMNS
+
+FROZEN = 0.5  # s without a change of a sensor that has noise
+HELD = 0.1  # share of rows that repeat the one before, from which a sensor is slower than the rows
+IN_STEP = 50  # poses from which a clock of their own is looked for
+IN_PHASE = 0.25  # concentration of their phases (0 to 1) from which they have one
+EDGE = 0.03  # cycles of that clock by which its phase may be wrong
+SENSORS = ("position", "quaternion", "velocity", "body_rates", "specific_force")
+
+
+def drop_frozen(flight: Flight, note) -> Flight:
+    """Constant columns refuse or drop their channel; frozen stretches become not sampled; holes are named."""
+    changes = {}
+    for channel in (c for c in CHANNELS if getattr(flight, c) is not None):
+        values, names = getattr(flight, channel), ", ".join(CHANNEL_COLUMNS[channel])
+        rows = np.flatnonzero(np.isfinite(values.reshape(len(values), -1)).all(1))
+        if len(rows) < 2:
+            raise Refused("corrupt", f"{names}: hardly any row holds a number")
+        if channel in SENSORS or channel == "motor_command":
+            frozen = _standing_still(flight, channel, rows, note)
+            if frozen.any():
+                changes[channel] = _unsampled(values, frozen)
+                rows = rows[~frozen[rows]]
+        if channel != "battery_voltage" and len(rows) > 1:
+            _name_hole(flight.time, rows, names, note)
+    return dataclasses.replace(flight, **changes) if changes else flight
+
+
+def _standing_still(flight: Flight, channel: str, rows, note) -> np.ndarray:
+    """(T,) rows in which a sensor is frozen; of columns that never change nothing can be used."""
+    columns, values = CHANNEL_COLUMNS[channel], getattr(flight, channel)
+    table = values.reshape(len(values), -1)
+    changed = np.diff(table[rows], axis=0) != 0
+    together = channel in ("position", "quaternion", "velocity")
+    dead = [] if together and changed.any() else np.flatnonzero(~changed.any(0))
+    if len(dead):
+        names = ", ".join(columns[i] for i in dead)
+        raise Refused("corrupt", f"{names}: the same value {table[rows[0], dead[0]]:g} in every row")
+    frozen = _frozen(table, rows, flight.time, together)
+    if frozen.any():
+        share, start = frozen.mean(), flight.time[np.argmax(frozen)]
+        words = f"{', '.join(columns)} stand still for {share * flight.duration:.1f} s from t = {start:.2f}"
+        if share > 0.5:
+            raise Refused("corrupt", f"{words}: frozen for {share:.0%} of the flight")
+        note("corrupt", f"{words}; taken as not sampled there")
+    return frozen
+
+
+def _name_hole(time, rows, names: str, note) -> None:
+    """Say where the longest stretch without samples is, if rows are there meanwhile: else it is a gap in time, named already."""
+    steps = np.diff(time[rows])
+    hole = int(np.argmax(steps))
+    if rows[hole + 1] - rows[hole] > 1 and steps[hole] > max(0.2, 10 * np.median(steps)):
+        note("gaps", f"{names}: not sampled for {steps[hole]:.2f} s after t = {time[rows][hole]:.2f}")
+
+
+def drop_repeats(flight: Flight, note) -> Flight:
+    """A sensor that is slower than the rows and whose last sample was written again counts as sampled where it changed.
+    A sample that appears in a row may be older than it by up to a row."""
+    changes = {}
+    for group in (("position", "quaternion", "velocity"), ("body_rates", "specific_force")):
+        logged = [c for c in group if getattr(flight, c) is not None]
+        if not logged:
+            continue
+        together = np.concatenate([getattr(flight, c).reshape(len(flight), -1) for c in logged], 1)
+        repeated = np.r_[False, (np.diff(together, axis=0) == 0).all(1)]
+        if repeated.mean() < HELD:
+            continue
+        note(
+            "held",
+            f"{repeated.mean():.0%} of the rows repeat the last sample of {', '.join(logged)}: left out",
+        )
+        for channel in logged:
+            changes[channel] = _unsampled(getattr(flight, channel), repeated)
+        if group[0] == "position":
+            changes["pose_age"] = flight.row_period
+    return dataclasses.replace(flight, **changes) if changes else flight
+
+
+def put_in_step(flight: Flight, note) -> Flight:
+    """Poses at the times of their rows, where the camera is slower than the log: a row says only that a new pose came since the
+    last one, and the camera's own clock is regular. Poses are on a line through their rows; a held one is half a row late on
+    the mean."""
+    logged = [c for c in ("position", "quaternion", "velocity") if getattr(flight, c) is not None]
+    if not logged:
+        return flight
+    rows = np.flatnonzero(
+        np.all([np.isfinite(getattr(flight, c).reshape(len(flight), -1)).all(1) for c in logged], 0)
+    )
+    if len(rows) < IN_STEP or len(rows) > (1.0 - HELD) * len(flight):
+        return flight
+    seen = flight.time[rows]
+    own = _regular_clock(seen, flight.row_period)
+    if own is None:
+        return flight
+    own = own - 0.5 * flight.pose_age
+    changes = {"pose_age": 0.0}
+    for channel in logged:
+        values = getattr(flight, channel)
+        moved = np.full_like(values, np.nan)
+        moved[rows] = np.stack([np.interp(seen, own, column) for column in values[rows].T], 1)
+        changes[channel] = moved
+    rate = (len(own) - 1) / (own[-1] - own[0])
+    note("held", f"poses come at {rate:.0f} Hz of a clock of their own: moved from it to the rows' times")
+    return dataclasses.replace(flight, **changes)
+
+
+def _regular_clock(seen: np.ndarray, row: float) -> np.ndarray | None:
+    """Times (S,) of a regular clock whose ticks were seen at times (S,) up to a `row` s apart from it, later where rows are
+    missing; None where they have none. Its rate is where the phases of what was seen agree most (Rayleigh's periodogram)."""
+    since = seen - seen[0]
+    usual = (len(seen) - 1) / since[-1]
+    rates = np.arange(0.9 * usual, 1.15 * usual, 0.2 / since[-1])
+    turned = np.exp(2j * np.pi * rates[:, None] * since).mean(1)
+    best = int(np.argmax(np.abs(turned)))
+    if np.abs(turned[best]) < IN_PHASE:
+        return None
+    middle = np.angle(turned[best]) / (2.0 * np.pi)
+    late = rates[best] * since - middle + 0.5 * row * rates[best]  # cycles since a tick could first be seen
+    ticks = np.floor(late + EDGE)
+    usual = late - ticks < row * rates[best] + EDGE
+    slope, start = np.polyfit(ticks[usual], seen[usual], 1)
+    return start + slope * ticks
+
+
+def _unsampled(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Values (T, ...) without those of some rows (T,)."""
+    left = values.copy()
+    left[rows] = np.nan
+    return left
+
+
+def _frozen(table: np.ndarray, rows: np.ndarray, time: np.ndarray, together: bool) -> np.ndarray:
+    """(T,) True in runs of at least FROZEN seconds in which a column (all columns if `together`) doesn't
+    change though it does elsewhere. Runs at the column's extremes are saturation, not a frozen sensor."""
+    values = table[rows]
+    still = np.diff(values, axis=0) == 0
+    extreme = (values == values.min(0)) | (values == values.max(0))
+    per_column = [still.all(1)] if together else [s & ~e for s, e in zip(still.T, extreme[1:].T, strict=True)]
+    frozen = np.zeros(len(time), bool)
+    for run in per_column:
+        for start, stop in runs_of(run):
+            if time[rows[stop]] - time[rows[start]] >= FROZEN:
+                frozen[rows[start] + 1 : rows[stop] + 1] = True
+    return frozen
+
+
+def runs_of(flags: np.ndarray) -> list[tuple[int, int]]:
+    """First row and the one after the last of every stretch in which `flags` (T,) hold."""
+    edges = np.flatnonzero(np.diff(np.r_[0, flags, 0]))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
