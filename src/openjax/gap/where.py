@@ -8,7 +8,6 @@ from openjax.flights.regimes import REGIMES, regimes_of
 from openjax.flights.track import smooth
 from openjax.gap.evidence import Evidence
 from openjax.gap.model.hypotheses import SetFit
-from openjax.gap.model.library import path_of
 from openjax.gap.model.replay import SKIP
 from openjax.gap.residual import disturbances, residuals_of
 
@@ -64,7 +63,7 @@ def _other_powers(evidence: Evidence, named) -> dict[str, list[np.ndarray]]:
     """The same of pose, radio and rate loop: their squared residuals."""
     found: dict[str, list[np.ndarray]] = {}
     for channel in evidence.channels:
-        floor = channel.residuals([e for e in evidence.library.effects if path_of(e) == channel.path])
+        floor = channel.residuals(evidence.library.of(channel.path))
         scale = {n: float(np.sqrt(np.mean(np.concatenate(v) ** 2))) + 1e-12 for n, v in floor.items()}
         powers = []
         for errors in (channel.residuals(()), channel.residuals(named), floor):

@@ -1,12 +1,11 @@
 """What a log says by ways of its own: pose, radio, rate loop and motion, each a channel with the same few methods."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from scipy.stats import norm
 from scipy.stats import t as student
-
-from openjax.gap.model.library import CARDS
 
 
 @dataclass(frozen=True)
@@ -18,14 +17,13 @@ class Estimated:
     above: float
 
 
-class Channel:
+class Channel(Protocol):
     """One way by which a log tells effects. `path` is the `Card.path` of those that it reads."""
 
     path: str = ""
 
     def acting(self) -> dict[str, float]:
         """{effect: probability} of the channel's effects that the log shows."""
-        raise NotImplementedError
 
     def undetectable(self) -> list[str]:
         """The channel's effects that these flights would not show at their usual size."""
@@ -33,16 +31,9 @@ class Channel:
 
     def estimate(self, effect: str, parameter: str) -> Estimated:
         """A parameter of an acting effect."""
-        raise NotImplementedError
 
     def residuals(self, named) -> dict[str, list[np.ndarray]]:
         """{name: [(T,) per track]} of normalised prediction errors with the effects `named`."""
-        raise NotImplementedError
-
-
-def effects_of(path: str, library) -> tuple[str, ...]:
-    """Effects of a library that a channel reads."""
-    return tuple(e for e in library.effects if CARDS[e].path == path)
 
 
 def few(count: int) -> float:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from openjax.flights.track import Track, smooth, turn_increments
-from openjax.gap.channels import Channel, Estimated, effects_of
+from openjax.gap.channels import Channel, Estimated
 from openjax.gap.decision import DECISION
 from openjax.gap.model.nuisances import SIZE
 from openjax.gap.model.whitening import fit_noise, whiten
@@ -72,7 +72,7 @@ def read_pose(tracks: list[Track], library) -> Pose | None:
         return None
     clock = DECISION.clock + max(t.pose_age for t in tracks)
     steps = tuple(max(round(POSE_HORIZON / t.dt), 1) for t in tracks)
-    return Pose(read_delay(tracks), clock, effects_of("estimator", library), steps)
+    return Pose(read_delay(tracks), clock, library.of("estimator"), steps)
 
 
 def read_delay(tracks: list[Track]) -> Delay:

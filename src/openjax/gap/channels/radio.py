@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from openjax.flights.track import Track, held_means
-from openjax.gap.channels import Channel, Estimated, effects_of, few
+from openjax.gap.channels import Channel, Estimated, few
 from openjax.gap.decision import DECISION
 from openjax.gap.model.library import CARDS
 
@@ -128,7 +128,7 @@ def read_radio(tracks: list[Track], library, sampled: bool = False) -> Radio:
         for late in (False, True)
         for lost in (False, True)
     }
-    names = {CARDS[e].fitted[0].name: e for e in effects_of("radio", library)}
+    names = {CARDS[e].fitted[0].name: e for e in library.of("radio")}
     return Radio(delay, links, names, max(t.dt for t in tracks), sampled)
 
 

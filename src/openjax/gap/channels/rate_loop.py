@@ -14,12 +14,13 @@ from scipy.signal import butter, detrend, lfilter, sosfiltfilt
 from scipy.stats import norm
 
 from openjax.flights.track import Track, smooth
-from openjax.gap.channels import Channel, Estimated, effects_of, robust_deviation
+from openjax.gap.channels import Channel, Estimated, robust_deviation
 from openjax.gap.channels.instruments import BAND, COUNT, EDGE, in_force, outputs_of
 from openjax.gap.decision import DECISION
 from openjax.gap.model.observer import GYRO_GAIN, TICKS, observe
 from openjax.gap.model.prediction import bucket, padded
 
+GAIN_STEP = 0.05
 # Spreads of the gains, of P's delay and of the share of the derivative that is filtered.
 PRIOR = np.array([0.4, 0.4, 0.4, 1.0, 1.0])
 FILTER = 30.0  # Hz of the low-pass of the derivative that the firmware of the Crazyflie may have
@@ -92,14 +93,17 @@ class RateLoop(Channel):
 
 def read_rate_loop(reading) -> RateLoop:
     """Read the rate controllers of all tracks of a `motion.Reading`."""
-    ticks, series = [], []
+    ticks, series, outputs = [], [], []
     tracks = zip(reading.heard, reading.vehicles, reading.arrived, reading.by_commands, strict=True)
     for track, vehicle, link, (_, drawn) in tracks:
-        ticks.append(observed(track, vehicle, link, reading.at_once)[1])
+        wanted, sent = observed(track, vehicle, link, reading.at_once)
+        ticks.append(sent)
+        logged, nominal, *larger = np.concatenate([track.motor[None], wanted]) @ outputs_of(vehicle)
+        outputs.append(np.stack([logged - nominal, *((made - nominal) / GAIN_STEP for made in larger)]))
         series.append(_series(track, vehicle, in_force(track, link), drawn, reading))
     change, error = read_gains(reading, series, ticks)
-    names = effects_of("rate_loop", reading.library)
-    return RateLoop(change, error, [s[:4] for s in series], ticks, names, max(t.dt for t in reading.heard))
+    names = reading.library.of("rate_loop")
+    return RateLoop(change, error, outputs, ticks, names, max(t.dt for t in reading.heard))
 
 
 def with_motors(track: Track, vehicle) -> Track:
@@ -112,25 +116,28 @@ def with_motors(track: Track, vehicle) -> Track:
     track = dataclasses.replace(track, motor=np.repeat(track.command[:, :1], 4, 1))
     for _ in range(2):
         wanted, _ = observed(track, vehicle, link)
-        track = dataclasses.replace(track, motor=wanted, motors_logged=False)
+        track = dataclasses.replace(track, motor=wanted[0], motors_logged=False)
     return track
 
 
 def observed(track: Track, vehicle, link, at_once=False):
-    """The observer's output: mean motor commands wanted (T, 4), and the commands sent in the ticks (T, TICKS, 4).
+    """The observer's output: mean motor commands (1 + 3, T, 4) that the nominal loop wants, and with one gain each larger by
+    GAIN_STEP; and the commands sent in the ticks (T, TICKS, 4).
 
     What pushed the body beyond the nominal physics in a first run is given to a second, so that the rates
     inside a row are right whatever the physics."""
     rows, size = len(track), bucket(len(track))
     inputs = [padded(v, size) for v in (in_force(track, link), track.motor, track.body_rates)]
     push = padded(np.zeros((rows, 3)), size)
-    for _ in range(2):
-        wanted, sent, rates = observe(vehicle, *inputs, push, np.float32(track.dt), at_once)
-        miss = track.body_rates[1:] - np.asarray(rates, float)[: rows - 1]
-        step = miss.copy()  # undo the observer's own correction of what it missed before
-        step[1:] -= (1.0 - GYRO_GAIN) * miss[:-1]
-        push = push + padded(smooth(np.concatenate([step, step[-1:]]), 0.06, track.dt) / track.dt, size)
-    return np.asarray(wanted, float)[:rows], np.asarray(sent)[:rows]
+    *_, rates = observe(vehicle, vehicle, *inputs, push, np.float32(track.dt), at_once)
+    miss = track.body_rates[1:] - np.asarray(rates, float)[: rows - 1]
+    step = miss.copy()  # undo the observer's own correction of what it missed before
+    step[1:] -= (1.0 - GYRO_GAIN) * miss[:-1]
+    push = padded(smooth(np.concatenate([step, step[-1:]]), 0.06, track.dt) / track.dt, size)
+    gains = ("rate_kp", "rate_ki", "rate_kd")
+    larger = [vehicle.replace(**{n: (1.0 + GAIN_STEP) * getattr(vehicle, n)}) for n in gains]
+    runs = [observe(c, vehicle, *inputs, push, np.float32(track.dt), at_once) for c in (vehicle, *larger)]
+    return np.array([r[0] for r in runs], float)[:, :rows], np.asarray(runs[0][1])[:rows]
 
 
 def read_gains(reading, series, ticks) -> tuple[np.ndarray, np.ndarray]:

@@ -1,9 +1,7 @@
-"""Sets of physics effects as hypotheses: Gauss-Newton fits through the simulator, and how well each explains
-a case.
+"""Sets of physics effects as hypotheses: Gauss-Newton fits through the simulator, and how well each explains a case.
 
-Every set is fitted with the same nuisances and weighed by its marginal likelihood (Laplace's
-approximation), so that parameters cost what they are worth. Singles and the best sets are fitted in full;
-the other pairs are weighed by adding the linearised singles."""
+Every set is fitted with the same nuisances and weighed by its marginal likelihood (Laplace's approximation), so that
+parameters cost what they are worth."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property

@@ -38,7 +38,11 @@ class Library:
     @cached_property
     def physics(self) -> tuple[str, ...]:
         """Effects that act between the motors and the motion."""
-        return tuple(e for e in self.effects if path_of(e) == "physics")
+        return self.of("physics")
+
+    def of(self, path: str) -> tuple[str, ...]:
+        """Effects that are read by one path of the log."""
+        return tuple(e for e in self.effects if path_of(e) == path)
 
 
 # Every physics parameter has a fixed place in theta, whatever is left out of a library: one compiled function. The last two are

@@ -22,7 +22,7 @@ FOLLOWED = (
 )
 
 
-def _ticking(vehicle, h):
+def _ticking(controller, vehicle, h):
     """The tick of `h` s: (rates, previous, integral, speed), command, offset of the motors and angular acceleration beyond the
     nominal -> the same, what the controller wanted and what the motors got."""
     at_rest = jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0])
@@ -30,7 +30,7 @@ def _ticking(vehicle, h):
     def tick(state, command, offset, push):
         rates, previous, integral, speed = state
         drone = DroneState(*at_rest, jnp.zeros(3), rates, speed, integral, previous, ())
-        wanted, integral = rate_controller(vehicle, drone, command, h)
+        wanted, integral = rate_controller(controller, drone, command, h)
         given = jnp.clip(wanted + offset, 0.0, 1.0)
         speed = rotor_speed_step(vehicle, speed, given, h)
         _, torque = total_wrench(vehicle, rotor_thrust(vehicle, speed), rotor_reaction(vehicle, speed))
@@ -42,15 +42,15 @@ def _ticking(vehicle, h):
 
 
 @partial(jax.jit, static_argnames="at_once")
-def observe(vehicle, command, motor, gyro, disturbance, dt, at_once=False):
-    """One track: command (T, TICKS, 4), motor (T, 4), gyro (T, 3) rad/s, disturbance (T, 3) rad/s^2 of angular acceleration
-    beyond the nominal; dt () s per row.
+def observe(controller, vehicle, command, motor, gyro, disturbance, dt, at_once=False):
+    """One track: `controller` is the vehicle with its gains; command (T, TICKS, 4), motor (T, 4), gyro (T, 3) rad/s,
+    disturbance (T, 3) rad/s^2 of angular acceleration beyond the nominal; dt () s per row.
 
     `at_once`: a row's motor is its first tick's, not the mean.
 
     Returns the controller's motor command as it would be logged (T, 4), the motor commands of the ticks (T, TICKS, 4) that
     suit the log, and the rates at the end of each row as predicted (T, 3)."""
-    tick = _ticking(vehicle, dt / TICKS)
+    tick = _ticking(controller, vehicle, dt / TICKS)
 
     def ticks(state, command, offset, push):
         return jax.lax.scan(lambda s, c: tick(s, c, offset, push), state, command, unroll=True)
@@ -84,7 +84,7 @@ def observe(vehicle, command, motor, gyro, disturbance, dt, at_once=False):
 def commanded(vehicle, command, dt):
     """Mean motor commands (T, 4) and body rates (T, 3) amid the rows that the body-rate commands (T, 4) alone cause:
     the nominal loop around the nominal vehicle, without gyroscope noise and air."""
-    tick = _ticking(vehicle, dt / TICKS)
+    tick = _ticking(vehicle, vehicle, dt / TICKS)
 
     def row(carry, command):
         start = carry[0]
