@@ -130,10 +130,23 @@ def decode(data: bytes) -> tuple[list[Stream], list[str]]:
     except (struct.error, IndexError, ValueError) as error:
         raise LogError("micro-SD log with a corrupt header") from error
     head, tick = _VERSIONS[version]
+    streams = []
+    for event, records in _records(data, start, end, events, head).items():
+        dtype = events[event]
+        if records and dtype.names:
+            stamps, packed = zip(*records, strict=True)
+            rows = np.frombuffer(b"".join(packed), dtype)
+            time = np.array(stamps, np.float64) * tick
+            streams.append(Stream(time, {name: rows[name].astype(float) for name in dtype.names}))
+    if not streams:
+        raise LogError("micro-SD log without a record")
+    return streams, remarks
+
+
+def _records(data: bytes, at: int, end: int, events, head: str) -> dict[int, list[tuple[int, bytes]]]:
+    """Event id -> (stamp, packed record) of every one from byte `at` on; the last of a log that was cut off may be torn."""
+    records: dict[int, list[tuple[int, bytes]]] = {event: [] for event in events}
     head_size = struct.calcsize(head)
-    records: dict[int, list[bytes]] = {event: [] for event in events}
-    stamps: dict[int, list[int]] = {event: [] for event in events}
-    at = start
     while at + head_size <= end:
         event, stamp = struct.unpack_from(head, data, at)
         if event not in events:
@@ -144,18 +157,9 @@ def decode(data: bytes) -> tuple[list[Stream], list[str]]:
         at += head_size
         if at + size > end:
             break
-        records[event].append(data[at : at + size])
-        stamps[event].append(stamp)
+        records[event].append((stamp, data[at : at + size]))
         at += size
-    streams = []
-    for event, dtype in events.items():
-        if records[event] and dtype.names:
-            rows = np.frombuffer(b"".join(records[event]), dtype)
-            time = np.array(stamps[event], np.float64) * tick
-            streams.append(Stream(time, {name: rows[name].astype(float) for name in dtype.names}))
-    if not streams:
-        raise LogError("micro-SD log without a record")
-    return streams, remarks
+    return records
 
 
 def _header(data: bytes, event_types: int) -> tuple[dict[int, np.dtype], int]:

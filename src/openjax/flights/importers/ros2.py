@@ -77,6 +77,11 @@ def read_bag(path: str | Path, mapping: ColumnMapping | None = None) -> LogTable
         raise LogError(
             f"ROS 2 bag can't be read: {str(error).splitlines()[0] if str(error) else type(error)}"
         ) from error
+    return _joined(path.name, *_by_vehicle(streams, wanted, mapping))
+
+
+def _by_vehicle(streams, wanted, mapping: ColumnMapping | None) -> tuple[dict[str, dict], list[str]]:
+    """The columns of each vehicle, and remarks on topics that hold none. Raises LogError if none does."""
     vehicles: dict[str, list[str]] = {}
     for topic in streams:
         vehicles.setdefault("" if mapping is not None else topic.rpartition("/")[0], []).append(topic)
@@ -94,7 +99,7 @@ def read_bag(path: str | Path, mapping: ColumnMapping | None = None) -> LogTable
         raise LogError(
             "; ".join(remarks) or "holds no topic of a known type; name its topics in columns.toml"
         )
-    return _joined(path.name, tables, remarks)
+    return tables, remarks
 
 
 def _wanted(connections, mapping: ColumnMapping | None) -> dict[str, dict[str, str]]:
