@@ -23,7 +23,6 @@ from openjax.vehicle import Vehicle, load_vehicle
 from openjax.vehicle.parameters import AIRFRAMES, NOMINAL
 
 NOMINAL_ORDER = ("front_right", "rear_right", "rear_left", "front_left")
-NOMINAL_SPIN = MappingProxyType(dict(zip(NOMINAL_ORDER, ("ccw", "cw", "ccw", "cw"), strict=True)))
 NOMINAL_NAME = "crazyflie-2.1"
 
 CALIBRATED_UNITS = MappingProxyType({
@@ -38,9 +37,9 @@ CALIBRATED_UNITS = MappingProxyType({
 FAR = 100.0
 """A calibrated value may be this many times the nominal one, or this part of it."""
 
-Place = Literal["front_right", "rear_right", "rear_left", "front_left"]
+Place = Literal[*NOMINAL_ORDER]
 Spin = Literal["cw", "ccw"]
-Quantity = Literal["mass", "thrust_constant", "torque_constant", "motor_time_constant", "inertia"]
+Quantity = Literal[*CALIBRATED_UNITS]
 
 
 @dataclass(frozen=True)
@@ -217,13 +216,14 @@ def _from_tables(plain: dict, path: Path, dtype) -> VehicleFile:
         raise UserError(
             f"{root}motor.order is {list(motor.order)}; it must name each of {', '.join(NOMINAL_ORDER)} once"
         )
-    spin = motor.spin or tuple(NOMINAL_SPIN[place] for place in motor.order)
+    mjcf = _own_mjcf(told.airframe, path)
+    nominal = load_vehicle(mjcf or told.airframe, dtype)
+    usual = ["cw" if spin > 0 else "ccw" for spin in nominal.rotor_spin]
+    spin = motor.spin or tuple(usual[NOMINAL_ORDER.index(place)] for place in motor.order)
     if sorted(spin) != ["ccw", "ccw", "cw", "cw"]:
         raise UserError(
             f'{root}motor.spin is {list(spin)}; it must hold two "cw" and two "ccw", in the order m1..m4'
         )
-    mjcf = _own_mjcf(told.airframe, path)
-    nominal = load_vehicle(mjcf or told.airframe, dtype)
     calibrated = {
         name: _calibrated(name, entry, nominal, f"{root}[calibrated.{name}]")
         for name, entry in tables.calibrated.items()
@@ -249,7 +249,7 @@ def _as_told(nominal: Vehicle, mass: float | None, motor: Motor, calibrated: dic
     changes: dict[str, Any] = {"rotor_spin": [1.0 if spin[name] == "cw" else -1.0 for name in NOMINAL_ORDER]}
     changes |= {"mass": mass} if mass is not None else {}
     changes |= {
-        name: entry.value if name == "inertia" else entry.value[0] for name, entry in calibrated.items()
+        name: entry.value if len(entry.value) > 1 else entry.value[0] for name, entry in calibrated.items()
     }
     if motor.torque_per_thrust is not None and "torque_constant" not in calibrated:
         thrust = changes.get("thrust_constant", float(nominal.thrust_constant))
