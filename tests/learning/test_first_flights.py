@@ -2,13 +2,20 @@
 
 import dataclasses
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
 import pytest
 
 from openjax.learning import preset
-from openjax.learning.analytic_gradient import crash_share, evader_distance, free_share, tip_share
+from openjax.learning.analytic_gradient import (
+    crash_share,
+    evader_distance,
+    free_share,
+    nearest_way,
+    tip_share,
+)
 from openjax.learning.first_flights import FirstFlights, first_game, make_first_flights
 from openjax.learning.settings import FirstFlightsSettings
 from openjax.learning.ways import ways_of
@@ -101,6 +108,13 @@ def test_an_evader_within_reach_is_not_free():
     )
     assert near[:, 0] == pytest.approx(0.1, abs=1e-3)
     assert (free_share(GAME, near) < 0.2).all() and (free_share(GAME, near) < free_share(GAME, far)).all()
+
+
+def test_one_near_pursuer_lets_others_be_far():
+    distance = jnp.array([[0.5, 0.5, 0.5], [0.0, 1.0, 1.0]])
+    assert nearest_way(distance) == pytest.approx([0.5, 0.15 * math.log(3.0)], abs=1e-3)
+    pull = jax.grad(lambda d: nearest_way(d)[0])(distance[1:])[0]
+    assert pull[0] > 0.99 and pull[1] < 0.01
 
 
 def test_a_tip_over_counts_as_a_touch_does():

@@ -44,6 +44,8 @@ SMOOTH_TILT = 0.05
 """The same for a tip over 90 degrees (cosine of the tilt)."""
 SMOOTH_CAPTURE = 0.1
 """The same for a capture (m)."""
+SMOOTH_NEAREST = 0.15
+"""The same for which pursuer is nearest to the evader (m)."""
 FAST = 0.05
 """Speed (m/s) above where the speed begins to cost that costs as much as a crash in every step would."""
 CRASH_IN_FLIGHT, BREACH_AT_START = 4.0, 0.5
@@ -102,7 +104,7 @@ class Way(NamedTuple):
     excess: jax.Array
     """mean excess of speed, in units of `FAST`"""
     distance: jax.Array
-    """m, mean length of the way to the evader beyond where a pursuer may rest"""
+    """(B,) m, mean length of the nearest pursuers' ways to the evader beyond where they may rest"""
     free: jax.Array
     """(B,) share of the steps in which nobody has caught the evader"""
 
@@ -157,13 +159,13 @@ class AnalyticGradient:
                 jnp.minimum(way.upright, rotation_axes(state.drones.quaternion)[1][..., 2]),
                 way.breach + breach_share(self.game, state) / steps,
                 way.excess + jax.nn.relu(_speed(state.drones) - limit) / FAST / steps,
-                way.distance + jax.nn.relu(distance - rest) / steps,
+                way.distance + nearest_way(jax.nn.relu(distance - rest)) / steps,
                 way.free + free_share(self.game, distance) / steps,
             )
             return (world, way), None
 
         zeros = jnp.zeros(world[1].drones.position.shape[:2])
-        first = world, Way(zeros + jnp.inf, zeros + 1.0, zeros, zeros, zeros, zeros[:, 0])
+        first = world, Way(zeros + jnp.inf, zeros + 1.0, zeros, zeros, zeros[:, 0], zeros[:, 0])
         return jax.lax.scan(one, first, None, length=steps)[0]
 
     def starts(self, key: jax.Array, bounds: jax.Array):
@@ -297,6 +299,12 @@ def evader_distance(game: PursuitSettings, state: PursuitState, ways: Ways) -> j
     """(W, N) m, ways from pursuers of worlds (W, ...) to the evader, whose flight has no gradient: its answers are a cliff."""
     evader = jax.lax.stop_gradient(state.evader_position)
     return jax.vmap(functools.partial(way_length, game))(state.task, ways, state.drones.position, evader)
+
+
+def nearest_way(distance: jax.Array) -> jax.Array:
+    """(W,) m, a smooth least of distances (W, N): where one pursuer is near, others needn't be, and may go round."""
+    number = distance.shape[-1]
+    return -SMOOTH_NEAREST * (jax.nn.logsumexp(-distance / SMOOTH_NEAREST, axis=-1) - jnp.log(number))
 
 
 def free_share(game: PursuitSettings, distance: jax.Array) -> jax.Array:
