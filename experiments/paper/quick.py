@@ -118,6 +118,7 @@ def page(results: dict) -> Page:
     """A row per seed."""
     columns = {
         "seed": "seed",
+        "recipe": lambda run: run.get("recipe", "today's"),
         "JAX": "jax",
         "whole command, s": "whole_command",
         "new tasks": _column("after", "validation"),
