@@ -77,7 +77,7 @@ def compile_first_flights(
             left = (time.monotonic() - started) * (how.updates / done - 1.0)
             say(
                 f"{done} of {how.updates} updates, {duration(left)} left | evader out of reach {shown['free']:.0%} of the time, "
-                f"pursuers {shown['distance']:.2f} m too far, close to a crash {shown['crashes']:.1%}"
+                f"the nearest pursuer {shown['distance']:.2f} m too far, close to a crash {shown['crashes']:.1%}"
             )
         return parameters.replace(actor=carry.parameters.actor)
 

@@ -1,8 +1,8 @@
 """The first stage of a run: to fly, and to go after the evader, by the gradient through the simulation.
 
-From scratch MAPPO spends half of its data on learning to fly. The equations of motion teach that in seconds: the mean
-distance to the evader over the next moments has a gradient, and so have near misses (`openjax.learning.analytic_gradient`).
-What has none, waiting, cutting off, going round, is left to MAPPO.
+From scratch MAPPO spends half of its data on learning to fly. The equations of motion teach that in seconds: how far the
+nearest pursuer is from the evader over the next moments has a gradient, and so have near misses
+(`openjax.learning.analytic_gradient`). What has none, waiting or cutting off, is left to MAPPO.
 """
 
 import dataclasses

@@ -128,7 +128,7 @@ class FirstFlightsSettings:
     anew: Annotated[float, Interval("[0, 1]")] = 0.15
     """Share of the worlds that start anew after each update, beside those that have to."""
     distance: Annotated[float, Interval("[0, 1000]")] = 3.0
-    """Weight of the mean distance to the evader (m), beside the share of the time in which it is free ..."""
+    """Weight of the nearest pursuer's mean way to the evader (m), beside the share of the time in which it is free ..."""
     crash: Annotated[float, Interval("[0, 1000]")] = 20.0
     """... at the end of the share of pursuers that touch something or tip over ..."""
     breach: Annotated[float, Interval("[0, 1000]")] = 10.0
