@@ -13,10 +13,8 @@ def floors(fleet, i, turbulence):
     """Noise floor (12,) of a case from the logs of variant i and what turbulence leaves to the true model."""
     spec = fleet.variants[i][0]
     rows = [r for flight in fleet.rows(i)[0] for r in flight]
-    each = [
-        measure.sensor_floor(spec["sensors"], r, fleet.flown, j)
-        for r, j in zip(rows, fleet.columns[i], strict=True)
-    ]
+    bodies = zip(rows, fleet.columns[i], strict=True)
+    each = [measure.sensor_floor(spec["sensors"], r, fleet.flown, j) for r, j in bodies]
     left = turbulence.copy()
     if "m" in spec["sensors"]["channels"]:
         samples, lasts = len(fleet.flown["motor"]), [round(r["t"][-1] / plant.SAMPLE) for r in rows]
@@ -64,16 +62,13 @@ def answer_of(fleet, i, squares, floor, wrong):
             said["logged_ms"] = sensors.pose_lag(said["delay_ms"], spec["sensors"])
     gap = {k: float(np.sqrt(energy[k][np.isfinite(floor)].mean())) for k in ("nominal", "truth")}
     expected = {"none": ["none"], "not_testable": ["none"], "unknown": ["unknown"], "garbage": ["garbage"]}
-    acceptable = {
-        n: accepted(n, spec["told"].weighed, shows[n], scale_stands_in(fleet, i, n, squares, floor))
-        for n in shows
-    }
+    weighed, scale = spec["told"].weighed, lambda n: scale_stands_in(fleet, i, n, squares, floor)
     return {
         "case": spec["name"],
         "category": category,
         "effects": names or ([spec["garbage"]] if spec["garbage"] else []),
         "expected": expected.get(category, seen),
-        "acceptable": acceptable,
+        "acceptable": {n: accepted(n, weighed, shown, scale(n)) for n, shown in shows.items()},
         "also_fine": spec["also_fine"] + parts + [n for n in names if n not in seen],
         "held_ms": 1e3 / spec["sensors"]["pose_rate"] if sensors.holds_poses(spec["sensors"]) else None,
         "in_sensors": bool(set(names) & set(unknowns.SENSOR_SITES)),
@@ -94,7 +89,7 @@ def answer_of(fleet, i, squares, floor, wrong):
             "closed_by_truth": 1 - gap["truth"] / gap["nominal"],
         },
         "wrong_columns": wrong,
-        "mass_weighed": spec["told"].weighed,
+        "mass_weighed": weighed,
         "told": spec["told"].__dict__,
         "controller": spec["controller"],
         "sensors": spec["sensors"],

@@ -5,6 +5,8 @@ that real ones have. The stranger's column draws sensors, a controller, vehicles
 others never draw; it is for reported runs only.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from experiments.diagnosis import controllers, effects, garbage, missions, real, sensors, unknowns, vehicle
@@ -28,6 +30,7 @@ BLIND = {
     "inertia": ("hover",),
     "rate_gains": ("hover",),
 }
+TIMED = ("command_latency", "packet_loss", "state_latency", "motor_lag")
 COLUMN = {"known": 0, "stranger": 1, "real": 2}
 
 
@@ -95,11 +98,8 @@ def draw_case(seed, column, number, category, index):
     elif category == "not_testable":
         effect = list(BLIND)[(index + turn) % len(BLIND)]
         # a form that is really zero away from the surface: the others reach further
-        causes = [
-            effects.draw(
-                rng, effect, "exponential" if effect in ("ground_effect", "ceiling_effect") else None
-            )
-        ]
+        form = "exponential" if effect in ("ground_effect", "ceiling_effect") else None
+        causes = [effects.draw(rng, effect, form)]
     elif category == "garbage":
         kinds = _kinds(column, garbage.KINDS, garbage.STRANGERS)
         spoiled = kinds[(index + turn) % len(kinds)]
@@ -118,14 +118,11 @@ def draw_case(seed, column, number, category, index):
     else:
         flights = draw_missions(rng, needed, style, rng.random() < 0.12 and category != "garbage")
     kind = str(rng.choice(_kinds(column, sensors.KINDS, sensors.STRANGERS)))
-    fast = any(
-        c["effect"] in ("command_latency", "packet_loss", "state_latency", "motor_lag") for c in causes
-    )
-    if fast and kind == "radio":
+    if kind == "radio" and any(c["effect"] in TIMED for c in causes):
         kind = "filtered"  # clocks that wander by ten milliseconds can't time anything
     drawn = sensors.draw(rng, kind, channels)
     if "mass" in (c["effect"] for c in causes):
-        told = vehicle.Told(**(told.__dict__ | {"weighed": False}))
+        told = replace(told, weighed=False)
     # 1000 rows a second make long files: the flights are shorter there
     most = TICKS if drawn["rate"] <= 250 else TICKS // 2 if drawn["rate"] <= 500 else TICKS * 2 // 5
     return {
@@ -162,8 +159,6 @@ def reference_of(rng, mission, ticks):
     if mission[0] in missions.PAIR:
         return list(missions.pair(mission[0], rng, ticks))
     if len(mission) == 2:
-        return [
-            missions.apart(missions.single(m, rng, ticks), side)
-            for m, side in zip(mission, (-1, 1), strict=True)
-        ]
+        sides = zip(mission, (-1, 1), strict=True)
+        return [missions.apart(missions.single(m, rng, ticks), side) for m, side in sides]
     return [missions.single(mission[0], rng, ticks)]

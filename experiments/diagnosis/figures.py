@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+from scipy.stats import binomtest
 
 from experiments.table import table
 
@@ -26,15 +27,6 @@ FIGURES = {
     "seconds": "seconds a case after the first, median",
     "seconds_first": "seconds of a process' first case, median",
 }
-
-
-def wilson(hits: int, n: int, z: float = 1.96) -> tuple[float, float]:
-    """95 % interval of a proportion (Wilson 1927); (0, 1) without data."""
-    if n == 0:
-        return 0.0, 1.0
-    p, d = hits / n, 1 + z * z / n
-    centre, half = p + z * z / (2 * n), z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    return max(0.0, (centre - half) / d), min(1.0, (centre + half) / d)
 
 
 def calibration_error(pairs: list, bins: int = 10) -> float:
@@ -95,12 +87,14 @@ CATEGORIES = {
 
 
 def cell(value: tuple[int, int] | float) -> str:
-    """A figure as text: counts with their 95 % interval."""
+    """A figure as text: counts with their 95 % interval (Wilson 1927)."""
     if isinstance(value, float):
         return "–" if math.isnan(value) else f"{value:.2f}"
     hits, n = value
-    low, high = wilson(hits, n)
-    return f"{hits}/{n} [{low:.2f}, {high:.2f}]" if n else "–"
+    if not n:
+        return "–"
+    low, high = binomtest(hits, n).proportion_ci(method="wilson")
+    return f"{hits}/{n} [{low:.2f}, {high:.2f}]"
 
 
 def figures_table(lines: list[dict]) -> list[str]:

@@ -85,17 +85,13 @@ class Fleet:
             links[columns] = any(c["effect"] in LINK for c in own)
             firmware[columns] = any(c["effect"] in FIRMWARE and c not in own for c in flew)
         known = [[c for c in own if c["effect"] in VOCABULARY] for own in causes_of]
-        return self.errors_of(self.model(known)[0], firmware, links)
-
-    def errors_of(self, parameters, firmware, links):
-        """Mean squares (12, variants) of a model; see `measure.errors`."""
+        parameters = self.model(known)[0]
         rms = measure.errors(self.seen, self.told, parameters, self.partner, firmware, links)
         return np.stack([(rms[:, c] ** 2).mean(axis=1) for c in self.columns], axis=1)
 
     def replayed(self, i, parameters, motors=None, lasts=None):
         """Mean squares (12,) of a model on variant i alone, driven by other motor commands (S, 4, n) than it got, if given;
-        `lasts` (n,): samples of them.
-        """
+        `lasts` (n,): samples of them."""
         c, no = self.columns[i], np.zeros(len(self.columns[i]), bool)
         flown = {k: x[..., c] for k, x in self.flown.items()}
         if motors is not None:
@@ -104,9 +100,7 @@ class Fleet:
         return (measure.errors(flown, told, own, self.partner[c] - c[0], no, no) ** 2).mean(axis=1)
 
     def energies(self):
-        """{model: mean squares (12, variants)}: the nominal model, the true one, and the true one without its first or
-        second cause.
-        """
+        """{model: mean squares (12, variants)}: the nominal model, the true one, and that without its first or second cause."""
         flew = [own for _, own in self.variants]
         out = {"nominal": self.errors([[] for _ in flew]), "truth": self.errors(flew)}
         if any(len(own) > 1 for own in flew):
@@ -152,18 +146,22 @@ def write_flight(path, vehicles, channels):
         times = rows["t"].tolist()
         lines += [(t, f"{t:.4f},{i}," + line % tuple(r)) for t, r in zip(times, table, strict=True)]
     lines.sort(key=lambda entry: entry[0])
-    text = (
-        ",".join(["t", "vehicle", *columns]) + "\n" + "\n".join(x for _, x in lines).replace("nan", "") + "\n"
-    )
+    text = "\n".join([",".join(["t", "vehicle", *columns]), *(x.replace("nan", "") for _, x in lines)]) + "\n"
     with open(path, "wb") as raw, gzip.GzipFile("", "wb", 6, raw, mtime=0) as packed:
         packed.write(text.encode())
 
 
-def write_case(fleet, i, folder, spoiled=False):
-    """Write the logs and `vehicle.toml` of variant i into `folder`; returns its rows and the columns that were spoiled."""
-    spec, (rows, wrong) = fleet.variants[i][0], fleet.rows(i, spoiled)
+def write_logs(folder, flights, channels, vehicle_file):
+    """Write a case's three logs and the text of its `vehicle.toml`."""
     folder.mkdir(parents=True, exist_ok=True)
-    for letter, flight in zip("abc", rows, strict=True):
-        write_flight(folder / f"flight_{letter}.csv.gz", flight, spec["sensors"]["channels"])
-    (folder / "vehicle.toml").write_text(real.toml(spec.get("form_errors"), spec["told"], spec["sensors"]))
-    return rows, wrong
+    for letter, flight in zip("abc", flights, strict=True):
+        write_flight(folder / f"flight_{letter}.csv.gz", flight, channels)
+    (folder / "vehicle.toml").write_text(vehicle_file)
+
+
+def write_case(fleet, i, folder, spoiled=False):
+    """Write the logs and `vehicle.toml` of variant i into `folder`; returns the columns that were spoiled."""
+    spec, (rows, wrong) = fleet.variants[i][0], fleet.rows(i, spoiled)
+    told = real.toml(spec.get("form_errors"), spec["told"], spec["sensors"])
+    write_logs(folder, rows, spec["sensors"]["channels"], told)
+    return wrong

@@ -34,11 +34,10 @@ STRANGERS = {
 
 def spoil(kind, flights, rng):
     """Spoil `flights` (list of {column: (n,)} of one vehicle) in place; returns the columns that are wrong."""
-    pick = {name: rng.permutation(3) for name in ("axes",)}
+    a, b, _ = rng.permutation(3)
     order = rng.permutation(4)
     while np.array_equal(order, np.arange(4)):
         order = rng.permutation(4)
-    a, b = pick["axes"][:2]
     if kind == "flipped_gyro_axis":  # an axis that hardly turns shows no flip
         turns = [np.mean([np.nanstd(f[c]) for f in flights]) for c in GYRO]
         a = a if turns[a] > 0.3 * max(turns) else int(np.argmax(turns))

@@ -94,7 +94,7 @@ def fly_chunk(job):
         squares = {k: x[:, i] for k, x in squares.items()}
         if spec["category"] == "unknown":  # no model holds it: the same flights without it
             squares["truth"] = np.minimum(squares["nominal"], nominal[:, place[spec["name"], "nominal"]])
-        _, wrong = write_case(fleet, i, Path(folder) / spec["name"], spoiled=True)
+        wrong = write_case(fleet, i, Path(folder) / spec["name"], spoiled=True)
         answers.append(answer_key.answer_of(fleet, i, squares, floors[spec["name"]], wrong))
     return answers
 
@@ -123,37 +123,27 @@ def generate(seed, column, count, logs, jobs=1, only=None, progress=True):
 
 def write_answers(path, answers, seed, column):
     """Write the answers as JSON; returns the SHA-256 of the file."""
-    path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(
-        {
-            "seed": seed,
-            "count": len(answers),
-            "column": column,
-            "channels": measure.CHANNELS,
-            "cases": {a["case"]: a for a in answers},
-        },
-        indent=1,
-    )
+    about = {"seed": seed, "count": len(answers), "column": column, "channels": measure.CHANNELS}
+    text = json.dumps(about | {"cases": {a["case"]: a for a in answers}}, indent=1)
     path.write_text(text)
     digest = hashlib.sha256(text.encode()).hexdigest()
     path.with_suffix(".sha256").write_text(digest + "\n")
     return digest
 
 
-def add_case_arguments(parser):
-    """What all that fly cases are told: which, and where to."""
+def case_parser(doc):
+    """A parser of what all that fly cases are told: which, and where to."""
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--logs", type=Path, required=True)
     parser.add_argument("--answers", type=Path, required=True)
     parser.add_argument("--jobs", type=int, default=1)
+    return parser
 
 
 def main():
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    add_case_arguments(parser)
+    parser = case_parser(__doc__)
     parser.add_argument("--column", choices=list(cases.COLUMN), default="known")
     parser.add_argument("--count", type=int, default=60)
     parser.add_argument("--only", help="categories, comma-separated: " + ", ".join(cases.SHARES))

@@ -64,10 +64,8 @@ def parameters(answer, report):
         row = {"effect": effect, "covered": []}
         derived = _derived(effect, cause, values)
         if derived is not None:
-            estimate, true = derived
-            rows.append(
-                row | {"error": float(np.linalg.norm(np.subtract(estimate, true)) / np.linalg.norm(true))}
-            )
+            off = np.linalg.norm(np.subtract(*derived))
+            rows.append(row | {"error": float(off / np.linalg.norm(derived[1]))})
             continue
         forms, truth_of, absent = TRUTH.get(effect, ((), None, 0.0))
         if cause["form"] not in forms:
@@ -76,9 +74,8 @@ def parameters(answer, report):
         if not truth or not set(truth) <= set(values):
             continue
         estimate, true = np.array([values[k] for k in truth]), np.array(list(truth.values()))
-        centre = (
-            estimate.mean() if effect == "motor_imbalance" else 0.0
-        )  # the common part is the thrust scale's
+        # the common part is the thrust scale's
+        centre = estimate.mean() if effect == "motor_imbalance" else 0.0
         size = float(np.linalg.norm(true - absent))
         for k, t in truth.items():
             interval = fitted[k].get("interval90")
@@ -94,12 +91,9 @@ def _derived(effect, cause, values):
         return values["strength"] * (PROPELLER / (0.05 + values.get("offset", 0.0))) ** 2, m["gain_at_5cm"]
     if effect == "wind" and {"x", "y", "drag"} <= set(values) and cause["form"] == "steady":
         # the force at rest: speed and drag apart show far less than their product
-        return values["drag"] * np.array([values["x"], values["y"]]), m["drag"] * np.array(
-            [m["w_x"], m["w_y"]]
-        )
+        said, true = np.array([values["x"], values["y"]]), np.array([m["w_x"], m["w_y"]])
+        return values["drag"] * said, m["drag"] * true
     if effect == "downwash" and "force" in values and cause["form"] == "gaussian":
-        length = values.get("length", 0.5)
-        return values["force"] * np.exp(-0.25 / length), 1e-3 * GRAVITY * m["A_g"] * np.exp(
-            -0.25 / m["height_m"]
-        )
+        said = values["force"] * np.exp(-0.25 / values.get("length", 0.5))
+        return said, 1e-3 * GRAVITY * m["A_g"] * np.exp(-0.25 / m["height_m"])
     return None

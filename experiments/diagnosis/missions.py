@@ -9,7 +9,6 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 RATE = 100.0
-SINGLE = ("hover", "agile", "fast", "climb", "low", "high", "yaw", "spiral", "step", "laps")
 PAIR = ("pass", "pass_moving")
 
 
@@ -54,17 +53,13 @@ def _doublets(rng, length, rate, axes, size):
 
 
 def _dither(rng, length):
-    """Pseudo-random body-rate commands (K, 4) on top of tracking: a broad excitation, as identification
-    flights have.
-    """
+    """Pseudo-random body-rate commands (K, 4) on top of tracking: a broad excitation, as identification flights have."""
     held = _held(rng, rng.choice([-1.0, 0.0, 1.0], (length, 3)), length, (0.04, 0.16))
     return np.concatenate([np.zeros((length, 1)), rng.uniform(0.2, 0.7) * held], axis=1)
 
 
 def single(kind, rng, length):
-    """One vehicle's reference: position (K, 3) m, velocity, acceleration, yaw (K,) rad, yaw rate, pulses (K,
-    4).
-    """
+    """One vehicle's reference: position (K, 3) m, velocity, acceleration, yaw (K,) rad, yaw rate, pulses (K, 4)."""
     t = np.arange(length) / RATE
     position = np.zeros((length, 3))
     centre = np.r_[rng.uniform(-0.15, 0.15, 2), rng.uniform(0.45, 0.75)]
@@ -140,17 +135,13 @@ def _smooth(position, yaw, pulses, sigma):
 
 def apart(reference, side):
     """The reference moved to one half of the arena, so that two vehicles never meet."""
-    out = dict(reference)
-    out["position"] = reference["position"] * np.array([0.5, 0.8, 1.0]) + np.array([0.38 * side, 0, 0])
-    for key in ("velocity", "acceleration"):
-        out[key] = reference[key] * np.array([0.5, 0.8, 1.0])
-    return out
+    smaller = {k: reference[k] * np.array([0.5, 0.8, 1.0]) for k in ("position", "velocity", "acceleration")}
+    smaller["position"] = smaller["position"] + np.array([0.38 * side, 0, 0])
+    return reference | smaller
 
 
 def pair(kind, rng, length):
-    """Two vehicles' references; the second passes above the first, so that the first is in its wake now and
-    then.
-    """
+    """Two vehicles' references; the second passes above the first, so that the first is in its wake now and then."""
     t = np.arange(length) / RATE
     lower = np.tile(np.r_[rng.uniform(-0.1, 0.1, 2), rng.uniform(0.3, 0.45)], (length, 1))
     if kind == "pass_moving":

@@ -72,10 +72,6 @@ class Firmware:
         self.slow = bool(self.keep.any())
         self.previous, self.slope = gyro.copy(), np.zeros((3, count))
 
-    def filtered(self, gyro):
-        """The gyroscope as the loop and the log get it."""
-        return self.gyro_filter(gyro)
-
     def __call__(self, command, gyro):
         """Motor commands (4, B) from the command in force (4, B) and the filtered gyroscope (3, B)."""
         p = self.p
@@ -100,10 +96,8 @@ class Body:
         self.inverse = np.moveaxis(np.linalg.inv(np.moveaxis(p["inertia"], 2, 0)), 0, 2)
         self.diagonal = not np.any(p["inertia"][~np.eye(3, dtype=bool)])
         self.principal = p["inertia"][np.arange(3), np.arange(3)]
-        self.arm_x, self.arm_y = (
-            vehicle.ROTOR_X[:, None] - p["com"][0],
-            vehicle.ROTOR_Y[:, None] - p["com"][1],
-        )
+        self.arm_x = vehicle.ROTOR_X[:, None] - p["com"][0]
+        self.arm_y = vehicle.ROTOR_Y[:, None] - p["com"][1]
         self.up, self.down = 1 - np.exp(-DT / p["tau_up"]), 1 - np.exp(-DT / p["tau_down"])
         self.second = np.where(p["tau_second"] > 0, 1 - np.exp(-DT / np.maximum(p["tau_second"], 1e-4)), 1.0)
         self.lifts = p["thrust_constant"] * p["rotor_gain"]
@@ -136,10 +130,8 @@ class Body:
         for other in others if self.wake else ():
             pull, gradient = effects.wake_force(p, self.position, other)
             outside = outside + np.stack([zero, zero, pull])
-            torque = (
-                torque
-                + vehicle.rotate_back(self.q, np.stack([gradient[1], -gradient[0], zero])) * vehicle.ARM**2
-            )
+            tilting = np.stack([gradient[1], -gradient[0], zero])
+            torque = torque + vehicle.rotate_back(self.q, tilting) * vehicle.ARM**2
         force = force + vehicle.rotate_back(self.q, outside)
         torque = torque + moment + gust_torque
         if unknowns:
@@ -244,7 +236,7 @@ class Flight:
         s, body = self.sample, self.body
         for name, kept in self.history.items():
             kept[s] = body.q if name == "quaternion" else getattr(body, name)
-        self.gyro = self.firmware.filtered(
+        self.gyro = self.firmware.gyro_filter(
             self.p["gyro_gain"] * body.rates + self.air["gyro_bias"] + self.air["gyro"][s]
         )
 

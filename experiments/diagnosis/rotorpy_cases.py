@@ -9,8 +9,8 @@ coefficient is taken negative: with its sign convention a positive one pitches t
 what flapping does.
 """
 
-import argparse
 import multiprocessing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,14 +18,20 @@ import numpy as np
 from experiments.diagnosis import cases, fleet, measure, sensors
 from experiments.diagnosis import vehicle as v
 from experiments.diagnosis.answer_key import HIDDEN, accepted
-from experiments.diagnosis.generate import add_case_arguments, write_answers
+from experiments.diagnosis.generate import case_parser, write_answers
 from experiments.diagnosis.plant import KEPT, POSE, SAMPLE, Battery, Filter
 from experiments.flying.single_thread import use_single_thread
 
+PATHS = ("circle", "eight", "rocking", "yawing")
 SECONDS = 8.0
 TUNNEL_HEIGHT = 0.65  # m
 LEAST = 4.0 / SAMPLE + 1  # samples that a flight must last
-QUIET, LAPS, TURNS, TURNING = ("hover",), ("circle", "eight"), ("eight", "rocking"), ("yawing", "rocking")
+LAPS, TURNS, TURNING = ("circle", "eight"), ("eight", "rocking"), ("yawing", "rocking")
+
+
+def hubs(x=0.0, y=0.0):
+    """Rotors of RotorPy's vehicle, numbered as the firmware has them, about a centre of mass at (x, y) m."""
+    return {f"r{i + 1}": np.array([v.ROTOR_X[i] - x, v.ROTOR_Y[i] - y, 0.0]) for i in range(4)}
 
 
 def _drag(rng, told, hover):
@@ -93,7 +99,7 @@ def _yaw(rng, told, hover):
 def _offset(rng, told, hover):
     angle, size = rng.uniform(0, 2 * np.pi), rng.uniform(0.2, 2.0)
     x, y = size * np.cos(angle), size * np.sin(angle)
-    return {"rotor_pos": _hubs(1e-3 * x, 1e-3 * y)}, None, {"x_mm": x, "y_mm": y}
+    return {"rotor_pos": hubs(1e-3 * x, 1e-3 * y)}, None, {"x_mm": x, "y_mm": y}
 
 
 def _lift(rng, told, hover):
@@ -131,16 +137,12 @@ KINDS = {
 }
 
 
-def _hubs(x=0.0, y=0.0):
-    return {f"r{i + 1}": np.array([v.ROTOR_X[i] - x, v.ROTOR_Y[i] - y, 0.0]) for i in range(4)}
-
-
 def rotorpy_vehicle(told, changed):
     """RotorPy's parameter dict of the told vehicle without aerodynamics, with some entries changed."""
     out = {
         "mass": told.mass,
         "num_rotors": 4,
-        "rotor_pos": _hubs(),
+        "rotor_pos": hubs(),
         "rotor_directions": v.SPIN,
         "rI": np.zeros(3),
     }
@@ -262,7 +264,9 @@ def make_case(job):
     seed, number, kind, folder = job
     rng = np.random.default_rng(np.random.SeedSequence([17, seed, number]))
     draw, effects, _, exposing = KINDS[kind]
-    told = told_for(rng, effects)
+    told = v.draw_told(rng)
+    if "mass" in effects:  # a vehicle whose mass is the cause wasn't weighed
+        told = replace(told, weighed=False)
     changed, wind, said = draw(rng, told, v.MAX_SPEED * np.sqrt(told.hover))
     np.random.seed(seed * 1000 + number)  # noqa: NPY002  RotorPy draws its motor noise from the global state
     needed = "pgm" if effects else "m"
@@ -270,64 +274,25 @@ def make_case(job):
     drawn["channels"] = drawn["channels"].replace("c", "")
     if "m" not in drawn["channels"]:
         drawn["channels"] += "m"
-    if drawn["rate"] > 500:
-        drawn["rate"] = 500
+    drawn["rate"] = min(drawn["rate"], 500)
     nuisance = {"k_eta": told.thrust_constant * (1 + drawn["thrust_offset"])}
-    names = choose_paths(rng, exposing, ("circle", "eight", "rocking", "yawing"))
+    # one trajectory that exposes the cause, where only some do, and others
+    names = [str(rng.choice(exposing))] if exposing else []
+    names += [str(n) for n in rng.choice(PATHS, 3 - len(names), replace=False)]
     ticks, flights, flown = int(SECONDS * 100), [], []
     for name in names:
-
-        def attempt(slower, name=name):
+        for slower in (1.0, 0.7, 0.5, 0.35):  # some vehicles can't follow fast paths
             air = sensors.draw_air(rng, drawn, ticks, drawn["voltage"] + rng.uniform(-0.15, 0.1))
-            return fly(told, nuisance | changed, wind, trajectory(name, rng, slower), drawn, air)
-
-        flown.append(slow_enough(attempt, LEAST))
-        length = min(ticks, int(flown[-1]["crashed"][0]) // 5 - 5)
-        flights.append([sensors.log_rows(rng, drawn, flown[-1], 0, length)])
+            flight = fly(told, nuisance | changed, wind, trajectory(name, rng, slower), drawn, air)
+            if flight["crashed"][0] >= LEAST:
+                break
+        flown.append(flight)
+        length = min(ticks, int(flight["crashed"][0]) // 5 - 5)
+        flights.append([sensors.log_rows(rng, drawn, flight, 0, length)])
     joined = {k: np.concatenate([f[k] for f in flown], axis=-1) for k in flown[0]}
-    place = write_logs(folder, number, flights, drawn, v.toml(told, "RotorPy 3", drawn))
-    return answer(place.name, kind, told, drawn, joined, flights, said)
-
-
-def fly_plan(options, kinds):
-    """Fly the cases of `kinds` in an order drawn by the seed, and write their answers."""
-    use_single_thread()
-    order = np.random.default_rng(options.seed).permutation(len(kinds))
-    jobs = [(options.seed, n, kinds[i], str(options.logs)) for n, i in enumerate(order, 1)]
-    with multiprocessing.get_context("spawn").Pool(options.jobs) as pool:
-        answers = sorted(pool.imap_unordered(make_case, jobs), key=lambda a: a["case"])
-    print("sha256", write_answers(options.answers, answers, options.seed, "rotorpy"))
-
-
-def told_for(rng, effects):
-    """The told vehicle of a case; one whose mass is the cause wasn't weighed."""
-    told = v.draw_told(rng)
-    return v.Told(**(told.__dict__ | {"weighed": False})) if "mass" in effects else told
-
-
-def choose_paths(rng, exposing, paths):
-    """Names of a case's three trajectories: one that exposes the cause, where only some do, and others."""
-    names = [str(rng.choice(exposing))] if exposing else []
-    return names + [str(n) for n in rng.choice(paths, 3 - len(names), replace=False)]
-
-
-def slow_enough(attempt, enough):
-    """The first flight of `attempt(slower)` that lasts `enough` samples, ever slower: some vehicles can't follow fast paths."""
-    for slower in (1.0, 0.7, 0.5, 0.35):
-        flight = attempt(slower)
-        if flight["crashed"][0] >= enough:
-            break
-    return flight
-
-
-def write_logs(folder, number, flights, drawn, vehicle):
-    """Write a case's three logs and its vehicle file; its folder."""
     place = Path(folder) / f"case_{number:03d}"
-    place.mkdir(parents=True, exist_ok=True)
-    for letter, flight in zip("abc", flights, strict=True):
-        fleet.write_flight(place / f"flight_{letter}.csv.gz", flight, drawn["channels"])
-    (place / "vehicle.toml").write_text(vehicle)
-    return place
+    fleet.write_logs(place, flights, drawn["channels"], v.toml(told, "RotorPy 3", drawn))
+    return answer(place.name, kind, told, drawn, joined, flights, said)
 
 
 def floor_of(told, drawn, joined, flights):
@@ -381,13 +346,16 @@ def answer(name, kind, told, drawn, joined, flights, said):
 
 
 def main():
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    add_case_arguments(parser)
+    parser = case_parser(__doc__)
     parser.add_argument("--each", type=int, default=4, help="cases of each kind")
     options = parser.parse_args()
-    fly_plan(options, [kind for kind in KINDS for _ in range(options.each)])
+    use_single_thread()
+    kinds = [kind for kind in KINDS for _ in range(options.each)]
+    order = np.random.default_rng(options.seed).permutation(len(kinds))
+    jobs = [(options.seed, n, kinds[i], str(options.logs)) for n, i in enumerate(order, 1)]
+    with multiprocessing.get_context("spawn").Pool(options.jobs) as pool:
+        answers = sorted(pool.imap_unordered(make_case, jobs), key=lambda a: a["case"])
+    print("sha256", write_answers(options.answers, answers, options.seed, "rotorpy"))
 
 
 if __name__ == "__main__":

@@ -18,16 +18,7 @@ from pathlib import Path
 from experiments.diagnosis import development, figures
 from experiments.table import Page, page_parser, publish
 
-LEFT_OUT = (
-    "parameters",
-    "quality",
-    "gap",
-    "probabilities",
-    "not_testable",
-    "rest",
-    "false_unknown",
-    "right_names",
-)
+LEFT_OUT = "parameters quality gap probabilities not_testable rest false_unknown right_names".split()
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -86,11 +77,8 @@ def page(results: dict) -> Page:
         f"{results['note']}"
     )
     lines = results["cases"]
-    return Page(
-        "The exam of the diagnosis",
-        prose,
-        ["\n".join(figures.figures_table(lines)), "## Misses\n\n" + "\n".join(figures.misses(lines))],
-    )
+    table, misses = ("\n".join(part(lines)) for part in (figures.figures_table, figures.misses))
+    return Page("The exam of the diagnosis", prose, [table, f"## Misses\n\n{misses}"])
 
 
 def main() -> None:

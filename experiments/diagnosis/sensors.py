@@ -14,20 +14,20 @@ from experiments.diagnosis.plant import SAMPLE
 KINDS = ("white", "coloured", "filtered", "vibrating", "quantised", "radio")
 STRANGERS = ("estimator", "stale")
 RATES = {50: 0.15, 100: 0.5, 200: 0.1, 250: 0.08, 500: 0.12, 1000: 0.05}
-COLUMNS = (
-    "t,vehicle,x,y,z,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz,ax,ay,az,cmd_thrust,cmd_wx,cmd_wy,cmd_wz,m1,m2,m3,m4,vbat"
-)
-COLUMNS = COLUMNS.split(",")
 # letter of a channel group -> its columns
 GROUPS = {
-    "p": COLUMNS[2:9],
-    "s": COLUMNS[9:12],
-    "g": COLUMNS[12:15],
-    "a": COLUMNS[15:18],
-    "c": COLUMNS[18:22],
+    "p": ["x", "y", "z", "qw", "qx", "qy", "qz"],
+    "s": ["vx", "vy", "vz"],
+    "g": ["wx", "wy", "wz"],
+    "a": ["ax", "ay", "az"],
+    "c": ["cmd_thrust", "cmd_wx", "cmd_wy", "cmd_wz"],
+    "m": ["m1", "m2", "m3", "m4"],
+    "v": ["vbat"],
 }
-GROUPS |= {"m": COLUMNS[22:26], "v": COLUMNS[26:27]}
+COLUMNS = ["t", "vehicle", *(column for group in GROUPS.values() for column in group)]
 DIGITS = (4,) * 3 + (5,) * 4 + (4,) * 3 + (4,) * 3 + (3,) * 3 + (4,) + (3,) * 3 + (4,) * 4 + (3,)
+LOGGED = {"p": 0.88, "g": 0.9, "a": 0.85, "s": 0.6, "c": 0.75, "m": 0.92, "v": 0.8}
+"""How often a log has a group."""
 DECIMALS = dict(zip(COLUMNS[2:], DIGITS, strict=True))
 TURBULENCE = {"none": (0.0, 0.05), "light": (0.3, 1.2), "strong": (2.0, 4.0)}  # mN rms per axis
 
@@ -50,18 +50,7 @@ def narrow(rng, count, axes, frequency, quality, rms, step):
 
 def _channels(rng, needed):
     """Letters of the logged groups: what an effect needs is there, the rest is drawn; always a legal log."""
-    have = set(needed)
-    for letter, chance in (
-        ("p", 0.88),
-        ("g", 0.9),
-        ("a", 0.85),
-        ("s", 0.6),
-        ("c", 0.75),
-        ("m", 0.92),
-        ("v", 0.8),
-    ):
-        if rng.random() < chance:
-            have.add(letter)
+    have = set(needed) | {letter for letter, chance in LOGGED.items() if rng.random() < chance}
     if "p" not in have:
         have -= {"s"}
         have |= {"a", "g"}
@@ -125,11 +114,8 @@ def draw(rng, kind, needed="", turbulence=None):
     elif kind == "radio":
         out |= {"wander": float(rng.uniform(2.0, 10.0)), "stream_rate": float(rng.uniform(70, 90))}
     elif kind == "estimator":
-        out |= {
-            "colour": float(rng.uniform(1.5, 4.0)),
-            "colour_time": float(rng.uniform(0.15, 0.5)),
-            "velocity": "smooth",
-        }
+        out |= {"colour": float(rng.uniform(1.5, 4.0)), "colour_time": float(rng.uniform(0.15, 0.5))}
+        out |= {"velocity": "smooth"}
     elif kind == "stale":
         out |= {"pose_rate": int(rng.choice([45, 60, 72]))}
     return out
@@ -179,9 +165,8 @@ def stack(flights):
 
 
 def _vibration(rng, sensors, samples, rms):
-    return narrow(
-        rng, samples, 3, sensors["vibration_frequency"], sensors["vibration_quality"], rms, SAMPLE
-    ) * np.array([1.0, 1.0, 0.6])
+    frequency, quality = sensors["vibration_frequency"], sensors["vibration_quality"]
+    return narrow(rng, samples, 3, frequency, quality, rms, SAMPLE) * np.array([1.0, 1.0, 0.6])
 
 
 def apply_nuisances(p, columns, sensors):
@@ -203,10 +188,6 @@ def at(signal, times):
     rest = place - whole
     rest = rest[:, None] if signal.ndim == 2 else rest
     return signal[whole] + rest * (signal[whole + 1] - signal[whole])
-
-
-def _normal(q):
-    return q / np.sqrt((q * q).sum(axis=1, keepdims=True))
 
 
 def _through(cut, signal):
@@ -242,7 +223,7 @@ def _pose(rng, sensors, flown, j, times, delay):
         velocity += coloured(rng, n, 3, sensors["colour_time"], 3e-3 * size * sensors["colour"], step)
     q = at(flown["quaternion"][:, :, j].astype(float), when)
     q = vehicle.multiply(q.T, np.concatenate([np.ones((1, n)), 0.5 * angle.T]))
-    return np.concatenate([position, _normal(q.T), velocity], axis=1)
+    return np.concatenate([position, (q / np.sqrt((q * q).sum(axis=0))).T, velocity], axis=1)
 
 
 def smooth_derivative(position, step):
@@ -272,11 +253,9 @@ def log_rows(rng, sensors, flown, j, ticks, unknown=(), hover=0.5):
         keep[:3] = True
         t = t[keep]
     n = len(t)
-    wander = (
-        coloured(rng, len(flown["rates"]), 2, 2.0, 1e-3 * sensors["wander"], SAMPLE)
-        if sensors["wander"]
-        else None
-    )
+    wander = None
+    if sensors["wander"]:
+        wander = coloured(rng, len(flown["rates"]), 2, 2.0, 1e-3 * sensors["wander"], SAMPLE)
 
     def stream(signal, times, clock=None):
         """A 500 Hz signal as its stream delivers it at `times`."""
@@ -314,9 +293,8 @@ def log_rows(rng, sensors, flown, j, ticks, unknown=(), hover=0.5):
     accel = flown["specific"][:, :, j].astype(float)
     samples = len(accel)
     accel = accel - np.cross(np.broadcast_to(tilt, accel.shape), accel) + np.array(sensors["accel_bias"])
-    noise = sensors["accel"] * rng.standard_normal((samples, 3)) + coloured(
-        rng, samples, 3, 3.0, 0.02, SAMPLE
-    )
+    noise = sensors["accel"] * rng.standard_normal((samples, 3))
+    noise += coloured(rng, samples, 3, 3.0, 0.02, SAMPLE)
     if sensors["colour"]:
         noise += coloured(rng, samples, 3, 0.02, 0.4 * sensors["accel"] * sensors["colour"], SAMPLE)
     if sensors["vibration"]:
@@ -334,9 +312,8 @@ def log_rows(rng, sensors, flown, j, ticks, unknown=(), hover=0.5):
         motor = (total_then - total[:samples]) / (last - np.arange(samples))[:, None]
     place = np.minimum((t / SAMPLE + 1e-6).astype(int), samples - 1)
     motors = stream(motor, t, 1) if sensors["stream_rate"] else motor[place]
-    command = flown["command"][:, :, j].astype(float)[
-        np.minimum((t / 0.01 + 1e-6).astype(int), len(flown["command"]) - 1)
-    ]
+    tick = np.minimum((t / 0.01 + 1e-6).astype(int), len(flown["command"]) - 1)
+    command = flown["command"][tick, :, j].astype(float)
     voltage = flown["voltage"][place, j] + 0.012 * rng.standard_normal(n)
     seldom = np.floor(t * 10 + 1e-6)
     voltage[np.concatenate([[False], seldom[1:] == seldom[:-1]])] = np.nan

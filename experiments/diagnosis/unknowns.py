@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from experiments.diagnosis.vehicle import rotate, rotate_back
+from experiments.diagnosis.vehicle import multiply, rotate_back
 
 
 class Site(NamedTuple):
@@ -157,24 +157,5 @@ def misread(causes, inputs, times):
 def turned(q, angle):
     """Attitudes q (n, 4) turned by small rotation vectors (n, 3) in the world."""
     half = np.concatenate([np.ones((len(q), 1)), 0.5 * angle], axis=1).T
-    out = rotate_product(half, q.T).T
+    out = multiply(half, q.T).T
     return out / np.linalg.norm(out, axis=1, keepdims=True)
-
-
-def rotate_product(a, b):
-    """Hamilton product of quaternions (4, n)."""
-    w, x = a[0] * b[0] - (a[1:] * b[1:]).sum(0), a[0] * b[1:] + b[0] * a[1:]
-    return np.concatenate([w[None], x + np.cross(a[1:], b[1:], axis=0)])
-
-
-__all__ = [
-    "FORMS",
-    "MISSIONS",
-    "SENSOR_SITES",
-    "SITES",
-    "Unknowns",
-    "inputs_of",
-    "misread",
-    "rotate",
-    "turned",
-]

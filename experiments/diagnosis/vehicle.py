@@ -169,9 +169,7 @@ def nominal_parameters(told):
         "tau_up": tau.copy(),
         "tau_down": tau.copy(),
         "rotor_gain": np.ones((4, count)),
-        "curve_map": np.tile(
-            [[0.0], [1.0], [0.0]], (1, count)
-        ),  # offset, slope, curvature of the thrust in the command
+        "curve_map": rows([0.0, 1.0, 0.0]),  # offset, slope, curvature of the thrust in the command
         "com": np.zeros((3, count)),
         "wind": np.zeros((3, count)),
         "kp": rows(RATE_KP),
@@ -227,15 +225,3 @@ def mix(thrust, output):
     r, p = roll / 2, pitch / 2
     m = np.stack([thrust - r - p - yaw, thrust - r + p + yaw, thrust + r + p - yaw, thrust + r - p + yaw])
     return np.minimum(np.maximum(m, 0.0), 1.0)
-
-
-def matrix_of(q):
-    """Rotations (3, 3, ...), body to world, of unit quaternions (4, ...)."""
-    w, x, y, z = q
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )

@@ -18,7 +18,7 @@ import numpy as np
 from experiments.paper import behaviours, main_tables, sweeps
 from experiments.paper.flights import environment_of, fly
 from experiments.paper.roster import ABLATIONS, METHODS, seeds_of
-from experiments.table import RESULTS, facts, write_page
+from experiments.table import RESULTS, documented_parser, facts, write_page
 from openjax.background import compile_ahead
 from openjax.baselines import METHODS as HEURISTICS
 from openjax.commands.command_line import run_command
@@ -149,9 +149,7 @@ def study(options: argparse.Namespace) -> None:
 
 def main(arguments: list[str]) -> int:
     """Fly or read the flights, then write all pages."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = documented_parser(__doc__)
     parser.add_argument("--report", action="store_true", help="from the stored flights")
     parser.add_argument("--episodes", type=int, default=100, help="per seed and layout; half for the sweeps")
     parser.add_argument("--physics", choices=("rigid", "mjx"), default="rigid", help="mjx: the same, slower")

@@ -11,7 +11,7 @@ import numpy as np
 
 from experiments.diagnosis import vehicle as v
 from experiments.diagnosis.plant import PER_TICK, SAMPLE, Firmware
-from experiments.diagnosis.vehicle import matrix_of
+from experiments.diagnosis.rotorpy_cases import hubs
 from experiments.flying.worlds.game import Poses, per_world
 from experiments.flying.worlds.plant import air_of, sensors_of, solids_of
 from openjax.pursuit import Task
@@ -24,8 +24,7 @@ def crazyflie() -> dict:
     """RotorPy's Crazyflie, with its rotors numbered and turning as the firmware has them."""
     from rotorpy.vehicles.crazyflie_params import quad_params
 
-    hubs = {f"r{i + 1}": np.array([v.ROTOR_X[i], v.ROTOR_Y[i], 0.0]) for i in range(4)}
-    return quad_params | {"rotor_pos": hubs, "rotor_directions": v.SPIN}
+    return quad_params | {"rotor_pos": hubs(), "rotor_directions": v.SPIN}
 
 
 class Bodies:
@@ -75,7 +74,7 @@ class Bodies:
 
     def _slope(self, s, speeds):
         model, q, rates, rotor = self.model, s[6:10], s[10:13], s[13:]
-        rotation = matrix_of((q / np.sqrt((q * q).sum(axis=0)))[[3, 0, 1, 2]])
+        attitude = np.roll(q / np.sqrt((q * q).sum(axis=0)), 1, axis=0)
         hubs = model.rotor_geometry  # (4, 3)
         force = np.zeros((3, 4, s.shape[1]))  # of each rotor, in the body frame
         force[2] = model.k_eta * rotor**2
@@ -83,14 +82,14 @@ class Bodies:
         torque[2] = model.k_m * (model.rotor_dir @ rotor**2)
         drag = 0.0
         if model.aero:
-            air = np.einsum("jib,jb->ib", rotation, s[3:6])
+            air = v.rotate_back(attitude, s[3:6])
             at_hubs = air[:, None] + np.cross(rates[:, None], hubs.T[:, :, None], axis=0)
             drag = -np.sqrt((air * air).sum(axis=0)) * (model.drag_matrix @ air)
             force -= rotor * np.einsum("ij,jrb->irb", model.rotor_drag_matrix, at_hubs)
             force[2] += model.k_h * (at_hubs[0] ** 2 + at_hubs[1] ** 2)
             torque += -model.k_flap * (rotor * np.stack([at_hubs[1], -at_hubs[0], 0.0 * rotor])).sum(axis=1)
         torque += np.cross(hubs.T[:, :, None], force, axis=0).sum(axis=1)
-        total = np.einsum("ijb,jb->ib", rotation, force.sum(axis=1) + drag)
+        total = v.rotate(attitude, force.sum(axis=1) + drag)
         total[2] -= model.mass * model.g
         spin = np.cross(rates, model.inertia @ rates, axis=0)
         x, y, z, w = q
@@ -98,15 +97,8 @@ class Bodies:
         turn = 0.5 * np.stack(
             [w * p - z * q_ + y * r, z * p + w * q_ - x * r, -y * p + x * q_ + w * r, -x * p - y * q_ - z * r]
         )
-        return np.concatenate(
-            [
-                s[3:6],
-                total / model.mass,
-                turn,
-                model.inv_inertia @ (torque - spin),
-                (speeds - rotor) / model.tau_m,
-            ]
-        )
+        accelerations = [total / model.mass, turn, model.inv_inertia @ (torque - spin)]
+        return np.concatenate([s[3:6], *accelerations, (speeds - rotor) / model.tau_m])
 
 
 class RotorPyWorld:
