@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from openjax.commands.machine import describe_machine
-from openjax.files import read_json, to_plain, write_json, write_text
+from openjax.files import read_json, write_json, write_text
 
 RESULTS = Path(__file__).parent / "results"
 PLACES = ("--out", "--work", "--results", "--flights", "--commit")
@@ -160,7 +160,7 @@ def publish(
     if not options.report:
         started = time.monotonic()
         found = study(options)
-        write_json(data, to_plain({**facts(options.commit), "seconds": time.monotonic() - started, **found}))
+        write_json(data, {**facts(options.commit), "seconds": time.monotonic() - started, **found})
     write_page(options.out, page, read_json(data), draw)
 
 

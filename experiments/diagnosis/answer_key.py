@@ -27,11 +27,9 @@ def floors(fleet, i, turbulence):
 def answer_of(fleet, i, squares, floor, wrong):
     """The answer of variant i: what was put in, what of it shows, which names are right; `wrong`: spoiled columns."""
     spec, own = fleet.variants[i]
-    quiet = np.maximum(floor**2 - squares["truth"], 0.0)  # what the sensors add
     known = np.isfinite(floor)
-    energy = {
-        k: np.where(known, (x + np.where(known, quiet, 0.0)) / floor**2, 0.0) for k, x in squares.items()
-    }
+    quiet = np.where(known, np.maximum(floor**2 - squares["truth"], 0.0), 0.0)  # what the sensors add
+    energy = {k: np.where(known, (x + quiet) / floor**2, 0.0) for k, x in squares.items()}
     names, shows = [c["effect"] for c in own], {}
     for j, name in enumerate(names):
         if name in VOCABULARY:
@@ -54,13 +52,15 @@ def answer_of(fleet, i, squares, floor, wrong):
         category = "not_testable"
     names = [*seen, *(n for n in names if n not in seen)]
     total = max(float(excess.sum()), 1e-12)
+    sums = {n: (energy[n] - energy["truth"]).sum() for n in names if n in energy}
     parts = [n for c in own for n in effects.PARTS.get((c["effect"], c["form"]), ())]
     causes = [c | {"magnitudes": dict(m)} for c, m in zip(own, fleet.magnitudes[i], strict=True)]
     for cause in causes:
         if cause["effect"] == "state_latency":
             said = cause["magnitudes"]
             said["logged_ms"] = sensors.pose_lag(said["delay_ms"], spec["sensors"])
-    gap = {k: float(np.sqrt(energy[k][np.isfinite(floor)].mean())) for k in ("nominal", "truth")}
+    before, after = (float(np.sqrt(energy[k][known].mean())) for k in ("nominal", "truth"))
+    said_floor = [float(f"{f:.3g}") if np.isfinite(f) else None for f in floor]
     expected = {"none": ["none"], "not_testable": ["none"], "unknown": ["unknown"], "garbage": ["garbage"]}
     weighed, scale = spec["told"].weighed, lambda n: scale_stands_in(fleet, i, n, squares, floor)
     return {
@@ -75,19 +75,10 @@ def answer_of(fleet, i, squares, floor, wrong):
         "causes": causes,
         "severity": cases.label(severity) if own else None,
         "severity_ratio": round(severity, 3),
-        "shares": {
-            n: round(float((energy[n] - energy["truth"]).sum() / total), 4) for n in names if n in energy
-        },
+        "shares": {n: round(float(s / total), 4) for n, s in sums.items()},
         "energy": {k: [round(float(x), 4) for x in e] for k, e in energy.items()},
-        "floor": {
-            c: float(f"{f:.3g}") if np.isfinite(f) else None
-            for c, f in zip(measure.CHANNELS, floor, strict=True)
-        },
-        "gap": {
-            "before": gap["nominal"],
-            "floor": gap["truth"],
-            "closed_by_truth": 1 - gap["truth"] / gap["nominal"],
-        },
+        "floor": dict(zip(measure.CHANNELS, said_floor, strict=True)),
+        "gap": {"before": before, "floor": after, "closed_by_truth": 1 - after / before},
         "wrong_columns": wrong,
         "mass_weighed": weighed,
         "told": spec["told"].__dict__,

@@ -32,10 +32,7 @@ class Controllers:
         for kind in np.unique(self.kinds):
             own = self.kinds == kind
             at = min(k + AHEAD, last) if kind == "preview" else k
-            goal = {
-                name: r[name][at][..., own]
-                for name in ("position", "velocity", "acceleration", "yaw", "yaw_rate")
-            }
+            goal = {name: r[name][at][..., own] for name in r if name != "pulses"}
             out[:, own] = getattr(self, "_" + kind)(own, goal, position[:, own], q[:, own], velocity[:, own])
         out = out + r["pulses"][k]
         out[0] = np.clip(out[0], 0.08, 0.92)
@@ -74,9 +71,8 @@ class Controllers:
         error = goal["position"] - position
         wanted = goal["velocity"] + 2.0 * error
         slip = wanted - velocity
-        want = np.array([[4.5], [4.5], [6.5]]) * slip + np.array([[1.2], [1.2], [5.0]]) * self._collect(
-            own, error
-        )
+        want = np.array([[4.5], [4.5], [6.5]]) * slip
+        want = want + np.array([[1.2], [1.2], [5.0]]) * self._collect(own, error)
         want = want + 0.6 * goal["acceleration"]
         w, x, y, z = q
         yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
@@ -90,8 +86,7 @@ class Controllers:
         return np.stack([thrust, 6.5 * (roll_goal - roll), 6.5 * (pitch_goal - pitch), 3.5 * twist])
 
     def _preview(self, own, goal, position, q, velocity):
-        out = self._geometric(
-            own, goal, position + 0.01 * AHEAD * velocity, q, velocity, gains=(4.0, 3.2, 6.0)
-        )
+        ahead = position + 0.01 * AHEAD * velocity
+        out = self._geometric(own, goal, ahead, q, velocity, gains=(4.0, 3.2, 6.0))
         self.smooth[:, own] += 0.5 * (out[1:] - self.smooth[:, own])
         return np.concatenate([out[:1], self.smooth[:, own]])

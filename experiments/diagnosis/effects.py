@@ -30,6 +30,7 @@ class Drawn(NamedTuple):
     needs: str
 
 
+SURFACE = ("inverse_square", "cheeseman_bennett", "exponential")
 _EFFECTS = {
     "mass": ((0.02, 0.30), ("plain", "payload"), (), "m"),
     "thrust_scale": ((0.02, 0.22), ("plain", "thrust_only"), (), "m"),
@@ -43,13 +44,8 @@ _EFFECTS = {
     ),
     "blade_flapping": ((0.05, 3.0), ("linear", "advance_ratio"), ("fast", "agile", "laps"), "pg"),
     "wind": ((0.2, 12.0), ("steady", "quadratic", "shear", "gusty"), ("yaw", "fast", "hover"), "p"),
-    "ground_effect": ((0.015, 0.35), ("inverse_square", "cheeseman_bennett", "exponential"), ("low",), "pm"),
-    "ceiling_effect": (
-        (0.015, 0.35),
-        ("inverse_square", "cheeseman_bennett", "exponential"),
-        ("high",),
-        "pm",
-    ),
+    "ground_effect": ((0.015, 0.35), SURFACE, ("low",), "pm"),
+    "ceiling_effect": ((0.015, 0.35), SURFACE, ("high",), "pm"),
     "downwash": ((2.0, 20.0), ("gaussian", "jet"), ("pass", "pass_moving"), "pm"),
     "motor_lag": ((0.2, 3.5), ("slower", "up_down", "second_order", "brushed"), ("agile", "step"), "gm"),
     "command_latency": ((4.0, 60.0), ("constant", "jitter", "spikes"), ("agile", "step", "yaw"), "gcm"),
@@ -149,9 +145,8 @@ def wake_force(p, position, other):
     edge = np.sqrt(r2 + 1e-9)
     jet = (0.15 / (0.15 + dz)) ** 2 / (1.0 + np.exp(np.clip((edge - 1.2 * width) / (0.25 * width), -40, 40)))
     shape = np.where(p["wake_jet"] > 0, jet, gauss)
-    slope = np.where(
-        p["wake_jet"] > 0, -jet * (1 - np.clip(jet, 0, 1)) / (0.25 * width * edge), -gauss / width**2
-    )
+    jet_slope = -jet * (1 - np.clip(jet, 0, 1)) / (0.25 * width * edge)
+    slope = np.where(p["wake_jet"] > 0, jet_slope, -gauss / width**2)
     return -p["wake"] * below * shape, -p["wake"] * below * slope * np.stack([dx, dy])
 
 
@@ -289,9 +284,8 @@ def apply(cause, p, c, arrival=None, rng=None):
         up, down = 1 + a, 1 + a
         if form == "up_down":
             up, down = 1 + a * (0.5 + 0.4 * s[1]), 1 + a * (1.1 + 0.6 * s[2])
-        if (
-            form == "brushed"
-        ):  # as measured on real ones: several times slower, differently up and down, 5 ms late
+        if form == "brushed":
+            # as measured on real ones: several times slower, differently up and down, 5 ms late
             up, down = 1 + a * (0.75 + 0.1 * s[1]), 1 + a * (1.0 + 0.2 * s[2])
             p["tau_second"][c] = 0.004 + 0.002 * s[3]
         said = {"tau_up": float(p["tau_up"][c][0] * up), "tau_down": float(p["tau_down"][c][0] * down)}

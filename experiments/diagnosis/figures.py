@@ -112,9 +112,8 @@ def misses(lines: list[dict]) -> list[str]:
         if r["right"] and not r["wrong_names"]:
             continue
         said, why = "+".join(r["words"]) or "none", r["error"] or (r["traceback"] or "").strip()[-160:]
-        out.append(
-            f"* {r['set']}/{r['case']} {r['category']}: {'+'.join(r['truth']) or 'none'} → {said} {why}"
-        )
+        true = "+".join(r["truth"]) or "none"
+        out.append(f"* {r['set']}/{r['case']} {r['category']}: {true} → {said} {why}")
     return out
 
 

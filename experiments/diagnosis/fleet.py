@@ -25,15 +25,6 @@ def bodies(seed, column, spec):
     return out
 
 
-def _write(cause, p, columns, arrival, strangers, rng):
-    """Write one cause into the batch; returns its magnitudes."""
-    name, size = cause["effect"], cause["size"]
-    if name in effects.EFFECTS:
-        return effects.apply(cause, p, columns, arrival, rng)
-    strangers.setdefault(name, []).append((columns, cause))
-    return {"strength": size, "unit": cause["unit"]}
-
-
 class Fleet:
     """Bodies of several variants of several cases, flown as one batch."""
 
@@ -56,11 +47,9 @@ class Fleet:
         arrival = np.repeat(10 * np.arange(cases.TICKS)[:, None], len(told), axis=1)
         self.parameters, strangers, self.magnitudes = self.model([c for _, c in variants], arrival)
         reference = {k: np.stack([r[k] for r in references], axis=-1) for k in references[0]}
-        self.flown = plant.fly(
-            plant.Batch(
-                told, self.parameters, reference, kinds, self.partner, arrival, sensors.stack(airs), strangers
-            )
-        )
+        air = sensors.stack(airs)
+        batch = plant.Batch(told, self.parameters, reference, kinds, self.partner, arrival, air, strangers)
+        self.flown = plant.fly(batch)
         # What is measured is what the logs cover: a fault that comes after their end shows nothing.
         self.seen = self.flown | {"crashed": np.minimum(self.flown["crashed"], logged)}
 
@@ -74,7 +63,11 @@ class Fleet:
             said = []
             for i, cause in enumerate(own):
                 rng = cases.case_rng(self.seed, self.column, spec["number"], 2, i)
-                said.append(_write(cause, p, columns, scratch, strangers, rng))
+                if cause["effect"] in VOCABULARY:
+                    said.append(effects.apply(cause, p, columns, scratch, rng))
+                else:
+                    strangers.setdefault(cause["effect"], []).append((columns, cause))
+                    said.append({"strength": cause["size"], "unit": cause["unit"]})
             magnitudes.append(said)
         return p, strangers, magnitudes
 
@@ -104,9 +97,7 @@ class Fleet:
         flew = [own for _, own in self.variants]
         out = {"nominal": self.errors([[] for _ in flew]), "truth": self.errors(flew)}
         if any(len(own) > 1 for own in flew):
-            out |= {
-                i: self.errors([[c for j, c in enumerate(own) if j != i] for own in flew]) for i in (0, 1)
-            }
+            out |= {i: self.errors([own[:i] + own[i + 1 :] for own in flew]) for i in (0, 1)}
         return out
 
     def lasts(self, i):

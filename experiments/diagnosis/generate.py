@@ -31,17 +31,11 @@ def _variants(spec):
         return {"final": []}
     out = {"nominal": []} if spec["category"] == "unknown" else {}
     for i, cause in enumerate(spec["causes"]):
-        low, high = (unknowns.SITES if spec["category"] == "unknown" else effects.EFFECTS)[
-            cause["effect"]
-        ].sizes
+        low, high = (unknowns.SITES | effects.EFFECTS)[cause["effect"]].sizes
         for n in range(SIZES):
             place = (n + cause["shape"][7]) / SIZES
             out[i, n] = [cause | {"size": float(low * (high / low) ** place)}]
     return out
-
-
-def _ratios(before, after, floor):
-    return np.sqrt(np.maximum(before - after, 0.0)) / floor
 
 
 def fly_chunk(job):
@@ -66,7 +60,8 @@ def fly_chunk(job):
             for n in range(SIZES):
                 at = place[name, (i, n)]
                 after = nominal[:, place[name, "nominal"]] if spec["category"] == "unknown" else truth[:, at]
-                severity = max(float(_ratios(nominal[:, at], after, floor).max()), 1e-3)
+                shown = np.sqrt(np.maximum(nominal[:, at] - after, 0.0)) / floor
+                severity = max(float(shown.max()), 1e-3)
                 if cause["effect"] in unknowns.SENSOR_SITES:  # the motion shows nothing: a middle size
                     severity = spec["targets"][i] * (1 + abs(n - 1.5))
                 crash = 10 * (first.lasts(at) < 0.7)
@@ -99,25 +94,24 @@ def fly_chunk(job):
     return answers
 
 
-def generate(seed, column, count, logs, jobs=1, only=None, progress=True):
+def in_processes(do, work, jobs):
+    """`do` of each piece of work by so many processes, as they come; one is this one."""
+    if jobs == 1:
+        yield from map(do, work)
+    else:
+        with multiprocessing.get_context("spawn").Pool(min(jobs, len(work))) as pool:
+            yield from pool.imap_unordered(do, work)
+
+
+def generate(seed, column, count, logs, jobs=1, only=None):
     """All cases; writes the logs and returns the answers, sorted by case."""
     specs = cases.draw_cases(seed, column, count, only)
     size = max(1, min(CHUNK, math.ceil(len(specs) / jobs)))
     work = [(seed, column, specs[i : i + size], Path(logs)) for i in range(0, len(specs), size)]
     answers, start = [], time.perf_counter()
-
-    def keep(part):
-        answers.extend(part)
-        if progress:
-            print(f"{len(answers)}/{len(specs)} cases, {time.perf_counter() - start:.0f} s", flush=True)
-
-    if jobs == 1:
-        for job in work:
-            keep(fly_chunk(job))
-    else:
-        with multiprocessing.get_context("spawn").Pool(min(jobs, len(work))) as pool:
-            for part in pool.imap_unordered(fly_chunk, work):
-                keep(part)
+    for part in in_processes(fly_chunk, work, jobs):
+        answers += part
+        print(f"{len(answers)}/{len(specs)} cases, {time.perf_counter() - start:.0f} s", flush=True)
     return sorted(answers, key=lambda a: a["case"])
 
 

@@ -41,9 +41,8 @@ class Filter:
         on = cut > 0
         k = np.tan(np.pi * np.where(on, cut, 1.0) * SAMPLE)
         scale = 1.0 / (1.0 + np.sqrt(2.0) * k + k * k)
-        self.b0, self.b1, self.b2 = (
-            np.where(on, c * k * k * scale, float(i == 0)) for i, c in enumerate((1, 2, 1))
-        )
+        self.b0 = np.where(on, k * k * scale, 1.0)
+        self.b1, self.b2 = (np.where(on, c * k * k * scale, 0.0) for c in (2, 1))
         self.a1 = np.where(on, 2 * (k * k - 1) * scale, 0.0)
         self.a2 = np.where(on, (1 - np.sqrt(2.0) * k + k * k) * scale, 0.0)
         self.any = bool(on.any())
@@ -113,9 +112,8 @@ class Body:
             u = unknowns.motors(u, time)
         before = self.rotor
         self.drive = self.drive + self.second * (vehicle.MAX_SPEED * np.sqrt(u) - self.drive)
-        self.rotor = self.rotor + np.where(self.drive > self.rotor, self.up, self.down) * (
-            self.drive - self.rotor
-        )
+        share = np.where(self.drive > self.rotor, self.up, self.down)
+        self.rotor = self.rotor + share * (self.drive - self.rotor)
         squared = self.rotor * self.rotor
         spinning = self.gyroscopes and p["propeller_inertia"] * vehicle.SPIN[:, None]
         thrust = self.lifts * squared * effects.surface_gain(p, self.active, self.position, self.q)
@@ -167,9 +165,8 @@ class Battery:
         current = (m * np.sqrt(m)).mean(axis=0)
         self.used = self.used + dt * current
         self.load = self.load + (dt / 0.04) * (current - self.load)
-        return (
-            self.air["open_voltage"] - self.air["discharge"] * self.used - self.air["resistance"] * self.load
-        )
+        air = self.air
+        return air["open_voltage"] - air["discharge"] * self.used - air["resistance"] * self.load
 
 
 def received(arrival, steps):
@@ -236,9 +233,8 @@ class Flight:
         s, body = self.sample, self.body
         for name, kept in self.history.items():
             kept[s] = body.q if name == "quaternion" else getattr(body, name)
-        self.gyro = self.firmware.gyro_filter(
-            self.p["gyro_gain"] * body.rates + self.air["gyro_bias"] + self.air["gyro"][s]
-        )
+        seen = self.p["gyro_gain"] * body.rates + self.air["gyro_bias"] + self.air["gyro"][s]
+        self.gyro = self.firmware.gyro_filter(seen)
 
     def seen(self):
         """Position (3, B), quaternion (4, B) and velocity (3, B) as the motion capture gives them now, late and noisy."""
@@ -268,19 +264,11 @@ class Flight:
         now = np.where(index >= 0, self.commands[np.maximum(index, 0), :, self.columns].T, self.start)
         m = self.firmware(now, self.gyro)
         self.voltage = self.battery.step(m, SAMPLE)
+        gusts = [air[name][k] for name in ("gust_force", "gust_torque", "slow")]
         others = [self.body.position[:, partner] + away for partner, away in self.partners]
         for half_step in range(2):
-            self.body.step(
-                m,
-                self.voltage,
-                self.battery.load,
-                air["gust_force"][k],
-                air["gust_torque"][k],
-                air["slow"][k],
-                others,
-                self.unknowns,
-                SAMPLE * s + DT * half_step,
-            )
+            now_s = SAMPLE * s + DT * half_step
+            self.body.step(m, self.voltage, self.battery.load, *gusts, others, self.unknowns, now_s)
             if self.solids is not None:
                 self.solids.stop(self.body.position, self.body.velocity)
         self.sample += 1

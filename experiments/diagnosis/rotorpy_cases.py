@@ -9,8 +9,8 @@ coefficient is taken negative: with its sign convention a positive one pitches t
 what flapping does.
 """
 
-import multiprocessing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ import numpy as np
 from experiments.diagnosis import cases, fleet, measure, sensors
 from experiments.diagnosis import vehicle as v
 from experiments.diagnosis.answer_key import HIDDEN, accepted
-from experiments.diagnosis.generate import case_parser, write_answers
+from experiments.diagnosis.generate import case_parser, in_processes, write_answers
 from experiments.diagnosis.plant import KEPT, POSE, SAMPLE, Battery, Filter
 from experiments.flying.single_thread import use_single_thread
 
@@ -49,21 +49,15 @@ def _flapping(rng, told, hover):
     return {"k_flap": -k / (4 * hover)}, None, {"torque_N_m_per_m_s": k, "tilt_rad_per_m_s": 0.0}
 
 
-def _wind(rng, told, hover):
+def _wind(rng, told, hover, name="steady", times=1):
     speed, angle = rng.uniform(0.4, 1.6), rng.uniform(0, 2 * np.pi)
     drag, _, said = _drag(rng, told, hover)
     wind = [speed * np.cos(angle), speed * np.sin(angle), 0.0]
-    return drag, ("steady", wind), {"w_x": wind[0], "w_y": wind[1], "speed": speed, "drag": said["d_xy"]}
-
-
-def _swaying(rng, told, hover):
-    drag, (_, wind), said = _wind(rng, told, hover)
-    return drag, ("swaying", wind), said
-
-
-def _tunnel(rng, told, hover):
-    drag, (_, wind), said = _wind(rng, told, hover)
-    return drag, ("tunnel", [2 * w for w in wind]), said
+    return (
+        drag,
+        (name, [times * w for w in wind]),
+        {"w_x": wind[0], "w_y": wind[1], "speed": speed, "drag": said["d_xy"]},
+    )
 
 
 def _lag(rng, told, hover):
@@ -78,11 +72,8 @@ def _mass(rng, told, hover):
 
 def _thrust(rng, told, hover):
     scale = rng.choice([-1, 1]) * rng.uniform(0.03, 0.15)
-    changed = {
-        "k_eta": told.thrust_constant * (1 + scale),
-        "k_m": told.torque_ratio * told.thrust_constant * (1 + scale),
-    }
-    return changed, None, {"scale": scale}
+    k_eta, k_m = told.thrust_constant * (1 + scale), told.torque_ratio * told.thrust_constant * (1 + scale)
+    return {"k_eta": k_eta, "k_m": k_m}, None, {"scale": scale}
 
 
 def _inertia(rng, told, hover):
@@ -124,7 +115,7 @@ KINDS = {
     "parasitic_drag": (_parasitic, ["rotor_drag"], "parasitic", LAPS),
     "blade_flapping": (_flapping, ["blade_flapping"], "linear", LAPS),
     "wind": (_wind, ["wind"], "steady", ("circle", "yawing", "hover")),
-    "swaying_wind": (_swaying, ["wind"], "swaying", ("circle", "yawing", "hover")),
+    "swaying_wind": (partial(_wind, name="swaying"), ["wind"], "swaying", ("circle", "yawing", "hover")),
     "motor_lag": (_lag, ["motor_lag"], "slower", TURNS),
     "mass": (_mass, ["mass"], "plain", ()),
     "thrust_scale": (_thrust, ["thrust_scale"], "plain", ()),
@@ -132,7 +123,7 @@ KINDS = {
     "yaw_torque": (_yaw, ["yaw_torque"], "scale", ("yawing",)),
     "com_offset": (_offset, ["com_offset"], "torque", ()),
     "translational_lift": (_lift, ["unknown"], "outside", LAPS),
-    "wind_tunnel": (_tunnel, ["unknown"], "outside", LAPS),
+    "wind_tunnel": (partial(_wind, name="tunnel", times=2), ["unknown"], "outside", LAPS),
     "drag_and_lag": (_drag_and_lag, ["rotor_drag", "motor_lag"], ("rotor_speed", "slower"), LAPS + TURNS),
 }
 
@@ -148,11 +139,8 @@ def rotorpy_vehicle(told, changed):
     }
     out |= dict(zip(("Ixx", "Iyy", "Izz"), told.inertia, strict=True))
     out |= dict.fromkeys(("Ixy", "Iyz", "Ixz", "c_Dx", "c_Dy", "c_Dz", "k_d", "k_z", "k_h", "k_flap"), 0.0)
-    out |= {
-        "k_eta": told.thrust_constant,
-        "k_m": told.torque_ratio * told.thrust_constant,
-        "tau_m": told.motor_time,
-    }
+    thrust = told.thrust_constant
+    out |= {"k_eta": thrust, "k_m": told.torque_ratio * thrust, "tau_m": told.motor_time}
     out |= {"rotor_speed_min": 0.0, "rotor_speed_max": v.MAX_SPEED, "motor_noise_std": 0.0}
     if set(changed) - set(out):
         raise ValueError(f"not parameters of RotorPy's multirotor: {sorted(set(changed) - set(out))}")
@@ -192,10 +180,8 @@ def trajectory(name, rng, slower=1.0):
     if name == "rocking":  # short swings on every axis
         size, rates = np.array([0.06, 0.07, 0.03]), slower * rng.uniform(0.7, 1.2, 3)
         return ThreeDCircularTraj(np.array([0, 0, height]), size, rates, yaw_bool=bool(rng.random() < 0.5))
-    sizes = np.array([radius, radius, rng.uniform(0.05, 0.25)])
-    return ThreeDCircularTraj(
-        np.array([0, 0, height]), sizes, np.array([rate, rate, 0.6 * rate]), yaw_bool=name == "yawing"
-    )
+    sizes, rates = np.array([radius, radius, rng.uniform(0.05, 0.25)]), np.array([rate, rate, 0.6 * rate])
+    return ThreeDCircularTraj(np.array([0, 0, height]), sizes, rates, yaw_bool=name == "yawing")
 
 
 def fly(told, changed, wind, path, drawn, air):
@@ -215,9 +201,8 @@ def fly(told, changed, wind, path, drawn, air):
     control = SE3Control(rotorpy_vehicle(told, {}))
     wind_at = _air(wind)
     low = Filter(np.array([drawn["gyro_cut"]]), 3, air["gyro_bias"][:, None])
-    battery = Battery(
-        {k: np.array([air[k]]) for k in ("open_voltage", "discharge", "resistance")}, np.array([told.hover])
-    )
+    cell = {k: np.array([air[k]]) for k in ("open_voltage", "discharge", "resistance")}
+    battery = Battery(cell, np.array([told.hover]))
     sizes = POSE | {k: size for k, size in KEPT.items() if k not in ("integral", "applied")}
     out = {name: np.zeros((samples, size, 1), np.float32) for name, size in sizes.items()}
     out |= {name: np.zeros((samples, 1), np.float32) for name in ("voltage", "load")}
@@ -306,13 +291,11 @@ def floor_of(told, drawn, joined, flights):
         return (measure.errors(flown, many, p, np.arange(3), none, none) ** 2).mean(axis=1)
 
     rows, samples, seen = [f[0] for f in flights], len(joined["motor"]), errors(joined)
-    sensed = (np.array([measure.sensor_floor(drawn, r, joined, j) for j, r in enumerate(rows)]) ** 2).mean(
-        axis=0
-    )
+    sensed = np.array([measure.sensor_floor(drawn, r, joined, j) for j, r in enumerate(rows)])
     logged = np.stack([measure.motors_of_log(r, samples) for r in rows], axis=-1)
     lasts = np.minimum(joined["crashed"], [round(r["t"][-1] / SAMPLE) for r in rows])
     hidden = [errors(joined | {"motor": m, "crashed": lasts}) for m in logged]
-    return seen, np.sqrt(sensed + np.maximum(np.min(hidden, axis=0) - seen, 0.0))
+    return seen, np.sqrt((sensed**2).mean(axis=0) + np.maximum(np.min(hidden, axis=0) - seen, 0.0))
 
 
 def answer(name, kind, told, drawn, joined, flights, said):
@@ -325,7 +308,8 @@ def answer(name, kind, told, drawn, joined, flights, said):
     category = {0: "none", 1: "unknown" if effects == ["unknown"] else "single", 2: "pair"}[len(effects)]
     if effects and severity < HIDDEN:
         category = "not_testable"
-    forms, each = ([x] if isinstance(x, str | dict) else list(x) for x in (form, said))
+    forms, each = ([x] if isinstance(x, str | dict) else x for x in (form, said))
+    causes = zip(truth, forms, each, strict=False)
     fine = ["wind", "rotor_drag"] if kind == "wind_tunnel" else []
     return {
         "case": name,
@@ -334,9 +318,7 @@ def answer(name, kind, told, drawn, joined, flights, said):
         "expected": ["none"] if category in ("none", "not_testable") else effects,
         "acceptable": {e: accepted(e, told.weighed) for e in effects if e != "unknown"},
         "also_fine": truth if category == "not_testable" else fine,
-        "causes": [
-            {"effect": e, "form": f, "magnitudes": m} for e, f, m in zip(truth, forms, each, strict=False)
-        ],
+        "causes": [{"effect": e, "form": f, "magnitudes": m} for e, f, m in causes],
         "severity": cases.label(severity) if effects else None,
         "severity_ratio": round(severity, 3),
         "told": told.__dict__,
@@ -353,8 +335,7 @@ def main():
     kinds = [kind for kind in KINDS for _ in range(options.each)]
     order = np.random.default_rng(options.seed).permutation(len(kinds))
     jobs = [(options.seed, n, kinds[i], str(options.logs)) for n, i in enumerate(order, 1)]
-    with multiprocessing.get_context("spawn").Pool(options.jobs) as pool:
-        answers = sorted(pool.imap_unordered(make_case, jobs), key=lambda a: a["case"])
+    answers = sorted(in_processes(make_case, jobs, options.jobs), key=lambda a: a["case"])
     print("sha256", write_answers(options.answers, answers, options.seed, "rotorpy"))
 
 

@@ -24,16 +24,14 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def fly(column: str, count: int, options) -> str:
     """Fly a column in a process of its own, which sees nothing of the diagnosis; the SHA-256 of its answers."""
-    logs, answers = options.work / column, options.work / f"{column}_answers.json"
+    work = options.work.resolve()
+    logs, answers = work / column, work / f"{column}_answers.json"
     if not answers.exists():
         module, number = ("rotorpy_cases", "--each") if column == "rotorpy" else ("generate", "--count")
         command = [sys.executable, "-m", f"experiments.diagnosis.{module}", number, str(count)]
         command += [] if column == "rotorpy" else ["--column", column]
         command += ["--seed", str(options.seed), "--logs", str(logs), "--answers", str(answers)]
-        environment = os.environ | {
-            "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-        }
-        subprocess.run([*command, "--jobs", str(options.cores)], env=environment, check=True)
+        subprocess.run([*command, "--jobs", str(options.cores)], cwd=ROOT, check=True)
     return answers.with_suffix(".sha256").read_text().strip()
 
 
@@ -48,10 +46,9 @@ def study(options) -> dict:
         arguments += ["--seconds", str(options.seconds - (time.perf_counter() - begin))]
     development.main(arguments)
     lines = [{k: v for k, v in line.items() if k not in LEFT_OUT} for line in development.read_lines([out])]
-    columns = {
-        name: {"figures": stored_figures([x for x in lines if x["set"] == name])}
-        for name in sorted({x["set"] for x in lines})
-    }
+    columns = {}
+    for name in sorted({x["set"] for x in lines}):
+        columns[name] = {"figures": stored_figures([x for x in lines if x["set"] == name])}
     found = {"seed": options.seed, "note": options.note, "answers_sha256": digests}
     return found | {"columns": columns, "cases": lines}
 

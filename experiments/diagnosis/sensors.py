@@ -204,9 +204,8 @@ def _pose(rng, sensors, flown, j, times, delay):
     step = float(np.median(np.diff(times)))
     when = times - delay
     position = at(flown["position"][:, :, j].astype(float), when)
-    position += sensors["position"] * rng.standard_normal((n, 3)) + coloured(
-        rng, n, 3, 1.0, 1.5e-4 * size, step
-    )
+    white = sensors["position"] * rng.standard_normal((n, 3))
+    position += white + coloured(rng, n, 3, 1.0, 1.5e-4 * size, step)
     angle = sensors["angle"] * rng.standard_normal((n, 3)) + coloured(rng, n, 3, 1.5, 8e-4 * size, step)
     velocity = at(flown["velocity"][:, :, j].astype(float), when)
     if sensors["kind"] == "estimator":  # smoothed: hardly any white noise, slow errors instead
@@ -317,11 +316,9 @@ def log_rows(rng, sensors, flown, j, ticks, unknown=(), hover=0.5):
     voltage = flown["voltage"][place, j] + 0.012 * rng.standard_normal(n)
     seldom = np.floor(t * 10 + 1e-6)
     voltage[np.concatenate([[False], seldom[1:] == seldom[:-1]])] = np.nan
-    imu = [
-        stream(gyro, t, 0) + wrong.get("unknown_gyroscope", 0.0),
-        stream(accel, t, 0) + wrong.get("unknown_accelerometer", 0.0),
-    ]
-    values = np.concatenate([pose, *imu, command, motors, voltage[:, None]], axis=1)
+    gyro = stream(gyro, t, 0) + wrong.get("unknown_gyroscope", 0.0)
+    accel = stream(accel, t, 0) + wrong.get("unknown_accelerometer", 0.0)
+    values = np.concatenate([pose, gyro, accel, command, motors, voltage[:, None]], axis=1)
     for i, column in enumerate(COLUMNS[2:]):
         step = 10.0 ** -DECIMALS[column]
         if sensors["quantum"] > 1 and column not in GROUPS["c"]:

@@ -68,10 +68,8 @@ def toml(told, source, sensors):
     """Text of the case's `vehicle.toml`: the vehicle as told, and what a laboratory knows of its logger."""
     lines = ["[vehicle]", 'name = "crazyflie-2.1"', f"mass = {told.mass:.5f}"]
     lines += [f"mass_weighed = {'true' if told.weighed else 'false'}", "", "[motor]", 'command = "thrust"']
-    lines += [
-        'order = ["front_right", "rear_right", "rear_left", "front_left"]',
-        'spin = ["ccw", "cw", "ccw", "cw"]',
-    ]
+    lines += ['order = ["front_right", "rear_right", "rear_left", "front_left"]']
+    lines += ['spin = ["ccw", "cw", "ccw", "cw"]']
     if (told.torque_ratio, told.thrust_constant) != (TORQUE_RATIO, THRUST_CONSTANT):
         lines.append(f"torque_per_thrust = {told.torque_ratio:.4g}")
     lines += ["", "[log]", f'source = "{source}"', f"motion_capture_rate = {sensors['pose_rate']}"]
@@ -86,13 +84,8 @@ def toml(told, source, sensors):
         values = value if isinstance(value, tuple) else (value,)
         interval = ", ".join(f"[{0.98 * v:.5g}, {1.02 * v:.5g}]" for v in values)
         said = ", ".join(f"{v:.5g}" for v in values)
-        lines += [
-            "",
-            f"[calibrated.{name}]",
-            f"value = [{said}]",
-            f"interval90 = [{interval}]",
-            f'unit = "{unit}"',
-        ]
+        lines += ["", f"[calibrated.{name}]", f"value = [{said}]"]
+        lines += [f"interval90 = [{interval}]", f'unit = "{unit}"']
     return "\n".join(lines) + "\n"
 
 

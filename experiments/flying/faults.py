@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import random
-from collections import deque
+from collections import defaultdict, deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,6 +47,8 @@ OTHER = (
     "policy silent", "policy: a number that is none", *WILD, "battery low", "battery unknown", *GONE, "key", ASLEEP,
 )  # fmt: skip
 KINDS = (*CAMERA, *RADIO, *OTHER)
+PASSING = ("poses jump", "camera: yaw turned", "camera: bodies swapped")
+"""These may be over after a moment, as those of numbers that are none and of attitudes."""
 START = 0.2
 """Nothing goes wrong before (s)."""
 MARGIN, FALL, ENDING = 0.1, 0.3, 5.0
@@ -109,16 +111,10 @@ def draw_fault(seed: int, latest: float) -> Fault:
     kind = KINDS[seed % len(KINDS)]
     time, vehicle, direction = rng.uniform(START, latest), rng.randrange(3), rng.uniform(0.0, 2.0 * math.pi)
     number = rng.choice((math.nan, math.inf, -math.inf, 1e300))
-    duration = {
-        "camera: one frame wrong": 0.0099, "camera: four frames wrong": 0.0399,
-    }.get(kind, math.inf)  # fmt: skip
+    duration = {"camera: one frame wrong": 0.0099, "camera: four frames wrong": 0.0399}.get(kind, math.inf)
     if kind.endswith("for a while"):
         duration = rng.uniform(0.05, 1.0)
-    elif (
-        "none" in kind
-        or "attitude" in kind
-        or kind in ("poses jump", "camera: yaw turned", "camera: bodies swapped")
-    ):
+    elif "none" in kind or "attitude" in kind or kind in PASSING:
         duration = rng.choice((0.0099, 0.05, 1.0, math.inf))
     amount = {
         "packets lost": rng.uniform(0.1, 0.7), "camera scaled": rng.choice((0.8, 1.2, 1.5, 1000.0)),
@@ -130,21 +126,18 @@ def draw_fault(seed: int, latest: float) -> Fault:
 class PoseDamage:
     """What is received in place of a vehicle's true poses, camera's or radio's."""
 
-    def __init__(self, fault: Fault, vehicles: int):
+    def __init__(self, fault: Fault):
         self._fault, self._random = fault, random.Random(fault.time)
         self._held: dict[tuple, Pose] = {}
-        self._past = {
-            (source, i): deque(maxlen=50) for source in ("camera", "radio") for i in range(vehicles)
-        }
+        self._past = defaultdict(lambda: deque(maxlen=50))
         self._field = self._random.randrange(100)
 
     def __call__(self, source: str, i: int, now: float, pose: Pose, others) -> Pose | None:
         """The pose received from `source`, "camera" or "radio"; `others`: true poses of all."""
         fault = self._fault
         self._past[source, i].append(pose)
-        mine = (
-            i == fault.vehicle or fault.kind.endswith("all") or fault.time < 0.0
-        )  # from the start the whole system
+        # from the start it is the whole system
+        mine = i == fault.vehicle or fault.kind.endswith("all") or fault.time < 0.0
         if fault.kind in GONE and mine and fault.on(now) and source == "radio":
             return None
         names = CAMERA if source == "camera" else RADIO

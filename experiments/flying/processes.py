@@ -39,12 +39,8 @@ from experiments.flying.faults import (
 
 ROLES = ("loop", "links", "guard")
 SIGNALS = ("KILL", "STOP", "TERM", "HUP", "INT", "TSTP", "QUIT")
-UNSENT = (
-    *BEYOND,
-    "poses: a number that is none",
-    "poses: no attitude",
-    *(k for k in (*CAMERA, *RADIO) if "clock" in k or "order" in k),
-)
+UNSENT = {k for k in (*CAMERA, *RADIO) if "clock" in k or "order" in k}
+UNSENT |= {*BEYOND, "poses: a number that is none", "poses: no attitude"}
 """No packet, or adapter, can say so; or nothing mends it."""
 KEYS = {
     "key l": "l", "key h, l a second later": "h…l", "h and l": "hl", "Ctrl-C": "\x03", "Ctrl-Z": "\x1a", "Ctrl-\\": "\x1c",
@@ -106,7 +102,7 @@ def fault_of(number: int, kind: str) -> Fault:
 
 def feed_of(fault: Fault, truth):
     """What a laboratory's adapter would be: poses of a camera at 100 Hz, damaged."""
-    damage, noise = PoseDamage(fault, 3), np.random.default_rng(7)
+    damage, noise = PoseDamage(fault), np.random.default_rng(7)
 
     def feed(update):
         due = time.perf_counter()

@@ -118,16 +118,12 @@ class Worlds:
         scenario, self._task = task_of(layout)
         self.faults, self.n, self._layout = faults, len(scenario.pursuers), layout
         starts = np.array(scenario.pursuers)
-        self._damage = [PoseDamage(fault, self.n) for fault in faults]
+        self._damage = [PoseDamage(fault) for fault in faults]
         vehicles = VirtualVehicles(load_vehicle(), np.tile(starts, (len(faults), 1)))
         self._vehicles = vehicles
         following = [fault.kind != "camera drifts" for fault in faults for _ in range(self.n)]
-        self.swarm = SimulatedSwarm(
-            vehicles,
-            following,
-            lambda *a: self._received("radio", *a),
-            lambda *a: self._received("camera", *a),
-        )
+        radio, camera = (functools.partial(self._received, source) for source in ("radio", "camera"))
+        self.swarm = SimulatedSwarm(vehicles, following, radio, camera)
         pillars = [(x, y, self.game.pillar_radius) for x, y in scenario.pillars]
         state = initial_state([tuple(s) for s in starts.tolist()], pillars, self.airframe)
         state = state._replace(drones=(Drone(Mode.PURSUIT),) * self.n)
@@ -154,9 +150,8 @@ class Worlds:
         now, samples = self.swarm.now, list(self.swarm.observe())
         flown = np.flatnonzero(self._down < LAIN).tolist()
         awake = [w for w in flown if not (self.faults[w].kind == ASLEEP and self.faults[w].on(now))]
-        self.swarm.asleep = {
-            w * self.n + i for w in set(range(len(self.faults))) - set(flown) for i in range(self.n)
-        }
+        over = set(range(len(self.faults))) - set(flown)
+        self.swarm.asleep = {w * self.n + i for w in over for i in range(self.n)}
         for w in awake:
             first = w * self.n
             before = self.states[w].drones
@@ -188,9 +183,8 @@ class Worlds:
         if self._measured is None:
             self._measured = self._first(self._task, poses)
         else:
-            self._measured = self._tick(
-                *self._measured[:2], poses, np.zeros(3, np.float32), np.zeros((), bool)
-            )
+            unseen = np.zeros(3, np.float32), np.zeros((), bool)
+            self._measured = self._tick(*self._measured[:2], poses, *unseen)
             for w, caught in enumerate(np.asarray(self._measured[4])):
                 if caught and self.captured[w] is None:
                     self.captured[w] = len(self._tracks)
@@ -259,9 +253,8 @@ def summary(records) -> list[dict]:
     """A row per kind."""
     rows = []
     for kind in (*KINDS, "none", ALL):
-        mine = [
-            r for r in records if kind == r["kind"] or (kind == ALL and r["kind"] not in (*BEYOND, "none"))
-        ]
+        kinds = {*KINDS} - {*BEYOND} if kind == ALL else {kind}
+        mine = [r for r in records if r["kind"] in kinds]
         if not mine:
             continue
         seconds = [r["seconds"] for r in mine if r["seconds"] is not None and r["kind"] not in SLOW]

@@ -38,11 +38,8 @@ def share_out(
             for done in as_completed(given):
                 if error := done.exception():
                     failed += 1
-                    print(
-                        f"{str(given[done])[:200]}: {type(error).__name__}: {error}",
-                        file=sys.stderr,
-                        flush=True,
-                    )
+                    said = f"{str(given[done])[:200]}: {type(error).__name__}: {error}"
+                    print(said, file=sys.stderr, flush=True)
                 elif done.result() is not None:
                     yield done.result()
         finally:  # also where who asks has failed: nobody waits for what isn't begun

@@ -89,9 +89,8 @@ def fly(name: str, options) -> dict[str, dict[str, dict]]:
             for tasks_of, own in part(flown).items():
                 summary = summarise(own)
                 found.setdefault(kind, {})[tasks_of] = finite(summary)
-                print(
-                    name, kind, tasks_of, *(cell(summary, column) for column in FIGURES.values()), flush=True
-                )
+                figures = (cell(summary, column) for column in FIGURES.values())
+                print(name, kind, tasks_of, *figures, flush=True)
     return found
 
 

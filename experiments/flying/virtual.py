@@ -22,9 +22,10 @@ class Truth:
     def __init__(self, number: int, context):
         self.number, self._numbers = number, context.RawArray("d", 1 + _POSE * number)
 
-    take_off = property(
-        lambda self: self._numbers[0] or math.inf, doc="When motors turned first (s); infinite before."
-    )
+    @property
+    def take_off(self) -> float:
+        """When motors turned first (s); infinite before."""
+        return self._numbers[0] or math.inf
 
     def begin(self, take_off: float) -> None:
         """Motors turn since `take_off` (s); zero: they don't."""
@@ -90,22 +91,20 @@ class _Flown:
         self._reset(Fault("none", math.inf, 0))
 
     def _reset(self, fault):
-        self._fault, self._damage = fault, PoseDamage(fault, 3)
+        self._fault, self._damage = fault, PoseDamage(fault)
         self._virtual.vehicles.reset()
         for firmware, link in zip(self._virtual.firmware, self._virtual.links, strict=True):
             firmware.restart()
             link.faults = link.faults.__class__()
-        self._rows, self._last, self._answers = [], 0.0, [None] * 3
+        self._rows, self._last = [], 0.0
         self._truth.begin(0.0)
 
     def damaged(self, i):
         """What vehicle i senses, as its log blocks tell it."""
         sensors = self._sensors(i)
         now = time.perf_counter() - self._truth.take_off
-        pose = Pose(
-            now, *(tuple(x.tolist()) for x in (sensors.position, sensors.velocity, sensors.quaternion))
-        )
-        pose = pose._replace(body_rates=tuple(sensors.body_rates.tolist()))
+        sensed = (sensors.position, sensors.velocity, sensors.quaternion, sensors.body_rates)
+        pose = Pose(now, *(tuple(x.tolist()) for x in sensed))
         sent = self._damage("radio", i, now, pose, ())
         if sent is pose or sent is None:
             return sensors
@@ -120,9 +119,8 @@ class _Flown:
         if now - self._last >= EVERY:
             self._last = now
             off = [f.set_point(virtual.time).mode == 0 for f in virtual.firmware]
-            self._rows.append(
-                (now, report.position.copy(), off, [f.armed and not f.emergency for f in virtual.firmware])
-            )
+            armed = [f.armed and not f.emergency for f in virtual.firmware]
+            self._rows.append((now, report.position.copy(), off, armed))
             if math.isinf(self._truth.take_off) and not all(off):
                 self._truth.begin(now)
             self._spoil(now - self._truth.take_off)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from experiments.paper.roster import METHODS, flights_of
 from experiments.table import Page, Table
@@ -22,20 +23,18 @@ CORRIDORS = (-0.2, 0.3)
 """passage: the rows of pillars at these y (m) part three ways."""
 EVERY = 8
 """Steps between the points of a path that is kept for the picture."""
+SIGHT = {
+    "seen": "first step in which anyone sees it",
+    "lost": "share of steps until the capture without sight",
+}
 MEASURES = {
     "wall": {"both sides": "pursuers round both ends of the wall at the same time, before the capture"},
     "narrow_gap": {
         "met": "captured from ahead: the evader flies towards the one that catches it",
         "shorter way": "way of the one that catches it, as a share of the evader's",
     },
-    "random": {
-        "seen": "first step in which anyone sees it",
-        "lost": "share of steps until the capture without sight",
-    },
-    "hidden": {
-        "seen": "first step in which anyone sees it",
-        "lost": "share of steps until the capture without sight",
-    },
+    "random": SIGHT,
+    "hidden": SIGHT,
     "passage": {
         "three ways": "a pursuer in each of the three corridors at the same time, before the capture"
     },
@@ -108,14 +107,12 @@ def page(results: dict) -> Page:
     rows = []
     for layout, measures in MEASURES.items():
         for name in measures:
-            of_methods = {
-                method: [f["layouts"][layout]["behaviour"][name] for f in flights_of(results, method)]
-                for method in METHODS
-            }
-            rows.append({"layout": layout, "name": name, **of_methods})
-    meanings = [
-        f"* {layout}, {name}: {text}" for layout, own in MEASURES.items() for name, text in own.items()
-    ]
+            row = {"layout": layout, "name": name}
+            for method in METHODS:
+                flown = flights_of(results, method)
+                row[method] = [f["layouts"][layout]["behaviour"][name] for f in flown]
+            rows.append(row)
+    meanings = [f"* {layout}, {n}: {text}" for layout, own in MEASURES.items() for n, text in own.items()]
     columns = {"layout": "layout", "behaviour": "name"}
     return Page(
         "What the pursuers do",
@@ -131,20 +128,14 @@ def page(results: dict) -> Page:
 
 def draw(results: dict, path: Path) -> None:
     """One episode of every method's first seed on the paper's four layouts."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     layouts = [layout for layout in MEASURES if layout != "hidden"]
     shown = [method for method in METHODS if flights_of(results, method)]
     figure = Figure(figsize=(3.1 * len(shown), 3.3 * len(layouts)), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(len(layouts), len(shown), squeeze=False)
     for i, layout in enumerate(layouts):
         for j, method in enumerate(shown):
             flown = flights_of(results, method)[0]["layouts"][layout]
-            told = ", ".join(
-                f"{name} {value:.2g}" for name, value in flown["behaviour"].items() if value is not None
-            )
+            told = ", ".join(f"{n} {x:.2g}" for n, x in flown["behaviour"].items() if x is not None)
             draw_from_above(axes[i, j], trajectory_of(flown["paths"], layout, told))
             axes[i, j].title.set_fontsize("x-small")
             axes[i, j].set(xlabel=method if i == len(layouts) - 1 else "", ylabel=layout if j == 0 else "")

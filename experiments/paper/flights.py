@@ -37,9 +37,8 @@ class Flights:
     """B episodes of the mean policy."""
 
     evaluation: Evaluation  # (B,) each
-    first: (
-        jax.Array
-    )  # (B, R) int32, first step with a capture within each radius; episode length + 1 where there is none
+    first: jax.Array
+    """(B, R) int32, first step with a capture within each radius; episode length + 1 where there is none."""
     paths: Paths
 
 
@@ -67,15 +66,9 @@ def fly(
         return observation, state, info
 
     def caught(state):
-        each = [
-            captures(
-                dataclasses.replace(settings, capture_radius=radius),
-                state.drones.position,
-                state.evader_position,
-                state.in_sight,
-            )
-            for radius in radii
-        ]
+        games = [dataclasses.replace(settings, capture_radius=radius) for radius in radii]
+        where = (state.drones.position, state.evader_position, state.in_sight)
+        each = [captures(game, *where) for game in games]
         return jnp.any(jnp.stack(each), axis=-1)
 
     def one(carry, _):

@@ -23,7 +23,7 @@ def page(results: dict) -> Page:
         "layout": "layout",
         "OPEN": "prediction_error:.4f",
         "keeping the last seen position": "last_seen_error:.4f",
-        "paper": "paper",
+        "paper": lambda r: PREDICTION.get(r["layout"]),
     }
     return Page(
         "The paper's tables",
@@ -43,10 +43,7 @@ def page(results: dict) -> Page:
             ),
             Table(
                 prediction,
-                [
-                    r | {"paper": PREDICTION.get(r["layout"])}
-                    for r in cells(results, ["OPEN"], "clamp", LAYOUTS)
-                ],
+                cells(results, ["OPEN"], "clamp", LAYOUTS),
                 "Prediction of the next position (m)",
                 "Mean distance to the true one over all steps, seen or not; speed clamp.",
             ),
@@ -96,8 +93,7 @@ def verdicts(results: dict) -> str:
                 mean, deviation = record["paper"][i]
                 if sign * (ours - mean) < -deviation - 5e-4:
                     below_paper.append(f"{layout}, {method}: {name} {ours:.3g} against {mean:.3g}")
-    first = "; ".join(above_open) or "in every cell"
-    second = "; ".join(below_paper) or "none"
-    return (
-        f"OPEN is the best but for: {first}." if above_open else "No method is better than OPEN in any cell."
-    ) + f" Worse than the paper's own value by more than its spread: {second}."
+    best = "No method is better than OPEN in any cell."
+    if above_open:
+        best = f"OPEN is the best but for: {'; '.join(above_open)}."
+    return f"{best} Worse than the paper's own value by more than its spread: {'; '.join(below_paper) or 'none'}."

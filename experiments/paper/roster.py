@@ -15,13 +15,8 @@ METHODS = {
 ABLATIONS = {"MAPPO + predictor": "predictor", "MAPPO + generator": "generator"}
 """The paper's other variants: MAPPO + EPN, MAPPO + AEG."""
 SEEDS = 3
-COLORS = dict(
-    zip(
-        (*METHODS, *ABLATIONS),
-        ("tab:orange", "tab:olive", "tab:brown", "tab:purple", "0.3", "tab:red", "tab:blue", "tab:green"),
-        strict=True,
-    )
-)
+HUES = ("tab:orange", "tab:olive", "tab:brown", "tab:purple", "0.3", "tab:red", "tab:blue", "tab:green")
+COLORS = dict(zip((*METHODS, *ABLATIONS), HUES, strict=True))
 
 
 def seeds_of(label: str) -> list[tuple[str, int]]:

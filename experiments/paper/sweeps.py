@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from experiments.paper.roster import COLORS, METHODS, flights_of
 from experiments.table import Page, Table, spread
@@ -82,43 +83,31 @@ def not_above(methods: dict, axis: str, values: tuple[float, ...], unit: str) ->
     found = []
     for label in methods.keys() - {"OPEN"} if "OPEN" in methods else ():
         for i, value in enumerate(values):
-            (rate, best), (step, early) = (
-                (mean(label, name, i), mean("OPEN", name, i)) for name in ("capture_rate", "capture_step")
-            )
+            rate, step = (mean(label, name, i) for name in ("capture_rate", "capture_step"))
+            best, early = (mean("OPEN", name, i) for name in ("capture_rate", "capture_step"))
             if rate > best + 1e-9 or (abs(rate - best) < 1e-9 and step < early):
-                found.append(
-                    f"{label} at {value} {unit} ({rate:.2f} / {step:.0f} against {best:.2f} / {early:.0f})"
-                )
-    return (
-        "OPEN isn't above: " + "; ".join(sorted(found)) + "."
-        if found
-        else "No method is above OPEN anywhere."
-    )
+                both = f"{rate:.2f} / {step:.0f} against {best:.2f} / {early:.0f}"
+                found.append(f"{label} at {value} {unit} ({both})")
+    return f"OPEN isn't above: {'; '.join(sorted(found))}." if found else "No method is above OPEN anywhere."
 
 
 def draw(results: dict, path: Path) -> None:
     """Capture rate and step over radius and over speed, mean and range over seeds."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     methods = seeds_by_method(results)
     figure = Figure(figsize=(11, 6.5), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(2, 2, sharex="col", sharey="row")
-    for j, (axis, x, own, label) in enumerate(
-        (
-            ("radius", RADII, RADIUS, "capture radius in empty (m)"),
-            ("speed", SPEEDS, SPEED, "evader speed in passage (m/s)"),
-        )
-    ):
+    swept = (
+        ("radius", RADII, RADIUS, "capture radius in empty (m)"),
+        ("speed", SPEEDS, SPEED, "evader speed in passage (m/s)"),
+    )
+    for j, (axis, x, own, label) in enumerate(swept):
         for i, name in enumerate(("capture_rate", "capture_step")):
             for method, seeds in methods.items():
                 values = np.array([seed[axis][name] for seed in seeds])
                 line = {"color": COLORS[method], "marker": "o", "markersize": 3, "label": method}
                 axes[i, j].plot(x, values.mean(axis=0), **line)
-                axes[i, j].fill_between(
-                    x, values.min(axis=0), values.max(axis=0), color=COLORS[method], alpha=0.15, linewidth=0
-                )
+                band = {"color": COLORS[method], "alpha": 0.15, "linewidth": 0}
+                axes[i, j].fill_between(x, values.min(axis=0), values.max(axis=0), **band)
             axes[i, j].axvline(own, color="black", linewidth=0.8, linestyle=":")
             axes[i, j].grid(alpha=0.3)
             axes[i, 0].set_ylabel(name.replace("_", " "))

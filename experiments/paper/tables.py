@@ -9,7 +9,6 @@ import dataclasses
 import functools
 import json
 import time
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +17,7 @@ import numpy as np
 from experiments.paper import behaviours, main_tables, sweeps
 from experiments.paper.flights import environment_of, fly
 from experiments.paper.roster import ABLATIONS, METHODS, seeds_of
-from experiments.table import RESULTS, documented_parser, facts, write_page
+from experiments.table import facts, page_parser, write_page
 from openjax.background import compile_ahead
 from openjax.baselines import METHODS as HEURISTICS
 from openjax.commands.command_line import run_command
@@ -149,13 +148,10 @@ def study(options: argparse.Namespace) -> None:
 
 def main(arguments: list[str]) -> int:
     """Fly or read the flights, then write all pages."""
-    parser = documented_parser(__doc__)
-    parser.add_argument("--report", action="store_true", help="from the stored flights")
+    parser = page_parser(__doc__, ".")
     parser.add_argument("--episodes", type=int, default=100, help="per seed and layout; half for the sweeps")
     parser.add_argument("--physics", choices=("rigid", "mjx"), default="rigid", help="mjx: the same, slower")
     parser.add_argument("--methods", nargs="+", choices=LABELS, default=list(LABELS), help="fly these anew")
-    parser.add_argument("--commit", default="", help="where the machine has no repository")
-    parser.add_argument("--out", type=Path, default=RESULTS, help="directory")
     options = parser.parse_args(arguments)
     if not options.report:
         study(options)

@@ -19,8 +19,7 @@ from experiments.diagnosis import (
 pytestmark = pytest.mark.slow
 
 
-def told(**changes):
-    return vehicle.Told(**changes)
+told = vehicle.Told
 
 
 def body(parameters, q=None, velocity=None, rates=None, speed=0.0):
@@ -42,14 +41,7 @@ def body(parameters, q=None, velocity=None, rates=None, speed=0.0):
 def steps(b, number, m=0.0):
     zero = np.zeros_like(b.rates)
     for _ in range(number):
-        b.step(
-            np.full((4, b.count), m),
-            np.full(b.count, 3.7),
-            np.full(b.count, 0.6),
-            zero,
-            zero,
-            0.0,
-        )
+        b.step(np.full((4, b.count), m), np.full(b.count, 3.7), np.full(b.count, 0.6), zero, zero, 0.0)
 
 
 def test_a_vehicle_without_thrust_falls_and_turns_as_mechanics_says():
@@ -116,13 +108,8 @@ def hovering():
     laps = cases.missions.single("laps", rng, 300)
     still = {k: np.zeros_like(x) for k, x in laps.items()}
     still["position"][:, 2] = 0.6
-    set_up = sensors.draw(rng, "white", "pgacmv", "none") | {
-        "size": 1e-9,
-        "gyro": 0.0,
-        "pose_delay": 0.0,
-        "gust": 0.0,
-    }
-    set_up |= {"gyro_bias": [0.0] * 3}
+    set_up = sensors.draw(rng, "white", "pgacmv", "none")
+    set_up |= {"size": 1e-9, "gyro": 0.0, "gyro_bias": [0.0] * 3, "pose_delay": 0.0, "gust": 0.0}
     air = sensors.stack([sensors.draw_air(rng, set_up, 300, 3.9) for _ in many])
     air["gyro_bias"] *= 0
     reference = {k: np.stack([still[k], laps[k]], axis=-1) for k in laps}
@@ -161,39 +148,37 @@ def test_the_measure_sees_nothing_in_a_true_model_and_a_wrong_thrust_by_its_size
     np.testing.assert_allclose(turned, rms, rtol=0.3, atol=1e-4)
 
 
-def log_of(flown, kind, **changes):
+def log_of(flown, kind, unknown=(), **changes):
     rng = np.random.default_rng(5)
-    set_up = (
-        sensors.draw(rng, kind, "psgacmv", "none") | {"rate": 100, "pose_rate": 100, "dropped": 0.0} | changes
-    )
-    return set_up, sensors.log_rows(rng, set_up, flown, 1, 300)
+    plain = {"rate": 100, "pose_rate": 100, "dropped": 0.0}
+    set_up = sensors.draw(rng, kind, "psgacmv", "none") | plain | changes
+    return sensors.log_rows(rng, set_up, flown, 1, 300, unknown)
 
 
 def test_drawn_sensors_have_the_noise_that_they_say(hovering):
     _, _, flown = hovering
     plain = {"accel_cut": 0.0, "tilt": [0, 0, 0], "accel_bias": [0, 0, 0], "pose_delay": 2.0, "quantum": 1.0}
-    _, rows = log_of(flown, "white", **plain, size=1.0, accel=0.2, position=2e-4, velocity="smooth")
+    rows = log_of(flown, "white", **plain, size=1.0, accel=0.2, position=2e-4, velocity="smooth")
     at = np.arange(300) * 5
     noise = rows["ax"] - flown["specific"][at, 0, 1]
     assert noise.std() == pytest.approx(0.2, rel=0.15)
     late = rows["x"] - (flown["position"][at, 0, 1] - 0.002 * flown["velocity"][at, 0, 1])
     assert late[10:].std() == pytest.approx(2.5e-4, rel=0.4)
-    _, filtered = log_of(flown, "filtered", **plain | {"accel_cut": 30.0}, size=1.0, accel=0.2)
+    filtered = log_of(flown, "filtered", **plain | {"accel_cut": 30.0}, size=1.0, accel=0.2)
     assert (filtered["ax"] - flown["specific"][at, 0, 1])[20:].std() < 0.13
-    _, coarse = log_of(flown, "quantised", **plain | {"quantum": 20.0})
+    coarse = log_of(flown, "quantised", **plain | {"quantum": 20.0})
     steps_seen = np.round(coarse["qx"] / 2e-4)
     np.testing.assert_allclose(coarse["qx"], steps_seen * 2e-4, atol=1e-9)
-    _, shaking = log_of(
-        flown, "vibrating", **plain, size=1e-3, accel=1e-3, vibration=1.0, vibration_frequency=20.0
-    )
+    quiet = {"size": 1e-3, "accel": 1e-3, "vibration": 1.0, "vibration_frequency": 20.0}
+    shaking = log_of(flown, "vibrating", **plain, **quiet)
     spectrum = np.abs(np.fft.rfft(shaking["ay"] - flown["specific"][at, 1, 1])) ** 2
     peak = np.fft.rfftfreq(300, 0.01)[spectrum[1:].argmax() + 1]
     assert 16 < peak < 24
-    _, slow = log_of(flown, "stale", pose_rate=50)
+    slow = log_of(flown, "stale", pose_rate=50)
     assert (np.diff(slow["x"])[0::2] == 0).mean() > 0.95
-    _, gaps = log_of(flown, "white", pose_rate=50)
+    gaps = log_of(flown, "white", pose_rate=50)
     assert np.isnan(gaps["x"]).mean() == pytest.approx(0.5, abs=0.02)
-    _, radio = log_of(flown, "radio", stream_rate=75.0, wander=0.0)
+    radio = log_of(flown, "radio", stream_rate=75.0, wander=0.0)
     exact = flown["motor"][at, 0, 1]
     assert 0 < np.abs(radio["m1"] - exact).max() < 0.3
 
@@ -239,32 +224,19 @@ def test_every_unknown_site_acts(hovering):
     for name, site in unknowns.SITES.items():
         own = cause | {"effect": name, "size": site.sizes[1]}
         if site.logs:
-            rng = np.random.default_rng(5)
-            drawn = sensors.draw(rng, "white", "psgacmv", "none") | {
-                "rate": 100,
-                "pose_rate": 100,
-                "dropped": 0,
-            }
-            one, two = (
-                sensors.log_rows(np.random.default_rng(5), drawn, flown, 1, 300, c) for c in ([], [own])
-            )
+            one, two = (log_of(flown, "white", unknown=unknown) for unknown in ([], [own]))
             wrong = {c for c in one if not np.allclose(one[c], two[c], equal_nan=True)}
             assert wrong and wrong <= set(sensors.GROUPS[site.logs]), name
             continue
         strange = unknowns.Unknowns({name: [(np.array([0]), own)]}, 1)
         u, moved = np.full((4, 1), 0.6), 0.0
         for s in range(0, 1400, 7):
-            state = [
-                flown[k][s, :, 1:].astype(float) for k in ("position", "quaternion", "velocity", "rates")
-            ]
+            names = ("position", "quaternion", "velocity", "rates")
+            state, time = [flown[k][s, :, 1:].astype(float) for k in names], 5 + 0.006 * s
             strange.look(*state, u, np.array([3.7]))
-            force, torque = strange.wrench(state[1], 5 + 0.006 * s)
-            moved = max(
-                moved,
-                np.abs(force).max() / 1e-2,
-                np.abs(torque).max() / 1e-4,
-                np.abs(strange.motors(u, 5 + 0.006 * s) - u).max() / 0.05,
-            )
+            force, torque = strange.wrench(state[1], time)
+            sizes = (force / 1e-2, torque / 1e-4, (strange.motors(u, time) - u) / 0.05)
+            moved = max(moved, *(np.abs(size).max() for size in sizes))
         assert moved > 0.3, name
 
 
@@ -282,13 +254,12 @@ def test_a_propeller_that_speeds_up_turns_the_body_and_keeps_the_whole_momentum(
 def test_garbage_spoils_what_it_says_and_nothing_else(hovering):
     _, _, flown = hovering
     for kind in garbage.KINDS | garbage.STRANGERS:
-        flights = [log_of(flown, "white")[1] for _ in range(3)]
+        flights = [log_of(flown, "white") for _ in range(3)]
         flights[1] = {k: x + 0.01 if k != "t" else x for k, x in flights[1].items()}
         before = [{k: x.copy() for k, x in f.items()} for f in flights]
         wrong = garbage.spoil(kind, flights, np.random.default_rng(2))
-        changed = {
-            k for f, o in zip(flights, before, strict=True) for k in f if not np.array_equal(f[k], o[k], True)
-        }
+        both = list(zip(flights, before, strict=True))
+        changed = {k for f, o in both for k in f if not np.array_equal(f[k], o[k], equal_nan=True)}
         assert changed and changed <= set(wrong), kind
 
 
@@ -304,7 +275,7 @@ def test_written_cases_can_be_read_and_say_what_they_hold(tmp_path, monkeypatch)
     for spec in drawn:
         spec |= {"ticks": [300] * 3, "missions": [("laps",)] * 3}
     monkeypatch.setattr(cases, "draw_cases", lambda *_: drawn)
-    answers = generate.generate(5, "known", 2, tmp_path / "logs", progress=False)
+    answers = generate.generate(5, "known", 2, tmp_path / "logs")
     digest = generate.write_answers(tmp_path / "answers.json", answers, 5, "known")
     assert (tmp_path / "answers.sha256").read_text().strip() == digest
     for answer in answers:
@@ -324,17 +295,14 @@ def test_rows_that_see_little_of_the_motors_hide_torque(hovering):
     many, p, flown = hovering
     none, left = np.zeros(2, bool), {}
     m = flown["motor"].copy()
-    m[::2], m[1::2] = (
-        m[::2] + 0.02,
-        m[1::2] - 0.02,
-    )  # the loop's own noise: fast, and without effect on the motion
+    m[::2] += 0.02  # the loop's own noise: fast, and without effect on the motion
+    m[1::2] -= 0.02
     for rate in (500, 50):
-        _, rows = log_of(flown | {"motor": m}, "white", rate=rate, motor="snapshot")
+        rows = log_of(flown | {"motor": m}, "white", rate=rate, motor="snapshot")
         held, straight = measure.motors_of_log(rows, len(m))
         logged = np.stack([held, held], axis=-1)
-        left[rate] = measure.errors(flown | {"motor": logged}, many, p, np.arange(2), none, none)[
-            3:6, 1
-        ].max()
+        seen = measure.errors(flown | {"motor": logged}, many, p, np.arange(2), none, none)
+        left[rate] = seen[3:6, 1].max()
         assert straight.shape == held.shape
     np.testing.assert_allclose(left[500], 0.0, atol=0.1)
     assert left[50] > 5 * left[500]

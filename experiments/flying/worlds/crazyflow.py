@@ -108,11 +108,10 @@ def main() -> None:
     rows = {n: np.stack([row[n] for row in worlds[0].rows], 1) for n in worlds[0].rows[0]}
     options.out.mkdir(parents=True)
     for i, layout in enumerate(options.layouts):
-        vehicles = [
-            {"t": PERIOD * np.arange(game.episode_length)}
-            | {c: values[j, :, k] for n, values in rows.items() for k, c in enumerate(CHANNEL_COLUMNS[n])}
-            for j in range(worlds[0].team * i, worlds[0].team * (i + 1))
-        ]
+        vehicles = []
+        for j in range(worlds[0].team * i, worlds[0].team * (i + 1)):
+            own = {c: x[j, :, k] for n, x in rows.items() for k, c in enumerate(CHANNEL_COLUMNS[n])}
+            vehicles.append({"t": PERIOD * np.arange(game.episode_length)} | own)
         write_csv(options.out / f"{layout}.csv.gz", log_of(vehicles, layout), {"t": 4})
         print(layout, {n: float(getattr(statistics, n)[i]) for n in ("captured", "capture_step", "crashed")})
     (options.out / "vehicle.toml").write_text(VEHICLE_TOML, encoding="utf-8")

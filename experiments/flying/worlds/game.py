@@ -32,10 +32,7 @@ class World(Protocol):
 def per_world(team: int, position, quaternion, velocity) -> Poses:
     """Poses of bodies in the last axis, (3, W * N) and so on, as `Poses`."""
     parts = {"position": position, "quaternion": quaternion, "velocity": velocity}
-    return {
-        name: np.asarray(value).T.reshape(-1, team, len(value)).astype(np.float32)
-        for name, value in parts.items()
-    }
+    return {n: np.asarray(x).T.reshape(-1, team, len(x)).astype(np.float32) for n, x in parts.items()}
 
 
 class SeenElsewhere:

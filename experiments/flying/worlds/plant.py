@@ -35,9 +35,8 @@ def air_of(drawn: dict, seed: int, number: int, ticks: int, worlds: range, team:
     for world in worlds:
         rng = rng_of(seed, number, 3, world)
         voltage = drawn["voltage"] + rng.uniform(-0.15, 0.1)
-        bodies += [
-            sensors.draw_air(rng, drawn, ticks, voltage + rng.uniform(-0.02, 0.02)) for _ in range(team)
-        ]
+        for _ in range(team):
+            bodies.append(sensors.draw_air(rng, drawn, ticks, voltage + rng.uniform(-0.02, 0.02)))
     return sensors.stack(bodies)
 
 

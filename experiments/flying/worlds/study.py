@@ -100,9 +100,8 @@ def do(job: Job) -> tuple[Job, dict[str, list[float]], float]:
     loaded, settings = loaded_policy(job.policy)
     task = scenario_task(settings, SCENARIOS[job.layout])
     tasks = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], job.number, axis=0), task)
-    keys = jax.vmap(functools.partial(jax.random.fold_in, jax.random.key(SEED)))(
-        np.arange(job.start, job.start + job.number)
-    )
+    numbers = np.arange(job.start, job.start + job.number)
+    keys = jax.vmap(functools.partial(jax.random.fold_in, jax.random.key(SEED)))(numbers)
     make = functools.partial(make_world, job.world, settings.episode_length, job.start)
     statistics = play(loaded, settings, tasks, keys, make)
     figures = {name: np.asarray(getattr(statistics, name), float).tolist() for name in FIGURES}
@@ -140,8 +139,10 @@ def page(results: dict) -> Page:
     for world in next(iter(results["records"].values())):
         for policy, worlds in results["records"].items():
             records = worlds.get(world, {})
+            about = {"world": world, "policy": policy}
             for layout, record in records.items():
-                rows.append({"world": world, "policy": policy, "layout": layout, **record})
+                rates = {name: f"{record[name]:.3f}" for name in ("captured", "crashed")}
+                rows.append({**about, "layout": layout, **record, **rates})
             if records:
                 mean = {name: np.mean([record[name] for record in records.values()]) for name in FIGURES}
                 mean["episodes"] = sum(record["episodes"] for record in records.values())
@@ -149,13 +150,13 @@ def page(results: dict) -> Page:
                     hits = binomtest(round(mean[name] * mean["episodes"]), mean["episodes"])
                     low, high = hits.proportion_ci(method="wilson")
                     mean[name] = f"{mean[name]:.3f} [{low:.2f}, {high:.2f}]"
-                rows.append({"world": world, "policy": policy, "layout": "**mean**", **mean})
+                rows.append({**about, "layout": "**mean**", **mean})
     columns = {
         **{name: name for name in ("world", "policy", "layout", "episodes")},
-        "capture": lambda row: _rate(row["captured"]),
+        "capture": "captured",
         "step": "capture_step:.0f",
         "collision": "collision_rate:.4f",
-        "crash": lambda row: _rate(row["crashed"]),
+        "crash": "crashed",
         "over speed": "over_speed_rate:.3f",
     }
     return Page(
@@ -165,10 +166,6 @@ def page(results: dict) -> Page:
         "code), also with each of its causes at three quarters of its range; rotorpy: RotorPy's own Crazyflie.",
         Table(columns, rows),
     )
-
-
-def _rate(value):
-    return value if isinstance(value, str) else f"{value:.3f}"
 
 
 def main() -> None:
