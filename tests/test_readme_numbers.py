@@ -112,7 +112,7 @@ def test_evaders():
             for policy in ("flight", "evaders")
         )
 
-    label = "uniform tasks without clamp, captures by `flight`, by `evaders`: the paper's evader"
+    label = "new tasks without clamp, captures by `flight`, by `evaders`: the paper's evader"
     assert cells(label)[0] == least(["field"], ["uniform"])
     assert cells("... of ten scripted evaders the one that suits the team least")[0] == least(
         SCRIPTED, ["uniform"]
