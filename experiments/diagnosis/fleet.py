@@ -153,6 +153,8 @@ def write_logs(folder, flights, channels, vehicle_file):
 def write_case(fleet, i, folder, spoiled=False):
     """Write the logs and `vehicle.toml` of variant i into `folder`; returns the columns that were spoiled."""
     spec, (rows, wrong) = fleet.variants[i][0], fleet.rows(i, spoiled)
-    told = real.toml(spec.get("form_errors"), spec["told"], spec["sensors"])
+    errors = spec.get("form_errors")
+    command = "pwm" if errors and errors["pwm"] else "thrust"
+    told = vehicle.toml(spec["told"], "simulated", spec["sensors"], command)
     write_logs(folder, rows, spec["sensors"]["channels"], told)
     return wrong

@@ -310,15 +310,9 @@ def fly(batch):
                 body.rates[:, dead], body.q[:, dead] = 0.0, np.array([[1.0], [0], [0], [0]])
         flight.look()
         specific = effects.seen_by_accelerometer(p, body.specific, body.rates) if lever else body.specific
-        for name, value in (
-            ("rates", body.rates),
-            ("specific", specific),
-            ("gyro", flight.gyro),
-            ("rotor", body.rotor),
-            ("integral", flight.firmware.integral),
-            ("voltage", flight.voltage),
-            ("load", flight.battery.load),
-        ):
+        now = {"rates": body.rates, "specific": specific, "gyro": flight.gyro, "rotor": body.rotor}
+        now |= {"integral": flight.firmware.integral, "voltage": flight.voltage, "load": flight.battery.load}
+        for name, value in now.items():
             out[name][s] = value
         if part == 0:
             flight.send(control(k, *flight.seen()))

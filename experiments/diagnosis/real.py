@@ -85,9 +85,3 @@ def as_logged(errors, told, rows):
         grams = 4e3 * rows[column] * told.thrust_constant * MAX_SPEED**2 / GRAVITY
         out[column] = np.clip((A * grams + B) * grams / volts, 0.0, 1.0).round(4)
     return out
-
-
-def toml(errors, told, sensors):
-    """Text of the case's `vehicle.toml`."""
-    text = vehicle.toml(told, "simulated", sensors)
-    return text.replace('command = "thrust"', 'command = "pwm"') if errors and errors["pwm"] else text

@@ -222,18 +222,11 @@ def fly(told, changed, wind, path, drawn, air):
         rotation = np.roll(state["q"], 1)[:, None]
         accel = model.statedot(state, {"cmd_motor_speeds": speeds}, SAMPLE)["vdot"][:, None]
         accel[2] += v.GRAVITY
-        for name, value in (
-            ("position", state["x"][:, None]),
-            ("velocity", state["v"][:, None]),
-            ("quaternion", rotation),
-            ("rates", state["w"][:, None]),
-            ("specific", v.rotate_back(rotation, accel)),
-            ("gyro", gyro),
-            ("rotor", state["rotor_speeds"][:, None]),
-            ("motor", m),
-            ("voltage", voltage),
-            ("load", battery.load),
-        ):
+        names = {"position": "x", "velocity": "v", "rates": "w", "rotor": "rotor_speeds"}
+        now = {name: state[theirs][:, None] for name, theirs in names.items()}
+        now |= {"quaternion": rotation, "specific": v.rotate_back(rotation, accel), "gyro": gyro}
+        now |= {"motor": m, "voltage": voltage, "load": battery.load}
+        for name, value in now.items():
             out[name][s] = value
         if state["x"][2] < 0.02 or np.linalg.norm(state["x"]) > 2.5:
             crashed = s

@@ -64,10 +64,15 @@ def draw_told(rng):
     )
 
 
-def toml(told, source, sensors):
+def toml(told, source, sensors, command="thrust"):
     """Text of the case's `vehicle.toml`: the vehicle as told, and what a laboratory knows of its logger."""
     lines = ["[vehicle]", 'name = "crazyflie-2.1"', f"mass = {told.mass:.5f}"]
-    lines += [f"mass_weighed = {'true' if told.weighed else 'false'}", "", "[motor]", 'command = "thrust"']
+    lines += [
+        f"mass_weighed = {'true' if told.weighed else 'false'}",
+        "",
+        "[motor]",
+        f'command = "{command}"',
+    ]
     lines += ['order = ["front_right", "rear_right", "rear_left", "front_left"]']
     lines += ['spin = ["ccw", "cw", "ccw", "cw"]']
     if (told.torque_ratio, told.thrust_constant) != (TORQUE_RATIO, THRUST_CONSTANT):
@@ -89,6 +94,7 @@ def toml(told, source, sensors):
     return "\n".join(lines) + "\n"
 
 
+SURFACE = {"image": 0.0, "exp": 0.0, "scale": 0.05, "inverse": 0.0, "offset": 0.01}  # of thrust near it
 # name -> neutral value of a parameter that is one number per body
 NEUTRAL = {
     "torque_gain": 1.0,  # of the reaction torque beside the thrust
@@ -117,16 +123,7 @@ NEUTRAL = {
     "wind_quadratic": 0.0,
     "wind_shear": 0.0,
     "wind_gust": 0.0,
-    "ground_image": 0.0,
-    "ground_exp": 0.0,
-    "ground_scale": 0.05,
-    "ground_inverse": 0.0,
-    "ground_offset": 0.01,
-    "ceiling_image": 0.0,
-    "ceiling_exp": 0.0,
-    "ceiling_scale": 0.05,
-    "ceiling_inverse": 0.0,
-    "ceiling_offset": 0.01,
+    **{f"{side}_{name}": value for side in ("ground", "ceiling") for name, value in SURFACE.items()},
     "wake": 0.0,  # N
     "wake_height": 0.3,
     "wake_width": 0.04,

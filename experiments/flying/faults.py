@@ -72,11 +72,6 @@ class Fault:
         """Whether there is motion capture in this flight."""
         return self.kind in CAMERA or self.direction < math.pi
 
-    @property
-    def unheld(self) -> int | None:
-        """The vehicle that nobody can hold, if there is one."""
-        return self.vehicle if self.kind in GONE else None
-
     def losses(self, now: float) -> tuple[float, float]:
         """Shares of a vehicle's set-points, and of what it sends, that are lost at `now` (s)."""
         gone = float(self.kind in GONE)
@@ -202,7 +197,7 @@ def outcome(fault: Fault, times, position, off, begin: float) -> dict:
     infinite where a position is no number. `seconds` until all stayed on the floor with their motors off, None if they
     didn't; `held`: (N,) whom one can hold.
     """
-    held = np.arange(off.shape[1]) != fault.unheld
+    held = (np.arange(off.shape[1]) != fault.vehicle) | (fault.kind not in GONE)
     late = times >= begin
     times, position, off = times[late], position[late][:, held], off[late][:, held]
     height, limits = position[..., 2], SafetySettings()

@@ -40,13 +40,11 @@ class SeenElsewhere:
 
     def reset(self, vehicle, drones: DroneState, key=None) -> DroneState:
         """Drones that are seen where they are."""
-        del vehicle, key
         seen = {name: getattr(drones, name) for name in ("position", "quaternion", "velocity")}
         return drones.replace(effect_memory=seen)
 
     def seen(self, drones: DroneState, effect_parameters=None) -> DroneState:
         """The drones as they were measured."""
-        del effect_parameters
         return drones.replace(**drones.effect_memory)
 
 
