@@ -113,14 +113,9 @@ def made(facts: Mapping) -> str:
     return f"Made with {versions.get('openjax', RELEASE)} ({commit[:14]}) by `{facts['command']}`{device}."
 
 
-def documented_parser(doc: str | None) -> argparse.ArgumentParser:
-    """A parser whose help begins with a module's docstring, lines as they are."""
-    return argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
-
-
 def page_parser(doc: str | None, name: str) -> argparse.ArgumentParser:
     """A parser with `--report`, `--commit` and, by default for the page `name`, `--out`."""
-    parser = documented_parser(doc)
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--report", action="store_true", help="from the stored results")
     parser.add_argument("--commit", default="", help="where the machine has no repository")
     parser.add_argument("--out", type=Path, default=RESULTS / name)

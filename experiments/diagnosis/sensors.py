@@ -256,14 +256,12 @@ def log_rows(rng, sensors, flown, j, ticks, unknown=(), hover=0.5):
     if sensors["wander"]:
         wander = coloured(rng, len(flown["rates"]), 2, 2.0, 1e-3 * sensors["wander"], SAMPLE)
 
-    def stream(signal, times, clock=None):
-        """A 500 Hz signal as its stream delivers it at `times`."""
-        late = 0.0 if wander is None or clock is None else at(wander[:, clock], times)
-        if not sensors["stream_rate"]:
-            return at(signal, times + late)
-        own = np.arange(0, seconds, 1 / sensors["stream_rate"])
-        late = 0.0 if np.ndim(late) == 0 else at(wander[:, clock], own)
-        values = at(signal, own + late)
+    def stream(signal, times, clock):
+        """A 500 Hz signal as its stream delivers it at `times`, by the IMU's clock (0) or the motors' (1)."""
+        own = np.arange(0, seconds, 1 / sensors["stream_rate"]) if sensors["stream_rate"] else times
+        values = at(signal, own + (0.0 if wander is None else at(wander[:, clock], own)))
+        if own is times:
+            return values
         return np.stack([np.interp(times, own, values[:, i]) for i in range(values.shape[1])], axis=1)
 
     out = {"t": t}

@@ -7,6 +7,7 @@ Body, rotors, thrust curve and drag are crazyflow's, with its identified `cf21B_
 from that vehicle. It is in no extra: `pip install crazyflow` (0.4).
 """
 
+import argparse
 from pathlib import Path
 
 import jax
@@ -15,7 +16,6 @@ import numpy as np
 from experiments.flying.worlds.game import play
 from experiments.flying.worlds.rotorpy import Bodies, RotorPyWorld
 from experiments.flying.worlds.study import SEED, loaded_policy
-from experiments.table import documented_parser
 from openjax.flights.reading import CHANNEL_COLUMNS, write_csv
 from openjax.flights.samples import PERIOD, log_of
 from openjax.pursuit import SCENARIOS, scenario_task
@@ -90,7 +90,8 @@ class CrazyflowWorld(RotorPyWorld):
 
 def main() -> None:
     """Fly a game in each layout, from drawn starts, and write the case."""
-    parser = documented_parser(__doc__)
+    formatter = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=formatter)
     parser.add_argument("out", type=Path, help="folder of the case")
     parser.add_argument("--policy", default="flight")
     parser.add_argument("--layouts", nargs="+", default=["random", "passage", "hidden"])
