@@ -9,7 +9,6 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from openjax.vehicle import hover_state, load_vehicle, make_drones_step
@@ -191,7 +190,6 @@ def draw(effect: Effect, path: Path) -> None:
     next(function for hook, function in DRAWN.items() if getattr(effect, hook) is not None)(effect, axes)
     axes.legend(fontsize="small", frameon=False)
     axes.spines[["top", "right"]].set_visible(False)
-    FigureCanvasAgg(figure)
     figure.savefig(path, dpi=110, metadata={"Software": None})
 
 

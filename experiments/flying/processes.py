@@ -196,7 +196,7 @@ class Flown:
         sys.stdin, sys.stdout, sys.stderr = open(0), open(1, "w", buffering=1), open(2, "w", buffering=1)
 
         def main(_):
-            return 0 if fly(self._arguments, self._prepared) else 2
+            fly(self._arguments, self._prepared)
 
         try:
             run_command(main)

@@ -60,15 +60,13 @@ class Arguments:
     safety: SafetySettings = field(default_factory=SafetySettings)
 
 
-def main(arguments: Sequence[str]) -> int:
-    """The command; its exit status is 2 where nothing was flown."""
-    parsed = parse(Arguments, Arguments(), arguments, PROGRAM)
-    flight = fly(parsed)
-    return 0 if flight is not None else 2
+def main(arguments: Sequence[str]) -> None:
+    """The command. Raises UserError where nothing was flown."""
+    fly(parse(Arguments, Arguments(), arguments, PROGRAM))
 
 
 def fly(arguments: Arguments, prepared: Prepared | None = None):
-    """Fly; returns the record. Raises UserError for what can't be, and where another process had to land the vehicles.
+    """Fly. Raises UserError for what can't be, and where another process had to land the vehicles.
 
     Args:
       arguments: the command's.
@@ -103,7 +101,6 @@ def fly(arguments: Arguments, prepared: Prepared | None = None):
         raise UserError(complaint)
     if arguments.out is not None and samples:
         console.print(f"{arguments.out}: next, openjax diagnose {arguments.out}")
-    return flight.record
 
 
 class Prepared(NamedTuple):

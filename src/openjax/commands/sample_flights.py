@@ -29,7 +29,7 @@ spin = ["ccw", "cw", "ccw", "cw"]
 
 [log]
 source = "simulated: openjax.sample_flights, seed {seed}, effect: {effect}"
-motion_capture_rate = 100   # Hz
+motor_rows = "mean"      # of the commands within a row
 floor_z = 0.0            # m
 """
 DECIMALS = {"t": 2, "vbat": 3} | {

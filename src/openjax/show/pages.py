@@ -7,7 +7,6 @@ from pathlib import Path
 import jinja2
 from matplotlib import rc_context
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 BEFORE, AFTER = "#d1495b", "#2e86ab"  # both stand out on white and on black
@@ -47,7 +46,6 @@ def add_legend(axes: Axes) -> None:
 
 def as_svg(figure: Figure, salt: str) -> str:
     """The figure as an element for a page: text stays text, ink takes the page's colour, sizes are the page's."""
-    FigureCanvasSVG(figure)
     data = io.StringIO()
     with rc_context({"svg.hashsalt": salt}):
         figure.savefig(data, format="svg", metadata={"Date": None, "Creator": None})

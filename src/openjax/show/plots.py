@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
@@ -104,6 +103,5 @@ def plot_training(path: Path, metrics_path: Path) -> None:
 
 
 def _save(figure, path):
-    FigureCanvasAgg(figure)
     with replacing(path) as partial:
         figure.savefig(partial, dpi=120)
