@@ -3,8 +3,7 @@
 Entities other than the pursuer itself are described by a few numbers each, so their embeddings, a linear layer and an
 activation, cost less to compute again than to read back. On a GPU a hand-written kernel (Pallas, Triton) therefore
 embeds them in registers, forward and backward, and nothing as large as samples x entities x features reaches memory:
-XLA's own fusions moved several times as many bytes. Elsewhere the same formula is left
-to XLA.
+XLA's own fusions moved several times as many bytes. Elsewhere the same formula is left to XLA.
 """
 
 import functools

@@ -1,8 +1,8 @@
 """Bias, layer normalisation and activation of a hidden layer in one pass over its samples.
 
 Left to XLA, the backward pass reads every layer several times (once for each of the sums over features and over
-samples); on a GPU a kernel (Pallas, Triton) holds a block of samples in registers and reads it once
-(experiments/performance.md). Elsewhere the same formula is left to XLA.
+samples); on a GPU a kernel (Pallas, Triton) holds a block of samples in registers and reads it once.
+Elsewhere the same formula is left to XLA.
 """
 
 import functools
