@@ -218,7 +218,8 @@ def _from_tables(plain: dict, path: Path, dtype) -> VehicleFile:
         )
     mjcf = _own_mjcf(told.airframe, path)
     nominal = load_vehicle(mjcf or told.airframe, dtype)
-    usual = ["cw" if spin > 0 else "ccw" for spin in nominal.rotor_spin]
+    # of NumPy's, as going through one of JAX's compiles, which a flight that writes its log can't in a fork
+    usual = ["cw" if spin > 0 else "ccw" for spin in np.asarray(nominal.rotor_spin)]
     spin = motor.spin or tuple(usual[NOMINAL_ORDER.index(place)] for place in motor.order)
     if sorted(spin) != ["ccw", "ccw", "cw", "cw"]:
         raise UserError(
