@@ -7,6 +7,7 @@ the difference is within two standard errors, or too small to matter (the one-st
 with a region of practical equivalence). How often each set is chosen when blocks of flight are weighed anew by a Bayesian
 bootstrap is its probability, so that words and probabilities can't disagree."""
 
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -68,9 +69,10 @@ class Selection:
 def select(evidence: Evidence) -> Selection:
     """Choose among the physics effects that the flights can show."""
     search = Search(evidence, testable(evidence))
-    best = search.climb(search.nothing)
-    chosen = search.simplest(best)
-    gains = {e: search.gap_growth(search.without(chosen, e), chosen) for e in chosen.effects}
+    search.climb(search.nothing)
+    [chosen] = search.choose(np.ones((1, len(search.nothing.judged.nats))))
+    without = {e: search.of_set(set(chosen.effects) - {e}, chosen.fit) for e in chosen.effects}
+    gains = {e: search.gap_growth(h, chosen) for e, h in without.items()}
     ordered = tuple(sorted(gains, key=lambda e: -gains[e]))
     chosen = replace(chosen, fit=fit_set(chosen.fit.replay, chosen.effects, chosen.fit.theta, rounds=ROUNDS))
     table = build(chosen.fit, {})
@@ -87,8 +89,9 @@ def testable(evidence: Evidence) -> dict[str, SetFit]:
     }
 
 
-def difference(better: Judged, other: Judged) -> tuple[float, float]:
-    """By how much the log density of one hypothesis exceeds another's on stretches left out, and the standard error.
+def difference(better: Judged, other: Judged) -> tuple[float, float, float]:
+    """By how much the log density of one hypothesis exceeds another's on stretches left out, the standard error, and which share
+    of its square white residuals would leave.
 
     Given what the two predict, only noise is random: its variance is that of white residuals or, where that is more, what
     the residuals of the better one show block by block (cluster-robust, Liang and Zeger 1986). So an effect that acts in one
@@ -96,7 +99,8 @@ def difference(better: Judged, other: Judged) -> tuple[float, float]:
     change = other.left - better.left
     cross = np.add.reduceat(change * better.left, better.starts)
     energy = np.add.reduceat(change * change, better.starts)
-    return float((cross + 0.5 * energy).sum()), float(np.sqrt(max((cross**2).sum(), energy.sum())))
+    square = max(float((cross**2).sum()), float(energy.sum()), 1e-12)
+    return float((cross + 0.5 * energy).sum()), square**0.5, float(energy.sum()) / square
 
 
 def possible(fit: SetFit) -> bool:
@@ -144,10 +148,6 @@ class Search:
             start[places((new,))] = self.singles[new].theta[places((new,))]
         return self.of_fit(fit_set(near.replay, [e for e in CARDS if e in key], start))
 
-    def without(self, here: Hypothesis, effect: str) -> Hypothesis:
-        """The hypothesis without one of its effects."""
-        return self.of_set(set(here.effects) - {effect}, here.fit)
-
     def climb(self, here: Hypothesis) -> Hypothesis:
         """Move to the best neighbour while the score rises and flights tell the two apart."""
         while True:
@@ -178,21 +178,12 @@ class Search:
         floor = np.where(self.evidence.replay.heard > 0, best.judged.squares.sum(0), 0.0)
         return level(other.judged.squares, floor) - 1.0
 
-    def matters(self, other: Hypothesis, best: Hypothesis) -> bool:
-        """Whether a hypothesis leaves a gap so much larger that it matters."""
-        growth, whole = self.gap_growth(other, best), self.gap_growth(self.nothing, best)
-        return growth > max(DECISION.least_gap, DECISION.form_error * whole)
-
     def clearly_worse(self, other: Hypothesis, best: Hypothesis) -> bool:
-        """Whether the flights tell a hypothesis from the best one, and it matters."""
-        gain, error = difference(best.judged, other.judged)
-        return gain > DECISION.standard_errors * error and self.matters(other, best)
-
-    def simplest(self, best: Hypothesis) -> Hypothesis:
-        """The hypothesis of the largest prior odds that isn't clearly worse than the best one."""
-        simpler = [h for h in self.visited.values() if h.log_odds > best.log_odds and possible(h.fit)]
-        simpler = [h for h in simpler if not self.clearly_worse(h, best)]
-        return max(simpler, key=lambda h: (h.log_odds, h.score), default=best)
+        """Whether flights tell a hypothesis from the best one, and it leaves a gap so much larger that it matters."""
+        gain, error, _ = difference(best.judged, other.judged)
+        growth, whole = self.gap_growth(other, best), self.gap_growth(self.nothing, best)
+        matters = growth > max(DECISION.least_gap, DECISION.form_error * whole)
+        return gain > DECISION.standard_errors * error and matters
 
     def equivalents(self, chosen: Hypothesis, named) -> dict[str, list[str]]:
         """For each named effect those in whose place, of the sets visited, flights don't tell the difference."""
@@ -209,21 +200,36 @@ class Search:
                 out[effect] = sorted(alike)
         return out
 
-    def weights(self) -> dict[frozenset, float]:
-        """{effects: share of the draws in which that set is chosen}, of a Bayesian bootstrap over blocks (Rubin 1981)."""
-        sets = [h for h in self.visited.values() if possible(h.fit)]
-        odds = np.array([h.log_odds for h in sets])
-        error = np.array([[difference(a.judged, b.judged)[1] for b in sets] for a in sets])
-        blocks = len(sets[0].judged.nats)
-        drawn = np.random.default_rng(0).dirichlet(np.ones(blocks), DRAWS) * blocks
-        density = drawn @ np.array([h.judged.nats for h in sets]).T  # (draws, sets)
-        use = self.evidence.replay.heard > 0
-        squares = np.einsum("db,sbc->dsc", drawn, np.array([h.judged.squares for h in sets])[..., use])
-        nothing, count = sets.index(self.nothing), np.zeros(len(sets))
+    @property
+    def rivals(self) -> list[Hypothesis]:
+        """The sets visited whose parameters are possible."""
+        return [h for h in self.visited.values() if possible(h.fit)]
+
+    def choose(self, weights: np.ndarray) -> list[Hypothesis]:
+        """For each row of blocks' weights (D, B) the hypothesis of the largest prior odds that isn't clearly worse than the best.
+        Of equal odds it is the one with the most evidence: its density, worth as many nats as blocks bear out (Pauli, Racugno,
+        Ventura 2011), less what its parameters cost (Occam's factor)."""
+        sets = self.rivals
+        odds, costs = np.array([(h.log_odds, h.fit.cost) for h in sets]).T
+        pairs = [[difference(a.judged, b.judged) for b in sets] for a in sets]
+        _, errors, trust = np.moveaxis(np.array(pairs), 2, 0)
+        density = weights @ np.array([h.judged.nats for h in sets]).T  # (D, sets)
+        use, nothing, chosen = self.evidence.replay.heard > 0, sets.index(self.nothing), []
+        squares = np.einsum("db,sbc->dsc", weights, np.array([h.judged.squares for h in sets])[..., use])
         for nats, square in zip(density, squares, strict=True):
             best = int(np.argmax(nats + odds))
             growth = np.sqrt((square / square[best]).mean(1)) - 1.0
             matters = growth > max(DECISION.least_gap, DECISION.form_error * growth[nothing])
-            worse = (nats[best] - nats > DECISION.standard_errors * error[best]) & matters
-            count[int(np.argmax(np.where(worse, -np.inf, odds + 1e-6 * (nats - nats[best]))))] += 1
-        return {frozenset(h.effects): float(n / DRAWS) for h, n in zip(sets, count, strict=True) if n}
+            worse = (nats[best] - nats > DECISION.standard_errors * errors[best]) & matters
+            usual = ~worse & (odds == odds[~worse].max())
+            first = int(np.argmax(np.where(usual, nats, -np.inf)))
+            evidence = trust[first] * (nats - nats[first]) - costs
+            chosen.append(sets[int(np.argmax(np.where(usual, evidence, -np.inf)))])
+        return chosen
+
+    def weights(self) -> dict[frozenset, float]:
+        """{effects: share of the draws in which that set is chosen}, of a Bayesian bootstrap over blocks (Rubin 1981)."""
+        blocks = len(self.nothing.judged.nats)
+        drawn = np.random.default_rng(0).dirichlet(np.ones(blocks), DRAWS) * blocks
+        count = Counter(frozenset(h.effects) for h in self.choose(drawn))
+        return {effects: n / DRAWS for effects, n in count.items()}

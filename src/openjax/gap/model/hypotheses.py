@@ -40,10 +40,14 @@ class SetFit:
         return np.linalg.inv(self.hessian)
 
     @cached_property
+    def cost(self) -> float:
+        """Nats that the parameters cost: how much narrower their posterior is than their prior."""
+        return 0.5 * float(np.linalg.slogdet(self.hessian)[1] - np.linalg.slogdet(self.precision)[1])
+
+    @property
     def score(self) -> float:
         """The log marginal likelihood."""
-        volume = np.linalg.slogdet(self.hessian)[1] - np.linalg.slogdet(self.precision)[1]
-        return float(-self.objective - 0.5 * volume)
+        return -self.objective - self.cost
 
     def parameters(self) -> dict[str, dict[str, tuple[float, float]]]:
         """{effect: {parameter: (value, standard deviation)}} of the set's own effects."""
