@@ -117,7 +117,7 @@ def test_gains_of_all_axes_are_one_reading_that_covers_what_they_disagree_by():
     assert apart.gain[1][0] > 0.35
     assert loop([0.4, 0, 0, 0.0, 0, 0], [0.05] * 3 + [np.inf] * 3).acting()
     assert not loop([0.04, 0, 0, 0.04, 0, 0], [0.01] * 6).acting()  # forms are wrong by as much
-    assert not loop([0.4, 0, 0, 0.4, 0, 0], [0.05] * 6, shown=0.01).acting()  # the motors don't follow
+    assert not loop([0.4, 0, 0, 0.4, 0, 0], [0.05] * 6, shown=0.01).named()  # the motors don't follow
 
 
 def test_without_enough_flight_gains_cannot_be_told():

@@ -3,7 +3,7 @@
 Replays step from row to row, so a flight is put on an even time grid once: rows between 100 Hz and 50 Hz
 are kept, faster logs are averaged down to 100 Hz, and a longer gap splits a flight into two tracks."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import convolve1d
@@ -207,3 +207,16 @@ def turn_increments(quaternion: np.ndarray) -> np.ndarray:
     """Rotation vectors (T - 1, 3), body frame, between successive attitudes (T, 4)."""
     attitude = Rotation.from_quat(quaternion, scalar_first=True)
     return (attitude[:-1].inv() * attitude[1:]).as_rotvec()
+
+
+def earlier(values: Array, delay: float, track: Track) -> Array:
+    """Rows (T, C) of a track as they were `delay` s earlier."""
+    return np.stack([np.interp(track.time - delay, track.time, column) for column in values.T], 1)
+
+
+def undelayed(track: Track, delay: float) -> Track:
+    """The track with its pose `delay` s younger than logged."""
+    pose = [n for n in ("position", "quaternion", "velocity") if getattr(track, n) is not None]
+    moved = {n: earlier(getattr(track, n), -delay, track) for n in pose}
+    moved["quaternion"] /= np.linalg.norm(moved["quaternion"], axis=1, keepdims=True)
+    return replace(track, **moved)

@@ -2,19 +2,17 @@
 
 import importlib
 
-from openjax.flights.flight import Case, Flight, Issue
-
 _ELSEWHERE = {
     "load_case": "openjax.flights.case",
     "diagnose_case": "openjax.gap.diagnosis",
     "Report": "openjax.gap.report",
 }
 
-__all__ = ["Case", "Flight", "Issue", *_ELSEWHERE]
+__all__ = list(_ELSEWHERE)
 
 
 def __getattr__(name: str):
-    # Diagnosing pulls in the vehicle (and JAX); the containers alone stay light to import.
+    # Diagnosing pulls in the vehicle (and JAX): imported once it is asked for.
     if name in _ELSEWHERE:
         return getattr(importlib.import_module(_ELSEWHERE[name]), name)
     raise AttributeError(name)

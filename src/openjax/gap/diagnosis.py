@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from openjax.flights.flight import Case
-from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence, gather
 from openjax.gap.intervals import estimates
 from openjax.gap.model.bounds import BOUND
@@ -34,15 +33,11 @@ def conclude(evidence: Evidence) -> Report:
     """The report that the evidence supports."""
     selection = select(evidence)
     acting = {e: selection.probability(e) for e in selection.effects}
-    acting |= {e: p for channel in evidence.channels for e, p in channel.acting().items()}
+    acting |= {e: p for channel in evidence.channels for e, p in channel.named().items()}
     check = check_residual(evidence, selection.fit)
     parts = split(evidence, selection, check.predicted, [e for e, p in acting.items() if p >= 0.5])
-    small = {e for e, share in parts.effects.items() if share.interval90[1] < DECISION.form_error}
-    if small:  # real, perhaps, but of no size worth a name
-        parts = split(evidence, selection, check.predicted, [e for e in parts.effects if e not in small])
     present = {e: acting[e] for e in parts.effects}
-    small.update(*(selection.equivalent.get(e, ()) for e in small))
-    chances = probabilities(present, parts.largest, check.probability, selection.weights, small)
+    chances = probabilities(present, parts.largest, check.probability, selection.weights)
     return _report(evidence, selection, check, parts, chances)
 
 

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from openjax.errors import UserError
 from openjax.flights.flight import Case
 from openjax.flights.kinematics import Kinematics, corrected, read_kinematics
-from openjax.flights.track import Track, tracks_of
+from openjax.flights.track import Track, tracks_of, undelayed
 from openjax.gap.channels import Channel
 from openjax.gap.channels.motion import Motion, make_reading, read_motion, rows_are_samples
-from openjax.gap.channels.pose import Pose, read_pose, undelayed
+from openjax.gap.channels.pose import Pose, read_pose
 from openjax.gap.channels.radio import read_radio
 from openjax.gap.channels.rate_loop import read_rate_loop, with_motors
 from openjax.gap.decision import DECISION

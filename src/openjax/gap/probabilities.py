@@ -7,12 +7,11 @@ from openjax.gap.decision import DECISION
 from openjax.vehicle.effects import EFFECTS
 
 
-def probabilities(present, largest, unknown: float, weights, small=frozenset()) -> dict[str, float]:
+def probabilities(present, largest, unknown: float, weights) -> dict[str, float]:
     """{cause, "none", "unknown": probability of being the strongest}, whose sum is one.
 
     present: {named effect: probability that it acts}. largest: {effect or "unexplained": how often it is the largest part}.
-    unknown: probability that what is unexplained is real. weights: {effects: how often that set was chosen}. small: effects of
-    no size."""
+    unknown: probability that what is unexplained is real. weights: {effects: how often that set was chosen}."""
     chance = dict.fromkeys((*EFFECTS, "none", "unknown"), 0.0)
     sure = (1.0 - unknown) if present else 1.0
     for effect, p in present.items():
@@ -22,7 +21,7 @@ def probabilities(present, largest, unknown: float, weights, small=frozenset()) 
     shared = {"none": 1e-3, **dict.fromkeys(present, 1e-3)}
     for effects, w in weights.items():
         if not effects & set(present):
-            others = effects - small or {"none"}
+            others = effects or {"none"}
             shared |= {e: shared.get(e, 0.0) + w / len(others) for e in others}
     total = sum(shared.values())
     for name, weight in shared.items():

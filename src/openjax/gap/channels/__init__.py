@@ -7,6 +7,8 @@ import numpy as np
 from scipy.stats import norm
 from scipy.stats import t as student
 
+from openjax.gap.decision import DECISION
+
 
 @dataclass(frozen=True)
 class Estimated:
@@ -34,6 +36,19 @@ class Channel(Protocol):
 
     def residuals(self, named) -> dict[str, list[np.ndarray]]:
         """{name: [(T,) per track]} of normalised prediction errors with the effects `named`."""
+
+    def named(self) -> dict[str, float]:
+        """Those of the acting effects without which the channel's errors grow by more than an effect's form may be wrong by."""
+        acting = self.acting()
+        return {e: p for e, p in acting.items() if self.growth(e, acting) > DECISION.form_error}
+
+    def growth(self, effect: str, acting) -> float:
+        """By what share the channel's errors are larger without an effect than with all that act."""
+        without, whole = (
+            np.array([np.mean(np.concatenate(v) ** 2) for v in self.residuals(named).values()])
+            for named in (set(acting) - {effect}, acting)
+        )
+        return float(np.sqrt((without / whole).mean())) - 1.0
 
 
 def few(count: int) -> float:

@@ -1,13 +1,13 @@
 """The pose: the attitude against the integrated gyroscope. No dynamics are needed to see a late pose."""
 
-import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 
-from openjax.flights.track import Track, smooth, turn_increments
+from openjax.flights.track import Track, earlier, smooth, turn_increments
 from openjax.gap.channels import Channel, Estimated
 from openjax.gap.decision import DECISION
+from openjax.gap.model.bounds import BOUND
 from openjax.gap.model.nuisances import SIZE
 from openjax.gap.model.whitening import fit_noise, whiten
 
@@ -70,7 +70,7 @@ def read_pose(tracks: list[Track], library) -> Pose | None:
     """The pose's channel; None without an attitude."""
     if any(t.quaternion is None for t in tracks):
         return None
-    clock = DECISION.clock + max(t.pose_age for t in tracks)
+    clock = BOUND * SIZE["pose_clock"] + max(t.pose_age for t in tracks)
     steps = tuple(max(round(POSE_HORIZON / t.dt), 1) for t in tracks)
     return Pose(read_delay(tracks), clock, library.of("estimator"), steps)
 
@@ -94,7 +94,7 @@ def _read_around(tracks: list[Track], delay: float) -> Delay:
     for track in tracks:
         turned = turn_increments(track.quaternion)
         gyro, calm = (
-            _late(v, delay, track) for v in (track.body_rates, smooth(track.body_rates, 0.03, track.dt))
+            earlier(v, delay, track) for v in (track.body_rates, smooth(track.body_rates, 0.03, track.dt))
         )
         between = 0.5 * (gyro[1:] + gyro[:-1]) * track.dt
         start = np.zeros((1, 3))
@@ -131,16 +131,3 @@ def _fit(data: list[np.ndarray]) -> Delay:
     before = [r + value * d[1] for r, d in zip(residual, data, strict=True)]
     nats = 0.5 * (gram[1, 0] * value - np.log(precision * DELAY_SPREAD**2))
     return Delay(float(value), float(precision**-0.5), float(nats), before, residual)
-
-
-def _late(values: np.ndarray, delay: float, track: Track) -> np.ndarray:
-    """Rows (T, C) as they were `delay` s earlier."""
-    return np.stack([np.interp(track.time - delay, track.time, column) for column in values.T], 1)
-
-
-def undelayed(track: Track, delay: float) -> Track:
-    """The track with its pose `delay` s younger than logged."""
-    pose = [n for n in ("position", "quaternion", "velocity") if getattr(track, n) is not None]
-    moved = {n: _late(getattr(track, n), -delay, track) for n in pose}
-    moved["quaternion"] /= np.linalg.norm(moved["quaternion"], axis=1, keepdims=True)
-    return dataclasses.replace(track, **moved)

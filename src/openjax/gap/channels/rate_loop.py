@@ -59,14 +59,8 @@ class RateLoop(Channel):
         return mean, np.maximum(apart, 1.0) / np.sqrt(total)
 
     def acting(self) -> dict[str, float]:
-        """Either group of axes may be retuned alone: the surer one tells. Gains that change by no more than forms are wrong by,
-        or predict the motors no better than by that, aren't told from a loop of another form."""
-        before, after = (
-            np.array([np.mean(np.concatenate(v) ** 2) for v in self.residuals(named).values()])
-            for named in ((), self.names)
-        )
-        if np.sqrt((before / after).mean()) < 1.0 + DECISION.form_error:
-            return {}
+        """Either group of axes may be retuned alone: the surer one tells. Gains that change by no more than forms are wrong by
+        aren't told from a loop of another form."""
         change, error = np.abs(self.change[[0, 3]]), self.error[[0, 3]]
         told = change > DECISION.standard_errors * error
         chance = norm.cdf((change - DECISION.form_error) / error) * told * (1.0 - DECISION.unknown)
