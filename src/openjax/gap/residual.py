@@ -1,8 +1,9 @@
 """What the chosen effects leave: whether it is more than sensors, air and errors of form leave.
 
 Things that should agree are held against each other: measured motion and replay, attitude and gyroscope, path and
-accelerometer, position and velocity. How much is left of each is told in standard deviations of cases of several worlds in
-which nothing unknown acts. The p-value of the largest is conformal over those (Vovk et al. 2005; `residual.json`)."""
+accelerometer, position and velocity. How much is left of each, given what is left of the others, is told in standard deviations
+of cases of several worlds in which nothing unknown acts. The p-value of the largest is conformal over those (Vovk et al. 2005;
+`residual.json`)."""
 
 import json
 from dataclasses import dataclass
@@ -10,7 +11,6 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import norm
 
 from openjax.flights.track import Track, specific_force_of, to_body
 from openjax.gap.decision import DECISION
@@ -126,11 +126,19 @@ def conformal_p(measured: dict[str, float]) -> tuple[float, str]:
 
 
 def standing_out(measured: dict[str, float]) -> tuple[float, str]:
-    """How far a case's measures stand out of the calibration's at most, in its upper standard deviations of their logarithm,
-    and by which one; logs without anything to hold against each other stand out nowhere."""
-    far = {n: (np.log(max(v, 1e-12)) - usual()[n][0]) / usual()[n][1] for n, v in measured.items()}
-    name = max(far, key=far.get, default="")
-    return far.get(name, -np.inf), name
+    """How far one of a case's measures stands out at most of what the others of its logs lead to expect, in standard deviations,
+    and which; logs without anything to hold against each other stand out nowhere. What makes a sensor noisy raises all that it
+    has a part in; so each logarithm is told given the others, as of a normal distribution."""
+    names, (mean, covariance) = list(HORIZONS), usual()
+    rows = [k for k, n in enumerate(names) if n in measured]
+    precision = np.linalg.inv(covariance[np.ix_(rows, rows)])
+    far = precision @ (logarithms(measured)[rows] - mean[rows]) / np.sqrt(np.diag(precision))
+    return max(zip(far.tolist(), (names[k] for k in rows), strict=True), default=(-np.inf, ""))
+
+
+def logarithms(measured: dict[str, float]) -> np.ndarray:
+    """(measures,) in the order of HORIZONS, NaN where there is none."""
+    return np.log([max(measured[n], 1e-12) if n in measured else np.nan for n in HORIZONS])
 
 
 @lru_cache(maxsize=1)
@@ -140,11 +148,7 @@ def calibration() -> list[dict[str, float]]:
 
 
 @lru_cache(maxsize=1)
-def usual() -> dict[str, tuple[float, float]]:
-    """{measure: the median of its logarithm and how far its upper standard deviation (norm's quantile) lies above}."""
-    found = {}
-    for name in HORIZONS:
-        logs = np.log([max(c[name], 1e-12) for c in calibration() if name in c])
-        middle, upper = np.quantile(logs, [0.5, norm.cdf(1.0)])
-        found[name] = float(middle), float(upper - middle)
-    return found
+def usual() -> tuple[np.ndarray, np.ndarray]:
+    """Mean (measures,) and covariance (measures, measures) of the logarithms over the calibration's cases that have them."""
+    logs = np.ma.masked_invalid([logarithms(case) for case in calibration()])
+    return logs.mean(0).filled(0.0), np.ma.cov(logs, rowvar=False).filled(0.0)
