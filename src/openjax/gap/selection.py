@@ -106,13 +106,8 @@ def difference(better: Judged, other: Judged) -> tuple[float, float, float]:
 def possible(fit: SetFit) -> bool:
     """Whether all fitted parameters lie within physical bounds."""
     found = fit.parameters()
-    return all(
-        CARDS[e].possible is None
-        or CARDS[e].possible(
-            {p: v for p, (v, _) in found[e].items()}, {p: s for p, (_, s) in found[e].items()}
-        )
-        for e in fit.effects
-    )
+    told = {e: [{p: v[k] for p, v in found[e].items()} for k in (0, 1)] for e in fit.effects}
+    return all(CARDS[e].possible is None or CARDS[e].possible(*both) for e, both in told.items())
 
 
 @dataclass(eq=False)

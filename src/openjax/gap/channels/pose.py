@@ -8,6 +8,7 @@ from openjax.flights.track import Track, earlier, smooth, turn_increments
 from openjax.gap.channels import Channel, Estimated
 from openjax.gap.decision import DECISION
 from openjax.gap.model.bounds import BOUND
+from openjax.gap.model.library import CARDS
 from openjax.gap.model.nuisances import SIZE
 from openjax.gap.model.whitening import fit_noise, whiten
 
@@ -52,7 +53,8 @@ class Pose(Channel):
 
     def acting(self) -> dict[str, float]:
         shown = self.late and self.fit.value > self.clock
-        return dict.fromkeys(self.names, 1.0 - DECISION.unknown) if shown else {}
+        odds = {e: self.fit.nats + CARDS[e].log_odds for e in self.names if shown}
+        return {e: 1.0 - DECISION.unknown for e, nats in odds.items() if nats > 0.0}
 
     def estimate(self, effect: str, parameter: str) -> Estimated:
         # The delay is against the gyroscope, and a gyroscope may be late itself.

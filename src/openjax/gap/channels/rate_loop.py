@@ -17,6 +17,7 @@ from openjax.flights.track import Track, smooth
 from openjax.gap.channels import Channel, Estimated, robust_deviation
 from openjax.gap.channels.instruments import BAND, COUNT, EDGE, in_force, outputs_of
 from openjax.gap.decision import DECISION
+from openjax.gap.model.library import CARDS
 from openjax.gap.model.observer import GYRO_GAIN, TICKS, observe
 from openjax.gap.model.prediction import bucket, padded
 
@@ -59,12 +60,12 @@ class RateLoop(Channel):
         return mean, np.maximum(apart, 1.0) / np.sqrt(total)
 
     def acting(self) -> dict[str, float]:
-        """Either group of axes may be retuned alone: the surer one tells. Gains that change by no more than forms are wrong by
-        aren't told from a loop of another form."""
-        change, error = np.abs(self.change[[0, 3]]), self.error[[0, 3]]
-        told = change > DECISION.standard_errors * error
-        chance = norm.cdf((change - DECISION.form_error) / error) * told * (1.0 - DECISION.unknown)
-        return {e: float(chance.max()) for e in self.names if chance.max() > 0.5}
+        """Either group of axes may be retuned alone: the surer one tells, if P changes by more than forms are wrong by."""
+        change, error = np.abs(self.change[[0, 3]]), np.minimum(self.error[[0, 3]], PRIOR[0])
+        nats = 0.5 * (change / error) ** 2 - np.log(PRIOR[0] / error)  # Savage and Dickey's
+        chance = norm.cdf((change - DECISION.form_error) / error) * (1.0 - DECISION.unknown)
+        odds = {e: chance[nats + CARDS[e].log_odds > 0.0].max(initial=0.0) for e in self.names}
+        return {e: float(p) for e, p in odds.items() if p > 0.5}
 
     def undetectable(self) -> list[str]:
         shown = PRIOR[0] > 2.0 * DECISION.standard_errors * self.error[[0, 3]].min()
