@@ -5,7 +5,7 @@ prior odds of its effects. A move takes one effect in, out, or puts it in anothe
 rises, so the search ends. Chosen is the set of the largest prior odds among those that these flights can't tell from the best:
 the difference is within two standard errors, or too small to matter (the one-standard-error rule of Breiman et al. 1984,
 with a region of practical equivalence). How often each set is chosen when blocks of flight are weighed anew by a Bayesian
-bootstrap is its probability, so that words and probabilities can't disagree."""
+bootstrap is its probability; named is the most probable one."""
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
@@ -70,13 +70,14 @@ def select(evidence: Evidence) -> Selection:
     """Choose among the physics effects that the flights can show."""
     search = Search(evidence, testable(evidence))
     search.climb(search.nothing)
-    [chosen] = search.choose(np.ones((1, len(search.nothing.judged.nats))))
+    weights = search.weights()
+    chosen = search.visited[max(weights, key=weights.get)]
     without = {e: search.of_set(set(chosen.effects) - {e}, chosen.fit) for e in chosen.effects}
     gains = {e: search.gap_growth(h, chosen) for e, h in without.items()}
     ordered = tuple(sorted(gains, key=lambda e: -gains[e]))
     chosen = replace(chosen, fit=fit_set(chosen.fit.replay, chosen.effects, chosen.fit.theta, rounds=ROUNDS))
     table = build(chosen.fit, {})
-    return Selection(chosen, table, ordered, search.weights(), search.equivalents(chosen, ordered))
+    return Selection(chosen, table, ordered, weights, search.equivalents(chosen, ordered))
 
 
 def testable(evidence: Evidence) -> dict[str, SetFit]:
