@@ -11,8 +11,7 @@ _ELSEWHERE = {
 __all__ = list(_ELSEWHERE)
 
 
-def __getattr__(name: str):
-    # Diagnosing pulls in the vehicle (and JAX): imported once it is asked for.
+def __getattr__(name: str):  # diagnosing pulls in the vehicle (and JAX)
     if name in _ELSEWHERE:
         return getattr(importlib.import_module(_ELSEWHERE[name]), name)
     raise AttributeError(name)

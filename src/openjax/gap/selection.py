@@ -196,16 +196,11 @@ class Search:
                 out[effect] = sorted(alike)
         return out
 
-    @property
-    def rivals(self) -> list[Hypothesis]:
-        """The sets visited whose parameters are possible."""
-        return [h for h in self.visited.values() if possible(h.fit)]
-
     def choose(self, weights: np.ndarray) -> list[Hypothesis]:
         """For each row of blocks' weights (D, B) the hypothesis of the largest prior odds that isn't clearly worse than the best.
         Of equal odds it is the one with the most evidence: its density, worth as many nats as blocks bear out (Pauli, Racugno,
         Ventura 2011), less what its parameters cost (Occam's factor)."""
-        sets = self.rivals
+        sets = [h for h in self.visited.values() if possible(h.fit)]
         odds, costs = np.array([(h.log_odds, h.fit.cost) for h in sets]).T
         pairs = [[difference(a.judged, b.judged) for b in sets] for a in sets]
         _, errors, trust = np.moveaxis(np.array(pairs), 2, 0)

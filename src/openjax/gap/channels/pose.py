@@ -52,9 +52,8 @@ class Pose(Channel):
         return self.fit.value > DECISION.standard_errors * self.fit.error and self.fit.nats > 0.0
 
     def acting(self) -> dict[str, float]:
-        shown = self.late and self.fit.value > self.clock
-        odds = {e: self.fit.nats + CARDS[e].log_odds for e in self.names if shown}
-        return {e: 1.0 - DECISION.unknown for e, nats in odds.items() if nats > 0.0}
+        odds = {e: self.fit.nats + CARDS[e].log_odds for e in self.names if self.fit.value > self.clock}
+        return {e: 1.0 - DECISION.unknown for e, nats in odds.items() if self.late and nats > 0.0}
 
     def estimate(self, effect: str, parameter: str) -> Estimated:
         # The delay is against the gyroscope, and a gyroscope may be late itself.
