@@ -73,7 +73,7 @@ def test_first_runs():
         rates = sorted(short(table[kind][figure], 2) for table in tables)
         return " to ".join(dict.fromkeys((rates[0], rates[-1])))
 
-    seeds = {1: "one seed", 2: "two seeds", 5: "five seeds"}[len(runs)]
+    seeds = {1: "one seed", 6: "six seeds"}[len(runs)]
     label = f"first runs on two cores (preset `quick`, {seeds}): captures of new tasks, behind the row of pillars `wall`"
     assert cells(label)[0] == ", ".join(range_of(kind, "capture_rate") for kind in ("validation", "wall"))
     label = "... crashes in new tasks, among the six pillars of `random`"
