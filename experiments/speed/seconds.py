@@ -149,10 +149,12 @@ def page(results: dict) -> Page:
         "then collisions": "reached.collision_rate:.4f",
         "caught in the last validation": "last.capture_rate:.3f",
     }
-    kept = [run["reached"]["seconds"] for run in rows if run["reached"] and run["kept"] == "all"]
     prose = f"Uniform validation tasks. An update is the median of a run's. {results['note']}"
-    if len(kept) > 1:
-        prose += f" With all kept, {len(kept)} runs take {np.median(kept):.1f} s (median), the slowest {max(kept):.1f} s."
+    for start in dict.fromkeys(run["start"] for run in rows):
+        own = [run for run in rows if run["start"] == start and run["kept"] == "all"]
+        seconds = [run["reached"]["seconds"] if run["reached"] else np.inf for run in own]
+        if len(own) > 2:
+            prose += f" `{start}` with all kept: {np.median(seconds):.1f} s in the median of {len(own)} runs."
     return Page("Seconds to a policy that catches", prose, Table(columns, rows))
 
 
