@@ -11,9 +11,12 @@ import pytest
 from openjax.learning import AnalyticSettings
 from openjax.learning.analytic_gradient import (
     APART,
+    SMOOTH,
     AnalyticGradient,
     breach_share,
     compile_analytic,
+    crash_depth,
+    crash_share,
     free_flight,
     side_by_side,
 )
@@ -71,6 +74,29 @@ def test_smooth_breaches_are_those_of_the_game(stage):
     assert 0.2 < (hard > 0).mean() < 0.9
     assert (smooth > 0.7 * hard).all()
     assert np.abs(smooth - hard).mean() < 0.1
+
+
+def test_deep_crashes_are_learnt_from():
+    """Where the share of a crash is flat its depth isn't: it falls by one every `SMOOTH` metres."""
+    gap = jnp.array([-0.2, -0.05, 0.0, 0.05, 0.2])
+    slope = jax.vmap(jax.grad(crash_depth))(gap)
+    np.testing.assert_allclose(slope, -crash_share(gap) / SMOOTH, rtol=1e-5)
+    assert slope[0] == pytest.approx(-1.0 / SMOOTH)
+
+
+@pytest.mark.slow
+def test_hard_starts_are_those_that_come_nearest(stage):
+    gradient, parameters = stage
+    key = jax.random.key(5)
+
+    @jax.jit
+    def least(starts):
+        return gradient.fly(parameters.actor, parameters, starts, gradient.steps)[1].least.min(-1)
+
+    bounds = jnp.concatenate([gradient.bounds()] * gradient.how.draws)
+    all_of_them = np.sort(least(gradient.starts(key, bounds)))
+    hard = np.sort(least(jax.jit(gradient.hard_starts)(parameters.actor, parameters, key)))
+    np.testing.assert_allclose(hard, all_of_them[: gradient.how.worlds], atol=1e-4)
 
 
 @pytest.mark.slow

@@ -2,9 +2,9 @@
 
 MAPPO is a poor teacher of what is decided within tenths of a second. Starts lean by up to 36 degrees, some beside a pillar or
 another pursuer; its noise averages out in the motors, and a crash says little of what would have avoided it. The equations of
-motion know. Here the actor follows the gradient of smooth shares of crashes, breaches and speeds over the limit through half
-seconds of free flight, from leaning starts and from moments of its own flights (Xu et al. 2022, short-horizon actor-critic,
-without the critic). All else is held to what it did.
+motion know. Here the actor follows the gradient of smooth crashes, breaches and speeds over the limit through half seconds of
+free flight, from the hardest of many leaning starts and from moments of its own flights (Xu et al. 2022, short-horizon
+actor-critic, without the critic). All else is held to what it did.
 """
 
 import dataclasses
@@ -186,6 +186,13 @@ class AnalyticGradient:
         worlds = jax.lax.scan(segment, self.starts(key, bounds), None, length=self.moments)[1]
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), worlds)
 
+    def hard_starts(self, actor: Any, parameters: PolicyParameters, key: jax.Array):
+        """Of `how.draws` times as many starts those with the least gaps on the actor's way: few of all come near a crash."""
+        starts = self.starts(key, jnp.concatenate([self.bounds()] * self.how.draws))
+        least = jnp.min(self.fly(actor, parameters, starts, self.steps)[1].least, axis=-1)
+        hardest = jax.lax.top_k(-least, self.how.worlds)[1]
+        return jax.tree.map(lambda leaf: leaf[hardest], starts)
+
     def loss(self, actor: Any, parameters: PolicyParameters, starts, flying):
         """What is learnt (), and its parts. `parameters` are the policy's before."""
         how, number = self.how, starts[1].step.shape[0]
@@ -194,14 +201,14 @@ class AnalyticGradient:
         change = (self.policy.distribution(actor, *inputs)[0] - mean) * jnp.exp(-log_std)
         worlds = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), starts, flying)
         (_, end), way = self.fly(actor, parameters, worlds, self.steps)
-        crash, drones = crash_share(way.least), jax.tree.map(lambda leaf: leaf[:number], end.drones)
+        drones = jax.tree.map(lambda leaf: leaf[:number], end.drones)
         fast, low = _speed(drones) - FASTEST, LOWEST - drones.position[..., 2]
         parts = {
-            "crashes_from_starts": (1.0, crash[:number]),
+            "crashes_from_starts": (1.0, crash_depth(way.least[:number])),
             "breaches_from_starts": (BREACH_AT_START, way.breach[:number]),
             # a dive saves some of those that start tilted towards something, so there the speed is free but for its end
             "ends": (0.2, jax.nn.relu(fast) + jax.nn.relu(low)),
-            "crashes_in_flight": (CRASH_IN_FLIGHT, crash[number:]),
+            "crashes_in_flight": (CRASH_IN_FLIGHT, crash_share(way.least[number:])),
             "breaches_in_flight": (how.breach, way.breach[number:]),
             "speed_in_flight": (how.speed, way.excess[number:]),
             "change": (how.hold, jnp.sum(change**2, axis=-1)),
@@ -214,11 +221,10 @@ class AnalyticGradient:
     def update(self, actor: Any, state: Any, parameters: PolicyParameters, flights, key: jax.Array):
         """The actor and its optimiser's state after an update, and the loss's parts."""
         start_key, choice_key = jax.random.split(key)
-        bounds = self.bounds()
         moments = flights[1].step.shape[0]
         chosen = jax.random.randint(choice_key, (self.how.worlds,), 0, moments)
         flying = jax.tree.map(lambda leaf: leaf[chosen], flights)
-        starts = self.starts(start_key, bounds)
+        starts = self.hard_starts(actor, parameters, start_key)
         gradient, parts = jax.grad(self.loss, has_aux=True)(actor, parameters, starts, flying)
         change, state = self.optimiser.update(finite_or_zero(gradient), state)
         return optax.apply_updates(actor, change), state, parts
@@ -272,6 +278,11 @@ def nearest_gap(game: PursuitSettings, state: PursuitState) -> jax.Array:
 def crash_share(gap: jax.Array) -> jax.Array:
     """How much of a crash a least gap (m) counts as, from 0 to 1: what has a gradient before anything is touched."""
     return jax.nn.sigmoid((3 * TOUCH - gap) / SMOOTH)
+
+
+def crash_depth(gap: jax.Array) -> jax.Array:
+    """The same that goes on to grow, by 1 every `SMOOTH`: what would crash by far is learnt from, too."""
+    return jax.nn.softplus((3 * TOUCH - gap) / SMOOTH)
 
 
 def tip_share(upright: jax.Array) -> jax.Array:

@@ -131,7 +131,7 @@ def evaders() -> TrainSettings:
         ),
         # as long as a breach costs less than a step in reach pays, pursuers learn to hold an evader from beyond the wall
         mappo=dict(target_kl=0.02, step_subsampling=2, entropy_coefficient=2e-3, penalty_ramp=0.5),
-        analytic=dict(look_every=20),
+        analytic=dict(updates=100, look_every=20, hold=0.2),
         vehicles_start=0.08,
         vehicles_ramp=0.08,
         evaders_start=0.09,

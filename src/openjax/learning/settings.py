@@ -156,6 +156,8 @@ class AnalyticSettings:
     """Updates between validations; the best of all is kept, what it was before among them."""
     worlds: Annotated[int, Interval("[1, 65536]")] = 640
     """Starts in an update, and as many moments of flights."""
+    draws: Annotated[int, Interval("[1, 1000]")] = 4
+    """How many times as many starts are flown as are learnt from: the hardest."""
     learning_rate: Annotated[float, Interval("(0, 1]")] = 3e-4
     """Adam step size at the start; falls linearly to a twentieth."""
     hold: Annotated[float, Interval("[0, 1000]")] = 0.04
