@@ -125,7 +125,7 @@ def test_best_response():
     """How often evaders that learned against the default policy were caught at the end of their training."""
     (response,) = [r for r in read("evaders")["responses"] if r["policy"] == "evaders"]
     last = response["curve"][-1]
-    label = "... three evaders that learned against `evaders` for 200 million steps, caught as they learned"
+    label = "... three evaders that learned against `evaders` before its last stage for 200 million steps, caught as they learned"
     assert cells(label)[0] == ", ".join(short(rate, 3) for rate in last["capture_rate"])
     assert len(last["capture_rate"]) == 3 and round(last["steps"] / 1e6) == 200
 

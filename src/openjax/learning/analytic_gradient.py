@@ -213,10 +213,8 @@ class AnalyticGradient:
             "speed_in_flight": (how.speed, way.excess[number:]),
             "change": (how.hold, jnp.sum(change**2, axis=-1)),
         }
-        parts = {name: (weight, jnp.mean(value)) for name, (weight, value) in parts.items()}
-        return sum(weight * value for weight, value in parts.values()), {
-            name: value for name, (_, value) in parts.items()
-        }
+        means = {name: jnp.mean(value) for name, (_, value) in parts.items()}
+        return sum(weight * means[name] for name, (weight, _) in parts.items()), means
 
     def update(self, actor: Any, state: Any, parameters: PolicyParameters, flights, key: jax.Array):
         """The actor and its optimiser's state after an update, and the loss's parts."""
@@ -248,13 +246,8 @@ class AnalyticGradient:
 def free_flight(environment: Pursuit) -> Pursuit:
     """`environment` as it is learnt in: nothing is solid while the gradient is taken, a crash is told by the gap."""
     free = dataclasses.replace(environment.settings, physics="rigid", contacts=False, reward=RewardSettings())
-    return Pursuit(
-        free,
-        environment.vehicle,
-        environment.effects,
-        environment.effect_parameters,
-        evader_networks=environment.evader_networks,
-    )
+    whole = {"vehicle_bounds": None, "evader_share": None, "dynamics": None}
+    return dataclasses.replace(environment, settings=free, **whole)
 
 
 def finite_or_zero(gradient: Any) -> Any:
