@@ -246,8 +246,8 @@ class AnalyticGradient:
 def free_flight(environment: Pursuit) -> Pursuit:
     """`environment` as it is learnt in: nothing is solid while the gradient is taken, a crash is told by the gap."""
     free = dataclasses.replace(environment.settings, physics="rigid", contacts=False, reward=RewardSettings())
-    whole = {"vehicle_bounds": None, "evader_share": None, "dynamics": None}
-    return dataclasses.replace(environment, settings=free, **whole)
+    by_default = {"vehicle_bounds": None, "evader_share": None, "dynamics": None}
+    return dataclasses.replace(environment, settings=free, **by_default)
 
 
 def finite_or_zero(gradient: Any) -> Any:
