@@ -46,7 +46,7 @@ def test_each_learns_from_its_own_samples_what_pays(worlds):
     evaders = start = jax.jit(learning.start)(jax.random.key(1))
     for key in jax.random.split(jax.random.key(2), 30):
         evaders, caught = improve(evaders, key)
-    which, seen = jax.jit(learning.see)(worlds)
+    which, seen = jax.jit(learning.see)(evaders.actor, worlds)
     np.testing.assert_array_equal(which, np.tile([-1, 0, -1, 1], WORLDS // 4))
     before, after = (outputs_of(e.actor, which, seen)[0][which == 1, 0] for e in (start, evaders))
     moved = float(jnp.mean(after - before))
@@ -116,7 +116,7 @@ def test_every_place_flies_its_own_network(worlds):
     learning = EvaderLearning(HOW, ENVIRONMENT, updates=1)
     networks = jax.vmap(init_network)(jax.random.split(jax.random.key(3), 2))
     networks["output"]["kernel"] = jax.random.normal(jax.random.key(4), networks["output"]["kernel"].shape)
-    which, seen = learning.see(worlds)
+    which, seen = learning.see(networks, worlds)
     found = outputs_of(networks, which, seen)
     for place in (0, 1):
         alone = outputs(jax.tree.map(lambda leaf, i=place: leaf[i], networks), seen)

@@ -77,26 +77,28 @@ class EvaderLearning:
         return clipped_adam(1.0, rate)
 
     def start(self, key: jax.Array) -> LearningEvaders:
-        """Evaders that do as the greedy one."""
+        """Evaders that do as greedy ones."""
         keys = jax.vmap(lambda key: jax.random.split(key, self.number))(jax.random.split(key))
+        numbers = jnp.arange(self.number)
         log_std = jnp.full((self.number, 3), self.how.initial_log_std, jnp.float32)
-        networks = *(jax.vmap(init_network)(own) for own in keys), log_std
+        networks = *(jax.vmap(init_network)(own, numbers) for own in keys), log_std
         return LearningEvaders(*networks, jax.vmap(self.optimiser.init)(networks))
 
-    def see(self, state: PursuitState) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Of worlds (E, ...) which network acts, (E,), and what it sees."""
+    def see(self, networks: Any, state: PursuitState) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """Of worlds (E, ...) which of the networks acts, (E,), and what it sees."""
         settings = self.environment.settings
+        which = learned_place(settings.evaders, state.evader.kind)
 
-        def one(state):
-            return features(scene_of(settings, state), state.evader.memory)
+        def one(which, state):
+            return features(networks, which, scene_of(settings, state), state.evader.memory)
 
-        return learned_place(settings.evaders, state.evader.kind), jax.vmap(one)(state)
+        return which, jax.vmap(one)(which, state)
 
     def act(
         self, evaders: LearningEvaders, state: PursuitState, noise: jax.Array
     ) -> tuple[jax.Array, EvaderSamples]:
         """Wishes (E, 3) in worlds (E, ...), NaN where none of the networks acts, and the samples; noise (E, 3)."""
-        which, seen = self.see(state)
+        which, seen = self.see(evaders.actor, state)
         mean = outputs_of(evaders.actor, which, seen)[0]
         log_std = self._by_network(which) @ evaders.log_std
         sample = mean + jnp.exp(log_std) * noise
@@ -171,7 +173,7 @@ class EvaderLearning:
         """What gradient steps need, minibatch by minibatch: see `_gradient` and `_loss`."""
         how, critic = self.how, evaders.critic
         value = outputs_of(critic, samples.which, samples.seen)[1]
-        last_value = outputs_of(critic, *self.see(last))[1]
+        last_value = outputs_of(critic, *self.see(evaders.actor, last))[1]
         caught = jnp.concatenate([~samples.flying[1:], last.statistics.captured[None]])
         advantage = generalised_advantages(
             REWARD * (~caught).astype(jnp.float32),

@@ -25,6 +25,11 @@ MARGIN = 0.02
 """Distance (m) at which an evader keeps off pillars and the arena's bounds."""
 AROUND = 0.1
 """A pillar's hugger stays this far from its surface, and way-points are left when nearer than this (m)."""
+PLACES = 128
+"""In the arena, among which one looks for the safest."""
+R_SEQUENCE = 1.2207440846057596 ** -np.arange(1.0, 4.0)
+"""Steps from point to point of a sequence of low discrepancy: by the root of x^4 = x + 1 (Roberts 2018, The unreasonable
+effectiveness of quasirandom sequences)."""
 FAR_AWAY = 100.0
 """Distance (m) at which pursuers are put that an evader doesn't know of."""
 
@@ -126,6 +131,22 @@ def pillar_hugger(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array
     return jnp.where(jnp.any(scene.pillar_active), hidden, away), memory
 
 
+def safe_place(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Fly to the place, of many all over the arena, that it would reach the longest before any pursuer; none behind a pillar."""
+    settings, pillars = scene.settings, (scene.pillar_position, scene.pillar_active)
+    share = np.mod(0.5 + np.arange(PLACES)[:, None] * R_SEQUENCE, 1.0).astype(np.float32)
+    radius, angle = settings.arena_radius * np.sqrt(share[:, 0]), 2.0 * np.pi * share[:, 1]
+    places = [radius * np.cos(angle), radius * np.sin(angle), settings.arena_height * share[:, 2]]
+    places = into_free_space(settings, jnp.stack(places, axis=-1), *pillars)
+    to_place = places - scene.position
+    own = _length(to_place)[:, 0] / scene.reach
+    theirs = _length(places[:, None] - scene.pursuers)[..., 0] / settings.max_speed
+    lead = jnp.min(jnp.where(scene.known, theirs, FAR_AWAY), axis=-1) - own
+    lead = jnp.where(line_of_sight(settings, places, scene.position, *pillars), lead, -jnp.inf)
+    chosen = _chosen(to_place, lead)
+    return chosen / jnp.maximum(_length(chosen), MARGIN), memory
+
+
 def way_points(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Fly from point to point, whatever the pursuers do. The points are a sequence of low discrepancy from a drawn one on."""
     settings = scene.settings
@@ -137,8 +158,7 @@ def way_points(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
     # after a second it gives up a point that it doesn't reach
     left = left - settings.time_step
     done = (_length(to_goal)[0] < AROUND) | (left < 0.0)
-    # the additive recurrence of the largest root of x^4 = x + 1 (Roberts 2018, The unreasonable effectiveness of R-sequences)
-    following = jnp.mod(share + 1.2207440846057596 ** -jnp.arange(1.0, 4.0), 1.0)
+    following = jnp.mod(share + R_SEQUENCE, 1.0)
     own = jnp.where(done, jnp.append(following, 1.0), jnp.append(share, left))
     return _unit(to_goal), jnp.concatenate([own, rest])
 
@@ -153,6 +173,7 @@ BEHAVIOURS: dict[str, Callable[[Scene, Any], tuple[jax.Array, Any]]] = {
     "two_step": two_step,
     "wall_runner": wall_runner,
     "pillar_hugger": pillar_hugger,
+    "safe_place": safe_place,
     "way_points": way_points,
     "frozen": frozen,
 }

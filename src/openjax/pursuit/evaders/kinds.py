@@ -38,7 +38,7 @@ EVADERS = {
     "greedy": EvaderKind(
         "greedy",
         "train",
-        look_ahead=(0.1, 0.15, 0.2, 0.25, 0.3),
+        look_ahead=(0.1, 0.15, 0.2, 0.3, 0.5),
         hiding=(0.0, 0.3),
         sees_all=(True, True, False),
     ),
@@ -48,6 +48,7 @@ EVADERS = {
     "greedy_far": EvaderKind("greedy", "held out", look_ahead=(0.4,)),
     "greedy_near": EvaderKind("greedy", "held out", look_ahead=(0.05,), hiding=(0.3,)),
     "two_step": EvaderKind("two_step", "held out"),
+    "safe_place": EvaderKind("safe_place", "held out"),
     "way_points": EvaderKind("way_points", "held out"),
     "frozen": EvaderKind("frozen", "held out"),
     "learned": EvaderKind("learned", "file"),

@@ -1,7 +1,7 @@
-"""A learned evader: a small network with a memory, added to what the greedy evader would do.
+"""A learned evader: a small network with a memory, added to what the greedy evader of some look-ahead would do.
 
 Its memory holds where the pursuers were in the last steps. Pursuers and pillars are pooled, so that their number and order
-don't matter. With zeros in its last layer, as it starts, it is the greedy evader.
+don't matter. With zeros in its last layer, as it starts, it is that greedy evader.
 """
 
 from typing import Any
@@ -16,6 +16,9 @@ from openjax.pursuit.evaders.kinds import EVADERS
 STEPS = 10
 """Steps that it remembers."""
 WIDTH = 64
+LOOK_AHEAD = (0.15, 0.5, 0.3)
+"""Seconds that the greedy evaders look ahead as which networks start, one after the other: a best response to who is caught
+out by a far-sighted one isn't found from a short-sighted one."""
 _OWN, _PURSUER, _PILLAR = 9, 10, 4
 
 
@@ -25,8 +28,8 @@ def learned_place(names: tuple[str, ...], kind: jax.Array) -> jax.Array:
     return jnp.asarray(np.where(is_learned, np.cumsum(is_learned) - 1, -1))[kind]
 
 
-def init_network(key: jax.Array) -> dict[str, Any]:
-    """Parameters of a network (actor and critic alike) whose output, three numbers and one, is zero."""
+def init_network(key: jax.Array, number: int | jax.Array = 0) -> dict[str, Any]:
+    """Parameters of a network (actor and critic alike) whose output, three numbers and one, is zero; `number` among others."""
     sizes = {
         "pursuer": (_PURSUER, WIDTH),
         "pillar": (_PILLAR, WIDTH),
@@ -38,12 +41,20 @@ def init_network(key: jax.Array) -> dict[str, Any]:
         name: {"kernel": jax.nn.initializers.he_normal()(own, size), "bias": jnp.zeros(size[1])}
         for (name, size), own in zip(sizes.items(), jax.random.split(key, len(sizes)), strict=True)
     }
-    return {**layers, "output": {"kernel": jnp.zeros((WIDTH, 4)), "bias": jnp.zeros(4)}}
+    look_ahead = jnp.asarray(LOOK_AHEAD)[number % len(LOOK_AHEAD)]  # goes with them, and has no gradient
+    return {
+        **layers,
+        "output": {"kernel": jnp.zeros((WIDTH, 4)), "bias": jnp.zeros(4)},
+        "look_ahead": look_ahead,
+    }
 
 
-def features(scene: Scene, memory: jax.Array) -> dict[str, jax.Array]:
-    """What the network sees: own (9,), pursuers (N, 10), pillars (P, 4), in_use (P,), greedy (3,)."""
-    settings = scene.settings
+def features(
+    networks: dict[str, Any], which: jax.Array, scene: Scene, memory: jax.Array
+) -> dict[str, jax.Array]:
+    """What the one of K networks that `which` () names sees: own (9,), pursuers (N, 10), pillars (P, 4), in_use (P,), greedy
+    (3,)."""
+    settings, scene = scene.settings, scene.replace(look_ahead=networks["look_ahead"][which])
     before = memory[MEMORY:].reshape(STEPS, *scene.pursuers.shape)
     relative = scene.pursuers - scene.position
     distance = jnp.sqrt(jnp.sum(relative**2, axis=-1, keepdims=True) + 1e-12)
@@ -107,6 +118,6 @@ def learned(
     networks: dict[str, Any], which: jax.Array, scene: Scene, memory: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """The behaviour of the network that `which` () names, without exploration."""
-    wish = outputs_of(networks, which, features(scene, memory))[0]
+    wish = outputs_of(networks, which, features(networks, which, scene, memory))[0]
     size = jnp.sqrt(jnp.sum(wish**2) + 1e-12)
     return wish / jnp.maximum(size, 1.0), remember(scene, memory)
