@@ -209,7 +209,8 @@ class _Run:
             self.progress.phase("learning by the gradient through the simulation")
 
             def validate(parameters):
-                return summarise(validation(parameters)[0].evaluation)
+                # the far tasks: by the uniform ones the best of many checkpoints was chosen, in part by luck
+                return summarise(validation(parameters)[1].evaluation)
 
             self.progress.message(keep_best(self.directory, self.last_stage(), validate, settings))
         return report(self.job, self.directory, validation, outcome, self.progress)
@@ -361,7 +362,7 @@ def keep_best(
     Args:
       directory: the run's; `policy.npz` is what the stage starts from, and what it writes.
       learn: (parameters, key) -> parameters on the way, and the history since the ones before.
-      validate: parameters -> summary of the uniform validation tasks.
+      validate: parameters -> summary of validation tasks by which no checkpoint was chosen.
       settings: of the run.
 
     Returns:

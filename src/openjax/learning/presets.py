@@ -137,7 +137,7 @@ def evaders() -> TrainSettings:
         evaders_start=0.09,
         evaders_ramp=0.12,
         evaders_validation=("field", "heavy", "pillar_hugger"),
-        total_steps=650_000_000,
+        total_steps=750_000_000,
     )
 
 
