@@ -20,10 +20,10 @@ from openjax.files import to_plain
 from openjax.flying.limits import SafetySettings
 from openjax.learning import GeneratorSettings, MappoSettings, TrainSettings
 from openjax.learning.settings import AdaptSettings
+from openjax.plain import from_plain
 from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import PursuitSettings, RewardSettings
 from openjax.ranges import Interval, check_intervals, ranged_fields
-from openjax.store.old_names import train_settings
 from openjax.virtual_crazyflie.link import LinkFaults
 
 SETTINGS = (
@@ -97,7 +97,7 @@ def test_what_is_inside_is_taken_unless_settings_contradict_each_other(data):
         assert "it must be in" not in str(error) and "whole number in" not in str(error)
         return
     if kind is TrainSettings:
-        assert train_settings(to_plain(made), "settings") == made
+        assert from_plain(TrainSettings, to_plain(made), "settings") == made
 
 
 def test_the_ends_belong_to_an_interval_as_its_brackets_say():

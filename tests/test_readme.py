@@ -12,9 +12,10 @@ import pytest
 import openjax
 from openjax.__main__ import COMMANDS
 from openjax.commands import calibrate, diagnose, sample_flights
+from openjax.learning import TrainSettings
+from openjax.plain import from_plain
 from openjax.store import DEFAULT_POLICY
 from openjax.store.environments import make_environment
-from openjax.store.old_names import train_settings
 from openjax.store.policy_files import WEIGHTS, load_policy_file
 from openjax.vehicle.vehicle_file import load_vehicle_file
 
@@ -141,5 +142,6 @@ def test_from_sample_flights_to_a_corrected_simulator(tmp_path):
 
 def test_the_default_policy_comes_from_todays_preset_of_its_name():
     """What ships was trained by the recipe that its card names."""
-    shipped = train_settings(load_policy_file(WEIGHTS / f"{DEFAULT_POLICY}.npz")[1], DEFAULT_POLICY)
-    assert shipped == openjax.preset(DEFAULT_POLICY)
+    stored = load_policy_file(WEIGHTS / f"{DEFAULT_POLICY}.npz")[1]
+    shipped = from_plain(TrainSettings, stored, f"{DEFAULT_POLICY}: ")
+    assert shipped == openjax.preset(DEFAULT_POLICY, seed=shipped.seed)

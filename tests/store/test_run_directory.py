@@ -63,19 +63,10 @@ def test_overwrite_replaces_the_run_and_keeps_foreign_files(tmp_path):
     assert [path.name for path in run.path.iterdir()] == ["notes.txt"]
 
 
-def test_settings_of_an_earlier_version_keep_loading(tmp_path):
+def test_a_setting_that_nobody_knows_is_told(tmp_path):
     run = create_run(tmp_path, overwrite=False)
     run.write_settings(preset("quick"), {})
     text = run.settings_file.read_text()
-    for new, old in (("clip_epsilon_end", "clip_end"), ("clip_epsilon", "clip"), ("gae_lambda", "trace")):
-        text = text.replace(f'"{new}"', f'"{old}"', 1)  # MAPPO's, which come first
-    text = text.replace("validation_", "evaluation_").replace(
-        '"observe_time"', '"observe_others_motion": false, "observe_time"'
-    )
-    run.settings_file.write_text(text)
-    assert run.read_settings() == preset("quick")
-    run.settings_file.write_text(
-        text.replace('"observe_others_motion": false', '"observe_others_motion": true')
-    )
-    with pytest.raises(UserError, match="unknown key 'observe_others_motion'"):
+    run.settings_file.write_text(text.replace('"observe_time"', '"observe_tide"'))
+    with pytest.raises(UserError, match="unknown key 'observe_tide'"):
         run.read_settings()

@@ -12,13 +12,13 @@ from openjax.baselines.velocity_controller import check_flyable
 from openjax.errors import UserError, suggestion
 from openjax.learning import TrainSettings
 from openjax.learning.train_state import policy_leaf
+from openjax.plain import from_plain
 from openjax.policy import NetworkSettings, Policy, PolicyParameters, PredictorSettings
 from openjax.pursuit import Observation, Pursuit, PursuitSettings
 from openjax.pursuit.evaders import SCRIPTED
 from openjax.store import DEFAULT_POLICY
 from openjax.store.checkpoint_files import is_checkpoint, load_arrays
 from openjax.store.checkpoints import Checkpoints
-from openjax.store.old_names import train_settings
 from openjax.store.policy_files import WEIGHTS, fill, load_policy_file, shipped_policies
 from openjax.store.run_directory import RunDirectory, is_run
 
@@ -123,7 +123,7 @@ def abstract_parameters(environment: Pursuit, policy: Policy) -> PolicyParameter
 
 def _from_file(path, source):
     leaves, settings, _ = load_policy_file(path)
-    return _build(train_settings(settings, f"{path}: "), leaves, source)
+    return _build(from_plain(TrainSettings, settings, f"{path}: "), leaves, source)
 
 
 def _from_run(run, source):

@@ -22,7 +22,7 @@ from typing import Any
 from openjax.errors import UserError
 from openjax.files import WRITING, check_output_folder, read_json, remove_unfinished, write_json
 from openjax.learning import TrainSettings
-from openjax.store.old_names import train_settings
+from openjax.plain import from_plain
 
 _FORMAT = "openjax run 1"
 SETTINGS_FILE = "settings.json"
@@ -90,7 +90,7 @@ class RunDirectory:
         stored = read_json(self.settings_file)
         if not isinstance(stored, dict) or stored.get("format") != _FORMAT:
             raise UserError(f"{self.settings_file} isn't of the format {_FORMAT!r}")
-        return train_settings(stored.get("settings"), f"{self.settings_file}: ")
+        return from_plain(TrainSettings, stored.get("settings"), f"{self.settings_file}: ")
 
 
 def is_run(path: Path) -> bool:
