@@ -73,7 +73,7 @@ def test_first_runs():
         rates = sorted(short(table[kind][figure], 2) for table in tables)
         return " to ".join(dict.fromkeys((rates[0], rates[-1])))
 
-    seeds = {6: "six seeds", 9: "nine seeds"}[len(runs)]
+    seeds = {9: "nine seeds"}[len(runs)]
     label = f"first runs on two cores (preset `quick`, {seeds}): captures of new tasks, behind the row of pillars `wall`"
     assert cells(label)[0] == ", ".join(range_of(kind, "capture_rate") for kind in ("validation", "wall"))
     label = "... crashes in new tasks, among the six pillars of `random`"
@@ -129,7 +129,7 @@ def test_best_response():
         short(min(r["capture_rate"] for r in learned if (r["scenario"] == "uniform") == uniform), 2)
         for uniform in (True, False)
     ]
-    label = "... drawn vehicles, three evaders that learned against `evaders`: the one caught least on new tasks, on the worst layout"
+    label = "... drawn vehicles, of three evaders that learned against `evaders` the one caught least: new tasks, worst layout"
     assert cells(label)[0] == ", ".join(value)
     assert len(response["curve"][-1]["capture_rate"]) == 3
     assert round(response["curve"][-1]["steps"] / 1e6) == 200

@@ -382,7 +382,7 @@ def keep_best(
         scores.append(selection_score(looks[-1], length))
         if scores[-1] > scores[kept]:
             kept = len(looks) - 1
-            better = {"validation_score": scores[kept], "analytic_updates": len(history)}
+            better = {"far_validation_score": scores[kept], "analytic_updates": len(history)}
             # at once: a stage that is ended early leaves the best of what it was
             save_policy_file(directory.policy, after, settings, {**notes, **better}, storage="float32")
     seconds, updates = round(time.monotonic() - began, 1), looks[kept]["update"]
@@ -391,4 +391,4 @@ def keep_best(
     told = f"{scores[0]:.4f} -> {scores[kept]:.4f} after {updates} of {len(history)} updates"
     if not kept:
         told = f"{scores[0]:.4f}, at most {max(scores[1:]):.4f} after it, not kept"
-    return f"by the gradient through the simulation: validation score {told}, {seconds:.0f} s"
+    return f"by the gradient through the simulation: score on far validation tasks {told}, {seconds:.0f} s"

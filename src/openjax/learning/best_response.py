@@ -55,7 +55,7 @@ class BestResponse:
         return EvaderLearning(self.how, self.environment, self.how.total_updates)
 
     def start(self, key: jax.Array) -> ResponseCarry:
-        """Evaders that do as the greedy one, and worlds at their starts."""
+        """Evaders that do as greedy ones, and worlds at their starts."""
         key, evader_key, world_key = jax.random.split(key, 3)
         observation, state = self._fresh(world_key)
         return ResponseCarry(

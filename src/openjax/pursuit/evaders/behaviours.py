@@ -134,10 +134,8 @@ def pillar_hugger(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array
 def safe_place(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Fly to the place, of many all over the arena, that it would reach the longest before any pursuer; none behind a pillar."""
     settings, pillars = scene.settings, (scene.pillar_position, scene.pillar_active)
-    share = np.mod(0.5 + np.arange(PLACES)[:, None] * R_SEQUENCE, 1.0).astype(np.float32)
-    radius, angle = settings.arena_radius * np.sqrt(share[:, 0]), 2.0 * np.pi * share[:, 1]
-    places = [radius * np.cos(angle), radius * np.sin(angle), settings.arena_height * share[:, 2]]
-    places = into_free_space(settings, jnp.stack(places, axis=-1), *pillars)
+    share = np.mod(0.5 + np.arange(PLACES)[:, None] * R_SEQUENCE[[1, 0, 2]], 1.0)
+    places = _free_place(scene, jnp.asarray(share, jnp.float32))
     to_place = places - scene.position
     own = _length(to_place)[:, 0] / scene.reach
     theirs = _length(places[:, None] - scene.pursuers)[..., 0] / settings.max_speed
@@ -149,17 +147,12 @@ def safe_place(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 def way_points(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Fly from point to point, whatever the pursuers do. The points are a sequence of low discrepancy from a drawn one on."""
-    settings = scene.settings
     share, left, rest = memory[:3], memory[3], memory[4:]
-    angle, radius = 2.0 * jnp.pi * share[0], settings.arena_radius * jnp.sqrt(share[1])
-    goal = jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), settings.arena_height * share[2]])
-    goal = into_free_space(settings, goal, scene.pillar_position, scene.pillar_active)
-    to_goal = goal - scene.position
+    to_goal = _free_place(scene, share) - scene.position
     # after a second it gives up a point that it doesn't reach
-    left = left - settings.time_step
+    left = left - scene.settings.time_step
     done = (_length(to_goal)[0] < AROUND) | (left < 0.0)
-    following = jnp.mod(share + R_SEQUENCE, 1.0)
-    own = jnp.where(done, jnp.append(following, 1.0), jnp.append(share, left))
+    own = jnp.where(done, jnp.append(jnp.mod(share + R_SEQUENCE, 1.0), 1.0), jnp.append(share, left))
     return _unit(to_goal), jnp.concatenate([own, rest])
 
 
@@ -177,6 +170,14 @@ BEHAVIOURS: dict[str, Callable[[Scene, Any], tuple[jax.Array, Any]]] = {
     "way_points": way_points,
     "frozen": frozen,
 }
+
+
+def _free_place(scene, share):
+    """(..., 3) m, a place outside pillars at shares (..., 3) from 0 to 1 of a turn, of the arena's area and of its height."""
+    settings = scene.settings
+    angle, radius = 2.0 * jnp.pi * share[..., 0], settings.arena_radius * jnp.sqrt(share[..., 1])
+    place = [radius * jnp.cos(angle), radius * jnp.sin(angle), settings.arena_height * share[..., 2]]
+    return into_free_space(settings, jnp.stack(place, axis=-1), scene.pillar_position, scene.pillar_active)
 
 
 def _ends(scene, start, tried):
