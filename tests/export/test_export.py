@@ -24,7 +24,9 @@ from openjax.store.policy_files import save_policy_file
 def policy_file(tmp_path_factory):
     """A small policy with random weights, the predictor's not small, so that a mistake anywhere shows."""
     settings = TrainSettings(
-        environment=PursuitSettings(observe_position=True, observe_history=2, history_length=4),
+        environment=PursuitSettings(
+            observe_position=True, observe_in="heading", observe_history=2, history_length=4
+        ),
         network=NetworkSettings(features=16, heads=2),
         predictor=PredictorSettings(units=8, horizons=(1, 5)),
     )

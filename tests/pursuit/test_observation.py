@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from openjax.policy.actor_critic import own_features
 from openjax.pursuit import Pursuit, PursuitSettings, Task
 from openjax.pursuit.observation import frame, observe, rotation_axes
 from openjax.vehicle import hover_state, load_vehicle
@@ -124,3 +125,45 @@ def test_frame_of_the_history(seen):
     evader = [*EVADER, 1, 2, 3] if seen else [-5] * 6
     np.testing.assert_allclose(numbers, [0.25, *evader, *POSITION.ravel()], atol=1e-6)
     assert numbers.shape == (settings.frame_size,)
+
+
+def test_in_its_heading_a_turned_game_looks_the_same():
+    settings = PursuitSettings(
+        physics="rigid", observe_in="heading", observe_position=True, observe_history=2, min_pillars=0
+    )
+    environment = Pursuit(settings)
+    step, key = jax.jit(environment.step), jax.random.key(1)
+    observation, state = jax.jit(environment.reset)(key)
+    angle = 2.5
+    turn = jnp.array(
+        [[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]],
+        jnp.float32,
+    )
+    w, x, y, z = state.drones.quaternion.T
+    c, s = np.cos(angle / 2), np.sin(angle / 2)
+    quaternion = jnp.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], axis=-1)
+    history = state.own_history.at[..., 3:6].set(rotation_axes(quaternion)[0])
+    history = history.at[..., 6:9].set(rotation_axes(quaternion)[1])
+    turned = state.replace(
+        task=state.task.replace(pillar_position=state.task.pillar_position @ turn[:2, :2].T),
+        drones=state.drones.replace(position=state.drones.position @ turn.T, quaternion=quaternion),
+        evader_position=turn @ state.evader_position,
+        last_seen=turn @ state.last_seen,
+        own_history=history,
+    )
+    for i in range(5):
+        action = 0.3 * jax.random.normal(jax.random.key(i), (3, 4)).at[:, 0].set(0.3)
+        observation, state, *_ = step(key, state, action)
+        other, turned, *_ = step(key, turned, action)
+    assert np.abs(turned.drones.position - state.drones.position).max() > 0.1
+    for name in ("self_state", "others", "pillars", "privileged"):
+        np.testing.assert_allclose(getattr(other, name), getattr(observation, name), atol=1e-5, err_msg=name)
+    predicted = jax.random.normal(key, (2, 3))
+    np.testing.assert_allclose(
+        own_features(other, predicted @ turn.T), own_features(observation, predicted), atol=1e-5
+    )
+    # the quaternion is that of the axes: yaw is gone, roll and pitch stay
+    own = other.self_state
+    for seen, axis in zip(rotation_axes(own[:, 3:7]), (own[:, 10:13], own[:, 13:16]), strict=True):
+        np.testing.assert_allclose(seen, axis, atol=1e-5)
+    np.testing.assert_allclose(own[:, 11], 0.0, atol=1e-6)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from openjax.errors import UserError
 from openjax.pursuit import Observation, Pursuit
 from openjax.pursuit.settings import HIDDEN
 from openjax.vehicle import hover_share
@@ -36,8 +37,17 @@ class Craft:
 
     @classmethod
     def of(cls, environment: Pursuit) -> "Craft":
-        """The craft of an environment's pursuers."""
+        """The craft of an environment's pursuers.
+
+        Raises:
+          UserError: they observe in other axes than the world's.
+        """
         settings = environment.settings
+        if settings.observe_in != "world":
+            raise UserError(
+                f"environment.observe_in {settings.observe_in}: heuristics and policies that put out a velocity or a field "
+                "read the world's axes; it must be world"
+            )
         with jax.ensure_compile_time_eval():  # an environment may be made inside a compiled program
             hover = round(float(hover_share(environment.vehicle)), 6)
         return cls(

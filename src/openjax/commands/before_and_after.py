@@ -32,6 +32,7 @@ _OF_THE_POLICY = (
     "observed_pillars",
     "observe_time",
     "observe_position",
+    "observe_in",
     "observe_history",
     "observe_history_spacing",
     "history_length",

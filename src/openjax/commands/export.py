@@ -25,7 +25,7 @@ TOLERANCE = 2e-5
 STEPS = {"flying games to compare on": 20.0, "writing and comparing": 10.0}
 """Seconds of each on a laptop, about."""
 NAMES = {"onnx": "policy.onnx", "jax": "policy.jax_export", "c": "policy.c"}
-EACH = ("self_state", "others", "pillars", "pillar_seen", "privileged", "position")
+EACH = ("self_state", "others", "pillars", "pillar_seen", "privileged", "position", "heading")
 """What each pursuer sees for itself; the rest of an observation is the team's."""
 
 
@@ -74,9 +74,11 @@ def observations(policy, number: int, seed: int) -> dict:
         return jax.lax.scan(step, (observation, state), jax.random.split(key, steps))[1]
 
     seen = play(observation, state, jax.random.key(seed + 1))
+    fields = {field.name: getattr(seen, field.name) for field in dataclasses.fields(seen)}
     return {
-        field.name: np.asarray(getattr(seen, field.name)).reshape(-1, *getattr(seen, field.name).shape[2:])
-        for field in dataclasses.fields(seen)
+        name: np.asarray(array).reshape(-1, *array.shape[2:])
+        for name, array in fields.items()
+        if array is not None
     }
 
 
@@ -95,7 +97,7 @@ def export(arguments: Arguments, tell: Callable[[str], None] = lambda step: None
     expected = np.asarray(jax.jit(jax.vmap(policy))(Observation(**seen)))
     if arguments.own:
         expected = expected[:, :1]
-        seen |= {name: seen[name][:, :1] for name in EACH}
+        seen |= {name: seen[name][:, :1] for name in EACH if name in seen}
     inputs = {name: jax.ShapeDtypeStruct(array.shape[1:], array.dtype) for name, array in seen.items()}
     tell(list(STEPS)[1])
     write = {"onnx": _onnx, "jax": _jax, "c": _c}[arguments.format]

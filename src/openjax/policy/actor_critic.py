@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from openjax.policy.encoder import Encoder, HiddenLayer, padded
 from openjax.policy.settings import NetworkSettings
 from openjax.pursuit import Observation
+from openjax.pursuit.observation import turned_back
 
 
 class Actor(nn.Module):
@@ -106,4 +107,5 @@ def own_features(
     if predicted is None:
         return observation.self_state
     relative = observation.position[..., :, None, :] - predicted[..., None, :, :]
+    relative = turned_back(observation.heading, relative)
     return jnp.concatenate([observation.self_state, relative.reshape(*relative.shape[:-2], -1)], axis=-1)

@@ -1,5 +1,7 @@
 """What each pursuer observes, and what the critic may see beside it."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -25,6 +27,8 @@ class Observation:
     position: jax.Array  # (N, 3) own positions, to express predicted positions relative to them
     last_seen: jax.Array  # (3,) where the evader was last seen
     frames: jax.Array  # (n, F) history for the predictor, oldest first
+    heading: jax.Array | None = None
+    """(N, 2) cosine and sine of the yaw by which each pursuer's vectors are turned back, all but `position`; None: by none"""
 
 
 def rotation_axes(quaternion: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -33,6 +37,17 @@ def rotation_axes(quaternion: jax.Array) -> tuple[jax.Array, jax.Array]:
     body_x = jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=-1)
     body_z = jnp.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=-1)
     return body_x, body_z
+
+
+def turned_back(heading: jax.Array | None, vector: jax.Array) -> jax.Array:
+    """Vectors (..., N, ..., 2 or more) turned about the vertical by minus the yaw `heading` (..., N, 2) of an `Observation`."""
+    if heading is None:
+        return vector
+    axes = (*heading.shape[:-1], *[1] * (vector.ndim - heading.ndim))
+    cosine, sine = heading[..., 0].reshape(axes), heading[..., 1].reshape(axes)
+    x, y = vector[..., 0], vector[..., 1]
+    xy = jnp.stack([cosine * x + sine * y, cosine * y - sine * x], axis=-1)
+    return jnp.concatenate([xy, vector[..., 2:]], axis=-1)
 
 
 def frame(
@@ -60,45 +75,66 @@ def observe(settings: PursuitSettings, state: PursuitState, seen_drones: DroneSt
     `seen_drones` is what sensors tell of `state.drones`; only the critic sees these themselves.
     """
     n = settings.num_pursuers
-    evader, seen, task = state.evader_position, state.seen, state.task
-    position, quaternion, velocity = seen_drones.position, seen_drones.quaternion, seen_drones.velocity
-    to_evader = position - evader
-    body_x, body_z = rotation_axes(quaternion)
-    parts = [jnp.where(seen, to_evader, HIDDEN), quaternion, velocity, body_x, body_z]
-    if settings.observe_time:
-        parts.append(jnp.broadcast_to(state.step.astype(jnp.float32) / settings.episode_length, (n, 4)))
-    if settings.observe_position:
-        parts.append(position)
-    if settings.observe_history:
-        spacing = settings.observe_history_spacing
-        parts.append(jnp.moveaxis(state.own_history[spacing - 1 :: spacing], 0, 1).reshape(n, -1))
+    evader, seen, task, position = state.evader_position, state.seen, state.task, seen_drones.position
+    heading = None
+    if settings.observe_in == "heading":
+        ahead = rotation_axes(seen_drones.quaternion)[0][:, :2]
+        heading = ahead / jnp.sqrt(jnp.sum(ahead**2, axis=-1, keepdims=True) + 1e-6)
+    turned = functools.partial(turned_back, heading)
 
     # slices and no index: the gradient of an index is a scatter
     others = jnp.stack([position[i] - jnp.concatenate([position[:i], position[i + 1 :]]) for i in range(n)])
-
     pillars, pillar_seen = _nearest_pillars(settings, position, task.pillar_position, task.pillar_active)
-    true_parts = [
-        state.drones.position - evader,
-        jnp.broadcast_to(state.evader_velocity, (n, 3)),
-        state.drones.position,
-        jnp.broadcast_to(seen.astype(jnp.float32), (n, 1)),
-    ]
+    drones = state.drones
+    vectors = drones.position - evader, jnp.broadcast_to(state.evader_velocity, (n, 3)), drones.position
+    true_parts = [*map(turned, vectors), jnp.broadcast_to(seen.astype(jnp.float32), (n, 1))]
     if settings.vehicles:
-        true_parts += [state.drones.velocity, standard_parameters(settings.vehicles, state.vehicles)]
+        true_parts += [turned(drones.velocity), standard_parameters(settings.vehicles, state.vehicles)]
     return Observation(
-        self_state=jnp.concatenate(parts, axis=-1),
-        others=others,
-        pillars=pillars,
+        self_state=_own_part(settings, state, seen_drones, turned),
+        others=turned(others),
+        pillars=jnp.where(pillar_seen[..., None], turned(pillars), HIDDEN),
         pillar_seen=pillar_seen,
         privileged=jnp.concatenate(true_parts, axis=-1),
         position=position,
         last_seen=state.last_seen,
         frames=state.frames[settings.history_spacing - 1 :: settings.history_spacing],
+        heading=heading,
     )
 
 
+def _own_part(settings, state, seen_drones, turned):
+    """`self_state`; `turned` turns vectors (N, ..., 3)."""
+    position, quaternion = seen_drones.position, seen_drones.quaternion
+    body_x, body_z = map(turned, rotation_axes(quaternion))
+    if settings.observe_in == "heading":
+        quaternion = _quaternion(body_x, body_z)
+    to_evader = jnp.where(state.seen, turned(position - state.evader_position), HIDDEN)
+    parts = [to_evader, quaternion, turned(seen_drones.velocity), body_x, body_z]
+    if settings.observe_time:
+        time = state.step.astype(jnp.float32) / settings.episode_length
+        parts.append(jnp.broadcast_to(time, (len(position), 4)))
+    if settings.observe_position:
+        parts.append(turned(position))
+    if settings.observe_history:
+        spacing = settings.observe_history_spacing
+        history = jnp.moveaxis(state.own_history[spacing - 1 :: spacing], 0, 1)
+        vectors = [turned(history[..., i : i + 3]) for i in (0, 3, 6)]
+        parts.append(jnp.concatenate([*vectors, history[..., 9:]], axis=-1).reshape(len(position), -1))
+    return jnp.concatenate(parts, axis=-1)
+
+
+def _quaternion(body_x, body_z):
+    """Unit quaternions (N, 4) wxyz, w > 0, of attitudes with these body axes (N, 3)."""
+    body_y = jnp.cross(body_z, body_x)
+    trace = body_x[:, 0] + body_y[:, 1] + body_z[:, 2]
+    w = 0.5 * jnp.sqrt(jnp.maximum(1.0 + trace, 1e-3))
+    x, y, z = body_y[:, 2] - body_z[:, 1], body_z[:, 0] - body_x[:, 2], body_x[:, 1] - body_y[:, 0]
+    return jnp.stack([w, 0.25 * x / w, 0.25 * y / w, 0.25 * z / w], axis=-1)
+
+
 def _nearest_pillars(settings, position, pillar_position, pillar_active):
-    """The k nearest active pillars of each pursuer: (N, k, 5) features, -5 in unused slots, and (N, k) in use."""
+    """The k nearest active pillars of each pursuer: (N, k, 5) features, and (N, k) in use."""
     n, k = settings.num_pursuers, settings.observed_pillars
     slots = pillar_position.shape[0]
     if slots < k:
@@ -124,4 +160,4 @@ def _nearest_pillars(settings, position, pillar_position, pillar_active):
         ],
         axis=-1,
     )
-    return jnp.where(seen[..., None], features, HIDDEN), seen
+    return features, seen

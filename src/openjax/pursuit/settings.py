@@ -101,6 +101,9 @@ class PursuitSettings:
     """Observe t/T; then the end of an episode is terminal, otherwise it is a truncation."""
     observe_position: bool = False
     """Also observe the own position in the arena (not in the paper, where the arena's bounds stay unseen)."""
+    observe_in: Literal["world", "heading"] = "world"
+    """Axes of what a pursuer observes. "heading": its own, but upright: a game turned about the arena's axis looks the same, at
+    any yaw (not in the paper)."""
     observe_history: Annotated[int, Interval("[0, 1000]")] = 0
     """Also observe this many of the last frames of the own velocity, attitude and command (not in the paper): they show how
     this vehicle answers, and which commands are still on their way."""

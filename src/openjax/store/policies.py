@@ -46,7 +46,8 @@ class LoadedPolicy:
             policy = Heuristic.for_environment(self.policy.name, environment)
             return dataclasses.replace(self, policy=policy)
         game, own = environment.settings, self.settings.environment
-        for name in ("num_pursuers", "self_size", "observed_pillars", "history_length", "frame_size"):
+        seen = ("self_size", "observe_in", "observed_pillars", "history_length", "frame_size")
+        for name in ("num_pursuers", *seen):
             if getattr(game, name) != getattr(own, name):
                 raise UserError(
                     f"policy {self.source} was trained with {name} {getattr(own, name)}, here it's "
@@ -65,11 +66,12 @@ class LoadedPolicy:
           UserError: the observation is that of another game.
         """
         game = self.settings.environment
-        given = (observation.self_state.shape[-1], *observation.frames.shape[-2:])
-        expected = (game.self_size, game.history_length, game.frame_size)
+        axes = "world" if observation.heading is None else "heading"
+        given = (observation.self_state.shape[-1], *observation.frames.shape[-2:], axes)
+        expected = (game.self_size, game.history_length, game.frame_size, game.observe_in)
         if given != expected:
             raise UserError(
-                f"policy {self.source} observes {expected} numbers (own state, history), "
+                f"policy {self.source} observes {expected} (own state, history, axes), "
                 f"here are {given}; make its game with openjax.make(policy.settings.environment)"
             )
         return self.policy.act(self.parameters, observation)
