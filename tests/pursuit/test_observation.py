@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from openjax.interfaces.flat import flat_observation
 from openjax.policy.actor_critic import own_features
 from openjax.pursuit import Pursuit, PursuitSettings, Task
 from openjax.pursuit.observation import frame, observe, rotation_axes
@@ -158,6 +159,7 @@ def test_in_its_heading_a_turned_game_looks_the_same():
     assert np.abs(turned.drones.position - state.drones.position).max() > 0.1
     for name in ("self_state", "others", "pillars", "privileged"):
         np.testing.assert_allclose(getattr(other, name), getattr(observation, name), atol=1e-5, err_msg=name)
+    np.testing.assert_allclose(flat_observation(other), flat_observation(observation), atol=1e-5)
     predicted = jax.random.normal(key, (2, 3))
     np.testing.assert_allclose(
         own_features(other, predicted @ turn.T), own_features(observation, predicted), atol=1e-5

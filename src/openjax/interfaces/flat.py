@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from openjax.pursuit import Observation, PursuitSettings
+from openjax.pursuit.observation import turned_back
 
 ACTION_SIZE = 4
 """Collective thrust, roll, pitch and yaw rate, each in -1..1."""
@@ -27,7 +28,7 @@ def flat_observation(observation: Observation) -> jax.Array:
         observation.self_state,
         observation.others.reshape(*lead, -1),
         observation.pillars.reshape(*lead, -1),
-        observation.position - observation.last_seen[..., None, :],
+        turned_back(observation.heading, observation.position - observation.last_seen[..., None, :]),
     )
     return jnp.concatenate(parts, axis=-1)
 
