@@ -1,5 +1,6 @@
 """What the page of a diagnosis says first: one sentence, and what to do next, which depends on the case."""
 
+import dataclasses
 import inspect
 
 import pytest
@@ -72,3 +73,11 @@ def test_what_was_left_out_stands_above_the_answer():
     left_out = [{"flight": "torn.csv", "issue": "no column t", "left_out": True}]
     page = page_of(report("effect", ["x"], ["x"], quality=left_out))
     assert page.index("Left out: torn.csv: no column t") < page.index("Shares of the gap")
+
+
+def test_an_interval_that_holds_no_effect_is_told():
+    """As where flights of two vehicles stand in one folder: one name, and no size of it that suits all."""
+    parameters = {"x": {"size": Estimate(1.0, "N", (-0.5, 2.5), (0.0, 2.0), may_be_none=True)}}
+    told = dataclasses.replace(report("effect", ["x"], ["x"]), parameters=parameters).in_words()
+    assert any("Flights disagree about x" in line for line in told)
+    assert not any("disagree" in line for line in CASES["effect"].in_words())

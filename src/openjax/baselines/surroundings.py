@@ -37,16 +37,11 @@ class Craft:
 
     @classmethod
     def of(cls, environment: Pursuit) -> "Craft":
-        """The craft of an environment's pursuers.
-
-        Raises:
-          UserError: they observe in other axes than the world's.
-        """
+        """The craft of an environment's pursuers; UserError where they don't observe in the world's axes."""
         settings = environment.settings
         if settings.observe_in != "world":
             raise UserError(
-                f"environment.observe_in {settings.observe_in}: heuristics and policies that put out a velocity or a field "
-                "read the world's axes; it must be world"
+                f"environment.observe_in {settings.observe_in}: methods that fly velocities need world"
             )
         with jax.ensure_compile_time_eval():  # an environment may be made inside a compiled program
             hover = round(float(hover_share(environment.vehicle)), 6)

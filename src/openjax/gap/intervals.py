@@ -33,6 +33,7 @@ def estimates(evidence: Evidence, fit: SetFit, named) -> dict[str, dict[str, Est
                 parameters[p].unit,
                 (v.value - REACH * v.below, v.value + REACH * v.above),
                 parameters[p].prior,
+                bool(-REACH * v.below <= parameters[p].none - v.value <= REACH * v.above),
             )
             for p, v in told.items()
         }

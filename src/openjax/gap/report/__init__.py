@@ -21,12 +21,14 @@ VERDICTS = {
 
 @dataclass(frozen=True)
 class Estimate:
-    """A fitted parameter with its 90 % interval, in `unit`; `usual` is the prior range."""
+    """A fitted parameter with its 90 % interval, in `unit`; `usual` is the prior range; `may_be_none`: the interval holds the
+    value at which the effect does nothing."""
 
     value: float
     unit: str
     interval90: tuple[float, float]
     usual: tuple[float, float]
+    may_be_none: bool = False
 
     def in_words(self, name: str) -> str:
         """The value of the parameter `name` with its interval and unit, and whether it is unusual."""
@@ -124,6 +126,11 @@ class Report:
             *(
                 f"{e}: {', '.join(v.in_words(p) for p, v in of.items())}."
                 for e, of in self.parameters.items()
+            ),
+            *(
+                f"Flights disagree about {e}: it may be none at all. Were they of one vehicle, and alike?"
+                for e, of in self.parameters.items()
+                if all(v.may_be_none for v in of.values())
             ),
             *(
                 f"These flights can't tell {e} from {', '.join(others)}."
