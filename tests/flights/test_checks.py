@@ -233,6 +233,11 @@ def test_a_case_that_cannot_be_used_is_one_line(case_folder, prepare, reason):
     assert "\n" not in str(caught.value)
 
 
+def test_a_folder_of_cases_says_where_they_are(case_folder):
+    with pytest.raises(UserError, match=f"cases are folders in it: {case_folder.name}, in all 1"):
+        load_case(case_folder.parent)
+
+
 def test_held_poses_of_a_slower_camera_are_moved_to_their_rows(sample_columns):
     columns = sample_columns["flight_a"]
     time = columns["t"] - columns["t"][0]

@@ -30,7 +30,9 @@ def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> 
         raise UserError(f"{path}: {what}; a case is a folder of flight logs with a vehicle.toml")
     logs = find_logs(path)
     if not logs:
-        raise UserError(f"{path}: holds no flight log (.csv, .csv.gz, micro-SD log or ROS 2 bag)")
+        inside = sorted(folder.parent.name for folder in path.glob("*/vehicle.toml"))
+        hint = f"; cases are folders in it: {inside[0]}, in all {len(inside)}" if inside else ""
+        raise UserError(f"{path}: holds no flight log (.csv, .csv.gz, micro-SD log or ROS 2 bag){hint}")
     described = (path / "vehicle.toml").exists()
     if not described and not comparison:
         raise UserError(f"{path}: no vehicle.toml; an empty one there means the nominal Crazyflie")
