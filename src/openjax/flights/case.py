@@ -30,9 +30,9 @@ def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> 
         raise UserError(f"{path}: {what}; a case is a folder of flight logs with a vehicle.toml")
     logs = find_logs(path)
     if not logs:
-        inside = sorted(folder.parent.name for folder in path.glob("*/vehicle.toml"))
-        hint = f"; cases are folders in it: {inside[0]}, in all {len(inside)}" if inside else ""
-        raise UserError(f"{path}: holds no flight log (.csv, .csv.gz, micro-SD log or ROS 2 bag){hint}")
+        raise UserError(
+            f"{path}: holds no flight log (.csv, .csv.gz, micro-SD log or ROS 2 bag){_cases_inside(path)}"
+        )
     described = (path / "vehicle.toml").exists()
     if not described and not comparison:
         raise UserError(f"{path}: no vehicle.toml; an empty one there means the nominal Crazyflie")
@@ -48,6 +48,11 @@ def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> 
     weighed = all(vehicle_file.mass_weighed_of(flight.vehicle) for flight in kept)
     vehicle_file = dataclasses.replace(vehicle_file, mass_weighed=weighed)
     return Case(path.resolve().name, tuple(kept), vehicle_file, tuple(issues), path)
+
+
+def _cases_inside(path):
+    cases = sorted(file.parent.name for file in path.glob("*/vehicle.toml"))
+    return f"; cases are folders in it: {cases[0]}, in all {len(cases)}" if cases else ""
 
 
 def _usable(read, vehicle_file: VehicleFile, comparison: bool) -> tuple[list[Flight], list[Issue]]:
