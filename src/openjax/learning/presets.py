@@ -123,7 +123,11 @@ def evaders() -> TrainSettings:
     return changed(
         flight(),
         environment=dict(
-            evaders=("field", "field", "greedy", "greedy", "wall_runner", "learned", "learned", "learned"),
+            evaders=(
+                *("field", "field", "greedy", "greedy", "wall_runner", "slow_hugger"),
+                *("learned", "learned", "learned"),
+            ),
+            observe_in="heading",  # turned, the game looks the same: half of the steps to .99
             min_pillars=0,
             # The distance pays for going near a pillar, the first capture for the last centimetres: a step of it alone costs too
             # much. Breaches that count .02 m early make a way between pillars .4 m apart cost as much as a capture pays

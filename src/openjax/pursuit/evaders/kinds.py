@@ -43,6 +43,8 @@ EVADERS = {
         sees_all=(True, True, False),
     ),
     "wall_runner": EvaderKind("wall_runner", "train", speed=(0.8, 1.0)),
+    # slow enough to be caught by whoever dares to come near: without it, some teams wait a pillar's width away for good
+    "slow_hugger": EvaderKind("pillar_hugger", "train", speed=(0.4, 0.7)),
     "heavy": EvaderKind("greedy", "validation", look_ahead=(0.2,), acceleration=(8.0,), hiding=(0.0, 0.3)),
     "pillar_hugger": EvaderKind("pillar_hugger", "validation"),
     "greedy_far": EvaderKind("greedy", "held out", look_ahead=(0.4,)),
