@@ -1,9 +1,10 @@
 """Policies in worlds that aren't the simulator: six layouts, drawn starts, no clamp.
 
-    python -m experiments.flying.worlds [--policy open flight] [--world plant rotorpy ...] [--episodes 100] [--jobs N]
+    python -m experiments.flying.worlds [--policy open flight] [--world plant rotorpy ...] [--held_out] [--episodes 100]
 
 Worlds: `plant`, the exam's plant, and with `plant:motor_lag` and so on each of its causes at three quarters of its range;
-`rotorpy`, RotorPy's own Crazyflie. Beside them: the simulator itself, `experiments.flying.vehicles`. Writes
+`rotorpy`, RotorPy's own Crazyflie. With `--held_out` each episode draws one of the held-out evaders instead of the paper's.
+Beside them: the simulator itself, `experiments.flying.vehicles`. Writes
 experiments/results/worlds.json and .md (--out).
 """
 
@@ -27,6 +28,7 @@ from experiments.flying.worlds.rotorpy import RotorPyWorld
 from experiments.table import Page, Table, page_parser, publish
 from openjax.commands.evaluator import layout_slots
 from openjax.pursuit import SCENARIOS, scenario_task
+from openjax.pursuit.evaders import HELD_OUT
 from openjax.store.policies import load_policy
 
 SEED = 500  # of the plant's and RotorPy's sensors; used for nothing else
@@ -57,6 +59,7 @@ class Job:
     """Episodes `start` to `start + number` of a policy in a layout of a world."""
 
     policy: str
+    held_out: bool
     world: str
     layout: str
     start: int
@@ -79,14 +82,15 @@ def make_world(world: str, ticks: int, start: int, drones, tasks):
 
 
 @functools.cache
-def loaded_policy(name: str):
-    """A policy, and its game without clamp and family."""
+def loaded_policy(name: str, held_out: bool):
+    """A policy, and its game without clamp and family, with the paper's evader or held-out ones."""
     loaded = load_policy(name)
     settings = dataclasses.replace(
         loaded.settings.environment,
         speed_limit="none",
         start_attitude="drawn",
         physics="rigid",
+        evaders=HELD_OUT if held_out else ("field",),
         vehicles=(),
         rare_vehicles=0.0,
         max_pillars=layout_slots(loaded.settings.environment),
@@ -97,7 +101,7 @@ def loaded_policy(name: str):
 def do(job: Job) -> tuple[Job, dict[str, list[float]], float]:
     """Figures of each episode of a job, and how long they took (s)."""
     begin = time.perf_counter()
-    loaded, settings = loaded_policy(job.policy)
+    loaded, settings = loaded_policy(job.policy, job.held_out)
     task = scenario_task(settings, SCENARIOS[job.layout])
     tasks = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], job.number, axis=0), task)
     numbers = np.arange(job.start, job.start + job.number)
@@ -112,7 +116,7 @@ def study(options: argparse.Namespace) -> dict:
     """Fly all policies in all layouts of all worlds."""
     started = time.monotonic()
     jobs = [
-        Job(policy, world, layout, start, min(options.chunk, options.episodes - start))
+        Job(policy, options.held_out, world, layout, start, min(options.chunk, options.episodes - start))
         for world in sorted(options.world, key=lambda name: name != "rotorpy")  # the slowest first
         for policy in options.policy
         for layout in options.layout
@@ -121,8 +125,9 @@ def study(options: argparse.Namespace) -> dict:
     found, records = defaultdict(lambda: defaultdict(list)), {}
     flown = share_out(do, [(job,) for job in jobs], min(options.jobs, len(jobs)), options.seconds)
     for done, (job, figures, seconds) in enumerate(flown, 1):
-        place = found[job.policy, job.world, job.layout]
-        places = records.setdefault(job.policy, {}).setdefault(job.world, {})
+        policy = f"{job.policy}, held-out evaders" if job.held_out else job.policy
+        place = found[policy, job.world, job.layout]
+        places = records.setdefault(policy, {}).setdefault(job.world, {})
         for name, values in figures.items():
             place[name] += values
         means = " ".join(f"{name} {np.mean(values):.3f}" for name, values in figures.items())
@@ -173,6 +178,7 @@ def main() -> None:
     parser = page_parser(__doc__, "worlds")
     parser.add_argument("--policy", nargs="+", default=["open", "flight"], help="names, runs or policy files")
     parser.add_argument("--world", nargs="+", default=list(PLAIN), help=", ".join((*PLAIN, *CAUSES)))
+    parser.add_argument("--held_out", action="store_true", help="against the held-out evaders")
     parser.add_argument("--layout", nargs="+", default=list(SCENARIOS))
     parser.add_argument("--episodes", type=int, default=100, help="per layout")
     parser.add_argument("--chunk", type=int, default=50, help="episodes that one process flies at once")
