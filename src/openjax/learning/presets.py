@@ -123,10 +123,7 @@ def evaders() -> TrainSettings:
     return changed(
         flight(),
         environment=dict(
-            evaders=(
-                *("field", "field", "greedy", "greedy", "wall_runner", "slow_hugger"),
-                *("learned", "learned", "learned"),
-            ),
+            evaders=("field", "field", "greedy", "greedy", "wall_runner", "slow_hugger", *["learned"] * 3),
             observe_in="heading",  # turned, the game looks the same: half of the steps to .99
             min_pillars=0,
             # The distance pays for going near a pillar, the first capture for the last centimetres: a step of it alone costs too
@@ -162,14 +159,7 @@ def dacoop() -> TrainSettings:
     return changed(mappo(), network=dict(output="field"), total_steps=100_000_000)
 
 
-PRESETS = {
-    "quick": quick,
-    "paper": paper,
-    "flight": flight,
-    "evaders": evaders,
-    "mappo": mappo,
-    "dacoop": dacoop,
-}
+PRESETS = {recipe.__name__: recipe for recipe in (quick, paper, flight, evaders, mappo, dacoop)}
 
 
 def preset(name: str, **changes) -> TrainSettings:
