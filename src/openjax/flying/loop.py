@@ -188,7 +188,6 @@ class Flight:
 
     def run(self) -> Record:
         """Fly it. Returns when all motors are off."""
-        gc.collect()
         gc.disable()
         try:
             pace = Pace(perf_counter())

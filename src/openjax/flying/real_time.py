@@ -1,6 +1,7 @@
 """Making a process fit for real time."""
 
 import contextlib
+import gc
 import os
 
 PRIORITY = 10
@@ -34,13 +35,13 @@ def compile_in_line(lowered):
 
 
 def hurry() -> str:
-    """Ask that this process's threads, and those they start, run before others; what was granted.
-
-    "real time": Linux's real-time scheduler; "nice": before others, as far as they are ordinary; "ordinary": nothing.
+    """Have this process's threads, and those they start, run before others, and nothing that is loaded searched for garbage;
+    what was granted: "real time", Linux's scheduler; "nice", before others as far as they are ordinary; "ordinary", nothing.
 
     Linux grants the real-time scheduler to root and to users with `rtprio` in /etc/security/limits.conf. All threads:
     JAX computes in several, and the loop would wait for one that waits for its turn.
     """
+    gc.freeze()  # a look through all of JAX's objects takes .1 s: for so long no virtual vehicle would say where it is
     ways = {
         "real time": lambda thread: os.sched_setscheduler(thread, os.SCHED_RR, os.sched_param(PRIORITY)),
         "nice": lambda thread: os.setpriority(os.PRIO_PROCESS, thread, NICE),  # threads', too, on Linux
