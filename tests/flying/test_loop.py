@@ -11,7 +11,7 @@ import pytest
 from openjax.flying.controller import Pose, nominal_airframe
 from openjax.flying.game import Play
 from openjax.flying.limits import SafetySettings
-from openjax.flying.loop import Flight, Plan, Record, flight_state
+from openjax.flying.loop import PATIENCE, Flight, Plan, Record, await_poses, flight_state
 from openjax.flying.state import Mode, PoseSample
 
 STARTS = ((0.5, 0.3, 0.5), (0.5, 0.0, 0.5), (0.5, -0.3, 0.5))
@@ -118,3 +118,20 @@ def test_the_record_says_when_each_tick_was_due_and_done(flight):
     assert timing["ticks"] == 700 and timing["missed_deadlines"] == 0
     assert timing["command_age_ms"]["p50"] == timing["measured_to_sent_ms"]["max"] == 1.0
     assert timing["due_to_sent_ms"]["p99"] == 1.5
+
+
+@pytest.mark.parametrize("waiting", [False, True])
+def test_a_tick_after_a_stall_gives_poses_time_to_arrive(waiting):
+    """All processes stood still: the loop, which woke up first, took poses for lost that were a millisecond away."""
+    links, waited = Hovering(), []
+
+    def wait(until):
+        waited.append(until)
+        if len(waited) == 1 + waiting:
+            links.now = time.perf_counter()
+        else:
+            time.sleep(0.07)  # where it spends most of its time
+
+    links.wait, links.now = wait, time.perf_counter() - 0.07 * (not waiting)
+    await_poses(links, links.now + (0.008 if waiting else 0.06))
+    assert len(waited) == 1 + waiting and waited[-1] - links.now <= PATIENCE

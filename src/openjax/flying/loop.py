@@ -25,7 +25,7 @@ PERIOD = 0.01
 MARGIN = 2.0e-3
 """A tick is due this long after the newest poses were measured (s), as far as the fastest packets tell."""
 EARLY, PATIENCE = 3.0e-3, 5.0e-3
-"""It begins as soon as all poses are there, up to this much before or after it is due (s)."""
+"""It begins as soon as all poses are there, up to this much before it is due or after it could begin (s)."""
 TRANSFER, SETTLE = 20.0, 0.3
 """All land if their starts aren't reached within this time (s); there they wait for so long."""
 GONE = 0.1
@@ -118,12 +118,15 @@ class Pace:
 
 def await_poses(vehicles: Links, due: float) -> None:
     """Return around `due` (s): as soon as each vehicle's newest pose is there that was measured before."""
-    while (now := perf_counter()) < due + PATIENCE:
+    latest = max(due, perf_counter()) + PATIENCE
+    while (now := perf_counter()) < latest or now > latest + PATIENCE:
+        if now > latest:  # it stood still: so may the links have, which have first to pass on what came
+            due, latest = now - PATIENCE, now + PATIENCE
         measured = measured_times(vehicles.observe())
         complete = all(t > due - PERIOD or now - t > GONE for t in measured)
         if complete and now >= due - EARLY:
             return
-        vehicles.wait(due - EARLY if complete else due + PATIENCE)
+        vehicles.wait(due - EARLY if complete else latest)
 
 
 def measured_times(samples) -> tuple[float, ...]:
@@ -183,15 +186,13 @@ class Flight:
         self._evader_flies = len(state.drones) > self._pursuers
         self.record = Record(len(state.drones))
         self._play, self._episode, self._begun = None, -1, 0.0
-        self._since = perf_counter()
-        self._alarm = ""
+        self._since, self._alarm = perf_counter(), ""
 
     def run(self) -> Record:
         """Fly it. Returns when all motors are off."""
         gc.disable()
         try:
-            pace = Pace(perf_counter())
-            self._since = perf_counter()
+            pace, self._since = Pace(perf_counter()), perf_counter()
             while not self.over:
                 self.tick(perf_counter(), pace.due)
                 due = pace.next(perf_counter(), measured_times(self.vehicles.observe()))
@@ -221,8 +222,7 @@ class Flight:
         actions = None
         if self._episode >= 0 or request is Request.PURSUE:
             actions = self._actions(now, request is Request.PURSUE)
-        event = Event(now, samples, actions, request, self._alarm)
-        self.state, set_points = decide(self.state, event)
+        self.state, set_points = decide(self.state, Event(now, samples, actions, request, self._alarm))
         sent = self.vehicles.send(set_points)
         self._alarm = self._watched(now, self.state)
         self.record.keep((due, sent, self._episode), arrivals, measured_times(samples), set_points)
