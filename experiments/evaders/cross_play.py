@@ -1,8 +1,8 @@
-"""Policies against every evader: `python -m experiments.evaders.cross_play --policy NAME ... [--game own|honest]`.
+"""Policies against every evader: `python -m experiments.evaders.cross_play --policy NAME ... [--game own|honest|clamp]`.
 
 All evaders by name, on the six layouts and on uniform tasks, with the nominal vehicle, a slower one and the family of the
 preset `flight`. Nothing is chosen by any of it; held-out evaders were never trained on. Game "own": the policy's; "honest": no
-clamp on the speed, the rate loop at 500 Hz. Writes experiments/results/evaders.json and .md (`--out`: others).
+clamp on the speed, the rate loop at 500 Hz; "clamp": the paper's, at 100 Hz. Writes evaders.json and .md (`--out`: others).
 """
 
 import dataclasses
@@ -55,7 +55,8 @@ def game_of(loaded: LoadedPolicy, game: str, physics: str) -> PursuitSettings:
     )
     if game == "own":
         return settings
-    return dataclasses.replace(settings, speed_limit="none", substeps=5)
+    limit, substeps = {"honest": ("none", 5), "clamp": ("clamp", 1)}[game]
+    return dataclasses.replace(settings, speed_limit=limit, substeps=substeps)
 
 
 def kinds_of(settings: PursuitSettings, layouts: int, uniform: int) -> dict[str, Task]:
@@ -219,7 +220,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument(
         "--policy", nargs="+", default=["flight", "evaders"], help="names, runs or policy files"
     )
-    parser.add_argument("--game", choices=("own", "honest"), default="honest")
+    parser.add_argument("--game", choices=("own", "honest", "clamp"), default="honest")
     parser.add_argument("--physics", choices=("rigid", "stops"), default="rigid")
     parser.add_argument("--vehicles", nargs="+", default=["nominal", "table", "family"])
     parser.add_argument("--episodes", type=int, default=100, help="per layout")

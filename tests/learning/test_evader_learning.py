@@ -9,8 +9,8 @@ from openjax import make
 from openjax.learning.evader_learning import EvaderLearning
 from openjax.learning.settings import EvaderLearningSettings
 from openjax.pursuit import uniform_task
-from openjax.pursuit.evaders import init_network
-from openjax.pursuit.evaders.learned import outputs, outputs_of
+from openjax.pursuit.evaders import init_network, scene_of
+from openjax.pursuit.evaders.learned import STEPS, features, outputs, outputs_of
 
 WORLDS = 512
 ENVIRONMENT = make(evaders=("field", "learned", "greedy", "learned"), physics="stops", max_pillars=5)
@@ -122,3 +122,26 @@ def test_every_place_flies_its_own_network(worlds):
         alone = outputs(jax.tree.map(lambda leaf, i=place: leaf[i], networks), seen)
         for mine, its in zip(found, alone, strict=True):
             np.testing.assert_allclose(mine[which == place], its[which == place], rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("own_axes", [True, False])
+def test_in_its_own_axes_a_turned_game_is_the_same(worlds, own_axes):
+    network = init_network(jax.random.key(5), own_axes=own_axes)
+    network["output"]["kernel"] = jax.random.normal(jax.random.key(6), network["output"]["kernel"].shape)
+    networks = jax.tree.map(lambda leaf: leaf[None], network)
+    cosine, sine = np.cos(0.7), np.sin(0.7)
+    turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]], np.float32)
+    scene = scene_of(ENVIRONMENT.settings, jax.tree.map(lambda leaf: leaf[1], worlds))
+    scene = scene.replace(
+        known=jnp.zeros(3, bool)
+    )  # nobody to be greedy about, whose directions are the world's
+    moved = {name: getattr(scene, name) @ turn.T for name in ("position", "velocity", "pursuers")}
+    turned = scene.replace(**moved, pillar_position=scene.pillar_position @ turn[:2, :2].T)
+    before = scene.pursuers + 0.1 * jax.random.normal(jax.random.key(7), (STEPS, 3, 3))
+
+    def wish(scene, before):
+        memory = jnp.concatenate([jnp.zeros(worlds.evader.memory.shape[-1] - before.size), before.ravel()])
+        return np.asarray(outputs(network, features(networks, 0, scene, memory))[0])
+
+    gap = np.abs(wish(turned, before @ turn.T) - wish(scene, before) @ turn.T).max()
+    assert gap < 1e-4 if own_axes else gap > 0.1

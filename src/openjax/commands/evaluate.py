@@ -149,10 +149,8 @@ def _game(command, loaded):
         raise UserError(
             "--environment.evaders learned: a name isn't enough; --opponent takes a file of openjax exploit"
         )
-    if command.scenario == "all":
-        scenarios = list(SCENARIOS.values())
-    else:
-        scenarios = [find_scenario(command.scenario, settings)]
+    of_all = command.scenario == "all"
+    scenarios = list(SCENARIOS.values()) if of_all else [find_scenario(command.scenario, settings)]
     wanted, there = settings.num_pursuers, len(scenarios[0].pursuers)
     if wanted not in (loaded.settings.environment.num_pursuers, there):
         raise UserError(

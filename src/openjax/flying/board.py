@@ -126,7 +126,5 @@ def stand_alone() -> None:
 
 def say(text: str) -> None:
     """A line on the terminal, if there still is one."""
-    try:
+    with contextlib.suppress(OSError):
         os.write(2, f"\r{text}\n".encode())
-    except OSError:
-        pass

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from openjax.pursuit import Observation, PursuitSettings
-from openjax.pursuit.observation import turned_back
+from openjax.pursuit.axes import turned_back
 
 ACTION_SIZE = 4
 """Collective thrust, roll, pitch and yaw rate, each in -1..1."""

@@ -53,10 +53,7 @@ class PursuitMultiAgentEnv:
         """`step_env`, and a new episode (of `reset_state`, where given) in place of one that has ended."""
         key, reset_key = jax.random.split(key)
         after = self.step_env(key, state, actions)
-        if reset_state is None:
-            fresh = self.reset(reset_key)
-        else:
-            fresh = self.get_obs(reset_state), reset_state
+        fresh = self.reset(reset_key) if reset_state is None else (self.get_obs(reset_state), reset_state)
         over = after[3]["__all__"]
         observations, state = jax.tree.map(lambda new, old: jnp.where(over, new, old), fresh, after[:2])
         return observations, state, *after[2:]

@@ -183,9 +183,8 @@ def _forward_kernel(layout, arithmetic, q_ref, own_ref, x_ref, inverse_ref, w_re
     def inverse(m):
         return inverse_ref[m, :]
 
-    entities = [own_ref[...].astype(jnp.float32)]
-    for m in range(number):
-        entities.append(activation(_linear(layout, add, x, inverse, w_ref, m)[1], arithmetic))
+    linear = (_linear(layout, add, x, inverse, w_ref, m)[1] for m in range(number))
+    entities = [own_ref[...].astype(jnp.float32), *(activation(entity, arithmetic) for entity in linear)]
     for h in range(heads):
         query = q_ref[:, h * f : (h + 1) * f].astype(jnp.float32) * layout.scale
         scores = [jnp.sum(query * entity, axis=1) for entity in entities]

@@ -13,6 +13,7 @@ class BestResponseSettings(EvaderLearningSettings):
     """How an evader learns against fixed pursuers."""
 
     learning_rate_end: Annotated[float, Interval("[0, 1]")] = 0.0
+    own_axes: bool = True
     total_steps: Annotated[int, Interval("[1, 1e15]")] = 200_000_000
     """Environment steps of each seed."""
     seeds: Annotated[int, Interval("[1, 64]")] = 3

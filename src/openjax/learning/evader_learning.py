@@ -80,7 +80,8 @@ class EvaderLearning:
         """Evaders that do as greedy ones."""
         keys = jax.vmap(lambda key: jax.random.split(key, self.number))(jax.random.split(key))
         log_std = jnp.full((self.number, 3), self.how.initial_log_std, jnp.float32)
-        networks = *(jax.vmap(init_network)(own, jnp.arange(self.number)) for own in keys), log_std
+        init = jax.vmap(functools.partial(init_network, own_axes=self.how.own_axes))
+        networks = *(init(own, jnp.arange(self.number)) for own in keys), log_std
         return LearningEvaders(*networks, jax.vmap(self.optimiser.init)(networks))
 
     def see(self, networks: Any, state: PursuitState) -> tuple[jax.Array, dict[str, jax.Array]]:

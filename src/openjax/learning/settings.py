@@ -107,6 +107,8 @@ class EvaderLearningSettings:
     discount: Annotated[float, Interval("[0, 1]")] = 0.995
     gae_lambda: Annotated[float, Interval("[0, 1]")] = 0.95
     initial_log_std: Annotated[float, Interval("[-10, 2]")] = -1.0
+    own_axes: bool = False
+    """Evaders see in axes of their own, x away from the arena's axis."""
 
     def __post_init__(self):
         check_intervals(self)

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from openjax.policy.encoder import Encoder, HiddenLayer, padded
 from openjax.policy.settings import NetworkSettings
 from openjax.pursuit import Observation
-from openjax.pursuit.observation import turned_back
+from openjax.pursuit.axes import turned_back
 
 
 class Actor(nn.Module):

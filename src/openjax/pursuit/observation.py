@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from openjax.pursuit.axes import turned_back
 from openjax.pursuit.collisions import pillar_distance
 from openjax.pursuit.settings import HIDDEN, PursuitSettings
 from openjax.pursuit.state import PursuitState
@@ -37,17 +38,6 @@ def rotation_axes(quaternion: jax.Array) -> tuple[jax.Array, jax.Array]:
     body_x = jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=-1)
     body_z = jnp.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=-1)
     return body_x, body_z
-
-
-def turned_back(heading: jax.Array | None, vector: jax.Array) -> jax.Array:
-    """Vectors (..., N, ..., 2 or more) turned about the vertical by minus the yaw `heading` (..., N, 2) of an `Observation`."""
-    if heading is None:
-        return vector
-    axes = (*heading.shape[:-1], *[1] * (vector.ndim - heading.ndim))
-    cosine, sine = heading[..., 0].reshape(axes), heading[..., 1].reshape(axes)
-    x, y = vector[..., 0], vector[..., 1]
-    xy = jnp.stack([cosine * x + sine * y, cosine * y - sine * x], axis=-1)
-    return jnp.concatenate([xy, vector[..., 2:]], axis=-1)
 
 
 def frame(

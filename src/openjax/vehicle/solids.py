@@ -61,12 +61,9 @@ _TOUCHING = -1e-6  # m, gap at which a contact acts but doesn't push
 def solids_xml(arena: Arena, n_pillars: int, n_others: int, dt: float) -> tuple[str, str]:
     """MJCF of the shapes (floor, pillars, other drones) and of their contact pairs with the geom "drone"."""
     shapes = ['<geom name="floor" type="plane" size="0 0 1"/>']
-    for k in range(n_pillars):
-        shapes.append(
-            f'<geom name="pillar_{k}" type="capsule" size="{arena.pillar_radius} {arena.height / 2}"/>'
-        )
-    for k in range(n_others):
-        shapes.append(f'<geom name="other_{k}" type="sphere" size="{DRONE_RADIUS}"/>')
+    pillar = f'type="capsule" size="{arena.pillar_radius} {arena.height / 2}"'
+    shapes += [f'<geom name="pillar_{k}" {pillar}/>' for k in range(n_pillars)]
+    shapes += [f'<geom name="other_{k}" type="sphere" size="{DRONE_RADIUS}"/>' for k in range(n_others)]
     names = ["floor", *(f"pillar_{k}" for k in range(n_pillars)), *(f"other_{k}" for k in range(n_others))]
     contacts = (
         f'<pair geom1="drone" geom2="{name}" condim="1" '

@@ -41,10 +41,7 @@ def field_velocity(
     pillars = jnp.sum(jnp.where(pillar_active[:, None], from_pillar / distance * strength, 0.0), axis=0)
 
     force = force + jnp.concatenate([wall + pillars, (floor - ceiling)[None]])
-    if settings.evader_norm == "axis":
-        size = jnp.max(jnp.abs(force))
-    else:
-        size = jnp.sqrt(jnp.sum(force**2) + 1e-12)
+    size = jnp.max(jnp.abs(force)) if settings.evader_norm == "axis" else jnp.sqrt(jnp.sum(force**2) + 1e-12)
     return settings.evader_speed * force / (size + EPSILON)
 
 

@@ -4,12 +4,14 @@ Its memory holds where the pursuers were in the last steps. Pursuers and pillars
 don't matter. With zeros in its last layer, as it starts, it is that greedy evader.
 """
 
+import functools
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from openjax.pursuit.axes import turned_back
 from openjax.pursuit.evaders.behaviours import MEMORY, Scene, greedy
 from openjax.pursuit.evaders.kinds import EVADERS
 
@@ -28,24 +30,23 @@ def learned_place(names: tuple[str, ...], kind: jax.Array) -> jax.Array:
     return jnp.asarray(np.where(is_learned, np.cumsum(is_learned) - 1, -1))[kind]
 
 
-def init_network(key: jax.Array, number: int | jax.Array = 0) -> dict[str, Any]:
-    """Parameters of a network (actor and critic alike) whose output, three numbers and one, is zero; `number` among others."""
-    sizes = {
-        "pursuer": (_PURSUER, WIDTH),
-        "pillar": (_PILLAR, WIDTH),
-        "own": (_OWN + 3 * WIDTH, WIDTH),
-        "hidden": (WIDTH, WIDTH),
-    }
+def init_network(key: jax.Array, number: int | jax.Array = 0, own_axes: bool = False) -> dict[str, Any]:
+    """Parameters of a network (actor and critic alike) whose output, three numbers and one, is zero; `number` among others.
+
+    With `own_axes` it sees in axes of its own, x away from the arena's axis, so that a game that is turned looks the same.
+    """
+    inputs = {"pursuer": _PURSUER, "pillar": _PILLAR, "own": _OWN + 3 * WIDTH, "hidden": WIDTH}
     layers = {
         # no orthogonal ones: several decompositions at once may wait for each other for ever on a CPU of two cores
-        name: {"kernel": jax.nn.initializers.he_normal()(own, size), "bias": jnp.zeros(size[1])}
-        for (name, size), own in zip(sizes.items(), jax.random.split(key, len(sizes)), strict=True)
+        name: {"kernel": jax.nn.initializers.he_normal()(own, (size, WIDTH)), "bias": jnp.zeros(WIDTH)}
+        for (name, size), own in zip(inputs.items(), jax.random.split(key, len(inputs)), strict=True)
     }
-    look_ahead = jnp.asarray(LOOK_AHEAD)[number % len(LOOK_AHEAD)]  # goes with them, and has no gradient
     return {
         **layers,
         "output": {"kernel": jnp.zeros((WIDTH, 4)), "bias": jnp.zeros(4)},
-        "look_ahead": look_ahead,
+        # these two go with them, and have no gradient
+        "look_ahead": jnp.asarray(LOOK_AHEAD)[number % len(LOOK_AHEAD)],
+        "own_axes": jnp.float32(own_axes),
     }
 
 
@@ -53,7 +54,7 @@ def features(
     networks: dict[str, Any], which: jax.Array, scene: Scene, memory: jax.Array
 ) -> dict[str, jax.Array]:
     """What the one of K networks that `which` () names sees: own (9,), pursuers (N, 10), pillars (P, 4), in_use (P,), greedy
-    (3,)."""
+    (3,), outward (2,)."""
     settings, scene = scene.settings, scene.replace(look_ahead=networks["look_ahead"][which])
     before = memory[MEMORY:].reshape(STEPS, *scene.pursuers.shape)
     relative = scene.pursuers - scene.position
@@ -66,14 +67,18 @@ def features(
     size = np.array([settings.arena_radius] * 2 + [settings.arena_height / 2], np.float32)
     middle = np.array(settings.middle, np.float32)
     wish = greedy(scene, memory)[0]
+    outward = scene.position[:2] / jnp.sqrt(jnp.sum(scene.position[:2] ** 2) + 1e-6)
+    outward = jnp.where(networks["own_axes"][which] > 0, outward, np.array([1.0, 0.0], np.float32))
+    own = functools.partial(turned_back, outward)
+    vectors = own((scene.position - middle) / size), own(scene.velocity / settings.evader_speed), own(wish)
+    moved = [own(relative), distance, own(2.0 * half / scale), own(whole / scale)]
     seen = {
-        "own": jnp.concatenate(
-            [(scene.position - middle) / size, scene.velocity / settings.evader_speed, wish]
-        ),
-        "pursuers": jnp.concatenate([relative, distance, 2.0 * half / scale, whole / scale], axis=-1),
-        "pillars": jnp.where(in_use, jnp.concatenate([to_pillar, gap, in_use], axis=-1), 0.0),
+        "own": jnp.concatenate(vectors),
+        "pursuers": jnp.concatenate(moved, axis=-1),
+        "pillars": jnp.where(in_use, jnp.concatenate([own(to_pillar), gap, in_use], axis=-1), 0.0),
         "in_use": scene.pillar_active,
         "greedy": wish,
+        "outward": outward,
     }
     # fused with what follows, the greedy evader in it takes a GPU's compiler minutes
     return jax.lax.optimization_barrier(seen)
@@ -90,7 +95,8 @@ def outputs(network: dict[str, Any], seen: dict[str, jax.Array]) -> tuple[jax.Ar
     pooled = [jnp.mean(pursuers, axis=-2), jnp.max(pursuers, axis=-2), jnp.sum(pillars, axis=-2)]
     hidden = jnp.tanh(dense("own", jnp.concatenate([seen["own"], *pooled], axis=-1)))
     out = dense("output", jnp.tanh(dense("hidden", hidden)))
-    return seen["greedy"] + out[..., :3], out[..., 3]
+    inverse = seen["outward"] * np.array([1.0, -1.0], np.float32)
+    return seen["greedy"] + turned_back(inverse, out[..., :3]), out[..., 3]
 
 
 def remember(scene: Scene, memory: jax.Array) -> jax.Array:
@@ -102,9 +108,8 @@ def outputs_of(
     networks: dict[str, Any], which: jax.Array, seen: dict[str, jax.Array]
 ) -> tuple[jax.Array, jax.Array]:
     """`outputs` of the one of K networks, every leaf with their axis first, that `which` (...) names for each of the features."""
-    wishes, values = jax.vmap(outputs, (0, None))(
-        networks, seen
-    )  # all of them: cheaper than their parameters by world
+    # all of them: cheaper than their parameters by world
+    wishes, values = jax.vmap(outputs, (0, None))(networks, seen)
     chosen = jax.nn.one_hot(which, values.shape[0], axis=0)
     return jnp.sum(chosen[..., None] * wishes, axis=0), jnp.sum(chosen * values, axis=0)
 

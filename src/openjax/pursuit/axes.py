@@ -1,0 +1,15 @@
+"""Axes of one's own: upright, turned about the vertical."""
+
+import jax
+import jax.numpy as jnp
+
+
+def turned_back(heading: jax.Array | None, vector: jax.Array) -> jax.Array:
+    """Vectors (..., N, ..., 2 or more) turned about the vertical by minus the yaw `heading` (..., N, 2) of an `Observation`."""
+    if heading is None:
+        return vector
+    axes = (*heading.shape[:-1], *[1] * (vector.ndim - heading.ndim))
+    cosine, sine = heading[..., 0].reshape(axes), heading[..., 1].reshape(axes)
+    x, y = vector[..., 0], vector[..., 1]
+    xy = jnp.stack([cosine * x + sine * y, cosine * y - sine * x], axis=-1)
+    return jnp.concatenate([xy, vector[..., 2:]], axis=-1)
