@@ -129,9 +129,9 @@ def test_best_response():
         short(min(r["capture_rate"] for r in learned if (r["scenario"] == "uniform") == uniform), 2)
         for uniform in (True, False)
     ]
-    label = "... drawn vehicles, of six evaders that learned against `evaders` the one caught least: new tasks, worst layout"
+    label = "... drawn vehicles, of twelve evaders that learned against `evaders` the one caught least: new tasks, worst layout"
     assert cells(label)[0] == ", ".join(value)
-    assert sum(len(response["curve"][-1]["capture_rate"]) for response in responses) == 6
+    assert sum(len(response["curve"][-1]["capture_rate"]) for response in responses) == 12
     assert all(round(response["curve"][-1]["steps"] / 1e6) == 200 for response in responses)
 
 
