@@ -103,7 +103,7 @@ def test_evaders():
     rates = {
         (r["policy"], r["evader"], r["tasks"]): r["capture_rate"]
         for r in read("evaders")["records"]
-        if r["vehicle"] == "nominal"
+        if (r["game"], r["vehicle"]) == ("honest", "nominal")
     }
 
     def least(evaders, places):
