@@ -118,8 +118,8 @@ class Pace:
 
 def await_poses(vehicles: Links, due: float) -> None:
     """Return around `due` (s): as soon as each vehicle's newest pose is there that was measured before."""
-    latest = max(due, perf_counter()) + PATIENCE
-    while (now := perf_counter()) < latest or now > latest + PATIENCE:
+    latest = max(due, begun := perf_counter()) + PATIENCE
+    while (now := perf_counter()) < latest or latest + PATIENCE < now < begun + GONE:
         if now > latest:  # it stood still: so may the links have, which have first to pass on what came
             due, latest = now - PATIENCE, now + PATIENCE
         measured = measured_times(vehicles.observe())
