@@ -32,6 +32,13 @@ from openjax.pursuit.evaders import EVADERS, HELD_OUT, SCRIPTED, VALIDATED
 from openjax.store.policies import LoadedPolicy, load_policy
 from openjax.vehicle.family import vehicle_family
 
+GAMES = {
+    "own": {},
+    "honest": {"speed_limit": "none", "substeps": 5},
+    "clamp": {"speed_limit": "clamp", "substeps": 1},
+}
+"""What of a policy's game changes."""
+
 
 @functools.cache
 def program(settings: PursuitSettings, policy):
@@ -53,10 +60,7 @@ def game_of(loaded: LoadedPolicy, game: str, physics: str) -> PursuitSettings:
         max_pillars=layout_slots(settings),
         reward=RewardSettings(),  # counts for nothing here: the same program for policies that differ in it
     )
-    if game == "own":
-        return settings
-    limit, substeps = {"honest": ("none", 5), "clamp": ("clamp", 1)}[game]
-    return dataclasses.replace(settings, speed_limit=limit, substeps=substeps)
+    return dataclasses.replace(settings, **GAMES[game])
 
 
 def kinds_of(settings: PursuitSettings, layouts: int, uniform: int) -> dict[str, Task]:
@@ -220,7 +224,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument(
         "--policy", nargs="+", default=["flight", "evaders"], help="names, runs or policy files"
     )
-    parser.add_argument("--game", choices=("own", "honest", "clamp"), default="honest")
+    parser.add_argument("--game", choices=GAMES, default="honest")
     parser.add_argument("--physics", choices=("rigid", "stops"), default="rigid")
     parser.add_argument("--vehicles", nargs="+", default=["nominal", "table", "family"])
     parser.add_argument("--episodes", type=int, default=100, help="per layout")

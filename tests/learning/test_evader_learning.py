@@ -132,9 +132,8 @@ def test_in_its_own_axes_a_turned_game_is_the_same(worlds, own_axes):
     cosine, sine = np.cos(0.7), np.sin(0.7)
     turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]], np.float32)
     scene = scene_of(ENVIRONMENT.settings, jax.tree.map(lambda leaf: leaf[1], worlds))
-    scene = scene.replace(
-        known=jnp.zeros(3, bool)
-    )  # nobody to be greedy about, whose directions are the world's
+    # nobody to be greedy about, whose directions are the world's
+    scene = scene.replace(known=jnp.zeros(3, bool))
     moved = {name: getattr(scene, name) @ turn.T for name in ("position", "velocity", "pursuers")}
     turned = scene.replace(**moved, pillar_position=scene.pillar_position @ turn[:2, :2].T)
     before = scene.pursuers + 0.1 * jax.random.normal(jax.random.key(7), (STEPS, 3, 3))

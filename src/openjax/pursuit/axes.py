@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 
 def turned_back(heading: jax.Array | None, vector: jax.Array) -> jax.Array:
-    """Vectors (..., N, ..., 2 or more) turned about the vertical by minus the yaw `heading` (..., N, 2) of an `Observation`."""
+    """Vectors (..., N, ..., 2 or more) turned about the vertical by minus the yaw with cosine and sine `heading` (..., N, 2)."""
     if heading is None:
         return vector
     axes = (*heading.shape[:-1], *[1] * (vector.ndim - heading.ndim))
