@@ -70,7 +70,7 @@ def closing_words(settings: TrainSettings, run: Path, on_cpu: bool) -> list[str]
         view += f" --scenario {layouts[-1].name}"
     steps = [f"{view} (in a browser)"]
     if on_cpu:
-        steps.append("openjax train --preset paper (the real game, five minutes on a GPU)")
+        steps.append("openjax train --preset paper (the real game, two minutes on a GPU)")
     steps.append(
         "openjax sample_flights flights, then openjax diagnose flights (from flight logs to a cause)"
     )
