@@ -54,14 +54,24 @@ def test_layouts(layout):
 
 
 def test_training_runs():
-    """Seconds of the three runs and their steps per second, at the preset's default settings."""
-    runs = list(read("h200_runs")["runs"].values())
-    seconds = [f"{run['layouts']['seconds']:.0f} s" for run in runs]
-    value = cells("a whole training run on one H200, compilation included")[0]
-    assert value == f"{', '.join(sorted(seconds[:2]))} (and {seconds[2]} on a GPU shared with another run)"
-    speeds = sorted(run["steps_per_second"] / 1e6 for run in runs[:2])
-    speed = cells("environment steps per second in such a run")[0]
-    assert speed == f"{speeds[0]:.1f} to {speeds[1]:.1f} million"
+    """Seconds, captures and crashes of the whole runs by the preset's default settings, and the steps per second of updates."""
+    runs = [run for run in read("seconds")["runs"] if run.get("whole")]
+    assert len(runs) == 8
+
+    def ends(numbers, digits):
+        return " to ".join(short(end(numbers), digits) for end in (min, max))
+
+    seconds = [
+        f"{ends([r['whole']['seconds'] for r in runs if r['kept'] == kept], 0)} s"
+        for kept in ("nothing", "all")
+    ]
+    label = "whole training runs on one H100 (preset `paper`): nothing compiled before, programs kept"
+    assert cells(label)[0] == ", ".join(seconds)
+    rates = [layout for run in runs for layout in run["whole"]["layouts"].values()]
+    value = cells("... these eight seeds in the six layouts: captures, crashes")[0]
+    assert value == ", ".join(ends([rate[figure] for rate in rates], 2) for figure in (0, 1))
+    speeds = [run["steps_per_second"] / 1e6 for run in runs]
+    assert cells("environment steps per second of their updates")[0] == f"{np.median(speeds):.1f} million"
 
 
 def test_first_runs():
@@ -83,7 +93,7 @@ def test_first_runs():
 def test_training_step():
     """The default network, the preset's number of worlds."""
     rows = read("faster_step")["rows"]
-    (row,) = [r for r in rows if r["run"] == "new" and r["label"] == "training" and r["worlds"] == 5120]
+    (row,) = [r for r in rows if r["run"] == "today" and r["label"] == "training" and r["worlds"] == 5120]
     assert cells("the training step alone")[0] == f"{row['sps'] / 1e6:.1f} million"
 
 

@@ -8,6 +8,8 @@ captures and crashes looked for in every physics step, and not only at those at 
 
 import argparse
 import dataclasses
+import functools
+import itertools
 import os
 import subprocess
 import sys
@@ -39,17 +41,12 @@ def train(options: argparse.Namespace, seed: int, cores: list[int]) -> dict:
     for name in (
         "JAX_COMPILATION_CACHE_DIR",
         "TF_CPP_MIN_LOG_LEVEL",
-    ):  # JAX sets the second one here, a user doesn't
+    ):  # JAX sets the latter here, a user doesn't
         environment.pop(name, None)
     started = time.monotonic()
     with open(f"{run}.txt", "w") as log:
-        subprocess.run(
-            ["taskset", "-c", ",".join(map(str, cores)), *command],
-            env=environment,
-            stdout=log,
-            stderr=subprocess.STDOUT,
-            check=True,
-        )
+        pinned = ["taskset", "-c", ",".join(map(str, cores)), *command]
+        subprocess.run(pinned, env=environment, stdout=log, stderr=subprocess.STDOUT, check=True)
     seconds = round(time.monotonic() - started)
     print(f"seed {seed}: {seconds} s", flush=True)
     return {"seed": seed, "jax": jax.__version__, "whole_command": seconds, **record(run)}
@@ -59,17 +56,13 @@ def record(run: Path) -> dict:
     """What the table of a run says, and its policy flown on the validation tasks once more."""
     layouts, loaded = read_json(run / "layouts.json"), load_policy(run)
     kept = {name: layouts[name] for name in ("after", "open", "seconds", "steps") if name in layouts}
-    return {
-        "time_step": loaded.settings.environment.time_step,
-        **kept,
-        "every_physics_step": fly_finely(loaded),
-    }
+    step = loaded.settings.environment.time_step
+    return {"time_step": step, **kept, "every_physics_step": fly_finely(loaded)}
 
 
 def fly_finely(loaded: LoadedPolicy) -> dict[str, float]:
     """Rates on the validation tasks in an environment whose step is one physics step, the policy's action held between."""
-    own = loaded.settings.environment
-    held = own.substeps
+    own, held = loaded.settings.environment, loaded.settings.environment.substeps
     game = Pursuit(
         dataclasses.replace(
             own,
@@ -109,8 +102,8 @@ def study(options: argparse.Namespace) -> dict:
     available = sorted(os.sched_getaffinity(0))
     places = [available[CORES * i : CORES * (i + 1)] for i in range(options.at_once)]
     with ThreadPoolExecutor(options.at_once) as pool:
-        start = lambda i: train(options, options.seeds[i], places[i % options.at_once])  # noqa: E731
-        runs = list(pool.map(start, range(len(options.seeds))))
+        cores = itertools.cycle(places)
+        runs = list(pool.map(functools.partial(train, options), options.seeds, cores))
     return {"preset": " ".join(PRESETS["quick"].__doc__.split()), "runs": runs}
 
 
@@ -159,9 +152,7 @@ def main() -> None:
     """The command."""
     parser = page_parser(__doc__, "quick")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument(
-        "--at_once", type=int, default=1, help="runs side by side, each on two cores of its own"
-    )
+    parser.add_argument("--at_once", type=int, default=1, help="runs side by side, on two cores each")
     parser.add_argument("--options", default="", help="more options of openjax.train")
     parser.add_argument("--runs", type=Path, default=Path("runs/quick"), help="folder of the runs")
     publish(parser.parse_args(), study, page)

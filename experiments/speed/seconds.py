@@ -1,12 +1,13 @@
 """Seconds to the first update, and to a policy that catches: `python -m experiments.speed.seconds [--starts paper] [--seeds 1]`.
 
-Runs of `openjax train`, one after the other, none to its end. Each of `--starts`, a preset and its options in quotes, is run
-twice, until its first validation: first with nothing kept, then with compiled programs and traces kept. Then each of `--seeds`
-flies the first of them, all kept, until a validation is what is asked for. Results are written after each run; `--go_on` adds to
-those that are there, and finds what was kept in the same `--cache`.
+Runs of `openjax train`, one after the other. Each of `--starts`, a preset and its options in quotes, is run twice, until its
+first validation: first with nothing kept, then with compiled programs and traces kept. Then each of `--seeds` flies the first
+of them, all kept, until a validation is what is asked for (`--whole`: to its end, `--cold`: with nothing kept). Results are
+written after each run; `--go_on` adds to those that are there, and finds what was kept in the same `--cache`.
 """
 
 import argparse
+import contextlib
 import os
 import re
 import shlex
@@ -20,59 +21,54 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.table import Page, Table, facts, page_parser, publish, write_page
+from experiments.table import Page, Table, facts, page_parser, publish
 from openjax.commands.command_line import run_command
 from openjax.files import read_json, to_plain, write_json
+from openjax.pursuit import SCENARIOS
 from openjax.show.metrics import METRICS_FILE, read_metrics
-
-CAPTURED, CRASHED = 0.99, 0.01
-"""Rates of the uniform validation tasks that are asked for."""
-LEAVES = 10.0
-"""Seconds that a run has to save what it has, when it is asked to end."""
 
 
 def good(validation: dict) -> bool:
-    """Whether a validation is what is asked for."""
-    return validation["capture_rate"] >= CAPTURED and validation["crash_rate"] <= CRASHED
+    """Whether a validation on uniform tasks is what is asked for."""
+    return validation["capture_rate"] >= 0.99 and validation["crash_rate"] <= 0.01
 
 
 class Runner:
     """Flies runs, until there is no time left."""
 
     def __init__(self, options: argparse.Namespace):
-        self.cache, self.longest = options.cache, options.longest
+        self.cache, self.longest, self.cold = options.cache, options.longest, options.cold
         self.ends = time.monotonic() + options.limit
+        self.enough = (lambda validation: False) if options.whole else good
 
     def all(self, starts: list[str], seeds: list[int]) -> Iterator[dict]:
         """The runs that are still to be had, the most telling first."""
-        first = seeds or [0]
-        for start in starts:
-            times = 1 if seeds and start == starts[0] else 2
-            for _ in range(times):
-                yield from self.fly(start, first[0], lambda validation: True)
+        for start in [] if self.cold else starts:
+            for _ in range(1 if seeds and start == starts[0] else 2):
+                yield from self.fly(start, (seeds or [0])[0], lambda validation: True)
         for seed in seeds:
-            yield from self.fly(starts[0], seed, good)
+            yield from self.fly(starts[0], seed, self.enough)
 
     def fly(self, start: str, seed: int, enough: Callable[[dict], bool]) -> Iterator[dict]:
         """One run's curve, until a validation is enough; nothing where the time is over."""
         if time.monotonic() >= self.ends:
             return
-        cache = self.cache / re.sub(r"\W+", "_", start)
+        cache = self.cache / re.sub(r"\W+", "_", f"{start} {seed if self.cold else ''}")
         kept = "all" if cache.exists() else "nothing"
         with tempfile.TemporaryDirectory() as folder:
             out = Path(folder) / "run"
             process, file = begin(start, seed, out, cache), out / METRICS_FILE
             ends = min(self.ends, time.monotonic() + self.longest)
-            while (
-                process.poll() is None and time.monotonic() < ends and not any(map(enough, validations(file)))
-            ):
+            while process.poll() is None and not any(map(enough, validations(file))):
+                if time.monotonic() > ends:
+                    break
                 time.sleep(0.2)
             if process.poll():
                 raise RuntimeError(out.with_suffix(".log").read_text()[-2000:])
             end(process)
             if not validations(file):  # what was kept isn't all
                 shutil.rmtree(cache, ignore_errors=True)
-            yield {"start": start, "seed": seed, "kept": kept, **curve(file)}
+            yield {"start": start, "seed": seed, "kept": kept, **curve(file), "whole": whole(out)}
 
 
 def begin(start: str, seed: int, out: Path, cache: Path) -> subprocess.Popen:
@@ -86,13 +82,12 @@ def begin(start: str, seed: int, out: Path, cache: Path) -> subprocess.Popen:
 
 
 def end(process: subprocess.Popen) -> None:
-    """Ask a process to save and end; what it compiles in the background isn't waited for."""
+    """Ask a process to save within 10 s and end; what it compiles in the background isn't waited for."""
     process.terminate()
-    try:
-        process.wait(LEAVES)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(10.0)
+    process.kill()
+    process.wait()
 
 
 def validations(file: Path) -> list[dict]:
@@ -112,8 +107,21 @@ def curve(file: Path) -> dict:
     }
 
 
+def whole(out: Path) -> dict | None:
+    """Seconds of a run that came to its end; capture rate, crash rate and steps to the capture by layout."""
+    if not (out / "layouts.json").exists():
+        return None
+    told = read_json(out / "layouts.json")
+    rates = ("capture_rate", "crash_rate", "capture_step")
+    layouts = {
+        r["scenario"]: [r[rate] for rate in rates] for r in told["after"] if r["scenario"] in SCENARIOS
+    }
+    captures, crashes, _ = zip(*layouts.values(), strict=True)
+    return {"seconds": told["seconds"], "least": min(captures), "most": max(crashes), "layouts": layouts}
+
+
 def study(options: argparse.Namespace) -> dict:
-    """All runs; the page is written after each."""
+    """All runs; they are stored after each, for `--report`."""
     stored = options.out.with_suffix(".json")
     runs = read_json(stored)["runs"] if options.go_on else []
     results = {"note": options.note, "runs": runs}
@@ -121,9 +129,7 @@ def study(options: argparse.Namespace) -> dict:
         options.cache = options.cache or Path(folder)
         for run in Runner(options).all(options.starts, options.seeds):
             runs.append(run)
-            plain = to_plain({**facts(options.commit), **results})
-            write_json(stored, plain)
-            write_page(options.out, page, plain)
+            write_json(stored, to_plain({**facts(options.commit), **results}))
     return results
 
 
@@ -148,14 +154,20 @@ def page(results: dict) -> Page:
         "env steps until then": "reached.steps:,",
         "then collisions": "reached.collision_rate:.4f",
         "caught in the last validation": "last.capture_rate:.3f",
+        "whole run, s": "whole.seconds:.1f",
+        "least caught in a layout": "whole.least:.2f",
+        "most crash": "whole.most:.2f",
     }
     prose = f"Uniform validation tasks. An update is the median of a run's. {results['note']}"
     for start in dict.fromkeys(run["start"] for run in rows):
-        own = [run for run in rows if run["start"] == start and run["kept"] == "all"]
-        seconds = [run["reached"]["seconds"] if run["reached"] else np.inf for run in own]
-        if len(own) > 2:
-            prose += f" `{start}` with all kept: {np.median(seconds):.1f} s in the median of {len(own)} runs."
-    return Page("Seconds to a policy that catches", prose, Table(columns, rows))
+        for kept in ("all", "nothing"):
+            own = [run for run in rows if (run["start"], run["kept"]) == (start, kept)]
+            seconds = [run["reached"]["seconds"] if run["reached"] else np.inf for run in own]
+            if len(own) > 2:
+                prose += f" `{start}` with {kept} kept: {np.median(seconds):.1f} s in the median of {len(own)} runs."
+    goals = {name: name for name in ("figure", "goal", "value", "machine", "page or command")}
+    parts = [Table(goals, results.get("goals", []), "Goals"), Table(columns, rows, "Runs")]
+    return Page("Seconds to a policy that catches", prose, [*parts, *results.get("tried", [])])
 
 
 def main(arguments: list[str]) -> int:
@@ -163,6 +175,8 @@ def main(arguments: list[str]) -> int:
     parser = page_parser(__doc__, "seconds")
     parser.add_argument("--starts", nargs="+", default=["paper"], help="presets, each with its options")
     parser.add_argument("--seeds", type=int, nargs="*", default=[], help="of runs until they catch")
+    parser.add_argument("--whole", action="store_true", help="run those to their end")
+    parser.add_argument("--cold", action="store_true", help="run only those, each with nothing kept")
     parser.add_argument("--limit", type=float, default=float("inf"), help="s after which all is over")
     parser.add_argument("--longest", type=float, default=200.0, help="s that one run may take")
     parser.add_argument("--cache", type=Path, help="where programs are kept; by default for these runs alone")
