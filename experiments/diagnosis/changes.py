@@ -151,9 +151,7 @@ def main() -> None:
     """Compare and report, or draw."""
     parser = page_parser(__doc__, "changes")
     parser.add_argument("--seeds", type=int, nargs="+", default=[])
-    parser.add_argument(
-        "--vehicles", nargs="+", default=[], metavar="NAME=FOLDER[=ANSWERS]", help="real flights"
-    )
+    parser.add_argument("--vehicles", nargs="+", default=[], help="real flights: NAME=FOLDER[=ANSWERS]")
     parser.add_argument("--work", type=Path, default=Path("runs/changes"), help="folder for sample flights")
     parser.add_argument("--figure", action="store_true")
     options = parser.parse_args()

@@ -86,12 +86,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--cores", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--note", default="", help="a sentence for the page")
-    parser.add_argument(
-        "--seconds", type=float, help="for flights and diagnoses; what is done by then counts"
-    )
-    parser.add_argument(
-        "--work", type=Path, default=Path("runs/exam"), help="logs and answers; not committed"
-    )
+    parser.add_argument("--seconds", type=float, help="for all; what is done by then counts")
+    parser.add_argument("--work", type=Path, default=Path("runs/exam"), help="logs, answers; not committed")
     publish(parser.parse_args(), study, page)
 
 

@@ -30,6 +30,7 @@ from openjax.pursuit import (
 )
 from openjax.pursuit.evaders import EVADERS, HELD_OUT, SCRIPTED, VALIDATED
 from openjax.store.policies import LoadedPolicy, load_policy
+from openjax.store.policy_files import shipped_policies
 from openjax.vehicle.family import vehicle_family
 
 GAMES = {
@@ -83,8 +84,7 @@ def fly(name: str, options) -> list[dict]:
             flown = run(loaded.parameters, tasks, jnp.int32(i), jax.random.key(0), changes)
             for kind, own in part(jax.tree.map(np.asarray, flown)).items():
                 case = {"policy": name, "game": options.game, "vehicle": vehicle, "evader": evader}
-                case |= {"tasks": kind, "of": EVADERS[evader].of}
-                records.append(case | summary(own))
+                records.append({**case, "tasks": kind, "of": EVADERS[evader].of, **summary(own)})
     return records
 
 
@@ -126,9 +126,10 @@ def page(results: dict) -> Page:
         "worst evader, layouts": "worst.layouts",
     }
     rows = [dict(zip(of, name, strict=True)) | overview(own) for name, own in by_policy.items()]
-    parts: list[Table | str] = [Table(columns, rows, title="Overview")]
+    parts: list[Table | str] = [Table(columns, rows, title="Overview"), everyone(by_policy)]
     for name, own in by_policy.items():
-        parts.append(by_evader(own, f"{name[0]}, {name[1]} game, {name[2]} vehicle"))
+        if name[0] in shipped_policies():
+            parts.append(by_evader(own, f"{name[0]}, {name[1]} game, {name[2]} vehicle"))
     if "responses" in results:
         parts.append(learned_ones(results["responses"]))
     if "runs" in results:
@@ -145,17 +146,13 @@ def page(results: dict) -> Page:
 
 def overview(records: list[dict]) -> dict:
     """Of one policy and vehicle: the paper's evader on the layouts, the held-out ones, the worst cells."""
-    places = {
-        "layouts": [record for record in records if record["tasks"] in SCENARIOS],
-        "uniform": [record for record in records if record["tasks"] == "uniform"],
-    }
+    places = {"layouts": [r for r in records if r["tasks"] in SCENARIOS]}
+    places["uniform"] = [r for r in records if r["tasks"] == "uniform"]
 
     def mean(rows, evaders):
-        rows = [row for row in rows if row["evader"] in evaders]
-        return {
-            name: np.mean([row[name] for row in rows])
-            for name in ("capture_rate", "crash_rate", "capture_step")
-        }
+        own = [row for row in rows if row["evader"] in evaders]
+        names = ("capture_rate", "crash_rate", "capture_step")
+        return {name: np.mean([row[name] for row in own]) for name in names}
 
     def worst(rows):
         row = min(rows, key=lambda row: row["capture_rate"])
@@ -168,14 +165,29 @@ def overview(records: list[dict]) -> dict:
     }
 
 
+def everyone(by_policy: dict[tuple, list[dict]]) -> Table:
+    """Captures of each evader by each policy in the layouts."""
+    rows = []
+    for (policy, game, vehicle), records in by_policy.items():
+        if (game, vehicle) == ("honest", "nominal"):
+            rows.append({"policy": policy})
+            for evader in SCRIPTED:
+                own = [r for r in records if r["evader"] == evader and r["tasks"] in SCENARIOS]
+                captures, episodes = (sum(r[name] for r in own) for name in ("captures", "episodes"))
+                low, high = binomtest(captures, episodes).proportion_ci(method="wilson")
+                rows[-1][evader] = f"{captures / episodes:.2f} [{low:.2f}, {high:.2f}]"
+    prose = "Captures in the six layouts, 95 % interval; honest game, nominal vehicle."
+    return Table({name: name for name in ("policy", *SCRIPTED)}, rows, "Everyone against everyone", prose)
+
+
 def by_evader(records: list[dict], title: str) -> Table:
     """A row for each evader, a column for each kind of tasks."""
     rows = []
     for evader in dict.fromkeys(record["evader"] for record in records):
         own = {record["tasks"]: record for record in records if record["evader"] == evader}
         rates = {name: f"{r['capture_rate']:.3f}, {r['crash_rate']:.3f}" for name, r in own.items()}
-        rates["low"] = min(r["interval"][0] for r in own.values())
-        rows.append({"evader": evader, "of": EVADERS[evader].of, **rates})
+        least = min(r["interval"][0] for r in own.values())
+        rows.append({"evader": evader, "of": EVADERS[evader].of, **rates, "low": least})
     columns = {"evader": "evader", "used for": "of", **{name: name for name in own}}
     return Table(columns | {"least lower end": "low:.3f"}, rows, title=title)
 
@@ -202,10 +214,8 @@ def learned_ones(responses: list[dict]) -> Table:
         row["own"] = ", ".join(f"{rate:.3f}" for rate in last["capture_rate"])
         for kind in dict.fromkeys(record["scenario"] for record in response.get("records", ())):
             own = [record for record in response["records"] if record["scenario"] == kind]
-            least = [
-                min(r["capture_rate"] for r in own if r["evader"].startswith("learned") == learned)
-                for learned in (False, True)
-            ]
+            rates = [(r["evader"].startswith("learned"), r["capture_rate"]) for r in own]
+            least = [min(rate for by, rate in rates if by == learned) for learned in (False, True)]
             row[kind] = ", ".join(f"{rate:.3f}" for rate in least)
         rows.append(row)
     columns = {"policy": "policy", "M steps a seed": "millions:.0f", "at last, while they learned": "own"}
@@ -221,9 +231,7 @@ def learned_ones(responses: list[dict]) -> Table:
 def main(arguments: list[str]) -> int:
     """Evaluate and write both files."""
     parser = page_parser(__doc__, "evaders")
-    parser.add_argument(
-        "--policy", nargs="+", default=["flight", "evaders"], help="names, runs or policy files"
-    )
+    parser.add_argument("--policy", nargs="+", default=["flight", "evaders"], help="names, runs or files")
     parser.add_argument("--game", choices=GAMES, default="honest")
     parser.add_argument("--physics", choices=("rigid", "stops"), default="rigid")
     parser.add_argument("--vehicles", nargs="+", default=["nominal", "table", "family"])

@@ -35,9 +35,7 @@ MEASURES = {
     },
     "random": SIGHT,
     "hidden": SIGHT,
-    "passage": {
-        "three ways": "a pursuer in each of the three corridors at the same time, before the capture"
-    },
+    "passage": {"three ways": "a pursuer in each of the three corridors at once, before the capture"},
 }
 
 
@@ -87,11 +85,8 @@ def one_episode(paths: Any) -> dict[str, list]:
     def thin(values):
         return np.round(np.asarray(values)[0, :end:EVERY], 3).tolist()
 
-    return {
-        "pursuers": thin(paths.pursuers),
-        "evader": thin(paths.evader),
-        "capture": int(np.argmax(caught)) // EVERY if caught.any() else None,
-    }
+    capture = int(np.argmax(caught)) // EVERY if caught.any() else None
+    return {"pursuers": thin(paths.pursuers), "evader": thin(paths.evader), "capture": capture}
 
 
 def _way(positions):
