@@ -88,7 +88,7 @@ def evaluate(
     Args:
       policy: a loaded policy, what `openjax.load_policy` takes, or a pure function from the `Observation` of one world
         to actions (N, 4) in -1..1, which flies the nominal game.
-      scenario: a layout's name, a TOML file with an own one, or "all".
+      scenario: a layout's name, a TOML file with an own one, "drawn" (by the seed), or "all" (see `openjax evaluate --help`).
       episodes: per layout.
       seed: draws the start attitudes.
       vehicle, effects: files to fly with, vehicle.toml and effects.toml.
@@ -96,8 +96,8 @@ def evaluate(
       changes: of the game that the policy was trained in, for example speed_limit="none".
 
     Returns:
-      A record, or a list of them for "all": scenario, episodes, capture_rate, capture_step, collision_rate,
-      collision_parts, crash_rate, over_speed_rate, prediction_error.
+      A record, or a list of them for "all": scenario, episodes; capture_rate, crash_rate in 0..1; capture_step, in control
+      steps; collision_rate, collision_parts (pillar, drone, bounds), over_speed_rate, of pursuer steps; prediction_error (m).
 
     Raises:
       UserError: an unusable layout, or a game that the policy can't play.
@@ -108,7 +108,8 @@ def evaluate(
         policy = load_policy(policy)
     elif not isinstance(policy, LoadedPolicy):
         nothing = PolicyParameters(actor={}, critic={}, predictor={})
-        settings = TrainSettings(environment=changed(PursuitSettings(), **changes))
+        game = changed(PursuitSettings(), **changes)
+        settings = TrainSettings(environment=game, rollout_length=game.episode_length)
         policy = LoadedPolicy(OwnController(policy), nothing, settings, "own controller")
     command = EvaluateCommand(
         policy=(policy.source,),

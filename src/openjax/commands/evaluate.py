@@ -37,9 +37,10 @@ class FlightOptions:
     """Runs' directories, policy files (.npz), checkpoints, or names of policies in the package (flight, open ...) or of
     heuristics: angelani, janosov, apf."""
     scenario: str = "all"
-    """wall, narrow_gap, random, passage, empty, hidden, a TOML file with an own layout, or all six."""
+    """wall, narrow_gap, random, passage, empty, hidden, a TOML file with an own layout, drawn (by --seed), or all six; these
+    have three pursuers, so a policy of another number flies drawn instead."""
     seed: Seed = 0
-    """Draws the start attitudes."""
+    """Draws the start attitudes, and the drawn layout."""
     opponent: str | None = None
     """Evader to fly against: field, greedy, wall_runner, heavy, pillar_hugger, greedy_far, greedy_near, two_step, safe_place,
     way_points, frozen, or a file that openjax exploit wrote; by default those of the policy's game."""
@@ -141,7 +142,7 @@ def fly_scenarios(command: EvaluateCommand, loaded, evaluators: dict) -> tuple[l
 def _game(command, loaded):
     """The game of a command, the policy in it, and the scenarios."""
     from openjax.commands.evaluator import layout_slots
-    from openjax.pursuit.scenarios import SCENARIOS, find_scenario
+    from openjax.pursuit.scenarios import SCENARIOS, drawn_scenario, find_scenario
     from openjax.store.environments import make_environment
 
     settings = command.environment
@@ -149,10 +150,14 @@ def _game(command, loaded):
         raise UserError(
             "--environment.evaders learned: a name isn't enough; --opponent takes a file of openjax exploit"
         )
-    of_all = command.scenario == "all"
-    scenarios = list(SCENARIOS.values()) if of_all else [find_scenario(command.scenario, settings)]
-    wanted, there = settings.num_pursuers, len(scenarios[0].pursuers)
-    if wanted not in (loaded.settings.environment.num_pursuers, there):
+    wanted, trained = settings.num_pursuers, loaded.settings.environment.num_pursuers
+    alike = [layout for layout in SCENARIOS.values() if len(layout.pursuers) == trained]
+    if command.scenario == "drawn" or (command.scenario == "all" and not alike):
+        scenarios = [drawn_scenario(settings, command.seed)]
+    else:
+        scenarios = alike if command.scenario == "all" else [find_scenario(command.scenario, settings)]
+    there = len(scenarios[0].pursuers)
+    if wanted not in (trained, there):
         raise UserError(
             f"--environment.num_pursuers {wanted}: layout {scenarios[0].name} has {there} pursuers"
         )

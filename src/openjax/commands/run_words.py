@@ -89,7 +89,9 @@ def unlike_the_papers(game: PursuitSettings) -> str:
         words.append("no clamp of the speed")
     if game.evader_speed < paper.evader_speed:
         words.append(f"the evader flies {game.evader_speed:g} m/s instead of {paper.evader_speed:g}")
-    pillars, theirs = (f"{own.min_pillars} to {own.max_pillars}" for own in (game, paper))
+    if game.num_pursuers != paper.num_pursuers:
+        words.append(f"{game.num_pursuers} pursuers instead of {paper.num_pursuers}")
+    pillars, theirs = (" to ".join(map(str, sorted({g.min_pillars, g.max_pillars}))) for g in (game, paper))
     if pillars != theirs:
         words.append(f"{pillars} pillars instead of {theirs}")
     if game.observed_pillars != paper.observed_pillars:

@@ -10,9 +10,15 @@ from openjax.pursuit.collisions import Breaches
 class StepInfo:
     """What happened in one step, beside the reward."""
 
-    captured: jax.Array  # (N,) bool
-    seen: jax.Array  # () bool, some pursuer sees the evader
+    captured: jax.Array
+    """(N,) bool: the evader is within the capture radius."""
+    seen: jax.Array
+    """() bool: some pursuer sees the evader."""
     breaches: Breaches
-    over_speed: jax.Array  # (N,) bool
-    crashed: jax.Array  # (N,) bool
-    penalty: jax.Array  # (N,) the reward's penalties, at most 0
+    """(N,) how many each: of the distance to pillars, to other pursuers, of the arena's bounds."""
+    over_speed: jax.Array
+    """(N,) bool: faster than `max_speed`."""
+    crashed: jax.Array
+    """(N,) bool: touches something, or has tipped over."""
+    penalty: jax.Array
+    """(N,) the reward's penalties, at most 0."""

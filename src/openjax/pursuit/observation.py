@@ -20,14 +20,20 @@ class Observation:
 
     self_state: jax.Array
     """(N, S) evader, quaternion wxyz, velocity, body x, body z axis, t/T x 4 [, position] [, history]"""
-    others: jax.Array  # (N, N - 1, O) other pursuers: relative position [, relative velocity, body z axis]
-    pillars: jax.Array  # (N, k, 5) nearest pillars: position relative to their centre (3), height, radius
-    pillar_seen: jax.Array  # (N, k) bool, slots in use
+    others: jax.Array
+    """(N, N - 1, O) other pursuers: relative position [, relative velocity, body z axis]"""
+    pillars: jax.Array
+    """(N, k, 5) nearest pillars: position relative to their centre (3), height, radius"""
+    pillar_seen: jax.Array
+    """(N, k) bool, slots in use"""
     privileged: jax.Array
     """(N, Q) true relative evader position, its velocity, own position, seen [, own velocity, vehicle]"""
-    position: jax.Array  # (N, 3) own positions, to express predicted positions relative to them
-    last_seen: jax.Array  # (3,) where the evader was last seen
-    frames: jax.Array  # (n, F) history for the predictor, oldest first
+    position: jax.Array
+    """(N, 3) own positions, to express predicted positions relative to them"""
+    last_seen: jax.Array
+    """(3,) where the evader was last seen"""
+    frames: jax.Array
+    """(n, F) history for the predictor, oldest first"""
     heading: jax.Array | None = None
     """(N, 2) cosine and sine of the yaw by which each pursuer's vectors are turned back, all but `position`; None: by none"""
 
