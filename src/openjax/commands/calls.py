@@ -109,7 +109,10 @@ def evaluate(
     elif not isinstance(policy, LoadedPolicy):
         nothing = PolicyParameters(actor={}, critic={}, predictor={})
         game = changed(PursuitSettings(), **changes)
-        settings = TrainSettings(environment=game, rollout_length=game.episode_length)
+        whole = dict.fromkeys(
+            ("rollout_length", "restart_steps"), game.episode_length
+        )  # which fits all games
+        settings = TrainSettings(environment=game, predictor=OwnController.predictor, **whole)
         policy = LoadedPolicy(OwnController(policy), nothing, settings, "own controller")
     command = EvaluateCommand(
         policy=(policy.source,),
