@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from openjax.commands.view import page_server
-from openjax.show.replay import replay_page, write_replay
+from openjax.show.replay import replay_page
 from openjax.show.trajectory import Trajectory
 
 
@@ -81,7 +81,7 @@ def test_server_answers_this_machine_only(flights):
 def test_a_browser_draws_it(flights, tmp_path):
     """Pillars' and pursuers' colours are in what a headless browser shows."""
     picture, page = tmp_path / "page.png", tmp_path / "page.html"
-    write_replay(page, flights)
+    page.write_text(replay_page(flights), encoding="utf-8")
     command = "chromium --headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking".split()
     command += [
         "--window-size=900,700",
