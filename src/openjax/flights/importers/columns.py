@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from openjax.errors import UserError
 from openjax.files import read_toml
@@ -158,12 +159,8 @@ def with_quaternion(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     rest = {c: v for c, v in columns.items() if c not in EULER}
     if any(a is None for a in angles) or all(c in rest for c in CHANNEL_COLUMNS["quaternion"]):
         return rest
-    (cr, cp, cy), (sr, sp, sy) = ([f(a / 2) for a in angles] for f in (np.cos, np.sin))
-    rest["qw"] = cr * cp * cy + sr * sp * sy
-    rest["qx"] = sr * cp * cy - cr * sp * sy
-    rest["qy"] = cr * sp * cy + sr * cp * sy
-    rest["qz"] = cr * cp * sy - sr * sp * cy
-    return rest
+    attitude = Rotation.from_euler("ZYX", np.stack(angles[::-1], 1)).as_quat(scalar_first=True)
+    return rest | dict(zip(CHANNEL_COLUMNS["quaternion"], attitude.T, strict=True))
 
 
 def _onto(clock, time, values, column: str, period: float) -> np.ndarray:
