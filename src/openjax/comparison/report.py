@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from openjax.comparison.causes import CHANGES
+from openjax.comparison.causes import CAUSES
 from openjax.comparison.figures import TRIMS
 from openjax.comparison.result import Change, Interval
 from openjax.show.pages import AFTER, BEFORE, GREY, STYLE, as_svg, filled
@@ -24,12 +24,6 @@ _NAMES = {
     "torque_gain": ("angular acceleration per motor command", "%", 0.0),
     "loop_gain": ("motor command per rate error", "%", 0.0),
     "shaking": ("gyroscope and motors above 20 Hz", "%", 0.0),
-}
-_CHANGED = {
-    "drag": "the drag changed",
-    "motors": "the motors' lag changed",
-    "inertia": "the inertia changed",
-    "gains": "the rate gains changed",
 }
 
 
@@ -90,7 +84,7 @@ def in_words(change: Change) -> list[str]:
                 "These flights can't split the causes named; a weighed vehicle or another propeller would."
             )
     elif change.changed:
-        moved = dict.fromkeys(n for c in change.likely_causes if c in CHANGES for n in CHANGES[c][0])
+        moved = dict.fromkeys(n for c in change.likely_causes for n in CAUSES[c].figures)
         lines += [
             f"{_NAMES[n][0].capitalize()}: {_difference(n, change.figures[n])}."
             for n in moved
@@ -125,7 +119,8 @@ def _cause_in_words(change: Change, cause: str) -> str:
         return f"a weight was {'added' if more else 'taken off'}{beside}"
     if cause == "whole vehicle":
         return "the whole vehicle is heavier or its thrust weaker" if more else "it is lighter or stronger"
-    return _CHANGED.get(cause, "something without a known pattern")
+    what = CAUSES[cause].what
+    return f"the {what} changed" if what else "something without a known pattern"
 
 
 def _difference(name: str, d: Interval) -> str:
