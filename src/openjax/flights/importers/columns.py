@@ -111,7 +111,7 @@ def load_mapping(path: str | Path) -> ColumnMapping:
     delimiter = tables.get("delimiter", ",")
     if not isinstance(delimiter, str) or len(delimiter) != 1:
         raise UserError(f"{path}: delimiter must be one character")
-    columns = {c: _source(c, entry, path) for c, entry in tables["columns"].items()}
+    columns = {c: source_of(c, entry, path) for c, entry in tables["columns"].items()}
     return ColumnMapping(columns, delimiter)
 
 
@@ -185,7 +185,8 @@ def _onto(clock, time, values, column: str, period: float) -> np.ndarray:
     return np.where(clock - time[np.clip(before, 0, None)] > max(_STALE * period, 0.1), np.nan, out)
 
 
-def _source(column: str, entry, path: Path) -> Source:
+def source_of(column: str, entry, path: Path) -> Source:
+    """An entry of a `columns.toml`. Raises UserError for an unknown key, column or unit."""
     known = (*LOG_COLUMNS, *EULER)
     if column not in known:
         raise UserError(f"{path}: unknown column {column!r} in [columns]; known are {', '.join(known)}")
