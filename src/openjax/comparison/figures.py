@@ -21,9 +21,8 @@ FULL = 0.98  # motor command from which on a rotor has nothing left to trim with
 LOW = 2.5  # Hz, below which drag isn't covered by vibration
 TURNING = (1.0, 10.0)  # Hz, where motors turn the vehicle
 DELAYS = (0, 2, 4, 6)  # rows, of the commands as instruments
-LEAST_EXCITED = (
-    0.7  # share of the regressors that commands must explain: weak instruments bias (Staiger, Stock 1997)
-)
+# share of the regressors that commands must explain: weak instruments bias (Staiger, Stock 1997)
+LEAST_EXCITED = 0.7
 ANSWERING = (4.0, 15.0)  # Hz, where the rate loop's proportional part outweighs its integral
 LAGS = np.geomspace(0.004, 0.2, 40)  # s, time constants that are tried
 
@@ -178,9 +177,8 @@ def _torque(torque, rates) -> dict:
 def _loop(torque, rates, commands) -> dict:
     """How strongly the rate loop answers a rate error, beside what it answers to a change of the rates, by quarters of the
     flight. In closed loop noise is in all three, so the commands are the instruments (two-stage least squares)."""
-    after = np.concatenate(
-        [rates[1:], rates[-1:]]
-    )  # motors hold from a row to the next: rates count in the middle
+    # motors hold from a row to the next: rates count in the middle
+    after = np.concatenate([rates[1:], rates[-1:]])
     error, change = commands - 0.5 * (rates + after), (after - rates) * RATE
     signals = (torque, error, change, *(np.roll(commands, k, 0) for k in DELAYS))
     filtered = np.stack([in_band(values, ANSWERING) for values in signals], -1)
@@ -199,14 +197,8 @@ def _loop(torque, rates, commands) -> dict:
 
 def _shaking(gyro, motor) -> dict:
     """Mean logarithm of the rms of gyroscope and motors above 20 Hz, sixths of the flight as units."""
-    levels = [
-        [
-            0.5 * np.log((part**2).sum(1).mean() + 1e-12)
-            for part in np.array_split(in_band(values, (20.0, 45.0)), 6)
-        ]
-        for values in (gyro, motor)
-    ]
-    each = np.mean(levels, 0)
+    parts = [np.array_split(in_band(values, (20.0, 45.0)), 6) for values in (gyro, motor)]
+    each = np.mean([[0.5 * np.log((p**2).sum(1).mean() + 1e-12) for p in own] for own in parts], 0)
     return {"shaking": (float(each.mean()), float(each.std(ddof=1) / np.sqrt(len(each))))}
 
 

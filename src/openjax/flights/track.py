@@ -41,9 +41,8 @@ class Track:
     neighbours: Array  # (K, T, 3) m, positions of the vehicles that flew along
     pose_age: float = 0.0  # s by which the pose may be older than its row, see `Flight`
     motors_logged: bool = True  # False: made by the nominal rate controller from the commands
-    fast_thrust: tuple[Array, Array] | None = (
-        None  # of logs faster than the grid: times (S,) s, mean of the motors (S,)
-    )
+    # of logs faster than the grid: times (S,) s, mean of the motors (S,)
+    fast_thrust: tuple[Array, Array] | None = None
     missing: Array | None = None  # (T,) rows that weren't logged: lines between their neighbours
 
     def __len__(self) -> int:

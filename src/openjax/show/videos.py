@@ -132,9 +132,8 @@ class _Pen:
         self._draw, self._radius, self._height = ImageDraw.Draw(image, "RGBA"), radius, height
         self._middle = np.array(image.size) / 2
         (ca, ce), (sa, se) = (function((AZIMUTH, ELEVATION)) for function in (np.cos, np.sin))
-        self._axes = np.array(
-            [[sa, -ca, 0], [-se * ca, -se * sa, -ce], [ce * ca, ce * sa, -se]]
-        )  # right, down, on
+        # right, down, on
+        self._axes = np.array([[sa, -ca, 0], [-se * ca, -se * sa, -ce], [ce * ca, ce * sa, -se]])
         self._camera = (0, 0, 0.38 * height) - DISTANCE * radius * self._axes[2]
 
     def depth(self, place) -> float:
