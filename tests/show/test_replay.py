@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from openjax.commands.view import page_server
+from openjax.pursuit import PursuitSettings
 from openjax.show.replay import replay_page
 from openjax.show.trajectory import Trajectory
 
@@ -27,11 +28,7 @@ def flights():
         evader_position=rng.uniform(-0.5, 0.5, (400, 3)),
         captured=np.arange(400)[:, None] >= np.array([20, 999, 999]),
         pillar_position=np.array([[0.0, 0.2], [0.3, 0.0]]),
-        arena_radius=0.9,
-        arena_height=1.2,
-        pillar_radius=0.1,
-        capture_radius=0.3,
-        time_step=0.01,
+        game=PursuitSettings(),
         crashed=np.arange(400)[:, None] >= np.array([999, 60, 399]),
         seen=np.arange(400) % 100 < 50,
         predicted=rng.uniform(-0.5, 0.5, (400, 5, 3)),
