@@ -31,6 +31,7 @@ CHANNEL_COLUMNS = {
     "motor_command": ("m1", "m2", "m3", "m4"),
     "battery_voltage": ("vbat",),
 }
+SENSORS = ("position", "quaternion", "velocity", "body_rates", "specific_force")
 
 
 @dataclass(frozen=True)

@@ -4,14 +4,13 @@ import dataclasses
 
 import numpy as np
 
-from openjax.flights.flight import CHANNEL_COLUMNS, Flight, Refused
+from openjax.flights.flight import CHANNEL_COLUMNS, SENSORS, Flight, Refused
 
 FROZEN = 0.5  # s without a change of a sensor that has noise
 HELD = 0.1  # share of rows that repeat the one before, from which a sensor is slower than the rows
 IN_STEP = 50  # poses from which a clock of their own is looked for
 IN_PHASE = 0.25  # concentration of their phases (0 to 1) from which they have one
 EDGE = 0.03  # cycles of that clock by which its phase may be wrong
-SENSORS = ("position", "quaternion", "velocity", "body_rates", "specific_force")
 
 
 def drop_frozen(flight: Flight, note) -> Flight:
