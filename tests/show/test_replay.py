@@ -13,7 +13,7 @@ from PIL import Image
 
 from openjax.commands.view import page_server
 from openjax.pursuit import PursuitSettings
-from openjax.show.replay import replay_page
+from openjax.show.replay import replay_page, write_replay
 from openjax.show.trajectory import Trajectory
 
 
@@ -78,7 +78,7 @@ def test_server_answers_this_machine_only(flights):
 def test_a_browser_draws_it(flights, tmp_path):
     """Pillars' and pursuers' colours are in what a headless browser shows."""
     picture, page = tmp_path / "page.png", tmp_path / "page.html"
-    page.write_text(replay_page(flights), encoding="utf-8")
+    write_replay(page, flights)
     command = "chromium --headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking".split()
     command += [
         "--window-size=900,700",

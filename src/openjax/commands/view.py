@@ -10,9 +10,9 @@ from typing import Annotated
 from openjax.commands.command_line import output_console, parse
 from openjax.commands.evaluate import EvaluateCommand, FlightOptions, fly_scenarios
 from openjax.errors import UserError
-from openjax.files import check_output, write_text
+from openjax.files import check_output
 from openjax.ranges import Interval
-from openjax.show.replay import replay_page
+from openjax.show.replay import replay_page, write_replay
 from openjax.show.trajectory import Trajectory
 
 PROGRAM = "openjax view"
@@ -46,7 +46,7 @@ def main(arguments: Sequence[str]) -> int:
         animate(command.gif, flights[0][1])
         console.print(f"{command.gif}: {command.gif.stat().st_size / 1e3:,.0f} kB")
     if command.html is not None:
-        write_text(command.html, replay_page(flights))
+        write_replay(command.html, flights)
         console.print(f"{command.html}: {command.html.stat().st_size / 1e3:,.0f} kB, opens in any browser")
     if command.gif is None and command.html is None:
         with page_server(replay_page(flights), command.port) as server:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from openjax.files import write_text
 from openjax.show.trajectory import Trajectory
 
 LONGEST_STEP = 0.025
@@ -24,6 +25,11 @@ def replay_page(flights: Sequence[tuple[str, Trajectory]]) -> str:
     data = json.dumps([_plain(policy, flight) for policy, flight in flights], separators=(",", ":"))
     # within a script element "<" may only stand escaped
     return TEMPLATE.read_text(encoding="utf-8").replace("@DATA@", data.replace("<", "\\u003c"))
+
+
+def write_replay(path: Path, flights: Sequence[tuple[str, Trajectory]]) -> None:
+    """Write the page of (policy's name, episode) pairs, or nothing."""
+    write_text(path, replay_page(flights))
 
 
 def _plain(policy: str, flight: Trajectory) -> dict:
