@@ -5,7 +5,6 @@ the evader behind pillars (random, and hidden, where nobody sees it at the start
 Here each is a number for every method, beside one episode from above.
 """
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -157,5 +156,9 @@ def trajectory_of(paths: dict, layout: str, title: str) -> Trajectory:
         captured=captured,
         crashed=np.zeros_like(captured),
         pillar_position=np.array(SCENARIOS[layout].pillars).reshape(-1, 2),
-        game=dataclasses.replace(settings, time_step=EVERY * settings.time_step),
+        arena_radius=settings.arena_radius,
+        arena_height=settings.arena_height,
+        pillar_radius=settings.pillar_radius,
+        capture_radius=settings.capture_radius,
+        time_step=EVERY * settings.time_step,
     )

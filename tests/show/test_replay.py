@@ -12,7 +12,6 @@ import pytest
 from PIL import Image
 
 from openjax.commands.view import page_server
-from openjax.pursuit import PursuitSettings
 from openjax.show.replay import replay_page, write_replay
 from openjax.show.trajectory import Trajectory
 
@@ -28,7 +27,11 @@ def flights():
         evader_position=rng.uniform(-0.5, 0.5, (400, 3)),
         captured=np.arange(400)[:, None] >= np.array([20, 999, 999]),
         pillar_position=np.array([[0.0, 0.2], [0.3, 0.0]]),
-        game=PursuitSettings(),
+        arena_radius=0.9,
+        arena_height=1.2,
+        pillar_radius=0.1,
+        capture_radius=0.3,
+        time_step=0.01,
         crashed=np.arange(400)[:, None] >= np.array([999, 60, 399]),
         seen=np.arange(400) % 100 < 50,
         predicted=rng.uniform(-0.5, 0.5, (400, 5, 3)),

@@ -13,7 +13,6 @@ from PIL import Image
 from openjax.errors import UserError
 from openjax.files import replacing, to_plain
 from openjax.plain import from_plain
-from openjax.pursuit import PursuitSettings
 from openjax.show.metrics import MetricsWriter, read_metrics
 from openjax.show.plots import plot_training, plot_trajectories
 from openjax.show.trajectory import Trajectory
@@ -107,14 +106,13 @@ def trajectory():
     level = np.tile([1.0, 0.0, 0.0, 0.0], (steps, 3, 1))
     pillars = np.array([[0.2, 0.1]])
     return Trajectory(
-        "wall", pursuers, level, pursuers[:, 0] * 0.5, captured, crashed, pillars, PursuitSettings()
+        "wall", pursuers, level, pursuers[:, 0] * 0.5, captured, crashed, pillars, 0.9, 1.2, 0.1, 0.3, 0.01
     )
 
 
 def test_animation_is_drawn_without_a_display(tmp_path, trajectory, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
-    slower = dataclasses.replace(trajectory.game, time_step=0.04)
-    longer = dataclasses.replace(trajectory, captured=np.zeros_like(trajectory.captured), game=slower)
+    longer = dataclasses.replace(trajectory, captured=np.zeros_like(trajectory.captured), time_step=0.04)
     animate(tmp_path / "chase.gif", trajectory)
     animate(tmp_path / "both.gif", trajectory, longer)
     with Image.open(tmp_path / "chase.gif") as one, Image.open(tmp_path / "both.gif") as both:

@@ -118,6 +118,7 @@ class Flown:
         """One of the episodes, for drawing."""
         batch, place = divmod(self.first + episode, self.evaluator.batch)
         record = jax.tree.map(lambda leaf: np.asarray(leaf[place]), self.records[batch])
+        settings = self.evaluator.settings
         active = np.asarray(self.tasks.pillar_active[episode])
         return Trajectory(
             title=title,
@@ -127,7 +128,11 @@ class Flown:
             captured=record.captured,
             crashed=record.crashed,
             pillar_position=np.asarray(self.tasks.pillar_position[episode])[active],
-            game=self.evaluator.settings,
+            arena_radius=settings.arena_radius,
+            arena_height=settings.arena_height,
+            pillar_radius=settings.pillar_radius,
+            capture_radius=settings.capture_radius,
+            time_step=settings.time_step,
             seen=record.seen,
             predicted=record.predicted,
         )

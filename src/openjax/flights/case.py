@@ -4,6 +4,7 @@ import dataclasses
 from collections import Counter
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 
 from openjax.errors import UserError
@@ -15,7 +16,7 @@ from openjax.flights.reading import LogError, flights_of
 from openjax.vehicle.vehicle_file import VehicleFile, load_vehicle_file
 
 
-def load_case(path: str | Path, comparison: bool = False) -> Case:
+def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> Case:
     """Read a case folder: its `vehicle.toml` and its logs (CSV, micro-SD logs, ROS 2 bags). For a `comparison`
     with other flights motor commands alone are enough, and without a vehicle file the nominal vehicle is
     taken.
@@ -35,7 +36,7 @@ def load_case(path: str | Path, comparison: bool = False) -> Case:
     described = (path / "vehicle.toml").exists()
     if not described and not comparison:
         raise UserError(f"{path}: no vehicle.toml; an empty one there means the nominal Crazyflie")
-    vehicle_file = load_vehicle_file(path / "vehicle.toml" if described else None)
+    vehicle_file = load_vehicle_file(path / "vehicle.toml" if described else None, dtype)
     mapping = load_mapping(path / MAPPING_FILE) if (path / MAPPING_FILE).exists() else None
     kept, issues = _usable([_read(log, vehicle_file, mapping) for log in logs], vehicle_file, comparison)
     if not kept:

@@ -46,10 +46,10 @@ def plot_trajectories(path: Path, trajectories: Sequence[Trajectory]) -> None:
 
 def draw_arena(axes: Axes, trajectory: Trajectory) -> None:
     """Arena and pillars from above."""
-    axes.add_patch(Circle((0, 0), trajectory.game.arena_radius, fill=False, color="black"))
+    axes.add_patch(Circle((0, 0), trajectory.arena_radius, fill=False, color="black"))
     for pillar in trajectory.pillar_position:
-        axes.add_patch(Circle(pillar, trajectory.game.pillar_radius, color="0.6"))
-    limit = 1.08 * trajectory.game.arena_radius
+        axes.add_patch(Circle(pillar, trajectory.pillar_radius, color="0.6"))
+    limit = 1.08 * trajectory.arena_radius
     axes.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal", xlabel="x [m]", ylabel="y [m]")
 
 
@@ -75,13 +75,11 @@ def draw_from_above(axes: Axes, trajectory: Trajectory) -> None:
         outcome = "not captured"
     else:
         captured_at = trajectory.evader_position[capture, :2]
-        axes.add_patch(
-            Circle(captured_at, trajectory.game.capture_radius, fill=False, color="0.5", linestyle=":")
-        )
+        axes.add_patch(Circle(captured_at, trajectory.capture_radius, fill=False, color="0.5", linestyle=":"))
         axes.plot(
             *captured_at, "*", color="gold", markeredgecolor="black", markersize=14, label="first capture"
         )
-        outcome = f"captured after {(capture + 1) * trajectory.game.time_step:.2f} s"
+        outcome = f"captured after {(capture + 1) * trajectory.time_step:.2f} s"
     axes.set_title(f"{trajectory.title}: {outcome}", fontsize="medium")
 
 

@@ -34,7 +34,7 @@ def write_replay(path: Path, flights: Sequence[tuple[str, Trajectory]]) -> None:
 
 def _plain(policy: str, flight: Trajectory) -> dict:
     """An episode up to two seconds after its capture: lengths in mm, quaternions in thousandths, times in frames."""
-    every = max(1, round(LONGEST_STEP / flight.game.time_step))
+    every = max(1, round(LONGEST_STEP / flight.time_step))
     steps = slice(0, flight.end(after=2.0), every)
 
     def thousandths(values):
@@ -47,12 +47,12 @@ def _plain(policy: str, flight: Trajectory) -> dict:
     plain = {
         "layout": flight.title,
         "policy": policy,
-        "dt": every * flight.game.time_step,
+        "dt": every * flight.time_step,
         "steps": len(poses),
-        "radius": flight.game.arena_radius,
-        "height": flight.game.arena_height,
-        "pillarRadius": flight.game.pillar_radius,
-        "captureRadius": flight.game.capture_radius,
+        "radius": flight.arena_radius,
+        "height": flight.arena_height,
+        "pillarRadius": flight.pillar_radius,
+        "captureRadius": flight.capture_radius,
         "pillars": np.asarray(flight.pillar_position, float).round(4).tolist(),
         "pursuers": [thousandths(pose) for pose in np.moveaxis(poses, 1, 0)],
         "evader": thousandths(flight.evader_position[steps]),

@@ -1,7 +1,6 @@
 """One flown episode as host arrays, for pictures and animations."""
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 
@@ -17,7 +16,11 @@ class Trajectory:
     captured: np.ndarray  # (T, N) bool, pursuers that capture in this step
     crashed: np.ndarray  # (T, N) bool, pursuers that touch something solid or lie on their side in this step
     pillar_position: np.ndarray  # (P, 2), those in use
-    game: Any  # its `PursuitSettings`
+    arena_radius: float
+    arena_height: float
+    pillar_radius: float
+    capture_radius: float
+    time_step: float  # s
     seen: np.ndarray | None = None  # (T,) bool, whether some pursuer sees the evader
     predicted: np.ndarray | None = None  # (T, K, 3) where the policy expects the evader in the steps after
 
@@ -40,7 +43,7 @@ class Trajectory:
         steps = len(self.evader_position)
         if self.capture_index is None:
             return steps
-        return min(steps, self.capture_index + round(after / self.game.time_step))
+        return min(steps, self.capture_index + round(after / self.time_step))
 
 
 def _first(flags):

@@ -42,7 +42,7 @@ def animate(path: Path, *trajectories: Trajectory) -> None:
 
 def steps_shown(trajectory: Trajectory) -> range:
     """Steps that are drawn."""
-    return range(0, trajectory.end(), max(1, round(1.0 / (FRAMES_PER_SECOND * trajectory.game.time_step))))
+    return range(0, trajectory.end(), max(1, round(1.0 / (FRAMES_PER_SECOND * trajectory.time_step))))
 
 
 def write_gif(path: Path, frames: list[np.ndarray]) -> None:
@@ -71,8 +71,8 @@ def caption(trajectory: Trajectory, step: int) -> tuple[str, str]:
     events = []
     for word, index in (("caught", trajectory.capture_index), ("crashed", trajectory.crash_index)):
         if index is not None and index <= step:
-            events.append(f"{word} at {(index + 1) * trajectory.game.time_step:.1f} s")
-    return f"{trajectory.title}: {(step + 1) * trajectory.game.time_step:.1f} s", ", ".join(events)
+            events.append(f"{word} at {(index + 1) * trajectory.time_step:.1f} s")
+    return f"{trajectory.title}: {(step + 1) * trajectory.time_step:.1f} s", ", ".join(events)
 
 
 def _frame(trajectory, step):
@@ -90,7 +90,7 @@ def _frame(trajectory, step):
 def draw(trajectory: Trajectory, step: int) -> Image.Image:
     """The scene of one step; the evader is golden while it's captured."""
     image = Image.new("RGB", (FINER * WIDTH, FINER * HEIGHT), "white")
-    pen = _Pen(image, trajectory.game.arena_radius, trajectory.game.arena_height)
+    pen = _Pen(image, trajectory.arena_radius, trajectory.arena_height)
     pen.arena()
     things = list(_things(pen, trajectory, step))
     for _, _, outlines in things:
@@ -104,17 +104,17 @@ def draw(trajectory: Trajectory, step: int) -> Image.Image:
 def _things(pen, trajectory, step):
     """(place, function that draws it, outlines of its shadow) of all that stands or flies in the scene."""
     for place in trajectory.pillar_position:
-        yield place, partial(pen.pillar, place, trajectory.game.pillar_radius), ()
+        yield place, partial(pen.pillar, place, trajectory.pillar_radius), ()
     bodies = Rotation.from_quat(trajectory.pursuer_quaternion[step], scalar_first=True).as_matrix()
     for i, body in enumerate(bodies):
         color, path = _rgb(PURSUER_COLORS[i % len(PURSUER_COLORS)]), trajectory.pursuer_position[:, i]
         rotors = path[step] + (ARM * _ROTORS[:, None] + ROTOR * _circle(12)) @ body.T
         yield path[step], partial(pen.vehicle, rotors, color), rotors
-        yield from _trail(pen, path, step, color, trajectory.game.time_step)
+        yield from _trail(pen, path, step, color, trajectory.time_step)
     color, path = _rgb(EVADER_COLOR), trajectory.evader_position
     now = (255, 200, 25) if trajectory.captured[step].any() else color
     yield path[step], partial(pen.ball, path[step], BALL, now), [path[step] + BALL * _circle(24)]
-    yield from _trail(pen, path, step, color, trajectory.game.time_step)
+    yield from _trail(pen, path, step, color, trajectory.time_step)
 
 
 def _trail(pen, path, step, color, time_step):
