@@ -19,7 +19,7 @@ from openjax.files import check_output, write_json
 from openjax.learning.presets import preset
 from openjax.learning.settings import TrainSettings
 from openjax.ranges import Interval
-from openjax.show.steps import Steps
+from openjax.show.progress import Steps
 
 PROGRAM = "openjax benchmark"
 PHYSICS = ("rigid_free", "rigid", "mjx_free", "mjx")

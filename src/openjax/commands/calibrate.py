@@ -15,7 +15,7 @@ from openjax.commands.command_line import one_thread_for_matrices, output_consol
 from openjax.errors import UserError
 from openjax.files import check_output
 from openjax.show.number_tables import numbers_table
-from openjax.show.steps import Steps
+from openjax.show.progress import Steps
 
 PROGRAM = "openjax calibrate"
 SECONDS = 15.0
