@@ -48,7 +48,8 @@ def test_each_learns_from_its_own_samples_what_pays(worlds):
         evaders, caught = improve(evaders, key)
     which, seen = jax.jit(learning.see)(evaders.actor, worlds)
     np.testing.assert_array_equal(which, np.tile([-1, 0, -1, 1], WORLDS // 4))
-    before, after = (outputs_of(e.actor, which, seen)[0][which == 1, 0] for e in (start, evaders))
+    told = jax.jit(outputs_of)
+    before, after = (told(e.actor, which, seen)[0][which == 1, 0] for e in (start, evaders))
     moved = float(jnp.mean(after - before))
     assert moved > 0.5
     assert np.mean(np.asarray(caught)[which == 1]) < 0.2
@@ -116,9 +117,9 @@ def test_every_place_flies_its_own_network(worlds):
     networks = jax.vmap(init_network)(jax.random.split(jax.random.key(3), 2))
     networks["output"]["kernel"] = jax.random.normal(jax.random.key(4), networks["output"]["kernel"].shape)
     which, seen = jax.jit(learning.see)(networks, worlds)
-    found = outputs_of(networks, which, seen)
+    found = jax.jit(outputs_of)(networks, which, seen)
     for place in (0, 1):
-        alone = outputs(jax.tree.map(lambda leaf, i=place: leaf[i], networks), seen)
+        alone = jax.jit(outputs)(jax.tree.map(lambda leaf, i=place: leaf[i], networks), seen)
         for mine, its in zip(found, alone, strict=True):
             np.testing.assert_allclose(mine[which == place], its[which == place], rtol=1e-5, atol=1e-5)
 
