@@ -86,8 +86,6 @@ class _Draws:
         self.sizes = np.abs(norm.ppf(0.5 + 0.5 * even[:, :2])) * USUAL_CHANGE * sign[:, None]
         self.places, self.normal = even[:, 3:5], norm.ppf(even[:, 5:])
         self.mixer, self.trims = mixer, trims
-        # Rotor commands in level flight of the reference, in units of their mean.
-        self.level = np.linalg.solve(mixer, np.r_[1.0, trims[1:]])
         self.place_of = {p: k for k, p in enumerate([(0,), (1,), (2,), (3,), *SIDES, EVERYWHERE, ()])}
         self.parts: list[tuple] = []
 
@@ -104,9 +102,14 @@ class _Draws:
 
     def trims_of(self, factors: np.ndarray) -> dict:
         """What rotor commands that rise by `factors` (DRAWS, 4) do to the trims, inexactly."""
-        mixed = (self.level * np.maximum(factors, 0.2)) @ self.mixer.T
-        change = np.c_[np.log(mixed[:, 0]), mixed[:, 1:] / mixed[:, :1] - self.trims[1:]]
+        change = trims_with(self.mixer, self.trims, np.maximum(factors, 0.2))
         return dict(zip(TRIMS, (change * (1.0 + INEXACT * self.normal[:, :4])).T, strict=True))
+
+
+def trims_with(mixer: np.ndarray, trims: np.ndarray, factors: np.ndarray) -> np.ndarray:
+    """Change (..., 4) of a reference's trims (4,) where the rotor commands of its level flight rise by `factors` (..., 4)."""
+    mixed = (np.linalg.solve(mixer, np.r_[1.0, trims[1:]]) * factors) @ mixer.T
+    return np.concatenate([np.log(mixed[..., :1]), mixed[..., 1:] / mixed[..., :1] - trims[1:]], -1)
 
 
 def hypotheses_of(mixer: np.ndarray, trims: np.ndarray) -> Hypotheses:
