@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import norm, qmc
 
-from openjax.comparison.figures import FIGURES, TRIMS
+from openjax.comparison.figures import PLACES, TRIMS
 
 
 @dataclass(frozen=True)
@@ -91,11 +91,11 @@ class _Draws:
 
     def add(self, cause: str, share: float, change: dict, place, size: np.ndarray) -> None:
         """Draws of a cause at a place; `change`: {figure: (DRAWS,)}."""
-        table = np.zeros((DRAWS, len(FIGURES)))
+        table = np.zeros((DRAWS, len(PLACES)))
         for name, values in change.items():
-            table[:, FIGURES.index(name)] = values
+            table[:, PLACES[name]] = values
         if CAUSES[cause].damage:
-            table[:, FIGURES.index("shaking")] = SHAKES[0] + SHAKES[1] * self.normal[:, 4]
+            table[:, PLACES["shaking"]] = SHAKES[0] + SHAKES[1] * self.normal[:, 4]
         weight = np.full(DRAWS, share * CAUSES[cause].prior / DRAWS)
         where = np.broadcast_to(place if isinstance(place, np.ndarray) else self.place_of[place], DRAWS)
         self.parts.append((table, weight, np.full(DRAWS, list(CAUSES).index(cause)), where, size))
