@@ -10,10 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from openjax.cluster.devices import carry_shardings, check_devices, make_device_step
+from openjax.commands.validation import uniform_tasks
 from openjax.errors import UserError
 from openjax.learning import TrainSettings, build, make_start, training_step
 from openjax.learning.rollout import collect
-from openjax.pursuit import Pursuit, hover_action, uniform_task
+from openjax.pursuit import Pursuit, hover_action
 from openjax.pursuit.environment import action_to_command
 from openjax.store.leaves import place
 from openjax.vehicle import hover_state, load_vehicle, make_drones_step
@@ -78,7 +79,7 @@ def _physics(part, settings, num_envs, steps):
         substeps=game.substeps,
         contacts=not part.endswith("_free"),
     )
-    tasks = _tasks(game, num_envs)
+    tasks = uniform_tasks(game, num_envs, game.max_pillars)
     drones = jax.jit(jax.vmap(lambda task: hover_state(vehicle, task.pursuer_position)))(tasks)
     command = action_to_command(jnp.broadcast_to(hover_action(vehicle), (game.num_pursuers, 4)))
     command = command.at[:, 1:].add(0.1)
@@ -127,11 +128,6 @@ def _rollout(settings, num_envs, steps):
         )
 
     return run, (parameters, observation, state, jax.random.key(2))
-
-
-def _tasks(settings, num_envs):
-    keys = jax.random.split(jax.random.key(0), num_envs)
-    return jax.jit(jax.vmap(lambda key: uniform_task(settings, key)))(keys)
 
 
 @dataclasses.dataclass(frozen=True)
