@@ -203,12 +203,9 @@ def _check_resumed(command, stored):
         raise UserError(f"--resume {resume} writes there; leave --out away")
     if command.overwrite:
         raise UserError("--resume and --overwrite exclude each other")
-    files = [
-        name
-        for name in ("start_from", "effects", "vehicle", "opponent")
-        if getattr(command, name) is not None
-    ]
-    for name in (*files, *different_settings(command.settings, stored)):
+    options = ("start_from", "effects", "vehicle", "opponent")
+    given = [name for name in options if getattr(command, name) is not None]
+    for name in (*given, *different_settings(command.settings, stored)):
         if name not in MAY_CHANGE:
             raise UserError(
                 f"--{name} can't change when a run is resumed; {', '.join(MAY_CHANGE)} can, or start another run "
