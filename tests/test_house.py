@@ -14,11 +14,11 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "openjax"
 EXCEPTIONS = Path(__file__).with_name("house_exceptions.txt")
-MOST_LINES = {"src": 31_384, "experiments": 8_000}
+MOST_LINES = {"src": 31_061, "experiments": 8_000}
 """Of Python; the goal of `src` is 26,000."""
 FUNCTION = {"lines": 40, "branches": 10, "arguments": 5}
 """The most of a function: lines without its docstring, branches and arguments without those of functions inside it."""
-OVER = {"lines": 29, "branches": 10, "arguments": 61}
+OVER = {"lines": 28, "branches": 10, "arguments": 61}
 """Functions that are still over each limit; too many branches have some of `flights`, `gap` and the experiments alone."""
 FLOORS = (
     "errors lazy platform background",

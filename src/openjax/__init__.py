@@ -9,54 +9,32 @@ observation, state, reward, terminated, truncated, info = jax.jit(environment.st
 )
 """
 
-import importlib
 from typing import TYPE_CHECKING
 
+from openjax.lazy import lazy_names
+
 if TYPE_CHECKING:  # so that editors complete and check what is loaded on first use only
-    from openjax.commands.calls import evaluate, train
-    from openjax.errors import UserError
-    from openjax.learning.presets import preset
-    from openjax.pursuit.environment import Pursuit, make
-    from openjax.pursuit.scenarios import SCENARIOS
-    from openjax.pursuit.settings import PursuitSettings
-    from openjax.pursuit.task import Task
-    from openjax.store.policies import load_policy
+    from openjax.commands.calls import evaluate as evaluate
+    from openjax.commands.calls import train as train
+    from openjax.errors import UserError as UserError
+    from openjax.learning.presets import preset as preset
+    from openjax.pursuit.environment import Pursuit as Pursuit
+    from openjax.pursuit.environment import make as make
+    from openjax.pursuit.scenarios import SCENARIOS as SCENARIOS
+    from openjax.pursuit.settings import PursuitSettings as PursuitSettings
+    from openjax.pursuit.task import Task as Task
+    from openjax.store.policies import load_policy as load_policy
 
 __version__ = "0.1.0"
 
-_PUBLIC = {
-    "Pursuit": "openjax.pursuit",
-    "PursuitSettings": "openjax.pursuit",
-    "SCENARIOS": "openjax.pursuit",
-    "Task": "openjax.pursuit",
-    "UserError": "openjax.errors",
-    "evaluate": "openjax.commands.calls",
-    "load_policy": "openjax.store.policies",
-    "make": "openjax.pursuit",
-    "preset": "openjax.learning",
-    "train": "openjax.commands.calls",
-}
-
-__all__ = [
-    "SCENARIOS",
-    "Pursuit",
-    "PursuitSettings",
-    "Task",
-    "UserError",
-    "evaluate",
-    "load_policy",
-    "make",
-    "preset",
-    "train",
-]
-
-
-def __getattr__(name: str):
-    # imported on first use: `openjax diagnose --help` needn't wait for MuJoCo
-    if name in _PUBLIC:
-        return getattr(importlib.import_module(_PUBLIC[name]), name)
-    raise AttributeError(f"module 'openjax' has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+# imported on first use: `openjax diagnose --help` needn't wait for MuJoCo
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__,
+    {
+        "commands.calls": "evaluate train",
+        "errors": "UserError",
+        "learning": "preset",
+        "pursuit": "Pursuit PursuitSettings SCENARIOS Task make",
+        "store.policies": "load_policy",
+    },
+)

@@ -52,9 +52,9 @@ def main(arguments: Sequence[str]) -> int | None:
     return importlib.import_module(f"openjax.commands.{command}").main(arguments[1:])
 
 
-def entry() -> None:
-    """What the installed script `openjax` calls."""
-    run_command(main)
+def entry(*command: str) -> None:
+    """What the installed script `openjax` calls; with a command's name, what `python -m openjax.NAME` does."""
+    run_command(lambda arguments: main([*command, *arguments]))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
 """`python -m openjax.adapt`: the command is `openjax.commands.adapt`."""
 
-from openjax.commands.adapt import main
-from openjax.commands.command_line import run_command
+from openjax.__main__ import entry
 
 if __name__ == "__main__":
-    run_command(main)
+    entry("adapt")

@@ -1,7 +1,6 @@
 """`python -m openjax.calibrate`: the command is `openjax.commands.calibrate`."""
 
-from openjax.commands.calibrate import main
-from openjax.commands.command_line import run_command
+from openjax.__main__ import entry
 
 if __name__ == "__main__":
-    run_command(main)
+    entry("calibrate")

@@ -1,7 +1,6 @@
-"""`openjax diagnose`: the command is `openjax.commands.diagnose`."""
+"""`python -m openjax.diagnose`: the command is `openjax.commands.diagnose`."""
 
-from openjax.commands.command_line import run_command
-from openjax.commands.diagnose import main
+from openjax.__main__ import entry
 
 if __name__ == "__main__":
-    run_command(main)
+    entry("diagnose")

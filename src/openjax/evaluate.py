@@ -1,7 +1,6 @@
-"""`openjax evaluate`: the command is `openjax.commands.evaluate`."""
+"""`python -m openjax.evaluate`: the command is `openjax.commands.evaluate`."""
 
-from openjax.commands.command_line import run_command
-from openjax.commands.evaluate import main
+from openjax.__main__ import entry
 
 if __name__ == "__main__":
-    run_command(main)
+    entry("evaluate")

@@ -1,7 +1,6 @@
 """`python -m openjax.fly`: the command is `openjax.commands.fly`."""
 
-from openjax.commands.command_line import run_command
-from openjax.commands.fly import main
+from openjax.__main__ import entry
 
 if __name__ == "__main__":
-    run_command(main)
+    entry("fly")

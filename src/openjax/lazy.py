@@ -6,14 +6,15 @@ from typing import Any
 
 
 def lazy_names(
-    package: str, homes: Mapping[str, str]
+    package: str, names: Mapping[str, str]
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """`__getattr__`, `__dir__` and `__all__` of a package.
 
     Args:
       package: its name.
-      homes: the module of the package that each public name lives in.
+      names: the public names that live in each of its modules, as words.
     """
+    homes = {name: module for module, words in names.items() for name in words.split()}
 
     def get(name: str):
         if name in homes:

@@ -1,7 +1,6 @@
 """`python -m openjax.sample_flights`: the command is `openjax.commands.sample_flights`."""
 
-from openjax.commands.command_line import run_command
-from openjax.commands.sample_flights import main
+from openjax.__main__ import entry
 
 if __name__ == "__main__":
-    run_command(main)
+    entry("sample_flights")

@@ -1,7 +1,6 @@
-"""`openjax train`: the command is `openjax.commands.train`."""
+"""`python -m openjax.train`: the command is `openjax.commands.train`."""
 
-from openjax.commands.command_line import run_command
-from openjax.commands.train import main
+from openjax.__main__ import entry
 
 if __name__ == "__main__":
-    run_command(main)
+    entry("train")

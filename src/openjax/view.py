@@ -1,7 +1,6 @@
 """`python -m openjax.view`: the command is `openjax.commands.view`."""
 
-from openjax.commands.command_line import run_command
-from openjax.commands.view import main
+from openjax.__main__ import entry
 
 if __name__ == "__main__":
-    run_command(main)
+    entry("view")

@@ -40,11 +40,18 @@ def policy_file(tmp_path_factory):
     return path
 
 
+@pytest.fixture(scope="module")
+def flown(policy_file):
+    """What the policy sees in games: several tests ask for the same, which takes seconds to compile."""
+    return observations(load_policy(str(policy_file)), 64, 0)
+
+
 NEEDS_CC = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler here")
 
 
 @pytest.mark.parametrize("kind", ["onnx", "jax", pytest.param("c", marks=NEEDS_CC)])
-def test_the_file_acts_as_the_policy_does(policy_file, tmp_path, kind):
+def test_the_file_acts_as_the_policy_does(policy_file, flown, tmp_path, monkeypatch, kind):
+    monkeypatch.setattr("openjax.commands.export.observations", lambda *_: dict(flown))
     if kind == "onnx":
         pytest.importorskip("onnxruntime", reason='the extra "export" is not installed')
     report = export(Arguments(str(policy_file), kind, out=tmp_path, observations=64))
@@ -63,12 +70,12 @@ def test_a_name_in_no_encoding_is_exported(policy_file, tmp_path):
 
 
 @NEEDS_CC
-def test_the_c_program_is_one_vehicles_policy_for_any_observation(policy_file):
+def test_the_c_program_is_one_vehicles_policy_for_any_observation(policy_file, flown):
     """Numbers that no game shows; a compiler that takes every warning for an error; a workspace full of NaN."""
     policy = load_policy(str(policy_file))
     rng = np.random.default_rng(1)
-    seen = observations(policy, 64, 0)
-    for name, values in seen.items():
+    seen = dict(flown)
+    for name, values in flown.items():
         noise = rng.normal(size=values.shape)
         seen[name] = (noise > 0) if values.dtype == bool else noise.astype(np.float32)
     expected = np.asarray(jax.jit(jax.vmap(policy))(Observation(**seen)))[:, :1]

@@ -48,7 +48,8 @@ def test_each_learns_from_its_own_samples_what_pays(worlds):
         evaders, caught = improve(evaders, key)
     which, seen = jax.jit(learning.see)(evaders.actor, worlds)
     np.testing.assert_array_equal(which, np.tile([-1, 0, -1, 1], WORLDS // 4))
-    before, after = (outputs_of(e.actor, which, seen)[0][which == 1, 0] for e in (start, evaders))
+    told = jax.jit(outputs_of)
+    before, after = (told(e.actor, which, seen)[0][which == 1, 0] for e in (start, evaders))
     moved = float(jnp.mean(after - before))
     assert moved > 0.5
     assert np.mean(np.asarray(caught)[which == 1]) < 0.2
@@ -60,8 +61,8 @@ def test_each_learns_from_its_own_samples_what_pays(worlds):
 def test_a_network_without_a_world_stays_as_it_is(worlds):
     """Evaders that come in late haven't more noise by then than they begin with."""
     learning = EvaderLearning(HOW, ENVIRONMENT, updates=1)
-    start = learning.start(jax.random.key(1))
-    samples = learning.act(start, worlds, jnp.ones((WORLDS, 3)))[1]
+    start = jax.jit(learning.start)(jax.random.key(1))
+    samples = jax.jit(learning.act)(start, worlds, jnp.ones((WORLDS, 3)))[1]
     samples = jax.tree.map(
         lambda leaf: leaf[None], samples.replace(which=jnp.where(samples.which == 0, 0, -1))
     )
@@ -78,11 +79,9 @@ def test_a_network_that_flies_all_worlds_learns_as_if_alone(worlds):
     alone = EvaderLearning(HOW, make(evaders=("learned",), physics="stops", max_pillars=5), updates=1)
     beside = EvaderLearning(HOW, ENVIRONMENT, updates=1)
     ended = worlds.replace(statistics=worlds.statistics.replace(captured=jnp.ones(WORLDS, bool)))
-    start = alone.start(jax.random.key(1))
-    kinds = jnp.zeros(WORLDS, jnp.int32)
-    samples = alone.act(
-        start, worlds.replace(evader=worlds.evader.replace(kind=kinds)), jnp.ones((WORLDS, 3))
-    )[1]
+    start = jax.jit(alone.start)(jax.random.key(1))
+    kinds = worlds.evader.replace(kind=jnp.zeros(WORLDS, jnp.int32))
+    samples = jax.jit(alone.act)(start, worlds.replace(evader=kinds), jnp.ones((WORLDS, 3)))[1]
     samples = jax.tree.map(lambda leaf: leaf[None], samples)
     two = jax.tree.map(lambda leaf: jnp.repeat(leaf, 2, axis=0), start)
     ends = [
@@ -95,7 +94,8 @@ def test_a_network_that_flies_all_worlds_learns_as_if_alone(worlds):
 
 def test_wishes_fly_only_where_a_network_acts(worlds):
     learning = EvaderLearning(HOW, ENVIRONMENT, updates=1)
-    wish, samples = jax.jit(learning.act)(learning.start(jax.random.key(1)), worlds, jnp.ones((WORLDS, 3)))
+    start = jax.jit(learning.start)(jax.random.key(1))
+    wish, samples = jax.jit(learning.act)(start, worlds, jnp.ones((WORLDS, 3)))
     acts = np.asarray(samples.which) >= 0
     assert (np.isnan(np.asarray(wish)).any(-1) == ~acts).all()
     step = jax.jit(jax.vmap(ENVIRONMENT.step, (None, 0, None, 0)))
@@ -116,10 +116,10 @@ def test_every_place_flies_its_own_network(worlds):
     learning = EvaderLearning(HOW, ENVIRONMENT, updates=1)
     networks = jax.vmap(init_network)(jax.random.split(jax.random.key(3), 2))
     networks["output"]["kernel"] = jax.random.normal(jax.random.key(4), networks["output"]["kernel"].shape)
-    which, seen = learning.see(networks, worlds)
-    found = outputs_of(networks, which, seen)
+    which, seen = jax.jit(learning.see)(networks, worlds)
+    found = jax.jit(outputs_of)(networks, which, seen)
     for place in (0, 1):
-        alone = outputs(jax.tree.map(lambda leaf, i=place: leaf[i], networks), seen)
+        alone = jax.jit(outputs)(jax.tree.map(lambda leaf, i=place: leaf[i], networks), seen)
         for mine, its in zip(found, alone, strict=True):
             np.testing.assert_allclose(mine[which == place], its[which == place], rtol=1e-5, atol=1e-5)
 
@@ -138,9 +138,10 @@ def test_in_its_own_axes_a_turned_game_is_the_same(worlds, own_axes):
     turned = scene.replace(**moved, pillar_position=scene.pillar_position @ turn[:2, :2].T)
     before = scene.pursuers + 0.1 * jax.random.normal(jax.random.key(7), (STEPS, 3, 3))
 
+    @jax.jit
     def wish(scene, before):
         memory = jnp.concatenate([jnp.zeros(worlds.evader.memory.shape[-1] - before.size), before.ravel()])
-        return np.asarray(outputs(network, features(networks, 0, scene, memory))[0])
+        return outputs(network, features(networks, 0, scene, memory))[0]
 
-    gap = np.abs(wish(turned, before @ turn.T) - wish(scene, before) @ turn.T).max()
+    gap = jnp.abs(wish(turned, before @ turn.T) - wish(scene, before) @ turn.T).max()
     assert gap < 1e-4 if own_axes else gap > 0.1

@@ -103,9 +103,8 @@ def test_an_evader_within_reach_is_not_free():
     state = jax.jit(jax.vmap(Pursuit(GAME).reset))(jax.random.split(jax.random.key(0), 4))[1]
     near = state.drones.position.at[:, 0].set(state.evader_position + jnp.array([0.1, 0.0, 0.0]))
     near = state.replace(drones=state.drones.replace(position=near))
-    far, near = (
-        evader_distance(GAME, s, jax.vmap(functools.partial(ways_of, GAME))(s.task)) for s in (state, near)
-    )
+    distance = jax.jit(lambda s: evader_distance(GAME, s, jax.vmap(functools.partial(ways_of, GAME))(s.task)))
+    far, near = distance(state), distance(near)
     assert near[:, 0] == pytest.approx(0.1, abs=1e-3)
     assert (free_share(GAME, near) < 0.2).all() and (free_share(GAME, near) < free_share(GAME, far)).all()
 
@@ -113,7 +112,7 @@ def test_an_evader_within_reach_is_not_free():
 def test_one_near_pursuer_lets_others_be_far():
     distance = jnp.array([[0.5, 0.5, 0.5], [0.0, 1.0, 1.0]])
     assert nearest_way(distance) == pytest.approx([0.5, 0.15 * math.log(3.0)], abs=1e-3)
-    pull = jax.grad(lambda d: nearest_way(d)[0])(distance[1:])[0]
+    pull = jax.jit(jax.grad(lambda d: nearest_way(d)[0]))(distance[1:])[0]
     assert pull[0] > 0.99 and pull[1] < 0.01
 
 

@@ -117,15 +117,15 @@ def learn():
     """Train on a probe; returns values and mean actions in the corners."""
     train = trained(SETTINGS, POLICY, UPDATES)
 
-    def call(**probe):
-        (actor, critic, scale), _ = train(probe_of(**probe))
+    @jax.jit
+    def call(probe):
+        (actor, critic, scale), _ = train(probe)
         mean, std = scale.moments
         corners = observation_of(*map(jnp.array, CORNERS))
         value = mean + std * POLICY.value(actor.parameters, critic.parameters, corners, None)[..., 0]
-        action = POLICY.action(POLICY.distribution(actor.parameters, corners, None)[0])[..., 0, :]
-        return np.asarray(value), np.asarray(action)
+        return value, POLICY.action(POLICY.distribution(actor.parameters, corners, None)[0])[..., 0, :]
 
-    return call
+    return lambda **probe: jax.device_get(call(probe_of(**probe)))
 
 
 def test_constant_reward_is_the_value(learn):

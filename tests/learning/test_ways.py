@@ -17,13 +17,14 @@ REACH = GAME.pillar_radius + GAME.pillar_clearance + ROOM
 CELL = 0.02
 
 
+@jax.jit
 def length(task, position, target):
     position, target = jnp.asarray(position), jnp.asarray(target)
     return way_length(GAME, task, ways_of(GAME, task), position, target)
 
 
 def one_pillar():
-    task = uniform_task(GAME, jax.random.key(0))
+    task = jax.jit(functools.partial(uniform_task, GAME))(jax.random.key(0))
     return task.replace(pillar_position=jnp.zeros_like(task.pillar_position), pillar_active=jnp.arange(5) < 1)
 
 
@@ -36,11 +37,12 @@ def test_round_one_pillar_it_is_two_tangents_and_an_arc():
 
 
 def test_who_is_too_near_a_pillar_leaves_it():
-    gradient = jax.grad(lambda p: length(one_pillar(), p[None], [-0.6, 0.0, 0.5])[0])
+    task = one_pillar()
+    gradient = jax.jit(jax.grad(lambda p: length(task, p[None], [-0.6, 0.0, 0.5])[0]))
     assert (
         gradient(jnp.array([0.12, 0.01, 0.5]))[0] < 0.1
     )  # not through the pillar, as the straight line would have it
-    assert length(one_pillar(), [[0.12, 0.01, 0.5]], [-0.6, 0.0, 0.5])[0] < TOLL
+    assert length(task, [[0.12, 0.01, 0.5]], [-0.6, 0.0, 0.5])[0] < TOLL
 
 
 def on_a_grid(task, source):
@@ -73,11 +75,8 @@ def cell(place):
 
 def test_round_rows_it_is_as_long_as_on_a_grid():
     keys = jax.random.split(jax.random.key(1), 6)
-    tasks = jax.vmap(lambda key: line_up_pillars(GAME, key, uniform_task(GAME, key)))(keys)
-    ways = jax.vmap(functools.partial(ways_of, GAME))(tasks)
-    lengths = jax.vmap(functools.partial(way_length, GAME))(
-        tasks, ways, tasks.pursuer_position, tasks.evader_position
-    )
+    tasks = jax.jit(jax.vmap(lambda key: line_up_pillars(GAME, key, uniform_task(GAME, key))))(keys)
+    lengths = jax.vmap(length)(tasks, tasks.pursuer_position, tasks.evader_position)
     height = tasks.pursuer_position[..., 2] - tasks.evader_position[:, None, 2]
     differences = []
     for b, own in enumerate(np.sqrt(np.asarray(lengths**2 - height**2))):

@@ -50,11 +50,8 @@ def functions(policy):
 def networks():
     """(parameters away from their start, function to mean and value)."""
     init, both = functions(POLICY)
-    parameters = init(jax.random.key(0), observation_of(0))
-    leaves, structure = jax.tree.flatten(parameters)
-    keys = jax.random.split(jax.random.key(1), len(leaves))
-    leaves = [x + 0.1 * jax.random.normal(k, x.shape) for x, k in zip(leaves, keys, strict=True)]
-    return structure.unflatten(leaves), both
+    parameters, draw = init(jax.random.key(0), observation_of(0)), np.random.default_rng(1)
+    return jax.tree.map(lambda x: x + 0.1 * draw.normal(size=x.shape).astype(x.dtype), parameters), both
 
 
 def test_order_of_others_and_pillars_does_not_matter(networks):

@@ -164,7 +164,7 @@ def test_draws_of_worlds():
     """Kinds with the odds that the names give, numbers from the lists; a curriculum from the first alone to all."""
     settings = PursuitSettings(evaders=("field", "greedy", "greedy", "wall_runner"))
     keys = jax.random.split(jax.random.key(5), 6000)
-    drawn = jax.vmap(lambda key: draw_evader(settings, key, jnp.zeros((3, 3))))(keys)
+    drawn = jax.jit(jax.vmap(lambda key: draw_evader(settings, key, jnp.zeros((3, 3)))))(keys)
     counts = np.bincount(np.asarray(drawn.kind), minlength=4) / 6000
     np.testing.assert_allclose(counts, 0.25, atol=0.03)
     greedy_worlds = np.isin(np.asarray(drawn.kind), (1, 2))
@@ -174,10 +174,11 @@ def test_draws_of_worlds():
         wanted, odds = np.unique(np.float32(getattr(EVADERS["greedy"], name)), return_counts=True)
         np.testing.assert_array_equal(values, wanted)
         np.testing.assert_allclose(found / found.sum(), odds / odds.sum(), atol=0.05)
+    drawn_for = jax.jit(
+        jax.vmap(lambda key, share: draw_evader(settings, key, jnp.zeros((3, 3)), share), (0, None))
+    )
     for share in (0.0, 0.4):
-        part = jax.vmap(
-            lambda key, share=share: draw_evader(settings, key, jnp.zeros((3, 3)), jnp.float32(share))
-        )(keys)
+        part = drawn_for(keys, jnp.float32(share))
         others = np.asarray(part.kind) != 0
         np.testing.assert_allclose(others.mean(), 0.75 * share, atol=0.03)
         assert (np.asarray(part.numbers["speed"])[others] <= 0.5 + 0.5 * share).all()

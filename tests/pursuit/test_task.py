@@ -89,7 +89,7 @@ def test_eight_pursuers_start_clear():
     settings = PursuitSettings(num_pursuers=8)
     tasks = jax.jit(jax.vmap(lambda key: uniform_task(settings, key)))(keys(1, 500))
     assert tasks.pursuer_position.shape == (500, 8, 3)
-    clear = jax.vmap(lambda task: starts_clear(settings, task))(tasks)
+    clear = jax.jit(jax.vmap(lambda task: starts_clear(settings, task)))(tasks)
     assert clear.all()
 
 
@@ -220,7 +220,9 @@ def test_scattered_starts_fill_the_arena_and_are_clear(uniform):
 def test_start_attitudes():
     from scipy.spatial.transform import Rotation
 
-    quaternion = np.asarray(jax.vmap(lambda key: start_attitude(SETTINGS, key))(keys(40))).reshape(-1, 4)
+    quaternion = np.asarray(jax.jit(jax.vmap(lambda key: start_attitude(SETTINGS, key)))(keys(40))).reshape(
+        -1, 4
+    )
     np.testing.assert_allclose(np.linalg.norm(quaternion, axis=-1), 1.0, atol=1e-5)
     yaw, pitch, roll = Rotation.from_quat(quaternion[:, [1, 2, 3, 0]]).as_euler("ZYX", degrees=True).T
     for angle, low in ((roll, -36), (pitch, -36), (yaw, 0)):

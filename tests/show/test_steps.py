@@ -8,8 +8,7 @@ from rich.console import Console
 
 import openjax
 from openjax.errors import UserError
-from openjax.show.progress import duration
-from openjax.show.steps import Steps
+from openjax.show.progress import Steps, duration
 
 
 def test_time_left_follows_this_machine(monkeypatch):

@@ -21,17 +21,11 @@ from openjax.vehicle.effects import EFFECTS
 from openjax.vehicle.vehicle_file import CALIBRATED_UNITS, CalibratedValue
 
 FITTED = ("thrust_scale", "yaw_torque", "motor_lag", "inertia")  # whose parameters are the constants
-BESIDE = (
-    "rotor_drag",
-    "com_offset",
-    "ground_effect",
-    "ceiling_effect",
-    "downwash",
-)  # mustn't be taken for them
+# what mustn't be taken for them
+BESIDE = ("rotor_drag", "com_offset", "ground_effect", "ceiling_effect", "downwash")
 ITERATIONS = 12
-DETERMINED = (
-    0.5  # of the prior's standard deviation: a constant with a larger one isn't told by these flights
-)
+# of the prior's standard deviation: a constant with a larger one isn't told by these flights
+DETERMINED = 0.5
 LEAST_EXPLAINED = 0.9  # share of the rates' changes; below, no constant that they tell can be trusted
 HORIZON = 0.25  # s over which changes are explained
 YAW_INERTIA_RANGE = (0.7, 1.6)  # of nominal; what it may be where it is assumed

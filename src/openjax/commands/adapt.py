@@ -17,7 +17,7 @@ from openjax.errors import UserError
 from openjax.files import check_output_folder
 from openjax.learning.settings import AdaptSettings
 from openjax.ranges import Interval, Seed
-from openjax.show.steps import Steps
+from openjax.show.progress import Steps
 from openjax.store import DEFAULT_POLICY
 from openjax.store.compiled_programs import cache_programs
 

@@ -19,7 +19,7 @@ from openjax.files import check_output, write_json
 from openjax.learning.presets import preset
 from openjax.learning.settings import TrainSettings
 from openjax.ranges import Interval
-from openjax.show.steps import Steps
+from openjax.show.progress import Steps
 
 PROGRAM = "openjax benchmark"
 PHYSICS = ("rigid_free", "rigid", "mjx_free", "mjx")
@@ -72,9 +72,8 @@ def main(arguments: Sequence[str]) -> int:
 
     if max(command.devices) > (available := len(jax.devices())):
         raise UserError(f"--devices is {max(command.devices)}; {available} are here")
-    from openjax.commands.benchmark_cases import cases
+    from openjax.commands.benchmark_cases import cases, time_compiled
     from openjax.commands.machine import describe_machine
-    from openjax.commands.timing import time_compiled
 
     machine, console = describe_machine(), output_console()
     print(f"{machine['device']}, JAX {machine['versions']['jax']}, commit {machine['commit']}", flush=True)

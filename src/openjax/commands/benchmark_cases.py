@@ -1,17 +1,20 @@
-"""What `openjax benchmark` times: physics, environment, rollout and the training step, each as one function."""
+"""What `openjax benchmark` times, and how: physics, environment, rollout and the training step, each as one function."""
 
 import dataclasses
+import time
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from openjax.cluster.devices import carry_shardings, check_devices, make_device_step
+from openjax.commands.validation import uniform_tasks
 from openjax.errors import UserError
 from openjax.learning import TrainSettings, build, make_start, training_step
 from openjax.learning.rollout import collect
-from openjax.pursuit import Pursuit, hover_action, uniform_task
+from openjax.pursuit import Pursuit, hover_action
 from openjax.pursuit.environment import action_to_command
 from openjax.store.leaves import place
 from openjax.vehicle import hover_state, load_vehicle, make_drones_step
@@ -76,7 +79,7 @@ def _physics(part, settings, num_envs, steps):
         substeps=game.substeps,
         contacts=not part.endswith("_free"),
     )
-    tasks = _tasks(game, num_envs)
+    tasks = uniform_tasks(game, num_envs, game.max_pillars)
     drones = jax.jit(jax.vmap(lambda task: hover_state(vehicle, task.pursuer_position)))(tasks)
     command = action_to_command(jnp.broadcast_to(hover_action(vehicle), (game.num_pursuers, 4)))
     command = command.at[:, 1:].add(0.1)
@@ -127,6 +130,48 @@ def _rollout(settings, num_envs, steps):
     return run, (parameters, observation, state, jax.random.key(2))
 
 
-def _tasks(settings, num_envs):
-    keys = jax.random.split(jax.random.key(0), num_envs)
-    return jax.jit(jax.vmap(lambda key: uniform_task(settings, key)))(keys)
+@dataclasses.dataclass(frozen=True)
+class Timing:
+    """One compiled function, timed."""
+
+    compile_seconds: float
+    """Tracing and compilation; a persistent compilation cache shortens it."""
+    seconds: float | None
+    """Median time of one call; None where it ran out of memory."""
+    slowest: float | None
+    """Of all calls."""
+    calls: int
+    memory: int | None
+    """Bytes for arguments, results and temporaries of one call, by the compiler's account."""
+
+
+def time_compiled(function: Callable, arguments: tuple, min_seconds: float) -> Timing:
+    """Compile `function` for `arguments`, run it once to warm up, then time three calls or more, for at least `min_seconds`.
+
+    Each call gets the same arguments and is waited for, so that all calls do the same work.
+    """
+    start = time.perf_counter()
+    compiled = jax.jit(function).lower(*arguments).compile()
+    compile_seconds = time.perf_counter() - start
+    memory = _memory(compiled)
+    times: list[float] = []
+    try:
+        jax.block_until_ready(compiled(*arguments))
+        while sum(times) < min_seconds or len(times) < 3:
+            start = time.perf_counter()
+            jax.block_until_ready(compiled(*arguments))
+            times.append(time.perf_counter() - start)
+    except jax.errors.JaxRuntimeError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        return Timing(compile_seconds, None, None, 0, memory)
+    return Timing(compile_seconds, float(np.median(times)), max(times), len(times), memory)
+
+
+def _memory(compiled):
+    """See `Timing.memory`; None where the compiler doesn't tell."""
+    told = compiled.memory_analysis()
+    if told is None:
+        return None
+    made = told.output_size_in_bytes + told.temp_size_in_bytes
+    return int(told.argument_size_in_bytes + made - told.alias_size_in_bytes)

@@ -15,7 +15,7 @@ from openjax.commands.command_line import one_thread_for_matrices, output_consol
 from openjax.errors import UserError
 from openjax.files import check_output
 from openjax.show.number_tables import numbers_table
-from openjax.show.steps import Steps
+from openjax.show.progress import Steps
 
 PROGRAM = "openjax calibrate"
 SECONDS = 15.0
@@ -42,18 +42,13 @@ def run(arguments: Arguments, console: Console):
     from openjax.vehicle.vehicle_file import load_vehicle_file, save_vehicle_file
 
     out = arguments.case / "vehicle_calibrated.toml" if arguments.out is None else arguments.out
-    if arguments.out is not None:  # else it lies in the case, of which more is said below
-        check_output(out, "--out")
     if out.exists() and not arguments.overwrite:
         raise UserError(f"{out}: exists already; use --overwrite to replace it or --out for another file")
     start = time.perf_counter()
     case = load_case(arguments.case)
     check_output(out, "--out")
     for issue in case.quality:
-        console.print(
-            f"[yellow]{'left out' if issue.refused else 'noted'}[/] {issue.flight}: {issue.issue}",
-            highlight=False,
-        )
+        console.print(f"[yellow]{'left out' if issue.refused else 'noted'}[/] {issue.flight}: {issue.issue}")
     with Steps("calibrating", {arguments.case.name: SECONDS}, console) as steps:
         steps.begin(arguments.case.name)
         result = calibrate(case)
@@ -64,7 +59,7 @@ def run(arguments: Arguments, console: Console):
         )
     calibrated = dataclasses.replace(load_vehicle_file(arguments.case), calibrated=result.calibrated())
     save_vehicle_file(out, calibrated)
-    console.print(f"{time.perf_counter() - start:.1f} s; written to [bold]{out}[/]", highlight=False)
+    console.print(f"{time.perf_counter() - start:.1f} s; written to [bold]{out}[/]")
     return result
 
 
@@ -91,7 +86,7 @@ def _print(result, console: Console) -> None:
         console.print(f"{channel}: the fitted vehicle explains {fitted} of what changed, the given {given}")
     console.print("[bold]What these flights can't tell[/]")
     for text in result.cannot_tell:
-        console.print(f"• {text}", highlight=False)
+        console.print(f"• {text}")
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -15,7 +15,7 @@ from rich.text import Text
 from openjax.commands.command_line import one_line, one_thread_for_matrices, output_console, parse
 from openjax.errors import UserError
 from openjax.files import check_output, check_output_folder, replacing, write_json
-from openjax.show.steps import Steps
+from openjax.show.progress import Steps
 from openjax.vehicle.effect_names import effect_names
 
 PROGRAM = "openjax diagnose"

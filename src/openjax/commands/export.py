@@ -16,7 +16,7 @@ from openjax.commands.command_line import output_console, parse
 from openjax.errors import UserError
 from openjax.files import check_output_folder, replacing
 from openjax.ranges import Interval, Seed
-from openjax.show.steps import Steps
+from openjax.show.progress import Steps
 from openjax.store import DEFAULT_POLICY
 
 PROGRAM = "openjax export"

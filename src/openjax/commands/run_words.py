@@ -1,7 +1,8 @@
 """What a run says in words: what is trained, and at its end what a crash is, what isn't the paper's, and what to type next."""
 
 from pathlib import Path
-from typing import Any
+
+from flax.traverse_util import flatten_dict
 
 from openjax.files import to_plain
 from openjax.learning import TrainSettings
@@ -30,16 +31,8 @@ def opening_words(settings: TrainSettings) -> str:
 
 def different_settings(own: TrainSettings, other: TrainSettings) -> list[str]:
     """The dotted names of settings that have another value."""
-    theirs = _leaves(to_plain(other))
-    return [name for name, value in _leaves(to_plain(own)).items() if value != theirs.get(name)]
-
-
-def _leaves(plain: Any, path: str = "") -> dict[str, Any]:
-    """The values of nested dictionaries by their dotted names."""
-    if not isinstance(plain, dict):
-        return {path: plain}
-    parts = (_leaves(value, f"{path}.{name}" if path else name) for name, value in plain.items())
-    return {name: value for part in parts for name, value in part.items()}
+    mine, theirs = (flatten_dict(to_plain(settings), sep=".") for settings in (own, other))
+    return [name for name, value in mine.items() if value != theirs.get(name)]
 
 
 def layouts_like(game: PursuitSettings) -> list[Scenario]:

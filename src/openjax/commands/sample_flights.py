@@ -1,6 +1,7 @@
 """`openjax sample_flights OUT`: make a case of three sample flights, to try calibration and
 diagnosis on."""
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,26 +16,7 @@ from openjax.ranges import Interval, Seed
 from openjax.vehicle.effect_names import effect_names
 
 PROGRAM = "openjax sample_flights"
-
-VEHICLE_TOML = """\
-[vehicle]
-name = "crazyflie-2.1"
-mass = {mass:.4f}            # kg, what the simulator should assume
-mass_weighed = true
-
-[motor]
-command = "thrust"       # m = 1 asks for the maximal rotor thrust
-order = ["front_right", "rear_right", "rear_left", "front_left"]
-spin = ["ccw", "cw", "ccw", "cw"]
-
-[log]
-source = "simulated: openjax.sample_flights, seed {seed}, effect: {effect}"
-motor_rows = "mean"      # of the commands within a row
-floor_z = 0.0            # m
-"""
-DECIMALS = {"t": 2, "vbat": 3} | {
-    c: 5 for c in ("x", "y", "z", "qw", "qx", "qy", "qz", "m1", "m2", "m3", "m4")
-}
+DECIMALS = {"t": 2, "vbat": 3} | dict.fromkeys("x y z qw qx qy qz m1 m2 m3 m4".split(), 5)
 _REST = 4
 _EFFECT_HELP = (
     f"What the vehicle suffers from that the simulator doesn't know: none, {', '.join(effect_names())}."
@@ -59,24 +41,27 @@ def make_case(arguments: Arguments) -> list[Path]:
     empty."""
     from openjax.flights.reading import LOG_COLUMNS, write_csv
     from openjax.flights.samples import fly, log_of, references
-    from openjax.vehicle import load_vehicle
     from openjax.vehicle.effects import EFFECTS
+    from openjax.vehicle.vehicle_file import load_vehicle_file, save_vehicle_file
 
     if arguments.effect not in ("none", *EFFECTS):
         hint = suggestion(arguments.effect, ("none", *EFFECTS))
         raise UserError(f"--effect {arguments.effect}: no such effect; {hint}")
     check_new_folder(arguments.out, "OUT")
     effects = {} if arguments.effect == "none" else {arguments.effect: EFFECTS[arguments.effect].card.sample}
-    vehicle = load_vehicle()
+    source = f"simulated: openjax.sample_flights, seed {arguments.seed}, effect: {arguments.effect}"
+    log = {"source": source, "motor_rows": "mean", "floor_z": 0.0}
+    described = dataclasses.replace(load_vehicle_file(), mass_weighed=True, log=log)
     decimals = {c: DECIMALS.get(c, _REST) for c in LOG_COLUMNS}
     flights = references(arguments.seed, arguments.duration, neighbour=arguments.effect == "downwash")
     with replacing(arguments.out) as folder:
         folder.mkdir()
         for number, (name, reference) in enumerate(flights.items()):
-            columns = fly(vehicle, vehicle, reference, 1000 * arguments.seed + number, effects)
+            columns = fly(
+                described.vehicle, described.vehicle, reference, 1000 * arguments.seed + number, effects
+            )
             write_csv(folder / f"{name}.csv.gz", log_of(columns, name), decimals)
-        text = VEHICLE_TOML.format(mass=float(vehicle.mass), seed=arguments.seed, effect=arguments.effect)
-        (folder / "vehicle.toml").write_text(text, encoding="utf-8")
+        save_vehicle_file(folder / "vehicle.toml", described)
     return sorted(arguments.out.iterdir())
 
 

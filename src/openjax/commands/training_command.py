@@ -43,11 +43,10 @@ def read_command(arguments: Sequence[str]) -> TrainCommand:
         default = preset(name or default_preset())
     command = parse(TrainCommand, TrainCommand(settings=default), arguments, PROGRAM)
     if resume is not None:
-        _check_kept(default, command.settings)
+        _check_resumed(command, default)
     if command.steps is not None:
         settings = dataclasses.replace(command.settings, total_steps=command.steps)
         command = dataclasses.replace(command, settings=settings)
-    _check(command)
     return command
 
 
@@ -197,28 +196,21 @@ def _check_same(settings, processes):
             )
 
 
-def _check_kept(stored, given):
-    """Raises UserError for settings beside --resume that the run can't take up in its middle."""
-    for name in different_settings(given, stored):
+def _check_resumed(command, stored):
+    """Raises UserError for options that don't go with --resume, and settings that a run can't take up in its middle."""
+    resume = command.resume
+    if command.out is not None and command.out.resolve() != resume.resolve():
+        raise UserError(f"--resume {resume} writes there; leave --out away")
+    if command.overwrite:
+        raise UserError("--resume and --overwrite exclude each other")
+    options = ("start_from", "effects", "vehicle", "opponent")
+    given = [name for name in options if getattr(command, name) is not None]
+    for name in (*given, *different_settings(command.settings, stored)):
         if name not in MAY_CHANGE:
             raise UserError(
                 f"--{name} can't change when a run is resumed; {', '.join(MAY_CHANGE)} can, or start another run "
                 "with --start_from"
             )
-
-
-def _check(command):
-    """Raises UserError for options that don't go with --resume."""
-    resume = command.resume
-    if resume is None:
-        return
-    if command.out is not None and command.out.resolve() != resume.resolve():
-        raise UserError(f"--resume {resume} writes there; leave --out away")
-    if command.overwrite:
-        raise UserError("--resume and --overwrite exclude each other")
-    for option in ("start_from", "effects", "vehicle", "opponent"):
-        if getattr(command, option) is not None:
-            raise UserError(f"--{option} can't change when a run is resumed")
 
 
 def _devices(text, settings, before):

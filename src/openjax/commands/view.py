@@ -12,6 +12,7 @@ from openjax.commands.evaluate import EvaluateCommand, FlightOptions, fly_scenar
 from openjax.errors import UserError
 from openjax.files import check_output
 from openjax.ranges import Interval
+from openjax.show.replay import replay_page, write_replay
 from openjax.show.trajectory import Trajectory
 
 PROGRAM = "openjax view"
@@ -38,21 +39,16 @@ def main(arguments: Sequence[str]) -> int:
     command = parse(ViewCommand, ViewCommand(), arguments, PROGRAM)
     check_output(command.html, "--html")
     check_output(command.gif, "--gif")
-    flights = fly_all(command)
-    console = output_console()
+    flights, console = fly_all(command), output_console()
     if command.gif is not None:
         from openjax.show.videos import animate
 
         animate(command.gif, flights[0][1])
         console.print(f"{command.gif}: {command.gif.stat().st_size / 1e3:,.0f} kB")
     if command.html is not None:
-        from openjax.show.replay import write_replay
-
         write_replay(command.html, flights)
         console.print(f"{command.html}: {command.html.stat().st_size / 1e3:,.0f} kB, opens in any browser")
     if command.gif is None and command.html is None:
-        from openjax.show.replay import replay_page
-
         with page_server(replay_page(flights), command.port) as server:
             address = f"http://localhost:{server.server_port}"
             print(f"{address} (Ctrl-C ends)", flush=True)

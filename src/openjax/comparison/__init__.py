@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from openjax.comparison.causes import CHANGES, ROTOR_PLACES, SIDES, hypotheses_of
+from openjax.comparison.causes import CAUSES, ROTOR_PLACES, SIDES, hypotheses_of
 from openjax.comparison.days import battery_of, by_day, days_told_apart, spread_of_days
 from openjax.comparison.figures import FIGURES, TRIMS, FlightFigures, figures_of, mixer_of
 from openjax.comparison.result import SHOWN, Change, Interval
@@ -77,7 +77,7 @@ def change_between(
         name=name,
         changed=evidence.changed > SHOWN,
         probability=evidence.changed,
-        trims_changed=evidence.changed > SHOWN and max(here, key=lambda c: here[c]) not in CHANGES,
+        trims_changed=evidence.changed > SHOWN and not CAUSES[max(here, key=lambda c: here[c])].figures,
         rotors=tuple(sorted(logged[j] for j in place)),
         side=ROTOR_PLACES[place[0]] if len(place) == 1 else SIDES.get(place, ""),
         causes=evidence.causes,

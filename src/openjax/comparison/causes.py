@@ -18,27 +18,32 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import norm, qmc
 
-from openjax.comparison.figures import FIGURES, TRIMS
+from openjax.comparison.figures import PLACES, TRIMS
 
-# Prior probabilities, if something changed: people knock propellers and tape things on more often than they swap motors.
+
+@dataclass(frozen=True)
+class Cause:
+    """What may have changed, how probable it is if something did, and the effects of the library that it is."""
+
+    prior: float
+    effects: tuple[str, ...] = ()
+    damage: bool = False  # it also shakes
+    figures: tuple[str, ...] = ()  # that it moves instead of the trims
+    usual: tuple[float, float] = (0.0, 0.0)  # mean and standard deviation of such a change
+    what: str = ""
+
+
+# People knock propellers and tape things on more often than they swap motors. Motors wear, drag is added.
 CAUSES = {
-    "one rotor weaker": 0.25,
-    "two rotors weaker": 0.2,
-    "weight": 0.15,
-    "whole vehicle": 0.1,
-    "drag": 0.08,
-    "motors": 0.06,
-    "inertia": 0.03,
-    "gains": 0.06,
-    "something else": 0.07,
-}
-DAMAGES = ("one rotor weaker", "two rotors weaker", "weight")
-# Of a cause besides the trims: its figures, mean and standard deviation of a usual change. Motors wear, drag is added.
-CHANGES = {
-    "drag": (("drag_x", "drag_y"), 0.15, 0.3),
-    "motors": (("lag",), 0.2, 0.5),
-    "inertia": (("torque_gain",), 0.0, 0.3),
-    "gains": (("loop_gain",), 0.0, 0.5),
+    "one rotor weaker": Cause(0.25, ("motor_imbalance",), damage=True),
+    "two rotors weaker": Cause(0.2, ("motor_imbalance",), damage=True),
+    "weight": Cause(0.15, ("mass", "com_offset"), damage=True),
+    "whole vehicle": Cause(0.1, ("mass", "thrust_scale")),
+    "drag": Cause(0.08, ("rotor_drag",), False, ("drag_x", "drag_y"), (0.15, 0.3), "drag"),
+    "motors": Cause(0.06, ("motor_lag",), False, ("lag",), (0.2, 0.5), "motors' lag"),
+    "inertia": Cause(0.03, ("inertia",), False, ("torque_gain",), (0.0, 0.3), "inertia"),
+    "gains": Cause(0.06, ("rate_gains",), False, ("loop_gain",), (0.0, 0.5), "rate gains"),
+    "something else": Cause(0.07),
 }
 LOOP_WITH_MOTORS = 0.3  # standard deviation: a motors' change also moves the estimate of the loop's gain
 SHAKES = (0.4, 0.4)  # mean and standard deviation of the rise of the logarithm with a damage
@@ -81,27 +86,30 @@ class _Draws:
         self.sizes = np.abs(norm.ppf(0.5 + 0.5 * even[:, :2])) * USUAL_CHANGE * sign[:, None]
         self.places, self.normal = even[:, 3:5], norm.ppf(even[:, 5:])
         self.mixer, self.trims = mixer, trims
-        # Rotor commands in level flight of the reference, in units of their mean.
-        self.level = np.linalg.solve(mixer, np.r_[1.0, trims[1:]])
         self.place_of = {p: k for k, p in enumerate([(0,), (1,), (2,), (3,), *SIDES, EVERYWHERE, ()])}
         self.parts: list[tuple] = []
 
     def add(self, cause: str, share: float, change: dict, place, size: np.ndarray) -> None:
         """Draws of a cause at a place; `change`: {figure: (DRAWS,)}."""
-        table = np.zeros((DRAWS, len(FIGURES)))
+        table = np.zeros((DRAWS, len(PLACES)))
         for name, values in change.items():
-            table[:, FIGURES.index(name)] = values
-        if cause in DAMAGES:
-            table[:, FIGURES.index("shaking")] = SHAKES[0] + SHAKES[1] * self.normal[:, 4]
-        weight = np.full(DRAWS, share * CAUSES[cause] / DRAWS)
+            table[:, PLACES[name]] = values
+        if CAUSES[cause].damage:
+            table[:, PLACES["shaking"]] = SHAKES[0] + SHAKES[1] * self.normal[:, 4]
+        weight = np.full(DRAWS, share * CAUSES[cause].prior / DRAWS)
         where = np.broadcast_to(place if isinstance(place, np.ndarray) else self.place_of[place], DRAWS)
         self.parts.append((table, weight, np.full(DRAWS, list(CAUSES).index(cause)), where, size))
 
     def trims_of(self, factors: np.ndarray) -> dict:
         """What rotor commands that rise by `factors` (DRAWS, 4) do to the trims, inexactly."""
-        mixed = (self.level * np.maximum(factors, 0.2)) @ self.mixer.T
-        change = np.c_[np.log(mixed[:, 0]), mixed[:, 1:] / mixed[:, :1] - self.trims[1:]]
+        change = trims_with(self.mixer, self.trims, np.maximum(factors, 0.2))
         return dict(zip(TRIMS, (change * (1.0 + INEXACT * self.normal[:, :4])).T, strict=True))
+
+
+def trims_with(mixer: np.ndarray, trims: np.ndarray, factors: np.ndarray) -> np.ndarray:
+    """Change (..., 4) of a reference's trims (4,) where the rotor commands of its level flight rise by `factors` (..., 4)."""
+    mixed = (np.linalg.solve(mixer, np.r_[1.0, trims[1:]]) * factors) @ mixer.T
+    return np.concatenate([np.log(mixed[..., :1]), mixed[..., 1:] / mixed[..., :1] - trims[1:]], -1)
 
 
 def hypotheses_of(mixer: np.ndarray, trims: np.ndarray) -> Hypotheses:
@@ -109,9 +117,11 @@ def hypotheses_of(mixer: np.ndarray, trims: np.ndarray) -> Hypotheses:
     draws = _Draws(mixer, trims)
     _rotors(draws)
     _weights(draws)
-    for cause, (names, mean, spread) in CHANGES.items():
-        size = mean + spread * draws.normal[:, 0]
-        each = {n: size * (1 + INEXACT * draws.normal[:, k + 1]) for k, n in enumerate(names)}
+    for cause, told in CAUSES.items():
+        if not told.figures:
+            continue
+        size = told.usual[0] + told.usual[1] * draws.normal[:, 0]
+        each = {n: size * (1 + INEXACT * draws.normal[:, k + 1]) for k, n in enumerate(told.figures)}
         if cause == "motors":
             each["loop_gain"] = LOOP_WITH_MOTORS * size * draws.normal[:, 2]
         draws.add(cause, 1.0, each, (), size)

@@ -13,26 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 
-from openjax.comparison.figures import FIGURES, FlightFigures
+from openjax.comparison.figures import FIGURES, PLACES, FlightFigures
 
-# Spread (standard deviation) of a vehicle's normal days, and of flights within a day. Trims, as shares of hover: 1 to 2.5 %,
-# measured on published flights of two Crazyflies; yaw more, because its torque is a hundredth of thrust times arm and a
-# tilted motor shows in it. Drag in 1/s; the others are logarithms. Gains are the firmware's numbers, which no day moves:
-# theirs is what the estimate repeats to in flights of different kinds.
-SPREADS = {
-    "hover": (0.012, 0.003),
-    "roll": (0.02, 0.0025),
-    "pitch": (0.02, 0.0025),
-    "yaw": (0.03, 0.005),
-    "drag_x": (0.04, 0.02),
-    "drag_y": (0.04, 0.02),
-    "lag": (0.1, 0.05),
-    "torque_gain": (0.07, 0.03),
-    "loop_gain": (0.02, 0.02),
-    "shaking": (0.35, 0.1),
-}
-DAY_SPREAD, WITHIN_DAY = (np.array([SPREADS[n][k] for n in FIGURES]) for k in (0, 1))
-HOVER = FIGURES.index("hover")
+DAY_SPREAD, WITHIN_DAY = np.array([(figure.day, figure.within) for figure in FIGURES.values()]).T
+HOVER = PLACES["hover"]
 PRIOR_DAYS = 6.0  # days of experience that this prior is worth
 SAME_DAY = 0.012  # of hover: roll and pitch trims further apart were flown on different days
 VOLTAGE_SLOPE = (0.0, 0.15)  # 1/V of hover, prior mean and standard deviation

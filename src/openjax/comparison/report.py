@@ -7,30 +7,10 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from openjax.comparison.causes import CHANGES
-from openjax.comparison.figures import TRIMS
+from openjax.comparison.causes import CAUSES
+from openjax.comparison.figures import FIGURES, TRIMS
 from openjax.comparison.result import Change, Interval
 from openjax.show.pages import AFTER, BEFORE, GREY, STYLE, as_svg, filled
-
-# figure: what it is, its unit, the factor to it; a logarithm's is a change in per cent
-_NAMES = {
-    "hover": ("thrust command at hover", "%", 0.0),
-    "roll": ("roll trim", "% of hover", 100.0),
-    "pitch": ("pitch trim", "% of hover", 100.0),
-    "yaw": ("yaw trim", "% of hover", 100.0),
-    "drag_x": ("drag along x", "1/s", 1.0),
-    "drag_y": ("drag along y", "1/s", 1.0),
-    "lag": ("time constant from motors to angular acceleration", "%", 0.0),
-    "torque_gain": ("angular acceleration per motor command", "%", 0.0),
-    "loop_gain": ("motor command per rate error", "%", 0.0),
-    "shaking": ("gyroscope and motors above 20 Hz", "%", 0.0),
-}
-_CHANGED = {
-    "drag": "the drag changed",
-    "motors": "the motors' lag changed",
-    "inertia": "the inertia changed",
-    "gains": "the rate gains changed",
-}
 
 
 def prediction(change: Change) -> dict:
@@ -90,9 +70,9 @@ def in_words(change: Change) -> list[str]:
                 "These flights can't split the causes named; a weighed vehicle or another propeller would."
             )
     elif change.changed:
-        moved = dict.fromkeys(n for c in change.likely_causes if c in CHANGES for n in CHANGES[c][0])
+        moved = dict.fromkeys(n for c in change.likely_causes for n in CAUSES[c].figures)
         lines += [
-            f"{_NAMES[n][0].capitalize()}: {_difference(n, change.figures[n])}."
+            f"{FIGURES[n].words.capitalize()}: {_difference(n, change.figures[n])}."
             for n in moved
             if n in change.figures
         ]
@@ -125,12 +105,13 @@ def _cause_in_words(change: Change, cause: str) -> str:
         return f"a weight was {'added' if more else 'taken off'}{beside}"
     if cause == "whole vehicle":
         return "the whole vehicle is heavier or its thrust weaker" if more else "it is lighter or stronger"
-    return _CHANGED.get(cause, "something without a known pattern")
+    what = CAUSES[cause].what
+    return f"the {what} changed" if what else "something without a known pattern"
 
 
 def _difference(name: str, d: Interval) -> str:
-    """ "+12 % [+8, +16]"; a factor of 0 in `_NAMES` marks a logarithm."""
-    _, unit, factor = _NAMES[name]
+    """ "+12 % [+8, +16]"; see `Figure`."""
+    unit, factor = FIGURES[name].unit, FIGURES[name].factor
     value, low, high = (factor * v if factor else 100 * np.expm1(v) for v in (d.value, d.low, d.high))
     return f"{value:+.3g} {unit} [{low:+.3g}, {high:+.3g}]"
 
@@ -146,7 +127,7 @@ def html_of(change: Change) -> str:
     """One page, nothing to fetch from elsewhere."""
     with rc_context(STYLE):
         picture = as_svg(draw(change), change.name)
-    differences = [(_NAMES[name][0], _difference(name, d)) for name, d in change.figures.items()]
+    differences = [(FIGURES[name].words, _difference(name, d)) for name, d in change.figures.items()]
     told = {"lines": in_words(change), "picture": picture, "differences": differences}
     return filled("changes.html.jinja", Path(__file__).parent, change=change, **told)
 

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from openjax.comparison.causes import CAUSES
 from openjax.comparison.figures import FlightFigures
 from openjax.flights.flight import Issue
 
@@ -62,17 +63,6 @@ class Change:
         """What changed by the names of the effect library, the most probable first."""
         if not self.changed:
             return ()
-        return tuple(dict.fromkeys(effect for cause in self.likely_causes for effect in _EFFECTS[cause]))
-
-
-_EFFECTS = {
-    "one rotor weaker": ("motor_imbalance",),
-    "two rotors weaker": ("motor_imbalance",),
-    "weight": ("mass", "com_offset"),
-    "whole vehicle": ("mass", "thrust_scale"),
-    "something else": (),
-    "drag": ("rotor_drag",),
-    "motors": ("motor_lag",),
-    "inertia": ("inertia",),
-    "gains": ("rate_gains",),
-}
+        return tuple(
+            dict.fromkeys(effect for cause in self.likely_causes for effect in CAUSES[cause].effects)
+        )

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from openjax.comparison.causes import CAUSES, SIDES, Hypotheses
+from openjax.comparison.causes import CAUSES, SIDES, Hypotheses, trims_with
 from openjax.comparison.result import SHOWN, Interval
 
 PRIOR_CHANGED = 0.5
@@ -80,17 +80,13 @@ def least_shown(
     hypotheses: Hypotheses, mixer: np.ndarray, trims: np.ndarray, scale: np.ndarray, freedom: np.ndarray
 ) -> float:
     """The loss of a single rotor that would just be said to be a change, whichever rotor it is, by its trims alone."""
-    level = np.linalg.solve(mixer, np.r_[1.0, trims[1:]])
     worst = 0.0
     for rotor in range(4):
         low, high = 0.0, 1.0
         for _ in range(8):
             middle = 0.5 * (low + high)
-            command = level.copy()
-            command[rotor] *= 1.0 + middle
-            mixed = mixer @ command
             change = np.full(len(scale), np.nan)
-            change[: len(trims)] = np.r_[np.log(mixed[0]), mixed[1:] / mixed[0] - trims[1:]]
+            change[: len(trims)] = trims_with(mixer, trims, 1.0 + middle * (np.arange(4) == rotor))
             shown = weigh(hypotheses, change, scale, freedom).changed > SHOWN
             low, high = (low, middle) if shown else (middle, high)
         worst = max(worst, high / (1.0 + high))

@@ -1,7 +1,6 @@
 """`python -m openjax.export`: the command is `openjax.commands.export`."""
 
-from openjax.commands.command_line import run_command
-from openjax.commands.export import main
+from openjax.__main__ import entry
 
 if __name__ == "__main__":
-    run_command(main)
+    entry("export")

@@ -17,33 +17,6 @@ ELEMENTWISE = {
     "or": "(float)({} != 0.0f || {} != 0.0f)", "not": "(float)({} == 0.0f)", "floor": "floorf({})",
     "select_n": "({0} != 0.0f ? {2} : {1})", "clamp": "fminf(fmaxf({1}, {0}), {2})", **FUNCTIONS,
 }  # fmt: skip
-PRODUCT = """
-/* out (rows, columns) = a (rows, inner) times b (inner, columns), all of them dense. Eight columns at a time: their sums
-   stay in registers, and both a compiler that vectorises and a processor without vectors do well by it. */
-static void product(const float *a, const float *b, float *out, int rows, int inner, int columns)
-{
-    for (int i = 0; i < rows; i++) {
-        int j = 0;
-        for (; j + 8 <= columns; j += 8) {
-            float sum[8] = {0.0f};
-            for (int k = 0; k < inner; k++) {
-                const float x = a[i * inner + k];
-                const float *w = b + k * columns + j;
-                for (int u = 0; u < 8; u++)
-                    sum[u] += x * w[u];
-            }
-            for (int u = 0; u < 8; u++)
-                out[i * columns + j + u] = sum[u];
-        }
-        for (; j < columns; j++) {
-            float sum = 0.0f;
-            for (int k = 0; k < inner; k++)
-                sum += a[i * inner + k] * b[k * columns + j];
-            out[i * columns + j] = sum;
-        }
-    }
-}
-"""
 
 
 def index_names(shape) -> list[str]:

@@ -1,16 +1,12 @@
 """Flight logs: containers, formats, importers and checks. Knows no effect."""
 
-import importlib
+from openjax.lazy import lazy_names
 
-from openjax.flights.flight import Case, Flight, Issue
-
-_ELSEWHERE = {"load_case": "case"}
-
-__all__ = ["Case", "Flight", "Issue", *_ELSEWHERE]
-
-
-def __getattr__(name: str):
-    # Reading pulls in the vehicle (and JAX); the containers alone stay light to import.
-    if name in _ELSEWHERE:
-        return getattr(importlib.import_module(f"openjax.flights.{_ELSEWHERE[name]}"), name)
-    raise AttributeError(name)
+# reading pulls in the vehicle (and JAX); the containers alone stay light to import
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__,
+    {
+        "case": "load_case",
+        "flight": "Case Flight Issue",
+    },
+)

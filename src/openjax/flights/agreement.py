@@ -10,9 +10,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from openjax.flights.flight import Flight, Issue
+from openjax.flights.flight import CHANNEL_COLUMNS, Flight, Issue
 from openjax.flights.pairs import AGREE, Pair, Signals, pairs_of
-from openjax.flights.reading import CHANNEL_COLUMNS
 from openjax.flights.signals import RATE, clock_of, first_order, in_band
 from openjax.flights.track import to_body
 

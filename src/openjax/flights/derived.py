@@ -83,13 +83,8 @@ def derive_rates(flight: Flight, note) -> Flight:
         return flight
     half = min(half, _enough(attitude, step))
     slope, reach = _slopes(time, attitude, half)
-    w, x, y, z = attitude.T
-    dw, dx, dy, dz = slope.T
-    rates = 2.0 * np.stack([
-        w * dx - x * dw - y * dz + z * dy,
-        w * dy - y * dw - z * dx + x * dz,
-        w * dz - z * dw - x * dy + y * dx,
-    ], 1)  # fmt: skip
+    (w, turned), (dw, changed) = ((q[:, :1], q[:, 1:]) for q in (attitude, slope))
+    rates = 2.0 * (w * changed - dw * turned - np.cross(turned, changed))
     rates[reach > 0.25] = np.nan
     derived = np.full((len(flight), 3), np.nan)
     derived[np.isfinite(flight.quaternion).all(1)] = rates

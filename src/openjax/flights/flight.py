@@ -19,11 +19,19 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 
-# Channels of a Flight in the order of the log format; each is None where it wasn't logged.
-CHANNELS = (
-    "position", "quaternion", "velocity", "body_rates", "specific_force",
-    "command_thrust", "command_body_rates", "motor_command", "battery_voltage",
-)  # fmt: skip
+# Channel of a Flight, which is None where it wasn't logged: its columns in the log format.
+CHANNEL_COLUMNS = {
+    "position": ("x", "y", "z"),
+    "quaternion": ("qw", "qx", "qy", "qz"),
+    "velocity": ("vx", "vy", "vz"),
+    "body_rates": ("wx", "wy", "wz"),
+    "specific_force": ("ax", "ay", "az"),
+    "command_thrust": ("cmd_thrust",),
+    "command_body_rates": ("cmd_wx", "cmd_wy", "cmd_wz"),
+    "motor_command": ("m1", "m2", "m3", "m4"),
+    "battery_voltage": ("vbat",),
+}
+SENSORS = ("position", "quaternion", "velocity", "body_rates", "specific_force")
 
 
 @dataclass(frozen=True)
@@ -131,7 +139,7 @@ class Flight:
 
     def rows(self, rows: slice | Array) -> Flight:
         """The flight with a subset of its rows."""
-        cut = {c: getattr(self, c)[rows] for c in CHANNELS if getattr(self, c) is not None}
+        cut = {c: getattr(self, c)[rows] for c in CHANNEL_COLUMNS if getattr(self, c) is not None}
         return dataclasses.replace(self, time=self.time[rows], **cut)
 
 

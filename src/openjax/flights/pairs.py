@@ -11,10 +11,9 @@ from functools import cached_property
 
 import numpy as np
 
-from openjax.flights.flight import Flight
-from openjax.flights.reading import CHANNEL_COLUMNS
-from openjax.flights.signals import RATE, in_band, on_clock, rates_of, up_of
-from openjax.flights.track import GRAVITY, to_body
+from openjax.flights.flight import CHANNEL_COLUMNS, Flight
+from openjax.flights.signals import RATE, in_band, on_clock, rates_of
+from openjax.flights.track import GRAVITY, rotation, to_body
 
 # Hz: above drift, below the noise of what is compared
 LOW, WIDE = (0.3, 2.5), (0.3, 4.0)
@@ -141,7 +140,7 @@ def pairs_of(s: Signals) -> Iterator[Pair]:
     along = None
     if acceleration is not None and s.quaternion is not None:
         size = np.full(len(acceleration), GRAVITY) if s.force is None else s.force[:, 2]
-        lift = up_of(s.quaternion) * np.median(size)
+        lift = rotation(s.quaternion)[:, :, 2] * np.median(size)
         names, what = ("the path's acceleration in x", "in y"), "the attitude's thrust"
         yield Pair(
             names, acceleration[:, :2], what, lift[:, :2], LOW, MOVED["tilt"], "m/s^2", (order, 0), "position"

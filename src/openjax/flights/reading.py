@@ -14,20 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from openjax.errors import UserError
-from openjax.flights.flight import Flight
+from openjax.flights.flight import CHANNEL_COLUMNS, Flight
 
-# Channel of a Flight: the log's columns, in order.
-CHANNEL_COLUMNS = {
-    "position": ("x", "y", "z"),
-    "quaternion": ("qw", "qx", "qy", "qz"),
-    "velocity": ("vx", "vy", "vz"),
-    "body_rates": ("wx", "wy", "wz"),
-    "specific_force": ("ax", "ay", "az"),
-    "command_thrust": ("cmd_thrust",),
-    "command_body_rates": ("cmd_wx", "cmd_wy", "cmd_wz"),
-    "motor_command": ("m1", "m2", "m3", "m4"),
-    "battery_voltage": ("vbat",),
-}
 LOG_COLUMNS = ("t", "vehicle", *(c for columns in CHANNEL_COLUMNS.values() for c in columns))
 
 WHOLE = ("quaternion", "motor_command")  # channels of which a part is a mistake, not a choice
@@ -140,18 +128,14 @@ def write_csv(path: str | Path, table: LogTable, decimals: dict[str, int] | None
     bytes). `decimals` per column; 6 where it isn't named. A NaN becomes an empty cell."""
     decimals = decimals or {}
     names = [n for n in LOG_COLUMNS if n in table.columns or n == "vehicle"]
-    cells = []
-    for name in names:
+
+    def cells(name):
         if name == "vehicle":
-            cells.append(table.vehicle.tolist())
-            continue
-        column = np.asarray(table.columns[name], float)
+            return table.vehicle.tolist()
         form = f"%.{decimals.get(name, 6)}f"
-        text = np.full(len(column), "", object)
-        known = ~np.isnan(column)
-        text[known] = [form % v for v in column[known].tolist()]
-        cells.append(text.tolist())
-    lines = [",".join(names), *(",".join(row) for row in zip(*cells, strict=True))]
+        return ["" if math.isnan(v) else form % v for v in np.asarray(table.columns[name], float).tolist()]
+
+    lines = [",".join(names), *(",".join(row) for row in zip(*map(cells, names), strict=True))]
     data = ("\n".join(lines) + "\n").encode()
     path = Path(path)
     path.write_bytes(gzip.compress(data, 6, mtime=0) if path.suffix == ".gz" else data)

@@ -159,16 +159,12 @@ def _fly(plant: Vehicle, assumed: Vehicle, wanted, voltage, parameters, key, nam
         drones, integral, force, load, key = carry
         wanted_row, air_time = inputs
         key, noise_key = jax.random.split(key)
-        seen = drones
-        if effects:
-            seen = jax.vmap(lambda d: composition.seen_state(effects, parameters, d))(drones)
+        seen = jax.vmap(partial(composition.seen_state, effects, parameters))(drones)
         sent, integral = jax.vmap(_position_controller, (None, 0, 0, 0))(assumed, seen, integral, wanted_row)
-        command = sent
         context, under_load = contexts(drones, load, air_time, PERIOD)
-        if effects:
-            change = partial(composition.change_command, effects, parameters)
-            command, memory = jax.vmap(change)(drones.effect_memory, command, context)
-            drones = drones.replace(effect_memory=memory)
+        change = partial(composition.change_command, effects, parameters)
+        command, memory = jax.vmap(change)(drones.effect_memory, sent, context)
+        drones = drones.replace(effect_memory=memory)
 
         def rate_loop(inner, noise):
             drones, _ = inner
@@ -189,9 +185,8 @@ def _fly(plant: Vehicle, assumed: Vehicle, wanted, voltage, parameters, key, nam
         noise = jax.random.normal(noise_key, (RATE_LOOPS, count, 3))
         (after, force_after), motors = jax.lax.scan(rate_loop, (drones, force), noise)
         motors = motors.mean(0)
-        if effects:
-            memory = jax.vmap(lambda d: composition.record(effects, d.effect_memory, d, PERIOD))(after)
-            after = after.replace(effect_memory=memory)
+        memory = jax.vmap(lambda d: composition.record(effects, d.effect_memory, d, PERIOD))(after)
+        after = after.replace(effect_memory=memory)
         # What motion capture and estimator deliver is what the controller sees; the IMU knows the moment
         # itself.
         pose = (seen.position, seen.quaternion, seen.velocity)

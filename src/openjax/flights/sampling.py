@@ -4,21 +4,19 @@ import dataclasses
 
 import numpy as np
 
-from openjax.flights.flight import CHANNELS, Flight, Refused
-from openjax.flights.reading import CHANNEL_COLUMNS
+from openjax.flights.flight import CHANNEL_COLUMNS, SENSORS, Flight, Refused
 
 FROZEN = 0.5  # s without a change of a sensor that has noise
 HELD = 0.1  # share of rows that repeat the one before, from which a sensor is slower than the rows
 IN_STEP = 50  # poses from which a clock of their own is looked for
 IN_PHASE = 0.25  # concentration of their phases (0 to 1) from which they have one
 EDGE = 0.03  # cycles of that clock by which its phase may be wrong
-SENSORS = ("position", "quaternion", "velocity", "body_rates", "specific_force")
 
 
 def drop_frozen(flight: Flight, note) -> Flight:
     """Constant columns refuse or drop their channel; frozen stretches become not sampled; holes are named."""
     changes = {}
-    for channel in (c for c in CHANNELS if getattr(flight, c) is not None):
+    for channel in (c for c in CHANNEL_COLUMNS if getattr(flight, c) is not None):
         values, names = getattr(flight, channel), ", ".join(CHANNEL_COLUMNS[channel])
         rows = np.flatnonzero(np.isfinite(values.reshape(len(values), -1)).all(1))
         if len(rows) < 2:

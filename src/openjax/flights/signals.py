@@ -9,7 +9,6 @@ from scipy.signal.windows import tukey
 from scipy.spatial.transform import Rotation
 
 from openjax.flights.flight import Flight
-from openjax.flights.track import rotation
 
 RATE = 100.0  # Hz, common clock of the comparisons
 LONGEST = 30.0  # s, enough to tell
@@ -72,8 +71,3 @@ def first_order(values: np.ndarray, time_constant: float) -> np.ndarray:
     blend = -np.expm1(-1 / (RATE * time_constant))
     start = (1.0 - blend) * values[:1]
     return lfilter([0.0, blend], [1.0, blend - 1.0], values, axis=0, zi=start)[0]
-
-
-def up_of(quaternion: np.ndarray) -> np.ndarray:
-    """Body z in the world (T, 3) of attitudes (T, 4)."""
-    return rotation(quaternion)[:, :, 2]

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import convolve1d
 from scipy.spatial.transform import Rotation
 
-from openjax.flights.flight import Case, Flight
+from openjax.flights.flight import SENSORS, Case, Flight
 
 Array = np.ndarray
 GRAVITY = 9.81  # m/s^2
@@ -41,9 +41,8 @@ class Track:
     neighbours: Array  # (K, T, 3) m, positions of the vehicles that flew along
     pose_age: float = 0.0  # s by which the pose may be older than its row, see `Flight`
     motors_logged: bool = True  # False: made by the nominal rate controller from the commands
-    fast_thrust: tuple[Array, Array] | None = (
-        None  # of logs faster than the grid: times (S,) s, mean of the motors (S,)
-    )
+    # of logs faster than the grid: times (S,) s, mean of the motors (S,)
+    fast_thrust: tuple[Array, Array] | None = None
     missing: Array | None = None  # (T,) rows that weren't logged: lines between their neighbours
 
     def __len__(self) -> int:
@@ -86,10 +85,7 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
         means = _means(at, flat, grid if ahead else grid - 0.5 * period, period, ahead)
         return means.reshape((count, *values.shape[1:]))
 
-    quaternion = take("quaternion")
-    motor = take("motor_command", ahead=True)
-    voltage = take("battery_voltage")
-    fast_thrust = None
+    motor, voltage, fast_thrust = take("motor_command", ahead=True), take("battery_voltage"), None
     if motor is not None and case.vehicle_file.motor.command == "pwm":
         motor = pwm_thrust(motor, voltage, case.vehicle_of(flight))
     elif motor is not None and faster:
@@ -106,11 +102,7 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
         flight=flight.log,
         dt=period,
         time=grid,
-        position=take("position"),
-        quaternion=quaternion,
-        velocity=take("velocity"),
-        body_rates=take("body_rates"),
-        specific_force=take("specific_force"),
+        **{sensor: take(sensor) for sensor in SENSORS},
         command=command,
         motor=motor,
         voltage=None if voltage is None else smooth(voltage, 0.3, period),

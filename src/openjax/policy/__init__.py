@@ -5,7 +5,7 @@ from openjax.lazy import lazy_names
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
-        **dict.fromkeys(("Policy", "PolicyParameters", "gaussian_entropy", "gaussian_log_prob"), "policy"),
-        **dict.fromkeys(("NetworkSettings", "PredictorSettings"), "settings"),
+        "policy": "Policy PolicyParameters gaussian_entropy gaussian_log_prob",
+        "settings": "NetworkSettings PredictorSettings",
     },
 )

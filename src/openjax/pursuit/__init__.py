@@ -5,29 +5,14 @@ from openjax.lazy import lazy_names
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
-        **dict.fromkeys(("Dynamics", "Pursuit", "action_to_command", "hover_action", "make"), "environment"),
-        **dict.fromkeys(("PursuitSettings", "RewardSettings"), "settings"),
-        **dict.fromkeys(
-            ("SCENARIOS", "Scenario", "find_scenario", "scenario_settings", "scenario_task"), "scenarios"
-        ),
-        **dict.fromkeys(
-            (
-                "Task",
-                "close_starts",
-                "empty_task",
-                "expand_task",
-                "line_up_pillars",
-                "scatter_starts",
-                "shift_pillars",
-                "task_descriptor",
-                "turn_task",
-                "uniform_task",
-            ),
-            "task",
-        ),
-        "EpisodeStatistics": "statistics",
-        "Observation": "observation",
-        "PursuitState": "state",
-        "StepInfo": "info",
+        "environment": "Dynamics Pursuit action_to_command hover_action make",
+        "info": "StepInfo",
+        "observation": "Observation",
+        "scenarios": "SCENARIOS Scenario find_scenario scenario_settings scenario_task",
+        "settings": "PursuitSettings RewardSettings",
+        "state": "PursuitState",
+        "statistics": "EpisodeStatistics",
+        "task": "Task close_starts empty_task expand_task line_up_pillars scatter_starts shift_pillars "
+        "task_descriptor turn_task uniform_task",
     },
 )

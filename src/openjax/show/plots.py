@@ -44,20 +44,14 @@ def plot_trajectories(path: Path, trajectories: Sequence[Trajectory]) -> None:
     _save(figure, path)
 
 
-def draw_arena(axes: Axes, trajectory: Trajectory) -> None:
-    """Arena and pillars from above."""
+def draw_from_above(axes: Axes, trajectory: Trajectory) -> None:
+    """One episode up to a second after its first capture, or whole without one."""
     axes.add_patch(Circle((0, 0), trajectory.arena_radius, fill=False, color="black"))
     for pillar in trajectory.pillar_position:
         axes.add_patch(Circle(pillar, trajectory.pillar_radius, color="0.6"))
     limit = 1.08 * trajectory.arena_radius
     axes.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal", xlabel="x [m]", ylabel="y [m]")
-
-
-def draw_from_above(axes: Axes, trajectory: Trajectory) -> None:
-    """One episode up to a second after its first capture, or whole without one."""
-    draw_arena(axes, trajectory)
-    capture = trajectory.capture_index
-    end = trajectory.end()
+    capture, end = trajectory.capture_index, trajectory.end()
     for i in range(trajectory.pursuer_position.shape[1]):
         position = trajectory.pursuer_position[:end, i]
         color = PURSUER_COLORS[i % len(PURSUER_COLORS)]

@@ -1,7 +1,7 @@
-"""What a run shows on the terminal from its first second on: a live panel, or plain lines into a file."""
+"""What a run, or another command that takes its time, shows on the terminal: a live display, or plain lines into a file."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Mapping
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -20,16 +20,30 @@ _SHOWN = {
     "archive_size": "archive size",
 }
 _LINE_INTERVAL = 5.0  # s between plain lines
+LONG = 30.0
+"""Seconds from which a file is told, too, how long a command's steps will take."""
 
 
-def live_display(render: Callable, console: Console, stays: bool) -> Live:
-    """What `render` returns, drawn again and again on a terminal; into a file it draws nothing."""
-    terminal = console.is_terminal
-    transient = not (stays and terminal)
-    return Live(get_renderable=render, console=console, auto_refresh=terminal, transient=transient)
+class _Display:
+    """What `_render` returns, drawn again and again on a terminal while it is entered; into a file it draws nothing."""
+
+    def __init__(self, console: Console, stays: bool):
+        terminal = console.is_terminal
+        self._console, self._spinner = console, Spinner("dots")
+        transient = not (stays and terminal)
+        self._live = Live(
+            get_renderable=self._render, console=console, auto_refresh=terminal, transient=transient
+        )
+
+    def __enter__(self):
+        self._live.start()
+        return self
+
+    def __exit__(self, *_):
+        self._live.stop()
 
 
-class Progress:
+class Progress(_Display):
     """Live display of a run. Use as a context manager.
 
     Args:
@@ -39,7 +53,6 @@ class Progress:
     """
 
     def __init__(self, title: str, total_steps: int, console: Console | None = None):
-        self._console = console or Console(highlight=False)
         self._title = title
         self._total = max(total_steps, 1)
         self._phase, self._phase_start = "starting", time.monotonic()
@@ -49,16 +62,8 @@ class Progress:
         self._values: dict[str, float] = {}
         self._validation: dict[str, float] = {}
         self._last_line = 0.0
+        super().__init__(console or Console(highlight=False), stays=True)  # which draws it
         self._lines = not self._console.is_terminal
-        self._spinner = Spinner("dots", text="")
-        self._live = live_display(self._render, self._console, stays=True)
-
-    def __enter__(self):
-        self._live.start()
-        return self
-
-    def __exit__(self, *_):
-        self._live.stop()
 
     def phase(self, text: str, announce: bool = True) -> None:
         """Say what is going on now, for example what is being compiled.
@@ -145,3 +150,55 @@ def duration(seconds: float) -> str:
     minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
+
+
+class Steps(_Display):
+    """One line on a terminal; into a file, how long it will take, if that is long. Use as a context manager.
+
+    Args:
+      title: what is done.
+      expected: {step: seconds on a usual machine}, in the order in which they come. What the steps so far took against
+        this tells how long the rest takes here.
+      console: where to draw.
+    """
+
+    def __init__(self, title: str, expected: Mapping[str, float], console: Console):
+        self._title, self._expected = title, dict(expected)
+        self._total = sum(self._expected.values())
+        self._done, self._step, self._note = 0.0, None, ""
+        self._start = self._step_start = time.monotonic()
+        super().__init__(console, stays=False)  # which draws it
+
+    def __enter__(self):
+        if self._total > LONG and not self._console.is_terminal:
+            self._console.print(f"{self._title}: about {duration(self._total)} ...", soft_wrap=True)
+        return super().__enter__()
+
+    def begin(self, step: str, note: str = "") -> None:
+        """The step before is done, and `step` begins; one that isn't in `expected` takes no time of its own."""
+        if step != self._step:
+            self._done += self._expected.get(self._step, 0.0)
+            self._step, self._step_start = step, time.monotonic()
+        self._note = note
+
+    def seconds_left(self, now: float) -> float:
+        """Until all steps are done, at time `now` of `time.monotonic`."""
+        took = self._step_start - self._start
+        slower = took / self._done if self._done > 0 else 1.0
+        running = max(slower * self._expected.get(self._step, 0.0) - (now - self._step_start), 0.0)
+        later = self._total - self._done - self._expected.get(self._step, 0.0)
+        return running + slower * max(later, 0.0)
+
+    def _render(self):
+        now = time.monotonic()
+        left = self.seconds_left(now)
+        done = (now - self._start) / max(now - self._start + left, 1e-6)
+        text = f"{self._title}: {self._step or 'starting'}{f' ({self._note})' if self._note else ''}"
+        row = Table.grid(padding=(0, 1))
+        row.add_row(
+            self._spinner,
+            Text(text),
+            ProgressBar(total=1.0, completed=done, width=24),
+            Text(f"about {duration(left)} left", style="dim"),
+        )
+        return row

@@ -35,18 +35,12 @@ def animate(path: Path, *trajectories: Trajectory) -> None:
       path: the .gif file.
       trajectories: the episode; of several, each is drawn below the one before.
     """
-    write_gif(
-        Path(path), _stacked([[_frame(flight, i) for i in steps_shown(flight)] for flight in trajectories])
-    )
-
-
-def steps_shown(trajectory: Trajectory) -> range:
-    """Steps that are drawn."""
-    return range(0, trajectory.end(), max(1, round(1.0 / (FRAMES_PER_SECOND * trajectory.time_step))))
-
-
-def write_gif(path: Path, frames: list[np.ndarray]) -> None:
-    """Write (H, W, 3) uint8 frames with one palette, which covers small coloured things too."""
+    films = []
+    for flight in trajectories:
+        every = max(1, round(1.0 / (FRAMES_PER_SECOND * flight.time_step)))
+        films.append([_frame(flight, step) for step in range(0, flight.end(), every)])
+    frames = _stacked(films)
+    # one palette, which covers small coloured things too
     sample = np.concatenate(frames[:: max(1, len(frames) // 6)])
     palette = Image.fromarray(sample).quantize(255, method=Image.Quantize.MAXCOVERAGE)
     images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
@@ -132,9 +126,8 @@ class _Pen:
         self._draw, self._radius, self._height = ImageDraw.Draw(image, "RGBA"), radius, height
         self._middle = np.array(image.size) / 2
         (ca, ce), (sa, se) = (function((AZIMUTH, ELEVATION)) for function in (np.cos, np.sin))
-        self._axes = np.array(
-            [[sa, -ca, 0], [-se * ca, -se * sa, -ce], [ce * ca, ce * sa, -se]]
-        )  # right, down, on
+        # right, down, on
+        self._axes = np.array([[sa, -ca, 0], [-se * ca, -se * sa, -ce], [ce * ca, ce * sa, -se]])
         self._camera = (0, 0, 0.38 * height) - DISTANCE * radius * self._axes[2]
 
     def depth(self, place) -> float:

@@ -1,14 +1,15 @@
 """Checkpoints of a run: the last few and the best are kept, the last good one is found again after any kill or damage."""
 
 import dataclasses
+import functools
 import shutil
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from openjax.background import in_background
 from openjax.cluster.processes import Processes
 from openjax.errors import UserError
 from openjax.files import WRITING
@@ -55,8 +56,7 @@ class Checkpoints:
         self.directory = Path(directory).absolute()
         self.keep_last = keep_last
         self._processes = processes or Processes()
-        self._pending: Future | None = None
-        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="checkpoint")
+        self._pending: Callable[[], None] | None = None
         self._known: dict[str, CheckpointRecord] = {}  # a finished checkpoint doesn't change
         self._damaged: dict[str, str] = {}
 
@@ -120,14 +120,14 @@ class Checkpoints:
             remove_state(path)
             self._known.pop(path.name, None), self._damaged.pop(path.name, None)
         started = start_save(path, carry, {**(notes or {}), "score": score})
-        self._pending = self._pool.submit(commit, path, started)
+        self._pending = in_background(functools.partial(commit, path, started))
 
     def wait(self) -> None:
         """Block until the checkpoint under way is on disk, then drop the ones that are no longer kept."""
         if self._pending is None:
             return
         pending, self._pending = self._pending, None
-        pending.result()
+        pending()
         if not self._processes.is_first:
             return
         records, best = self.records(), self.best()

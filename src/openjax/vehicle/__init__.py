@@ -5,18 +5,10 @@ from openjax.lazy import lazy_names
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
-        **dict.fromkeys(("DronesStep", "make_drones_step"), "drones"),
-        **dict.fromkeys(
-            ("Vehicle", "hover_rotor_speed", "hover_share", "load_vehicle", "max_rotor_thrust"), "parameters"
-        ),
-        **dict.fromkeys(
-            ("quaternion_integrate", "quaternion_multiply", "rigid_step", "rotate", "rotate_inverse"),
-            "rigid_body",
-        ),
-        **dict.fromkeys(
-            ("commanded_rotor_speed", "rotor_reaction", "rotor_speed_step", "rotor_thrust", "total_wrench"),
-            "rotors",
-        ),
-        **dict.fromkeys(("DroneState", "hover_state"), "state"),
+        "drones": "DronesStep make_drones_step",
+        "parameters": "Vehicle hover_rotor_speed hover_share load_vehicle max_rotor_thrust",
+        "rigid_body": "quaternion_integrate quaternion_multiply rigid_step rotate rotate_inverse",
+        "rotors": "commanded_rotor_speed rotor_reaction rotor_speed_step rotor_thrust total_wrench",
+        "state": "DroneState hover_state",
     },
 )

@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from openjax.errors import UserError
 from openjax.files import read_toml
@@ -110,7 +111,7 @@ def load_mapping(path: str | Path) -> ColumnMapping:
     delimiter = tables.get("delimiter", ",")
     if not isinstance(delimiter, str) or len(delimiter) != 1:
         raise UserError(f"{path}: delimiter must be one character")
-    columns = {c: _source(c, entry, path) for c, entry in tables["columns"].items()}
+    columns = {c: source_of(c, entry, path) for c, entry in tables["columns"].items()}
     return ColumnMapping(columns, delimiter)
 
 
@@ -158,12 +159,8 @@ def with_quaternion(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     rest = {c: v for c, v in columns.items() if c not in EULER}
     if any(a is None for a in angles) or all(c in rest for c in CHANNEL_COLUMNS["quaternion"]):
         return rest
-    (cr, cp, cy), (sr, sp, sy) = ([f(a / 2) for a in angles] for f in (np.cos, np.sin))
-    rest["qw"] = cr * cp * cy + sr * sp * sy
-    rest["qx"] = sr * cp * cy - cr * sp * sy
-    rest["qy"] = cr * sp * cy + sr * cp * sy
-    rest["qz"] = cr * cp * sy - sr * sp * cy
-    return rest
+    attitude = Rotation.from_euler("ZYX", np.stack(angles[::-1], 1)).as_quat(scalar_first=True)
+    return rest | dict(zip(CHANNEL_COLUMNS["quaternion"], attitude.T, strict=True))
 
 
 def _onto(clock, time, values, column: str, period: float) -> np.ndarray:
@@ -188,7 +185,8 @@ def _onto(clock, time, values, column: str, period: float) -> np.ndarray:
     return np.where(clock - time[np.clip(before, 0, None)] > max(_STALE * period, 0.1), np.nan, out)
 
 
-def _source(column: str, entry, path: Path) -> Source:
+def source_of(column: str, entry, path: Path) -> Source:
+    """An entry of a `columns.toml`. Raises UserError for an unknown key, column or unit."""
     known = (*LOG_COLUMNS, *EULER)
     if column not in known:
         raise UserError(f"{path}: unknown column {column!r} in [columns]; known are {', '.join(known)}")

@@ -12,54 +12,20 @@ from zlib import crc32
 
 import numpy as np
 
-from openjax.flights.importers.columns import UNITS, ColumnMapping, Source, Stream, merge_streams
+from openjax.files import read_toml
+from openjax.flights.importers.columns import ColumnMapping, Source, Stream, merge_streams, source_of
 from openjax.flights.reading import LARGEST, LogError, LogTable
 
 MAGIC = 0xBC
 _VERSIONS = {1: ("<HI", 1e-3), 2: ("<HQ", 1e-6)}
 _TYPES = set("bBhHiIqQefd")
 
-
-def _firmware_sources() -> dict[str, list[Source]]:
-    """Log variables of the firmware that hold each column, best first. `controller.pitchRate`, `r_pitch`,
-    `stateEstimate.pitch`, `stabilizer.pitch` and `ratePitch` are in the firmware's legacy sense, opposite to a
-    rotation about y."""
-    deg, g, mrad = UNITS["deg"], UNITS["g"], UNITS["mrad/s"]
-    sources = {
-        "vbat": [Source("pm.vbat"), Source("pm.vbatMV", 1e-3)],
-        "cmd_thrust": [Source("controller.cmd_thrust", UNITS["16bit"])],
-        "cmd_wx": [Source("controller.rollRate", deg)],
-        "cmd_wy": [Source("controller.pitchRate", -deg)],
-        "cmd_wz": [Source("controller.yawRate", deg)],
-    }
-    for angle, sign in (("roll", 1.0), ("pitch", -1.0), ("yaw", 1.0)):
-        sources[angle] = [
-            Source(f"stateEstimate.{angle}", sign * deg),
-            Source(f"stabilizer.{angle}", sign * deg),
-        ]
-    for axis in "xyz":
-        sources[axis] = [Source(f"stateEstimate.{axis}"), Source(f"stateEstimateZ.{axis}", 1e-3)]
-        sources[f"v{axis}"] = [Source(f"stateEstimate.v{axis}"), Source(f"stateEstimateZ.v{axis}", 1e-3)]
-        angle, sign = {"x": ("roll", 1.0), "y": ("pitch", -1.0), "z": ("yaw", 1.0)}[axis]
-        sources[f"w{axis}"] = [
-            Source(f"gyro.{axis}", deg),
-            Source(f"controller.r_{angle}", sign),
-            Source(f"stateEstimateZ.rate{angle.capitalize()}", sign * mrad),
-        ]
-        sources[f"a{axis}"] = [Source(f"acc.{axis}", g)]
-    sources["az"].append(Source("controller.accelz", g))
-    for number, part in enumerate("wxyz"):
-        sources[f"q{part}"] = [Source(f"stateEstimate.q{part}"), Source(f"kalman.q{number}")]
-    for motor in "1234":
-        sources[f"m{motor}"] = [
-            Source(f"motor.m{motor}", UNITS["16bit"]),
-            Source(f"mixer.m{motor}", UNITS["16bit"]),
-            Source(f"pwm.m{motor}_pwm", UNITS["16bit"]),
-        ]
-    return sources
-
-
-FIRMWARE_SOURCES = _firmware_sources()
+_FIRMWARE = Path(__file__).with_name("micro_sd.toml")
+FIRMWARE_SOURCES = {
+    column: [source_of(column, entry, _FIRMWARE) for entry in entries]
+    for column, entries in read_toml(_FIRMWARE).items()
+}
+"""Log variables of the firmware that hold each column, best first."""
 
 
 def is_micro_sd(path: Path) -> bool:
