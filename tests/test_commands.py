@@ -328,6 +328,11 @@ def wrong_layout(change):
         (train, "--effects {folder}/nothing.toml", "nothing.toml"),
         (train, "--vehicle {folder}/nothing.toml", "nothing.toml"),
         (train, "--start_from {folder}", "is no policy"),
+        (
+            train,
+            "--start_from open --environment.observe_in heading",
+            "it observes in world, the run in heading",
+        ),
         (train, "--compare_with opne", "policy opne: no such file"),
         (train, "--devices 1000", "expected all or a number up to"),
         (evaluate, "--policy {folder}", "is no policy"),

@@ -342,6 +342,11 @@ def _start_parameters(job, fresh: PolicyParameters) -> PolicyParameters:
     if isinstance(loaded.policy, Heuristic):
         raise UserError(f"--start_from {job.start_from}: a heuristic has no networks to start from")
     settings = loaded.settings
+    axes, there = job.settings.environment.observe_in, settings.environment.observe_in
+    if axes != there:  # of the same shapes
+        raise UserError(
+            f"--start_from {job.start_from}: it observes in {there}, the run in {axes} (--environment.observe_in)"
+        )
     own = with_longer_history(
         loaded.parameters, settings.predictor, settings.environment, job.settings.environment
     )
