@@ -8,6 +8,7 @@ from scipy.signal import butter, sosfilt
 from openjax.errors import UserError
 from openjax.flights.case import load_case
 from openjax.flights.checks import check_flight
+from openjax.flights.pairs import Signals, pairs_of
 from openjax.flights.reading import CHANNEL_COLUMNS, LogTable, flights_of, write_csv
 from openjax.flights.samples import log_of
 from openjax.vehicle import load_vehicle
@@ -96,6 +97,19 @@ def test_an_estimates_wandering_position_is_no_contradiction_while_hovering():
         columns |= dict(zip(CHANNEL_COLUMNS[channel], values.T, strict=True))
     kept, found = refusals(columns)
     assert kept is not None, found
+
+
+@pytest.mark.parametrize(("hover", "contradicts"), [(0.5, [False]), (0.85, []), (None, [True])])
+def test_motors_at_their_limit_need_not_add_up_to_the_thrust(hover, contradicts):
+    """A light and a heavy vehicle, whose mixer is cut at full thrust; and motors that follow another thrust."""
+    rng, steps = np.random.default_rng(6), 3000
+    slow = sosfilt(butter(2, 2.0, fs=100.0, output="sos"), rng.standard_normal((steps, 3)), axis=0)
+    thrust, roll, other = slow.T / slow.std(0)[:, None] * [[0.01], [0.05], [0.01]]
+    center = hover or 0.5
+    asked = center + (thrust if hover else other)[:, None] + (roll + 0.15)[:, None] * [1.0, -1.0, 1.0, -1.0]
+    nothing = dict.fromkeys(("position", "quaternion", "velocity", "body_rates", "force", "commands"))
+    logged = Signals(motor=np.clip(asked, 0.0, 1.0), thrust=(center + thrust)[:, None], **nothing)
+    assert [bool(pair.bad.any()) for pair in pairs_of(logged)] == contradicts
 
 
 def test_what_most_flights_contradict_the_calm_ones_must_show_to_be_right(case_folder, sample_columns):

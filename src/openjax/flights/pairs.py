@@ -68,6 +68,11 @@ class Signals:
         """Body rates (T, 3) rad/s by differences of the attitude."""
         return None if self.quaternion is None else rates_of(self.quaternion)
 
+    @property
+    def saturated(self) -> bool:
+        """Whether motors have often nothing left to follow commands with."""
+        return self.motor is not None and float((self.motor > FULL).any(1).mean()) > 0.2
+
     @cached_property
     def acceleration(self) -> tuple[np.ndarray | None, int]:
         """Of the path, m/s^2 in the world, and how many times what was logged of it was differentiated."""
@@ -153,9 +158,7 @@ def pairs_of(s: Signals) -> Iterator[Pair]:
             least, what = max(MOVED["force"], 2.0 * float(off)), "the path's acceleration"
             yield Pair(("az",), s.force[:, 2:], what, along, LOW, least, "m/s^2", (0, order))
     yield from _caused(s, along, order)
-    # A saturated vehicle has nothing left to follow commands with.
-    helpless = s.motor is not None and float((s.motor > FULL).any(1).mean()) > 0.2
-    if s.commands is not None and s.rates is not None and not helpless:
+    if s.commands is not None and s.rates is not None and not s.saturated:
         least, what = MOVED["command"], "the body rates"
         yield Pair(commands, s.commands, what, s.rates, LOW, least, "rad/s", (None, 0), "commands")
 
@@ -171,7 +174,7 @@ def _caused(s: Signals, along: np.ndarray | None, order: int) -> Iterator[Pair]:
         asked = collective * np.median(felt) / max(float(np.median(collective)), 1e-3)
         what, least = "what the motors would make", MOVED["thrust"]
         yield Pair(("the force felt",), felt, what, asked, LOW, least, "m/s^2", (order, None))
-    if s.thrust is not None:
+    if s.thrust is not None and not s.saturated:
         what = "m1 + m2 + m3 + m4"
         yield Pair(
             ("cmd_thrust",), 100 * s.thrust, what, 100 * collective, WIDE, MOVED["share"], "%", (None, None)
