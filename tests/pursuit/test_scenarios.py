@@ -7,9 +7,8 @@ import pytest
 
 from openjax.errors import UserError
 from openjax.pursuit import SCENARIOS, PursuitSettings, find_scenario, scenario_settings, scenario_task
-from openjax.pursuit.scenarios import drawn_scenario
 from openjax.pursuit.sensing import line_of_sight
-from openjax.pursuit.task import starts_clear, uniform_task
+from openjax.pursuit.task import starts_clear
 
 NOMINAL = PursuitSettings()
 
@@ -134,17 +133,3 @@ def test_unknown_names_and_missing_files(tmp_path):
         find_scenario("walls", NOMINAL)
     with pytest.raises(UserError, match="no such layout"):
         find_scenario(str(tmp_path / "none.toml"), NOMINAL)
-
-
-def test_a_drawn_layout_is_the_task_that_its_seed_draws():
-    settings = PursuitSettings(num_pursuers=2, min_pillars=1, max_pillars=4)
-    for seed in range(5):
-        drawn, task = drawn_scenario(settings, seed), uniform_task(settings, jax.random.key(seed))
-        again = scenario_task(settings, drawn)
-        number = int(task.pillar_active.sum())
-        np.testing.assert_array_equal(again.pursuer_position, task.pursuer_position)
-        np.testing.assert_array_equal(again.evader_position, task.evader_position)
-        np.testing.assert_array_equal(
-            again.pillar_position[:number], task.pillar_position[task.pillar_active]
-        )
-        assert int(again.pillar_active.sum()) == number == len(drawn.pillars)

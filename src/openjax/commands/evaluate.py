@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 PROGRAM = "openjax evaluate"
 COMPILING = 15.0
 """Seconds that a policy's game takes to compile on a laptop, about."""
+LARGEST_BATCH = 1000
+"""Episodes that are flown at once, whose paths are all kept."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,10 +39,10 @@ class FlightOptions:
     """Runs' directories, policy files (.npz), checkpoints, or names of policies in the package (flight, open ...) or of
     heuristics: angelani, janosov, apf."""
     scenario: str = "all"
-    """wall, narrow_gap, random, passage, empty, hidden, a TOML file with an own layout, drawn (by --seed), or all six; these
-    have three pursuers, so a policy of another number flies drawn instead."""
+    """wall, narrow_gap, random, passage, empty, hidden, a TOML file with an own layout, uniform (another task in each episode,
+    as in the validation of a run), or all six; these have three pursuers: a policy of another number flies uniform instead."""
     seed: Seed = 0
-    """Draws the start attitudes, and the drawn layout."""
+    """Draws the start attitudes."""
     opponent: str | None = None
     """Evader to fly against: field, greedy, wall_runner, heavy, pillar_hugger, greedy_far, greedy_near, two_step, safe_place,
     way_points, frozen, or a file that openjax exploit wrote; by default those of the policy's game."""
@@ -119,30 +121,30 @@ def fly_scenarios(command: EvaluateCommand, loaded, evaluators: dict) -> tuple[l
     """
     import jax
 
-    from openjax.commands.evaluator import Evaluator, layout_tasks
+    from openjax.commands.evaluator import Evaluator
 
-    game, loaded, scenarios = _game(command, loaded)
+    game, loaded, tasks = _game(command, loaded)
     kind = (game.settings, loaded.policy, command.opponent)
     compiled = kind in evaluators
     if not compiled:
-        evaluators[kind] = Evaluator(game, loaded.policy, command.episodes)
-    expected = {scenario.name: 0.02 * command.episodes for scenario in scenarios}
+        evaluators[kind] = Evaluator(game, loaded.policy, min(command.episodes, LARGEST_BATCH))
+    expected, first = dict.fromkeys(tasks, 0.02 * command.episodes), next(iter(tasks))
     if not compiled:
-        expected[scenarios[0].name] += COMPILING
+        expected[first] += COMPILING
     with Steps(f"flying {loaded.source}", expected, output_console()) as steps:
 
         def tell(layout):
-            steps.begin(layout, "compiled first" if not compiled and layout == scenarios[0].name else "")
+            steps.begin(layout, "compiled first" if not compiled and layout == first else "")
 
-        tasks, key = layout_tasks(game.settings, scenarios, command.episodes), jax.random.key(command.seed)
-        flown = evaluators[kind].fly(loaded.parameters, tasks, key, tell)
+        flown = evaluators[kind].fly(loaded.parameters, tasks, jax.random.key(command.seed), tell)
         return [kind.record() for kind in flown], [kind.trajectory(0, kind.name) for kind in flown]
 
 
 def _game(command, loaded):
-    """The game of a command, the policy in it, and the scenarios."""
-    from openjax.commands.evaluator import layout_slots
-    from openjax.pursuit.scenarios import SCENARIOS, drawn_scenario, find_scenario
+    """The game of a command, the policy in it, and the tasks by layout."""
+    from openjax.commands.evaluator import layout_slots, layout_tasks
+    from openjax.commands.validation import uniform_tasks
+    from openjax.pursuit.scenarios import SCENARIOS, find_scenario
     from openjax.store.environments import make_environment
 
     settings = command.environment
@@ -151,20 +153,20 @@ def _game(command, loaded):
             "--environment.evaders learned: a name isn't enough; --opponent takes a file of openjax exploit"
         )
     wanted, trained = settings.num_pursuers, loaded.settings.environment.num_pursuers
-    alike = [layout for layout in SCENARIOS.values() if len(layout.pursuers) == trained]
-    if command.scenario == "drawn" or (command.scenario == "all" and not alike):
-        scenarios = [drawn_scenario(settings, command.seed)]
-    else:
-        scenarios = alike if command.scenario == "all" else [find_scenario(command.scenario, settings)]
-    there = len(scenarios[0].pursuers)
+    layouts = [layout for layout in SCENARIOS.values() if len(layout.pursuers) == trained]
+    if command.scenario not in ("all", "uniform"):
+        layouts = [find_scenario(command.scenario, settings)]
+    uniform = command.scenario == "uniform" or not layouts
+    there = wanted if uniform else len(layouts[0].pursuers)
     if wanted not in (trained, there):
-        raise UserError(
-            f"--environment.num_pursuers {wanted}: layout {scenarios[0].name} has {there} pursuers"
-        )
-    slots = max(layout_slots(settings), *(len(scenario.pillars) for scenario in scenarios))
-    settings = dataclasses.replace(settings, max_pillars=slots, num_pursuers=there)
-    environment = make_environment(settings, command.vehicle, command.effects, command.opponent)
-    return environment, loaded.in_game(environment), scenarios
+        raise UserError(f"--environment.num_pursuers {wanted}: layout {layouts[0].name} has {there} pursuers")
+    slots = max([layout_slots(settings), *(len(layout.pillars) for layout in layouts)])
+    game = dataclasses.replace(settings, max_pillars=slots, num_pursuers=there)
+    environment = make_environment(game, command.vehicle, command.effects, command.opponent)
+    loaded = loaded.in_game(environment)
+    if uniform:
+        return environment, loaded, {"uniform": uniform_tasks(settings, command.episodes, slots)}
+    return environment, loaded, layout_tasks(game, layouts, command.episodes)
 
 
 def _show(command, results):

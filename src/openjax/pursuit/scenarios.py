@@ -5,7 +5,6 @@ import itertools
 import math
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -13,7 +12,7 @@ from openjax.errors import UserError, suggestion
 from openjax.files import read_toml
 from openjax.plain import from_plain
 from openjax.pursuit.settings import PursuitSettings
-from openjax.pursuit.task import Task, uniform_task
+from openjax.pursuit.task import Task
 from openjax.vehicle.solids import DRONE_RADIUS
 
 MOST_PILLARS = 32
@@ -113,14 +112,6 @@ def scenario_task(settings: PursuitSettings, scenario: Scenario) -> Task:
         pillar_position=jnp.asarray(pillars),
         pillar_active=jnp.arange(slots) < used,
     )
-
-
-def drawn_scenario(settings: PursuitSettings, seed: int) -> Scenario:
-    """A task that `uniform_task` draws, as a layout: for games with other pursuers than the six have."""
-    task = jax.jit(uniform_task, static_argnums=0)(settings, jax.random.key(seed))
-    starts, pillars = task.pursuer_position, task.pillar_position[task.pillar_active]
-    points = (tuple(map(tuple, np.asarray(places).tolist())) for places in (pillars, starts))
-    return Scenario("drawn", *points, tuple(np.asarray(task.evader_position).tolist()))
 
 
 def find_scenario(name_or_path: str, settings: PursuitSettings) -> Scenario:
