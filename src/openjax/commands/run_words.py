@@ -86,7 +86,7 @@ def unlike_the_papers(game: PursuitSettings) -> str:
         words.append(f"{game.num_pursuers} pursuers instead of {paper.num_pursuers}")
     pillars, theirs = (" to ".join(map(str, sorted({g.min_pillars, g.max_pillars}))) for g in (game, paper))
     if pillars != theirs:
-        words.append(f"{pillars} {'pillar' if pillars == '1' else 'pillars'} instead of {theirs}")
+        words.append(f"{pillars} pillars instead of {theirs}")
     if game.observed_pillars != paper.observed_pillars:
         words.append(f"{game.observed_pillars} pillars in view instead of {paper.observed_pillars}")
     if game.start_attitude != paper.start_attitude:
