@@ -248,6 +248,7 @@ def test_evaluation_of_a_policy_that_hovers():
     metrics = summarise(evaluation)
     # two drones are too close all the time; in one of two episodes the evader starts within reach
     assert (metrics["capture_rate"], metrics["capture_step"]) == (0.5, 5.5)
+    assert metrics["slowest_capture_step"] == 10.0
     assert metrics["collision_rate"] == 1.0 and metrics["collision_parts"] == {
         "pillar": 0.0,
         "drone": 1.0,

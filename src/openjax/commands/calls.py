@@ -96,8 +96,9 @@ def evaluate(
       changes: of the game that the policy was trained in, for example speed_limit="none".
 
     Returns:
-      A record, or a list of them for "all": scenario, episodes; capture_rate, crash_rate in 0..1; capture_step, in control
-      steps; collision_rate, collision_parts (pillar, drone, bounds), over_speed_rate, of pursuer steps; prediction_error (m).
+      A record, or a list of them for "all": scenario, episodes; capture_rate, crash_rate in 0..1; capture_step, and
+      slowest_capture_step of the slowest hundredth, in control steps; collision_rate, collision_parts (pillar, drone, bounds)
+      and over_speed_rate, of pursuer steps; prediction_error (m).
 
     Raises:
       UserError: an unusable layout, or a game that the policy can't play.

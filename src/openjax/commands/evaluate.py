@@ -1,7 +1,7 @@
 """Evaluate a policy: `openjax evaluate --policy PATH --scenario NAME|FILE.toml`.
 
-Prints, and with `--json` writes, for each scenario: scenario, episodes, capture_rate, capture_step,
-collision_rate, collision_parts, crash_rate, over_speed_rate, prediction_error.
+Prints, and with `--json` writes, for each scenario: scenario, episodes, capture_rate, capture_step, slowest_capture_step (of
+the slowest hundredth of the episodes), collision_rate, collision_parts, crash_rate, over_speed_rate, prediction_error.
 From Python: `openjax.evaluate(policy, scenario)`, see `openjax.commands.calls.evaluate`.
 """
 

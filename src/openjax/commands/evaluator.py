@@ -23,6 +23,7 @@ FIELDS = (
     "episodes",
     "capture_rate",
     "capture_step",
+    "slowest_capture_step",
     "collision_rate",
     "collision_parts",
     "crash_rate",

@@ -87,8 +87,9 @@ def make_evaluate(
 
 
 def summarise(evaluation: Evaluation) -> dict[str, float]:
-    """Captures, breaches, crashes and errors as means over the episodes."""
+    """Captures, breaches, crashes and errors as means over the episodes, capture steps of the slowest hundredth too."""
     statistics = evaluation.statistics
+    slowest = jnp.sort(statistics.capture_step)[-max(1, len(statistics.capture_step) // 100) :]
     steps = jnp.maximum(statistics.steps, 1)
 
     def mean(x):
@@ -97,6 +98,7 @@ def summarise(evaluation: Evaluation) -> dict[str, float]:
     return {
         "capture_rate": mean(statistics.captured),
         "capture_step": mean(statistics.capture_step),
+        "slowest_capture_step": mean(slowest),
         "collision_rate": mean(statistics.collision_rate),
         "collision_parts": {
             "pillar": mean(statistics.pillar_steps / steps),
