@@ -86,7 +86,7 @@ def test_first_runs():
         rates = sorted(short(table[kind][figure], 2) for table in tables)
         return " to ".join(dict.fromkeys((rates[0], rates[-1])))
 
-    seeds = {9: "nine seeds"}[len(runs)]
+    seeds = {14: "fourteen seeds"}[len(runs)]
     label = f"first runs on two or three cores (preset `quick`, {seeds}): captures of new tasks, of the worst layout"
     assert cells(label)[0] == ", ".join(range_of(kind, "capture_rate") for kind in ("validation", "worst"))
     label = "... crashes in new tasks, among the six pillars of `random`"

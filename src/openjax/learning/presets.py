@@ -13,7 +13,7 @@ from openjax.ranges import changed
 
 
 def quick() -> TrainSettings:
-    """Five minutes on two CPU cores: the paper's evader and starts, any number of pillars up to five, and 25 commands a second
+    """Minutes on two CPU cores: the paper's evader and starts, any number of pillars up to five, and 25 commands a second
     instead of 100. The gradient through the simulation teaches to fly and to chase, then MAPPO goes on."""
     return TrainSettings(
         environment=PursuitSettings(
