@@ -127,8 +127,9 @@ def page(results: dict) -> Page:
     }
     rows = [dict(zip(of, name, strict=True)) | overview(own) for name, own in by_policy.items()]
     parts: list[Table | str] = [Table(columns, rows, title="Overview"), everyone(by_policy)]
+    shipped = shipped_policies()
     for name, own in by_policy.items():
-        if name[0] in shipped_policies():
+        if name[0] in shipped:
             parts.append(by_evader(own, f"{name[0]}, {name[1]} game, {name[2]} vehicle"))
     if "responses" in results:
         parts.append(learned_ones(results["responses"]))

@@ -121,9 +121,13 @@ def fly_scenarios(command: EvaluateCommand, loaded, evaluators: dict) -> tuple[l
     """
     import jax
 
-    from openjax.commands.evaluator import Evaluator
+    from openjax.commands.evaluator import Evaluator, layout_tasks
+    from openjax.commands.validation import uniform_tasks
 
-    game, loaded, tasks = _game(command, loaded)
+    game, loaded, layouts = _game(command, loaded)
+    tasks = layout_tasks(game.settings, layouts, command.episodes)
+    if not layouts:
+        tasks["uniform"] = uniform_tasks(command.environment, command.episodes, game.settings.max_pillars)
     kind = (game.settings, loaded.policy, command.opponent)
     compiled = kind in evaluators
     if not compiled:
@@ -141,9 +145,8 @@ def fly_scenarios(command: EvaluateCommand, loaded, evaluators: dict) -> tuple[l
 
 
 def _game(command, loaded):
-    """The game of a command, the policy in it, and the tasks by layout."""
-    from openjax.commands.evaluator import layout_slots, layout_tasks
-    from openjax.commands.validation import uniform_tasks
+    """The game of a command, the policy in it, and the layouts; none: uniform tasks."""
+    from openjax.commands.evaluator import layout_slots
     from openjax.pursuit.scenarios import SCENARIOS, find_scenario
     from openjax.store.environments import make_environment
 
@@ -153,20 +156,17 @@ def _game(command, loaded):
             "--environment.evaders learned: a name isn't enough; --opponent takes a file of openjax exploit"
         )
     wanted, trained = settings.num_pursuers, loaded.settings.environment.num_pursuers
-    layouts = [layout for layout in SCENARIOS.values() if len(layout.pursuers) == trained]
-    if command.scenario not in ("all", "uniform"):
-        layouts = [find_scenario(command.scenario, settings)]
-    uniform = command.scenario == "uniform" or not layouts
-    there = wanted if uniform else len(layouts[0].pursuers)
+    if command.scenario == "all":
+        layouts = [layout for layout in SCENARIOS.values() if len(layout.pursuers) == trained]
+    else:
+        layouts = [] if command.scenario == "uniform" else [find_scenario(command.scenario, settings)]
+    there = len(layouts[0].pursuers) if layouts else wanted
     if wanted not in (trained, there):
         raise UserError(f"--environment.num_pursuers {wanted}: layout {layouts[0].name} has {there} pursuers")
     slots = max([layout_slots(settings), *(len(layout.pillars) for layout in layouts)])
     game = dataclasses.replace(settings, max_pillars=slots, num_pursuers=there)
     environment = make_environment(game, command.vehicle, command.effects, command.opponent)
-    loaded = loaded.in_game(environment)
-    if uniform:
-        return environment, loaded, {"uniform": uniform_tasks(settings, command.episodes, slots)}
-    return environment, loaded, layout_tasks(game, layouts, command.episodes)
+    return environment, loaded.in_game(environment), layouts
 
 
 def _show(command, results):

@@ -68,7 +68,7 @@ class Signals:
         """Body rates (T, 3) rad/s by differences of the attitude."""
         return None if self.quaternion is None else rates_of(self.quaternion)
 
-    @property
+    @cached_property
     def saturated(self) -> bool:
         """Whether motors have often nothing left to follow commands with."""
         return self.motor is not None and float((self.motor > FULL).any(1).mean()) > 0.2
