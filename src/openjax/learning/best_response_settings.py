@@ -27,6 +27,10 @@ class BestResponseSettings(EvaderLearningSettings):
 
     def __post_init__(self):
         super().__post_init__()
+        if self.pool:
+            raise UserError(
+                f"pool {self.pool}: a best response learns against fixed pursuers, without past selves"
+            )
         if self.num_envs % self.minibatches:
             raise UserError(f"num_envs {self.num_envs} must be a multiple of minibatches {self.minibatches}")
 

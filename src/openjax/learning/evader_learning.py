@@ -17,9 +17,10 @@ from flax import struct
 
 from openjax.learning.advantages import generalised_advantages
 from openjax.learning.collectives import mean_over_devices, minibatches
+from openjax.learning.evader_pool import EvaderPool, paid, renewed, start_pool, with_drawn
 from openjax.learning.settings import EvaderLearningSettings
 from openjax.learning.train_state import clipped_adam, shuffled
-from openjax.policy import gaussian_entropy, gaussian_log_prob
+from openjax.policy import gaussian_divergence, gaussian_entropy, gaussian_log_prob
 from openjax.pursuit import Pursuit, PursuitState
 from openjax.pursuit.evaders import init_network, learned_place, scene_of
 from openjax.pursuit.evaders.learned import features, outputs, outputs_of
@@ -30,17 +31,31 @@ REWARD = 0.01
 
 @struct.dataclass
 class LearningEvaders:
-    """K networks: every leaf has their axis first."""
+    """L networks that learn: every leaf of theirs has their axis first."""
 
     actor: Any
     critic: Any
-    log_std: jax.Array  # (K, 3)
+    log_std: jax.Array  # (L, 3)
     optimiser: Any
+    reference: tuple[Any, jax.Array] | None = None
+    """Earlier actor and log_std, (L, ...); None without a divergence."""
+    pool: EvaderPool | None = None
+    """What flies in the other places; None where all learn."""
+    updates: jax.Array | None = None
+    """() int32, updates done; None where nobody asks."""
 
     @property
     def networks(self) -> tuple[Any, Any, jax.Array]:
         """What learns."""
         return self.actor, self.critic, self.log_std
+
+    @property
+    def flying(self) -> "LearningEvaders":
+        """What acts: with the actors and log_std of all K places, those that learn first."""
+        if self.pool is None:
+            return self
+        actor, log_std = with_drawn(self.pool, (self.actor, self.log_std))
+        return self.replace(actor=actor, log_std=log_std, pool=None)
 
 
 @struct.dataclass
@@ -65,9 +80,14 @@ class EvaderLearning:
 
     @property
     def number(self) -> int:
-        """Networks; 0: none learns, as the game names none, or brings their networks with it."""
+        """Networks that fly; 0: none learns, as the game names none, or brings their networks with it."""
         brought = self.environment.evader_networks is not None
         return 0 if brought else self.environment.settings.evaders.count("learned")
+
+    @property
+    def learners(self) -> int:
+        """Networks that learn, the first ones."""
+        return min(self.number, 1) if self.how.pool else self.number
 
     @functools.cached_property
     def optimiser(self) -> optax.GradientTransformation:
@@ -82,7 +102,13 @@ class EvaderLearning:
         log_std = jnp.full((self.number, 3), self.how.initial_log_std, jnp.float32)
         init = jax.vmap(functools.partial(init_network, own_axes=self.how.own_axes))
         networks = *(init(own, jnp.arange(self.number)) for own in keys), log_std
-        return LearningEvaders(*networks, jax.vmap(self.optimiser.init)(networks))
+        pool = start_pool(networks[0], log_std, self.how.pool) if self.how.pool else None
+        if pool is not None:
+            networks = jax.tree.map(lambda leaf: leaf[: self.learners], networks)
+        reference = (networks[0], networks[2]) if self.how.reference_kl else None
+        updates = jnp.zeros((), jnp.int32) if self.how.pool or self.how.reference_kl else None
+        optimiser = jax.vmap(self.optimiser.init)(networks)
+        return LearningEvaders(*networks, optimiser, reference, pool, updates)
 
     def see(self, networks: Any, state: PursuitState) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Of worlds (E, ...) which of the networks acts, (E,), and what it sees."""
@@ -97,10 +123,13 @@ class EvaderLearning:
     def act(
         self, evaders: LearningEvaders, state: PursuitState, noise: jax.Array
     ) -> tuple[jax.Array, EvaderSamples]:
-        """Wishes (E, 3) in worlds (E, ...), NaN where none of the networks acts, and the samples; noise (E, 3)."""
+        """Wishes (E, 3) in worlds (E, ...), NaN where none of the networks acts, and the samples; noise (E, 3).
+
+        `evaders` are those that are `flying`.
+        """
         which, seen = self.see(evaders.actor, state)
         mean = outputs_of(evaders.actor, which, seen)[0]
-        log_std = self._by_network(which) @ evaders.log_std
+        log_std = jax.nn.one_hot(which, self.number) @ evaders.log_std
         sample = mean + jnp.exp(log_std) * noise
         log_prob = jax.vmap(gaussian_log_prob)(sample, mean, log_std)
         samples = EvaderSamples(seen, which, sample, log_prob, ~state.statistics.captured)
@@ -130,16 +159,34 @@ class EvaderLearning:
         start = evaders.networks, evaders.optimiser
         order = shuffled(key, how.epochs, how.minibatches)
         (networks, state), _ = jax.lax.scan(step, start, order)
-        return LearningEvaders(*networks, state)
+        actor, critic, log_std = networks
+        evaders = evaders.replace(actor=actor, critic=critic, log_std=log_std, optimiser=state)
+        return self._remembered(evaders, samples, last, jax.random.fold_in(key, 1), axis)
+
+    def _remembered(self, evaders, samples, last, key, axis):
+        """The evaders with reference and pool after an update."""
+        if evaders.updates is None:
+            return evaders
+        how, updates, learner = self.how, evaders.updates + 1, (evaders.actor, evaders.log_std)
+        reference, pool = evaders.reference, evaders.pool
+        if reference is not None:
+            due = updates % how.reference_every == 0
+            reference = jax.tree.map(lambda new, old: jnp.where(due, new, old), learner, reference)
+        if pool is not None:
+            rollouts = evaders.updates % how.pool_every + 1
+            begun = last.statistics.steps <= rollouts * samples.flying.shape[0]
+            pool = paid(pool, samples.which[0], samples.flying, begun, axis)
+            pool = renewed(how, pool, learner, updates, key)
+        return evaders.replace(reference=reference, pool=pool, updates=updates)
 
     def _by_network(self, which):
-        """(..., K) of (...,): one for the network, zero for the others."""
-        return jax.nn.one_hot(which, self.number)
+        """(..., L) of (...,): one for the network, zero for the others and where none of them learns."""
+        return jax.nn.one_hot(which, self.learners)
 
     def _gradient(self, networks, worlds, part):
         """Of the networks' losses, each from its own worlds alone: some of them at a time, as often as the busiest one needs.
 
-        worlds: the networks' numbers of worlds (K,) and all worlds (K, W), each network's own ones first; part: see `_loss`.
+        worlds: the networks' numbers of worlds (L,) and all worlds (L, W), each network's own ones first; part: see `_loss`.
         """
         (number, order), kinds = worlds, len(self.environment.settings.evaders)
         some = order.shape[1] // max(n for n in range(1, kinds + 1) if order.shape[1] % n == 0)
@@ -155,11 +202,11 @@ class EvaderLearning:
 
     def _loss(self, networks, own, part):
         """() of one network, the sum over worlds of the mean over steps; own (n,) whether a world is the network's; part: seen,
-        sample, log_prob, weight, advantage, target, all (n, T, ...)."""
+        sample, log_prob, weight, advantage, target, the reference's mean and log_std or None, all (n, T, ...)."""
         actor, critic, log_std = networks
-        seen, sample, log_prob, weight, advantage, target = part
-        weight = own[:, None] * weight
-        log_ratio = gaussian_log_prob(sample, outputs(actor, seen)[0], log_std) - log_prob
+        seen, sample, log_prob, weight, advantage, target, reference = part
+        weight, mean = own[:, None] * weight, outputs(actor, seen)[0]
+        log_ratio = gaussian_log_prob(sample, mean, log_std) - log_prob
         # samples of other networks count for nothing, and mustn't overflow
         ratio = jnp.exp(jnp.where(weight > 0.0, log_ratio, 0.0))
         clipped = jnp.clip(ratio, 1.0 - self.how.clip_epsilon, 1.0 + self.how.clip_epsilon)
@@ -167,13 +214,16 @@ class EvaderLearning:
         error = (outputs(critic, seen)[1] - target) ** 2
         # weighted too: before the first of its worlds begins, a network's noise stays as it is
         entropy = self.how.entropy_coefficient * gaussian_entropy(log_std)
-        return jnp.sum(jnp.mean(weight * (0.5 * error - surrogate - entropy), axis=1))
+        loss = 0.5 * error - surrogate - entropy
+        if reference is not None:
+            loss += self.how.reference_kl * gaussian_divergence(mean, log_std, *reference)
+        return jnp.sum(jnp.mean(weight * loss, axis=1))
 
     def _batch(self, evaders, samples, last, axis):
         """What gradient steps need, minibatch by minibatch: see `_gradient` and `_loss`."""
         how, critic = self.how, evaders.critic
         value = outputs_of(critic, samples.which, samples.seen)[1]
-        last_value = outputs_of(critic, *self.see(evaders.actor, last))[1]
+        last_value = outputs_of(critic, *self.see(evaders.flying.actor, last))[1]
         caught = jnp.concatenate([~samples.flying[1:], last.statistics.captured[None]])
         advantage = generalised_advantages(
             REWARD * (~caught).astype(jnp.float32),
@@ -185,7 +235,7 @@ class EvaderLearning:
             how.gae_lambda,
         )
         # a world keeps its evader until the rollout's end
-        flying = samples.flying[..., None] * self._by_network(samples.which[0])  # (T, E, K)
+        flying = samples.flying[..., None] * self._by_network(samples.which[0])  # (T, E, L)
         scale = 1.0 / jnp.maximum(mean_over_devices(jnp.mean(flying, (0, 1)), axis), 1e-4)
         weight = jnp.sum(scale * flying, axis=-1)
 
@@ -197,7 +247,16 @@ class EvaderLearning:
         centred = advantage - mean(advantage)
         normal = centred / (jnp.sqrt(mean(centred**2)) + 1e-8)
         batch = samples.seen, samples.sample, samples.log_prob, weight, normal, advantage + value
+        batch += (self._told(evaders.reference, samples),)
         which = minibatches(samples.which[:1], how.minibatches)[..., 0]  # (M, W)
-        own = which[:, None] == jnp.arange(self.number)[:, None]
+        own = which[:, None] == jnp.arange(self.learners)[:, None]
         worlds = jnp.sum(own, axis=-1), jnp.argsort(~own, axis=-1)
         return worlds, minibatches(batch, how.minibatches)
+
+    def _told(self, reference, samples):
+        """What the reference's Gaussians are at the samples: mean and log_std, (T, E, 3) both; None without one."""
+        if reference is None:
+            return None
+        actor, log_std = reference
+        mean = outputs_of(actor, samples.which, samples.seen)[0]
+        return mean, jnp.sum(self._by_network(samples.which)[..., None] * log_std, axis=-2)

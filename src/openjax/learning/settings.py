@@ -109,6 +109,19 @@ class EvaderLearningSettings:
     initial_log_std: Annotated[float, Interval("[-10, 2]")] = -1.0
     own_axes: bool = False
     """Evaders see in axes of their own, x away from the arena's axis."""
+    reference_kl: Annotated[float, Interval("[0, 1000]")] = 0.0
+    """Weight of the divergence (nats) from a reference, an earlier self (Nash policy gradient); 0: there is none."""
+    reference_every: Annotated[int, Interval("[1, 1000000]")] = 40
+    """Updates after which the reference is replaced by what has been learnt."""
+    pool: Annotated[int, Interval("[0, 1024]")] = 0
+    """Past selves from which the networks but the first are drawn, which alone learns; 0: all learn. See
+    `openjax.learning.evader_pool`."""
+    pool_every: Annotated[int, Interval("[1, 1000000]")] = 10
+    """Updates between draws; those of an episode and more, as what began before counts for nothing."""
+    pool_draws: Annotated[int, Interval("[1, 1000000]")] = 4
+    """Draws after which the one that learns replaces the oldest past self."""
+    pool_rate: Annotated[float, Interval("[0, 1000]")] = 0.5
+    """Weights' growth (nats) for a share of the time free, beside that of the one that learns; 0: equal odds."""
 
     def __post_init__(self):
         check_intervals(self)
@@ -278,6 +291,10 @@ class TrainSettings:
         yield (
             rollout % self.mappo.step_subsampling == 0,
             f"mappo.step_subsampling {self.mappo.step_subsampling} must divide rollout_length {rollout}",
+        )
+        yield (
+            not self.evader_learning.pool or self.environment.evaders.count("learned") > 1,
+            "evader_learning.pool needs two or more learned in environment.evaders",
         )
         last, windows = self.predictor.horizons[-1], self.predictor.windows
         yield (

@@ -194,7 +194,7 @@ class _Step:
         learning = None
         if carry.evaders is not None:
             draws = jax.vmap(lambda k: jax.random.normal(jax.random.fold_in(k, 1), (shape[0], 3)))(keys)
-            learning = self.parts.evaders, carry.evaders, jnp.moveaxis(draws, 1, 0)
+            learning = self.parts.evaders, carry.evaders.flying, jnp.moveaxis(draws, 1, 0)
         rollout, observation, state = collect(
             environment, policy, carry.policy, *world, jnp.moveaxis(noise, 1, 0), share, learning
         )
@@ -222,7 +222,10 @@ class _Step:
     def learn_evaders(self, carry, flown):
         key = jax.random.fold_in(self._key(carry, 3), 1)
         evaders = self.parts.evaders.learn(carry.evaders, flown.rollout.learning, carry.state, key, self.axis)
-        return carry.replace(evaders=evaders), {"evader_noise": jnp.mean(evaders.log_std)}
+        metrics = {"evader_noise": jnp.mean(evaders.log_std)}
+        if evaders.pool is not None:
+            metrics |= {"evader_variety": evaders.pool.variety}
+        return carry.replace(evaders=evaders), metrics
 
     def renew(self, carry):
         settings, schedule, axis = self.settings, self.settings.schedule, self.axis

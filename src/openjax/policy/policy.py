@@ -155,3 +155,14 @@ def gaussian_log_prob(
 def gaussian_entropy(log_std: Float[Array, " size"]) -> Float[Array, ""]:
     """Entropy of independent Gaussians."""
     return jnp.sum(log_std + 0.5 * jnp.log(2 * jnp.pi * jnp.e))
+
+
+def gaussian_divergence(
+    mean: Float[Array, "*samples size"],
+    log_std: Float[Array, "*#samples size"],
+    other_mean: Float[Array, "*samples size"],
+    other_log_std: Float[Array, "*#samples size"],
+) -> Float[Array, "*samples"]:
+    """Kullback-Leibler divergence (nats) of independent Gaussians from other ones."""
+    square = (jnp.exp(2.0 * log_std) + (mean - other_mean) ** 2) * jnp.exp(-2.0 * other_log_std)
+    return jnp.sum(other_log_std - log_std + 0.5 * (square - 1.0), axis=-1)
