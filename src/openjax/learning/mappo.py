@@ -13,7 +13,7 @@ from openjax.learning.collectives import joint_moments, mean_over_devices, minib
 from openjax.learning.rollout import Rollout
 from openjax.learning.settings import MappoSettings
 from openjax.learning.train_state import Optimisers, TrainState, clipped_adam, shuffled
-from openjax.policy import Policy, gaussian_entropy, gaussian_log_prob
+from openjax.policy import Policy, gaussian_divergence, gaussian_entropy, gaussian_log_prob
 from openjax.pursuit import Observation
 
 
@@ -51,6 +51,7 @@ class Batch:
     log_prob: jax.Array  # (..., N)
     advantage: jax.Array  # (..., N)
     target: jax.Array  # (..., N) normalised returns
+    reference: tuple[jax.Array, jax.Array] | None = None  # its mean and log_std (..., N, A)
 
 
 WATCHED = ("policy_loss", "value_loss", "kl", "clipped", "entropy", "actor_gradient")
@@ -112,8 +113,9 @@ def loss(
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Sum of actor's and critic's () loss, `parameters` (actor, critic); and what to watch.
 
-    The actor's is the surrogate, its ratio clipped to 1 +- `clip` (), minus the entropy bonus; the critic's the Huber
-    loss of normalised values. Unless they share an encoder, neither's gradient knows of the other.
+    The actor's is the surrogate, its ratio clipped to 1 +- `clip` (), minus the entropy bonus, plus the divergence from a
+    reference; the critic's the Huber loss of normalised values. Unless they share an encoder, neither's gradient knows of
+    the other.
     """
     mean, log_std, value = policy.evaluate(*parameters, batch.observation, batch.predicted)
     log_ratio = gaussian_log_prob(batch.action, mean, log_std) - batch.log_prob
@@ -122,6 +124,9 @@ def loss(
     surrogate = jnp.mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
     entropy = gaussian_entropy(log_std)
     policy_loss = -surrogate - settings.entropy_coefficient * entropy
+    if batch.reference is not None:
+        away = gaussian_divergence(mean, log_std, *batch.reference)
+        policy_loss += settings.reference_kl * jnp.mean(away)
     value_loss = jnp.mean(optax.huber_loss(value, batch.target, delta=settings.huber))
     watch = {
         "kl": jnp.mean(ratio - 1.0 - log_ratio),
@@ -146,6 +151,7 @@ def update_policy(
     key: jax.Array,
     axis: str | None,
     progress: jax.Array | float = 0.0,
+    reference: Any = None,
 ) -> tuple[TrainState, TrainState, ValueScale, dict[str, jax.Array]]:
     """All epochs of the policy update on one rollout.
 
@@ -162,6 +168,7 @@ def update_policy(
       key: shuffles, the same on all devices.
       axis: name of the devices' axis.
       progress: () share of the run that is done, for the clip range.
+      reference: parameters of an actor from which the policy shouldn't diverge; None: it may.
 
     Returns:
       actor, critic, value scale, {name: () metric}.
@@ -204,6 +211,7 @@ def update_policy(
         log_prob=rollout.log_prob,
         advantage=(advantage - advantage_mean) / (advantage_std + 1e-8),
         target=(returns - mean) / std,
+        reference=None if reference is None else _told(policy.distribution(reference, *flown)),
     )
     batch = minibatches(batch, settings.minibatches)
     clip = settings.clip_epsilon + (settings.clip_epsilon_end - settings.clip_epsilon) * progress
@@ -236,6 +244,12 @@ def update_policy(
     critic = critic.replace(parameters=to_critic(critic.parameters))
     metrics = dict(zip(WATCHED, jnp.mean(watched, axis=0), strict=True))
     return actor, critic, scale, metrics | {"explained_variance": explained, "value_scale": std}
+
+
+def _told(distribution):
+    """Mean and log standard deviation of a Gaussian, one of both for each sample."""
+    mean, log_std = distribution
+    return mean, jnp.broadcast_to(log_std, mean.shape)
 
 
 def every_nth(x, first, number):

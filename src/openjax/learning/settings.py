@@ -34,6 +34,10 @@ class MappoSettings:
     target_kl: Annotated[float, Interval("[0, 10]")] = 0.0
     """Divergence (nats) of the learning policy from the one that flew, near which the actor's step size keeps it; 0: steps
     aren't scaled. A run that starts from a policy with little noise needs it."""
+    reference_kl: Annotated[float, Interval("[0, 1000]")] = 0.0
+    """Weight of the divergence (nats) from a reference, an earlier policy (Nash policy gradient); 0: there is none."""
+    reference_every: Annotated[int, Interval("[1, 1000000]")] = 40
+    """Updates after which the reference is replaced by what has been learnt."""
     entropy_coefficient: Annotated[float, Interval("[0, 10]")] = 1e-3
     """Weight of the entropy."""
     discount: Annotated[float, Interval("[0, 1]")] = 0.995

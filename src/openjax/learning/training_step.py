@@ -3,6 +3,7 @@
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -40,6 +41,8 @@ class TrainCarry:
     archive: TaskArchive
     key: jax.Array
     update: jax.Array  # () int32, training steps done
+    reference: Any = None
+    """Parameters of an earlier actor; None without a divergence from it."""
 
     @property
     def policy(self) -> PolicyParameters:
@@ -54,6 +57,8 @@ class TrainCarry:
             actor=self.actor.replace(parameters=policy.actor),
             critic=self.critic.replace(parameters=policy.critic),
             predictor=self.predictor.replace(parameters=policy.predictor),
+            # a copy: a step is given its carry's memory, which can't be the same twice
+            reference=None if self.reference is None else jax.tree.map(jnp.copy, policy.actor),
         )
 
 
@@ -114,6 +119,7 @@ def initial_carry(settings: TrainSettings, parts: Building, key: jax.Array) -> T
         archive=archive,
         key=key,
         update=jnp.zeros((), jnp.int32),
+        reference=policy.actor if settings.mappo.reference_kl else None,
     )
 
 
@@ -214,10 +220,14 @@ class _Step:
     def learn_policy(self, carry, flown):
         before, last = (carry.actor, carry.critic, carry.value_scale), (carry.observation, flown.predicted)
         how = self.settings.mappo, self.parts.policy, self.parts.optimisers
+        share, reference = self._progress(carry), carry.reference
         actor, critic, scale, metrics = update_policy(
-            *how, *before, flown.rollout, *last, self._key(carry, 3), self.axis, self._progress(carry)
+            *how, *before, flown.rollout, *last, self._key(carry, 3), self.axis, share, reference
         )
-        return carry.replace(actor=actor, critic=critic, value_scale=scale), metrics
+        if reference is not None:
+            due = (carry.update + 1) % how[0].reference_every == 0
+            reference = jax.tree.map(lambda new, old: jnp.where(due, new, old), actor.parameters, reference)
+        return carry.replace(actor=actor, critic=critic, value_scale=scale, reference=reference), metrics
 
     def learn_evaders(self, carry, flown):
         key = jax.random.fold_in(self._key(carry, 3), 1)
