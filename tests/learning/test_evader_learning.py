@@ -1,5 +1,7 @@
 """Evaders that learn: each from its own samples, in the direction that pays; and who flies what in a world."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -90,6 +92,47 @@ def test_a_network_that_flies_all_worlds_learns_as_if_alone(worlds):
     ]
     for mine, its in zip(*(jax.tree.leaves(end.networks) for end in ends), strict=True):
         np.testing.assert_allclose(its[0], mine[0], atol=1e-5)
+
+
+def test_beside_past_selves_the_first_alone_learns(worlds):
+    how = dataclasses.replace(HOW, pool=3, pool_every=2, pool_draws=1, reference_kl=0.1, reference_every=2)
+    learning = EvaderLearning(how, ENVIRONMENT, updates=30)
+    evaders = start = jax.jit(learning.start)(jax.random.key(1))
+    ended = worlds.replace(statistics=worlds.statistics.replace(captured=jnp.arange(WORLDS) % 8 < 4))
+    learn = jax.jit(learning.learn)
+    for update in (1, 2):
+        samples = jax.jit(learning.act)(evaders.flying, worlds, jnp.ones((WORLDS, 3)))[1]
+        before = evaders
+        evaders = learn(
+            evaders, jax.tree.map(lambda leaf: leaf[None], samples), ended, jax.random.key(update)
+        )
+    own = evaders.actor["output"]["kernel"][0]
+    assert np.any(own != start.actor["output"]["kernel"][0])
+    # taken after two updates, in place of the oldest; so is the reference
+    kept = evaders.pool.actor["output"]["kernel"]
+    np.testing.assert_array_equal(kept[0], own)
+    np.testing.assert_array_equal(kept[1:], start.pool.actor["output"]["kernel"][1:])
+    np.testing.assert_array_equal(evaders.reference[0]["output"]["kernel"][0], own)
+    for old, first in zip(*map(jax.tree.leaves, (before.reference, start.reference)), strict=True):
+        np.testing.assert_array_equal(old, first)
+
+
+def test_a_strong_reference_holds_an_evader(worlds):
+    def moved(how):
+        learning = EvaderLearning(how, ENVIRONMENT, updates=30)
+        evaders = start = jax.jit(learning.start)(jax.random.key(1))
+        learn = jax.jit(learning.learn)
+        for key in jax.random.split(jax.random.key(2), 5):
+            noise = jax.random.normal(key, (WORLDS, 3))
+            samples = jax.jit(learning.act)(evaders, worlds, noise)[1]
+            ended = worlds.replace(statistics=worlds.statistics.replace(captured=samples.sample[:, 0] < 0.0))
+            evaders = learn(evaders, jax.tree.map(lambda leaf: leaf[None], samples), ended, key)
+        which, seen = learning.see(evaders.actor, worlds)
+        after, before = (outputs_of(e.actor, which, seen)[0] for e in (evaders, start))
+        return float(jnp.mean(jnp.abs(after - before)[which >= 0]))
+
+    held = dataclasses.replace(HOW, reference_kl=100.0, reference_every=1000)
+    assert moved(held) < 0.2 * moved(HOW)
 
 
 def test_wishes_fly_only_where_a_network_acts(worlds):
