@@ -257,6 +257,8 @@ class TrainSettings:
         check_intervals(self)
         if self.evaders_validation:
             check_evaders(self.evaders_validation)
+        if self.evader_learning.pool and self.environment.evaders.count("learned") < 2:
+            raise UserError("evader_learning.pool needs two or more learned in environment.evaders")
         for holds, text in self._demands():
             if not holds:
                 raise UserError(text)
@@ -295,10 +297,6 @@ class TrainSettings:
         yield (
             rollout % self.mappo.step_subsampling == 0,
             f"mappo.step_subsampling {self.mappo.step_subsampling} must divide rollout_length {rollout}",
-        )
-        yield (
-            not self.evader_learning.pool or self.environment.evaders.count("learned") > 1,
-            "evader_learning.pool needs two or more learned in environment.evaders",
         )
         last, windows = self.predictor.horizons[-1], self.predictor.windows
         yield (
