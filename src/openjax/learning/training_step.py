@@ -220,10 +220,8 @@ class _Step:
     def learn_policy(self, carry, flown):
         before, last = (carry.actor, carry.critic, carry.value_scale), (carry.observation, flown.predicted)
         how = self.settings.mappo, self.parts.policy, self.parts.optimisers
-        share, reference = self._progress(carry), carry.reference
-        actor, critic, scale, metrics = update_policy(
-            *how, *before, flown.rollout, *last, self._key(carry, 3), self.axis, share, reference
-        )
+        when, reference = (self._key(carry, 3), self.axis, self._progress(carry)), carry.reference
+        actor, critic, scale, metrics = update_policy(*how, *before, flown.rollout, *last, *when, reference)
         if reference is not None:
             due = (carry.update + 1) % how[0].reference_every == 0
             reference = jax.tree.map(lambda new, old: jnp.where(due, new, old), actor.parameters, reference)
