@@ -20,7 +20,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from experiments.table import Page, Table, page_parser, publish
+from experiments.table import Page, Table, page_parser, publish, spread
 from openjax.commands.validation import uniform_tasks
 from openjax.files import read_json
 from openjax.learning.presets import PRESETS
@@ -28,8 +28,8 @@ from openjax.pursuit import SCENARIOS, Pursuit
 from openjax.store.policies import LoadedPolicy, load_policy
 
 CORES = 2
-ROWS = ("row_20", "row_24", "row_27", "row_30", "row_32", "row_34", "row_36")
-"""Rows of pillars by the least distance of neighbours (cm), as the results name them."""
+TRIED_ON = ("rows .30", "rows .35", "rows .33 to .40", "gates", "cluster", "six pillars", "crashes")
+"""What variants of the first flights were flown on; spacings in metres."""
 
 
 def train(options: argparse.Namespace, seed: int, cores: list[int]) -> dict:
@@ -120,14 +120,13 @@ def page(results: dict) -> Page:
         **{f"`{name}`": _column("after", name) for name in SCENARIOS},
         "new tasks, `open`": _column("open", "validation"),
     }
-    rows = {f"from .{name[4:]} m": f"rows.{name}:.2f" for name in ROWS}
+    tried = {name: (lambda row, name=name: spread(row[name], ".2f")) for name in TRIED_ON}
     return Page(
         "The quick preset: what two CPU cores learn",
         f"{results['preset']} Each cell: capture rate, seconds to the capture, crash rate. {results.get('note', '')}",
         [
             Table(columns, results["runs"]),
-            "Captures in rows of four pillars, by how far apart they stand:",
-            Table({"seed": "seed", **rows}, [run for run in results["runs"] if "rows" in run]),
+            Table({"variant": "variant", "updates": "updates", **tried}, *results["trials"]),
             "\n".join(f"* {found}" for found in results.get("findings", ())),
         ],
     )

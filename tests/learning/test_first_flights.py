@@ -119,3 +119,4 @@ def test_one_near_pursuer_lets_others_be_far():
 def test_a_tip_over_counts_as_a_touch_does():
     assert tip_share(jnp.cos(jnp.deg2rad(60.0))) < 0.01 < 0.99 < tip_share(jnp.cos(jnp.deg2rad(100.0)))
     assert crash_share(jnp.array(0.1)) < 0.01 < 0.5 < crash_share(jnp.array(0.0))
+    assert crash_share(jnp.array(0.1), 0.05) > 0.1  # felt earlier

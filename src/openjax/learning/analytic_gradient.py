@@ -268,9 +268,9 @@ def nearest_gap(game: PursuitSettings, state: PursuitState) -> jax.Array:
     return jnp.minimum(gap, position[..., 2] - DRONE_RADIUS)
 
 
-def crash_share(gap: jax.Array) -> jax.Array:
-    """How much of a crash a least gap (m) counts as, from 0 to 1: what has a gradient before anything is touched."""
-    return jax.nn.sigmoid((3 * TOUCH - gap) / SMOOTH)
+def crash_share(gap: jax.Array, smooth: float = SMOOTH) -> jax.Array:
+    """How much of a crash a least gap (m) counts as, from 1 to 0 over `smooth` (m): it has a gradient before a touch."""
+    return jax.nn.sigmoid((3 * TOUCH - gap) / smooth)
 
 
 def crash_depth(gap: jax.Array) -> jax.Array:

@@ -114,7 +114,7 @@ class FirstFlights:
         parts = {
             "free": (1.0, way.free),
             "distance": (how.distance, way.distance),
-            "crashes": (penalty * how.crash, crash_share(way.least)),
+            "crashes": (penalty * how.crash, crash_share(way.least, how.crash_smooth)),
             "tips": (risen * how.crash, tip_share(way.upright)),
             "breaches": (penalty * how.breach, way.breach),
             "speed": (how.speed * (self.environment.settings.speed_limit == "none"), way.excess),

@@ -45,8 +45,9 @@ def quick() -> TrainSettings:
             clip_epsilon_end=0.2,
             discount=0.99,
         ),
+        # a crash that is felt from afar: pursuers go round rows of pillars, and don't try gaps under half a metre
         first_flights=FirstFlightsSettings(
-            updates=1000, steps=20, learning_rate=2e-3, crash=30.0, breach=4.0
+            updates=800, worlds=128, steps=20, learning_rate=2e-3, crash=30.0, crash_smooth=0.05, breach=4.0
         ),
         # few tasks reach the archive in so short a run; drawn from too often, they'd be all that is learnt
         generator=GeneratorSettings(capacity=500, expansion=0.3, pillar_shift=0.1, row_share=0.25),

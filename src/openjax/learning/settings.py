@@ -133,6 +133,8 @@ class FirstFlightsSettings:
     """Weight of the nearest pursuer's mean way to the evader (m), beside the share of the time in which it is free ..."""
     crash: Annotated[float, Interval("[0, 1000]")] = 20.0
     """... at the end of the share of pursuers that touch something or tip over ..."""
+    crash_smooth: Annotated[float, Interval("[0.001, 1]")] = 0.012
+    """... from all to none over this distance (m): a longer one is felt earlier, and closes narrower ways ..."""
     breach: Annotated[float, Interval("[0, 1000]")] = 10.0
     """... and of the mean number of breaches ..."""
     speed: Annotated[float, Interval("[0, 1000]")] = 1.0
