@@ -129,11 +129,6 @@ def _difference(found, expected, source):
     return difference
 
 
-def _in_ascii(name) -> str:
-    """A file's name as a C compiler and every terminal can read it."""
-    return name.encode("ascii", "backslashreplace").decode()
-
-
 def _described(inputs) -> dict:
     return {name: {"shape": list(kind.shape), "type": str(kind.dtype)} for name, kind in inputs.items()}
 
@@ -184,7 +179,8 @@ def _c(act, inputs, seen, source):
     from openjax.export.c_program import c_program
 
     name = Path(NAMES["c"]).stem
-    program = c_program(act, inputs, "action", name, f"The policy {_in_ascii(Path(source).name)}")
+    readable = Path(source).name.encode("ascii", "backslashreplace").decode()  # by every C compiler
+    program = c_program(act, inputs, "action", name, f"The policy {readable}")
     extra = {
         "inputs": _described(program.inputs),
         "numbers": program.numbers,
