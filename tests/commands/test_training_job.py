@@ -28,10 +28,18 @@ GOOD = {
 
 
 @pytest.mark.parametrize(
-    "crashes, kept", [([0.1, 0.0, 0.05], 1), ([0.1, 0.05, 0.0], 2), ([0.0, 0.1, 0.0], 0)]
+    "crashes, kept, asked_after",
+    [
+        ([0.1, 0.0, 0.05], 1, 99),
+        ([0.1, 0.05, 0.0], 2, 99),
+        ([0.0, 0.1, 0.0], 0, 99),
+        ([0.1, 0.05], 1, 7),
+        ([0.1], 0, 3),
+    ],
 )
-def test_last_stage_keeps_what_validates_best(crashes, kept, tmp_path):
-    settings = preset("quick", network=dict(features=8, heads=1), predictor=dict(enabled=False))
+def test_last_stage_keeps_what_validates_best_and_ends_when_asked(crashes, kept, asked_after, tmp_path):
+    small = dict(network=dict(features=8, heads=1), predictor=dict(enabled=False))
+    settings = preset("quick", **small, analytic=dict(updates=10, look_every=5))
     environment = Pursuit(settings.environment)
     observation = jax.eval_shape(lambda key: environment.reset(key)[0], jax.random.key(0))
     observation = jax.tree.map(lambda kind: jnp.zeros(kind.shape, kind.dtype), observation)
@@ -40,18 +48,17 @@ def test_last_stage_keeps_what_validates_best(crashes, kept, tmp_path):
     save_policy_file(directory.policy, before, settings, {"update": 7}, storage="float32")
 
     def learn(parameters, key):
-        for moved in (1.0, 2.0):
-            yield (
-                jax.tree.map(lambda leaf, by=moved: leaf + by, parameters),
-                [{"crashes_from_starts": 0.1}] * 5,
-            )
+        for moved in np.arange(1, 11) / 5:
+            updates.append(moved)
+            yield jax.tree.map(lambda leaf, by=moved: leaf + by, parameters), {"crashes_from_starts": 0.1}
 
-    rates = iter(crashes)
+    rates, updates = iter(crashes), []
 
     def validate(parameters):
         return GOOD | {"crash_rate": next(rates)}
 
-    message = keep_best(directory, learn, validate, settings)
+    message = keep_best(directory, learn, validate, settings, lambda: len(updates) >= asked_after)
+    assert len(updates) == min(asked_after, 10) and next(rates, None) is None
     leaves, _, notes = load_policy_file(directory.policy)
     first = named_leaves(before)
     for name, leaf in leaves.items():

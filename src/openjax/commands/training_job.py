@@ -200,20 +200,24 @@ class _Run:
         if outcome.update == self.first_update and settings.total_updates > outcome.update:
             when = f"before its first update, {outcome.seconds:.0f} s after the start"
             self.progress.message(f"MAPPO did not begin: {outcome.stopped_by} came {when}")
-        if signals:
-            advice = f"go on with openjax train --resume {path}"
-            self.progress.message(f"{signals[0]}: saved at update {outcome.update}; {advice}")
-            return None
-        validation = self.validation()
-        if settings.analytic.updates:
+        if not signals and settings.analytic.updates:
             self.progress.phase("learning by the gradient through the simulation")
+            self.progress.message(self._learn_last())
+        if asked := (*signals, self.stop.name)[0]:
+            said = f"{asked}: saved at update {outcome.update}; go on with openjax train --resume {path}"
+            self.progress.message(said)
+            return None
+        return report(self.job, self.directory, self.validation(), outcome, self.progress)
 
-            def validate(parameters):
-                # the far tasks: by the uniform ones the best of many checkpoints was chosen, in part by luck
-                return summarise(validation(parameters)[1].evaluation)
+    def _learn_last(self):
+        """The last stage; what to tell of it."""
 
-            self.progress.message(keep_best(self.directory, self.last_stage(), validate, settings))
-        return report(self.job, self.directory, validation, outcome, self.progress)
+        def validate(parameters):
+            # the far tasks: by the uniform ones the best of many checkpoints was chosen, in part by luck
+            return summarise(self.validation()(parameters)[1].evaluation)
+
+        learn = self.last_stage()
+        return keep_best(self.directory, learn, validate, self.settings, lambda: self.stop.name is not None)
 
     def _first_flights(self):
         """The stage before MAPPO, of a run that has it still to come; else None."""
@@ -358,17 +362,19 @@ def _start_parameters(job, fresh: PolicyParameters) -> PolicyParameters:
 
 def keep_best(
     directory: RunDirectory,
-    learn: Callable[[PolicyParameters, jax.Array], Iterator[tuple[PolicyParameters, list[dict]]]],
+    learn: Callable[[PolicyParameters, jax.Array], Iterator[tuple[PolicyParameters, dict]]],
     validate: Callable[[PolicyParameters], dict],
     settings: TrainSettings,
+    over: Callable[[], bool],
 ) -> str:
     """Take a run's policy through the last stage, and keep the best of what it becomes and what it was.
 
     Args:
       directory: the run's; `policy.npz` is what the stage starts from, and what it writes.
-      learn: (parameters, key) -> parameters on the way, and the history since the ones before.
+      learn: (parameters, key) -> after each update the parameters and its metrics.
       validate: parameters -> summary of validation tasks by which no checkpoint was chosen.
       settings: of the run.
+      over: is asked after each update whether to stop.
 
     Returns:
       what to tell of it.
@@ -382,7 +388,11 @@ def keep_best(
     looks, history, kept = [{"update": 0, **validate(before)}], [], 0
     scores = [selection_score(looks[0], length)]
     for after, parts in learn(before, jax.random.key(settings.seed)):
-        history += parts
+        history.append(parts)
+        if over():
+            break
+        if len(history) % settings.analytic.look_every and len(history) != settings.analytic.updates:
+            continue
         looks.append({"update": len(history), **validate(after)})
         scores.append(selection_score(looks[-1], length))
         if scores[-1] > scores[kept]:
@@ -395,5 +405,5 @@ def keep_best(
     write_json(directory.path / "analytic.json", {**facts, "validation": looks, "history": history})
     told = f"{scores[0]:.4f} -> {scores[kept]:.4f} after {updates} of {len(history)} updates"
     if not kept:
-        told = f"{scores[0]:.4f}, at most {max(scores[1:]):.4f} after it, not kept"
+        told = f"{scores[0]:.4f}, at most {max(scores[1:], default=scores[0]):.4f} after it, not kept"
     return f"by the gradient through the simulation: score on far validation tasks {told}, {seconds:.0f} s"

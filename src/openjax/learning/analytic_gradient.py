@@ -322,12 +322,11 @@ def _speed(drones):
 
 def compile_analytic(
     gradient: AnalyticGradient, parameters: PolicyParameters
-) -> Callable[[PolicyParameters, jax.Array], Iterator[tuple[PolicyParameters, list[dict[str, float]]]]]:
+) -> Callable[[PolicyParameters, jax.Array], Iterator[tuple[PolicyParameters, dict[str, float]]]]:
     """Start to compile the stage for parameters of these shapes (or abstract ones), in the background.
 
     Returns:
-      the stage, which waits for the compiler: (parameters, key) -> after every `look_every` updates, and at the end, the
-      parameters and the metrics of each of these updates.
+      the stage, which waits for the compiler: (parameters, key) -> after every update the parameters and its metrics.
     """
     key = jax.eval_shape(lambda: jax.random.key(0))
     record = jax.jit(lambda parameters, key: gradient.flights(parameters, key, gradient.bounds()))
@@ -341,18 +340,10 @@ def compile_analytic(
         record, update = (wait() for wait in ready)
         flight_key, update_key = jax.random.split(key)
         actor, state = parameters.actor, gradient.optimiser.init(parameters.actor)
-        flights, history = record(parameters, flight_key), []
-        for number in range(1, gradient.how.updates + 1):
-            actor, state, parts = update(
-                actor, state, parameters, flights, jax.random.fold_in(update_key, number - 1)
-            )
-            history.append(parts)
-            if number % gradient.how.look_every == 0 or number == gradient.how.updates:
-                parts = jax.device_get(history)
-                history = []
-                yield (
-                    parameters.replace(actor=actor),
-                    [{name: float(value) for name, value in update.items()} for update in parts],
-                )
+        flights = record(parameters, flight_key)
+        for number in range(gradient.how.updates):
+            own_key = jax.random.fold_in(update_key, number)
+            actor, state, parts = update(actor, state, parameters, flights, own_key)
+            yield parameters.replace(actor=actor), {name: float(value) for name, value in parts.items()}
 
     return learn
