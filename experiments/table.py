@@ -160,10 +160,7 @@ def publish(
 
 
 def write_page(
-    out: Path,
-    page: Callable[[Any], Page],
-    results: Any,
-    draw: Callable[[Any, Path], None] | None = None,
+    out: Path, page: Callable[[Any], Page], results: Any, draw: Callable[[Any, Path], None] | None = None
 ) -> None:
     """Write and print the page of `results`, and draw its figure if there is one."""
     text = "\n".join(page(results).lines(results)) + "\n"

@@ -1,12 +1,7 @@
 """The presets: settings of whole training runs by name."""
 
 from openjax.errors import UserError, suggestion
-from openjax.learning.settings import (
-    FirstFlightsSettings,
-    GeneratorSettings,
-    MappoSettings,
-    TrainSettings,
-)
+from openjax.learning.settings import FirstFlightsSettings, GeneratorSettings, MappoSettings, TrainSettings
 from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import PursuitSettings, RewardSettings
 from openjax.ranges import changed

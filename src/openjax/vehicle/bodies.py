@@ -40,12 +40,7 @@ class Bodies:
         return jax.vmap(move, (vehicles_axis(vehicle), 0, 0, 0, 0))(vehicle, drones, force, torque, around)
 
     def rigid(
-        self,
-        vehicle: Vehicle,
-        drone: DroneState,
-        force: Vector,
-        torque: Vector,
-        around: Surroundings | None,
+        self, vehicle: Vehicle, drone: DroneState, force: Vector, torque: Vector, around: Surroundings | None
     ) -> DroneState:
         """One drone by the written-out equations, in free flight if nothing is `around`."""
 

@@ -172,10 +172,7 @@ def _series(track: Track, vehicle, ruling: np.ndarray, drawn: np.ndarray, readin
     x = _terms(track, vehicle, sent - rates, slope)
     z = _terms(track, vehicle, sent - drawn, np.gradient(drawn, track.dt, axis=0))
     apart = reading.late or 0.0
-    off = [
-        apart * np.gradient(x[0], track.dt, axis=0),
-        _terms(track, vehicle, sent, filtered - slope)[2],
-    ]
+    off = [apart * np.gradient(x[0], track.dt, axis=0), _terms(track, vehicle, sent, filtered - slope)[2]]
     late = [apart * np.gradient(v, track.dt, axis=0) for v in z[[0, 2]]]
     y = track.motor @ outputs_of(vehicle) - x.sum(0)
     return np.stack([y, *x, *off, *z, *late])
