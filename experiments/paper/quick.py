@@ -120,16 +120,13 @@ def page(results: dict) -> Page:
         **{f"`{name}`": _column("after", name) for name in SCENARIOS},
         "new tasks, `open`": _column("open", "validation"),
     }
-    tried = {name: (lambda row, name=name: spread(row[name], ".2f")) for name in TRIED_ON}
-    return Page(
-        "The quick preset: what two CPU cores learn",
-        f"{results['preset']} Each cell: capture rate, seconds to the capture, crash rate. {results.get('note', '')}",
-        [
-            Table(columns, results["runs"]),
-            Table({"variant": "variant", "updates": "updates", **tried}, *results["trials"]),
-            "\n".join(f"* {found}" for found in results.get("findings", ())),
-        ],
-    )
+    parts: list[Table | str] = [Table(columns, results["runs"])]
+    if "trials" in results:
+        tried = {name: (lambda row, name=name: spread(row[name], ".2f")) for name in TRIED_ON}
+        parts.append(Table({"variant": "variant", "updates": "updates", **tried}, *results["trials"]))
+    parts.append("\n".join(f"* {found}" for found in results.get("findings", ())))
+    prose = f"{results['preset']} Each cell: capture rate, seconds to the capture, crash rate. {results.get('note', '')}"
+    return Page("The quick preset: what two CPU cores learn", prose, parts)
 
 
 def _column(kind, scenario):
