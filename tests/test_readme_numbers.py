@@ -86,7 +86,7 @@ def test_first_runs():
         rates = sorted(short(table[kind][figure], 2) for table in tables)
         return " to ".join(dict.fromkeys((rates[0], rates[-1])))
 
-    seeds = {2: "two seeds"}[len(runs)]
+    seeds = {10: "ten runs"}[len(runs)]
     label = f"first runs on two cores (preset `quick`, {seeds}): captures of new tasks, of the worst layout"
     assert cells(label)[0] == ", ".join(range_of(kind, "capture_rate") for kind in ("validation", "worst"))
     label = "... crashes in new tasks, among the six pillars of `random`"
@@ -142,9 +142,9 @@ def test_best_response():
         short(min(r["capture_rate"] for r in learned if (r["scenario"] == "uniform") == uniform), 2)
         for uniform in (True, False)
     ]
-    label = "... drawn vehicles, of twelve evaders that learned against `evaders` the one caught least: new tasks, worst layout"
+    label = "... drawn vehicles, of eighteen evaders that learned against `evaders` the one caught least: new tasks, worst layout"
     assert cells(label)[0] == ", ".join(value)
-    assert sum(len(response["curve"][-1]["capture_rate"]) for response in responses) == 12
+    assert sum(len(response["curve"][-1]["capture_rate"]) for response in responses) == 18
     assert all(round(response["curve"][-1]["steps"] / 1e6) == 200 for response in responses)
 
 

@@ -20,17 +20,10 @@ from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import layout_slots, layout_tasks, stacked
 from openjax.commands.validation import uniform_tasks
 from openjax.learning.best_response import make_duel
-from openjax.pursuit import (
-    SCENARIOS,
-    EpisodeStatistics,
-    Pursuit,
-    PursuitSettings,
-    RewardSettings,
-    Task,
-)
+from openjax.pursuit import SCENARIOS, EpisodeStatistics, Pursuit, PursuitSettings, RewardSettings, Task
 from openjax.pursuit.evaders import EVADERS, HELD_OUT, SCRIPTED, VALIDATED
+from openjax.store import DEFAULT_POLICY
 from openjax.store.policies import LoadedPolicy, load_policy
-from openjax.store.policy_files import shipped_policies
 from openjax.vehicle.family import vehicle_family
 
 GAMES = {
@@ -84,18 +77,17 @@ def fly(name: str, options) -> list[dict]:
             flown = run(loaded.parameters, tasks, jnp.int32(i), jax.random.key(0), changes)
             for kind, own in part(jax.tree.map(np.asarray, flown)).items():
                 case = {"policy": name, "game": options.game, "vehicle": vehicle, "evader": evader}
-                records.append({**case, "tasks": kind, "of": EVADERS[evader].of, **summary(own)})
+                records.append({**case, "tasks": kind, **summary(own)})
     return records
 
 
 def summary(statistics: EpisodeStatistics) -> dict:
-    """Counts and means over episodes, with Wilson's 95 % interval of the capture rate."""
+    """Counts and means over episodes."""
     number, captures = len(statistics.captured), int(statistics.captured.sum())
     return {
         "episodes": number,
         "captures": captures,
         "capture_rate": captures / number,
-        "interval": tuple(binomtest(captures, number).proportion_ci(method="wilson")),
         "crash_rate": float(statistics.crashed.mean()),
         "capture_step": float(statistics.capture_step.mean()),
         "collision_rate": float((statistics.collision_steps / statistics.steps).mean()),
@@ -127,9 +119,8 @@ def page(results: dict) -> Page:
     }
     rows = [dict(zip(of, name, strict=True)) | overview(own) for name, own in by_policy.items()]
     parts: list[Table | str] = [Table(columns, rows, title="Overview"), everyone(by_policy)]
-    shipped = shipped_policies()
     for name, own in by_policy.items():
-        if name[0] in shipped:
+        if name[0] == DEFAULT_POLICY:
             parts.append(by_evader(own, f"{name[0]}, {name[1]} game, {name[2]} vehicle"))
     if "responses" in results:
         parts.append(learned_ones(results["responses"]))
@@ -175,10 +166,15 @@ def everyone(by_policy: dict[tuple, list[dict]]) -> Table:
             for evader in SCRIPTED:
                 own = [r for r in records if r["evader"] == evader and r["tasks"] in SCENARIOS]
                 captures, episodes = (sum(r[name] for r in own) for name in ("captures", "episodes"))
-                low, high = binomtest(captures, episodes).proportion_ci(method="wilson")
+                low, high = interval(captures, episodes)
                 rows[-1][evader] = f"{captures / episodes:.2f} [{low:.2f}, {high:.2f}]"
     prose = "Captures in the six layouts, 95 % interval; honest game, nominal vehicle."
     return Table({name: name for name in ("policy", *SCRIPTED)}, rows, "Everyone against everyone", prose)
+
+
+def interval(captures: int, episodes: int) -> tuple[float, float]:
+    """Wilson's 95 % interval of a capture rate."""
+    return binomtest(captures, episodes).proportion_ci(method="wilson")
 
 
 def by_evader(records: list[dict], title: str) -> Table:
@@ -187,7 +183,7 @@ def by_evader(records: list[dict], title: str) -> Table:
     for evader in dict.fromkeys(record["evader"] for record in records):
         own = {record["tasks"]: record for record in records if record["evader"] == evader}
         rates = {name: f"{r['capture_rate']:.3f}, {r['crash_rate']:.3f}" for name, r in own.items()}
-        least = min(r["interval"][0] for r in own.values())
+        least = min(interval(r["captures"], r["episodes"])[0] for r in own.values())
         rows.append({"evader": evader, "of": EVADERS[evader].of, **rates, "low": least})
     columns = {"evader": "evader", "used for": "of", **{name: name for name in own}}
     return Table(columns | {"least lower end": "low:.3f"}, rows, title=title)
