@@ -118,7 +118,11 @@ def page(results: dict) -> Page:
         "worst evader, layouts": "worst.layouts",
     }
     rows = [dict(zip(of, name, strict=True)) | overview(own) for name, own in by_policy.items()]
-    parts: list[Table | str] = [Table(columns, rows, title="Overview"), everyone(by_policy)]
+    parts: list[Table | str] = [
+        Table(columns, rows, title="Overview"),
+        *told(results, "findings", "What was found"),
+    ]
+    parts.append(everyone(by_policy))
     for name, own in by_policy.items():
         if name[0] == DEFAULT_POLICY:
             parts.append(by_evader(own, f"{name[0]}, {name[1]} game, {name[2]} vehicle"))
@@ -126,14 +130,20 @@ def page(results: dict) -> Page:
         parts.append(learned_ones(results["responses"]))
     if "runs" in results:
         parts.append(whole_runs(results["runs"]))
-    if "tried" in results:
-        parts.append("\n".join(["## What else was tried", "", *(f"* {line}" for line in results["tried"])]))
+    parts += told(results, "tried", "What else was tried")
     prose = (
         "Capture rate, crash rate. The last column is the least lower end of the capture rates' 95 % intervals. "
         "Held-out evaders were never trained on, nor were checkpoints chosen by them. Crashes count to the end of the 8 s, "
         "after the capture too."
     )
     return Page("Policies against evaders", prose, parts)
+
+
+def told(results: dict, name: str, title: str) -> list[str]:
+    """A section of what is told in words, if anything is."""
+    return (
+        ["\n".join([f"## {title}", "", *(f"* {line}" for line in results[name])])] if name in results else []
+    )
 
 
 def overview(records: list[dict]) -> dict:
