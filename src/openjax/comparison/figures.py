@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from openjax.flights.flight import Case, Flight
+from openjax.flights.pairs import FULL
 from openjax.flights.signals import RATE, clock_of, first_order, in_band, on_clock
 from openjax.flights.track import GRAVITY, pwm_thrust, specific_force_of, to_body
 
 CLEAR_OF_FLOOR = 0.25  # m, where the ground's cushion is gone
 SETTLED = 0.5  # s after take-off and before landing that are left out
 BLOCK = 2.0  # s, over which rows of a flight count as one
-FULL = 0.98  # motor command from which on a rotor has nothing left to trim with
 LOW = 2.5  # Hz, below which drag isn't covered by vibration
 TURNING = (1.0, 10.0)  # Hz, where motors turn the vehicle
 DELAYS = (0, 2, 4, 6)  # rows, of the commands as instruments

@@ -22,7 +22,7 @@ LAG = 0.2  # s, largest clock offset and latency between honest streams
 AGREE = 0.5  # share of the correlation to be expected below which two channels contradict each other
 FITS = 0.75  # share above which another labelling is what was meant
 TELLS = 0.5  # correlation that the sensors' noise must leave for a comparison to tell anything
-FULL = 0.98  # motor command that counts as the largest
+FULL = 0.98  # motor command that counts as the largest: a rotor has nothing left to trim with
 # Motion (rms in the band) that is more than what else moves the channel that must follow: a pose that a filter makes is off by a
 # few cm/s and some hundredths of a radian; floor, wakes and a battery change the thrust by some per cent of hover; a loop at
 # rest opposes the air. Commanded thrust and motors (per cent) are exact.
