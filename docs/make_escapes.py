@@ -50,6 +50,17 @@ def draw_heights(axes, flight: Trajectory) -> None:
     axes.set(xlabel="s", ylabel="height [m]", xlim=(0, flight.end() * flight.time_step), ylim=(0, 1.2))
 
 
+def draw(path: Path, flights: list[Trajectory]) -> None:
+    """A column for each flight: from above, and heights."""
+    figure = Figure(figsize=(3.4 * len(flights), 5), layout="constrained")
+    panels = figure.subplots(2, len(flights), height_ratios=(3, 1))
+    for (above, below), flight in zip(panels.T, flights, strict=True):
+        draw_from_above(above, flight)
+        draw_heights(below, flight)
+    with replacing(path) as partial:
+        figure.savefig(partial, format="png", dpi=80)
+
+
 def main() -> None:
     """Fly, draw and tell."""
     parser = argparse.ArgumentParser(
@@ -71,27 +82,21 @@ def main() -> None:
         evaluator = Evaluator(environment, own.policy, BATCH)
         return evaluator.fly(own.parameters, {opponent: tasks}, jax.random.key(0))[0]
 
-    opponent, field = fly(options.opponent), fly("field")
-    caught = np.asarray(opponent.evaluation.statistics.captured)
-    escapes = np.flatnonzero(~caught)[:SHOWN]
-    flights = [field.trajectory(escapes[0], "the paper's evader")]
-    flights += [opponent.trajectory(i, options.opponent) for i in escapes]
-    figure = Figure(figsize=(3.4 * len(flights), 5), layout="constrained")
-    panels = figure.subplots(2, len(flights), height_ratios=(3, 1))
-    for (above, below), flight in zip(panels.T, flights, strict=True):
-        draw_from_above(above, flight)
-        draw_heights(below, flight)
-    with replacing(options.out) as path:
-        figure.savefig(path, format="png", dpi=80)
-    print(f"{options.opponent}: {caught.mean():.3f} of {options.tasks} captured")
-    for name, flown, which in (
-        ("the paper's evader, captures", field, np.flatnonzero(caught)[:100]),
-        (f"{options.opponent}, captures", opponent, np.flatnonzero(caught)[:100]),
-        (f"{options.opponent}, escapes", opponent, np.flatnonzero(~caught)),
-    ):
+    def tell(flown, name, which):
         all_of = [habits(flown.trajectory(i, "")) for i in which]
         means = ", ".join(f"{np.mean([h[k] for h in all_of]):.2f} {k}" for k in all_of[0])
         print(f"{name} ({len(all_of)}): {means}")
+
+    field, flown = fly("field"), fly(options.opponent)
+    caught = np.asarray(flown.evaluation.statistics.captured)
+    some, escapes = np.flatnonzero(caught)[:BATCH], np.flatnonzero(~caught)
+    print(f"{options.opponent}: {caught.mean():.3f} of {options.tasks} captured")
+    tell(field, "the paper's evader, on tasks that the other doesn't survive", some)
+    tell(flown, f"{options.opponent}, there", some)
+    if len(escapes):
+        tell(flown, f"{options.opponent}, escapes", escapes)
+        seen = [field.trajectory(escapes[0], "the paper's evader")]
+        draw(options.out, [*seen, *(flown.trajectory(i, options.opponent) for i in escapes[:SHOWN])])
 
 
 if __name__ == "__main__":

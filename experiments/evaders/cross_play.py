@@ -118,11 +118,8 @@ def page(results: dict) -> Page:
         "worst evader, layouts": "worst.layouts",
     }
     rows = [dict(zip(of, name, strict=True)) | overview(own) for name, own in by_policy.items()]
-    parts: list[Table | str] = [
-        Table(columns, rows, title="Overview"),
-        *told(results, "findings", "What was found"),
-    ]
-    parts.append(everyone(by_policy))
+    parts: list[Table | str] = [Table(columns, rows, title="Overview")]
+    parts += [*told(results, "findings", "What was found"), everyone(by_policy)]
     for name, own in by_policy.items():
         if name[0] == DEFAULT_POLICY:
             parts.append(by_evader(own, f"{name[0]}, {name[1]} game, {name[2]} vehicle"))
@@ -141,9 +138,8 @@ def page(results: dict) -> Page:
 
 def told(results: dict, name: str, title: str) -> list[str]:
     """A section of what is told in words, if anything is."""
-    return (
-        ["\n".join([f"## {title}", "", *(f"* {line}" for line in results[name])])] if name in results else []
-    )
+    lines = [f"* {line}" for line in results.get(name, ())]
+    return ["\n".join([f"## {title}", "", *lines])] if lines else []
 
 
 def overview(records: list[dict]) -> dict:
