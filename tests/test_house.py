@@ -14,7 +14,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "openjax"
 EXCEPTIONS = Path(__file__).with_name("house_exceptions.txt")
-MOST_LINES = {"src": 31_088, "experiments": 8_000}
+MOST_LINES = {"src": 31_092, "experiments": 8_000}
 """Of Python; the goal of `src` is 26,000."""
 FUNCTION = {"lines": 40, "branches": 10, "arguments": 5}
 """The most of a function: lines without its docstring, branches and arguments without those of functions inside it."""

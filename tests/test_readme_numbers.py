@@ -81,16 +81,18 @@ def test_first_runs():
 
     for table in tables:
         table["worst"] = min((table[name] for name in SCENARIOS), key=lambda row: row["capture_rate"])
+    for table, run in zip(tables, runs, strict=True):
+        table["finely"] = run["every_physics_step"]
 
     def range_of(kind, figure):
         rates = sorted(short(table[kind][figure], 2) for table in tables)
         return " to ".join(dict.fromkeys((rates[0], rates[-1])))
 
-    seeds = {10: "ten runs"}[len(runs)]
-    label = f"first runs on two cores (preset `quick`, {seeds}): captures of new tasks, of the worst layout"
+    assert (len(runs), len({run["seed"] for run in runs})) == (10, 5)
+    label = "first runs on two cores (preset `quick`, five seeds on two machines): captures of new tasks, of the worst layout"
     assert cells(label)[0] == ", ".join(range_of(kind, "capture_rate") for kind in ("validation", "worst"))
-    label = "... crashes in new tasks, among the six pillars of `random`"
-    assert cells(label)[0] == ", ".join(range_of(kind, "crash_rate") for kind in ("validation", "random"))
+    label = "... crashes in new tasks, in every step of the physics; among the six pillars of `random`"
+    assert cells(label)[0] == ", ".join(range_of(kind, "crash_rate") for kind in ("finely", "random"))
 
 
 def test_training_step():
@@ -151,7 +153,10 @@ def test_best_response():
 @pytest.mark.parametrize(
     ("label", "names"),
     [
-        ("diagnosis of 120 simulated cases that no tuning saw: first cause named is right", ["first"]),
+        (
+            "diagnosis of 120 simulated cases drawn afterwards: first cause named is right (64 with one cause)",
+            ["first"],
+        ),
         ("... nothing else is named", ["nothing_else"]),
         (
             "... a cause that no model covers is called unknown, gets a wrong name (14 cases)",

@@ -115,7 +115,7 @@ def page(results: dict) -> Page:
         "JAX": "jax",
         "whole command, s": "whole_command",
         "new tasks": _column("after", "validation"),
-        "... every 10 ms": lambda run: _three(run.get("every_physics_step"), 1.0),
+        "... looked at every 10 ms": lambda run: _three(run.get("every_physics_step"), 1.0),
         "far starts": _column("after", "validation_far"),
         **{f"`{name}`": _column("after", name) for name in SCENARIOS},
         "new tasks, `open`": _column("open", "validation"),

@@ -44,8 +44,8 @@ class FlightOptions:
     seed: Seed = 0
     """Draws the start attitudes."""
     opponent: str | None = None
-    """Evader to fly against: field, greedy, wall_runner, heavy, pillar_hugger, greedy_far, greedy_near, two_step, safe_place,
-    way_points, frozen, or a file that openjax exploit wrote; by default those of the policy's game."""
+    """Evader to fly against: field, greedy, wall_runner, slow_hugger, heavy, pillar_hugger, greedy_far, greedy_near, two_step,
+    safe_place, way_points, frozen, or a file that openjax exploit wrote; by default those of the policy's game."""
     compilation_cache: bool = True
     """Keep compiled programs in the user's cache folder."""
 

@@ -103,9 +103,13 @@ class Report:
         }
         return _plain(found | {"shares": shares, "parameters": estimates})
 
+    def class_of(self, effect: str) -> str:
+        """A named effect, and those that would do as well in its place."""
+        return " or ".join([effect, *self.equivalent.get(effect, ())])
+
     def shares_in_words(self) -> str:
-        """Every named effect's share with its interval, then sensors and clocks, then what is unexplained."""
-        named = [(e, self.shares.effects[e]) for e in self.named]
+        """Every named class' share with its interval, then sensors and clocks, then what is unexplained."""
+        named = [(self.class_of(e), self.shares.effects[e]) for e in self.named]
         parts = ", ".join(
             f"{e} {_short(v.value)} [{_short(v.interval90[0])}, {_short(v.interval90[1])}]" for e, v in named
         )

@@ -49,7 +49,7 @@ def sentence(report: Report) -> str:
     if not named:
         return VERDICTS[report.verdict]
     parts = " and ".join(
-        f"{' or '.join([e, *report.equivalent.get(e, ())]).replace('_', ' ')} ({100 * report.shares.effects[e].value:.0f} %)"
+        f"{report.class_of(e).replace('_', ' ')} ({100 * report.shares.effects[e].value:.0f} %)"
         for e in named
     )
     whole = sum(report.shares.effects[e].value for e in named) > 0.995  # 100 %, as it is shown
