@@ -73,8 +73,8 @@ def page(results: dict) -> Page:
         f"In brackets: 95 % interval. Seed {results['seed']}; SHA-256 of the answers: {digests or 'given'}. "
         f"{results['note']}"
     )
-    lines = results["cases"]
-    table, misses = ("\n".join(part(lines)) for part in (figures.figures_table, figures.misses))
+    table, misses = ("\n".join(part(results["cases"])) for part in (figures.figures_table, figures.misses))
+    misses += results.get("history", "")
     return Page("The exam of the diagnosis", prose, [table, f"## Misses\n\n{misses}"])
 
 
