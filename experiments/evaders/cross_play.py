@@ -12,8 +12,8 @@ from collections import defaultdict
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.stats import binomtest
 
+from experiments.diagnosis.figures import wilson
 from experiments.flying.vehicles import vehicles
 from experiments.table import Page, Table, page_parser, publish
 from openjax.commands.command_line import run_command
@@ -176,15 +176,10 @@ def everyone(by_policy: dict[tuple, list[dict]]) -> Table:
             for evader in SCRIPTED:
                 own = [r for r in records if r["evader"] == evader and r["tasks"] in SCENARIOS]
                 captures, episodes = (sum(r[name] for r in own) for name in ("captures", "episodes"))
-                low, high = interval(captures, episodes)
+                low, high = wilson(captures, episodes)
                 rows[-1][evader] = f"{captures / episodes:.2f} [{low:.2f}, {high:.2f}]"
     prose = "Captures in the six layouts, 95 % interval; honest game, nominal vehicle."
     return Table({name: name for name in ("policy", *SCRIPTED)}, rows, "Everyone against everyone", prose)
-
-
-def interval(captures: int, episodes: int) -> tuple[float, float]:
-    """Wilson's 95 % interval of a capture rate."""
-    return binomtest(captures, episodes).proportion_ci(method="wilson")
 
 
 def by_evader(records: list[dict], title: str) -> Table:
@@ -193,7 +188,7 @@ def by_evader(records: list[dict], title: str) -> Table:
     for evader in dict.fromkeys(record["evader"] for record in records):
         own = {record["tasks"]: record for record in records if record["evader"] == evader}
         rates = {name: f"{r['capture_rate']:.3f}, {r['crash_rate']:.3f}" for name, r in own.items()}
-        least = min(interval(r["captures"], r["episodes"])[0] for r in own.values())
+        least = min(wilson(r["captures"], r["episodes"])[0] for r in own.values())
         rows.append({"evader": evader, "of": EVADERS[evader].of, **rates, "low": least})
     columns = {"evader": "evader", "used for": "of", **{name: name for name in own}}
     prose = "The last column is the least lower end of the capture rates' 95 % intervals."

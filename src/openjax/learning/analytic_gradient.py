@@ -344,6 +344,6 @@ def compile_analytic(
         for number in range(gradient.how.updates):
             own_key = jax.random.fold_in(update_key, number)
             actor, state, parts = update(actor, state, parameters, flights, own_key)
-            yield parameters.replace(actor=actor), {name: float(value) for name, value in parts.items()}
+            yield parameters.replace(actor=actor), jax.device_get(parts)
 
     return learn
