@@ -51,13 +51,18 @@ def test_readme_and_pages_stay_short():
 
 
 def test_links_lead_somewhere():
-    """To a file, and where a page is named with a heading, to that heading."""
-    results = (ROOT / "experiments" / "results").rglob("*.md")
-    for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES, *results):
+    """To a file, and where a page is named with a heading, to that heading.
+
+    The site shows a copy of the pages of results: their links stay among them and the site's pages.
+    """
+    results = ROOT / "experiments" / "results"
+    for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES, *results.rglob("*.md")):
         text = page.read_text(encoding="utf-8")
         for path, heading in re.findall(r"\]\((?!http)([^)#]*)#?([^)]*)\)", text):
             target = page.parent / path if path else page
             assert target.exists(), f"{page.name}: {path}"
+            if results in page.parents:
+                assert {ROOT / "docs", results} & set(target.resolve().parents), f"{page.name}: {path}"
             if heading:
                 titles = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), re.MULTILINE)
                 assert heading in [title.lower().replace(" ", "-") for title in titles], (
