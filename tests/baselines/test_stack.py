@@ -1,41 +1,19 @@
 """Stack with point pursuers: it catches every scripted evader inside its bound, and one gets away close outside."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from openjax.baselines import Heuristic
-from openjax.baselines.stack import StackParameters, stack, stack_bound
-from openjax.baselines.surroundings import Craft, length, surroundings
+from openjax.baselines.stack import stack_bound
 from openjax.pursuit import Pursuit, PursuitSettings, uniform_task
 from openjax.pursuit.evaders import draw_evader
 from openjax.pursuit.evaders.behaviours import MARGIN
-from openjax.vehicle import DroneState
+from tests.baselines.points import game_of_points, stack_team
 
-STEP = 0.01
+STEP = PursuitSettings().time_step
 EVADERS = ("field", "greedy", "greedy_near", "wall_runner", "way_points")
-
-
-@dataclasses.dataclass(frozen=True)
-class Points:
-    """Dynamics in which pursuers are points: the last three numbers of an action are a velocity, as shares of `speed` (m/s)."""
-
-    speed: float
-    time_step: float
-
-    def reset(self, vehicle, drones: DroneState, key=None) -> DroneState:
-        return drones
-
-    def __call__(self, vehicle, drones: DroneState, command: jax.Array, *_) -> DroneState:
-        share = command[:, 1:] / jnp.pi
-        velocity = self.speed * share / jnp.maximum(length(share), 1.0)
-        return drones.replace(velocity=velocity, position=drones.position + self.time_step * velocity)
-
-    def seen(self, drones: DroneState, effect_parameters=None) -> DroneState:
-        return drones
 
 
 def round_the_wall(settings, place):
@@ -54,19 +32,8 @@ def captures(number=64, wish=None, **changes):
 
     With a `wish` (settings, place -> (3,)) all do as it says.
     """
-    settings = PursuitSettings(
-        physics="stops",
-        speed_limit="none",
-        evaders=EVADERS,
-        episode_length=500,
-        min_pillars=0,
-        max_pillars=1,
-        **changes,
-    )
-    environment = Pursuit(settings, dynamics=Points(settings.max_speed, STEP))
-    craft = Craft.of(environment)
-    craft = dataclasses.replace(craft, speed=settings.max_speed, response=0.0)
-    parameters = StackParameters(tolerance=0.05, gain=1.0 / STEP)
+    environment = game_of_points(evaders=EVADERS, episode_length=500, **changes)
+    settings, team = environment.settings, stack_team(environment)
 
     def fly(key, kind):
         task = uniform_task(settings, key)
@@ -76,8 +43,7 @@ def captures(number=64, wish=None, **changes):
 
         def one(world, _):
             observation, state = world
-            velocity = stack(craft, parameters, surroundings(craft, observation))
-            action = jnp.concatenate([jnp.zeros((3, 1)), velocity / settings.max_speed], axis=-1)
+            action = team.act({}, observation)
             wished = None if wish is None else wish(settings, state.evader_position)
             observation, state, *_ = environment.step(key, state, action, wished)
             return (observation, state), None

@@ -1,0 +1,58 @@
+"""Pursuers that are points, and how they fly: games whose answer is known."""
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from openjax.baselines.stack import StackParameters, stack
+from openjax.baselines.surroundings import Craft, length, surroundings
+from openjax.pursuit import Observation, Pursuit, PursuitSettings
+from openjax.vehicle import DroneState
+
+
+@dataclasses.dataclass(frozen=True)
+class Points:
+    """Dynamics in which pursuers are points: the last three numbers of an action are a velocity, as shares of `speed` (m/s)."""
+
+    speed: float
+    time_step: float
+
+    def reset(self, vehicle, drones: DroneState, key=None) -> DroneState:
+        return drones
+
+    def __call__(self, vehicle, drones: DroneState, command: jax.Array, *_) -> DroneState:
+        share = command[:, 1:] / jnp.pi
+        velocity = self.speed * share / jnp.maximum(length(share), 1.0)
+        return drones.replace(velocity=velocity, position=drones.position + self.time_step * velocity)
+
+    def seen(self, drones: DroneState, effect_parameters=None) -> DroneState:
+        return drones
+
+
+def game_of_points(**changes) -> Pursuit:
+    """A game of points in an arena without pillars, if its tasks have none."""
+    fixed = {"physics": "stops", "speed_limit": "none", "min_pillars": 0, "max_pillars": 1}
+    settings = PursuitSettings(**(fixed | changes))
+    return Pursuit(settings, dynamics=Points(settings.max_speed, settings.time_step))
+
+
+@dataclasses.dataclass(frozen=True)
+class Team:
+    """A policy for `Points`, by a function from observations to velocities (..., N, 3) as shares of the speed."""
+
+    velocity: Callable[[Observation], jax.Array]
+
+    def act(self, parameters, observation: Observation) -> jax.Array:
+        """(..., N, 4): no thrust, a velocity."""
+        velocity = self.velocity(observation)
+        return jnp.concatenate([jnp.zeros_like(velocity[..., :1]), velocity], axis=-1)
+
+
+def stack_team(environment: Pursuit) -> Team:
+    """Stack, by points that correct themselves within a step."""
+    settings = environment.settings
+    craft = dataclasses.replace(Craft.of(environment), speed=settings.max_speed, response=0.0)
+    how = StackParameters(tolerance=0.05, gain=1.0 / settings.time_step)
+    return Team(lambda seen: stack(craft, how, surroundings(craft, seen)) / settings.max_speed)
