@@ -25,7 +25,6 @@ def left_over(push):
     replay = SimpleNamespace(
         tracks=tracks,
         usable=np.ones(9),
-        heard=np.ones(6),
         noises=noises,
         whiten=lambda r, k: np.concatenate([n.whiten(r[:, n.axes]) for n in noises], 1),
     )

@@ -1,11 +1,14 @@
 """The algebra of decisions against plain least squares."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
 from openjax.gap.model.bounds import BOUND
 from openjax.gap.model.cross_validation import Equations
+from openjax.gap.model.hypotheses import _loudness
 from openjax.gap.model.table import Model, Table, _errors
 
 
@@ -21,13 +24,22 @@ def columns():
     return out
 
 
-def test_without_a_pose_the_accelerometer_says_what_the_velocity_became():
-    rng = np.random.default_rng(1)
-    specific = rng.standard_normal((1, 200, 3))
-    x = np.concatenate([np.zeros((1, 200, 6)), specific], 2)
-    blind = _errors(x, 0.01, np.array([1, 1, 1, 0, 0, 0, 1, 1, 1]))
-    np.testing.assert_allclose(blind[0, 60, 3:], 0.01 * specific[0, 36:61].sum(0), rtol=1e-9)
-    assert not _errors(x, 0.01, np.ones(9)).any()
+def test_the_gap_holds_the_accelerometer_against_the_velocity_that_it_says():
+    """So a push that nuisances of the path could take, as a leaning world takes wind, still shows."""
+    specific = np.random.default_rng(1).standard_normal((1, 200, 3))
+    errors = _errors(np.concatenate([np.zeros((1, 200, 6)), specific], 2), 0.01)
+    np.testing.assert_allclose(errors[0, 60, 6:], 0.01 * specific[0, 36:61].sum(0), rtol=1e-9)
+    assert not errors[..., :6].any()
+
+
+def test_a_loud_second_counts_less_in_its_own_axes_and_in_no_other():
+    replay = SimpleNamespace(tracks=[SimpleNamespace(dt=0.01)], whiten=lambda residual, track: residual)
+    residual = np.random.default_rng(2).standard_normal((400, 9))
+    residual[200:300, 3:5] *= 7.0
+    loudness = _loudness(replay, residual, 0)
+    expected = np.ones((400, 9))
+    expected[200:300, 3:5] = 7.0
+    np.testing.assert_allclose(loudness, expected, rtol=0.25)
 
 
 def test_nuisances_of_the_vehicle_are_alike_on_all_blocks_and_bounded_and_a_blocks_own_are_marginalised(

@@ -32,7 +32,7 @@ CALIBRATION = Path(__file__).with_name("residual.json")
 @dataclass(frozen=True)
 class Check:
     """`measures` {name: value} and the one that stands out most, `where`; its `p_value` among cases without an unknown cause;
-    `predicted` (6,): share of each motion channel's squared error beyond what such cases leave, where the check rejects."""
+    `predicted` (9,): share of each motion channel's squared error beyond what such cases leave, where the check rejects."""
 
     measures: dict[str, float]
     where: str
@@ -59,7 +59,7 @@ def check_residual(evidence: Evidence, fit: SetFit) -> Check:
     residuals = residuals_of(fit)
     measured, excess = measure(evidence, residuals)
     p_value, name = conformal_p(measured)
-    predicted = excess if p_value <= DECISION.unknown else np.zeros(6)
+    predicted = excess if p_value <= DECISION.unknown else np.zeros(9)
     return Check(measured, HORIZONS.get(name, (0.0, ""))[1], p_value, predicted)
 
 
@@ -80,10 +80,10 @@ def disturbances(track: Track, residual: np.ndarray) -> np.ndarray:
 
 
 def measure(evidence: Evidence, residuals: list[np.ndarray]) -> tuple[dict[str, float], np.ndarray]:
-    """{name: measure} of what is left, and (6,) by which share the motion channels' squares exceed what the calibration's cases
+    """{name: measure} of what is left, and (9,) by which share the motion channels' squares exceed what the calibration's cases
     leave at most."""
     dt = evidence.tracks[0].dt
-    skip, out, excess = int(SKIP / dt), {}, np.zeros(6)
+    skip, out, excess = int(SKIP / dt), {}, np.zeros(9)
     for name, parts in _series(evidence, residuals).items():
         step = max(round(HORIZONS[name][0] / dt), 1)
         size = np.concatenate([(p[step:] - p[:-step])[skip:] for p in parts]).std(0)

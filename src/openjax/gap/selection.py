@@ -15,7 +15,7 @@ import numpy as np
 
 from openjax.gap.decision import DECISION
 from openjax.gap.evidence import Evidence
-from openjax.gap.model.cross_validation import Judged, judge, level, promise
+from openjax.gap.model.cross_validation import Judged, judge, promise
 from openjax.gap.model.hypotheses import SetFit, fit_set
 from openjax.gap.model.library import CARDS, places
 from openjax.gap.model.table import Table, build, with_effects
@@ -171,8 +171,9 @@ class Search:
 
     def gap_growth(self, other: Hypothesis, best: Hypothesis) -> float:
         """By how many floors the gap is larger under another hypothesis than under the best."""
-        floor = np.where(self.evidence.replay.heard > 0, best.judged.squares.sum(0), 0.0)
-        return level(other.judged.squares, floor) - 1.0
+        use = self.evidence.replay.usable > 0
+        square, floor = (h.judged.squares.sum(0)[use] for h in (other, best))
+        return float(np.sqrt((square / floor).mean())) - 1.0
 
     def clearly_worse(self, other: Hypothesis, best: Hypothesis) -> bool:
         """Whether flights tell a hypothesis from the best one, and it leaves a gap so much larger that it matters."""
@@ -205,7 +206,7 @@ class Search:
         pairs = [[difference(a.judged, b.judged) for b in sets] for a in sets]
         _, errors, trust = np.moveaxis(np.array(pairs), 2, 0)
         density = weights @ np.array([h.judged.nats for h in sets]).T  # (D, sets)
-        use, nothing, chosen = self.evidence.replay.heard > 0, sets.index(self.nothing), []
+        use, nothing, chosen = self.evidence.replay.usable > 0, sets.index(self.nothing), []
         squares = np.einsum("db,sbc->dsc", weights, np.array([h.judged.squares for h in sets])[..., use])
         for nats, square in zip(density, squares, strict=True):
             best = int(np.argmax(nats + odds))

@@ -1,9 +1,9 @@
 """How the gap splits: what each accepted effect, the sensors and the unexplained rest take of it, on stretches that no
 parameter was fitted to.
 
-The gap is the rms over channels of each channel's prediction error over its floor: velocity over 0.25 s, body rates
-over 0.05 s, the pose against the gyroscope over 0.1 s, the motor commands from the body-rate commands. The floor is what
-is left with all accepted effects, less what the residual check finds in excess of noise.
+The gap is the rms over channels of each channel's prediction error over its floor: velocity over 0.25 s as path and
+accelerometer say it, body rates over 0.05 s, the pose against the gyroscope over 0.1 s, the motor commands from the body-rate
+commands. The floor is what is left with all accepted effects, less what the residual check finds in excess of noise.
 A share is what the gap's square grows by when one part goes and all others stay (its usefulness, Darlington 1968), in proportion
 to that of all parts, so that shares add up to one with what is unexplained."""
 
@@ -19,8 +19,8 @@ from openjax.gap.model.table import ERRORS, with_effects
 from openjax.gap.selection import DRAWS, Selection
 
 METRIC = (
-    "rms over channels of prediction error / noise floor on stretches left out (velocity over 0.25 s, body rates over "
-    "0.05 s, pose against gyroscope over 0.1 s, motor commands from body-rate commands)"
+    "rms over channels of prediction error / noise floor on stretches left out (velocity over 0.25 s by path and by "
+    "accelerometer, body rates over 0.05 s, pose against gyroscope over 0.1 s, motor commands from body-rate commands)"
 )
 # Nuisances that are the sensors' and the clocks': how they are mounted, biased, filtered and timed.
 SENSORS = (
@@ -76,10 +76,10 @@ class Split:
 
 
 def split(evidence: Evidence, selection: Selection, predicted: np.ndarray, named) -> Split:
-    """Shares of the `named` effects, of all paths. `predicted` (6,): share of each motion channel's squared error that the
+    """Shares of the `named` effects, of all paths. `predicted` (9,): share of each motion channel's squared error that the
     residual check finds in excess of noise."""
     channels, squares = _squares_of_sets(evidence, selection, named)  # (sets, blocks, channels)
-    known = dict(zip((n for n, _ in ERRORS), predicted, strict=True))
+    known = dict(zip(ERRORS, predicted, strict=True))
     left = 1.0 - np.array([known.get(n, 0.0) for n in channels])
     blocks = squares.shape[1]
     drawn = np.random.default_rng(0).dirichlet(np.ones(blocks), DRAWS)
@@ -140,7 +140,7 @@ def _squares_of_sets(evidence: Evidence, selection: Selection, named) -> tuple[l
     def squares(there, off=None) -> dict[str, np.ndarray]:
         gone = [e for e in named if e not in there and e in selection.fit.effects]
         motion = ablated(table, found, (*never, *gone), off) / table.rows[:, None]
-        heard = {n: motion[:, k] for k, (n, _) in enumerate(ERRORS) if table.usable[k] > 0}
+        heard = {n: motion[:, k] for k, n in enumerate(ERRORS) if table.usable[k] > 0}
         return heard | _other_squares(evidence, [e for e in there if e not in selection.fit.effects], table)
 
     sets = [squares(named), squares((), sensors), squares(())]

@@ -79,9 +79,7 @@ def in_words(places: list[Place]) -> str:
     """The two largest cells as text."""
     words = {"force": "force along body", "torque": "torque about body"}
     parts = []
-    for place in places[:2]:
-        if place.share < 0.02 or place.before < 1.15:
-            continue
+    for place in (p for p in places[:2] if p.share >= 0.02 and p.before >= 1.15):
         kind, _, axis = place.channel.partition("_")
         name = f"{words[kind]} {axis}" if kind in words else place.channel
         parts.append(

@@ -9,11 +9,12 @@ from functools import cached_property
 import numpy as np
 
 from openjax.gap.model.library import ABSENT, CARDS, PLACE, Library, places, prior
-from openjax.gap.model.replay import GROUPS, SKIP, Replay
+from openjax.gap.model.replay import GROUPS, SKIP, Replay, block_count
 from openjax.gap.model.whitening import fit_noise
 
 ITERATIONS = 6
 SMALL_STEP = 0.05  # nats: an improvement below this ends the search
+STEADY = 20.0  # degrees of freedom of the prior on a block's variance, whose scale is that of all blocks
 UNEXPOSED = 0.5  # nats that a typical effect would leave: below, the effect isn't fitted at all
 
 
@@ -139,7 +140,20 @@ def with_noise_of(replay: Replay, residuals: list[np.ndarray]) -> Replay:
         fit_noise(axes, residuals, integrated, skip=skip) if replay.usable[axes[0]] else old
         for (axes, integrated), old in zip(GROUPS, replay.noises, strict=True)
     )
-    return replace(replay, noises=noises)
+    replay = replace(replay, noises=noises, loudness=None)
+    return replace(replay, loudness=tuple(_loudness(replay, r, k) for k, r in enumerate(residuals)))
+
+
+def _loudness(replay: Replay, residual: np.ndarray, track: int) -> np.ndarray:
+    """(T', 9) how loud the noise is in each block: rotors, air and what motors do between rows are quieter in hover than in a
+    turn. The variance of a group of axes has a scaled inverse chi-squared prior (Gelman et al. 2013)."""
+    squares = replay.whiten(residual, track) ** 2
+    out = np.ones_like(squares)
+    for rows in np.array_split(np.arange(len(squares)), block_count(len(squares), replay.tracks[track].dt)):
+        for axes, _ in GROUPS:
+            block = np.ix_(rows, axes)
+            out[block] = (squares[block].sum() + STEADY) / (squares[block].size + STEADY)
+    return np.sqrt(out)
 
 
 def without_nuisances(replay: Replay, residual: np.ndarray, track: int) -> np.ndarray:

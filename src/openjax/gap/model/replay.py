@@ -21,6 +21,7 @@ GROUPS = (((0, 1), True), ((2,), True), ((3, 4), True), ((5,), True), ((6, 7), F
 FIRST_NOISE = (0.03, 0.03, 0.006, 0.006, 0.25, 0.25)
 MOTORS_LATE = ("clock of the motors", "delay of the motors")
 SKIP = 0.2  # s left out at the start of a track: rotor speeds are not known there
+BLOCK = 1.0  # s that are left out together: gusts and sensors forget within less
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,12 +34,11 @@ class Replay:
     nominal: list[np.ndarray]  # (T, 9)
     nuisances: list[np.ndarray]  # (N, T, 9), in units of their standard deviations
     nuisance_names: tuple[str, ...]
-    sizes: list[
-        np.ndarray
-    ]  # usual sizes of each track's first nuisances: the vehicle's numbers, its propellers' inertia, its motors' clock and delay
+    sizes: list[np.ndarray]  # usual ones of each track's numbers, propellers, motors' clock and delay
     numbers: tuple  # the vehicle's numbers
     usable: np.ndarray  # (9,) channels that were logged
     noises: tuple[Noise, ...]  # unlogged channels have one, but count nothing
+    loudness: tuple[np.ndarray, ...] | None = None  # (T', 9) of each track, in units of the noise models
 
     @property
     def tracks(self) -> tuple[Track, ...]:
@@ -52,11 +52,6 @@ class Replay:
     def flight_of(self) -> np.ndarray:
         """(tracks,) index of a track's flight."""
         return np.array([self.flights.index(t.flight) for t in self.tracks])
-
-    @property
-    def heard(self) -> np.ndarray:
-        """(6,) whether the gap's channels were logged: body rates, and velocity or, without a pose, specific force."""
-        return np.concatenate([self.usable[:3], self.usable[3:6] if self.usable[3] else self.usable[6:9]])
 
     @cached_property
     def shared(self) -> np.ndarray:
@@ -96,7 +91,8 @@ class Replay:
         """x (..., T, 9) of a track -> (..., T', 9) in units of the noise, without the first moments."""
         out = whiten(self.noises, x)
         out *= self.usable
-        return out[..., int(SKIP / self.tracks[track].dt) :, :]
+        out = out[..., int(SKIP / self.tracks[track].dt) :, :]
+        return out if self.loudness is None else out / self.loudness[track]
 
     def grams(self, columns: list[np.ndarray]) -> np.ndarray:
         """Inner products (F, C, C) per flight of columns [(C, T, 9) per track], nuisances marginalised."""
@@ -178,6 +174,11 @@ def _balanced(nuisances: np.ndarray, count: int) -> np.ndarray:
     out = nuisances.copy()
     out[:count, :, RATES] -= np.linspace(0.0, 1.0, out.shape[1])[:, None] * out[:count, -1:, RATES]
     return out
+
+
+def block_count(rows: int, dt: float) -> int:
+    """Into how many blocks so many rows of dt s are cut."""
+    return max(rows // max(int(BLOCK / dt), 1), 1)
 
 
 def _measured(track: Track) -> np.ndarray:

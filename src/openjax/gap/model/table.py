@@ -16,17 +16,16 @@ from scipy.linalg import block_diag
 
 from openjax.gap.model.hypotheses import SetFit
 from openjax.gap.model.library import ABSENT, CARDS, places, prior
-from openjax.gap.model.replay import SKIP
+from openjax.gap.model.replay import FORCE, SKIP, block_count
 
-BLOCK = 1.0  # s that are left out together: gusts and sensors forget within less
-HORIZONS = {"velocity": 0.25, "rates": 0.05}  # s of the predictions whose errors are the gap
-ERRORS = tuple((f"{kind} {axis}", 3 * number + k) for number, kind in enumerate(("rates", "velocity"))
-               for k, axis in enumerate("xyz"))  # fmt: skip
+# s of the predictions whose errors are the gap; "acceleration" is the velocity that the accelerometer says
+HORIZONS = {"rates": 0.05, "velocity": 0.25, "acceleration": 0.25}
+ERRORS = tuple(f"{kind} {axis}" for kind in HORIZONS for axis in "xyz")
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """`white` (B, C, C) and `error` (B, 6, C, C) by block; `rows` (B,) that count; `track_of` (B,). Columns: 0 is
+    """`white` (B, C, C) and `error` (B, 9, C, C) by block; `rows` (B,) that count; `track_of` (B,). Columns: 0 is
     what is left; `derivative` {place: column}; `step` {effect: column}; `part` {effect: column}; the last are nuisances, of
     which `shared` (N,) are the case's and the others a block's."""
 
@@ -39,7 +38,7 @@ class Table:
     step: dict[str, int]
     part: dict[str, int]
     shared: np.ndarray
-    usable: np.ndarray  # (6,) of the errors
+    usable: np.ndarray  # (9,) of the errors
     columns: list  # whitened columns (C, M) of each block
 
     @property
@@ -96,11 +95,10 @@ def build(fit: SetFit, singles: dict[str, SetFit] | None) -> Table:
         now = replay.measured[number] - c[0]
         nuisances = replay.nuisances[number]
         x = np.concatenate([c, m[: len(others)] - now, now - m[len(others) :], nuisances])
-        skip, size = int(SKIP / track.dt), max(int(BLOCK / track.dt), 1)
         w = np.concatenate([replay.whiten(x[: -len(nuisances)], number), replay.whitened_nuisances[number]])
-        e = _errors(x, track.dt, replay.usable)
-        count = max(w.shape[1] // size, 1)
-        for a, b in zip(np.array_split(w, count, 1), _split(e, skip, count), strict=True):
+        count = block_count(w.shape[1], track.dt)
+        e = _errors(x, track.dt)[:, max(int(SKIP / track.dt), 25) :]
+        for a, b in zip(np.array_split(w, count, 1), np.array_split(e, count, 1), strict=True):
             flat = a.reshape(len(x), -1)
             whole.append(flat)
             white.append(flat @ flat.T)
@@ -114,27 +112,19 @@ def build(fit: SetFit, singles: dict[str, SetFit] | None) -> Table:
         {e: at + k for k, e in enumerate(others)},
         {e: at + len(others) + k for k, e in enumerate(own)},
         replay.shared,
-        replay.heard,
+        replay.usable,
         whole,
     )  # fmt: skip
 
 
-def _errors(x: np.ndarray, dt: float, usable: np.ndarray) -> np.ndarray:
-    """Errors (C, T, 6) of predictions over HORIZONS that end at each row. Without a pose the accelerometer says what the
-    velocity became, in axes of the body."""
-    out = np.zeros((*x.shape[:2], 6))
-    for k, kind in enumerate(("rates", "velocity")):
-        step = max(round(HORIZONS[kind] / dt), 1)
-        whole = x[..., 3 * k : 3 * k + 3]
-        if kind == "velocity" and not usable[3]:
-            whole = np.cumsum(x[..., 6:9], axis=1) * dt
-        out[:, step:, 3 * k : 3 * k + 3] = whole[:, step:] - whole[:, :-step]
+def _errors(x: np.ndarray, dt: float) -> np.ndarray:
+    """Errors (C, T, 9) of predictions over HORIZONS that end at each row."""
+    out = np.zeros_like(x)
+    for k, horizon in enumerate(HORIZONS.values()):
+        axes, step = slice(3 * k, 3 * k + 3), max(round(horizon / dt), 1)
+        whole = np.cumsum(x[..., axes], axis=1) * dt if axes == FORCE else x[..., axes]
+        out[:, step:, axes] = whole[:, step:] - whole[:, :-step]
     return out
-
-
-def _split(e: np.ndarray, skip: int, count: int) -> list[np.ndarray]:
-    first = max(skip, 25)
-    return np.array_split(e[:, first:], count, 1)
 
 
 def with_effects(table: Table, add=(), drop=()) -> Model:
