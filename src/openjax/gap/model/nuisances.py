@@ -50,8 +50,8 @@ def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> dict[str
     force = nominal[:, FORCE]
     for name, axis in zip("xy", np.eye(3), strict=False):
         column(f"frame tilt {name}", VELOCITY, moved(np.cross(axis, body)), SIZE["frame_tilt"])
-    for number, name in enumerate("xyz"):
-        column(f"accelerometer bias {name}", 6 + number, 1.0, SIZE["accelerometer_bias"])
+    for number, name in enumerate("xyz"):  # another in each flight, as a chip's temperature is
+        column(f"accelerometer bias {name} of {track.flight}", 6 + number, 1.0, SIZE["accelerometer_bias"])
     for name, axis in zip("xyz", np.eye(3), strict=True):
         column(f"IMU tilt {name}", RATES, -np.cross(axis, rates - rates[0]), SIZE["imu_tilt"])
         column(f"IMU tilt {name}", FORCE, -np.cross(axis, force), SIZE["imu_tilt"])

@@ -143,7 +143,7 @@ def make_replay(tracks, vehicles, motor_ticks, feedback, numbers, one_clock=True
         columns_of(track, path, p, made, at_once)
         for track, path, p, made in zip(tracks, physics.paths, nominal, feedback, strict=True)
     ]
-    names = tuple(max(named, key=len))  # without a velocity a track has fewer
+    names = tuple(dict.fromkeys(name for columns in named for name in columns))
     moving = (*(" ".join(key[:2]) for key in numbers), "propellers' inertia", *MOTORS_LATE)
     own, apart = [key[2] for key in numbers], SIZE["motor_clock" if one_clock else "streams_apart"]
     sizes = [
