@@ -52,7 +52,7 @@ def test_nuisances_of_the_vehicle_are_alike_on_all_blocks_and_bounded_and_a_bloc
     rows = [np.concatenate([r[None], x[2:3], x[5:]]) for r, x in zip(left, columns, strict=True)]
     shared, order = np.array([True, True, False]), np.arange(2)
     white = np.array([x @ x.T for x in rows])
-    table = Table(None, white, None, None, order, {}, {}, {}, shared, None, rows)
+    table = Table(None, white, None, None, order, {}, {}, {}, shared, rows)
     model = Model((), np.array([1]), np.array([-0.2]), np.array([[4.0]]))
     equations = Equations(table, model)
     found = equations.solve(table.marginal.sum(0))[2]

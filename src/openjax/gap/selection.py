@@ -73,7 +73,7 @@ def select(evidence: Evidence) -> Selection:
     weights = search.weights()
     chosen = search.visited[max(weights, key=weights.get)]
     without = {e: search.of_set(set(chosen.effects) - {e}, chosen.fit) for e in chosen.effects}
-    gains = {e: search.gap_growth(h, chosen) for e, h in without.items()}
+    gains = {e: growth(h.judged.squares.sum(0), chosen.judged.squares.sum(0)) for e, h in without.items()}
     ordered = tuple(sorted(gains, key=lambda e: -gains[e]))
     chosen = replace(chosen, fit=fit_set(chosen.fit.replay, chosen.effects, chosen.fit.theta, rounds=ROUNDS))
     table = build(chosen.fit, {})
@@ -102,6 +102,16 @@ def difference(better: Judged, other: Judged) -> tuple[float, float, float]:
     energy = np.add.reduceat(change * change, better.starts)
     square = max(float((cross**2).sum()), float(energy.sum()), 1e-12)
     return float((cross + 0.5 * energy).sum()), square**0.5, float(energy.sum()) / square
+
+
+def growth(squares: np.ndarray, floor: np.ndarray) -> np.ndarray:
+    """By how many floors a gap of squared errors (..., channels) is larger than one of the squares `floor` (channels,)."""
+    return np.sqrt((squares / floor).mean(-1)) - 1.0
+
+
+def matters(squares: np.ndarray, floor: np.ndarray, nothing: np.ndarray):
+    """Whether a gap (..., channels) is so much larger than `floor` that it matters beside what `nothing` (channels,) leaves."""
+    return growth(squares, floor) > max(DECISION.least_gap, DECISION.form_error * growth(nothing, floor))
 
 
 def possible(fit: SetFit) -> bool:
@@ -169,18 +179,11 @@ class Search:
         sets += [effects | {e} for e in alone]
         return [self.of_set(s, here.fit) for s in dict.fromkeys(sets)]
 
-    def gap_growth(self, other: Hypothesis, best: Hypothesis) -> float:
-        """By how many floors the gap is larger under another hypothesis than under the best."""
-        use = self.evidence.replay.usable > 0
-        square, floor = (h.judged.squares.sum(0)[use] for h in (other, best))
-        return float(np.sqrt((square / floor).mean())) - 1.0
-
     def clearly_worse(self, other: Hypothesis, best: Hypothesis) -> bool:
         """Whether flights tell a hypothesis from the best one, and it leaves a gap so much larger that it matters."""
         gain, error, _ = difference(best.judged, other.judged)
-        growth, whole = self.gap_growth(other, best), self.gap_growth(self.nothing, best)
-        matters = growth > max(DECISION.least_gap, DECISION.form_error * whole)
-        return gain > DECISION.standard_errors * error and matters
+        gaps = (h.judged.squares.sum(0) for h in (other, best, self.nothing))
+        return gain > DECISION.standard_errors * error and bool(matters(*gaps))
 
     def equivalents(self, chosen: Hypothesis, named) -> dict[str, list[str]]:
         """For each named effect those in whose place, of the sets visited, flights don't tell the difference."""
@@ -206,13 +209,12 @@ class Search:
         pairs = [[difference(a.judged, b.judged) for b in sets] for a in sets]
         _, errors, trust = np.moveaxis(np.array(pairs), 2, 0)
         density = weights @ np.array([h.judged.nats for h in sets]).T  # (D, sets)
-        use, nothing, chosen = self.evidence.replay.usable > 0, sets.index(self.nothing), []
-        squares = np.einsum("db,sbc->dsc", weights, np.array([h.judged.squares for h in sets])[..., use])
+        nothing, chosen = sets.index(self.nothing), []
+        squares = np.einsum("db,sbc->dsc", weights, np.array([h.judged.squares for h in sets]))
         for nats, square in zip(density, squares, strict=True):
             best = int(np.argmax(nats + odds))
-            growth = np.sqrt((square / square[best]).mean(1)) - 1.0
-            matters = growth > max(DECISION.least_gap, DECISION.form_error * growth[nothing])
-            worse = (nats[best] - nats > DECISION.standard_errors * errors[best]) & matters
+            large = matters(square, square[best], square[nothing])
+            worse = (nats[best] - nats > DECISION.standard_errors * errors[best]) & large
             usual = ~worse & (odds == odds[~worse].max())
             first = int(np.argmax(np.where(usual, nats, -np.inf)))
             evidence = trust[first] * (nats - nats[first]) - costs

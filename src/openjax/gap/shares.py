@@ -140,7 +140,7 @@ def _squares_of_sets(evidence: Evidence, selection: Selection, named) -> tuple[l
     def squares(there, off=None) -> dict[str, np.ndarray]:
         gone = [e for e in named if e not in there and e in selection.fit.effects]
         motion = ablated(table, found, (*never, *gone), off) / table.rows[:, None]
-        heard = {n: motion[:, k] for k, n in enumerate(ERRORS) if table.usable[k] > 0}
+        heard = dict(zip(np.array(ERRORS)[evidence.replay.usable > 0], motion.T, strict=True))
         return heard | _other_squares(evidence, [e for e in there if e not in selection.fit.effects], table)
 
     sets = [squares(named), squares((), sensors), squares(())]

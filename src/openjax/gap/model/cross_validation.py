@@ -13,8 +13,8 @@ from openjax.gap.model.table import Model, Table
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """A model on stretches left out: `nats` (B,) minus half the whitened sum of squares, `squares` (B, 9) of the
-    errors, `taken` (B, N) of the shared nuisances."""
+    """A model on stretches left out: `nats` (B,) minus half the whitened sum of squares, `squares` (B, K) of the
+    errors of logged channels, `taken` (B, N) of the shared nuisances."""
 
     nats: np.ndarray
     squares: np.ndarray
@@ -81,12 +81,12 @@ def judge(table: Table, model: Model) -> Judged:
 
 
 def _squares(table: Table, found: np.ndarray) -> np.ndarray:
-    """Squared errors (B, 9) with coefficients (B, C)."""
+    """Squared errors (B, K) with coefficients (B, C)."""
     return np.einsum("bkc,bc->bk", np.einsum("bkcd,bd->bkc", table.error, found), found)
 
 
 def ablated(table: Table, found: np.ndarray, drop=(), off: np.ndarray | None = None) -> np.ndarray:
-    """Squared errors (B, 9) of a table's set with the coefficients `found` (B, C) of `left_out`, without the effects `drop` and
+    """Squared errors (B, K) of a table's set with the coefficients `found` (B, C) of `left_out`, without the effects `drop` and
     the nuisances `off` (N,); everything else stays as fitted."""
     found = found.copy()
     kept = {int(i) for e in table.fit.effects if e not in drop for i in prior((e,))[0]}

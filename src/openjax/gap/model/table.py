@@ -25,7 +25,7 @@ ERRORS = tuple(f"{kind} {axis}" for kind in HORIZONS for axis in "xyz")
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """`white` (B, C, C) and `error` (B, 9, C, C) by block; `rows` (B,) that count; `track_of` (B,). Columns: 0 is
+    """`white` (B, C, C) and `error` (B, logged of ERRORS, C, C) by block; `rows` (B,) that count; `track_of` (B,). Columns: 0 is
     what is left; `derivative` {place: column}; `step` {effect: column}; `part` {effect: column}; the last are nuisances, of
     which `shared` (N,) are the case's and the others a block's."""
 
@@ -38,7 +38,6 @@ class Table:
     step: dict[str, int]
     part: dict[str, int]
     shared: np.ndarray
-    usable: np.ndarray  # (9,) of the errors
     columns: list  # whitened columns (C, M) of each block
 
     @property
@@ -97,7 +96,7 @@ def build(fit: SetFit, singles: dict[str, SetFit] | None) -> Table:
         x = np.concatenate([c, m[: len(others)] - now, now - m[len(others) :], nuisances])
         w = np.concatenate([replay.whiten(x[: -len(nuisances)], number), replay.whitened_nuisances[number]])
         count = block_count(w.shape[1], track.dt)
-        e = _errors(x, track.dt)[:, max(int(SKIP / track.dt), 25) :]
+        e = _errors(x, track.dt)[:, max(int(SKIP / track.dt), 25) :, replay.usable > 0]
         for a, b in zip(np.array_split(w, count, 1), np.array_split(e, count, 1), strict=True):
             flat = a.reshape(len(x), -1)
             whole.append(flat)
@@ -112,7 +111,6 @@ def build(fit: SetFit, singles: dict[str, SetFit] | None) -> Table:
         {e: at + k for k, e in enumerate(others)},
         {e: at + len(others) + k for k, e in enumerate(own)},
         replay.shared,
-        replay.usable,
         whole,
     )  # fmt: skip
 
