@@ -1,4 +1,6 @@
-"""Settings and fixtures of the whole suite: it compiles much and computes little, so the compiler may leave out costly passes."""
+"""Settings and fixtures of the whole suite: it compiles much and computes little, so the compiler
+may leave out costly passes.
+"""
 
 import gc
 import os
@@ -9,8 +11,11 @@ import pytest
 from hypothesis import HealthCheck, settings
 from jaxtyping import install_import_hook
 
-# shapes and types of arrays in signatures are checked at each call, which is when a function is traced; settings check themselves
-_networks = [f"openjax.policy.{name}" for name in ("actor_critic", "encoder", "policy", "predictor")]
+# shapes and types of arrays in signatures are checked at each call, which is when a function is
+# traced; settings check themselves
+_networks = [
+    f"openjax.policy.{name}" for name in ("actor_critic", "encoder", "policy", "predictor")
+]
 install_import_hook([*_networks, "openjax.learning.advantages"], "beartype.beartype")
 
 _flags = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
@@ -23,8 +28,11 @@ os.environ.setdefault("XLA_FLAGS", _flags)
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-# what one test compiled, its other processes, other workers and the next session needn't compile again
-os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parent / ".pytest_cache" / "compiled"))
+# what one test compiled, its other processes, other workers and the next session needn't compile
+# again
+os.environ.setdefault(
+    "JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parent / ".pytest_cache" / "compiled")
+)
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
 
@@ -48,7 +56,9 @@ command = "thrust"
 
 @pytest.fixture(scope="session")
 def sample_columns():
-    """Columns of three sample flights of the nominal vehicle: {"flight_a": {"t": ..., ...}, ...}."""
+    """Columns of three sample flights of the nominal vehicle: {"flight_a": {"t": ..., ...},
+    ...}.
+    """
     from openjax.flights.samples import fly, references
     from openjax.vehicle import load_vehicle
 

@@ -1,4 +1,6 @@
-"""The documentation site: `make docs` builds it into docs/_build/html, and any warning is an error."""
+"""The documentation site: `make docs` builds it into docs/_build/html, and any warning is an
+error.
+"""
 
 import re
 import shutil
@@ -38,7 +40,9 @@ autodoc_default_options = {"exclude-members": "replace, tree_flatten, tree_unfla
 html_theme = "furo"
 html_title = f"openjax {release}"
 html_static_path = []
-html_extra_path = ["extra"]  # a replay of six layouts: `openjax view --scenario all --seed 3 --html FILE`
+html_extra_path = [
+    "extra"
+]  # a replay of six layouts: `openjax view --scenario all --seed 3 --html FILE`
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "measured"  # a copy of the pages of results, so that links lead to them
@@ -47,7 +51,9 @@ TO_PAGES = re.compile(r"\]\((?:\.\./)*docs/")
 
 
 def setup(app):
-    """Bring the pages of results in, and let links that lead there from outside lead into the site."""
+    """Bring the pages of results in, and let links that lead there from outside lead into the
+    site.
+    """
     shutil.rmtree(RESULTS, ignore_errors=True)
     shutil.copytree(HERE.parent / "experiments" / "results", RESULTS)
     app.connect("source-read", lambda app, name, source: _lead_inside(source))

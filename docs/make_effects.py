@@ -1,7 +1,9 @@
-"""The page of the effects and its pictures, from the effects' own code: `python docs/make_effects.py`.
+"""The page of the effects and its pictures, from the effects' own code: `python
+docs/make_effects.py`.
 
-Each kind of hook has its picture: what becomes of a command, of a pose, of a motor command, of a rotor's thrust, of the wrench,
-or of a manoeuvre where the vehicle itself is another one. Grey is the nominal vehicle; parameters are usual ones.
+Each kind of hook has its picture: what becomes of a command, of a pose, of a motor command, of a
+rotor's thrust, of the wrench, or of a manoeuvre where the vehicle itself is another one. Grey is
+the nominal vehicle; parameters are usual ones.
 """
 
 from pathlib import Path
@@ -27,7 +29,9 @@ HOVER = float(VEHICLE.mass * VEHICLE.gravity / (4 * max_rotor_thrust(VEHICLE)))
 
 
 def usual(effect: Effect) -> dict:
-    """Parameters at which the effect acts, as arrays; where they may have either sign, every second one has the other."""
+    """Parameters at which the effect acts, as arrays; where they may have either sign, every second
+    one has the other.
+    """
     values = {}
     for i, (name, what) in enumerate(effect.parameters.items()):
         low, high = what.prior
@@ -50,7 +54,8 @@ def draw_command(effect, axes):
     sent = np.where((time > 0.1) & (time < 0.3), 2.0, 0.0) + np.where(
         time > 0.3, 1.5 * np.sin(20 * (time - 0.3)), 0
     )
-    state, arrived = state_at(), []
+    state = state_at()
+    arrived = []
     memory = effect.initial_memory(VEHICLE, state, 0.01, jax.random.key(1))
     context = make_context(VEHICLE, state, dt=0.01)
     for rate in sent:
@@ -67,7 +72,8 @@ def draw_sensor(effect, axes):
     """A path, as flown and as the controller sees it."""
     time = np.arange(0.0, 0.6, 0.01)
     path = 0.1 * np.sin(10 * time)
-    state, seen = state_at((path[0], 0.0, 0.6)), []
+    state = state_at((path[0], 0.0, 0.6))
+    seen = []
     memory = effect.initial_memory(VEHICLE, state, 0.01, jax.random.key(1))
     for x in path:
         state = state_at((x, 0.0, 0.6))
@@ -85,13 +91,15 @@ def draw_motor(effect, axes):
     lines = {}
     for voltage in (4.1, 3.7, 3.3):
         context = make_context(VEHICLE, state_at(), battery_voltage=voltage)
-        lines[voltage] = jax.vmap(lambda m, c=context: effect.motor(usual(effect), jnp.full(4, m), c)[0])(
-            commands
-        )
+        lines[voltage] = jax.vmap(
+            lambda m, c=context: effect.motor(usual(effect), jnp.full(4, m), c)[0]
+        )(commands)
     same = all(np.allclose(line, lines[3.7], atol=1e-6) for line in lines.values())
     for (voltage, line), colour in zip(lines.items(), COLOURS, strict=False):
         if not same or voltage == 3.7:
-            axes.plot(commands, line, color=colour, label="with the effect" if same else f"{voltage} V")
+            axes.plot(
+                commands, line, color=colour, label="with the effect" if same else f"{voltage} V"
+            )
     axes.set(xlabel="motor command", ylabel="takes effect as")
 
 
@@ -102,7 +110,10 @@ def draw_thrust(effect, axes):
     def factors(z):
         state = state_at((0.0, 0.0, z))
         context = make_context(VEHICLE, state)
-        return effect.thrust(usual(effect), context.thrust, 0 * context.thrust, context)[0] / context.thrust
+        return (
+            effect.thrust(usual(effect), context.thrust, 0 * context.thrust, context)[0]
+            / context.thrust
+        )
 
     found = np.stack([np.asarray(factors(z)) for z in heights])
     axes.axhline(1.0, label="nominal", **GREY)
@@ -118,7 +129,9 @@ def draw_thrust(effect, axes):
 
 
 def draw_wrench(effect, axes):
-    """Force against forward speed; where speed doesn't matter, against the place of a vehicle above."""
+    """Force against forward speed; where speed doesn't matter, against the place of a vehicle
+    above.
+    """
 
     def force(speed, offset):
         state = state_at(velocity=(speed, 0.0, 0.0))
@@ -127,12 +140,16 @@ def draw_wrench(effect, axes):
             effect.wrench(usual(effect), make_context(VEHICLE, state, others_position=other))[0]
         )
 
-    speeds, offsets = np.linspace(-1.5, 1.5, 31), np.linspace(-0.4, 0.4, 41)
+    speeds = np.linspace(-1.5, 1.5, 31)
+    offsets = np.linspace(-0.4, 0.4, 41)
     along = np.stack([force(speed, 9.0) for speed in speeds])
     if np.ptp(along, axis=0).max() > 1e-9:
-        grid, found, label = speeds, along, "forward speed [m/s]"
+        grid = speeds
+        found = along
+        label = "forward speed [m/s]"
     else:
-        grid, label = offsets, "place of a vehicle .4 m above, to the side [m]"
+        grid = offsets
+        label = "place of a vehicle .4 m above, to the side [m]"
         found = np.stack([force(0.0, offset) for offset in offsets])
     axes.axhline(0.0, label="nominal", **GREY)
     for axis, colour in zip(range(3), COLOURS, strict=False):
@@ -142,7 +159,9 @@ def draw_wrench(effect, axes):
 
 
 def draw_body(effect, axes):
-    """Answer of the vehicle to steps of roll rate, yaw rate and thrust; what differs most is drawn."""
+    """Answer of the vehicle to steps of roll rate, yaw rate and thrust; what differs most is
+    drawn.
+    """
     time = np.arange(0.0, 0.8, DT)
     commands = np.zeros((len(time), 1, 4), np.float32)
     commands[:, 0, 0] = HOVER * np.where(time > 0.55, 1.25, 1.0)
@@ -155,7 +174,9 @@ def draw_body(effect, axes):
         for names, parameters in (((), {}), ((effect.name,), {effect.name: usual(effect)}))
     ]
     scale = {"roll rate [rad/s]": 3.0, "yaw rate [rad/s]": 2.0, "vertical speed [m/s]": 0.3}
-    most = max(scale, key=lambda name: np.abs(answers[1][name] - answers[0][name]).max() / scale[name])
+    most = max(
+        scale, key=lambda name: np.abs(answers[1][name] - answers[0][name]).max() / scale[name]
+    )
     axes.plot(time, answers[0][most], label="nominal", **GREY)
     axes.plot(time, answers[1][most], color=COLOURS[0], label="with the effect")
     axes.set(xlabel="time [s]", ylabel=most)
@@ -187,7 +208,9 @@ def draw(effect: Effect, path: Path) -> None:
     """Write the picture of an effect."""
     figure = Figure(figsize=(4.6, 2.5), layout="constrained")
     axes = figure.subplots()
-    next(function for hook, function in DRAWN.items() if getattr(effect, hook) is not None)(effect, axes)
+    next(function for hook, function in DRAWN.items() if getattr(effect, hook) is not None)(
+        effect, axes
+    )
     axes.legend(fontsize="small", frameon=False)
     axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(path, dpi=110, metadata={"Software": None})
@@ -198,12 +221,16 @@ def page() -> str:
     lines = [
         f"# The {len(EFFECTS)} effects",
         "",
-        "Each is one file in `src/openjax/vehicle/effects` and serves twice: `openjax train --effects effects.toml`",
-        "flies with it, and `openjax diagnose` fits it. The pictures come from that code with usual parameters;",
+        "Each is one file in `src/openjax/vehicle/effects` and serves twice: `openjax train "
+        "--effects effects.toml`",
+        "flies with it, and `openjax diagnose` fits it. The pictures come from that code with "
+        "usual parameters;",
         "grey is the nominal vehicle.",
         "",
-        "Symbols: $m$ motor command, $T_i$ and $Q_i$ thrust and reaction torque of rotor $i$, $v_i$ velocity of its hub",
-        "through the air in the body frame, $R$ propeller radius, $z_i$ its height, $u$ command of thrust and body rates,",
+        "Symbols: $m$ motor command, $T_i$ and $Q_i$ thrust and reaction torque of rotor $i$, "
+        "$v_i$ velocity of its hub",
+        "through the air in the body frame, $R$ propeller radius, $z_i$ its height, $u$ command of "
+        "thrust and body rates,",
         "$V$ battery voltage.",
     ]
     for name, effect in EFFECTS.items():
@@ -214,7 +241,9 @@ def page() -> str:
         lines += ["| parameter | unit | usual |", "|---|---|---|"]
         for parameter, what in effect.parameters.items():
             meaning = f" ({what.meaning})" if what.meaning else ""
-            lines.append(f"| `{parameter}`{meaning} | {what.unit} | {what.prior[0]:g} … {what.prior[1]:g} |")
+            lines.append(
+                f"| `{parameter}`{meaning} | {what.unit} | {what.prior[0]:g} … {what.prior[1]:g} |"
+            )
         sources = dict.fromkeys(what.source for what in effect.parameters.values())
         lines += ["", f"*{'; '.join(sources)}.*"]
     return "\n".join(lines) + "\n"

@@ -1,7 +1,9 @@
-"""The picture of evaders that get away: `python docs/make_escapes.py [--opponent NAME] [--policy NAME] [--tasks 1024]`.
+"""The picture of evaders that get away: `python docs/make_escapes.py [--opponent NAME] [--policy
+NAME] [--tasks 1024]`.
 
-On uniform tasks with four or five pillars, with the vehicles that the policy was trained on. Left: the paper's evader on the
-first task that the opponent survives; then the first three such tasks. Prints what the evaders do, in captures and in escapes.
+On uniform tasks with four or five pillars, with the vehicles that the policy was trained on. Left:
+the paper's evader on the first task that the opponent survives; then the first three such tasks.
+Prints what the evaders do, in captures and in escapes.
 """
 
 import argparse
@@ -28,7 +30,8 @@ BATCH = 128
 def habits(flight: Trajectory) -> dict[str, float]:
     """What the evader does until it is caught, and how fast the pursuers fly."""
     last = max(flight.end(after=0.0), 2)
-    evader, pursuers = flight.evader_position[:last], flight.pursuer_position[:last]
+    evader = flight.evader_position[:last]
+    pursuers = flight.pursuer_position[:last]
     velocity = np.diff(evader, axis=0) / flight.time_step
     speeds = np.linalg.norm(np.diff(pursuers, axis=0), axis=-1) / flight.time_step
     return {
@@ -36,7 +39,9 @@ def habits(flight: Trajectory) -> dict[str, float]:
         "m/s up or down": np.abs(velocity[:, 2]).mean(),
         "m between lowest and highest": np.ptp(evader[:, 2]),
         "share of the time in sight": flight.seen[:last].mean(),
-        "m to the nearest pursuer": np.linalg.norm(pursuers - evader[:, None], axis=-1).min(1).mean(),
+        "m to the nearest pursuer": np.linalg.norm(pursuers - evader[:, None], axis=-1)
+        .min(1)
+        .mean(),
         "m/s of the pursuers": speeds.mean(),
     }
 
@@ -47,7 +52,9 @@ def draw_heights(axes, flight: Trajectory) -> None:
     for i, color in enumerate(PURSUER_COLORS[: flight.pursuer_position.shape[1]]):
         axes.plot(time, flight.pursuer_position[:, i, 2], color=color, linewidth=0.8)
     axes.plot(time, flight.evader_position[:, 2], color=EVADER_COLOR)
-    axes.set(xlabel="s", ylabel="height [m]", xlim=(0, flight.end() * flight.time_step), ylim=(0, 1.2))
+    axes.set(
+        xlabel="s", ylabel="height [m]", xlim=(0, flight.end() * flight.time_step), ylim=(0, 1.2)
+    )
 
 
 def draw(path: Path, flights: list[Trajectory]) -> None:
@@ -87,16 +94,20 @@ def main() -> None:
         means = ", ".join(f"{np.mean([h[k] for h in all_of]):.2f} {k}" for k in all_of[0])
         print(f"{name} ({len(all_of)}): {means}")
 
-    field, flown = fly("field"), fly(options.opponent)
+    field = fly("field")
+    flown = fly(options.opponent)
     caught = np.asarray(flown.evaluation.statistics.captured)
-    some, escapes = np.flatnonzero(caught)[:BATCH], np.flatnonzero(~caught)
+    some = np.flatnonzero(caught)[:BATCH]
+    escapes = np.flatnonzero(~caught)
     print(f"{options.opponent}: {caught.mean():.3f} of {options.tasks} captured")
     tell(field, "the paper's evader, on tasks that the other doesn't survive", some)
     tell(flown, f"{options.opponent}, there", some)
     if len(escapes):
         tell(flown, f"{options.opponent}, escapes", escapes)
         seen = [field.trajectory(escapes[0], "the paper's evader")]
-        draw(options.out, [*seen, *(flown.trajectory(i, options.opponent) for i in escapes[:SHOWN])])
+        draw(
+            options.out, [*seen, *(flown.trajectory(i, options.opponent) for i in escapes[:SHOWN])]
+        )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,5 @@
-"""One's own controller on the test layouts, beside a shipped policy: capture rate, collisions, crashes.
+"""One's own controller on the test layouts, beside a shipped policy: capture rate, collisions,
+crashes.
 
 python examples/own_controller.py
 """
@@ -12,11 +13,16 @@ HOVER = hover_action(openjax.make().vehicle)[0]
 
 
 def chase(observation):
-    """Lean towards where the evader was last seen and away from the others, with what a real pursuer knows."""
-    quaternion, velocity = observation.self_state[:, 3:7], observation.self_state[:, 7:10]
+    """Lean towards where the evader was last seen and away from the others, with what a real
+    pursuer knows.
+    """
+    quaternion = observation.self_state[:, 3:7]
+    velocity = observation.self_state[:, 7:10]
     others = observation.others  # (N, N - 1, 3) m, from another pursuer to the own position
     apart = jnp.sum(others / jnp.sum(others**2, axis=-1, keepdims=True), axis=1)
-    target = observation.last_seen.at[2].set(0.5)  # at one height: the evader may dive, the floor is solid
+    target = observation.last_seen.at[2].set(
+        0.5
+    )  # at one height: the evader may dive, the floor is solid
     towards = target - observation.position + 0.15 * apart
     lean = jnp.array([-1.0, 1.0])  # roll moves towards -y, pitch towards +x
     wanted = lean * (0.2 * towards[:, [1, 0]] - 0.1 * velocity[:, [1, 0]])

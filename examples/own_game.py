@@ -9,12 +9,15 @@ import jax.numpy as jnp
 import openjax
 from openjax.pursuit import hover_action
 
-WORLDS, STEPS = 64, 500
+WORLDS = 64
+STEPS = 500
 game = openjax.make(num_pursuers=3, evader_speed=0.6, max_pillars=3, min_pillars=3, physics="rigid")
 
 
 def controller(state):
-    """(N, 4) actions that lean towards the evader: a rate command in proportion to where it is, seen from the drone."""
+    """(N, 4) actions that lean towards the evader: a rate command in proportion to where it is,
+    seen from the drone.
+    """
     drones, tilt = state.drones, state.drones.quaternion[:, 1:3]  # sine of half the roll and pitch
     towards = state.evader_position - drones.position
     lean = jnp.array([-1.0, 1.0])  # roll moves towards -y, pitch towards +x
@@ -37,4 +40,7 @@ def episode(key):
 
 
 captured = jax.jit(jax.vmap(episode))(jax.random.split(jax.random.key(0), WORLDS))
-print(f"captured in {int(captured.sum())} of {WORLDS} worlds within {STEPS * game.settings.time_step:.0f} s")
+print(
+    f"captured in {int(captured.sum())} of {WORLDS} worlds within "
+    f"{STEPS * game.settings.time_step:.0f} s"
+)

@@ -1,11 +1,13 @@
-"""One manner for all studies: measure, store what was found as JSON, make the page from what is stored.
+"""One manner for all studies: measure, store what was found as JSON, make the page from what is
+stored.
 
 from experiments.table import Page, Table, page_parser, publish
 
-def study(options) -> dict: ...            # what is stored, beside command, machine, commit and seconds
-def page(results) -> Page:                 # what is read from there
+def study(options) -> dict: ...            # what is stored, beside command, machine, commit and
+seconds def page(results) -> Page:                 # what is read from there
     columns = {"policy": "name", "capture": "summary.capture_rate:.3f", "step": "capture_step:.0f"}
-    return Page("Policies on other vehicles", "No clamp, drawn starts.", Table(columns, results["records"]))
+    return Page("Policies on other vehicles", "No clamp, drawn starts.", Table(columns,
+    results["records"]))
 
 publish(page_parser(__doc__, "vehicles").parse_args(arguments), study, page)
 """
@@ -32,15 +34,17 @@ RELEASE = "0.1.0"
 """Of results that don't name theirs."""
 
 Column = str | Callable[[Mapping], Any]
-"""Of a record: a path through it with a format, `summary.capture_rate:.3f`, or what is computed from it."""
+"""Of a record: a path through it with a format, `summary.capture_rate:.3f`, or what is computed
+from it.
+"""
 
 
 @dataclass(frozen=True)
 class Table:
     """Records, one a row, and by the head of each column what it shows of them.
 
-    A list of numbers is shown as mean (standard deviation), a truth as yes or no, and what is missing, None or no number
-    as a dash.
+    A list of numbers is shown as mean (standard deviation), a truth as yes or no, and what is
+    missing, None or no number as a dash.
     """
 
     columns: Mapping[str, Column]
@@ -52,7 +56,9 @@ class Table:
         """The section's Markdown."""
         head = [f"## {self.title}", ""] if self.title else []
         prose = [self.prose, ""] if self.prose else []
-        rows = [[cell(record, column) for column in self.columns.values()] for record in self.records]
+        rows = [
+            [cell(record, column) for column in self.columns.values()] for record in self.records
+        ]
         return [*head, *prose, *table(list(self.columns), rows)]
 
 
@@ -115,7 +121,9 @@ def made(facts: Mapping) -> str:
 
 def page_parser(doc: str | None, name: str) -> argparse.ArgumentParser:
     """A parser with `--report`, `--commit` and, by default for the page `name`, `--out`."""
-    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--report", action="store_true", help="from the stored results")
     parser.add_argument("--commit", default="", help="where the machine has no repository")
     parser.add_argument("--out", type=Path, default=RESULTS / name)
@@ -126,7 +134,8 @@ def typed_command() -> str:
     """The command that runs, as one types it, without the places of its work and its results."""
     spec = getattr(sys.modules["__main__"], "__spec__", None)
     name = spec.name.removesuffix(".__main__") if spec else Path(sys.argv[0]).name
-    words, kept = iter(sys.argv[1:]), []
+    words = iter(sys.argv[1:])
+    kept = []
     for word in words:
         if word in PLACES:
             next(words, None)
@@ -136,7 +145,9 @@ def typed_command() -> str:
 
 
 def facts(commit: str | None = None) -> dict:
-    """What stands beside all results: the command, the machine, and the commit, where the source tree can't tell."""
+    """What stands beside all results: the command, the machine, and the commit, where the source
+    tree can't tell.
+    """
     machine = describe_machine()
     return {"command": typed_command(), "machine": machine | ({"commit": commit} if commit else {})}
 
@@ -147,7 +158,8 @@ def publish(
     page: Callable[[Any], Page],
     draw: Callable[[Any, Path], None] | None = None,
 ) -> None:
-    """Store what `study` finds (unless told to read it), then write and print the page made from what is stored.
+    """Store what `study` finds (unless told to read it), then write and print the page made from
+    what is stored.
 
     Command, machine and seconds stand beside it; `draw` draws the page's figure.
     """
@@ -160,7 +172,10 @@ def publish(
 
 
 def write_page(
-    out: Path, page: Callable[[Any], Page], results: Any, draw: Callable[[Any, Path], None] | None = None
+    out: Path,
+    page: Callable[[Any], Page],
+    results: Any,
+    draw: Callable[[Any, Path], None] | None = None,
 ) -> None:
     """Write and print the page of `results`, and draw its figure if there is one."""
     text = "\n".join(page(results).lines(results)) + "\n"

@@ -1,4 +1,6 @@
-"""From flights to a fine-tuned policy, at a tiny size: what is drawn, what is written, what is refused."""
+"""From flights to a fine-tuned policy, at a tiny size: what is drawn, what is written, what is
+refused.
+"""
 
 import json
 from types import SimpleNamespace
@@ -71,7 +73,9 @@ def test_vehicles_are_drawn_from_the_intervals_and_a_share_of_all_else():
 def test_the_game_is_as_vehicles_fly_whatever_the_policy_knew():
     game = adapting_game(PursuitSettings())
     assert (game.speed_limit, game.substeps, game.start_attitude) == ("none", 5, "drawn")
-    assert game.observe_history == 12 and adapting_game(PursuitSettings(time_step=0.04)).substeps == 20
+    assert (
+        game.observe_history == 12 and adapting_game(PursuitSettings(time_step=0.04)).substeps == 20
+    )
 
 
 def test_only_what_is_clearly_better_is_kept():
@@ -84,7 +88,9 @@ def test_only_what_is_clearly_better_is_kept():
 
 
 def test_the_best_step_on_the_way_is_kept():
-    """A stand-in for training whose policy is its own step, and which is worth most after the third."""
+    """A stand-in for training whose policy is its own step, and which is worth most after the
+    third.
+    """
     policy = PolicyParameters(actor=np.zeros(1), critic={}, predictor=np.zeros(1))
     training = AdaptSettings(updates=6, look_every=1)
     adaptation = SimpleNamespace(
@@ -117,8 +123,12 @@ def only(names, monkeypatch):
     monkeypatch.setattr(family, "known_effects", lambda: few)
 
 
-def test_moments_in_flight_are_the_nominal_vehicles_with_a_settled_other_one(policy_file, monkeypatch):
-    """A heavy vehicle at a moment of the light one's flight: where that is, with rotors that carry its own weight."""
+def test_moments_in_flight_are_the_nominal_vehicles_with_a_settled_other_one(
+    policy_file, monkeypatch
+):
+    """A heavy vehicle at a moment of the light one's flight: where that is, with rotors that carry
+    its own weight.
+    """
     only(("mass", "state_latency"), monkeypatch)
     loaded = load_policy(policy_file)
     adaptation = make_adaptation(loaded.settings, AdaptSettings(worlds=2))
@@ -126,7 +136,8 @@ def test_moments_in_flight_are_the_nominal_vehicles_with_a_settled_other_one(pol
     bounds = bounds_of({"mass": {"extra": 0.008}}, {}, rest=0.0)
     flights = adaptation.fly(parameters, jax.random.key(0), bounds)
     nominal = adaptation.fly(parameters, jax.random.key(0), bounds_of({}, {}, rest=0.0))
-    own, other = flights.state.drones, nominal.state.drones
+    own = flights.state.drones
+    other = nominal.state.drones
     np.testing.assert_array_equal(own.position, other.position)
     np.testing.assert_array_equal(
         own.effect_memory["state_latency"]["pose"], other.effect_memory["state_latency"]["pose"]
@@ -154,11 +165,14 @@ def test_a_policy_is_fine_tuned_measured_and_written(policy_file, tmp_path, monk
     effects = tmp_path / "effects.toml"
     save_effects(effects, VALUES, INTERVALS)
     training = AdaptSettings(worlds=2, updates=1)
-    command = adapt.AdaptCommand(effects, str(policy_file), tmp_path / "out", episodes=2, training=training)
+    command = adapt.AdaptCommand(
+        effects, str(policy_file), tmp_path / "out", episodes=2, training=training
+    )
     results = adapting.adapt(command)
     assert json.loads((command.out / "adapt.json").read_text())["effects"] == ["motor_lag"]
     assert "motor_lag.extra_up" in (command.out / "adapt.html").read_text()
-    before, after = load_policy(policy_file), load_policy(command.out / "policy.npz")
+    before = load_policy(policy_file)
+    after = load_policy(command.out / "policy.npz")
     assert dict((name, low) for name, low, *_ in after.settings.environment.vehicles)[
         "motor_lag.extra_up"
     ] == pytest.approx(0.035)

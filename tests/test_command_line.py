@@ -1,4 +1,6 @@
-"""`openjax`: every command has help that needs no JAX; mistyped names are mended; editors see the public functions."""
+"""`openjax`: every command has help that needs no JAX; mistyped names are mended; editors see the
+public functions.
+"""
 
 import importlib.util
 import subprocess

@@ -1,4 +1,6 @@
-"""The commands as a user runs them, tiny: training, kill and resume, evaluation, benchmark, bad input."""
+"""The commands as a user runs them, tiny: training, kill and resume, evaluation, benchmark, bad
+input.
+"""
 
 import dataclasses
 import json
@@ -45,7 +47,8 @@ ALONE = ["--compare_with", "none"]
 def start(arguments):
     """A command in a process of its own; it says what it compiles.
 
-    Its output goes to a file: it's longer than a pipe holds that nobody reads while the run goes on.
+    Its output goes to a file: it's longer than a pipe holds that nobody reads while the run goes
+    on.
     """
     environment = {**os.environ, "JAX_LOG_COMPILES": "1"}
     output = tempfile.TemporaryFile("w+")
@@ -67,8 +70,11 @@ def finish(started, status=0):
 def train_arguments(tmp_path_factory):
     """The tiny run, in a simulator with effects and another vehicle, on all devices."""
     directory = tmp_path_factory.mktemp("simulator")
-    effects, vehicle = directory / "effects.toml", directory / "vehicle.toml"
-    effects.write_text("[rotor_drag]\nd_xy = 0.01\n[command_latency]\ndelay = { value = 0.02, unit = 's' }\n")
+    effects = directory / "effects.toml"
+    vehicle = directory / "vehicle.toml"
+    effects.write_text(
+        "[rotor_drag]\nd_xy = 0.01\n[command_latency]\ndelay = { value = 0.02, unit = 's' }\n"
+    )
     vehicle.write_text("[vehicle]\nmass = 0.034\n")
     files = ["--effects", str(effects), "--vehicle", str(vehicle)]
     return ["openjax.train", *TINY, *STEPS, *files, "--devices", "all"]
@@ -107,7 +113,9 @@ def test_train_shows_progress_and_leaves_what_the_readme_says(whole_run):
         "chase.gif",
     ):
         assert (out / name).stat().st_size > 100, name
-    assert [r["update"] for r in read_metrics(out / "metrics.jsonl", "train")] == list(range(1, UPDATES + 1))
+    assert [r["update"] for r in read_metrics(out / "metrics.jsonl", "train")] == list(
+        range(1, UPDATES + 1)
+    )
     layouts = json.loads((out / "layouts.json").read_text())
     scenarios = [row["scenario"] for row in layouts["after"]]
     assert scenarios == ["validation", "validation_far", *SCENARIOS]
@@ -126,12 +134,16 @@ def test_minutes_are_of_learning_however_long_the_compiler_takes(tmp_path):
         "1",
         *ALONE,
     ]
-    finish(start(["openjax.train", *arguments, "--minutes", "0.02", "--out", str(tmp_path / "run")]))
+    finish(
+        start(["openjax.train", *arguments, "--minutes", "0.02", "--out", str(tmp_path / "run")])
+    )
     learnt = list(read_metrics(tmp_path / "run" / "metrics.jsonl", "train"))
     assert 0 < len(learnt) < 100_000_000 // 160
 
 
-def test_killed_in_the_middle_of_a_checkpoint_and_resumed_equals_whole(whole_run, tmp_path, train_arguments):
+def test_killed_in_the_middle_of_a_checkpoint_and_resumed_equals_whole(
+    whole_run, tmp_path, train_arguments
+):
     out = tmp_path / "killed"
     process, _ = start([*train_arguments, *ALONE, "--out", str(out)])
     checkpoints = Checkpoints(out / "checkpoints")
@@ -156,7 +168,8 @@ def test_killed_in_the_middle_of_a_checkpoint_and_resumed_equals_whole(whole_run
     whole = Checkpoints(whole_run[0] / "checkpoints").latest()
     again = checkpoints.latest()
     assert whole.update == again.update == UPDATES
-    expected, arrays = load_arrays(whole.path), load_arrays(again.path)
+    expected = load_arrays(whole.path)
+    arrays = load_arrays(again.path)
     assert len(expected) > 100 and expected.keys() == arrays.keys()
     for name, array in expected.items():
         np.testing.assert_array_equal(array, arrays[name], err_msg=name)
@@ -199,7 +212,9 @@ def test_nan_stops_the_run_and_leaves_the_state(tmp_path, monkeypatch, capsys, t
     status, _ = in_process(train.main, options, monkeypatch, capsys)
     assert status == 1
     report = json.loads((out / "not_finite" / "report.json").read_text())
-    assert report["update"] == 4 and all(name.startswith("actor/parameters/") for name in report["leaves"])
+    assert report["update"] == 4 and all(
+        name.startswith("actor/parameters/") for name in report["leaves"]
+    )
     assert is_checkpoint(out / "not_finite" / "000000004")
     assert Checkpoints(out / "checkpoints").latest().update == 3
 
@@ -230,7 +245,10 @@ def test_evaluate_prints_and_writes_the_records(whole_run, tmp_path, monkeypatch
     layout = tmp_path / "own.toml"
     layout.write_text(LAYOUT)
     for scenario in ("hidden", layout):
-        assert in_process(evaluate.main, [*arguments, "--scenario", scenario], monkeypatch, capsys)[0] == 0
+        assert (
+            in_process(evaluate.main, [*arguments, "--scenario", scenario], monkeypatch, capsys)[0]
+            == 0
+        )
         row = json.loads(records.read_text())
         assert tuple(row) == FIELDS and row["episodes"] == 4
         if scenario == "hidden":
@@ -244,7 +262,9 @@ def test_shipped_policies_act_in_their_game_and_refuse_another():
     for name in shipped_policies():
         policy = openjax.load_policy(name)
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(policy.parameters)), name
-        kinds[policy.policy, policy.settings.environment] = policy  # seeds of one kind act by one program
+        kinds[policy.policy, policy.settings.environment] = (
+            policy  # seeds of one kind act by one program
+        )
     for policy in kinds.values():
         environment = openjax.make(policy.settings.environment, speed_limit="none")
         observation = jax.eval_shape(environment.reset, jax.random.key(0))[0]
@@ -286,7 +306,9 @@ def test_benchmark_writes_table_and_file(tmp_path, monkeypatch, capsys):
         ("- fly", 14),
         ("- renew", 14),
     ]
-    assert all(row["env_steps_per_second"] > 0 and row["compile_seconds"] > 0 for row in result["rows"])
+    assert all(
+        row["env_steps_per_second"] > 0 and row["compile_seconds"] > 0 for row in result["rows"]
+    )
     assert {"device", "versions", "commit"} <= result["machine"].keys()
 
 
@@ -302,15 +324,24 @@ def wrong_layout(change):
             "--environment.capture_radios 1",
             "unknown setting --environment.capture_radios; did you mean",
         ),
-        (train, "--environment.num_pursuers 9", "num_pursuers is 9; it must be a whole number in [1, 8]"),
-        (train, "--environment.pillar_radius 5", "leaves no room in an arena of radius 0.9: less than 0.83"),
+        (
+            train,
+            "--environment.num_pursuers 9",
+            "num_pursuers is 9; it must be a whole number in [1, 8]",
+        ),
+        (
+            train,
+            "--environment.pillar_radius 5",
+            "leaves no room in an arena of radius 0.9: less than 0.83",
+        ),
         (train, "--mappo.epochs two", "--mappo.epochs is 'two'; expected a whole number"),
         (train, "--network.heads 0", "network.heads is 0; it must be a whole number in"),
         (train, "--mappo.learning_rate nan", "mappo.learning_rate is nan; it must be in (0, 1]"),
         (train, "--restart_close 0.5", "restart_close 0.5 needs restart_every"),
         (
             train,
-            "--num_envs 16000000 --rollout_length 9600 --environment.episode_length 9600 --restart_steps 9600",
+            "--num_envs 16000000 --rollout_length 9600 --environment.episode_length 9600 "
+            "--restart_steps 9600",
             "worlds of 9600 steps need at least",
         ),  # more than any machine has
         (train, "--out /proc/run", "can't be written there"),
@@ -336,7 +367,11 @@ def wrong_layout(change):
         (train, "--compare_with opne", "policy opne: no such file"),
         (train, "--devices 1000", "expected all or a number up to"),
         (evaluate, "--policy {folder}", "is no policy"),
-        (evaluate, "--policy {run} --scenario nowhere", "no such layout, nor a .toml file; there are wall"),
+        (
+            evaluate,
+            "--policy {run} --scenario nowhere",
+            "no such layout, nor a .toml file; there are wall",
+        ),
         (evaluate, "--policy {run} --scenario {folder}/outside.toml", "outside the arena"),
         (evaluate, "--policy {run} --scenario {folder}/over.toml", "over the start"),
         (evaluate, "--policy {run} --json {folder}/no/where.json", "doesn't exist"),
@@ -345,7 +380,11 @@ def wrong_layout(change):
             "--policy {run} --environment.evaders learned",
             "a name isn't enough; --opponent takes a file",
         ),
-        (evaluate, "--policy {run} --episode 3", "unknown setting --episode; did you mean --episodes?"),
+        (
+            evaluate,
+            "--policy {run} --episode 3",
+            "unknown setting --episode; did you mean --episodes?",
+        ),
         (benchmark, "--envs 0", "--envs is 0; it must be a whole number in"),
     ],
 )
@@ -363,5 +402,7 @@ def test_bad_input_is_one_line_and_status_2(
     status, error = in_process(main.main, arguments, monkeypatch, capsys)
     assert status == 2
     assert len(error.strip().splitlines()) == 1 and message in error
-    assert {path: path.stat().st_mtime_ns for path in [*run.rglob("*"), *folder.rglob("*")]} == before
+    assert {
+        path: path.stat().st_mtime_ns for path in [*run.rglob("*"), *folder.rglob("*")]
+    } == before
     assert os.listdir(tmp_path) == ["folder"]

@@ -1,4 +1,6 @@
-"""The page of the effects is what their files say, and that of the flying policies what is stored."""
+"""The page of the effects is what their files say, and that of the flying policies what is
+stored.
+"""
 
 import importlib.util
 import json
@@ -30,7 +32,11 @@ def test_policies_that_fly_are_as_stored():
     page = (DOCS / "policies_that_fly.md").read_text(encoding="utf-8")
 
     def mean(of_layouts, figure, digits):
-        return f"{np.mean([of_layouts[name][figure] for name in SCENARIOS]):.{digits}f}".removeprefix("0")
+        return (
+            f"{np.mean([of_layouts[name][figure] for name in SCENARIOS]):.{digits}f}".removeprefix(
+                "0"
+            )
+        )
 
     figures = {"capture_rate": 3, "crash_rate": 3, "over_speed_rate": 3}
     for name, of_vehicles in policies.items():

@@ -37,7 +37,9 @@ def test_training_from_python_gives_a_policy(tmp_path, monkeypatch, capsys):
     tiny = openjax.preset("quick")
     tiny = dataclasses.replace(
         tiny,
-        environment=dataclasses.replace(tiny.environment, time_step=0.01, substeps=1, episode_length=40),
+        environment=dataclasses.replace(
+            tiny.environment, time_step=0.01, substeps=1, episode_length=40
+        ),
         network=dataclasses.replace(tiny.network, features=8, heads=1),
         predictor=dataclasses.replace(tiny.predictor, enabled=False),  # less to compile
         first_flights=dataclasses.replace(tiny.first_flights, updates=0),

@@ -1,7 +1,8 @@
 """The house: how much there is, how long a function gets, which room may know which.
 
-What is over a function's limits today stands in `house_exceptions.txt`, which only gets shorter: a function over a limit that
-isn't listed fails, and so does a listed one that is no longer over. `python -m tests.test_house` writes the list.
+What is over a function's limits today stands in `house_exceptions.txt`, which only gets shorter: a
+function over a limit that isn't listed fails, and so does a listed one that is no longer over.
+`python -m tests.test_house` writes the list.
 """
 
 import ast
@@ -17,9 +18,13 @@ EXCEPTIONS = Path(__file__).with_name("house_exceptions.txt")
 MOST_LINES = {"src": 31_092, "experiments": 8_000}
 """Of Python; the goal of `src` is 26,000."""
 FUNCTION = {"lines": 40, "branches": 10, "arguments": 5}
-"""The most of a function: lines without its docstring, branches and arguments without those of functions inside it."""
+"""The most of a function: lines without its docstring, branches and arguments without those of
+functions inside it.
+"""
 OVER = {"lines": 28, "branches": 10, "arguments": 61}
-"""Functions that are still over each limit; too many branches have some of `flights`, `gap` and the experiments alone."""
+"""Functions that are still over each limit; too many branches have some of `flights`, `gap` and the
+experiments alone.
+"""
 FLOORS = (
     "errors lazy platform background",
     "files ranges kernels",
@@ -67,7 +72,8 @@ def parsed(path: Path) -> ast.Module:
 @functools.cache
 def imports() -> dict[str, set[str]]:
     """Modules that each module imports, in functions too, but not for types alone."""
-    known, found = modules(), defaultdict(set)
+    known = modules()
+    found = defaultdict(set)
     for name, path in known.items():
         types_only = {
             inner
@@ -92,12 +98,15 @@ def size(function: ast.FunctionDef | ast.AsyncFunctionDef) -> dict[str, int]:
     inside = {
         node
         for inner in ast.walk(function)
-        if inner is not function and isinstance(inner, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+        if inner is not function
+        and isinstance(inner, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
         for node in ast.walk(inner)
     }
     own = [node for node in ast.walk(function) if node not in inside]
     branches = sum(
-        isinstance(node, ast.If | ast.For | ast.While | ast.ExceptHandler | ast.IfExp | ast.match_case)
+        isinstance(
+            node, ast.If | ast.For | ast.While | ast.ExceptHandler | ast.IfExp | ast.match_case
+        )
         for node in own
     )
     branches += sum(len(node.ifs) for node in own if isinstance(node, ast.comprehension))
@@ -120,13 +129,17 @@ def over_the_limits() -> set[str]:
                 if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                     over = [name for name, number in size(node).items() if number > FUNCTION[name]]
                     if over:
-                        found.add(f"{path.relative_to(ROOT).as_posix()} {node.name}: {', '.join(over)}")
+                        found.add(
+                            f"{path.relative_to(ROOT).as_posix()} {node.name}: {', '.join(over)}"
+                        )
     return found
 
 
 @pytest.mark.parametrize("part", MOST_LINES)
 def test_there_is_no_more_of_it(part):
-    lines = sum(len(path.read_text(encoding="utf-8").splitlines()) for path in (ROOT / part).rglob("*.py"))
+    lines = sum(
+        len(path.read_text(encoding="utf-8").splitlines()) for path in (ROOT / part).rglob("*.py")
+    )
     assert lines <= MOST_LINES[part]
 
 
@@ -154,7 +167,8 @@ def test_rooms_import_downwards_only():
 
 def test_no_module_imports_itself_by_a_detour():
     def reachable(start):
-        seen, left = set(), set(imports()[start])
+        seen = set()
+        left = set(imports()[start])
         while left:
             name = left.pop()
             seen.add(name)

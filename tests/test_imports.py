@@ -1,4 +1,6 @@
-"""What stands alone can be loaded alone: the paper's ideas without physics, commands' help without arrays."""
+"""What stands alone can be loaded alone: the paper's ideas without physics, commands' help without
+arrays.
+"""
 
 import subprocess
 import sys

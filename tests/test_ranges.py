@@ -1,4 +1,6 @@
-"""Every setting's range, all at once: what is inside is taken, what is outside is refused by name, in one line."""
+"""Every setting's range, all at once: what is inside is taken, what is outside is refused by name,
+in one line.
+"""
 
 import dataclasses
 import math
@@ -58,7 +60,9 @@ def test_every_number_declares_a_range():
     for kind in (*SETTINGS, *COMMANDS, *OF_FLIGHTS):
         ranged = {field.name for field in ranged_fields(kind)}
         for name, hint in typing.get_type_hints(kind).items():
-            assert name in ranged or hint not in numbers, f"{kind.__module__}.{kind.__name__}.{name}"
+            assert name in ranged or hint not in numbers, (
+                f"{kind.__module__}.{kind.__name__}.{name}"
+            )
 
 
 def outside(interval: Interval):
@@ -66,7 +70,9 @@ def outside(interval: Interval):
     return st.one_of(
         st.sampled_from([math.nan, math.inf, -math.inf, 10**30, -1e300, 1e300]),
         st.floats(max_value=interval.low - 1e-3 * (1.0 + abs(interval.low)), allow_infinity=False),
-        st.floats(min_value=interval.high + 1e-3 * (1.0 + abs(interval.high)), allow_infinity=False),
+        st.floats(
+            min_value=interval.high + 1e-3 * (1.0 + abs(interval.high)), allow_infinity=False
+        ),
         st.integers(max_value=math.ceil(interval.low) - 1),
         st.integers(min_value=math.floor(interval.high) + 1),
     )
@@ -78,7 +84,9 @@ def test_what_is_outside_is_refused_by_name(data):
     value = data.draw(st.one_of(outside(field.interval), st.sampled_from(["1", True, [1], {}])))
     # of a setting, already its making is refused; a command is checked when it was read
     with pytest.raises(UserError) as error:
-        check_intervals(dataclasses.replace(kind(), **{field.name: (value,) if field.several else value}))
+        check_intervals(
+            dataclasses.replace(kind(), **{field.name: (value,) if field.several else value})
+        )
     message = str(error.value)
     assert field.name in message and str(field.interval) in message
     assert "\n" not in message and len(message) < 300
@@ -86,7 +94,9 @@ def test_what_is_outside_is_refused_by_name(data):
 
 @given(data=st.data())
 def test_what_is_inside_is_taken_unless_settings_contradict_each_other(data):
-    kind, field = data.draw(st.sampled_from([(kind, field) for kind, field in FIELDS if kind in SETTINGS]))
+    kind, field = data.draw(
+        st.sampled_from([(kind, field) for kind, field in FIELDS if kind in SETTINGS])
+    )
     numbers = st.integers(math.ceil(field.interval.low), math.floor(field.interval.high))
     if field.kind is float:
         numbers = st.floats(field.interval.low, field.interval.high)
@@ -112,5 +122,8 @@ def test_help_shows_the_range(capsys):
     with pytest.raises(SystemExit):
         parse(TrainCommand, TrainCommand(), ["--help"], "train")
     shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert "Adam step size at the start; falls linearly to zero over `total_steps`. In (0, 1]." in shown
+    assert (
+        "Adam step size at the start; falls linearly to zero over `total_steps`. In (0, 1]."
+        in shown
+    )
     assert "In [1, 8]." in shown

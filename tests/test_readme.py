@@ -1,4 +1,6 @@
-"""The README's commands: each exists, and the way from sample flights to a corrected simulator works as written."""
+"""The README's commands: each exists, and the way from sample flights to a corrected simulator
+works as written.
+"""
 
 import importlib.util
 import json
@@ -62,7 +64,9 @@ def test_links_lead_somewhere():
             target = page.parent / path if path else page
             assert target.exists(), f"{page.name}: {path}"
             if results in page.parents:
-                assert {ROOT / "docs", results} & set(target.resolve().parents), f"{page.name}: {path}"
+                assert {ROOT / "docs", results} & set(target.resolve().parents), (
+                    f"{page.name}: {path}"
+                )
             if heading:
                 titles = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), re.MULTILINE)
                 assert heading in [title.lower().replace(" ", "-") for title in titles], (
@@ -96,7 +100,9 @@ def test_modules_that_the_pages_name_are_there():
     ]
     for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES):
         for name in re.findall(r"`([\w/]+\.py)`", page.read_text(encoding="utf-8")):
-            assert any(f"/{module}".endswith(f"/{name}") for module in modules), f"{page.name}: {name}"
+            assert any(f"/{module}".endswith(f"/{name}") for module in modules), (
+                f"{page.name}: {name}"
+            )
 
 
 @pytest.mark.slow
@@ -110,7 +116,8 @@ def test_python_of_the_readme_runs():
 @pytest.mark.slow
 def test_from_sample_flights_to_a_corrected_simulator(tmp_path):
     """sample_flights -> calibrate -> diagnose -> an environment that flies with what was found."""
-    case, out = tmp_path / "drag", tmp_path / "diagnosis"
+    case = tmp_path / "drag"
+    out = tmp_path / "diagnosis"
     sample_flights.main([str(case), "--effect", "rotor_drag"])
     calibrate.main([str(case), "--out", str(tmp_path / "vehicle_calibrated.toml")])
     vehicle = load_vehicle_file(tmp_path / "vehicle_calibrated.toml").vehicle

@@ -15,7 +15,9 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 def read(name):
-    return json.loads((ROOT / "experiments" / "results" / f"{name}.json").read_text(encoding="utf-8"))
+    return json.loads(
+        (ROOT / "experiments" / "results" / f"{name}.json").read_text(encoding="utf-8")
+    )
 
 
 def short(value, digits):
@@ -54,7 +56,9 @@ def test_layouts(layout):
 
 
 def test_training_runs():
-    """Seconds, captures and crashes of the whole runs by the preset's default settings, and the steps per second of updates."""
+    """Seconds, captures and crashes of the whole runs by the preset's default settings, and the
+    steps per second of updates.
+    """
     runs = [run for run in read("seconds")["runs"] if run.get("whole")]
     assert len(runs) == 8
 
@@ -65,13 +69,18 @@ def test_training_runs():
         f"{ends([r['whole']['seconds'] for r in runs if r['kept'] == kept], 0)} s"
         for kept in ("nothing", "all")
     ]
-    label = "whole training runs on one H100 (preset `paper`): nothing compiled before, programs kept"
+    label = (
+        "whole training runs on one H100 (preset `paper`): nothing compiled before, programs kept"
+    )
     assert cells(label)[0] == ", ".join(seconds)
     rates = [layout for run in runs for layout in run["whole"]["layouts"].values()]
     value = cells("... these eight seeds in the six layouts: captures, crashes")[0]
     assert value == ", ".join(ends([rate[figure] for rate in rates], 2) for figure in (0, 1))
     speeds = [run["steps_per_second"] / 1e6 for run in runs]
-    assert cells("environment steps per second of their updates")[0] == f"{np.median(speeds):.1f} million"
+    assert (
+        cells("environment steps per second of their updates")[0]
+        == f"{np.median(speeds):.1f} million"
+    )
 
 
 def test_first_runs():
@@ -80,7 +89,9 @@ def test_first_runs():
     tables = [{row["scenario"]: row for row in run["after"]} for run in runs]
 
     for table in tables:
-        table["worst"] = min((table[name] for name in SCENARIOS), key=lambda row: row["capture_rate"])
+        table["worst"] = min(
+            (table[name] for name in SCENARIOS), key=lambda row: row["capture_rate"]
+        )
     for table, run in zip(tables, runs, strict=True):
         table["finely"] = run["every_physics_step"]
 
@@ -90,15 +101,23 @@ def test_first_runs():
 
     assert (len(runs), len({run["seed"] for run in runs})) == (10, 5)
     label = "first runs on two cores (preset `quick`, five seeds on two machines): captures of new tasks, of the worst layout"
-    assert cells(label)[0] == ", ".join(range_of(kind, "capture_rate") for kind in ("validation", "worst"))
-    label = "... crashes in new tasks, in every step of the physics; among the six pillars of `random`"
-    assert cells(label)[0] == ", ".join(range_of(kind, "crash_rate") for kind in ("finely", "random"))
+    assert cells(label)[0] == ", ".join(
+        range_of(kind, "capture_rate") for kind in ("validation", "worst")
+    )
+    label = (
+        "... crashes in new tasks, in every step of the physics; among the six pillars of `random`"
+    )
+    assert cells(label)[0] == ", ".join(
+        range_of(kind, "crash_rate") for kind in ("finely", "random")
+    )
 
 
 def test_training_step():
     """The default network, the preset's number of worlds."""
     rows = read("faster_step")["rows"]
-    (row,) = [r for r in rows if r["run"] == "today" and r["label"] == "training" and r["worlds"] == 5120]
+    (row,) = [
+        r for r in rows if r["run"] == "today" and r["label"] == "training" and r["worlds"] == 5120
+    ]
     assert cells("the training step alone")[0] == f"{row['sps'] / 1e6:.1f} million"
 
 
@@ -137,9 +156,16 @@ def test_evaders():
 
 
 def test_best_response():
-    """Captures of the evader, of all that learned against the default policy, that is caught least."""
+    """Captures of the evader, of all that learned against the default policy, that is caught
+    least.
+    """
     responses = [r for r in read("evaders")["responses"] if r["policy"].startswith("evaders")]
-    learned = [r for response in responses for r in response["records"] if r["evader"].startswith("learned")]
+    learned = [
+        r
+        for response in responses
+        for r in response["records"]
+        if r["evader"].startswith("learned")
+    ]
     value = [
         short(min(r["capture_rate"] for r in learned if (r["scenario"] == "uniform") == uniform), 2)
         for uniform in (True, False)
@@ -154,7 +180,8 @@ def test_best_response():
     ("label", "names"),
     [
         (
-            "diagnosis of 120 simulated cases drawn afterwards: first cause named is right (64 with one cause)",
+            "diagnosis of 120 simulated cases drawn afterwards: first cause named is right (64 "
+            "with one cause)",
             ["first"],
         ),
         ("... nothing else is named", ["nothing_else"]),
@@ -179,7 +206,9 @@ def test_the_game():
     pillars = f"{game.min_pillars} to {game.max_pillars} pillars"
     row = (
         f"| radius {short(game.arena_radius, 1)} m, height {game.arena_height} m, {pillars} "
-        f"| {game.num_pursuers}, up to {game.max_speed:g} m/s | {game.evader_speed} m/s, a moving point "
-        f"| within {short(game.capture_radius, 1)} m, in {seconds:.0f} s | thrust and body rates, {1 / game.time_step:.0f} Hz |"
+        f"| {game.num_pursuers}, up to {game.max_speed:g} m/s | {game.evader_speed} m/s, a moving "
+        "point "
+        f"| within {short(game.capture_radius, 1)} m, in {seconds:.0f} s | thrust and body rates, "
+        f"{1 / game.time_step:.0f} Hz |"
     )
     assert row in README

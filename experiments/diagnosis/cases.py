@@ -1,18 +1,39 @@
-"""Which cases are drawn. Everything follows from the seed, the column (`known` or `stranger`) and the case's number.
+"""Which cases are drawn. Everything follows from the seed, the column (`known` or `stranger`) and
+the case's number.
 
-The known column may be used for development at will, and the real one, the same on vehicles with the errors of form
-that real ones have. The stranger's column draws sensors, a controller, vehicles, unknown kinds and garbage that the
-others never draw; it is for reported runs only.
+The known column may be used for development at will, and the real one, the same on vehicles with
+the errors of form that real ones have. The stranger's column draws sensors, a controller, vehicles,
+unknown kinds and garbage that the others never draw; it is for reported runs only.
 """
 
 from dataclasses import replace
 
 import numpy as np
 
-from experiments.diagnosis import controllers, effects, garbage, missions, real, sensors, unknowns, vehicle
+from experiments.diagnosis import (
+    controllers,
+    effects,
+    garbage,
+    missions,
+    real,
+    sensors,
+    unknowns,
+    vehicle,
+)
 
-SHARES = {"single": 0.50, "none": 0.14, "pair": 0.10, "unknown": 0.12, "not_testable": 0.06, "garbage": 0.08}
-BANDS = {"low": (0.8, 1.6), "medium": (2.0, 4.0), "high": (5.0, 40.0)}  # gap in noise floors, see `measure`
+SHARES = {
+    "single": 0.50,
+    "none": 0.14,
+    "pair": 0.10,
+    "unknown": 0.12,
+    "not_testable": 0.06,
+    "garbage": 0.08,
+}
+BANDS = {
+    "low": (0.8, 1.6),
+    "medium": (2.0, 4.0),
+    "high": (5.0, 40.0),
+}  # gap in noise floors, see `measure`
 TICKS = 1000  # of 10 ms in a flight, at most
 STYLES = {  # what a lab flies beside the flight that exposes the cause
     "excite": ("agile", "step", "yaw", "climb"),
@@ -41,7 +62,15 @@ def case_rng(seed, column, number, *more):
 
 def label(severity):
     """Severity band of a gap in noise floors."""
-    return "hidden" if severity < 0.5 else "low" if severity < 2.0 else "medium" if severity < 4.5 else "high"
+    return (
+        "hidden"
+        if severity < 0.5
+        else "low"
+        if severity < 2.0
+        else "medium"
+        if severity < 4.5
+        else "high"
+    )
 
 
 def _target(rng, band):
@@ -50,7 +79,9 @@ def _target(rng, band):
 
 
 def draw_missions(rng, needed, style, two):
-    """Three flights, each a mission or a pair of them; what is needed is flown twice if there is room."""
+    """Three flights, each a mission or a pair of them; what is needed is flown twice if there is
+    room.
+    """
     flights = [str(rng.choice(options)) for options in needed * 2 if options][:3]
     while len(flights) < 3:
         rest = [m for m in STYLES[style] if m not in flights]
@@ -66,7 +97,9 @@ def _kinds(column, known, strangers):
 
 
 def draw_case(seed, column, number, category, index):
-    """One case as a dict of plain values; `index` counts within the category, so that kinds come in turn."""
+    """One case as a dict of plain values; `index` counts within the category, so that kinds come in
+    turn.
+    """
     rng = case_rng(seed, column, number)
     told = vehicle.draw_told(rng)
     wrong_form = None
@@ -74,7 +107,11 @@ def draw_case(seed, column, number, category, index):
         told, wrong_form = real.draw(rng, column == "stranger")
     turn = int(case_rng(seed, column, 0, 7, sorted(SHARES).index(category)).integers(1000))
     names = list(effects.EFFECTS)
-    causes, targets, needed, channels, spoiled = [], [], [], "", None
+    causes = []
+    targets = []
+    needed = []
+    channels = ""
+    spoiled = None
     if category == "single":
         effect = names[(index + turn) % len(names)]
         causes = [effects.draw(rng, effect)]
@@ -93,7 +130,8 @@ def draw_case(seed, column, number, category, index):
         form = unknowns.FORMS["stranger" if column == "stranger" else "known"]
         causes = [{"effect": kind, "form": form, "shape": rng.uniform(0, 1, 8).tolist()}]
         causes[0] |= {"size": float(low * (high / low) ** rng.uniform()), "unit": unit}
-        targets, needed = [_target(rng, str(rng.choice(["medium", "high"])))], [unknowns.MISSIONS]
+        targets = [_target(rng, str(rng.choice(["medium", "high"])))]
+        needed = [unknowns.MISSIONS]
         channels = "pgmv" + logs
     elif category == "not_testable":
         effect = list(BLIND)[(index + turn) % len(BLIND)]
@@ -144,7 +182,9 @@ def draw_case(seed, column, number, category, index):
 
 
 def draw_cases(seed, column, count, only=None):
-    """A list of `count` cases in shuffled order, categories in the shares of `SHARES` (or those named in `only`)."""
+    """A list of `count` cases in shuffled order, categories in the shares of `SHARES` (or those
+    named in `only`).
+    """
     shares = {k: w for k, w in SHARES.items() if not only or k in only}
     total = sum(shares.values())
     counts = {k: int(np.floor(count * w / total)) for k, w in shares.items()}

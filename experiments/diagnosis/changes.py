@@ -1,12 +1,15 @@
-"""What changed, where the answer is known: sample flights with a known effect, and real flights of two Crazyflies.
+"""What changed, where the answer is known: sample flights with a known effect, and real flights of
+two Crazyflies.
 
-    python -m experiments.diagnosis.changes --work DIR --seeds 11 12 13 --vehicles E8=FOLDER E9=FOLDER=ANSWERS.json
+    python -m experiments.diagnosis.changes --work DIR --seeds 11 12 13 --vehicles E8=FOLDER
+    E9=FOLDER=ANSWERS.json
 
-Sample flights of each effect, and of none, are compared with those of none flown with another seed. A vehicle is a folder of
-conditions with `labels.json` (or a file of answers) and its normal flights in `normal_flight` or `reference`. These two are of
-CrazyPAD (github.com/AerialRoboticsUUST/CrazyPAD, commit 5448265, MIT; Masalimov et al., Data 2024, 9(6), 79): no orientation.
-Every condition is compared with all normal flights, and each day of normal flights with the others.
-`--figure` draws the figure of docs/what_changed.md into `--work` instead.
+Sample flights of each effect, and of none, are compared with those of none flown with another seed.
+A vehicle is a folder of conditions with `labels.json` (or a file of answers) and its normal flights
+in `normal_flight` or `reference`. These two are of CrazyPAD
+(github.com/AerialRoboticsUUST/CrazyPAD, commit 5448265, MIT; Masalimov et al., Data 2024, 9(6),
+79): no orientation. Every condition is compared with all normal flights, and each day of normal
+flights with the others. `--figure` draws the figure of docs/what_changed.md into `--work` instead.
 """
 
 from pathlib import Path
@@ -29,7 +32,8 @@ NORMAL = ("normal_flight", "reference")
 
 def record_of(vehicle: str, condition: str, truth: dict, change: Change) -> dict:
     """One comparison: what was done, and what was said."""
-    answer, size = prediction(change), change.size
+    answer = prediction(change)
+    size = change.size
     return {
         "vehicle": vehicle,
         "condition": condition,
@@ -68,7 +72,9 @@ def vehicle_records(name: str, folder: Path, labels: dict) -> list[dict]:
             out.append(record_of(name, f"normal flights, day {number}", {"cause": "none"}, change))
     for condition, truth in labels.items():
         if condition != normal:
-            change = comparison.change_between(condition, comparison.read(folder / condition)[1], old, case)
+            change = comparison.change_between(
+                condition, comparison.read(folder / condition)[1], old, case
+            )
             out.append(record_of(name, condition, truth, change))
     return out
 
@@ -121,12 +127,16 @@ def page(results: dict) -> Page:
         "changed": "changed",
         "said": lambda r: ", ".join(r["said"]) or None,
         "rotors": lambda r: "+".join(f"m{i}" for i in r["rotors"]) or None,
-        "size, % [90 %]": lambda r: "{:.0f} [{:.0f}, {:.0f}]".format(*(100 * v for v in r["size90"])),
+        "size, % [90 %]": lambda r: "{:.0f} [{:.0f}, {:.0f}]".format(
+            *(100 * v for v in r["size90"])
+        ),
         "least that shows, %": lambda r: f"{100 * r['least']:.0f}",
     }
     prose = (
-        "Two sets of flights of one vehicle are compared; what was changed is known. The real flights are open: they were in "
-        "sight when the priors were settled. The sample flights' seeds were not. Sizes are of a rotor's thrust, or of what "
+        "Two sets of flights of one vehicle are compared; what was changed is known. The real "
+        "flights are open: they were in "
+        "sight when the priors were settled. The sample flights' seeds were not. Sizes are of a "
+        "rotor's thrust, or of what "
         "changed."
     )
     records = results["records"]
@@ -134,12 +144,19 @@ def page(results: dict) -> Page:
 
 
 def figure(folder: Path) -> None:
-    """Two normal days, whose rotors differ by 2 % as new propellers do, and one with a weaker rotor."""
-    vehicle, rng = load_vehicle(), np.random.default_rng(3)
-    for seed, (name, weaker) in enumerate({"friday": 0.0, "monday": 0.0, "tuesday": 0.22}.items(), 1):
+    """Two normal days, whose rotors differ by 2 % as new propellers do, and one with a weaker
+    rotor.
+    """
+    vehicle = load_vehicle()
+    rng = np.random.default_rng(3)
+    for seed, (name, weaker) in enumerate(
+        {"friday": 0.0, "monday": 0.0, "tuesday": 0.22}.items(), 1
+    ):
         (folder / name).mkdir(parents=True)
         factors = 0.02 * rng.standard_normal(4) - weaker * np.array([0.0, 0.0, 1.0, 0.0])
-        effects = {"motor_imbalance": dict(zip(("m1", "m2", "m3", "m4"), factors.tolist(), strict=True))}
+        effects = {
+            "motor_imbalance": dict(zip(("m1", "m2", "m3", "m4"), factors.tolist(), strict=True))
+        }
         for k, (flight, reference) in enumerate(references(seed=seed, duration=8.0).items()):
             columns = fly(vehicle, vehicle, reference, 10 * seed + k, effects)
             write_csv(folder / name / f"{flight}.csv.gz", log_of(columns, flight))
@@ -151,8 +168,12 @@ def main() -> None:
     """Compare and report, or draw."""
     parser = page_parser(__doc__, "changes")
     parser.add_argument("--seeds", type=int, nargs="+", default=[])
-    parser.add_argument("--vehicles", nargs="+", default=[], help="real flights: NAME=FOLDER[=ANSWERS]")
-    parser.add_argument("--work", type=Path, default=Path("runs/changes"), help="folder for sample flights")
+    parser.add_argument(
+        "--vehicles", nargs="+", default=[], help="real flights: NAME=FOLDER[=ANSWERS]"
+    )
+    parser.add_argument(
+        "--work", type=Path, default=Path("runs/changes"), help="folder for sample flights"
+    )
     parser.add_argument("--figure", action="store_true")
     options = parser.parse_args()
     figure(options.work) if options.figure else publish(options, study, page)

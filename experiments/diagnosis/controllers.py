@@ -1,8 +1,10 @@
-"""Three off-board controllers that turn a reference and a measured pose into collective thrust and body rates.
+"""Three off-board controllers that turn a reference and a measured pose into collective thrust and
+body rates.
 
-`geometric` aligns the thrust with the wanted acceleration; `cascade` is a chain of PIDs on position, velocity and
-Euler angles, as firmware position controllers are; `preview` (stranger's column only) tracks a point ahead, every
-20 ms, with smoothed commands. All see the told mass and thrust constant.
+`geometric` aligns the thrust with the wanted acceleration; `cascade` is a chain of PIDs on
+position, velocity and Euler angles, as firmware position controllers are; `preview` (stranger's
+column only) tracks a point ahead, every 20 ms, with smoothed commands. All see the told mass and
+thrust constant.
 """
 
 import numpy as np
@@ -16,28 +18,40 @@ AHEAD = 8  # ticks that `preview` looks ahead
 
 
 class Controllers:
-    """The controllers of a batch: `kind` names one per body, `mass` (B,) kg and `most` (B,) N of all four rotors."""
+    """The controllers of a batch: `kind` names one per body, `mass` (B,) kg and `most` (B,) N of
+    all four rotors.
+    """
 
     def __init__(self, kinds, mass, most, reference):
-        self.kinds, self.mass, self.most, self.reference = np.array(kinds), mass, most, reference
+        self.kinds = np.array(kinds)
+        self.mass = mass
+        self.most = most
+        self.reference = reference
         self.period = np.array([PERIOD[k] for k in kinds])
         count = len(kinds)
         self.integral, self.smooth = np.zeros((3, count)), np.zeros((3, count))
         self.command = None
 
     def __call__(self, k, position, q, velocity):
-        """Commands (4, B) at tick k: thrust 0..1 and body rates rad/s; held where the controller is not due."""
-        r, last = self.reference, len(self.reference["position"]) - 1
+        """Commands (4, B) at tick k: thrust 0..1 and body rates rad/s; held where the controller is
+        not due.
+        """
+        r = self.reference
+        last = len(self.reference["position"]) - 1
         out = np.zeros((4, len(self.mass)))
         for kind in np.unique(self.kinds):
             own = self.kinds == kind
             at = min(k + AHEAD, last) if kind == "preview" else k
             goal = {name: r[name][at][..., own] for name in r if name != "pulses"}
-            out[:, own] = getattr(self, "_" + kind)(own, goal, position[:, own], q[:, own], velocity[:, own])
+            out[:, own] = getattr(self, "_" + kind)(
+                own, goal, position[:, own], q[:, own], velocity[:, own]
+            )
         out = out + r["pulses"][k]
         out[0] = np.clip(out[0], 0.08, 0.92)
         out[1:] = np.clip(out[1:], -np.pi, np.pi)
-        self.command = out if self.command is None else np.where(k % self.period == 0, out, self.command)
+        self.command = (
+            out if self.command is None else np.where(k % self.period == 0, out, self.command)
+        )
         return self.command
 
     def _collect(self, own, error):
@@ -57,14 +71,21 @@ class Controllers:
         want = want + np.array([[1.5], [1.5], [5.0]]) * self._collect(own, error)
         want[2] = np.clip(want[2], -6.0, 8.0) + GRAVITY
         side = np.sqrt(want[0] ** 2 + want[1] ** 2)
-        want[:2] *= np.minimum(1.0, 0.78 * want[2] / np.maximum(side, 1e-9))  # at most 38 degrees of tilt
+        want[:2] *= np.minimum(
+            1.0, 0.78 * want[2] / np.maximum(side, 1e-9)
+        )  # at most 38 degrees of tilt
         w, x, y, z = q
         up = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
         lean = rotate_back(q, cross(up, want / np.sqrt((want * want).sum(axis=0))))
         heading = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
         twist = (goal["yaw"] - heading + np.pi) % (2 * np.pi) - np.pi
         return np.stack(
-            [self._thrust(own, want, up), turn * lean[0], turn * lean[1], 3.0 * twist + goal["yaw_rate"]]
+            [
+                self._thrust(own, want, up),
+                turn * lean[0],
+                turn * lean[1],
+                3.0 * twist + goal["yaw_rate"],
+            ]
         )
 
     def _cascade(self, own, goal, position, q, velocity):

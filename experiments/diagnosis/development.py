@@ -1,11 +1,13 @@
-"""Diagnose sets of cases with known answers, in parallel processes: one JSON line a case, and one table.
+"""Diagnose sets of cases with known answers, in parallel processes: one JSON line a case, and one
+table.
 
-    python -m experiments.diagnosis.development --sets DIR DIR=ANSWERS.json … --cores 2 --out cases.jsonl
-    python -m experiments.diagnosis.development --report cases.jsonl …
+    python -m experiments.diagnosis.development --sets DIR DIR=ANSWERS.json … --cores 2 --out
+    cases.jsonl python -m experiments.diagnosis.development --report cases.jsonl …
 
-A set is a folder of cases (folders of logs with a vehicle.toml); its answers lie in DIR/answers.json, in DIR_answers.json
-beside it or are named. Lines are written as cases end, so that a run which is cut short still counts; cases in the file
-already aren't done again. `--engine-options` is a JSON object handed to `openjax.gap.diagnosis.diagnose_case`.
+A set is a folder of cases (folders of logs with a vehicle.toml); its answers lie in
+DIR/answers.json, in DIR_answers.json beside it or are named. Lines are written as cases end, so
+that a run which is cut short still counts; cases in the file already aren't done again.
+`--engine-options` is a JSON object handed to `openjax.gap.diagnosis.diagnose_case`.
 """
 
 import argparse
@@ -50,7 +52,10 @@ def diagnose(job: tuple) -> dict:
     global _done
     place, folder, answer, options = job
     true = truth.truth_of(answer)
-    start, report, error, trace = time.perf_counter(), None, None, None
+    start = time.perf_counter()
+    report = None
+    error = None
+    trace = None
     try:
         from openjax.errors import UserError
         from openjax.flights.case import load_case
@@ -59,10 +64,13 @@ def diagnose(job: tuple) -> dict:
         try:
             report = diagnose_case(load_case(folder), **options).to_dict()
         except UserError as refusal:
-            error = str(refusal).replace(f"{folder.parent}/", "")[:500]  # a case, not a place of this machine
+            error = str(refusal).replace(f"{folder.parent}/", "")[
+                :500
+            ]  # a case, not a place of this machine
     except Exception:  # a traceback is a finding, not the end
         trace = traceback.format_exc()[-2000:]
-    seconds, _done = round(time.perf_counter() - start, 2), _done + 1
+    seconds = round(time.perf_counter() - start, 2)
+    _done = _done + 1
     words = truth.words_of(report)
     line = {"set": place, "case": folder.name, "category": true.category, "truth": true.effects}
     line |= {"words": words} | truth.judge(true, words)
@@ -71,7 +79,16 @@ def diagnose(job: tuple) -> dict:
     line |= {"top": truth.top_probability(right, (report or {}).get("probabilities", {}))}
     line |= {"severity": answer.get("severity"), "magnitudes": parameters(answer, report)}
     line |= {"seconds": seconds, "first": _done == 1, "error": error, "traceback": trace}
-    kept = ("probabilities", "shares", "parameters", "gap", "not_testable", "rest", "quality", "residual")
+    kept = (
+        "probabilities",
+        "shares",
+        "parameters",
+        "gap",
+        "not_testable",
+        "rest",
+        "quality",
+        "residual",
+    )
     return line | {k: report[k] for k in kept if report and k in report}
 
 
@@ -87,7 +104,10 @@ def run(jobs: list[tuple], cores: int, out: Path, seconds: float | None) -> None
             try:
                 line = results.next(timeout=left)
             except multiprocessing.TimeoutError:
-                print(f"time is up after {seconds:.0f} s, {len(jobs) - number + 1} left", file=sys.stderr)
+                print(
+                    f"time is up after {seconds:.0f} s, {len(jobs) - number + 1} left",
+                    file=sys.stderr,
+                )
                 return
             file.write(json.dumps(line, default=list) + "\n")
             file.flush()
@@ -114,7 +134,11 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--report", nargs="+", type=Path, default=[], help="tables of stored lines")
     options = parser.parse_args(arguments)
     if options.sets:
-        done = {(r["set"], r["case"]) for r in read_lines([options.out])} if options.out.exists() else ()
+        done = (
+            {(r["set"], r["case"]) for r in read_lines([options.out])}
+            if options.out.exists()
+            else ()
+        )
         jobs = find_jobs(options.sets, options.engine_options)
         jobs = [job for job in jobs if (job[0], job[1].name) not in done]
         if jobs:

@@ -1,8 +1,10 @@
-"""How the twenty effects act inside the plant, and how a drawn cause is written into the plant's parameters.
+"""How the twenty effects act inside the plant, and how a drawn cause is written into the plant's
+parameters.
 
-A cause is {"effect", "form", "size", "shape"}: `size` is the one number that decides the severity, `shape` are
-eight uniform draws that fix everything else (signs, axes, ratios), once per case. The first form of an effect is
-close to what any library would write; the others are not. Arrays have the body index last.
+A cause is {"effect", "form", "size", "shape"}: `size` is the one number that decides the severity,
+`shape` are eight uniform draws that fix everything else (signs, axes, ratios), once per case. The
+first form of an effect is close to what any library would write; the others are not. Arrays have
+the body index last.
 """
 
 from typing import NamedTuple
@@ -22,7 +24,9 @@ from experiments.diagnosis.vehicle import (
 
 
 class Drawn(NamedTuple):
-    """What is drawn of an effect: (smallest, largest) size, forms, missions that expose it, logged channels that it needs."""
+    """What is drawn of an effect: (smallest, largest) size, forms, missions that expose it, logged
+    channels that it needs.
+    """
 
     sizes: tuple
     forms: tuple
@@ -34,7 +38,12 @@ SURFACE = ("inverse_square", "cheeseman_bennett", "exponential")
 _EFFECTS = {
     "mass": ((0.02, 0.30), ("plain", "payload"), (), "m"),
     "thrust_scale": ((0.02, 0.22), ("plain", "thrust_only"), (), "m"),
-    "battery_sag": ((0.10, 1.2), ("linear", "power", "quadratic", "load"), ("climb", "agile", "step"), "mv"),
+    "battery_sag": (
+        (0.10, 1.2),
+        ("linear", "power", "quadratic", "load"),
+        ("climb", "agile", "step"),
+        "mv",
+    ),
     "thrust_saturation": ((0.1, 0.95), ("hard", "voltage", "soft"), ("climb",), "m"),
     "rotor_drag": (
         (0.003, 0.035),
@@ -47,8 +56,18 @@ _EFFECTS = {
     "ground_effect": ((0.015, 0.35), SURFACE, ("low",), "pm"),
     "ceiling_effect": ((0.015, 0.35), SURFACE, ("high",), "pm"),
     "downwash": ((2.0, 20.0), ("gaussian", "jet"), ("pass", "pass_moving"), "pm"),
-    "motor_lag": ((0.2, 3.5), ("slower", "up_down", "second_order", "brushed"), ("agile", "step"), "gm"),
-    "command_latency": ((4.0, 60.0), ("constant", "jitter", "spikes"), ("agile", "step", "yaw"), "gcm"),
+    "motor_lag": (
+        (0.2, 3.5),
+        ("slower", "up_down", "second_order", "brushed"),
+        ("agile", "step"),
+        "gm",
+    ),
+    "command_latency": (
+        (4.0, 60.0),
+        ("constant", "jitter", "spikes"),
+        ("agile", "step", "yaw"),
+        "gcm",
+    ),
     "packet_loss": ((0.01, 0.5), ("independent", "bursts"), ("agile", "step", "yaw"), "gcm"),
     "thrust_curve": ((0.05, 1.0), ("quadratic", "power", "dip"), ("climb",), "m"),
     "motor_imbalance": ((0.003, 0.15), ("all", "one_weak"), (), "gm"),
@@ -89,8 +108,11 @@ class Active:
 
 
 def motor_demand(p, active, m, voltage, load):
-    """Motor commands (4, B) to effective thrust fraction: thrust map, battery, saturation, in this order."""
-    u, hover = m, p["hover"]
+    """Motor commands (4, B) to effective thrust fraction: thrust map, battery, saturation, in this
+    order.
+    """
+    u = m
+    hover = p["hover"]
     if active("curve_map"):
         u = p["curve_map"][0] + (p["curve_map"][1] + p["curve_map"][2] * m) * m
     if active("curve_quadratic"):
@@ -126,16 +148,23 @@ def surface_gain(p, active, position, q):
     for side in sides:
         distance = height if side == "ground" else CEILING - height
         d = np.maximum(distance, 0.0) + p[side + "_offset"]
-        # Cheeseman-Bennett 1 / (1 - (R / 4 z)^2) with an effective radius; an exponential; the simple (R / z)^2
+        # Cheeseman-Bennett 1 / (1 - (R / 4 z)^2) with an effective radius; an exponential; the
+        # simple (R / z)^2
         ratio = np.minimum((p[side + "_image"] * PROPELLER / (4.0 * d)) ** 2, 0.5)
-        gain = gain + (1.0 / (1.0 - ratio) - 1.0) + p[side + "_exp"] * np.exp(-d / p[side + "_scale"])
+        gain = (
+            gain + (1.0 / (1.0 - ratio) - 1.0) + p[side + "_exp"] * np.exp(-d / p[side + "_scale"])
+        )
         gain = gain + p[side + "_inverse"] * (PROPELLER / d) ** 2
     return gain
 
 
 def wake_force(p, position, other):
-    """Vertical force (B,) N, negative, from the rotor wake of the vehicle at `other` (3, B), and its gradient (2, B) N/m."""
-    dx, dy, dz = position[0] - other[0], position[1] - other[1], other[2] - position[2]
+    """Vertical force (B,) N, negative, from the rotor wake of the vehicle at `other` (3, B), and
+    its gradient (2, B) N/m.
+    """
+    dx = position[0] - other[0]
+    dy = position[1] - other[1]
+    dz = other[2] - position[2]
     below = np.where(dz > 0.02, 1.0, 0.0)
     dz = np.maximum(dz, 0.02)
     width = p["wake_width"] + p["wake_spread"] * dz
@@ -143,7 +172,9 @@ def wake_force(p, position, other):
     gauss = np.exp(-0.5 * r2 / width**2) * np.exp(-dz / p["wake_height"])
     # free jet: speed falls with 1 / distance, a top-hat with soft edge
     edge = np.sqrt(r2 + 1e-9)
-    jet = (0.15 / (0.15 + dz)) ** 2 / (1.0 + np.exp(np.clip((edge - 1.2 * width) / (0.25 * width), -40, 40)))
+    jet = (0.15 / (0.15 + dz)) ** 2 / (
+        1.0 + np.exp(np.clip((edge - 1.2 * width) / (0.25 * width), -40, 40))
+    )
     shape = np.where(p["wake_jet"] > 0, jet, gauss)
     jet_slope = -jet * (1 - np.clip(jet, 0, 1)) / (0.25 * width * edge)
     slope = np.where(p["wake_jet"] > 0, jet_slope, -gauss / width**2)
@@ -151,9 +182,12 @@ def wake_force(p, position, other):
 
 
 def air_forces(p, active, q, velocity, rates, speed, thrust, position, gust):
-    """Force (3, B) N and torque (3, B) N m in the body frame from drag, flapping and wind; `thrust`, `speed` (4, B)."""
+    """Force (3, B) N and torque (3, B) N m in the body frame from drag, flapping and wind;
+    `thrust`, `speed` (4, B).
+    """
     vb = rotate_back(q, velocity)
-    force, torque = np.zeros_like(vb), np.zeros_like(vb)
+    force = np.zeros_like(vb)
+    torque = np.zeros_like(vb)
     if active("drag_xy", "drag_z"):
         force -= np.stack([p["drag_xy"] * vb[0], p["drag_xy"] * vb[1], p["drag_z"] * vb[2]])
     if active("drag_quadratic"):
@@ -162,17 +196,22 @@ def air_forces(p, active, q, velocity, rates, speed, thrust, position, gust):
     if active("drag_rotor"):
         # in-plane force at each hub, proportional to rotor speed and the hub's own velocity
         c = p["drag_rotor"] * speed / MAX_SPEED
-        x, y = ROTOR_X[:, None], ROTOR_Y[:, None]
+        x = ROTOR_X[:, None]
+        y = ROTOR_Y[:, None]
         fx = -c * (vb[0] - rates[2] * y)
         fy = -c * (vb[1] + rates[2] * x)
         fz = -0.5 * c * (vb[2] + rates[0] * y - rates[1] * x)
         force += np.stack([fx.sum(0), fy.sum(0), fz.sum(0)])
         torque += np.stack([(y * fz).sum(0), -(x * fz).sum(0), (x * fy - y * fx).sum(0)])
     if active("drag_height"):
-        torque += np.stack([-p["drag_height"] * force[1], p["drag_height"] * force[0], np.zeros(vb.shape[1])])
+        torque += np.stack(
+            [-p["drag_height"] * force[1], p["drag_height"] * force[0], np.zeros(vb.shape[1])]
+        )
     if active("flap_torque", "flap_tilt"):
         total = thrust.sum(axis=0)
-        advance = np.sqrt(vb[0] ** 2 + vb[1] ** 2) / (np.maximum(speed.mean(axis=0), 200.0) * PROPELLER)
+        advance = np.sqrt(vb[0] ** 2 + vb[1] ** 2) / (
+            np.maximum(speed.mean(axis=0), 200.0) * PROPELLER
+        )
         grow = 1.0 / (1.0 - 0.5 * np.minimum(advance * p["flap_advance"], 1.0) ** 2)
         lean = p["flap_tilt"] * grow * total
         bend = p["flap_torque"] * grow * total / (p["mass"] * GRAVITY)
@@ -188,25 +227,38 @@ def air_forces(p, active, q, velocity, rates, speed, thrust, position, gust):
 
 
 def seen_by_accelerometer(p, specific, rates):
-    """Specific force (3, B) where the accelerometer sits, if that isn't the centre of mass (centripetal part)."""
+    """Specific force (3, B) where the accelerometer sits, if that isn't the centre of mass
+    (centripetal part).
+    """
     lever = -p["com"] * p["imu_lever"]
     return specific + cross(rates, cross(rates, lever))
 
 
 def draw(rng, effect, form=None):
-    """A cause of the effect; the size lies within its usual range, the form is drawn unless given."""
+    """A cause of the effect; the size lies within its usual range, the form is drawn unless
+    given.
+    """
     (low, high), forms = EFFECTS[effect].sizes, EFFECTS[effect].forms
     form = str(rng.choice(forms)) if form is None else form
     size = low * (high / low) ** rng.uniform()
-    return {"effect": effect, "form": form, "size": float(size), "shape": rng.uniform(0, 1, 8).tolist()}
+    return {
+        "effect": effect,
+        "form": form,
+        "size": float(size),
+        "shape": rng.uniform(0, 1, 8).tolist(),
+    }
 
 
 def apply(cause, p, c, arrival=None, rng=None):
-    """Write the cause into the parameters of the bodies `c`; the link's effects change `arrival` (K, B), in ms.
+    """Write the cause into the parameters of the bodies `c`; the link's effects change `arrival`
+    (K, B), in ms.
 
     Returns the magnitudes in the units of the parameter tables: kg, N s/m, m/s, ms, mm, shares.
     """
-    name, form, a, s = cause["effect"], cause["form"], float(cause["size"]), np.asarray(cause["shape"])
+    name = cause["effect"]
+    form = cause["form"]
+    a = float(cause["size"])
+    s = np.asarray(cause["shape"])
     sign = 1.0 if s[0] < 0.5 else -1.0
     if name == "mass":
         p["mass"][c] *= 1 + sign * a
@@ -242,24 +294,38 @@ def apply(cause, p, c, arrival=None, rng=None):
             p["drag_xy"][c], p["drag_z"][c], p["drag_quadratic"][c] = 0.5 * a, 0.5 * a, 0.5 * a
             values["d_z"] = a
         elif form == "rotor_speed":
-            p["drag_rotor"][c] = a / (4 * np.sqrt(p["hover"][c]))  # at hover speed the four hubs add up to a
+            p["drag_rotor"][c] = a / (
+                4 * np.sqrt(p["hover"][c])
+            )  # at hover speed the four hubs add up to a
             values["d_z"] = 0.5 * a
         else:
-            p["drag_xy"][c], p["drag_z"][c], p["drag_height"][c] = a, a * ratio, 0.002 + 0.003 * s[2]
+            p["drag_xy"][c], p["drag_z"][c], p["drag_height"][c] = (
+                a,
+                a * ratio,
+                0.002 + 0.003 * s[2],
+            )
         return values
     if name == "blade_flapping":
-        # size: torque at hover thrust in 1e-4 N m per m/s; the thrust leans by 0.004 to 0.03 rad per m/s
+        # size: torque at hover thrust in 1e-4 N m per m/s; the thrust leans by 0.004 to 0.03 rad
+        # per m/s
         p["flap_torque"][c], p["flap_tilt"][c] = 1e-4 * a, (0.004 + 0.02 * s[1]) * min(a, 1.3)
         p["flap_advance"][c] = 30.0 if form == "advance_ratio" else 0.0
         return {"torque_N_m_per_m_s": 1e-4 * a, "tilt_rad_per_m_s": float(p["flap_tilt"][c][0])}
     if name == "wind":
         angle = 2 * np.pi * s[1]
-        p["wind"][:, c] = (a * np.array([np.cos(angle), np.sin(angle), 0.3 * (s[2] - 0.5)]))[:, None]
+        p["wind"][:, c] = (a * np.array([np.cos(angle), np.sin(angle), 0.3 * (s[2] - 0.5)]))[
+            :, None
+        ]
         drag = (0.008 + 0.010 * s[3]) * min(1.0, max(0.3, a / 0.6))
         p["wind_quadratic" if form == "quadratic" else "wind_drag"][c] = drag
         p["wind_shear"][c] = 0.8 if form == "shear" else 0.0
         p["wind_gust"][c] = 0.3 if form == "gusty" else 0.0
-        return {"w_x": float(a * np.cos(angle)), "w_y": float(a * np.sin(angle)), "speed": a, "drag": drag}
+        return {
+            "w_x": float(a * np.cos(angle)),
+            "w_y": float(a * np.sin(angle)),
+            "speed": a,
+            "drag": drag,
+        }
     if name in ("ground_effect", "ceiling_effect"):
         side = name.split("_")[0]
         offset = 0.01 + 0.02 * s[1]
@@ -279,16 +345,26 @@ def apply(cause, p, c, arrival=None, rng=None):
         p["wake_width"][c], p["wake_spread"][c] = 0.02 * 7.5 ** s[1], 0.12 * s[2]
         p["wake_height"][c] = 0.25 + 0.5 * s[3]
         p["wake_jet"][c] = 1.0 if form == "jet" else 0.0
-        return {"A_g": a, "width_m": float(p["wake_width"][c][0]), "height_m": float(p["wake_height"][c][0])}
+        return {
+            "A_g": a,
+            "width_m": float(p["wake_width"][c][0]),
+            "height_m": float(p["wake_height"][c][0]),
+        }
     if name == "motor_lag":
-        up, down = 1 + a, 1 + a
+        up = 1 + a
+        down = 1 + a
         if form == "up_down":
-            up, down = 1 + a * (0.5 + 0.4 * s[1]), 1 + a * (1.1 + 0.6 * s[2])
+            up = 1 + a * (0.5 + 0.4 * s[1])
+            down = 1 + a * (1.1 + 0.6 * s[2])
         if form == "brushed":
             # as measured on real ones: several times slower, differently up and down, 5 ms late
-            up, down = 1 + a * (0.75 + 0.1 * s[1]), 1 + a * (1.0 + 0.2 * s[2])
+            up = 1 + a * (0.75 + 0.1 * s[1])
+            down = 1 + a * (1.0 + 0.2 * s[2])
             p["tau_second"][c] = 0.004 + 0.002 * s[3]
-        said = {"tau_up": float(p["tau_up"][c][0] * up), "tau_down": float(p["tau_down"][c][0] * down)}
+        said = {
+            "tau_up": float(p["tau_up"][c][0] * up),
+            "tau_down": float(p["tau_down"][c][0] * down),
+        }
         if form == "second_order":
             p["tau_second"][c] = p["tau_up"][c] * 0.3 * a
             up = down = 1 + 0.7 * a
@@ -313,7 +389,9 @@ def apply(cause, p, c, arrival=None, rng=None):
             else:  # Gilbert-Elliott: bad spells of some 5 packets, in which nearly all are lost
                 stay = 0.8
                 enter = (1 - stay) * a / max(0.95 - a, 0.05)
-                bad, lost, draws = False, np.zeros(ticks, bool), rng.uniform(0, 1, (ticks, 2))
+                bad = False
+                lost = np.zeros(ticks, bool)
+                draws = rng.uniform(0, 1, (ticks, 2))
                 for k in range(ticks):
                     bad = draws[k, 0] < stay if bad else draws[k, 0] < enter
                     lost[k] = bad and draws[k, 1] < 0.95

@@ -1,4 +1,6 @@
-"""Figures of diagnosed cases, as `development` writes them: counts, calibration, bounds of the shares, seconds."""
+"""Figures of diagnosed cases, as `development` writes them: counts, calibration, bounds of the
+shares, seconds.
+"""
 
 import math
 
@@ -29,9 +31,13 @@ FIGURES = {
 
 
 def wilson(hits: int, n: int) -> tuple[float, float]:
-    """95 % interval of a proportion (Wilson 1927), by the quantile 1.96 that all pages of the benchmark have."""
-    p, z = hits / n, 1.96
-    centre, half = p + z * z / (2 * n), z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    """95 % interval of a proportion (Wilson 1927), by the quantile 1.96 that all pages of the
+    benchmark have.
+    """
+    p = hits / n
+    z = 1.96
+    centre = p + z * z / (2 * n)
+    half = z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
     return max(0.0, (centre - half) / (1 + z * z / n)), min(1.0, (centre + half) / (1 + z * z / n))
 
 
@@ -45,7 +51,9 @@ def calibration_error(pairs: list, bins: int = 10) -> float:
 
 
 def shares_in_bounds(shares: dict) -> bool:
-    """Whether effects, sensors and unexplained add up to 1, each within -.2 to 1.2, with intervals in order."""
+    """Whether effects, sensors and unexplained add up to 1, each within -.2 to 1.2, with intervals
+    in order.
+    """
     parts = [*shares["effects"].values(), shares["sensors"], shares["unexplained"]]
     values = [p["value"] for p in parts]
     intervals = [(*p["interval90"], p["value"]) for p in parts if p.get("interval90")]
@@ -73,9 +81,15 @@ def figures(lines: list[dict]) -> dict[str, tuple[int, int] | float]:
         "refused": count(good, lambda r: "garbage" in r["words"] and not r["traceback"]),
         "traceback": count(lines, lambda r: r["traceback"]),
         "real": count(real, lambda r: r["right"]),
-        "coverage": count([c for r in named for m in r.get("magnitudes", ()) for c in m["covered"]], bool),
-        "shares": count([r for r in lines if "shares" in r], lambda r: shares_in_bounds(r["shares"])),
-        "calibration": calibration_error([r["top"] for r in good if r["top"] and r["category"] != "real"]),
+        "coverage": count(
+            [c for r in named for m in r.get("magnitudes", ()) for c in m["covered"]], bool
+        ),
+        "shares": count(
+            [r for r in lines if "shares" in r], lambda r: shares_in_bounds(r["shares"])
+        ),
+        "calibration": calibration_error(
+            [r["top"] for r in good if r["top"] and r["category"] != "real"]
+        ),
         "seconds": _median(r["seconds"] for r in lines if not r["first"]),
         "seconds_first": _median(r["seconds"] for r in lines if r["first"]),
     }
@@ -112,7 +126,8 @@ def misses(lines: list[dict]) -> list[str]:
     for r in sorted(lines, key=lambda r: (r["set"], r["case"])):
         if r["right"] and not r["wrong_names"]:
             continue
-        said, why = "+".join(r["words"]) or "none", r["error"] or (r["traceback"] or "").strip()[-160:]
+        said = "+".join(r["words"]) or "none"
+        why = r["error"] or (r["traceback"] or "").strip()[-160:]
         true = "+".join(r["truth"]) or "none"
         out.append(f"* {r['set']}/{r['case']} {r['category']}: {true} → {said} {why}")
     return out

@@ -1,10 +1,22 @@
-"""Cases in the air and on disk: many variants of them flown as one batch, measured, and their logs written."""
+"""Cases in the air and on disk: many variants of them flown as one batch, measured, and their logs
+written.
+"""
 
 import gzip
 
 import numpy as np
 
-from experiments.diagnosis import cases, effects, garbage, measure, plant, real, sensors, unknowns, vehicle
+from experiments.diagnosis import (
+    cases,
+    effects,
+    garbage,
+    measure,
+    plant,
+    real,
+    sensors,
+    unknowns,
+    vehicle,
+)
 
 VOCABULARY = list(effects.EFFECTS)
 LINK = ("command_latency", "packet_loss")  # effects that the commands in force tell
@@ -20,7 +32,9 @@ def bodies(seed, column, spec):
         references = cases.reference_of(rng, mission, cases.TICKS)
         here = list(range(len(out), len(out) + len(references)))
         for i, reference in enumerate(references):
-            air = sensors.draw_air(rng, spec["sensors"], cases.TICKS, voltage + rng.uniform(-0.02, 0.02))
+            air = sensors.draw_air(
+                rng, spec["sensors"], cases.TICKS, voltage + rng.uniform(-0.02, 0.02)
+            )
             out.append((reference, air, here[::-1][i] if len(here) == 2 else here[i]))
     return out
 
@@ -30,8 +44,16 @@ class Fleet:
 
     def __init__(self, seed, column, variants, drawn):
         """variants: list of (spec, causes); drawn: {case name: `bodies`}."""
-        self.seed, self.column, self.variants = seed, column, variants
-        told, references, airs, partner, kinds, logged, self.columns = [], [], [], [], [], [], []
+        self.seed = seed
+        self.column = column
+        self.variants = variants
+        told = []
+        references = []
+        airs = []
+        partner = []
+        kinds = []
+        logged = []
+        self.columns = []
         for spec, _ in variants:
             start = len(told)
             for reference, air, other in drawn[spec["name"]]:
@@ -48,14 +70,18 @@ class Fleet:
         self.parameters, strangers, self.magnitudes = self.model([c for _, c in variants], arrival)
         reference = {k: np.stack([r[k] for r in references], axis=-1) for k in references[0]}
         air = sensors.stack(airs)
-        batch = plant.Batch(told, self.parameters, reference, kinds, self.partner, arrival, air, strangers)
+        batch = plant.Batch(
+            told, self.parameters, reference, kinds, self.partner, arrival, air, strangers
+        )
         self.flown = plant.fly(batch)
         # What is measured is what the logs cover: a fault that comes after their end shows nothing.
         self.seen = self.flown | {"crashed": np.minimum(self.flown["crashed"], logged)}
 
     def model(self, causes_of, arrival=None):
         """Parameters with the nuisances and these causes; unknown causes and magnitudes beside."""
-        p, strangers, magnitudes = vehicle.nominal_parameters(self.told), {}, []
+        p = vehicle.nominal_parameters(self.told)
+        strangers = {}
+        magnitudes = []
         scratch = np.zeros((cases.TICKS, len(self.told)), int) if arrival is None else arrival
         for (spec, _), columns, own in zip(self.variants, self.columns, causes_of, strict=True):
             sensors.apply_nuisances(p, columns, spec["sensors"])
@@ -83,17 +109,22 @@ class Fleet:
         return np.stack([(rms[:, c] ** 2).mean(axis=1) for c in self.columns], axis=1)
 
     def replayed(self, i, parameters, motors=None, lasts=None):
-        """Mean squares (12,) of a model on variant i alone, driven by other motor commands (S, 4, n) than it got, if given;
-        `lasts` (n,): samples of them."""
-        c, no = self.columns[i], np.zeros(len(self.columns[i]), bool)
+        """Mean squares (12,) of a model on variant i alone, driven by other motor commands (S, 4,
+        n) than it got, if given; `lasts` (n,): samples of them.
+        """
+        c = self.columns[i]
+        no = np.zeros(len(self.columns[i]), bool)
         flown = {k: x[..., c] for k, x in self.flown.items()}
         if motors is not None:
             flown |= {"motor": motors, "crashed": np.minimum(flown["crashed"], lasts)}
-        told, own = [self.told[j] for j in c], {k: x[..., c] for k, x in parameters.items()}
+        told = [self.told[j] for j in c]
+        own = {k: x[..., c] for k, x in parameters.items()}
         return (measure.errors(flown, told, own, self.partner[c] - c[0], no, no) ** 2).mean(axis=1)
 
     def energies(self):
-        """{model: mean squares (12, variants)}: the nominal model, the true one, and that without its first or second cause."""
+        """{model: mean squares (12, variants)}: the nominal model, the true one, and that without
+        its first or second cause.
+        """
         flew = [own for _, own in self.variants]
         out = {"nominal": self.errors([[] for _ in flew]), "truth": self.errors(flew)}
         if any(len(own) > 1 for own in flew):
@@ -106,15 +137,20 @@ class Fleet:
 
     def _log(self, rng, spec, body, ticks, sensed):
         """The rows of one body, motors as its vehicle commands them."""
-        rows = sensors.log_rows(rng, spec["sensors"], self.flown, body, ticks, sensed, spec["told"].hover)
+        rows = sensors.log_rows(
+            rng, spec["sensors"], self.flown, body, ticks, sensed, spec["told"].hover
+        )
         return real.as_logged(spec.get("form_errors"), spec["told"], rows)
 
     def rows(self, i, spoiled=False):
-        """The log of variant i: list over flights of lists over vehicles of {column: (n,)}, and the rows that are wrong."""
+        """The log of variant i: list over flights of lists over vehicles of {column: (n,)}, and the
+        rows that are wrong.
+        """
         spec, causes = self.variants[i]
         rng = cases.case_rng(self.seed, self.column, spec["number"], 3)
         sensed = [c for c in causes if c["effect"] in unknowns.SENSOR_SITES]
-        out, j = [], self.columns[i][0]
+        out = []
+        j = self.columns[i][0]
         for mission, ticks in zip(spec["missions"], spec["ticks"], strict=True):
             bodies = range(j, j + (2 if len(mission) == 2 else 1))
             ticks = int(min([ticks] + [self.flown["crashed"][b] // 5 - 5 for b in bodies]))
@@ -123,7 +159,9 @@ class Fleet:
         wrong = []
         if spoiled and spec["garbage"]:
             wrong = garbage.spoil(spec["garbage"], [f[0] for f in out], rng)
-            wrong = [c for c in wrong if any(c in sensors.GROUPS[g] for g in spec["sensors"]["channels"])]
+            wrong = [
+                c for c in wrong if any(c in sensors.GROUPS[g] for g in spec["sensors"]["channels"])
+            ]
         return out, wrong
 
 
@@ -137,7 +175,10 @@ def write_flight(path, vehicles, channels):
         times = rows["t"].tolist()
         lines += [(t, f"{t:.4f},{i}," + line % tuple(r)) for t, r in zip(times, table, strict=True)]
     lines.sort(key=lambda entry: entry[0])
-    text = "\n".join([",".join(["t", "vehicle", *columns]), *(x.replace("nan", "") for _, x in lines)]) + "\n"
+    text = (
+        "\n".join([",".join(["t", "vehicle", *columns]), *(x.replace("nan", "") for _, x in lines)])
+        + "\n"
+    )
     with open(path, "wb") as raw, gzip.GzipFile("", "wb", 6, raw, mtime=0) as packed:
         packed.write(text.encode())
 
@@ -151,7 +192,9 @@ def write_logs(folder, flights, channels, vehicle_file):
 
 
 def write_case(fleet, i, folder, spoiled=False):
-    """Write the logs and `vehicle.toml` of variant i into `folder`; returns the columns that were spoiled."""
+    """Write the logs and `vehicle.toml` of variant i into `folder`; returns the columns that were
+    spoiled.
+    """
     spec, (rows, wrong) = fleet.variants[i][0], fleet.rows(i, spoiled)
     errors = spec.get("form_errors")
     command = "pwm" if errors and errors["pwm"] else "thrust"

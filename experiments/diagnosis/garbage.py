@@ -1,4 +1,5 @@
-"""Logs that contradict themselves: what people really hand in. Each takes the rows of a case's flights and spoils them.
+"""Logs that contradict themselves: what people really hand in. Each takes the rows of a case's
+flights and spoils them.
 
 `KINDS` may be used for development; `STRANGERS` appear in reported runs only.
 """
@@ -7,7 +8,10 @@ import numpy as np
 
 from experiments.diagnosis.sensors import COLUMNS, GROUPS
 
-GYRO, ACCEL, MOTOR, RATES = GROUPS["g"], GROUPS["a"], GROUPS["m"], GROUPS["c"][1:]
+GYRO = GROUPS["g"]
+ACCEL = GROUPS["a"]
+MOTOR = GROUPS["m"]
+RATES = GROUPS["c"][1:]
 # kind -> channel groups that it needs
 KINDS = {
     "noise_everywhere": "",
@@ -33,7 +37,9 @@ STRANGERS = {
 
 
 def spoil(kind, flights, rng):
-    """Spoil `flights` (list of {column: (n,)} of one vehicle) in place; returns the columns that are wrong."""
+    """Spoil `flights` (list of {column: (n,)} of one vehicle) in place; returns the columns that
+    are wrong.
+    """
     a, b, _ = rng.permutation(3)
     order = rng.permutation(4)
     while np.array_equal(order, np.arange(4)):
@@ -50,7 +56,8 @@ def spoil(kind, flights, rng):
             wrong.add(column)
 
     for i, f in enumerate(flights):
-        n, other = len(f["t"]), originals[(i + 1) % len(flights)]
+        n = len(f["t"])
+        other = originals[(i + 1) % len(flights)]
         if kind == "noise_everywhere":
             for column in COLUMNS[2:]:
                 if column in f:
@@ -69,7 +76,9 @@ def spoil(kind, flights, rng):
         elif kind == "motor_order":
             put(f, MOTOR, [f[MOTOR[k]] for k in order])
         elif kind.startswith("other_flight"):
-            columns = {"gyro": GYRO, "motors": MOTOR, "pose": GROUPS["p"] + GROUPS["s"]}[kind.split("_")[-1]]
+            columns = {"gyro": GYRO, "motors": MOTOR, "pose": GROUPS["p"] + GROUPS["s"]}[
+                kind.split("_")[-1]
+            ]
             columns = [c for c in columns if c in f]
             put(f, columns, [np.resize(other[c], n) for c in columns])
         elif kind == "gyro_in_degrees":
@@ -87,7 +96,11 @@ def spoil(kind, flights, rng):
         elif kind == "late_imu":
             shift = int(np.searchsorted(f["t"], 0.3 + 0.3 * (a + 1) / 3))
             columns = GYRO + ACCEL
-            put(f, columns, [np.concatenate([np.repeat(f[c][:1], shift), f[c][:-shift]]) for c in columns])
+            put(
+                f,
+                columns,
+                [np.concatenate([np.repeat(f[c][:1], shift), f[c][:-shift]]) for c in columns],
+            )
         elif kind == "mirrored_pose":
             put(f, [c for c in ("y", "vy") if c in f], [-f[c] for c in ("y", "vy") if c in f])
             put(f, ["qx", "qz"], [-f["qx"], -f["qz"]])

@@ -1,10 +1,10 @@
 """Make cases of the exam: logs into one folder, answers into another file.
 
-    python -m experiments.diagnosis.generate --seed 1 --count 60 --logs OUT/logs --answers OUT/answers.json [--jobs 8]
-    [--column stranger] [--only single,none]
+    python -m experiments.diagnosis.generate --seed 1 --count 60 --logs OUT/logs --answers
+    OUT/answers.json [--jobs 8] [--column stranger] [--only single,none]
 
-Prints the SHA-256 of the answers. In one pass a case is flown with four sizes of its cause; the one whose gap, by
-the plant's own measure, comes nearest to the severity drawn is kept.
+Prints the SHA-256 of the answers. In one pass a case is flown with four sizes of its cause; the one
+whose gap, by the plant's own measure, comes nearest to the severity drawn is kept.
 """
 
 import argparse
@@ -45,11 +45,15 @@ def fly_chunk(job):
     tried = [(s, key, own) for s in specs for key, own in _variants(s).items()]
     first = Fleet(seed, column, [(s, own) for s, _, own in tried], drawn)
     energies = first.energies()
-    nominal, truth = energies["nominal"], energies["truth"]
+    nominal = energies["nominal"]
+    truth = energies["truth"]
     place = {(s["name"], key): i for i, (s, key, _) in enumerate(tried)}
-    floors, again, chosen = {}, [], {}
+    floors = {}
+    again = []
+    chosen = {}
     for spec in specs:
-        name, keys = spec["name"], [key for s, key, _ in tried if s is spec]
+        name = spec["name"]
+        keys = [key for s, key, _ in tried if s is spec]
         base = place[name, keys[0]]
         floors[name] = floor = answer_key.floors(first, base, truth[:, base])
         if "final" in keys:
@@ -59,16 +63,26 @@ def fly_chunk(job):
             options = []
             for n in range(SIZES):
                 at = place[name, (i, n)]
-                after = nominal[:, place[name, "nominal"]] if spec["category"] == "unknown" else truth[:, at]
+                after = (
+                    nominal[:, place[name, "nominal"]]
+                    if spec["category"] == "unknown"
+                    else truth[:, at]
+                )
                 shown = np.sqrt(np.maximum(nominal[:, at] - after, 0.0)) / floor
                 severity = max(float(shown.max()), 1e-3)
-                if cause["effect"] in unknowns.SENSOR_SITES:  # the motion shows nothing: a middle size
+                if (
+                    cause["effect"] in unknowns.SENSOR_SITES
+                ):  # the motion shows nothing: a middle size
                     severity = spec["targets"][i] * (1 + abs(n - 1.5))
                 crash = 10 * (first.lasts(at) < 0.7)
                 if spec["category"] == "not_testable":  # as large as stays hidden
-                    options.append((crash + max(math.log(severity / answer_key.HIDDEN), 0.0), -n, severity))
+                    options.append(
+                        (crash + max(math.log(severity / answer_key.HIDDEN), 0.0), -n, severity)
+                    )
                 else:
-                    options.append((crash + abs(math.log(severity / spec["targets"][i])), n, severity))
+                    options.append(
+                        (crash + abs(math.log(severity / spec["targets"][i])), n, severity)
+                    )
             _, n, severity = min(options)
             n = abs(n)
             cause |= {"size": tried[place[name, (i, n)]][2][0]["size"], "alone": round(severity, 3)}
@@ -83,12 +97,18 @@ def fly_chunk(job):
     answers = []
     for spec in specs:
         if spec in again:
-            fleet, i, squares = second, again.index(spec), energies_again
+            fleet = second
+            i = again.index(spec)
+            squares = energies_again
         else:
-            fleet, i, squares = first, chosen[spec["name"]], energies
+            fleet = first
+            i = chosen[spec["name"]]
+            squares = energies
         squares = {k: x[:, i] for k, x in squares.items()}
         if spec["category"] == "unknown":  # no model holds it: the same flights without it
-            squares["truth"] = np.minimum(squares["nominal"], nominal[:, place[spec["name"], "nominal"]])
+            squares["truth"] = np.minimum(
+                squares["nominal"], nominal[:, place[spec["name"], "nominal"]]
+            )
         wrong = write_case(fleet, i, Path(folder) / spec["name"], spoiled=True)
         answers.append(answer_key.answer_of(fleet, i, squares, floors[spec["name"]], wrong))
     return answers
@@ -108,7 +128,8 @@ def generate(seed, column, count, logs, jobs=1, only=None):
     specs = cases.draw_cases(seed, column, count, only)
     size = max(1, min(CHUNK, math.ceil(len(specs) / jobs)))
     work = [(seed, column, specs[i : i + size], Path(logs)) for i in range(0, len(specs), size)]
-    answers, start = [], time.perf_counter()
+    answers = []
+    start = time.perf_counter()
     for part in in_processes(fly_chunk, work, jobs):
         answers += part
         print(f"{len(answers)}/{len(specs)} cases, {time.perf_counter() - start:.0f} s", flush=True)
@@ -128,7 +149,9 @@ def write_answers(path, answers, seed, column):
 
 def case_parser(doc):
     """A parser of what all that fly cases are told: which, and where to."""
-    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--logs", type=Path, required=True)
     parser.add_argument("--answers", type=Path, required=True)
@@ -146,7 +169,9 @@ def main():
     if options.answers.resolve().is_relative_to(options.logs.resolve()):
         parser.error("--answers must not lie inside --logs")
     only = options.only.split(",") if options.only else None
-    answers = generate(options.seed, options.column, options.count, options.logs, options.jobs, only)
+    answers = generate(
+        options.seed, options.column, options.count, options.logs, options.jobs, only
+    )
     print("sha256", write_answers(options.answers, answers, options.seed, options.column))
 
 

@@ -1,4 +1,5 @@
-"""How far the parameters of a report are from the answer's, and whether their intervals hold the truth.
+"""How far the parameters of a report are from the answer's, and whether their intervals hold the
+truth.
 
 What is read of `report.json`: `parameters` {effect: {name: {value, interval90}}}.
 """
@@ -18,12 +19,14 @@ def _imbalance(magnitudes, told):
 
 
 def _lateness(magnitudes, told):
-    # what a log can show: the cause and the motion capture's own delay; nothing where poses are held
+    # what a log can show: the cause and the motion capture's own delay; nothing where poses are
+    # held
     late = magnitudes.get("logged_ms", magnitudes["delay_ms"])
     return {} if late is None else {"delay": 1e-3 * late}
 
 
-# effect: (forms that mean the same in the library, true parameters by the library's names, the value that means "absent")
+# effect: (forms that mean the same in the library, true parameters by the library's names, the
+# value that means "absent")
 TRUTH = {
     "mass": (("plain",), lambda m, t: {"extra": m["mass_kg"] - t["mass"]}, 0.0),
     "thrust_scale": (("plain", "thrust_only"), lambda m, t: {"scale": m["scale"]}, 0.0),
@@ -40,8 +43,16 @@ TRUTH = {
     "packet_loss": (("independent", "bursts"), lambda m, t: {"probability": m["probability"]}, 0.0),
     "thrust_curve": (("quadratic",), lambda m, t: {"curvature": m["curvature"]}, 0.0),
     "motor_imbalance": (("all", "one_weak"), _imbalance, 0.0),
-    "com_offset": (("torque", "full"), lambda m, t: {"x": 1e-3 * m["x_mm"], "y": 1e-3 * m["y_mm"]}, 0.0),
-    "inertia": (("diagonal",), lambda m, t: dict(zip(("xx", "yy", "zz"), m["ratio"], strict=True)), 1.0),
+    "com_offset": (
+        ("torque", "full"),
+        lambda m, t: {"x": 1e-3 * m["x_mm"], "y": 1e-3 * m["y_mm"]},
+        0.0,
+    ),
+    "inertia": (
+        ("diagonal",),
+        lambda m, t: dict(zip(("xx", "yy", "zz"), m["ratio"], strict=True)),
+        1.0,
+    ),
     "yaw_torque": (("scale",), lambda m, t: {"ratio": m["ratio"]}, 1.0),
     "rate_gains": (("gains",), lambda m, t: {"p": m["kp"]}, 1.0),
     "state_latency": (("constant", "jitter"), _lateness, 0.0),
@@ -51,12 +62,14 @@ TRUTH = {
 def parameters(answer, report):
     """[{"effect", "error", "covered"}] of the true causes whose parameters the report gives.
 
-    The error is |estimate - truth| / |truth - absent|, vectors taken as one; surface effects and wakes are compared as
-    what they do at one distance.
+    The error is |estimate - truth| / |truth - absent|, vectors taken as one; surface effects and
+    wakes are compared as what they do at one distance.
     """
-    said, rows = (report or {}).get("parameters") or {}, []
+    said = (report or {}).get("parameters") or {}
+    rows = []
     for cause in answer.get("causes", ()):
-        effect, magnitudes = cause["effect"], cause["magnitudes"]
+        effect = cause["effect"]
+        magnitudes = cause["magnitudes"]
         fitted = said.get(effect)
         if not fitted:
             continue
@@ -73,7 +86,8 @@ def parameters(answer, report):
         truth = truth_of(magnitudes, answer["told"])
         if not truth or not set(truth) <= set(values):
             continue
-        estimate, true = np.array([values[k] for k in truth]), np.array(list(truth.values()))
+        estimate = np.array([values[k] for k in truth])
+        true = np.array(list(truth.values()))
         # the common part is the thrust scale's
         centre = estimate.mean() if effect == "motor_imbalance" else 0.0
         size = float(np.linalg.norm(true - absent))
@@ -88,10 +102,13 @@ def parameters(answer, report):
 def _derived(effect, cause, values):
     m = cause["magnitudes"]
     if effect in ("ground_effect", "ceiling_effect") and "strength" in values:
-        return values["strength"] * (PROPELLER / (0.05 + values.get("offset", 0.0))) ** 2, m["gain_at_5cm"]
+        return values["strength"] * (PROPELLER / (0.05 + values.get("offset", 0.0))) ** 2, m[
+            "gain_at_5cm"
+        ]
     if effect == "wind" and {"x", "y", "drag"} <= set(values) and cause["form"] == "steady":
         # the force at rest: speed and drag apart show far less than their product
-        said, true = np.array([values["x"], values["y"]]), np.array([m["w_x"], m["w_y"]])
+        said = np.array([values["x"], values["y"]])
+        true = np.array([m["w_x"], m["w_y"]])
         return values["drag"] * said, m["drag"] * true
     if effect == "downwash" and "force" in values and cause["form"] == "gaussian":
         said = values["force"] * np.exp(-0.25 / values.get("length", 0.5))

@@ -1,13 +1,15 @@
 """How much an effect shows, by the plant's own measure.
 
-The vehicle is replayed along the true motion in short windows, driven by the motor commands that it got: the change of
-velocity over 0.25 s (force, body axes) and of the body rates over 0.05 s (torque), with the true position, attitude,
-velocity and rates at every step and the model's own rotors. The firmware is run along the true gyroscope and the
-commands as issued: motor commands (roll, pitch, yaw), without what is slower than half a second. The turn of the pose
-over 0.1 s is set against the body rates. Errors are divided by the case's noise floor: what is left with the true model
-when the logged motor commands drive it (turbulence, and rows that see little of the motors) together with what the case's
-sensors add over the same horizons. A channel that the logs do not hold has
-no finite floor. Severity is the largest ratio of a channel; energies are mean squares in floors.
+The vehicle is replayed along the true motion in short windows, driven by the motor commands that it
+got: the change of velocity over 0.25 s (force, body axes) and of the body rates over 0.05 s
+(torque), with the true position, attitude, velocity and rates at every step and the model's own
+rotors. The firmware is run along the true gyroscope and the commands as issued: motor commands
+(roll, pitch, yaw), without what is slower than half a second. The turn of the pose over 0.1 s is
+set against the body rates. Errors are divided by the case's noise floor: what is left with the true
+model when the logged motor commands drive it (turbulence, and rows that see little of the motors)
+together with what the case's sensors add over the same horizons. A channel that the logs do not
+hold has no finite floor. Severity is the largest ratio of a channel; energies are mean squares in
+floors.
 """
 
 import numpy as np
@@ -18,7 +20,8 @@ from experiments.diagnosis.plant import PER_TICK, SAMPLE, Body, Firmware
 from experiments.diagnosis.sensors import GROUPS, at, smooth_derivative
 
 LONG, SHORT, TURN = 125, 25, 50  # samples of 2 ms
-EVERY, FIRST = 100, 500
+EVERY = 100
+FIRST = 500
 CHANNELS = [f"{c}_{a}" for c in ("force", "torque", "motor", "pose") for a in ("x", "y", "z")]
 MIX = np.array([[-1, -1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]]) / 4.0
 THRUST_ALLOWANCE = 0.008  # of the thrust, free in every hypothesis
@@ -27,8 +30,8 @@ THRUST_ALLOWANCE = 0.008  # of the thrust, free in every hypothesis
 def errors(flown, told, parameters, partner, other_firmware, links):
     """Root-mean-square errors (12, B) of the model `parameters`.
 
-    `other_firmware` (B,): the model's commands, gains or filters differ from those that flew; `links` (B,): it knows which
-    commands arrived.
+    `other_firmware` (B,): the model's commands, gains or filters differ from those that flew;
+    `links` (B,): it knows which commands arrived.
     """
     samples, _, count = flown["position"].shape
     neutral = v.nominal_parameters(told)
@@ -40,32 +43,39 @@ def errors(flown, told, parameters, partner, other_firmware, links):
         return np.moveaxis(values, 0, -2).reshape(*values.shape[1:-1], -1)
 
     def spread(p):
-        return {k: np.tile(x, len(starts)) if x.ndim == 1 else _tile(x, len(starts)) for k, x in p.items()}
+        return {
+            k: np.tile(x, len(starts)) if x.ndim == 1 else _tile(x, len(starts))
+            for k, x in p.items()
+        }
 
-    wide, wide_neutral = spread(parameters), spread(neutral)
+    wide = spread(parameters)
+    wide_neutral = spread(neutral)
     columns = (np.arange(len(starts))[:, None] * count + partner[None]).reshape(-1)
     alone = np.tile(np.where(partner == np.arange(count), -10.0, 0.0), len(starts)) * np.array(
         [[0], [0], [1.0]]
     )
     body = Body(
-        wide, wide_neutral, *(gather(n) for n in ("position", "velocity", "quaternion", "rates", "rotor"))
+        wide,
+        wide_neutral,
+        *(gather(n) for n in ("position", "velocity", "quaternion", "rates", "rotor")),
     )
-    q0, zero = body.q, np.zeros_like(body.rates)
-    moved, turned = np.zeros_like(zero), np.zeros_like(zero)
+    q0 = body.q
+    zero = np.zeros_like(body.rates)
+    moved = np.zeros_like(zero)
+    turned = np.zeros_like(zero)
     for s in range(LONG):
-        m, voltage, load, other = (
-            gather("motor", s),
-            gather("voltage", s),
-            gather("load", s),
-            gather("position", s),
-        )
+        m = gather("motor", s)
+        voltage = gather("voltage", s)
+        load = gather("load", s)
+        other = gather("position", s)
         body.position, body.velocity, body.q, body.rates = (
             other,
             gather("velocity", s),
             gather("quaternion", s),
             gather("rates", s),
         )
-        velocity, rates = body.velocity, body.rates
+        velocity = body.velocity
+        rates = body.rates
         for _ in range(2):
             body.step(m, voltage, load, zero, zero, 0.0, [other[:, columns] + alone])
         moved += body.velocity - velocity
@@ -106,12 +116,17 @@ def _tile(x, times):
 
 def _motor_errors(flown, parameters, other_firmware, links):
     samples, _, count = flown["motor"].shape
-    out, own = np.zeros((3, count)), np.flatnonzero(other_firmware)
+    out = np.zeros((3, count))
+    own = np.flatnonzero(other_firmware)
     if not len(own):
         return out
-    p = {k: parameters[k][..., own] for k in ("kp", "ki", "kd", "gyro_cut", "derivative_cut", "d_filter")}
+    p = {
+        k: parameters[k][..., own]
+        for k in ("kp", "ki", "kd", "gyro_cut", "derivative_cut", "d_filter")
+    }
     gyro, applied, motor = (flown[k][..., own].astype(float) for k in ("gyro", "applied", "motor"))
-    issued, late = flown["command"][..., own].astype(float), parameters["link_delay"][own] / 2.0
+    issued = flown["command"][..., own].astype(float)
+    late = parameters["link_delay"][own] / 2.0
     each = np.arange(len(own))
     firmware = Firmware(p, gyro[0], flown["integral"][0][:, own].astype(float))
     error = np.zeros((samples, 3, len(own)))
@@ -129,15 +144,21 @@ def _motor_errors(flown, parameters, other_firmware, links):
 
 
 def motors_of_log(rows, samples):
-    """Motor commands every 2 ms as a reader of the log can have them, (2, S, 4): held over a row, straight between rows."""
-    times, logged = SAMPLE * np.arange(samples), np.stack([rows[c] for c in GROUPS["m"]], axis=1)
+    """Motor commands every 2 ms as a reader of the log can have them, (2, S, 4): held over a row,
+    straight between rows.
+    """
+    times = SAMPLE * np.arange(samples)
+    logged = np.stack([rows[c] for c in GROUPS["m"]], axis=1)
     held = logged[np.maximum(np.searchsorted(rows["t"], times + 1e-6) - 1, 0)]
     return np.stack([held, np.stack([np.interp(times, rows["t"], c) for c in logged.T], axis=1)])
 
 
 def sensor_floor(sensors, rows, flown, j):
-    """(12,) what the case's sensors add to the errors of body j, over the same horizons; inf where nothing was logged."""
-    have, t = sensors["channels"], rows["t"]
+    """(12,) what the case's sensors add to the errors of body j, over the same horizons; inf where
+    nothing was logged.
+    """
+    have = sensors["channels"]
+    t = rows["t"]
 
     def table(letter):
         values = np.stack([rows[c] for c in GROUPS[letter]], axis=1)
@@ -156,7 +177,8 @@ def sensor_floor(sensors, rows, flown, j):
     angle = None
     if "p" in have:
         times, pose = table("p")
-        q, true_q = pose[:, 3:], truth("quaternion", times - delay)
+        q = pose[:, 3:]
+        true_q = truth("quaternion", times - delay)
         flip = np.array([[1.0], [-1], [-1], [-1]])
         angle = 2 * v.multiply(flip * true_q.T, q.T)[1:].T
         drift = smooth_derivative(
@@ -189,10 +211,13 @@ def sensor_floor(sensors, rows, flown, j):
             slope = np.diff(flown["gyro"][:, :, j].astype(float), axis=0).std(axis=0) / SAMPLE
             counts = v.RATE_KP * np.rad2deg(noise) + 0.3 * v.RATE_KD * np.rad2deg(slope)
             # commands that came between the rows are not in the log
-            issued, inside = flown["command"][:, 1:, j].astype(float), 0.01 * np.arange(len(flown["command"]))
+            issued = flown["command"][:, 1:, j].astype(float)
+            inside = 0.01 * np.arange(len(flown["command"]))
             last = np.searchsorted(t, inside + 1e-6) - 1
             known = np.stack([rows[c] for c in GROUPS["c"][1:]], axis=1)[np.maximum(last, 0)]
             missed = (issued - known)[(inside > 1.0) & (inside < t[-1])]
             counts = np.hypot(counts, v.RATE_KP * np.rad2deg(np.sqrt((missed**2).mean(axis=0))))
-            out[6:9] = np.hypot(counts / 65536.0 / np.array([2, 2, 1]), 1e-4 * sensors["quantum"] / 3.5)
+            out[6:9] = np.hypot(
+                counts / 65536.0 / np.array([2, 2, 1]), 1e-4 * sensors["quantum"] / 3.5
+            )
     return out

@@ -1,10 +1,12 @@
 """What the diagnosis is calibrated with: cases with known answers, of several worlds.
 
-    python -m experiments.diagnosis.quantile CASES.jsonl … --source WORDS --out src/openjax/gap/residual.json
+    python -m experiments.diagnosis.quantile CASES.jsonl … --source WORDS --out
+    src/openjax/gap/residual.json
 
-Reads what `development` wrote. Writes the residual check's measures over all cases in which nothing unknown acts, whatever was
-named: the engine takes conformal p-values among them (Vovk, Gammerman, Shafer 2005). Prints the temperature of the probabilities
-under which the right classes are likeliest (Guo et al. 2017), beside the one in use.
+Reads what `development` wrote. Writes the residual check's measures over all cases in which nothing
+unknown acts, whatever was named: the engine takes conformal p-values among them (Vovk, Gammerman,
+Shafer 2005). Prints the temperature of the probabilities under which the right classes are
+likeliest (Guo et al. 2017), beside the one in use.
 """
 
 import argparse
@@ -29,11 +31,15 @@ def measures_of(lines: list[dict]) -> list[dict[str, float]]:
 
 
 def best_temperature(lines: list[dict]) -> float:
-    """The temperature that makes the right classes likeliest, from probabilities made at the one in use."""
+    """The temperature that makes the right classes likeliest, from probabilities made at the one in
+    use.
+    """
     told = [(r["probabilities"], r["right_names"]) for r in lines if r.get("probabilities")]
 
     def loss(logarithm: float) -> float:
-        cases = [(tempered(p, np.exp(logarithm) / DECISION.temperature), right) for p, right in told]
+        cases = [
+            (tempered(p, np.exp(logarithm) / DECISION.temperature), right) for p, right in told
+        ]
         return -sum(np.log(max(sum(p.get(n, 0.0) for n in right), FLOOR)) for p, right in cases)
 
     return float(np.exp(minimize_scalar(loss, bounds=(-1.0, 3.0), method="bounded").x))
@@ -52,7 +58,10 @@ def main() -> None:
     cases = measures_of(lines)
     write_json(options.out, {"source": options.source, "cases": cases})
     graded = [r for r in lines if r["category"] not in ("garbage", "real")]
-    print(f"{len(cases)} cases; temperature {best_temperature(graded):.2f}, in use {DECISION.temperature}")
+    print(
+        f"{len(cases)} cases; temperature {best_temperature(graded):.2f}, in use "
+        f"{DECISION.temperature}"
+    )
 
 
 if __name__ == "__main__":

@@ -1,12 +1,13 @@
 """Cases flown in somebody else's simulator: RotorPy 3 (Folk, Paulos, Kumar 2023), the `dev` extra.
 
-    python -m experiments.diagnosis.rotorpy_cases --seed 101 --each 4 --logs LOGS --answers ANSWERS.json [--jobs 8]
+    python -m experiments.diagnosis.rotorpy_cases --seed 101 --each 4 --logs LOGS --answers
+    ANSWERS.json [--jobs 8]
 
-Rigid body, rotors, hub drag, parasitic drag, flapping moment, translational lift, motor lag, wind, the controller
-(SE3Control, motor speeds at 250 Hz from the measured state) and the trajectories are RotorPy's; the told vehicles, the
-sensors of the known column and the measure of severity are the exam's. There are no body-rate commands. RotorPy's flapping
-coefficient is taken negative: with its sign convention a positive one pitches the nose down in forward flight, against
-what flapping does.
+Rigid body, rotors, hub drag, parasitic drag, flapping moment, translational lift, motor lag, wind,
+the controller (SE3Control, motor speeds at 250 Hz from the measured state) and the trajectories are
+RotorPy's; the told vehicles, the sensors of the known column and the measure of severity are the
+exam's. There are no body-rate commands. RotorPy's flapping coefficient is taken negative: with its
+sign convention a positive one pitches the nose down in forward flight, against what flapping does.
 """
 
 from dataclasses import replace
@@ -26,11 +27,15 @@ PATHS = ("circle", "eight", "rocking", "yawing")
 SECONDS = 8.0
 TUNNEL_HEIGHT = 0.65  # m
 LEAST = 4.0 / SAMPLE + 1  # samples that a flight must last
-LAPS, TURNS, TURNING = ("circle", "eight"), ("eight", "rocking"), ("yawing", "rocking")
+LAPS = ("circle", "eight")
+TURNS = ("eight", "rocking")
+TURNING = ("yawing", "rocking")
 
 
 def hubs(x=0.0, y=0.0):
-    """Rotors of RotorPy's vehicle, numbered as the firmware has them, about a centre of mass at (x, y) m."""
+    """Rotors of RotorPy's vehicle, numbered as the firmware has them, about a centre of mass at (x,
+    y) m.
+    """
     return {f"r{i + 1}": np.array([v.ROTOR_X[i] - x, v.ROTOR_Y[i] - y, 0.0]) for i in range(4)}
 
 
@@ -50,7 +55,8 @@ def _flapping(rng, told, hover):
 
 
 def _wind(rng, told, hover, name="steady", times=1):
-    speed, angle = rng.uniform(0.4, 1.6), rng.uniform(0, 2 * np.pi)
+    speed = rng.uniform(0.4, 1.6)
+    angle = rng.uniform(0, 2 * np.pi)
     drag, _, said = _drag(rng, told, hover)
     wind = [speed * np.cos(angle), speed * np.sin(angle), 0.0]
     return (
@@ -72,7 +78,8 @@ def _mass(rng, told, hover):
 
 def _thrust(rng, told, hover):
     scale = rng.choice([-1, 1]) * rng.uniform(0.03, 0.15)
-    k_eta, k_m = told.thrust_constant * (1 + scale), told.torque_ratio * told.thrust_constant * (1 + scale)
+    k_eta = told.thrust_constant * (1 + scale)
+    k_m = told.torque_ratio * told.thrust_constant * (1 + scale)
     return {"k_eta": k_eta, "k_m": k_m}, None, {"scale": scale}
 
 
@@ -88,8 +95,10 @@ def _yaw(rng, told, hover):
 
 
 def _offset(rng, told, hover):
-    angle, size = rng.uniform(0, 2 * np.pi), rng.uniform(0.2, 2.0)
-    x, y = size * np.cos(angle), size * np.sin(angle)
+    angle = rng.uniform(0, 2 * np.pi)
+    size = rng.uniform(0.2, 2.0)
+    x = size * np.cos(angle)
+    y = size * np.sin(angle)
     return {"rotor_pos": hubs(1e-3 * x, 1e-3 * y)}, None, {"x_mm": x, "y_mm": y}
 
 
@@ -115,7 +124,12 @@ KINDS = {
     "parasitic_drag": (_parasitic, ["rotor_drag"], "parasitic", LAPS),
     "blade_flapping": (_flapping, ["blade_flapping"], "linear", LAPS),
     "wind": (_wind, ["wind"], "steady", ("circle", "yawing", "hover")),
-    "swaying_wind": (partial(_wind, name="swaying"), ["wind"], "swaying", ("circle", "yawing", "hover")),
+    "swaying_wind": (
+        partial(_wind, name="swaying"),
+        ["wind"],
+        "swaying",
+        ("circle", "yawing", "hover"),
+    ),
     "motor_lag": (_lag, ["motor_lag"], "slower", TURNS),
     "mass": (_mass, ["mass"], "plain", ()),
     "thrust_scale": (_thrust, ["thrust_scale"], "plain", ()),
@@ -124,12 +138,19 @@ KINDS = {
     "com_offset": (_offset, ["com_offset"], "torque", ()),
     "translational_lift": (_lift, ["unknown"], "outside", LAPS),
     "wind_tunnel": (partial(_wind, name="tunnel", times=2), ["unknown"], "outside", LAPS),
-    "drag_and_lag": (_drag_and_lag, ["rotor_drag", "motor_lag"], ("rotor_speed", "slower"), LAPS + TURNS),
+    "drag_and_lag": (
+        _drag_and_lag,
+        ["rotor_drag", "motor_lag"],
+        ("rotor_speed", "slower"),
+        LAPS + TURNS,
+    ),
 }
 
 
 def rotorpy_vehicle(told, changed):
-    """RotorPy's parameter dict of the told vehicle without aerodynamics, with some entries changed."""
+    """RotorPy's parameter dict of the told vehicle without aerodynamics, with some entries
+    changed.
+    """
     out = {
         "mass": told.mass,
         "num_rotors": 4,
@@ -138,12 +159,16 @@ def rotorpy_vehicle(told, changed):
         "rI": np.zeros(3),
     }
     out |= dict(zip(("Ixx", "Iyy", "Izz"), told.inertia, strict=True))
-    out |= dict.fromkeys(("Ixy", "Iyz", "Ixz", "c_Dx", "c_Dy", "c_Dz", "k_d", "k_z", "k_h", "k_flap"), 0.0)
+    out |= dict.fromkeys(
+        ("Ixy", "Iyz", "Ixz", "c_Dx", "c_Dy", "c_Dz", "k_d", "k_z", "k_h", "k_flap"), 0.0
+    )
     thrust = told.thrust_constant
     out |= {"k_eta": thrust, "k_m": told.torque_ratio * thrust, "tau_m": told.motor_time}
     out |= {"rotor_speed_min": 0.0, "rotor_speed_max": v.MAX_SPEED, "motor_noise_std": 0.0}
     if set(changed) - set(out):
-        raise ValueError(f"not parameters of RotorPy's multirotor: {sorted(set(changed) - set(out))}")
+        raise ValueError(
+            f"not parameters of RotorPy's multirotor: {sorted(set(changed) - set(out))}"
+        )
     return out | changed
 
 
@@ -156,12 +181,15 @@ def _air(kind):
     name, mean = kind
     mean = np.array(mean)
     if name == "tunnel":
-        # Its axis goes through the origin, which is on the floor: it is lifted to where the flights are.
+        # Its axis goes through the origin, which is on the floor: it is lifted to where the flights
+        # are.
         tunnel = WindTunnel(np.linalg.norm(mean), mean / np.linalg.norm(mean), 0.25)
         return lambda t, x: tunnel.update(t, x - [0.0, 0.0, TUNNEL_HEIGHT])
     steady = ConstantWind(*mean)
     sway = SinusoidWind(0.25 * mean, np.array([0.4, 0.55, 0.3]), np.array([0.0, 0.7, 0.3]))
-    return steady.update if name == "steady" else lambda t, x: steady.update(t, x) + sway.update(t, x)
+    return (
+        steady.update if name == "steady" else lambda t, x: steady.update(t, x) + sway.update(t, x)
+    )
 
 
 def trajectory(name, rng, slower=1.0):
@@ -170,17 +198,25 @@ def trajectory(name, rng, slower=1.0):
     from rotorpy.trajectories.hover_traj import HoverTraj
     from rotorpy.trajectories.lissajous_traj import TwoDLissajous
 
-    height, speed = rng.uniform(0.5, 0.8), rng.uniform(0.8, 1.3) * slower
+    height = rng.uniform(0.5, 0.8)
+    speed = rng.uniform(0.8, 1.3) * slower
     if name == "hover":
         return HoverTraj(x0=np.array([0.0, 0.0, height]))
     if name == "eight":
         a = speed
-        return TwoDLissajous(A=0.55, B=0.5, a=a, b=2 * a, height=height, yaw_bool=bool(rng.random() < 0.5))
-    radius, rate = rng.uniform(0.4, 0.6), speed / 0.5 / (2 * np.pi)
+        return TwoDLissajous(
+            A=0.55, B=0.5, a=a, b=2 * a, height=height, yaw_bool=bool(rng.random() < 0.5)
+        )
+    radius = rng.uniform(0.4, 0.6)
+    rate = speed / 0.5 / (2 * np.pi)
     if name == "rocking":  # short swings on every axis
-        size, rates = np.array([0.06, 0.07, 0.03]), slower * rng.uniform(0.7, 1.2, 3)
-        return ThreeDCircularTraj(np.array([0, 0, height]), size, rates, yaw_bool=bool(rng.random() < 0.5))
-    sizes, rates = np.array([radius, radius, rng.uniform(0.05, 0.25)]), np.array([rate, rate, 0.6 * rate])
+        size = np.array([0.06, 0.07, 0.03])
+        rates = slower * rng.uniform(0.7, 1.2, 3)
+        return ThreeDCircularTraj(
+            np.array([0, 0, height]), size, rates, yaw_bool=bool(rng.random() < 0.5)
+        )
+    sizes = np.array([radius, radius, rng.uniform(0.05, 0.25)])
+    rates = np.array([rate, rate, 0.6 * rate])
     return ThreeDCircularTraj(np.array([0, 0, height]), sizes, rates, yaw_bool=name == "yawing")
 
 
@@ -192,11 +228,19 @@ def fly(told, changed, wind, path, drawn, air):
     samples = int(SECONDS / SAMPLE)
     goal = path.update(0.0)
     hover = v.MAX_SPEED * np.sqrt(told.hover)
-    state = {"x": goal["x"].astype(float), "v": goal["x_dot"].astype(float), "q": np.array([0, 0, 0, 1.0])}
+    state = {
+        "x": goal["x"].astype(float),
+        "v": goal["x_dot"].astype(float),
+        "q": np.array([0, 0, 0, 1.0]),
+    }
     state |= {"w": np.zeros(3), "wind": np.zeros(3), "rotor_speeds": np.full(4, hover)}
     tight = {"method": "RK23", "rtol": 1e-5, "atol": 1e-7}
     model = Multirotor(
-        rotorpy_vehicle(told, changed), state, "cmd_motor_speeds", aero=True, integrator_kwargs=tight
+        rotorpy_vehicle(told, changed),
+        state,
+        "cmd_motor_speeds",
+        aero=True,
+        integrator_kwargs=tight,
     )
     control = SE3Control(rotorpy_vehicle(told, {}))
     wind_at = _air(wind)
@@ -206,7 +250,8 @@ def fly(told, changed, wind, path, drawn, air):
     sizes = POSE | {k: size for k, size in KEPT.items() if k not in ("integral", "applied")}
     out = {name: np.zeros((samples, size, 1), np.float32) for name, size in sizes.items()}
     out |= {name: np.zeros((samples, 1), np.float32) for name in ("voltage", "load")}
-    m, crashed = np.full((4, 1), told.hover), samples
+    m = np.full((4, 1), told.hover)
+    crashed = samples
     voltage = battery.step(m, 0.0)
     for s in range(samples):
         t = SAMPLE * s
@@ -215,9 +260,14 @@ def fly(told, changed, wind, path, drawn, air):
         if s % 2 == 0:
             k = s // 5
             q = state["q"] + 0.5 * np.append(air["seen_attitude"][k][1:] * 2, 0.0) * state["q"][3]
-            seen = {"x": state["x"] + air["seen_position"][k], "v": state["v"] + air["seen_velocity"][k]}
+            seen = {
+                "x": state["x"] + air["seen_position"][k],
+                "v": state["v"] + air["seen_velocity"][k],
+            }
             seen |= {"q": q / np.linalg.norm(q), "w": gyro[:, 0]}
-            speeds = np.clip(control.update(t, seen, path.update(t))["cmd_motor_speeds"], 0.0, v.MAX_SPEED)
+            speeds = np.clip(
+                control.update(t, seen, path.update(t))["cmd_motor_speeds"], 0.0, v.MAX_SPEED
+            )
             m = (speeds[:, None] / v.MAX_SPEED) ** 2
         rotation = np.roll(state["q"], 1)[:, None]
         accel = model.statedot(state, {"cmd_motor_speeds": speeds}, SAMPLE)["vdot"][:, None]
@@ -257,7 +307,9 @@ def make_case(job):
     # one trajectory that exposes the cause, where only some do, and others
     names = [str(rng.choice(exposing))] if exposing else []
     names += [str(n) for n in rng.choice(PATHS, 3 - len(names), replace=False)]
-    ticks, flights, flown = int(SECONDS * 100), [], []
+    ticks = int(SECONDS * 100)
+    flights = []
+    flown = []
     for name in names:
         for slower in (1.0, 0.7, 0.5, 0.35):  # some vehicles can't follow fast paths
             air = sensors.draw_air(rng, drawn, ticks, drawn["voltage"] + rng.uniform(-0.15, 0.1))
@@ -274,16 +326,20 @@ def make_case(job):
 
 
 def floor_of(told, drawn, joined, flights):
-    """(seen, floor): mean squares (12,) of the told vehicle without a cause, and root mean squares of what air, sensors
-    and the rows of the log leave to a true one."""
-    many, none = [told] * 3, np.zeros(3, bool)
+    """(seen, floor): mean squares (12,) of the told vehicle without a cause, and root mean squares
+    of what air, sensors and the rows of the log leave to a true one.
+    """
+    many = [told] * 3
+    none = np.zeros(3, bool)
     p = v.nominal_parameters(many)
     p["rotor_gain"] *= 1 + drawn["thrust_offset"]
 
     def errors(flown):
         return (measure.errors(flown, many, p, np.arange(3), none, none) ** 2).mean(axis=1)
 
-    rows, samples, seen = [f[0] for f in flights], len(joined["motor"]), errors(joined)
+    rows = [f[0] for f in flights]
+    samples = len(joined["motor"])
+    seen = errors(joined)
     sensed = np.array([measure.sensor_floor(drawn, r, joined, j) for j, r in enumerate(rows)])
     logged = np.stack([measure.motors_of_log(r, samples) for r in rows], axis=-1)
     lasts = np.minimum(joined["crashed"], [round(r["t"][-1] / SAMPLE) for r in rows])
@@ -298,7 +354,9 @@ def answer(name, kind, told, drawn, joined, flights, said):
     known = np.isfinite(floor)
     severity = float(np.sqrt(np.where(known, seen / floor**2, 0.0).max()))
     truth = [e if e != "unknown" else kind for e in effects]
-    category = {0: "none", 1: "unknown" if effects == ["unknown"] else "single", 2: "pair"}[len(effects)]
+    category = {0: "none", 1: "unknown" if effects == ["unknown"] else "single", 2: "pair"}[
+        len(effects)
+    ]
     if effects and severity < HIDDEN:
         category = "not_testable"
     forms, each = ([x] if isinstance(x, str | dict) else x for x in (form, said))

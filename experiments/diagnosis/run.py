@@ -1,11 +1,14 @@
-"""The exam from end to end: cases are drawn and flown, their answers sealed, the logs diagnosed, the answers opened.
+"""The exam from end to end: cases are drawn and flown, their answers sealed, the logs diagnosed,
+the answers opened.
 
-    python -m experiments.diagnosis.run --columns stranger=120 rotorpy=2 --seed 1201 --cores 24 --work DIR --out PAGE
+    python -m experiments.diagnosis.run --columns stranger=120 rotorpy=2 --seed 1201 --cores 24
+    --work DIR --out PAGE
 
-A column is `known`, `real` or `stranger` with a number of cases, or `rotorpy` with a number of cases of each kind.
-`--sets DIR[=ANSWERS]` takes folders of cases that are there already. The digest of the answers is written before the first
-diagnosis. A column whose answers lie in the work folder isn't flown again, and cases that are diagnosed aren't again.
-`--report` makes the page anew from what is stored. Seeds below 1000 are for development; each other seed is answered once.
+A column is `known`, `real` or `stranger` with a number of cases, or `rotorpy` with a number of
+cases of each kind. `--sets DIR[=ANSWERS]` takes folders of cases that are there already. The digest
+of the answers is written before the first diagnosis. A column whose answers lie in the work folder
+isn't flown again, and cases that are diagnosed aren't again. `--report` makes the page anew from
+what is stored. Seeds below 1000 are for development; each other seed is answered once.
 """
 
 import math
@@ -18,16 +21,23 @@ from pathlib import Path
 from experiments.diagnosis import development, figures
 from experiments.table import Page, page_parser, publish
 
-LEFT_OUT = "parameters quality gap probabilities not_testable rest false_unknown right_names".split()
+LEFT_OUT = (
+    "parameters quality gap probabilities not_testable rest false_unknown right_names".split()
+)
 ROOT = Path(__file__).resolve().parents[2]
 
 
 def fly(column: str, count: int, options) -> str:
-    """Fly a column in a process of its own, which sees nothing of the diagnosis; the SHA-256 of its answers."""
+    """Fly a column in a process of its own, which sees nothing of the diagnosis; the SHA-256 of its
+    answers.
+    """
     work = options.work.resolve()
-    logs, answers = work / column, work / f"{column}_answers.json"
+    logs = work / column
+    answers = work / f"{column}_answers.json"
     if not answers.exists():
-        module, number = ("rotorpy_cases", "--each") if column == "rotorpy" else ("generate", "--count")
+        module, number = (
+            ("rotorpy_cases", "--each") if column == "rotorpy" else ("generate", "--count")
+        )
         command = [sys.executable, "-m", f"experiments.diagnosis.{module}", number, str(count)]
         command += [] if column == "rotorpy" else ["--column", column]
         command += ["--seed", str(options.seed), "--logs", str(logs), "--answers", str(answers)]
@@ -37,7 +47,8 @@ def fly(column: str, count: int, options) -> str:
 
 def study(options) -> dict:
     """Fly, diagnose and judge all columns."""
-    begin, wanted = time.perf_counter(), dict(entry.split("=") for entry in options.columns)
+    begin = time.perf_counter()
+    wanted = dict(entry.split("=") for entry in options.columns)
     digests = {column: fly(column, int(count), options) for column, count in wanted.items()}
     out = options.work / "cases.jsonl"
     sets = [str(options.work / column) for column in wanted] + options.sets
@@ -45,7 +56,10 @@ def study(options) -> dict:
     if options.seconds:
         arguments += ["--seconds", str(options.seconds - (time.perf_counter() - begin))]
     development.main(arguments)
-    lines = [{k: v for k, v in line.items() if k not in LEFT_OUT} for line in development.read_lines([out])]
+    lines = [
+        {k: v for k, v in line.items() if k not in LEFT_OUT}
+        for line in development.read_lines([out])
+    ]
     columns = {}
     for name in sorted({x["set"] for x in lines}):
         columns[name] = {"figures": stored_figures([x for x in lines if x["set"] == name])}
@@ -70,10 +84,13 @@ def page(results: dict) -> Page:
     digests = ", ".join(f"{c} {d[:16]}" for c, d in results["answers_sha256"].items())
     prose = (
         "Cases are flown, their answers sealed, the logs diagnosed, the answers opened, once. "
-        f"In brackets: 95 % interval. Seed {results['seed']}; SHA-256 of the answers: {digests or 'given'}. "
+        f"In brackets: 95 % interval. Seed {results['seed']}; SHA-256 of the answers: "
+        f"{digests or 'given'}. "
         f"{results['note']}"
     )
-    table, misses = ("\n".join(part(results["cases"])) for part in (figures.figures_table, figures.misses))
+    table, misses = (
+        "\n".join(part(results["cases"])) for part in (figures.figures_table, figures.misses)
+    )
     misses += results.get("history", "")
     return Page("The exam of the diagnosis", prose, [table, f"## Misses\n\n{misses}"])
 
@@ -87,7 +104,9 @@ def main() -> None:
     parser.add_argument("--cores", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--note", default="", help="a sentence for the page")
     parser.add_argument("--seconds", type=float, help="for all; what is done by then counts")
-    parser.add_argument("--work", type=Path, default=Path("runs/exam"), help="logs, answers; not committed")
+    parser.add_argument(
+        "--work", type=Path, default=Path("runs/exam"), help="logs, answers; not committed"
+    )
     publish(parser.parse_args(), study, page)
 
 

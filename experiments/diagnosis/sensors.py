@@ -1,8 +1,9 @@
-"""The family of sensors and logs: what a case's vehicle carries, the air that it flies in, and the rows of its logs.
+"""The family of sensors and logs: what a case's vehicle carries, the air that it flies in, and the
+rows of its logs.
 
-`draw` makes a case's set-up; eight kinds of sensors, two of which (`STRANGERS`) are drawn for reported runs only.
-Every case, "none" included, has biases, a tilt up to 1 degree between IMU and tracked frame, a thrust offset up to
-0.8 % and constants off by up to 1 % beside what is told.
+`draw` makes a case's set-up; eight kinds of sensors, two of which (`STRANGERS`) are drawn for
+reported runs only. Every case, "none" included, has biases, a tilt up to 1 degree between IMU and
+tracked frame, a thrust offset up to 0.8 % and constants off by up to 1 % beside what is told.
 """
 
 import numpy as np
@@ -33,7 +34,9 @@ TURBULENCE = {"none": (0.0, 0.05), "light": (0.3, 1.2), "strong": (2.0, 4.0)}  #
 
 
 def coloured(rng, count, axes, time, rms, step):
-    """First-order noise (count, axes) of correlation time `time` (s) and the given rms, sampled every `step` (s)."""
+    """First-order noise (count, axes) of correlation time `time` (s) and the given rms, sampled
+    every `step` (s).
+    """
     keep = np.exp(-step / time)
     white = rng.standard_normal((count, axes)) * np.sqrt(1 - keep**2)
     white[0] /= np.sqrt(1 - keep**2)
@@ -41,7 +44,9 @@ def coloured(rng, count, axes, time, rms, step):
 
 
 def narrow(rng, count, axes, frequency, quality, rms, step):
-    """Narrow-band noise (count, axes) around `frequency` (Hz): white noise through a resonance of the given quality."""
+    """Narrow-band noise (count, axes) around `frequency` (Hz): white noise through a resonance of
+    the given quality.
+    """
     pole = np.exp(-np.pi * frequency / quality * step)
     a = [1.0, -2 * pole * np.cos(2 * np.pi * frequency * step), pole * pole]
     signal = lfilter([1.0], a, rng.standard_normal((count + 500, axes)), axis=0)[500:]
@@ -49,7 +54,9 @@ def narrow(rng, count, axes, frequency, quality, rms, step):
 
 
 def _channels(rng, needed):
-    """Letters of the logged groups: what an effect needs is there, the rest is drawn; always a legal log."""
+    """Letters of the logged groups: what an effect needs is there, the rest is drawn; always a
+    legal log.
+    """
     have = set(needed) | {letter for letter, chance in LOGGED.items() if rng.random() < chance}
     if "p" not in have:
         have -= {"s"}
@@ -62,13 +69,19 @@ def _channels(rng, needed):
 
 
 def draw(rng, kind, needed="", turbulence=None):
-    """Sensors and air of a case: a dict of plain numbers, see the keys below. `needed`: letters of `GROUPS`."""
+    """Sensors and air of a case: a dict of plain numbers, see the keys below. `needed`: letters of
+    `GROUPS`.
+    """
     size = float(np.exp(rng.uniform(np.log(0.5), np.log(2.0))))  # good and bad instruments
     tilt = rng.standard_normal(3)
     tilt *= np.deg2rad(rng.uniform(0, 1.0)) / np.linalg.norm(tilt)
     filtered = kind == "filtered" or rng.random() < 0.5
     turbulence = turbulence or str(rng.choice(list(TURBULENCE), p=[0.35, 0.45, 0.2]))
-    rate = int(rng.choice(list(RATES), p=list(RATES.values()))) if kind not in ("radio", "stale") else 100
+    rate = (
+        int(rng.choice(list(RATES), p=list(RATES.values())))
+        if kind not in ("radio", "stale")
+        else 100
+    )
     out = {
         "kind": kind,
         "rate": rate,
@@ -78,7 +91,9 @@ def draw(rng, kind, needed="", turbulence=None):
         "accel_bias": rng.uniform(-0.35, 0.35, 3).tolist(),
         "gyro_bias": rng.uniform(-0.02, 0.02, 3).tolist(),
         "thrust_offset": float(rng.uniform(-0.008, 0.008)),
-        "constants_off": rng.uniform(-0.01, 0.01, 5).tolist(),  # motor time, yaw torque, three moments
+        "constants_off": rng.uniform(
+            -0.01, 0.01, 5
+        ).tolist(),  # motor time, yaw torque, three moments
         "turbulence": turbulence,
         "gust": float(rng.uniform(*TURBULENCE[turbulence])),
         "pose_delay": float(rng.uniform(0.0, 2.5)),  # ms
@@ -99,7 +114,8 @@ def draw(rng, kind, needed="", turbulence=None):
         "velocity": str(rng.choice(["smooth", "derived"])),
         "motor": "mean" if rng.random() < 0.7 else "snapshot",
         "wander": 0.0,  # ms rms of the clocks of IMU and motors against the pose
-        "stream_rate": 0.0,  # Hz of the streams that were interpolated onto the rows; 0: sampled at the rows
+        # Hz of the streams that were interpolated onto the rows; 0: sampled at the rows
+        "stream_rate": 0.0,
         "dropped": float(rng.choice([0.0, 0.0, 0.01, 0.04])),
         "voltage": float(rng.uniform(3.6, 4.05)),
         "resistance": float(rng.uniform(0.12, 0.3)),
@@ -114,7 +130,10 @@ def draw(rng, kind, needed="", turbulence=None):
     elif kind == "radio":
         out |= {"wander": float(rng.uniform(2.0, 10.0)), "stream_rate": float(rng.uniform(70, 90))}
     elif kind == "estimator":
-        out |= {"colour": float(rng.uniform(1.5, 4.0)), "colour_time": float(rng.uniform(0.15, 0.5))}
+        out |= {
+            "colour": float(rng.uniform(1.5, 4.0)),
+            "colour_time": float(rng.uniform(0.15, 0.5)),
+        }
         out |= {"velocity": "smooth"}
     elif kind == "stale":
         out |= {"pose_rate": int(rng.choice([45, 60, 72]))}
@@ -122,9 +141,15 @@ def draw(rng, kind, needed="", turbulence=None):
 
 
 def draw_air(rng, sensors, ticks, voltage, strong=1.0):
-    """Air, gyroscope and pose of one body in one flight as `plant.fly` wants them (no body axis yet)."""
-    samples, size, gust = 5 * ticks, sensors["size"], 1e-3 * sensors["gust"] * strong
-    force = coloured(rng, ticks, 3, 0.35, gust, 0.01) + coloured(rng, ticks, 3, 0.05, 0.4 * gust, 0.01)
+    """Air, gyroscope and pose of one body in one flight as `plant.fly` wants them (no body axis
+    yet).
+    """
+    samples = 5 * ticks
+    size = sensors["size"]
+    gust = 1e-3 * sensors["gust"] * strong
+    force = coloured(rng, ticks, 3, 0.35, gust, 0.01) + coloured(
+        rng, ticks, 3, 0.05, 0.4 * gust, 0.01
+    )
     torque = coloured(rng, ticks, 3, 0.08, 0.013 * gust, 0.01) * np.array([1.0, 1.0, 0.5])
     gyro = sensors["gyro"] * rng.standard_normal((samples, 3))
     if sensors["colour"]:
@@ -150,12 +175,16 @@ def draw_air(rng, sensors, ticks, voltage, strong=1.0):
 
 
 def holds_poses(sensors):
-    """Whether rows repeat the last pose, which makes them late by half the hold on average, whatever flies."""
+    """Whether rows repeat the last pose, which makes them late by half the hold on average,
+    whatever flies.
+    """
     return sensors["kind"] == "stale" and "p" in sensors["channels"]
 
 
 def pose_lag(delay_ms, sensors):
-    """By how much poses in the log are late, ms: the cause together with the motion capture's own; None if they are held."""
+    """By how much poses in the log are late, ms: the cause together with the motion capture's own;
+    None if they are held.
+    """
     return None if holds_poses(sensors) else delay_ms + sensors["pose_delay"]
 
 
@@ -165,12 +194,15 @@ def stack(flights):
 
 
 def _vibration(rng, sensors, samples, rms):
-    frequency, quality = sensors["vibration_frequency"], sensors["vibration_quality"]
+    frequency = sensors["vibration_frequency"]
+    quality = sensors["vibration_quality"]
     return narrow(rng, samples, 3, frequency, quality, rms, SAMPLE) * np.array([1.0, 1.0, 0.6])
 
 
 def apply_nuisances(p, columns, sensors):
-    """What is off in every case: thrust, motor time, yaw torque, moments of inertia, and the firmware's filters."""
+    """What is off in every case: thrust, motor time, yaw torque, moments of inertia, and the
+    firmware's filters.
+    """
     lag, yaw, *moments = sensors["constants_off"]
     p["rotor_gain"][:, columns] *= 1 + sensors["thrust_offset"]
     p["tau_up"][columns] *= 1 + 3 * lag
@@ -178,7 +210,10 @@ def apply_nuisances(p, columns, sensors):
     p["torque_ratio"][columns] *= 1 + yaw
     for i, off in enumerate(moments):
         p["inertia"][i, i, columns] *= 1 + off
-    p["gyro_cut"][columns], p["derivative_cut"][columns] = sensors["gyro_cut"], sensors["derivative_cut"]
+    p["gyro_cut"][columns], p["derivative_cut"][columns] = (
+        sensors["gyro_cut"],
+        sensors["derivative_cut"],
+    )
 
 
 def at(signal, times):
@@ -200,16 +235,20 @@ def _through(cut, signal):
 
 def _pose(rng, sensors, flown, j, times, delay):
     """Position, orientation, velocity (n, 10) of the motion capture at its own `times`."""
-    size, n = sensors["size"], len(times)
+    size = sensors["size"]
+    n = len(times)
     step = float(np.median(np.diff(times)))
     when = times - delay
     position = at(flown["position"][:, :, j].astype(float), when)
     white = sensors["position"] * rng.standard_normal((n, 3))
     position += white + coloured(rng, n, 3, 1.0, 1.5e-4 * size, step)
-    angle = sensors["angle"] * rng.standard_normal((n, 3)) + coloured(rng, n, 3, 1.5, 8e-4 * size, step)
+    angle = sensors["angle"] * rng.standard_normal((n, 3)) + coloured(
+        rng, n, 3, 1.5, 8e-4 * size, step
+    )
     velocity = at(flown["velocity"][:, :, j].astype(float), when)
     if sensors["kind"] == "estimator":  # smoothed: hardly any white noise, slow errors instead
-        slow, time = sensors["colour"], sensors["colour_time"]
+        slow = sensors["colour"]
+        time = sensors["colour_time"]
         wander = coloured(rng, n, 3, time, slow * 6e-4 * size, step)
         position += wander - sensors["position"] * 0.8 * rng.standard_normal((n, 3))
         angle = coloured(rng, n, 3, time, slow * 2.5e-3 * size, step)
@@ -217,9 +256,13 @@ def _pose(rng, sensors, flown, j, times, delay):
     elif sensors["velocity"] == "derived":
         velocity = smooth_derivative(position, step)
     else:
-        velocity += 3e-3 * size * rng.standard_normal((n, 3)) + coloured(rng, n, 3, 0.3, 1e-3 * size, step)
+        velocity += 3e-3 * size * rng.standard_normal((n, 3)) + coloured(
+            rng, n, 3, 0.3, 1e-3 * size, step
+        )
     if sensors["kind"] == "coloured":
-        velocity += coloured(rng, n, 3, sensors["colour_time"], 3e-3 * size * sensors["colour"], step)
+        velocity += coloured(
+            rng, n, 3, sensors["colour_time"], 3e-3 * size * sensors["colour"], step
+        )
     q = at(flown["quaternion"][:, :, j].astype(float), when)
     q = vehicle.multiply(q.T, np.concatenate([np.ones((1, n)), 0.5 * angle.T]))
     return np.concatenate([position, (q / np.sqrt((q * q).sum(axis=0))).T, velocity], axis=1)
@@ -228,7 +271,9 @@ def _pose(rng, sensors, flown, j, times, delay):
 def smooth_derivative(position, step):
     """Least-squares slope over seven samples."""
     half = np.arange(-3, 4)
-    padded = np.concatenate([np.repeat(position[:1], 3, 0), position, np.repeat(position[-1:], 3, 0)])
+    padded = np.concatenate(
+        [np.repeat(position[:1], 3, 0), position, np.repeat(position[-1:], 3, 0)]
+    )
     out = sum(h * padded[3 + h : 3 + h + len(position)] for h in half) / (28.0 * step)
     out[:3], out[-3:] = out[3], out[-4]
     return out
@@ -242,10 +287,12 @@ def _inputs(flown, j, times, hover):
 
 
 def log_rows(rng, sensors, flown, j, ticks, unknown=(), hover=0.5):
-    """Rows of body j: dict column -> (n,) with NaN where a channel was not sampled; `t` first. All groups are made,
-    the caller leaves out what was not logged. `unknown`: causes that sit in sensors.
+    """Rows of body j: dict column -> (n,) with NaN where a channel was not sampled; `t` first. All
+    groups are made, the caller leaves out what was not logged. `unknown`: causes that sit in
+    sensors.
     """
-    seconds, rate = 0.01 * ticks, sensors["rate"]
+    seconds = 0.01 * ticks
+    rate = sensors["rate"]
     t = np.arange(int(seconds * rate)) / rate
     if sensors["dropped"]:
         keep = rng.random(len(t)) >= sensors["dropped"]
@@ -257,12 +304,16 @@ def log_rows(rng, sensors, flown, j, ticks, unknown=(), hover=0.5):
         wander = coloured(rng, len(flown["rates"]), 2, 2.0, 1e-3 * sensors["wander"], SAMPLE)
 
     def stream(signal, times, clock):
-        """A 500 Hz signal as its stream delivers it at `times`, by the IMU's clock (0) or the motors' (1)."""
+        """A 500 Hz signal as its stream delivers it at `times`, by the IMU's clock (0) or the
+        motors' (1).
+        """
         own = np.arange(0, seconds, 1 / sensors["stream_rate"]) if sensors["stream_rate"] else times
         values = at(signal, own + (0.0 if wander is None else at(wander[:, clock], own)))
         if own is times:
             return values
-        return np.stack([np.interp(times, own, values[:, i]) for i in range(values.shape[1])], axis=1)
+        return np.stack(
+            [np.interp(times, own, values[:, i]) for i in range(values.shape[1])], axis=1
+        )
 
     out = {"t": t}
     # pose: at its own rate, empty cells between, held (stale) or interpolated
@@ -289,7 +340,11 @@ def log_rows(rng, sensors, flown, j, ticks, unknown=(), hover=0.5):
     gyro = flown["gyro"][:, :, j].astype(float)
     accel = flown["specific"][:, :, j].astype(float)
     samples = len(accel)
-    accel = accel - np.cross(np.broadcast_to(tilt, accel.shape), accel) + np.array(sensors["accel_bias"])
+    accel = (
+        accel
+        - np.cross(np.broadcast_to(tilt, accel.shape), accel)
+        + np.array(sensors["accel_bias"])
+    )
     noise = sensors["accel"] * rng.standard_normal((samples, 3))
     noise += coloured(rng, samples, 3, 3.0, 0.02, SAMPLE)
     if sensors["colour"]:
@@ -305,7 +360,9 @@ def log_rows(rng, sensors, flown, j, ticks, unknown=(), hover=0.5):
         total = np.concatenate([np.zeros((1, 4)), np.cumsum(motor, axis=0)])
         width = min(500 / rate, samples)
         last = np.minimum(np.arange(samples) + width, samples)
-        total_then = np.stack([np.interp(last, np.arange(samples + 1), total[:, i]) for i in range(4)], 1)
+        total_then = np.stack(
+            [np.interp(last, np.arange(samples + 1), total[:, i]) for i in range(4)], 1
+        )
         motor = (total_then - total[:samples]) / (last - np.arange(samples))[:, None]
     place = np.minimum((t / SAMPLE + 1e-6).astype(int), samples - 1)
     motors = stream(motor, t, 1) if sensors["stream_rate"] else motor[place]

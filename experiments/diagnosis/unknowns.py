@@ -1,10 +1,12 @@
-"""Causes outside the vocabulary, drawn by a generator: thousands of kinds, so that none can be written a detector for.
+"""Causes outside the vocabulary, drawn by a generator: thousands of kinds, so that none can be
+written a detector for.
 
-A kind is a site (a force, a torque, the motors, a sensor) and a function f of a random subset of place, motion, motors,
-voltage and time: a sum of random Fourier features (Rahimi, Recht 2007) without its mean and its linear part, as far as
-the inputs are normally distributed. What is left can't be taken over by a constant or a line in any input, which
-the vocabulary's effects are. It sets in at a random time. The `switching` form, for reported runs alone, is the sign of such a
-sum: knocks, relays, steps. Everything follows from the eight uniform draws of the cause.
+A kind is a site (a force, a torque, the motors, a sensor) and a function f of a random subset of
+place, motion, motors, voltage and time: a sum of random Fourier features (Rahimi, Recht 2007)
+without its mean and its linear part, as far as the inputs are normally distributed. What is left
+can't be taken over by a constant or a line in any input, which the vocabulary's effects are. It
+sets in at a random time. The `switching` form, for reported runs alone, is the sign of such a sum:
+knocks, relays, steps. Everything follows from the eight uniform draws of the cause.
 """
 
 from typing import NamedTuple
@@ -15,7 +17,9 @@ from experiments.diagnosis.vehicle import multiply, rotate_back
 
 
 class Site(NamedTuple):
-    """Where a kind acts: (smallest, largest) root mean square, its unit, whether in the logs alone."""
+    """Where a kind acts: (smallest, largest) root mean square, its unit, whether in the logs
+    alone.
+    """
 
     sizes: tuple
     unit: str
@@ -48,14 +52,23 @@ SLOWEST, FASTEST = 0.3, 4.0  # Hz, of a kind that time has a part in
 
 
 class Generated:
-    """The functions of some bodies' causes: calls give values (n,) with a root mean square of about one."""
+    """The functions of some bodies' causes: calls give values (n,) with a root mean square of about
+    one.
+    """
 
     def __init__(self, causes):
         """causes: n dicts with `shape` and `form`."""
         drawn = [self._draw(cause) for cause in causes]
-        self.waves, self.phases, self.onset, self.axis, self.rotors, self.mean, self.slope, self.world = (
-            np.stack(part, axis=-1) for part in zip(*drawn, strict=True)
-        )
+        (
+            self.waves,
+            self.phases,
+            self.onset,
+            self.axis,
+            self.rotors,
+            self.mean,
+            self.slope,
+            self.world,
+        ) = (np.stack(part, axis=-1) for part in zip(*drawn, strict=True))
         self.switching = np.array([cause["form"] == "switching" for cause in causes])
 
     @staticmethod
@@ -68,7 +81,9 @@ class Generated:
         waves = rng.standard_normal((FEATURES, len(SCALE)))
         waves *= np.concatenate([np.full(INPUTS[n][0], n in chosen) for n in names])
         still = waves[:, :-1]
-        still *= rng.uniform(1.5, 3.0) / np.maximum(np.linalg.norm(still, axis=1, keepdims=True), 1e-9)
+        still *= rng.uniform(1.5, 3.0) / np.maximum(
+            np.linalg.norm(still, axis=1, keepdims=True), 1e-9
+        )
         if "time" in chosen:
             turns = SLOWEST * (FASTEST / SLOWEST) ** rng.uniform(size=FEATURES)
             waves[:, -1] = 2 * np.pi * turns * rng.choice([-1, 1], FEATURES)
@@ -79,10 +94,21 @@ class Generated:
         onset = rng.uniform(1.5, 5.0) if rng.random() < 0.4 else 0.0
         axis = rng.standard_normal(3)
         rotors = rng.permutation([1.0, *rng.choice([0.0, 1.0, -1.0], 3)])
-        return waves, phases, onset, axis / np.linalg.norm(axis), rotors, mean, slope, rng.random() < 0.5
+        return (
+            waves,
+            phases,
+            onset,
+            axis / np.linalg.norm(axis),
+            rotors,
+            mean,
+            slope,
+            rng.random() < 0.5,
+        )
 
     def __call__(self, inputs, time):
-        """Values (n,) at inputs (14, n), of which the last row is replaced by the time since the onset."""
+        """Values (n,) at inputs (14, n), of which the last row is replaced by the time since the
+        onset.
+        """
         x = np.concatenate([inputs, np.broadcast_to(time - self.onset, (1, inputs.shape[1]))])
         waves = np.cos(np.einsum("fin,in->fn", self.waves, x) + self.phases).sum(0)
         smooth = (waves - self.mean - (self.slope * x).sum(0)) * np.sqrt(2.0 / FEATURES)
@@ -91,8 +117,9 @@ class Generated:
 
 
 def inputs_of(position, q, velocity, rates, motors, voltage, hover):
-    """(14, n) what the functions depend on, each about normally distributed: positions, velocities and rates (3, n), q and
-    motors (4, n), voltage and hover command (n,)."""
+    """(14, n) what the functions depend on, each about normally distributed: positions, velocities
+    and rates (3, n), q and motors (4, n), voltage and hover command (n,).
+    """
     middle = position - np.array([[0.0], [0.0], [0.6]])
     rows = [middle, rotate_back(q, velocity), rates, motors - hover, voltage[None] - 3.7]
     return np.concatenate(rows) / SCALE[:-1, None]
@@ -102,7 +129,10 @@ class Unknowns:
     """The unknown causes of a batch of `count` bodies: {site: [(columns, cause), …]}."""
 
     def __init__(self, causes, count, hover=0.5):
-        self.count, self.hover, self.inputs, self.sites = count, hover, None, {}
+        self.count = count
+        self.hover = hover
+        self.inputs = None
+        self.sites = {}
         for site, entries in causes.items():
             if site in SENSOR_SITES or not entries:
                 continue
@@ -133,7 +163,8 @@ class Unknowns:
 
     def wrench(self, q, time):
         """Force (3, B) N and torque (3, B) N m in the body frame."""
-        force, torque = np.zeros((3, self.count)), np.zeros((3, self.count))
+        force = np.zeros((3, self.count))
+        torque = np.zeros((3, self.count))
         if "unknown_force" in self.sites:
             columns, function, values = self._values("unknown_force", time)
             push = 1e-3 * function.axis * values
@@ -145,7 +176,9 @@ class Unknowns:
 
 
 def misread(causes, inputs, times):
-    """{site: (n, 3)} by how much the sensors of one body are off at `times` (n,); `inputs` (14, n)."""
+    """{site: (n, 3)} by how much the sensors of one body are off at `times` (n,); `inputs` (14,
+    n).
+    """
     out = {}
     for cause in causes:
         function = Generated([cause])

@@ -1,7 +1,9 @@
-"""The vehicle of the exam's plants: published constants, parameters per simulated body, and vector helpers.
+"""The vehicle of the exam's plants: published constants, parameters per simulated body, and vector
+helpers.
 
-Nothing is imported from `openjax`, so that a mistake in one is not repeated in the other. Arrays carry the body
-index last, (3, B) or (4, B). Frames: world z up, body x forward, y left, z up, quaternions wxyz body to world.
+Nothing is imported from `openjax`, so that a mistake in one is not repeated in the other. Arrays
+carry the body index last, (3, B) or (4, B). Frames: world z up, body x forward, y left, z up,
+quaternions wxyz body to world.
 """
 
 from dataclasses import dataclass
@@ -30,7 +32,9 @@ OUTPUT_LIMIT = 32767.0
 
 @dataclass(frozen=True)
 class Told:
-    """What the simulator is told about a vehicle: mass kg, thrust constant N s^2, k_m/k_f m, motor time s, inertia kg m^2."""
+    """What the simulator is told about a vehicle: mass kg, thrust constant N s^2, k_m/k_f m, motor
+    time s, inertia kg m^2.
+    """
 
     mass: float = MASS
     thrust_constant: float = THRUST_CONSTANT
@@ -46,10 +50,16 @@ class Told:
 
 
 def draw_told(rng):
-    """A vehicle of 27 to 45 g. A heavy one carries stronger motors; constants are off the published ones by some per cent."""
+    """A vehicle of 27 to 45 g. A heavy one carries stronger motors; constants are off the published
+    ones by some per cent.
+    """
     mass = float(rng.uniform(0.027, 0.045))
     standard = mass < 0.037 and rng.random() < 0.6
-    thrust = THRUST_CONSTANT if standard else mass * GRAVITY / (4 * rng.uniform(0.5, 0.66) * MAX_SPEED**2)
+    thrust = (
+        THRUST_CONSTANT
+        if standard
+        else mass * GRAVITY / (4 * rng.uniform(0.5, 0.66) * MAX_SPEED**2)
+    )
     size = 1.0 if standard and rng.random() < 0.5 else mass / MASS * rng.uniform(0.93, 1.1)
     ratio = TORQUE_RATIO if rng.random() < 0.6 else rng.uniform(0.006, 0.02)
     time = MOTOR_TIME if standard and rng.random() < 0.5 else rng.uniform(0.02, 0.04)
@@ -65,7 +75,9 @@ def draw_told(rng):
 
 
 def toml(told, source, sensors, command="thrust"):
-    """Text of the case's `vehicle.toml`: the vehicle as told, and what a laboratory knows of its logger."""
+    """Text of the case's `vehicle.toml`: the vehicle as told, and what a laboratory knows of its
+    logger.
+    """
     lines = ["[vehicle]", 'name = "crazyflie-2.1"', f"mass = {told.mass:.5f}"]
     lines += [
         f"mass_weighed = {'true' if told.weighed else 'false'}",
@@ -94,7 +106,13 @@ def toml(told, source, sensors, command="thrust"):
     return "\n".join(lines) + "\n"
 
 
-SURFACE = {"image": 0.0, "exp": 0.0, "scale": 0.05, "inverse": 0.0, "offset": 0.01}  # of thrust near it
+SURFACE = {
+    "image": 0.0,
+    "exp": 0.0,
+    "scale": 0.05,
+    "inverse": 0.0,
+    "offset": 0.01,
+}  # of thrust near it
 # name -> neutral value of a parameter that is one number per body
 NEUTRAL = {
     "torque_gain": 1.0,  # of the reaction torque beside the thrust
@@ -123,7 +141,9 @@ NEUTRAL = {
     "wind_quadratic": 0.0,
     "wind_shear": 0.0,
     "wind_gust": 0.0,
-    **{f"{side}_{name}": value for side in ("ground", "ceiling") for name, value in SURFACE.items()},
+    **{
+        f"{side}_{name}": value for side in ("ground", "ceiling") for name, value in SURFACE.items()
+    },
     "wake": 0.0,  # N
     "wake_height": 0.3,
     "wake_width": 0.04,
@@ -141,7 +161,9 @@ NEUTRAL = {
 
 
 def nominal_parameters(told):
-    """Parameters of the bodies described by a list of `Told`, as told. Effects overwrite entries."""
+    """Parameters of the bodies described by a list of `Told`, as told. Effects overwrite
+    entries.
+    """
     count = len(told)
 
     def rows(values):
@@ -172,9 +194,15 @@ def rotate(q, v):
     """Body vector (3, B) to world by quaternions (4, B)."""
     w, x, y, z = q
     vx, vy, vz = v
-    tx, ty, tz = 2 * (y * vz - z * vy), 2 * (z * vx - x * vz), 2 * (x * vy - y * vx)
+    tx = 2 * (y * vz - z * vy)
+    ty = 2 * (z * vx - x * vz)
+    tz = 2 * (x * vy - y * vx)
     return np.stack(
-        [vx + w * tx + y * tz - z * ty, vy + w * ty + z * tx - x * tz, vz + w * tz + x * ty - y * tx]
+        [
+            vx + w * tx + y * tz - z * ty,
+            vy + w * ty + z * tx - x * tz,
+            vz + w * tz + x * ty - y * tx,
+        ]
     )
 
 
@@ -185,7 +213,9 @@ def rotate_back(q, v):
 
 def cross(a, b):
     """Cross product of (3, B) vectors."""
-    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    return np.stack(
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    )
 
 
 def multiply(a, b):
@@ -210,8 +240,13 @@ def turn(q, w, dt):
 
 
 def mix(thrust, output):
-    """Firmware mixer: collective thrust (B,) 0..1 and outputs (3, B) in counts to motor commands (4, B) in 0..1."""
+    """Firmware mixer: collective thrust (B,) 0..1 and outputs (3, B) in counts to motor commands
+    (4, B) in 0..1.
+    """
     roll, pitch, yaw = np.minimum(np.maximum(output, -OUTPUT_LIMIT), OUTPUT_LIMIT) / 65536.0
-    r, p = roll / 2, pitch / 2
-    m = np.stack([thrust - r - p - yaw, thrust - r + p + yaw, thrust + r + p - yaw, thrust + r - p + yaw])
+    r = roll / 2
+    p = pitch / 2
+    m = np.stack(
+        [thrust - r - p - yaw, thrust - r + p + yaw, thrust + r + p - yaw, thrust + r - p + yaw]
+    )
     return np.minimum(np.maximum(m, 0.0), 1.0)

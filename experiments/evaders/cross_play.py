@@ -1,8 +1,10 @@
-"""Policies against every evader: `python -m experiments.evaders.cross_play --policy NAME ... [--game own|honest|clamp]`.
+"""Policies against every evader: `python -m experiments.evaders.cross_play --policy NAME ...
+[--game own|honest|clamp]`.
 
-All evaders by name, on the six layouts and on uniform tasks, with the nominal vehicle, a slower one and the family of the
-preset `flight`. Nothing is chosen by any of it; held-out evaders were never trained on. Game "own": the policy's; "honest": no
-clamp on the speed, the rate loop at 500 Hz; "clamp": the paper's, at 100 Hz. Writes evaders.json and .md (`--out`: others).
+All evaders by name, on the six layouts and on uniform tasks, with the nominal vehicle, a slower one
+and the family of the preset `flight`. Nothing is chosen by any of it; held-out evaders were never
+trained on. Game "own": the policy's; "honest": no clamp on the speed, the rate loop at 500 Hz;
+"clamp": the paper's, at 100 Hz. Writes evaders.json and .md (`--out`: others).
 """
 
 import dataclasses
@@ -20,7 +22,14 @@ from openjax.commands.command_line import run_command
 from openjax.commands.evaluator import layout_slots, layout_tasks, stacked
 from openjax.commands.validation import uniform_tasks
 from openjax.learning.best_response import make_duel
-from openjax.pursuit import SCENARIOS, EpisodeStatistics, Pursuit, PursuitSettings, RewardSettings, Task
+from openjax.pursuit import (
+    SCENARIOS,
+    EpisodeStatistics,
+    Pursuit,
+    PursuitSettings,
+    RewardSettings,
+    Task,
+)
 from openjax.pursuit.evaders import EVADERS, HELD_OUT, SCRIPTED, VALIDATED
 from openjax.store import DEFAULT_POLICY
 from openjax.store.policies import LoadedPolicy, load_policy
@@ -52,7 +61,8 @@ def game_of(loaded: LoadedPolicy, game: str, physics: str) -> PursuitSettings:
         # of uniform tasks, which have four or five
         min_pillars=4,
         max_pillars=layout_slots(settings),
-        reward=RewardSettings(),  # counts for nothing here: the same program for policies that differ in it
+        # counts for nothing here: the same program for policies that differ in it
+        reward=RewardSettings(),
     )
     return dataclasses.replace(settings, **GAMES[game])
 
@@ -83,7 +93,8 @@ def fly(name: str, options) -> list[dict]:
 
 def summary(statistics: EpisodeStatistics) -> dict:
     """Counts and means over episodes."""
-    number, captures = len(statistics.captured), int(statistics.captured.sum())
+    number = len(statistics.captured)
+    captures = int(statistics.captured.sum())
     return {
         "episodes": number,
         "captures": captures,
@@ -101,7 +112,9 @@ def study(options) -> dict:
 
 
 def page(results: dict) -> Page:
-    """First what matters of each policy and vehicle, then capture rates and crashes by evader, then how it was learnt."""
+    """First what matters of each policy and vehicle, then capture rates and crashes by evader, then
+    how it was learnt.
+    """
     of = ("policy", "game", "vehicle")
     by_policy = defaultdict(list)
     for record in results["records"]:
@@ -131,9 +144,12 @@ def page(results: dict) -> Page:
         results, "commands", "Commands, commits, machines"
     )
     prose = (
-        "Capture rate, crash rate. Vehicles: the nominal one; `table`, slower (motors by 40 ms, commands 15 ms and poses 10 ms "
-        "late, drag); `family`, drawn as in training. Uniform tasks are drawn ones that nobody trained on. "
-        "Held-out evaders were never trained on, nor were checkpoints chosen by them. Crashes count to the end of the 8 s, "
+        "Capture rate, crash rate. Vehicles: the nominal one; `table`, slower (motors by 40 ms, "
+        "commands 15 ms and poses 10 ms "
+        "late, drag); `family`, drawn as in training. Uniform tasks are drawn ones that nobody "
+        "trained on. "
+        "Held-out evaders were never trained on, nor were checkpoints chosen by them. Crashes "
+        "count to the end of the 8 s, "
         "after the capture too."
     )
     return Page("Policies against evaders", prose, parts)
@@ -142,12 +158,16 @@ def page(results: dict) -> Page:
 def told(results: dict, name: str, title: str) -> list[str]:
     """A section of what is told in words, if anything is."""
     found = results.get(name, ())
-    lines = [f"* {line}: {found[line]}" if isinstance(found, dict) else f"* {line}" for line in found]
+    lines = [
+        f"* {line}: {found[line]}" if isinstance(found, dict) else f"* {line}" for line in found
+    ]
     return ["\n".join([f"## {title}", "", *lines])] if lines else []
 
 
 def overview(records: list[dict]) -> dict:
-    """Of one policy and vehicle: the paper's evader on the layouts, the held-out ones, the worst cells."""
+    """Of one policy and vehicle: the paper's evader on the layouts, the held-out ones, the worst
+    cells.
+    """
     places = {"layouts": [r for r in records if r["tasks"] in SCENARIOS]}
     places["uniform"] = [r for r in records if r["tasks"] == "uniform"]
 
@@ -175,11 +195,15 @@ def everyone(by_policy: dict[tuple, list[dict]]) -> Table:
             rows.append({"policy": policy})
             for evader in SCRIPTED:
                 own = [r for r in records if r["evader"] == evader and r["tasks"] in SCENARIOS]
-                captures, episodes = (sum(r[name] for r in own) for name in ("captures", "episodes"))
+                captures, episodes = (
+                    sum(r[name] for r in own) for name in ("captures", "episodes")
+                )
                 low, high = wilson(captures, episodes)
                 rows[-1][evader] = f"{captures / episodes:.2f} [{low:.2f}, {high:.2f}]"
     prose = "Captures in the six layouts, 95 % interval; honest game, nominal vehicle."
-    return Table({name: name for name in ("policy", *SCRIPTED)}, rows, "Everyone against everyone", prose)
+    return Table(
+        {name: name for name in ("policy", *SCRIPTED)}, rows, "Everyone against everyone", prose
+    )
 
 
 def by_evader(records: list[dict], title: str) -> Table:
@@ -202,14 +226,20 @@ def whole_runs(runs: list[dict]) -> Table:
         shown = max(run["validations"], key=lambda row: row["score"]), run["validations"][-1]
         rows += [{"run": run["run"], **row} for row in shown]
     columns = {"run": "run", "M steps": "millions:.0f", "s": "seconds:.0f", "score": "score:.3f"}
-    columns |= {"capture": "capture_rate:.3f", "crash": "crash_rate:.3f", "breaches": "collision_rate:.4f"}
+    columns |= {
+        "capture": "capture_rate:.3f",
+        "crash": "crash_rate:.3f",
+        "breaches": "collision_rate:.4f",
+    }
     prose = "Tasks of the validation, never trained on, with drawn vehicles: a run's best and its last. s counts compilation."
     title = f"Training, validated against field, {', '.join(VALIDATED)}"
     return Table(columns, rows, title=title, prose=prose)
 
 
 def learned_ones(responses: list[dict]) -> Table:
-    """What `openjax exploit --json` wrote of each policy: the least captures of a scripted and of a learned evader."""
+    """What `openjax exploit --json` wrote of each policy: the least captures of a scripted and of a
+    learned evader.
+    """
     rows = []
     for response in responses:
         last = response["curve"][-1]
@@ -221,12 +251,19 @@ def learned_ones(responses: list[dict]) -> Table:
             least = [min(rate for by, rate in rates if by == learned) for learned in (False, True)]
             row[kind] = ", ".join(f"{rate:.3f}" for rate in least)
         rows.append(row)
-    columns = {"policy": "policy", "M steps a seed": "millions:.0f", "at last, while they learned": "own"}
+    columns = {
+        "policy": "policy",
+        "M steps a seed": "millions:.0f",
+        "at last, while they learned": "own",
+    }
     columns |= {name: name for name in [*SCENARIOS, "uniform"]}
     prose = (
-        "Captures of each of three evaders in the last episodes of their training, half of them on the layouts (`openjax "
-        "exploit`); then of the worst scripted evader, of the best of the learned ones, with the vehicles that the policy was "
-        "trained on. A learned evader that is caught more often than a scripted one is no best response."
+        "Captures of each of three evaders in the last episodes of their training, half of them on "
+        "the layouts (`openjax "
+        "exploit`); then of the worst scripted evader, of the best of the learned ones, with the "
+        "vehicles that the policy was "
+        "trained on. A learned evader that is caught more often than a scripted one is no best "
+        "response."
     )
     return Table(columns, rows, title="Against evaders that learned", prose=prose)
 
@@ -234,7 +271,9 @@ def learned_ones(responses: list[dict]) -> Table:
 def main(arguments: list[str]) -> int:
     """Evaluate and write both files."""
     parser = page_parser(__doc__, "evaders")
-    parser.add_argument("--policy", nargs="+", default=["flight", "evaders"], help="names, runs or files")
+    parser.add_argument(
+        "--policy", nargs="+", default=["flight", "evaders"], help="names, runs or files"
+    )
     parser.add_argument("--game", choices=GAMES, default="honest")
     parser.add_argument("--physics", choices=("rigid", "stops"), default="rigid")
     parser.add_argument("--vehicles", nargs="+", default=["nominal", "table", "family"])

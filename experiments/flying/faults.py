@@ -1,6 +1,8 @@
-"""Faults of a flight where they happen: in what a camera or a radio sends, in a link, a policy, a process, a key.
+"""Faults of a flight where they happen: in what a camera or a radio sends, in a link, a policy, a
+process, a key.
 
-A fault is drawn from its number: kind, moment, vehicle, amount. `PoseDamage` does to poses what the kind says.
+A fault is drawn from its number: kind, moment, vehicle, amount. `PoseDamage` does to poses what the
+kind says.
 """
 
 from __future__ import annotations
@@ -16,7 +18,9 @@ from openjax.flying.controller import Pose
 from openjax.flying.limits import SafetySettings
 
 FOLLOWED = "camera drifts, the estimator follows"
-"""A limit: with nothing on board that sees the floor, a slow drift looks like a tilt that is wrong by two degrees."""
+"""A limit: with nothing on board that sees the floor, a slow drift looks like a tilt that is wrong
+by two degrees.
+"""
 ASLEEP = "all processes stand still for a while"
 """Another: meanwhile vehicles turn on as they were told last, then level, then stop."""
 BEYOND = (FOLLOWED, ASLEEP)
@@ -35,13 +39,17 @@ RADIO = (
     "poses: clock steps",
 )  # fmt: skip
 WILD = {
-    "policy wild": lambda tick, n, shape: np.random.default_rng(10 * tick + n).uniform(-1.0, 1.0, shape),
+    "policy wild": lambda tick, n, shape: np.random.default_rng(10 * tick + n).uniform(
+        -1.0, 1.0, shape
+    ),
     "policy huge": lambda tick, n, shape: np.random.default_rng(n).choice((-1e30, 1e30), shape),
     "policy alternating": lambda tick, n, shape: (
         np.random.default_rng(n).choice((-1.0, 1.0), shape) * (-1) ** (tick // (1 + n % 5))
     ),
 }
-"""The policy's action (N, 4) at a tick of flight n: drawn anew; one extreme for good; from one to the other."""
+"""The policy's action (N, 4) at a tick of flight n: drawn anew; one extreme for good; from one to
+the other.
+"""
 OTHER = (
     "loop stopped", "links stopped", "guard stopped", "loop and links stopped", "loop and guard stopped",
     "policy silent", "policy: a number that is none", *WILD, "battery low", "battery unknown", *GONE, "key", ASLEEP,
@@ -51,13 +59,19 @@ PASSING = ("poses jump", "camera: yaw turned", "camera: bodies swapped")
 """These may be over after a moment, as those of numbers that are none and of attitudes."""
 START = 0.2
 """Nothing goes wrong before (s)."""
-MARGIN, FALL, ENDING = 0.1, 0.3, 5.0
-"""Out of the arena by more (m) is out; motors off above (m) is a fall; a flight must be over so long (s) after what ends it."""
+MARGIN = 0.1
+FALL = 0.3
+ENDING = 5.0
+"""Out of the arena by more (m) is out; motors off above (m) is a fall; a flight must be over so
+long (s) after what ends it.
+"""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """What goes wrong, when (s), with which vehicle, for how long (s), how much, in which direction."""
+    """What goes wrong, when (s), with which vehicle, for how long (s), how much, in which
+    direction.
+    """
 
     kind: str
     time: float
@@ -83,11 +97,15 @@ class Fault:
         return up * self.on(now), down * self.on(now)
 
     def answered(self, action: np.ndarray, now: float) -> np.ndarray | None:
-        """What the policy is said to have answered (N, 4) at `now` (s) in place of `action`; None: nothing."""
+        """What the policy is said to have answered (N, 4) at `now` (s) in place of `action`; None:
+        nothing.
+        """
         if not self.on(now) or not self.kind.startswith("policy"):
             return action
         if self.kind in WILD:
-            return WILD[self.kind](round(100 * now), self.vehicle + round(100 * self.time), action.shape)
+            return WILD[self.kind](
+                round(100 * now), self.vehicle + round(100 * self.time), action.shape
+            )
         action = np.array(action, np.float32)  # as networks answer: larger numbers are infinite
         with np.errstate(over="ignore"):
             action[self.vehicle, round(100 * self.time) % 4] = self.number
@@ -99,14 +117,20 @@ class Fault:
 
 
 def draw_fault(seed: int, latest: float) -> Fault:
-    """The fault number `seed`, which begins by `latest` (s); the kinds take turns. None below zero."""
+    """The fault number `seed`, which begins by `latest` (s); the kinds take turns. None below
+    zero.
+    """
     if seed < 0:
         return Fault("none", math.inf, 0)
     rng = random.Random(seed)
     kind = KINDS[seed % len(KINDS)]
-    time, vehicle, direction = rng.uniform(START, latest), rng.randrange(3), rng.uniform(0.0, 2.0 * math.pi)
+    time = rng.uniform(START, latest)
+    vehicle = rng.randrange(3)
+    direction = rng.uniform(0.0, 2.0 * math.pi)
     number = rng.choice((math.nan, math.inf, -math.inf, 1e300))
-    duration = {"camera: one frame wrong": 0.0099, "camera: four frames wrong": 0.0399}.get(kind, math.inf)
+    duration = {"camera: one frame wrong": 0.0099, "camera: four frames wrong": 0.0399}.get(
+        kind, math.inf
+    )
     if kind.endswith("for a while"):
         duration = rng.uniform(0.05, 1.0)
     elif "none" in kind or "attitude" in kind or kind in PASSING:
@@ -142,8 +166,13 @@ class PoseDamage:
         return self._damaged(fault.kind.replace("poses", "camera"), source, i, now, pose, others)
 
     def _damaged(self, kind, source, i, now, pose, others):
-        fault, what = self._fault, kind.removeprefix("camera").removeprefix(":").strip()
-        away = (fault.amount * math.cos(fault.direction), fault.amount * math.sin(fault.direction), 0.0)
+        fault = self._fault
+        what = kind.removeprefix("camera").removeprefix(":").strip()
+        away = (
+            fault.amount * math.cos(fault.direction),
+            fault.amount * math.sin(fault.direction),
+            0.0,
+        )
         since = now - fault.time
         if what.startswith("lost"):
             return None
@@ -173,10 +202,16 @@ class PoseDamage:
         if what == "restarts":
             return None if since < 0.5 * fault.amount else _shifted(pose, away, 1.0)
         if what == "clock steps":
-            return pose._replace(time=pose.time + math.copysign(fault.amount, math.cos(fault.direction)))
+            return pose._replace(
+                time=pose.time + math.copysign(fault.amount, math.cos(fault.direction))
+            )
         if what == "out of order":
             return self._earlier(source, i, self._random.randrange(4))
-        name = "body_rates" if kind.startswith("gyroscope") else ("position", "quaternion")[self._field % 2]
+        name = (
+            "body_rates"
+            if kind.startswith("gyroscope")
+            else ("position", "quaternion")[self._field % 2]
+        )
         values = list(getattr(pose, name))
         values[self._field % len(values)] = fault.number
         return pose._replace(**{name: tuple(values)})
@@ -187,20 +222,25 @@ class PoseDamage:
 
 
 def _shifted(pose: Pose, away, share: float) -> Pose:
-    return pose._replace(position=tuple(p + share * a for p, a in zip(pose.position, away, strict=True)))
+    return pose._replace(
+        position=tuple(p + share * a for p, a in zip(pose.position, away, strict=True))
+    )
 
 
 def outcome(fault: Fault, times, position, off, begin: float) -> dict:
     """What became of the vehicles from `begin` (s) on; of one that is gone itself nothing is asked.
 
-    times (T,), position (T, N, 3) m and off (T, N), motors off, are the truth. `out`: farthest beyond arena or ceiling (m);
-    infinite where a position is no number. `seconds` until all stayed on the floor with their motors off, None if they
-    didn't; `held`: (N,) whom one can hold.
+    times (T,), position (T, N, 3) m and off (T, N), motors off, are the truth. `out`: farthest
+    beyond arena or ceiling (m); infinite where a position is no number. `seconds` until all stayed
+    on the floor with their motors off, None if they didn't; `held`: (N,) whom one can hold.
     """
     held = (np.arange(off.shape[1]) != fault.vehicle) | (fault.kind not in GONE)
     late = times >= begin
-    times, position, off = times[late], position[late][:, held], off[late][:, held]
-    height, limits = position[..., 2], SafetySettings()
+    times = times[late]
+    position = position[late][:, held]
+    off = off[late][:, held]
+    height = position[..., 2]
+    limits = SafetySettings()
     sideways = np.linalg.norm(position[..., :2], axis=-1) - limits.arena_radius
     up = np.flatnonzero(~(off & (height < 0.02)).all(1))
     first = up[-1] + 1 if len(up) else 0
@@ -214,6 +254,8 @@ def outcome(fault: Fault, times, position, off, begin: float) -> dict:
 
 
 def finite(row: dict) -> dict:
-    """A row as JSON has it: null for what is no finite number, and in `not_finite` what that was."""
+    """A row as JSON has it: null for what is no finite number, and in `not_finite` what that
+    was.
+    """
     odd = {name: str(x) for name, x in row.items() if isinstance(x, float) and not math.isfinite(x)}
     return {**row, **dict.fromkeys(odd), "not_finite": odd} if odd else row

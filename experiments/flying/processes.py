@@ -1,7 +1,9 @@
-"""One flight of real processes with its fault: `openjax fly` on a terminal of its own, real cflib over UDP.
+"""One flight of real processes with its fault: `openjax fly` on a terminal of its own, real cflib
+over UDP.
 
-At a drawn moment after the take-off a signal goes to a process, a key to the terminal, nonsense to a vehicle, or what motion
-capture or the vehicles send is damaged. JAX doesn't survive a fork: a flight is a fork of its worker that asks it for actions.
+At a drawn moment after the take-off a signal goes to a process, a key to the terminal, nonsense to
+a vehicle, or what motion capture or the vehicles send is damaged. JAX doesn't survive a fork: a
+flight is a fork of its worker that asks it for actions.
 """
 
 import contextlib
@@ -81,7 +83,9 @@ SETTLE = 1.0
 
 
 def ends_flight(kind: str) -> bool:
-    """Whether a fault of this kind must end its flight; links and guard are deaf to a terminal's signals."""
+    """Whether a fault of this kind must end its flight; links and guard are deaf to a terminal's
+    signals.
+    """
     name, _, target = kind.partition(" ")
     deaf = name in SIGNALS[2:] and target in ("links", "guard")
     return not (deaf or kind in ENDLESS or kind in START)
@@ -90,7 +94,8 @@ def ends_flight(kind: str) -> bool:
 def fault_of(number: int, kind: str) -> Fault:
     """The fault with this number and kind."""
     rng = random.Random(number)
-    time, vehicle = rng.uniform(0.3, LATEST), rng.randrange(3)
+    time = rng.uniform(0.3, LATEST)
+    vehicle = rng.randrange(3)
     if kind in DRAWN:
         drawn = (draw_fault(seed, LATEST) for seed in range(1000 * number, 1000 * number + 1000))
         return replace(next(like for like in drawn if like.kind == kind), time=time)
@@ -102,7 +107,8 @@ def fault_of(number: int, kind: str) -> Fault:
 
 def feed_of(fault: Fault, truth):
     """What a laboratory's adapter would be: poses of a camera at 100 Hz, damaged."""
-    damage, noise = PoseDamage(fault), np.random.default_rng(7)
+    damage = PoseDamage(fault)
+    noise = np.random.default_rng(7)
 
     def feed(update):
         due = time.perf_counter()
@@ -121,11 +127,16 @@ def feed_of(fault: Fault, truth):
 
 
 class RemoteGame:
-    """The game of a flight, played by the worker; `spoil` makes of each play what the policy is said to have answered."""
+    """The game of a flight, played by the worker; `spoil` makes of each play what the policy is
+    said to have answered.
+    """
 
     def __init__(self, game, pipe, spoil):
-        self.task, self.settings, self.airframe = game.task, game.settings, game.airframe
-        self._pipe, self._spoil = pipe, spoil
+        self.task = game.task
+        self.settings = game.settings
+        self.airframe = game.airframe
+        self._pipe = pipe
+        self._spoil = spoil
 
     def start(self, poses):
         """See `openjax.flying.game.Game.start`."""
@@ -151,12 +162,17 @@ class Flown:
 
     def __init__(self, number, kind, virtual, arguments, prepared):
         self.fault = fault_of(number, kind)
-        self._number, self._kind, self._virtual = number, kind, virtual
+        self._number = number
+        self._kind = kind
+        self._virtual = virtual
         session = prepared.session
         if self.fault.captured and kind not in ("none", "second fly"):
             session = replace(session, feed=feed_of(self.fault, virtual.truth))
         self._arguments, self._prepared = arguments, prepared._replace(session=session)
-        self._said, self._open, self._pids, self._second = b"", True, {}, ""
+        self._said = b""
+        self._open = True
+        self._pids = {}
+        self._second = ""
 
     def fly(self) -> dict:
         """What became of it."""
@@ -165,12 +181,16 @@ class Flown:
         game = self._prepared.game
         pid, self._terminal = pty.fork()
         if pid == 0:
-            self._prepared = self._prepared._replace(game=RemoteGame(game, theirs, self._spoil_play))
+            self._prepared = self._prepared._replace(
+                game=RemoteGame(game, theirs, self._spoil_play)
+            )
             self._child()
         theirs.close()
         threading.Thread(target=play, args=(game, ours), daemon=True).start()
         begin = time.perf_counter()
-        status, injected, settled = None, None, 0.0
+        status = None
+        injected = None
+        settled = 0.0
         while True:
             now = time.perf_counter()
             self._drain()
@@ -193,7 +213,11 @@ class Flown:
         from openjax.commands.fly import fly
 
         # the worker's are others: what multiprocessing puts in their place, files
-        sys.stdin, sys.stdout, sys.stderr = open(0), open(1, "w", buffering=1), open(2, "w", buffering=1)
+        sys.stdin, sys.stdout, sys.stderr = (
+            open(0),
+            open(1, "w", buffering=1),
+            open(2, "w", buffering=1),
+        )
 
         def main(_):
             fly(self._arguments, self._prepared)
@@ -231,7 +255,9 @@ class Flown:
         self._pids = {"loop": pid}
         with contextlib.suppress(OSError):
             children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-            spawned = [int(c) for c in children if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()]
+            spawned = [
+                int(c) for c in children if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()
+            ]
             self._pids.update(zip(("links", "guard"), sorted(spawned), strict=False))
 
     def _inject(self, pid):
@@ -304,8 +330,11 @@ class Flown:
             os.close(self._terminal)
 
     def _record(self, status, injected, begin) -> dict:
-        track, fault = self._virtual.track(), self.fault
-        seen = outcome(fault, track["time"], track["position"], track["off"].astype(bool), injected or begin)
+        track = self._virtual.track()
+        fault = self.fault
+        seen = outcome(
+            fault, track["time"], track["position"], track["off"].astype(bool), injected or begin
+        )
         held = seen.pop("held")
         said = [line for line in self._said.decode(errors="replace").splitlines() if line.strip()]
         row = {
@@ -320,7 +349,13 @@ class Flown:
         """Whether all went as it must."""
         if self._kind in START:
             return not row["took_off"] and row["status"] == 2
-        if not row["took_off"] or row["out"] > MARGIN or row["armed"] or row["status"] is None or row["left"]:
+        if (
+            not row["took_off"]
+            or row["out"] > MARGIN
+            or row["armed"]
+            or row["status"] is None
+            or row["left"]
+        ):
             return False
         if any(name in self._kind for name in STOPPED):  # the operator wants them to fall
             return row["seconds"] is not None and row["seconds"] < 1.5

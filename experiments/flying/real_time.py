@@ -1,7 +1,8 @@
-"""Faults at their source in real time: `python -m experiments.flying.real_time [--flights 100] [--processes 3]`.
+"""Faults at their source in real time: `python -m experiments.flying.real_time [--flights 100]
+[--processes 3]`.
 
-Each worker compiles the policy once and has virtual Crazyflies of its own, in a process that keeps where they truly were; what
-goes wrong is in `experiments.flying.processes`.
+Each worker compiles the policy once and has virtual Crazyflies of its own, in a process that keeps
+where they truly were; what goes wrong is in `experiments.flying.processes`.
 """
 
 import atexit
@@ -43,14 +44,20 @@ def main() -> None:
     arguments = tyro.cli(Arguments)
     names = [kind for kind in KINDS if any(part in kind for part in arguments.only)]
     records = read_json(arguments.out)["records"] if arguments.go_on else []
-    left = set(range(arguments.seed, arguments.seed + arguments.flights)) - {r["number"] for r in records}
+    left = set(range(arguments.seed, arguments.seed + arguments.flights)) - {
+        r["number"] for r in records
+    }
     work = [(n, names[n % len(names)]) for n in sorted(left)]
-    random.Random(arguments.seed).shuffle(work)  # whenever it stops, kinds were flown without favour
-    stands, jobs = facts(), [(number, kind, arguments.policy) for number, kind in work]
+    random.Random(arguments.seed).shuffle(
+        work
+    )  # whenever it stops, kinds were flown without favour
+    stands = facts()
+    jobs = [(number, kind, arguments.policy) for number, kind in work]
     for row in share_out(fly, jobs, arguments.processes, arguments.seconds_left):
         records.append(finite(row))
         print("well" if row["well"] else "NOT WELL", json.dumps(row), flush=True)
-        well, in_order = sum(r["well"] for r in records), sorted(records, key=lambda r: r["number"])
+        well = sum(r["well"] for r in records)
+        in_order = sorted(records, key=lambda r: r["number"])
         counts = {"flights": len(records), "well": well, "policy": arguments.policy}
         write_json(arguments.out, {**stands, **counts, "records": in_order})
     write_page(arguments.out, page, read_json(arguments.out))
@@ -58,7 +65,8 @@ def main() -> None:
 
 def page(results) -> Page:
     """What became of the flights, by groups of kinds."""
-    rows, records = [], results["records"]
+    rows = []
+    records = results["records"]
     for group, kinds in {**GROUPS, "all": KINDS}.items():
         mine = [r for r in records if r["kind"] in kinds]
         ends = [r["seconds"] for r in mine if r["seconds"] is not None and ends_flight(r["kind"])]
@@ -75,11 +83,17 @@ def page(results) -> Page:
         "longest end (s)": "longest:.1f",
     }  # fmt: skip
     prose = (
-        "`openjax fly` in processes and on a terminal of its own, real `cflib` over UDP; where the virtual vehicles truly "
-        f"were. As they must: nobody more than {MARGIN:g} m out of the arena (.9 m), nobody armed at the end, no fall that "
+        "`openjax fly` in processes and on a terminal of its own, real `cflib` over UDP; where the "
+        "virtual vehicles truly "
+        f"were. As they must: nobody more than {MARGIN:g} m out of the arena (.9 m), nobody armed "
+        "at the end, no fall that "
         f"nobody asked for, no process left, down {ENDING:g} s after what must end the flight."
     )
-    ill = [f"Not well: {r['kind']} (flight {r['number']}): {r['said']}" for r in records if not r["well"]]
+    ill = [
+        f"Not well: {r['kind']} (flight {r['number']}): {r['said']}"
+        for r in records
+        if not r["well"]
+    ]
     return Page("Faults where they happen, in real time", prose, [Table(columns, rows), *ill])
 
 
@@ -98,7 +112,9 @@ def _made_once(policy):
 
     virtual = VirtualProcess("wall")
     atexit.register(virtual.close)
-    arguments = FlyArguments(policy=policy, uri=tuple(virtual.uris), episode_seconds=8.0, body_logs=1)
+    arguments = FlyArguments(
+        policy=policy, uri=tuple(virtual.uris), episode_seconds=8.0, body_logs=1
+    )
     prepared = prepare(arguments)
     real_time.hurry()
     return virtual, arguments, prepared

@@ -1,9 +1,11 @@
-"""Faults at their source, in simulated time: `python -m experiments.flying.simulated [--faults 3000] [--processes 4]`.
+"""Faults at their source, in simulated time: `python -m experiments.flying.simulated [--faults
+3000] [--processes 4]`.
 
-Three vehicles hunt in a layout; at a drawn moment something goes wrong (`experiments.flying.faults`). Counted is where the
-*true* vehicles are, from then to the end: how far out, how high, whether one fell or stayed armed. The vehicles are
-openjax's with the firmware's watchdogs; policy, game, judge and state machine are those of `openjax fly`. In half of the
-flights there is motion capture, which the estimators on board follow as far as it is believed.
+Three vehicles hunt in a layout; at a drawn moment something goes wrong
+(`experiments.flying.faults`). Counted is where the *true* vehicles are, from then to the end: how
+far out, how high, whether one fell or stayed armed. The vehicles are openjax's with the firmware's
+watchdogs; policy, game, judge and state machine are those of `openjax fly`. In half of the flights
+there is motion capture, which the estimators on board follow as far as it is believed.
 """
 
 from __future__ import annotations
@@ -51,7 +53,8 @@ from openjax.virtual_crazyflie.firmware import LEVEL_AFTER
 from openjax.virtual_crazyflie.simulated import SimulatedSwarm, Uplink
 from openjax.virtual_crazyflie.vehicles import VirtualVehicles
 
-LATEST, SECONDS = 4.0, 14.0
+LATEST = 4.0
+SECONDS = 14.0
 """Nothing begins to go wrong after; who flies then is asked to land (s)."""
 OVER = "time is over"
 """The reason of these landings."""
@@ -83,8 +86,12 @@ class Arguments:
     """Where git can't tell it."""
 
 
-def fly(seeds: list[int], layout: str, policy_name: str, level_after: float = LEVEL_AFTER) -> list[dict]:
-    """Fly one fault per seed, side by side; a record of each. A seed below zero is a flight without fault."""
+def fly(
+    seeds: list[int], layout: str, policy_name: str, level_after: float = LEVEL_AFTER
+) -> list[dict]:
+    """Fly one fault per seed, side by side; a record of each. A seed below zero is a flight without
+    fault.
+    """
     worlds = Worlds([draw_fault(seed, LATEST) for seed in seeds], layout, policy_name)
     for firmware in worlds.swarm.firmware:
         firmware.level_after = level_after
@@ -96,8 +103,9 @@ def fly(seeds: list[int], layout: str, policy_name: str, level_after: float = LE
 
 @functools.cache
 def compiled_game(policy_name: str):
-    """A policy's game: layout by name -> (layout, task); its settings, the airframe, and its two functions for flights
-    side by side, the first one with the task as its first argument."""
+    """A policy's game: layout by name -> (layout, task); its settings, the airframe, and its two
+    functions for flights side by side, the first one with the task as its first argument.
+    """
     policy = openjax.load_policy(policy_name)
     game = policy.settings.environment
 
@@ -107,7 +115,13 @@ def compiled_game(policy_name: str):
 
     settings, airframe, first, tick = game_functions(policy)
     first = jax.jit(jax.vmap(first, in_axes=(None, 0)))
-    return task_of, settings, airframe, first, jax.jit(jax.vmap(tick, in_axes=(0, 0, 0, None, None)))
+    return (
+        task_of,
+        settings,
+        airframe,
+        first,
+        jax.jit(jax.vmap(tick, in_axes=(0, 0, 0, None, None))),
+    )
 
 
 class Worlds:
@@ -122,14 +136,18 @@ class Worlds:
         vehicles = VirtualVehicles(load_vehicle(), np.tile(starts, (len(faults), 1)))
         self._vehicles = vehicles
         following = [fault.kind != "camera drifts" for fault in faults for _ in range(self.n)]
-        radio, camera = (functools.partial(self._received, source) for source in ("radio", "camera"))
+        radio, camera = (
+            functools.partial(self._received, source) for source in ("radio", "camera")
+        )
         self.swarm = SimulatedSwarm(vehicles, following, radio, camera)
         pillars = [(x, y, self.game.pillar_radius) for x, y in scenario.pillars]
         state = initial_state([tuple(s) for s in starts.tolist()], pillars, self.airframe)
         state = state._replace(drones=(Drone(Mode.PURSUIT),) * self.n)
         self.states = [state] * len(faults)
         self._landing = [False] * len(faults)
-        self._measured, self._play, self._tracks = None, None, []
+        self._measured = None
+        self._play = None
+        self._tracks = []
         self.captured = [None] * len(faults)
         self._down = np.zeros(len(faults), int)  # ticks on the floor with motors off
 
@@ -138,7 +156,8 @@ class Worlds:
         fault = self.faults[w]
         if source == "camera" and not fault.captured:
             return None
-        report, first = self._vehicles.report, w * self.n
+        report = self._vehicles.report
+        first = w * self.n
         others = [
             Pose(now, tuple(report.position[j].tolist()), (0.0,) * 3, tuple(report.quaternion[j].tolist()))
             for j in range(first, first + self.n)
@@ -147,7 +166,8 @@ class Worlds:
 
     def tick(self) -> bool:
         """10 ms of all flights; whether any goes on."""
-        now, samples = self.swarm.now, list(self.swarm.observe())
+        now = self.swarm.now
+        samples = list(self.swarm.observe())
         flown = np.flatnonzero(self._down < LAIN).tolist()
         awake = [w for w in flown if not (self.faults[w].kind == ASLEEP and self.faults[w].on(now))]
         over = set(range(len(self.faults))) - set(flown)
@@ -192,10 +212,14 @@ class Worlds:
 
     def _flown(self, w, now, samples):
         """The set-points of flight w at this tick; None where none is sent."""
-        fault, since = self.faults[w], now - self.faults[w].time
-        on, vehicle = fault.on(now), w * self.n + fault.vehicle
+        fault = self.faults[w]
+        since = now - self.faults[w].time
+        on = fault.on(now)
+        vehicle = w * self.n + fault.vehicle
         voltages = {"battery low": 3.0, "battery unknown": math.nan}
-        self.swarm.uplinks[vehicle] = Uplink(fault.losses(now)[0], voltages.get(fault.kind) if on else None)
+        self.swarm.uplinks[vehicle] = Uplink(
+            fault.losses(now)[0], voltages.get(fault.kind) if on else None
+        )
         if on and fault.kind == "drone restarts":
             self.swarm.firmware[vehicle].restart()
         if on and fault.kind in PILOTS and not self._landing[w]:
@@ -204,7 +228,9 @@ class Worlds:
             self.states[w], self._landing[w] = take_over(self.states[w], now), True
         action = None if self._landing[w] else fault.answered(self._actions[w], now)
         actions = None if action is None else tuple(from_action(a, THRUST_LIMIT) for a in action)
-        landing = on and (fault.kind == "key" or (fault.kind == "guard stopped" and since > 2.0 * SILENCE))
+        landing = on and (
+            fault.kind == "key" or (fault.kind == "guard stopped" and since > 2.0 * SILENCE)
+        )
         over = not landing and now >= SECONDS
         request = Request.LAND if landing or over else Request.NONE
         event = Event(now, samples, actions, request, OVER if over else "")
@@ -217,12 +243,17 @@ class Worlds:
         return [{"seed": seed, **self._record(w, track[:, w])} for w, seed in enumerate(seeds)]
 
     def _record(self, w, track) -> dict:
-        """Where the vehicles of flight w were from its fault on. track (T, N, 4): true position (m), motors off."""
-        fault, drones = self.faults[w], self.states[w].drones
-        position, off = track[..., :3], track[..., 3] > 0.0
+        """Where the vehicles of flight w were from its fault on. track (T, N, 4): true position
+        (m), motors off.
+        """
+        fault = self.faults[w]
+        drones = self.states[w].drones
+        position = track[..., :3]
+        off = track[..., 3] > 0.0
         begin = min(fault.time, 0.01 * (len(track) - 1))
         seen = outcome(fault, 0.01 * np.arange(len(track)), position, off, begin)
-        held, ended = seen.pop("held"), any(d.reason not in ("", OVER) for d in drones)
+        held = seen.pop("held")
+        ended = any(d.reason not in ("", OVER) for d in drones)
         crashed = np.array([f.crashed for f in self.swarm.firmware[w * self.n : (w + 1) * self.n]])
         pairs = [position[:, i] - position[:, j] for i in range(3) for j in range(i)]
         return {
@@ -235,7 +266,9 @@ class Worlds:
 
 
 PILOTS = ("loop stopped", "links stopped", "loop and links stopped", "loop and guard stopped")
-"""Somebody else flies after a tenth of a second. (Which one takes over is for real processes: `experiments.flying.real_time`.)"""
+"""Somebody else flies after a tenth of a second. (Which one takes over is for real processes:
+`experiments.flying.real_time`.)
+"""
 
 
 def well(row: dict) -> bool:
@@ -244,7 +277,14 @@ def well(row: dict) -> bool:
     return row["out"] <= MARGIN and not (row["fell"] or row["hard"] or row["armed"]) and in_time
 
 
-SLOW = ("packets lost", "poses out of order", "camera scaled", "camera late", "camera drifts", FOLLOWED)
+SLOW = (
+    "packets lost",
+    "poses out of order",
+    "camera scaled",
+    "camera late",
+    "camera drifts",
+    FOLLOWED,
+)
 """These may take effect long after they begin."""
 ALL = "all but drifts that the estimator follows, and processes that stand still"
 
@@ -269,7 +309,9 @@ def summary(records) -> list[dict]:
 
 
 def main() -> None:
-    arguments, begin, jobs = tyro.cli(Arguments), time.time(), []
+    arguments = tyro.cli(Arguments)
+    begin = time.time()
+    jobs = []
     use_single_thread()  # before a worker imports JAX
     drawn = range(arguments.seed, arguments.seed + arguments.faults)
     seeds = [s for s in drawn if any(part in KINDS[s % len(KINDS)] for part in arguments.kinds)]
@@ -278,8 +320,11 @@ def main() -> None:
         mine += [-1] * (-len(mine) % arguments.batch)  # all batches are of one size: compiled once
         batches = [mine[i : i + arguments.batch] for i in range(0, len(mine), arguments.batch)]
         jobs += [(batch, layout, arguments.policy, arguments.level_after) for batch in batches]
-    jobs.sort(key=lambda job: job[0][0])  # whenever it stops, all kinds and layouts were flown as often
-    records, stands = [], facts(arguments.commit)
+    jobs.sort(
+        key=lambda job: job[0][0]
+    )  # whenever it stops, all kinds and layouts were flown as often
+    records = []
+    stands = facts(arguments.commit)
     try:
         for flown in share_out(fly, jobs, arguments.processes, arguments.seconds_left):
             records += flown
@@ -295,9 +340,12 @@ def main() -> None:
 def page(results) -> Page:
     """Rows of `summary`."""
     prose = (
-        f"{sum(r['faults'] for r in results['summary'] if r['kind'] in KINDS)} flights of three vehicles with the policy "
-        f"`{results['policy']}`, one fault each, from its moment to the end. As they must: nobody more than {MARGIN:g} m out "
-        f"of the arena (.9 m), no fall from above {FALL:g} m, nobody down hard, nobody armed at the end, motors off on the "
+        f"{sum(r['faults'] for r in results['summary'] if r['kind'] in KINDS)} flights of three "
+        "vehicles with the policy "
+        f"`{results['policy']}`, one fault each, from its moment to the end. As they must: nobody "
+        f"more than {MARGIN:g} m out "
+        f"of the arena (.9 m), no fall from above {FALL:g} m, nobody down hard, nobody armed at "
+        "the end, motors off on the "
         f"floor {ENDING:g} s after a fault that ends the flight."
     )
     columns = {
@@ -305,7 +353,9 @@ def page(results) -> Page:
         "out by more than .1 m": "out:d", "farthest (m)": "farthest:.2f", "fell": "fell:d", "hard": "hard:d",
         "on at the end": "armed:d", "longest end (s)": "longest:.1f", "nearest two (m)": "nearest:.2f",
     }  # fmt: skip
-    return Page("Faults where they happen, in simulated time", prose, Table(columns, results["summary"]))
+    return Page(
+        "Faults where they happen, in simulated time", prose, Table(columns, results["summary"])
+    )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,6 @@
-"""One thread per process, for programs whose processes are the parallel part; and work shared out to them."""
+"""One thread per process, for programs whose processes are the parallel part; and work shared out
+to them.
+"""
 
 import math
 import os
@@ -27,11 +29,14 @@ def use_single_thread() -> None:
 def share_out(
     do: Callable, jobs: Iterable[tuple], processes: int, seconds: float = math.inf
 ) -> Iterator[Any]:
-    """What `do(*job)` gives in one of so many processes, as it comes; none is begun after `seconds`.
+    """What `do(*job)` gives in one of so many processes, as it comes; none is begun after
+    `seconds`.
 
-    A job that fails is a line on standard error, and the others go on; RuntimeError at the end says how many did.
+    A job that fails is a line on standard error, and the others go on; RuntimeError at the end says
+    how many did.
     """
-    latest, failed = time.time() + seconds, 0
+    latest = time.time() + seconds
+    failed = 0
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         try:
             given = {pool.submit(_in_time, do, job, latest): job for job in jobs}

@@ -1,8 +1,10 @@
-"""Policies on vehicles that they weren't made for: `python -m experiments.flying.vehicles [--policy NAME ...] [--number 1024]`.
+"""Policies on vehicles that they weren't made for: `python -m experiments.flying.vehicles [--policy
+NAME ...] [--number 1024]`.
 
-No clamp, rate loop at 500 Hz, solid contacts, drawn starts, the paper's evader. Vehicles: the nominal one; `table`, with motors
-40 ms slower, commands 15 ms and poses 10 ms late, and drag; the family of the preset `flight`. Tasks: uniform validation ones and
-the six layouts. Nothing is chosen by the layouts. Writes experiments/results/vehicles.json and .md (`--out`: others).
+No clamp, rate loop at 500 Hz, solid contacts, drawn starts, the paper's evader. Vehicles: the
+nominal one; `table`, with motors 40 ms slower, commands 15 ms and poses 10 ms late, and drag; the
+family of the preset `flight`. Tasks: uniform validation ones and the six layouts. Nothing is chosen
+by the layouts. Writes experiments/results/vehicles.json and .md (`--out`: others).
 """
 
 import dataclasses
@@ -33,10 +35,14 @@ FIGURES = {
 
 
 def vehicles(airframe: str = NOMINAL) -> dict[str, np.ndarray]:
-    """Bounds (R, 4) of each kind of an airframe's vehicles; only the family has any that are rare."""
+    """Bounds (R, 4) of each kind of an airframe's vehicles; only the family has any that are
+    rare.
+    """
     family = vehicle_family(airframe)
     names = [entry.parameter for entry in family]
-    none = np.repeat([[find_parameter(name)[1].none] for name in names], 4, axis=1).astype(np.float32)
+    none = np.repeat([[find_parameter(name)[1].none] for name in names], 4, axis=1).astype(
+        np.float32
+    )
     one = none.copy()
     for name, value in TABLE.items():
         one[names.index(name)] = value
@@ -69,7 +75,8 @@ def game_of(own: PursuitSettings, airframe: str, physics: str) -> PursuitSetting
         rare_vehicles=0.5,
         min_pillars=PursuitSettings().min_pillars,  # of uniform tasks
         max_pillars=layout_slots(own),
-        reward=RewardSettings(),  # counts for nothing here: the same program for policies that differ in it
+        # counts for nothing here: the same program for policies that differ in it
+        reward=RewardSettings(),
     )
 
 
@@ -85,7 +92,9 @@ def fly(name: str, options) -> dict[str, dict[str, dict]]:
     (tasks, part), (run, found) = stacked(kinds), (program(game, loaded.policy), {})
     for kind, bounds in vehicles(game.airframe).items():
         if kind in options.vehicles:
-            flown = jax.tree.map(np.asarray, run(loaded.parameters, tasks, jax.random.key(0), bounds))
+            flown = jax.tree.map(
+                np.asarray, run(loaded.parameters, tasks, jax.random.key(0), bounds)
+            )
             for tasks_of, own in part(flown).items():
                 summary = summarise(own)
                 found.setdefault(kind, {})[tasks_of] = finite(summary)
@@ -96,7 +105,11 @@ def fly(name: str, options) -> dict[str, dict[str, dict]]:
 
 def finite(summary: dict) -> dict:
     """`summary` without what isn't a number."""
-    return {name: value for name, value in summary.items() if isinstance(value, dict) or np.isfinite(value)}
+    return {
+        name: value
+        for name, value in summary.items()
+        if isinstance(value, dict) or np.isfinite(value)
+    }
 
 
 def study(options) -> dict:
@@ -115,10 +128,12 @@ def page(results: dict) -> Page:
     ]
     return Page(
         "Policies on other vehicles",
-        f"No clamp, rate loop at 500 Hz, drawn starts, contacts of `rigid`; {results['number']} uniform validation tasks, "
-        f"{results['layouts']} episodes of each layout. Nominal: the nominal vehicle; table: motors 40 ms slower, commands 15 ms "
-        "and poses 10 ms late, drag of .0125 N s/m; family: the vehicles of the preset flight, half of them rare ones. "
-        + results.get("note", ""),
+        f"No clamp, rate loop at 500 Hz, drawn starts, contacts of `rigid`; {results['number']} "
+        "uniform validation tasks, "
+        f"{results['layouts']} episodes of each layout. Nominal: the nominal vehicle; table: "
+        "motors 40 ms slower, commands 15 ms "
+        "and poses 10 ms late, drag of .0125 N s/m; family: the vehicles of the preset flight, "
+        "half of them rare ones. " + results.get("note", ""),
         Table({"policy": "policy", "vehicle": "vehicle", "tasks": "tasks", **FIGURES}, rows),
     )
 
@@ -126,12 +141,16 @@ def page(results: dict) -> Page:
 def main(arguments: list[str]) -> int:
     """Evaluate and write both files."""
     parser = page_parser(__doc__, "vehicles")
-    parser.add_argument("--policy", nargs="+", default=["open", "flight"], help="names, runs or policy files")
+    parser.add_argument(
+        "--policy", nargs="+", default=["open", "flight"], help="names, runs or policy files"
+    )
     parser.add_argument("--number", type=int, default=1024, help="uniform tasks")
     parser.add_argument("--layouts", type=int, default=100, help="episodes of each layout; 0: none")
     parser.add_argument("--physics", default="rigid")
     parser.add_argument("--vehicles", nargs="+", choices=list(vehicles()), default=list(vehicles()))
-    parser.add_argument("--airframe", choices=list(AIRFRAMES), help="what flies; default: the policy's own")
+    parser.add_argument(
+        "--airframe", choices=list(AIRFRAMES), help="what flies; default: the policy's own"
+    )
     publish(parser.parse_args(arguments), study, page)
     return 0
 

@@ -1,4 +1,6 @@
-"""Virtual Crazyflies of an experiment, in a process of their own that keeps where they truly were."""
+"""Virtual Crazyflies of an experiment, in a process of their own that keeps where they truly
+were.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,9 @@ class Truth:
     def poses(self) -> list[Pose]:
         """Of all vehicles."""
         rows = np.array(self._numbers[1:]).reshape(self.number, _POSE).tolist()
-        return [Pose(r[0], tuple(r[1:4]), tuple(r[4:7]), tuple(r[7:11]), tuple(r[11:14])) for r in rows]
+        return [
+            Pose(r[0], tuple(r[1:4]), tuple(r[4:7]), tuple(r[7:11]), tuple(r[11:14])) for r in rows
+        ]
 
 
 class VirtualProcess:
@@ -49,17 +53,23 @@ class VirtualProcess:
         context = multiprocessing.get_context("spawn")
         self.truth = Truth(3, context)
         self._pipe, pipe = context.Pipe()
-        self._process = context.Process(target=_serve, args=(scenario, self.truth, pipe), daemon=True)
+        self._process = context.Process(
+            target=_serve, args=(scenario, self.truth, pipe), daemon=True
+        )
         self._process.start()
         self.uris = self._pipe.recv()
 
     def reset(self, fault: Fault) -> None:
-        """All on their stands, switched off and on; the fault's damage is done to what they send."""
+        """All on their stands, switched off and on; the fault's damage is done to what they
+        send.
+        """
         self._pipe.send(fault)
         self._pipe.recv()
 
     def track(self) -> dict[str, np.ndarray]:
-        """Since the last reset: time (T,), position (T, N, 3), off and armed (T, N), crashed (N,)."""
+        """Since the last reset: time (T,), position (T, N, 3), off and armed (T, N), crashed
+        (N,).
+        """
         self._pipe.send(None)
         return self._pipe.recv()
 
@@ -85,7 +95,9 @@ class _Flown:
     """What is looked at between two steps of the vehicles."""
 
     def __init__(self, virtual, truth, pipe):
-        self._virtual, self._truth, self._pipe = virtual, truth, pipe
+        self._virtual = virtual
+        self._truth = truth
+        self._pipe = pipe
         self._sensors = virtual.vehicles.sensors
         virtual.vehicles.sensors = self.damaged
         self._reset(Fault("none", math.inf, 0))
@@ -96,7 +108,8 @@ class _Flown:
         for firmware, link in zip(self._virtual.firmware, self._virtual.links, strict=True):
             firmware.restart()
             link.faults = link.faults.__class__()
-        self._rows, self._last = [], 0.0
+        self._rows = []
+        self._last = 0.0
         self._truth.begin(0.0)
 
     def damaged(self, i):
@@ -108,12 +121,17 @@ class _Flown:
         sent = self._damage("radio", i, now, pose, ())
         if sent is pose or sent is None:
             return sensors
-        parts = [np.array(p) for p in (sent.position, sent.velocity, sent.quaternion, sent.body_rates)]
-        return sensors.__class__(*parts, sensors.specific_force, sensors.motor_command, sensors.voltage)
+        parts = [
+            np.array(p) for p in (sent.position, sent.velocity, sent.quaternion, sent.body_rates)
+        ]
+        return sensors.__class__(
+            *parts, sensors.specific_force, sensors.motor_command, sensors.voltage
+        )
 
     def look(self) -> bool:
         """Note where all are; do what is asked."""
-        now, virtual = time.perf_counter(), self._virtual
+        now = time.perf_counter()
+        virtual = self._virtual
         report = virtual.vehicles.report
         self._truth.write(now, report)
         if now - self._last >= EVERY:
@@ -129,7 +147,13 @@ class _Flown:
             if asked is None:
                 times, positions, off, armed = zip(*self._rows, strict=True)
                 crashed = [f.crashed for f in virtual.firmware]
-                kinds = {"time": times, "position": positions, "off": off, "armed": armed, "crashed": crashed}
+                kinds = {
+                    "time": times,
+                    "position": positions,
+                    "off": off,
+                    "armed": armed,
+                    "crashed": crashed,
+                }
                 self._pipe.send({name: np.array(values) for name, values in kinds.items()})
             else:
                 self._reset(asked)

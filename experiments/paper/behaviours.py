@@ -1,8 +1,9 @@
 """The paper's behaviours, measured and drawn.
 
-The paper shows four by pictures: surrounding from both sides (wall), a shortcut instead of following (narrow_gap), finding
-the evader behind pillars (random, and hidden, where nobody sees it at the start), blocking all three ways out (passage).
-Here each is a number for every method, beside one episode from above.
+The paper shows four by pictures: surrounding from both sides (wall), a shortcut instead of
+following (narrow_gap), finding the evader behind pillars (random, and hidden, where nobody sees it
+at the start), blocking all three ways out (passage). Here each is a number for every method, beside
+one episode from above.
 """
 
 from pathlib import Path
@@ -28,30 +29,37 @@ SIGHT = {
     "lost": "share of steps until the capture without sight",
 }
 MEASURES = {
-    "wall": {"both sides": "pursuers round both ends of the wall at the same time, before the capture"},
+    "wall": {
+        "both sides": "pursuers round both ends of the wall at the same time, before the capture"
+    },
     "narrow_gap": {
         "met": "captured from ahead: the evader flies towards the one that catches it",
         "shorter way": "way of the one that catches it, as a share of the evader's",
     },
     "random": SIGHT,
     "hidden": SIGHT,
-    "passage": {"three ways": "a pursuer in each of the three corridors at once, before the capture"},
+    "passage": {
+        "three ways": "a pursuer in each of the three corridors at once, before the capture"
+    },
 }
 
 
 def measure(layout: str, paths: Any, statistics: Any) -> dict[str, float | None]:
-    """What `MEASURES` names, mean over B episodes; of those with a capture where only they tell ("met", "shorter way").
+    """What `MEASURES` names, mean over B episodes; of those with a capture where only they tell
+    ("met", "shorter way").
 
     Args:
         layout: a name of `MEASURES`.
         paths: pursuers (B, T, N, 3), evader (B, T, 3), seen (B, T), captured (B, T, N).
         statistics: `EpisodeStatistics` with leading axis B.
     """
-    pursuers, evader = np.asarray(paths.pursuers), np.asarray(paths.evader)
+    pursuers = np.asarray(paths.pursuers)
+    evader = np.asarray(paths.evader)
     caught = np.asarray(statistics.captured)
     end = np.asarray(statistics.capture_step)
     before = np.arange(pursuers.shape[1])[None] < end[:, None]
-    x, y = pursuers[..., 0], pursuers[..., 1]
+    x = pursuers[..., 0]
+    y = pursuers[..., 1]
     if layout == "wall":
         # beyond the middle plane or in line with the wall: not merely on the way there
         there = x < 0.15
@@ -63,7 +71,8 @@ def measure(layout: str, paths: Any, statistics: Any) -> dict[str, float | None]
         blocked = np.all([np.any(way, axis=-1) for way in ways], axis=0)
         return {"three ways": float(np.mean(np.any(blocked & before, axis=1)))}
     if layout == "narrow_gap":
-        met, ways = [], []
+        met = []
+        ways = []
         for b in np.flatnonzero(caught):
             last = end[b] - 1
             who = int(np.argmax(paths.captured[b, last]))
@@ -107,11 +116,14 @@ def page(results: dict) -> Page:
                 flown = flights_of(results, method)
                 row[method] = [f["layouts"][layout]["behaviour"][name] for f in flown]
             rows.append(row)
-    meanings = [f"* {layout}, {n}: {text}" for layout, own in MEASURES.items() for n, text in own.items()]
+    meanings = [
+        f"* {layout}, {n}: {text}" for layout, own in MEASURES.items() for n, text in own.items()
+    ]
     columns = {"layout": "layout", "behaviour": "name"}
     return Page(
         "What the pursuers do",
-        f"{results['episodes']} episodes per seed, speed clamp, drawn starts; mean (standard deviation over seeds). The "
+        f"{results['episodes']} episodes per seed, speed clamp, drawn starts; mean (standard "
+        "deviation over seeds). The "
         "paper names these behaviours and shows a picture of each; it has no numbers for them.",
         (
             "\n".join(meanings),
@@ -133,13 +145,16 @@ def draw(results: dict, path: Path) -> None:
             told = ", ".join(f"{n} {x:.2g}" for n, x in flown["behaviour"].items() if x is not None)
             draw_from_above(axes[i, j], trajectory_of(flown["paths"], layout, told))
             axes[i, j].title.set_fontsize("x-small")
-            axes[i, j].set(xlabel=method if i == len(layouts) - 1 else "", ylabel=layout if j == 0 else "")
+            axes[i, j].set(
+                xlabel=method if i == len(layouts) - 1 else "", ylabel=layout if j == 0 else ""
+            )
     figure.savefig(path, dpi=70)
 
 
 def trajectory_of(paths: dict, layout: str, title: str) -> Trajectory:
     """A kept path as what is drawn."""
-    pursuers, settings = np.array(paths["pursuers"]), PursuitSettings()
+    pursuers = np.array(paths["pursuers"])
+    settings = PursuitSettings()
     captured = np.zeros(pursuers.shape[:2], bool)
     if paths["capture"] is not None:
         captured[paths["capture"] :] = True

@@ -1,4 +1,6 @@
-"""Flights for the paper's tables: many episodes of one policy in one compiled call, each with its own evader speed."""
+"""Flights for the paper's tables: many episodes of one policy in one compiled call, each with its
+own evader speed.
+"""
 
 import dataclasses
 import functools
@@ -38,7 +40,9 @@ class Flights:
 
     evaluation: Evaluation  # (B,) each
     first: jax.Array
-    """(B, R) int32, first step with a capture within each radius; episode length + 1 where there is none."""
+    """(B, R) int32, first step with a capture within each radius; episode length + 1 where there is
+    none.
+    """
     paths: Paths
 
 
@@ -52,16 +56,21 @@ def fly(
     speeds: jax.Array,
     key: jax.Array,
 ) -> Flights:
-    """One episode per task (leading axis B), with evader speeds (B,) in m/s; `key` draws the start attitudes.
+    """One episode per task (leading axis B), with evader speeds (B,) in m/s; `key` draws the start
+    attitudes.
 
-    A radius changes nothing but what counts as a capture, so each flight tells it for all `radii` (m).
+    A radius changes nothing but what counts as a capture, so each flight tells it for all `radii`
+    (m).
     """
     settings = environment.settings
     plain = {field.name: getattr(settings, field.name) for field in dataclasses.fields(settings)}
-    never, number = settings.episode_length + 1, speeds.shape[0]
+    never = settings.episode_length + 1
+    number = speeds.shape[0]
 
     def step(state, action, speed):
-        swept = dataclasses.replace(environment, settings=SweptSettings(**{**plain, "evader_speed": speed}))
+        swept = dataclasses.replace(
+            environment, settings=SweptSettings(**{**plain, "evader_speed": speed})
+        )
         observation, state, *_, info = swept.step(jax.random.key(0), state, action)
         return observation, state, info
 
@@ -91,7 +100,9 @@ def fly(
     return Flights(
         evaluation=Evaluation(
             statistics=state.statistics,
-            prediction_error=predicted if policy.predictor.enabled else jnp.full_like(predicted, jnp.nan),
+            prediction_error=predicted
+            if policy.predictor.enabled
+            else jnp.full_like(predicted, jnp.nan),
             last_seen_error=last_seen,
         ),
         first=first,

@@ -1,4 +1,6 @@
-"""The paper's tables: six methods on its layouts, its parts on layouts unlike its training, errors of the prediction."""
+"""The paper's tables: six methods on its layouts, its parts on layouts unlike its training, errors
+of the prediction.
+"""
 
 from collections.abc import Iterable
 
@@ -8,7 +10,12 @@ from experiments.paper.roster import METHODS, flights_of
 from experiments.paper.values import MAIN, PARTS, PREDICTION
 from experiments.table import Page, Table, cell
 
-FIGURES = {"capture_rate": ".3f", "capture_step": ".0f", "collision_rate": ".4f", "crash_rate": ".3f"}
+FIGURES = {
+    "capture_rate": ".3f",
+    "capture_step": ".0f",
+    "collision_rate": ".4f",
+    "crash_rate": ".3f",
+}
 BETTER = {"capture_rate": 1, "capture_step": -1, "collision_rate": -1}
 """Whether more of it is better, or less."""
 LAYOUTS = (*MAIN, "hidden")
@@ -27,19 +34,27 @@ def page(results: dict) -> Page:
     }
     return Page(
         "The paper's tables",
-        f"{results['episodes']} episodes per seed and layout, drawn starts. A cell holds ours / the paper's, each the mean "
-        "(standard deviation over three seeds: of the training, or of the start attitudes where nothing was trained). "
-        "The paper has no `hidden`. Collision rate: share of steps in which any pursuer is too near to anything. Crash "
+        f"{results['episodes']} episodes per seed and layout, drawn starts. A cell holds ours / "
+        "the paper's, each the mean "
+        "(standard deviation over three seeds: of the training, or of the start attitudes where "
+        "nothing was trained). "
+        "The paper has no `hidden`. Collision rate: share of steps in which any pursuer is too "
+        "near to anything. Crash "
         "rate: share of episodes in which any pursuer touches something solid or tips over.",
         (
-            Table(columns, cells(results, METHODS, "clamp", LAYOUTS), "Speed clamp, as in the paper"),
+            Table(
+                columns, cells(results, METHODS, "clamp", LAYOUTS), "Speed clamp, as in the paper"
+            ),
             verdicts(results),
-            Table(columns, cells(results, METHODS, "no clamp", LAYOUTS), "Honest physics: no clamp"),
+            Table(
+                columns, cells(results, METHODS, "no clamp", LAYOUTS), "Honest physics: no clamp"
+            ),
             Table(
                 columns,
                 cells(results, VARIANTS, "clamp", PARTS),
                 "The paper's parts on layouts unlike its training",
-                "Speed clamp. Penalties were chosen for OPEN; plain MAPPO's were chosen anew (preset `mappo`).",
+                "Speed clamp. Penalties were chosen for OPEN; plain MAPPO's were chosen anew "
+                "(preset `mappo`).",
             ),
             Table(
                 prediction,
@@ -51,12 +66,16 @@ def page(results: dict) -> Page:
     )
 
 
-def cells(results: dict, methods: Iterable[str], condition: str, layouts: Iterable[str]) -> list[dict]:
+def cells(
+    results: dict, methods: Iterable[str], condition: str, layouts: Iterable[str]
+) -> list[dict]:
     """By layout and method: each figure's values, one per seed, and the paper's."""
     found = []
     for layout in layouts:
         for method in methods:
-            records = [f["layouts"][layout]["record"] for f in flights_of(results, method, condition)]
+            records = [
+                f["layouts"][layout]["record"] for f in flights_of(results, method, condition)
+            ]
             if records:
                 seeds = {name: [record.get(name) for record in records] for name in records[0]}
                 paper = (MAIN.get(layout, {}) | PARTS.get(layout, {})).get(method)
@@ -82,13 +101,18 @@ def beside_paper(figure: str, form: str):
 
 def verdicts(results: dict) -> str:
     """Where OPEN isn't the best, and where a method is below the paper's own value of it."""
-    above_open, below_paper = [], []
+    above_open = []
+    below_paper = []
     for layout in MAIN:
         records = {r["method"]: r for r in cells(results, METHODS, "clamp", [layout])}
         for i, (figure, sign) in enumerate(BETTER.items()):
             for method, record in records.items():
-                ours, name = float(np.mean(record[figure])), figure.replace("_", " ")
-                if "OPEN" in records and sign * (ours - float(np.mean(records["OPEN"][figure]))) > 0:
+                ours = float(np.mean(record[figure]))
+                name = figure.replace("_", " ")
+                if (
+                    "OPEN" in records
+                    and sign * (ours - float(np.mean(records["OPEN"][figure]))) > 0
+                ):
                     above_open.append(f"{layout}: {method} has the better {name}")
                 mean, deviation = record["paper"][i]
                 if sign * (ours - mean) < -deviation - 5e-4:

@@ -1,9 +1,11 @@
-"""The quick preset as a user with two cores meets it: the whole command, installed but nothing compiled, for several seeds.
+"""The quick preset as a user with two cores meets it: the whole command, installed but nothing
+compiled, for several seeds.
 
     python -m experiments.paper.quick [--seeds 0 1 2] [--at_once 1] [--options "..."]
 
-Each run has two cores of its own and an empty cache. Its policy is then flown on the validation tasks once more, with
-captures and crashes looked for in every physics step, and not only at those at which the policy steers.
+Each run has two cores of its own and an empty cache. Its policy is then flown on the validation
+tasks once more, with captures and crashes looked for in every physics step, and not only at those
+at which the policy steers.
 """
 
 import argparse
@@ -36,7 +38,13 @@ def train(options: argparse.Namespace, seed: int, cores: list[int]) -> dict:
     """One run on those cores: what its table says, and the seconds of the whole command."""
     run = options.runs / f"seed_{seed}"
     command = [sys.executable, "-m", "openjax.train", "--preset", "quick", "--seed", str(seed)]
-    command += ["--out", str(run), "--overwrite", "--no-compilation_cache", *options.options.split()]
+    command += [
+        "--out",
+        str(run),
+        "--overwrite",
+        "--no-compilation_cache",
+        *options.options.split(),
+    ]
     environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
     for name in (
         "JAX_COMPILATION_CACHE_DIR",
@@ -54,15 +62,21 @@ def train(options: argparse.Namespace, seed: int, cores: list[int]) -> dict:
 
 def record(run: Path) -> dict:
     """What the table of a run says, and its policy flown on the validation tasks once more."""
-    layouts, loaded = read_json(run / "layouts.json"), load_policy(run)
-    kept = {name: layouts[name] for name in ("after", "open", "seconds", "steps") if name in layouts}
+    layouts = read_json(run / "layouts.json")
+    loaded = load_policy(run)
+    kept = {
+        name: layouts[name] for name in ("after", "open", "seconds", "steps") if name in layouts
+    }
     step = loaded.settings.environment.time_step
     return {"time_step": step, **kept, "every_physics_step": fly_finely(loaded)}
 
 
 def fly_finely(loaded: LoadedPolicy) -> dict[str, float]:
-    """Rates on the validation tasks in an environment whose step is one physics step, the policy's action held between."""
-    own, held = loaded.settings.environment, loaded.settings.environment.substeps
+    """Rates on the validation tasks in an environment whose step is one physics step, the policy's
+    action held between.
+    """
+    own = loaded.settings.environment
+    held = loaded.settings.environment.substeps
     game = Pursuit(
         dataclasses.replace(
             own,
@@ -82,7 +96,9 @@ def fly_finely(loaded: LoadedPolicy) -> dict[str, float]:
             observation, state = carry
             action = loaded(observation)
             for _ in range(held):
-                observation, state, *_ = jax.vmap(game.step, (None, 0, 0))(jax.random.key(0), state, action)
+                observation, state, *_ = jax.vmap(game.step, (None, 0, 0))(
+                    jax.random.key(0), state, action
+                )
             return (observation, state), None
 
         start = jax.vmap(game.reset_to)(keys, tasks)
@@ -123,7 +139,9 @@ def page(results: dict) -> Page:
     parts: list[Table | str] = [Table(columns, results["runs"])]
     if "trials" in results:
         tried = {name: (lambda row, name=name: spread(row[name], ".2f")) for name in TRIED_ON}
-        parts.append(Table({"variant": "variant", "updates": "updates", **tried}, *results["trials"]))
+        parts.append(
+            Table({"variant": "variant", "updates": "updates", **tried}, *results["trials"])
+        )
     parts.append("\n".join(f"* {found}" for found in results.get("findings", ())))
     prose = f"{results['preset']} Each cell: capture rate, seconds to the capture, crash rate. {results.get('note', '')}"
     return Page("The quick preset: what two CPU cores learn", prose, parts)
@@ -148,7 +166,9 @@ def main() -> None:
     """The command."""
     parser = page_parser(__doc__, "quick")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--at_once", type=int, default=1, help="runs side by side, on two cores each")
+    parser.add_argument(
+        "--at_once", type=int, default=1, help="runs side by side, on two cores each"
+    )
     parser.add_argument("--options", default="", help="more options of openjax.train")
     parser.add_argument("--runs", type=Path, default=Path("runs/quick"), help="folder of the runs")
     publish(parser.parse_args(), study, page)

@@ -15,13 +15,23 @@ METHODS = {
 ABLATIONS = {"MAPPO + predictor": "predictor", "MAPPO + generator": "generator"}
 """The paper's other variants: MAPPO + EPN, MAPPO + AEG."""
 SEEDS = 3
-HUES = ("tab:orange", "tab:olive", "tab:brown", "tab:purple", "0.3", "tab:red", "tab:blue", "tab:green")
+HUES = (
+    "tab:orange",
+    "tab:olive",
+    "tab:brown",
+    "tab:purple",
+    "0.3",
+    "tab:red",
+    "tab:blue",
+    "tab:green",
+)
 COLORS = dict(zip((*METHODS, *ABLATIONS), HUES, strict=True))
 
 
 def seeds_of(label: str) -> list[tuple[str, int]]:
-    """(policy, evaluation seed) for each of a method's seeds: those of its training, or of its start attitudes where
-    there is no training."""
+    """(policy, evaluation seed) for each of a method's seeds: those of its training, or of its
+    start attitudes where there is no training.
+    """
     beginning = (METHODS | ABLATIONS)[label]
     if beginning in HEURISTICS:
         return [(beginning, seed) for seed in range(SEEDS)]

@@ -1,4 +1,6 @@
-"""Put trained policies into the package, without their critics: `python -m experiments.paper.ship_weights NAME=RUN ...`."""
+"""Put trained policies into the package, without their critics: `python -m
+experiments.paper.ship_weights NAME=RUN ...`.
+"""
 
 from pathlib import Path
 

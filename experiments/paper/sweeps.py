@@ -1,7 +1,7 @@
 """All methods over the capture radius and the evader's speed.
 
-As in the paper's two figures: the radius in `empty`, the speed in `passage`; policies trained at one radius and one speed fly
-at others.
+As in the paper's two figures: the radius in `empty`, the speed in `passage`; policies trained at
+one radius and one speed fly at others.
 """
 
 from pathlib import Path
@@ -15,14 +15,17 @@ from experiments.table import Page, Table, spread
 
 RADII = (0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5)
 SPEEDS = (1.0, 1.2, 1.3, 1.4, 1.6, 1.8, 2.0, 2.3, 2.6)
-RADIUS, SPEED = 0.3, 1.3
+RADIUS = 0.3
+SPEED = 1.3
 """Of the training."""
 CELLS = (("empty", SPEED), *(("passage", speed) for speed in SPEEDS))
 """Layout and evader speed (m/s) of what is flown."""
 
 
 def figures(flown: list[Any], length: int) -> dict:
-    """Capture rate and step over the radii and over the speeds, of `Flights` for each of `CELLS`."""
+    """Capture rate and step over the radii and over the speeds, of `Flights` for each of
+    `CELLS`.
+    """
     first = np.stack([part.first for part in flown])
     missed = first > length
     rate = np.round(1 - missed.mean(axis=1), 5)
@@ -41,24 +44,31 @@ def figures(flown: list[Any], length: int) -> dict:
 
 def seeds_by_method(results: dict) -> dict[str, list[dict]]:
     """The two sweeps of each method's seeds, with the clamp."""
-    methods = {label: [flight["sweeps"] for flight in flights_of(results, label)] for label in METHODS}
+    methods = {
+        label: [flight["sweeps"] for flight in flights_of(results, label)] for label in METHODS
+    }
     return {label: seeds for label, seeds in methods.items() if seeds}
 
 
 def page(results: dict) -> Page:
     """A table of either sweep."""
-    methods, parts = seeds_by_method(results), []
+    methods = seeds_by_method(results)
+    parts = []
     for title, axis, values, unit in (
         ("Capture radius, in `empty`", "radius", RADII, "m"),
         ("Evader speed, in `passage`", "speed", SPEEDS, "m/s"),
     ):
-        columns = {"method": "method"} | {f"{value} {unit}": at(axis, i) for i, value in enumerate(values)}
+        columns = {"method": "method"} | {
+            f"{value} {unit}": at(axis, i) for i, value in enumerate(values)
+        }
         rows = [{"method": label, "seeds": seeds} for label, seeds in methods.items()]
         parts += [Table(columns, rows, title), not_above(methods, axis, values, unit)]
     return Page(
         "Capture radius and evader speed",
-        f"{max(1, results['episodes'] // 2)} episodes per seed and cell, three seeds, speed clamp, drawn starts. Every policy "
-        f"is the one of the main table, trained or searched at {RADIUS} m and {SPEED} m/s only. Capture rate (standard "
+        f"{max(1, results['episodes'] // 2)} episodes per seed and cell, three seeds, speed clamp, "
+        "drawn starts. Every policy "
+        f"is the one of the main table, trained or searched at {RADIUS} m and {SPEED} m/s only. "
+        "Capture rate (standard "
         "deviation over seeds) / capture step. The paper shows both as figures without numbers.",
         (*parts, "![Capture rate and step over radius and speed](sweeps.png)"),
     )
@@ -88,7 +98,11 @@ def not_above(methods: dict, axis: str, values: tuple[float, ...], unit: str) ->
             if rate > best + 1e-9 or (abs(rate - best) < 1e-9 and step < early):
                 both = f"{rate:.2f} / {step:.0f} against {best:.2f} / {early:.0f}"
                 found.append(f"{label} at {value} {unit} ({both})")
-    return f"OPEN isn't above: {'; '.join(sorted(found))}." if found else "No method is above OPEN anywhere."
+    return (
+        f"OPEN isn't above: {'; '.join(sorted(found))}."
+        if found
+        else "No method is above OPEN anywhere."
+    )
 
 
 def draw(results: dict, path: Path) -> None:

@@ -1,7 +1,9 @@
-"""The paper's tables and figures, by the shipped weights: `python -m experiments.paper.tables [--episodes 100]`.
+"""The paper's tables and figures, by the shipped weights: `python -m experiments.paper.tables
+[--episodes 100]`.
 
-Flies every method once, all its layouts, capture radii and evader speeds in one compiled call, and stores what came of it in
-experiments/results/tables.json; the pages in `PAGES` are made from there. `--report` makes them again.
+Flies every method once, all its layouts, capture radii and evader speeds in one compiled call, and
+stores what came of it in experiments/results/tables.json; the pages in `PAGES` are made from there.
+`--report` makes them again.
 """
 
 import argparse
@@ -45,7 +47,11 @@ def game_of(name: str, limit: str, physics: str) -> tuple[LoadedPolicy, Pursuit]
     game = loaded.settings.environment
     # the reward changes nothing that is counted here; one for all saves compilations
     game = dataclasses.replace(
-        game, max_pillars=layout_slots(game), reward=RewardSettings(), speed_limit=limit, physics=physics
+        game,
+        max_pillars=layout_slots(game),
+        reward=RewardSettings(),
+        speed_limit=limit,
+        physics=physics,
     )
     environment = environment_of(game)
     return loaded.in_game(environment), environment
@@ -59,7 +65,10 @@ def cells_of(evader_speed: float, episodes: int) -> list[tuple[str, float, int]]
 
 def tasks_of(game: PursuitSettings, cells: list[tuple[str, float, int]]) -> dict[int, Task]:
     """The tasks of each cell, by its place."""
-    return {i: repeat_task(scenario_task(game, SCENARIOS[name]), n) for i, (name, _, n) in enumerate(cells)}
+    return {
+        i: repeat_task(scenario_task(game, SCENARIOS[name]), n)
+        for i, (name, _, n) in enumerate(cells)
+    }
 
 
 def call_of(name: str, seed: int, limit: str, physics: str, episodes: int) -> tuple:
@@ -79,7 +88,9 @@ def call_of(name: str, seed: int, limit: str, physics: str, episodes: int) -> tu
 
 
 def of_policy(name: str, seed: int, limit: str, physics: str, episodes: int) -> dict:
-    """By layout: the record of a policy, what it did there, the paths of one episode; and its two sweeps."""
+    """By layout: the record of a policy, what it did there, the paths of one episode; and its two
+    sweeps.
+    """
     call = call_of(name, seed, limit, physics, episodes)
     game = call[0].settings
     cells = cells_of(game.evader_speed, episodes)
@@ -93,7 +104,10 @@ def of_policy(name: str, seed: int, limit: str, physics: str, episodes: int) -> 
             "behaviour": behaviours.measure(layout, part.paths, part.evaluation.statistics),
             "paths": behaviours.one_episode(part.paths),
         }
-    return {"layouts": layouts, "sweeps": sweeps.figures(parts[len(LAYOUTS) :], game.episode_length)}
+    return {
+        "layouts": layouts,
+        "sweeps": sweeps.figures(parts[len(LAYOUTS) :], game.episode_length),
+    }
 
 
 def flights_to_keep(options: argparse.Namespace, alike: dict) -> list[dict]:
@@ -103,11 +117,15 @@ def flights_to_keep(options: argparse.Namespace, alike: dict) -> list[dict]:
         return []
     kept = read_json(stored)
     same = {name: kept.get(name) for name in alike} == alike
-    return [flight for flight in kept["flights"] if same and flight["method"] not in options.methods]
+    return [
+        flight for flight in kept["flights"] if same and flight["method"] not in options.methods
+    ]
 
 
 def calls_of(options: argparse.Namespace) -> dict[tuple[str, str], list[tuple[str, int]]]:
-    """Policies and seeds by method and condition; heuristics fly without the clamp, too: no training chose their speed."""
+    """Policies and seeds by method and condition; heuristics fly without the clamp, too: no
+    training chose their speed.
+    """
     return {
         (label, condition): seeds_of(label)
         for label in options.methods
@@ -120,12 +138,15 @@ def study(options: argparse.Namespace) -> None:
     """Fly and store all methods and the ablations."""
     started = time.monotonic()
     alike = {"episodes": options.episodes, "physics": options.physics}
-    rest, wanted = (options.physics, options.episodes), calls_of(options)
+    rest = (options.physics, options.episodes)
+    wanted = calls_of(options)
     flights = flights_to_keep(options, alike)
     compiled = {}
     for (label, condition), seeds in wanted.items():  # compiled side by side, and while others fly
         for name, seed in seeds[:1]:
-            compiled[label, condition] = compile_ahead(fly, *call_of(name, seed, LIMITS[condition], *rest))
+            compiled[label, condition] = compile_ahead(
+                fly, *call_of(name, seed, LIMITS[condition], *rest)
+            )
     for (label, condition), seeds in wanted.items():
         if (label, condition) in compiled:
             compiled[label, condition]()
@@ -149,9 +170,15 @@ def study(options: argparse.Namespace) -> None:
 def main(arguments: list[str]) -> int:
     """Fly or read the flights, then write all pages."""
     parser = page_parser(__doc__, ".")
-    parser.add_argument("--episodes", type=int, default=100, help="per seed and layout; half for the sweeps")
-    parser.add_argument("--physics", choices=("rigid", "mjx"), default="rigid", help="mjx: the same, slower")
-    parser.add_argument("--methods", nargs="+", choices=LABELS, default=list(LABELS), help="fly these anew")
+    parser.add_argument(
+        "--episodes", type=int, default=100, help="per seed and layout; half for the sweeps"
+    )
+    parser.add_argument(
+        "--physics", choices=("rigid", "mjx"), default="rigid", help="mjx: the same, slower"
+    )
+    parser.add_argument(
+        "--methods", nargs="+", choices=LABELS, default=list(LABELS), help="fly these anew"
+    )
     options = parser.parse_args(arguments)
     if not options.report:
         study(options)

@@ -1,9 +1,12 @@
-"""Seconds to the first update, and to a policy that catches: `python -m experiments.speed.seconds [--starts paper] [--seeds 1]`.
+"""Seconds to the first update, and to a policy that catches: `python -m experiments.speed.seconds
+[--starts paper] [--seeds 1]`.
 
-Runs of `openjax train`, one after the other. Each of `--starts`, a preset and its options in quotes, is run twice, until its
-first validation: first with nothing kept, then with compiled programs and traces kept. Then each of `--seeds` flies the first
-of them, all kept, until a validation is what is asked for (`--whole`: to its end, `--cold`: with nothing kept). Results are
-written after each run; `--go_on` adds to those that are there, and finds what was kept in the same `--cache`.
+Runs of `openjax train`, one after the other. Each of `--starts`, a preset and its options in
+quotes, is run twice, until its first validation: first with nothing kept, then with compiled
+programs and traces kept. Then each of `--seeds` flies the first of them, all kept, until a
+validation is what is asked for (`--whole`: to its end, `--cold`: with nothing kept). Results are
+written after each run; `--go_on` adds to those that are there, and finds what was kept in the same
+`--cache`.
 """
 
 import argparse
@@ -37,7 +40,9 @@ class Runner:
     """Flies runs, until there is no time left."""
 
     def __init__(self, options: argparse.Namespace):
-        self.cache, self.longest, self.cold = options.cache, options.longest, options.cold
+        self.cache = options.cache
+        self.longest = options.longest
+        self.cold = options.cold
         self.ends = time.monotonic() + options.limit
         self.enough = (lambda validation: False) if options.whole else good
 
@@ -57,7 +62,8 @@ class Runner:
         kept = "all" if cache.exists() else "nothing"
         with tempfile.TemporaryDirectory() as folder:
             out = Path(folder) / "run"
-            process, file = begin(start, seed, out, cache), out / METRICS_FILE
+            process = begin(start, seed, out, cache)
+            file = out / METRICS_FILE
             ends = min(self.ends, time.monotonic() + self.longest)
             while process.poll() is None and not any(map(enough, validations(file))):
                 if time.monotonic() > ends:
@@ -75,14 +81,24 @@ def begin(start: str, seed: int, out: Path, cache: Path) -> subprocess.Popen:
     """A run as a process, which keeps programs in a folder of its own."""
     environment = {**os.environ, "XDG_CACHE_HOME": str(cache)}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
-    command = [sys.executable, "-m", "openjax.train", "--preset", *shlex.split(start), "--seed", str(seed)]
+    command = [
+        sys.executable,
+        "-m",
+        "openjax.train",
+        "--preset",
+        *shlex.split(start),
+        "--seed",
+        str(seed),
+    ]
     command += ["--compare_with", "none", "--out", str(out)]
     with open(out.with_suffix(".log"), "w") as log:
         return subprocess.Popen(command, env=environment, stdout=log, stderr=subprocess.STDOUT)
 
 
 def end(process: subprocess.Popen) -> None:
-    """Ask a process to save within 10 s and end; what it compiles in the background isn't waited for."""
+    """Ask a process to save within 10 s and end; what it compiles in the background isn't waited
+    for.
+    """
     process.terminate()
     with contextlib.suppress(subprocess.TimeoutExpired):
         process.wait(10.0)
@@ -98,7 +114,9 @@ def validations(file: Path) -> list[dict]:
 def curve(file: Path) -> dict:
     """First update, updates a second and validations of a run, from its metrics."""
     trained = list(read_metrics(file, "train")) if file.exists() else []
-    steps, seconds = (np.diff([update[name] for update in trained]) for name in ("steps", "seconds"))
+    steps, seconds = (
+        np.diff([update[name] for update in trained]) for name in ("steps", "seconds")
+    )
     return {
         "first_update": trained[0]["seconds"] if trained else None,
         "update": float(np.median(seconds)) if len(seconds) else None,
@@ -108,16 +126,25 @@ def curve(file: Path) -> dict:
 
 
 def whole(out: Path) -> dict | None:
-    """Seconds of a run that came to its end; capture rate, crash rate and steps to the capture by layout."""
+    """Seconds of a run that came to its end; capture rate, crash rate and steps to the capture by
+    layout.
+    """
     if not (out / "layouts.json").exists():
         return None
     told = read_json(out / "layouts.json")
     rates = ("capture_rate", "crash_rate", "capture_step")
     layouts = {
-        r["scenario"]: [r[rate] for rate in rates] for r in told["after"] if r["scenario"] in SCENARIOS
+        r["scenario"]: [r[rate] for rate in rates]
+        for r in told["after"]
+        if r["scenario"] in SCENARIOS
     }
     captures, crashes, _ = zip(*layouts.values(), strict=True)
-    return {"seconds": told["seconds"], "least": min(captures), "most": max(crashes), "layouts": layouts}
+    return {
+        "seconds": told["seconds"],
+        "least": min(captures),
+        "most": max(crashes),
+        "layouts": layouts,
+    }
 
 
 def study(options: argparse.Namespace) -> dict:
@@ -162,7 +189,9 @@ def page(results: dict) -> Page:
     for start in dict.fromkeys(run["start"] for run in rows):
         for kept in ("all", "nothing"):
             own = [
-                run for run in rows if (run["start"], run["kept"]) == (start, kept) and run["validations"][1:]
+                run
+                for run in rows
+                if (run["start"], run["kept"]) == (start, kept) and run["validations"][1:]
             ]
             seconds = [run["reached"]["seconds"] if run["reached"] else np.inf for run in own]
             if len(own) > 2 and np.isfinite(np.median(seconds)):
@@ -175,13 +204,21 @@ def page(results: dict) -> Page:
 def main(arguments: list[str]) -> int:
     """Fly the runs, write both files."""
     parser = page_parser(__doc__, "seconds")
-    parser.add_argument("--starts", nargs="+", default=["paper"], help="presets, each with its options")
+    parser.add_argument(
+        "--starts", nargs="+", default=["paper"], help="presets, each with its options"
+    )
     parser.add_argument("--seeds", type=int, nargs="*", default=[], help="of runs until they catch")
     parser.add_argument("--whole", action="store_true", help="run those to their end")
-    parser.add_argument("--cold", action="store_true", help="run only those, each with nothing kept")
-    parser.add_argument("--limit", type=float, default=float("inf"), help="s after which all is over")
+    parser.add_argument(
+        "--cold", action="store_true", help="run only those, each with nothing kept"
+    )
+    parser.add_argument(
+        "--limit", type=float, default=float("inf"), help="s after which all is over"
+    )
     parser.add_argument("--longest", type=float, default=200.0, help="s that one run may take")
-    parser.add_argument("--cache", type=Path, help="where programs are kept; by default for these runs alone")
+    parser.add_argument(
+        "--cache", type=Path, help="where programs are kept; by default for these runs alone"
+    )
     parser.add_argument("--go_on", action="store_true", help="add to the results that are there")
     parser.add_argument("--note", default="")
     publish(parser.parse_args(arguments), study, page)

@@ -41,7 +41,9 @@ def body(parameters, q=None, velocity=None, rates=None, speed=0.0):
 def steps(b, number, m=0.0):
     zero = np.zeros_like(b.rates)
     for _ in range(number):
-        b.step(np.full((4, b.count), m), np.full(b.count, 3.7), np.full(b.count, 0.6), zero, zero, 0.0)
+        b.step(
+            np.full((4, b.count), m), np.full(b.count, 3.7), np.full(b.count, 0.6), zero, zero, 0.0
+        )
 
 
 def test_a_vehicle_without_thrust_falls_and_turns_as_mechanics_says():
@@ -49,9 +51,12 @@ def test_a_vehicle_without_thrust_falls_and_turns_as_mechanics_says():
     b = body(p, velocity=[0.5, -0.2, 1.0], rates=[3.0, -2.0, 5.0])
     momentum = lambda: vehicle.rotate(b.q, b.principal * b.rates)  # noqa: E731
     energy = lambda: 0.5 * (b.principal * b.rates**2).sum()  # noqa: E731
-    before, spin = momentum(), energy()
+    before = momentum()
+    spin = energy()
     steps(b, 500)
-    np.testing.assert_allclose(b.position[:, 0], [0.25, -0.1, 1.0 + 0.5 - 0.5 * 9.81 * 0.25], atol=1e-9)
+    np.testing.assert_allclose(
+        b.position[:, 0], [0.25, -0.1, 1.0 + 0.5 - 0.5 * 9.81 * 0.25], atol=1e-9
+    )
     np.testing.assert_allclose(b.velocity[:, 0], [0.5, -0.2, 1.0 - 9.81 * 0.5], atol=1e-9)
     np.testing.assert_allclose(momentum(), before, rtol=0.01, atol=2e-7)
     assert energy() == pytest.approx(spin, rel=0.01)
@@ -72,7 +77,9 @@ def test_rotors_follow_a_step_with_their_lag_and_hover_carries_the_weight():
 def test_each_effect_pushes_as_its_formula_says():
     def specific(effect, size, form, shape=(0.25,) * 8, **state):
         p = vehicle.nominal_parameters([told()])
-        effects.apply({"effect": effect, "form": form, "size": size, "shape": list(shape)}, p, np.array([0]))
+        effects.apply(
+            {"effect": effect, "form": form, "size": size, "shape": list(shape)}, p, np.array([0])
+        )
         b = body(p, speed=vehicle.MAX_SPEED * np.sqrt(told().hover), **state)
         steps(b, 1, m=told().hover)
         return b
@@ -83,7 +90,9 @@ def test_each_effect_pushes_as_its_formula_says():
     assert drag.specific[0, 0] == pytest.approx(-0.01 / 0.0321)
     hubs = specific("rotor_drag", 0.01, "rotor_speed", velocity=[1.0, 0, 0])
     assert hubs.specific[0, 0] == pytest.approx(-0.01 / 0.0321, rel=1e-6)
-    offset = specific("com_offset", 1.0, "torque", shape=(0.0,) * 8)  # 1 mm forward: weight x arm about y
+    offset = specific(
+        "com_offset", 1.0, "torque", shape=(0.0,) * 8
+    )  # 1 mm forward: weight x arm about y
     assert offset.rates[1, 0] == pytest.approx(0.001 * 0.0321 * 9.81 / 1.4e-5 * 0.001, rel=1e-3)
     still = specific("wind", 1.0, "steady", shape=(0.0,) * 8)
     assert still.specific[0, 0] == pytest.approx(0.008 / 0.0321)
@@ -102,7 +111,9 @@ def test_the_firmware_filter_is_a_butterworth_and_starts_at_rest():
 
 @pytest.fixture(scope="module")
 def hovering():
-    """Two vehicles of different mass for 3 s, one holding a point, one on laps, in still air and without noise."""
+    """Two vehicles of different mass for 3 s, one holding a point, one on laps, in still air and
+    without noise.
+    """
     many = [told(mass=0.03), told(mass=0.042, thrust_constant=3e-8, motor_time=0.03)]
     rng = np.random.default_rng(1)
     laps = cases.missions.single("laps", rng, 300)
@@ -121,9 +132,12 @@ def hovering():
 
 def test_hover_needs_the_weight_and_motion_agrees_with_the_sensors(hovering):
     many, _, flown = hovering
-    np.testing.assert_allclose(flown["motor"][-250:, :, 0].mean(axis=(0, 1)), many[0].hover, rtol=1e-3)
+    np.testing.assert_allclose(
+        flown["motor"][-250:, :, 0].mean(axis=(0, 1)), many[0].hover, rtol=1e-3
+    )
     assert (flown["crashed"] == 1500).all()
-    speed, q = flown["velocity"][:, :, 1].astype(float), flown["quaternion"][:, :, 1].astype(float)
+    speed = flown["velocity"][:, :, 1].astype(float)
+    q = flown["quaternion"][:, :, 1].astype(float)
     assert np.abs(speed[:, :2]).max() > 0.3
     accel = np.gradient(speed, 0.002, axis=0)[500:-5]
     accel[:, 2] += 9.81
@@ -157,7 +171,13 @@ def log_of(flown, kind, unknown=(), **changes):
 
 def test_drawn_sensors_have_the_noise_that_they_say(hovering):
     _, _, flown = hovering
-    plain = {"accel_cut": 0.0, "tilt": [0, 0, 0], "accel_bias": [0, 0, 0], "pose_delay": 2.0, "quantum": 1.0}
+    plain = {
+        "accel_cut": 0.0,
+        "tilt": [0, 0, 0],
+        "accel_bias": [0, 0, 0],
+        "pose_delay": 2.0,
+        "quantum": 1.0,
+    }
     rows = log_of(flown, "white", **plain, size=1.0, accel=0.2, position=2e-4, velocity="smooth")
     at = np.arange(300) * 5
     noise = rows["ax"] - flown["specific"][at, 0, 1]
@@ -193,16 +213,22 @@ def test_the_stranger_column_shares_no_kind_with_the_known_one():
     ):
         one, two = ({read(c) for c in column} - {None} for column in (known, strange))
         assert one and two and not one & two
-    assert {c["causes"][0]["effect"] for c in known if c["category"] == "single"} == set(effects.EFFECTS)
+    assert {c["causes"][0]["effect"] for c in known if c["category"] == "single"} == set(
+        effects.EFFECTS
+    )
     assert cases.draw_cases(3, "known", 250) == known
     for c in known:
         for cause in c["causes"]:
-            needs = effects.EFFECTS[cause["effect"]].needs if cause["effect"] in effects.EFFECTS else ""
+            needs = (
+                effects.EFFECTS[cause["effect"]].needs if cause["effect"] in effects.EFFECTS else ""
+            )
             assert set(needs) <= set(c["sensors"]["channels"])
 
 
 def test_generated_kinds_differ_and_no_line_in_their_inputs_explains_them():
-    """Else a named effect, which is such a line, would be half right, and a detector for one kind would find all."""
+    """Else a named effect, which is such a line, would be half right, and a detector for one kind
+    would find all.
+    """
     rng = np.random.default_rng(0)
     causes = [{"shape": rng.uniform(size=8), "form": "smooth"} for _ in range(40)]
     function = unknowns.Generated(causes)
@@ -211,7 +237,8 @@ def test_generated_kinds_differ_and_no_line_in_their_inputs_explains_them():
         inputs = np.repeat(rng.standard_normal((len(unknowns.SCALE) - 1, 1)), 40, axis=1)
         values.append(np.r_[inputs[:, 0], function(inputs, 50.0 + 10 * rng.uniform())])
     values = np.array(values)
-    x, f = np.c_[np.ones(600), values[:, :-40]], values[:, -40:]
+    x = np.c_[np.ones(600), values[:, :-40]]
+    f = values[:, -40:]
     line = x @ np.linalg.lstsq(x, f, rcond=None)[0]
     explained = 1 - (f - line).var(0) / f.var(0)
     assert np.median(explained) < 0.15 and np.abs(np.corrcoef(f.T) - np.eye(40)).max() < 0.6
@@ -229,10 +256,12 @@ def test_every_unknown_site_acts(hovering):
             assert wrong and wrong <= set(sensors.GROUPS[site.logs]), name
             continue
         strange = unknowns.Unknowns({name: [(np.array([0]), own)]}, 1)
-        u, moved = np.full((4, 1), 0.6), 0.0
+        u = np.full((4, 1), 0.6)
+        moved = 0.0
         for s in range(0, 1400, 7):
             names = ("position", "quaternion", "velocity", "rates")
-            state, time = [flown[k][s, :, 1:].astype(float) for k in names], 5 + 0.006 * s
+            state = [flown[k][s, :, 1:].astype(float) for k in names]
+            time = 5 + 0.006 * s
             strange.look(*state, u, np.array([3.7]))
             force, torque = strange.wrench(state[1], time)
             sizes = (force / 1e-2, torque / 1e-4, (strange.motors(u, time) - u) / 0.05)
@@ -284,16 +313,22 @@ def test_written_cases_can_be_read_and_say_what_they_hold(tmp_path, monkeypatch)
         assert answer["gap"]["before"] >= 0.99
         if answer["category"] == "pair":
             assert sum(answer["shares"].values()) == pytest.approx(1.0, abs=0.35)
-        elif answer["effects"] == ["rotor_drag"]:  # on laps it shows: the key may not call it hidden
+        elif answer["effects"] == [
+            "rotor_drag"
+        ]:  # on laps it shows: the key may not call it hidden
             assert answer["category"] == "single" and answer["expected"] == ["rotor_drag"]
         mass = answer["told"]["mass"]
-        assert f"mass = {mass:.5f}" in (tmp_path / "logs" / answer["case"] / "vehicle.toml").read_text()
+        assert (
+            f"mass = {mass:.5f}"
+            in (tmp_path / "logs" / answer["case"] / "vehicle.toml").read_text()
+        )
 
 
 def test_rows_that_see_little_of_the_motors_hide_torque(hovering):
     """A key whose floor forgets this asks for torques that no reader of a slow log can see."""
     many, p, flown = hovering
-    none, left = np.zeros(2, bool), {}
+    none = np.zeros(2, bool)
+    left = {}
     m = flown["motor"].copy()
     m[::2] += 0.02  # the loop's own noise: fast, and without effect on the motion
     m[1::2] -= 0.02

@@ -25,9 +25,16 @@ FLIGHTS = {1: ("agile", "yaw", "fast"), 2: ("climb", "step", "agile"), 3: ("laps
 
 
 def fly(*numbers, causes=(), **changes):
-    """Vehicles told exactly, with hard manoeuvres in light turbulence; `changes` of their sensors."""
+    """Vehicles told exactly, with hard manoeuvres in light turbulence; `changes` of their
+    sensors.
+    """
     drawn = sensors.draw(np.random.default_rng(3), "white", "psgacmv", "light")
-    drawn |= {"constants_off": [0.0] * 5, "thrust_offset": 0.0, "gyro_cut": 0.0, "derivative_cut": 0.0}
+    drawn |= {
+        "constants_off": [0.0] * 5,
+        "thrust_offset": 0.0,
+        "gyro_cut": 0.0,
+        "derivative_cut": 0.0,
+    }
     drawn |= changes
     specs = [
         {
@@ -54,7 +61,9 @@ def nominal():
 
 
 def _replay(vehicle, start, motors, commands, from_commands):
-    """Velocity and rates after each tick of 10 ms, replayed with the simulator's own functions at 2 ms."""
+    """Velocity and rates after each tick of 10 ms, replayed with the simulator's own functions at 2
+    ms.
+    """
     dt = 0.002
 
     def tick(carry, inputs):
@@ -63,7 +72,8 @@ def _replay(vehicle, start, motors, commands, from_commands):
             m, integral = rate_controller(vehicle, state, command, dt)
             m = m if from_commands else m_logged
             rotor = rotor_speed_step(vehicle, state.rotor_speed, m, dt)
-            thrust, reaction = rotor_thrust(vehicle, rotor), rotor_reaction(vehicle, rotor)
+            thrust = rotor_thrust(vehicle, rotor)
+            reaction = rotor_reaction(vehicle, rotor)
             force, torque = total_wrench(vehicle, thrust, reaction)
             new = rigid_step(vehicle, state, rotate(state.quaternion, force), torque, dt)
             rotors = {"rotor_speed": rotor, "rate_integral": integral}
@@ -77,9 +87,12 @@ def _replay(vehicle, start, motors, commands, from_commands):
 
 @pytest.mark.parametrize("from_commands", [False, True])
 def test_nominal_plant_agrees_with_the_rigid_simulator(nominal, from_commands):
-    # a wrong sign, unit, motor order, spin, gain or lag in either would show at many times the gusts
-    flown, bodies = nominal.flown, nominal.columns[0]
-    starts, length = np.arange(100, TICKS - 25, 20), 20
+    # a wrong sign, unit, motor order, spin, gain or lag in either would show at many times the
+    # gusts
+    flown = nominal.flown
+    bodies = nominal.columns[0]
+    starts = np.arange(100, TICKS - 25, 20)
+    length = 20
 
     def gather(name, tick=0):
         values = flown[name][5 * (starts + tick)].astype(float)
@@ -98,7 +111,9 @@ def test_nominal_plant_agrees_with_the_rigid_simulator(nominal, from_commands):
     start = jax.tree.map(jnp.asarray, start)
 
     def windows(name):
-        cut = [np.moveaxis(flown[name][5 * k : 5 * (k + length)][:, :, bodies], 2, 0) for k in starts]
+        cut = [
+            np.moveaxis(flown[name][5 * k : 5 * (k + length)][:, :, bodies], 2, 0) for k in starts
+        ]
         return np.stack(cut).reshape(-1, length, 5, 4)
 
     replayed = jax.jit(jax.vmap(lambda s, m, c: _replay(load_vehicle(), s, m, c, from_commands)))
@@ -106,8 +121,12 @@ def test_nominal_plant_agrees_with_the_rigid_simulator(nominal, from_commands):
 
     def error(name, values, ticks):
         truth = gather(name, ticks)
-        moved = truth - np.asarray(getattr(start, "velocity" if name == "velocity" else "body_rates"))
-        return np.sqrt(np.mean((values[:, ticks - 1] - truth) ** 2, 0)), np.sqrt(np.mean(moved**2, 0))
+        moved = truth - np.asarray(
+            getattr(start, "velocity" if name == "velocity" else "body_rates")
+        )
+        return np.sqrt(np.mean((values[:, ticks - 1] - truth) ** 2, 0)), np.sqrt(
+            np.mean(moved**2, 0)
+        )
 
     dv, moved_v = error("velocity", velocity, 20)
     dw, moved_w = error("rates", rates, 5)
@@ -123,7 +142,9 @@ def test_a_case_does_not_depend_on_its_companions(nominal):
 
 
 def test_a_factor_stands_in_for_a_battery_only_while_its_voltage_stays(monkeypatch):
-    """Else the key would want a name that no reader of one steady flight could know, or let any scale pass for a battery."""
+    """Else the key would want a name that no reader of one steady flight could know, or let any
+    scale pass for a battery.
+    """
     monkeypatch.setattr(cases, "TICKS", 400)
     sag = effects.draw(np.random.default_rng(1), "battery_sag", "linear") | {"size": 1.2}
     for discharge, stands_in in ((0.0, True), (0.2, False)):

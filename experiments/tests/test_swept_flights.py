@@ -1,4 +1,6 @@
-"""Radii and speeds that are swept over at once give what a game with that radius and that speed gives."""
+"""Radii and speeds that are swept over at once give what a game with that radius and that speed
+gives.
+"""
 
 import dataclasses
 
@@ -22,12 +24,15 @@ WORLDS = 12
 def test_swept_speed_and_radius_are_those_of_a_game_with_them():
     environment = Pursuit(SETTINGS)
     policy = Policy.for_environment(
-        environment, NetworkSettings(features=8, heads=2), PredictorSettings(units=4, horizons=(1, 5))
+        environment,
+        NetworkSettings(features=8, heads=2),
+        PredictorSettings(units=4, horizons=(1, 5)),
     )
     key = jax.random.key(3)
     parameters = jax.jit(lambda key: policy.init(key, environment.reset(key)[0]))(key)
     tasks = jax.vmap(lambda key: uniform_task(SETTINGS, key))(jax.random.split(key, WORLDS))
-    radii, speeds = (0.3, 0.6), jnp.where(jnp.arange(WORLDS) < 6, 1.3, 2.0)
+    radii = (0.3, 0.6)
+    speeds = jnp.where(jnp.arange(WORLDS) < 6, 1.3, 2.0)
     flown = fly(environment, policy, radii, parameters, tasks, speeds, jax.random.key(5))
     first = np.asarray(flown.first)
     keys = jax.random.split(jax.random.key(5), WORLDS)
@@ -39,7 +44,9 @@ def test_swept_speed_and_radius_are_those_of_a_game_with_them():
             observation, state = carry
             return own.step(key, state, policy.act(parameters, observation))[:2], None
 
-        return jax.lax.scan(one, own.reset_to(key, task), length=other.episode_length)[0][1].statistics
+        return jax.lax.scan(one, own.reset_to(key, task), length=other.episode_length)[0][
+            1
+        ].statistics
 
     expected = jax.jit(jax.vmap(episode))(keys, tasks)
     captured = np.asarray(first[6:, 1]) <= other.episode_length
@@ -47,7 +54,9 @@ def test_swept_speed_and_radius_are_those_of_a_game_with_them():
     assert 0 < captured.sum()
     np.testing.assert_array_equal(first[6:, 1][captured], expected.capture_step[6:][captured])
     statistics = flown.evaluation.statistics
-    np.testing.assert_allclose(statistics.collision_rate[6:], expected.collision_rate[6:], atol=1e-6)
+    np.testing.assert_allclose(
+        statistics.collision_rate[6:], expected.collision_rate[6:], atol=1e-6
+    )
     own_radius = np.where(first[:, 0] > other.episode_length, other.episode_length, first[:, 0])
     np.testing.assert_array_equal(statistics.capture_step, own_radius)
     assert (np.asarray(first[:, 1]) <= np.asarray(first[:, 0])).all()

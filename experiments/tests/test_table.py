@@ -7,7 +7,15 @@ from experiments.table import Page, Table, page_parser, publish
 
 
 def test_results_name_the_command_without_their_own_places_and_the_commit(tmp_path, monkeypatch):
-    arguments = ["--number", "3", "--name", "two words", "--commit=abc", "--out", str(tmp_path / "page")]
+    arguments = [
+        "--number",
+        "3",
+        "--name",
+        "two words",
+        "--commit=abc",
+        "--out",
+        str(tmp_path / "page"),
+    ]
     monkeypatch.setattr(sys, "argv", ["study", *arguments])
     parser = page_parser("A study.", "page")
     parser.add_argument("--number", type=int)
@@ -17,7 +25,9 @@ def test_results_name_the_command_without_their_own_places_and_the_commit(tmp_pa
         return {"number": options.number}
 
     def page(results):
-        return Page("Things", f"{results['number']} of them.", Table({"number": "number"}, [results]))
+        return Page(
+            "Things", f"{results['number']} of them.", Table({"number": "number"}, [results])
+        )
 
     publish(parser.parse_args(arguments), study, page)
     results = json.loads((tmp_path / "page.json").read_text())
@@ -30,7 +40,13 @@ def test_results_name_the_command_without_their_own_places_and_the_commit(tmp_pa
 
 
 def test_cells_of_records():
-    record = {"name": "one", "rates": {"crash": 0.25}, "seeds": [1.0, 3.0], "nan": float("nan"), "done": True}
+    record = {
+        "name": "one",
+        "rates": {"crash": 0.25},
+        "seeds": [1.0, 3.0],
+        "nan": float("nan"),
+        "done": True,
+    }
     columns = {
         "name": "name",
         "crash": "rates.crash:.3f",

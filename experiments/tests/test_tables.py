@@ -15,8 +15,11 @@ pytestmark = pytest.mark.slow
 
 
 def flight(pursuers, evader, capture, who=0, seen=None):
-    """One episode (leading axis 1) of pursuers (T, N, 2) and evader (T, 2), captured by `who` in step `capture`."""
-    pursuers, evader = np.asarray(pursuers, float), np.asarray(evader, float)
+    """One episode (leading axis 1) of pursuers (T, N, 2) and evader (T, 2), captured by `who` in
+    step `capture`.
+    """
+    pursuers = np.asarray(pursuers, float)
+    evader = np.asarray(evader, float)
     steps, number = pursuers.shape[:2]
     captured = np.zeros((1, steps, number), bool)
     if capture is not None:
@@ -37,7 +40,9 @@ def line(start, end, steps=20):
     return np.linspace(start, end, steps)
 
 
-@pytest.mark.parametrize(("second", "capture", "expected"), [(-0.7, 20, 1.0), (0.7, 20, 0.0), (-0.7, 5, 0.0)])
+@pytest.mark.parametrize(
+    ("second", "capture", "expected"), [(-0.7, 20, 1.0), (0.7, 20, 0.0), (-0.7, 5, 0.0)]
+)
 def test_both_sides_means_both_ends_at_once_before_the_capture(second, capture, expected):
     first = line([0.6, 0.7], [-0.3, 0.7])
     other = line([0.6, second], [-0.3, second])
@@ -54,7 +59,8 @@ def test_three_ways_are_three_corridors(heights, expected):
 
 def test_a_catch_from_ahead_is_told_from_one_from_behind_and_ways_are_compared():
     evader = line([0.0, 0.0], [1.0, 0.0])
-    ahead, behind = line([1.2, 0.0], [1.1, 0.0]), line([-0.5, 0.0], [0.9, 0.0])
+    ahead = line([1.2, 0.0], [1.1, 0.0])
+    behind = line([-0.5, 0.0], [0.9, 0.0])
     pursuers = np.stack([ahead, behind], axis=1)
     met = behaviours.measure("narrow_gap", *flight(pursuers, evader, 20, who=0))
     followed = behaviours.measure("narrow_gap", *flight(pursuers, evader, 20, who=1))
@@ -78,7 +84,12 @@ def test_every_method_has_its_seeds():
 
 def test_the_page_says_where_open_is_not_better_and_where_we_are_worse_than_the_paper():
     def flights(method, rate, step, collisions):
-        record = {"capture_rate": rate, "capture_step": step, "collision_rate": collisions, "crash_rate": 0.0}
+        record = {
+            "capture_rate": rate,
+            "capture_step": step,
+            "collision_rate": collisions,
+            "crash_rate": 0.0,
+        }
         layouts = {layout: {"record": record} for layout in MAIN}
         return {"method": method, "condition": "clamp", "layouts": layouts}
 
@@ -96,7 +107,9 @@ def test_sweeps_say_where_open_is_not_above():
     methods = {"APF": seeds([0.5, 1.0], [700, 90]), "OPEN": seeds([0.4, 1.0], [700, 100])}
     text = sweeps.not_above(methods, "radius", (0.1, 0.3), "m")
     assert "APF at 0.1 m (0.50 / 700 against 0.40 / 700); APF at 0.3 m" in text
-    assert "No method is above" in sweeps.not_above({"OPEN": methods["OPEN"]}, "radius", (0.1, 0.3), "m")
+    assert "No method is above" in sweeps.not_above(
+        {"OPEN": methods["OPEN"]}, "radius", (0.1, 0.3), "m"
+    )
 
 
 def test_the_pages_are_those_of_the_stored_flights():

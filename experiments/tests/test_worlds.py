@@ -19,7 +19,9 @@ def start():
 
 @pytest.mark.parametrize("name", ["plant", "rotorpy"])
 def test_worlds_fly_alike_for_a_moment(start, name):
-    """The same numbers in, the same flight out, as far as vehicles are alike: hover, then a pitch rate."""
+    """The same numbers in, the same flight out, as far as vehicles are alike: hover, then a pitch
+    rate.
+    """
     if name == "rotorpy":
         pytest.importorskip("rotorpy")
     world = make_world(name, 20, 0, start.drones, start.task)
@@ -39,7 +41,9 @@ def test_worlds_fly_alike_for_a_moment(start, name):
 
 
 def test_rotorpy_at_once_is_rotorpy_one_by_one():
-    """`Bodies` against `Multirotor.step` with a tight solver: vehicles that tumble, with every aerodynamic term."""
+    """`Bodies` against `Multirotor.step` with a tight solver: vehicles that tumble, with every
+    aerodynamic term.
+    """
     multirotor = pytest.importorskip("rotorpy.vehicles.multirotor")
     rng = np.random.default_rng(0)
     terms = {"c_Dx": 0.01, "c_Dz": 0.02, "k_h": 1e-4, "k_flap": 2e-7, "Ixy": 1e-6, "Ixz": -1.5e-6}
@@ -53,7 +57,8 @@ def test_rotorpy_at_once_is_rotorpy_one_by_one():
         "w": 4 * rng.normal(size=(3, 3)),
         "rotor_speeds": rng.uniform(500, 2400, (4, 3)),
     }
-    bodies, alone = Bodies(model, states), [{n: x[:, i] for n, x in states.items()} for i in range(3)]
+    bodies = Bodies(model, states)
+    alone = [{n: x[:, i] for n, x in states.items()} for i in range(3)]
     for _ in range(50):
         speeds = rng.uniform(0, 2600, (4, 3))  # some beyond what motors can
         bodies.step(speeds, 0.002)

@@ -1,4 +1,5 @@
-"""openjax: multi-quadrotor pursuit-evasion in JAX, trained in one compiled step, with a diagnosis of the sim-to-real gap.
+"""openjax: multi-quadrotor pursuit-evasion in JAX, trained in one compiled step, with a diagnosis
+of the sim-to-real gap.
 
 import jax, openjax
 environment = openjax.make(physics="rigid")

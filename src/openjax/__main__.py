@@ -38,7 +38,9 @@ def usage() -> str:
 
 
 def main(arguments: Sequence[str]) -> int | None:
-    """Run the command that the first argument names; returns its exit status. Raises UserError for an unknown one."""
+    """Run the command that the first argument names; returns its exit status. Raises UserError for
+    an unknown one.
+    """
     name = arguments[0] if arguments else "--help"
     if name in ("-h", "--help", "help"):
         print(usage())
@@ -53,7 +55,9 @@ def main(arguments: Sequence[str]) -> int | None:
 
 
 def entry(*command: str) -> None:
-    """What the installed script `openjax` calls; with a command's name, what `python -m openjax.NAME` does."""
+    """What the installed script `openjax` calls; with a command's name, what `python -m
+    openjax.NAME` does.
+    """
     run_command(lambda arguments: main([*command, *arguments]))
 
 

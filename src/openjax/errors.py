@@ -7,12 +7,15 @@ from collections.abc import Iterable
 class UserError(Exception):
     """Something a user asked for can't be done.
 
-    The message is one line: what was wrong, where, and what would be right. Commands print it and exit with status 2.
+    The message is one line: what was wrong, where, and what would be right. Commands print it and
+    exit with status 2.
     """
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:
-    """What an error can say of a name that isn't among the `known` ones: the one that is nearest, or all."""
+    """What an error can say of a name that isn't among the `known` ones: the one that is nearest,
+    or all.
+    """
     known = list(known)
     close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
     return f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}"

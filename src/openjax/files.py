@@ -32,7 +32,8 @@ def read_toml(path: str | Path, what: str = "file") -> dict[str, Any]:
       what: names it in errors, for example `effects file`.
 
     Raises:
-      UserError: it's missing, too large, no TOML or nested too deep, or holds integers of more than 64 bits.
+      UserError: it's missing, too large, no TOML or nested too deep, or holds integers of more than
+      64 bits.
     """
     return _read(path, what, "TOML", tomllib.loads)
 
@@ -53,9 +54,13 @@ def _read(path, what, language, parse: Callable[[str], Any]):
             raise UserError(f"{path}: {path.stat().st_size} bytes are too many for a {what}")
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
-        raise UserError(f"{path}: not readable as {language} (byte {error.start} is not UTF-8)") from None
+        raise UserError(
+            f"{path}: not readable as {language} (byte {error.start} is not UTF-8)"
+        ) from None
     except (OSError, ValueError) as error:
-        raise UserError(f"{path}: can't be read ({getattr(error, 'strerror', None) or error})") from None
+        raise UserError(
+            f"{path}: can't be read ({getattr(error, 'strerror', None) or error})"
+        ) from None
     try:
         value = parse(text)
     except RecursionError:
@@ -86,10 +91,12 @@ def _check_plain(path, value):
 
 @contextlib.contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """A path to write a file or folder to; it takes the place of `path` when the block ends without an error.
+    """A path to write a file or folder to; it takes the place of `path` when the block ends without
+    an error.
 
-    Readers see what was there before or the whole of the new, also after a power failure; after an error nothing of the
-    new is left. Whatever the disk or the permissions have against it is an `OSError`.
+    Readers see what was there before or the whole of the new, also after a power failure; after an
+    error nothing of the new is left. Whatever the disk or the permissions have against it is an
+    `OSError`.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -135,7 +142,8 @@ def read_checked(path: str | Path) -> bytes | None:
     except OSError:
         return None
     size = hashlib.sha256().digest_size
-    digest, content = written[:size], written[size:]
+    digest = written[:size]
+    content = written[size:]
     return content if hashlib.sha256(content).digest() == digest else None
 
 
@@ -148,7 +156,9 @@ def write_text(path: str | Path, text: str) -> None:
 def to_plain(value: Any) -> Any:
     """Dataclasses, tuples and paths as JSON values (dict, list, str, numbers, None)."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: to_plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+        return {
+            field.name: to_plain(getattr(value, field.name)) for field in dataclasses.fields(value)
+        }
     if isinstance(value, dict):
         return {str(key): to_plain(entry) for key, entry in value.items()}
     if isinstance(value, tuple | list):
@@ -184,11 +194,15 @@ def check_output(path: str | Path | None, option: str) -> None:
         if path.exists() and not os.access(path, os.W_OK):
             raise UserError(f"{option} {path}: may not be written to")
     except OSError as error:
-        raise UserError(f"{option} {path}: can't be written there ({error.strerror or error})") from None
+        raise UserError(
+            f"{option} {path}: can't be written there ({error.strerror or error})"
+        ) from None
 
 
 def check_output_folder(path: str | Path, option: str) -> None:
-    """Whether a folder is there or can be made, and can be written to; changes nothing. Raises UserError."""
+    """Whether a folder is there or can be made, and can be written to; changes nothing. Raises
+    UserError.
+    """
     path = Path(path).absolute()
     try:
         there = next(folder for folder in (path, *path.parents) if folder.exists())
@@ -197,11 +211,15 @@ def check_output_folder(path: str | Path, option: str) -> None:
         with tempfile.TemporaryFile(dir=there):
             pass
     except OSError as error:
-        raise UserError(f"{option} {path}: can't be written there ({error.strerror or error})") from None
+        raise UserError(
+            f"{option} {path}: can't be written there ({error.strerror or error})"
+        ) from None
 
 
 def check_new_folder(path: str | Path, option: str) -> None:
-    """Whether a folder can be made there, or is there and empty; changes nothing. Raises UserError."""
+    """Whether a folder can be made there, or is there and empty; changes nothing. Raises
+    UserError.
+    """
     path = Path(path)
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise UserError(f"{option} {path}: exists and isn't an empty folder; name another one")

@@ -1,4 +1,6 @@
-"""Packages whose names are loaded when first asked for: `openjax.learning.archive` alone needn't wait for MuJoCo."""
+"""Packages whose names are loaded when first asked for: `openjax.learning.archive` alone needn't
+wait for MuJoCo.
+"""
 
 import importlib
 from collections.abc import Callable, Mapping

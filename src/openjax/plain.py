@@ -1,4 +1,6 @@
-"""Plain values, as TOML and JSON hold them, to nested frozen dataclasses, strictly; `openjax.files.to_plain` is the way back."""
+"""Plain values, as TOML and JSON hold them, to nested frozen dataclasses, strictly;
+`openjax.files.to_plain` is the way back.
+"""
 
 import dataclasses
 import math
@@ -11,20 +13,25 @@ from openjax.errors import UserError, suggestion
 from openjax.ranges import check_intervals, shown
 
 ROOT = ": "
-"""What the name of a place ends in that is a file, and no setting: `a.toml: `, then `a.toml: motor.order`."""
+"""What the name of a place ends in that is a file, and no setting: `a.toml: `, then `a.toml:
+motor.order`.
+"""
 
 WORDS = {int: "a whole number", float: "a number", str: "text", bool: "true or false"}
 
 
 def from_plain(kind: Any, value: Any, where: str = "settings") -> Any:
-    """The inverse of `to_plain` for the annotated type `kind`; numbers are finite and lie in their intervals.
+    """The inverse of `to_plain` for the annotated type `kind`; numbers are finite and lie in their
+    intervals.
 
     Raises:
-      UserError: an unknown key, a missing one, or a value that doesn't fit its annotation; `where` names the place.
+      UserError: an unknown key, a missing one, or a value that doesn't fit its annotation; `where`
+      names the place.
     """
     if dataclasses.is_dataclass(kind):
         return _dataclass_from_plain(kind, value, where)
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    origin = typing.get_origin(kind)
+    arguments = typing.get_args(kind)
     if origin is typing.Annotated:
         return from_plain(arguments[0], value, where)
     if origin in (typing.Union, types.UnionType):
@@ -39,7 +46,9 @@ def from_plain(kind: Any, value: Any, where: str = "settings") -> Any:
             for key, entry in _table(value, where).items()
         }
     if origin is typing.Literal and value not in arguments:
-        raise UserError(f"{where} is {shown(value)}; expected one of {', '.join(map(repr, arguments))}")
+        raise UserError(
+            f"{where} is {shown(value)}; expected one of {', '.join(map(repr, arguments))}"
+        )
     return value if origin is typing.Literal else _leaf_from_plain(kind, value, where)
 
 
@@ -80,7 +89,8 @@ def _leaf_from_plain(kind, value, where):
 
 def _dataclass_from_plain(kind, value, where):
     fields = {field.name: field for field in dataclasses.fields(kind) if field.init}
-    root, given = where.removesuffix(ROOT), _table(value, where)
+    root = where.removesuffix(ROOT)
+    given = _table(value, where)
     for key in given:
         if key not in fields:
             raise UserError(
@@ -91,7 +101,9 @@ def _dataclass_from_plain(kind, value, where):
         if none and name not in given:
             raise UserError(f"{root} lacks {name}")
     hints = typing.get_type_hints(kind, include_extras=True)
-    made = kind(**{key: from_plain(hints[key], entry, _place(where, key)) for key, entry in given.items()})
+    made = kind(
+        **{key: from_plain(hints[key], entry, _place(where, key)) for key, entry in given.items()}
+    )
     check_intervals(made, _place(where, ""))
     return made
 

@@ -1,4 +1,6 @@
-"""What this machine computes with: cores as devices; a formula or its hand-written kernel, and what kernels need of arrays."""
+"""What this machine computes with: cores as devices; a formula or its hand-written kernel, and what
+kernels need of arrays.
+"""
 
 import contextlib
 import functools
@@ -16,8 +18,9 @@ MOST_CORES = 4
 def make_cores_devices() -> None:
     """Have JAX see a processor's cores as devices, before anything asks for them.
 
-    Worlds are shared out to devices whole, while most operations on all of them are too short for several threads. It
-    does nothing where there may be an accelerator, or the number of devices was asked for.
+    Worlds are shared out to devices whole, while most operations on all of them are too short for
+    several threads. It does nothing where there may be an accelerator, or the number of devices was
+    asked for.
     """
     accelerator = can_compile_for_cuda() and jax.config.jax_platforms != "cpu"
     asked = jax.config.jax_num_cpu_devices >= 0 or "device_count" in os.environ.get("XLA_FLAGS", "")
@@ -29,7 +32,9 @@ def make_cores_devices() -> None:
 
 @functools.cache
 def can_compile_for_cuda() -> bool:
-    """Whether JAX's CUDA compiler is installed: without it, nobody asks for kernels, and they needn't be traced."""
+    """Whether JAX's CUDA compiler is installed: without it, nobody asks for kernels, and they
+    needn't be traced.
+    """
     names = ("xla_cuda13", "xla_cuda12")
     return importlib.util.find_spec("jax_plugins") is not None and any(
         importlib.util.find_spec(f"jax_plugins.{name}") is not None for name in names
@@ -37,20 +42,26 @@ def can_compile_for_cuda() -> bool:
 
 
 def on_platform(reference: Callable, kernel: Callable, *static) -> Callable:
-    """A function of arrays that runs `kernel` on NVIDIA GPUs and `reference` elsewhere; `static` come first."""
+    """A function of arrays that runs `kernel` on NVIDIA GPUs and `reference` elsewhere; `static`
+    come first.
+    """
 
     def run(*arrays):
         if not can_compile_for_cuda():
             return reference(*static, *arrays)
         return jax.lax.platform_dependent(
-            *arrays, default=functools.partial(reference, *static), cuda=functools.partial(kernel, *static)
+            *arrays,
+            default=functools.partial(reference, *static),
+            cuda=functools.partial(kernel, *static),
         )
 
     return run
 
 
 def whole_blocks(array: jax.Array, size: int, axis: int = 0, mode: str = "constant") -> jax.Array:
-    """`array` padded at the end of `axis` to a multiple of `size`, for a kernel that works on whole blocks."""
+    """`array` padded at the end of `axis` to a multiple of `size`, for a kernel that works on whole
+    blocks.
+    """
     extra = -array.shape[axis] % size
     widths = [(0, extra if i == axis else 0) for i in range(array.ndim)]
     return jnp.pad(array, widths, mode=mode) if extra else array

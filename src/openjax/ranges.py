@@ -2,7 +2,8 @@
 
     learning_rate: Annotated[float, Interval("(0, 1]")] = 5e-4
 
-`check_intervals` validates by them, `--help` shows them, and one test draws values from inside and outside of each.
+`check_intervals` validates by them, `--help` shows them, and one test draws values from inside and
+outside of each.
 """
 
 import dataclasses
@@ -21,14 +22,19 @@ _NOTATION = re.compile(r"([\[(])\s*([^,\s]+)\s*,\s*([^,\s]+)\s*([\])])")
 
 @dataclasses.dataclass(frozen=True)
 class Interval:
-    """The numbers that a setting may have, in the notation of mathematics: "[1, 8]", "(0, 1]". Always bounded."""
+    """The numbers that a setting may have, in the notation of mathematics: "[1, 8]", "(0, 1]".
+    Always bounded.
+    """
 
     notation: str
     unit: str = ""
 
     def __post_init__(self):
         if not (
-            self._parts and math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high
+            self._parts
+            and math.isfinite(self.low)
+            and math.isfinite(self.high)
+            and self.low < self.high
         ):
             raise ValueError(f"{self.notation!r} is no bounded interval")
 
@@ -76,7 +82,8 @@ def ranged_fields(settings: type) -> tuple[Ranged, ...]:
     found = []
     for name, hint in typing.get_type_hints(settings, include_extras=True).items():
         interval = next(
-            (entry for entry in getattr(hint, "__metadata__", ()) if isinstance(entry, Interval)), None
+            (entry for entry in getattr(hint, "__metadata__", ()) if isinstance(entry, Interval)),
+            None,
         )
         if interval is None:
             continue
@@ -85,7 +92,9 @@ def ranged_fields(settings: type) -> tuple[Ranged, ...]:
         if optional:
             kind = next(entry for entry in typing.get_args(kind) if entry is not type(None))
         several = typing.get_origin(kind) is tuple
-        found.append(Ranged(name, typing.get_args(kind)[0] if several else kind, interval, several, optional))
+        found.append(
+            Ranged(name, typing.get_args(kind)[0] if several else kind, interval, several, optional)
+        )
     return tuple(found)
 
 
@@ -107,13 +116,20 @@ def check_intervals(settings: Any, group: str = "") -> None:
             raise UserError(f"{group}{field.name} is {shown(given)}; it must be a list of numbers")
         kind = numbers.Integral if field.kind is int else numbers.Real
         for value in given if field.several else (given,):
-            if isinstance(value, bool) or not isinstance(value, kind) or value not in field.interval:
+            if (
+                isinstance(value, bool)
+                or not isinstance(value, kind)
+                or value not in field.interval
+            ):
                 whole = "a whole number in" if field.kind is int else "in"
-                raise UserError(f"{group}{field.name} is {shown(value)}; it must be {whole} {field.interval}")
+                raise UserError(
+                    f"{group}{field.name} is {shown(value)}; it must be {whole} {field.interval}"
+                )
 
 
 def changed(settings: Any, **changes) -> Any:
-    """`dataclasses.replace` for settings within settings: a dict stands for changes of the settings under that name.
+    """`dataclasses.replace` for settings within settings: a dict stands for changes of the settings
+    under that name.
 
     `changed(preset("paper"), seed=1, environment=dict(reward=dict(crash=40.0)))`
 

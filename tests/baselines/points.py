@@ -14,7 +14,9 @@ from openjax.vehicle import DroneState
 
 @dataclasses.dataclass(frozen=True)
 class Points:
-    """Dynamics in which pursuers are points: the last three numbers of an action are a velocity, as shares of `speed` (m/s)."""
+    """Dynamics in which pursuers are points: the last three numbers of an action are a velocity, as
+    shares of `speed` (m/s).
+    """
 
     speed: float
     time_step: float
@@ -25,7 +27,9 @@ class Points:
     def __call__(self, vehicle, drones: DroneState, command: jax.Array, *_) -> DroneState:
         share = command[:, 1:] / jnp.pi
         velocity = self.speed * share / jnp.maximum(length(share), 1.0)
-        return drones.replace(velocity=velocity, position=drones.position + self.time_step * velocity)
+        return drones.replace(
+            velocity=velocity, position=drones.position + self.time_step * velocity
+        )
 
     def seen(self, drones: DroneState, effect_parameters=None) -> DroneState:
         return drones
@@ -40,7 +44,9 @@ def game_of_points(**changes) -> Pursuit:
 
 @dataclasses.dataclass(frozen=True)
 class Team:
-    """A policy for `Points`, by a function from observations to velocities (..., N, 3) as shares of the speed."""
+    """A policy for `Points`, by a function from observations to velocities (..., N, 3) as shares of
+    the speed.
+    """
 
     velocity: Callable[[Observation], jax.Array]
 

@@ -27,7 +27,9 @@ APART = Task(
 
 
 def test_the_velocity_controllers_step_response():
-    """From tilted rest to full speed along an axis and back to hover: fast, hardly overshooting, height kept."""
+    """From tilted rest to full speed along an axis and back to hover: fast, hardly overshooting,
+    height kept.
+    """
     craft = Craft.of(HONEST)
 
     @jax.jit
@@ -62,11 +64,15 @@ def test_surroundings_are_what_the_observation_says():
         return (observation, state), None
 
     start = jax.jit(HONEST.reset_to)(jax.random.key(1), APART)
-    (observation, state), _ = jax.jit(lambda start: jax.lax.scan(one, start, None, length=60))(start)
+    (observation, state), _ = jax.jit(lambda start: jax.lax.scan(one, start, None, length=60))(
+        start
+    )
     known = surroundings(craft, observation)
     velocity = np.asarray(state.drones.velocity)
     np.testing.assert_allclose(known.target_velocity[1], state.evader_velocity, atol=1e-6)
-    np.testing.assert_allclose(known.from_others_velocity[0, 0], velocity[0] - velocity[1], atol=0.1)
+    np.testing.assert_allclose(
+        known.from_others_velocity[0, 0], velocity[0] - velocity[1], atol=0.1
+    )
     np.testing.assert_allclose(known.team_velocity[0], velocity.mean(axis=0), atol=0.05)
     # where all will be after the vehicle's response, straight on
     later = np.asarray(state.drones.position) + craft.response * velocity
@@ -102,22 +108,30 @@ def test_a_heuristic_says_what_it_cannot_fly(changes, complaint):
 
 def test_a_velocity_policy_flies_the_velocity_that_its_network_puts_out():
     """Where it asks for more than the drones may fly, their largest speed."""
-    network, predictor = NetworkSettings(output="velocity", squash="mean"), PredictorSettings(enabled=False)
+    network = NetworkSettings(output="velocity", squash="mean")
+    predictor = PredictorSettings(enabled=False)
     policy = VelocityPolicy.for_environment(HONEST, network, predictor)
     sample = jnp.array([[0.3, -0.4, 0.0], [2.0, 1.0, 0.0]])
 
     def one(carry, _):
         observation, state = carry
-        observation, state, *_ = HONEST.step(jax.random.key(0), state, policy.action(sample, observation))
+        observation, state, *_ = HONEST.step(
+            jax.random.key(0), state, policy.action(sample, observation)
+        )
         return (observation, state), None
 
     start = jax.jit(HONEST.reset_to)(jax.random.key(1), APART)
     (_, state), _ = jax.jit(lambda start: jax.lax.scan(one, start, None, length=80))(start)
     diagonal = policy.craft.speed / np.sqrt(2.0)
-    expected = [[0.3 * policy.craft.speed, -0.4 * policy.craft.speed, 0.0], [diagonal, diagonal, 0.0]]
+    expected = [
+        [0.3 * policy.craft.speed, -0.4 * policy.craft.speed, 0.0],
+        [diagonal, diagonal, 0.0],
+    ]
     np.testing.assert_allclose(state.drones.velocity, expected, atol=0.05)
     with pytest.raises(UserError, match="control steps"):
-        VelocityPolicy.for_environment(openjax.make(physics="rigid", time_step=0.05), network, predictor)
+        VelocityPolicy.for_environment(
+            openjax.make(physics="rigid", time_step=0.05), network, predictor
+        )
 
 
 def test_dacoop_flies_the_field_that_its_network_sets():
@@ -139,10 +153,21 @@ def test_dacoop_flies_the_field_that_its_network_sets():
 
 def test_evaluation_through_the_command(tmp_path, capsys):
     out = tmp_path / "out.json"
-    options = ["--environment.physics", "rigid", "--environment.episode_length", "40", "--episodes", "4"]
+    options = [
+        "--environment.physics",
+        "rigid",
+        "--environment.episode_length",
+        "40",
+        "--episodes",
+        "4",
+    ]
     assert main(["--policy", "apf", "--scenario", "empty", "--json", str(out), *options]) == 0
     record = json.loads(out.read_text())
-    assert record["scenario"] == "empty" and record["episodes"] == 4 and record["prediction_error"] is None
+    assert (
+        record["scenario"] == "empty"
+        and record["episodes"] == 4
+        and record["prediction_error"] is None
+    )
     assert record["collision_rate"] < 0.2 and record["over_speed_rate"] == 0.0
     with pytest.raises(UserError, match="control steps"):
         main(["--policy", "janosov", "--scenario", "wall", "--environment.time_step", "0.05"])

@@ -19,13 +19,18 @@ FAR = 9.0
 
 
 def situation(position, target, velocity=None, target_velocity=(0.0, 0.0, 0.0), pillars=()):
-    """Surroundings of N pursuers at (N, 3) in the middle of a wide, high arena with pillars (x, y) of radius 0.1 m."""
+    """Surroundings of N pursuers at (N, 3) in the middle of a wide, high arena with pillars (x, y)
+    of radius 0.1 m.
+    """
     position = np.asarray(position, np.float32)
     n = len(position)
-    velocity = np.zeros((n, 3), np.float32) if velocity is None else np.asarray(velocity, np.float32)
+    velocity = (
+        np.zeros((n, 3), np.float32) if velocity is None else np.asarray(velocity, np.float32)
+    )
     index = [[j for j in range(n) if j != i] for i in range(n)]
     index = np.array(index, int).reshape(n, n - 1)
-    normal, distance = np.zeros((n, 4, 2), np.float32), np.full((n, 4), FAR, np.float32)
+    normal = np.zeros((n, 4, 2), np.float32)
+    distance = np.full((n, 4), FAR, np.float32)
     normal[:, :, 0] = 1.0
     for k, pillar in enumerate(pillars):
         offset = position[:, :2] - np.asarray(pillar)
@@ -62,11 +67,15 @@ def test_a_lone_pursuer_flies_straight_to_a_resting_evader(name):
 def test_angelani_adds_attraction_alignment_and_repulsion():
     parameters = AngelaniParameters(alignment=0.5, repulsion=2.0, repulsion_range=0.3, width=0.1)
     known = situation(
-        [[0.0, 0.0, 1.0], [0.0, 0.4, 1.0]], [1.0, 0.0, 1.0], velocity=[[0.0, 1.0, 0.0], [0.0, 1.0, 0.0]]
+        [[0.0, 0.0, 1.0], [0.0, 0.4, 1.0]],
+        [1.0, 0.0, 1.0],
+        velocity=[[0.0, 1.0, 0.0], [0.0, 1.0, 0.0]],
     )
     # one Fermi function a tenth of a metre beyond its range, in units of its width: 1 / (1 + e)
     expected = np.array([1.0, 0.5 - 2.0 / (1.0 + np.e), 0.0])
-    np.testing.assert_allclose(angelani(CRAFT, parameters, known)[0], CRAFT.speed * unit(expected), atol=1e-4)
+    np.testing.assert_allclose(
+        angelani(CRAFT, parameters, known)[0], CRAFT.speed * unit(expected), atol=1e-4
+    )
 
 
 def test_janosov_leads_a_moving_evader_and_spreads():
@@ -79,14 +88,20 @@ def test_janosov_leads_a_moving_evader_and_spreads():
     )
     lone = situation([[0.0, 0.0, 1.0]], [1.0, 0.0, 1.0], target_velocity=[0.0, 1.3, 0.0])
     expected = unit([1.0, 0.2 * 1.3, 0.0])
-    np.testing.assert_allclose(janosov(CRAFT, parameters, lone)[0], CRAFT.speed * expected, atol=1e-4)
+    np.testing.assert_allclose(
+        janosov(CRAFT, parameters, lone)[0], CRAFT.speed * expected, atol=1e-4
+    )
     near = situation([[0.9, 0.0, 1.0]], [1.0, 0.0, 1.0], target_velocity=[0.0, 1.3, 0.0])
     ahead = 0.1 / 1.3  # it would be there before the prediction's end
     expected = unit([0.1, ahead * 1.3, 0.0])
-    np.testing.assert_allclose(janosov(CRAFT, parameters, near)[0], CRAFT.speed * expected, atol=1e-4)
+    np.testing.assert_allclose(
+        janosov(CRAFT, parameters, near)[0], CRAFT.speed * expected, atol=1e-4
+    )
     two = situation([[0.0, 0.0, 1.0], [0.0, 0.5, 1.0]], [1.0, 0.0, 1.0])
     expected = unit([1.0, -0.5, 0.0])
-    np.testing.assert_allclose(janosov(CRAFT, parameters, two)[0], CRAFT.speed * expected, atol=1e-4)
+    np.testing.assert_allclose(
+        janosov(CRAFT, parameters, two)[0], CRAFT.speed * expected, atol=1e-4
+    )
 
 
 def test_janosovs_walls_stop_a_pursuer_at_their_surface_and_are_not_felt_beyond_their_range():
@@ -94,14 +109,19 @@ def test_janosovs_walls_stop_a_pursuer_at_their_surface_and_are_not_felt_beyond_
     at_surface = situation([[-0.1, 0.0, 1.0]], [1.0, 0.0, 1.0], pillars=[(0.0, 0.0)])
     np.testing.assert_allclose(janosov(CRAFT, parameters, at_surface)[0], 0.0, atol=1e-4)
     half_way = situation([[-0.2, 0.0, 1.0]], [1.0, 0.0, 1.0], pillars=[(0.0, 0.0)])
-    np.testing.assert_allclose(janosov(CRAFT, parameters, half_way)[0], [0.5 * CRAFT.speed, 0, 0], atol=1e-3)
+    np.testing.assert_allclose(
+        janosov(CRAFT, parameters, half_way)[0], [0.5 * CRAFT.speed, 0, 0], atol=1e-3
+    )
     beyond = situation([[-0.31, 0.0, 1.0]], [1.0, 0.0, 1.0], pillars=[(0.0, 0.0)])
-    np.testing.assert_allclose(janosov(CRAFT, parameters, beyond)[0], [CRAFT.speed, 0, 0], atol=1e-4)
+    np.testing.assert_allclose(
+        janosov(CRAFT, parameters, beyond)[0], [CRAFT.speed, 0, 0], atol=1e-4
+    )
 
 
 def test_the_fields_forces_in_closed_form():
     parameters = ApfParameters(repulsion=1e-3, influence=0.3, margin=0.1, balance=0.1)
-    # 0.2 m from a pillar's surface: 0.1 m beyond the margin; others 0.34 m apart: 0.2 m beyond theirs
+    # 0.2 m from a pillar's surface: 0.1 m beyond the margin; others 0.34 m apart: 0.2 m beyond
+    # theirs
     known = situation(
         [[-0.3, 0.0, 1.0], [-0.3, 0.34, 1.0]], [0.0, 2.0, 1.0], pillars=[(0.0, 0.0), (0.0, -4.0)]
     )
@@ -113,18 +133,25 @@ def test_the_fields_forces_in_closed_form():
     between = situation([[0.0, 0.0, 1.0]], [0.0, 2.0, 1.0], pillars=[(0.3, 0.0), (-0.3, 0.0)])
     np.testing.assert_allclose(forces(parameters, between).repulsion[0], 0.0, atol=1e-5)
     nearer = situation([[-0.27, 0.0, 1.0], [-0.27, 0.24, 1.0]], [0.0, 2.0, 1.0])
-    np.testing.assert_allclose(forces(parameters, nearer).individual[0], [0.0, -0.5, 0.0], atol=1e-4)
+    np.testing.assert_allclose(
+        forces(parameters, nearer).individual[0], [0.0, -0.5, 0.0], atol=1e-4
+    )
 
 
 @pytest.mark.parametrize("drift", [-1.0, 1.0])
 def test_in_front_of_a_pillar_the_field_follows_its_wall_to_the_side_it_flies_to(drift):
     parameters = ApfParameters(repulsion=0.01, influence=0.3, margin=0.07, balance=0.1)
     known = situation(
-        [[-0.2, 0.0, 1.0]], [1.0, 0.0, 1.0], velocity=[[0.3, 0.2 * drift, 0.0]], pillars=[(0.0, 0.0)]
+        [[-0.2, 0.0, 1.0]],
+        [1.0, 0.0, 1.0],
+        velocity=[[0.3, 0.2 * drift, 0.0]],
+        pillars=[(0.0, 0.0)],
     )
     field = forces(parameters, known)
     assert float(jnp.sum((field.attraction + field.repulsion) * field.attraction)) < 0.0
-    np.testing.assert_allclose(apf(CRAFT, parameters, known)[0], [0.0, drift * CRAFT.speed, 0.0], atol=1e-3)
+    np.testing.assert_allclose(
+        apf(CRAFT, parameters, known)[0], [0.0, drift * CRAFT.speed, 0.0], atol=1e-3
+    )
     # beside the pillar it is no longer in the way
     past = situation([[0.2, 0.25 * drift, 1.0]], [1.0, 0.25 * drift, 1.0], pillars=[(0.0, 0.0)])
     assert apf(CRAFT, parameters, past)[0, 0] > 0.5 * CRAFT.speed
@@ -132,7 +159,9 @@ def test_in_front_of_a_pillar_the_field_follows_its_wall_to_the_side_it_flies_to
 
 def test_inside_the_margin_it_turns_away_from_the_obstacle_as_well():
     parameters = ApfParameters(repulsion=0.01, influence=0.3, margin=0.12, balance=0.1)
-    known = situation([[-0.2, 0.0, 1.0]], [1.0, 0.0, 1.0], velocity=[[0.3, 0.2, 0.0]], pillars=[(0.0, 0.0)])
+    known = situation(
+        [[-0.2, 0.0, 1.0]], [1.0, 0.0, 1.0], velocity=[[0.3, 0.2, 0.0]], pillars=[(0.0, 0.0)]
+    )
     expected = CRAFT.speed * unit([-1.0, 1.0, 0.0])
     np.testing.assert_allclose(apf(CRAFT, parameters, known)[0], expected, atol=1e-3)
 
@@ -162,7 +191,8 @@ def test_turning_the_world_turns_the_velocities(name):
     key = jax.random.key(3)
     turned = turn_task(key, task)
     angle = np.arctan2(*np.asarray(turned.evader_position)[1::-1]) - np.arctan2(0.1, -0.3)
-    method, craft = METHODS[name], Craft.of(environment)
+    method = METHODS[name]
+    craft = Craft.of(environment)
 
     @jax.jit
     def desired(task):
@@ -170,7 +200,8 @@ def test_turning_the_world_turns_the_velocities(name):
         return method.rule(craft, best(name, method.kind), surroundings(craft, observation))
 
     rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    plain, other = np.asarray(desired(task)), np.asarray(desired(turned))
+    plain = np.asarray(desired(task))
+    other = np.asarray(desired(turned))
     np.testing.assert_allclose(other[:, :2], plain[:, :2] @ rotation.T, atol=1e-4)
     np.testing.assert_allclose(other[:, 2], plain[:, 2], atol=1e-4)
 

@@ -1,4 +1,6 @@
-"""Stack with point pursuers: it catches every scripted evader inside its bound, and one gets away close outside."""
+"""Stack with point pursuers: it catches every scripted evader inside its bound, and one gets away
+close outside.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -17,8 +19,11 @@ EVADERS = ("field", "greedy", "greedy_near", "wall_runner", "way_points")
 
 
 def round_the_wall(settings, place):
-    """(3,) wish of an evader at (3,) `place` that runs round the wall, half-way between two pursuers' heights."""
-    between, step = settings.arena_height * jnp.array([1.0, 2.0]) / 3, settings.evader_speed * STEP
+    """(3,) wish of an evader at (3,) `place` that runs round the wall, half-way between two
+    pursuers' heights.
+    """
+    between = settings.arena_height * jnp.array([1.0, 2.0]) / 3
+    step = settings.evader_speed * STEP
     up = jnp.clip((between[jnp.argmin(jnp.abs(between - place[2]))] - place[2]) / step, -1.0, 1.0)
     radius = jnp.linalg.norm(place[:2])
     out = place[:2] / radius
@@ -28,12 +33,14 @@ def round_the_wall(settings, place):
 
 
 def captures(number=64, wish=None, **changes):
-    """(kinds, number) whether each scripted evader is caught, from drawn starts in an empty arena; (kinds, number) steps.
+    """(kinds, number) whether each scripted evader is caught, from drawn starts in an empty arena;
+    (kinds, number) steps.
 
     With a `wish` (settings, place -> (3,)) all do as it says.
     """
     environment = game_of_points(evaders=EVADERS, episode_length=500, **changes)
-    settings, team = environment.settings, stack_team(environment)
+    settings = environment.settings
+    team = stack_team(environment)
 
     def fly(key, kind):
         task = uniform_task(settings, key)
@@ -48,7 +55,9 @@ def captures(number=64, wish=None, **changes):
             observation, state, *_ = environment.step(key, state, action, wished)
             return (observation, state), None
 
-        return jax.lax.scan(one, (observation, state), length=settings.episode_length)[0][1].statistics
+        return jax.lax.scan(one, (observation, state), length=settings.episode_length)[0][
+            1
+        ].statistics
 
     keys = jax.random.split(jax.random.key(0), number)
     kinds = jnp.arange(len(EVADERS))
@@ -59,7 +68,9 @@ def captures(number=64, wish=None, **changes):
 
 def test_the_bound_of_the_papers_arena():
     assert stack_bound(PursuitSettings()) == pytest.approx(0.9 / (0.9 - 0.05**0.5))
-    assert stack_bound(PursuitSettings(num_pursuers=2)) == 0.0  # a height of .3 m isn't covered by .3 m
+    assert (
+        stack_bound(PursuitSettings(num_pursuers=2)) == 0.0
+    )  # a height of .3 m isn't covered by .3 m
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
-"""Calibration: a vehicle with other constants, flown and logged, is recovered within the intervals; what
-flights can't tell is said and kept nominal."""
+"""Calibration: a vehicle with other constants, flown and logged, is recovered within the intervals;
+what flights can't tell is said and kept nominal.
+"""
 
 import dataclasses
 import subprocess
@@ -22,7 +23,13 @@ from openjax.vehicle.vehicle_file import Motor, VehicleFile, load_vehicle_file
 
 NOMINAL = load_vehicle()
 # Relative to nominal: thrust, inertia xx, yy, torque per thrust's share, motor time constant.
-ALTERED = {"thrust_constant": 1.09, "xx": 1.2, "yy": 0.85, "torque_constant": 0.4, "motor_time_constant": 1.8}
+ALTERED = {
+    "thrust_constant": 1.09,
+    "xx": 1.2,
+    "yy": 0.85,
+    "torque_constant": 0.4,
+    "motor_time_constant": 1.8,
+}
 
 
 def altered(thrust_constant, xx, yy, torque_constant, motor_time_constant):
@@ -35,7 +42,12 @@ def altered(thrust_constant, xx, yy, torque_constant, motor_time_constant):
 
 
 def fly_case(
-    plant, effects=None, change=lambda c: c, weighed=True, names=("flight_a", "flight_b", "flight_c"), **file
+    plant,
+    effects=None,
+    change=lambda c: c,
+    weighed=True,
+    names=("flight_a", "flight_b", "flight_c"),
+    **file,
 ):
     flights = []
     for number, (name, reference) in enumerate(references(seed=1, duration=8.0).items()):
@@ -58,7 +70,11 @@ def truths(scale):
     return [
         ("thrust_constant", 0, float(NOMINAL.thrust_constant) * scale["thrust_constant"]),
         ("torque_constant", 0, float(NOMINAL.torque_constant) * scale["torque_constant"]),
-        ("motor_time_constant", 0, float(NOMINAL.motor_time_constant) * scale["motor_time_constant"]),
+        (
+            "motor_time_constant",
+            0,
+            float(NOMINAL.motor_time_constant) * scale["motor_time_constant"],
+        ),
         ("inertia", 0, inertia[0] * scale["xx"]),
         ("inertia", 1, inertia[1] * scale["yy"]),
     ]
@@ -69,9 +85,12 @@ def assert_recovered(result, scale, tolerance, but=()):
         if name not in but:
             quantity = result.quantities[name]
             low, high = quantity.interval90[axis]
-            # Of some thirty 90 % intervals here three may miss: half as wide again must hold them all.
+            # Of some thirty 90 % intervals here three may miss: half as wide again must hold them
+            # all.
             half_width = 0.5 * np.log(high / low)
-            assert quantity.determined and abs(np.log(quantity.value[axis] / truth)) < 1.5 * half_width, (
+            assert (
+                quantity.determined and abs(np.log(quantity.value[axis] / truth)) < 1.5 * half_width
+            ), (
                 name,
                 axis,
             )
@@ -101,7 +120,9 @@ def test_drag_and_an_offset_centre_of_mass_are_not_taken_for_the_constants():
 def test_without_weighing_the_assumed_mass_carries_over(altered_case):
     file = dataclasses.replace(altered_case.vehicle_file, mass_weighed=False)
     heavier = dataclasses.replace(file, vehicle=NOMINAL.replace(mass=NOMINAL.mass * 1.1))
-    weighed, assumed = (calibrate(dataclasses.replace(altered_case, vehicle_file=f)) for f in (file, heavier))
+    weighed, assumed = (
+        calibrate(dataclasses.replace(altered_case, vehicle_file=f)) for f in (file, heavier)
+    )
     for name in ("thrust_constant", "inertia"):
         ratio = assumed.quantities[name].value[0] / weighed.quantities[name].value[0]
         assert ratio == pytest.approx(1.1, rel=0.01)
@@ -127,7 +148,9 @@ def test_with_duty_cycles_the_thrust_map_is_a_nuisance():
         full = 4 * float(NOMINAL.thrust_constant * NOMINAL.max_rotor_speed**2) / 9.81e-3  # g
         motors = {}
         for name in ("m1", "m2", "m3", "m4"):
-            grams = 0.8 * full * columns[name]  # the vehicle gives 1 / 0.8 of what the public map says
+            grams = (
+                0.8 * full * columns[name]
+            )  # the vehicle gives 1 / 0.8 of what the public map says
             motors[name] = (-0.0006239 * grams**2 + 0.088 * grams) / voltage
         return columns | motors
 
@@ -135,7 +158,8 @@ def test_with_duty_cycles_the_thrust_map_is_a_nuisance():
     result = calibrate(fly_case(altered(**scale), change=duty_cycles, motor=Motor(command="pwm")))
     assert "thrust_constant" not in result.calibrated()
     assert any(
-        "Against the public map the flights' thrust per assumed mass is 1.2" in t for t in result.cannot_tell
+        "Against the public map the flights' thrust per assumed mass is 1.2" in t
+        for t in result.cannot_tell
     )
     assert_recovered(result, scale, 0.1, but=("thrust_constant",))
 
@@ -144,11 +168,16 @@ def test_what_is_not_excited_is_left_nominal():
     """The motors' common part alone, so that no torque acts."""
     case = fly_case(NOMINAL, names=("flight_a", "flight_b"))
     common = tuple(
-        dataclasses.replace(f, motor_command=np.repeat(f.motor_command.mean(1, keepdims=True), 4, 1))
+        dataclasses.replace(
+            f, motor_command=np.repeat(f.motor_command.mean(1, keepdims=True), 4, 1)
+        )
         for f in case.flights
     )
     result = calibrate(dataclasses.replace(case, flights=common))
-    assert not result.quantities["inertia"].determined and not result.quantities["torque_constant"].determined
+    assert (
+        not result.quantities["inertia"].determined
+        and not result.quantities["torque_constant"].determined
+    )
     assert "thrust_constant" in result.calibrated()
 
 
@@ -166,7 +195,12 @@ def test_the_command_writes_a_file_that_loads(case_folder, tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "What these flights can't tell" in printed and "thrust constant" in printed
     file = load_vehicle_file(out)
-    assert set(file.calibrated) == {"thrust_constant", "torque_constant", "motor_time_constant", "inertia"}
+    assert set(file.calibrated) == {
+        "thrust_constant",
+        "torque_constant",
+        "motor_time_constant",
+        "inertia",
+    }
     np.testing.assert_allclose(file.vehicle.thrust_constant, NOMINAL.thrust_constant, rtol=0.02)
     with pytest.raises(UserError, match="--overwrite"):
         main([str(case_folder), "--out", str(out)])
@@ -184,7 +218,8 @@ def test_as_a_command_a_bad_case_exits_with_status_2(tmp_path):
 
 @pytest.mark.parametrize("problem", ["no folder", "unknown key", "no logs"])
 def test_bad_input_is_one_line_and_leaves_nothing(case_folder, tmp_path, problem):
-    out, case = tmp_path / "out.toml", case_folder
+    out = tmp_path / "out.toml"
+    case = case_folder
     if problem == "no folder":
         case = tmp_path / "nowhere"
     elif problem == "unknown key":

@@ -1,5 +1,6 @@
-"""Training on several devices and processes: the same result on the same worlds, resumed on another number of devices,
-and one clear line when a process is lost or the worlds can't be shared out. Virtual CPU devices, processes on loopback.
+"""Training on several devices and processes: the same result on the same worlds, resumed on another
+number of devices, and one clear line when a process is lost or the worlds can't be shared out.
+Virtual CPU devices, processes on loopback.
 """
 
 import os
@@ -31,7 +32,8 @@ OPTIONS = """
     --num_envs 32 --rollout_length 10 --restart_every 2 --restart_steps 10 --total_steps 100000000 --validation_episodes 2
 """.split()
 
-# The same run on one device and on four of one process, next to that of two processes with two devices each.
+# The same run on one device and on four of one process, next to that of two processes with two
+# devices each.
 ONE_PROCESS = """
 import sys
 from pathlib import Path
@@ -156,9 +158,12 @@ def train(*options, **popen):
 
 @pytest.fixture(scope="module")
 def killed(tmp_path_factory):
-    """A run of two processes, the second killed after its first checkpoint: directory, the first's end."""
+    """A run of two processes, the second killed after its first checkpoint: directory, the first's
+    end.
+    """
     directory = tmp_path_factory.mktemp("job")
-    run, address = directory / "run", free_address()
+    run = directory / "run"
+    address = free_address()
     processes = []
     for i in range(2):
         job = ("--coordinator_address", address, "--num_processes", 2, "--process_id", i)
@@ -175,7 +180,13 @@ def killed(tmp_path_factory):
         for process in processes:
             process.kill()
             process.wait()
-    return run, status, seconds, (directory / "0.err").read_text(), (directory / "1.out").read_text()
+    return (
+        run,
+        status,
+        seconds,
+        (directory / "0.err").read_text(),
+        (directory / "1.out").read_text(),
+    )
 
 
 def test_lost_process_ends_the_others_with_one_line(killed):
@@ -198,7 +209,9 @@ def test_only_the_first_process_writes_and_shows(killed):
     assert updates[:UPDATES] == [1, 2, 3] and len(set(updates)) == len(updates)
 
 
-def test_any_number_of_devices_and_processes_trains_alike_and_goes_on_from_each_other(killed, tmp_path):
+def test_any_number_of_devices_and_processes_trains_alike_and_goes_on_from_each_other(
+    killed, tmp_path
+):
     command = [sys.executable, "-c", ONE_PROCESS, str(killed[0]), str(tmp_path), str(UPDATES)]
     done = subprocess.run(command, env=environment_with(4), capture_output=True, text=True)
     assert done.returncode == 0 and "same" in done.stdout, done.stderr[-3000:]
@@ -209,7 +222,10 @@ def test_worlds_that_cannot_be_shared_out_are_an_error_of_one_line(tmp_path):
     process = train("--devices", "all", "--out", tmp_path / "run", env=environment_with(3), **pipes)
     _, error = process.communicate()
     assert process.returncode == 2
-    assert error == "error: num_envs 32 can't be shared out to 3 devices; 48 could, or --devices 1 or 2\n"
+    assert (
+        error
+        == "error: num_envs 32 can't be shared out to 3 devices; 48 could, or --devices 1 or 2\n"
+    )
     assert not (tmp_path / "run").exists()
 
 
@@ -228,7 +244,9 @@ def test_the_loss_of_process_0_is_told_by_the_others():
     _, error = other.communicate(timeout=20)
     first.communicate()
     assert other.returncode == 1
-    assert re.fullmatch(r"error: process 0 of 2 \(on \S+\) was lost: .*; start it again\n", error), error
+    assert re.fullmatch(
+        r"error: process 0 of 2 \(on \S+\) was lost: .*; start it again\n", error
+    ), error
 
 
 SLURM = {
@@ -258,7 +276,9 @@ OPEN_MPI = {
         (OPEN_MPI, (None, None, None, True), Membership("10.0.0.1:61442", 2, 1, "ompi")),
     ],
 )
-def test_membership_comes_from_the_command_line_or_the_manager(monkeypatch, variables, arguments, expected):
+def test_membership_comes_from_the_command_line_or_the_manager(
+    monkeypatch, variables, arguments, expected
+):
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
     assert find_membership(*arguments) == expected

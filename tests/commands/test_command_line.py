@@ -1,4 +1,6 @@
-"""One place turns whatever isn't openjax's to mend into one line with exit status 2; mistakes of openjax keep their trace."""
+"""One place turns whatever isn't openjax's to mend into one line with exit status 2; mistakes of
+openjax keep their trace.
+"""
 
 import io
 import os
@@ -23,7 +25,10 @@ def raising(error):
     ("error", "line"),
     [
         (UserError("too\n  wide"), "error: too wide"),
-        (OSError(28, "No space left on device", "runs/a"), "error: runs/a: no space left on device"),
+        (
+            OSError(28, "No space left on device", "runs/a"),
+            "error: runs/a: no space left on device",
+        ),
         (PermissionError(13, "Permission denied", "out"), "error: out: permission denied"),
         (
             ValueError("tensorstore: No space left on device [/x]"),
@@ -38,7 +43,11 @@ def test_what_the_machine_or_the_user_did_is_one_line(error, line, capsys):
         run_command(raising(error))
     shown = capsys.readouterr().err
     assert stop.value.code == 2
-    assert shown.startswith(line) and shown.count("\n") == 1 and len(shown) <= LONGEST + len("error: \n")
+    assert (
+        shown.startswith(line)
+        and shown.count("\n") == 1
+        and len(shown) <= LONGEST + len("error: \n")
+    )
 
 
 def test_a_mistake_of_openjax_is_not_hidden():
@@ -82,5 +91,6 @@ def test_a_mistyped_option_is_told_what_would_be_right(typed, told):
 def test_numbers_and_truths_may_be_written_as_people_do():
     typed = "--total_steps 2e6 --environment.observe_position true --minutes 1e1".split()
     command = parse(ExploitCommand, ExploitCommand(), typed, "openjax exploit")
-    settings, game = command.learning, command.environment
+    settings = command.learning
+    game = command.environment
     assert (settings.total_steps, game.observe_position, command.minutes) == (2_000_000, True, 10.0)

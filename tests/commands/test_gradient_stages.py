@@ -21,15 +21,21 @@ SETTINGS = preset(
 def test_the_first_flights_stop_when_asked_to():
     environment = build(SETTINGS).environment
     fresh = make_start(SETTINGS)(jax.random.key(0)).policy
-    said, asked = [], iter([False, True])
+    said = []
+    asked = iter([False, True])
     _, learn = compile_first_flights(
-        first_flights(SETTINGS, environment), jax.eval_shape(lambda: fresh), said.append, lambda: next(asked)
+        first_flights(SETTINGS, environment),
+        jax.eval_shape(lambda: fresh),
+        said.append,
+        lambda: next(asked),
     )
     learnt = learn(fresh, jax.random.key(1))
     assert len(said) == 1 and said[0].startswith(f"{TOGETHER} of {2 * TOGETHER} updates, ")
     moved = [
         np.abs(np.asarray(new) - old).max()
-        for new, old in zip(jax.tree.leaves(learnt.actor), jax.tree.leaves(fresh.actor), strict=True)
+        for new, old in zip(
+            jax.tree.leaves(learnt.actor), jax.tree.leaves(fresh.actor), strict=True
+        )
     ]
     assert 0.0 < max(moved) < 1.0
     assert learnt.critic is fresh.critic

@@ -18,7 +18,9 @@ def test_another_game_is_said_to_be_one_and_judged_by_layouts_like_it():
 def test_the_papers_game_is_judged_by_all_six():
     paper = preset("paper")
     assert len(layouts_like(paper.environment)) == 6
-    assert not any("Easier" in line for line in closing_words(paper, Path("runs/train"), on_cpu=False))
+    assert not any(
+        "Easier" in line for line in closing_words(paper, Path("runs/train"), on_cpu=False)
+    )
 
 
 def test_a_changed_preset_is_not_announced_as_the_preset():
@@ -27,4 +29,6 @@ def test_a_changed_preset_is_not_announced_as_the_preset():
         "preset flight: Policies to be flown"
     )
     changed = preset("flight", environment=dict(evader_speed=2.0), num_envs=20480)
-    assert opening_words(changed).startswith("preset flight, changed in environment.evader_speed, num_envs: ")
+    assert opening_words(changed).startswith(
+        "preset flight, changed in environment.evader_speed, num_envs: "
+    )

@@ -37,7 +37,9 @@ GOOD = {
         ([0.1], 0, 3),
     ],
 )
-def test_last_stage_keeps_what_validates_best_and_ends_when_asked(crashes, kept, asked_after, tmp_path):
+def test_last_stage_keeps_what_validates_best_and_ends_when_asked(
+    crashes, kept, asked_after, tmp_path
+):
     small = dict(network=dict(features=8, heads=1), predictor=dict(enabled=False))
     settings = preset("quick", **small, analytic=dict(updates=10, look_every=5))
     environment = Pursuit(settings.environment)
@@ -50,9 +52,13 @@ def test_last_stage_keeps_what_validates_best_and_ends_when_asked(crashes, kept,
     def learn(parameters, key):
         for moved in np.arange(1, 11) / 5:
             updates.append(moved)
-            yield jax.tree.map(lambda leaf, by=moved: leaf + by, parameters), {"crashes_from_starts": 0.1}
+            yield (
+                jax.tree.map(lambda leaf, by=moved: leaf + by, parameters),
+                {"crashes_from_starts": 0.1},
+            )
 
-    rates, updates = iter(crashes), []
+    rates = iter(crashes)
+    updates = []
 
     def validate(parameters):
         return GOOD | {"crash_rate": next(rates)}
@@ -70,6 +76,8 @@ def test_last_stage_keeps_what_validates_best_and_ends_when_asked(crashes, kept,
 
 def test_a_vehicle_that_is_known_by_name_needs_no_file_in_the_run(tmp_path):
     settings = preset("quick")
-    command = TrainCommand(vehicle=Path("brushless"), out=tmp_path / "run", devices="1", settings=settings)
+    command = TrainCommand(
+        vehicle=Path("brushless"), out=tmp_path / "run", devices="1", settings=settings
+    )
     job, _, files = prepare(command, [], 0.0, Processes())
     assert job.settings.environment.airframe == "brushless" and files == {}

@@ -1,4 +1,6 @@
-"""The host loop on a toy carry: exact resume, one compilation, stops on a NaN, a signal, a time limit."""
+"""The host loop on a toy carry: exact resume, one compilation, stops on a NaN, a signal, a time
+limit.
+"""
 
 import gc
 import json
@@ -93,7 +95,8 @@ def run(directory, compiled_step, updates, resume=False, evaluate=None, **plan):
 def assert_same(a, b):
     for (name, x), (_, y) in zip(named_leaves(a).items(), named_leaves(b).items(), strict=True):
         if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
-            x, y = jax.random.key_data(x), jax.random.key_data(y)
+            x = jax.random.key_data(x)
+            y = jax.random.key_data(y)
         assert x.dtype == y.dtype
         np.testing.assert_array_equal(np.asarray(x), np.asarray(y), err_msg=name)
 
@@ -105,13 +108,21 @@ def test_resumed_run_equals_uninterrupted_run_and_compiles_once(tmp_path, compil
     parts = run(tmp_path / "parts", compiled, 12, resume=True, overlap=overlap)
     assert_same(whole.carry, parts.carry)
     assert compiled._cache_size() == 1
-    losses = [[r["loss"] for r in read_metrics(tmp_path / d / "metrics.jsonl")] for d in ("whole", "parts")]
+    losses = [
+        [r["loss"] for r in read_metrics(tmp_path / d / "metrics.jsonl")]
+        for d in ("whole", "parts")
+    ]
     assert losses[0] == losses[1]
 
 
 def test_best_and_last_checkpoints_are_kept(tmp_path, compiled):
     scores = iter([0.2, 0.9, 0.3, 0.4, 0.5])
-    run(tmp_path, compiled, 20, evaluate=lambda stop: lambda carry: (next(scores), {"capture_rate": 0.0}))
+    run(
+        tmp_path,
+        compiled,
+        20,
+        evaluate=lambda stop: lambda carry: (next(scores), {"capture_rate": 0.0}),
+    )
     checkpoints = Checkpoints(tmp_path / "checkpoints")
     assert [record.update for record in checkpoints.records()] == [8, 16, 20]
     assert checkpoints.best().update == 8
@@ -149,7 +160,9 @@ def test_time_limit_stops(tmp_path, compiled):
 
 
 def test_an_update_leaves_nothing_in_memory(compiled, tmp_path):
-    """A process of half a gigabyte may grow by 5 % in a hundred thousand updates: 250 bytes each."""
+    """A process of half a gigabyte may grow by 5 % in a hundred thousand updates: 250 bytes
+    each.
+    """
     seen = []
 
     def evaluate(stop):

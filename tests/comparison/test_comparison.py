@@ -1,5 +1,6 @@
-"""What changed between two sets of flights: on flown vehicles with a known change, and on trims made by hand for what
-only many flights show (days, sizes, classes)."""
+"""What changed between two sets of flights: on flown vehicles with a known change, and on trims
+made by hand for what only many flights show (days, sizes, classes).
+"""
 
 import json
 
@@ -23,7 +24,10 @@ CHANGES = {
     "rotor": {"motor_imbalance": {"m1": 0.0, "m2": 0.0, "m3": -0.15, "m4": 0.0}},
     "heavier": {"mass": {"extra": 0.004}},
     "weight": {"mass": {"extra": 0.003}, "com_offset": {"x": 0.0, "y": 0.004}},
-    **{name: {name: EFFECTS[name].card.sample} for name in ("rotor_drag", "motor_lag", "rate_gains")},
+    **{
+        name: {name: EFFECTS[name].card.sample}
+        for name in ("rotor_drag", "motor_lag", "rate_gains")
+    },
 }
 
 
@@ -31,7 +35,11 @@ CHANGES = {
 def folders(tmp_path_factory):
     """Two folders of flights of the sample vehicle, and one per change."""
     root = tmp_path_factory.mktemp("flights")
-    flown = [("monday", {}, 1), ("tuesday", {}, 2), *((n, effects, 7) for n, effects in CHANGES.items())]
+    flown = [
+        ("monday", {}, 1),
+        ("tuesday", {}, 2),
+        *((n, effects, 7) for n, effects in CHANGES.items()),
+    ]
     for name, effects, seed in flown:
         (root / name).mkdir()
         for number, (flight, reference) in enumerate(references(seed=seed, duration=8.0).items()):
@@ -82,17 +90,24 @@ def test_the_drag_is_that_of_the_effect(folders):
 
 @pytest.mark.parametrize("kept", [("m",), ("m", "x", "y", "z"), ("m", "a", "w")])
 def test_poor_logs_tell_as_much_about_trims(folders, tmp_path, kept):
-    """Motors alone, position without attitude, sensors without a pose: no gyroscope or orientation is needed."""
+    """Motors alone, position without attitude, sensors without a pose: no gyroscope or orientation
+    is needed.
+    """
     for name in ("monday", "rotor"):
         (tmp_path / name).mkdir()
         for flight in load_case(folders / name, comparison=True).flights:
-            columns = {"t": flight.time} | {f"m{i + 1}": flight.motor_command[:, i] for i in range(4)}
+            columns = {"t": flight.time} | {
+                f"m{i + 1}": flight.motor_command[:, i] for i in range(4)
+            }
             if "x" in kept:
                 columns |= dict(zip("xyz", flight.position.T, strict=True))
             if "w" in kept:
                 columns |= {f"w{a}": v for a, v in zip("xyz", flight.body_rates.T, strict=True)}
                 columns |= {f"a{a}": v for a, v in zip("xyz", flight.specific_force.T, strict=True)}
-            write_csv(tmp_path / name / flight.log, LogTable(flight.log, columns, np.full(len(flight), "0")))
+            write_csv(
+                tmp_path / name / flight.log,
+                LogTable(flight.log, columns, np.full(len(flight), "0")),
+            )
     change = comparison.compare(tmp_path / "rotor", [tmp_path / "monday"])
     assert change.changed and change.rotors == (3,)
 
@@ -115,16 +130,22 @@ def test_a_folder_of_several_vehicles_is_refused(case, tmp_path):
 
 
 def trims(day, factors=(1, 1, 1, 1), offset=(0, 0, 0, 0), seed=0, flights=3):
-    rng, mixer = np.random.default_rng(seed), mixer_of(VEHICLE)
+    rng = np.random.default_rng(seed)
+    mixer = mixer_of(VEHICLE)
     level = np.linalg.solve(mixer, np.r_[1.0, np.asarray(offset, float)[1:]])
     out = []
     for k in range(flights):
         mixed = mixer @ (level * factors)
-        value = np.r_[0.6 * mixed[0] * (1 + offset[0]), mixed[1:] / mixed[0]] + 0.001 * rng.standard_normal(4)
+        value = np.r_[
+            0.6 * mixed[0] * (1 + offset[0]), mixed[1:] / mixed[0]
+        ] + 0.001 * rng.standard_normal(4)
         names = ("hover", "roll", "pitch", "yaw")
         out.append(
             FlightFigures(
-                f"{day}{k}", day, {n: (float(v), 0.001) for n, v in zip(names, value, strict=True)}, None
+                f"{day}{k}",
+                day,
+                {n: (float(v), 0.001) for n, v in zip(names, value, strict=True)},
+                None,
             )
         )
     return out
@@ -132,7 +153,9 @@ def trims(day, factors=(1, 1, 1, 1), offset=(0, 0, 0, 0), seed=0, flights=3):
 
 def test_the_spread_of_days_is_learnt_and_hides_what_is_smaller(case):
     wild = [
-        f for k, roll in enumerate((-0.05, 0.0, 0.05)) for f in trims(f"d{k}", offset=(0, roll, 0, 0), seed=k)
+        f
+        for k, roll in enumerate((-0.05, 0.0, 0.05))
+        for f in trims(f"d{k}", offset=(0, roll, 0, 0), seed=k)
     ]
     calm = [f for k in range(8) for f in trims(f"d{k}", seed=k)]
     new = trims("new", factors=(1, 1, 1.095, 1), seed=9)
@@ -157,7 +180,9 @@ def test_sizes_grow_with_the_change_and_intervals_hold_it(case):
 
 def test_two_rotors_of_a_side_are_a_class_with_a_weight_there(case):
     old = [f for k in range(3) for f in trims(f"d{k}", seed=k)]
-    change = comparison.change_between("new", trims("new", factors=(1.15, 1.15, 1, 1), seed=5), old, case)
+    change = comparison.change_between(
+        "new", trims("new", factors=(1.15, 1.15, 1, 1), seed=5), old, case
+    )
     assert change.changed and change.rotors == (1, 2) and change.side == "right"
     assert {"motor_imbalance", "com_offset"} <= set(change.effects)
     chances = prediction(change)["probabilities"]
@@ -174,14 +199,18 @@ def test_rotors_are_counted_as_logged(case, folders, tmp_path):
             columns = {"t": flight.time} | {
                 f"m{i + 1}": flight.motor_command[:, (i + 2) % 4] for i in range(4)
             }
-            write_csv(tmp_path / name / flight.log, LogTable(flight.log, columns, np.full(len(flight), "0")))
+            write_csv(
+                tmp_path / name / flight.log,
+                LogTable(flight.log, columns, np.full(len(flight), "0")),
+            )
     change = comparison.compare(tmp_path / "rotor", [tmp_path / "monday"])
     assert change.rotors == (1,) and change.side == "rear left"
 
 
 def test_the_command_writes_page_and_numbers_and_spares_the_others(folders, tmp_path, capsys):
     (tmp_path / "empty").mkdir()
-    out, answers = tmp_path / "out", tmp_path / "answers.json"
+    out = tmp_path / "out"
+    answers = tmp_path / "answers.json"
     status = main([
         str(folders / "rotor"), str(tmp_path / "empty"), "--reference", str(folders / "monday"),
         "--out", str(out), "--predictions", str(answers),

@@ -1,4 +1,6 @@
-"""Export: the file says what the policy says, for networks of both shapes, and refuses what it can't say."""
+"""Export: the file says what the policy says, for networks of both shapes, and refuses what it
+can't say.
+"""
 
 import json
 import os
@@ -22,7 +24,9 @@ from openjax.store.policy_files import save_policy_file
 
 @pytest.fixture(scope="module")
 def policy_file(tmp_path_factory):
-    """A small policy with random weights, the predictor's not small, so that a mistake anywhere shows."""
+    """A small policy with random weights, the predictor's not small, so that a mistake anywhere
+    shows.
+    """
     settings = TrainSettings(
         environment=PursuitSettings(
             observe_position=True, observe_in="heading", observe_history=2, history_length=4
@@ -42,7 +46,9 @@ def policy_file(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def flown(policy_file):
-    """What the policy sees in games: several tests ask for the same, which takes seconds to compile."""
+    """What the policy sees in games: several tests ask for the same, which takes seconds to
+    compile.
+    """
     return observations(load_policy(str(policy_file)), 64, 0)
 
 
@@ -71,7 +77,9 @@ def test_a_name_in_no_encoding_is_exported(policy_file, tmp_path):
 
 @NEEDS_CC
 def test_the_c_program_is_one_vehicles_policy_for_any_observation(policy_file, flown):
-    """Numbers that no game shows; a compiler that takes every warning for an error; a workspace full of NaN."""
+    """Numbers that no game shows; a compiler that takes every warning for an error; a workspace
+    full of NaN.
+    """
     policy = load_policy(str(policy_file))
     rng = np.random.default_rng(1)
     seen = dict(flown)
@@ -80,8 +88,12 @@ def test_the_c_program_is_one_vehicles_policy_for_any_observation(policy_file, f
         seen[name] = (noise > 0) if values.dtype == bool else noise.astype(np.float32)
     expected = np.asarray(jax.jit(jax.vmap(policy))(Observation(**seen)))[:, :1]
     own = {name: values[:, :1] if name in EACH else values for name, values in seen.items()}
-    inputs = {name: jax.ShapeDtypeStruct(values.shape[1:], values.dtype) for name, values in own.items()}
-    program = c_program(lambda **fields: policy(Observation(**fields)), inputs, "action", "small", "A policy")
+    inputs = {
+        name: jax.ShapeDtypeStruct(values.shape[1:], values.dtype) for name, values in own.items()
+    }
+    program = c_program(
+        lambda **fields: policy(Observation(**fields)), inputs, "action", "small", "A policy"
+    )
     assert np.ptp(expected, axis=0).min() > 0.01  # a thousand times what may differ
     np.testing.assert_allclose(compiled(program, "small")(own), expected, atol=1e-5)
     assert "privileged" not in program.inputs
@@ -113,7 +125,9 @@ def test_operations_become_their_counterparts_in_onnx():
     from openjax.export.onnx_graph import onnx_model
 
     model = onnx_model(everything, KINDS, "y")
-    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(
+        model.SerializeToString(), providers=["CPUExecutionProvider"]
+    )
     found = session.run(None, {"x": X, "flag": FLAG})[0]
     np.testing.assert_allclose(found, everything(X, FLAG), rtol=2e-5, atol=2e-5)
 

@@ -1,5 +1,6 @@
-"""Garbage is called garbage: logs whose channels contradict each other are refused with the numbers. That good
-flights pass is tested with the other checks."""
+"""Garbage is called garbage: logs whose channels contradict each other are refused with the
+numbers. That good flights pass is tested with the other checks.
+"""
 
 import numpy as np
 import pytest
@@ -26,7 +27,8 @@ def refusals(columns):
 @pytest.mark.parametrize("how", ["shuffled", "of another time", "noise"])
 def test_a_channel_that_contradicts_the_others_is_garbage(channel, how, sample_columns):
     columns = sample_columns["flight_b"]
-    rng, rows = np.random.default_rng(1), len(columns["t"])
+    rng = np.random.default_rng(1)
+    rows = len(columns["t"])
     order = rng.permutation(rows) if how == "shuffled" else np.roll(np.arange(rows), rows // 3)
     changed = dict(columns)
     for name in CHANNEL_COLUMNS[channel]:
@@ -41,7 +43,8 @@ def test_a_channel_that_contradicts_the_others_is_garbage(channel, how, sample_c
 
 
 def test_noise_in_every_column_is_garbage(sample_columns):
-    columns, rng = sample_columns["flight_b"], np.random.default_rng(2)
+    columns = sample_columns["flight_b"]
+    rng = np.random.default_rng(2)
     noise = {
         n: v if n == "t" else np.nanmean(v) + np.nanstd(v) * rng.standard_normal(len(v))
         for n, v in columns.items()
@@ -61,8 +64,11 @@ def test_a_column_copied_over_another_is_garbage(sample_columns):
 
 
 def test_clocks_apart_filters_and_noise_are_no_contradiction(sample_columns):
-    """What honest sensors do: 100 ms between the streams, smoothing, and noise as strong as in bad logs."""
-    columns, rng = sample_columns["flight_c"], np.random.default_rng(3)
+    """What honest sensors do: 100 ms between the streams, smoothing, and noise as strong as in bad
+    logs.
+    """
+    columns = sample_columns["flight_c"]
+    rng = np.random.default_rng(3)
     late = dict(columns)
     for channel, noise in (("body_rates", 0.3), ("specific_force", 1.0)):
         for name in CHANNEL_COLUMNS[channel]:
@@ -75,9 +81,13 @@ def test_clocks_apart_filters_and_noise_are_no_contradiction(sample_columns):
 
 
 def test_an_estimates_wandering_position_is_no_contradiction_while_hovering():
-    rng, t = np.random.default_rng(5), np.arange(0.0, 8.0, 0.01)
+    rng = np.random.default_rng(5)
+    t = np.arange(0.0, 8.0, 0.01)
     low = butter(2, 1.5, fs=100.0, output="sos")
-    slow = {n: sosfilt(low, rng.standard_normal((len(t) + 500, 3)), axis=0)[500:] for n in ("place", "lean")}
+    slow = {
+        n: sosfilt(low, rng.standard_normal((len(t) + 500, 3)), axis=0)[500:]
+        for n in ("place", "lean")
+    }
     slow = {n: v / v.std(0) for n, v in slow.items()}
     place = [0.0, 0.0, 0.6] + 0.003 * slow["place"]  # m: what ultra-wideband ranges leave
     lean = 0.01 * slow["lean"]
@@ -101,19 +111,32 @@ def test_an_estimates_wandering_position_is_no_contradiction_while_hovering():
 
 @pytest.mark.parametrize(("hover", "contradicts"), [(0.5, [False]), (0.85, []), (None, [True])])
 def test_motors_at_their_limit_need_not_add_up_to_the_thrust(hover, contradicts):
-    """A light and a heavy vehicle, whose mixer is cut at full thrust; and motors that follow another thrust."""
-    rng, steps = np.random.default_rng(6), 3000
+    """A light and a heavy vehicle, whose mixer is cut at full thrust; and motors that follow
+    another thrust.
+    """
+    rng = np.random.default_rng(6)
+    steps = 3000
     slow = sosfilt(butter(2, 2.0, fs=100.0, output="sos"), rng.standard_normal((steps, 3)), axis=0)
     thrust, roll, other = slow.T / slow.std(0)[:, None] * [[0.01], [0.05], [0.01]]
     center = hover or 0.5
-    asked = center + (thrust if hover else other)[:, None] + (roll + 0.15)[:, None] * [1.0, -1.0, 1.0, -1.0]
-    nothing = dict.fromkeys(("position", "quaternion", "velocity", "body_rates", "force", "commands"))
+    asked = (
+        center
+        + (thrust if hover else other)[:, None]
+        + (roll + 0.15)[:, None] * [1.0, -1.0, 1.0, -1.0]
+    )
+    nothing = dict.fromkeys(
+        ("position", "quaternion", "velocity", "body_rates", "force", "commands")
+    )
     logged = Signals(motor=np.clip(asked, 0.0, 1.0), thrust=(center + thrust)[:, None], **nothing)
     assert [bool(pair.bad.any()) for pair in pairs_of(logged)] == contradicts
 
 
-def test_what_most_flights_contradict_the_calm_ones_must_show_to_be_right(case_folder, sample_columns):
-    """Swapped gyroscope columns in every log: where the vehicle hardly turns they don't show, and aren't trusted."""
+def test_what_most_flights_contradict_the_calm_ones_must_show_to_be_right(
+    case_folder, sample_columns
+):
+    """Swapped gyroscope columns in every log: where the vehicle hardly turns they don't show, and
+    aren't trusted.
+    """
     swapped = {n: c | {"wx": c["wy"], "wy": c["wx"]} for n, c in sample_columns.items()}
     calm = {n: v[:300] for n, v in swapped["flight_a"].items()}
     rng = np.random.default_rng(4)
@@ -126,7 +149,9 @@ def test_what_most_flights_contradict_the_calm_ones_must_show_to_be_right(case_f
     }
     calm |= still | {"z": 0.5 + 0.001 * rng.standard_normal(300)}
     calm |= {m: 0.5 + 0.01 * rng.standard_normal(300) for m in ("m1", "m2", "m3", "m4")}
-    calm |= {a: (9.81 if a == "az" else 0.0) + 0.1 * rng.standard_normal(300) for a in ("ax", "ay", "az")}
+    calm |= {
+        a: (9.81 if a == "az" else 0.0) + 0.1 * rng.standard_normal(300) for a in ("ax", "ay", "az")
+    }
     calm["cmd_thrust"] = (calm["m1"] + calm["m2"] + calm["m3"] + calm["m4"]) / 4
     assert refusals(calm)[1] == []
     for name in ("flight_b", "flight_c"):

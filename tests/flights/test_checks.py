@@ -57,17 +57,33 @@ REFUSED = {
     "gyroscope axis reversed": (scaled("wz", -1), "axes", "wz holds minus z"),
     "accelerometer upside down": (scaled("az", -1), "axes", "accelerometer"),
     "accelerometer axes swapped": (renamed("ay az", "az ay"), "axes", "ay holds z"),
-    "position axes swapped": (renamed("x y vx vy", "y x vy vx"), "axes", "position axes: x holds y"),
+    "position axes swapped": (
+        renamed("x y vx vy", "y x vy vx"),
+        "axes",
+        "position axes: x holds y",
+    ),
     "command reversed": (scaled("cmd_wy", -1), "axes", "cmd_wy holds minus y"),
-    "quaternion xyzw": (renamed("qw qx qy qz", "qx qy qz qw"), "quaternion", "in the order x, y, z, w"),
+    "quaternion xyzw": (
+        renamed("qw qx qy qz", "qx qy qz qw"),
+        "quaternion",
+        "in the order x, y, z, w",
+    ),
     "quaternion world to body": (scaled("qx qy qz", -1), "quaternion", "from world to body"),
     "quaternion not unit": (scaled("qw qx qy qz", 0.5), "quaternion", "aren't unit"),
     "motor order": (renamed("m1 m2 m3 m4", "m2 m3 m4 m1"), "motors", "m1 rear_right"),
     "two motors swapped": (renamed("m1 m2", "m2 m1"), "motors", "motor order"),
     "dead gyroscope axis": (frozen("wy"), "corrupt", "wy: the same value"),
-    "motor column corrupt": (lambda c: c | {"m2": c["m2"] - 1.0}, "corrupt", "commands lie in 0..1"),
+    "motor column corrupt": (
+        lambda c: c | {"m2": c["m2"] - 1.0},
+        "corrupt",
+        "commands lie in 0..1",
+    ),
     "two recordings in one file": (lambda c: c | {"t": c["t"] % 4.0}, "time", "runs backwards"),
-    "frozen clock": (lambda c: c | {"t": np.round(c["t"] / 0.05) * 0.05}, "time", "repeat the time"),
+    "frozen clock": (
+        lambda c: c | {"t": np.round(c["t"] / 0.05) * 0.05},
+        "time",
+        "repeat the time",
+    ),
     "no commands": (without("m1", "m2", "m3", "m4", "cmd_thrust"), "columns", "no commands"),
     "no state": (without("x", "ax"), "columns", "needs position and orientation"),
     "too short": (lambda c: {k: v[:150] for k, v in c.items()}, "short", "at least 2 s"),
@@ -118,7 +134,9 @@ def test_motors_alone_are_enough_for_a_comparison(sample_columns):
     columns = sample_columns["flight_b"]
     motors = {k: columns[k] for k in ("t", "m1", "m2", "m3", "m4")}
     # two stretches in the air with the ground between: both are kept
-    motors = {k: np.where(k == "t" or abs(columns["t"] - 4.0) > 0.5, v, 0.0) for k, v in motors.items()}
+    motors = {
+        k: np.where(k == "t" or abs(columns["t"] - 4.0) > 0.5, v, 0.0) for k, v in motors.items()
+    }
     motors["t"] = columns["t"]
     (flight,), _ = flights_of(LogTable("flight.csv", motors, np.full(len(columns["t"]), "0")))
     assert check_flight(flight, VEHICLE)[0] is None
@@ -130,7 +148,9 @@ def test_motors_alone_are_enough_for_a_comparison(sample_columns):
 def test_other_row_rates_pass(rate, sample_columns):
     columns = sample_columns["flight_c"]
     at = np.arange(0.0, columns["t"][-1], 1 / rate)
-    resampled = {k: np.interp(at, columns["t"], v) for k, v in columns.items() if k != "vbat"} | {"t": at}
+    resampled = {k: np.interp(at, columns["t"], v) for k, v in columns.items() if k != "vbat"} | {
+        "t": at
+    }
     kept, issues = check(resampled)
     assert issues == [] and kept.row_period == pytest.approx(1 / rate)
 
@@ -140,20 +160,27 @@ def test_velocity_is_derived_where_it_is_missing(sample_columns):
     kept, issues = check(without("vx", "vy", "vz")(columns))
     assert kept.velocity_derived and [i.kind for i in issues] == ["columns"]
     logged = np.stack([columns["vx"], columns["vy"], columns["vz"]], 1)
-    assert np.sqrt(np.mean((kept.velocity - logged) ** 2)) < 0.02  # m/s; the logged one has 0.005 of noise
+    assert (
+        np.sqrt(np.mean((kept.velocity - logged) ** 2)) < 0.02
+    )  # m/s; the logged one has 0.005 of noise
 
 
 def test_a_velocity_that_missing_rows_have_spoilt_is_taken_from_the_position(sample_columns):
     columns = {k: v for k, v in sample_columns["flight_b"].items()}
     position = np.stack([columns[n] for n in "xyz"], 1)
     kept = np.random.default_rng(0).random(len(position)) > 0.02
-    half, step = 3, columns["t"][1] - columns["t"][0]
+    half = 3
+    step = columns["t"][1] - columns["t"][0]
     rows = np.flatnonzero(kept)
-    ahead, behind = np.clip([np.arange(len(rows)) + half, np.arange(len(rows)) - half], 0, len(rows) - 1)
+    ahead, behind = np.clip(
+        [np.arange(len(rows)) + half, np.arange(len(rows)) - half], 0, len(rows) - 1
+    )
     # as if all rows were a step apart
     spoilt = (position[rows[ahead]] - position[rows[behind]]) / (2 * half * step)
     true = np.stack([columns[n] for n in ("vx", "vy", "vz")], 1)[rows]
-    columns = {k: v[rows] for k, v in columns.items()} | dict(zip(("vx", "vy", "vz"), spoilt.T, strict=True))
+    columns = {k: v[rows] for k, v in columns.items()} | dict(
+        zip(("vx", "vy", "vz"), spoilt.T, strict=True)
+    )
     flight, issues = check(columns)
     inside = slice(half, -half)
     before, after = (np.sqrt(np.mean((v - true)[inside] ** 2)) for v in (spoilt, flight.velocity))
@@ -188,7 +215,10 @@ def test_parts_on_the_ground_are_cut_away(sample_columns):
     rest = {k: np.full(200, v[0]) for k, v in columns.items() if k != "vbat"}
     rest |= {m: np.zeros(200) for m in ("m1", "m2", "m3", "m4")} | {"z": np.full(200, 0.05)}
     rng = np.random.default_rng(0)
-    rest = {k: v + (1e-5 * rng.standard_normal(200) if k[0] in "wavxyzq" else 0) for k, v in rest.items()}
+    rest = {
+        k: v + (1e-5 * rng.standard_normal(200) if k[0] in "wavxyzq" else 0)
+        for k, v in rest.items()
+    }
     rest["t"] = np.arange(200) * 0.01
     joined = {k: np.r_[rest[k], columns[k]] for k in rest}
     joined["t"] = np.r_[rest["t"], 2.0 + columns["t"]]
@@ -205,7 +235,11 @@ def test_one_bad_log_spares_the_others(case_folder, sample_columns):
     case = load_case(case_folder)
     assert [f.name for f in case.flights] == ["flight_b.csv.gz", "flight_c.csv.gz"]
     reasons = {i.flight: i.kind for i in case.quality if i.refused}
-    assert reasons == {"flight_a.csv.gz": "units", "flight_d.csv.gz": "duplicate", "flight_e.csv": "reading"}
+    assert reasons == {
+        "flight_a.csv.gz": "units",
+        "flight_d.csv.gz": "duplicate",
+        "flight_e.csv": "reading",
+    }
 
 
 def test_a_copy_with_another_clock_and_layout_is_a_duplicate(case_folder, sample_columns):
@@ -222,8 +256,14 @@ def test_a_copy_with_another_clock_and_layout_is_a_duplicate(case_folder, sample
     [
         (lambda f: [p.unlink() for p in f.glob("*.gz")], "holds no flight log"),
         (lambda f: (f / "vehicle.toml").unlink(), "an empty one"),
-        (lambda f: (f / "vehicle.toml").write_text("[motor]\ncomand = 'pwm'\n"), "unknown key 'comand'"),
-        (lambda f: [p.write_bytes(b"") for p in f.glob("*.gz")], r"no flight can be used: .* \(and 2 more\)"),
+        (
+            lambda f: (f / "vehicle.toml").write_text("[motor]\ncomand = 'pwm'\n"),
+            "unknown key 'comand'",
+        ),
+        (
+            lambda f: [p.write_bytes(b"") for p in f.glob("*.gz")],
+            r"no flight can be used: .* \(and 2 more\)",
+        ),
     ],
 )
 def test_a_case_that_cannot_be_used_is_one_line(case_folder, prepare, reason):
@@ -242,7 +282,8 @@ def test_held_poses_of_a_slower_camera_are_moved_to_their_rows(sample_columns):
     columns = sample_columns["flight_a"]
     time = columns["t"] - columns["t"][0]
     taken = np.floor(time * 55.0 + 1e-9) / 55.0  # when the pose was taken that a row holds
-    pose, kept = "x y z qw qx qy qz".split(), np.random.default_rng(0).random(len(time)) > 0.04
+    pose = "x y z qw qx qy qz".split()
+    kept = np.random.default_rng(0).random(len(time)) > 0.04
     held = {n: np.interp(taken, time, v) if n in pose else v for n, v in columns.items()}
     flight, _ = check({n: v[kept] for n, v in without("vx", "vy", "vz")(held).items()})
     truth, _ = check(columns)

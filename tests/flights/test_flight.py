@@ -1,4 +1,6 @@
-"""The flight container: slower channels, gaps and neighbours are handled once, for everyone behind it."""
+"""The flight container: slower channels, gaps and neighbours are handled once, for everyone behind
+it.
+"""
 
 import numpy as np
 import pytest
@@ -40,7 +42,8 @@ def test_stretches_break_at_gaps_and_rows_cut_every_channel():
 
 
 def test_others_are_those_of_the_same_log():
-    first, second = flight([0, 1]), Flight("log.csv:1", "log.csv", "1", np.array([0.0, 1.0]))
+    first = flight([0, 1])
+    second = Flight("log.csv:1", "log.csv", "1", np.array([0.0, 1.0]))
     elsewhere = Flight("b.csv:1", "b.csv", "1", np.array([0.0, 1.0]))
     case = Case("case", (first, second, elsewhere), vehicle_file=None)
     assert case.others(first) == (second,) and case.others(elsewhere) == ()
@@ -48,7 +51,9 @@ def test_others_are_those_of_the_same_log():
 
 @pytest.mark.parametrize("rate", [100, 200, 250, 500])
 def test_faster_logs_become_means_over_the_rows_of_the_grid(rate):
-    """Motors hold until the next row; sensors are straight between rows and averaged around a grid point."""
+    """Motors hold until the next row; sensors are straight between rows and averaged around a grid
+    point.
+    """
     time = np.arange(0.0, 4.0, 1 / rate)
     jumps = np.floor(time / 0.004 + 1e-9) % 7 / 10.0
     ramp = np.stack([time, 2 * time, -time], 1)
@@ -59,4 +64,6 @@ def test_faster_logs_become_means_over_the_rows_of_the_grid(rate):
     expected = held[: len(held) // 10 * 10].reshape(-1, 10).mean(1) if rate > 100 else jumps
     rows = slice(1, len(track) - 2)
     np.testing.assert_allclose(track.motor[rows, 0], expected[: len(track)][rows], atol=1e-9)
-    np.testing.assert_allclose(track.body_rates[rows], np.outer(track.time, [1, 2, -1])[rows], atol=1e-9)
+    np.testing.assert_allclose(
+        track.body_rates[rows], np.outer(track.time, [1, 2, -1])[rows], atol=1e-9
+    )

@@ -1,5 +1,6 @@
-"""Whatever a log holds, a case is read or refused in one line: never a traceback, and one bad log never takes the
-others with it."""
+"""Whatever a log holds, a case is read or refused in one line: never a traceback, and one bad log
+never takes the others with it.
+"""
 
 import numpy as np
 import pytest
@@ -16,7 +17,24 @@ from openjax.vehicle import load_vehicle
 VEHICLE = load_vehicle()
 
 CELLS = st.sampled_from(
-    ["", "nan", "inf", "-inf", "1e300", "1e-300", "-0", "0", "x", '"', ",", "\n", "\r", "1;2", "\t", "é"]
+    [
+        "",
+        "nan",
+        "inf",
+        "-inf",
+        "1e300",
+        "1e-300",
+        "-0",
+        "0",
+        "x",
+        '"',
+        ",",
+        "\n",
+        "\r",
+        "1;2",
+        "\t",
+        "é",
+    ]
 )
 EDITS = st.lists(st.tuples(st.floats(0, 1), st.integers(0, 40), CELLS), min_size=1, max_size=12)
 

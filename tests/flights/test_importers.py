@@ -1,4 +1,6 @@
-"""Importers: what a laboratory's files hold arrives with the right sign, unit, clock and vehicle."""
+"""Importers: what a laboratory's files hold arrives with the right sign, unit, clock and
+vehicle.
+"""
 
 import struct
 from zlib import crc32
@@ -16,10 +18,14 @@ DEGREES = 180 / np.pi
 
 
 def micro_sd(events, version=2, cut=0):
-    """A micro-SD log as the firmware writes it; events: [(name, period us, {variable: (letter, values)})]."""
+    """A micro-SD log as the firmware writes it; events: [(name, period us, {variable: (letter,
+    values)})].
+    """
     data = struct.pack("<BHH", 0xBC, version, len(events))
     for number, (name, _, variables) in enumerate(events):
-        data += struct.pack("<H", number) + name.encode() + b"\0" + struct.pack("<H", len(variables))
+        data += (
+            struct.pack("<H", number) + name.encode() + b"\0" + struct.pack("<H", len(variables))
+        )
         for variable, (letter, _) in variables.items():
             data += f"{variable}({letter})".encode() + b"\0"
     stamped = []
@@ -34,16 +40,26 @@ def micro_sd(events, version=2, cut=0):
 
 
 def firmware_variables(c):
-    """A sample flight as the firmware logs it: degrees, g, counts, and its legacy sense of pitch."""
+    """A sample flight as the firmware logs it: degrees, g, counts, and its legacy sense of
+    pitch.
+    """
     floats = {f"stateEstimate.{a}": c[a] for a in "xyz"}
     floats |= {f"stateEstimate.q{a}": c[f"q{a}"] for a in "wxyz"}
     floats |= {f"gyro.{a}": c[f"w{a}"] * DEGREES for a in "xyz"} | {
         f"acc.{a}": c[f"a{a}"] / 9.80665 for a in "xyz"
     }
-    floats |= {"controller.cmd_thrust": c["cmd_thrust"] * 65535, "controller.rollRate": c["cmd_wx"] * DEGREES}
-    floats |= {"controller.pitchRate": -c["cmd_wy"] * DEGREES, "controller.yawRate": c["cmd_wz"] * DEGREES}
+    floats |= {
+        "controller.cmd_thrust": c["cmd_thrust"] * 65535,
+        "controller.rollRate": c["cmd_wx"] * DEGREES,
+    }
+    floats |= {
+        "controller.pitchRate": -c["cmd_wy"] * DEGREES,
+        "controller.yawRate": c["cmd_wz"] * DEGREES,
+    }
     variables = {name: ("f", values) for name, values in floats.items()}
-    return variables | {f"motor.m{i}": ("H", np.round(c[f"m{i}"] * 65535).astype(int)) for i in (1, 2, 3, 4)}
+    return variables | {
+        f"motor.m{i}": ("H", np.round(c[f"m{i}"] * 65535).astype(int)) for i in (1, 2, 3, 4)
+    }
 
 
 @pytest.fixture
@@ -99,7 +115,9 @@ def test_micro_sd_log_of_one_clock(tmp_path, columns, version):
 
 def test_micro_sd_streams_are_put_on_the_imu_clock(tmp_path, columns):
     variables = firmware_variables(columns)
-    slow = {n: (letter, v[::2]) for n, (letter, v) in variables.items() if n.startswith("stateEstimate")}
+    slow = {
+        n: (letter, v[::2]) for n, (letter, v) in variables.items() if n.startswith("stateEstimate")
+    }
     fast = {n: v for n, v in variables.items() if n not in slow}
     battery = {"pm.vbat": ("f", np.linspace(4.0, 3.8, 8))}
     events = [("pose", 20_000, slow), ("imu", 10_000, fast), ("power", 1_000_000, battery)]
@@ -113,7 +131,9 @@ def test_micro_sd_streams_are_put_on_the_imu_clock(tmp_path, columns):
 
 
 def test_the_controllers_variables_stand_for_motors_and_gyroscope(tmp_path, columns):
-    """What a log of the controller holds: mixer inputs, gyroscope in the firmware's sense, vertical force."""
+    """What a log of the controller holds: mixer inputs, gyroscope in the firmware's sense, vertical
+    force.
+    """
     m = 65535 * np.stack([columns[f"m{i}"] for i in "1234"])
     inputs = {
         "thrust": m.mean(0),
@@ -123,7 +143,10 @@ def test_the_controllers_variables_stand_for_motors_and_gyroscope(tmp_path, colu
     }
     variables = {f"controller.cmd_{n}": ("f", v) for n, v in inputs.items()}
     variables |= {f"stateEstimate.{a}": ("f", columns[a]) for a in "xyz"}
-    variables |= {"controller.r_roll": ("f", columns["wx"]), "controller.r_pitch": ("f", -columns["wy"])}
+    variables |= {
+        "controller.r_roll": ("f", columns["wx"]),
+        "controller.r_pitch": ("f", -columns["wy"]),
+    }
     variables |= {
         "controller.r_yaw": ("f", columns["wz"]),
         "controller.accelz": ("f", columns["az"] / 9.80665),
@@ -131,7 +154,9 @@ def test_the_controllers_variables_stand_for_motors_and_gyroscope(tmp_path, colu
     (tmp_path / "log04").write_bytes(micro_sd([("fixedFrequency", 10_000, variables)]))
     table = read_log(tmp_path / "log04")
     assert "mixer" in table.remarks[0]
-    assert_same(table, {n: columns[n] for n in ("m1", "m2", "m3", "m4", "wx", "wy", "wz", "az", "x")})
+    assert_same(
+        table, {n: columns[n] for n in ("m1", "m2", "m3", "m4", "wx", "wy", "wz", "az", "x")}
+    )
     (flight,), _ = flights_of(table)
     assert flight.specific_force is None
 
@@ -172,7 +197,9 @@ def test_a_mapped_csv_in_other_names_units_and_angles(tmp_path, columns):
         "yaw": np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy**2 + qz**2)) * DEGREES,
     } | {f"u{i}": columns[f"m{i}"] * 255 for i in (1, 2, 3, 4)}
     lines = [";".join([*other, "comment"])]
-    lines += [";".join([*(f"{v:.7f}" for v in row), "text"]) for row in zip(*other.values(), strict=True)]
+    lines += [
+        ";".join([*(f"{v:.7f}" for v in row), "text"]) for row in zip(*other.values(), strict=True)
+    ]
     (tmp_path / "other.csv").write_text("\n".join(lines))
     (tmp_path / "columns.toml").write_text(
         'delimiter = ";"\n[columns]\nt = { from = "stamp", unit = "ms" }\n'
@@ -206,7 +233,9 @@ def test_a_mapping_with_a_slip_says_where(tmp_path, text, reason):
 
 
 def write_bag(path, columns, storage):
-    """A ROS 2 bag of two vehicles with standard messages: pose at 50 Hz, IMU and motors at 100 Hz."""
+    """A ROS 2 bag of two vehicles with standard messages: pose at 50 Hz, IMU and motors at 100
+    Hz.
+    """
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -245,16 +274,22 @@ def write_bag(path, columns, storage):
                 zero = np.zeros(9)
                 messages = {"imu": kinds["Imu"](header, none, zero, rates, zero, force, zero)}
                 motors = np.array([columns[f"m{i}"][k] for i in (1, 2, 3, 4)], np.float32)
-                messages["motors"] = kinds["Float32MultiArray"](kinds["MultiArrayLayout"]([], 0), motors)
+                messages["motors"] = kinds["Float32MultiArray"](
+                    kinds["MultiArrayLayout"]([], 0), motors
+                )
                 if k % 2 == 0:
-                    point = kinds["Point"](columns["x"][k] + number, columns["y"][k], columns["z"][k])
+                    point = kinds["Point"](
+                        columns["x"][k] + number, columns["y"][k], columns["z"][k]
+                    )
                     attitude = kinds["Quaternion"](*(columns[f"q{a}"][k] for a in "xyzw"))
                     messages["pose"] = kinds["PoseStamped"](header, kinds["Pose"](point, attitude))
                 for name, message in messages.items():
                     # Received 3 ms after it was stamped; the motors have no stamp of their own.
                     delay = 0 if name == "motors" else 3_000_000
                     connection = topics[name]
-                    writer.write(connection, at + delay, store.serialize_cdr(message, connection.msgtype))
+                    writer.write(
+                        connection, at + delay, store.serialize_cdr(message, connection.msgtype)
+                    )
 
 
 @pytest.mark.parametrize("storage", ["SQLITE3", "MCAP"])
@@ -267,11 +302,15 @@ def test_ros2_bag_of_two_vehicles(tmp_path, columns, storage):
     assert set(table.vehicle.tolist()) == {"cf1", "cf2"}
     for number, vehicle in enumerate(("cf1", "cf2")):
         rows = table.vehicle == vehicle
-        own = type(table)("bag", {n: v[rows] for n, v in table.columns.items()}, table.vehicle[rows])
+        own = type(table)(
+            "bag", {n: v[rows] for n, v in table.columns.items()}, table.vehicle[rows]
+        )
         assert_same(own, {n: columns[n] for n in ("t", "wx", "wz", "ay", "m1", "m4")}, 1e-5)
         np.testing.assert_allclose(own.columns["x"][:-1:2], columns["x"][::2] + number, atol=1e-6)
     mapping = tmp_path / "columns.toml"
-    mapping.write_text('[columns]\nwx = "/cf2/imu:angular_velocity.x"\nm1 = "/cf2/motors:data[0]"\n')
+    mapping.write_text(
+        '[columns]\nwx = "/cf2/imu:angular_velocity.x"\nm1 = "/cf2/motors:data[0]"\n'
+    )
     mapped = read_log(tmp_path / "bag", load_mapping(mapping))
     assert_same(mapped, {n: columns[n] for n in ("wx", "m1")}, 1e-5)
     mapping.write_text('[columns]\nwx = "/cf2/imu:angular_velocity.q"\n')

@@ -1,4 +1,6 @@
-"""Sensors against each other: what is wrong with a sensor is found, measured and corrected, whatever flies."""
+"""Sensors against each other: what is wrong with a sensor is found, measured and corrected,
+whatever flies.
+"""
 
 import dataclasses
 
@@ -16,23 +18,32 @@ def read_kinematics(tracks):
 
 
 def _track(gain=1.0, tilt=0.0, scale=1.0, seed=1, rows=1500):
-    """A made flight: smooth rates, attitude by integration, a path whose acceleration the accelerometer feels."""
-    rng, dt = np.random.default_rng(seed), 0.01
+    """A made flight: smooth rates, attitude by integration, a path whose acceleration the
+    accelerometer feels.
+    """
+    rng = np.random.default_rng(seed)
+    dt = 0.01
     time = dt * np.arange(rows)
-    rates = np.stack([1.5 * np.sin(2 * np.pi * f * time + k) for k, f in enumerate((0.9, 1.3, 0.6))], 1)
+    rates = np.stack(
+        [1.5 * np.sin(2 * np.pi * f * time + k) for k, f in enumerate((0.9, 1.3, 0.6))], 1
+    )
     quaternion = np.zeros((rows, 4))
     quaternion[0, 0] = 1.0
     for k in range(1, rows):
         half = 0.25 * dt * (rates[k] + rates[k - 1])
-        w, u = quaternion[k - 1, 0], quaternion[k - 1, 1:]
+        w = quaternion[k - 1, 0]
+        u = quaternion[k - 1, 1:]
         quaternion[k] = np.r_[w - u @ half, u + w * half + np.cross(u, half)]
         quaternion[k] /= np.linalg.norm(quaternion[k])
     acceleration = np.stack([np.sin(2 * np.pi * f * time) for f in (0.5, 0.7, 0.4)], 1)
     velocity = np.cumsum(acceleration, 0) * dt
     force = np.einsum("tji,tj->ti", rotation(quaternion), acceleration + np.array([0.0, 0.0, 9.81]))
-    lean = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(tilt), -np.sin(tilt)], [0.0, np.sin(tilt), np.cos(tilt)]])
+    lean = np.array(
+        [[1.0, 0.0, 0.0], [0.0, np.cos(tilt), -np.sin(tilt)], [0.0, np.sin(tilt), np.cos(tilt)]]
+    )
     half = np.array([np.sin(tilt / 2), 0.0, 0.0])
-    w, u = quaternion[:, :1], quaternion[:, 1:]
+    w = quaternion[:, :1]
+    u = quaternion[:, 1:]
     leaned = np.concatenate([w * np.cos(tilt / 2) - u @ half[:, None], u * np.cos(tilt / 2) + w * half
                              + np.cross(half, u)], 1)  # fmt: skip
     return Track(
@@ -54,9 +65,12 @@ def test_a_gyroscope_with_another_gain_is_found_and_corrected(gain):
     found = read_kinematics(tracks)
     unusual = abs(gain - 1.0) > DECISION.gyroscope_gain
     assert (
-        found.gain == pytest.approx(gain, abs=0.01) and list(found.findings) == ["gyroscope gain"] * unusual
+        found.gain == pytest.approx(gain, abs=0.01)
+        and list(found.findings) == ["gyroscope gain"] * unusual
     )
-    assert read_kinematics([corrected(t, found) for t in tracks]).gain == pytest.approx(1.0, abs=0.01)
+    assert read_kinematics([corrected(t, found) for t in tracks]).gain == pytest.approx(
+        1.0, abs=0.01
+    )
 
 
 @pytest.mark.parametrize("scale", [0.8, 1.05, 1.2])
@@ -68,9 +82,9 @@ def test_positions_in_another_scale_than_the_accelerometers_are_a_finding(scale)
 def test_a_world_that_leans_is_found_and_put_upright():
     tracks = [_track(tilt=np.radians(4.0))]
     found = read_kinematics(tracks)
-    assert np.degrees(found.tilt) == pytest.approx([4.0, 0.0], abs=0.4) and list(found.findings) == [
-        "world tilt"
-    ]
+    assert np.degrees(found.tilt) == pytest.approx([4.0, 0.0], abs=0.4) and list(
+        found.findings
+    ) == ["world tilt"]
     assert read_kinematics([corrected(t, found) for t in tracks]).findings == {}
 
 
@@ -78,4 +92,6 @@ def test_streams_on_clocks_that_wander_tell_no_gain():
     track = _track()
     late = np.interp(track.time + 0.12 * np.sin(track.time), track.time, track.time)
     rates = np.stack([np.interp(late, track.time, c) for c in 1.1 * track.body_rates.T], 1)
-    assert set(read_kinematics([dataclasses.replace(track, body_rates=rates)]).findings) == {"clocks"}
+    assert set(read_kinematics([dataclasses.replace(track, body_rates=rates)]).findings) == {
+        "clocks"
+    }

@@ -1,4 +1,6 @@
-"""Reading logs: what is in the file arrives in the right channel, row and vehicle, and only that."""
+"""Reading logs: what is in the file arrives in the right channel, row and vehicle, and only
+that.
+"""
 
 import gzip
 import time
@@ -20,11 +22,15 @@ def write(path, text):
 def test_round_trip_of_every_channel(tmp_path, sample_columns):
     columns = sample_columns["flight_b"]
     for name in ("log.csv", "log.csv.gz"):
-        write_csv(tmp_path / name, LogTable(name, columns, np.full(len(columns["t"]), "0")), {"t": 9})
+        write_csv(
+            tmp_path / name, LogTable(name, columns, np.full(len(columns["t"]), "0")), {"t": 9}
+        )
         table = read_csv(tmp_path / name)
         assert set(table.columns) == set(columns) and not table.remarks
         for column, values in columns.items():
-            np.testing.assert_allclose(table.columns[column], values, atol=1e-6)  # NaN where not sampled
+            np.testing.assert_allclose(
+                table.columns[column], values, atol=1e-6
+            )  # NaN where not sampled
     (a,), (b,) = (flights_of(read_csv(tmp_path / n))[0] for n in ("log.csv", "log.csv.gz"))
     assert a.fingerprint == b.fingerprint
     assert a.quaternion.shape == (len(a), 4) and a.motor_command.shape == (len(a), 4)
@@ -54,7 +60,8 @@ def test_vehicles_in_long_format_are_told_apart(tmp_path):
 def test_motors_arrive_in_the_nominal_order(tmp_path):
     text = HEADER + "0,1,2,3,4,5,6,.1,.2,.3,.4,\n"
     table = read_csv(write(tmp_path / "log.csv", text))
-    # m1 rear left, m2 front left, m3 front right, m4 rear right: nominal m1 (front right) is the logged m3.
+    # m1 rear left, m2 front left, m3 front right, m4 rear right: nominal m1 (front right) is the
+    # logged m3.
     (flight,), _ = flights_of(table, motor_permutation=(2, 3, 0, 1))
     assert flight.motor_command[0].tolist() == [0.3, 0.4, 0.1, 0.2]
 
@@ -63,7 +70,10 @@ def test_a_channel_with_a_missing_column_is_left_out_and_named(tmp_path):
     table = read_csv(write(tmp_path / "log.csv", "t,x,y,wx,wy,wz,colour\n0,1,2,3,4,5,6\n"))
     (flight,), remarks = flights_of(table)
     assert flight.position is None and flight.body_rates is not None
-    assert remarks == ["unknown column left out: colour", "x, y without z: position is left out; log z"]
+    assert remarks == [
+        "unknown column left out: colour",
+        "x, y without z: position is left out; log z",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -89,7 +99,8 @@ def test_what_is_no_log_says_why(tmp_path, text, reason):
 @pytest.mark.parametrize(
     "data",
     [b"\x1f\x8bnot gzip", gzip.compress(b"t,wx\n0,1\n" * 500)[:40], b"\xff\xfe\x00t"],
-    # gzip writes the time into its header: names from the data would differ between the processes of a run
+    # gzip writes the time into its header: names from the data would differ between the processes
+    # of a run
     ids=["no gzip", "cut short", "no text"],
 )
 def test_corrupt_files_say_so(tmp_path, data):

@@ -1,4 +1,6 @@
-"""With the real cflib over loopback: its packets mean what we mean, a flight from take-off to its log, the guard."""
+"""With the real cflib over loopback: its packets mean what we mean, a flight from take-off to its
+log, the guard.
+"""
 
 import multiprocessing
 import subprocess
@@ -51,7 +53,9 @@ angles = st.floats(-3.0, 3.0)
 
 
 @settings(max_examples=50, deadline=None)
-@given(st.sampled_from([RATES, ANGLES]), angles, angles, angles, st.floats(LEAST_THRUST, MOST_THRUST))
+@given(
+    st.sampled_from([RATES, ANGLES]), angles, angles, angles, st.floats(LEAST_THRUST, MOST_THRUST)
+)
 def test_a_set_point_arrives_on_board_as_it_was_meant(mode, roll, pitch, yaw_rate, thrust):
     from cflib.crazyflie.commander import Commander
 
@@ -126,7 +130,12 @@ class Hovering:
         # hover, level out, and wobble: a log in which nothing changes is refused
         wobble = 0.05 * np.sin(0.3 * self.steps + np.arange(3))
         action = [
-            [0.2492 + wobble[2], wobble[0] - p.quaternion[1], wobble[1] - p.quaternion[2], wobble[2]]
+            [
+                0.2492 + wobble[2],
+                wobble[0] - p.quaternion[1],
+                wobble[1] - p.quaternion[2],
+                wobble[2],
+            ]
             for p in poses
         ]
         nothing = np.zeros(3)
@@ -142,7 +151,9 @@ def flight_of(links, seconds):
 
 
 def fly_hovering(uris, folder, body_logs, seconds):
-    """A short flight: the flight, what was recorded of the first vehicle, and the case as the diagnosis reads it."""
+    """A short flight: the flight, what was recorded of the first vehicle, and the case as the
+    diagnosis reads it.
+    """
     from openjax.flights.case import load_case
 
     with connected(uris, body_logs) as links:
@@ -164,7 +175,8 @@ def test_a_flight_from_the_floor_to_its_log(uris, tmp_path):
     assert flight.record.episodes[0]["capture_step"] == 11
     timing = flight.record.timing()
     assert timing["ticks"] > 200
-    # a set-point leaves after the poses that it was made of, and those were measured before they arrived
+    # a set-point leaves after the poses that it was made of, and those were measured before they
+    # arrived
     assert 0.0 < timing["command_age_ms"]["p50"] < timing["measured_to_sent_ms"]["p50"] < 10.0
     assert {f.vehicle for f in case.flights} == {"0", "1", "2"}
     for flown in case.flights:
@@ -178,15 +190,21 @@ def test_a_flight_from_the_floor_to_its_log(uris, tmp_path):
 @pytest.mark.real_time
 @pytest.mark.parametrize(("latency", "loss"), [(0.0, 0.0), (6.0, 0.0), (12.0, 0.1)])
 def test_the_log_tells_the_links_latency_and_loss(tmp_path, latency, loss):
-    """By the motors, whose mean is the thrust that was asked for as long as none of them is at its limit."""
+    """By the motors, whose mean is the thrust that was asked for as long as none of them is at its
+    limit.
+    """
     with virtual("--latency_ms", str(latency), "--loss", str(loss)) as uris:
         _, _, case = fly_hovering(uris, tmp_path, body_logs=5, seconds=4.0)
-    delays, sent, arrived = [], 0, 0
+    delays = []
+    sent = 0
+    arrived = 0
     for flown in case.flights:
         motors = flown.motor_command.mean(1)
         logged = np.isfinite(motors) & (flown.motor_command.max(1) < 0.999)
         # The five blocks of motors aren't sampled together; on a busy machine two of them may meet.
-        phases = np.histogram((1e3 * flown.time[np.isfinite(motors)]) % 10.0, bins=10, range=(0.0, 10.0))[0]
+        phases = np.histogram(
+            (1e3 * flown.time[np.isfinite(motors)]) % 10.0, bins=10, range=(0.0, 10.0)
+        )[0]
         assert (phases > 0.1 * phases.max()).sum() >= 3
         changes = np.flatnonzero(np.diff(flown.command_thrust) != 0.0)[2:-6] + 1
         for change in changes:
@@ -245,8 +263,12 @@ def test_a_broken_link_process_is_an_error_and_not_a_wait(uris):
 @pytest.mark.slow
 @pytest.mark.real_time
 def test_motion_capture_is_seen_here_and_on_board():
-    """The virtual Crazyflie in a thread of this process, so that its firmware can be looked into."""
-    virtual = VirtualCrazyflies(VirtualVehicles(load_vehicle(), [(0.4, 0.0)]), port=0, faults=LinkFaults())
+    """The virtual Crazyflie in a thread of this process, so that its firmware can be looked
+    into.
+    """
+    virtual = VirtualCrazyflies(
+        VirtualVehicles(load_vehicle(), [(0.4, 0.0)]), port=0, faults=LinkFaults()
+    )
     over = threading.Event()
     thread = threading.Thread(target=virtual.run, args=(over.is_set,), daemon=True)
     thread.start()
@@ -255,16 +277,22 @@ def test_motion_capture_is_seen_here_and_on_board():
         with connected(virtual.uris, 0, MotionCaptured) as captured:
             state = initial_state([(0.4, 0.0, 0.5)], settings=PATIENT)
             for k in range(40):
-                captured.update(0, (0.3 + 0.005 * k, 0.0, 0.5), (1.0, 0.0, 0.0, 0.0), at=100.0 + 0.01 * k)
+                captured.update(
+                    0, (0.3 + 0.005 * k, 0.0, 0.5), (1.0, 0.0, 0.0, 0.0), at=100.0 + 0.01 * k
+                )
                 (sample,) = captured.observe()
                 state = see(state, 100.0 + 0.01 * k, (sample,))
                 captured.believed(0, state.drones[0].captured.pose, told=True)
             assert captured.arrivals() == (100.0 + 0.01 * 39,)
-            np.testing.assert_allclose(state.drones[0].estimate.velocity, (0.5, 0.0, 0.0), atol=1e-3)
+            np.testing.assert_allclose(
+                state.drones[0].estimate.velocity, (0.5, 0.0, 0.0), atol=1e-3
+            )
             deadline = time.monotonic() + 60.0
             while firmware.external_poses < 40 and time.monotonic() < deadline:
                 time.sleep(0.01)
-            np.testing.assert_allclose(firmware.external_pose[:4], (0.495, 0.0, 0.5, 1.0), atol=1e-6)
+            np.testing.assert_allclose(
+                firmware.external_pose[:4], (0.495, 0.0, 0.5, 1.0), atol=1e-6
+            )
     finally:
         over.set()
         thread.join()

@@ -50,7 +50,9 @@ def test_the_links_process_doesnt_outlive_one_that_is_killed_while_it_connects(m
     try:
         assert loop.stdout.readline() == b"connecting\n"
         deadline = time.monotonic() + 60.0
-        while len(children) < 2 and time.monotonic() < deadline:  # the links' and multiprocessing's own
+        while (
+            len(children) < 2 and time.monotonic() < deadline
+        ):  # the links' and multiprocessing's own
             time.sleep(0.1)
             with open(f"/proc/{loop.pid}/task/{loop.pid}/children") as file:
                 children = [int(child) for child in file.read().split()]

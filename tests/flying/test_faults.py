@@ -1,4 +1,6 @@
-"""Faults at their source, flown in simulated time by the true vehicles: one of each kind; vehicles of another weight."""
+"""Faults at their source, flown in simulated time by the true vehicles: one of each kind; vehicles
+of another weight.
+"""
 
 import json
 import math
@@ -28,7 +30,8 @@ def test_a_vehicle_of_another_weight_flies_or_is_stopped_before_it_could_fall(sh
     vehicle = load_vehicle()
     vehicles = VirtualVehicles(vehicle.replace(mass=share * vehicle.mass), [(0.4, 0.0)])
     swarm = SimulatedSwarm(vehicles, [False], lambda i, now, pose: pose, lambda *_: None)
-    state, highest = initial_state([(0.4, 0.0, 0.5)]), 0.0
+    state = initial_state([(0.4, 0.0, 0.5)])
+    highest = 0.0
     for tick in range(800):
         if state.all_in(Mode.STOPPED, Mode.LANDED):
             break
@@ -50,6 +53,17 @@ def test_a_job_that_fails_costs_no_other(capsys):
 
 
 def test_what_is_infinite_is_written_as_null_and_named():
-    row = {"kind": "camera drifts", "duration": math.inf, "out": math.nan, "time": 1.5, "seconds": None}
+    row = {
+        "kind": "camera drifts",
+        "duration": math.inf,
+        "out": math.nan,
+        "time": 1.5,
+        "seconds": None,
+    }
     read = json.loads(json.dumps(finite(row), allow_nan=False))
-    assert read == {**row, "duration": None, "out": None, "not_finite": {"duration": "inf", "out": "nan"}}
+    assert read == {
+        **row,
+        "duration": None,
+        "out": None,
+        "not_finite": {"duration": "inf", "out": "nan"},
+    }

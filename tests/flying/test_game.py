@@ -38,7 +38,9 @@ def test_the_packed_tick_plays_as_the_games_own_functions():
         place = np.zeros(3, np.float32) if evader is None else evader.astype(np.float32)
         state, action, *rest = tick(state, action, pose_array(seen), place, evader is not None)
         for mine, expected in zip(play, (action, *rest), strict=True):
-            np.testing.assert_allclose(np.asarray(mine, float), np.asarray(expected, float), atol=1e-5)
+            np.testing.assert_allclose(
+                np.asarray(mine, float), np.asarray(expected, float), atol=1e-5
+            )
         caught |= play.captured
     assert caught
 

@@ -1,4 +1,6 @@
-"""Poses judged: what no vehicle can have done isn't believed, what one can is; and nothing wrong reaches the game."""
+"""Poses judged: what no vehicle can have done isn't believed, what one can is; and nothing wrong
+reaches the game.
+"""
 
 import math
 from dataclasses import replace
@@ -25,7 +27,8 @@ HERE = Pose(0.0, (0.4, 0.0, 0.5), (0.3, 0.0, 0.0), LEVEL, (0.0, 0.0, 0.1))
 
 def turned(angle, axis=3):
     return tuple(
-        math.cos(angle / 2) if i == 0 else math.sin(angle / 2) if i == axis else 0.0 for i in range(4)
+        math.cos(angle / 2) if i == 0 else math.sin(angle / 2) if i == axis else 0.0
+        for i in range(4)
     )
 
 
@@ -35,7 +38,9 @@ def test_a_number_that_is_none_is_refused_in_every_field(field, bad):
     for k in range(len(getattr(HERE, field))):
         values = list(getattr(HERE, field))
         values[k] = bad
-        assert judge(HERE._replace(**{field: tuple(values)}), None, 0.0, LIMITS) is Verdict.NOT_FINITE
+        assert (
+            judge(HERE._replace(**{field: tuple(values)}), None, 0.0, LIMITS) is Verdict.NOT_FINITE
+        )
 
 
 @pytest.mark.parametrize(
@@ -64,7 +69,9 @@ def test_one_wrong_frame(changes, verdict):
 def test_a_vehicle_gets_farther_while_nothing_is_heard_than_while_it_is_landed_by_reckoning(
     x, unseen, verdict
 ):
-    """.8 m away after .3 s: the last of many wrong poses, or the first one after a radio's outage."""
+    """.8 m away after .3 s: the last of many wrong poses, or the first one after a radio's
+    outage.
+    """
     assert judge(HERE._replace(time=0.3, position=(x, 0.0, 0.5)), HERE, unseen, LIMITS) is verdict
 
 
@@ -73,11 +80,19 @@ unit = st.floats(-1.0, 1.0)
 
 @given(st.tuples(unit, unit, unit), st.tuples(unit, unit, unit), st.floats(0.001, 0.5))
 def test_what_a_vehicle_can_do_is_believed(push, spin, dt):
-    """Any acceleration of thrust and gravity, any angular acceleration of its rotors, for any time in which nothing is heard."""
-    thrust = tuple(9.81 / nominal_airframe().hover_thrust * a / max(math.hypot(*push), 1.0) for a in push)
+    """Any acceleration of thrust and gravity, any angular acceleration of its rotors, for any time
+    in which nothing is heard.
+    """
+    thrust = tuple(
+        9.81 / nominal_airframe().hover_thrust * a / max(math.hypot(*push), 1.0) for a in push
+    )
     acceleration = (*thrust[:2], thrust[2] - 9.81)
-    alpha = [nominal_airframe().angular_acceleration * a / max(math.hypot(*spin), 1.0) for a in spin]
-    drawn = HERE._replace(body_rates=tuple(0.5 * dt * a for a in alpha))  # the mean rates of the way
+    alpha = [
+        nominal_airframe().angular_acceleration * a / max(math.hypot(*spin), 1.0) for a in spin
+    ]
+    drawn = HERE._replace(
+        body_rates=tuple(0.5 * dt * a for a in alpha)
+    )  # the mean rates of the way
     there = moved_on(drawn, dt)
     there = there._replace(
         position=tuple(
@@ -98,7 +113,9 @@ def test_poses_out_of_order_late_or_from_the_future_change_nothing():
     track = Track(HERE._replace(time=1.0))
     for time in (0.99, 1.0, 0.5, 1.2, math.nan, math.inf):
         assert (
-            track.after(HERE._replace(time=time, position=(0.401, 0.0, 0.5)), 1.01, LIMITS, True, None)
+            track.after(
+                HERE._replace(time=time, position=(0.401, 0.0, 0.5)), 1.01, LIMITS, True, None
+            )
             is track
         )
     assert Track().after(None, 1.0, LIMITS, True, None) == Track()

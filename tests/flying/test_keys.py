@@ -27,7 +27,13 @@ def terminal():
 
 def test_the_strongest_of_all_keys_of_one_read_counts(terminal):
     ours, theirs = terminal
-    expected = {" ": Request.STOP, "q": Request.STOP, "l": Request.LAND, "h": Request.HOLD, "x": Request.NONE}
+    expected = {
+        " ": Request.STOP,
+        "q": Request.STOP,
+        "l": Request.LAND,
+        "h": Request.HOLD,
+        "x": Request.NONE,
+    }
     order = list(expected.values())
     with Operator(theirs) as operator:
         assert operator() is Request.NONE
@@ -89,7 +95,9 @@ print(input())
 
 def test_who_stands_alone_is_deaf_to_a_terminal_and_its_end():
     command = [sys.executable, "-c", ALONE]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
         try:
             assert process.stdout.readline() == "True\n"
             for name in DEAF:

@@ -18,7 +18,9 @@ STARTS = ((0.5, 0.3, 0.5), (0.5, 0.0, 0.5), (0.5, -0.3, 0.5))
 
 
 class Hovering:
-    """Links to three vehicles that rise as soon as they are asked to, and a game whose policy hovers."""
+    """Links to three vehicles that rise as soon as they are asked to, and a game whose policy
+    hovers.
+    """
 
     airframe = nominal_airframe()
     settings = SimpleNamespace(num_pursuers=3, pillar_radius=0.1, max_speed=1.0)
@@ -28,7 +30,8 @@ class Hovering:
     )  # fmt: skip
 
     def __init__(self):
-        self.now, self.height = 0.0, 0.0
+        self.now = 0.0
+        self.height = 0.0
         self._nothing = np.zeros(3)
         self._action = np.array([[2 * self.airframe.hover_thrust - 1, 0.0, 0.0, 0.0]] * 3)
 
@@ -79,7 +82,9 @@ def flight():
 
 
 def test_ticks_leave_half_a_kilobyte_each_and_nothing_to_collect(flight):
-    """The garbage collector is off in flight; two kilobytes a tick were 128 MB in eleven minutes."""
+    """The garbage collector is off in flight; two kilobytes a tick were 128 MB in eleven
+    minutes.
+    """
     _, go_on = flight
     gc.collect()
     gc.disable()
@@ -101,7 +106,9 @@ def test_a_flight_may_end_before_its_first_tick():
 
 
 def test_poses_that_are_never_of_now_end_a_flight_that_hasnt_begun():
-    """A motion capture that stamps them by another clock: nothing flies, and the flight says why."""
+    """A motion capture that stamps them by another clock: nothing flies, and the flight says
+    why.
+    """
     links = Hovering()
     flight = Flight(links, links, flight_state(links, 3, SafetySettings()), Plan())
     begin = time.perf_counter()
@@ -122,8 +129,11 @@ def test_the_record_says_when_each_tick_was_due_and_done(flight):
 
 @pytest.mark.parametrize("waiting", [False, True])
 def test_a_tick_after_a_stall_gives_poses_time_to_arrive(waiting):
-    """All processes stood still: the loop, which woke up first, took poses for lost that were a millisecond away."""
-    links, waited = Hovering(), []
+    """All processes stood still: the loop, which woke up first, took poses for lost that were a
+    millisecond away.
+    """
+    links = Hovering()
+    waited = []
 
     def wait(until):
         waited.append(until)

@@ -1,4 +1,6 @@
-"""Before take-off: each thing that must be so, wrong on its own, is one line that says what to do."""
+"""Before take-off: each thing that must be so, wrong on its own, is one line that says what to
+do.
+"""
 
 import math
 import subprocess
@@ -78,10 +80,15 @@ with sole_command(["udp://one", "udp://two"]):
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux's abstract names")
 def test_a_second_fly_is_refused_until_the_first_is_gone_however_it_went():
-    first = subprocess.Popen([sys.executable, "-c", HOLDER], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    first = subprocess.Popen(
+        [sys.executable, "-c", HOLDER], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
     try:
         assert first.stdout.readline() == b"held\n"
-        with pytest.raises(UserError, match="has this vehicle"), sole_command(["udp://zero", "udp://two"]):
+        with (
+            pytest.raises(UserError, match="has this vehicle"),
+            sole_command(["udp://zero", "udp://two"]),
+        ):
             pass
         with sole_command(["udp://zero"]):  # what was held before the refusal is free again
             pass

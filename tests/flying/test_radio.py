@@ -39,10 +39,14 @@ class Vehicle:
 @pytest.fixture
 def vehicles(monkeypatch):
     """By URI, on one dongle."""
-    air, lock = [Vehicle() for _ in range(3)], threading.Lock()
+    air = [Vehicle() for _ in range(3)]
+    lock = threading.Lock()
 
     class Dongle:
-        version, DR_250KPS, DR_1MPS, DR_2MPS = 0.53, 0, 1, 2
+        version = 0.53
+        DR_250KPS = 0
+        DR_1MPS = 1
+        DR_2MPS = 2
 
         def __init__(self, devid=0):
             self._address = None
@@ -67,8 +71,11 @@ def vehicles(monkeypatch):
 
 
 def send(links, seconds=2.0):
-    """Set-points at 100 Hz, and poses of motion capture where they can be sent; the longest time (s) that they took."""
-    longest, end = 0.0, time.perf_counter() + seconds
+    """Set-points at 100 Hz, and poses of motion capture where they can be sent; the longest time
+    (s) that they took.
+    """
+    longest = 0.0
+    end = time.perf_counter() + seconds
     while (begin := time.perf_counter()) < end:
         for i in range(3 * hasattr(links, "send_pose")):
             links.send_pose(i, (begin, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
@@ -81,7 +88,8 @@ def send(links, seconds=2.0):
 def check_the_others_fly_on(links, vehicles):
     first, _, last = vehicles.values()
     before = [v.firmware.set_points for v in (first, last)]
-    longest, end = send(links), time.perf_counter()
+    longest = send(links)
+    end = time.perf_counter()
     assert longest < 0.1
     for vehicle, count in zip((first, last), before, strict=True):
         assert vehicle.firmware.set_points - count > 50
@@ -92,7 +100,9 @@ def check_the_others_fly_on(links, vehicles):
 
 @pytest.mark.real_time
 def test_a_vehicle_that_doesnt_answer_keeps_no_other_waiting(vehicles):
-    """cflib waits two seconds for it, by when the others' watchdogs would have stopped their motors."""
+    """cflib waits two seconds for it, by when the others' watchdogs would have stopped their
+    motors.
+    """
     swarm = Swarm(list(vehicles))
     swarm.connect()
     try:

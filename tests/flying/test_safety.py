@@ -39,7 +39,9 @@ def still(time, place, velocity=(0.0, 0.0, 0.0), quaternion=LEVEL):
 def pursuing(velocity=(0.0, 0.0, 0.0)):
     state = initial_state(PLACES)
     poses = [Pose(0.0, p, velocity, LEVEL) for p in PLACES]
-    drones = tuple(Drone(Mode.PURSUIT, estimate=p, own=Track(p), seen=0.0, sent=POLICY) for p in poses)
+    drones = tuple(
+        Drone(Mode.PURSUIT, estimate=p, own=Track(p), seen=0.0, sent=POLICY) for p in poses
+    )
     return state._replace(drones=drones)
 
 
@@ -57,11 +59,18 @@ def test_the_policy_flies_while_all_is_well():
 
 
 def test_who_takes_over_knows_where_vehicles_have_got_to():
-    board, state = Board(3, multiprocessing.get_context("spawn")), pursuing((0.4, 0.0, 0.0))
-    turning = state.drones[0]._replace(estimate=state.drones[0].estimate._replace(body_rates=(2.0, 0.0, 0.0)))
+    board = Board(3, multiprocessing.get_context("spawn"))
+    state = pursuing((0.4, 0.0, 0.0))
+    turning = state.drones[0]._replace(
+        estimate=state.drones[0].estimate._replace(body_rates=(2.0, 0.0, 0.0))
+    )
     board.write(Role.LOOP, 0.0, state._replace(drones=(turning, *state.drones[1:])))
     first, second, _ = take_over(board.read(initial_state(PLACES), 0.1), 0.1).drones
-    assert first.estimate.position[0] == second.estimate.position[0] == pytest.approx(PLACES[0][0] + 0.04)
+    assert (
+        first.estimate.position[0]
+        == second.estimate.position[0]
+        == pytest.approx(PLACES[0][0] + 0.04)
+    )
     assert roll_pitch_yaw(first.estimate.quaternion)[0] == pytest.approx(0.2, abs=1e-2)
     assert first.mode is second.mode is Mode.HOLD
 
@@ -86,7 +95,8 @@ class Still:
 @pytest.mark.parametrize("role", Role)
 def test_a_stop_is_heard_by_whoever_lands(role):
     """By the loop, too: it has the keys, and once it lands by itself nobody else asks for them."""
-    board, links = Board(3, multiprocessing.get_context("spawn"), silence=0.01), Still()
+    board = Board(3, multiprocessing.get_context("spawn"), silence=0.01)
+    links = Still()
     board.write(Role.LOOP, time.perf_counter(), pursuing())
 
     def listen():
@@ -101,7 +111,9 @@ DONGLE = "\0openjax test of a dongle"
 
 
 def hold(board, ready):
-    """Have what only one process can have, until killed, which takes a while with so much memory to give back."""
+    """Have what only one process can have, until killed, which takes a while with so much memory to
+    give back.
+    """
     held = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     held.bind(DONGLE)
     board.enter(Role.LINKS)
@@ -110,11 +122,14 @@ def hold(board, ready):
     time.sleep(60.0 + len(memory))
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="Linux's abstract names, and pidfd")
+@pytest.mark.skipif(
+    not sys.platform.startswith("linux"), reason="Linux's abstract names, and pidfd"
+)
 def test_what_an_ended_process_held_is_free():
     """A radio dongle is one process's: who takes over opens it right after."""
     context = multiprocessing.get_context("spawn")
-    board, ready = Board(1, context, silence=5.0), context.Event()
+    board = Board(1, context, silence=5.0)
+    ready = context.Event()
     holder = context.Process(target=hold, args=(board, ready))
     holder.start()
     try:
@@ -144,13 +159,18 @@ def test_a_lost_pose_lands_that_one_by_reckoning_and_stops_the_others():
 
 @pytest.mark.parametrize(("ticks", "mode"), [(4, Mode.PURSUIT), (40, Mode.LAND)])
 def test_a_pose_that_jumps_is_not_followed(ticks, mode):
-    """Motion capture takes the vehicle for another: for a moment nothing happens, for longer it lands where it is."""
-    state, away = pursuing(), (0.1, 0.0, 0.5)
+    """Motion capture takes the vehicle for another: for a moment nothing happens, for longer it
+    lands where it is.
+    """
+    state = pursuing()
+    away = (0.1, 0.0, 0.5)
     for k in range(1, 3):
         state, _ = step(state, event(0.01 * k))
     for k in range(3, 3 + ticks):
         time = 0.01 * k
-        state, _ = step(state, event(time, _1=PoseSample(Pose(time, away, (0.0,) * 3, LEVEL), time, 4.0)))
+        state, _ = step(
+            state, event(time, _1=PoseSample(Pose(time, away, (0.0,) * 3, LEVEL), time, 4.0))
+        )
     assert math.dist(state.drones[1].estimate.position[:2], PLACES[1][:2]) < 0.02
     assert state.modes[1] is mode
     assert state.drones[1].reason == ("pose jumped" if mode is Mode.LAND else "")
@@ -163,10 +183,14 @@ def test_a_pose_that_jumps_is_not_followed(ticks, mode):
 @pytest.mark.parametrize("frames", [1, 4])
 @pytest.mark.parametrize("off", [0.14, 2.0])
 def test_wrong_frames_of_motion_capture_move_nothing(frames, off):
-    """Velocities are differences of its positions: a frame that isn't refused in time is a velocity of metres a second."""
-    state, place = pursuing(), PLACES[1]
+    """Velocities are differences of its positions: a frame that isn't refused in time is a velocity
+    of metres a second.
+    """
+    state = pursuing()
+    place = PLACES[1]
     for k in range(1, 30):
-        time, wrong = 0.01 * k, 10 <= k < 10 + frames
+        time = 0.01 * k
+        wrong = 10 <= k < 10 + frames
         seen = still(time, (place[0] + off * wrong, *place[1:]))
         sample = PoseSample(still(time, place), time, 4.0, captured=seen)
         state, _ = step(state, event(time, _1=sample))
@@ -177,7 +201,8 @@ def test_wrong_frames_of_motion_capture_move_nothing(frames, off):
 
 def test_an_own_estimate_that_is_elsewhere_is_not_believed_for_having_waited():
     """With time it might have drifted there by reckoning; motion capture sees that it hasn't."""
-    state, away = pursuing(), (0.5, 0.6, 0.5)
+    state = pursuing()
+    away = (0.5, 0.6, 0.5)
     for k in range(1, 150):
         now = 0.01 * k
         own = still(now, PLACES[0] if k < 5 else away)
@@ -188,9 +213,11 @@ def test_an_own_estimate_that_is_elsewhere_is_not_believed_for_having_waited():
 
 
 def test_the_estimator_on_board_is_told_what_is_near_it_and_no_more():
-    state, told = pursuing(), []
+    state = pursuing()
+    told = []
     for k in range(1, 41):
-        time, place = 0.01 * k, PLACES[1]
+        time = 0.01 * k
+        place = PLACES[1]
         seen = still(time, (place[0] + 0.0012 * k, *place[1:]))
         sample = PoseSample(still(time, place), time, 4.0, captured=seen)
         state, _ = step(state, event(time, _1=sample))
@@ -220,8 +247,13 @@ def test_what_is_out_of_limits_ends_the_game_for_all(pose, reason):
 
 @pytest.mark.parametrize("error", [-0.35, 0.0, 0.05])
 def test_a_landing_is_soft_where_the_floor_isnt_where_it_is_thought(error):
-    """A point mass on the floor of closed form: the estimate's height is wrong by `error` (m) from the landing on."""
-    state, height, speed, touched = pursuing(), 0.5, 0.0, []
+    """A point mass on the floor of closed form: the estimate's height is wrong by `error` (m) from
+    the landing on.
+    """
+    state = pursuing()
+    height = 0.5
+    speed = 0.0
+    touched = []
     for k in range(1, 600):
         time = 0.01 * k
         seen = still(time, (*PLACES[1][:2], height + error * min(k / 100, 1.0)), (0.0, 0.0, speed))
@@ -239,13 +271,16 @@ def test_who_leans_the_wrong_way_turns_before_it_pushes():
     """Leaning 45 degrees outwards and asked to brake, full thrust would drive it out."""
     lean = (math.cos(math.pi / 8), 0.0, math.sin(math.pi / 8), 0.0)
     hover = nominal_airframe().hover_thrust
-    thrust = [accelerate(q, (-5.0, 0.0, 0.0), nominal_airframe(), 0.0).thrust for q in (LEVEL, lean)]
+    thrust = [
+        accelerate(q, (-5.0, 0.0, 0.0), nominal_airframe(), 0.0).thrust for q in (LEVEL, lean)
+    ]
     assert thrust[0] == pytest.approx(hover)
     assert thrust[1] == pytest.approx(hover * (9.81 - 5.0) / 9.81 * math.sqrt(0.5))
 
 
 def test_upside_down_for_long_its_motors_are_off_and_the_others_land():
-    state, over = pursuing(), (0.1, 0.995, 0.0, 0.0)
+    state = pursuing()
+    over = (0.1, 0.995, 0.0, 0.0)
     drone = state.drones[1]._replace(own=Track(Pose(0.0, PLACES[1], (0.0,) * 3, over)))
     state = state._replace(drones=(state.drones[0], drone, state.drones[2]))
     for k in range(1, 20):
@@ -266,11 +301,16 @@ def test_an_action_that_is_no_number_is_none(bad):
 
 
 def test_vehicles_that_close_in_are_parted():
-    """Two head on at 1 m/s each, as the policy wants; they brake at what is counted on, and stay apart."""
+    """Two head on at 1 m/s each, as the policy wants; they brake at what is counted on, and stay
+    apart.
+    """
     places = [[-0.5, 0.0, 0.5], [0.5, 0.02, 0.5]]
-    speeds, nearest = [1.0, -1.0], math.inf
+    speeds = [1.0, -1.0]
+    nearest = math.inf
     for _ in range(200):
-        poses = [Pose(0.0, tuple(p), (v, 0.0, 0.0), LEVEL) for p, v in zip(places, speeds, strict=True)]
+        poses = [
+            Pose(0.0, tuple(p), (v, 0.0, 0.0), LEVEL) for p, v in zip(places, speeds, strict=True)
+        ]
         wanted = [parting_velocity(LIMITS, i, poses) for i in range(2)]
         for i in range(2):
             if wanted[i] is not None:
@@ -282,7 +322,9 @@ def test_vehicles_that_close_in_are_parted():
 
 
 def lift(rise, seconds=2.5):
-    """Modes and reasons after a test lift in which the vehicle's poses are rise(height of the others) (m)."""
+    """Modes and reasons after a test lift in which the vehicle's poses are rise(height of the
+    others) (m).
+    """
     state = initial_state(PLACES)
     height = 0.0
     for k in range(1, int(100 * seconds)):
@@ -290,7 +332,9 @@ def lift(rise, seconds=2.5):
         seen = [(*p[:2], height) for p in PLACES]
         place, captured = rise(PLACES[1], height)
         samples = [PoseSample(still(time, p), time, 4.0) for p in seen]
-        samples[1] = PoseSample(still(time, place), time, 4.0, captured=captured and still(time, captured))
+        samples[1] = PoseSample(
+            still(time, place), time, 4.0, captured=captured and still(time, captured)
+        )
         request = Request.TRANSFER if k == 5 else Request.NONE
         state, _ = step(state, Event(time, tuple(samples), None, request))
         if any(m is Mode.LIFT for m in state.modes):
@@ -351,7 +395,8 @@ def test_a_landing_by_reckoning_has_the_time_that_its_height_takes(ceiling):
         Drone(Mode.PURSUIT, estimate=Pose(0.0, (*p[:2], ceiling), (0.0,) * 3, LEVEL), seen=0.0)
         for p in PLACES
     )
-    state, now = high._replace(drones=drones), 0.0
+    state = high._replace(drones=drones)
+    now = 0.0
     while not state.all_in(Mode.SETTLE):
         now += 0.01
         assert now < 20.0
@@ -392,8 +437,12 @@ def test_the_fence_turns_back_what_could_not_stop_any_more():
 @given(st.floats(0.0, 3.0), st.floats(-5.0, 14.0))
 def test_who_brakes_stops_before_the_point_that_the_fence_counts_on(speed, present):
     """Stepped in plain numbers: an acceleration that follows the braking with a lag."""
-    counted_on = stopping_point(LIMITS, Pose(0.0, (0.0,) * 3, (speed, 0.0, 0.0), LEVEL), (present, 0.0, 0.0))
-    x, farthest, acceleration = 0.0, 0.0, present
+    counted_on = stopping_point(
+        LIMITS, Pose(0.0, (0.0,) * 3, (speed, 0.0, 0.0), LEVEL), (present, 0.0, 0.0)
+    )
+    x = 0.0
+    farthest = 0.0
+    acceleration = present
     while speed > 0.0 or acceleration > 0.0:
         acceleration += 1e-3 / LIMITS.reaction * (-LIMITS.braking - acceleration)
         speed += 1e-3 * acceleration
@@ -408,10 +457,16 @@ poses = st.builds(
     st.floats(0.0, 0.3),
     st.tuples(numbers, numbers, numbers),
     st.tuples(numbers, numbers, numbers),
-    st.sampled_from([LEVEL, (0.8, 0.6, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (math.nan,) * 4, (0.0,) * 4]),
+    st.sampled_from(
+        [LEVEL, (0.8, 0.6, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (math.nan,) * 4, (0.0,) * 4]
+    ),
 )
 ticks = st.tuples(
-    st.lists(st.tuples(st.none() | poses, st.floats(0.0, 1.0), st.floats(2.0, 4.2)), min_size=3, max_size=3),
+    st.lists(
+        st.tuples(st.none() | poses, st.floats(0.0, 1.0), st.floats(2.0, 4.2)),
+        min_size=3,
+        max_size=3,
+    ),
     st.booleans(),
     st.sampled_from([*[Request.NONE] * 6, *Request]),
 )
@@ -420,11 +475,14 @@ ticks = st.tuples(
 @settings(max_examples=60, deadline=None)
 @given(st.lists(ticks, min_size=1, max_size=25))
 def test_any_events_give_finite_set_points_and_ends_are_ends(events):
-    state, now = pursuing(), 0.0
+    state = pursuing()
+    now = 0.0
     for seen, acts, request in events:
         now += 0.01
         sightings = tuple(
-            PoseSample(None if pose is None else Pose(now - pose[0], *pose[1:]), now - silent, voltage)
+            PoseSample(
+                None if pose is None else Pose(now - pose[0], *pose[1:]), now - silent, voltage
+            )
             for pose, silent, voltage in seen
         )
         over = [mode in (Mode.STOPPED,) for mode in state.modes]

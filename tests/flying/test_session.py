@@ -1,4 +1,6 @@
-"""Real processes, a real terminal, real cflib: whatever is killed, stopped or typed, true vehicles come down and are disarmed."""
+"""Real processes, a real terminal, real cflib: whatever is killed, stopped or typed, true vehicles
+come down and are disarmed.
+"""
 
 import sys
 import threading
@@ -58,7 +60,8 @@ class Level:
 def flying():
     virtual = VirtualProcess("wall")
     starts = [(*pose.position[:2], 0.5) for pose in virtual.truth.poses()]
-    game, uris = Level(starts), tuple(virtual.uris)
+    game = Level(starts)
+    uris = tuple(virtual.uris)
     state = flight_state(game, 3, SafetySettings())
     prepared = Prepared(
         game,

@@ -16,7 +16,8 @@ import numpy as np
 from openjax.commands.command_line import LONGEST, one_line
 from tests.fuzz.inputs import KINDS
 
-SECONDS, MEGABYTES = 30.0, 1000.0
+SECONDS = 30.0
+MEGABYTES = 1000.0
 
 _warm: set = set()
 
@@ -40,30 +41,39 @@ def try_case(kind: str, seed: int) -> tuple[str, str]:
     """One case: `refused`, `accepted` or `failed`, and what is to be told of it."""
     function = KINDS[kind]
     rng = random.Random(f"{kind} {seed}")
-    memory, started = _megabytes(), time.process_time()
+    memory = _megabytes()
+    started = time.process_time()
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder) / "work"
         place.mkdir()
         try:
             with contextlib.redirect_stderr(io.StringIO()):
                 accepted = function(rng, place)
-            outcome, told = "accepted", ""
+            outcome = "accepted"
+            told = ""
             if not finite(accepted):
-                outcome, told = "failed", "nonsense accepted: a number that isn't finite"
+                outcome = "failed"
+                told = "nonsense accepted: a number that isn't finite"
         except Exception as error:
             told = one_line(error)
             outcome = "refused"
             if told is None or "\n" in told or not told or len(told) > LONGEST:
-                outcome, told = "failed", "".join(traceback.format_exception(error))[-2000:]
+                outcome = "failed"
+                told = "".join(traceback.format_exception(error))[-2000:]
         left = [
-            str(path) for path in place.rglob("*") if path.name.startswith(".writing") or path.name == "run"
+            str(path)
+            for path in place.rglob("*")
+            if path.name.startswith(".writing") or path.name == "run"
         ]
         if left:
-            outcome, told = "failed", f"left behind: {left[:3]}"
+            outcome = "failed"
+            told = f"left behind: {left[:3]}"
     if time.process_time() - started > SECONDS:
-        outcome, told = "failed", f"took {time.process_time() - started:.0f} s ({told})"
+        outcome = "failed"
+        told = f"took {time.process_time() - started:.0f} s ({told})"
     if _megabytes() - memory > MEGABYTES:
-        outcome, told = "failed", f"took {_megabytes() - memory:.0f} MB ({told})"
+        outcome = "failed"
+        told = f"took {_megabytes() - memory:.0f} MB ({told})"
     return outcome, told
 
 

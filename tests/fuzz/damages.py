@@ -1,4 +1,6 @@
-"""Damaged checkpoints of a tiny run: what is restored must be bit for bit what was saved in it or in the one before."""
+"""Damaged checkpoints of a tiny run: what is restored must be bit for bit what was saved in it or
+in the one before.
+"""
 
 import random
 import shutil
@@ -18,7 +20,9 @@ TINY = """--preset quick --environment.time_step 0.01 --environment.substeps 1
 
 
 def make_checkpoints(folder: Path) -> None:
-    """Two checkpoints of a tiny training carry in `folder`/checkpoints, and all their bits in `folder`/UPDATE.npz."""
+    """Two checkpoints of a tiny training carry in `folder`/checkpoints, and all their bits in
+    `folder`/UPDATE.npz.
+    """
     import jax
 
     from openjax.learning import make_start
@@ -29,7 +33,8 @@ def make_checkpoints(folder: Path) -> None:
     for update in (1, 2):
         carry = place(make_start(_tiny_settings())(jax.random.key(update)))
         np.savez(
-            folder / f"{update}.npz", **{name: _plain(leaf) for name, leaf in named_leaves(carry).items()}
+            folder / f"{update}.npz",
+            **{name: _plain(leaf) for name, leaf in named_leaves(carry).items()},
         )
         checkpoints.save(update, carry, score=float(update), notes={"seconds": 1.0})
     checkpoints.wait()
@@ -42,7 +47,9 @@ def _tiny_settings():
 
 
 def try_damages(folder: Path, seeds: range) -> list[str]:
-    """Damage the newest checkpoint (now and then either) and restore: `same`, `before`, `refused` or what went wrong."""
+    """Damage the newest checkpoint (now and then either) and restore: `same`, `before`, `refused`
+    or what went wrong.
+    """
     import jax
 
     from openjax.errors import UserError
@@ -77,9 +84,12 @@ def try_damages(folder: Path, seeds: range) -> list[str]:
                     _plain(leaf).tobytes() == saved[record.update][name].tobytes()
                     for name, leaf in named_leaves(carry).items()
                 ) and all(
-                    leaf.tobytes() == saved[best.update][name].tobytes() for name, leaf in leaves.items()
+                    leaf.tobytes() == saved[best.update][name].tobytes()
+                    for name, leaf in leaves.items()
                 )
-                outcomes.append("silently wrong" if not good else "same" if record.update == 2 else "before")
+                outcomes.append(
+                    "silently wrong" if not good else "same" if record.update == 2 else "before"
+                )
             except UserError:
                 outcomes.append("refused")
             except Exception as error:
@@ -92,4 +102,6 @@ def _plain(leaf):
     import jax
     import jax.numpy as jnp
 
-    return np.asarray(jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf)
+    return np.asarray(
+        jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
+    )

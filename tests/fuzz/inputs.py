@@ -123,8 +123,11 @@ def fuzz_layout(rng: random.Random, folder: Path):
 
     path = _write(folder / "own.toml", changed_text(rng, LAYOUT))
     scenario = find_scenario(str(path), PursuitSettings())
-    slots, number = len(scenario.pillars), len(scenario.pursuers)
-    return scenario_task(PursuitSettings(min_pillars=0, max_pillars=slots, num_pursuers=number), scenario)
+    slots = len(scenario.pillars)
+    number = len(scenario.pursuers)
+    return scenario_task(
+        PursuitSettings(min_pillars=0, max_pillars=slots, num_pursuers=number), scenario
+    )
 
 
 def fuzz_effects(rng: random.Random, folder: Path):
@@ -202,9 +205,7 @@ def _other_policy(rng, good, kind):
         if kind < 0.8:
             members[name] = changed_bytes(rng, members[name])
         elif kind < 0.9:  # a header that promises much
-            text = (
-                f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({rng.choice((10**9, 10**30, -5))},), }}"
-            )
+            text = f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({rng.choice((10**9, 10**30, -5))},), }}"
             members[name] = (
                 b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode() + b"\0" * 64
             )

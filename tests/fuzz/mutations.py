@@ -42,7 +42,9 @@ def changed_text(rng: random.Random, text: str) -> str:
             text = text[:at] + "[" * rng.choice((1, 40, 3000)) + text[at:]
         elif kind == 5:
             words = text.split(" ")
-            words[rng.randrange(len(words))] = rng.choice(VALUES).encode("utf-8", "replace").decode()
+            words[rng.randrange(len(words))] = (
+                rng.choice(VALUES).encode("utf-8", "replace").decode()
+            )
             text = " ".join(words)
         elif kind == 6:
             text = text.replace("\n", rng.choice(("\r", "\r\n", "\n\n", " ")))
@@ -50,7 +52,9 @@ def changed_text(rng: random.Random, text: str) -> str:
             digits = [i for i, character in enumerate(text) if character.isdigit()]
             if digits:
                 at = rng.choice(digits)
-                text = text[:at] + rng.choice(("e", "-", "99999999", ".", "nan", "")) + text[at + 1 :]
+                text = (
+                    text[:at] + rng.choice(("e", "-", "99999999", ".", "nan", "")) + text[at + 1 :]
+                )
     return text
 
 

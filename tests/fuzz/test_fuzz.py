@@ -1,4 +1,6 @@
-"""A few hundred hostile inputs, changed at random from fixed seeds, and a few damaged checkpoints."""
+"""A few hundred hostile inputs, changed at random from fixed seeds, and a few damaged
+checkpoints.
+"""
 
 from collections import Counter
 

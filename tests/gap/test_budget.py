@@ -1,4 +1,6 @@
-"""The diagnosis stays small: lines, named numbers and numbers that decide have budgets; no effect is named outside its file."""
+"""The diagnosis stays small: lines, named numbers and numbers that decide have budgets; no effect
+is named outside its file.
+"""
 
 import ast
 import re
@@ -22,7 +24,9 @@ def named_numbers(source: str) -> list[str]:
             isinstance(part, ast.Constant) and type(part.value) in (int, float)
             for part in ast.walk(node.value)
         ):
-            names = [n.id for target in node.targets for n in ast.walk(target) if isinstance(n, ast.Name)]
+            names = [
+                n.id for target in node.targets for n in ast.walk(target) if isinstance(n, ast.Name)
+            ]
             found += [name for name in names if name.isupper()]
     return found
 
@@ -40,7 +44,9 @@ def test_few_numbers_decide_and_each_has_a_meaning_and_a_source():
 
 def test_no_effect_is_named_outside_its_file():
     pattern = re.compile("[\"'](" + "|".join(EFFECTS) + ")\\b")
-    assert not [(path.name, hit) for path, source in SOURCES.items() for hit in pattern.findall(source)]
+    assert not [
+        (path.name, hit) for path, source in SOURCES.items() for hit in pattern.findall(source)
+    ]
 
 
 def test_no_function_is_longer_than_one_thing_needs():

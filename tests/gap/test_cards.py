@@ -11,8 +11,14 @@ from openjax.vehicle.effects import EFFECTS
 
 @pytest.mark.parametrize("name", EFFECTS)
 def test_a_card_is_complete(name):
-    effect, card = EFFECTS[name], EFFECTS[name].card
-    assert card.path in ("physics", "radio", "rate_loop", "estimator") and card.next_flight.endswith(".")
+    effect = EFFECTS[name]
+    card = EFFECTS[name].card
+    assert card.path in (
+        "physics",
+        "radio",
+        "rate_loop",
+        "estimator",
+    ) and card.next_flight.endswith(".")
     assert {p.name for p in card.fitted} <= set(effect.parameters) and set(card.sample) <= set(
         effect.parameters
     )
@@ -20,17 +26,23 @@ def test_a_card_is_complete(name):
     assert all(len(start) == len(card.fitted) for start in card.others)
     sizes = (card.nuisance, card.nuisance_duty, card.nuisance_samples)
     assert all(
-        set(s) <= set(effect.parameters) and all(callable(v) or v > 0 for v in s.values()) for s in sizes
+        set(s) <= set(effect.parameters) and all(callable(v) or v > 0 for v in s.values())
+        for s in sizes
     )
     assert card.log_odds < 0
 
 
 def test_every_fitted_parameter_has_its_own_place():
     physics = [e for e in CARDS if CARDS[e].path == "physics"]
-    assert sorted(places(physics)) == list(range(len(THETA))) and len(ABSENT) == len(STEP) == len(THETA) + 2
+    assert (
+        sorted(places(physics)) == list(range(len(THETA)))
+        and len(ABSENT) == len(STEP) == len(THETA) + 2
+    )
     for effect in physics:
         index, mean, precision = prior((effect,))
-        assert len(index) == len(set(index)) == len(mean) and np.linalg.eigvalsh(precision).min() > 0
+        assert (
+            len(index) == len(set(index)) == len(mean) and np.linalg.eigvalsh(precision).min() > 0
+        )
 
 
 def test_bounded_least_squares_agree_with_scipy():
@@ -56,13 +68,16 @@ def seems(effect, deviation=1e-6, **value):
 
 
 def test_what_pushes_along_the_motion_is_no_drag():
-    assert seems("rotor_drag", d_xy=0.004, d_z=0.0) and not seems("rotor_drag", d_xy=-0.01, d_z=0.004)
+    assert seems("rotor_drag", d_xy=0.004, d_z=0.0) and not seems(
+        "rotor_drag", d_xy=-0.01, d_z=0.004
+    )
     assert seems("wind", x=0.5, y=0.0, z=0.0, drag=0.004, along=1.0)
     assert not seems("wind", x=0.5, y=0.0, z=0.0, drag=-0.004, along=1.0)
     assert not seems("wind", x=0.5, y=0.0, z=1.0, drag=0.004, along=-0.1)
 
 
 def test_above_the_ceiling_there_is_none():
-    low, high = np.zeros((5, 3)), np.zeros((5, 3))
+    low = np.zeros((5, 3))
+    high = np.zeros((5, 3))
     high[2, 2] = 1.3
     assert CARDS["ceiling_effect"].impossible(high) and not CARDS["ceiling_effect"].impossible(low)

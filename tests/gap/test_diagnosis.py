@@ -1,4 +1,6 @@
-"""The diagnosis on flights whose cause is known: the right name, honest parameters, and honest refusals."""
+"""The diagnosis on flights whose cause is known: the right name, honest parameters, and honest
+refusals.
+"""
 
 import gzip
 import json
@@ -34,10 +36,18 @@ DRAG = {"d_xy": 0.015, "d_z": 0.006}
 
 
 def _case(
-    folder, effects, weighed=False, flights=("flight_a", "flight_b", "flight_c"), seed=3, logged=lambda c: c
+    folder,
+    effects,
+    weighed=False,
+    flights=("flight_a", "flight_b", "flight_c"),
+    seed=3,
+    logged=lambda c: c,
 ):
-    """Fly and log a case; `flights` may repeat a reference, `logged` changes the columns {name: (T,)}."""
-    vehicle, found = load_vehicle(), references(seed=seed, duration=8.0)
+    """Fly and log a case; `flights` may repeat a reference, `logged` changes the columns {name:
+    (T,)}.
+    """
+    vehicle = load_vehicle()
+    found = references(seed=seed, duration=8.0)
     folder.mkdir(parents=True)
     (folder / "vehicle.toml").write_text(VEHICLE.format(weighed=str(weighed).lower()))
     for number, name in enumerate(flights):
@@ -56,7 +66,8 @@ def _held(columns):
 
 def _late(columns):
     """The pose is 4 ms older than its row says."""
-    pose, t = ("x", "y", "z", "qw", "qx", "qy", "qz", "vx", "vy", "vz"), columns["t"]
+    pose = ("x", "y", "z", "qw", "qx", "qy", "qz", "vx", "vy", "vz")
+    t = columns["t"]
     return {n: np.interp(t - 0.004, t, v) if n in pose else v for n, v in columns.items()}
 
 
@@ -66,7 +77,9 @@ def folders(tmp_path_factory):
     return {
         "none": _case(root / "none", {}),
         "drag": _case(root / "drag", {"rotor_drag": DRAG}),
-        "late": _case(root / "late", {"rotor_drag": {n: 3.0 * v for n, v in DRAG.items()}}, logged=_late),
+        "late": _case(
+            root / "late", {"rotor_drag": {n: 3.0 * v for n, v in DRAG.items()}}, logged=_late
+        ),
         "mass": _case(root / "mass", {"mass": {"extra": 0.003}}),
         "weighed": _case(root / "weighed", {"thrust_scale": {"scale": -0.08}}, weighed=True),
         "held": _case(root / "held", {}, logged=_held),
@@ -113,7 +126,9 @@ def test_a_pose_that_rows_repeat_is_no_late_pose(reports):
 
 
 def test_a_strong_cause_outside_the_library_is_unknown_not_its_neighbour(tmp_path):
-    strong = _case(tmp_path / "strong", {"rotor_drag": {name: 2.0 * size for name, size in DRAG.items()}})
+    strong = _case(
+        tmp_path / "strong", {"rotor_drag": {name: 2.0 * size for name, size in DRAG.items()}}
+    )
     report = diagnose_case(load_case(strong), without=("rotor_drag", "wind", "blade_flapping"))
     assert report.verdict == "unknown" and report.effects[0] == "unknown"
 
@@ -121,7 +136,9 @@ def test_a_strong_cause_outside_the_library_is_unknown_not_its_neighbour(tmp_pat
 def test_mass_and_thrust_are_one_class_until_the_mass_is_weighed(reports):
     assert reports["mass"].effects in (("mass",), ("thrust_scale",))
     named = reports["mass"].effects[0]
-    assert {"mass": "thrust_scale", "thrust_scale": "mass"}[named] in reports["mass"].equivalent[named]
+    assert {"mass": "thrust_scale", "thrust_scale": "mass"}[named] in reports["mass"].equivalent[
+        named
+    ]
     weighed = reports["weighed"]
     assert weighed.effects == ("thrust_scale",)
     assert "mass" not in weighed.equivalent.get("thrust_scale", [])
@@ -133,7 +150,10 @@ def test_what_was_not_flown_is_not_testable(reports, tmp_path):
     doublets = _case(tmp_path / "doublets", {}, flights=("flight_c", "flight_c"))
     missing = not_testable(gather(load_case(doublets), library()))
     assert {"ground_effect", "ceiling_effect", "downwash"} <= set(missing)
-    assert "downwash" in reports["drag"].not_testable and "motor_lag" not in reports["drag"].not_testable
+    assert (
+        "downwash" in reports["drag"].not_testable
+        and "motor_lag" not in reports["drag"].not_testable
+    )
 
 
 def test_the_report_has_the_agreed_form(reports):
@@ -152,7 +172,11 @@ def test_the_report_has_the_agreed_form(reports):
         assert set(data["not_testable"]) <= set(EFFECTS)
         first = data["effects"][0] if data["effects"] else "none"
         assert data["probabilities"][first] == max(data["probabilities"].values())
-        assert set(data["shares"]["effects"]) == set(data["effects"]) - {"unknown"} == set(data["parameters"])
+        assert (
+            set(data["shares"]["effects"])
+            == set(data["effects"]) - {"unknown"}
+            == set(data["parameters"])
+        )
         prediction = report.prediction()
         assert set(prediction) == {"effects", "probabilities", "where", "reduction", "not_testable"}
         assert sum(prediction["probabilities"].values()) == pytest.approx(1.0, abs=1e-3)
@@ -168,10 +192,14 @@ def main(arguments):
 
 
 def test_the_command_writes_everything_or_nothing(folders, reports, tmp_path, capsys, monkeypatch):
-    # what it says of the drag is known; that a command diagnoses is asked where the README's commands are run
+    # what it says of the drag is known; that a command diagnoses is asked where the README's
+    # commands are run
     monkeypatch.setattr("openjax.gap.diagnosis.diagnose_case", lambda case, *_: reports[case.name])
     out = tmp_path / "out"
-    assert main([str(folders["drag"]), "--out", str(out), "--predictions", str(tmp_path / "p.json")]) == 0
+    assert (
+        main([str(folders["drag"]), "--out", str(out), "--predictions", str(tmp_path / "p.json")])
+        == 0
+    )
     names, parameters = load_effects(out / "drag" / "effects.toml")
     assert names == ("rotor_drag",) and parameters["rotor_drag"]["d_xy"] == pytest.approx(
         DRAG["d_xy"], rel=0.1
@@ -184,7 +212,9 @@ def test_the_command_writes_everything_or_nothing(folders, reports, tmp_path, ca
     assert "already exists" in capsys.readouterr().err
 
 
-def test_a_fault_in_one_case_does_not_cost_the_others(folders, reports, tmp_path, capsys, monkeypatch):
+def test_a_fault_in_one_case_does_not_cost_the_others(
+    folders, reports, tmp_path, capsys, monkeypatch
+):
     def diagnosed(case, *_):
         return {"drag": reports["drag"]}[case.name]  # KeyError: what no check has foreseen
 
@@ -196,11 +226,15 @@ def test_a_fault_in_one_case_does_not_cost_the_others(folders, reports, tmp_path
     assert sorted(p.name for p in out.iterdir()) == ["drag"] and "report.html" not in said.out
 
 
-def test_a_log_without_an_attitude_is_diagnosed_and_one_left_out_is_named(folders, tmp_path, capsys):
+def test_a_log_without_an_attitude_is_diagnosed_and_one_left_out_is_named(
+    folders, tmp_path, capsys
+):
     folder = tmp_path / "case"
     shutil.copytree(folders["drag"], folder)
     for path in folder.glob("*.csv.gz"):
-        rows = [line.split(",") for line in gzip.decompress(path.read_bytes()).decode().splitlines()]
+        rows = [
+            line.split(",") for line in gzip.decompress(path.read_bytes()).decode().splitlines()
+        ]
         keep = [k for k, name in enumerate(rows[0]) if name not in ("qw", "qx", "qy", "qz")]
         text = "\n".join(",".join(row[k] for k in keep) for row in rows) + "\n"
         path.write_bytes(gzip.compress(text.encode()))
@@ -212,7 +246,8 @@ def test_a_log_without_an_attitude_is_diagnosed_and_one_left_out_is_named(folder
 
 @pytest.mark.parametrize("kind", ["missing", "empty", "no_commands", "unknown_effect"])
 def test_bad_input_is_one_line_and_leaves_nothing(folders, tmp_path, capsys, kind):
-    folder, more = tmp_path / "case", []
+    folder = tmp_path / "case"
+    more = []
     if kind != "missing":
         folder.mkdir()
         (folder / "vehicle.toml").write_text(VEHICLE.format(weighed="false"))
@@ -221,7 +256,8 @@ def test_bad_input_is_one_line_and_leaves_nothing(folders, tmp_path, capsys, kin
             "t,wx,wy,wz\n" + "".join(f"{k / 100},0.1,{k % 7},0\n" for k in range(500))
         )
     if kind == "unknown_effect":
-        folder, more = folders["none"], ["--without", "gremlins"]
+        folder = folders["none"]
+        more = ["--without", "gremlins"]
     assert main([str(folder), "--out", str(tmp_path / "out"), *more]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and error.count("\n") == 1

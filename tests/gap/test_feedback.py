@@ -17,15 +17,23 @@ from openjax.gap.model.library import Library
 from openjax.vehicle import load_vehicle
 from openjax.vehicle.rate_controller import mixer
 
-ROWS, DT, TICKS = 900, 0.01, 5
+ROWS = 900
+DT = 0.01
+TICKS = 5
 
 
 def flown(seed, p=1.0, gust=0.0, noise=0.005, sampled=False):
-    """A flight in which commands step every .3 s: rigid body, motors' lag, and the firmware's loop at 500 Hz with a P of
-    `p` times the nominal one, gusts of `gust` rad/s^2 and `noise` rad/s in the gyroscope."""
-    vehicle, rng = load_vehicle(), np.random.default_rng(seed)
-    gains = [np.asarray(getattr(vehicle, n), float) * COUNT for n in ("rate_kp", "rate_ki", "rate_kd")]
-    mix, h = np.asarray(mixer(vehicle), float), DT / TICKS
+    """A flight in which commands step every .3 s: rigid body, motors' lag, and the firmware's loop
+    at 500 Hz with a P of `p` times the nominal one, gusts of `gust` rad/s^2 and `noise` rad/s in
+    the gyroscope.
+    """
+    vehicle = load_vehicle()
+    rng = np.random.default_rng(seed)
+    gains = [
+        np.asarray(getattr(vehicle, n), float) * COUNT for n in ("rate_kp", "rate_ki", "rate_kd")
+    ]
+    mix = np.asarray(mixer(vehicle), float)
+    h = DT / TICKS
     reach = np.asarray(vehicle.rotor_position, float)
     arms = np.stack([reach[:, 1], -reach[:, 0]])
     arms = np.concatenate(
@@ -42,8 +50,12 @@ def flown(seed, p=1.0, gust=0.0, noise=0.005, sampled=False):
     )
     command = np.repeat(0.6 * rng.standard_normal((ROWS // 30, 3)), 30, axis=0)
     command += 0.1 * rng.standard_normal((ROWS, 3))  # a position controller's own noise
-    rates, integral, thrust, before = np.zeros(3), np.zeros(3), np.full(4, 0.6), np.zeros(3)
-    push, out = np.zeros(3), {"rates": [], "motor": []}
+    rates = np.zeros(3)
+    integral = np.zeros(3)
+    thrust = np.full(4, 0.6)
+    before = np.zeros(3)
+    push = np.zeros(3)
+    out = {"rates": [], "motor": []}
     for row in range(ROWS):
         motors = []
         for tick in range(TICKS):
@@ -55,7 +67,9 @@ def flown(seed, p=1.0, gust=0.0, noise=0.005, sampled=False):
             wanted = p * gains[0] * error + gains[1] * integral - gains[2] * (seen - before) / h
             before = seen
             motors.append(np.clip(0.6 + mix @ wanted, 0.0, 1.0))
-            thrust = thrust + (1.0 - np.exp(-h / float(vehicle.motor_time_constant))) * (motors[-1] - thrust)
+            thrust = thrust + (1.0 - np.exp(-h / float(vehicle.motor_time_constant))) * (
+                motors[-1] - thrust
+            )
             push = 0.98 * push + 0.2 * gust * rng.standard_normal(3)
             rates = rates + h * (turning @ thrust + push)
         out["motor"].append(motors[0] if sampled else np.mean(motors, 0))
@@ -86,14 +100,17 @@ def test_gains_are_what_the_loop_has_whatever_gusts_and_noise_do(p, sampled):
         library=Library(),
     )
     found = read_rate_loop(reading)
-    change, error = found.change, found.error
+    change = found.change
+    error = found.error
     assert change[0] == pytest.approx(p - 1.0, abs=2.0 * error[0])
     assert change[3] == pytest.approx(p - 1.0, abs=0.03)
     assert bool(loop(change, error, p - 1.0).acting()) == (p != 1.0)
 
 
 def test_calm_flights_leave_all_of_the_motors_to_feedback():
-    """What commands caused is told apart: with gusts alone, the feedback part is nearly all that the motors did."""
+    """What commands caused is told apart: with gusts alone, the feedback part is nearly all that
+    the motors did.
+    """
     track, vehicle, link = flown(1, gust=20.0)
     (still,) = read_feedback([track], [vehicle], [caused_by_commands(track, vehicle, link)])
     quiet, _, _ = flown(1)
@@ -117,7 +134,9 @@ def test_gains_of_all_axes_are_one_reading_that_covers_what_they_disagree_by():
     assert apart.gain[1][0] > 0.35
     assert loop([0.4, 0, 0, 0.0, 0, 0], [0.05] * 3 + [np.inf] * 3).acting()
     assert not loop([0.04, 0, 0, 0.04, 0, 0], [0.01] * 6).acting()  # forms are wrong by as much
-    assert not loop([0.4, 0, 0, 0.4, 0, 0], [0.05] * 6, shown=0.01).named()  # the motors don't follow
+    assert not loop(
+        [0.4, 0, 0, 0.4, 0, 0], [0.05] * 6, shown=0.01
+    ).named()  # the motors don't follow
 
 
 def test_without_enough_flight_gains_cannot_be_told():

@@ -1,4 +1,6 @@
-"""What the page of a diagnosis says first: one sentence, and what to do next, which depends on the case."""
+"""What the page of a diagnosis says first: one sentence, and what to do next, which depends on the
+case.
+"""
 
 import dataclasses
 import inspect
@@ -24,7 +26,12 @@ def report(verdict, effects=(), parameters=(), **more):
         "unexplained": Share(0.0, (0.0, 0.1)),
     }
     values = {e: {"size": Estimate(1.0, "N", (0.5, 1.5), (0.0, 2.0))} for e in parameters}
-    filled = {"equivalent": {}, "not_testable": [], "next_flight": "slow passes.", "quality": []} | more
+    filled = {
+        "equivalent": {},
+        "not_testable": [],
+        "next_flight": "slow passes.",
+        "quality": [],
+    } | more
     return Report(
         case="tuesday", verdict=verdict, effects=tuple(effects), probabilities={"none": 0.5, "unknown": 0.3},
         shares=Split(**fields), parameters=values, where=[], gap=gap, **filled
@@ -41,10 +48,15 @@ CASES = {
 
 
 def test_next_steps_depend_on_the_case():
-    commands = {name: [command for _, command in next_steps(case) if command] for name, case in CASES.items()}
+    commands = {
+        name: [command for _, command in next_steps(case) if command]
+        for name, case in CASES.items()
+    }
     assert any("train" in command for command in commands["effect"])
     assert not any(
-        "train" in command for name in ("none", "unknown", "not testable") for command in commands[name]
+        "train" in command
+        for name in ("none", "unknown", "not testable")
+        for command in commands[name]
     )
     assert any("--reference tuesday" in command for command in commands["none"])
     told = {name: " ".join(why for why, _ in next_steps(case)) for name, case in CASES.items()}
@@ -58,7 +70,9 @@ def test_a_normal_flight_is_not_charted_as_a_gap():
     assert shares(CASES["none"]) == []
     assert sentence(CASES["none"]).startswith("The simulator agrees")
     assert "y or z (20 %)" in sentence(CASES["two"])
-    assert "rotor x (70 %)" in sentence(CASES["effect"]) and "shrink by 70 %" in sentence(CASES["effect"])
+    assert "rotor x (70 %)" in sentence(CASES["effect"]) and "shrink by 70 %" in sentence(
+        CASES["effect"]
+    )
 
 
 @pytest.mark.parametrize("name", list(CASES))
@@ -76,7 +90,9 @@ def test_what_was_left_out_stands_above_the_answer():
 
 
 def test_an_interval_that_holds_no_effect_is_told():
-    """As where flights of two vehicles stand in one folder: one name, and no size of it that suits all."""
+    """As where flights of two vehicles stand in one folder: one name, and no size of it that suits
+    all.
+    """
     parameters = {"x": {"size": Estimate(1.0, "N", (-0.5, 2.5), (0.0, 2.0), may_be_none=True)}}
     told = dataclasses.replace(report("effect", ["x"], ["x"]), parameters=parameters).in_words()
     assert any("Flights disagree about x" in line for line in told)

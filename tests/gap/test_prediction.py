@@ -23,12 +23,12 @@ def track_of(rows: int, seed: int) -> Track:
 
 def test_tracks_and_parameters_that_share_a_call_are_not_mixed_up():
     light = load_vehicle()
-    tracks, vehicles = (
-        [track_of(200 + 10 * k, k) for k in range(3)],
-        [light, light.replace(mass=0.9 * light.mass), light],
-    )
+    tracks = [track_of(200 + 10 * k, k) for k in range(3)]
+    vehicles = [light, light.replace(mass=0.9 * light.mass), light]
     ticks = [np.repeat(t.motor[:, None], TICKS, 1) for t in tracks]
-    theta = ABSENT + 5.0 * STEP * np.random.default_rng(9).uniform(0.0, 1.0, (LANES // 2, len(ABSENT)))
+    theta = ABSENT + 5.0 * STEP * np.random.default_rng(9).uniform(
+        0.0, 1.0, (LANES // 2, len(ABSENT))
+    )
     together = make_physics(tracks, vehicles, ticks).predict(theta)
     for number, track in enumerate(tracks):
         alone = make_physics(
@@ -42,8 +42,11 @@ def test_tracks_and_parameters_that_share_a_call_are_not_mixed_up():
 
 
 def test_a_wrong_moment_of_inertia_turns_nothing_that_motors_hold_against():
-    """Motors that always pull one way hold against something, known or not: their sum is zero, and nothing to be scaled."""
-    track, vehicle = track_of(300, 1), load_vehicle()
+    """Motors that always pull one way hold against something, known or not: their sum is zero, and
+    nothing to be scaled.
+    """
+    track = track_of(300, 1)
+    vehicle = load_vehicle()
     track.motor[:, :2] += 0.1  # against a centre of mass to the right, or whatever it is
     still = np.zeros((300, 3))
     numbers = (("inertia", "xx", 0.3),)
@@ -53,16 +56,22 @@ def test_a_wrong_moment_of_inertia_turns_nothing_that_motors_hold_against():
     assert abs(replay.nuisances[0][0, -1, RATES]).max() < 1e-6
     aside = ABSENT.copy()
     aside[PLACE["com_offset", "y"]] = 0.001
-    around, steps = replay.around(aside), np.array([0.0, 1e-2])
+    around = replay.around(aside)
+    steps = np.array([0.0, 1e-2])
     heavier = np.repeat(aside[None], 2, 0)
     heavier[:, PLACE["inertia", "xx"]] += steps
     light, heavy = replay.predict(heavier)[0][:, :, 0]
-    np.testing.assert_allclose(around.nuisances[0][0, 1:, 0] / 0.3, (heavy - light)[1:] / 1e-2, rtol=0.05)
+    np.testing.assert_allclose(
+        around.nuisances[0][0, 1:, 0] / 0.3, (heavy - light)[1:] / 1e-2, rtol=0.05
+    )
 
 
 def test_a_propeller_that_spins_up_turns_the_body_by_its_angular_momentum():
-    """Whatever the motors' lag does on the way: the sum over time is what the rotors' speeds changed by."""
-    track, vehicle = track_of(300, 1), load_vehicle()
+    """Whatever the motors' lag does on the way: the sum over time is what the rotors' speeds
+    changed by.
+    """
+    track = track_of(300, 1)
+    vehicle = load_vehicle()
     harder = np.arange(300)[:, None] >= 150
     track.motor[:] = np.where(harder, 0.4 + 0.2 * np.array([1.0, 0.0, 1.0, 0.0]), 0.4)
     with_propellers = np.repeat(ABSENT[None], 2, 0)
@@ -71,4 +80,6 @@ def test_a_propeller_that_spins_up_turns_the_body_by_its_angular_momentum():
     without, turned = physics.predict(with_propellers)[0][:, -1, RATES]
     gained = np.sqrt([0.6, 0.4, 0.6, 0.4]) - np.sqrt(0.4)
     gained = float(vehicle.max_rotor_speed) * gained @ np.asarray(vehicle.rotor_spin, float)
-    np.testing.assert_allclose(turned - without, [0.0, 0.0, 0.002 * gained], atol=1e-3 * abs(gained) * 0.002)
+    np.testing.assert_allclose(
+        turned - without, [0.0, 0.0, 0.002 * gained], atol=1e-3 * abs(gained) * 0.002
+    )

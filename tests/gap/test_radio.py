@@ -1,4 +1,6 @@
-"""What a link did to the commands, read from logs whose motors are sampled every 2 ms, as `openjax.fly` writes them."""
+"""What a link did to the commands, read from logs whose motors are sampled every 2 ms, as
+`openjax.fly` writes them.
+"""
 
 from types import SimpleNamespace
 
@@ -17,8 +19,9 @@ CASE = SimpleNamespace(
 
 
 def flown(latency, loss, jitter=0.0005, phase=0.004, seed=0, seconds=16.0):
-    """Tracks of a log: commands every 10 ms from `phase` on, late by a half-normal jitter (s), arriving `latency` later or
-    never; and the share that never did."""
+    """Tracks of a log: commands every 10 ms from `phase` on, late by a half-normal jitter (s),
+    arriving `latency` later or never; and the share that never did.
+    """
     rng = np.random.default_rng(seed)
     number = int(100 * seconds)
     sent = 0.01 * np.arange(number) + phase + np.abs(rng.normal(0.0, jitter, number))
@@ -67,4 +70,6 @@ def test_rows_begin_where_commands_do():
     (track,), _ = flown(0.0, 0.0, jitter=1e-5)
     changed = np.diff(track.command[:, 0]) != 0.0
     assert changed.mean() > 0.98
-    assert np.abs(track.motor.mean(1) - track.command[:, 0]).max() < 1e-4  # no row mixes two commands
+    assert (
+        np.abs(track.motor.mean(1) - track.command[:, 0]).max() < 1e-4
+    )  # no row mixes two commands

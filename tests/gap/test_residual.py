@@ -8,11 +8,14 @@ import pytest
 from openjax.gap.model.whitening import Noise
 from openjax.gap.residual import HORIZONS, calibration, conformal_p, measure, standing_out
 
-ROWS, DT = 1500, 0.01
+ROWS = 1500
+DT = 0.01
 
 
 def left_over(push):
-    """Measures of two tracks whose replay leaves white noise, and `push` (T,) in the first channel's increments."""
+    """Measures of two tracks whose replay leaves white noise, and `push` (T,) in the first
+    channel's increments.
+    """
     rng = np.random.default_rng(0)
     tracks = [
         SimpleNamespace(
@@ -21,7 +24,10 @@ def left_over(push):
         )
         for _ in range(2)
     ]  # fmt: skip
-    noises = [Noise(axes, np.ones(1), np.ones(1), 1.0) for axes in ((0, 1), (2,), (3, 4), (5,), (6, 7), (8,))]
+    noises = [
+        Noise(axes, np.ones(1), np.ones(1), 1.0)
+        for axes in ((0, 1), (2,), (3, 4), (5,), (6, 7), (8,))
+    ]
     replay = SimpleNamespace(
         tracks=tracks,
         usable=np.ones(9),
@@ -46,7 +52,11 @@ def test_p_values_fall_with_each_measure_and_none_is_zero(name):
     usual = {n: float(np.median([c[n] for c in calibration() if n in c])) for n in HORIZONS}
     values = [conformal_p(usual | {name: usual[name] * k}) for k in (1.0, 10.0, 1e3)]
     p_values = [p for p, _ in values]
-    assert p_values[0] > 0.5 and p_values == sorted(p_values, reverse=True) and 0.0 < p_values[-1] < 0.01
+    assert (
+        p_values[0] > 0.5
+        and p_values == sorted(p_values, reverse=True)
+        and 0.0 < p_values[-1] < 0.01
+    )
     assert values[-1][1] == name
 
 

@@ -1,4 +1,6 @@
-"""Sample flights: a complete, flyable, repeatable case; and the command keeps its hands off what is there."""
+"""Sample flights: a complete, flyable, repeatable case; and the command keeps its hands off what is
+there.
+"""
 
 import numpy as np
 import pytest
@@ -29,10 +31,12 @@ def test_the_nominal_controller_follows_the_reference(sample_columns):
 
 def test_an_effect_shows_where_it_should():
     """Rotor drag: the lateral specific force is minus d/m times the body velocity."""
-    vehicle, reference = load_vehicle(), references(seed=1, duration=8.0)["flight_b"]
+    vehicle = load_vehicle()
+    reference = references(seed=1, duration=8.0)["flight_b"]
     columns = fly(vehicle, vehicle, reference, 1, {"rotor_drag": {"d_xy": 0.02}})[0]
     w, z = columns["qw"], columns["qz"]  # nearly level: turn by yaw only
-    cos, sin = 1 - 2 * z**2, 2 * w * z
+    cos = 1 - 2 * z**2
+    sin = 2 * w * z
     forward = cos * columns["vx"] + sin * columns["vy"]
     slope = np.polyfit(forward, columns["ax"], 1)[0]
     assert slope == pytest.approx(-0.02 / 0.0321, rel=0.1)
@@ -42,13 +46,21 @@ def test_the_command_makes_a_case_that_passes_every_check(tmp_path):
     for number in (1, 2):
         main([str(tmp_path / f"case{number}"), "--duration", "8"])
     case = load_case(tmp_path / "case1")
-    assert [f.name for f in case.flights] == ["flight_a.csv.gz", "flight_b.csv.gz", "flight_c.csv.gz"]
+    assert [f.name for f in case.flights] == [
+        "flight_a.csv.gz",
+        "flight_b.csv.gz",
+        "flight_c.csv.gz",
+    ]
     assert case.quality == () and case.vehicle_file.mass_weighed
     first, second = (sorted((tmp_path / f"case{n}").iterdir()) for n in (1, 2))
-    assert [p.read_bytes() for p in first] == [p.read_bytes() for p in second]  # same seed, same bytes
+    assert [p.read_bytes() for p in first] == [
+        p.read_bytes() for p in second
+    ]  # same seed, same bytes
 
 
-@pytest.mark.parametrize("arguments", [["--effect", "gremlins"], ["--duration", "1"], ["--colour", "red"]])
+@pytest.mark.parametrize(
+    "arguments", [["--effect", "gremlins"], ["--duration", "1"], ["--colour", "red"]]
+)
 def test_bad_arguments_are_one_line(tmp_path, arguments):
     with pytest.raises(UserError) as caught:
         main([str(tmp_path / "case"), *arguments])

@@ -1,4 +1,6 @@
-"""The criterion against closed forms: differences of log density, shares that add up, probabilities of form errors."""
+"""The criterion against closed forms: differences of log density, shares that add up, probabilities
+of form errors.
+"""
 
 import numpy as np
 import pytest
@@ -23,13 +25,16 @@ def test_the_difference_of_two_hypotheses_has_the_error_that_repeated_noise_show
     ])  # fmt: skip
     assert found[:, 0].mean() == pytest.approx(0.5 * (effect**2).sum(), rel=0.1)
     assert found[:, 1].mean() == pytest.approx(found[:, 0].std(), rel=0.25)
-    # A gain in one block alone is told: it is five standard errors there, though the rest of the flight says nothing.
+    # A gain in one block alone is told: it is five standard errors there, though the rest of the
+    # flight says nothing.
     assert np.median(found[:, 0] / found[:, 1]) > 2.0
 
 
 def test_the_difference_counts_blocks_not_samples_where_the_residual_is_coloured():
     rng = np.random.default_rng(1)
-    slow = np.repeat(rng.standard_normal((300, 20)), 50, axis=1)  # every block has one draw of noise
+    slow = np.repeat(
+        rng.standard_normal((300, 20)), 50, axis=1
+    )  # every block has one draw of noise
     effect = np.full(1000, 0.3)
     found = np.array([difference(judged(n, 20), judged(n + effect, 20)) for n in slow])
     assert found[:, 1].mean() == pytest.approx(found[:, 0].std(), rel=0.2)

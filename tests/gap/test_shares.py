@@ -20,9 +20,9 @@ def test_shares_and_what_is_unexplained_add_up_to_one():
 def test_one_part_alone_has_all_that_is_explained():
     squares = np.array([1.1, 9.0, 9.0, 9.0, 1.1])[:, None, None] * np.ones((5, 10, 2))
     values, square = shares_of_squares(squares, np.full((1, 10), 0.1), np.full(2, 1.0 / 1.1))
-    assert values[0] == pytest.approx([1.0 - 0.1 / 8.0, 0.0, 0.1 / 8.0]) and square[0] == pytest.approx(
-        [9.0, 1.1]
-    )
+    assert values[0] == pytest.approx([1.0 - 0.1 / 8.0, 0.0, 0.1 / 8.0]) and square[
+        0
+    ] == pytest.approx([9.0, 1.1])
 
 
 def test_without_a_gap_all_there_is_are_the_sensors():

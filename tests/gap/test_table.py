@@ -14,7 +14,9 @@ from openjax.gap.model.table import Model, Table, _errors
 
 @pytest.fixture
 def columns():
-    """Whitened columns of two tracks: what is left, four candidates, three nuisances that explain a part of it."""
+    """Whitened columns of two tracks: what is left, four candidates, three nuisances that explain a
+    part of it.
+    """
     rng = np.random.default_rng(0)
     out = []
     for _ in range(2):
@@ -25,7 +27,9 @@ def columns():
 
 
 def test_the_gap_holds_the_accelerometer_against_the_velocity_that_it_says():
-    """So a push that nuisances of the path could take, as a leaning world takes wind, still shows."""
+    """So a push that nuisances of the path could take, as a leaning world takes wind, still
+    shows.
+    """
     specific = np.random.default_rng(1).standard_normal((1, 200, 3))
     errors = _errors(np.concatenate([np.zeros((1, 200, 6)), specific], 2), 0.01)
     np.testing.assert_allclose(errors[0, 60, 6:], 0.01 * specific[0, 36:61].sum(0), rtol=1e-9)
@@ -33,7 +37,9 @@ def test_the_gap_holds_the_accelerometer_against_the_velocity_that_it_says():
 
 
 def test_a_loud_second_counts_less_in_its_own_axes_and_in_no_other():
-    replay = SimpleNamespace(tracks=[SimpleNamespace(dt=0.01)], whiten=lambda residual, track: residual)
+    replay = SimpleNamespace(
+        tracks=[SimpleNamespace(dt=0.01)], whiten=lambda residual, track: residual
+    )
     residual = np.random.default_rng(2).standard_normal((400, 9))
     residual[200:300, 3:5] *= 7.0
     loudness = _loudness(replay, residual, 0)
@@ -48,9 +54,12 @@ def test_nuisances_of_the_vehicle_are_alike_on_all_blocks_and_bounded_and_a_bloc
     left = [
         x[0] + s * 5.0 * x[6] for x, s in zip(columns, (1.0, -1.0), strict=True)
     ]  # the second would differ in sign
-    left = [r + 3.0 * x[5] for r, x in zip(left, columns, strict=True)]  # and the first be beyond its bound
+    left = [
+        r + 3.0 * x[5] for r, x in zip(left, columns, strict=True)
+    ]  # and the first be beyond its bound
     rows = [np.concatenate([r[None], x[2:3], x[5:]]) for r, x in zip(left, columns, strict=True)]
-    shared, order = np.array([True, True, False]), np.arange(2)
+    shared = np.array([True, True, False])
+    order = np.arange(2)
     white = np.array([x @ x.T for x in rows])
     table = Table(None, white, None, None, order, {}, {}, {}, shared, rows)
     model = Model((), np.array([1]), np.array([-0.2]), np.array([[4.0]]))
@@ -59,7 +68,9 @@ def test_nuisances_of_the_vehicle_are_alike_on_all_blocks_and_bounded_and_a_bloc
     own = [equations.coefficients(found, k)[4] for k in range(2)]
 
     def objective(z):
-        step, common, own = z[:1], z[1:3], z[3:]
+        step = z[:1]
+        common = z[1:3]
+        own = z[3:]
         value = 0.5 * 4.0 * (0.2 + step[0]) ** 2 + 0.5 * (common @ common + own @ own)
         for k, (r, x) in enumerate(zip(left, columns, strict=True)):
             value += 0.5 * ((r - step @ x[2:3] - common @ x[5:7] - own[k] * x[7]) ** 2).sum()
@@ -67,5 +78,7 @@ def test_nuisances_of_the_vehicle_are_alike_on_all_blocks_and_bounded_and_a_bloc
 
     bounds = [(None, None)] + [(-BOUND, BOUND)] * 2 + [(None, None)] * 2
     best = minimize(objective, np.zeros(5), bounds=bounds, options={"ftol": 1e-14})
-    np.testing.assert_allclose(objective(np.array([*found, *(-u for u in own)])), best.fun, rtol=1e-6)
+    np.testing.assert_allclose(
+        objective(np.array([*found, *(-u for u in own)])), best.fun, rtol=1e-6
+    )
     assert np.abs(found[1:]).max() <= BOUND

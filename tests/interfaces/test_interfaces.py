@@ -31,12 +31,16 @@ def test_flat_observation_is_all_that_a_pursuer_has(game):
     np.testing.assert_array_equal(
         flat[1, start : start + 3], observation.position[1] - observation.position[0]
     )
-    np.testing.assert_allclose(flat[:, -3:], observation.position - observation.last_seen, atol=1e-7)
+    np.testing.assert_allclose(
+        flat[:, -3:], observation.position - observation.last_seen, atol=1e-7
+    )
 
 
 def test_spaces_hold_what_the_game_gives(game):
     observation, _ = jax.jit(game.reset)(jax.random.key(1))
-    assert jax.tree.all(jax.tree.map(lambda space, x: space.contains(x), game.observation_space, observation))
+    assert jax.tree.all(
+        jax.tree.map(lambda space, x: space.contains(x), game.observation_space, observation)
+    )
     assert game.action_space.contains(game.action_space.sample(jax.random.key(2)))
     assert not game.action_space.contains(np.full((3, 4), 1.5, np.float32))
     assert not game.action_space.contains(np.zeros((2, 4), np.float32))
@@ -89,7 +93,9 @@ def test_jaxmarl_interface_is_the_game_and_starts_anew(game):
     jitted = jax.jit(game.step)
     expected, expected_state = jax.jit(game.reset)(key)
     np.testing.assert_allclose(observations["pursuer_2"], flat_observation(expected)[2], atol=1e-6)
-    actions = {agent: adapter.action_space(agent).sample(jax.random.key(5)) for agent in adapter.agents}
+    actions = {
+        agent: adapter.action_space(agent).sample(jax.random.key(5)) for agent in adapter.agents
+    }
     for step in range(1, LENGTH + 1):
         observations, state, rewards, dones, _ = adapter.step(key, state, actions)
         action = jnp.stack([actions[agent] for agent in adapter.agents])

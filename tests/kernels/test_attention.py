@@ -1,4 +1,6 @@
-"""The folded attention against the textbook's, and the kernel (in interpret mode) against the plain formula."""
+"""The folded attention against the textbook's, and the kernel (in interpret mode) against the plain
+formula.
+"""
 
 import flax.linen as nn
 import jax
@@ -21,7 +23,8 @@ from openjax.policy.encoder import SelfAttention, normalised_linear
 
 pytestmark = pytest.mark.slow
 
-FEATURES, HEADS = 16, 4
+FEATURES = 16
+HEADS = 4
 
 
 def shaken(tree, seed, size=0.3):
@@ -47,10 +50,15 @@ def textbook(p, own, others, pillars, seen):
         normal = centred / np.sqrt((centred**2).mean(-1, keepdims=True) + 1e-6)
         return gelu(normal * p[f"{name}_scale"] + p[f"{name}_shift"][0])
 
-    tokens = np.concatenate([own[:, None], embedded(others, "others"), embedded(pillars, "pillars")], axis=1)
+    tokens = np.concatenate(
+        [own[:, None], embedded(others, "others"), embedded(pillars, "pillars")], axis=1
+    )
     there = np.concatenate([np.ones((len(own), 1 + others.shape[1]), bool), seen], axis=1)
-    query, keys, values = own @ p["query"], tokens @ p["key"], tokens @ p["value"]
-    width, mixed = FEATURES // HEADS, []
+    query = own @ p["query"]
+    keys = tokens @ p["key"]
+    values = tokens @ p["value"]
+    width = FEATURES // HEADS
+    mixed = []
     for head in range(HEADS):
         part = slice(head * width, (head + 1) * width)
         score = np.einsum("bd,bmd->bm", query[:, part], keys[..., part]) / np.sqrt(width)
@@ -63,7 +71,9 @@ def textbook(p, own, others, pillars, seen):
 
 @pytest.fixture
 def on_machine(monkeypatch):
-    """Choose the program for machines with or without CUDA: kernels' formula, or one entity at a time."""
+    """Choose the program for machines with or without CUDA: kernels' formula, or one entity at a
+    time.
+    """
     return lambda cuda: monkeypatch.setattr(encoder, "can_compile_for_cuda", lambda: cuda)
 
 
@@ -72,7 +82,8 @@ def test_folded_attention_is_multi_head_attention_with_one_query(cuda, on_machin
     on_machine(cuda)
     draw = np.random.default_rng(0)
     own = draw.normal(size=(7, FEATURES))
-    others, pillars = draw.normal(size=(7, 2, 3)), draw.normal(size=(7, 3, 5))
+    others = draw.normal(size=(7, 2, 3))
+    pillars = draw.normal(size=(7, 3, 5))
     seen = draw.uniform(size=(7, 3)) < 0.5
     seen[0], seen[1] = False, True
     pillars[~seen] = -5.0
@@ -89,7 +100,8 @@ def test_both_programs_have_the_same_gradients(on_machine):
     keys = jax.random.split(jax.random.key(4), 4)
     seen = jax.random.uniform(keys[3], (9, 3)) < 0.5
     own, others, pillars = (
-        jax.random.normal(k, (9, *s)) for k, s in zip(keys[:3], [(20,), (2, 3), (3, 5)], strict=True)
+        jax.random.normal(k, (9, *s))
+        for k, s in zip(keys[:3], [(20,), (2, 3), (3, 5)], strict=True)
     )
     module = encoder.Encoder(FEATURES, HEADS, jnp.float32)
     parameters = shaken(jax.jit(module.init)(jax.random.key(0), own, others, pillars, seen), 1)
@@ -103,14 +115,20 @@ def test_both_programs_have_the_same_gradients(on_machine):
         with jax.default_matmul_precision("highest"):
             return jax.jit(jax.grad(loss, argnums=(0, 1)))(parameters, own)
 
-    one_by_one, fused = gradient(cuda=False), gradient(cuda=True)
-    for (path, a), b in zip(jax.tree.leaves_with_path(one_by_one), jax.tree.leaves(fused), strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-4 * float(jnp.abs(b).max()) + 1e-5, err_msg=str(path))
+    one_by_one = gradient(cuda=False)
+    fused = gradient(cuda=True)
+    for (path, a), b in zip(
+        jax.tree.leaves_with_path(one_by_one), jax.tree.leaves(fused), strict=True
+    ):
+        np.testing.assert_allclose(
+            a, b, atol=1e-4 * float(jnp.abs(b).max()) + 1e-5, err_msg=str(path)
+        )
 
 
 def test_normalised_linear_is_layer_norm_of_the_linear_layer():
     keys = jax.random.split(jax.random.key(2), 2)
-    x, linear = jax.random.normal(keys[0], (50, 5)), jax.random.normal(keys[1], (6, FEATURES)) + 0.5
+    x = jax.random.normal(keys[0], (50, 5))
+    linear = jax.random.normal(keys[1], (6, FEATURES)) + 0.5
     x = x.at[0].set(-5.0).at[1].set(0.0)
     inverse, weights = jax.jit(normalised_linear)(x, linear)
     norm = nn.LayerNorm(epsilon=1e-6, use_bias=False, use_scale=False)

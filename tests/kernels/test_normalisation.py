@@ -16,7 +16,11 @@ FEATURES = 16
 def drawn(rows):
     keys = jax.random.split(jax.random.key(0), 3)
     x = 2.0 * jax.random.normal(keys[0], (rows, FEATURES)) + 1.0
-    return x, jax.random.normal(keys[1], (3, FEATURES)), jax.random.normal(keys[2], (rows, FEATURES))
+    return (
+        x,
+        jax.random.normal(keys[1], (3, FEATURES)),
+        jax.random.normal(keys[2], (rows, FEATURES)),
+    )
 
 
 def flax_layer(x, affine, activate):

@@ -1,8 +1,9 @@
-"""Evaders that learn, where the best response is known: `python -m tests.learning.known_games [--radius M]`.
+"""Evaders that learn, where the best response is known: `python -m tests.learning.known_games
+[--radius M]`.
 
-Stack with a capture radius forces a capture inside its bound and not outside. Without one: two points that fly straight at a
-slower evader in a wide plane; what it can reach at the best is an optimal control problem, solved from each start by itself.
-Prints a record.
+Stack with a capture radius forces a capture inside its bound and not outside. Without one: two
+points that fly straight at a slower evader in a wide plane; what it can reach at the best is an
+optimal control problem, solved from each start by itself. Prints a record.
 """
 
 import argparse
@@ -22,17 +23,25 @@ STARTS = 128
 
 
 def learn(environment: Pursuit, team: Team, draw, steps: int, **changes):
-    """Statistics (S, STARTS) of the S evaders of a game that learned, and (1, STARTS) of the greedy one; the starts, which
-    `draw` (key -> Task) gave to none of them before."""
+    """Statistics (S, STARTS) of the S evaders of a game that learned, and (1, STARTS) of the greedy
+    one; the starts, which `draw` (key -> Task) gave to none of them before.
+    """
     seeds = environment.settings.evaders.count("learned")
     how = dict(total_steps=steps, seeds=seeds, num_envs=256, layouts=1.0) | changes
-    drawn = [jax.vmap(draw)(jax.random.split(jax.random.key(i), n)) for i, n in enumerate((1024, STARTS))]
+    drawn = [
+        jax.vmap(draw)(jax.random.split(jax.random.key(i), n)) for i, n in enumerate((1024, STARTS))
+    ]
     response = BestResponse(BestResponseSettings(**how), environment, team, drawn[0])
-    carry, step = jax.jit(response.start)(jax.random.key(2)), jax.jit(response.step, donate_argnums=1)
+    carry = jax.jit(response.start)(jax.random.key(2))
+    step = jax.jit(response.step, donate_argnums=1)
     for _ in range(response.how.total_updates):
-        carry, _ = jax.block_until_ready(step({}, carry))  # a CPU with dozens under way waits for ever
+        carry, _ = jax.block_until_ready(
+            step({}, carry)
+        )  # a CPU with dozens under way waits for ever
     duel = jax.jit(make_duel(environment, team))
-    networks = [jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], carry.evaders.actor) for i in range(seeds)]
+    networks = [
+        jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], carry.evaders.actor) for i in range(seeds)
+    ]
 
     def fly(network):
         return duel({}, drawn[1], jnp.int32(0), jax.random.key(3), {"evader_networks": network})
@@ -51,7 +60,10 @@ def against_stack(radius: float, steps: int, seeds: int = 1) -> dict:
         return task.replace(pillar_active=jnp.zeros_like(task.pillar_active))
 
     learned, greedy, _ = learn(environment, stack_team(environment), draw, steps)
-    captured = {"learned": learned.captured.mean(-1).tolist(), "greedy": float(greedy.captured.mean())}
+    captured = {
+        "learned": learned.captured.mean(-1).tolist(),
+        "greedy": float(greedy.captured.mean()),
+    }
     return {"radius": radius, "steps": steps, **captured}
 
 
@@ -73,7 +85,9 @@ def two_against_one(steps: int, seeds: int = 1) -> dict:
         episode_length=250,
     )
     settings = environment.settings
-    learned, greedy, starts = learn(environment, Team(straight), draw_between, steps, own_axes=False)
+    learned, greedy, starts = learn(
+        environment, Team(straight), draw_between, steps, own_axes=False
+    )
     apart = starts.pursuer_position - starts.evader_position[:, None]
     exact = longest(settings, apart[..., :2])
     seconds = [statistics.capture_step * settings.time_step for statistics in (learned, greedy)]
@@ -82,8 +96,11 @@ def two_against_one(steps: int, seeds: int = 1) -> dict:
 
 
 def draw_between(key) -> Task:
-    """An evader between two pursuers, one nearer than the other, in the plane at half the height."""
-    low, high = jnp.array([0.5, 0.9, -0.5, -1.0]), jnp.array([0.8, 1.5, 0.5, 1.0])
+    """An evader between two pursuers, one nearer than the other, in the plane at half the
+    height.
+    """
+    low = jnp.array([0.5, 0.9, -0.5, -1.0])
+    high = jnp.array([0.8, 1.5, 0.5, 1.0])
     near, far, one, other = jax.random.uniform(key, (4,), minval=low, maxval=high)
     angle = jnp.array([one, jnp.pi + other])
     level = jnp.array([near, far])[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
@@ -92,14 +109,19 @@ def draw_between(key) -> Task:
     return Task(pursuers, middle, jnp.zeros((1, 2)), jnp.zeros(1, bool))
 
 
-def longest(settings: PursuitSettings, pursuers: jax.Array, knots: int = 8, samples: int = 128) -> jax.Array:
-    """(B,) seconds for which an evader can keep away from `straight` ones at (B, N, 2) from it, by the cross-entropy method.
+def longest(
+    settings: PursuitSettings, pursuers: jax.Array, knots: int = 8, samples: int = 128
+) -> jax.Array:
+    """(B,) seconds for which an evader can keep away from `straight` ones at (B, N, 2) from it, by
+    the cross-entropy method.
 
-    The headings lie on lines between knots. More knots, samples and rounds gave the same within a time step, and so
-    does the closed form (d - r) / (v_p - v_e) of one pursuer.
+    The headings lie on lines between knots. More knots, samples and rounds gave the same within a
+    time step, and so does the closed form (d - r) / (v_p - v_e) of one pursuer.
     """
-    steps, dt = settings.episode_length, settings.time_step
-    stride, reach = settings.max_speed * dt, settings.evader_speed * dt
+    steps = settings.episode_length
+    dt = settings.time_step
+    stride = settings.max_speed * dt
+    reach = settings.evader_speed * dt
 
     def fly(pursuers, at_knots):
         heading = jnp.interp(jnp.linspace(0.0, knots - 1.0, steps), jnp.arange(knots), at_knots)

@@ -26,14 +26,21 @@ def test_against_plain_python(trace):
     draw = np.random.default_rng(0)
     reward, value, next_value = draw.normal(size=(3, 12, 20))
     ends = draw.uniform(size=(12, 20))
-    terminated, truncated = ends < 0.1, (ends > 0.1) & (ends < 0.2)
+    terminated = ends < 0.1
+    truncated = (ends > 0.1) & (ends < 0.2)
     truncated[:, 0], terminated[:, 0] = False, False  # one world without an end
     terminated[-1, 1] = True
     expected = [
-        reference(*(x[:, e] for x in (reward, value, next_value, terminated, truncated)), 0.9, trace)
+        reference(
+            *(x[:, e] for x in (reward, value, next_value, terminated, truncated)), 0.9, trace
+        )
         for e in range(20)
     ]
     got = jax.jit(generalised_advantages, static_argnums=(5, 6))(
-        *(x.astype(np.float32) for x in (reward, value, next_value)), terminated, truncated, 0.9, trace
+        *(x.astype(np.float32) for x in (reward, value, next_value)),
+        terminated,
+        truncated,
+        0.9,
+        trace,
     )
     np.testing.assert_allclose(got, np.stack(expected, axis=1), atol=1e-5)

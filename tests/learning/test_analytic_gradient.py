@@ -1,4 +1,6 @@
-"""The stage by the gradient through the simulation: its starts, what it counts, and that it learns it."""
+"""The stage by the gradient through the simulation: its starts, what it counts, and that it learns
+it.
+"""
 
 import dataclasses
 
@@ -57,7 +59,9 @@ def stage():
     how = AnalyticSettings(updates=6, worlds=4, learning_rate=3e-3, hold=0.0)
     environment = free_flight(Pursuit(game))
     observation, _ = jax.jit(environment.reset)(jax.random.key(0))
-    return AnalyticGradient(how, environment, policy), jax.jit(policy.init)(jax.random.key(1), observation)
+    return AnalyticGradient(how, environment, policy), jax.jit(policy.init)(
+        jax.random.key(1), observation
+    )
 
 
 @pytest.mark.slow
@@ -65,11 +69,16 @@ def test_smooth_breaches_are_those_of_the_game(stage):
     game = stage[0].game
     key = jax.random.split(jax.random.key(2), 3)
     tasks = jax.jit(jax.vmap(lambda key: uniform_task(game, key)))(jax.random.split(key[0], 256))
-    _, state = jax.jit(jax.vmap(stage[0].environment.reset_to))(jax.random.split(key[1], 256), tasks)
-    position = jax.random.uniform(key[2], (256, 3, 3), minval=-0.6, maxval=0.6) * jnp.array([2.0, 2.0, 2.2])
+    _, state = jax.jit(jax.vmap(stage[0].environment.reset_to))(
+        jax.random.split(key[1], 256), tasks
+    )
+    position = jax.random.uniform(key[2], (256, 3, 3), minval=-0.6, maxval=0.6) * jnp.array(
+        [2.0, 2.0, 2.2]
+    )
     state = state.replace(drones=state.drones.replace(position=position))
     counted = jax.vmap(lambda p, t: breaches(game, p, t.pillar_position, t.pillar_active).total)
-    hard, smooth = np.asarray(counted(position, tasks)), np.asarray(breach_share(game, state))
+    hard = np.asarray(counted(position, tasks))
+    smooth = np.asarray(breach_share(game, state))
     assert 0.2 < (hard > 0).mean() < 0.9
     assert (smooth > 0.7 * hard).all()
     assert np.abs(smooth - hard).mean() < 0.1
@@ -108,11 +117,14 @@ def test_gradient_is_that_of_the_loss_and_learning_follows_it(stage):
         return gradient.loss(actor, parameters, starts, starts)[0]
 
     value, slope = jax.jit(jax.value_and_grad(loss))(parameters.actor)
-    steepness, step = float(optax.global_norm(slope)), 1e-3
+    steepness = float(optax.global_norm(slope))
+    step = 1e-3
     direction = jax.tree.map(lambda leaf: leaf / steepness, slope)
 
     def moved(size):
-        return loss(jax.tree.map(lambda leaf, along: leaf + size * along, parameters.actor, direction))
+        return loss(
+            jax.tree.map(lambda leaf, along: leaf + size * along, parameters.actor, direction)
+        )
 
     assert moved(step) - moved(-step) == pytest.approx(2 * step * steepness, rel=0.1)
     updates = list(compile_analytic(gradient, parameters)(parameters, jax.random.key(4)))

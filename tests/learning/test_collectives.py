@@ -31,7 +31,7 @@ def test_mean_of_every_leaf():
 
 def test_one_collective_for_all_parameters():
     leaves = [jnp.zeros((n, 2)) for n in range(1, 20)]
-    averaged = jax.make_jaxpr(lambda x: mean_over_devices(x, "devices"), axis_env=[("devices", DEVICES)])(
-        leaves
-    )
+    averaged = jax.make_jaxpr(
+        lambda x: mean_over_devices(x, "devices"), axis_env=[("devices", DEVICES)]
+    )(leaves)
     assert sum("psum" in equation.primitive.name for equation in averaged.eqns) == 1

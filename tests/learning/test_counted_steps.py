@@ -3,7 +3,13 @@
 import jax
 import pytest
 
-from openjax.learning import GeneratorSettings, MappoSettings, TrainSettings, build, make_training_step
+from openjax.learning import (
+    GeneratorSettings,
+    MappoSettings,
+    TrainSettings,
+    build,
+    make_training_step,
+)
 from openjax.learning.training_step import initial_carry
 from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import Pursuit, PursuitSettings
@@ -22,8 +28,10 @@ TINY = TrainSettings(
 
 
 def test_a_training_step_simulates_exactly_the_steps_that_are_counted():
-    """The generator flies no episodes of its own: the world's step is traced once, in a scan of the rollout's length
-    over all worlds; any other use of it would be data that learning curves leave out."""
+    """The generator flies no episodes of its own: the world's step is traced once, in a scan of the
+    rollout's length over all worlds; any other use of it would be data that learning curves leave
+    out.
+    """
     calls = []
 
     class Watched(Pursuit):
@@ -42,5 +50,7 @@ def test_a_training_step_simulates_exactly_the_steps_that_are_counted():
         if eqn.primitive.name == "scan"
     ]
     commands = (TINY.rollout_length, TINY.num_envs, TINY.environment.num_pursuers, 4)
-    assert sum(length == TINY.rollout_length and commands in shapes for length, shapes in lengths) == 1
+    assert (
+        sum(length == TINY.rollout_length and commands in shapes for length, shapes in lengths) == 1
+    )
     assert TINY.steps_per_update == TINY.rollout_length * TINY.num_envs

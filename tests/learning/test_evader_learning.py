@@ -1,4 +1,6 @@
-"""Evaders that learn: each from its own samples, in the direction that pays; and who flies what in a world."""
+"""Evaders that learn: each from its own samples, in the direction that pays; and who flies what in
+a world.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +15,9 @@ from openjax.pursuit.evaders import init_network, scene_of
 from openjax.pursuit.evaders.learned import STEPS, features, outputs, outputs_of
 
 WORLDS = 512
-ENVIRONMENT = make(evaders=("field", "learned", "greedy", "learned"), physics="stops", max_pillars=5)
+ENVIRONMENT = make(
+    evaders=("field", "learned", "greedy", "learned"), physics="stops", max_pillars=5
+)
 HOW = EvaderLearningSettings(epochs=4, learning_rate=3e-3, initial_log_std=0.0)
 
 
@@ -76,7 +80,9 @@ def test_a_network_without_a_world_stays_as_it_is(worlds):
 
 def test_a_network_that_flies_all_worlds_learns_as_if_alone(worlds):
     """Beside another one it gets its worlds some at a time."""
-    alone = EvaderLearning(HOW, make(evaders=("learned",), physics="stops", max_pillars=5), updates=1)
+    alone = EvaderLearning(
+        HOW, make(evaders=("learned",), physics="stops", max_pillars=5), updates=1
+    )
     beside = EvaderLearning(HOW, ENVIRONMENT, updates=1)
     ended = worlds.replace(statistics=worlds.statistics.replace(captured=jnp.ones(WORLDS, bool)))
     start = jax.jit(alone.start)(jax.random.key(1))
@@ -99,11 +105,15 @@ def test_wishes_fly_only_where_a_network_acts(worlds):
     acts = np.asarray(samples.which) >= 0
     assert (np.isnan(np.asarray(wish)).any(-1) == ~acts).all()
     step = jax.jit(jax.vmap(ENVIRONMENT.step, (None, 0, None, 0)))
-    hover, own = jnp.zeros((3, 4)), jnp.full((WORLDS, 3), jnp.nan)
+    hover = jnp.zeros((3, 4))
+    own = jnp.full((WORLDS, 3), jnp.nan)
     flown, alone = (
-        np.asarray(step(jax.random.key(0), worlds, hover, w)[1].evader_position) for w in (wish, own)
+        np.asarray(step(jax.random.key(0), worlds, hover, w)[1].evader_position)
+        for w in (wish, own)
     )
-    plain = jax.jit(jax.vmap(ENVIRONMENT.step, (None, 0, None)))(jax.random.key(0), worlds, hover)[1]
+    plain = jax.jit(jax.vmap(ENVIRONMENT.step, (None, 0, None)))(jax.random.key(0), worlds, hover)[
+        1
+    ]
     np.testing.assert_array_equal(alone, plain.evader_position)
     np.testing.assert_array_equal(flown[~acts], alone[~acts])
     blank = worlds.replace(evader=worlds.evader.replace(memory=0.0 * worlds.evader.memory))
@@ -115,21 +125,28 @@ def test_wishes_fly_only_where_a_network_acts(worlds):
 def test_every_place_flies_its_own_network(worlds):
     learning = EvaderLearning(HOW, ENVIRONMENT, updates=1)
     networks = jax.vmap(init_network)(jax.random.split(jax.random.key(3), 2))
-    networks["output"]["kernel"] = jax.random.normal(jax.random.key(4), networks["output"]["kernel"].shape)
+    networks["output"]["kernel"] = jax.random.normal(
+        jax.random.key(4), networks["output"]["kernel"].shape
+    )
     which, seen = jax.jit(learning.see)(networks, worlds)
     found = jax.jit(outputs_of)(networks, which, seen)
     for place in (0, 1):
         alone = jax.jit(outputs)(jax.tree.map(lambda leaf, i=place: leaf[i], networks), seen)
         for mine, its in zip(found, alone, strict=True):
-            np.testing.assert_allclose(mine[which == place], its[which == place], rtol=1e-5, atol=1e-5)
+            np.testing.assert_allclose(
+                mine[which == place], its[which == place], rtol=1e-5, atol=1e-5
+            )
 
 
 @pytest.mark.parametrize("own_axes", [True, False])
 def test_in_its_own_axes_a_turned_game_is_the_same(worlds, own_axes):
     network = init_network(jax.random.key(5), own_axes=own_axes)
-    network["output"]["kernel"] = jax.random.normal(jax.random.key(6), network["output"]["kernel"].shape)
+    network["output"]["kernel"] = jax.random.normal(
+        jax.random.key(6), network["output"]["kernel"].shape
+    )
     networks = jax.tree.map(lambda leaf: leaf[None], network)
-    cosine, sine = np.cos(0.7), np.sin(0.7)
+    cosine = np.cos(0.7)
+    sine = np.sin(0.7)
     turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]], np.float32)
     scene = scene_of(ENVIRONMENT.settings, jax.tree.map(lambda leaf: leaf[1], worlds))
     # nobody to be greedy about, whose directions are the world's
@@ -140,7 +157,9 @@ def test_in_its_own_axes_a_turned_game_is_the_same(worlds, own_axes):
 
     @jax.jit
     def wish(scene, before):
-        memory = jnp.concatenate([jnp.zeros(worlds.evader.memory.shape[-1] - before.size), before.ravel()])
+        memory = jnp.concatenate(
+            [jnp.zeros(worlds.evader.memory.shape[-1] - before.size), before.ravel()]
+        )
         return outputs(network, features(networks, 0, scene, memory))[0]
 
     gap = jnp.abs(wish(turned, before @ turn.T) - wish(scene, before) @ turn.T).max()

@@ -1,4 +1,6 @@
-"""The stage before MAPPO: its game is the run's, and what it teaches brings pursuers nearer to the evader."""
+"""The stage before MAPPO: its game is the run's, and what it teaches brings pursuers nearer to the
+evader.
+"""
 
 import dataclasses
 import functools
@@ -23,7 +25,12 @@ from openjax.policy import NetworkSettings, Policy, PredictorSettings
 from openjax.pursuit import Pursuit, PursuitSettings
 
 GAME = PursuitSettings(
-    physics="rigid", num_pursuers=2, min_pillars=0, max_pillars=1, start_attitude="level", evader_speed=0.8
+    physics="rigid",
+    num_pursuers=2,
+    min_pillars=0,
+    max_pillars=1,
+    start_attitude="level",
+    evader_speed=0.8,
 )
 
 
@@ -33,7 +40,9 @@ def test_a_second_of_the_stage_is_a_second_of_the_game():
         game = preset(name).environment
         own = first_game(Pursuit(game), how).settings
         assert own.time_step == pytest.approx(how.time_step)
-        assert own.episode_length * own.time_step == pytest.approx(game.episode_length * game.time_step)
+        assert own.episode_length * own.time_step == pytest.approx(
+            game.episode_length * game.time_step
+        )
         assert not own.contacts and own.speed_limit == game.speed_limit
 
 
@@ -42,11 +51,15 @@ def test_pursuers_come_nearer():
     how = FirstFlightsSettings(updates=160, worlds=48, learning_rate=5e-3)
     environment = first_game(Pursuit(GAME), how)
     policy = Policy.for_environment(
-        environment, NetworkSettings(features=16, heads=1, squash="sample"), PredictorSettings(enabled=False)
+        environment,
+        NetworkSettings(features=16, heads=1, squash="sample"),
+        PredictorSettings(enabled=False),
     )
     flights = FirstFlights(how, environment, policy)
     observation, _ = jax.jit(environment.reset)(jax.random.key(0))
-    carry = jax.jit(flights.begin)(jax.jit(policy.init)(jax.random.key(1), observation), jax.random.key(2))
+    carry = jax.jit(flights.begin)(
+        jax.jit(policy.init)(jax.random.key(1), observation), jax.random.key(2)
+    )
     some = jax.jit(make_first_flights(flights, 20))
     distances = []
     for done in range(0, 120, 20):
@@ -79,7 +92,8 @@ def test_two_devices_learn_what_one_does():
     one = FirstFlights(how, environment, Policy.for_environment(environment, *networks))
     two = dataclasses.replace(one, axis="devices")
     observation, _ = jax.jit(environment.reset)(jax.random.key(0))
-    parameters, key = jax.jit(one.policy.init)(jax.random.key(1), observation), jax.random.key(2)
+    parameters = jax.jit(one.policy.init)(jax.random.key(1), observation)
+    key = jax.random.key(2)
 
     @jax.jit
     def both(parameters, key):
@@ -88,7 +102,9 @@ def test_two_devices_learn_what_one_does():
         return mine, shares(lambda: two.update(two.begin(parameters, key), key), in_axes=())()
 
     (carry, parts), (their_carry, their_parts) = both(parameters, key)
-    for leaf, theirs in zip(jax.tree.leaves(carry.world), jax.tree.leaves(their_carry.world), strict=True):
+    for leaf, theirs in zip(
+        jax.tree.leaves(carry.world), jax.tree.leaves(their_carry.world), strict=True
+    ):
         if leaf.dtype == jnp.float32:
             assert jnp.allclose(leaf, theirs.reshape(leaf.shape), atol=1e-5)
     for leaf, theirs in zip(
@@ -103,10 +119,15 @@ def test_an_evader_within_reach_is_not_free():
     state = jax.jit(jax.vmap(Pursuit(GAME).reset))(jax.random.split(jax.random.key(0), 4))[1]
     near = state.drones.position.at[:, 0].set(state.evader_position + jnp.array([0.1, 0.0, 0.0]))
     near = state.replace(drones=state.drones.replace(position=near))
-    distance = jax.jit(lambda s: evader_distance(GAME, s, jax.vmap(functools.partial(ways_of, GAME))(s.task)))
-    far, near = distance(state), distance(near)
+    distance = jax.jit(
+        lambda s: evader_distance(GAME, s, jax.vmap(functools.partial(ways_of, GAME))(s.task))
+    )
+    far = distance(state)
+    near = distance(near)
     assert near[:, 0] == pytest.approx(0.1, abs=1e-3)
-    assert (free_share(GAME, near) < 0.2).all() and (free_share(GAME, near) < free_share(GAME, far)).all()
+    assert (free_share(GAME, near) < 0.2).all() and (
+        free_share(GAME, near) < free_share(GAME, far)
+    ).all()
 
 
 def test_one_near_pursuer_lets_others_be_far():
@@ -117,6 +138,8 @@ def test_one_near_pursuer_lets_others_be_far():
 
 
 def test_a_tip_over_counts_as_a_touch_does():
-    assert tip_share(jnp.cos(jnp.deg2rad(60.0))) < 0.01 < 0.99 < tip_share(jnp.cos(jnp.deg2rad(100.0)))
+    assert (
+        tip_share(jnp.cos(jnp.deg2rad(60.0))) < 0.01 < 0.99 < tip_share(jnp.cos(jnp.deg2rad(100.0)))
+    )
     assert crash_share(jnp.array(0.1)) < 0.01 < 0.5 < crash_share(jnp.array(0.0))
     assert crash_share(jnp.array(0.1), 0.05) > 0.1  # felt earlier

@@ -21,7 +21,9 @@ KEYS = jax.random.split(jax.random.key(0), 1000)
 
 @functools.cache
 def generate(settings):
-    return jax.jit(jax.vmap(lambda archive, key: generate_task(settings, GAME, archive, key), (None, 0)))
+    return jax.jit(
+        jax.vmap(lambda archive, key: generate_task(settings, GAME, archive, key), (None, 0))
+    )
 
 
 def generated(settings, archive):
@@ -29,7 +31,9 @@ def generated(settings, archive):
 
 
 def archived():
-    """An archive of one task that no uniform draw can give: pillars off the grid, all on the other side."""
+    """An archive of one task that no uniform draw can give: pillars off the grid, all on the other
+    side.
+    """
     archive = empty_archive(empty_task(GAME), 8)
     task = Task(
         pursuer_position=jnp.array([[-0.5, 0, 0.6], [-0.5, 0.3, 0.6], [-0.5, -0.3, 0.6]]),
@@ -84,14 +88,14 @@ def test_turned_uniform_tasks_come_from_all_sides():
 
 def test_a_share_of_uniform_tasks_has_its_pillars_in_a_row():
     rows = dataclasses.replace(NOMINAL, row_share=0.25)
-    plain, varied = (
-        generated(NOMINAL, empty_archive(empty_task(GAME), 8)),
-        generated(rows, empty_archive(empty_task(GAME), 8)),
-    )
+    plain = generated(NOMINAL, empty_archive(empty_task(GAME), 8))
+    varied = generated(rows, empty_archive(empty_task(GAME), 8))
     np.testing.assert_array_equal(varied.pursuer_position, plain.pursuer_position)
     changed = np.asarray(varied.pillar_position != plain.pillar_position).any(axis=(1, 2))
     np.testing.assert_allclose(changed.mean(), 0.25, atol=0.05)
-    shifted = generated(dataclasses.replace(NOMINAL, pillar_shift=0.05), empty_archive(empty_task(GAME), 8))
+    shifted = generated(
+        dataclasses.replace(NOMINAL, pillar_shift=0.05), empty_archive(empty_task(GAME), 8)
+    )
     moved = np.asarray(shifted.pillar_position - plain.pillar_position)
     assert 0.04 < np.abs(moved).max() <= 0.05 + 1e-6
 

@@ -1,4 +1,6 @@
-"""An evader that learns gets away where it is known that one can, and the reference of the study is right."""
+"""An evader that learns gets away where it is known that one can, and the reference of the study is
+right.
+"""
 
 import jax.numpy as jnp
 import numpy as np

@@ -1,4 +1,6 @@
-"""Probe environments whose values and best actions are known, each of which isolates one part of MAPPO."""
+"""Probe environments whose values and best actions are known, each of which isolates one part of
+MAPPO.
+"""
 
 import dataclasses
 
@@ -9,7 +11,13 @@ import optax
 import pytest
 
 from openjax.errors import UserError
-from openjax.learning.mappo import every_nth, follow_kl, initial_value_scale, make_optimiser, update_policy
+from openjax.learning.mappo import (
+    every_nth,
+    follow_kl,
+    initial_value_scale,
+    make_optimiser,
+    update_policy,
+)
 from openjax.learning.presets import preset
 from openjax.learning.rollout import Rollout
 from openjax.learning.settings import MappoSettings
@@ -17,7 +25,9 @@ from openjax.learning.train_state import Optimisers
 from openjax.policy import NetworkSettings, Policy, PredictorSettings, gaussian_log_prob
 from openjax.pursuit import Observation
 
-STEPS, WORLDS, UPDATES = 2, 64, 120
+STEPS = 2
+WORLDS = 64
+UPDATES = 120
 DISCOUNT = 0.5
 SETTINGS = MappoSettings(
     learning_rate=5e-3,
@@ -55,7 +65,9 @@ def flags(key, length):
 
 
 def one_update(settings, policy, optimisers, probe, carry, key):
-    """The update after a rollout of one probe; carry: actor, critic, value scale. Also its metrics."""
+    """The update after a rollout of one probe; carry: actor, critic, value scale. Also its
+    metrics.
+    """
     actor, critic, scale = carry
     flag_key, noise_key, shuffle_key = jax.random.split(key, 3)
     flag = flags(flag_key, STEPS + 1)
@@ -65,7 +77,10 @@ def one_update(settings, policy, optimisers, probe, carry, key):
     action = mean + jnp.exp(log_std) * jax.random.normal(noise_key, mean.shape)
     miss = (policy.action(action)[..., 0, 0] - 0.5 * flag[:-1]) ** 2
     reward = (
-        probe["constant"] + probe["by_flag"] * flag[:-1] + probe["by_step"] * late - probe["by_action"] * miss
+        probe["constant"]
+        + probe["by_flag"] * flag[:-1]
+        + probe["by_step"] * late
+        - probe["by_action"] * miss
     )
     rollout = Rollout(
         observation=observation,
@@ -83,7 +98,10 @@ def one_update(settings, policy, optimisers, probe, carry, key):
     return tuple(carry), metrics
 
 
-CORNERS = np.array([[-1.0, -1.0], [1.0, 1.0]], np.float32), np.array([[0.0, 1.0], [0.0, 1.0]], np.float32)
+CORNERS = (
+    np.array([[-1.0, -1.0], [1.0, 1.0]], np.float32),
+    np.array([[0.0, 1.0], [0.0, 1.0]], np.float32),
+)
 """Flag and second step, of flag -1, +1 (rows) in the first, second step (columns)."""
 
 
@@ -93,7 +111,9 @@ def trained(settings, policy, updates):
 
     @jax.jit
     def train(probe):
-        states = optimisers.start(policy.init(jax.random.key(0), observation_of(*map(jnp.array, CORNERS))))
+        states = optimisers.start(
+            policy.init(jax.random.key(0), observation_of(*map(jnp.array, CORNERS)))
+        )
         return jax.lax.scan(
             lambda carry, key: one_update(settings, policy, optimisers, probe, carry, key),
             (states["actor"], states["critic"], initial_value_scale()),
@@ -104,9 +124,16 @@ def trained(settings, policy, updates):
 
 
 def probe_of(
-    constant=0.0, by_flag=0.0, by_step=0.0, by_action=0.0, terminated=(True, True), truncated=(False, False)
+    constant=0.0,
+    by_flag=0.0,
+    by_step=0.0,
+    by_action=0.0,
+    terminated=(True, True),
+    truncated=(False, False),
 ):
-    """The reward is constant + by_flag * flag + by_step * (second step) - by_action * (first action - 0.5 flag)^2."""
+    """The reward is constant + by_flag * flag + by_step * (second step) - by_action * (first action
+    - 0.5 flag)^2.
+    """
     numbers = dict(constant=constant, by_flag=by_flag, by_step=by_step, by_action=by_action)
     probe = {name: jnp.float32(value) for name, value in numbers.items()}
     return probe | {"terminated": jnp.array(terminated), "truncated": jnp.array(truncated)}
@@ -122,8 +149,12 @@ def learn():
         (actor, critic, scale), _ = train(probe)
         mean, std = scale.moments
         corners = observation_of(*map(jnp.array, CORNERS))
-        value = mean + std * POLICY.value(actor.parameters, critic.parameters, corners, None)[..., 0]
-        return value, POLICY.action(POLICY.distribution(actor.parameters, corners, None)[0])[..., 0, :]
+        value = (
+            mean + std * POLICY.value(actor.parameters, critic.parameters, corners, None)[..., 0]
+        )
+        return value, POLICY.action(POLICY.distribution(actor.parameters, corners, None)[0])[
+            ..., 0, :
+        ]
 
     return lambda **probe: jax.device_get(call(probe_of(**probe)))
 
@@ -153,9 +184,11 @@ def test_the_policy_finds_the_action_that_the_observation_asks_for(learn):
 
 def test_the_actor_can_start_to_learn_later_than_the_critic():
     settings = dataclasses.replace(SETTINGS, actor_start=0.5, epochs=1, minibatches=1)
-    parameter, moves = jnp.ones(3), []
+    parameter = jnp.ones(3)
+    moves = []
     for optimiser in make_optimiser(settings, 4):
-        state, own = optimiser.init(parameter), []
+        state = optimiser.init(parameter)
+        own = []
         for _ in range(4):
             change, state = optimiser.update(parameter, state, parameter)
             own.append(float(jnp.abs(change).max()))
@@ -166,12 +199,16 @@ def test_the_actor_can_start_to_learn_later_than_the_critic():
 
 def test_steps_shrink_while_the_policy_has_moved_too_far_and_grow_again():
     scaled = follow_kl(0.01)
-    change, state = jnp.ones(3), scaled.init(jnp.ones(3))
+    change = jnp.ones(3)
+    state = scaled.init(jnp.ones(3))
     scales = []
     for kl in [0.0] * 30 + [0.015] * 3 + [0.03] * 5 + [jnp.inf, jnp.nan] + [0.001] * 9:
         step, state = scaled.update(change, state, kl=jnp.float32(kl))
         scales.append(float(step[0]))
-    rise, rest, fall, again = scales[:30], scales[30:33], scales[33:40], scales[40:]
+    rise = scales[:30]
+    rest = scales[30:33]
+    fall = scales[33:40]
+    again = scales[40:]
     assert rise == sorted(rise) and rise[-1] == 1.0 and set(rest) == {1.0}
     np.testing.assert_allclose(fall, 1.5 ** -np.arange(1.0, 8.0), rtol=1e-5)
     assert again[-1] == 1.0
@@ -182,7 +219,8 @@ def test_steps_shrink_while_the_policy_has_moved_too_far_and_grow_again():
 
 def test_a_policy_with_little_noise_stays_near_itself():
     network = dataclasses.replace(POLICY.network, initial_log_std=-5.0)
-    policy, kl = dataclasses.replace(POLICY, network=network), {}
+    policy = dataclasses.replace(POLICY, network=network)
+    kl = {}
     for target in (0.0, 0.01):
         settings = dataclasses.replace(SETTINGS, epochs=8, minibatches=8, target_kl=target)
         kl[target] = np.asarray(trained(settings, policy, 15)(probe_of(by_action=1.0))[1]["kl"])
@@ -195,7 +233,9 @@ def test_a_gradient_step_may_see_every_third_step_of_all_worlds():
     steps = jnp.broadcast_to(jnp.arange(12)[None, :, None], (5, 12, 2))
     thirds = jnp.stack([every_nth(steps, jnp.int32(first), 3) for first in range(3)])
     np.testing.assert_array_equal(thirds[1, 4, :, 0], [1, 4, 7, 10])
-    np.testing.assert_array_equal(np.sort(thirds[:, 2, :, 1], axis=None), np.arange(12))  # none left out
+    np.testing.assert_array_equal(
+        np.sort(thirds[:, 2, :, 1], axis=None), np.arange(12)
+    )  # none left out
     assert every_nth(steps, None, 1) is steps
     with pytest.raises(UserError, match="step_subsampling 3 must divide rollout_length 80"):
         preset("paper", mappo=MappoSettings(minibatches=16, step_subsampling=3))

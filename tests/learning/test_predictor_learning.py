@@ -19,7 +19,9 @@ from openjax.learning.train_state import TrainState
 from openjax.policy import NetworkSettings, Policy, PredictorSettings, gaussian_log_prob
 from openjax.pursuit import Observation, Pursuit, PursuitSettings
 
-WORLDS, STEPS, HORIZONS = 2, 6, (1, 3)
+WORLDS = 2
+STEPS = 6
+HORIZONS = (1, 3)
 GAME = PursuitSettings(
     physics="rigid",
     episode_length=12,
@@ -32,7 +34,9 @@ GAME = PursuitSettings(
 
 @pytest.fixture(scope="module")
 def recorded():
-    """Two rollouts, world 1 reset between them; each with the state it starts from and the game's own account."""
+    """Two rollouts, world 1 reset between them; each with the state it starts from and the game's
+    own account.
+    """
     environment = Pursuit(GAME)
     policy = Policy.for_environment(
         environment,
@@ -43,7 +47,9 @@ def recorded():
     @jax.jit
     def play(parameters, observation, state, key, share):
         noise = jax.random.normal(key, (STEPS, WORLDS, GAME.num_pursuers, 4))
-        rollout, last, after = collect(environment, policy, parameters, observation, state, noise, share)
+        rollout, last, after = collect(
+            environment, policy, parameters, observation, state, noise, share
+        )
 
         def one(carry, action):
             observation, state = carry
@@ -53,7 +59,9 @@ def recorded():
             return (following, state), (observation, state.evader_position, reward, info.penalty)
 
         (own_last, _), account = jax.lax.scan(one, (observation, state), rollout.action)
-        mean, log_std = policy.distribution(parameters.actor, rollout.observation, rollout.predicted)
+        mean, log_std = policy.distribution(
+            parameters.actor, rollout.observation, rollout.predicted
+        )
         density = gaussian_log_prob(rollout.action, mean, log_std)
         own_noise = (rollout.action - mean) / jnp.exp(log_std)
         return rollout, last, after, (account, own_last, density, own_noise - noise)
@@ -63,7 +71,9 @@ def recorded():
     parameters = jax.jit(policy.init)(jax.random.key(1), observation)
     runs = []
     for number, share in enumerate((1.0, 0.25)):
-        rollout, last, after, account = play(parameters, observation, state, jax.random.key(number), share)
+        rollout, last, after, account = play(
+            parameters, observation, state, jax.random.key(number), share
+        )
         runs.append((state, rollout, last, account))
         fresh = reset(jax.random.split(jax.random.key(7), WORLDS))
         observation, state = jax.tree.map(lambda x, new: x.at[1].set(new[1]), (last, after), fresh)
@@ -76,7 +86,9 @@ def test_a_rollout_is_what_the_game_says(recorded):
         runs, (1.0, 0.25), strict=True
     ):
         observation, evader, reward, penalty = account
-        np.testing.assert_allclose(rollout.observation.self_state, observation.self_state, atol=1e-5)
+        np.testing.assert_allclose(
+            rollout.observation.self_state, observation.self_state, atol=1e-5
+        )
         np.testing.assert_allclose(last.self_state, own_last.self_state, atol=1e-5)
         np.testing.assert_allclose(rollout.evader, evader, atol=1e-5)
         np.testing.assert_allclose(rollout.log_prob, density, atol=1e-3)
@@ -97,8 +109,12 @@ def test_windows_and_labels_are_those_of_the_game_and_cross_no_reset(recorded):
         assert frames.shape[1:3] == (room, 3)
         for world in range(WORLDS):
             for t in range(room):
-                np.testing.assert_allclose(frames[world, t], observation.frames[t, world], atol=1e-5)
-                np.testing.assert_allclose(last_seen[world, t], observation.last_seen[t, world], atol=1e-5)
+                np.testing.assert_allclose(
+                    frames[world, t], observation.frames[t, world], atol=1e-5
+                )
+                np.testing.assert_allclose(
+                    last_seen[world, t], observation.last_seen[t, world], atol=1e-5
+                )
                 for k, horizon in enumerate(HORIZONS):
                     np.testing.assert_allclose(
                         positions[world, t, k], evader[t + horizon - 1, world], atol=1e-5
@@ -114,8 +130,13 @@ def test_windows_and_labels_are_those_of_the_game_and_cross_no_reset(recorded):
 
 @pytest.mark.slow
 def test_learns_a_circling_evader():
-    """An evader that circles at 1.3 m/s in view is foreseen far better than by keeping where it was last seen."""
-    worlds, steps, span, radius = 32, 20, 10, 0.5
+    """An evader that circles at 1.3 m/s in view is foreseen far better than by keeping where it was
+    last seen.
+    """
+    worlds = 32
+    steps = 20
+    span = 10
+    radius = 0.5
     policy = Policy(predictor=PredictorSettings(units=32, horizons=(1, 5), windows=8, steps=4))
     optimiser = optax.adam(3e-3)
     time = jnp.arange(-span, steps + 1)
@@ -124,23 +145,35 @@ def test_learns_a_circling_evader():
         """Frames of a world at all times, and the positions."""
         phase_key, sign_key = jax.random.split(key)
         sign = jnp.where(jax.random.bernoulli(sign_key), 1.0, -1.0)
-        turn = jax.random.uniform(phase_key, (), maxval=2 * jnp.pi) + sign * 1.3 * 0.01 / radius * time
+        turn = (
+            jax.random.uniform(phase_key, (), maxval=2 * jnp.pi) + sign * 1.3 * 0.01 / radius * time
+        )
         position = jnp.stack(
             [radius * jnp.cos(turn), radius * jnp.sin(turn), jnp.full_like(turn, 0.6)], axis=-1
         )
-        velocity = 1.3 * sign * jnp.stack([-jnp.sin(turn), jnp.cos(turn), jnp.zeros_like(turn)], axis=-1)
+        velocity = (
+            1.3 * sign * jnp.stack([-jnp.sin(turn), jnp.cos(turn), jnp.zeros_like(turn)], axis=-1)
+        )
         pursuer = jnp.zeros((len(time), 3))
-        return jnp.concatenate([jnp.zeros((len(time), 1)), position, velocity, pursuer], axis=-1), position
+        return jnp.concatenate(
+            [jnp.zeros((len(time), 1)), position, velocity, pursuer], axis=-1
+        ), position
 
     def rollout_of(key):
         frames, position = jax.vmap(circle)(jax.random.split(key, worlds))
-        frames, position = jnp.swapaxes(frames, 0, 1), jnp.swapaxes(position, 0, 1)
+        frames = jnp.swapaxes(frames, 0, 1)
+        position = jnp.swapaxes(position, 0, 1)
         nothing = jnp.zeros((steps, worlds, 1))
         observation = Observation(
             *[nothing] * 6, last_seen=position[span:-1], frames=frames[span:-1, :, None]
         )
         rollout = Rollout(
-            observation, None, *[nothing] * 3, terminated=None, truncated=None, evader=position[span + 1 :]
+            observation,
+            None,
+            *[nothing] * 3,
+            terminated=None,
+            truncated=None,
+            evader=position[span + 1 :],
         )
         return jnp.swapaxes(frames[1 : span + 1], 0, 1), rollout
 
@@ -187,7 +220,9 @@ def test_the_loss_counts_in_flown_distances_what_was_seen_before():
     game = PursuitSettings(evader_speed=2.0, arena_height=1.0)
     settings = PredictorSettings(horizons=(1, 10))
     true = jnp.zeros((2, 2, 3))
-    predicted = true.at[:, 0, 0].set(0.02).at[:, 1, 0].set(0.4)  # one and two flown distances too far along x
+    predicted = (
+        true.at[:, 0, 0].set(0.02).at[:, 1, 0].set(0.4)
+    )  # one and two flown distances too far along x
     last_seen = jnp.array([[0.0, 0.0, 0.5], [0.1, 0.0, 0.5]])  # the first stands for: not yet seen
 
     def loss(predicted, **changes):
@@ -204,7 +239,8 @@ def test_step_size_stays_or_reaches_zero_at_the_end_of_the_run(decay):
     updates = 5
     settings = PredictorSettings(learning_rate=0.1, decay=decay, windows=8, steps=4)
     optimiser = make_predictor_optimiser(settings, updates)
-    state, moved = optimiser.init(jnp.zeros(())), []
+    state = optimiser.init(jnp.zeros(()))
+    moved = []
     for _ in range(updates * settings.steps + 1):
         step, state = optimiser.update(jnp.ones(()), state)
         moved.append(-float(step))

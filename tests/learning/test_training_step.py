@@ -1,4 +1,6 @@
-"""The compiled training step as a whole: compiles once, keeps its carry's types, resets in turn, obeys its switches."""
+"""The compiled training step as a whole: compiles once, keeps its carry's types, resets in turn,
+obeys its switches.
+"""
 
 import dataclasses
 import functools
@@ -29,9 +31,14 @@ from openjax.pursuit import SCENARIOS, PursuitSettings, hover_action, scenario_t
 
 pytestmark = pytest.mark.slow
 
-GROUPS, LENGTH, ROLLOUT, UPDATES = 3, 12, 4, 7
+GROUPS = 3
+LENGTH = 12
+ROLLOUT = 4
+UPDATES = 7
 SETTINGS = TrainSettings(
-    environment=PursuitSettings(episode_length=LENGTH, physics="rigid", capture_radius=1.0, history_length=3),
+    environment=PursuitSettings(
+        episode_length=LENGTH, physics="rigid", capture_radius=1.0, history_length=3
+    ),
     network=NetworkSettings(features=8, heads=2),
     predictor=PredictorSettings(units=4, windows=2, steps=1, horizons=(1, 2)),
     mappo=MappoSettings(minibatches=2, epochs=1, penalty_start=0.2, penalty_ramp=0.5),
@@ -44,10 +51,15 @@ SETTINGS = TrainSettings(
 
 @pytest.fixture(scope="module")
 def run():
-    """(start, carries after each of UPDATES steps, their metrics, the compiled step); carries as NumPy."""
+    """(start, carries after each of UPDATES steps, their metrics, the compiled step); carries as
+    NumPy.
+    """
     carry = make_start(SETTINGS)(jax.random.key(0))
     step = jax.jit(make_training_step(SETTINGS), donate_argnums=0)
-    start, carries, metrics, donated = _numpy(carry), [], [], carry
+    start = _numpy(carry)
+    carries = []
+    metrics = []
+    donated = carry
     for _ in range(UPDATES):
         carry, watched = step(carry)
         carries.append(_numpy(carry))
@@ -57,7 +69,9 @@ def run():
 
 def _numpy(tree):
     def copied(x):
-        return np.array(jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x)
+        return np.array(
+            jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x
+        )
 
     return jax.tree.map(copied, tree)
 
@@ -70,7 +84,10 @@ def test_compiles_once_and_keeps_the_types_of_its_carry(run):
     shapes = [jax.tree.map(lambda x: (x.shape, x.dtype), tree) for tree in (start, carries[-1])]
     assert shapes[0] == shapes[1]
     # the buffers of the carry that was handed in are used again
-    assert donated.state.drones.position.is_deleted() and donated.archive.tasks.pillar_position.is_deleted()
+    assert (
+        donated.state.drones.position.is_deleted()
+        and donated.archive.tasks.pillar_position.is_deleted()
+    )
 
 
 def test_metrics_are_finite_numbers(run):
@@ -120,7 +137,8 @@ def test_environments_that_share_a_task_start_alike_but_for_their_attitude(run):
 
 def test_only_whole_episodes_enter_the_archive(run):
     _, carries, metrics, *_ = run
-    # the groups that started late end incomplete episodes in the first two steps; then two tasks per step enter
+    # the groups that started late end incomplete episodes in the first two steps; then two tasks
+    # per step enter
     sizes = [int(carry.archive.size) for carry in carries]
     assert sizes == [0, 0, 2, 4, 6, 8, 8]
     assert [watched["archive_size"] for watched in metrics] == sizes
@@ -134,7 +152,9 @@ def test_what_an_update_changes(run):
     for before, after in ((start, carries[0]), (carries[0], carries[1])):
         for name in ("actor", "critic", "predictor"):
             moved = jax.tree.map(
-                lambda a, b: np.any(a != b), getattr(before.policy, name), getattr(after.policy, name)
+                lambda a, b: np.any(a != b),
+                getattr(before.policy, name),
+                getattr(after.policy, name),
             )
             assert any(jax.tree.leaves(moved)), name
         assert np.any(before.key != after.key) and after.update == before.update + 1
@@ -163,7 +183,9 @@ NO_GENERATOR = dataclasses.replace(SETTINGS.generator, enabled=False)
 
 
 def traced(settings):
-    """Shapes and types of a run's carry before and after a step, and the names of the step's metrics."""
+    """Shapes and types of a run's carry before and after a step, and the names of the step's
+    metrics.
+    """
     start = functools.partial(initial_carry, settings, build(settings))
     before = jax.eval_shape(start, jax.random.key(0))
     after, metrics = jax.eval_shape(make_training_step(settings), before)
@@ -207,7 +229,9 @@ def test_penalties_ramp_up():
 
 
 def test_evaluation_of_a_policy_that_hovers():
-    """Drones that hover at their starts in `empty`: nothing is captured or breached, and the evader is always seen."""
+    """Drones that hover at their starts in `empty`: nothing is captured or breached, and the evader
+    is always seen.
+    """
     layout = dataclasses.replace(
         SCENARIOS["empty"], pursuers=((0.0, 0.5, 0.5), (0.0, 0.5, 0.62), (0.5, 0.0, 0.5))
     )
@@ -224,7 +248,9 @@ def test_evaluation_of_a_policy_that_hovers():
     )
     parts = build(settings)
     task = jax.tree.map(lambda x: jnp.stack([x, x]), scenario_task(game, layout))
-    near = task.replace(evader_position=task.evader_position.at[1].set(jnp.array([0.5, -0.27, 0.5])))
+    near = task.replace(
+        evader_position=task.evader_position.at[1].set(jnp.array([0.5, -0.27, 0.5]))
+    )
 
     @jax.jit
     def play(key, tasks):
@@ -233,12 +259,21 @@ def test_evaluation_of_a_policy_that_hovers():
         parameters = jax.tree_util.tree_map_with_path(
             lambda path, x: jnp.zeros_like(x) if _is_output(path) else x, parameters
         )
-        return make_evaluate(parts.environment, parts.policy, trajectory=True)(parameters, tasks, key)
+        return make_evaluate(parts.environment, parts.policy, trajectory=True)(
+            parameters, tasks, key
+        )
 
     evaluation, trajectory = play(jax.random.key(0), near)
-    assert trajectory.pursuers.shape == (2, 10, 3, 3) and trajectory.predicted.shape == (2, 10, 2, 3)
+    assert trajectory.pursuers.shape == (2, 10, 3, 3) and trajectory.predicted.shape == (
+        2,
+        10,
+        2,
+        3,
+    )
     np.testing.assert_allclose(
-        trajectory.pursuers, np.broadcast_to(near.pursuer_position[:, None], (2, 10, 3, 3)), atol=2e-3
+        trajectory.pursuers,
+        np.broadcast_to(near.pursuer_position[:, None], (2, 10, 3, 3)),
+        atol=2e-3,
     )
     np.testing.assert_allclose(hover_action(parts.environment.vehicle)[1:], 0.0)
     # the predictor's output is zero: it says what keeping the last seen position says
@@ -270,7 +305,10 @@ def _is_output(path):
     [
         (dict(rollout_length=5), "rollout_length 5 must divide environment.episode_length 12"),
         (dict(num_envs=10), "num_envs 10 must be a multiple of 6"),
-        (dict(mappo=MappoSettings(minibatches=5)), "num_envs 12 must be a multiple of mappo.minibatches 5"),
+        (
+            dict(mappo=MappoSettings(minibatches=5)),
+            "num_envs 12 must be a multiple of mappo.minibatches 5",
+        ),
         (
             dict(predictor=PredictorSettings(windows=4, steps=1, horizons=(1, 3))),
             "do not fit into rollout_length 4",
@@ -303,8 +341,10 @@ def test_the_worlds_of_every_second_task_start_anew_within_the_episode(no_learni
     carry = make_start(settings)(jax.random.key(0))
     step = jax.jit(make_training_step(settings))
     world = np.arange(settings.num_envs)
-    group, brief = world % GROUPS, world // GROUPS // settings.episodes_per_task % 2 == 0
-    expected, entered = group * ROLLOUT, 0
+    group = world % GROUPS
+    brief = world // GROUPS // settings.episodes_per_task % 2 == 0
+    expected = group * ROLLOUT
+    entered = 0
     for update in range(UPDATES):
         before = carry.state
         carry, _ = step(carry)

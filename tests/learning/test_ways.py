@@ -19,17 +19,21 @@ CELL = 0.02
 
 @jax.jit
 def length(task, position, target):
-    position, target = jnp.asarray(position), jnp.asarray(target)
+    position = jnp.asarray(position)
+    target = jnp.asarray(target)
     return way_length(GAME, task, ways_of(GAME, task), position, target)
 
 
 def one_pillar():
     task = jax.jit(functools.partial(uniform_task, GAME))(jax.random.key(0))
-    return task.replace(pillar_position=jnp.zeros_like(task.pillar_position), pillar_active=jnp.arange(5) < 1)
+    return task.replace(
+        pillar_position=jnp.zeros_like(task.pillar_position), pillar_active=jnp.arange(5) < 1
+    )
 
 
 def test_round_one_pillar_it_is_two_tangents_and_an_arc():
-    far, bent = 0.6, math.acos(REACH / 0.6)
+    far = 0.6
+    bent = math.acos(REACH / 0.6)
     tangent = math.sqrt(far**2 - REACH**2)
     way = length(one_pillar(), [[far, 0.0, 0.5], [far, far, 0.5]], [-far, 0.0, 0.5])
     assert way[0] == pytest.approx(2 * tangent + REACH * (math.pi - 2 * bent), rel=0.01)
@@ -46,15 +50,20 @@ def test_who_is_too_near_a_pillar_leaves_it():
 
 
 def on_a_grid(task, source):
-    """The lengths (m) of ways from a place to all cells; a step leads to any cell at most three away in x and y."""
+    """The lengths (m) of ways from a place to all cells; a step leads to any cell at most three
+    away in x and y.
+    """
     places = np.arange(-0.9, 0.9 + CELL / 2, CELL)
     x, y = np.meshgrid(places, places, indexing="ij")
     free = x**2 + y**2 < GAME.arena_radius**2
-    for (a, b), active in zip(np.asarray(task.pillar_position), np.asarray(task.pillar_active), strict=True):
+    for (a, b), active in zip(
+        np.asarray(task.pillar_position), np.asarray(task.pillar_active), strict=True
+    ):
         free &= ~active | ((x - a) ** 2 + (y - b) ** 2 >= REACH**2)
     steps = [(i, j) for i in range(-3, 4) for j in range(-3, 4) if math.gcd(i, j) == 1]
     start = cell(source)
-    best, queue = {start: 0.0}, [(0.0, start)]
+    best = {start: 0.0}
+    queue = [(0.0, start)]
     while queue:
         way, (i, j) = heapq.heappop(queue)
         if way > best[i, j]:

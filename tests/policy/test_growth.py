@@ -1,4 +1,6 @@
-"""A policy that observes a longer history than it was trained with does what it did, until it learns."""
+"""A policy that observes a longer history than it was trained with does what it did, until it
+learns.
+"""
 
 import dataclasses
 
@@ -19,7 +21,8 @@ pytestmark = pytest.mark.slow
 def test_the_grown_policy_acts_alike(frames, predicts):
     old = PursuitSettings(physics="rigid", observe_position=True, observe_history=frames)
     new = dataclasses.replace(old, observe_history=3)
-    network, predictor = NetworkSettings(features=8, heads=2), PredictorSettings(enabled=predicts, units=4)
+    network = NetworkSettings(features=8, heads=2)
+    predictor = PredictorSettings(enabled=predicts, units=4)
     worlds = [Pursuit(settings) for settings in (old, new)]
     policies = [Policy.for_environment(world, network, predictor) for world in worlds]
 
@@ -54,4 +57,6 @@ def test_a_policy_without_networks_is_refused():
     heuristic = openjax.load_policy("apf")
     longer = dataclasses.replace(heuristic.settings.environment, observe_history=12)
     with pytest.raises(openjax.UserError, match="no networks"):
-        with_longer_history(heuristic.parameters, PredictorSettings(), heuristic.settings.environment, longer)
+        with_longer_history(
+            heuristic.parameters, PredictorSettings(), heuristic.settings.environment, longer
+        )

@@ -9,11 +9,18 @@ import pytest
 from scipy.stats import norm
 
 from openjax.errors import UserError
-from openjax.policy import NetworkSettings, Policy, PredictorSettings, gaussian_entropy, gaussian_log_prob
+from openjax.policy import (
+    NetworkSettings,
+    Policy,
+    PredictorSettings,
+    gaussian_entropy,
+    gaussian_log_prob,
+)
 from openjax.policy.predictor import EvaderPredictor
 from openjax.pursuit import Observation
 
-N, BATCH = 3, 4
+N = 3
+BATCH = 4
 POLICY = Policy(NetworkSettings(features=16, heads=2), PredictorSettings(units=8, horizons=(1, 2)))
 
 
@@ -50,8 +57,11 @@ def functions(policy):
 def networks():
     """(parameters away from their start, function to mean and value)."""
     init, both = functions(POLICY)
-    parameters, draw = init(jax.random.key(0), observation_of(0)), np.random.default_rng(1)
-    return jax.tree.map(lambda x: x + 0.1 * draw.normal(size=x.shape).astype(x.dtype), parameters), both
+    parameters = init(jax.random.key(0), observation_of(0))
+    draw = np.random.default_rng(1)
+    return jax.tree.map(
+        lambda x: x + 0.1 * draw.normal(size=x.shape).astype(x.dtype), parameters
+    ), both
 
 
 def test_order_of_others_and_pillars_does_not_matter(networks):
@@ -76,7 +86,9 @@ def test_unused_slots_have_no_influence_and_used_ones_have(networks):
         for a, b in zip(both(parameters, observation), both(parameters, changed), strict=True):
             same = np.all(np.asarray(a == b).reshape(BATCH, N, -1), axis=-1)
             expected = (
-                ~np.asarray(observation.pillar_seen).any(axis=-1) if used else np.ones((BATCH, N), bool)
+                ~np.asarray(observation.pillar_seen).any(axis=-1)
+                if used
+                else np.ones((BATCH, N), bool)
             )
             np.testing.assert_array_equal(same, expected)
 
@@ -88,7 +100,9 @@ def test_pursuers_share_one_actor_and_worlds_do_not_mix(networks):
     one = jax.tree.map(lambda x: x[1:2], observation)
     shuffled = jnp.array([2, 0, 1])
     fields = ("self_state", "others", "pillars", "pillar_seen", "privileged", "position")
-    turned = observation.replace(**{name: getattr(observation, name)[:, shuffled] for name in fields})
+    turned = observation.replace(
+        **{name: getattr(observation, name)[:, shuffled] for name in fields}
+    )
     for a, b in zip((mean, value), both(parameters, turned), strict=True):
         np.testing.assert_allclose(a[:, shuffled], b, atol=1e-5)
     for a, b in zip((mean, value), jax.tree.map(lambda x: x, both(parameters, one)), strict=True):
@@ -99,7 +113,9 @@ def test_what_is_privileged_is_the_critics_alone(networks):
     parameters, both = networks
     observation = observation_of(4)
     mean, value = both(parameters, observation)
-    more_mean, more_value = both(parameters, observation.replace(privileged=observation.privileged + 1))
+    more_mean, more_value = both(
+        parameters, observation.replace(privileged=observation.privileged + 1)
+    )
     np.testing.assert_array_equal(mean, more_mean)
     assert (value != more_value).all()
 
@@ -109,14 +125,17 @@ def test_a_critic_of_observations_does_not_see_it():
     policy = Policy(network, PredictorSettings(enabled=False))
     observation = observation_of(4)
     parameters = jax.jit(policy.init)(jax.random.key(0), observation)
-    value = jax.jit(lambda observation: policy.value(parameters.actor, parameters.critic, observation, None))
+    value = jax.jit(
+        lambda observation: policy.value(parameters.actor, parameters.critic, observation, None)
+    )
     more = observation.replace(privileged=observation.privileged + 1)
     np.testing.assert_array_equal(value(observation), value(more))
 
 
 def test_a_critic_of_layers_sees_all_and_each_pursuer_its_own():
     policy = Policy(
-        NetworkSettings(features=16, heads=2, critic_encoder="layers"), PredictorSettings(enabled=False)
+        NetworkSettings(features=16, heads=2, critic_encoder="layers"),
+        PredictorSettings(enabled=False),
     )
     observation = observation_of(4)
     parameters = jax.jit(policy.init)(jax.random.key(0), observation)
@@ -124,7 +143,9 @@ def test_a_critic_of_layers_sees_all_and_each_pursuer_its_own():
     @jax.jit
     def slopes(observation):
         def of_first(observation):
-            return jnp.sum(policy.value(parameters.actor, parameters.critic, observation, None)[:, 0])
+            return jnp.sum(
+                policy.value(parameters.actor, parameters.critic, observation, None)[:, 0]
+            )
 
         return jax.grad(of_first, allow_int=True)(observation)
 
@@ -145,7 +166,9 @@ def test_one_pursuer_without_predictor_starts_near_hover():
     parameters = jax.jit(policy.init)(jax.random.key(0), observation)
     assert parameters.predictor == {} and policy.predict(parameters, observation) is None
     action = jax.jit(policy.act)(parameters, observation)
-    np.testing.assert_allclose(action, np.broadcast_to([np.tanh(0.3), 0, 0, 0], (BATCH, 1, 4)), atol=0.1)
+    np.testing.assert_allclose(
+        action, np.broadcast_to([np.tanh(0.3), 0, 0, 0], (BATCH, 1, 4)), atol=0.1
+    )
     assert all(x.dtype == jnp.float32 for x in jax.tree.leaves(parameters))
 
 
@@ -172,7 +195,9 @@ def test_density_and_entropy():
     sample, mean = draw.normal(size=(2, 5, 4))
     log_std = np.array([-1.0, 0.0, 0.5, -0.2])
     density = gaussian_log_prob(jnp.asarray(sample), jnp.asarray(mean), jnp.asarray(log_std))
-    np.testing.assert_allclose(density, norm.logpdf(sample, mean, np.exp(log_std)).sum(-1), rtol=1e-4)
+    np.testing.assert_allclose(
+        density, norm.logpdf(sample, mean, np.exp(log_std)).sum(-1), rtol=1e-4
+    )
     np.testing.assert_allclose(
         gaussian_entropy(jnp.asarray(log_std)), norm.entropy(0, np.exp(log_std)).sum(), rtol=1e-5
     )
@@ -200,13 +225,18 @@ def test_predictor_is_an_lstm_whose_range_is_the_arena(relative):
     output = (hidden @ p["output"]["kernel"] + p["output"]["bias"]).reshape(BATCH, 2, 3)
     scale = np.array([0.9, 0.9, 0.6])
     start = np.asarray(observation.last_seen)[:, None] if relative else np.array([0, 0, 0.6])
-    np.testing.assert_allclose(predicted, start + (0.1 if relative else 1.0) * scale * output, atol=1e-4)
+    np.testing.assert_allclose(
+        predicted, start + (0.1 if relative else 1.0) * scale * output, atol=1e-4
+    )
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: NetworkSettings(features=10, heads=4), "features 10 must be a multiple of heads 4"),
+        (
+            lambda: NetworkSettings(features=10, heads=4),
+            "features 10 must be a multiple of heads 4",
+        ),
         (
             lambda: NetworkSettings(shared_encoder=True, critic_encoder="layers"),
             "critic_encoder layers has no effect",

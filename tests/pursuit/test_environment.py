@@ -1,4 +1,6 @@
-"""The environment as pure functions: compiled or not, mapped or not, any size; its end, its gradients, its solids."""
+"""The environment as pure functions: compiled or not, mapped or not, any size; its end, its
+gradients, its solids.
+"""
 
 import chex
 import jax
@@ -36,7 +38,9 @@ def test_compiled_and_mapped_is_the_same_as_eager_one_by_one(tiny):
     _, states = jax.jit(jax.vmap(tiny.reset))(keys)
     step = jax.jit(jax.vmap(chex.assert_max_traces(tiny.step, n=1)))
     together = step(keys, states, actions)
-    step(keys, together[1], actions)  # what a step returns is what it takes: nothing is compiled again
+    step(
+        keys, together[1], actions
+    )  # what a step returns is what it takes: nothing is compiled again
     eager = tiny.step(keys[2], jax.tree.map(lambda x: x[2], states), actions[2])
     chex.assert_trees_all_close(jax.tree.map(lambda x: x[2], together), eager, atol=1e-4, rtol=1e-5)
     chex.assert_trees_all_equal(together, step(keys, states, actions))  # pure
@@ -63,14 +67,19 @@ def test_the_end_is_terminal_where_the_time_is_observed(observe_time):
         return jax.lax.scan(one, environment.reset(key)[1], length=4)[1]
 
     terminated, truncated = play(KEY)
-    ends, never = [False, False, True, True], [False] * 4
-    assert [terminated.tolist(), truncated.tolist()] == ([ends, never] if observe_time else [never, ends])
+    ends = [False, False, True, True]
+    never = [False] * 4
+    assert [terminated.tolist(), truncated.tolist()] == (
+        [ends, never] if observe_time else [never, ends]
+    )
 
 
 @pytest.mark.parametrize(
     "changes",
     [
-        dict(num_pursuers=1, observe_position=True, min_pillars=0, max_pillars=0, history_spacing=2),
+        dict(
+            num_pursuers=1, observe_position=True, min_pillars=0, max_pillars=0, history_spacing=2
+        ),
         dict(num_pursuers=8, max_pillars=2, min_pillars=0, speed_limit="none"),
         dict(
             arena_radius=2.0,
@@ -115,7 +124,9 @@ def test_commands():
 
 
 def test_order_within_a_step_and_history():
-    """The evader flees where the pursuers were, frames are taken every `history_spacing` steps, oldest first."""
+    """The evader flees where the pursuers were, frames are taken every `history_spacing` steps,
+    oldest first.
+    """
     environment = make(TINY, episode_length=100, history_length=3, history_spacing=2)
 
     @jax.jit
@@ -126,12 +137,20 @@ def test_order_within_a_step_and_history():
 
         def one(state, action):
             observation, new, *_ = environment.step(key, state, action)
-            return new, (observation, new.evader_position, new.evader_velocity, new.drones.position, new.seen)
+            return new, (
+                observation,
+                new.evader_position,
+                new.evader_velocity,
+                new.drones.position,
+                new.seen,
+            )
 
         actions = jax.random.uniform(key, (9, 3, 4), minval=-1.0)
         return observation, state, jax.lax.scan(one, state, actions)[1]
 
-    first, start, (observation, evader, velocity, position, seen) = jax.tree.map(np.asarray, play(KEY))
+    first, start, (observation, evader, velocity, position, seen) = jax.tree.map(
+        np.asarray, play(KEY)
+    )
     np.testing.assert_allclose(evader[0], start.evader_position + 0.01 * velocity[0], atol=1e-6)
     pillars = start.task.pillar_position, start.task.pillar_active
 
@@ -157,7 +176,9 @@ def test_order_within_a_step_and_history():
                 continue
             at = step - 1
             shown = np.r_[evader[at], velocity[at]] if seen[at] else np.full(6, -5.0)
-            np.testing.assert_allclose(frame, np.r_[step / 100, shown, position[at].ravel()], atol=1e-6)
+            np.testing.assert_allclose(
+                frame, np.r_[step / 100, shown, position[at].ravel()], atol=1e-6
+            )
 
 
 def test_clamp_cuts_the_norm_of_the_velocity():
@@ -181,7 +202,9 @@ def test_clamp_cuts_the_norm_of_the_velocity():
 
 @pytest.mark.slow
 def test_gradients_of_free_flight_are_finite_and_right(tiny):
-    """Of the distance to the evader after some steps, by the actions; checked along one direction."""
+    """Of the distance to the evader after some steps, by the actions; checked along one
+    direction.
+    """
 
     def loss(actions, state):
         def one(state, action):
@@ -207,7 +230,9 @@ def test_gradients_of_free_flight_are_finite_and_right(tiny):
 
 
 def test_pillar_and_floor_are_solid():
-    """One drone flies into a pillar, one falls to the floor, one flies into another drone: all stay outside."""
+    """One drone flies into a pillar, one falls to the floor, one flies into another drone: all stay
+    outside.
+    """
     settings = PursuitSettings(
         num_pursuers=4,
         max_pillars=1,
@@ -218,7 +243,9 @@ def test_pillar_and_floor_are_solid():
     )
     environment = Pursuit(settings)
     task = Task(
-        pursuer_position=jnp.array([[0.3, 0.0, 0.6], [0.0, -0.6, 0.3], [-0.5, 0.4, 0.6], [-0.5, 0.65, 0.6]]),
+        pursuer_position=jnp.array(
+            [[0.3, 0.0, 0.6], [0.0, -0.6, 0.3], [-0.5, 0.4, 0.6], [-0.5, 0.65, 0.6]]
+        ),
         evader_position=jnp.array([-0.7, -0.2, 0.6]),
         pillar_position=jnp.zeros((1, 2)),
         pillar_active=jnp.ones(1, bool),
@@ -249,7 +276,9 @@ def test_pillar_and_floor_are_solid():
 
 
 def test_physical_effects_act_in_the_game():
-    """Drag slows, a late sensor shows the past, random packet loss differs from episode to episode."""
+    """Drag slows, a late sensor shows the past, random packet loss differs from episode to
+    episode.
+    """
     names = ("rotor_drag", "state_latency", "packet_loss")
     parameters = {name: EFFECTS[name].typical() for name in names}
     environment = Pursuit(TINY, effects=names, effect_parameters=parameters)
@@ -273,7 +302,9 @@ def test_physical_effects_act_in_the_game():
     ("physics", "effects"), [("mjx", ()), ("rigid", ()), ("stops", ()), ("rigid", ("rotor_drag",))]
 )
 def test_pillars_are_as_wide_and_as_high_as_the_settings_say(physics, effects):
-    """Thrown at a pillar of 0.3 m and over one that ends below: stopped at the surface, and not stopped."""
+    """Thrown at a pillar of 0.3 m and over one that ends below: stopped at the surface, and not
+    stopped.
+    """
     settings = PursuitSettings(
         num_pursuers=2,
         min_pillars=0,

@@ -14,14 +14,19 @@ MIDDLE = (0.0, 0.0, 0.6)
 FAR = (0.0, 0.0, 50.0)  # exerts 0.02 at most
 
 
-def velocity(evader, pursuers=((FAR),), in_sight=None, pillars=((5.0, 5.0),), active=None, **settings):
-    pursuers, pillars = jnp.asarray(pursuers), jnp.asarray(pillars)
+def velocity(
+    evader, pursuers=((FAR),), in_sight=None, pillars=((5.0, 5.0),), active=None, **settings
+):
+    pursuers = jnp.asarray(pursuers)
+    pillars = jnp.asarray(pillars)
     in_sight = jnp.zeros(len(pursuers), bool) if in_sight is None else jnp.asarray(in_sight)
     active = jnp.ones(len(pillars), bool) if active is None else jnp.asarray(active)
     if active.shape == (1,) and pillars[0, 0] == 5.0:
         active = jnp.zeros(1, bool)
     return np.asarray(
-        field_velocity(PursuitSettings(**settings), jnp.asarray(evader), pursuers, in_sight, pillars, active)
+        field_velocity(
+            PursuitSettings(**settings), jnp.asarray(evader), pursuers, in_sight, pillars, active
+        )
     )
 
 
@@ -36,13 +41,20 @@ def along(force):
         (dict(evader=(0.0, 0.0, 0.5)), (0, 0, 1 / 0.5 - 1 / 0.7)),
         (dict(evader=(0.5, 0.0, 0.6)), (-1 / 0.4, 0, 0)),
         (dict(evader=(0.3, 0.4, 0.4)), (-0.6 / 0.4, -0.8 / 0.4, 1 / 0.4 - 1 / 0.8)),
-        (dict(evader=MIDDLE, pursuers=[(0.3, 0, 0.2)], in_sight=[True]), (-0.3 / 0.25, 0, 0.4 / 0.25)),
+        (
+            dict(evader=MIDDLE, pursuers=[(0.3, 0, 0.2)], in_sight=[True]),
+            (-0.3 / 0.25, 0, 0.4 / 0.25),
+        ),
         (
             dict(evader=(0.3, 0, 0.5), pursuers=[(0.3, -0.5, 0.5)], in_sight=[False]),
             (-1 / 0.6, 0, 2 - 1 / 0.7),
         ),
         (
-            dict(evader=(0.3, 0, 0.6), pursuers=[(0.3, -0.5, 0.6), (0, 0, 0.6)], in_sight=[True, False]),
+            dict(
+                evader=(0.3, 0, 0.6),
+                pursuers=[(0.3, -0.5, 0.6), (0, 0, 0.6)],
+                in_sight=[True, False],
+            ),
             (-1 / 0.6, 2, 0),
         ),
         (
@@ -101,7 +113,8 @@ def flee(settings):
 def test_turning_the_scene_turns_the_velocity(scenes):
     angle = 0.7
     turn = jnp.array(
-        [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]], jnp.float32
+        [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]],
+        jnp.float32,
     )
 
     def turned(x):

@@ -1,4 +1,6 @@
-"""Scripted evaders: against plain Python, and what holds for all of them; the curriculum and the draws."""
+"""Scripted evaders: against plain Python, and what holds for all of them; the curriculum and the
+draws.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -7,7 +9,15 @@ import pytest
 
 from openjax import UserError, make
 from openjax.pursuit import SCENARIOS, PursuitSettings, scenario_settings, scenario_task
-from openjax.pursuit.evaders import EVADERS, HELD_OUT, SCRIPTED, TRAINED, VALIDATED, draw_evader, init_network
+from openjax.pursuit.evaders import (
+    EVADERS,
+    HELD_OUT,
+    SCRIPTED,
+    TRAINED,
+    VALIDATED,
+    draw_evader,
+    init_network,
+)
 from openjax.pursuit.evaders.behaviours import DIRECTIONS, MARGIN, MEMORY, Scene, directions, greedy
 
 ALL = SCRIPTED
@@ -16,11 +26,15 @@ SETTINGS = PursuitSettings(physics="stops", evaders=ALL, episode_length=240)
 
 @pytest.fixture(scope="module")
 def flown():
-    """Every evader twice on every layout, against pursuers that fly at random: states (T, layouts * 2 * evaders, ...)."""
+    """Every evader twice on every layout, against pursuers that fly at random: states (T, layouts *
+    2 * evaders, ...).
+    """
     environment = make(SETTINGS, max_pillars=6)
     settings = environment.settings
     tasks = [scenario_task(settings, scenario) for scenario in SCENARIOS.values()]
-    tasks = jax.tree.map(lambda *leaves: jnp.repeat(jnp.stack(leaves), 2 * len(ALL), axis=0), *tasks)
+    tasks = jax.tree.map(
+        lambda *leaves: jnp.repeat(jnp.stack(leaves), 2 * len(ALL), axis=0), *tasks
+    )
     kinds = jnp.tile(jnp.arange(len(ALL)), 2 * len(SCENARIOS))
     actions = jax.random.uniform(jax.random.key(1), (240, 3, 4), minval=-0.3, maxval=0.4)
 
@@ -47,7 +61,9 @@ def test_every_evader_stays_inside_and_out_of_pillars(flown):
     assert np.isfinite(place).all()
     assert (np.linalg.norm(place[..., :2], axis=-1) < settings.arena_radius).all()
     assert (place[..., 2] > 0).all() and (place[..., 2] < settings.arena_height).all()
-    to_axis = np.linalg.norm(place[..., None, :2] - np.asarray(states.task.pillar_position), axis=-1)
+    to_axis = np.linalg.norm(
+        place[..., None, :2] - np.asarray(states.task.pillar_position), axis=-1
+    )
     in_use = np.asarray(states.task.pillar_active)
     assert to_axis[in_use].min() >= settings.pillar_radius
 
@@ -60,7 +76,9 @@ def test_speed_and_acceleration_are_bounded(flown):
     assert speed.max() <= settings.evader_speed * (1 + 1e-3)
     heavy = np.asarray(states.evader.kind[0]) == ALL.index("heavy")
     place = np.asarray(states.evader_position)
-    to_axis = np.linalg.norm(place[..., None, :2] - np.asarray(states.task.pillar_position), axis=-1)
+    to_axis = np.linalg.norm(
+        place[..., None, :2] - np.asarray(states.task.pillar_position), axis=-1
+    )
     to_axis = np.where(np.asarray(states.task.pillar_active), to_axis, np.inf).min(-1)
     # what is in its way stops it at once
     near = (to_axis < settings.pillar_radius + MARGIN + 0.02) | (place[..., 2] < MARGIN + 0.02)
@@ -89,7 +107,9 @@ def plain_greedy(settings, position, pursuers, known, pillars, look_ahead, hidin
 
     def blocked(a, b):
         for pillar in pillars:
-            along = np.dot(pillar - a[:2], (b - a)[:2]) / max(np.dot((b - a)[:2], (b - a)[:2]), 1e-12)
+            along = np.dot(pillar - a[:2], (b - a)[:2]) / max(
+                np.dot((b - a)[:2], (b - a)[:2]), 1e-12
+            )
             if (
                 0 <= along <= 1
                 and np.linalg.norm(a[:2] + along * (b - a)[:2] - pillar) < settings.pillar_radius
@@ -119,7 +139,8 @@ def plain_greedy(settings, position, pursuers, known, pillars, look_ahead, hidin
 
 
 def test_greedy_against_plain_python():
-    settings, draw = PursuitSettings(), np.random.default_rng(3)
+    settings = PursuitSettings()
+    draw = np.random.default_rng(3)
     decide = jax.jit(greedy)
     compared = 0
     for _ in range(60):
@@ -129,7 +150,8 @@ def test_greedy_against_plain_python():
         active = np.arange(5) < len(pillars)
         padded = np.concatenate([pillars, np.zeros((5 - len(pillars), 2))])
         known = np.array([True, *(draw.uniform(size=2) < 0.7)])
-        look_ahead, hiding = draw.uniform(0.05, 0.4), draw.choice([0.0, 0.3])
+        look_ahead = draw.uniform(0.05, 0.4)
+        hiding = draw.choice([0.0, 0.3])
         scene = Scene(
             settings,
             *(jnp.asarray(x, jnp.float32) for x in (position, np.zeros(3), np.array(pursuers))),
@@ -139,7 +161,9 @@ def test_greedy_against_plain_python():
             *(jnp.float32(x) for x in (look_ahead, hiding, settings.evader_speed)),
         )
         wish = decide(scene, jnp.zeros(MEMORY))[0]
-        expected, lead = plain_greedy(settings, position, pursuers, known, pillars, look_ahead, hiding)
+        expected, lead = plain_greedy(
+            settings, position, pursuers, known, pillars, look_ahead, hiding
+        )
         if lead > 1e-4:  # else rounding decides
             compared += 1
             np.testing.assert_allclose(wish, expected, atol=1e-6)
@@ -149,7 +173,9 @@ def test_greedy_against_plain_python():
 def test_one_that_knows_of_no_pursuer_waits():
     settings = scenario_settings(PursuitSettings(evaders=("greedy",)), SCENARIOS["hidden"])
     environment = make(settings, physics="stops", start_attitude="level")
-    _, state = jax.jit(environment.reset_to)(jax.random.key(0), scenario_task(settings, SCENARIOS["hidden"]))
+    _, state = jax.jit(environment.reset_to)(
+        jax.random.key(0), scenario_task(settings, SCENARIOS["hidden"])
+    )
     assert not state.in_sight.any()
     step = jax.jit(environment.step)
     for sees_all in (0.0, 1.0):
@@ -157,11 +183,15 @@ def test_one_that_knows_of_no_pursuer_waits():
         own = state.replace(evader=state.evader.replace(numbers=numbers))
         after = step(jax.random.key(0), own, jnp.zeros((3, 4)))[1]
         moved = np.linalg.norm(after.evader_position - state.evader_position)
-        np.testing.assert_allclose(moved, sees_all * settings.evader_speed * settings.time_step, rtol=1e-3)
+        np.testing.assert_allclose(
+            moved, sees_all * settings.evader_speed * settings.time_step, rtol=1e-3
+        )
 
 
 def test_draws_of_worlds():
-    """Kinds with the odds that the names give, numbers from the lists; a curriculum from the first alone to all."""
+    """Kinds with the odds that the names give, numbers from the lists; a curriculum from the first
+    alone to all.
+    """
     settings = PursuitSettings(evaders=("field", "greedy", "greedy", "wall_runner"))
     keys = jax.random.split(jax.random.key(5), 6000)
     drawn = jax.jit(jax.vmap(lambda key: draw_evader(settings, key, jnp.zeros((3, 3)))))(keys)

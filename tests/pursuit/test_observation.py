@@ -60,7 +60,9 @@ def test_unseen_evader_is_marked_for_all_but_not_for_the_critic():
     observation = observed(seen=False)
     np.testing.assert_array_equal(observation.self_state[:, :3], -5.0)
     np.testing.assert_allclose(observation.privileged[:, :3], POSITION - EVADER, atol=1e-6)
-    np.testing.assert_allclose(observation.privileged[:, 3:6], np.tile([1.3, 0, 0], (3, 1)), atol=1e-6)
+    np.testing.assert_allclose(
+        observation.privileged[:, 3:6], np.tile([1.3, 0, 0], (3, 1)), atol=1e-6
+    )
     np.testing.assert_array_equal(observation.privileged[:, 9], 0.0)
     np.testing.assert_array_equal(observed().privileged[:, 9], 1.0)
 
@@ -130,18 +132,28 @@ def test_frame_of_the_history(seen):
 
 def test_in_its_heading_a_turned_game_looks_the_same():
     settings = PursuitSettings(
-        physics="rigid", observe_in="heading", observe_position=True, observe_history=2, min_pillars=0
+        physics="rigid",
+        observe_in="heading",
+        observe_position=True,
+        observe_history=2,
+        min_pillars=0,
     )
     environment = Pursuit(settings)
-    step, key = jax.jit(environment.step), jax.random.key(1)
+    step = jax.jit(environment.step)
+    key = jax.random.key(1)
     observation, state = jax.jit(environment.reset)(key)
     angle = 2.5
     turn = jnp.array(
-        [[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]],
+        [
+            [np.cos(angle), -np.sin(angle), 0.0],
+            [np.sin(angle), np.cos(angle), 0.0],
+            [0.0, 0.0, 1.0],
+        ],
         jnp.float32,
     )
     w, x, y, z = state.drones.quaternion.T
-    c, s = np.cos(angle / 2), np.sin(angle / 2)
+    c = np.cos(angle / 2)
+    s = np.sin(angle / 2)
     quaternion = jnp.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], axis=-1)
     history = state.own_history.at[..., 3:6].set(rotation_axes(quaternion)[0])
     history = history.at[..., 6:9].set(rotation_axes(quaternion)[1])
@@ -158,7 +170,9 @@ def test_in_its_heading_a_turned_game_looks_the_same():
         other, turned, *_ = step(key, turned, action)
     assert np.abs(turned.drones.position - state.drones.position).max() > 0.1
     for name in ("self_state", "others", "pillars", "privileged"):
-        np.testing.assert_allclose(getattr(other, name), getattr(observation, name), atol=1e-5, err_msg=name)
+        np.testing.assert_allclose(
+            getattr(other, name), getattr(observation, name), atol=1e-5, err_msg=name
+        )
     np.testing.assert_allclose(flat_observation(other), flat_observation(observation), atol=1e-5)
     predicted = jax.random.normal(key, (2, 3))
     np.testing.assert_allclose(

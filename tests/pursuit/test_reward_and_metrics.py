@@ -1,6 +1,7 @@
 """Reward and metrics against short episodes worked out by hand.
 
-The drones hover or glide at a constant velocity (free flight, level, thrust at hover), the evader hardly moves.
+The drones hover or glide at a constant velocity (free flight, level, thrust at hover), the evader
+hardly moves.
 """
 
 import dataclasses
@@ -64,7 +65,8 @@ def play():
 
 
 def test_capture_bounds_pillar_and_speed(play):
-    # pursuer 0 comes within 0.3 m in step 2; 1 is too fast and leaves the arena in step 3; 2 nears the pillar in step 4
+    # pursuer 0 comes within 0.3 m in step 2; 1 is too fast and leaves the arena in step 3; 2 nears
+    # the pillar in step 4
     start = [(0.315, 0, 0.6), (0, 0.85, 0.6), (-0.4625, 0, 0.6)]
     statistics, reward, info = play(
         task(start, (0, 0, 0.6), (-0.65, 0)), [(-1, 0, 0), (0, 2, 0), (-0.5, 0, 0)], change=0.1
@@ -93,7 +95,9 @@ def test_no_capture_through_a_pillar(play):
     statistics, reward, info = play(task(hidden, (0, 0, 0.6), (0.12, 0)))
     assert info.seen.all() and not info.captured.any()
     assert not statistics.captured and statistics.capture_step == 4
-    np.testing.assert_allclose(reward[:, 0], 2 - 0.028 - 10, atol=1e-4)  # the pillar's surface is 0.06 m away
+    np.testing.assert_allclose(
+        reward[:, 0], 2 - 0.028 - 10, atol=1e-4
+    )  # the pillar's surface is 0.06 m away
     assert statistics.pillar_steps == 4 and statistics.collision_rate == 1.0
 
 
@@ -116,22 +120,32 @@ def test_every_breach_counts():
     pillars = jnp.array([[0.15, 0.0], [-0.15, 0.0], [0.0, -0.1]])
     counted = breaches(PursuitSettings(), position, pillars, jnp.array([True, True, False]))
     np.testing.assert_array_equal(counted.pillar, [2, 0, 0])
-    np.testing.assert_array_equal(counted.drone, [0, 0, 0])  # 0.164 m apart in space, 0.13 from above
+    np.testing.assert_array_equal(
+        counted.drone, [0, 0, 0]
+    )  # 0.164 m apart in space, 0.13 from above
     np.testing.assert_array_equal(counted.bounds, [1, 0, 1])
     np.testing.assert_array_equal(counted.total, [3, 0, 1])
-    wider = breaches(PursuitSettings(), position, pillars, jnp.array([True, True, False]), margin=0.06)
+    wider = breaches(
+        PursuitSettings(), position, pillars, jnp.array([True, True, False]), margin=0.06
+    )
     np.testing.assert_array_equal(wider.total, [4, 4, 1])
 
 
 def test_crashes():
-    position = jnp.array([[0.5, 0, 0.05], [0.5, 0, 0.07], [-0.5, 0, 0.6], [-0.5, 0.5, 0.6], [0, -0.151, 0.5]])
+    position = jnp.array(
+        [[0.5, 0, 0.05], [0.5, 0, 0.07], [-0.5, 0, 0.6], [-0.5, 0.5, 0.6], [0, -0.151, 0.5]]
+    )
     up = jnp.array([1.0, 1.0, -0.01, 0.01, 1.0])
     pillars = jnp.array([[0.0, 0.0]])
     apart = position.at[1, 0].set(0.2)
     crash = crashed(PursuitSettings(), apart, up, pillars, jnp.ones(1, bool))
-    np.testing.assert_array_equal(crash, [True, False, True, False, True])  # floor, -, tilt, -, pillar
+    np.testing.assert_array_equal(
+        crash, [True, False, True, False, True]
+    )  # floor, -, tilt, -, pillar
     crash = crashed(PursuitSettings(), position, up, pillars, jnp.zeros(1, bool))
-    np.testing.assert_array_equal(crash, [True, True, True, False, False])  # the first two touch each other
+    np.testing.assert_array_equal(
+        crash, [True, True, True, False, False]
+    )  # the first two touch each other
 
 
 def test_margin_widens_the_reward_only():
@@ -145,10 +159,16 @@ def test_margin_widens_the_reward_only():
         _, state, _, _, _, info = environment.step(jax.random.key(0), state, hover)
         return info.penalty, state.statistics
 
-    penalty, statistics = first_step(task([(0.5, 0, 0.6), (0.5, 0.15, 0.6), (-0.5, 0, 0.6)], (0, 0, 0.6)))
+    penalty, statistics = first_step(
+        task([(0.5, 0, 0.6), (0.5, 0.15, 0.6), (-0.5, 0, 0.6)], (0, 0, 0.6))
+    )
     assert penalty.tolist() == [-10, -10, 0] and statistics.collision_rate == 0
-    penalty, statistics = first_step(task([(0.5, 0, 0.6), (0.5, 0.11, 0.6), (-0.5, 0, 0.6)], (0, 0, 0.6)))
-    assert penalty.tolist() == [-17, -17, 0] and not statistics.crashed  # an early crash is no first one
+    penalty, statistics = first_step(
+        task([(0.5, 0, 0.6), (0.5, 0.11, 0.6), (-0.5, 0, 0.6)], (0, 0, 0.6))
+    )
+    assert (
+        penalty.tolist() == [-17, -17, 0] and not statistics.crashed
+    )  # an early crash is no first one
 
 
 def test_lookahead_counts_in_the_reward_what_comes_at_the_present_velocity():
@@ -164,6 +184,8 @@ def test_lookahead_counts_in_the_reward_what_comes_at_the_present_velocity():
     pillar_active = jnp.zeros_like(state.task.pillar_active)
     state = state.replace(drones=drones, task=state.task.replace(pillar_active=pillar_active))
     action = state.previous_action
-    with_it, without = (jax.jit(game.step)(jax.random.key(0), state, action) for game in (environment, plain))
+    with_it, without = (
+        jax.jit(game.step)(jax.random.key(0), state, action) for game in (environment, plain)
+    )
     np.testing.assert_allclose(with_it[2] - without[2], [-10.0, 0.0, 0.0], atol=1e-4)
     assert not with_it[1].statistics.collision_steps.any()

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from openjax.errors import UserError
-from openjax.pursuit import SCENARIOS, PursuitSettings, find_scenario, scenario_settings, scenario_task
+from openjax.pursuit import (
+    SCENARIOS,
+    PursuitSettings,
+    find_scenario,
+    scenario_settings,
+    scenario_task,
+)
 from openjax.pursuit.sensing import line_of_sight
 from openjax.pursuit.task import starts_clear
 
@@ -20,7 +26,11 @@ def mirrored(x, y):
 RIGHT = {(0.6, 0), (0.8, 0), (0.8, -0.2)}
 TABLE = {  # pillars, pursuers, evader; all at a height of 0.5 m
     "wall": (mirrored(0, 0.15) | mirrored(0, 0.45), {(0.6, 0.4), (0.6, 0), (0.6, -0.4)}, (-0.8, 0)),
-    "narrow_gap": (mirrored(0.3, 0.3) | {(0, 0.3)}, {(0, 0.7), (0.2, 0.7), (-0.2, 0.7)}, (-0.5, 0.2)),
+    "narrow_gap": (
+        mirrored(0.3, 0.3) | {(0, 0.3)},
+        {(0, 0.7), (0.2, 0.7), (-0.2, 0.7)},
+        (-0.5, 0.2),
+    ),
     "random": (
         {(0.6, 0.4), (-0.6, 0.4), (-0.2, 0.4), (0, 0.2), (-0.2, -0.4), (0, -0.2)},
         RIGHT,
@@ -48,7 +58,9 @@ def test_layouts_are_those_of_the_table_and_start_clear(name):
     settings, task = start_of(name)
 
     def rounded(points):
-        return {tuple(float(x) for x in np.round(point, 6)) for point in np.asarray(points, np.float64)}
+        return {
+            tuple(float(x) for x in np.round(point, 6)) for point in np.asarray(points, np.float64)
+        }
 
     assert rounded(np.asarray(task.pillar_position)[np.asarray(task.pillar_active)]) == rounded(
         [*map(list, pillars)]
@@ -63,7 +75,11 @@ def test_layouts_are_those_of_the_table_and_start_clear(name):
 def test_how_many_see_the_evader_at_the_start(name, seeing):
     settings, task = start_of(name)
     sees = line_of_sight(
-        settings, task.pursuer_position, task.evader_position, task.pillar_position, task.pillar_active
+        settings,
+        task.pursuer_position,
+        task.evader_position,
+        task.pillar_position,
+        task.pillar_active,
     )
     assert int(sees.sum()) == seeing
 
@@ -101,8 +117,16 @@ def test_own_layout(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("[[0.0, 0.0]]", "[[0.95, 0.0]]", r"pillar \(0.95, 0.0\) stands outside the arena of radius 0.9 m"),
-        ("[[0.0, 0.0]]", "[[0.45, 0.0]]", r"pillar \(0.45, 0.0\) stands over the start of pursuer 1"),
+        (
+            "[[0.0, 0.0]]",
+            "[[0.95, 0.0]]",
+            r"pillar \(0.95, 0.0\) stands outside the arena of radius 0.9 m",
+        ),
+        (
+            "[[0.0, 0.0]]",
+            "[[0.45, 0.0]]",
+            r"pillar \(0.45, 0.0\) stands over the start of pursuer 1",
+        ),
         ("[[0.0, 0.0]]", "[[-0.5, 0.0]]", "stands over the start of the evader"),
         ("[[0.0, 0.0]]", "[[0.0, 0.0, 0.0]]", r"pillars.0. has 3 entries; expected 2"),
         ("[[0.0, 0.0]]", "3", "pillars is 3; expected a list"),
@@ -114,7 +138,11 @@ def test_own_layout(tmp_path):
         ("pursuers = [[0.5, 0, 0.6], [0.5, 0.3, 0.6]]", "", "lacks pursuers"),
         ("[[0.5, 0, 0.6], [0.5, 0.3, 0.6]]", "[]", "has 0 pursuers; 1 to 8 are possible"),
         ("[0.5, 0, 0.6]", "[0.5, 0.25, 0.6]", "two pursuers start inside each other"),
-        ("[0.5, 0, 0.6]", "[1.5, 0, 0.6]", "pursuer 1 starts at .* outside the arena of 0.9 m by 1.2 m"),
+        (
+            "[0.5, 0, 0.6]",
+            "[1.5, 0, 0.6]",
+            "pursuer 1 starts at .* outside the arena of 0.9 m by 1.2 m",
+        ),
         ("0.1, 0.7]", "0.1, 1.7]", "the evader starts at .* outside the arena"),
         ("evader = [-0.5, 0.1, 0.7]", "", "lacks evader"),
     ],

@@ -15,11 +15,14 @@ RADIUS = PursuitSettings().pillar_radius
 
 @pytest.fixture(scope="module")
 def sight():
-    """(B, 2) starts, (B, 2) ends and (B, P, 2) pillars with (B, P) in use, seen from above -> (B,) bool."""
+    """(B, 2) starts, (B, 2) ends and (B, P, 2) pillars with (B, P) in use, seen from above -> (B,)
+    bool.
+    """
 
     def one(start, end, pillars, active):
         lift = jnp.array([0.5])
-        position, target = jnp.concatenate([start, lift])[None], jnp.concatenate([end, 2 * lift])
+        position = jnp.concatenate([start, lift])[None]
+        target = jnp.concatenate([end, 2 * lift])
         return line_of_sight(PursuitSettings(), position, target, pillars, active)[0]
 
     return jax.jit(jax.vmap(one))
@@ -64,7 +67,8 @@ def test_against_walking_along_the_segment(sight, points):
     share = np.linspace(0, 1, 4001)
     distance = np.linalg.norm(start + share[:, None] * (end - start) - pillar, axis=1)
     nearest = distance.argmin()
-    # where the nearest point is at an end or the distance the radius within rounding, both answers are right
+    # where the nearest point is at an end or the distance the radius within rounding, both answers
+    # are right
     foot = np.dot(pillar - start, end - start) / length**2
     assume(min(abs(foot), abs(1 - foot)) > 1e-3 and abs(distance[nearest] - RADIUS) > 1e-4)
     clear = not (0 < nearest < 4000 and distance[nearest] < RADIUS)

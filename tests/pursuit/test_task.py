@@ -37,13 +37,17 @@ def expand():
 
 
 def distances(tasks):
-    """Between pursuers, from pursuers and from the evader to the surface of the nearest pillar; (B, ...) each."""
+    """Between pursuers, from pursuers and from the evader to the surface of the nearest pillar; (B,
+    ...) each.
+    """
     pursuers, evader, pillars = (
         np.asarray(x, np.float64)
         for x in (tasks.pursuer_position, tasks.evader_position, tasks.pillar_position)
     )
     n = pursuers.shape[1]
-    between = np.linalg.norm(pursuers[:, :, None] - pursuers[:, None], axis=-1)[:, ~np.eye(n, dtype=bool)]
+    between = np.linalg.norm(pursuers[:, :, None] - pursuers[:, None], axis=-1)[
+        :, ~np.eye(n, dtype=bool)
+    ]
 
     def to_pillars(points):
         distance = np.linalg.norm(points[:, :, None, :2] - pillars[:, None], axis=-1) - 0.1
@@ -62,17 +66,20 @@ def assert_clear(tasks, slack=1e-6):
 
 def test_uniform_tasks_start_in_their_box_and_clear(uniform):
     assert_clear(uniform)
-    pursuers, evader = np.asarray(uniform.pursuer_position), np.asarray(uniform.evader_position)
+    pursuers = np.asarray(uniform.pursuer_position)
+    evader = np.asarray(uniform.evader_position)
     mirrored = evader * [-1, 1, 1]
     for positions in (pursuers.reshape(-1, 3), mirrored):
-        low, high = positions.min(axis=0), positions.max(axis=0)
+        low = positions.min(axis=0)
+        high = positions.max(axis=0)
         assert (low >= [0.1, -0.536, 0.5]).all() and (high <= np.float32([0.536, 0.536, 0.7])).all()
         np.testing.assert_allclose(low, [0.1, -0.536, 0.5], atol=0.02)  # and fill it
         np.testing.assert_allclose(high, [0.536, 0.536, 0.7], atol=0.02)
 
 
 def test_pillars_of_uniform_tasks(uniform):
-    pillars, active = np.asarray(uniform.pillar_position), np.asarray(uniform.pillar_active)
+    pillars = np.asarray(uniform.pillar_position)
+    active = np.asarray(uniform.pillar_active)
     number = active.sum(axis=1)
     assert set(number) == {4, 5} and 0.4 < np.mean(number == 5) < 0.6
     cells = np.round(pillars / 0.2).astype(int)
@@ -80,8 +87,12 @@ def test_pillars_of_uniform_tasks(uniform):
     assert (np.linalg.norm(pillars[active], axis=-1) < 0.8).all()
     for cell, used in zip(cells[:500], active[:500], strict=True):
         assert len({tuple(c) for c in cell[used]}) == used.sum()
-    starts = np.concatenate([uniform.pursuer_position, uniform.evader_position[:, None]], axis=1)[..., :2]
-    same_cell = (np.round(starts / 0.2)[:, :, None] == cells[:, None]).all(axis=-1) & active[:, None]
+    starts = np.concatenate([uniform.pursuer_position, uniform.evader_position[:, None]], axis=1)[
+        ..., :2
+    ]
+    same_cell = (np.round(starts / 0.2)[:, :, None] == cells[:, None]).all(axis=-1) & active[
+        :, None
+    ]
     assert not same_cell.any()
 
 
@@ -96,7 +107,8 @@ def test_eight_pursuers_start_clear():
 def test_expansion_moves_vehicles_a_little_and_never_into_a_breach(uniform, expand):
     tasks = uniform
     for generation in range(4):  # out of the box of the uniform draw
-        parents, tasks = tasks, expand(keys(10 + generation), tasks)
+        parents = tasks
+        tasks = expand(keys(10 + generation), tasks)
         for name in ("pillar_position", "pillar_active"):
             np.testing.assert_array_equal(getattr(tasks, name), getattr(uniform, name))
         for name in ("pursuer_position", "evader_position"):
@@ -110,7 +122,11 @@ def test_expansion_moves_vehicles_a_little_and_never_into_a_breach(uniform, expa
     assert positions[..., 2].min() >= 0.5 - 1e-6 and positions[..., 2].max() <= 0.7 + 1e-6
     assert positions[:, :3, 0].min() < 0.0
     assert (
-        np.mean(np.any(np.asarray(tasks.evader_position) != np.asarray(parents.evader_position), axis=-1))
+        np.mean(
+            np.any(
+                np.asarray(tasks.evader_position) != np.asarray(parents.evader_position), axis=-1
+            )
+        )
         > 0.95
     )
 
@@ -151,7 +167,9 @@ def test_shifted_pillars_leave_the_grid_and_keep_clear_of_starts(uniform):
     shift = jax.jit(jax.vmap(lambda key, task: shift_pillars(SETTINGS, key, task, 0.1)))
     shifted = shift(keys(31), uniform)
     assert_clear(shifted)
-    moved = np.asarray(shifted.pillar_position - uniform.pillar_position)[np.asarray(uniform.pillar_active)]
+    moved = np.asarray(shifted.pillar_position - uniform.pillar_position)[
+        np.asarray(uniform.pillar_active)
+    ]
     assert 0.099 < np.abs(moved).max() <= 0.1 + 1e-6
     stayed = (moved == 0.0).all(axis=-1)
     assert 0.0 < stayed.mean() < 0.2  # those that would have come too close
@@ -161,11 +179,15 @@ def test_shifted_pillars_leave_the_grid_and_keep_clear_of_starts(uniform):
 
 
 def test_pillars_in_a_row_stand_between_the_sides(uniform):
-    lined = jax.jit(jax.vmap(lambda key, task: line_up_pillars(SETTINGS, key, task)))(keys(32), uniform)
+    lined = jax.jit(jax.vmap(lambda key, task: line_up_pillars(SETTINGS, key, task)))(
+        keys(32), uniform
+    )
     assert_clear(lined)
     active = np.asarray(lined.pillar_active)
     np.testing.assert_array_equal(active, uniform.pillar_active)
-    whole = (np.asarray(lined.pillar_position != uniform.pillar_position).any(axis=-1) | ~active).all(axis=-1)
+    whole = (
+        np.asarray(lined.pillar_position != uniform.pillar_position).any(axis=-1) | ~active
+    ).all(axis=-1)
     assert whole.mean() > 0.1  # rows of which no pillar had to stay
     for pillars, used in zip(
         np.asarray(lined.pillar_position, np.float64)[whole], active[whole], strict=True
@@ -175,12 +197,16 @@ def test_pillars_in_a_row_stand_between_the_sides(uniform):
         np.testing.assert_allclose(spacing, spacing[0], atol=1e-5)
         assert 0.2 - 1e-5 <= spacing[0] <= 0.4 + 1e-5
         np.testing.assert_allclose(step, np.broadcast_to(step[0], step.shape), atol=1e-5)
-        assert np.abs(step[0, 0]) <= step[0, 1] + 1e-5  # across the line between the sides, within 45 degrees
+        assert (
+            np.abs(step[0, 0]) <= step[0, 1] + 1e-5
+        )  # across the line between the sides, within 45 degrees
         assert np.abs(pillars[used].mean(axis=0)).max() <= 0.2 + 1e-5
 
 
 def test_close_starts_leave_little_room_beside_a_pillar_or_another_pursuer(uniform):
-    close = jax.jit(jax.vmap(lambda key, task: close_starts(SETTINGS, key, task, 0.5)))(keys(33), uniform)
+    close = jax.jit(jax.vmap(lambda key, task: close_starts(SETTINGS, key, task, 0.5)))(
+        keys(33), uniform
+    )
     assert_clear(close)
     assert np.abs(close.pursuer_position[..., 2] - 0.6).max() <= 0.1 + 1e-6
     for name in ("evader_position", "pillar_position", "pillar_active"):
@@ -194,7 +220,9 @@ def test_close_starts_leave_little_room_beside_a_pillar_or_another_pursuer(unifo
     assert to_pursuer[moved].mean() > 0.35 and to_pillar[moved].mean() > 0.5
     # without pillars there's nothing to be put beside for the first
     alone = uniform.replace(pillar_active=np.zeros_like(uniform.pillar_active))
-    close = jax.jit(jax.vmap(lambda key, task: close_starts(SETTINGS, key, task, 1.0)))(keys(34), alone)
+    close = jax.jit(jax.vmap(lambda key, task: close_starts(SETTINGS, key, task, 1.0)))(
+        keys(34), alone
+    )
     assert_clear(close)
     moved = np.asarray(close.pursuer_position != uniform.pursuer_position).any(axis=-1)
     assert not moved[:, 0].any() and moved[:, 1:].mean() > 0.9
@@ -202,9 +230,12 @@ def test_close_starts_leave_little_room_beside_a_pillar_or_another_pursuer(unifo
 
 
 def test_scattered_starts_fill_the_arena_and_are_clear(uniform):
-    scattered = jax.jit(jax.vmap(lambda key, task: scatter_starts(SETTINGS, key, task)))(keys(35), uniform)
+    scattered = jax.jit(jax.vmap(lambda key, task: scatter_starts(SETTINGS, key, task)))(
+        keys(35), uniform
+    )
     assert_clear(scattered)
-    pursuers, evader = np.asarray(scattered.pursuer_position), np.asarray(scattered.evader_position)
+    pursuers = np.asarray(scattered.pursuer_position)
+    evader = np.asarray(scattered.evader_position)
     for points in (pursuers.reshape(-1, 3), evader):
         radius = np.linalg.norm(points[:, :2], axis=-1)
         assert 0.75 < radius.max() <= 0.8 + 1e-6 and radius.min() < 0.1
@@ -220,11 +251,13 @@ def test_scattered_starts_fill_the_arena_and_are_clear(uniform):
 def test_start_attitudes():
     from scipy.spatial.transform import Rotation
 
-    quaternion = np.asarray(jax.jit(jax.vmap(lambda key: start_attitude(SETTINGS, key)))(keys(40))).reshape(
-        -1, 4
-    )
+    quaternion = np.asarray(
+        jax.jit(jax.vmap(lambda key: start_attitude(SETTINGS, key)))(keys(40))
+    ).reshape(-1, 4)
     np.testing.assert_allclose(np.linalg.norm(quaternion, axis=-1), 1.0, atol=1e-5)
-    yaw, pitch, roll = Rotation.from_quat(quaternion[:, [1, 2, 3, 0]]).as_euler("ZYX", degrees=True).T
+    yaw, pitch, roll = (
+        Rotation.from_quat(quaternion[:, [1, 2, 3, 0]]).as_euler("ZYX", degrees=True).T
+    )
     for angle, low in ((roll, -36), (pitch, -36), (yaw, 0)):
         np.testing.assert_allclose([angle.min(), angle.max()], [low, 36], atol=0.5)
         assert angle.min() >= low - 1e-3 and angle.max() <= 36 + 1e-3

@@ -1,4 +1,6 @@
-"""Vehicles of their own in the game: drawn anew in each episode, shown to the critic; the history shown to the actor."""
+"""Vehicles of their own in the game: drawn anew in each episode, shown to the critic; the history
+shown to the actor.
+"""
 
 import dataclasses
 
@@ -17,13 +19,19 @@ FAMILY = (
     ("view_noise.position", 0.001, 0.001, 0.001, 0.001),
 )
 SETTINGS = PursuitSettings(
-    physics="stops", speed_limit="none", vehicles=FAMILY, observe_history=3, observe_history_spacing=2
+    physics="stops",
+    speed_limit="none",
+    vehicles=FAMILY,
+    observe_history=3,
+    observe_history_spacing=2,
 )
 
 
 @pytest.fixture(scope="module")
 def flown():
-    """An environment, its start, and ten steps of ever new actions: actions, states, observations."""
+    """An environment, its start, and ten steps of ever new actions: actions, states,
+    observations.
+    """
     environment = Pursuit(SETTINGS)
     observation, state = jax.jit(environment.reset)(KEY)
     actions = jax.random.uniform(KEY, (10, 3, 4), minval=-0.3, maxval=0.3)
@@ -61,7 +69,9 @@ def test_bounds_given_later_go_before_those_of_the_settings():
 def test_history_is_what_was_seen_and_commanded(flown):
     _, _, _, actions, _, observations = flown
     own = observations.self_state
-    history = np.asarray(own[..., -3 * OWN_FRAME :]).reshape(10, 3, 3, OWN_FRAME)  # step, pursuer, frame
+    history = np.asarray(own[..., -3 * OWN_FRAME :]).reshape(
+        10, 3, 3, OWN_FRAME
+    )  # step, pursuer, frame
     velocity = np.asarray(own[..., 7:10])
     for k, back in ((2, 0), (1, 2), (0, 4)):  # frames two steps apart, the newest last
         np.testing.assert_allclose(history[9, :, k, -4:], actions[9 - back], atol=1e-6)

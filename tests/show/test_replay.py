@@ -1,4 +1,6 @@
-"""The replay page holds the flights as they were, needs nothing from elsewhere, and is drawn by a browser."""
+"""The replay page holds the flights as they were, needs nothing from elsewhere, and is drawn by a
+browser.
+"""
 
 import http.client
 import json
@@ -40,8 +42,11 @@ def flights():
 
 
 def test_page_holds_the_flight(flights):
-    page, flight = replay_page(flights), flights[0][1]
-    (data,) = re.findall(r'<script id="data" type="application/json">(.*?)</script>', page, re.DOTALL)
+    page = replay_page(flights)
+    flight = flights[0][1]
+    (data,) = re.findall(
+        r'<script id="data" type="application/json">(.*?)</script>', page, re.DOTALL
+    )
     (shown,) = json.loads(data)
     assert shown["layout"] == "wall</script>" and shown["dt"] == pytest.approx(0.02)
     steps = range(0, 220, 2)  # two seconds after the capture
@@ -50,7 +55,9 @@ def test_page_holds_the_flight(flights):
     np.testing.assert_allclose(poses[:, :3], flight.pursuer_position[steps, 1], atol=6e-4)
     np.testing.assert_allclose(poses[:, 3:], flight.pursuer_quaternion[steps, 1], atol=6e-4)
     np.testing.assert_allclose(
-        np.array(shown["predicted"]).reshape(-1, 3, 3) / 1000, flight.predicted[steps][:, ::2], atol=6e-4
+        np.array(shown["predicted"]).reshape(-1, 3, 3) / 1000,
+        flight.predicted[steps][:, ::2],
+        atol=6e-4,
     )
     assert shown["capture"] == 10
     assert shown["crashes"] == [None, 30, None]  # the third's comes after what is shown
@@ -80,7 +87,8 @@ def test_server_answers_this_machine_only(flights):
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="no chromium on this machine")
 def test_a_browser_draws_it(flights, tmp_path):
     """Pillars' and pursuers' colours are in what a headless browser shows."""
-    picture, page = tmp_path / "page.png", tmp_path / "page.html"
+    picture = tmp_path / "page.png"
+    page = tmp_path / "page.html"
     write_replay(page, flights)
     command = "chromium --headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking".split()
     command += [

@@ -21,7 +21,9 @@ def test_time_left_follows_this_machine(monkeypatch):
     steps.begin("fast")
     assert steps.seconds_left(now[0]) == pytest.approx(20.0)
     assert steps.seconds_left(now[0] + 4.0) == pytest.approx(16.0)
-    assert steps.seconds_left(now[0] + 40.0) == pytest.approx(10.0)  # late: the last step is still to come
+    assert steps.seconds_left(now[0] + 40.0) == pytest.approx(
+        10.0
+    )  # late: the last step is still to come
 
 
 def test_nothing_but_text_goes_into_files():

@@ -46,7 +46,9 @@ for flip in range(flips + 1):
 
 @pytest.mark.slow
 def test_flipped_bits_end_no_process_and_change_no_number(tmp_path):
-    """Each start after a flip says that the entry is damaged and compiles anew. OPENJAX_FLIPS: how often, else four times."""
+    """Each start after a flip says that the entry is damaged and compiles anew. OPENJAX_FLIPS: how
+    often, else four times.
+    """
     flips = int(os.environ.get("OPENJAX_FLIPS", "4"))
     environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(tmp_path), "JAX_PLATFORMS": "cpu"}
     command = [sys.executable, "-c", FLIPS, "0", str(flips)]
@@ -74,7 +76,9 @@ def test_the_folder_is_the_users_own(tmp_path):
         code = "from openjax.store.compiled_programs import cache_programs; print(cache_programs())"
         environment = {**os.environ, "XDG_CACHE_HOME": str(cache)}
         environment.pop("JAX_COMPILATION_CACHE_DIR", None)
-        ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+        ran = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, env=environment
+        )
         assert ran.returncode == 0, ran.stderr
         return ran.stdout.strip()
 

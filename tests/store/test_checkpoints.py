@@ -51,7 +51,9 @@ def test_half_written_checkpoint_is_passed_over_and_removed(run):
 
 
 def test_any_changed_byte_is_found(run):
-    """Flipped bits, cut ends and missing files, anywhere in the newest checkpoint, its checksums included."""
+    """Flipped bits, cut ends and missing files, anywhere in the newest checkpoint, its checksums
+    included.
+    """
     rng = np.random.default_rng(0)
     kept = run.directory.with_name("kept")
     shutil.copytree(run.directory, kept)
@@ -73,7 +75,9 @@ def test_any_changed_byte_is_found(run):
         warnings = []
         carry, record = again.restore_latest(abstract, warnings.append)
         assert record.update == 1 and int(carry["n"]) == 1, damaged
-        told = is_checkpoint(run.directory / "000000002")  # not where nothing says that it was finished
+        told = is_checkpoint(
+            run.directory / "000000002"
+        )  # not where nothing says that it was finished
         assert ["000000002 is damaged" in text for text in warnings] == [True] * told, damaged
         assert again.load_best(only_n, lambda text: None)[1].update == 1
 
@@ -97,7 +101,9 @@ def test_other_shape_is_named(run):
     def other():
         return {**init(), "actor": {"kernel": jnp.ones((3, 5))}}
 
-    with pytest.raises(UserError, match=r"actor/kernel is float32\[3, 4\] there, .* float32\[3, 5\]"):
+    with pytest.raises(
+        UserError, match=r"actor/kernel is float32\[3, 4\] there, .* float32\[3, 5\]"
+    ):
         run.restore_latest(abstract_like(place(other())))
 
 

@@ -1,4 +1,6 @@
-"""Run directories: one process at a time, nothing foreign overwritten, a killed start in nobody's way."""
+"""Run directories: one process at a time, nothing foreign overwritten, a killed start in nobody's
+way.
+"""
 
 import os
 import signal
@@ -22,7 +24,9 @@ with locked(sys.argv[1]):
 
 def test_a_directory_is_for_one_process_until_it_ends_or_is_killed(tmp_path):
     run = tmp_path / "run"
-    holder = subprocess.Popen([sys.executable, "-c", HOLD, str(run)], stdout=subprocess.PIPE, text=True)
+    holder = subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(run)], stdout=subprocess.PIPE, text=True
+    )
     assert holder.stdout.readline() == "held\n"
     with pytest.raises(UserError, match="another process trains"), locked(run):
         pass

@@ -16,7 +16,17 @@ from openjax.plain import from_plain
 from openjax.show.metrics import MetricsWriter, read_metrics
 from openjax.show.plots import plot_training, plot_trajectories
 from openjax.show.trajectory import Trajectory
-from openjax.show.videos import AZIMUTH, DISTANCE, ELEVATION, HEIGHT, OPENING, WIDTH, animate, caption, draw
+from openjax.show.videos import (
+    AZIMUTH,
+    DISTANCE,
+    ELEVATION,
+    HEIGHT,
+    OPENING,
+    WIDTH,
+    animate,
+    caption,
+    draw,
+)
 from openjax.store.policy_files import fill, load_policy_file, save_policy_file
 
 
@@ -35,7 +45,9 @@ class Outer:
 
 
 def test_what_gets_its_name_is_on_the_disk_before_and_the_name_after(tmp_path, monkeypatch):
-    happened, fsync, rename = [], os.fsync, os.replace
+    happened = []
+    fsync = os.fsync
+    rename = os.replace
     monkeypatch.setattr(os, "fsync", lambda of: (happened.append(os.fstat(of).st_ino), fsync(of)))
     monkeypatch.setattr(os, "replace", lambda *paths: (happened.append("renamed"), rename(*paths)))
     with replacing(tmp_path / "run") as partial:
@@ -49,7 +61,10 @@ def test_settings_round_trip_and_are_strict():
     settings = Outer(Inner("b", (4,), 2.0), 1.0, 7)
     assert from_plain(Outer, to_plain(settings)) == settings
     for wrong, message in (
-        ({"inner": {"kinds": "a"}}, r"settings\.inner has the unknown key 'kinds'; did you mean kind"),
+        (
+            {"inner": {"kinds": "a"}},
+            r"settings\.inner has the unknown key 'kinds'; did you mean kind",
+        ),
         ({"inner": {"kind": "c"}}, r"settings\.inner\.kind is 'c'; expected one of 'a', 'b'"),
         ({"count": 2.5}, r"settings\.count is 2\.5; expected a whole number"),
     ):
@@ -60,12 +75,16 @@ def test_settings_round_trip_and_are_strict():
 def test_metrics_survive_a_kill_and_are_cut_to_the_resumed_update(tmp_path):
     writer = MetricsWriter(tmp_path, tensorboard=False)
     for update in range(1, 6):
-        writer.write("train", update, update * 10, 0.1, {"loss": float("nan") if update == 2 else update})
+        writer.write(
+            "train", update, update * 10, 0.1, {"loss": float("nan") if update == 2 else update}
+        )
     # No close: the file must already hold everything. Then a write that a kill cut short.
     with open(tmp_path / "metrics.jsonl", "ab") as file:
         file.write(b'{"event": "train", "upd')
     assert [r["loss"] for r in read_metrics(tmp_path / "metrics.jsonl")] == [1, None, 3, 4, 5]
-    MetricsWriter(tmp_path, resumed_update=3, tensorboard=False).write("train", 4, 40, 0.1, {"loss": 40})
+    MetricsWriter(tmp_path, resumed_update=3, tensorboard=False).write(
+        "train", 4, 40, 0.1, {"loss": 40}
+    )
     assert [r["loss"] for r in read_metrics(tmp_path / "metrics.jsonl")] == [1, None, 3, 40]
 
 
@@ -75,10 +94,14 @@ def test_policy_file_round_trip(tmp_path):
     save_policy_file(path, parameters, Outer(), {"steps": 5})
     leaves, settings, notes = load_policy_file(path)
     restored = fill(parameters, leaves, str(path))
-    np.testing.assert_allclose(restored["actor"]["kernel"], parameters["actor"]["kernel"], atol=5e-4)
+    np.testing.assert_allclose(
+        restored["actor"]["kernel"], parameters["actor"]["kernel"], atol=5e-4
+    )
     assert restored["actor"]["kernel"].dtype == jnp.float32 and int(restored["count"]) == 3
     assert from_plain(Outer, settings) == Outer() and notes == {"steps": 5}
-    with pytest.raises(UserError, match=r"actor/kernel is \[2, 3\] there, its settings make it \[2, 4\]"):
+    with pytest.raises(
+        UserError, match=r"actor/kernel is \[2, 3\] there, its settings make it \[2, 4\]"
+    ):
         fill({"actor": {"kernel": jnp.zeros((2, 4))}}, leaves, str(path))
 
 
@@ -106,21 +129,38 @@ def trajectory():
     level = np.tile([1.0, 0.0, 0.0, 0.0], (steps, 3, 1))
     pillars = np.array([[0.2, 0.1]])
     return Trajectory(
-        "wall", pursuers, level, pursuers[:, 0] * 0.5, captured, crashed, pillars, 0.9, 1.2, 0.1, 0.3, 0.01
+        "wall",
+        pursuers,
+        level,
+        pursuers[:, 0] * 0.5,
+        captured,
+        crashed,
+        pillars,
+        0.9,
+        1.2,
+        0.1,
+        0.3,
+        0.01,
     )
 
 
 def test_animation_is_drawn_without_a_display(tmp_path, trajectory, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
-    longer = dataclasses.replace(trajectory, captured=np.zeros_like(trajectory.captured), time_step=0.04)
+    longer = dataclasses.replace(
+        trajectory, captured=np.zeros_like(trajectory.captured), time_step=0.04
+    )
     animate(tmp_path / "chase.gif", trajectory)
     animate(tmp_path / "both.gif", trajectory, longer)
     with Image.open(tmp_path / "chase.gif") as one, Image.open(tmp_path / "both.gif") as both:
-        assert one.n_frames == 5 and both.n_frames == 20 and both.size == (one.width, 2 * one.height)
+        assert (
+            one.n_frames == 5 and both.n_frames == 20 and both.size == (one.width, 2 * one.height)
+        )
 
 
 def test_what_is_near_hides_what_is_far_and_all_stands_on_the_floor(trajectory):
-    """By the pinhole camera's own formula: the evader's pixels are where its position is seen, unless a pillar is before it."""
+    """By the pinhole camera's own formula: the evader's pixels are where its position is seen,
+    unless a pillar is before it.
+    """
 
     def red(flight):
         shown = np.asarray(draw(flight, 0)).astype(int)
@@ -130,7 +170,10 @@ def test_what_is_near_hides_what_is_far_and_all_stands_on_the_floor(trajectory):
         away = np.full_like(trajectory.pursuer_position, -50.0)
         there = np.broadcast_to(place, trajectory.evader_position.shape)
         return dataclasses.replace(
-            trajectory, pursuer_position=away, evader_position=there, pillar_position=np.array([pillar])
+            trajectory,
+            pursuer_position=away,
+            evader_position=there,
+            pillar_position=np.array([pillar]),
         )
 
     towards = np.array([np.cos(AZIMUTH), np.sin(AZIMUTH)])  # away from the camera
@@ -141,7 +184,8 @@ def test_what_is_near_hides_what_is_far_and_all_stands_on_the_floor(trajectory):
         )
         ahead = (np.array([0, 0, 0.38 * 1.2]) - camera) / (DISTANCE * 0.9)
         right = np.cross(ahead, (0, 0, 1)) / np.linalg.norm(np.cross(ahead, (0, 0, 1)))
-        off, zoom = np.array(place) - camera, HEIGHT / 2 / np.tan(OPENING / 2)
+        off = np.array(place) - camera
+        zoom = HEIGHT / 2 / np.tan(OPENING / 2)
         at = zoom * np.array([off @ right, -off @ np.cross(right, ahead)]) / (off @ ahead)
         assert abs(seen.mean(axis=0) - at - (WIDTH / 2, HEIGHT / 2)).max() < 1.5
         assert len(red(alone(place, place[:2] - 0.2 * towards))) < len(seen) / 4
@@ -156,7 +200,11 @@ def test_pictures_are_drawn(tmp_path, trajectory):
     writer = MetricsWriter(tmp_path)
     for update in range(3):
         writer.write(
-            "train", update, update, 0.0, {"capture_rate": 0.1 * update, "capture_step": float("nan")}
+            "train",
+            update,
+            update,
+            0.0,
+            {"capture_rate": 0.1 * update, "capture_step": float("nan")},
         )
     writer.close()
     plot_training(tmp_path / "training.png", tmp_path / "metrics.jsonl")

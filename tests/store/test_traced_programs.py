@@ -56,7 +56,9 @@ def test_what_was_traced_once_is_found_again_and_does_the_same(tmp_path, step, t
     def never(carry):
         raise AssertionError("traced again")
 
-    found = recalled("step", jax.jit(never), lambda: (carry(),), carry(), "these settings", tmp_path)
+    found = recalled(
+        "step", jax.jit(never), lambda: (carry(),), carry(), "these settings", tmp_path
+    )
     assert outcome(found, carry()) == expected
     with pytest.raises(AssertionError, match="traced again"):
         recalled("step", jax.jit(never), lambda: (carry(),), carry(), "other settings", tmp_path)
@@ -65,7 +67,9 @@ def test_what_was_traced_once_is_found_again_and_does_the_same(tmp_path, step, t
     whole = file.read_bytes()
     file.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
     assert outcome(of("these settings"), carry()) == expected
-    again = recalled("step", jax.jit(never), lambda: (carry(),), carry(), "these settings", tmp_path)
+    again = recalled(
+        "step", jax.jit(never), lambda: (carry(),), carry(), "these settings", tmp_path
+    )
     assert outcome(again, carry()) == expected and list(tmp_path.iterdir()) == [file]
 
 
@@ -75,7 +79,9 @@ def test_a_program_that_cannot_be_kept_is_used_as_it_is(tmp_path):
         return jax.pure_callback(lambda x: x, x, x)
 
     assert (
-        recalled("told", told, lambda: (jnp.zeros(2),), Carry(jnp.zeros(()), jnp.zeros(())), "", tmp_path)
+        recalled(
+            "told", told, lambda: (jnp.zeros(2),), Carry(jnp.zeros(()), jnp.zeros(())), "", tmp_path
+        )
         is told
     )
     assert not list(tmp_path.iterdir())

@@ -1,4 +1,6 @@
-"""Random crashes (floor, pillar, drone on drone, pillar and floor at once), by `rigid` and by MuJoCo C on the same model."""
+"""Random crashes (floor, pillar, drone on drone, pillar and floor at once), by `rigid` and by
+MuJoCo C on the same model.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -10,26 +12,34 @@ from openjax.vehicle.arena import Arena
 from openjax.vehicle.mjx_body import world_xml
 from openjax.vehicle.solids import encounters, place_solids, surroundings
 
-DT, DRONES, PILLARS = 0.01, 3, 5
+DT = 0.01
+DRONES = 3
+PILLARS = 5
 KINDS = ("floor", "pillar", "drone on drone", "pillar and floor at once")
 STEPS = 10
 """Of the flights, .1 s."""
 
 
 def crashes(number, seed):
-    """Starts (B, 3, ...) of drones about to crash, each kind as often; none of them inside anything."""
+    """Starts (B, 3, ...) of drones about to crash, each kind as often; none of them inside
+    anything.
+    """
     draw = np.random.default_rng(seed)
     pillar = draw.uniform(-0.6, 0.6, (number, PILLARS, 2))
     active = draw.random((number, PILLARS)) < 0.8
     position = draw.uniform([-0.8, -0.8, 0.06], [0.8, 0.8, 0.6], (number, DRONES, 3))
     velocity = draw.normal(0, 1, (number, DRONES, 3))
     kind = np.arange(number) % 4
-    floor, beside, both = kind == 0, (kind == 1) | (kind == 3), kind == 3
+    floor = kind == 0
+    beside = (kind == 1) | (kind == 3)
+    both = kind == 3
     position[floor, 0, 2] = 0.05 + draw.uniform(0, 0.05, floor.sum())
     velocity[floor, 0, 2] = -np.abs(velocity[floor, 0, 2]) - 0.5
     angle, active[beside, 0] = draw.uniform(0, 2 * np.pi, beside.sum()), True
     outward = np.stack([np.cos(angle), np.sin(angle)], -1)
-    position[beside, 0, :2] = pillar[beside, 0] + outward * draw.uniform(0.15, 0.19, (beside.sum(), 1))
+    position[beside, 0, :2] = pillar[beside, 0] + outward * draw.uniform(
+        0.15, 0.19, (beside.sum(), 1)
+    )
     velocity[beside, 0, :2] = -outward * draw.uniform(0.3, 2, (beside.sum(), 1)) + draw.normal(
         0, 0.5, (beside.sum(), 2)
     )
@@ -42,7 +52,10 @@ def crashes(number, seed):
     velocity[pair, 0] += along * draw.uniform(0, 1.5, (pair.sum(), 1))
     velocity[pair, 1] -= along * draw.uniform(0, 1.5, (pair.sum(), 1))
     to_pillar = np.linalg.norm(position[:, :, None, :2] - pillar[:, None], axis=-1) - 0.15
-    apart = [np.linalg.norm(position[:, i] - position[:, j], axis=-1) for i, j in ((0, 1), (0, 2), (1, 2))]
+    apart = [
+        np.linalg.norm(position[:, i] - position[:, j], axis=-1)
+        for i, j in ((0, 1), (0, 2), (1, 2))
+    ]
     gaps = [
         position[..., 2].min(1) - 0.05,
         np.where(active[:, None], to_pillar, 9).min((1, 2)),
@@ -56,7 +69,9 @@ def crashes(number, seed):
 
 
 def flown(start, dtype, steps=STEPS):
-    """Positions and velocities (B, T, 3, 3), attitudes and body rates over T `steps`, and those of free flight."""
+    """Positions and velocities (B, T, 3, 3), attitudes and body rates over T `steps`, and those of
+    free flight.
+    """
     vehicle = load_vehicle(dtype=dtype)
 
     def one(position, velocity, quaternion, command, pillar, active):
@@ -66,7 +81,12 @@ def flown(start, dtype, steps=STEPS):
 
             def advance(drones, _):
                 drones = step(vehicle, drones, command, pillar, active)
-                return drones, (drones.position, drones.velocity, drones.quaternion, drones.body_rates)
+                return drones, (
+                    drones.position,
+                    drones.velocity,
+                    drones.quaternion,
+                    drones.body_rates,
+                )
 
             return jax.lax.scan(advance, first, None, length=steps)[1]
 
@@ -77,9 +97,11 @@ def flown(start, dtype, steps=STEPS):
 
 
 def by_mujoco(start, free):
-    """Positions, velocities (B, T, 3, 3) over as many steps as `free` has, and what is touched (B, T, 3, things) by MuJoCo C.
+    """Positions, velocities (B, T, 3, 3) over as many steps as `free` has, and what is touched (B,
+    T, 3, things) by MuJoCo C.
 
-    The spheres have no friction, so attitudes and thrusts, and with them free accelerations, are those of free flight.
+    The spheres have no friction, so attitudes and thrusts, and with them free accelerations, are
+    those of free flight.
     """
     position, velocity, _, _, pillar, active = start
     model = mujoco.MjModel.from_xml_string(world_xml(Arena(), PILLARS, DRONES - 1, DT))
@@ -98,10 +120,13 @@ def by_mujoco(start, free):
             position, velocity, around
         )
 
-    positions, velocities, touched = [], [], []
+    positions = []
+    velocities = []
+    touched = []
     for t in range(force.shape[1]):
         shapes = np.asarray(place(position, velocity, pillar, active))
-        acceleration, hit = np.zeros_like(position), np.zeros((*position.shape[:2], len(things)), bool)
+        acceleration = np.zeros_like(position)
+        hit = np.zeros((*position.shape[:2], len(things)), bool)
         for b, n in np.ndindex(*position.shape[:2]):
             model.geom_pos[things] = shapes[b, n]
             data.qpos[:3], data.qvel[:3], data.qfrc_applied[:3] = (

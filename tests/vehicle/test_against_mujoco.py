@@ -6,7 +6,13 @@ import mujoco
 import numpy as np
 import pytest
 
-from openjax.vehicle import hover_state, load_vehicle, make_drones_step, max_rotor_thrust, rotor_thrust
+from openjax.vehicle import (
+    hover_state,
+    load_vehicle,
+    make_drones_step,
+    max_rotor_thrust,
+    rotor_thrust,
+)
 from openjax.vehicle.parameters import find_mjcf
 
 STEPS = 100
@@ -15,7 +21,9 @@ QVEL = np.array([1.0, 2.0, 0.5, 3.0, -5.0, 8.0])
 
 
 def hard_manoeuvres():
-    """(STEPS, 1, 4) commands that jump ten times a second, into the saturation of motors and controller."""
+    """(STEPS, 1, 4) commands that jump ten times a second, into the saturation of motors and
+    controller.
+    """
     draw = np.random.default_rng(0)
     jumps = np.concatenate(
         [draw.uniform(0.2, 0.95, (10, 1)), draw.uniform(-1, 1, (10, 3)) * [20, 20, 10]], axis=1
@@ -49,7 +57,9 @@ def test_a_second_of_hard_manoeuvres(airframe, physics, contacts, substeps):
 
         commands = jnp.asarray(hard_manoeuvres())[::substeps]
         _, flown = jax.jit(lambda start: jax.lax.scan(advance, start, commands))(start)
-        thrust = np.asarray(jax.vmap(lambda speed: rotor_thrust(vehicle, speed))(flown.rotor_speed[:, 0]))
+        thrust = np.asarray(
+            jax.vmap(lambda speed: rotor_thrust(vehicle, speed))(flown.rotor_speed[:, 0])
+        )
         if substeps > 1:  # what goes on within a step isn't seen from outside
             thrust = inner_thrusts(vehicle, start, commands, substeps)
         flown = jax.tree.map(np.asarray, flown)
@@ -79,5 +89,7 @@ def inner_thrusts(vehicle, start, commands, substeps):
         drones = step(vehicle, drones, command, *none)
         return drones, drones.rotor_speed[0]
 
-    _, speed = jax.jit(lambda: jax.lax.scan(advance, start, jnp.repeat(commands, substeps, axis=0)))()
+    _, speed = jax.jit(
+        lambda: jax.lax.scan(advance, start, jnp.repeat(commands, substeps, axis=0))
+    )()
     return np.asarray(vehicle.thrust_constant * speed**2)

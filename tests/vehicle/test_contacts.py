@@ -27,8 +27,12 @@ def test_a_tenth_of_a_second_of_crashes(flights, precision, tolerance):
 
 def test_the_crashes_are_crashes_of_every_kind(flights):
     _, kind, _, _, (_, _, touched) = flights
-    floor, pillar, other = touched[..., 0], touched[..., 1 : 1 + PILLARS], touched[..., 1 + PILLARS :]
+    floor = touched[..., 0]
+    pillar = touched[..., 1 : 1 + PILLARS]
+    other = touched[..., 1 + PILLARS :]
     anything = touched.any((1, 2, 3))
     assert all(anything[kind == k].mean() > 0.6 for k in range(4)), KINDS
-    assert floor[kind == 0].any((1, 2)).mean() > 0.9 and other[kind == 2].any((1, 2, 3)).mean() > 0.5
+    assert (
+        floor[kind == 0].any((1, 2)).mean() > 0.9 and other[kind == 2].any((1, 2, 3)).mean() > 0.5
+    )
     assert (floor[..., None] & pillar).any((1, 2, 3))[kind == 3].mean() > 0.1, "both at once"

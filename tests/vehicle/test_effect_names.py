@@ -21,7 +21,8 @@ def constants(tree):
 
 
 def test_no_effects_name_stands_outside_its_file():
-    package, names = Path(openjax.__file__).parent, known_effects().keys() - OWN
+    package = Path(openjax.__file__).parent
+    names = known_effects().keys() - OWN
     own = {package / "vehicle" / "effects" / f"{name}.py" for name in names - DISTURBANCES.keys()}
     assert all(path.is_file() for path in own)
     files = {path for room in ROOMS for path in (package / room).rglob("*.py")}

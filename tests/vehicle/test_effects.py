@@ -34,7 +34,9 @@ def vehicle():
     return load_vehicle()
 
 
-def state_at(vehicle, position=(0, 0, 0.6), quaternion=None, velocity=(0, 0, 0), body_rates=(0, 0, 0)):
+def state_at(
+    vehicle, position=(0, 0, 0.6), quaternion=None, velocity=(0, 0, 0), body_rates=(0, 0, 0)
+):
     drone = hover_state(
         vehicle, jnp.asarray(position, jnp.float32), quaternion, jnp.asarray(velocity, jnp.float32)
     )
@@ -86,7 +88,9 @@ def test_body_effects_change_what_they_name(vehicle):
     scaled = changed("thrust_scale", scale=-0.1)
     assert scaled == {"thrust_constant": pytest.approx(0.9), "torque_constant": pytest.approx(0.9)}
     assert changed("yaw_torque", ratio=0.2) == {"torque_constant": pytest.approx(0.2)}
-    np.testing.assert_allclose(changed("inertia", xx=1.2, zz=0.8)["inertia"], [1.2, 1, 0.8], rtol=1e-5)
+    np.testing.assert_allclose(
+        changed("inertia", xx=1.2, zz=0.8)["inertia"], [1.2, 1, 0.8], rtol=1e-5
+    )
     gains = changed("rate_gains", p=0.5, d=2.0)
     assert set(gains) == {"rate_kp", "rate_kd"} and np.allclose(gains["rate_kp"], 0.5)
 
@@ -95,9 +99,11 @@ def test_motor_lag_has_the_time_constants_that_were_asked_for(vehicle):
     slow = EFFECTS["motor_lag"].body(given("motor_lag", extra_up=0.035, extra_down=0.055), vehicle)
     low, high = float(vehicle.max_rotor_speed) * np.sqrt([0.2, 0.8])
     for start, command, end, time_constant in ((low, 0.8, high, 0.06), (high, 0.2, low, 0.08)):
-        speed, times = jnp.full(4, start), 0.0
+        speed = jnp.full(4, start)
+        times = 0.0
         while abs(speed[0] - end) > np.exp(-1) * abs(start - end):
-            speed, times = rotor_speed_step(slow, speed, jnp.full(4, command), 1e-3), times + 1e-3
+            speed = rotor_speed_step(slow, speed, jnp.full(4, command), 1e-3)
+            times = times + 1e-3
         assert times == pytest.approx(time_constant, abs=2e-3)
 
 
@@ -106,7 +112,9 @@ def test_com_offset_and_imbalance_trim_differently(vehicle):
     moved = EFFECTS["com_offset"].body(given("com_offset", x=0.002, y=-0.001), vehicle)
     speed = state_at(vehicle).rotor_speed
     force, torque = total_wrench(moved, rotor_thrust(moved, speed), rotor_reaction(moved, speed))
-    np.testing.assert_allclose(torque, [0.001 * force[2], 0.002 * force[2], 0], rtol=1e-3, atol=1e-8)
+    np.testing.assert_allclose(
+        torque, [0.001 * force[2], 0.002 * force[2], 0], rtol=1e-3, atol=1e-8
+    )
     _, torque = rotors(vehicle, "motor_imbalance", {"m1": 0.1})
     assert torque[0] < 0 and torque[1] < 0 and torque[2] < 0  # front right, counter-clockwise
 
@@ -116,7 +124,9 @@ def test_battery_sag_follows_the_voltage_or_the_time(vehicle):
 
     def sagged(**context):
         context = make_context(vehicle, state_at(vehicle), **context)
-        return float(EFFECTS["battery_sag"].motor(given("battery_sag", exponent=2.0), command, context)[0])
+        return float(
+            EFFECTS["battery_sag"].motor(given("battery_sag", exponent=2.0), command, context)[0]
+        )
 
     assert sagged(battery_voltage=3.9) == pytest.approx(0.6)
     assert sagged(battery_voltage=3.5) == pytest.approx(0.6 * (3.5 / 3.9) ** 2)
@@ -126,14 +136,21 @@ def test_battery_sag_follows_the_voltage_or_the_time(vehicle):
 def test_saturation_is_one_sided_and_the_curve_is_not(vehicle):
     context = make_context(vehicle, state_at(vehicle))
     command = jnp.array([0.2, 0.5, 0.8, 0.95])
-    cut = EFFECTS["thrust_saturation"].motor(given("thrust_saturation", limit=0.7), command, context)
+    cut = EFFECTS["thrust_saturation"].motor(
+        given("thrust_saturation", limit=0.7), command, context
+    )
     np.testing.assert_allclose(cut, [0.2, 0.5, 0.7, 0.7], rtol=1e-6)
     low = context.replace(battery_voltage=jnp.float32(3.5))
     sagging = given("thrust_saturation", limit=0.7, voltage_slope=0.5)
-    np.testing.assert_allclose(EFFECTS["thrust_saturation"].motor(sagging, command, low)[3], 0.56, rtol=1e-5)
-    bent = EFFECTS["thrust_curve"].motor(given("thrust_curve", offset=0.01, curvature=0.1), command, context)
+    np.testing.assert_allclose(
+        EFFECTS["thrust_saturation"].motor(sagging, command, low)[3], 0.56, rtol=1e-5
+    )
+    bent = EFFECTS["thrust_curve"].motor(
+        given("thrust_curve", offset=0.01, curvature=0.1), command, context
+    )
     np.testing.assert_allclose(bent, 0.01 + command + 0.1 * command**2, rtol=1e-6)
-    # Absent, it leaves what a curve, or a battery fuller than its reference, gives beyond the nominal largest thrust.
+    # Absent, it leaves what a curve, or a battery fuller than its reference, gives beyond the
+    # nominal largest thrust.
     absent = EFFECTS["thrust_saturation"].motor(given("thrust_saturation"), 1.2 * command, low)
     np.testing.assert_allclose(absent, 1.2 * command, rtol=1e-6)
 
@@ -144,14 +161,18 @@ def test_rotor_drag_opposes_motion_and_damps_rates(vehicle):
     assert not force.any() and not torque.any()
     force, _ = wrench(vehicle, "rotor_drag", values, velocity=(1, -2, 0.5))
     np.testing.assert_allclose(force, [-0.02, 0.04, -0.005], rtol=1e-5)
-    force, _ = wrench(vehicle, "rotor_drag", values, velocity=(1, 0, 0), quaternion=yawed(np.pi / 2))
+    force, _ = wrench(
+        vehicle, "rotor_drag", values, velocity=(1, 0, 0), quaternion=yawed(np.pi / 2)
+    )
     np.testing.assert_allclose(force, [0, 0.02, 0], atol=1e-7)  # it flies to its right
     _, torque = wrench(vehicle, "rotor_drag", values, body_rates=(2, -3, 4))
     assert np.all(torque * [2, -3, 4] < 0)
 
 
 def test_blade_flapping_tilts_back_and_pitches_up(vehicle):
-    force, torque = wrench(vehicle, "blade_flapping", {"tilt": 0.02, "stiffness": 1e-4}, velocity=(1.5, 0, 0))
+    force, torque = wrench(
+        vehicle, "blade_flapping", {"tilt": 0.02, "stiffness": 1e-4}, velocity=(1.5, 0, 0)
+    )
     weight = float(vehicle.mass * vehicle.gravity)
     np.testing.assert_allclose(force, [-0.02 * 1.5 * weight, 0, 0], rtol=1e-4, atol=1e-9)
     np.testing.assert_allclose(torque, [0, -1.5e-4, 0], rtol=1e-4, atol=1e-9)
@@ -165,7 +186,9 @@ def test_wind_persists_at_rest_and_turns_with_yaw(vehicle):
     np.testing.assert_allclose(
         wrench(vehicle, "wind", values, quaternion=yawed(np.pi / 2))[0], [0, -0.02, 0], atol=1e-7
     )
-    np.testing.assert_allclose(wrench(vehicle, "wind", values, velocity=(2, 0, 0))[0], [0, 0, 0], atol=1e-8)
+    np.testing.assert_allclose(
+        wrench(vehicle, "wind", values, velocity=(2, 0, 0))[0], [0, 0, 0], atol=1e-8
+    )
     # In still air it is rotor drag: along the axes by its share, and against the body's rates.
     still = {"x": 0.0, "y": 0.0, "z": 0.0, "drag": 0.02, "along": 0.4}
     moving = dict(velocity=(0.5, -1.0, 2.0), body_rates=(1.0, 2.0, 3.0))
@@ -175,7 +198,9 @@ def test_wind_persists_at_rest_and_turns_with_yaw(vehicle):
     )
 
 
-@pytest.mark.parametrize(("name", "plane", "side"), [("ground_effect", 0.0, 1), ("ceiling_effect", 1.2, -1)])
+@pytest.mark.parametrize(
+    ("name", "plane", "side"), [("ground_effect", 0.0, 1), ("ceiling_effect", 1.2, -1)]
+)
 def test_a_near_plane_adds_thrust_and_a_gradient_tilts(vehicle, name, plane, side):
     values = {"strength": 0.6, "offset": 0.01}
     weight = float(vehicle.mass * vehicle.gravity)
@@ -183,9 +208,13 @@ def test_a_near_plane_adds_thrust_and_a_gradient_tilts(vehicle, name, plane, sid
         rotors(vehicle, name, values, position=(0, 0, plane + side * d))[0][2] / weight
         for d in (0.05, 0.1, 0.6)
     ]
-    np.testing.assert_allclose(gains, 1 + 0.6 * (0.023 / np.array([0.06, 0.11, 0.61])) ** 2, rtol=1e-5)
+    np.testing.assert_allclose(
+        gains, 1 + 0.6 * (0.023 / np.array([0.06, 0.11, 0.61])) ** 2, rtol=1e-5
+    )
     rolled = jnp.array([np.cos(0.1), np.sin(0.1), 0, 0])  # the left side is up
-    _, torque = rotors(vehicle, name, values, position=(0, 0, plane + side * 0.05), quaternion=rolled)
+    _, torque = rotors(
+        vehicle, name, values, position=(0, 0, plane + side * 0.05), quaternion=rolled
+    )
     assert (
         torque[0] * side < 0
     )  # the side nearer to the plane gains more: the floor rights, the ceiling turns over
@@ -193,7 +222,9 @@ def test_a_near_plane_adds_thrust_and_a_gradient_tilts(vehicle, name, plane, sid
 
 def test_downwash_pushes_only_what_is_below(vehicle):
     def push(other, **values):
-        return wrench(vehicle, "downwash", {"force": 0.1, **values}, jnp.array([other]), position=(0, 0, 0.5))
+        return wrench(
+            vehicle, "downwash", {"force": 0.1, **values}, jnp.array([other]), position=(0, 0, 0.5)
+        )
 
     right_under, torque = push([0.0, 0, 0.8], width=0.2, spread=0.0)
     rotor_radius_share = np.exp(-(0.043**2) / (2 * 0.2**2))
@@ -206,11 +237,13 @@ def test_downwash_pushes_only_what_is_below(vehicle):
 
 
 def test_latency_delays_by_fractions_of_a_step(vehicle):
-    effect, drone = EFFECTS["command_latency"], state_at(vehicle)
+    effect = EFFECTS["command_latency"]
+    drone = state_at(vehicle)
     context = make_context(vehicle, drone, dt=0.01)
 
     def received(delay):
-        memory, got = effect.initial_memory(vehicle, drone, 0.01, None), []
+        memory = effect.initial_memory(vehicle, drone, 0.01, None)
+        got = []
         for k in range(8):
             command = jnp.array([0.1 * k, 0, 0, 0])
             arrived, memory = effect.command({"delay": delay}, memory, command, context)
@@ -219,12 +252,15 @@ def test_latency_delays_by_fractions_of_a_step(vehicle):
 
     np.testing.assert_allclose(received(0.0), 0.1 * np.arange(8), atol=1e-6)
     np.testing.assert_allclose(received(0.025)[4:], 0.1 * (np.arange(4, 8) - 2.5), atol=1e-5)
-    slope = jax.jacfwd(received)(jnp.float32(0.0))  # a fit that starts from no delay must see where to go
+    slope = jax.jacfwd(received)(
+        jnp.float32(0.0)
+    )  # a fit that starts from no delay must see where to go
     np.testing.assert_allclose(slope[1:], -0.1 / 0.01, rtol=1e-4)
 
 
 def test_packet_loss_holds_the_last_command(vehicle):
-    effect, drone = EFFECTS["packet_loss"], state_at(vehicle)
+    effect = EFFECTS["packet_loss"]
+    drone = state_at(vehicle)
     context = make_context(vehicle, drone)
     commands = jnp.zeros((2000, 4)).at[:, 0].set(jnp.arange(2000.0))
 
@@ -249,12 +285,15 @@ def test_packet_loss_holds_the_last_command(vehicle):
 def commands(steps):
     """(steps, 2, 4) commands that change in each step and reach full thrust."""
     draw = np.random.default_rng(2)
-    thrust, rates = draw.uniform(0.3, 1.0, (20, 2, 1)), draw.uniform(-3, 3, (20, 2, 3))
+    thrust = draw.uniform(0.3, 1.0, (20, 2, 1))
+    rates = draw.uniform(-3, 3, (20, 2, 3))
     return jnp.asarray(np.concatenate([thrust, rates], axis=-1), jnp.float32)[:steps]
 
 
 def flight(vehicle, effects, steps=20):
-    """A jitted flight of two drones, one above the other: parameters -> (states, seen at the end)."""
+    """A jitted flight of two drones, one above the other: parameters -> (states, seen at the
+    end).
+    """
     step = make_drones_step("rigid", effects=effects)
     start = hover_state(
         vehicle, jnp.array([[0.0, 0, 0.2], [0.01, 0, 0.5]]), velocity=jnp.array([0.5, -0.3, 0.1])
@@ -275,7 +314,9 @@ def flight(vehicle, effects, steps=20):
 
 @pytest.fixture(scope="module")
 def fly(vehicle):
-    """A flight with all effects, each of which can be switched on by its parameters; compiled once."""
+    """A flight with all effects, each of which can be switched on by its parameters; compiled
+    once.
+    """
     everything = flight(vehicle, tuple(EFFECTS))
     return lambda **on: everything(jax.tree.map(jnp.float32, {**NONE, **on}))
 
@@ -345,17 +386,23 @@ def test_an_effect_of_ones_own(vehicle, nominal):
         wrench=lambda parameters, context: (jnp.stack([parameters["x"], 0, 0]), jnp.zeros(3)),
     )
     states, _ = flight(vehicle, (push, "mass"), steps=3)({"push": {"x": jnp.float32(0.0321)}})
-    np.testing.assert_allclose(states.velocity[2, :, 0] - nominal.velocity[2, :, 0], 0.03, atol=1e-3)
+    np.testing.assert_allclose(
+        states.velocity[2, :, 0] - nominal.velocity[2, :, 0], 0.03, atol=1e-3
+    )
 
 
 def test_hooks_map_over_logged_states(vehicle):
     """What the diagnosis does: the drag along a logged flight, differentiated in the parameter."""
-    states = jax.vmap(lambda v: state_at(vehicle, velocity=v))(jnp.linspace(-1, 1, 9)[:, None] * jnp.ones(3))
+    states = jax.vmap(lambda v: state_at(vehicle, velocity=v))(
+        jnp.linspace(-1, 1, 9)[:, None] * jnp.ones(3)
+    )
 
     def drag(d_xy):
         contexts = jax.vmap(lambda state: make_context(vehicle, state))(states)
         parameters = {"d_xy": d_xy, "d_z": 0.0}
-        return jax.vmap(lambda context: EFFECTS["rotor_drag"].wrench(parameters, context)[0])(contexts)
+        return jax.vmap(lambda context: EFFECTS["rotor_drag"].wrench(parameters, context)[0])(
+            contexts
+        )
 
     slope = jax.jacfwd(drag)(jnp.float32(0.01))
     np.testing.assert_allclose(slope[:, 0], -np.linspace(-1, 1, 9), atol=1e-6)
@@ -383,6 +430,8 @@ def test_parameters_of_nothing_are_refused(vehicle, wrong):
 def test_rate_gains_act_in_the_controller(vehicle):
     soft = EFFECTS["rate_gains"].body(given("rate_gains", p=0.5, i=0.5, d=0.5), vehicle)
     command = jnp.array([0.5, 0.5, 0, 0])
-    nominal, halved = (rate_controller(v, state_at(vehicle), command, 0.01)[0] - 0.5 for v in (vehicle, soft))
+    nominal, halved = (
+        rate_controller(v, state_at(vehicle), command, 0.01)[0] - 0.5 for v in (vehicle, soft)
+    )
     np.testing.assert_allclose(halved, 0.5 * nominal, rtol=1e-4)
     assert float(4 * max_rotor_thrust(soft)) == pytest.approx(float(4 * max_rotor_thrust(vehicle)))

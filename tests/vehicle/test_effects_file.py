@@ -1,4 +1,6 @@
-"""effects.toml: what is written is read back, and anything strange is refused with what would be right."""
+"""effects.toml: what is written is read back, and anything strange is refused with what would be
+right.
+"""
 
 import pytest
 
@@ -9,7 +11,9 @@ from openjax.vehicle.effects import EFFECTS, load_effects, save_effects
 def test_everything_comes_back(tmp_path):
     path = tmp_path / "effects.toml"
     written = {name: effect.typical() for name, effect in EFFECTS.items()}
-    save_effects(path, written, intervals={"rotor_drag": {"d_xy": (0.01, 0.02)}}, notes="three flights")
+    save_effects(
+        path, written, intervals={"rotor_drag": {"d_xy": (0.01, 0.02)}}, notes="three flights"
+    )
     names, read = load_effects(path)
     assert names == tuple(sorted(EFFECTS)) and read == written
     text = path.read_text()

@@ -1,4 +1,6 @@
-"""Families of vehicles: what is drawn, that each drone flies its own, and what solid things do to `stops`."""
+"""Families of vehicles: what is drawn, that each drone flies its own, and what solid things do to
+`stops`.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +35,8 @@ def test_each_vehicle_is_drawn_from_its_ranges_and_one_effect_at_most_from_the_r
     drawn = draw_vehicles(SMALL, KEY, 4000, rare=0.5)
     mass, up, down = drawn["mass"]["extra"], *drawn["motor_lag"].values()
     assert len(np.unique(mass)) > 3900
-    heavy, slow = mass > 0.003, up > 0.03
+    heavy = mass > 0.003
+    slow = up > 0.03
     np.testing.assert_array_equal(slow, down > 0.03)  # an effect is rare with all its parameters
     assert not np.any(heavy & slow)
     np.testing.assert_allclose([heavy.mean(), slow.mean()], 0.25, atol=0.03)
@@ -46,7 +49,8 @@ def test_each_vehicle_is_drawn_from_its_ranges_and_one_effect_at_most_from_the_r
 
 @pytest.mark.parametrize("airframe", AIRFRAMES)
 def test_standard_parameters_are_zero_without_the_effect(airframe):
-    none, family = {}, vehicle_family(airframe)
+    none = {}
+    family = vehicle_family(airframe)
     for entry in family:
         effect, _, parameter = entry[0].partition(".")
         none.setdefault(effect, {})[parameter] = jnp.full(2, find_parameter(entry[0])[1].none)
@@ -75,14 +79,21 @@ def test_a_drone_of_a_mixed_team_flies_as_in_a_team_of_its_own_kind():
     apart = jnp.array([[0.0, 0.0, 1.0], [3.0, 0.0, 1.0]])
     start = step.reset(vehicle, hover_state(vehicle, apart), KEY)
     command = jnp.array([[0.8, 0.5, 0.2, 0.1]] * 2)
-    fly = jax.jit(lambda drones, parameters: step(vehicle, drones, command, *NO_PILLARS, parameters))
-    mixed = {"mass": {"extra": jnp.array([0.0, 0.005])}, "motor_lag": {"extra_up": jnp.array([0.05, 0.0])}}
+    fly = jax.jit(
+        lambda drones, parameters: step(vehicle, drones, command, *NO_PILLARS, parameters)
+    )
+    mixed = {
+        "mass": {"extra": jnp.array([0.0, 0.005])},
+        "motor_lag": {"extra_up": jnp.array([0.05, 0.0])},
+    }
     together = fly(fly(start, mixed), mixed)
     for i in range(2):
         own = jax.tree.map(lambda leaf, i=i: leaf[i], mixed)
         alone = fly(fly(start, own), own)
         np.testing.assert_allclose(together.velocity[i], alone.velocity[i], rtol=1e-5, atol=1e-7)
-        np.testing.assert_allclose(together.body_rates[i], alone.body_rates[i], rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(
+            together.body_rates[i], alone.body_rates[i], rtol=1e-4, atol=1e-6
+        )
     assert together.velocity[1, 2] != pytest.approx(float(together.velocity[0, 2]), abs=1e-4)
 
 
@@ -106,5 +117,7 @@ def test_stops_keeps_drones_out_of_floor_pillars_and_one_another():
     assert path[:, :, 2].min() > 0.05 - 1e-6
     assert np.linalg.norm(path[:, 1] - path[:, 2], axis=-1).min() > 0.1 - 1e-3
     free = jax.jit(step)(vehicle, hover_state(vehicle, start + 2.0), command, *pillars)
-    same = jax.jit(make_drones_step("rigid"))(vehicle, hover_state(vehicle, start + 2.0), command, *pillars)
+    same = jax.jit(make_drones_step("rigid"))(
+        vehicle, hover_state(vehicle, start + 2.0), command, *pillars
+    )
     np.testing.assert_allclose(free.position, same.position, atol=1e-6)

@@ -86,7 +86,9 @@ def test_hover_holds_for_eight_seconds(vehicle, fly):
     assert np.abs(np.linalg.norm(states.quaternion, axis=-1) - 1).max() < 1e-6
 
 
-@pytest.mark.parametrize(("axis", "rate"), [(0, 1.5), (0, -1.5), (1, 1.5), (1, -1.5), (2, 0.8), (2, -0.8)])
+@pytest.mark.parametrize(
+    ("axis", "rate"), [(0, 1.5), (0, -1.5), (1, 1.5), (1, -1.5), (2, 0.8), (2, -0.8)]
+)
 def test_body_rates_settle_on_the_command(vehicle, fly, axis, rate):
     start = hover_state(vehicle, jnp.array([[0.0, 0, 5.0]]))
     command = jnp.array([[0.62, 0, 0, 0]]).at[0, 1 + axis].set(rate)
@@ -111,7 +113,9 @@ def test_thrust_sets_the_climb(vehicle, fly, thrust, sign):
 def test_mixer_raises_the_right_motors(vehicle, axis, up):
     """+roll lifts the left, +pitch the rear, +yaw speeds up the clockwise rotors."""
     state = jax.tree.map(lambda leaf: leaf[0], hover_state(vehicle, jnp.zeros((1, 3))))
-    motors, integral = rate_controller(vehicle, state, jnp.array([0.5, 0, 0, 0]).at[1 + axis].set(0.3), 0.01)
+    motors, integral = rate_controller(
+        vehicle, state, jnp.array([0.5, 0, 0, 0]).at[1 + axis].set(0.3), 0.01
+    )
     assert sorted(np.flatnonzero(motors > 0.5)) == up
     assert integral[axis] == pytest.approx(np.degrees(0.3) * 0.01, rel=1e-5)
 
@@ -147,8 +151,9 @@ def test_motor_lag_is_exact(vehicle):
 
 @pytest.mark.slow
 def test_gradients_are_right_and_finite(vehicle):
-    """By MJX among solids as by the written-out equations; finite on the floor, where a contact acts, and at full stop of
-    a rotor, where the square root of the command has no slope."""
+    """By MJX among solids as by the written-out equations; finite on the floor, where a contact
+    acts, and at full stop of a rotor, where the square root of the command has no slope.
+    """
     pillars = jnp.array([[0.5, 0.0]]), jnp.ones(1, bool)
 
     def slopes(physics):
@@ -162,8 +167,11 @@ def test_gradients_are_right_and_finite(vehicle):
 
         return jax.jit(jax.grad(end, argnums=(0, 1, 2)))
 
-    rigid, mjx = slopes("rigid"), slopes("mjx")
-    np.testing.assert_allclose(mjx(0.7, vehicle.mass, 1.0), rigid(0.7, vehicle.mass, 1.0), rtol=1e-3)
+    rigid = slopes("rigid")
+    mjx = slopes("mjx")
+    np.testing.assert_allclose(
+        mjx(0.7, vehicle.mass, 1.0), rigid(0.7, vehicle.mass, 1.0), rtol=1e-3
+    )
     assert np.all(np.abs(rigid(0.7, vehicle.mass, 1.0)) > 1e-3)
     for thrust, height in ((0.0, 1.0), (0.5, 0.05), (0.0, 0.049)):
         assert np.isfinite(mjx(thrust, vehicle.mass, height)).all()
@@ -171,7 +179,9 @@ def test_gradients_are_right_and_finite(vehicle):
 
 
 def test_precision_is_that_of_the_state(vehicle):
-    """No leaf changes its dtype or becomes weakly typed: a step is the carry of a scan, whatever x64 says."""
+    """No leaf changes its dtype or becomes weakly typed: a step is the carry of a scan, whatever
+    x64 says.
+    """
     start = hover_state(vehicle, jnp.array([[0.0, 0, 0.5], [0.5, 0, 0.5]]))
     for physics, contacts in (("rigid", False), ("mjx", True)):
         for x64 in (False, True):
@@ -180,7 +190,11 @@ def test_precision_is_that_of_the_state(vehicle):
                 pillars = jnp.zeros((1, 2), jnp.float32), jnp.ones(1, bool)
                 end = jax.eval_shape(lambda d: step(vehicle, d, jnp.zeros((2, 4)), *pillars), start)  # noqa: B023
             for before, after in zip(jax.tree.leaves(start), jax.tree.leaves(end), strict=True):
-                assert (after.dtype, after.shape, after.weak_type) == (before.dtype, before.shape, False)
+                assert (after.dtype, after.shape, after.weak_type) == (
+                    before.dtype,
+                    before.shape,
+                    False,
+                )
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,6 @@
-"""The rigid step of many drones: its kernel (in interpret mode), its maps and its derivatives against the mapped step."""
+"""The rigid step of many drones: its kernel (in interpret mode), its maps and its derivatives
+against the mapped step.
+"""
 
 from functools import partial
 
@@ -30,15 +32,20 @@ def drawn(*lead):
         leaf + scale * jax.random.normal(key, leaf.shape)
         for leaf, scale, key in zip(leaves, scales, keys, strict=False)
     ]
-    command = jax.random.uniform(keys[7], (*lead, 4), minval=-0.2, maxval=1.2) * jnp.array([1.0, 9, 9, 9])
+    command = jax.random.uniform(keys[7], (*lead, 4), minval=-0.2, maxval=1.2) * jnp.array(
+        [1.0, 9, 9, 9]
+    )
     return structure.unflatten(leaves), command
 
 
 def crowded(worlds):
-    """Worlds of two drones close to the floor, each other and two pillars, of which one isn't there."""
+    """Worlds of two drones close to the floor, each other and two pillars, of which one isn't
+    there.
+    """
     drones, command = drawn(worlds, 2)
     position = drones.position * jnp.array([0.05, 0.05, 0.01]) + jnp.array([0, 0, 0.06])
-    pillars, active = jnp.array([[0.2, 0.0], [-0.1, -0.1]]), jnp.array([True, False])
+    pillars = jnp.array([[0.2, 0.0], [-0.1, -0.1]])
+    active = jnp.array([True, False])
     lead = (worlds, *pillars.shape)
     drones = drones.replace(position=position)
     return drones, command, (jnp.broadcast_to(pillars, lead), jnp.broadcast_to(active, lead[:2]))
@@ -81,7 +88,9 @@ def test_kernel_computes_contacts():
     expected = plainly(drones, command, pillars)
     assert_close(stepped, expected, 1e-4)
     free = freely(drones, command)
-    assert (np.abs(free.velocity - expected.velocity).max(-1) > 0.1).mean() > 0.5, "most must touch something"
+    assert (np.abs(free.velocity - expected.velocity).max(-1) > 0.1).mean() > 0.5, (
+        "most must touch something"
+    )
 
 
 def test_mapped_over_worlds_and_over_vehicles():
@@ -89,7 +98,9 @@ def test_mapped_over_worlds_and_over_vehicles():
     expected = freely(drones, command)
     assert_close(jax.jit(jax.vmap(lambda d, c: fly(VEHICLE, d, c)))(drones, command), expected)
     one_command = jax.jit(jax.vmap(lambda d: fly(VEHICLE, d, command[0])))(drones)
-    assert_close(one_command, jax.jit(jax.vmap(lambda d: fly_plainly(VEHICLE, d, command[0])))(drones))
+    assert_close(
+        one_command, jax.jit(jax.vmap(lambda d: fly_plainly(VEHICLE, d, command[0])))(drones)
+    )
     heavier = jax.tree.map(lambda leaf: jnp.stack([leaf, 1.2 * leaf]), VEHICLE)
     first = jax.tree.map(lambda leaf: leaf[0], drones)
     both = jax.jit(jax.vmap(lambda vehicle: fly(vehicle, first, command[0])))(heavier)
@@ -111,7 +122,9 @@ def test_memory_of_effects_that_the_step_does_not_have_is_left_alone():
 def test_worlds_become_more_worlds_of_one_call(monkeypatch):
     drones, command, pillars = crowded(6)
     step = lambda drones, command, pillars: AMONG_SOLIDS(VEHICLE, drones, command, *pillars)  # noqa: E731
-    twice = jax.tree.map(lambda leaf: leaf.reshape(2, 3, *leaf.shape[1:]), (drones, command, pillars))
+    twice = jax.tree.map(
+        lambda leaf: leaf.reshape(2, 3, *leaf.shape[1:]), (drones, command, pillars)
+    )
     got = jax.jit(jax.vmap(jax.vmap(step)))(*twice)
     expected = jax.jit(jax.vmap(lambda *world: mapped_step(AMONG_SOLIDS.fused, VEHICLE, *world)))(
         drones, command, pillars
@@ -154,7 +167,9 @@ def test_componentwise_moves_sums_and_compares():
     results = evaluate(jax.make_jaxpr(function)(x[0], y[0]), [split(x.T), split(y.T)])
     for got, expected in zip(results, jax.vmap(function)(x, y), strict=True):
         blocks = [jnp.broadcast_to(block, 7) for block in got.ravel()]
-        np.testing.assert_allclose(np.stack(blocks, -1).reshape(expected.shape), expected, rtol=1e-6)
+        np.testing.assert_allclose(
+            np.stack(blocks, -1).reshape(expected.shape), expected, rtol=1e-6
+        )
 
 
 def test_what_mixes_components_otherwise_is_named():

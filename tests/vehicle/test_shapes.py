@@ -1,4 +1,6 @@
-"""Shapes in types are true: a function that gets arrays of its arguments' types gives those of its result's."""
+"""Shapes in types are true: a function that gets arrays of its arguments' types gives those of its
+result's.
+"""
 
 import dataclasses
 import inspect
@@ -43,7 +45,9 @@ def example(kind, name):
     if kind is DroneState:
         return hover_state(load_vehicle(), jnp.eye(3) if name == "drones" else jnp.ones(3))
     if dataclasses.is_dataclass(kind):
-        return kind(**{name: example(field, name) for name, field in typing.get_type_hints(kind).items()})
+        return kind(
+            **{name: example(field, name) for name, field in typing.get_type_hints(kind).items()}
+        )
     return None
 
 

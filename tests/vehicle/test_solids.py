@@ -1,4 +1,6 @@
-"""Floor, pillars and other drones are solid: nothing is flown through, at speed or under full thrust."""
+"""Floor, pillars and other drones are solid: nothing is flown through, at speed or under full
+thrust.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -7,7 +9,9 @@ import pytest
 
 from openjax.vehicle import hover_state, load_vehicle, make_drones_step
 
-PILLARS = np.array([[0.5, 0.0], [0.5, 0.2], [0.3, 0.4], [-0.5, 0.0], [0.0, -0.4]])  # diagonal: 83 mm apart
+PILLARS = np.array(
+    [[0.5, 0.0], [0.5, 0.2], [0.3, 0.4], [-0.5, 0.0], [0.0, -0.4]]
+)  # diagonal: 83 mm apart
 ACTIVE = np.array([True, True, True, True, False])
 START = np.array([[0.0, 0.0, 0.5], [0.0, 0.8, 0.5], [-0.3, -0.8, 0.5]])
 LEVEL = np.array([1.0, 0, 0, 0])
@@ -22,13 +26,18 @@ def gaps(position):
     """Smallest gap (m) to floor, active pillars and each other over a flight (T, 3, 3)."""
     pillar = np.linalg.norm(position[:, :, None, :2] - PILLARS[ACTIVE], axis=-1) - 0.15
     pillar = np.where(position[:, :, None, 2] < 1.2, pillar, np.inf)
-    pairs = [np.linalg.norm(position[:, i] - position[:, j], axis=-1) for i, j in ((0, 1), (0, 2), (1, 2))]
+    pairs = [
+        np.linalg.norm(position[:, i] - position[:, j], axis=-1)
+        for i, j in ((0, 1), (0, 2), (1, 2))
+    ]
     return position[..., 2].min() - 0.05, pillar.min(), np.min(pairs) - 0.1
 
 
 @pytest.fixture(scope="module", params=["mjx", "rigid"])
 def fly(request):
-    """fly(position, velocity, quaternion, thrust) -> positions (150, 3, 3) and velocities of three drones."""
+    """fly(position, velocity, quaternion, thrust) -> positions (150, 3, 3) and velocities of three
+    drones.
+    """
     vehicle = load_vehicle()
     step = make_drones_step(request.param)
 
@@ -40,18 +49,20 @@ def fly(request):
             drones = step(vehicle, drones, command, jnp.asarray(PILLARS), jnp.asarray(ACTIVE))
             return drones, (drones.position, drones.velocity)
 
-        return jax.lax.scan(advance, hover_state(vehicle, position, quaternion, velocity), None, length=150)[
-            1
-        ]
+        return jax.lax.scan(
+            advance, hover_state(vehicle, position, quaternion, velocity), None, length=150
+        )[1]
 
     def run(position=START, velocity=((0, 0, 0),) * 3, quaternion=(LEVEL,) * 3, thrust=0.6):
-        velocity, quaternion = np.asarray(velocity, float), np.asarray(quaternion)
+        velocity = np.asarray(velocity, float)
+        quaternion = np.asarray(quaternion)
         return jax.tree.map(np.asarray, flight(np.asarray(position), velocity, quaternion, thrust))
 
     return run
 
 
-TO_THE_PILLAR, TO_THE_WEDGE = turned([0, 1, 0], np.pi / 2), turned([0, 1, 0], np.pi / 2)
+TO_THE_PILLAR = turned([0, 1, 0], np.pi / 2)
+TO_THE_WEDGE = turned([0, 1, 0], np.pi / 2)
 
 
 @pytest.mark.parametrize(
@@ -80,11 +91,13 @@ def test_nothing_is_entered(fly, case):
 def test_drones_stay_solid_between_floor_and_pillar(fly):
     """A drone driven at 3 m/s into another that can't yield: soft for a moment, never passed."""
     onto = fly(
-        position=[[0, 0.6, 0.08], [0, 0.6, 0.5], START[2]], velocity=[[0, 0, 0], [0, 0, -3], [0, 0, 0]]
+        position=[[0, 0.6, 0.08], [0, 0.6, 0.5], START[2]],
+        velocity=[[0, 0, 0], [0, 0, -3], [0, 0, 0]],
     )[0]
     assert (onto[:, 1, 2] > onto[:, 0, 2]).mean() > 0.1 and gaps(onto)[2] > -0.025
     against = fly(
-        position=[[0.35, 0, 0.5], [0.2, 0, 0.5], START[2]], velocity=[[0, 0, 0], [3, 0, 0], [0, 0, 0]]
+        position=[[0.35, 0, 0.5], [0.2, 0, 0.5], START[2]],
+        velocity=[[0, 0, 0], [3, 0, 0], [0, 0, 0]],
     )[0]
     assert gaps(against)[2] > -0.025 and gaps(against)[1] > -0.005
 
@@ -95,8 +108,12 @@ def test_no_gap_narrower_than_a_drone_is_passed(fly, speed):
     across = np.array([0.2, -0.2]) / np.hypot(0.2, 0.2)
     through = np.array([1.0, 1.0]) / np.sqrt(2)
     draw = np.random.default_rng(1)
-    for angle, offset in zip(draw.uniform(-0.5, 0.5, 12), draw.uniform(-0.03, 0.03, 12), strict=True):
-        heading = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) @ through
+    for angle, offset in zip(
+        draw.uniform(-0.5, 0.5, 12), draw.uniform(-0.03, 0.03, 12), strict=True
+    ):
+        heading = (
+            np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) @ through
+        )
         start = np.array([0.4, 0.3]) + offset * across - 0.2 * heading
         pressed = turned([-heading[1], heading[0], 0], np.pi / 2)
         for quaternion, thrust in ((LEVEL, 0.62), (pressed, 0.9)):
@@ -136,7 +153,9 @@ def test_an_inactive_pillar_is_not_there(fly):
 
 
 def test_solids_change_nothing_in_free_flight(fly):
-    """The flight by MJX among solids is that by the written-out equations, until something is touched."""
+    """The flight by MJX among solids is that by the written-out equations, until something is
+    touched.
+    """
     vehicle = load_vehicle()
     step = make_drones_step("rigid", contacts=False)
     velocity = np.array([[0.2, 0.1, 0.3], [-0.1, 0.1, 0.2], [0.0, 0.2, 0.1]])

@@ -1,4 +1,6 @@
-"""vehicle.toml: strict where a slip would go unnoticed, free for facts, unchanged by a round trip."""
+"""vehicle.toml: strict where a slip would go unnoticed, free for facts, unchanged by a round
+trip.
+"""
 
 import dataclasses
 
@@ -72,7 +74,8 @@ def test_what_the_file_says_is_applied(tmp_path):
 
 
 def test_an_empty_file_is_the_nominal_vehicle(tmp_path):
-    nominal, file = load_vehicle(), load_vehicle_file(write(tmp_path, ""))
+    nominal = load_vehicle()
+    file = load_vehicle_file(write(tmp_path, ""))
     for name in ("mass", "inertia", "thrust_constant", "torque_constant", "rotor_spin"):
         np.testing.assert_array_equal(getattr(file.vehicle, name), getattr(nominal, name))
     assert file.motor_permutation == (0, 1, 2, 3)
@@ -81,7 +84,9 @@ def test_an_empty_file_is_the_nominal_vehicle(tmp_path):
 def test_spin_follows_the_place_and_can_be_reversed(tmp_path):
     nominal = load_vehicle()
     moved = load_vehicle_file(
-        write(tmp_path, '[motor]\norder = ["rear_right", "front_right", "front_left", "rear_left"]\n')
+        write(
+            tmp_path, '[motor]\norder = ["rear_right", "front_right", "front_left", "rear_left"]\n'
+        )
     )
     np.testing.assert_array_equal(moved.vehicle.rotor_spin, nominal.rotor_spin)
     assert moved.motor.spin == ("cw", "ccw", "cw", "ccw")
@@ -104,7 +109,9 @@ def test_saving_keeps_text_and_comments_and_replaces_the_calibration(tmp_path):
 
 
 def test_a_file_made_from_nothing_reads_back(tmp_path):
-    file = VehicleFile(vehicle=load_vehicle(), name="new", motor=Motor(command="pwm"), mass_weighed=True)
+    file = VehicleFile(
+        vehicle=load_vehicle(), name="new", motor=Motor(command="pwm"), mass_weighed=True
+    )
     save_vehicle_file(tmp_path / "vehicle.toml", file)
     again = load_vehicle_file(tmp_path)
     assert (again.name, again.motor.command, again.mass_weighed) == ("new", "pwm", True)
@@ -116,7 +123,9 @@ def test_a_name_or_a_file_says_the_airframe(tmp_path):
     assert float(load_vehicle_file("brushless").vehicle.mass) == mass
     path = write(tmp_path, '[vehicle]\nairframe = "brushless"\n')
     file = load_vehicle_file(path)
-    assert (file.airframe, file.name) == ("brushless", "brushless") and float(file.vehicle.mass) == mass
+    assert (file.airframe, file.name) == ("brushless", "brushless") and float(
+        file.vehicle.mass
+    ) == mass
     save_vehicle_file(tmp_path / "again.toml", dataclasses.replace(file, path=None))
     assert float(load_vehicle_file(tmp_path / "again.toml").vehicle.mass) == mass
 
@@ -142,7 +151,10 @@ def test_an_mjcf_of_ones_own_goes_where_its_vehicle_file_goes(tmp_path):
         ("[vehicles.1]\ninertia = 1", "unknown key 'inertia'"),
         ("[motors]\ncommand = 'pwm'", "unknown key 'motors'; did you mean motor"),
         ("[motor]\ncommand = 'rpm'", "motor.command is 'rpm'; expected one of"),
-        ("[motor]\norder = ['front_right', 'front_right', 'rear_left', 'front_left']", "motor.order"),
+        (
+            "[motor]\norder = ['front_right', 'front_right', 'rear_left', 'front_left']",
+            "motor.order",
+        ),
         ("[motor]\nspin = ['cw', 'cw', 'cw', 'ccw']", "motor.spin"),
         ("[vehicle]\nmass = 32.1", "it must be in .0.005, 1. kg"),
         ("[vehicle]\nmass = -1", "it must be in"),

@@ -1,4 +1,6 @@
-"""The MJCF holds the numbers of the nominal Crazyflie, and anything else is refused with a reason."""
+"""The MJCF holds the numbers of the nominal Crazyflie, and anything else is refused with a
+reason.
+"""
 
 import typing
 
@@ -18,12 +20,21 @@ def test_nominal_numbers_come_out_of_the_compiled_model():
     assert vehicle.mass == pytest.approx(0.0321)
     np.testing.assert_allclose(vehicle.inertia, [1.4e-5, 1.4e-5, 2.17e-5])
     np.testing.assert_allclose(np.linalg.norm(vehicle.rotor_position, axis=1), 0.043, rtol=1e-6)
-    assert np.sign(vehicle.rotor_position).tolist() == [[1, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]]
+    assert np.sign(vehicle.rotor_position).tolist() == [
+        [1, -1, 0],
+        [-1, -1, 0],
+        [-1, 1, 0],
+        [1, 1, 0],
+    ]
     assert vehicle.rotor_spin.tolist() == [-1, 1, -1, 1]
     assert vehicle.torque_constant == pytest.approx(7.24e-10)
     assert max_rotor_thrust(vehicle) == pytest.approx(0.12596, rel=1e-5)
-    assert 4 * max_rotor_thrust(vehicle) / (vehicle.mass * vehicle.gravity) == pytest.approx(1.60, abs=0.01)
-    assert 4 * vehicle.thrust_constant * hover_rotor_speed(vehicle) ** 2 == pytest.approx(0.0321 * 9.81)
+    assert 4 * max_rotor_thrust(vehicle) / (vehicle.mass * vehicle.gravity) == pytest.approx(
+        1.60, abs=0.01
+    )
+    assert 4 * vehicle.thrust_constant * hover_rotor_speed(vehicle) ** 2 == pytest.approx(
+        0.0321 * 9.81
+    )
     np.testing.assert_allclose(vehicle.rate_kp, [250, 250, 120])
     np.testing.assert_allclose(vehicle.rate_integral_limit, [33.3, 33.3, 166.7])
 
@@ -67,7 +78,9 @@ def test_a_missing_model_is_refused(tmp_path):
 
 
 def test_hover_state_broadcasts():
-    drones = hover_state(load_vehicle(), np.zeros((5, 3, 3)), quaternion=np.tile([1.0, 0, 0, 0], (3, 1)))
+    drones = hover_state(
+        load_vehicle(), np.zeros((5, 3, 3)), quaternion=np.tile([1.0, 0, 0, 0], (3, 1))
+    )
     assert drones.quaternion.shape == (5, 3, 4)
     assert drones.rotor_speed.shape == (5, 3, 4)
     assert {leaf.dtype for leaf in jax.tree.leaves(drones)} == {np.dtype("float32")}

@@ -8,7 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from openjax.errors import UserError
-from openjax.flying.crtp import Packet, Port, compress_quaternion, decode, expand_quaternion, pack_number
+from openjax.flying.crtp import (
+    Packet,
+    Port,
+    compress_quaternion,
+    decode,
+    expand_quaternion,
+    pack_number,
+)
 from openjax.flying.motion_capture import find_feed
 from openjax.flying.set_point import ANGLES, OFF, RATES, SetPoint
 from openjax.virtual_crazyflie.firmware import LEVEL_AFTER, STOP_AFTER, WATCHDOG, VirtualFirmware
@@ -27,7 +34,9 @@ SENSORS = Sensors(
 
 
 def ask(firmware, port, channel, data, now=0.0):
-    return [decode(raw) for raw in firmware.receive(Packet(port, channel, bytes(data)).encode(), now)]
+    return [
+        decode(raw) for raw in firmware.receive(Packet(port, channel, bytes(data)).encode(), now)
+    ]
 
 
 @given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 0.1))
@@ -59,7 +68,9 @@ def test_a_log_block_holds_what_was_asked_for_in_its_units_and_order():
     assert gyro == pytest.approx(np.degrees(-0.2), rel=1e-3)
     assert motor == round(0.3 * 65535)
     # late or not, the next ones stay in step with the start
-    assert firmware.logs.packets(firmware, 0.0377, SENSORS) and firmware.logs.next() == pytest.approx(0.04)
+    assert firmware.logs.packets(
+        firmware, 0.0377, SENSORS
+    ) and firmware.logs.next() == pytest.approx(0.04)
 
 
 def test_a_block_longer_than_a_packet_is_refused():

@@ -1,10 +1,12 @@
-"""crazyflow's brushless Crazyflie as a world (Schuck and others 2026, arXiv 2606.01478), and a policy's flights in it as a case.
+"""crazyflow's brushless Crazyflie as a world (Schuck and others 2026, arXiv 2606.01478), and a
+policy's flights in it as a case.
 
-    SCIPY_ARRAY_API=1 python -m experiments.flying.worlds.crazyflow OUT [--policy flight] [--layouts random passage hidden]
+    SCIPY_ARRAY_API=1 python -m experiments.flying.worlds.crazyflow OUT [--policy flight] [--layouts
+    random passage hidden]
 
-Body, rotors, thrust curve and drag are crazyflow's, with its identified `cf21B_500`; all else is as in
-`experiments.flying.worlds.rotorpy`, with the gains of `brushless`. `openjax diagnose OUT` then says in what crazyflow differs
-from that vehicle. It is in no extra: `pip install crazyflow` (0.4).
+Body, rotors, thrust curve and drag are crazyflow's, with its identified `cf21B_500`; all else is as
+in `experiments.flying.worlds.rotorpy`, with the gains of `brushless`. `openjax diagnose OUT` then
+says in what crazyflow differs from that vehicle. It is in no extra: `pip install crazyflow` (0.4).
 """
 
 import argparse
@@ -51,14 +53,17 @@ class CrazyflowBodies(Bodies):
 
 
 class CrazyflowWorld(RotorPyWorld):
-    """Vehicles of crazyflow; `rows` are what was sampled at each tick: arrays (B, ...) by channel of the log."""
+    """Vehicles of crazyflow; `rows` are what was sampled at each tick: arrays (B, ...) by channel
+    of the log.
+    """
 
     def make_bodies(self, start, firmware):
         """See `RotorPyWorld`."""
         from crazyflow.dynamics import load_params, parametrize
         from crazyflow.dynamics.first_principles import dynamics
 
-        vehicle, self.rows = load_vehicle("brushless"), []
+        vehicle = load_vehicle("brushless")
+        self.rows = []
         for name in ("kp", "ki", "kd"):
             firmware[name][:] = np.asarray(getattr(vehicle, f"rate_{name}"))[:, None]
         self._most = float(max_rotor_thrust(vehicle))
@@ -81,10 +86,16 @@ class CrazyflowWorld(RotorPyWorld):
     def fly(self, command):
         """See `RotorPyWorld`."""
         row = {name: value.reshape(-1, value.shape[-1]) for name, value in self._seen.items()}
-        row["body_rates"] = (self.bodies.rates + self.air["gyro_bias"] + self.air["gyro"][5 * self.tick]).T
+        row["body_rates"] = (
+            self.bodies.rates + self.air["gyro_bias"] + self.air["gyro"][5 * self.tick]
+        ).T
         super().fly(command)
         thrust, rates = np.split(command.reshape(-1, 4), (1,), axis=1)
-        told = {"command_thrust": thrust, "command_body_rates": rates, "motor_command": self.motors.T}
+        told = {
+            "command_thrust": thrust,
+            "command_body_rates": rates,
+            "motor_command": self.motors.T,
+        }
         self.rows.append(row | told)
 
 
@@ -95,7 +106,8 @@ def main() -> None:
     parser.add_argument("out", type=Path, help="folder of the case")
     parser.add_argument("--policy", default="flight")
     parser.add_argument("--layouts", nargs="+", default=["random", "passage", "hidden"])
-    options, worlds = parser.parse_args(), []
+    options = parser.parse_args()
+    worlds = []
     loaded, game = loaded_policy(options.policy)
     tasks = [scenario_task(game, SCENARIOS[name]) for name in options.layouts]
     keys = jax.random.split(jax.random.key(SEED), len(tasks))
@@ -114,7 +126,10 @@ def main() -> None:
             own = {c: x[j, :, k] for n, x in rows.items() for k, c in enumerate(CHANNEL_COLUMNS[n])}
             vehicles.append({"t": PERIOD * np.arange(game.episode_length)} | own)
         write_csv(options.out / f"{layout}.csv.gz", log_of(vehicles, layout), {"t": 4})
-        print(layout, {n: float(getattr(statistics, n)[i]) for n in ("captured", "capture_step", "crashed")})
+        print(
+            layout,
+            {n: float(getattr(statistics, n)[i]) for n in ("captured", "capture_step", "crashed")},
+        )
     (options.out / "vehicle.toml").write_text(VEHICLE_TOML, encoding="utf-8")
 
 

@@ -1,5 +1,5 @@
-"""What a world is: it flies bodies by commands, and says where they are and where they are seen. And the game around it, which is
-`openjax.pursuit`'s own, without its physics.
+"""What a world is: it flies bodies by commands, and says where they are and where they are seen.
+And the game around it, which is `openjax.pursuit`'s own, without its physics.
 """
 
 import functools
@@ -13,11 +13,15 @@ from openjax.pursuit import EpisodeStatistics, Pursuit, PursuitSettings, Task, a
 from openjax.vehicle import DroneState
 
 Poses = dict[str, np.ndarray]
-"""position (W, N, 3) m, quaternion (W, N, 4) wxyz, velocity (W, N, 3) m/s of N pursuers in W worlds, float32."""
+"""position (W, N, 3) m, quaternion (W, N, 4) wxyz, velocity (W, N, 3) m/s of N pursuers in W
+worlds, float32.
+"""
 
 
 class World(Protocol):
-    """W worlds with N vehicles each, at the start of their episodes. A tick is a control step, 10 ms."""
+    """W worlds with N vehicles each, at the start of their episodes. A tick is a control step, 10
+    ms.
+    """
 
     def poses(self) -> Poses:
         """Where the vehicles are."""
@@ -26,13 +30,17 @@ class World(Protocol):
         """Where the vehicles are seen at this tick: late, noisy, as the world has it."""
 
     def fly(self, command: np.ndarray) -> None:
-        """One tick after sending `command` (W, N, 4): collective thrust in 0..1, body rates in rad/s."""
+        """One tick after sending `command` (W, N, 4): collective thrust in 0..1, body rates in
+        rad/s.
+        """
 
 
 def per_world(team: int, position, quaternion, velocity) -> Poses:
     """Poses of bodies in the last axis, (3, W * N) and so on, as `Poses`."""
     parts = {"position": position, "quaternion": quaternion, "velocity": velocity}
-    return {n: np.asarray(x).T.reshape(-1, team, len(x)).astype(np.float32) for n, x in parts.items()}
+    return {
+        n: np.asarray(x).T.reshape(-1, team, len(x)).astype(np.float32) for n, x in parts.items()
+    }
 
 
 class SeenElsewhere:
@@ -77,7 +85,9 @@ def play(
 
 @functools.cache
 def _compiled(settings, policy):
-    """The game's start, its observation of measured poses, the policy, and the game's step with poses from outside."""
+    """The game's start, its observation of measured poses, the policy, and the game's step with
+    poses from outside.
+    """
     game = Pursuit(settings, dynamics=SeenElsewhere())
 
     def observe(state, seen):

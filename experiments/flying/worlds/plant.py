@@ -1,7 +1,8 @@
-"""The exam's plant as a world: vehicles that take a command every 10 ms; 1 kHz inside, no code of the simulator.
+"""The exam's plant as a world: vehicles that take a command every 10 ms; 1 kHz inside, no code of
+the simulator.
 
-A game needs the next state before it knows the next command, a speed limit after each tick, solid things and the
-wakes of a whole team: `exam.plant.Flight` flies all of it, one tick at a time.
+A game needs the next state before it knows the next command, a speed limit after each tick, solid
+things and the wakes of a whole team: `exam.plant.Flight` flies all of it, one tick at a time.
 """
 
 from dataclasses import dataclass
@@ -24,7 +25,9 @@ def rng_of(seed: int, number: int, *more: int) -> np.random.Generator:
 
 
 def sensors_of(seed: int, number: int) -> dict:
-    """Sensors and air of a vehicle: light turbulence, white noise, every channel logged at 100 Hz."""
+    """Sensors and air of a vehicle: light turbulence, white noise, every channel logged at 100
+    Hz.
+    """
     drawn = sensors.draw(rng_of(seed, number, 1), "white", "psgacmv", "light")
     return drawn | {"rate": 100, "pose_rate": 100, "dropped": 0.0}
 
@@ -44,8 +47,9 @@ def air_of(drawn: dict, seed: int, number: int, ticks: int, worlds: range, team:
 class Solids:
     """What can't be flown through: floor, pillars, and the other bodies of the same world.
 
-    pillar (2, P, B) m and active (P, B) are those of each body's world; bodies of a world are neighbours in the
-    last axis, `team` of them. Impacts are inelastic and without friction, as in `openjax.vehicle`.
+    pillar (2, P, B) m and active (P, B) are those of each body's world; bodies of a world are
+    neighbours in the last axis, `team` of them. Impacts are inelastic and without friction, as in
+    `openjax.vehicle`.
     """
 
     pillar: np.ndarray
@@ -53,7 +57,9 @@ class Solids:
     team: int
 
     def stop(self, position, velocity):
-        """Push bodies (3, B) out of what they touch, and take the approaching part of their velocity, in place."""
+        """Push bodies (3, B) out of what they touch, and take the approaching part of their
+        velocity, in place.
+        """
         low = position[2] < RADIUS
         if low.any():
             position[2, low] = RADIUS
@@ -72,7 +78,8 @@ class Solids:
             between = worlds[:, :, shift:] - worlds[:, :, : self.team - shift]
             apart = np.sqrt((between * between).sum(axis=0))
             for w, j in zip(*np.nonzero(apart < 2 * RADIUS), strict=True):
-                one, other = w * self.team + j, w * self.team + j + shift
+                one = w * self.team + j
+                other = w * self.team + j + shift
                 normal = between[:, w, j] / max(apart[w, j], 1e-9)
                 closing = min(normal @ (velocity[:, other] - velocity[:, one]), 0.0)
                 half = 0.5 * (2 * RADIUS - apart[w, j])
@@ -82,7 +89,8 @@ class Solids:
 
 
 class PlantWorld:
-    """Nominal vehicles in the exam's plant, each with its own noise and all with the same cause, or none.
+    """Nominal vehicles in the exam's plant, each with its own noise and all with the same cause, or
+    none.
 
     Args:
       drones: (W, N, ...) at the start.
@@ -105,7 +113,9 @@ class PlantWorld:
     ):
         worlds, self.team = drones.position.shape[:2]
         count = worlds * self.team
-        told, drawn, everyone = [vehicle.Told()] * count, sensors_of(seed, number), np.arange(count)
+        told = [vehicle.Told()] * count
+        drawn = sensors_of(seed, number)
+        everyone = np.arange(count)
         parameters = vehicle.nominal_parameters(told)
         sensors.apply_nuisances(parameters, everyone, drawn)
         ticks += 1  # a pose is measured after the last step, too

@@ -1,9 +1,11 @@
-"""RotorPy 3 as a world (Folk, Paulos, Kumar 2023; the `dev` extra): its `Multirotor` and its own Crazyflie.
+"""RotorPy 3 as a world (Folk, Paulos, Kumar 2023; the `dev` extra): its `Multirotor` and its own
+Crazyflie.
 
-Rigid body, rotors, drag at the hubs and motor lag are RotorPy's, with its identified Crazyflie: 30 g, motors of 72 ms,
-other thrust and torque constants. RotorPy integrates one vehicle at a time; `Bodies` evaluates the same equations for all
-at once, and a test holds it against `Multirotor.step`. The firmware's rate loop at 500 Hz and the sensors' noise are
-those of the exam's plant, since RotorPy's Crazyflie has no motor commands; commanded thrust is in units of the nominal
+Rigid body, rotors, drag at the hubs and motor lag are RotorPy's, with its identified Crazyflie: 30
+g, motors of 72 ms, other thrust and torque constants. RotorPy integrates one vehicle at a time;
+`Bodies` evaluates the same equations for all at once, and a test holds it against
+`Multirotor.step`. The firmware's rate loop at 500 Hz and the sensors' noise are those of the exam's
+plant, since RotorPy's Crazyflie has no motor commands; commanded thrust is in units of the nominal
 vehicle's.
 """
 
@@ -28,10 +30,12 @@ def crazyflie() -> dict:
 
 
 class Bodies:
-    """What `Multirotor.step` does, for B vehicles at once: its equations with its numbers, by a Runge-Kutta step.
+    """What `Multirotor.step` does, for B vehicles at once: its equations with its numbers, by a
+    Runge-Kutta step.
 
     Args:
-      model: RotorPy's `Multirotor`, with or without aerodynamics; wind and ground aren't known here.
+      model: RotorPy's `Multirotor`, with or without aerodynamics; wind and ground aren't known
+      here.
       state: {"x": (3, B), "v": (3, B), "q": (4, B) as xyzw, "w": (3, B), "rotor_speeds": (4, B)}.
     """
 
@@ -61,8 +65,10 @@ class Bodies:
 
     def step(self, speeds: np.ndarray, time: float) -> None:
         """`time` s under commanded motor speeds (4, B) in rad/s."""
-        least, most = self.model.rotor_speed_min, self.model.rotor_speed_max
-        speeds, s = np.clip(speeds, least, most), self.state
+        least = self.model.rotor_speed_min
+        most = self.model.rotor_speed_max
+        speeds = np.clip(speeds, least, most)
+        s = self.state
         one = self._slope(s, speeds)
         two = self._slope(s + 0.5 * time * one, speeds)
         three = self._slope(s + 0.5 * time * two, speeds)
@@ -73,7 +79,10 @@ class Bodies:
         self.state = s
 
     def _slope(self, s, speeds):
-        model, q, rates, rotor = self.model, s[6:10], s[10:13], s[13:]
+        model = self.model
+        q = s[6:10]
+        rates = s[10:13]
+        rotor = s[13:]
         attitude = np.roll(q / np.sqrt((q * q).sum(axis=0)), 1, axis=0)
         hubs = model.rotor_geometry  # (4, 3)
         force = np.zeros((3, 4, s.shape[1]))  # of each rotor, in the body frame
@@ -87,7 +96,9 @@ class Bodies:
             drag = -np.sqrt((air * air).sum(axis=0)) * (model.drag_matrix @ air)
             force -= rotor * np.einsum("ij,jrb->irb", model.rotor_drag_matrix, at_hubs)
             force[2] += model.k_h * (at_hubs[0] ** 2 + at_hubs[1] ** 2)
-            torque += -model.k_flap * (rotor * np.stack([at_hubs[1], -at_hubs[0], 0.0 * rotor])).sum(axis=1)
+            torque += -model.k_flap * (
+                rotor * np.stack([at_hubs[1], -at_hubs[0], 0.0 * rotor])
+            ).sum(axis=1)
         torque += np.cross(hubs.T[:, :, None], force, axis=0).sum(axis=1)
         total = v.rotate(attitude, force.sum(axis=1) + drag)
         total[2] -= model.mass * model.g
@@ -95,7 +106,12 @@ class Bodies:
         x, y, z, w = q
         p, q_, r = rates
         turn = 0.5 * np.stack(
-            [w * p - z * q_ + y * r, z * p + w * q_ - x * r, -y * p + x * q_ + w * r, -x * p - y * q_ - z * r]
+            [
+                w * p - z * q_ + y * r,
+                z * p + w * q_ - x * r,
+                -y * p + x * q_ + w * r,
+                -x * p - y * q_ - z * r,
+            ]
         )
         accelerations = [total / model.mass, turn, model.inv_inertia @ (torque - spin)]
         return np.concatenate([s[3:6], *accelerations, (speeds - rotor) / model.tau_m])
@@ -127,10 +143,13 @@ class RotorPyWorld:
         drawn = sensors_of(seed, 0)
         self.air = air_of(drawn, seed, 0, ticks + 1, range(first, first + worlds), self.team)
         self.firmware = Firmware(firmware, self.air["gyro_bias"].astype(float))
-        self.solids, self.tick = solids_of(tasks, self.team), 0
+        self.solids = solids_of(tasks, self.team)
+        self.tick = 0
 
     def make_bodies(self, start, firmware) -> Bodies:
-        """The bodies, which hover at `start`; another vehicle's gains are written into `firmware`."""
+        """The bodies, which hover at `start`; another vehicle's gains are written into
+        `firmware`.
+        """
         from rotorpy.vehicles.multirotor import Multirotor
 
         model = Multirotor(crazyflie(), control_abstraction="cmd_motor_speeds", aero=True)
@@ -143,13 +162,19 @@ class RotorPyWorld:
 
     def poses(self) -> Poses:
         """Where the vehicles are."""
-        return per_world(self.team, self.bodies.position, self.bodies.quaternion, self.bodies.velocity)
+        return per_world(
+            self.team, self.bodies.position, self.bodies.quaternion, self.bodies.velocity
+        )
 
     def measure(self) -> Poses:
         """Where the motion capture sees them."""
-        air, k, bodies = self.air, self.tick, self.bodies
+        air = self.air
+        k = self.tick
+        bodies = self.bodies
         late = 1e-3 * air["pose_delay"]
-        quaternion = v.multiply(v.turn(bodies.quaternion, -bodies.rates, late), air["seen_attitude"][k])
+        quaternion = v.multiply(
+            v.turn(bodies.quaternion, -bodies.rates, late), air["seen_attitude"][k]
+        )
         quaternion /= np.sqrt((quaternion * quaternion).sum(axis=0))
         position = bodies.position - late * bodies.velocity + air["seen_position"][k]
         return per_world(self.team, position, quaternion, bodies.velocity + air["seen_velocity"][k])

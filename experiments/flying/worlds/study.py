@@ -1,11 +1,12 @@
 """Policies in worlds that aren't the simulator: six layouts, drawn starts, no clamp.
 
-    python -m experiments.flying.worlds [--policy open flight] [--world plant rotorpy ...] [--held_out] [--episodes 100]
+    python -m experiments.flying.worlds [--policy open flight] [--world plant rotorpy ...]
+    [--held_out] [--episodes 100]
 
-Worlds: `plant`, the exam's plant, and with `plant:motor_lag` and so on each of its causes at three quarters of its range;
-`rotorpy`, RotorPy's own Crazyflie. With `--held_out` each episode draws one of the held-out evaders instead of the paper's.
-Beside them: the simulator itself, `experiments.flying.vehicles`. Writes
-experiments/results/worlds.json and .md (--out).
+Worlds: `plant`, the exam's plant, and with `plant:motor_lag` and so on each of its causes at three
+quarters of its range; `rotorpy`, RotorPy's own Crazyflie. With `--held_out` each episode draws one
+of the held-out evaders instead of the paper's. Beside them: the simulator itself,
+`experiments.flying.vehicles`. Writes experiments/results/worlds.json and .md (--out).
 """
 
 import argparse
@@ -116,13 +117,21 @@ def study(options: argparse.Namespace) -> dict:
     """Fly all policies in all layouts of all worlds."""
     started = time.monotonic()
     jobs = [
-        Job(policy, options.held_out, world, layout, start, min(options.chunk, options.episodes - start))
+        Job(
+            policy,
+            options.held_out,
+            world,
+            layout,
+            start,
+            min(options.chunk, options.episodes - start),
+        )
         for world in sorted(options.world, key=lambda name: name != "rotorpy")  # the slowest first
         for policy in options.policy
         for layout in options.layout
         for start in range(0, options.episodes, options.chunk)
     ]
-    found, records = defaultdict(lambda: defaultdict(list)), {}
+    found = defaultdict(lambda: defaultdict(list))
+    records = {}
     flown = share_out(do, [(job,) for job in jobs], min(options.jobs, len(jobs)), options.seconds)
     for done, (job, figures, seconds) in enumerate(flown, 1):
         policy = f"{job.policy}, held-out evaders" if job.held_out else job.policy
@@ -132,7 +141,9 @@ def study(options: argparse.Namespace) -> dict:
             place[name] += values
         means = " ".join(f"{name} {np.mean(values):.3f}" for name, values in figures.items())
         of = f"{done}/{len(jobs)} {job.policy} {job.world} {job.layout} {job.start}"
-        print(f"{of} {means} ({seconds:.0f} s, {time.monotonic() - started:.0f} s in all)", flush=True)
+        print(
+            f"{of} {means} ({seconds:.0f} s, {time.monotonic() - started:.0f} s in all)", flush=True
+        )
         record = {"episodes": len(place["crashed"])}
         places[job.layout] = record | {name: float(np.mean(place[name])) for name in FIGURES}
     return {"records": records}
@@ -149,7 +160,9 @@ def page(results: dict) -> Page:
                 rates = {name: f"{record[name]:.3f}" for name in ("captured", "crashed")}
                 rows.append({**about, "layout": layout, **record, **rates})
             if records:
-                mean = {name: np.mean([record[name] for record in records.values()]) for name in FIGURES}
+                mean = {
+                    name: np.mean([record[name] for record in records.values()]) for name in FIGURES
+                }
                 mean["episodes"] = sum(record["episodes"] for record in records.values())
                 for name in ("captured", "crashed"):
                     hits = binomtest(round(mean[name] * mean["episodes"]), mean["episodes"])
@@ -166,9 +179,12 @@ def page(results: dict) -> Page:
     }
     return Page(
         "Policies in worlds that aren't the simulator",
-        "No clamp, drawn starts. Nominal: the simulator with the rate loop at 500 Hz; table: the same with motors 40 ms "
-        "slower, commands 15 ms and poses 10 ms late, and drag of .0125 N s/m; plant: the exam's plant (1 kHz, no shared "
-        "code), also with each of its causes at three quarters of its range; rotorpy: RotorPy's own Crazyflie.",
+        "No clamp, drawn starts. Nominal: the simulator with the rate loop at 500 Hz; table: the "
+        "same with motors 40 ms "
+        "slower, commands 15 ms and poses 10 ms late, and drag of .0125 N s/m; plant: the exam's "
+        "plant (1 kHz, no shared "
+        "code), also with each of its causes at three quarters of its range; rotorpy: RotorPy's "
+        "own Crazyflie.",
         Table(columns, rows),
     )
 
@@ -176,12 +192,20 @@ def page(results: dict) -> Page:
 def main() -> None:
     """Fly, or read, and write the page."""
     parser = page_parser(__doc__, "worlds")
-    parser.add_argument("--policy", nargs="+", default=["open", "flight"], help="names, runs or policy files")
-    parser.add_argument("--world", nargs="+", default=list(PLAIN), help=", ".join((*PLAIN, *CAUSES)))
+    parser.add_argument(
+        "--policy", nargs="+", default=["open", "flight"], help="names, runs or policy files"
+    )
+    parser.add_argument(
+        "--world", nargs="+", default=list(PLAIN), help=", ".join((*PLAIN, *CAUSES))
+    )
     parser.add_argument("--held_out", action="store_true", help="against the held-out evaders")
     parser.add_argument("--layout", nargs="+", default=list(SCENARIOS))
     parser.add_argument("--episodes", type=int, default=100, help="per layout")
-    parser.add_argument("--chunk", type=int, default=50, help="episodes that one process flies at once")
+    parser.add_argument(
+        "--chunk", type=int, default=50, help="episodes that one process flies at once"
+    )
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--seconds", type=float, default=math.inf, help="begin nothing new after this long")
+    parser.add_argument(
+        "--seconds", type=float, default=math.inf, help="begin nothing new after this long"
+    )
     publish(parser.parse_args(), study, page)

@@ -1,5 +1,6 @@
-"""Methods without a learned policy of their own: those that the paper compares with (Angelani, Janosov, potential field, DACOOP;
-see docs/methods.md), and stack, which forces a capture."""
+"""Methods without a learned policy of their own: those that the paper compares with (Angelani,
+Janosov, potential field, DACOOP; see docs/methods.md), and stack, which forces a capture.
+"""
 
 from openjax.baselines.craft_policy import CraftPolicy
 from openjax.baselines.dacoop import DacoopPolicy
@@ -20,7 +21,9 @@ __all__ = [
 ]
 
 
-def make_policy(environment: Pursuit, network: NetworkSettings, predictor: PredictorSettings) -> Policy:
+def make_policy(
+    environment: Pursuit, network: NetworkSettings, predictor: PredictorSettings
+) -> Policy:
     """The policy for an environment, of the kind that `network.output` says."""
     kinds = {"commands": Policy, "velocity": VelocityPolicy, "field": DacoopPolicy}
     return kinds[network.output].for_environment(environment, network, predictor)

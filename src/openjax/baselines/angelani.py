@@ -1,8 +1,8 @@
 """Angelani (2012), Collective predation and escape strategies, Physical Review Letters 109, 118104.
 
-Self-propelled particles of constant speed, drawn to the nearest prey, aligned with their own kind and kept apart from
-it by a repulsion that a Fermi function switches on at close range. Its plane has neither walls nor obstacles: here they
-repel as another predator does.
+Self-propelled particles of constant speed, drawn to the nearest prey, aligned with their own kind
+and kept apart from it by a repulsion that a Fermi function switches on at close range. Its plane
+has neither walls nor obstacles: here they repel as another predator does.
 """
 
 import jax
@@ -34,8 +34,8 @@ class AngelaniParameters:
 def angelani(craft: Craft, parameters: AngelaniParameters, known: Surroundings) -> jax.Array:
     """Desired velocities (..., N, 3), m/s, world.
 
-    v = v_max N[N(r_e - r_i) + w_a N(sum_j v_j) + w_r sum_j N(r_i - r_j) / (1 + exp((d_ij - r_r) / s)) + obstacles],
-    N(x) = x / |x|.
+    v = v_max N[N(r_e - r_i) + w_a N(sum_j v_j) + w_r sum_j N(r_i - r_j) / (1 + exp((d_ij - r_r) /
+    s)) + obstacles], N(x) = x / |x|.
     """
 
     def fermi(distance, middle):

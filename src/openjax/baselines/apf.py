@@ -1,8 +1,10 @@
-"""Artificial potential field with wall following, as in DACOOP (Zhang et al., 2022) after Koren and Borenstein (1991).
+"""Artificial potential field with wall following, as in DACOOP (Zhang et al., 2022) after Koren and
+Borenstein (1991).
 
-Attraction to the evader, repulsion from obstacles, and between pursuers a force that repels at close range and
-attracts at long. Where attraction and repulsion together point away from the evader (the local minimum that Koren and
-Borenstein describe), the pursuer flies along the obstacle instead.
+Attraction to the evader, repulsion from obstacles, and between pursuers a force that repels at
+close range and attracts at long. Where attraction and repulsion together point away from the evader
+(the local minimum that Koren and Borenstein describe), the pursuer flies along the obstacle
+instead.
 """
 
 import jax
@@ -13,7 +15,9 @@ from openjax.baselines.parameters import parameter
 from openjax.baselines.surroundings import Craft, Surroundings, length, level, unit, upward
 
 SAFE_PURSUER = 0.14
-"""Distance between two pursuers at which their repulsion grows without bound (m): the game's safety distance."""
+"""Distance between two pursuers at which their repulsion grows without bound (m): the game's safety
+distance.
+"""
 NEAREST = 0.005
 """Distances beyond the safe ones are taken to be at least this (m), so that forces stay finite."""
 
@@ -27,7 +31,9 @@ class ApfParameters:
     influence: jax.Array = parameter(0.3, 0.05, 0.6)
     """rho: distance from a surface beyond which it doesn't repel (m)."""
     margin: jax.Array = parameter(0.14, 0.05, 0.25)
-    """Distance from a surface at which its repulsion grows without bound (m); the robot's radius in the source."""
+    """Distance from a surface at which its repulsion grows without bound (m); the robot's radius in
+    the source.
+    """
     balance: jax.Array = parameter(0.2, 0.003, 1.0)
     """lambda: of the force between pursuers, 1/2 - lambda / d: they keep 2 lambda apart (m)."""
 
@@ -59,17 +65,23 @@ def forces(parameters: ApfParameters, known: Surroundings) -> Forces:
     pull = -known.from_others / distance * (0.5 - balance / beyond)
     return Forces(
         attraction=unit(known.target - known.position),
-        repulsion=level(jnp.sum(each[..., None] * known.obstacle_normal, axis=-2)) + upward(vertical),
+        repulsion=level(jnp.sum(each[..., None] * known.obstacle_normal, axis=-2))
+        + upward(vertical),
         individual=jnp.sum(pull, axis=-2) / max(known.from_others.shape[-2], 1),
         inside=jnp.min(known.obstacle_distance, axis=-1) < parameters.margin,
     )
 
 
 def apf(craft: Craft, parameters: ApfParameters, known: Surroundings) -> jax.Array:
-    """Desired velocities (..., N, 3), m/s, world: along the field, or along an obstacle that is in the way."""
+    """Desired velocities (..., N, 3), m/s, world: along the field, or along an obstacle that is in
+    the way.
+    """
     field = forces(parameters, known)
     total = field.attraction + field.repulsion + field.individual
-    blocked = jnp.sum((field.attraction + field.repulsion) * field.attraction, axis=-1, keepdims=True) < 0.0
+    blocked = (
+        jnp.sum((field.attraction + field.repulsion) * field.attraction, axis=-1, keepdims=True)
+        < 0.0
+    )
     along = wall_following(field, known.velocity)
     return craft.speed * jnp.where(blocked, along, unit(total))
 
@@ -77,8 +89,9 @@ def apf(craft: Craft, parameters: ApfParameters, known: Surroundings) -> jax.Arr
 def wall_following(field: Forces, velocity: jax.Array) -> jax.Array:
     """(..., N, 3) unit vector at right angles to the obstacles' repulsion.
 
-    The side is that to which the other pursuers push or, where they push less than the evader pulls, that to which the
-    pursuer flies anyhow. Inside the margin it turns half away from the obstacle; its height is the field's.
+    The side is that to which the other pursuers push or, where they push less than the evader
+    pulls, that to which the pursuer flies anyhow. Inside the margin it turns half away from the
+    obstacle; its height is the field's.
     """
     away = unit(field.repulsion[..., :2])
     left = jnp.stack([-away[..., 1], away[..., 0]], axis=-1)

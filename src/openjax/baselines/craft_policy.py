@@ -1,4 +1,6 @@
-"""Learnt policies whose samples aren't commands: a velocity controller flies what they stand for."""
+"""Learnt policies whose samples aren't commands: a velocity controller flies what they stand
+for.
+"""
 
 import dataclasses
 from typing import ClassVar

@@ -1,9 +1,11 @@
-"""DACOOP (Zhang et al., 2022, Multi-robot cooperative pursuit via potential field-enhanced reinforcement learning).
+"""DACOOP (Zhang et al., 2022, Multi-robot cooperative pursuit via potential field-enhanced
+reinforcement learning).
 
-A network turns the two main parameters of the potential field at every step and for each pursuer: the scale of the
-obstacles' repulsion and the balance of the force between pursuers. As in the paper, MAPPO learns them in place of D3QN,
-so they are continuous. The network is the actor that plain MAPPO has; its two outputs, in -1..1, are positions between the
-ends of both ranges, on a logarithmic scale, and training starts from the field of `START`.
+A network turns the two main parameters of the potential field at every step and for each pursuer:
+the scale of the obstacles' repulsion and the balance of the force between pursuers. As in the
+paper, MAPPO learns them in place of D3QN, so they are continuous. The network is the actor that
+plain MAPPO has; its two outputs, in -1..1, are positions between the ends of both ranges, on a
+logarithmic scale, and training starts from the field of `START`.
 """
 
 import dataclasses
@@ -20,7 +22,9 @@ from openjax.pursuit import Observation
 
 LEARNED = ("repulsion", "balance")
 START = ApfParameters(repulsion=2e-3, influence=0.4, margin=0.08, balance=0.5)
-"""The field at the start of training; what isn't learnt stays, also of shipped weights, whatever a search finds."""
+"""The field at the start of training; what isn't learnt stays, also of shipped weights, whatever a
+search finds.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +40,9 @@ class DacoopPolicy(CraftPolicy):
         return tuple(math.atanh(min(max(place, -0.95), 0.95)) for place in places)
 
     def action(self, sample: jax.Array, observation: Observation) -> jax.Array:
-        """The action (..., N, 4) in -1..1 that a sample (..., N, 2) of the Gaussian, or its mean, stands for."""
+        """The action (..., N, 4) in -1..1 that a sample (..., N, 2) of the Gaussian, or its mean,
+        stands for.
+        """
         return velocity_action(self.craft, observation, self.desired(sample, observation))
 
     def desired(self, sample: jax.Array, observation: Observation) -> jax.Array:

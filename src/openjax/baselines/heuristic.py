@@ -49,7 +49,9 @@ class WithoutNetwork:
     def distribution(
         self, actor: Any, observation: Observation, predicted: None
     ) -> tuple[jax.Array, jax.Array]:
-        """Action (..., N, 4) in -1..1 and log standard deviation (4,): none, as nothing explores."""
+        """Action (..., N, 4) in -1..1 and log standard deviation (4,): none, as nothing
+        explores.
+        """
         return self.mean(actor, observation), jnp.full(4, -jnp.inf)
 
     def action(self, sample: jax.Array, observation: Observation) -> jax.Array:
@@ -81,7 +83,9 @@ class Heuristic(WithoutNetwork):
 
     def parameters(self) -> PolicyParameters:
         """The parameters that the search found."""
-        return PolicyParameters(actor=best(self.name, METHODS[self.name].kind), critic={}, predictor={})
+        return PolicyParameters(
+            actor=best(self.name, METHODS[self.name].kind), critic={}, predictor={}
+        )
 
     def mean(self, actor: Any, observation: Observation) -> jax.Array:
         """Action (..., N, 4) in -1..1."""

@@ -1,8 +1,9 @@
-"""Janosov, Virágh, Vásárhelyi and Vicsek (2017), Group chasing tactics: how to catch a faster prey, NJP 19, 053003.
+"""Janosov, Virágh, Vásárhelyi and Vicsek (2017), Group chasing tactics: how to catch a faster prey,
+NJP 19, 053003.
 
-Chasers fly to where the prey will be, damped by their relative velocity, spread out by a long repulsion among
-themselves, avoid each other at close range, and are turned round by soft walls: those of the arena there, and here
-pillars, floor and ceiling as well.
+Chasers fly to where the prey will be, damped by their relative velocity, spread out by a long
+repulsion among themselves, avoid each other at close range, and are turned round by soft walls:
+those of the arena there, and here pillars, floor and ceiling as well.
 """
 
 import jax
@@ -20,7 +21,9 @@ class JanosovParameters:
     prediction_time: jax.Array = parameter(0.5, 0.02, 2.0)
     """tau_pred: the prey is expected to fly straight for that long at most (s)."""
     chase_friction: jax.Array = parameter(0.1, 0.001, 1.0)
-    """C_f of the chase: weight of the velocity relative to the prey over the squared distance (m s)."""
+    """C_f of the chase: weight of the velocity relative to the prey over the squared distance (m
+    s).
+    """
     interaction: jax.Array = parameter(0.8, 0.01, 3.0)
     """C_inter: the long repulsion's share of the speed."""
     interaction_range: jax.Array = parameter(1.0, 0.2, 2.0)
@@ -36,10 +39,13 @@ class JanosovParameters:
 
 
 def janosov(craft: Craft, parameters: JanosovParameters, known: Surroundings) -> jax.Array:
-    """Desired velocities (..., N, 3), m/s, world: the sum of the terms, cut at the largest speed."""
+    """Desired velocities (..., N, 3), m/s, world: the sum of the terms, cut at the largest
+    speed.
+    """
     to_target = known.target - known.position
     ahead = jnp.minimum(
-        parameters.prediction_time, length(to_target) / jnp.maximum(length(known.target_velocity), 1e-3)
+        parameters.prediction_time,
+        length(to_target) / jnp.maximum(length(known.target_velocity), 1e-3),
     )
     predicted = known.target + ahead * known.target_velocity
     relative = known.velocity - known.target_velocity
@@ -64,5 +70,7 @@ def janosov(craft: Craft, parameters: JanosovParameters, known: Surroundings) ->
     walls = level(jnp.sum(near[..., None] * known.obstacle_normal, axis=-2)) + upward(
         soft_wall(known.floor_distance) - soft_wall(known.ceiling_distance)
     )
-    terms = chase + parameters.interaction * unit(spread) + unit(avoidance) + parameters.wall * walls
+    terms = (
+        chase + parameters.interaction * unit(spread) + unit(avoidance) + parameters.wall * walls
+    )
     return craft.speed * terms / jnp.maximum(length(terms), 1.0)

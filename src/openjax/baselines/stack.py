@@ -1,13 +1,15 @@
 """Stack: point pursuers that force a capture of a faster evader in an arena without pillars.
 
-All N gather on the arena's axis at heights (2 i - 1) H / 2 N, keep the evader's angle about the axis, and move outwards. The
-evader is never farther than H / 2 N above or below one of these heights, so that pursuer has it within r once they are within
-s = sqrt(r^2 - (H / 2 N)^2) of it along the ray. A pursuer at radius x keeps the angle of an evader at radius y if
-v_p y >= v_e x; the worst is the wall, y = R, up to x = R - s. So a capture is forced within finite time if
+All N gather on the arena's axis at heights (2 i - 1) H / 2 N, keep the evader's angle about the
+axis, and move outwards. The evader is never farther than H / 2 N above or below one of these
+heights, so that pursuer has it within r once they are within s = sqrt(r^2 - (H / 2 N)^2) of it
+along the ray. A pursuer at radius x keeps the angle of an evader at radius y if v_p y >= v_e x; the
+worst is the wall, y = R, up to x = R - s. So a capture is forced within finite time if
 
     v_e / v_p < R / (R - sqrt(r^2 - (H / 2 N)^2)),
 
-1.331 for three pursuers, r = .3 m, R = .9 m, H = 1.2 m. (An evader between axis and pursuer has crossed s before.)
+1.331 for three pursuers, r = .3 m, R = .9 m, H = 1.2 m. (An evader between axis and pursuer has
+crossed s before.)
 """
 
 import jax
@@ -20,7 +22,9 @@ from openjax.pursuit.settings import PursuitSettings
 
 
 def stack_bound(settings: PursuitSettings) -> float:
-    """The ratio of speeds v_e / v_p below which stack forces a capture; 0 where a pursuer's height isn't covered."""
+    """The ratio of speeds v_e / v_p below which stack forces a capture; 0 where a pursuer's height
+    isn't covered.
+    """
     half = settings.arena_height / (2 * settings.num_pursuers)
     if half >= settings.capture_radius:
         return 0.0
@@ -30,7 +34,9 @@ def stack_bound(settings: PursuitSettings) -> float:
 
 @struct.dataclass
 class StackParameters:
-    """How well pursuers must stand on the ray before they move outwards, and how fast they correct themselves."""
+    """How well pursuers must stand on the ray before they move outwards, and how fast they correct
+    themselves.
+    """
 
     tolerance: jax.Array = parameter(0.05, 0.005, 0.2)
     """Distance from the ray and from the own height (m)."""
@@ -43,10 +49,12 @@ def stack(craft: Craft, parameters: StackParameters, known: Surroundings) -> jax
     number = known.position.shape[-2]
     goal = craft.arena_height * (2 * jnp.arange(number) + 1.0) / (2 * number)
     height = goal - known.position[..., 2]
-    target, place = known.target[..., :2], known.position[..., :2]
+    target = known.target[..., :2]
+    place = known.position[..., :2]
     out = target / length(target)
     aside = jnp.stack([-out[..., 1], out[..., 0]], axis=-1)
-    along, across = jnp.sum(place * out, axis=-1), jnp.sum(place * aside, axis=-1)
+    along = jnp.sum(place * out, axis=-1)
+    across = jnp.sum(place * aside, axis=-1)
     ready = (jnp.abs(height) < parameters.tolerance) & (jnp.abs(across) < parameters.tolerance)
     ready = jnp.all(ready & (along > -parameters.tolerance), axis=-1, keepdims=True)
 

@@ -26,22 +26,29 @@ class Craft:
     arena_height: float = 1.2
     """m"""
     speed: float = 0.98
-    """Speed that the methods command (m/s): short of the largest by the velocity controller's overshoot."""
+    """Speed that the methods command (m/s): short of the largest by the velocity controller's
+    overshoot.
+    """
     hover_thrust: float = 0.625
     """Collective thrust that carries the vehicle, as a share of the largest."""
     history_seconds: float = 0.09
     """Time between the first and the last frame of the observed history (s)."""
     response: float = 0.15
-    """Time that the velocity controller takes to fly what it is told (s). A method is asked what it would do where all will
-    be by then: a point mass, which it takes itself for, would turn at once."""
+    """Time that the velocity controller takes to fly what it is told (s). A method is asked what it
+    would do where all will be by then: a point mass, which it takes itself for, would turn at
+    once.
+    """
 
     @classmethod
     def of(cls, environment: Pursuit) -> "Craft":
-        """The craft of an environment's pursuers; UserError where they don't observe in the world's axes."""
+        """The craft of an environment's pursuers; UserError where they don't observe in the world's
+        axes.
+        """
         settings = environment.settings
         if settings.observe_in != "world":
             raise UserError(
-                f"environment.observe_in {settings.observe_in}: methods that fly velocities need world"
+                f"environment.observe_in {settings.observe_in}: methods that fly velocities need "
+                "world"
             )
         with jax.ensure_compile_time_eval():  # an environment may be made inside a compiled program
             hover = round(float(hover_share(environment.vehicle)), 6)
@@ -50,25 +57,32 @@ class Craft:
             arena_height=settings.arena_height,
             speed=0.98 * settings.max_speed,
             hover_thrust=hover,
-            history_seconds=(settings.history_length - 1) * settings.history_spacing * settings.time_step,
+            history_seconds=(settings.history_length - 1)
+            * settings.history_spacing
+            * settings.time_step,
         )
 
 
 @struct.dataclass
 class Surroundings:
-    """N pursuers' surroundings after their response time, all flying straight on; leading axes as in the observation. World
-    frame, m and m/s."""
+    """N pursuers' surroundings after their response time, all flying straight on; leading axes as
+    in the observation. World frame, m and m/s.
+    """
 
     position: jax.Array  # (..., N, 3)
     velocity: jax.Array  # (..., N, 3)
-    target: jax.Array  # (..., N, 3) the evader; where it was last seen while it is hidden, the middle before
+    target: (
+        jax.Array
+    )  # (..., N, 3) the evader; where it was last seen while it is hidden, the middle before
     target_velocity: jax.Array  # (..., N, 3) zero while it is hidden
     from_others: jax.Array  # (..., N, N - 1, 3) position relative to each other pursuer
     from_others_velocity: jax.Array  # (..., N, N - 1, 3) velocity relative to each other pursuer
     team_velocity: jax.Array  # (..., N, 3) mean velocity of all pursuers
     obstacle_normal: jax.Array
     """(..., N, k + 1, 2) away from each pillar in sight and from the arena's wall, unit"""
-    obstacle_distance: jax.Array  # (..., N, k + 1) to their surface; infinite where there is no pillar
+    obstacle_distance: (
+        jax.Array
+    )  # (..., N, k + 1) to their surface; infinite where there is no pillar
     floor_distance: jax.Array  # (..., N)
     ceiling_distance: jax.Array  # (..., N)
 
@@ -76,10 +90,11 @@ class Surroundings:
 def surroundings(craft: Craft, observation: Observation) -> Surroundings:
     """Read an observation of (..., N) pursuers.
 
-    The others' velocities are those of the observed history, mean over its length (0.09 s by default): a pursuer
-    measures no velocity but its own.
+    The others' velocities are those of the observed history, mean over its length (0.09 s by
+    default): a pursuer measures no velocity but its own.
     """
-    own, velocity = observation.position, observation.self_state[..., VELOCITY]
+    own = observation.position
+    velocity = observation.self_state[..., VELOCITY]
     number = own.shape[-2]
     newest = observation.frames[..., -1, :]
     seen = newest[..., 1:2] > 0.9 * HIDDEN
@@ -112,7 +127,8 @@ def surroundings(craft: Craft, observation: Observation) -> Surroundings:
 
 def _obstacles(craft, observation):
     """`obstacle_normal` and `obstacle_distance`."""
-    own, velocity = observation.position, observation.self_state[..., VELOCITY]
+    own = observation.position
+    velocity = observation.self_state[..., VELOCITY]
     pillar = observation.pillars
     across = jnp.sqrt(jnp.sum(pillar[..., :2] ** 2, axis=-1) + 1e-12)
     to_pillar = jnp.where(observation.pillar_seen, across - pillar[..., 4], jnp.inf)

@@ -1,8 +1,9 @@
 """The velocity controller: a point mass's velocity as thrust and body rates of the real vehicle.
 
-A desired velocity becomes an acceleration, that a direction and size of the thrust, and the body's z axis is turned
-there: the translational half of the geometric controller of Lee, Leok and McClamroch (2010), with the attitude loop left
-to the vehicle's own rate controller. A function of the observation alone, without memory.
+A desired velocity becomes an acceleration, that a direction and size of the thrust, and the body's
+z axis is turned there: the translational half of the geometric controller of Lee, Leok and
+McClamroch (2010), with the attitude loop left to the vehicle's own rate controller. A function of
+the observation alone, without memory.
 """
 
 import jax
@@ -14,7 +15,9 @@ from openjax.pursuit import Observation
 from openjax.pursuit.observation import rotation_axes
 
 VELOCITY_GAIN = 6.0
-"""1/s, velocity error to acceleration: slower than the attitude, whose lag is that of the motors (25 ms) and of the turn."""
+"""1/s, velocity error to acceleration: slower than the attitude, whose lag is that of the motors
+(25 ms) and of the turn.
+"""
 ATTITUDE_GAIN = 15.0
 """1/s, error of the body's z axis (rad) to body rates."""
 LARGEST_TILT = 0.7
@@ -22,7 +25,9 @@ LARGEST_TILT = 0.7
 YAW_GAIN = 2.0
 """1/s, yaw (rad) to yaw rate: the nose is turned to the world's x axis."""
 CLIMB_LIMITS = (-0.5, 0.3)
-"""Vertical acceleration in units of gravity; thrust over weight is 1.44 with the commanded thrust cut at 0.9."""
+"""Vertical acceleration in units of gravity; thrust over weight is 1.44 with the commanded thrust
+cut at 0.9.
+"""
 GRAVITY = 9.81
 """m/s^2"""
 SLOWEST_CONTROL = 0.03
@@ -32,7 +37,9 @@ HEAVIEST = 0.8
 
 
 def check_flyable(name: str, craft: Craft, time_step: float) -> None:
-    """Raises UserError where the controller can't fly this craft with control steps of `time_step` (s) for `name`."""
+    """Raises UserError where the controller can't fly this craft with control steps of `time_step`
+    (s) for `name`.
+    """
     if time_step > SLOWEST_CONTROL:
         raise UserError(
             f"{name}: its velocity controller can't fly control steps of {time_step} s; "
@@ -40,13 +47,16 @@ def check_flyable(name: str, craft: Craft, time_step: float) -> None:
         )
     if craft.hover_thrust > HEAVIEST:
         raise UserError(
-            f"{name}: a vehicle that hovers at {craft.hover_thrust:.2f} of its thrust leaves its velocity "
+            f"{name}: a vehicle that hovers at {craft.hover_thrust:.2f} of its thrust leaves its "
+            "velocity "
             f"controller no room; at most {HEAVIEST} is possible"
         )
 
 
 def velocity_action(craft: Craft, observation: Observation, desired: jax.Array) -> jax.Array:
-    """(..., N, 4) action in -1..1 (thrust, body rates) that flies the desired velocities (..., N, 3) in m/s, world."""
+    """(..., N, 4) action in -1..1 (thrust, body rates) that flies the desired velocities (..., N,
+    3) in m/s, world.
+    """
     own = observation.self_state
     body_x, body_z = rotation_axes(own[..., QUATERNION])
     thrust = VELOCITY_GAIN / GRAVITY * (desired - own[..., VELOCITY])  # in units of the weight
@@ -57,9 +67,12 @@ def velocity_action(craft: Craft, observation: Observation, desired: jax.Array) 
     share = craft.hover_thrust * jnp.sum(thrust * body_z, axis=-1)
     turn = ATTITUDE_GAIN * jnp.cross(body_z, unit(thrust))
     yaw = jnp.arctan2(body_x[..., 1], body_x[..., 0])
-    roll_rate, pitch_rate = _dot(turn, body_x), _dot(turn, jnp.cross(body_z, body_x))
+    roll_rate = _dot(turn, body_x)
+    pitch_rate = _dot(turn, jnp.cross(body_z, body_x))
     rates = jnp.stack([roll_rate, pitch_rate, -YAW_GAIN * yaw], axis=-1)
-    return jnp.clip(jnp.concatenate([2.0 * share[..., None] - 1.0, rates / jnp.pi], axis=-1), -1.0, 1.0)
+    return jnp.clip(
+        jnp.concatenate([2.0 * share[..., None] - 1.0, rates / jnp.pi], axis=-1), -1.0, 1.0
+    )
 
 
 def _dot(a, b):

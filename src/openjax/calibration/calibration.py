@@ -1,8 +1,10 @@
-"""Calibration: the nominal vehicle's own constants from flights, with intervals and with what can't be told.
+"""Calibration: the nominal vehicle's own constants from flights, with intervals and with what can't
+be told.
 
-The constants are parameters of effects, fitted all at once by the diagnosis' replay: through the simulator, with its sensors'
-nuisances and its coloured noise, beside what usually acts as well. Errors come from that noise, or from what flights disagree by
-where that is more."""
+The constants are parameters of effects, fitted all at once by the diagnosis' replay: through the
+simulator, with its sensors' nuisances and its coloured noise, beside what usually acts as well.
+Errors come from that noise, or from what flights disagree by where that is more.
+"""
 
 import dataclasses
 from dataclasses import dataclass, field
@@ -20,17 +22,25 @@ from openjax.gap.residual import residuals_of
 from openjax.vehicle.effects import EFFECTS
 from openjax.vehicle.vehicle_file import CALIBRATED_UNITS, CalibratedValue
 
-FITTED = ("thrust_scale", "yaw_torque", "motor_lag", "inertia")  # whose parameters are the constants
+FITTED = (
+    "thrust_scale",
+    "yaw_torque",
+    "motor_lag",
+    "inertia",
+)  # whose parameters are the constants
 # what mustn't be taken for them
 BESIDE = ("rotor_drag", "com_offset", "ground_effect", "ceiling_effect", "downwash")
 ITERATIONS = 12
 # of the prior's standard deviation: a constant with a larger one isn't told by these flights
 DETERMINED = 0.5
-LEAST_EXPLAINED = 0.9  # share of the rates' changes; below, no constant that they tell can be trusted
+LEAST_EXPLAINED = (
+    0.9  # share of the rates' changes; below, no constant that they tell can be trusted
+)
 HORIZON = 0.25  # s over which changes are explained
 YAW_INERTIA_RANGE = (0.7, 1.6)  # of nominal; what it may be where it is assumed
-# Relative error (standard deviation) that remains however long one flies: commands and states are known every
-# 10 ms only, and thrust differs by up to a per cent from flight to flight. Measured by closed loop.
+# Relative error (standard deviation) that remains however long one flies: commands and states are
+# known every 10 ms only, and thrust differs by up to a per cent from flight to flight. Measured by
+# closed loop.
 MODEL_ERROR = {
     "thrust_constant": 0.005,
     "torque_constant": 0.005,
@@ -40,19 +50,20 @@ MODEL_ERROR = {
 TOLD_BY_RATES = ("torque_constant", "motor_time_constant", "inertia")
 
 # What flights can't tell, in words.
-_YAW_CLASS = (
-    "yaw torque constant against yaw inertia: only their ratio shows in yaw; the inertia is assumed nominal"
-)
+_YAW_CLASS = "yaw torque constant against yaw inertia: only their ratio shows in yaw; the inertia is assumed nominal"
 _NOT_WEIGHED = (
-    "mass against thrust: the mass wasn't weighed, so thrust and torque constants and inertia hold for the "
+    "mass against thrust: the mass wasn't weighed, so thrust and torque constants and inertia hold "
+    "for the "
     "assumed {grams:.1f} g; a mass off by 1 % moves them all by 1 %. Weigh the vehicle"
 )
 _UNKNOWN_MAP = (
-    "the thrust constant: the commands are duty cycles whose map to thrust isn't known. Against the public "
+    "the thrust constant: the commands are duty cycles whose map to thrust isn't known. Against "
+    "the public "
     "map the flights' thrust per assumed mass is {scale:.3g}; torques were scaled alike"
 )
 _NOT_EXPLAINED = (
-    "inertia, torque constant, motor lag: motors explain only {share:.0%} of what the gyroscope shows. "
+    "inertia, torque constant, motor lag: motors explain only {share:.0%} of what the gyroscope "
+    "shows. "
     "Their clocks may disagree, or something else acts: run openjax.diagnose"
 )
 _ADVICE = {
@@ -66,7 +77,9 @@ _ASSUMED_MASS = "for the assumed mass, which wasn't weighed"
 
 @dataclass(frozen=True)
 class Quantity:
-    """A fitted constant: value, 90 % interval and nominal value, each a tuple of length 1 (3 for inertia)."""
+    """A fitted constant: value, 90 % interval and nominal value, each a tuple of length 1 (3 for
+    inertia).
+    """
 
     value: tuple[float, ...]
     interval90: tuple[tuple[float, float], ...]
@@ -78,9 +91,10 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Result of a calibration. `cannot_tell` says in words what these flights leave open; `nuisances` what was
-    fitted beside, {name: (value, unit)}; `explained` the share of each channel's changes that the nominal vehicle
-    explains, and the fitted one."""
+    """Result of a calibration. `cannot_tell` says in words what these flights leave open;
+    `nuisances` what was fitted beside, {name: (value, unit)}; `explained` the share of each
+    channel's changes that the nominal vehicle explains, and the fitted one.
+    """
 
     quantities: dict[str, Quantity]
     cannot_tell: tuple[str, ...]
@@ -106,13 +120,15 @@ def calibrate(case: Case) -> Calibration:
     usable = tuple(f for f in case.flights if f.has_motors and f.body_rates is not None)
     if not usable:
         raise UserError(
-            f"{case.name}: no flight holds motor commands (m1..m4) and the gyroscope; calibration needs both"
+            f"{case.name}: no flight holds motor commands (m1..m4) and the gyroscope; calibration "
+            "needs both"
         )
     evidence = gather(dataclasses.replace(case, flights=usable), library())
     exposure = evidence.motion.exposure
     effects = [e for e in CARDS if e in FITTED or (e in BESIDE and exposure[e] >= UNEXPOSED)]
     # The vehicle's numbers are what is fitted, and no nuisances.
-    replay, own = evidence.replay, len(evidence.replay.numbers)
+    replay = evidence.replay
+    own = len(evidence.replay.numbers)
     replay = dataclasses.replace(
         replay,
         nuisances=[n[own:] for n in replay.nuisances],
@@ -120,7 +136,8 @@ def calibrate(case: Case) -> Calibration:
         sizes=[s[own:] for s in replay.sizes],
         numbers=(),
     )
-    fit, nothing = fit_set(replay, effects, iterations=ITERATIONS), fit_set(replay, ())
+    fit = fit_set(replay, effects, iterations=ITERATIONS)
+    nothing = fit_set(replay, ())
     explained = _explained(replay, nothing, fit)
     # Where gyroscope and attitude share no clock, the rates tell nothing.
     share = explained.get("body rates", (0.0, 0.0))[1]
@@ -141,8 +158,10 @@ def calibrate(case: Case) -> Calibration:
 
 
 def logarithms(theta: np.ndarray, vehicle, duty_cycles: bool) -> dict[str, np.ndarray]:
-    """{constant: logarithms of its values over the nominal ones, (1,) or (2,)} at parameters theta (P,). Yaw shows only the
-    ratio of torque to inertia, which is told for the nominal inertia; with duty cycles for the nominal thrust constant."""
+    """{constant: logarithms of its values over the nominal ones, (1,) or (2,)} at parameters theta
+    (P,). Yaw shows only the ratio of torque to inertia, which is told for the nominal inertia; with
+    duty cycles for the nominal thrust constant.
+    """
     at = {key: theta[place] for key, place in PLACE.items() if key[0] in FITTED}
     thrust = 1.0 + at["thrust_scale", "scale"]
     torque = (1.0 if duty_cycles else thrust) * at["yaw_torque", "ratio"] / at["inertia", "zz"]
@@ -157,7 +176,8 @@ def logarithms(theta: np.ndarray, vehicle, duty_cycles: bool) -> dict[str, np.nd
 
 
 def _quantities(evidence: Evidence, fit: SetFit, rates_fit: bool) -> dict[str, Quantity]:
-    file, vehicle = evidence.case.vehicle_file, evidence.vehicles[0]
+    file = evidence.case.vehicle_file
+    vehicle = evidence.vehicles[0]
     duty_cycles = file.motor.command == "pwm"
     wider = robust_deviation(fit.covariance, fit.grams[:, 1:, 0]) / np.sqrt(np.diag(fit.covariance))
     covariance = fit.covariance * np.outer(wider, wider)
@@ -172,7 +192,9 @@ def _quantities(evidence: Evidence, fit: SetFit, rates_fit: bool) -> dict[str, Q
     for name, value in at.items():
         slope = np.array(slopes[name]).T
         deviation, known = (np.sqrt(np.diag(slope @ c @ slope.T)) for c in (covariance, before))
-        told = bool((deviation < DETERMINED * known).all()) and (rates_fit or name not in TOLD_BY_RATES)
+        told = bool((deviation < DETERMINED * known).all()) and (
+            rates_fit or name not in TOLD_BY_RATES
+        )
         told &= not (duty_cycles and name == "thrust_constant")
         out[name] = _quantity(name, vehicle, value, np.hypot(deviation, MODEL_ERROR[name]), told)
         if name in ("thrust_constant", "inertia") and not file.mass_weighed:
@@ -181,25 +203,42 @@ def _quantities(evidence: Evidence, fit: SetFit, rates_fit: bool) -> dict[str, Q
     return out
 
 
-def _quantity(name: str, vehicle, logs: np.ndarray, deviations: np.ndarray, determined: bool) -> Quantity:
+def _quantity(
+    name: str, vehicle, logs: np.ndarray, deviations: np.ndarray, determined: bool
+) -> Quantity:
     nominal = np.atleast_1d(np.asarray(getattr(vehicle, name), float))
     value = nominal.copy()
     value[: len(logs)] *= np.exp(logs)
     reach = np.exp(REACH * deviations)
     pairs = [(float(v / r), float(v * r)) for v, r in zip(value, reach, strict=False)]
     pairs += [
-        (low * nominal[2], high * nominal[2]) for low, high in [YAW_INERTIA_RANGE][: len(value) - len(logs)]
+        (low * nominal[2], high * nominal[2])
+        for low, high in [YAW_INERTIA_RANGE][: len(value) - len(logs)]
     ]
-    notes = {"inertia": "zz is assumed nominal", "torque_constant": "for the nominal inertia about z"}
+    notes = {
+        "inertia": "zz is assumed nominal",
+        "torque_constant": "for the nominal inertia about z",
+    }
     unit = CALIBRATED_UNITS[name]
     return Quantity(
-        tuple(value.tolist()), tuple(pairs), tuple(nominal.tolist()), unit, determined, notes.get(name, "")
+        tuple(value.tolist()),
+        tuple(pairs),
+        tuple(nominal.tolist()),
+        unit,
+        determined,
+        notes.get(name, ""),
     )
 
 
-def _cannot_tell(evidence: Evidence, fit: SetFit, quantities: dict[str, Quantity], share: float) -> list[str]:
-    """What these flights leave open, in words. `share` of the rates' changes that the fitted vehicle explains."""
-    file, out, untold = evidence.case.vehicle_file, [], []
+def _cannot_tell(
+    evidence: Evidence, fit: SetFit, quantities: dict[str, Quantity], share: float
+) -> list[str]:
+    """What these flights leave open, in words. `share` of the rates' changes that the fitted
+    vehicle explains.
+    """
+    file = evidence.case.vehicle_file
+    out = []
+    untold = []
     if file.motor.command == "pwm":
         out.append(_UNKNOWN_MAP.format(scale=1.0 + fit.theta[PLACE["thrust_scale", "scale"]]))
         untold.append("thrust_constant")
@@ -210,11 +249,15 @@ def _cannot_tell(evidence: Evidence, fit: SetFit, quantities: dict[str, Quantity
         out.append(_NOT_EXPLAINED.format(share=max(share, 0.0)))
         untold += TOLD_BY_RATES
     hardly = [n for n in _ADVICE if n not in untold and not quantities[n].determined]
-    return out + [f"{n.replace('_', ' ')}: these flights hardly excite it; {_ADVICE[n]}" for n in hardly]
+    return out + [
+        f"{n.replace('_', ' ')}: these flights hardly excite it; {_ADVICE[n]}" for n in hardly
+    ]
 
 
 def _explained(replay, nothing: SetFit, fit: SetFit) -> dict[str, tuple[float, float]]:
-    """Per kind of channel the share of its changes over HORIZON that the nominal vehicle explains, and the fitted one."""
+    """Per kind of channel the share of its changes over HORIZON that the nominal vehicle explains,
+    and the fitted one.
+    """
     kinds = {"body rates": slice(0, 3), "velocity": slice(3, 6), "specific force": slice(8, 9)}
     steps = [max(round(HORIZON / t.dt), 1) for t in replay.tracks]
 
@@ -224,7 +267,9 @@ def _explained(replay, nothing: SetFit, fit: SetFit) -> dict[str, tuple[float, f
 
     fits = residuals_of(nothing), residuals_of(fit)
     return {
-        kind: tuple(1.0 - square(left, channels) / square(replay.measured, channels) for left in fits)
+        kind: tuple(
+            1.0 - square(left, channels) / square(replay.measured, channels) for left in fits
+        )
         for kind, channels in kinds.items()
         if replay.usable[channels].all()
     }

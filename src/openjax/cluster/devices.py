@@ -1,7 +1,9 @@
-"""A training run on several devices, of one host or of many: the worlds are shared out, all else is the same on each.
+"""A training run on several devices, of one host or of many: the worlds are shared out, all else is
+the same on each.
 
-The step sees its own device's worlds and averages over all where it must (`openjax.learning.collectives`), so
-that one device and many give the same result on the same worlds, up to the order of sums.
+The step sees its own device's worlds and averages over all where it must
+(`openjax.learning.collectives`), so that one device and many give the same result on the same
+worlds, up to the order of sums.
 """
 
 import dataclasses
@@ -24,7 +26,9 @@ _SHARED_OUT = ("observation", "state")
 
 
 def can_share_out(settings: TrainSettings, number: int) -> bool:
-    """Whether each of `number` devices gets the same share of the worlds, of every task and of every minibatch."""
+    """Whether each of `number` devices gets the same share of the worlds, of every task and of
+    every minibatch.
+    """
     return number == 1 or settings.num_envs % (number * _group(settings)) == 0
 
 
@@ -32,14 +36,16 @@ def check_devices(settings: TrainSettings, number: int) -> None:
     """Whether the worlds can be shared out.
 
     Raises:
-      UserError: they can't, with the next number of worlds that could, and the numbers of devices that can.
+      UserError: they can't, with the next number of worlds that could, and the numbers of devices
+      that can.
     """
     if not can_share_out(settings, number):
         unit = number * _group(settings)
         possible = -(-settings.num_envs // unit) * unit
         fewer = [n for n in range(1, number) if can_share_out(settings, n)]
         raise UserError(
-            f"num_envs {settings.num_envs} can't be shared out to {number} devices; {possible} could, "
+            f"num_envs {settings.num_envs} can't be shared out to {number} devices; {possible} "
+            "could, "
             f"or --devices {' or '.join(map(str, fewer))}"
         )
 
@@ -65,7 +71,8 @@ def check_memory(settings: TrainSettings, number: int) -> None:
     needed = 4 * (shared_out + settings.generator.capacity * tasks + validation)
     if needed > (memory := _memory()):
         raise UserError(
-            f"{settings.num_envs} worlds of {settings.rollout_length} steps need at least {needed / 2**30:.0f} GiB on each "
+            f"{settings.num_envs} worlds of {settings.rollout_length} steps need at least "
+            f"{needed / 2**30:.0f} GiB on each "
             f"of {number} devices, which has {memory / 2**30:.0f}; fewer --num_envs need less"
         )
 
@@ -81,7 +88,9 @@ def _memory():
 def carry_shardings(number: int) -> TrainCarry | jax.sharding.Sharding:
     """Where the leaves of a carry lie, as a prefix of its tree."""
     same = everywhere(number)
-    return same if number == 1 else _carry_of(NamedSharding(_mesh(number), PartitionSpec(AXIS)), same)
+    return (
+        same if number == 1 else _carry_of(NamedSharding(_mesh(number), PartitionSpec(AXIS)), same)
+    )
 
 
 def everywhere(number: int) -> jax.sharding.Sharding:
@@ -102,20 +111,26 @@ def make_device_step(settings: TrainSettings, environment: Pursuit, number: int)
     if number == 1:
         return make_training_step(settings, environment)
     step = make_training_step(settings, environment, axis=AXIS)
-    carry, same = _carry_of(PartitionSpec(AXIS), PartitionSpec()), PartitionSpec()
+    carry = _carry_of(PartitionSpec(AXIS), PartitionSpec())
+    same = PartitionSpec()
     return _shared_out(number, step, (carry,), (carry, same))
 
 
 def make_device_first_flights(
     flights: FirstFlights, together: int, number: int
 ) -> tuple[Callable, Callable, Any]:
-    """`flights.begin` and `make_first_flights` on `number` devices, not yet compiled; where the leaves of their carry lie."""
+    """`flights.begin` and `make_first_flights` on `number` devices, not yet compiled; where the
+    leaves of their carry lie.
+    """
     if number == 1:
         return flights.begin, make_first_flights(flights, together), None
-    flights, same = dataclasses.replace(flights, axis=AXIS), PartitionSpec()
+    flights = dataclasses.replace(flights, axis=AXIS)
+    same = PartitionSpec()
     carry = FirstCarry(same, same, PartitionSpec(AXIS), same)
     begin = _shared_out(number, flights.begin, (same, same), carry)
-    some = _shared_out(number, make_first_flights(flights, together), (carry, same, same), (carry, same))
+    some = _shared_out(
+        number, make_first_flights(flights, together), (carry, same, same), (carry, same)
+    )
     at = {name: NamedSharding(_mesh(number), spec) for name, spec in vars(carry).items()}
     return begin, some, FirstCarry(**at)
 
@@ -123,19 +138,26 @@ def make_device_first_flights(
 def compiler_options(number: int, brief: bool = False) -> dict:
     """For programs on `number` devices; a `brief` one runs for seconds alone.
 
-    On a GPU XLA tries each matrix product in dozens of ways. That is half of its work, and where it doesn't, a training step
-    takes three times as long. A brief program takes those of cuBLAS as they are.
+    On a GPU XLA tries each matrix product in dozens of ways. That is half of its work, and where it
+    doesn't, a training step takes three times as long. A brief program takes those of cuBLAS as
+    they are.
     """
     if jax.default_backend() == "gpu":
         return {"xla_gpu_autotune_level": 0, "xla_gpu_enable_triton_gemm": False} if brief else {}
     # where devices are cores, threads would get in their way
-    return {"xla_cpu_multi_thread_eigen": False} if number > 1 and jax.default_backend() == "cpu" else {}
+    return (
+        {"xla_cpu_multi_thread_eigen": False}
+        if number > 1 and jax.default_backend() == "cpu"
+        else {}
+    )
 
 
 def _shared_out(number, function, takes, gives):
     """A function of each device's share as one of the whole, as the specifications have it."""
     # gradients are averaged in it; with the check on, they'd be summed before that
-    return jax.shard_map(function, mesh=_mesh(number), in_specs=takes, out_specs=gives, check_vma=False)
+    return jax.shard_map(
+        function, mesh=_mesh(number), in_specs=takes, out_specs=gives, check_vma=False
+    )
 
 
 def _mesh(number):

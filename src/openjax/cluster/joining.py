@@ -1,4 +1,6 @@
-"""Joining a job of several processes: which place this one has, and the connections between them."""
+"""Joining a job of several processes: which place this one has, and the connections between
+them.
+"""
 
 import atexit
 import contextlib
@@ -31,11 +33,16 @@ class Membership:
     num_processes: int
     process_id: int
     detection: str
-    """What JAX is to ask for this process' devices: `slurm`, `ompi`, or `deactivate` (all of the host)."""
+    """What JAX is to ask for this process' devices: `slurm`, `ompi`, or `deactivate` (all of the
+    host).
+    """
 
 
 def find_membership(
-    coordinator_address: str | None, num_processes: int | None, process_id: int | None, all_devices: bool
+    coordinator_address: str | None,
+    num_processes: int | None,
+    process_id: int | None,
+    all_devices: bool,
 ) -> Membership | None:
     """This process' place, from the command line or else from Slurm or Open MPI; None: it is alone.
 
@@ -57,10 +64,13 @@ def find_membership(
     address, number, index = given
     host, _, port = address.rpartition(":")
     if not (host and port.isdecimal() and len(port) <= 5 and 0 < int(port) < 65535):
-        raise UserError(f"--coordinator_address is {address[:80]!r}; expected host:port of process 0")
+        raise UserError(
+            f"--coordinator_address is {address[:80]!r}; expected host:port of process 0"
+        )
     if number < 1 or not 0 <= index < number:
         raise UserError(
-            f"--process_id {index} and --num_processes {number}: expected an id from 0 to the number less one"
+            f"--process_id {index} and --num_processes {number}: expected an id from 0 to the "
+            "number less one"
         )
     if not all_devices:
         raise UserError(f"{number} processes train on all of their devices; add --devices all")
@@ -68,9 +78,11 @@ def find_membership(
 
 
 def _detected(given):
-    """What is missing of address, number and id, as `jax.distributed.initialize` itself would find it.
+    """What is missing of address, number and id, as `jax.distributed.initialize` itself would find
+    it.
 
-    Only its private part tells; the public one joins at once, and the processes' own connections come before that.
+    Only its private part tells; the public one joins at once, and the processes' own connections
+    come before that.
     """
     from jax._src.clusters import ClusterEnv
 
@@ -84,7 +96,8 @@ def _detected(given):
 
 @contextlib.contextmanager
 def joined(membership: Membership | None) -> Iterator[Processes]:
-    """Join the job, before JAX touches a device; leave it together with the others, or tell them what went wrong.
+    """Join the job, before JAX touches a device; leave it together with the others, or tell them
+    what went wrong.
 
     Raises:
       UserError: not all processes came in time, or a port is taken.
@@ -110,12 +123,15 @@ def joined(membership: Membership | None) -> Iterator[Processes]:
             processes.leave()
         except BaseException as error:
             if isinstance(error, UserError):
-                status, reason = 2, _one_line(error)
+                status = 2
+                reason = _one_line(error)
             elif isinstance(error, KeyboardInterrupt):
-                status, reason = 130, "interrupted"
+                status = 130
+                reason = "interrupted"
             else:
                 processes.await_verdict()
-                status, reason = 1, f"{type(error).__name__}: {_one_line(error)}"
+                status = 1
+                reason = f"{type(error).__name__}: {_one_line(error)}"
             processes.fail(status, reason)
             # JAX would wait for the others at exit; once this error is told, nothing is left to do.
             atexit.register(os._exit, status)
@@ -123,8 +139,8 @@ def joined(membership: Membership | None) -> Iterator[Processes]:
 
 
 def _tune_alone():
-    """Have XLA choose its GPU kernels in each process by itself. Shared, all processes wait for each other's choices in
-    every program, also in one that only process 0 compiles.
+    """Have XLA choose its GPU kernels in each process by itself. Shared, all processes wait for
+    each other's choices in every program, also in one that only process 0 compiles.
     """
     flags = os.environ.get("XLA_FLAGS", "")
     if "xla_gpu_shard_autotuning" not in flags:
@@ -137,11 +153,12 @@ def _one_line(error):
 
 @contextlib.contextmanager
 def _connected(membership):
-    """Connections, their readers and hosts by process (to all others on process 0, to process 0 elsewhere), and where JAX
-    is to look for its coordinator: at the port after process 0's own.
+    """Connections, their readers and hosts by process (to all others on process 0, to process 0
+    elsewhere), and where JAX is to look for its coordinator: at the port after process 0's own.
     """
     host, _, port = membership.coordinator_address.rpartition(":")
-    host, port = host.strip("[]"), int(port)
+    host = host.strip("[]")
+    port = int(port)
     if membership.process_id != 0:
         connection = _call(host, port, membership)
         with _held_open(host, port + 1) as address:
@@ -160,15 +177,19 @@ def _listen(port):
             ("", port), family=socket.AF_INET6 if both else socket.AF_INET, dualstack_ipv6=both
         )
     except OSError as error:
-        raise UserError(f"the coordinator's port {port} can't be used: {error.strerror or error}") from None
+        raise UserError(
+            f"the coordinator's port {port} can't be used: {error.strerror or error}"
+        ) from None
 
 
 @contextlib.contextmanager
 def _held_open(host, port):
-    """An address on this host that leads to another one, and whose connections stay open when that is gone.
+    """An address on this host that leads to another one, and whose connections stay open when that
+    is gone.
 
-    JAX ends a process at once, by a stack trace, when its connection to the coordinator closes; like this the process has
-    time to say in one line what happened, which it learns from its own connection.
+    JAX ends a process at once, by a stack trace, when its connection to the coordinator closes;
+    like this the process has time to say in one line what happened, which it learns from its own
+    connection.
     """
 
     def serve():
@@ -211,7 +232,9 @@ def _call(host, port, membership):
         except OSError as error:
             reason = str(error.strerror or error)
         if time.monotonic() > deadline:
-            raise UserError(f"process 0 can't be reached at {host}:{port} within {JOIN:.0f} s: {reason}")
+            raise UserError(
+                f"process 0 can't be reached at {host}:{port} within {JOIN:.0f} s: {reason}"
+            )
         time.sleep(0.2)
 
 
@@ -225,7 +248,9 @@ def _accept(server, number):
             connection, _ = server.accept()
         except TimeoutError:
             missing = ", ".join(str(i) for i in range(1, number) if i not in found)
-            raise UserError(f"process {missing} of {number} didn't come within {JOIN:.0f} s") from None
+            raise UserError(
+                f"process {missing} of {number} didn't come within {JOIN:.0f} s"
+            ) from None
         connection.settimeout(10.0)
         reader = connection.makefile("rb")
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # a stranger

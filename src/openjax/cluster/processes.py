@@ -1,9 +1,10 @@
 """The processes of a job that trains on several hosts: what all of them know, and the loss of one.
 
-Arrays travel by JAX's own collectives. Beside these every process holds one TCP connection to process 0. Over it the
-processes agree on what only one of them knows (a signal, a clock, a score), and by it they notice a process that is
-gone. JAX's heartbeat (0.10) ends the others by a stack trace without a word of who was lost, whether or not it may
-recover, and its collectives time out while process 0 compiles or draws for minutes: so both are done here.
+Arrays travel by JAX's own collectives. Beside these every process holds one TCP connection to
+process 0. Over it the processes agree on what only one of them knows (a signal, a clock, a score),
+and by it they notice a process that is gone. JAX's heartbeat (0.10) ends the others by a stack
+trace without a word of who was lost, whether or not it may recover, and its collectives time out
+while process 0 compiles or draws for minutes: so both are done here.
 """
 
 import contextlib
@@ -32,10 +33,15 @@ class Processes:
     """
 
     def __init__(self, number: int = 1, index: int = 0, connections: dict | None = None):
-        """`connections`: (socket, its reader, host) by process: to all others on process 0, to process 0 elsewhere."""
-        self.number, self.index = number, index
+        """`connections`: (socket, its reader, host) by process: to all others on process 0, to
+        process 0 elsewhere.
+        """
+        self.number = number
+        self.index = index
         self.advice = "start it again"
-        self._links = {other: _Link(self, other, *link) for other, link in (connections or {}).items()}
+        self._links = {
+            other: _Link(self, other, *link) for other, link in (connections or {}).items()
+        }
         self._asked = {other: queue.Queue() for other in self._links}
         self._answers: queue.Queue = queue.Queue()
         self._ending = threading.Lock()  # taken once, by what ends this process first
@@ -73,12 +79,16 @@ class Processes:
         """Tell the others that this process ends with an exit status, and why; they end too."""
         self._ending.acquire(blocking=False)
         # what all did wrong, each reports by itself in the meantime
-        self._send_all({"error": f"process {self.index} ended: {text}", "status": status, "after": GRACE})
+        self._send_all(
+            {"error": f"process {self.index} ended: {text}", "status": status, "after": GRACE}
+        )
         for link in self._links.values():
             link.close(2 * GRACE)
 
     def await_verdict(self) -> None:
-        """After an error that a lost process may have caused: time for that news, which ends this process."""
+        """After an error that a lost process may have caused: time for that news, which ends this
+        process.
+        """
         threading.Event().wait(GRACE if self._links else 0.0)
 
     def receive(self, other: int, message: dict) -> None:
@@ -91,7 +101,9 @@ class Processes:
             self.end(other, message)
 
     def end(self, source: int, message: dict) -> None:
-        """Pass on what went wrong, say it and end: the main thread may wait for the lost process for ever."""
+        """Pass on what went wrong, say it and end: the main thread may wait for the lost process
+        for ever.
+        """
         if not self._ending.acquire(blocking=False):
             return
         if self.is_first:
@@ -109,9 +121,14 @@ class Processes:
 class _Link:
     """A connection to another process: lines of JSON, and signs of life in both directions."""
 
-    def __init__(self, job: Processes, other: int, connection: socket.socket, reader: BinaryIO, host: str):
-        self._job, self._other, self._host = job, other, host
-        self._socket, self._reader = connection, reader
+    def __init__(
+        self, job: Processes, other: int, connection: socket.socket, reader: BinaryIO, host: str
+    ):
+        self._job = job
+        self._other = other
+        self._host = host
+        self._socket = connection
+        self._reader = reader
         self._sending = threading.Lock()
         self._closed = threading.Event()
         connection.settimeout(SILENCE)
@@ -132,7 +149,8 @@ class _Link:
         self._closed.wait(seconds)
 
     def _read(self):
-        why, leaves = "its connection closed", False
+        why = "its connection closed"
+        leaves = False
         try:
             for line in self._reader:
                 message = json.loads(line)
@@ -146,8 +164,12 @@ class _Link:
             why = "it sent half a message"
         self._closed.set()
         if not leaves:
-            job, who = self._job, f"process {self._other} of {self._job.number} (on {self._host})"
-            job.end(self._other, {"error": f"{who} was lost: {why}; {job.advice}", "status": 1, "after": 0.0})
+            job = self._job
+            who = f"process {self._other} of {self._job.number} (on {self._host})"
+            job.end(
+                self._other,
+                {"error": f"{who} was lost: {why}; {job.advice}", "status": 1, "after": 0.0},
+            )
 
     def _beat(self):
         while not self._closed.wait(BEAT):

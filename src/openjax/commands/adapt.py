@@ -1,8 +1,8 @@
 """From flights to a better policy: `openjax adapt FLIGHTS --policy NAME --out DIR`.
 
-Diagnoses the flights, draws vehicles from the intervals of what was found, fine-tunes the policy on them by the gradient
-through the simulation, and measures both policies on tasks and vehicles that neither was trained on. Writes DIR/policy.npz,
-adapt.json and adapt.html.
+Diagnoses the flights, draws vehicles from the intervals of what was found, fine-tunes the policy on
+them by the gradient through the simulation, and measures both policies on tasks and vehicles that
+neither was trained on. Writes DIR/policy.npz, adapt.json and adapt.html.
 """
 
 import dataclasses
@@ -33,7 +33,9 @@ class AdaptCommand:
     out: Path = Path("adapted")
     """Directory for what is found."""
     episodes: Annotated[int | None, Interval("[1, 1000000]")] = None
-    """Episodes by which the policies are measured; by default 1024 on an accelerator, 128 on a CPU."""
+    """Episodes by which the policies are measured; by default 1024 on an accelerator, 128 on a
+    CPU.
+    """
     seed: Seed = 0
     overwrite: bool = False
     """Replace what --out already holds."""
@@ -43,7 +45,9 @@ class AdaptCommand:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """The command; returns its exit status. Raises UserError where there are no flights, or none that can be used."""
+    """The command; returns its exit status. Raises UserError where there are no flights, or none
+    that can be used.
+    """
     command = parse(AdaptCommand, AdaptCommand(), arguments, "openjax adapt")
     if not command.flights.exists():
         raise UserError(f"{command.flights}: no such folder of flights, nor effects.toml")
@@ -56,7 +60,8 @@ def main(arguments: Sequence[str]) -> int:
 
     from openjax.commands.adapting import ON_CPU, STEPS, adapt, check, in_words
 
-    console, on_cpu = output_console(), jax.default_backend() == "cpu"
+    console = output_console()
+    on_cpu = jax.default_backend() == "cpu"
     command = dataclasses.replace(command, episodes=command.episodes or (128 if on_cpu else 1024))
     check(command)
     with Steps(f"adapting {command.policy}", ON_CPU if on_cpu else STEPS, console) as steps:

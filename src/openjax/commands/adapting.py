@@ -1,4 +1,6 @@
-"""What `openjax adapt` does: a diagnosis beside the compiler, vehicles drawn from it, fine-tuning, figures of both policies."""
+"""What `openjax adapt` does: a diagnosis beside the compiler, vehicles drawn from it, fine-tuning,
+figures of both policies.
+"""
 
 import contextlib
 import dataclasses
@@ -39,20 +41,27 @@ WHICH = ("nominal", "before", "after")
 LOSSES = ("crash_rate", "collision_rate", "capture_step")
 """Figures that a vehicle can make worse, of which adapting is to win back what it can."""
 ERRORS = 2.0
-"""A loss is one that is larger than so many standard errors of the differences of single episodes."""
+"""A loss is one that is larger than so many standard errors of the differences of single
+episodes.
+"""
 
 
 def check(command: "AdaptCommand") -> None:
-    """What can be wrong with flights and policy is told before anything is compiled. Raises UserError."""
+    """What can be wrong with flights and policy is told before anything is compiled. Raises
+    UserError.
+    """
     if isinstance(load_policy(command.policy).policy, Heuristic):
         raise UserError(f"--policy {command.policy}: a heuristic has no networks that could learn")
     (load_case if command.flights.is_dir() else load_effects)(command.flights)
 
 
 def adapt(command: "AdaptCommand", tell: Callable[[str], None] = lambda step: None) -> dict:
-    """Do all of it and write it down; `tell` hears the steps. Raises UserError for flights that can't be diagnosed or an
-    unusable policy."""
-    started, seconds, steps = time.monotonic(), {}, iter(STEPS)
+    """Do all of it and write it down; `tell` hears the steps. Raises UserError for flights that
+    can't be diagnosed or an unusable policy.
+    """
+    started = time.monotonic()
+    seconds = {}
+    steps = iter(STEPS)
     tell(next(steps))
     with _diagnosis(command) as effects:
         bench = _Bench(command)  # compiles meanwhile
@@ -90,7 +99,8 @@ class _Bench:
     """A policy, and the compiled programs that fine-tune and measure it."""
 
     def __init__(self, command: "AdaptCommand"):
-        self.loaded, self._training = load_policy(command.policy), command.training
+        self.loaded = load_policy(command.policy)
+        self._training = command.training
         self.adaptation = make_adaptation(self.loaded.settings, command.training)
         self.game, self._key = self.adaptation.game, jax.random.key(command.seed)
         tasks = uniform_tasks(self.game, 2 * command.episodes, self.game.max_pillars)
@@ -98,7 +108,9 @@ class _Bench:
         self._measured_on = jax.tree.map(lambda leaf: leaf[command.episodes :], tasks)
         self._parameters = starting_parameters(self.loaded.parameters, self.loaded.settings)
         self._nominal = bounds_of({}, {}, rest=0.0)
-        self.ready = compile_programs(self.adaptation, self._parameters, self._chosen_by, self._nominal)
+        self.ready = compile_programs(
+            self.adaptation, self._parameters, self._chosen_by, self._nominal
+        )
 
     def _fly(self, parameters, tasks, number, bounds) -> dict:
         """Figures (B,) of a policy's episodes; the same `number` draws the same ones."""
@@ -106,24 +118,33 @@ class _Bench:
         return episode_figures(self.adaptation.evaluate(parameters, tasks, key, bounds).statistics)
 
     def fine_tune(self, found: _Found):
-        """The best of the policy's updates (see `openjax.learning.adaptation.fine_tune`), by `selection_score`.
+        """The best of the policy's updates (see `openjax.learning.adaptation.fine_tune`), by
+        `selection_score`.
 
-        Speeds over the limit count as far as they are more than in the same episode of the policy as it was with the nominal
-        vehicle: to fly as fast with the diagnosed one is what is wanted, and a vehicle that made a policy slower did nothing
-        good by it.
+        Speeds over the limit count as far as they are more than in the same episode of the policy
+        as it was with the nominal vehicle: to fly as fast with the diagnosed one is what is wanted,
+        and a vehicle that made a policy slower did nothing good by it.
         """
         usual = self._fly(self._parameters, self._chosen_by, 1, self._nominal)
 
         def scores(policy):
             flown = self._fly(policy, self._chosen_by, 1, found.bounds)
-            flown["over_speed_rate"] = np.maximum(flown["over_speed_rate"], usual["over_speed_rate"])
+            flown["over_speed_rate"] = np.maximum(
+                flown["over_speed_rate"], usual["over_speed_rate"]
+            )
             return selection_score(flown, self.game.episode_length)
 
-        return fine_tune(self.adaptation, self._parameters, found.bounds, self._training, self._key, scores)
+        return fine_tune(
+            self.adaptation, self._parameters, found.bounds, self._training, self._key, scores
+        )
 
     def measure(self, found: _Found, tuned) -> dict[str, dict]:
         """Figures (B,) of `WHICH` on tasks that no checkpoint was chosen by."""
-        cases = (self._parameters, self._nominal), (self._parameters, found.bounds), (tuned, found.bounds)
+        cases = (
+            (self._parameters, self._nominal),
+            (self._parameters, found.bounds),
+            (tuned, found.bounds),
+        )
         return {
             which: self._fly(parameters, self._measured_on, 2, bounds)
             for which, (parameters, bounds) in zip(WHICH, cases, strict=True)
@@ -144,7 +165,10 @@ def _results(command, found, flown, tuned) -> dict:
             if effect in found.values
         ],
         "episodes": command.episodes,
-        **{which: {name: float(own[name].mean()) for name in FIGURES} for which, own in flown.items()},
+        **{
+            which: {name: float(own[name].mean()) for name in FIGURES}
+            for which, own in flown.items()
+        },
         "won_back": won_back(flown),
         "kept": f"fine-tuned, as it was after step {tuned.update}"
         if tuned.update
@@ -160,13 +184,16 @@ def _write(command, bench, found, tuned, results):
     settings = dataclasses.replace(bench.loaded.settings, environment=game)
     command.out.mkdir(parents=True, exist_ok=True)
     notes = {"adapted_from": command.policy, "effects": found.values, "machine": results["machine"]}
-    save_policy_file(command.out / "policy.npz", tuned.parameters, settings, notes, storage="float32")
+    save_policy_file(
+        command.out / "policy.npz", tuned.parameters, settings, notes, storage="float32"
+    )
     write_json(command.out / "adapt.json", results)
     write_text(command.out / "adapt.html", page(results))
 
 
 def won_back(flown: dict) -> dict[str, float | None]:
-    """Of each loss, before against nominal, the share that is none any more after; None where there was none beyond chance.
+    """Of each loss, before against nominal, the share that is none any more after; None where there
+    was none beyond chance.
 
     Args:
       flown: {"nominal", "before", "after": figures (B,) of the same episodes}.
@@ -181,11 +208,14 @@ def won_back(flown: dict) -> dict[str, float | None]:
 
 @contextlib.contextmanager
 def _diagnosis(command: "AdaptCommand") -> Iterator[Callable[[], Path]]:
-    """A diagnosis that runs beside the compiler; what is given waits for the effects file that it writes."""
+    """A diagnosis that runs beside the compiler; what is given waits for the effects file that it
+    writes.
+    """
     if not command.flights.is_dir():
         yield lambda: command.flights
         return
-    out, name = command.out / "diagnosis", command.flights.resolve().name
+    out = command.out / "diagnosis"
+    name = command.flights.resolve().name
     shutil.rmtree(out, ignore_errors=True)
     process = subprocess.Popen(
         [sys.executable, "-m", "openjax.diagnose", str(command.flights), "--out", str(out)],
@@ -224,7 +254,9 @@ def compile_programs(adaptation, parameters, tasks, bounds):
 
 def in_words(results: dict) -> list[str]:
     """What was found and gained."""
-    effects = ", ".join(results["effects"]) or "no effect: the simulator is right to within the noise"
+    effects = (
+        ", ".join(results["effects"]) or "no effect: the simulator is right to within the noise"
+    )
     changes = "; ".join(
         f"{name.replace('_', ' ')} " + " → ".join(f"{results[which][name]:.3g}" for which in WHICH)
         for name in FIGURES
@@ -233,9 +265,12 @@ def in_words(results: dict) -> list[str]:
     won = ", ".join(f"{name.replace('_', ' ')} {share:.0%}" for name, share in shares.items())
     return [
         f"Found: {effects}.",
-        f"On {results['episodes']} tasks that neither was trained on, with the nominal vehicle → with vehicles drawn from what "
+        f"On {results['episodes']} tasks that neither was trained on, with the nominal vehicle → "
+        "with vehicles drawn from what "
         f"was found, before → after: {changes}.",
-        f"Won back of what the vehicle costs: {won}." if won else "The vehicle costs nothing beyond chance.",
+        f"Won back of what the vehicle costs: {won}."
+        if won
+        else "The vehicle costs nothing beyond chance.",
         f"Kept: {results['kept']}. {results['seconds']['measured']:.0f} s.",
     ]
 
@@ -244,7 +279,12 @@ def page(results: dict) -> str:
     """One self-contained HTML page."""
     from openjax.show.pages import filled  # with matplotlib: not before the compiler has begun
 
-    values = {"words": in_words(results), "figures": FIGURES, "which": WHICH, "picture": _picture(results)}
+    values = {
+        "words": in_words(results),
+        "figures": FIGURES,
+        "which": WHICH,
+        "picture": _picture(results),
+    }
     return filled("adapt.html.jinja", Path(__file__).parent, results=results, **values)
 
 

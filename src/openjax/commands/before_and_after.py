@@ -1,4 +1,6 @@
-"""A run's report: its first and its best policy, and another one, in layouts and validation tasks; table and pictures."""
+"""A run's report: its first and its best policy, and another one, in layouts and validation tasks;
+table and pictures.
+"""
 
 import dataclasses
 from collections.abc import Sequence
@@ -42,7 +44,9 @@ _OF_THE_POLICY = (
 
 
 def game_for(settings: PursuitSettings, policy: LoadedPolicy) -> PursuitSettings:
-    """The game of `settings` for another policy, which sees and steers as it was trained to; episodes last as long."""
+    """The game of `settings` for another policy, which sees and steers as it was trained to;
+    episodes last as long.
+    """
     own = policy.settings.environment
     return dataclasses.replace(
         settings,
@@ -53,7 +57,11 @@ def game_for(settings: PursuitSettings, policy: LoadedPolicy) -> PursuitSettings
 
 
 def compare(
-    policy: LoadedPolicy, environment: Pursuit, scenarios: Sequence[Scenario], episodes: int, validation: int
+    policy: LoadedPolicy,
+    environment: Pursuit,
+    scenarios: Sequence[Scenario],
+    episodes: int,
+    validation: int,
 ) -> tuple[list[dict], list[Trajectory]]:
     """Fly a policy in the game of a run: `validation` of the uniform validation tasks, and layouts.
 
@@ -65,8 +73,8 @@ def compare(
       validation: number of tasks.
 
     Returns:
-      records as of `Flown.record`, that of the validation tasks first, their capture steps in steps of the run; and
-      the first episode of each.
+      records as of `Flown.record`, that of the validation tasks first, their capture steps in steps
+      of the run; and the first episode of each.
 
     Raises:
       UserError: the policy can't play this game.
@@ -79,14 +87,23 @@ def compare(
     evaluator = Evaluator(game, policy.policy, validation + episodes * len(scenarios))
     flown = evaluator.fly(policy.parameters, tasks, jax.random.key(0))
     longer = settings.time_step / environment.settings.time_step
-    rows = [row | {"capture_step": longer * row["capture_step"]} for row in (kind.record() for kind in flown)]
+    rows = [
+        row | {"capture_step": longer * row["capture_step"]}
+        for row in (kind.record() for kind in flown)
+    ]
     return rows, [kind.trajectory(0, f"{kind.name}, {policy.source}") for kind in flown]
 
 
 def report(
-    job: "TrainingJob", directory: RunDirectory, validation: Validation, outcome: Outcome, progress: Progress
+    job: "TrainingJob",
+    directory: RunDirectory,
+    validation: Validation,
+    outcome: Outcome,
+    progress: Progress,
 ) -> Table:
-    """Evaluate the first and the best policy on the layouts, draw the best one's flights; the table of both."""
+    """Evaluate the first and the best policy on the layouts, draw the best one's flights; the table
+    of both.
+    """
     settings = job.settings
     fitting = layouts_like(settings.environment)
     abstract = jax.eval_shape(lambda: outcome.carry.policy)
@@ -95,19 +112,25 @@ def report(
         progress.phase(f"evaluating the policy {moment} training on the layouts")
         parameters = fill(abstract, load_policy_file(path)[0], str(path))
         flown = validation(parameters)
-        shown = [(flown[0], i, f"validation task {i + 1}") for i in range(min(3, validation.number))]
+        shown = [
+            (flown[0], i, f"validation task {i + 1}") for i in range(min(3, validation.number))
+        ]
         if fitting:
             tasks = layout_tasks(validation.evaluator.settings, fitting, job.layout_episodes)
             layouts = validation.evaluator.fly(parameters, tasks, jax.random.key(0))
-            flown, shown = [*flown, *layouts], [(layout, 0, layout.name) for layout in layouts]
+            flown = [*flown, *layouts]
+            shown = [(layout, 0, layout.name) for layout in layouts]
         rows[moment] = [kind.record(_BESIDE_RECORD) for kind in flown]
     flights = [kind.trajectory(episode, title) for kind, episode, title in shown]
-    others, their_flights = [], []
+    others = []
+    their_flights = []
     if job.compare_with is not None:
         progress.phase(f"evaluating {job.compare_with} in the same game")
         # its networks may be large, and these are minutes on a small machine
         number = min(job.layout_episodes, 8), min(validation.number, 32)
-        others, their_flights = compare(load_policy(job.compare_with), job.environment, fitting, *number)
+        others, their_flights = compare(
+            load_policy(job.compare_with), job.environment, fitting, *number
+        )
     progress.phase("drawing")
     facts = {
         **({job.compare_with: others} if others else {}),
@@ -134,7 +157,9 @@ def _draw(directory, flights, their_flights):
     captured = [flight for flight in flights if flight.capture_index is not None]
     chosen = (captured or flights)[0]
     shown = [flight for flight in their_flights if flight.title.startswith(f"{chosen.title}, ")]
-    shown.insert(0, dataclasses.replace(chosen, title=f"{chosen.title}, this run") if shown else chosen)
+    shown.insert(
+        0, dataclasses.replace(chosen, title=f"{chosen.title}, this run") if shown else chosen
+    )
     animate(directory.path / "chase.gif", *shown)
 
 
@@ -149,9 +174,11 @@ def before_after_table(
     other: str | None = None,
     others: Sequence[dict] = (),
 ) -> Table:
-    """Captures, collisions and crashes before and after training; last what the policy `other` does in the same game.
+    """Captures, collisions and crashes before and after training; last what the policy `other` does
+    in the same game.
 
-    Capture steps are of `time_step` seconds in all records. Beside another policy there is no room for collisions.
+    Capture steps are of `time_step` seconds in all records. Beside another policy there is no room
+    for collisions.
     """
     columns = [
         ("capture\nrate", "capture_rate", 1.0, ".2f"),
@@ -164,7 +191,9 @@ def before_after_table(
         del columns[2]
         last.append(f"policy {other}:\nrate, seconds, crash")
     heads = [head for head, *_ in columns]
-    table = numbers_table("Before and after training, in the game that was trained", "", *heads, *last)
+    table = numbers_table(
+        "Before and after training, in the game that was trained", "", *heads, *last
+    )
     theirs = {row["scenario"]: row for row in others}
 
     def shown(row):

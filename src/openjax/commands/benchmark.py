@@ -1,8 +1,9 @@
 """Speed on this machine: `openjax benchmark [--envs 1024 4096] [--json FILE]`.
 
-Steps per second of the physics (rigid and MJX, each with and without solids), of the environment, of rollouts with the
-policy and of the whole training step, over a sweep of environment counts; and of the programs that the step is made of, which
-say where its time goes; the step on several devices, with `--devices 1 2 4`. Same command on CPU and GPU.
+Steps per second of the physics (rigid and MJX, each with and without solids), of the environment,
+of rollouts with the policy and of the whole training step, over a sweep of environment counts; and
+of the programs that the step is made of, which say where its time goes; the step on several
+devices, with `--devices 1 2 4`. Same command on CPU and GPU.
 """
 
 import dataclasses
@@ -34,13 +35,17 @@ class BenchmarkCommand:
     """Measure steps per second of each layer, from the physics to the whole training step."""
 
     preset: str | None = None
-    """quick, paper, flight, mappo or dacoop: networks and learner; by default what fits the machine."""
+    """quick, paper, flight, mappo or dacoop: networks and learner; by default what fits the
+    machine.
+    """
     envs: Annotated[tuple[int, ...], Interval("[1, 16777216]")] = ()
     """Environment counts; by default a sweep that fits the machine."""
     training_envs: Annotated[tuple[int, ...], Interval("[1, 16777216]")] = ()
     """Environment counts of the training step; by default those that fit the machine."""
     devices: Annotated[tuple[int, ...], Interval("[1, 65536]")] = (1,)
-    """Numbers of devices on which the training step is measured; its worlds are shared out to them."""
+    """Numbers of devices on which the training step is measured; its worlds are shared out to
+    them.
+    """
     parts: tuple[Part, ...] = PARTS
     """What to measure."""
     steps: Annotated[int, Interval("[1, 100000]")] = 50
@@ -60,7 +65,9 @@ def main(arguments: Sequence[str]) -> int:
         from openjax.platform import make_cores_devices
 
         make_cores_devices()
-    on_cpu = {"-h", "--help"} & set(arguments) or importlib.import_module("jax").default_backend() == "cpu"
+    on_cpu = {"-h", "--help"} & set(arguments) or importlib.import_module(
+        "jax"
+    ).default_backend() == "cpu"
     default = BenchmarkCommand(
         envs=(64, 512) if on_cpu else (2048, 8192, 32768, 131072, 1048576),
         training_envs=(320,) if on_cpu else (2048, 4096, 8192, 16384),
@@ -75,8 +82,12 @@ def main(arguments: Sequence[str]) -> int:
     from openjax.commands.benchmark_cases import cases, time_compiled
     from openjax.commands.machine import describe_machine
 
-    machine, console = describe_machine(), output_console()
-    print(f"{machine['device']}, JAX {machine['versions']['jax']}, commit {machine['commit']}", flush=True)
+    machine = describe_machine()
+    console = output_console()
+    print(
+        f"{machine['device']}, JAX {machine['versions']['jax']}, commit {machine['commit']}",
+        flush=True,
+    )
     rows = []
     facts = {"command": " ".join([PROGRAM, *arguments]), "machine": machine}
     facts["compilation_cache"] = jax.config.jax_compilation_cache_dir is not None
@@ -85,7 +96,9 @@ def main(arguments: Sequence[str]) -> int:
         for name, part, number, _ in sweep:
             steps.begin(name)
             for *case, function, inputs in cases(command, part, number):
-                rows.append(_row(*case, command.settings, time_compiled(function, inputs, command.seconds)))
+                rows.append(
+                    _row(*case, command.settings, time_compiled(function, inputs, command.seconds))
+                )
                 console.print(_line(rows[-1]), soft_wrap=True)
                 # after each measurement, so that an interrupted sweep leaves what it has
                 write_json(command.json, {**facts, "settings": command.settings, "rows": rows})
@@ -96,19 +109,25 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _sweep(command) -> list[tuple[str, str, int, float]]:
-    """(name, part, environments, seconds that it takes on two cores, about) of all that is measured."""
+    """(name, part, environments, seconds that it takes on two cores, about) of all that is
+    measured.
+    """
     sweep = []
     for part in command.parts:
-        numbers, programs = command.envs, 1
+        numbers = command.envs
+        programs = 1
         if part == "training":
-            numbers, programs = command.training_envs, 5 * len(command.devices)
+            numbers = command.training_envs
+            programs = 5 * len(command.devices)
         seconds = SECONDS[part] + programs * command.seconds
         sweep += [(f"{part}, {number:,} environments", part, number, seconds) for number in numbers]
     return sweep
 
 
 def _programs_and_step(rows) -> str | None:
-    """How long the step's programs take beside the step as one; None where one of them wasn't measured."""
+    """How long the step's programs take beside the step as one; None where one of them wasn't
+    measured.
+    """
     phases = [row["seconds"] for row in rows if row["part"].startswith("- ")]
     if not phases or None in phases:
         return None
@@ -117,7 +136,9 @@ def _programs_and_step(rows) -> str | None:
 
 
 def _row(part, num_envs, steps, settings, timing) -> dict:
-    """One measurement (a `Timing`); an environment step moves one world by one control step, all its drones."""
+    """One measurement (a `Timing`); an environment step moves one world by one control step, all
+    its drones.
+    """
     speed = None if timing.seconds is None else num_envs * steps / timing.seconds
     return {
         "part": part,
@@ -126,13 +147,20 @@ def _row(part, num_envs, steps, settings, timing) -> dict:
         "num_drones": settings.environment.num_pursuers,
         "steps_per_call": steps,
         "env_steps_per_second": speed,
-        "drone_steps_per_second": None if speed is None else speed * settings.environment.num_pursuers,
+        "drone_steps_per_second": None
+        if speed is None
+        else speed * settings.environment.num_pursuers,
         **dataclasses.asdict(timing),
     }
 
 
 def _line(row):
-    speed, memory = row["env_steps_per_second"], row["memory"]
-    told = "out of memory" if speed is None else f"{speed:,.0f} env steps/s, {1e3 * row['seconds']:,.1f} ms"
+    speed = row["env_steps_per_second"]
+    memory = row["memory"]
+    told = (
+        "out of memory"
+        if speed is None
+        else f"{speed:,.0f} env steps/s, {1e3 * row['seconds']:,.1f} ms"
+    )
     needs = "" if memory is None else f", {memory / 1e6:,.0f} MB"
     return f"{row['part']:17} {row['num_envs']:>9,} environments: {told} (compiled in {row['compile_seconds']:.1f} s{needs})"

@@ -1,4 +1,6 @@
-"""What `openjax benchmark` times, and how: physics, environment, rollout and the training step, each as one function."""
+"""What `openjax benchmark` times, and how: physics, environment, rollout and the training step,
+each as one function.
+"""
 
 import dataclasses
 import time
@@ -26,8 +28,11 @@ if TYPE_CHECKING:
 def cases(
     command: "BenchmarkCommand", part: str, num_envs: int
 ) -> Iterator[tuple[str, int, int, Callable, tuple]]:
-    """(name, environments, control steps per call, function, its arguments) of a part, made one at a time."""
-    settings, steps = command.settings, command.steps
+    """(name, environments, control steps per call, function, its arguments) of a part, made one at
+    a time.
+    """
+    settings = command.settings
+    steps = command.steps
     if part == "training":
         for number in command.devices:
             fitting = fitting_settings(settings, num_envs, number)
@@ -42,7 +47,9 @@ def cases(
 
 
 def _training(settings, devices):
-    """The whole training step, then, of one device, the programs that it is made of: (name, function, its arguments)."""
+    """The whole training step, then, of one device, the programs that it is made of: (name,
+    function, its arguments).
+    """
     carry = make_start(settings)(jax.random.key(0))
     if devices > 1:
         step = make_device_step(settings, Pursuit(settings.environment), devices)
@@ -52,14 +59,18 @@ def _training(settings, devices):
     yield "training", training_step.make_training_step(settings), (carry,)
     yield "- fly", phases.fly, (carry,)
     flown = jax.eval_shape(phases.fly, carry)[1]
-    flown = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), flown)  # takes as long as any
+    flown = jax.tree.map(
+        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), flown
+    )  # takes as long as any
     for learn in phases.learn:
         yield f"- {learn.__name__}", learn, (carry, flown)
     yield "- renew", phases.renew, (carry,)
 
 
 def fitting_settings(settings: TrainSettings, num_envs: int, devices: int = 1) -> TrainSettings:
-    """The settings with the nearest number of environments from above that they and so many devices allow."""
+    """The settings with the nearest number of environments from above that they and so many devices
+    allow.
+    """
     for number in range(num_envs, num_envs + 10_000):
         try:
             fitting = dataclasses.replace(settings, num_envs=number)
@@ -67,12 +78,15 @@ def fitting_settings(settings: TrainSettings, num_envs: int, devices: int = 1) -
             return fitting
         except UserError:
             continue
-    raise UserError(f"training_envs {num_envs}: no number of environments from there on fits the settings")
+    raise UserError(
+        f"training_envs {num_envs}: no number of environments from there on fits the settings"
+    )
 
 
 def _physics(part, settings, num_envs, steps):
     """Drones of each world hover among a task's pillars and turn slowly."""
-    game, vehicle = settings.environment, load_vehicle()
+    game = settings.environment
+    vehicle = load_vehicle()
     drones_step = make_drones_step(
         physics=part.removesuffix("_free"),
         dt=game.time_step,
@@ -103,7 +117,9 @@ def _environment(settings, num_envs, steps):
 
     def run(state, action):
         def one(state, _):
-            observation, state, reward, *_ = jax.vmap(environment.step, (None, 0, 0))(key, state, action)
+            observation, state, reward, *_ = jax.vmap(environment.step, (None, 0, 0))(
+                key, state, action
+            )
             # Observation and reward are used, else the compiler would leave them out.
             used = sum(jnp.sum(leaf) for leaf in jax.tree.leaves(observation)) + jnp.sum(reward)
             return state, used
@@ -146,7 +162,8 @@ class Timing:
 
 
 def time_compiled(function: Callable, arguments: tuple, min_seconds: float) -> Timing:
-    """Compile `function` for `arguments`, run it once to warm up, then time three calls or more, for at least `min_seconds`.
+    """Compile `function` for `arguments`, run it once to warm up, then time three calls or more,
+    for at least `min_seconds`.
 
     Each call gets the same arguments and is waited for, so that all calls do the same work.
     """

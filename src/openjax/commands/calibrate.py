@@ -35,7 +35,9 @@ class Arguments:
 
 
 def run(arguments: Arguments, console: Console):
-    """Calibrate, print and write; returns the Calibration. Raises UserError; writes nothing then."""
+    """Calibrate, print and write; returns the Calibration. Raises UserError; writes nothing
+    then.
+    """
     one_thread_for_matrices()
     from openjax.calibration.calibration import calibrate
     from openjax.flights.case import load_case
@@ -43,21 +45,28 @@ def run(arguments: Arguments, console: Console):
 
     out = arguments.case / "vehicle_calibrated.toml" if arguments.out is None else arguments.out
     if out.exists() and not arguments.overwrite:
-        raise UserError(f"{out}: exists already; use --overwrite to replace it or --out for another file")
+        raise UserError(
+            f"{out}: exists already; use --overwrite to replace it or --out for another file"
+        )
     start = time.perf_counter()
     case = load_case(arguments.case)
     check_output(out, "--out")
     for issue in case.quality:
-        console.print(f"[yellow]{'left out' if issue.refused else 'noted'}[/] {issue.flight}: {issue.issue}")
+        console.print(
+            f"[yellow]{'left out' if issue.refused else 'noted'}[/] {issue.flight}: {issue.issue}"
+        )
     with Steps("calibrating", {arguments.case.name: SECONDS}, console) as steps:
         steps.begin(arguments.case.name)
         result = calibrate(case)
     _print(result, console)
     if not result.calibrated():
         raise UserError(
-            f"{arguments.case}: these flights determine none of the vehicle's constants; nothing is written"
+            f"{arguments.case}: these flights determine none of the vehicle's constants; nothing "
+            "is written"
         )
-    calibrated = dataclasses.replace(load_vehicle_file(arguments.case), calibrated=result.calibrated())
+    calibrated = dataclasses.replace(
+        load_vehicle_file(arguments.case), calibrated=result.calibrated()
+    )
     save_vehicle_file(out, calibrated)
     console.print(f"{time.perf_counter() - start:.1f} s; written to [bold]{out}[/]")
     return result
@@ -68,10 +77,18 @@ def _print(result, console: Console) -> None:
     table = numbers_table(title, "quantity", "value", "90 % interval", "of nominal", "")
     for name, quantity in result.quantities.items():
         for i, value in enumerate(quantity.value):
-            label = name.replace("_", " ") + (f" {('xx', 'yy', 'zz')[i]}" if len(quantity.value) > 1 else "")
+            label = name.replace("_", " ") + (
+                f" {('xx', 'yy', 'zz')[i]}" if len(quantity.value) > 1 else ""
+            )
             assumed = name == "inertia" and i == 2
             low, high = quantity.interval90[i]
-            remark = "assumed" if assumed else "" if quantity.determined else "not determined: nominal kept"
+            remark = (
+                "assumed"
+                if assumed
+                else ""
+                if quantity.determined
+                else "not determined: nominal kept"
+            )
             table.add_row(
                 f"{label} [dim]{quantity.unit}[/]",
                 f"{value:.4g}",
@@ -83,7 +100,9 @@ def _print(result, console: Console) -> None:
     for channel, (before, after) in result.explained.items():
         given = f"{before:.1%}" if before > 0 else "none"
         fitted = f"{max(after, 0.0):.1%}"
-        console.print(f"{channel}: the fitted vehicle explains {fitted} of what changed, the given {given}")
+        console.print(
+            f"{channel}: the fitted vehicle explains {fitted} of what changed, the given {given}"
+        )
     console.print("[bold]What these flights can't tell[/]")
     for text in result.cannot_tell:
         console.print(f"• {text}")

@@ -86,19 +86,23 @@ def evaluate(
     """Fly a policy's mean on layouts as `openjax evaluate` does.
 
     Args:
-      policy: a loaded policy, what `openjax.load_policy` takes, or a pure function from the `Observation` of one world
+      policy: a loaded policy, what `openjax.load_policy` takes, or a pure function from the
+      `Observation` of one world
         to actions (N, 4) in -1..1, which flies the nominal game.
-      scenario: a layout's name, a TOML file with an own one, "uniform", or "all" (see `openjax evaluate --help`).
+      scenario: a layout's name, a TOML file with an own one, "uniform", or "all" (see `openjax
+      evaluate --help`).
       episodes: per layout.
       seed: draws the start attitudes.
       vehicle, effects: files to fly with, vehicle.toml and effects.toml.
-      opponent: evader to fly against, a name in `openjax.pursuit.evaders.SCRIPTED` or a file; None: those of the policy's game.
+      opponent: evader to fly against, a name in `openjax.pursuit.evaders.SCRIPTED` or a file; None:
+      those of the policy's game.
       changes: of the game that the policy was trained in, for example speed_limit="none".
 
     Returns:
-      A record, or a list of them for "all": scenario, episodes; capture_rate, crash_rate in 0..1; capture_step, and
-      slowest_capture_step of the slowest hundredth, in control steps; collision_rate, collision_parts (pillar, drone, bounds)
-      and over_speed_rate, of pursuer steps; prediction_error (m).
+      A record, or a list of them for "all": scenario, episodes; capture_rate, crash_rate in 0..1;
+      capture_step, and slowest_capture_step of the slowest hundredth, in control steps;
+      collision_rate, collision_parts (pillar, drone, bounds) and over_speed_rate, of pursuer steps;
+      prediction_error (m).
 
     Raises:
       UserError: an unusable layout, or a game that the policy can't play.
@@ -131,7 +135,9 @@ def evaluate(
 
 @dataclasses.dataclass(frozen=True)
 class OwnController(WithoutNetwork):
-    """A pure function from an `Observation` to actions (N, 4). It is mapped over worlds, so it sees the observation of one."""
+    """A pure function from an `Observation` to actions (N, 4). It is mapped over worlds, so it sees
+    the observation of one.
+    """
 
     function: Callable[[Observation], jax.Array]
 

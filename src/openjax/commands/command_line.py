@@ -1,4 +1,6 @@
-"""Command lines from frozen dataclasses (tyro): help from docstrings, one-line errors, exit status 2."""
+"""Command lines from frozen dataclasses (tyro): help from docstrings, one-line errors, exit status
+2.
+"""
 
 import argparse
 import contextlib
@@ -27,21 +29,30 @@ _OF_THE_DISK = ("No space left on device", "Disk quota exceeded", "Read-only fil
 LONGEST = 500
 """Characters of an error's line."""
 
-KINDS = {"INT": "a whole number", "int()": "a whole number", "FLOAT": "a number", "float": "a number"}
+KINDS = {
+    "INT": "a whole number",
+    "int()": "a whole number",
+    "FLOAT": "a number",
+    "float": "a number",
+}
 """What an option wants, by what tyro says where it gets something else."""
 
 
-def parse(command: type[Command], default: Command, arguments: Sequence[str], program: str) -> Command:
+def parse(
+    command: type[Command], default: Command, arguments: Sequence[str], program: str
+) -> Command:
     """The dataclass `command` filled from command-line arguments.
 
     Args:
-      command: frozen dataclass; nested dataclasses become `--outer.inner value`, underscores or dashes alike.
+      command: frozen dataclass; nested dataclasses become `--outer.inner value`, underscores or
+      dashes alike.
       default: values of what isn't given.
       arguments: command line without the program's name.
       program: the name for the help text.
 
     Raises:
-      UserError: unknown option, unusable value or one outside its interval, in one line. `--help` prints and exits with status 0.
+      UserError: unknown option, unusable value or one outside its interval, in one line. `--help`
+      prints and exits with status 0.
     """
     import tyro
 
@@ -71,7 +82,8 @@ def _showing_intervals():
     """Rules for tyro by which `--help` shows the interval of a setting after what it means."""
     from tyro.constructors import ConstructorRegistry
 
-    registry, inside = ConstructorRegistry(), set()
+    registry = ConstructorRegistry()
+    inside = set()
 
     @registry.struct_rule
     def with_intervals(info):
@@ -91,7 +103,9 @@ def _showing_intervals():
             if field.name not in intervals:
                 return field
             text = field.helptext() if callable(field.helptext) else field.helptext
-            return dataclasses.replace(field, helptext=f"{text or ''} In {intervals[field.name]}.".strip())
+            return dataclasses.replace(
+                field, helptext=f"{text or ''} In {intervals[field.name]}.".strip()
+            )
 
         return dataclasses.replace(spec, fields=tuple(shown(field) for field in spec.fields))
 
@@ -107,7 +121,9 @@ def peek(arguments: Sequence[str], name: str) -> str | None:
 
 
 def one_thread_for_matrices() -> None:
-    """Small matrices: more threads than one only wait for each other. It is read when NumPy is loaded, so call it before."""
+    """Small matrices: more threads than one only wait for each other. It is read when NumPy is
+    loaded, so call it before.
+    """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
@@ -118,7 +134,9 @@ def output_console() -> Console:
 
 
 def run_command(main: Callable[[Sequence[str]], int | None]) -> None:
-    """Run a command's `main(arguments)` and exit: 0, its own status, or 2 with one line for whatever isn't ours to mend."""
+    """Run a command's `main(arguments)` and exit: 0, its own status, or 2 with one line for
+    whatever isn't ours to mend.
+    """
     quiet_libraries()
     for stream in (sys.stdout, sys.stderr):  # a terminal may not know every character
         if hasattr(stream, "reconfigure"):
@@ -145,7 +163,9 @@ def run_command(main: Callable[[Sequence[str]], int | None]) -> None:
 
 
 def one_line(error: BaseException) -> str | None:
-    """What to tell of an error that the user or the machine made, in one line; None: it's a mistake in openjax."""
+    """What to tell of an error that the user or the machine made, in one line; None: it's a mistake
+    in openjax.
+    """
     text = " ".join(str(error).split())
     if isinstance(error, OSError):
         reason = error.strerror or text or type(error).__name__
@@ -153,7 +173,10 @@ def one_line(error: BaseException) -> str | None:
         text = f"{where}{reason[:1].lower()}{reason[1:]}"
     elif isinstance(error, MemoryError):
         text = "not enough memory"
-    elif type(error).__name__ in ("JaxRuntimeError", "XlaRuntimeError") and "RESOURCE_EXHAUSTED" in text:
+    elif (
+        type(error).__name__ in ("JaxRuntimeError", "XlaRuntimeError")
+        and "RESOURCE_EXHAUSTED" in text
+    ):
         text = f"not enough memory on the device; fewer --num_envs need less ({text})"
     elif type(error) is RuntimeError and text.startswith("Unable to initialize backend"):
         text = f"JAX finds no device: {text}"
@@ -166,26 +189,38 @@ def one_line(error: BaseException) -> str | None:
 
 
 def _discard_output() -> None:
-    """Send what may still be in the buffer of standard output nowhere, so that the exit doesn't trip over it."""
+    """Send what may still be in the buffer of standard output nowhere, so that the exit doesn't
+    trip over it.
+    """
     with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def quiet_libraries() -> None:
-    """Keep libraries' notes that no user can act on off the terminal; what matters comes as an exception."""
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # 3: neither that XLA compiles slowly, an error to it
+    """Keep libraries' notes that no user can act on off the terminal; what matters comes as an
+    exception.
+    """
+    os.environ.setdefault(
+        "TF_CPP_MIN_LOG_LEVEL", "3"
+    )  # 3: neither that XLA compiles slowly, an error to it
     for name in ("absl", "jax._src.xla_bridge", "asyncio"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     warnings.filterwarnings("ignore", message="Sharding info not provided when restoring")
 
 
 def option_names(settings, prefix: str = "") -> list[str]:
-    """All option names of a dataclass instance, nested ones with dots; a group of `tyro.conf.arg(name="")` adds no prefix."""
-    names, hints = [], typing.get_type_hints(type(settings), include_extras=True)
+    """All option names of a dataclass instance, nested ones with dots; a group of
+    `tyro.conf.arg(name="")` adds no prefix.
+    """
+    names = []
+    hints = typing.get_type_hints(type(settings), include_extras=True)
     for field in dataclasses.fields(settings):
         value = getattr(settings, field.name)
         if dataclasses.is_dataclass(value):
-            named = [getattr(entry, "name", None) for entry in getattr(hints[field.name], "__metadata__", ())]
+            named = [
+                getattr(entry, "name", None)
+                for entry in getattr(hints[field.name], "__metadata__", ())
+            ]
             names += option_names(value, prefix if "" in named else f"{prefix}{field.name}.")
         else:
             names.append(f"--{prefix}{field.name}")
@@ -200,7 +235,9 @@ def _like_python(argument):
 
 
 def _one_line(box: str) -> str:
-    """The message of tyro's box: what stands in it up to its first rule, below its title where no box can be drawn."""
+    """The message of tyro's box: what stands in it up to its first rule, below its title where no
+    box can be drawn.
+    """
     lines = [line.strip("╰╯│ ") for line in box.splitlines() if not line.startswith("╭")]
     parts = itertools.groupby(lines, key=lambda line: bool(line.strip("─-")))
     parts = [" ".join(part) for says_something, part in parts if says_something]
@@ -217,7 +254,8 @@ def _unknown(argument, default, program):
         return f"unexpected argument {argument!r}; options are written --name value, see {program} --help"
     name = argument.split("=", 1)[0].replace("-", "_").replace("__", "--", 1)
     known = option_names(default)
-    # a setting's own name often comes without its group, or with another: --n_pursuers for --environment.n_pursuers
+    # a setting's own name often comes without its group, or with another: --n_pursuers for
+    # --environment.n_pursuers
     own = re.split(r"\.|--", name)[-1]
     close = [option for option in known if re.split(r"\.|--", option)[-1] == own]
     close = close or difflib.get_close_matches(name, known, n=1, cutoff=0.6)

@@ -26,17 +26,20 @@ _WITHOUT_HELP = f"Effects that the library must do without, of {', '.join(effect
 
 @dataclass(frozen=True)
 class Options:
-    """Diagnose the sim-to-real gap: where the simulator differs from flights, which effect causes it, how far
-    it shrinks.
+    """Diagnose the sim-to-real gap: where the simulator differs from flights, which effect causes
+    it, how far it shrinks.
 
     Writes OUT/<case>/report.html, report.json and effects.toml (which `openjax train --effects`
-    flies with)."""
+    flies with).
+    """
 
     cases: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Folders of flight logs, each with a vehicle.toml."""
     reference: tuple[Path, ...] = ()
-    """Folders of earlier flights of the same vehicle: report what changed since instead (changes.html and
-    changes.json); one folder per day tells how far days differ. Motor commands alone are enough."""
+    """Folders of earlier flights of the same vehicle: report what changed since instead
+    (changes.html and changes.json); one folder per day tells how far days differ. Motor commands
+    alone are enough.
+    """
     out: Path = Path("diagnosis")
     """Where the reports go, one folder per case."""
     predictions: Path | None = None
@@ -54,16 +57,19 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def run(options: Options) -> int:
-    """Diagnose every case; a case that can't be used is named and the rest goes on. Raises UserError for
-    bad options."""
+    """Diagnose every case; a case that can't be used is named and the rest goes on. Raises
+    UserError for bad options.
+    """
     one_thread_for_matrices()
-    console, names = output_console(), _checked_names(options)
+    console = output_console()
+    names = _checked_names(options)
     answer = _changes if options.reference else _diagnosis
     if not options.reference:
         from openjax.gap.model.library import library
 
         library(options.without)  # is wrong now or never
-    predictions, failed = {}, 0
+    predictions = {}
+    failed = 0
     for i, (folder, name) in enumerate(zip(options.cases, names, strict=True)):
         try:
             with Steps("diagnosing", {case: SECONDS for case in names[i:]}, console) as steps:
@@ -77,16 +83,22 @@ def run(options: Options) -> int:
             print(f"error: {_unforeseen(name, error)}", file=sys.stderr)
         else:
             predictions[name] = prediction
-            console.print(Panel(Text("\n".join(lines)), title=f"{name}: {title}", title_align="left"))
+            console.print(
+                Panel(Text("\n".join(lines)), title=f"{name}: {title}", title_align="left")
+            )
     if options.predictions is not None and predictions:
         write_json(options.predictions, predictions)
     return 2 if failed == len(names) else 0
 
 
 def _checked_names(options: Options) -> list[str]:
-    """What the cases are called; all that can be wrong with where they're written to is said before the work."""
+    """What the cases are called; all that can be wrong with where they're written to is said before
+    the work.
+    """
     if not options.cases:
-        raise UserError("no case given: name at least one folder of flight logs with a vehicle.toml")
+        raise UserError(
+            "no case given: name at least one folder of flight logs with a vehicle.toml"
+        )
     names = [c.resolve().name for c in options.cases]
     twice = next((n for n in names if names.count(n) > 1), None)
     if twice is not None:
@@ -94,7 +106,9 @@ def _checked_names(options: Options) -> list[str]:
     check_output_folder(options.out, "--out")
     for name in names:
         if (options.out / name).exists() and not options.overwrite:
-            raise UserError(f"{options.out / name} already exists: choose another --out or give --overwrite")
+            raise UserError(
+                f"{options.out / name} already exists: choose another --out or give --overwrite"
+            )
     check_output(options.predictions, "--predictions")
     return names
 
@@ -102,7 +116,9 @@ def _checked_names(options: Options) -> list[str]:
 def _diagnosis(
     options: Options, folder: Path, name: str, tell: Callable[[str], None]
 ) -> tuple[str, list[str], dict]:
-    """Title, lines and prediction of what causes a case's gap, after its report was written whole."""
+    """Title, lines and prediction of what causes a case's gap, after its report was written
+    whole.
+    """
     from openjax.flights.case import load_case
     from openjax.gap.diagnosis import diagnose_case
     from openjax.gap.report import write_report

@@ -1,8 +1,9 @@
 """Evaluate a policy: `openjax evaluate --policy PATH --scenario NAME|FILE.toml`.
 
-Prints, and with `--json` writes, for each scenario: scenario, episodes, capture_rate, capture_step, slowest_capture_step (of
-the slowest hundredth of the episodes), collision_rate, collision_parts, crash_rate, over_speed_rate, prediction_error.
-From Python: `openjax.evaluate(policy, scenario)`, see `openjax.commands.calls.evaluate`.
+Prints, and with `--json` writes, for each scenario: scenario, episodes, capture_rate, capture_step,
+slowest_capture_step (of the slowest hundredth of the episodes), collision_rate, collision_parts,
+crash_rate, over_speed_rate, prediction_error. From Python: `openjax.evaluate(policy, scenario)`,
+see `openjax.commands.calls.evaluate`.
 """
 
 import dataclasses
@@ -36,21 +37,28 @@ class FlightOptions:
     """What is flown: policies on layouts, against an evader."""
 
     policy: tuple[str, ...] = (DEFAULT_POLICY,)
-    """Runs' directories, policy files (.npz), checkpoints, or names of policies in the package (flight, open ...) or of
-    heuristics: angelani, janosov, apf."""
+    """Runs' directories, policy files (.npz), checkpoints, or names of policies in the package
+    (flight, open ...) or of heuristics: angelani, janosov, apf.
+    """
     scenario: str = "all"
-    """wall, narrow_gap, random, passage, empty, hidden, a TOML file with an own layout, uniform (another task in each episode,
-    as in the validation of a run), or all six; these have three pursuers: a policy of another number flies uniform instead."""
+    """wall, narrow_gap, random, passage, empty, hidden, a TOML file with an own layout, uniform
+    (another task in each episode, as in the validation of a run), or all six; these have three
+    pursuers: a policy of another number flies uniform instead.
+    """
     seed: Seed = 0
     """Draws the start attitudes."""
     opponent: str | None = None
-    """Evader to fly against: field, greedy, wall_runner, slow_hugger, heavy, pillar_hugger, greedy_far, greedy_near, two_step,
-    safe_place, way_points, frozen, or a file that openjax exploit wrote; by default those of the policy's game."""
+    """Evader to fly against: field, greedy, wall_runner, slow_hugger, heavy, pillar_hugger,
+    greedy_far, greedy_near, two_step, safe_place, way_points, frozen, or a file that openjax
+    exploit wrote; by default those of the policy's game.
+    """
     compilation_cache: bool = True
     """Keep compiled programs in the user's cache folder."""
 
     def start(self) -> list["LoadedPolicy"]:
-        """The policies, loaded, after JAX was told where it keeps programs. Raises UserError where there are none."""
+        """The policies, loaded, after JAX was told where it keeps programs. Raises UserError where
+        there are none.
+        """
         if self.compilation_cache:
             cache_programs()
         from openjax.store.policies import load_policy
@@ -64,9 +72,9 @@ class FlightOptions:
 class EvaluateCommand(FlightOptions):
     """Fly a policy's mean on a layout and count captures, collisions and crashes.
 
-    The game is the one that the policy was trained in; any --environment.setting can be changed, for example
-    --environment.speed_limit none or --environment.start_attitude level. Of several policies, for example one per training
-    seed, mean and standard deviation are shown too.
+    The game is the one that the policy was trained in; any --environment.setting can be changed,
+    for example --environment.speed_limit none or --environment.start_attitude level. Of several
+    policies, for example one per training seed, mean and standard deviation are shown too.
     """
 
     episodes: Annotated[int, Interval("[1, 1000000]")] = 100
@@ -74,7 +82,9 @@ class EvaluateCommand(FlightOptions):
     json: Path | None = None
     """File to write the records to: an object for one scenario, a list for all."""
     vehicle: Path | None = None
-    """Vehicle to fly: crazyflie, brushless, or a vehicle.toml; by default the airframe that the policy was trained for."""
+    """Vehicle to fly: crazyflie, brushless, or a vehicle.toml; by default the airframe that the
+    policy was trained for.
+    """
     effects: Path | None = None
     """Physical effects to fly with (effects.toml)."""
     environment: tyro.conf.FlagConversionOff[PursuitSettings] = dataclasses.field(
@@ -84,16 +94,22 @@ class EvaluateCommand(FlightOptions):
 
 def main(arguments: Sequence[str]) -> int:
     """The command; returns its exit status."""
-    command, evaluators = parse(EvaluateCommand, EvaluateCommand(), arguments, PROGRAM), {}
+    command = parse(EvaluateCommand, EvaluateCommand(), arguments, PROGRAM)
+    evaluators = {}
     policies = prepare(command, arguments)
     _show(
-        command, [(own, loaded.source, fly_scenarios(own, loaded, evaluators)[0]) for own, loaded in policies]
+        command,
+        [
+            (own, loaded.source, fly_scenarios(own, loaded, evaluators)[0])
+            for own, loaded in policies
+        ],
     )
     return 0
 
 
 def prepare(command: EvaluateCommand, arguments: Sequence[str]) -> list[tuple]:
-    """Each policy, and the command with that policy's own game as the default; all that can be wrong was looked at.
+    """Each policy, and the command with that policy's own game as the default; all that can be
+    wrong was looked at.
 
     Raises:
       UserError: an unusable file or layout, or a game that a policy can't play.
@@ -109,7 +125,8 @@ def prepare(command: EvaluateCommand, arguments: Sequence[str]) -> list[tuple]:
 
 
 def fly_scenarios(command: EvaluateCommand, loaded, evaluators: dict) -> tuple[list[dict], list]:
-    """A record (see `openjax.commands.evaluator.FIELDS`) and the first episode's `Trajectory` per scenario.
+    """A record (see `openjax.commands.evaluator.FIELDS`) and the first episode's `Trajectory` per
+    scenario.
 
     Args:
       command: what to fly, with the game's settings.
@@ -127,12 +144,15 @@ def fly_scenarios(command: EvaluateCommand, loaded, evaluators: dict) -> tuple[l
     game, loaded, layouts = _game(command, loaded)
     tasks = layout_tasks(game.settings, layouts, command.episodes)
     if not layouts:
-        tasks["uniform"] = uniform_tasks(command.environment, command.episodes, game.settings.max_pillars)
+        tasks["uniform"] = uniform_tasks(
+            command.environment, command.episodes, game.settings.max_pillars
+        )
     kind = (game.settings, loaded.policy, command.opponent)
     compiled = kind in evaluators
     if not compiled:
         evaluators[kind] = Evaluator(game, loaded.policy, min(command.episodes, LARGEST_BATCH))
-    expected, first = dict.fromkeys(tasks, 0.02 * command.episodes), next(iter(tasks))
+    expected = dict.fromkeys(tasks, 0.02 * command.episodes)
+    first = next(iter(tasks))
     if not compiled:
         expected[first] += COMPILING
     with Steps(f"flying {loaded.source}", expected, output_console()) as steps:
@@ -153,16 +173,22 @@ def _game(command, loaded):
     settings = command.environment
     if "learned" in settings.evaders and command.opponent is None:
         raise UserError(
-            "--environment.evaders learned: a name isn't enough; --opponent takes a file of openjax exploit"
+            "--environment.evaders learned: a name isn't enough; --opponent takes a file of "
+            "openjax exploit"
         )
-    wanted, trained = settings.num_pursuers, loaded.settings.environment.num_pursuers
+    wanted = settings.num_pursuers
+    trained = loaded.settings.environment.num_pursuers
     if command.scenario == "all":
         layouts = [layout for layout in SCENARIOS.values() if len(layout.pursuers) == trained]
     else:
-        layouts = [] if command.scenario == "uniform" else [find_scenario(command.scenario, settings)]
+        layouts = (
+            [] if command.scenario == "uniform" else [find_scenario(command.scenario, settings)]
+        )
     there = len(layouts[0].pursuers) if layouts else wanted
     if wanted not in (trained, there):
-        raise UserError(f"--environment.num_pursuers {wanted}: layout {layouts[0].name} has {there} pursuers")
+        raise UserError(
+            f"--environment.num_pursuers {wanted}: layout {layouts[0].name} has {there} pursuers"
+        )
     slots = max([layout_slots(settings), *(len(layout.pillars) for layout in layouts)])
     game = dataclasses.replace(settings, max_pillars=slots, num_pursuers=there)
     environment = make_environment(game, command.vehicle, command.effects, command.opponent)
@@ -184,4 +210,6 @@ def _show(command, results):
     if command.json is not None:
         plain = [rows if command.scenario == "all" else rows[0] for *_, rows in results]
         sources = [source for _, source, _ in results]
-        write_json(command.json, plain[0] if len(plain) == 1 else dict(zip(sources, plain, strict=True)))
+        write_json(
+            command.json, plain[0] if len(plain) == 1 else dict(zip(sources, plain, strict=True))
+        )

@@ -1,4 +1,6 @@
-"""Evaluation of policies on layouts and on validation tasks, as tables, records and trajectories."""
+"""Evaluation of policies on layouts and on validation tasks, as tables, records and
+trajectories.
+"""
 
 import dataclasses
 import math
@@ -56,8 +58,9 @@ class Evaluator:
     ) -> list["Flown"]:
         """One episode per task; `kinds` are tasks by name, each with a leading axis of its own.
 
-        Kinds that fill whole batches are flown one by one (`tell` hears which), so that a kind's result is the same alone
-        and among others; else all are packed into as few batches as they need.
+        Kinds that fill whole batches are flown one by one (`tell` hears which), so that a kind's
+        result is the same alone and among others; else all are packed into as few batches as they
+        need.
         """
         numbers = [tasks.evader_position.shape[0] for tasks in kinds.values()]
         if not any(number % self.batch for number in numbers):
@@ -77,18 +80,23 @@ class Evaluator:
     def _fly(self, parameters, tasks, key):
         """Evaluation (B,) of the tasks on the host, and the device trajectories of each batch."""
         number = tasks.evader_position.shape[0]
-        evaluations, records = [], []
+        evaluations = []
+        records = []
         for i, start in enumerate(range(0, number, self.batch)):
             index = np.minimum(np.arange(start, start + self.batch), number - 1)
             part = jax.tree.map(lambda leaf, index=index: leaf[index], tasks)
             evaluation, record = self._evaluate(parameters, part, jax.random.fold_in(key, i))
             used = min(self.batch, number - start)
-            evaluations.append(jax.tree.map(lambda leaf, used=used: np.asarray(leaf)[:used], evaluation))
+            evaluations.append(
+                jax.tree.map(lambda leaf, used=used: np.asarray(leaf)[:used], evaluation)
+            )
             records.append(record)
         return jax.tree.map(lambda *parts: np.concatenate(parts), *evaluations), records
 
     def compile_ahead(self, parameters: PolicyParameters, task: Task) -> Callable[[], None]:
-        """Start to compile for parameters and tasks of these shapes, of which `task` has a leading axis of any length."""
+        """Start to compile for parameters and tasks of these shapes, of which `task` has a leading
+        axis of any length.
+        """
 
         def one_batch(leaf):
             return jax.ShapeDtypeStruct((self.batch, *leaf.shape[1:]), leaf.dtype)
@@ -152,7 +160,9 @@ def episode_figures(statistics: EpisodeStatistics) -> dict[str, np.ndarray]:
 
 
 def layout_slots(settings: PursuitSettings) -> int:
-    """Pillar slots that hold every layout and uniform task, so that one compiled evaluation serves all."""
+    """Pillar slots that hold every layout and uniform task, so that one compiled evaluation serves
+    all.
+    """
     return max(settings.max_pillars, *(len(scenario.pillars) for scenario in SCENARIOS.values()))
 
 
@@ -162,23 +172,34 @@ def repeat_task(task: Task, number: int) -> Task:
 
 
 def stacked(kinds: Mapping[str, Task]) -> tuple[Task, Callable[[Any], dict[str, Any]]]:
-    """Tasks of several kinds one after the other, and what parts a tree of results (B, ...) by their names again."""
+    """Tasks of several kinds one after the other, and what parts a tree of results (B, ...) by
+    their names again.
+    """
     ends = np.cumsum([tasks.evader_position.shape[0] for tasks in kinds.values()]).tolist()
     places = dict(zip(kinds, map(slice, [0, *ends], ends), strict=False))
 
     def part(results):
-        return {name: jax.tree.map(lambda leaf, own=own: leaf[own], results) for name, own in places.items()}
+        return {
+            name: jax.tree.map(lambda leaf, own=own: leaf[own], results)
+            for name, own in places.items()
+        }
 
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *kinds.values()), part
 
 
-def layout_tasks(settings: PursuitSettings, scenarios: Sequence[Scenario], episodes: int) -> dict[str, Task]:
+def layout_tasks(
+    settings: PursuitSettings, scenarios: Sequence[Scenario], episodes: int
+) -> dict[str, Task]:
     """So many times each layout, by name."""
-    return {layout.name: repeat_task(scenario_task(settings, layout), episodes) for layout in scenarios}
+    return {
+        layout.name: repeat_task(scenario_task(settings, layout), episodes) for layout in scenarios
+    }
 
 
 def record_of(scenario: str, episodes: int, summary: dict, extra: tuple[str, ...] = ()) -> dict:
-    """A summary as a record with exactly `FIELDS` (and `extra` ones); what isn't a number is None."""
+    """A summary as a record with exactly `FIELDS` (and `extra` ones); what isn't a number is
+    None.
+    """
     values = {"scenario": scenario, "episodes": episodes, **summary}
 
     def clean(value):
@@ -191,7 +212,13 @@ def record_of(scenario: str, episodes: int, summary: dict, extra: tuple[str, ...
 
 def results_table(title: str, rows: Sequence[dict], game: str) -> Table:
     """Records as a table, below it a sentence on the game."""
-    heads = ("epi-\nsodes", "capture\nrate", "capture\nstep", "colli-\nsions", "pillar/drone/\nbounds")
+    heads = (
+        "epi-\nsodes",
+        "capture\nrate",
+        "capture\nstep",
+        "colli-\nsions",
+        "pillar/drone/\nbounds",
+    )
     heads += ("crash\nrate", "over-\nspeed", "predicted\noff by, m")
     table = numbers_table(title, "scenario", *heads, caption=game)
     for row in rows:
@@ -202,7 +229,9 @@ def results_table(title: str, rows: Sequence[dict], game: str) -> Table:
             f"{row['capture_rate']:.3f}",
             f"{row['capture_step']:.0f}",
             f"{row['collision_rate']:.4f}",
-            "/".join(f"{parts[name]:.3f}".removeprefix("0") for name in ("pillar", "drone", "bounds")),
+            "/".join(
+                f"{parts[name]:.3f}".removeprefix("0") for name in ("pillar", "drone", "bounds")
+            ),
             f"{row['crash_rate']:.3f}",
             f"{row['over_speed_rate']:.4f}",
             "–" if row["prediction_error"] is None else f"{row['prediction_error']:.4f}",

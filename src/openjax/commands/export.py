@@ -1,8 +1,10 @@
-"""`openjax export --policy open --format onnx --out DIR`: a policy for programs that don't know openjax.
+"""`openjax export --policy open --format onnx --out DIR`: a policy for programs that don't know
+openjax.
 
-All formats hold the mean policy of a whole team, predictor included: from the observation's arrays to actions (N, 4) in
--1..1: collective thrust, roll, pitch and yaw rate; with `--own`, that of one pursuer, as a vehicle computes it on board.
-The result is compared with the policy itself before it is written.
+All formats hold the mean policy of a whole team, predictor included: from the observation's arrays
+to actions (N, 4) in -1..1: collective thrust, roll, pitch and yaw rate; with `--own`, that of one
+pursuer, as a vehicle computes it on board. The result is compared with the policy itself before it
+is written.
 """
 
 import dataclasses
@@ -36,7 +38,9 @@ class Arguments:
     policy: str = DEFAULT_POLICY
     """A run's directory, a policy file (.npz), or the name of a policy in the package."""
     format: Literal["onnx", "jax", "c"] = "onnx"
-    """onnx: for onnxruntime and its kin (pip install onnx onnxruntime); jax: for jax.export.deserialize; c: C99."""
+    """onnx: for onnxruntime and its kin (pip install onnx onnxruntime); jax: for
+    jax.export.deserialize; c: C99.
+    """
     own: bool = False
     """One pursuer's action instead of the whole team's."""
     out: Path = Path("exported")
@@ -48,7 +52,9 @@ class Arguments:
 
 
 def observations(policy, number: int, seed: int) -> dict:
-    """{field: array (number or more, ...)} of observations from games that the policy plays, NumPy."""
+    """{field: array (number or more, ...)} of observations from games that the policy plays,
+    NumPy.
+    """
     import jax
     import jax.numpy as jnp
     import numpy as np
@@ -57,7 +63,8 @@ def observations(policy, number: int, seed: int) -> dict:
 
     settings = dataclasses.replace(policy.settings.environment, physics="rigid", vehicles=())
     environment = Pursuit(settings)
-    worlds, steps = 64, -(-number // 64)
+    worlds = 64
+    steps = -(-number // 64)
     reset = jax.jit(jax.vmap(environment.reset))
     observation, state = reset(jax.random.split(jax.random.key(seed), worlds))
 
@@ -83,7 +90,9 @@ def observations(policy, number: int, seed: int) -> dict:
 
 
 def export(arguments: Arguments, tell: Callable[[str], None] = lambda step: None) -> dict:
-    """Write the files; returns what FORMAT.json says. `tell` hears the steps. Raises UserError if it can't be, or differs."""
+    """Write the files; returns what FORMAT.json says. `tell` hears the steps. Raises UserError if
+    it can't be, or differs.
+    """
     import jax
     import numpy as np
 
@@ -98,10 +107,14 @@ def export(arguments: Arguments, tell: Callable[[str], None] = lambda step: None
     if arguments.own:
         expected = expected[:, :1]
         seen |= {name: seen[name][:, :1] for name in EACH if name in seen}
-    inputs = {name: jax.ShapeDtypeStruct(array.shape[1:], array.dtype) for name, array in seen.items()}
+    inputs = {
+        name: jax.ShapeDtypeStruct(array.shape[1:], array.dtype) for name, array in seen.items()
+    }
     tell(list(STEPS)[1])
     write = {"onnx": _onnx, "jax": _jax, "c": _c}[arguments.format]
-    files, found, extra = write(lambda **fields: policy(Observation(**fields)), inputs, seen, policy.source)
+    files, found, extra = write(
+        lambda **fields: policy(Observation(**fields)), inputs, seen, policy.source
+    )
     report = {
         "policy": policy.source,
         "format": arguments.format,
@@ -120,17 +133,23 @@ def export(arguments: Arguments, tell: Callable[[str], None] = lambda step: None
 
 
 def _difference(found, expected, source):
-    """The largest of an action; None where nothing was compared. Raises UserError for one too large."""
+    """The largest of an action; None where nothing was compared. Raises UserError for one too
+    large.
+    """
     if found is None:
         return None
     difference = float(abs(found - expected).max())
     if not difference <= TOLERANCE:
-        raise UserError(f"the exported policy differs by {difference:.2g} from {source}: nothing was written")
+        raise UserError(
+            f"the exported policy differs by {difference:.2g} from {source}: nothing was written"
+        )
     return difference
 
 
 def _described(inputs) -> dict:
-    return {name: {"shape": list(kind.shape), "type": str(kind.dtype)} for name, kind in inputs.items()}
+    return {
+        name: {"shape": list(kind.shape), "type": str(kind.dtype)} for name, kind in inputs.items()
+    }
 
 
 def _onnx(act, inputs, seen, source):
@@ -168,7 +187,9 @@ def _jax(act, inputs, seen, source):
     data = bytes(exported.serialize())
     again = jax.export.deserialize(bytearray(data))
     call = jax.jit(again.call)
-    found = [np.asarray(call({k: v[i] for k, v in seen.items()})) for i in range(len(seen["frames"]))]
+    found = [
+        np.asarray(call({k: v[i] for k, v in seen.items()})) for i in range(len(seen["frames"]))
+    ]
     extra = {"inputs": _described(inputs), "platforms": list(exported.platforms)}
     return {NAMES["jax"]: data}, np.stack(found), extra
 

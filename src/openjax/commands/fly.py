@@ -1,7 +1,7 @@
 """`openjax fly --policy PATH --uri URI [URI ...]`: fly a policy on Crazyflies, real or virtual.
 
-A hundred times a second from poses to body rates and thrust, through the real `cflib`. The flight is written as a case
-that `openjax diagnose` reads.
+A hundred times a second from poses to body rates and thrust, through the real `cflib`. The flight
+is written as a case that `openjax diagnose` reads.
 """
 
 from __future__ import annotations
@@ -27,36 +27,52 @@ PROGRAM = "openjax fly"
 class Arguments:
     """Fly a policy on as many Crazyflies as it has pursuers, and log it for the diagnosis.
 
-    While it flies: space or q stops all motors; l, Ctrl-C, Ctrl-Z or a closed terminal land; h waits.
+    While it flies: space or q stops all motors; l, Ctrl-C, Ctrl-Z or a closed terminal land; h
+    waits.
     """
 
     policy: str = DEFAULT_POLICY
     """A run's directory, a policy file (.npz), or the name of a policy in the package."""
-    uri: tuple[str, ...] = ("udp://127.0.0.1:19850", "udp://127.0.0.1:19851", "udp://127.0.0.1:19852")
+    uri: tuple[str, ...] = (
+        "udp://127.0.0.1:19850",
+        "udp://127.0.0.1:19851",
+        "udp://127.0.0.1:19852",
+    )
     """One vehicle per pursuer: udp://HOST:PORT (virtual), radio://0/80/2M/E7E7E7E7E7 (real)."""
     evader_uri: str | None = None
-    """A further vehicle that flies the evader by the game's rule; without it the evader is a point in the computer."""
+    """A further vehicle that flies the evader by the game's rule; without it the evader is a point
+    in the computer.
+    """
     scenario: str = "wall"
     """Layout: a name or a TOML file. Pillars exist in the computer only, unless you put them up."""
     episodes: Annotated[int, Interval("[1, 100000]")] = 1
-    """Games, one after the other. Between them all fly straight back: with real pillars leave it at 1."""
+    """Games, one after the other. Between them all fly straight back: with real pillars leave it at
+    1.
+    """
     episode_seconds: Annotated[float | None, Interval("(0, 1e9]")] = None
     """End each game after this time; otherwise it lasts as long as in training."""
     out: Path | None = None
     """Folder for the logs, a case for openjax.diagnose; must not exist or be empty."""
     vehicle: Path | None = None
-    """What flies (crazyflie, brushless, or a vehicle.toml); by default the airframe that the policy was trained for."""
+    """What flies (crazyflie, brushless, or a vehicle.toml); by default the airframe that the policy
+    was trained for.
+    """
     body_logs: Annotated[int | None, Interval("[0, 5]")] = None
-    """Log blocks of motors and accelerometer per vehicle, 0 to 5; default 5 over UDP, 1 over radio."""
+    """Log blocks of motors and accelerometer per vehicle, 0 to 5; default 5 over UDP, 1 over
+    radio.
+    """
     motion_capture: str | None = None
-    """MODULE:FUNCTION that feeds poses; default: the vehicles' own estimates. See openjax.flying.motion_capture."""
+    """MODULE:FUNCTION that feeds poses; default: the vehicles' own estimates. See
+    openjax.flying.motion_capture.
+    """
     guard: bool = True
     """A further process lands the vehicles if the others stop. Don't fly real ones without."""
     guard_after: Annotated[float, Interval("[0.01, 60]")] = 0.1
     """Silence of the loop, or of the links, after which the next process lands all (s)."""
     watchdog: bool = True
-    """Let the firmware stop the motors 1 s after the last set-point (otherwise 2 s). It locks the vehicle, also after the
-    flight; the next one restarts it."""
+    """Let the firmware stop the motors 1 s after the last set-point (otherwise 2 s). It locks the
+    vehicle, also after the flight; the next one restarts it.
+    """
     safety: SafetySettings = field(default_factory=SafetySettings)
 
 
@@ -86,7 +102,9 @@ def fly(arguments: Arguments, prepared: Prepared | None = None):
     with Session(flown.session, flown.state) as session:
         session.check()
         plan = Plan(arguments.episodes, arguments.episode_seconds or math.inf)
-        flight = Flight(session.links, flown.game, flown.state, plan, session.requests, session.watched)
+        flight = Flight(
+            session.links, flown.game, flown.state, plan, session.requests, session.watched
+        )
         console.print("flying: space or q stops all motors; l, Ctrl-C or Ctrl-Z land; h waits")
         samples, complaint = session.fly(flight)
     if arguments.out is not None and samples:  # before a word is said: the terminal may be gone
@@ -96,7 +114,9 @@ def fly(arguments: Arguments, prepared: Prepared | None = None):
             complaint = "; ".join(filter(None, (complaint, f"no log: {one_line(error)}")))
     _show(console, flight)
     if session.scheduler != "real time":
-        console.print("no real-time scheduler: on a busy machine deadlines are missed (docs/flying.md)")
+        console.print(
+            "no real-time scheduler: on a busy machine deadlines are missed (docs/flying.md)"
+        )
     if complaint:
         raise UserError(complaint)
     if arguments.out is not None and samples:
@@ -146,7 +166,9 @@ def prepare(arguments: Arguments) -> Prepared:
     state = flight_state(game, len(uris), arguments.safety)
     remarks = ()
     if vehicle.airframe != settings.airframe:
-        remarks = (f"the policy was trained for {settings.airframe}; what flies is {vehicle.airframe}",)
+        remarks = (
+            f"the policy was trained for {settings.airframe}; what flies is {vehicle.airframe}",
+        )
     about = {"policy": policy.source, "scenario": scenario.name, "uris": uris}
     return Prepared(game, state, session, vehicle, about, remarks)
 
@@ -159,7 +181,11 @@ def _write(out, flown, flight, samples, scheduler):
     described = dataclasses.replace(
         flown.vehicle, path=None, log={"source": f"openjax.fly, policy {policy}", "floor_z": 0.0}
     )
-    about = {**flown.about, "scheduler": scheduler, "reasons": [d.reason for d in flight.state.drones]}
+    about = {
+        **flown.about,
+        "scheduler": scheduler,
+        "reasons": [d.reason for d in flight.state.drones],
+    }
     with replacing(out) as folder:
         folder.mkdir()
         write_case(folder, samples, flight.record, described, about)
@@ -172,7 +198,9 @@ def _check_numbers(arguments, starts, pursuers):
             f"--uri names {names} vehicles, the policy flies {pursuers}: name all after one --uri"
         )
     if starts != pursuers:
-        raise UserError(f"--scenario {arguments.scenario} has {starts} starts, the policy flies {pursuers}")
+        raise UserError(
+            f"--scenario {arguments.scenario} has {starts} starts, the policy flies {pursuers}"
+        )
 
 
 def _check(arguments):
@@ -193,12 +221,16 @@ def _show(console, flight):
         return
     age = timing["command_age_ms"]
     console.print(
-        f"{timing['seconds']:.1f} s, {timing['ticks']} ticks: command age {age['p50']:.2f} ms median, "
-        f"{age['p99']:.2f} ms p99; {timing['missed_deadlines']} missed deadlines ({timing['missed_share']:.2%})"
+        f"{timing['seconds']:.1f} s, {timing['ticks']} ticks: command age {age['p50']:.2f} ms "
+        "median, "
+        f"{age['p99']:.2f} ms p99; {timing['missed_deadlines']} missed deadlines "
+        f"({timing['missed_share']:.2%})"
     )
     for number, game in enumerate(record.episodes):
         caught = f"caught at step {game['capture_step']}" if game["capture_step"] else "not caught"
-        console.print(f"game {number}: {caught}, {game['steps']} steps, {game['breaches']} with a breach")
+        console.print(
+            f"game {number}: {caught}, {game['steps']} steps, {game['breaches']} with a breach"
+        )
     for i, drone in enumerate(flight.state.drones):
         if drone.reason not in ("", "asked to land"):
             console.print(f"vehicle {i}: {drone.mode.value}, {drone.reason}")

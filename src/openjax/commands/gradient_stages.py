@@ -1,4 +1,6 @@
-"""The stages of a run by the gradient through the simulation, before MAPPO and after it, compiled while other things are."""
+"""The stages of a run by the gradient through the simulation, before MAPPO and after it, compiled
+while other things are.
+"""
 
 import dataclasses
 import time
@@ -9,7 +11,12 @@ import jax
 import jax.numpy as jnp
 
 from openjax.background import in_background
-from openjax.cluster.devices import compiler_options, everywhere, make_device_first_flights, own_copy
+from openjax.cluster.devices import (
+    compiler_options,
+    everywhere,
+    make_device_first_flights,
+    own_copy,
+)
 from openjax.learning import build
 from openjax.learning.analytic_gradient import AnalyticGradient, compile_analytic, free_flight
 from openjax.learning.first_flights import FirstFlights, first_game
@@ -25,14 +32,17 @@ TOGETHER = 100
 
 def compile_last_stage(settings: TrainSettings, environment: Pursuit, policy: Any) -> Callable:
     """The stage after MAPPO, compiled for parameters of these shapes; see `compile_analytic`."""
-    stage = AnalyticGradient(settings.analytic, free_flight(environment), _exact(settings, environment))
+    stage = AnalyticGradient(
+        settings.analytic, free_flight(environment), _exact(settings, environment)
+    )
     return compile_analytic(stage, abstract_like(policy))
 
 
 def first_flights(settings: TrainSettings, environment: Pursuit) -> FirstFlights:
     """The stage before MAPPO of a run with these settings."""
     how = settings.first_flights
-    game, exact = first_game(environment, how), _exact(settings, environment)
+    game = first_game(environment, how)
+    exact = _exact(settings, environment)
     return FirstFlights(how, game, exact, settings.generator)
 
 
@@ -47,14 +57,15 @@ def compile_first_flights(
 
     Args:
       flights: the stage.
-      policy: the parameters' shapes and dtypes; on several devices of one process, these share the worlds.
+      policy: the parameters' shapes and dtypes; on several devices of one process, these share the
+      worlds.
       say: hears how it goes.
       over: is asked every few seconds whether to stop.
       keep: `recalled` for the run, where traces are kept.
 
     Returns:
-      a function that waits for the compiler, and the stage: (fresh parameters, key) -> parameters; None where it was over
-      before it began.
+      a function that waits for the compiler, and the stage: (fresh parameters, key) -> parameters;
+      None where it was over before it began.
     """
     how = flights.how
     devices = _number_of_devices(policy, how.worlds)
@@ -62,7 +73,8 @@ def compile_first_flights(
     some_ready, begin_ready = _compiling(flights, policy, devices, at, keep)
 
     def learn(parameters, key):
-        some, begin = some_ready(), begin_ready()
+        some = some_ready()
+        begin = begin_ready()
         if over():
             return None
         started = time.monotonic()
@@ -76,8 +88,10 @@ def compile_first_flights(
             shown = {name: float(value) for name, value in parts.items()}  # waits for them
             left = (time.monotonic() - started) * (how.updates / done - 1.0)
             say(
-                f"{done} of {how.updates} updates, {duration(left)} left | evader out of reach {shown['free']:.0%} of the time, "
-                f"the nearest pursuer {shown['distance']:.2f} m too far, close to a crash {shown['crashes']:.1%}"
+                f"{done} of {how.updates} updates, {duration(left)} left | evader out of reach "
+                f"{shown['free']:.0%} of the time, "
+                f"the nearest pursuer {shown['distance']:.2f} m too far, close to a crash "
+                f"{shown['crashes']:.1%}"
             )
         return parameters.replace(actor=carry.parameters.actor)
 
@@ -85,8 +99,12 @@ def compile_first_flights(
 
 
 def _compiling(flights, policy, devices, at, keep):
-    """Some updates and the start of the stage, as the background compiles them for arguments that lie `at` a sharding."""
-    begin, some, shardings = make_device_first_flights(flights, min(TOGETHER, flights.how.updates), devices)
+    """Some updates and the start of the stage, as the background compiles them for arguments that
+    lie `at` a sharding.
+    """
+    begin, some, shardings = make_device_first_flights(
+        flights, min(TOGETHER, flights.how.updates), devices
+    )
     policy, key, done = abstract_like(
         (policy, *jax.eval_shape(lambda: (jax.random.key(0), jnp.int32(0)))), at
     )
@@ -95,18 +113,27 @@ def _compiling(flights, policy, devices, at, keep):
         some = keep("first_flights", jax.jit(some), lambda: (carry, key, done), carry=carry)
     options = compiler_options(devices, brief=True)
     some = jax.jit(some, donate_argnums=0, compiler_options=options)
-    lowered = some.lower(carry, key, done), jax.jit(begin, compiler_options=options).lower(policy, key)
+    lowered = (
+        some.lower(carry, key, done),
+        jax.jit(begin, compiler_options=options).lower(policy, key),
+    )
     return [in_background(program.compile) for program in lowered]
 
 
 def _number_of_devices(policy, worlds):
-    """How many devices share worlds whose policy lies on some of this process; 1 where they can't."""
+    """How many devices share worlds whose policy lies on some of this process; 1 where they
+    can't.
+    """
     places = {getattr(leaf, "sharding", None) for leaf in jax.tree.leaves(policy)} - {None}
     number = max((len(at.device_set) for at in places if at.is_fully_addressable), default=1)
     return number if worlds % number == 0 else 1
 
 
 def _exact(settings: TrainSettings, environment: Pursuit) -> Policy:
-    """The run's policy in float32: tens of steps of the simulation follow each action, too far for rough arithmetic."""
+    """The run's policy in float32: tens of steps of the simulation follow each action, too far for
+    rough arithmetic.
+    """
     policy = build(settings, environment).policy
-    return dataclasses.replace(policy, network=dataclasses.replace(policy.network, compute_type="float32"))
+    return dataclasses.replace(
+        policy, network=dataclasses.replace(policy.network, compute_type="float32")
+    )

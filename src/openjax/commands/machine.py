@@ -22,7 +22,9 @@ def describe_machine() -> dict:
         "platform": devices[0].platform,
         "device_count": len(devices),
         "processes": jax.process_count(),
-        "cpu_cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "cpu_cores": len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count(),
         "python": platform.python_version(),
         "versions": {"openjax": openjax.__version__} | {name: version(name) for name in _PACKAGES},
         **commit(),
@@ -31,11 +33,14 @@ def describe_machine() -> dict:
 
 
 def commit() -> dict:
-    """`commit` (hash or None) of the running source tree; `commit_clean` is False with local changes."""
+    """`commit` (hash or None) of the running source tree; `commit_clean` is False with local
+    changes.
+    """
     this_file = Path(__file__).resolve()
     source = this_file.parents[1]
     revision = _git(source, "rev-parse", "HEAD")
-    # Installed from a wheel, the files may lie inside another repository, whose commit says nothing.
+    # Installed from a wheel, the files may lie inside another repository, whose commit says
+    # nothing.
     if revision is None or _git(source, "ls-files", "--error-unmatch", str(this_file)) is None:
         return {"commit": None, "commit_clean": None}
     changes = _git(source, "status", "--porcelain", "--", str(source))
@@ -45,7 +50,11 @@ def commit() -> dict:
 def _git(directory, *arguments):
     try:
         found = subprocess.run(
-            ["git", "-C", str(directory), *arguments], capture_output=True, text=True, timeout=10, check=True
+            ["git", "-C", str(directory), *arguments],
+            capture_output=True,
+            text=True,
+            timeout=10,
+            check=True,
         )
     except (OSError, subprocess.SubprocessError):
         return None

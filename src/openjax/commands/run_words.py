@@ -1,4 +1,6 @@
-"""What a run says in words: what is trained, and at its end what a crash is, what isn't the paper's, and what to type next."""
+"""What a run says in words: what is trained, and at its end what a crash is, what isn't the
+paper's, and what to type next.
+"""
 
 from pathlib import Path
 
@@ -14,7 +16,9 @@ NAMED = 3
 
 
 def opening_words(settings: TrainSettings) -> str:
-    """Which preset this is, or comes nearest to, and what that is: nobody should take another game for the paper's."""
+    """Which preset this is, or comes nearest to, and what that is: nobody should take another game
+    for the paper's.
+    """
     changed = {
         name: [leaf for leaf in different_settings(settings, make()) if leaf != "seed"]
         for name, make in PRESETS.items()
@@ -38,7 +42,8 @@ def different_settings(own: TrainSettings, other: TrainSettings) -> list[str]:
 def layouts_like(game: PursuitSettings) -> list[Scenario]:
     """The test layouts that a policy of this game can be judged by.
 
-    They have its pursuers, and at most a fifth more pillars than it was trained with, as in the paper (6 for 5).
+    They have its pursuers, and at most a fifth more pillars than it was trained with, as in the
+    paper (6 for 5).
     """
     most = 1.2 * game.max_pillars
     return [
@@ -53,7 +58,8 @@ def closing_words(settings: TrainSettings, run: Path, on_cpu: bool) -> list[str]
     game = settings.environment
     seconds = game.episode_length * game.time_step
     lines = [
-        "A crash: any drone touches the floor, a pillar or another drone, or tips over, at any time of "
+        "A crash: any drone touches the floor, a pillar or another drone, or tips over, at any "
+        "time of "
         f"the {seconds:.0f} s, after the capture, too."
     ]
     if differs := unlike_the_papers(game):
@@ -65,7 +71,8 @@ def closing_words(settings: TrainSettings, run: Path, on_cpu: bool) -> list[str]
     if on_cpu:
         steps.append("openjax train --preset paper (the real game, two minutes on a GPU)")
     steps.append(
-        "openjax sample_flights flights, then openjax diagnose flights (from flight logs to a cause)"
+        "openjax sample_flights flights, then openjax diagnose flights (from flight logs to a "
+        "cause)"
     )
     return [*lines, "\n  ".join(["Next:", *steps])]
 
@@ -81,10 +88,14 @@ def unlike_the_papers(game: PursuitSettings) -> str:
     if game.speed_limit != paper.speed_limit:
         words.append("no clamp of the speed")
     if game.evader_speed < paper.evader_speed:
-        words.append(f"the evader flies {game.evader_speed:g} m/s instead of {paper.evader_speed:g}")
+        words.append(
+            f"the evader flies {game.evader_speed:g} m/s instead of {paper.evader_speed:g}"
+        )
     if game.num_pursuers != paper.num_pursuers:
         words.append(f"{game.num_pursuers} pursuers instead of {paper.num_pursuers}")
-    pillars, theirs = (" to ".join(map(str, sorted({g.min_pillars, g.max_pillars}))) for g in (game, paper))
+    pillars, theirs = (
+        " to ".join(map(str, sorted({g.min_pillars, g.max_pillars}))) for g in (game, paper)
+    )
     if pillars != theirs:
         words.append(f"{pillars} pillars instead of {theirs}")
     if game.observed_pillars != paper.observed_pillars:
@@ -92,5 +103,7 @@ def unlike_the_papers(game: PursuitSettings) -> str:
     if game.start_attitude != paper.start_attitude:
         words.append("level starts instead of tilted ones")
     if game.time_step > paper.time_step:
-        words.append(f"{1 / game.time_step:.0f} commands a second instead of {1 / paper.time_step:.0f}")
+        words.append(
+            f"{1 / game.time_step:.0f} commands a second instead of {1 / paper.time_step:.0f}"
+        )
     return f"Unlike the paper's game: {', '.join(words)}." if words else ""

@@ -18,9 +18,7 @@ from openjax.vehicle.effect_names import effect_names
 PROGRAM = "openjax sample_flights"
 DECIMALS = {"t": 2, "vbat": 3} | dict.fromkeys("x y z qw qx qy qz m1 m2 m3 m4".split(), 5)
 _REST = 4
-_EFFECT_HELP = (
-    f"What the vehicle suffers from that the simulator doesn't know: none, {', '.join(effect_names())}."
-)
+_EFFECT_HELP = f"What the vehicle suffers from that the simulator doesn't know: none, {', '.join(effect_names())}."
 
 
 @dataclass(frozen=True)
@@ -37,8 +35,9 @@ class Arguments:
 
 
 def make_case(arguments: Arguments) -> list[Path]:
-    """Write the case; returns its files. Raises UserError for an unknown effect or a folder that isn't
-    empty."""
+    """Write the case; returns its files. Raises UserError for an unknown effect or a folder that
+    isn't empty.
+    """
     from openjax.flights.reading import LOG_COLUMNS, write_csv
     from openjax.flights.samples import fly, log_of, references
     from openjax.vehicle.effects import EFFECTS
@@ -48,17 +47,27 @@ def make_case(arguments: Arguments) -> list[Path]:
         hint = suggestion(arguments.effect, ("none", *EFFECTS))
         raise UserError(f"--effect {arguments.effect}: no such effect; {hint}")
     check_new_folder(arguments.out, "OUT")
-    effects = {} if arguments.effect == "none" else {arguments.effect: EFFECTS[arguments.effect].card.sample}
+    effects = (
+        {}
+        if arguments.effect == "none"
+        else {arguments.effect: EFFECTS[arguments.effect].card.sample}
+    )
     source = f"simulated: openjax.sample_flights, seed {arguments.seed}, effect: {arguments.effect}"
     log = {"source": source, "motor_rows": "mean", "floor_z": 0.0}
     described = dataclasses.replace(load_vehicle_file(), mass_weighed=True, log=log)
     decimals = {c: DECIMALS.get(c, _REST) for c in LOG_COLUMNS}
-    flights = references(arguments.seed, arguments.duration, neighbour=arguments.effect == "downwash")
+    flights = references(
+        arguments.seed, arguments.duration, neighbour=arguments.effect == "downwash"
+    )
     with replacing(arguments.out) as folder:
         folder.mkdir()
         for number, (name, reference) in enumerate(flights.items()):
             columns = fly(
-                described.vehicle, described.vehicle, reference, 1000 * arguments.seed + number, effects
+                described.vehicle,
+                described.vehicle,
+                reference,
+                1000 * arguments.seed + number,
+                effects,
             )
             write_csv(folder / f"{name}.csv.gz", log_of(columns, name), decimals)
         save_vehicle_file(folder / "vehicle.toml", described)
@@ -70,6 +79,8 @@ def main(arguments: Sequence[str]) -> None:
     parsed = parse(Arguments, Arguments(out=tyro.MISSING), arguments, PROGRAM)
     files = make_case(parsed)
     console = output_console()
-    console.print(f"[bold]{parsed.out}[/]: three flights of {parsed.duration:g} s, effect: {parsed.effect}")
+    console.print(
+        f"[bold]{parsed.out}[/]: three flights of {parsed.duration:g} s, effect: {parsed.effect}"
+    )
     for file in files:
         console.print(f"  {file.name}  {file.stat().st_size / 1024:.1f} KiB")

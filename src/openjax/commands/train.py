@@ -1,7 +1,7 @@
 """Train pursuers: `openjax train [--preset NAME] [--out DIR] [--any.setting value]`.
 
-Writes a run directory (see `openjax.store.run_directory`) with logs, checkpoints, the best policy and
-pictures. Ctrl-C or SIGTERM saves and exits; `--resume DIR` goes on exactly where it stopped.
+Writes a run directory (see `openjax.store.run_directory`) with logs, checkpoints, the best policy
+and pictures. Ctrl-C or SIGTERM saves and exits; `--resume DIR` goes on exactly where it stopped.
 From Python: `openjax.train(settings, out)`, see `openjax.commands.calls.train`.
 """
 
@@ -17,14 +17,17 @@ def main(arguments: Sequence[str]) -> int:
     if {"-h", "--help"} & set(arguments):
         return _help(arguments)
     if peek(arguments, "process_id") in (None, "0"):
-        print("openjax.train: loading JAX and MuJoCo ...", flush=True)  # takes seconds; nobody should wonder
+        print(
+            "openjax.train: loading JAX and MuJoCo ...", flush=True
+        )  # takes seconds; nobody should wonder
     import jax
 
     from openjax.cluster.joining import joined
     from openjax.commands.training_command import membership, read_command, start
     from openjax.platform import make_cores_devices
 
-    # the same numbers by a kernel of JAX's own: written out, they're half of what there is to compile for a GPU
+    # the same numbers by a kernel of JAX's own: written out, they're half of what there is to
+    # compile for a GPU
     jax.config.update("jax_threefry_gpu_kernel_lowering", True)
     place = membership(arguments)
     if place is None and peek(arguments, "devices") != "all":

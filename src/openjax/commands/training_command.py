@@ -1,4 +1,6 @@
-"""What `openjax train` was asked for, checked, and the start of a run: everything before the first array."""
+"""What `openjax train` was asked for, checked, and the start of a run: everything before the first
+array.
+"""
 
 import contextlib
 import dataclasses
@@ -34,10 +36,13 @@ def read_command(arguments: Sequence[str]) -> TrainCommand:
     Raises:
       UserError: anything wrong with it, before a file is touched.
     """
-    resume, name = peek(arguments, "resume"), peek(arguments, "preset")
+    resume = peek(arguments, "resume")
+    name = peek(arguments, "preset")
     if resume is not None:
         if name is not None:
-            raise UserError("--preset and --resume exclude each other: a resumed run keeps its settings")
+            raise UserError(
+                "--preset and --resume exclude each other: a resumed run keeps its settings"
+            )
         default = open_run(Path(resume)).read_settings()
     else:
         default = preset(name or default_preset())
@@ -51,7 +56,8 @@ def read_command(arguments: Sequence[str]) -> TrainCommand:
 
 
 def membership(arguments: Sequence[str]) -> Membership | None:
-    """The place among several processes that the command line or the job's manager gives to this one.
+    """The place among several processes that the command line or the job's manager gives to this
+    one.
 
     It's needed before the command line can be read in full, as a preset depends on the devices.
     """
@@ -77,7 +83,9 @@ def default_preset() -> str:
     return "quick" if jax.default_backend() == "cpu" else "paper"
 
 
-def start(command: TrainCommand, arguments: Sequence[str], started: float, processes: Processes) -> int:
+def start(
+    command: TrainCommand, arguments: Sequence[str], started: float, processes: Processes
+) -> int:
     """Make the run's directory, or open it, and train. Returns the exit status."""
     cache = cache_programs() if command.compilation_cache else None
     job, directory, files = prepare(command, arguments, started, processes)
@@ -97,7 +105,8 @@ def start(command: TrainCommand, arguments: Sequence[str], started: float, proce
         processes.everyone()
         if not directory.path.is_dir():
             raise UserError(
-                f"{directory.path} isn't there on the host of process {processes.index}; all hosts must share it"
+                f"{directory.path} isn't there on the host of process {processes.index}; all hosts "
+                "must share it"
             )
         return run_job(job, directory, console=output_console())
 
@@ -132,8 +141,11 @@ def prepare(
     job = TrainingJob(
         settings=settings,
         environment=environment,
-        # what a run started from is needed again only where it was killed before its first checkpoint
-        start_from=None if resumed and Checkpoints(resumed.checkpoints).any_finished() else started_from,
+        # what a run started from is needed again only where it was killed before its first
+        # checkpoint
+        start_from=None
+        if resumed and Checkpoints(resumed.checkpoints).any_finished()
+        else started_from,
         devices=facts["devices"],
         processes=processes,
         time_limit=float("inf") if command.minutes is None else 60.0 * command.minutes,
@@ -147,13 +159,21 @@ def prepare(
 
 
 def _files(command, resumed):
-    """What the run flies with by its name in a run's directory: vehicle, effects, evader; None where there is none."""
-    given = {"vehicle.toml": command.vehicle, "effects.toml": command.effects, "evader.npz": command.opponent}
+    """What the run flies with by its name in a run's directory: vehicle, effects, evader; None
+    where there is none.
+    """
+    given = {
+        "vehicle.toml": command.vehicle,
+        "effects.toml": command.effects,
+        "evader.npz": command.opponent,
+    }
     return {name: path or (resumed and resumed.optional(name)) for name, path in given.items()}
 
 
 def _free_directory(command, processes):
-    """Where a new run is written, the same for all processes. Raises UserError where it can't be."""
+    """Where a new run is written, the same for all processes. Raises UserError where it can't
+    be.
+    """
     name = f"{time.strftime('%Y%m%d-%H%M%S')}-{command.preset or default_preset()}"
     out = Path(processes.of_first(str(command.out or Path("runs") / name)))
     check_free(out, command.overwrite)
@@ -163,7 +183,9 @@ def _free_directory(command, processes):
 def _layout_episodes(environment):
     """How often each layout is flown where nobody says."""
     drawn = (
-        environment.settings.start_attitude == "drawn" or environment.settings.vehicles or environment.effects
+        environment.settings.start_attitude == "drawn"
+        or environment.settings.vehicles
+        or environment.effects
     )
     return 1 if not drawn else 32 if jax.default_backend() == "cpu" else 100
 
@@ -186,7 +208,9 @@ def _lasting(start_from):
 
 
 def _check_same(settings, processes):
-    """Raises UserError where processes were started with different settings: their results would drift apart."""
+    """Raises UserError where processes were started with different settings: their results would
+    drift apart.
+    """
     own = {"settings": to_plain(settings), "JAX": jax.__version__}
     for other, theirs in enumerate(processes.everyone(own)):
         different = [name for name in own if own[name] != theirs[name]]
@@ -197,7 +221,9 @@ def _check_same(settings, processes):
 
 
 def _check_resumed(command, stored):
-    """Raises UserError for options that don't go with --resume, and settings that a run can't take up in its middle."""
+    """Raises UserError for options that don't go with --resume, and settings that a run can't take
+    up in its middle.
+    """
     resume = command.resume
     if command.out is not None and command.out.resolve() != resume.resolve():
         raise UserError(f"--resume {resume} writes there; leave --out away")
@@ -208,13 +234,16 @@ def _check_resumed(command, stored):
     for name in (*given, *different_settings(command.settings, stored)):
         if name not in MAY_CHANGE:
             raise UserError(
-                f"--{name} can't change when a run is resumed; {', '.join(MAY_CHANGE)} can, or start another run "
+                f"--{name} can't change when a run is resumed; {', '.join(MAY_CHANGE)} can, or "
+                "start another run "
                 "with --start_from"
             )
 
 
 def _devices(text, settings, before):
-    """How many; where nobody says, as many as `before`, or as many cores as the worlds can be shared out to."""
+    """How many; where nobody says, as many as `before`, or as many cores as the worlds can be
+    shared out to.
+    """
     available = len(jax.devices())
     if text is None and jax.default_backend() == "cpu" and jax.process_count() == 1:
         cores = max(number for number in range(1, available + 1) if can_share_out(settings, number))
@@ -224,6 +253,7 @@ def _devices(text, settings, before):
         return available
     if not (text.isdecimal() and len(text) <= 9 and 1 <= int(text) <= available):
         raise UserError(
-            f"--devices is {text[:40]!r}; expected all or a number up to the {available} that are here"
+            f"--devices is {text[:40]!r}; expected all or a number up to the {available} that are "
+            "here"
         )
     return int(text)

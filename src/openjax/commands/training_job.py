@@ -26,7 +26,11 @@ from openjax.cluster.devices import (
 )
 from openjax.cluster.processes import Processes
 from openjax.commands.before_and_after import game_for, report
-from openjax.commands.gradient_stages import compile_first_flights, compile_last_stage, first_flights
+from openjax.commands.gradient_stages import (
+    compile_first_flights,
+    compile_last_stage,
+    first_flights,
+)
 from openjax.commands.run_words import closing_words
 from openjax.commands.training_loop import Loop, NotFiniteError, Outcome, Plan, StopRequest, guarded
 from openjax.commands.validation import Validation, flat_metrics, selection_score
@@ -76,8 +80,11 @@ class TrainingJob:
 
     @property
     def made_from(self) -> str:
-        """What the run's programs depend on, beside the package's sources; the seed comes in as a key."""
-        game, settings = self.environment, dataclasses.replace(self.settings, seed=0)
+        """What the run's programs depend on, beside the package's sources; the seed comes in as a
+        key.
+        """
+        game = self.environment
+        settings = dataclasses.replace(self.settings, seed=0)
         arrays = jax.tree.leaves((game.vehicle, game.effect_parameters, game.evader_networks))
         arrays = [np.asarray(leaf).tolist() for leaf in arrays]
         names = str(jax.tree.structure(game.effect_parameters))
@@ -95,7 +102,9 @@ class TrainingJob:
         check_devices(self.settings, self.devices)
         check_memory(self.settings, self.devices)
         if self.start_from is not None:
-            abstract = abstract_parameters(self.environment, build(self.settings, self.environment).policy)
+            abstract = abstract_parameters(
+                self.environment, build(self.settings, self.environment).policy
+            )
             _start_parameters(self, abstract)
         if self.compare_with is not None:
             other = load_policy(self.compare_with)
@@ -103,7 +112,8 @@ class TrainingJob:
 
 
 def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
-    """Train from the last checkpoint on, or from the start where there is none, then write the report.
+    """Train from the last checkpoint on, or from the start where there is none, then write the
+    report.
 
     Returns:
       the exit status: 0, or 1 after a NaN.
@@ -124,7 +134,8 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
         for line in closing_words(job.settings, directory.path, jax.default_backend() == "cpu"):
             console.print(line, soft_wrap=True)
         console.print(
-            f"run, policy and pictures are in {directory.path}, the chase in chase.gif", soft_wrap=True
+            f"run, policy and pictures are in {directory.path}, the chase in chase.gif",
+            soft_wrap=True,
         )
     return 0
 
@@ -132,18 +143,29 @@ def run_job(job: TrainingJob, directory: RunDirectory, console: Console) -> int:
 class _Run:
     """One process' part of a run: what its steps share, and the programs as they get ready."""
 
-    def __init__(self, job: TrainingJob, directory: RunDirectory, stop: StopRequest, progress: Progress):
-        self.job, self.directory, self.stop, self.progress = job, directory, stop, progress
-        self.settings, self.processes = job.settings, job.processes
+    def __init__(
+        self, job: TrainingJob, directory: RunDirectory, stop: StopRequest, progress: Progress
+    ):
+        self.job = job
+        self.directory = directory
+        self.stop = stop
+        self.progress = progress
+        self.settings = job.settings
+        self.processes = job.processes
         self.taught, self.began, self.validation = False, float("inf"), None
         self.checkpoints = Checkpoints(directory.checkpoints, processes=job.processes)
         self.processes.advice = f"go on with openjax train --resume {directory.path} --devices all"
 
     def train(self) -> Outcome | None:
-        """Compile and train; None where a signal or the time limit came before anything was learnt. Raises NotFiniteError."""
-        job, settings = self.job, self.settings
+        """Compile and train; None where a signal or the time limit came before anything was learnt.
+        Raises NotFiniteError.
+        """
+        job = self.job
+        settings = self.settings
         latest = self.checkpoints.latest()
-        done = self.processes.of_first(latest is not None and latest.update >= settings.total_updates)
+        done = self.processes.of_first(
+            latest is not None and latest.update >= settings.total_updates
+        )
         if done:
             self.progress.message(
                 "all updates are done; --total_steps N goes on to more. Its report is made anew"
@@ -191,8 +213,11 @@ class _Run:
         )
 
     def finish(self, outcome: Outcome) -> Table | None:
-        """Write the best policy, then the report, whose table it is; None where a signal ended the run."""
-        settings, path = self.settings, self.directory.path
+        """Write the best policy, then the report, whose table it is; None where a signal ended the
+        run.
+        """
+        settings = self.settings
+        path = self.directory.path
         signals = [name for name in self.processes.everyone(self.stop.name) if name is not None]
         if not self.processes.is_first:
             return None
@@ -213,18 +238,26 @@ class _Run:
         """The last stage; what to tell of it."""
 
         def validate(parameters):
-            # the far tasks: by the uniform ones the best of many checkpoints was chosen, in part by luck
+            # the far tasks: by the uniform ones the best of many checkpoints was chosen, in part by
+            # luck
             return summarise(self.validation()(parameters)[1].evaluation)
 
         learn = self.last_stage()
-        return keep_best(self.directory, learn, validate, self.settings, lambda: self.stop.name is not None)
+        return keep_best(
+            self.directory, learn, validate, self.settings, lambda: self.stop.name is not None
+        )
 
     def _first_flights(self):
         """The stage before MAPPO, of a run that has it still to come; else None."""
-        if not self.settings.first_flights.updates or self.job.start_from or self.checkpoints.any_finished():
+        if (
+            not self.settings.first_flights.updates
+            or self.job.start_from
+            or self.checkpoints.any_finished()
+        ):
             return None
         flights = first_flights(self.settings, self.job.environment)
-        say, policy = self.progress.message, self.abstract.policy
+        say = self.progress.message
+        policy = self.abstract.policy
         return compile_first_flights(flights, policy, say, self._over, self.job.keep)
 
     def _over(self):
@@ -235,7 +268,9 @@ class _Run:
 
     def _first_carry(self, start):
         """The carry to start from, the updates done and the seconds spent."""
-        job, settings, checkpoints = self.job, self.settings, self.checkpoints
+        job = self.job
+        settings = self.settings
+        checkpoints = self.checkpoints
         checkpoints.remove_unfinished()
         if self.processes.of_first(checkpoints.any_finished()):
             carry, record = checkpoints.restore_latest(self.abstract, self.progress.message)
@@ -246,7 +281,11 @@ class _Run:
             carry = carry.with_policy(_start_parameters(job, carry.policy))
         if self.processes.is_first:
             save_policy_file(
-                self.directory.start_policy, carry.policy, settings, {"update": 0}, storage="float32"
+                self.directory.start_policy,
+                carry.policy,
+                settings,
+                {"update": 0},
+                storage="float32",
             )
         if self.first_flights is not None:
             ready, learn = self.first_flights
@@ -271,9 +310,10 @@ class _Run:
 
     def _compile_beside(self, step_ready):
         """Wait for the training step; what is needed later is compiled in the background."""
-        first, settings = self.processes.is_first, self.settings
-        # while an accelerator's compiler works for long, validation is made beside it; else its tracing would
-        # only hold up the first update, and on a CPU both would share the same cores
+        first = self.processes.is_first
+        settings = self.settings
+        # while an accelerator's compiler works for long, validation is made beside it; else its
+        # tracing would only hold up the first update, and on a CPU both would share the same cores
         if jax.default_backend() != "cpu":
             try:
                 step_ready(_SOON)
@@ -291,7 +331,9 @@ class _Run:
             self.validation = in_background(self._ready_validation)
 
     def _ready_validation(self):
-        """The validation, compiled; and what else is needed soon after the first update is loaded."""
+        """The validation, compiled; and what else is needed soon after the first update is
+        loaded.
+        """
         load_orbax()
         validation = Validation(self.settings, self.job.environment)
         tasks = validation.tasks["validation"]
@@ -302,7 +344,9 @@ class _Run:
         """Score and metrics of a carry on the validation tasks; the same in all processes."""
         if not self.processes.is_first:
             return self.processes.of_first()
-        uniform, far = (summarise(kind.evaluation) for kind in self.validation()(own_copy(carry.policy)))
+        uniform, far = (
+            summarise(kind.evaluation) for kind in self.validation()(own_copy(carry.policy))
+        )
         score = selection_score(uniform, self.settings.environment.episode_length)
         return self.processes.of_first((score, {**flat_metrics(uniform, far), "score": score}))
 
@@ -321,8 +365,11 @@ class _Run:
 
 
 def _programs(job):
-    """The run's start and its step, from earlier runs' traces where they're kept, and the kind of the carry."""
-    settings, shardings = job.settings, carry_shardings(job.devices)
+    """The run's start and its step, from earlier runs' traces where they're kept, and the kind of
+    the carry.
+    """
+    settings = job.settings
+    shardings = carry_shardings(job.devices)
     start = make_start(settings, job.environment)
     abstract = abstract_like(jax.eval_shape(start, jax.random.key(settings.seed)), shardings)
     same = everywhere(job.devices)
@@ -330,26 +377,37 @@ def _programs(job):
     tried = job.devices == 1 or (jax.default_backend() == "cpu" and jax.process_count() == 1)
     if tried and (keep := job.keep):
         step = keep("step", step, lambda: (abstract,), carry=abstract)
-        fresh, arguments = start, lambda: (jax.random.key(settings.seed),)
+        fresh = start
+        arguments = lambda: (jax.random.key(settings.seed),)
 
         def start(key):
-            return jax.jit(keep("start", fresh, arguments, carry=abstract), out_shardings=shardings)(key)
+            return jax.jit(
+                keep("start", fresh, arguments, carry=abstract), out_shardings=shardings
+            )(key)
 
-    # without shardings, the compiler may move a leaf, and the next call would compile again; all processes can read the rest
-    options = {"out_shardings": (shardings, same, same), "compiler_options": compiler_options(job.devices)}
+    # without shardings, the compiler may move a leaf, and the next call would compile again; all
+    # processes can read the rest
+    options = {
+        "out_shardings": (shardings, same, same),
+        "compiler_options": compiler_options(job.devices),
+    }
     return start, jax.jit(step, donate_argnums=0, **options), abstract
 
 
 def _start_parameters(job, fresh: PolicyParameters) -> PolicyParameters:
-    """Those of the policy that the run starts from; `fresh` ones where it has no critic, or one of another game."""
+    """Those of the policy that the run starts from; `fresh` ones where it has no critic, or one of
+    another game.
+    """
     loaded = load_policy(job.start_from)
     if isinstance(loaded.policy, Heuristic):
         raise UserError(f"--start_from {job.start_from}: a heuristic has no networks to start from")
     settings = loaded.settings
-    axes, there = job.settings.environment.observe_in, settings.environment.observe_in
+    axes = job.settings.environment.observe_in
+    there = settings.environment.observe_in
     if axes != there:  # of the same shapes
         raise UserError(
-            f"--start_from {job.start_from}: it observes in {there}, the run in {axes} (--environment.observe_in)"
+            f"--start_from {job.start_from}: it observes in {there}, the run in {axes} "
+            "(--environment.observe_in)"
         )
     own = with_longer_history(
         loaded.parameters, settings.predictor, settings.environment, job.settings.environment
@@ -367,7 +425,8 @@ def keep_best(
     settings: TrainSettings,
     over: Callable[[], bool],
 ) -> str:
-    """Take a run's policy through the last stage, and keep the best of what it becomes and what it was.
+    """Take a run's policy through the last stage, and keep the best of what it becomes and what it
+    was.
 
     Args:
       directory: the run's; `policy.npz` is what the stage starts from, and what it writes.
@@ -385,13 +444,18 @@ def keep_best(
     # where the validation, too, was compiled for
     before = place(fill(abstract, before, str(directory.policy)))
     length = settings.environment.episode_length
-    looks, history, kept = [{"update": 0, **validate(before)}], [], 0
+    looks = [{"update": 0, **validate(before)}]
+    history = []
+    kept = 0
     scores = [selection_score(looks[0], length)]
     for after, parts in learn(before, jax.random.key(settings.seed)):
         history.append(parts)
         if over():
             break
-        if len(history) % settings.analytic.look_every and len(history) != settings.analytic.updates:
+        if (
+            len(history) % settings.analytic.look_every
+            and len(history) != settings.analytic.updates
+        ):
             continue
         looks.append({"update": len(history), **validate(after)})
         scores.append(selection_score(looks[-1], length))
@@ -399,11 +463,16 @@ def keep_best(
             kept = len(looks) - 1
             better = {"far_validation_score": scores[kept], "analytic_updates": len(history)}
             # at once: a stage that is ended early leaves the best of what it was
-            save_policy_file(directory.policy, after, settings, {**notes, **better}, storage="float32")
-    seconds, updates = round(time.monotonic() - began, 1), looks[kept]["update"]
+            save_policy_file(
+                directory.policy, after, settings, {**notes, **better}, storage="float32"
+            )
+    seconds = round(time.monotonic() - began, 1)
+    updates = looks[kept]["update"]
     facts = {"seconds": seconds, "kept": updates, "validation_scores": scores}
     write_json(directory.path / "analytic.json", {**facts, "validation": looks, "history": history})
     told = f"{scores[0]:.4f} -> {scores[kept]:.4f} after {updates} of {len(history)} updates"
     if not kept:
-        told = f"{scores[0]:.4f}, at most {max(scores[1:], default=scores[0]):.4f} after it, not kept"
+        told = (
+            f"{scores[0]:.4f}, at most {max(scores[1:], default=scores[0]):.4f} after it, not kept"
+        )
     return f"by the gradient through the simulation: score on far validation tasks {told}, {seconds:.0f} s"

@@ -1,4 +1,5 @@
-"""The host's side of training: the compiled step, log, evaluate, checkpoint, stop when asked or at a NaN.
+"""The host's side of training: the compiled step, log, evaluate, checkpoint, stop when asked or at
+a NaN.
 
 Works on any carry; it knows nothing of what is trained.
 """
@@ -42,9 +43,12 @@ class Plan:
     time_limit: float = float("inf")
     """Seconds of training time (compilation included) after which to stop."""
     validate_start: bool = False
-    """Validate before the first update, too: what a run starts from may be the best there will be."""
+    """Validate before the first update, too: what a run starts from may be the best there will
+    be.
+    """
     overlap: bool | None = None
-    """Start an update before the last one's metrics are read: an accelerator then never waits for the host.
+    """Start an update before the last one's metrics are read: an accelerator then never waits for
+    the host.
 
     None: on accelerators. On a CPU nothing is gained, and a NaN stops the run one update sooner.
     """
@@ -62,7 +66,9 @@ class Outcome:
 
 
 class StopRequest:
-    """SIGINT and SIGTERM ask to stop after the present update; a second SIGINT interrupts at once."""
+    """SIGINT and SIGTERM ask to stop after the present update; a second SIGINT interrupts at
+    once.
+    """
 
     def __init__(self):
         self.name: str | None = None
@@ -83,7 +89,8 @@ class StopRequest:
 
 
 def guarded(step: Callable[[Any], tuple[Any, dict]]) -> Callable:
-    """`step`, a pure function carry -> (carry, metrics by name), with a check of its result for NaN in the same program.
+    """`step`, a pure function carry -> (carry, metrics by name), with a check of its result for NaN
+    in the same program.
 
     Returns:
       carry -> (carry, metrics, (L,) bool: which of the leaves of `float_leaves(carry)` hold a NaN).
@@ -101,7 +108,9 @@ def guarded(step: Callable[[Any], tuple[Any, dict]]) -> Callable:
 def float_leaves(carry: Any) -> dict[str, jax.Array]:
     """The floating-point leaves of a carry by path."""
     return {
-        name: leaf for name, leaf in named_leaves(carry).items() if jnp.issubdtype(leaf.dtype, jnp.floating)
+        name: leaf
+        for name, leaf in named_leaves(carry).items()
+        if jnp.issubdtype(leaf.dtype, jnp.floating)
     }
 
 
@@ -137,7 +146,9 @@ class Loop:
         Raises:
           NotFiniteError: a leaf of the carry holds a NaN.
         """
-        plan, update, pending = self.plan, self.first_update, None
+        plan = self.plan
+        update = self.first_update
+        pending = None
         self._started = self._saved_at = time.monotonic()
         best = self.checkpoints.best()
         self._best_score = best.score if best else -float("inf")
@@ -162,7 +173,9 @@ class Loop:
                 self._save(update, carry, validate=due)
         self._save(update, carry)  # does nothing where it's saved already
         self.checkpoints.wait()
-        return Outcome(carry, update, self._elapsed(), reason if update < plan.total_updates else None)
+        return Outcome(
+            carry, update, self._elapsed(), reason if update < plan.total_updates else None
+        )
 
     def _elapsed(self):
         return self.seconds + time.monotonic() - self._started
@@ -175,7 +188,8 @@ class Loop:
     def _finish(self, carry, reached, update, values, broken):
         """Read, write and show the metrics of an update.
 
-        Raises NotFiniteError for a NaN, and leaves the carry, which `reached` one update more where updates overlap.
+        Raises NotFiniteError for a NaN, and leaves the carry, which `reached` one update more where
+        updates overlap.
         """
         broken = np.asarray(broken)
         values = {name: float(value) for name, value in jax.device_get(values).items()}
@@ -187,7 +201,9 @@ class Loop:
         self.progress.update(update * self.plan.steps_per_update, values)
 
     def _decide(self):
-        """Why to stop, and whether a checkpoint is late: a signal to any process counts, and the first one's clock."""
+        """Why to stop, and whether a checkpoint is late: a signal to any process counts, and the
+        first one's clock.
+        """
         late = time.monotonic() - self._saved_at > self.plan.checkpoint_seconds
         asked = self.everyone([self.stop.name, self._elapsed() >= self.plan.time_limit, late])
         signals = [name for name, _, _ in asked if name is not None]
@@ -211,11 +227,20 @@ class Loop:
         self.checkpoints.wait()
         place = Path(self.directory) / NOT_FINITE
         save_state(place / f"{reached:09d}", carry, {"update": reached})
-        metrics = {name: value if np.isfinite(value) else str(value) for name, value in values.items()}
-        report = {"update": update, "state_after_update": reached, "leaves": leaves, "metrics": metrics}
+        metrics = {
+            name: value if np.isfinite(value) else str(value) for name, value in values.items()
+        }
+        report = {
+            "update": update,
+            "state_after_update": reached,
+            "leaves": leaves,
+            "metrics": metrics,
+        }
         if jax.process_index() == 0:
             write_json(place / "report.json", report)
         latest = self.checkpoints.latest()
-        good = f"the last good checkpoint is {latest.path}" if latest else "there is no checkpoint yet"
+        good = (
+            f"the last good checkpoint is {latest.path}" if latest else "there is no checkpoint yet"
+        )
         shown = ", ".join(leaves[:3]) + (f" and {len(leaves) - 3} more" if len(leaves) > 3 else "")
         return NotFiniteError(f"NaN in update {update} in {shown}; the state is in {place}, {good}")

@@ -1,4 +1,6 @@
-"""Validation tasks, never trained on: the same in every run, to watch it and to choose its best checkpoint. Never the layouts."""
+"""Validation tasks, never trained on: the same in every run, to watch it and to choose its best
+checkpoint. Never the layouts.
+"""
 
 import dataclasses
 
@@ -14,7 +16,9 @@ VALIDATION_KEY = 20_000_003
 """The validation tasks are drawn from this key in all runs, so that runs can be compared."""
 
 FAR_EXPANSIONS = 20
-"""Local expansions that lead to a far task: 0.26 m along each axis in the mean square, where nothing stops them."""
+"""Local expansions that lead to a far task: 0.26 m along each axis in the mean square, where
+nothing stops them.
+"""
 
 
 def uniform_tasks(settings: PursuitSettings, number: int, slots: int) -> Task:
@@ -27,22 +31,26 @@ def uniform_tasks(settings: PursuitSettings, number: int, slots: int) -> Task:
 def far_tasks(settings: PursuitSettings, number: int, slots: int) -> Task:
     """The first `number` validation far tasks, with `slots` pillar slots.
 
-    Other uniform tasks, turned about the arena's axis and expanded as those in a generator's archive are: starts up
-    to 0.1 m from the arena's wall, and pursuers that start apart from each other or around the evader.
+    Other uniform tasks, turned about the arena's axis and expanded as those in a generator's
+    archive are: starts up to 0.1 m from the arena's wall, and pursuers that start apart from each
+    other or around the evader.
     """
 
     def draw(key):
         uniform_key, turn_key, expand_key = jax.random.split(key, 3)
         task = turn_task(turn_key, uniform_task(settings, uniform_key))
         keys = jax.random.split(expand_key, FAR_EXPANSIONS)
-        return jax.lax.scan(lambda task, key: (expand_task(settings, key, task), None), task, keys)[0]
+        return jax.lax.scan(lambda task, key: (expand_task(settings, key, task), None), task, keys)[
+            0
+        ]
 
     keys = jax.random.split(jax.random.fold_in(jax.random.key(VALIDATION_KEY), 1), number)
     return _with_slots(jax.jit(jax.vmap(draw))(keys), slots)
 
 
 class Validation:
-    """A run's uniform and as many far tasks, flown in one call of one compiled evaluation; it has room for layouts' pillars.
+    """A run's uniform and as many far tasks, flown in one call of one compiled evaluation; it has
+    room for layouts' pillars.
 
     Args:
       settings: of the run; from its game the tasks are drawn.
@@ -50,8 +58,10 @@ class Validation:
     """
 
     def __init__(self, settings: TrainSettings, environment: Pursuit):
-        drawn, self.number = settings.environment, settings.validation_episodes
-        slots, evaders = layout_slots(drawn), settings.evaders_validation or drawn.evaders
+        drawn = settings.environment
+        self.number = settings.validation_episodes
+        slots = layout_slots(drawn)
+        evaders = settings.evaders_validation or drawn.evaders
         game = dataclasses.replace(drawn, max_pillars=slots, evaders=evaders)
         wide = dataclasses.replace(environment, settings=game, dynamics=None)
         self.evaluator = Evaluator(wide, build(settings, environment).policy, 2 * self.number)
@@ -68,9 +78,10 @@ class Validation:
 def selection_score(summary: dict, episode_length: int) -> float:
     """By which the best checkpoint is chosen, on the uniform validation tasks; at most 1.
 
-    Captures and safety come first: a tenth of the episode's length sooner is worth a 200th of the captures, a 100th of
-    the crashes. The reward isn't asked: how it weighs a second stage's smoothness, or a first crash, says how to learn
-    and not what is better, and a score that held it would keep the first checkpoints of a policy that starts smooth.
+    Captures and safety come first: a tenth of the episode's length sooner is worth a 200th of the
+    captures, a 100th of the crashes. The reward isn't asked: how it weighs a second stage's
+    smoothness, or a first crash, says how to learn and not what is better, and a score that held it
+    would keep the first checkpoints of a policy that starts smooth.
 
     Args:
       summary: from `openjax.learning.summarise`.
@@ -86,11 +97,15 @@ def selection_score(summary: dict, episode_length: int) -> float:
 
 
 def flat_metrics(uniform: dict, far: dict) -> dict[str, float]:
-    """Both summaries by name, the far one's with `far_` before it; parts of collisions as their own numbers."""
+    """Both summaries by name, the far one's with `far_` before it; parts of collisions as their own
+    numbers.
+    """
 
     def flat(summary):
         values = {name: value for name, value in summary.items() if not isinstance(value, dict)}
-        return values | {f"collision_{part}": value for part, value in summary["collision_parts"].items()}
+        return values | {
+            f"collision_{part}": value for part, value in summary["collision_parts"].items()
+        }
 
     return flat(uniform) | {f"far_{name}": value for name, value in flat(far).items()}
 

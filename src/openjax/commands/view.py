@@ -1,4 +1,6 @@
-"""Watch policies in three dimensions: `openjax view --policy flight open --scenario wall`, in a browser or as a file."""
+"""Watch policies in three dimensions: `openjax view --policy flight open --scenario wall`, in a
+browser or as a file.
+"""
 
 import dataclasses
 import webbrowser
@@ -17,12 +19,16 @@ from openjax.show.trajectory import Trajectory
 
 PROGRAM = "openjax view"
 OWN_NAMES = ("localhost", "127.0.0.1")
-"""Hosts that a browser may have asked for: a page elsewhere can't make its own name stand for this machine."""
+"""Hosts that a browser may have asked for: a page elsewhere can't make its own name stand for this
+machine.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
 class ViewCommand(FlightOptions):
-    """Fly one episode of each layout with each policy, and show them in a browser: the page has all in it."""
+    """Fly one episode of each layout with each policy, and show them in a browser: the page has all
+    in it.
+    """
 
     html: Path | None = None
     """Write the page to this file, to send to somebody, instead of serving it."""
@@ -35,11 +41,14 @@ class ViewCommand(FlightOptions):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """The command; returns its exit status. Raises UserError for an unusable policy, layout, file or port."""
+    """The command; returns its exit status. Raises UserError for an unusable policy, layout, file
+    or port.
+    """
     command = parse(ViewCommand, ViewCommand(), arguments, PROGRAM)
     check_output(command.html, "--html")
     check_output(command.gif, "--gif")
-    flights, console = fly_all(command), output_console()
+    flights = fly_all(command)
+    console = output_console()
     if command.gif is not None:
         from openjax.show.videos import animate
 
@@ -47,7 +56,9 @@ def main(arguments: Sequence[str]) -> int:
         console.print(f"{command.gif}: {command.gif.stat().st_size / 1e3:,.0f} kB")
     if command.html is not None:
         write_replay(command.html, flights)
-        console.print(f"{command.html}: {command.html.stat().st_size / 1e3:,.0f} kB, opens in any browser")
+        console.print(
+            f"{command.html}: {command.html.stat().st_size / 1e3:,.0f} kB, opens in any browser"
+        )
     if command.gif is None and command.html is None:
         with page_server(replay_page(flights), command.port) as server:
             address = f"http://localhost:{server.server_port}"
@@ -64,8 +75,11 @@ def fly_all(command: ViewCommand) -> list[tuple[str, Trajectory]]:
     Raises:
       UserError: an unusable policy or layout.
     """
-    flights, evaluators = [], {}
-    shared = {field.name: getattr(command, field.name) for field in dataclasses.fields(FlightOptions)}
+    flights = []
+    evaluators = {}
+    shared = {
+        field.name: getattr(command, field.name) for field in dataclasses.fields(FlightOptions)
+    }
     for loaded in command.start():
         own = EvaluateCommand(**shared, episodes=1, environment=loaded.settings.environment)
         flights += [(loaded.source, flight) for flight in fly_scenarios(own, loaded, evaluators)[1]]
@@ -73,7 +87,8 @@ def fly_all(command: ViewCommand) -> list[tuple[str, Trajectory]]:
 
 
 def page_server(page: str, port: int) -> ThreadingHTTPServer:
-    """A server of one page, to be used as a context manager, that this machine's browsers alone can reach.
+    """A server of one page, to be used as a context manager, that this machine's browsers alone can
+    reach.
 
     Raises:
       UserError: the port isn't free.

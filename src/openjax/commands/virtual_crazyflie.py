@@ -1,7 +1,9 @@
-"""`openjax virtual_crazyflie`: Crazyflies that are simulated, for everything that speaks to real ones.
+"""`openjax virtual_crazyflie`: Crazyflies that are simulated, for everything that speaks to real
+ones.
 
-They answer CRTP over UDP as `cflib` expects (`udp://127.0.0.1:19850` and on); inside fly openjax's vehicles in real
-time, rate loop at 500 Hz, with any effects, and a link with latency and loss to order.
+They answer CRTP over UDP as `cflib` expects (`udp://127.0.0.1:19850` and on); inside fly openjax's
+vehicles in real time, rate loop at 500 Hz, with any effects, and a link with latency and loss to
+order.
 """
 
 import math
@@ -30,7 +32,9 @@ class Arguments:
     port: Annotated[int, Interval("[0, 65535]")] = BASE_PORT
     """UDP port of the first; cflib's scan looks at 19850 to 19859."""
     scenario: str = "wall"
-    """They stand below the pursuers' starts of this layout (a name or a TOML file); more of them in a row behind."""
+    """They stand below the pursuers' starts of this layout (a name or a TOML file); more of them in
+    a row behind.
+    """
     vehicle: Path | None = None
     """The vehicle inside: crazyflie, brushless, or a vehicle.toml; by default the Crazyflie 2.1."""
     effects: Path | None = None
@@ -60,7 +64,9 @@ def make(arguments: Arguments):
     effects = load_effects(arguments.effects)[1] if arguments.effects else {}
     vehicle = load_vehicle_file(arguments.vehicle).vehicle
     vehicles = VirtualVehicles(vehicle, stands, effects, arguments.battery, arguments.endurance)
-    return VirtualCrazyflies(vehicles, arguments.host, arguments.port, arguments.link, arguments.needs_arming)
+    return VirtualCrazyflies(
+        vehicles, arguments.host, arguments.port, arguments.link, arguments.needs_arming
+    )
 
 
 def main(arguments: Sequence[str]) -> None:

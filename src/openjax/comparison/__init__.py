@@ -1,8 +1,10 @@
-"""What changed since last week: two sets of flights of one vehicle, compared with each other instead of with the
-simulator, so that what model and sensors share cancels.
+"""What changed since last week: two sets of flights of one vehicle, compared with each other
+instead of with the simulator, so that what model and sensors share cancels.
 
-`figures` reads what each flight says about its vehicle; `days` takes a day as a random effect; `causes` says what each
-cause would do, `weigh` how well each explains what differs; `result` is what comes out, `report` tells it."""
+`figures` reads what each flight says about its vehicle; `days` takes a day as a random effect;
+`causes` says what each cause would do, `weigh` how well each explains what differs; `result` is
+what comes out, `report` tells it.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,9 +22,11 @@ from openjax.flights.flight import Case, Issue
 
 
 def compare(flights: Path, references: Sequence[Path]) -> Change:
-    """What changed in the flights of a folder against those of one or more reference folders (days).
+    """What changed in the flights of a folder against those of one or more reference folders
+    (days).
 
-    Raises UserError for a folder without a usable flight and for flights of several vehicles."""
+    Raises UserError for a folder without a usable flight and for flights of several vehicles.
+    """
     new_case, new, quality = read(Path(flights))
     old: list[FlightFigures] = []
     for folder in references:
@@ -35,11 +39,16 @@ def compare(flights: Path, references: Sequence[Path]) -> Change:
 
 
 def read(folder: Path) -> tuple[Case, list[FlightFigures], list[Issue]]:
-    """A folder's case, the figures of its flights by day, and what was left out. Raises UserError as `compare`."""
+    """A folder's case, the figures of its flights by day, and what was left out. Raises UserError
+    as `compare`.
+    """
     case = load_case(folder, comparison=True)
     if len({f.vehicle for f in case.flights}) > 1:
-        raise UserError(f"{folder}: holds several vehicles; a comparison is of one vehicle with itself")
-    quality, figures = list(case.quality), []
+        raise UserError(
+            f"{folder}: holds several vehicles; a comparison is of one vehicle with itself"
+        )
+    quality = list(case.quality)
+    figures = []
     for flight in case.flights:
         found = figures_of(flight, case, str(folder))
         if isinstance(found, str):
@@ -59,7 +68,9 @@ def change_between(
     case: Case,
     quality: tuple[Issue, ...] = (),
 ) -> Change:
-    """`compare` for figures that are there already; `case` gives the vehicle's geometry and motor order."""
+    """`compare` for figures that are there already; `case` gives the vehicle's geometry and motor
+    order.
+    """
     mixer = mixer_of(case.vehicle_of(case.flights[0]))
     battery = battery_of([*new, *old])
     before, after = (by_day(f, battery) for f in (old, new))
@@ -72,12 +83,14 @@ def change_between(
     evidence = weigh(hypotheses, difference, scale, freedom)
     logged = [case.vehicle_file.motor_permutation[j] + 1 for j in range(4)]
     place, within = evidence.place()
-    here, reach = evidence.causes_at(within), 1.645 * scale
+    here = evidence.causes_at(within)
+    reach = 1.645 * scale
     return Change(
         name=name,
         changed=evidence.changed > SHOWN,
         probability=evidence.changed,
-        trims_changed=evidence.changed > SHOWN and not CAUSES[max(here, key=lambda c: here[c])].figures,
+        trims_changed=evidence.changed > SHOWN
+        and not CAUSES[max(here, key=lambda c: here[c])].figures,
         rotors=tuple(sorted(logged[j] for j in place)),
         side=ROTOR_PLACES[place[0]] if len(place) == 1 else SIDES.get(place, ""),
         causes=evidence.causes,

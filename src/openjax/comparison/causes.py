@@ -1,16 +1,16 @@
-"""What a cause would do to a flight's figures: draws of its size, its place and how well real changes follow its pattern.
+"""What a cause would do to a flight's figures: draws of its size, its place and how well real
+changes follow its pattern.
 
-    one rotor weaker by a share e     hover, roll, pitch and yaw move alike, signs by the rotor's place and spin
-    two rotors weaker                 the sum of two such
-    a weight beside a rotor or side   hover, roll and pitch, no yaw
-    the whole vehicle                 hover alone (mass, propellers, thrust)
-    drag                              both drags
-    motors                            the lag from motors to angular acceleration, a little the gains' estimate
-    inertia                           the angular acceleration per command
-    gains                             the commands per rate error
-    something else                    trims without a pattern
+    one rotor weaker by a share e     hover, roll, pitch and yaw move alike, signs by the rotor's
+    place and spin two rotors weaker                 the sum of two such a weight beside a rotor or
+    side   hover, roll and pitch, no yaw the whole vehicle                 hover alone (mass,
+    propellers, thrust) drag                              both drags motors
+    the lag from motors to angular acceleration, a little the gains' estimate inertia
+    the angular acceleration per command gains                             the commands per rate
+    error something else                    trims without a pattern
 
-A rotor that is weaker by e at the same command is given 1 / (1 - e) of it. What is cut, bent or taped on also shakes.
+A rotor that is weaker by e at the same command is given 1 / (1 - e) of it. What is cut, bent or
+taped on also shakes.
 """
 
 from dataclasses import dataclass
@@ -23,7 +23,9 @@ from openjax.comparison.figures import PLACES, TRIMS
 
 @dataclass(frozen=True)
 class Cause:
-    """What may have changed, how probable it is if something did, and the effects of the library that it is."""
+    """What may have changed, how probable it is if something did, and the effects of the library
+    that it is.
+    """
 
     prior: float
     effects: tuple[str, ...] = ()
@@ -33,7 +35,8 @@ class Cause:
     what: str = ""
 
 
-# People knock propellers and tape things on more often than they swap motors. Motors wear, drag is added.
+# People knock propellers and tape things on more often than they swap motors. Motors wear, drag is
+# added.
 CAUSES = {
     "one rotor weaker": Cause(0.25, ("motor_imbalance",), damage=True),
     "two rotors weaker": Cause(0.2, ("motor_imbalance",), damage=True),
@@ -45,7 +48,9 @@ CAUSES = {
     "gains": Cause(0.06, ("rate_gains",), False, ("loop_gain",), (0.0, 0.5), "rate gains"),
     "something else": Cause(0.07),
 }
-LOOP_WITH_MOTORS = 0.3  # standard deviation: a motors' change also moves the estimate of the loop's gain
+LOOP_WITH_MOTORS = (
+    0.3  # standard deviation: a motors' change also moves the estimate of the loop's gain
+)
 SHAKES = (0.4, 0.4)  # mean and standard deviation of the rise of the logarithm with a damage
 USUAL_CHANGE = 0.15  # of a rotor's command, or of the weight
 STRONGER = 0.15  # share of changes the other way: a mended rotor, a weight taken off
@@ -67,7 +72,9 @@ EVERYWHERE = (0, 1, 2, 3)
 
 @dataclass(frozen=True)
 class Hypotheses:
-    """Draws from all causes: change of the figures (N, F), prior weight, cause, place and size of each."""
+    """Draws from all causes: change of the figures (N, F), prior weight, cause, place and size of
+    each.
+    """
 
     change: np.ndarray
     weight: np.ndarray
@@ -85,8 +92,11 @@ class _Draws:
         sign = np.where(even[:, 2] < STRONGER, -1.0, 1.0)
         self.sizes = np.abs(norm.ppf(0.5 + 0.5 * even[:, :2])) * USUAL_CHANGE * sign[:, None]
         self.places, self.normal = even[:, 3:5], norm.ppf(even[:, 5:])
-        self.mixer, self.trims = mixer, trims
-        self.place_of = {p: k for k, p in enumerate([(0,), (1,), (2,), (3,), *SIDES, EVERYWHERE, ()])}
+        self.mixer = mixer
+        self.trims = trims
+        self.place_of = {
+            p: k for k, p in enumerate([(0,), (1,), (2,), (3,), *SIDES, EVERYWHERE, ()])
+        }
         self.parts: list[tuple] = []
 
     def add(self, cause: str, share: float, change: dict, place, size: np.ndarray) -> None:
@@ -97,7 +107,9 @@ class _Draws:
         if CAUSES[cause].damage:
             table[:, PLACES["shaking"]] = SHAKES[0] + SHAKES[1] * self.normal[:, 4]
         weight = np.full(DRAWS, share * CAUSES[cause].prior / DRAWS)
-        where = np.broadcast_to(place if isinstance(place, np.ndarray) else self.place_of[place], DRAWS)
+        where = np.broadcast_to(
+            place if isinstance(place, np.ndarray) else self.place_of[place], DRAWS
+        )
         self.parts.append((table, weight, np.full(DRAWS, list(CAUSES).index(cause)), where, size))
 
     def trims_of(self, factors: np.ndarray) -> dict:
@@ -107,13 +119,17 @@ class _Draws:
 
 
 def trims_with(mixer: np.ndarray, trims: np.ndarray, factors: np.ndarray) -> np.ndarray:
-    """Change (..., 4) of a reference's trims (4,) where the rotor commands of its level flight rise by `factors` (..., 4)."""
+    """Change (..., 4) of a reference's trims (4,) where the rotor commands of its level flight rise
+    by `factors` (..., 4).
+    """
     mixed = (np.linalg.solve(mixer, np.r_[1.0, trims[1:]]) * factors) @ mixer.T
     return np.concatenate([np.log(mixed[..., :1]), mixed[..., 1:] / mixed[..., :1] - trims[1:]], -1)
 
 
 def hypotheses_of(mixer: np.ndarray, trims: np.ndarray) -> Hypotheses:
-    """Draws for a vehicle of this `mixer` (4, 4) whose reference has these trims (4,), the first a logarithm."""
+    """Draws for a vehicle of this `mixer` (4, 4) whose reference has these trims (4,), the first a
+    logarithm.
+    """
     draws = _Draws(mixer, trims)
     _rotors(draws)
     _weights(draws)
@@ -121,7 +137,9 @@ def hypotheses_of(mixer: np.ndarray, trims: np.ndarray) -> Hypotheses:
         if not told.figures:
             continue
         size = told.usual[0] + told.usual[1] * draws.normal[:, 0]
-        each = {n: size * (1 + INEXACT * draws.normal[:, k + 1]) for k, n in enumerate(told.figures)}
+        each = {
+            n: size * (1 + INEXACT * draws.normal[:, k + 1]) for k, n in enumerate(told.figures)
+        }
         if cause == "motors":
             each["loop_gain"] = LOOP_WITH_MOTORS * size * draws.normal[:, 2]
         draws.add(cause, 1.0, each, (), size)
@@ -134,7 +152,10 @@ def hypotheses_of(mixer: np.ndarray, trims: np.ndarray) -> Hypotheses:
 
 def _rotors(draws: _Draws) -> None:
     """One rotor weaker, or two."""
-    sizes, lost = draws.sizes, draws.sizes / (1.0 + draws.sizes)  # one that needs 1 + d has lost d / (1 + d)
+    sizes, lost = (
+        draws.sizes,
+        draws.sizes / (1.0 + draws.sizes),
+    )  # one that needs 1 + d has lost d / (1 + d)
     for rotor in range(4):
         factors = np.ones((DRAWS, 4))
         factors[:, rotor] += sizes[:, 0]
@@ -153,9 +174,11 @@ def _rotors(draws: _Draws) -> None:
 def _weights(draws: _Draws) -> None:
     """A weight within the circle through the rotors, and one that all carry alike."""
     # In units of the rotors' distance from the axes.
-    radius, angle = np.sqrt(2.0 * draws.places[:, 0]), 2 * np.pi * draws.places[:, 1]
+    radius = np.sqrt(2.0 * draws.places[:, 0])
+    angle = 2 * np.pi * draws.places[:, 1]
     left, rear = (radius * f(angle) for f in (np.cos, np.sin))
-    signs, weight = 4.0 * draws.mixer[1:3], draws.sizes[:, 0]
+    signs = 4.0 * draws.mixer[1:3]
+    weight = draws.sizes[:, 0]
     beside = left[:, None] * signs[0] + rear[:, None] * signs[1]
     near = np.clip(0.5 * beside, -1.0, 1.0)
     places = np.array([draws.place_of[_beside(row)] for row in near])
@@ -166,7 +189,9 @@ def _weights(draws: _Draws) -> None:
 
 
 def _beside(near: np.ndarray) -> tuple[int, ...]:
-    """The rotors beside a weight, from how near (4,) -1 to 1 it is to each: one, two of a side, or all."""
+    """The rotors beside a weight, from how near (4,) -1 to 1 it is to each: one, two of a side, or
+    all.
+    """
     order = np.argsort(-near)
     if near[order[0]] < 0.3:
         return EVERYWHERE

@@ -1,9 +1,11 @@
-"""Days as a random effect: figures of each day, how far normal days of a vehicle lie apart, and what the battery has in it.
+"""Days as a random effect: figures of each day, how far normal days of a vehicle lie apart, and
+what the battery has in it.
 
-A flight's trims (how hard it had to work to hover, and the roll, pitch and yaw that the mixer added to stay level)
-repeat within a day far better than from day to day: batteries, propellers and how the frame was put together
-shift them. The spread of days is learnt from the reference's days where it holds several, over a prior; flights of one
-folder whose trims are far apart count as several days.
+A flight's trims (how hard it had to work to hover, and the roll, pitch and yaw that the mixer added
+to stay level) repeat within a day far better than from day to day: batteries, propellers and how
+the frame was put together shift them. The spread of days is learnt from the reference's days where
+it holds several, over a prior; flights of one folder whose trims are far apart count as several
+days.
 """
 
 import dataclasses
@@ -24,14 +26,17 @@ VOLTAGE_SPREAD = 0.1  # V, by which flights without a logged voltage may differ
 
 
 def days_told_apart(figures: Sequence[FlightFigures]) -> list[FlightFigures]:
-    """The flights of one folder with their days: those whose roll and pitch trims lie further apart than flights of
-    a day ever do count as flown on different days."""
+    """The flights of one folder with their days: those whose roll and pitch trims lie further apart
+    than flights of a day ever do count as flown on different days.
+    """
     if len(figures) < 2:
         return list(figures)
     trims = np.array([f.all()[0][1:3] for f in figures])
     error = max(float(np.median([f.all()[1][1:3].max() for f in figures])), 1e-9)
     groups = fcluster(linkage(trims, "complete"), max(SAME_DAY, 3.0 * error), "distance")
-    return [dataclasses.replace(f, day=f"{f.day}#{g}") for f, g in zip(figures, groups, strict=True)]
+    return [
+        dataclasses.replace(f, day=f"{f.day}#{g}") for f, g in zip(figures, groups, strict=True)
+    ]
 
 
 @dataclass(frozen=True)
@@ -58,10 +63,13 @@ class Battery:
 
 
 def battery_of(figures: Sequence[FlightFigures]) -> Battery:
-    """How hover follows the battery's voltage: flights of a day against each other, since neither the day nor a
-    change can enter there."""
+    """How hover follows the battery's voltage: flights of a day against each other, since neither
+    the day nor a change can enter there.
+    """
     mean, sigma = VOLTAGE_SLOPE
-    xx, xy, voltages = 0.0, 0.0, []
+    xx = 0.0
+    xy = 0.0
+    voltages = []
     for day in {f.day for f in figures}:
         pairs = [
             (f.voltage, np.log(f.values["hover"][0]))
@@ -76,12 +84,15 @@ def battery_of(figures: Sequence[FlightFigures]) -> Battery:
     noise = WITHIN_DAY[HOVER] ** 2
     precision = xx / noise + 1 / sigma**2
     voltage = float(np.mean(voltages)) if voltages else 0.0
-    return Battery(voltage, float((xy / noise + mean / sigma**2) / precision), float(precision**-0.5))
+    return Battery(
+        voltage, float((xy / noise + mean / sigma**2) / precision), float(precision**-0.5)
+    )
 
 
 def by_day(figures: Sequence[FlightFigures], battery: Battery) -> Days:
     """Means of each day's flights, weighted by their errors, at the voltage of `battery`."""
-    days, variances = [], []
+    days = []
+    variances = []
     for day in dict.fromkeys(f.day for f in figures):
         each = [_at_voltage(f, battery) for f in figures if f.day == day]
         values, errors = (np.array(part) for part in zip(*each, strict=True))
@@ -90,7 +101,8 @@ def by_day(figures: Sequence[FlightFigures], battery: Battery) -> Days:
         with np.errstate(invalid="ignore", divide="ignore"):
             days.append((np.nan_to_num(values) * precision).sum(0) / total)
             variances.append(np.where(total > 0, 1 / total, np.nan))
-    days, variances = np.array(days), np.array(variances)
+    days = np.array(days)
+    variances = np.array(variances)
     count = np.maximum(np.isfinite(days).sum(0), 1)
     mean = np.where(np.isfinite(days).any(0), np.nansum(days, 0) / count, np.nan)
     return Days(days, mean, np.sqrt(np.nansum(variances, 0)) / count)
@@ -111,9 +123,11 @@ def _at_voltage(flight: FlightFigures, battery: Battery) -> tuple[np.ndarray, np
 
 
 def spread_of_days(*sets: Days) -> tuple[np.ndarray, np.ndarray]:
-    """Standard deviation (F,) of normal days and the degrees of freedom (F,) behind it: the prior and what the days of each
-    set show."""
-    freedom, total = np.full(len(FIGURES), PRIOR_DAYS), PRIOR_DAYS * DAY_SPREAD**2
+    """Standard deviation (F,) of normal days and the degrees of freedom (F,) behind it: the prior
+    and what the days of each set show.
+    """
+    freedom = np.full(len(FIGURES), PRIOR_DAYS)
+    total = PRIOR_DAYS * DAY_SPREAD**2
     for one in sets:
         freedom = freedom + np.maximum(one.count - 1, 0)
         total = total + np.nansum((one.days - one.mean) ** 2, 0)

@@ -1,6 +1,7 @@
-"""What one flight says about its vehicle without a model of it: how hard each rotor works, how strongly the air
-brakes, how late torques follow the motors, how noisy the sensors are. Poor in absolute terms (scales, biases
-and the simulator's misfit are in them), good for comparing flights with flights, where what is shared cancels.
+"""What one flight says about its vehicle without a model of it: how hard each rotor works, how
+strongly the air brakes, how late torques follow the motors, how noisy the sensors are. Poor in
+absolute terms (scales, biases and the simulator's misfit are in them), good for comparing flights
+with flights, where what is shared cancels.
 """
 
 from dataclasses import dataclass
@@ -26,8 +27,10 @@ LAGS = np.geomspace(0.004, 0.2, 40)  # s, time constants that are tried
 
 @dataclass(frozen=True)
 class Figure:
-    """What a figure is in words, its unit and the factor to it (0: a logarithm, told as a change in per cent), and its standard
-    deviations over a vehicle's normal days and over flights within a day."""
+    """What a figure is in words, its unit and the factor to it (0: a logarithm, told as a change in
+    per cent), and its standard deviations over a vehicle's normal days and over flights within a
+    day.
+    """
 
     words: str
     unit: str
@@ -36,9 +39,10 @@ class Figure:
     within: float
 
 
-# Trims, as shares of hover: 1 to 2.5 % over days, measured on published flights of two Crazyflies; yaw more, because its torque
-# is a hundredth of thrust times arm and a tilted motor shows in it. Gains are the firmware's numbers, which no day moves: theirs
-# is what the estimate repeats to in flights of different kinds.
+# Trims, as shares of hover: 1 to 2.5 % over days, measured on published flights of two Crazyflies;
+# yaw more, because its torque is a hundredth of thrust times arm and a tilted motor shows in it.
+# Gains are the firmware's numbers, which no day moves: theirs is what the estimate repeats to in
+# flights of different kinds.
 FIGURES = {
     "hover": Figure("thrust command at hover", "%", 0.0, 0.012, 0.003),
     "roll": Figure("roll trim", "% of hover", 100.0, 0.02, 0.0025),
@@ -59,11 +63,12 @@ TRIMS = ("hover", "roll", "pitch", "yaw")
 class FlightFigures:
     """One flight's figures: {name: (value, standard error)}.
 
-    hover: mean thrust command per specific thrust, as a fraction of a rotor's maximum at 1 g; roll, pitch, yaw: the
-    mixer's share of it that keeps the vehicle level (left, rear and clockwise rotors harder: positive), also
-    fractions of hover; drag_x, drag_y: 1/s. Logarithms of: lag, the time constant in s from motors to angular
-    acceleration; torque_gain, angular acceleration per command; loop_gain, command per rate error; shaking, the rms of
-    gyroscope and motors above 20 Hz. What the log can't give is missing.
+    hover: mean thrust command per specific thrust, as a fraction of a rotor's maximum at 1 g; roll,
+    pitch, yaw: the mixer's share of it that keeps the vehicle level (left, rear and clockwise
+    rotors harder: positive), also fractions of hover; drag_x, drag_y: 1/s. Logarithms of: lag, the
+    time constant in s from motors to angular acceleration; torque_gain, angular acceleration per
+    command; loop_gain, command per rate error; shaking, the rms of gyroscope and motors above 20
+    Hz. What the log can't give is missing.
     """
 
     name: str
@@ -78,7 +83,9 @@ class FlightFigures:
 
 
 def mixer_of(vehicle) -> np.ndarray:
-    """(4, 4) rows hover, roll, pitch, yaw: signs of each rotor's torque about x, y and z, and a quarter each."""
+    """(4, 4) rows hover, roll, pitch, yaw: signs of each rotor's torque about x, y and z, and a
+    quarter each.
+    """
     place = np.asarray(vehicle.rotor_position, float)
     spin = np.asarray(vehicle.rotor_spin, float)
     return np.stack([np.ones(4), np.sign(place[:, 1]), -np.sign(place[:, 0]), np.sign(spin)]) / 4.0
@@ -108,7 +115,9 @@ def _in_the_air(flight: Flight, case: Case) -> np.ndarray:
         time = flight.time[stretch]
         rows[stretch] = (time > time[0] + SETTLED) & (time < time[-1] - SETTLED)
     if flight.position is not None:
-        height = flight.interpolated("position")[:, 2] - float(case.vehicle_file.log.get("floor_z", 0.0))
+        height = flight.interpolated("position")[:, 2] - float(
+            case.vehicle_file.log.get("floor_z", 0.0)
+        )
         clear = height > CLEAR_OF_FLOOR
         # Who flies low all the time is compared as he flies.
         rows &= clear if clear[rows].mean() > 0.5 else True
@@ -135,8 +144,10 @@ def _trims(flight: Flight, motor: np.ndarray, rows: np.ndarray, mixer: np.ndarra
 
 
 def _specific_thrust(flight: Flight) -> np.ndarray:
-    """m/s^2 (T,), by the path and the attitude where they are known: an accelerometer's bias would be taken for
-    a change of thrust. Without a path g: over a flight that starts and ends at rest it is the mean."""
+    """m/s^2 (T,), by the path and the attitude where they are known: an accelerometer's bias would
+    be taken for a change of thrust. Without a path g: over a flight that starts and ends at rest it
+    is the mean.
+    """
     if flight.velocity is None:
         return np.full(len(flight), GRAVITY)
     velocity = flight.interpolated("velocity")
@@ -154,8 +165,10 @@ def _dynamics(flight: Flight, case: Case, vehicle) -> dict:
         return {}
     out = {}
     gyro = None if flight.body_rates_derived else on_clock(flight, "body_rates", grid)
-    force, motor = on_clock(flight, "specific_force", grid), on_clock(flight, "motor_command", grid)
-    quaternion, velocity = on_clock(flight, "quaternion", grid), on_clock(flight, "velocity", grid)
+    force = on_clock(flight, "specific_force", grid)
+    motor = on_clock(flight, "motor_command", grid)
+    quaternion = on_clock(flight, "quaternion", grid)
+    velocity = on_clock(flight, "velocity", grid)
     if quaternion is not None and velocity is not None:
         out |= _drag(quaternion, velocity, force)
     if gyro is not None:
@@ -182,15 +195,17 @@ def _drag(quaternion, velocity, force) -> dict:
 
 
 def _torque(torque, rates) -> dict:
-    """The time constant from roll and pitch torques to angular accelerations: of all first-order lags the one whose output
-    correlates best, by quarters of the flight; and the gain behind it."""
+    """The time constant from roll and pitch torques to angular accelerations: of all first-order
+    lags the one whose output correlates best, by quarters of the flight; and the gain behind it.
+    """
     if in_band(rates, TURNING).std(0).min() < 0.15:
         return {}
     y = in_band(np.gradient(rates, 1 / RATE, axis=0), TURNING)
     lagged = np.stack([in_band(first_order(torque, lag), TURNING) for lag in LAGS])
     estimates = []
     for part in np.array_split(np.arange(len(y)), 4):
-        cross, power = (y[part] * lagged[:, part]).sum((1, 2)), (lagged[:, part] ** 2).sum((1, 2))
+        cross = (y[part] * lagged[:, part]).sum((1, 2))
+        power = (lagged[:, part] ** 2).sum((1, 2))
         scores = cross / np.sqrt(power)
         best = int(np.argmax(scores))
         if not 0 < best < len(LAGS) - 1 or cross[best] <= 0:
@@ -198,16 +213,23 @@ def _torque(torque, rates) -> dict:
         a, b, c = scores[best - 1 : best + 2]
         peak = 0.5 * (a - c) / (a - 2 * b + c) * np.log(LAGS[1] / LAGS[0])
         estimates.append((np.log(LAGS[best]) + peak, np.log(cross[best] / power[best])))
-    mean, error = np.mean(estimates, 0), np.std(estimates, 0, ddof=1) / 2.0
-    return {"lag": (float(mean[0]), float(error[0])), "torque_gain": (float(mean[1]), float(error[1]))}
+    mean = np.mean(estimates, 0)
+    error = np.std(estimates, 0, ddof=1) / 2.0
+    return {
+        "lag": (float(mean[0]), float(error[0])),
+        "torque_gain": (float(mean[1]), float(error[1])),
+    }
 
 
 def _loop(torque, rates, commands) -> dict:
-    """How strongly the rate loop answers a rate error, beside what it answers to a change of the rates, by quarters of the
-    flight. In closed loop noise is in all three, so the commands are the instruments (two-stage least squares)."""
+    """How strongly the rate loop answers a rate error, beside what it answers to a change of the
+    rates, by quarters of the flight. In closed loop noise is in all three, so the commands are the
+    instruments (two-stage least squares).
+    """
     # motors hold from a row to the next: rates count in the middle
     after = np.concatenate([rates[1:], rates[-1:]])
-    error, change = commands - 0.5 * (rates + after), (after - rates) * RATE
+    error = commands - 0.5 * (rates + after)
+    change = (after - rates) * RATE
     signals = (torque, error, change, *(np.roll(commands, k, 0) for k in DELAYS))
     filtered = np.stack([in_band(values, ANSWERING) for values in signals], -1)
     gains = []
@@ -224,7 +246,9 @@ def _loop(torque, rates, commands) -> dict:
 
 
 def _shaking(gyro, motor) -> dict:
-    """Mean logarithm of the rms of gyroscope and motors above 20 Hz, sixths of the flight as units."""
+    """Mean logarithm of the rms of gyroscope and motors above 20 Hz, sixths of the flight as
+    units.
+    """
     parts = [np.array_split(in_band(values, (20.0, 45.0)), 6) for values in (gyro, motor)]
     each = np.mean([[0.5 * np.log((p**2).sum(1).mean() + 1e-12) for p in own] for own in parts], 0)
     return {"shaking": (float(each.mean()), float(each.std(ddof=1) / np.sqrt(len(each))))}

@@ -14,8 +14,12 @@ from openjax.show.pages import AFTER, BEFORE, GREY, STYLE, as_svg, filled
 
 
 def prediction(change: Change) -> dict:
-    """The case's entry in a predictions file: `probabilities` of no change and of each cause add up to one."""
-    causes = {c.replace(" ", "_"): round(change.probability * p, 5) for c, p in change.causes.items()}
+    """The case's entry in a predictions file: `probabilities` of no change and of each cause add up
+    to one.
+    """
+    causes = {
+        c.replace(" ", "_"): round(change.probability * p, 5) for c, p in change.causes.items()
+    }
     return {
         "changed": change.changed,
         "effects": list(change.effects),
@@ -38,10 +42,15 @@ def to_dict(change: Change) -> dict:
         "least_shown": round(change.least, 4),
         "size90": [round(change.size.low, 4), round(change.size.high, 4)],
         "places": {
-            "+".join(map(str, p)) or "unclear": round(v, 4) for p, v in change.places.items() if v > 5e-4
+            "+".join(map(str, p)) or "unclear": round(v, 4)
+            for p, v in change.places.items()
+            if v > 5e-4
         },
         "figures": {n: interval(v) for n, v in change.figures.items()},
-        "days": {"reference": change.days, "spread": {n: round(v, 4) for n, v in change.spread.items()}},
+        "days": {
+            "reference": change.days,
+            "spread": {n: round(v, 4) for n, v in change.spread.items()},
+        },
         "flights": [
             {"flight": f.name, "set": name, "day": f.day.rpartition("/")[2], "voltage": f.voltage}
             | {n: round(v[0], 5) for n, v in f.values.items()}
@@ -67,7 +76,8 @@ def in_words(change: Change) -> list[str]:
         lines.append(f"Size: {value:.0f} % [{low:.0f}, {high:.0f}] of a rotor's thrust{end}")
         if len(told) > 1:
             lines.append(
-                "These flights can't split the causes named; a weighed vehicle or another propeller would."
+                "These flights can't split the causes named; a weighed vehicle or another "
+                "propeller would."
             )
     elif change.changed:
         moved = dict.fromkeys(n for c in change.likely_causes for n in CAUSES[c].figures)
@@ -81,44 +91,62 @@ def in_words(change: Change) -> list[str]:
         for n, v in change.figures.items()
         if n in TRIMS
     )
-    lines.append(f"Trims against the reference, as shares of hover, with the spread of days: {differences}.")
+    lines.append(
+        f"Trims against the reference, as shares of hover, with the spread of days: {differences}."
+    )
     days = f"{change.days} day{'s' * (change.days > 1)}"
     spread = (
-        "estimated from them and a prior" if change.days > 1 else "a prior: fly the reference on several days"
+        "estimated from them and a prior"
+        if change.days > 1
+        else "a prior: fly the reference on several days"
     )
     lines.append(
-        f"The reference holds {len(change.reference)} flights of {days} (their spread is {spread}). A single rotor that "
+        f"The reference holds {len(change.reference)} flights of {days} (their spread is "
+        f"{spread}). A single rotor that "
         f"lost less than {100 * change.least:.0f} % of its thrust would not show."
     )
     return lines
 
 
 def _cause_in_words(change: Change, cause: str) -> str:
-    rotors, more = " and ".join(str(r) for r in change.rotors), change.size.value > 0
-    weaker, several = "weaker" if more else "stronger", len(change.rotors) > 1
+    rotors = " and ".join(str(r) for r in change.rotors)
+    more = change.size.value > 0
+    weaker = "weaker" if more else "stronger"
+    several = len(change.rotors) > 1
     if cause == "one rotor weaker" and several:
         return f"one of rotors {rotors} ({change.side}) is {weaker}"
     if cause.endswith("weaker"):
-        return f"rotor{'s' * several} {rotors} ({change.side}) {'are' if several else 'is'} {weaker}"
+        return (
+            f"rotor{'s' * several} {rotors} ({change.side}) {'are' if several else 'is'} {weaker}"
+        )
     if cause == "weight":
         beside = f" at the {change.side}" if change.side and change.side != "diagonal" else ""
         return f"a weight was {'added' if more else 'taken off'}{beside}"
     if cause == "whole vehicle":
-        return "the whole vehicle is heavier or its thrust weaker" if more else "it is lighter or stronger"
+        return (
+            "the whole vehicle is heavier or its thrust weaker"
+            if more
+            else "it is lighter or stronger"
+        )
     what = CAUSES[cause].what
     return f"the {what} changed" if what else "something without a known pattern"
 
 
 def _difference(name: str, d: Interval) -> str:
     """ "+12 % [+8, +16]"; see `Figure`."""
-    unit, factor = FIGURES[name].unit, FIGURES[name].factor
-    value, low, high = (factor * v if factor else 100 * np.expm1(v) for v in (d.value, d.low, d.high))
+    unit = FIGURES[name].unit
+    factor = FIGURES[name].factor
+    value, low, high = (
+        factor * v if factor else 100 * np.expm1(v) for v in (d.value, d.low, d.high)
+    )
     return f"{value:+.3g} {unit} [{low:+.3g}, {high:+.3g}]"
 
 
 def write(change: Change, folder: Path, pictures: bool = True) -> None:
     """`changes.json` and (with `pictures`) `changes.html` into an existing folder."""
-    (folder / "changes.json").write_text(json.dumps(to_dict(change), indent=1) + "\n", encoding="utf-8")
+    (folder / "changes.json").write_text(
+        json.dumps(to_dict(change), indent=1) + "\n", encoding="utf-8"
+    )
     if pictures:
         (folder / "changes.html").write_text(html_of(change), encoding="utf-8")
 
@@ -127,13 +155,17 @@ def html_of(change: Change) -> str:
     """One page, nothing to fetch from elsewhere."""
     with rc_context(STYLE):
         picture = as_svg(draw(change), change.name)
-    differences = [(FIGURES[name].words, _difference(name, d)) for name, d in change.figures.items()]
+    differences = [
+        (FIGURES[name].words, _difference(name, d)) for name, d in change.figures.items()
+    ]
     told = {"lines": in_words(change), "picture": picture, "differences": differences}
     return filled("changes.html.jinja", Path(__file__).parent, change=change, **told)
 
 
 def draw(change: Change):
-    """Trims of every flight, day by day, beside what days differ by; and where the change would sit."""
+    """Trims of every flight, day by day, beside what days differ by; and where the change would
+    sit.
+    """
     figure = Figure(figsize=(11, 3.6), layout="constrained")
     axes = figure.subplots(1, 5, width_ratios=(1, 1, 1, 1, 1.3))
     level = np.mean([f.values["hover"][0] for f in change.reference])
@@ -144,15 +176,26 @@ def draw(change: Change):
                 own = [f.values[name][0] for f in figures if f.day == day]
                 values = 100 * (np.array(own) / level - 1.0 if name == "hover" else np.array(own))
                 place = k + 0.6 * ((j + 0.5) / len(days) - 0.5)
-                axis.plot(np.full(len(values), place), values, "o", ms=5, color=(GREY, BEFORE)[k], alpha=0.8)
+                axis.plot(
+                    np.full(len(values), place),
+                    values,
+                    "o",
+                    ms=5,
+                    color=(GREY, BEFORE)[k],
+                    alpha=0.8,
+                )
         middle = 100 * np.mean([f.values[name][0] / level - 1 if name == "hover" else f.values[name][0]
                                 for f in change.reference])  # fmt: skip
         spread = 100 * change.spread[name]
-        axis.axhspan(middle - 1.645 * spread, middle + 1.645 * spread, color=AFTER, alpha=0.12, lw=0)
+        axis.axhspan(
+            middle - 1.645 * spread, middle + 1.645 * spread, color=AFTER, alpha=0.12, lw=0
+        )
         axis.set(title=name, xticks=(0, 1), xticklabels=("reference", "new"), xlim=(-0.6, 1.6))
     axes[0].set_ylabel("% of hover (band: 90 % of normal days)")
     places = sorted(change.places.items(), key=lambda item: -item[1])[:6]
-    names = ["all" if len(p) == 4 else "+".join(f"m{i}" for i in p) or "no rotor's" for p, _ in places]
+    names = [
+        "all" if len(p) == 4 else "+".join(f"m{i}" for i in p) or "no rotor's" for p, _ in places
+    ]
     shares = [change.probability * share for _, share in places]
     axes[4].barh(["no change", *names][::-1], [1 - change.probability, *shares][::-1], color=AFTER)
     axes[4].set(title="probability", xlim=(0, 1))

@@ -22,10 +22,11 @@ class Interval:
 class Change:
     """What differs between two sets of flights.
 
-    `probability` that the vehicle changed. `places` {rotors: p} and `causes` {cause: p} say how probable each is if it
-    did (`causes_here`: at the most probable place); rotors count 1 to 4 as logged (m1..m4). `trims_changed`: the most
-    probable cause moves the trims. `size` is the thrust that was lost, as a share of one rotor's, at the most probable place (for
-    a weight: its share of a rotor's load); `figures` are the differences, their intervals with the spread of a day in
+    `probability` that the vehicle changed. `places` {rotors: p} and `causes` {cause: p} say how
+    probable each is if it did (`causes_here`: at the most probable place); rotors count 1 to 4 as
+    logged (m1..m4). `trims_changed`: the most probable cause moves the trims. `size` is the thrust
+    that was lost, as a share of one rotor's, at the most probable place (for a weight: its share of
+    a rotor's load); `figures` are the differences, their intervals with the spread of a day in
     them; `least` is the loss of a single rotor that these flights would have shown.
     """
 
@@ -53,7 +54,9 @@ class Change:
 
     @property
     def likely_causes(self) -> tuple[str, ...]:
-        """The most probable cause at the most probable place, and those that these flights can't split from it."""
+        """The most probable cause at the most probable place, and those that these flights can't
+        split from it.
+        """
         top = max(self.causes_here.values())
         likely = [c for c, p in self.causes_here.items() if p > 0.25 * top]
         return tuple(sorted(likely, key=lambda c: -self.causes_here[c]))
@@ -64,5 +67,7 @@ class Change:
         if not self.changed:
             return ()
         return tuple(
-            dict.fromkeys(effect for cause in self.likely_causes for effect in CAUSES[cause].effects)
+            dict.fromkeys(
+                effect for cause in self.likely_causes for effect in CAUSES[cause].effects
+            )
         )

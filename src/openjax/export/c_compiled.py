@@ -1,4 +1,6 @@
-"""A generated C program, compiled here and called from Python: to compare it with what it was made of."""
+"""A generated C program, compiled here and called from Python: to compare it with what it was made
+of.
+"""
 
 import ctypes
 import math
@@ -28,21 +30,31 @@ class Compiled:
             command = [compiler, *FLAGS, "-o", str(library), str(folder / f"{name}.c"), "-lm"]
             ran = subprocess.run(command, capture_output=True, text=True, check=False)
             if ran.returncode != 0:
-                complaint = next((line for line in ran.stderr.splitlines() if "error" in line), "no word")
+                complaint = next(
+                    (line for line in ran.stderr.splitlines() if "error" in line), "no word"
+                )
                 raise UserError(f"{compiler} refuses the exported program: {complaint}")
             self._function = getattr(ctypes.CDLL(str(library)), name)
         self._function.restype = None
         self._inputs = tuple(program.inputs)
         fields = [
-            (name, (ctypes.c_ubyte if kind.dtype == bool else ctypes.c_float) * math.prod(kind.shape))
+            (
+                name,
+                (ctypes.c_ubyte if kind.dtype == bool else ctypes.c_float) * math.prod(kind.shape),
+            )
             for name, kind in program.inputs.items()
         ]
         observation = type("Observation", (ctypes.Structure,), {"_fields_": fields})()
-        self._observation = {name: np.ctypeslib.as_array(getattr(observation, name)) for name in self._inputs}
+        self._observation = {
+            name: np.ctypeslib.as_array(getattr(observation, name)) for name in self._inputs
+        }
         self._workspace = np.full(program.workspace, np.nan, np.float32)  # nobody clears it
         self._output = np.zeros(program.shape, np.float32)
         arrays = (self._workspace, self._output)
-        self._pointers = [ctypes.byref(observation), *(ctypes.c_void_p(a.ctypes.data) for a in arrays)]
+        self._pointers = [
+            ctypes.byref(observation),
+            *(ctypes.c_void_p(a.ctypes.data) for a in arrays),
+        ]
 
     def __call__(self, seen: dict) -> np.ndarray:
         """Outputs (number, ...) for {input: array (number, ...)}."""

@@ -1,7 +1,8 @@
-"""A JAX function as a plain C99 program: no allocation, no library but `math.h`, weights as const arrays.
+"""A JAX function as a plain C99 program: no allocation, no library but `math.h`, weights as const
+arrays.
 
-The function is traced and what doesn't depend on its inputs is computed, as for ONNX. Intermediate arrays share one
-workspace, which the caller provides.
+The function is traced and what doesn't depend on its inputs is computed, as for ONNX. Intermediate
+arrays share one workspace, which the caller provides.
 """
 
 import math
@@ -45,7 +46,9 @@ class CProgram:
 
 
 def _placed(buffers: list[Buffer]) -> int:
-    """Give all buffers their offsets, so that two that live at once don't overlap; the floats needed."""
+    """Give all buffers their offsets, so that two that live at once don't overlap; the floats
+    needed.
+    """
     placed: list[Buffer] = []
     for buffer in sorted(buffers, key=lambda b: -b.size):
         others = sorted(
@@ -62,9 +65,14 @@ def _placed(buffers: list[Buffer]) -> int:
 
 
 def c_program(
-    function: Callable, inputs: dict[str, jax.ShapeDtypeStruct], output: str, prefix: str, about: str
+    function: Callable,
+    inputs: dict[str, jax.ShapeDtypeStruct],
+    output: str,
+    prefix: str,
+    about: str,
 ) -> CProgram:
-    """A C program of `function(**inputs)`, which returns one array; inputs that it doesn't read are left out.
+    """A C program of `function(**inputs)`, which returns one array; inputs that it doesn't read are
+    left out.
 
     Args:
       function: to be traced.
@@ -78,7 +86,11 @@ def c_program(
     """
     writer, workspace, shape = _written(function, inputs, output)
     text = "\n".join(writer.statements)
-    read = {name: kind for name, kind in inputs.items() if f"in->{name}[" in text or f"in->{name}," in text}
+    read = {
+        name: kind
+        for name, kind in inputs.items()
+        if f"in->{name}[" in text or f"in->{name}," in text
+    }
     values = {"about": about, "prefix": prefix, "inputs": read, "output": output, "shape": shape}
     values |= {"workspace": workspace, "writer": writer, "statements": text}
     return CProgram(
@@ -94,8 +106,11 @@ def c_program(
 
 
 def _written(function, inputs, output):
-    """The statements of a function, the floats of workspace that they need, and the shape of its result."""
-    traced, writer = trace(function, inputs), Writer()
+    """The statements of a function, the floats of workspace that they need, and the shape of its
+    result.
+    """
+    traced = trace(function, inputs)
+    writer = Writer()
     given = [dense_array(f"in->{name}", kind.shape) for name, kind in inputs.items()]
     (result,) = writer.run(traced.jaxpr, traced.consts, given)
     shape = tuple(traced.out_avals[0].shape)

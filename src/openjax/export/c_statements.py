@@ -1,7 +1,8 @@
-"""Statements of a C program, written operation by operation: what `openjax.export.c_program` puts into a file.
+"""Statements of a C program, written operation by operation: what `openjax.export.c_program` puts
+into a file.
 
-Products of matrices become calls of one function, other operations a loop nest each. Transposes, slices and broadcasts are
-arrays with other strides, as in NumPy, and cost nothing.
+Products of matrices become calls of one function, other operations a loop nest each. Transposes,
+slices and broadcasts are arrays with other strides, as in NumPy, and cost nothing.
 """
 
 import math
@@ -33,7 +34,9 @@ class Buffer:
 
 @dataclass(frozen=True)
 class Array:
-    """An array of the program, or a part of one: entry (i, j) is name[offset + i * strides[0] + j * strides[1]], and so on."""
+    """An array of the program, or a part of one: entry (i, j) is name[offset + i * strides[0] + j *
+    strides[1]], and so on.
+    """
 
     name: str
     shape: tuple[int, ...]
@@ -70,7 +73,9 @@ class Array:
     ) -> "Array":
         """Entries from `starts` on, every `steps`-th of each axis."""
         steps = steps or [1] * len(shape)
-        offset = self.offset + sum(start * own for start, own in zip(starts, self.strides, strict=True))
+        offset = self.offset + sum(
+            start * own for start, own in zip(starts, self.strides, strict=True)
+        )
         strides = tuple(step * own for step, own in zip(steps, self.strides, strict=True))
         return replace(self, shape=tuple(shape), strides=strides, offset=int(offset))
 
@@ -95,21 +100,26 @@ class Writer(Walk):
         self.statements: list[str] = []
         self.buffers: list[Buffer] = []
         self.constants: list[np.ndarray] = []
-        self.multiply_adds, self.functions = 0, 0
+        self.multiply_adds = 0
+        self.functions = 0
         self._names: dict[bytes, int] = {}
 
     # -- arrays
 
     def array(self, value) -> Array:
-        """A value as it is read; one number is written where it is used, rows that are alike are kept once."""
+        """A value as it is read; one number is written where it is used, rows that are alike are
+        kept once.
+        """
         if isinstance(value, Array):
             return value
         value = np.asarray(value, np.float32)
-        shape, strides = value.shape, list(row_by_row(value.shape))
+        shape = value.shape
+        strides = list(row_by_row(value.shape))
         for axis in range(value.ndim):
             one = value.take([0], axis)
             if value.shape[axis] > 1 and np.array_equal(np.broadcast_to(one, value.shape), value):
-                value, strides = one, [s // shape[axis] if a < axis else s for a, s in enumerate(strides)]
+                value = one
+                strides = [s // shape[axis] if a < axis else s for a, s in enumerate(strides)]
                 strides[axis] = 0
         if value.size == 1:
             return Array("", shape, tuple(strides), number=literal(value.item()))
@@ -135,7 +145,9 @@ class Writer(Walk):
 
     def write(self, out: Array, form: str, *values: Array) -> Array:
         """Write every entry of an array, which is the form of those of `values`."""
-        if all(value.number or (value.dense and value.shape == out.shape) for value in (out, *values)):
+        if all(
+            value.number or (value.dense and value.shape == out.shape) for value in (out, *values)
+        ):
             whole = (math.prod(out.shape),)  # one loop
             out, *values = (replace(value, shape=whole, strides=(1,)) for value in (out, *values))
         indices = index_names(out.shape)
@@ -159,7 +171,9 @@ class Writer(Walk):
             v.aval.dtype.kind for v in (operation.equation.invars[0], operation.equation.outvars[0])
         )
         if after == "b" != before:
-            raise UserError("the policy turns numbers into flags, which the C export doesn't know yet")
+            raise UserError(
+                "the policy turns numbers into flags, which the C export doesn't know yet"
+            )
         return operation.inputs[0]
 
     _op_copy = _op_copy_p = _op_optimization_barrier = _op_convert_element_type = _op_stop_gradient
@@ -174,15 +188,19 @@ class Writer(Walk):
         return self._made(form, [value], operation.shape)
 
     def _transpose(self, value, order):
-        shape, strides = zip(*((value.shape[axis], value.strides[axis]) for axis in order), strict=True)
+        shape, strides = zip(
+            *((value.shape[axis], value.strides[axis]) for axis in order), strict=True
+        )
         return replace(value, shape=shape, strides=strides)
 
     def _op_slice(self, operation):
-        starts, steps = operation.parameters["start_indices"], operation.parameters["strides"]
+        starts = operation.parameters["start_indices"]
+        steps = operation.parameters["strides"]
         return operation.inputs[0].part(starts, operation.shape, steps)
 
     def _op_broadcast_in_dim(self, operation):
-        value, strides = operation.inputs[0], [0] * len(operation.shape)
+        value = operation.inputs[0]
+        strides = [0] * len(operation.shape)
         for axis, size, own in zip(
             operation.parameters["broadcast_dimensions"], value.shape, value.strides, strict=True
         ):
@@ -191,20 +209,30 @@ class Writer(Walk):
 
     def _reshape(self, value, shape):
         value = self.array(value)
-        if [n for n in value.shape if n > 1] == [n for n in shape if n > 1]:  # only axes of length one
-            left = iter(own for own, size in zip(value.strides, value.shape, strict=True) if size > 1)
-            return replace(value, shape=shape, strides=tuple(next(left) if size > 1 else 0 for size in shape))
+        if [n for n in value.shape if n > 1] == [
+            n for n in shape if n > 1
+        ]:  # only axes of length one
+            left = iter(
+                own for own, size in zip(value.strides, value.shape, strict=True) if size > 1
+            )
+            return replace(
+                value, shape=shape, strides=tuple(next(left) if size > 1 else 0 for size in shape)
+            )
         return replace(self.stored(value), shape=shape, strides=row_by_row(shape))
 
     def _op_split(self, operation):
-        value, axis, start, parts = operation.inputs[0], operation.parameters["axis"], 0, []
+        value = operation.inputs[0]
+        axis = operation.parameters["axis"]
+        start = 0
+        parts = []
         for size in operation.parameters["sizes"]:
             parts.append(value.part(*_within(value.shape, axis, start, size)))
             start += size
         return parts
 
     def _join(self, values, shape, axis):
-        joined, start = self.new(shape), 0
+        joined = self.new(shape)
+        start = 0
         for value in map(self.array, values):
             self.write(joined.part(*_within(shape, axis, start, value.shape[axis])), "{}", value)
             start += value.shape[axis]
@@ -218,9 +246,12 @@ class Writer(Walk):
         return padded
 
     def _op_reduce_sum(self, operation):
-        value, shape, axes = operation.inputs[0], operation.shape, operation.parameters["axes"]
+        value = operation.inputs[0]
+        shape = operation.shape
+        axes = operation.parameters["axes"]
         start, form = _REDUCE[operation.name]
-        reduced, every = self.new(shape), index_names(value.shape)
+        reduced = self.new(shape)
+        every = index_names(value.shape)
         outer = [index for axis, index in enumerate(every) if axis not in axes]
         inner = [index for axis, index in enumerate(every) if axis in axes]
         added = f"sum = {form.format('sum', value.at(every))};"
@@ -234,16 +265,20 @@ class Writer(Walk):
     _op_reduce_max = _op_reduce_min = _op_reduce_sum
 
     def _product(self, left, right, shape):
-        left, right = self.stored(self.array(left)), self.stored(self.array(right))
+        left = self.stored(self.array(left))
+        right = self.stored(self.array(right))
         rows, inner, columns = *left.shape[-2:], shape[-1]
-        out, batches = self.new(shape), math.prod(shape[:-2])
+        out = self.new(shape)
+        batches = math.prod(shape[:-2])
         for k in range(batches):
             sizes = (rows * inner, inner * columns, rows * columns)
             places = [
                 replace(v, offset=v.offset + k * n).start
                 for v, n in zip((left, right, out), sizes, strict=True)
             ]
-            self.emit(f"product({', '.join(places)}, {rows}, {inner}, {columns});", left, right, out)
+            self.emit(
+                f"product({', '.join(places)}, {rows}, {inner}, {columns});", left, right, out
+            )
         self.multiply_adds += batches * rows * inner * columns
         return out
 

@@ -33,7 +33,9 @@ def loops(sizes, indices, body: str) -> str:
     ]
     if "\n" in body:
         body = "{\n" + indented(body) + "\n}"
-    return "\n".join([*(4 * " " * k + head for k, head in enumerate(heads)), indented(body, len(heads))])
+    return "\n".join(
+        [*(4 * " " * k + head for k, head in enumerate(heads)), indented(body, len(heads))]
+    )
 
 
 def indented(text: str, times: int = 1) -> str:

@@ -1,7 +1,8 @@
 """A JAX function as a plain ONNX graph, built node by node with `onnx.helper`.
 
-The function is traced, what doesn't depend on its inputs is computed, and each operation left becomes its ONNX
-counterpart. So it follows the networks wherever they go, as long as they keep to the operations below.
+The function is traced, what doesn't depend on its inputs is computed, and each operation left
+becomes its ONNX counterpart. So it follows the networks wherever they go, as long as they keep to
+the operations below.
 """
 
 import math
@@ -24,7 +25,9 @@ _ELEMENTWISE = {
 
 
 class _Graph(Walk):
-    """Nodes and constants of a graph under construction. A value is a NumPy array or the name of a tensor."""
+    """Nodes and constants of a graph under construction. A value is a NumPy array or the name of a
+    tensor.
+    """
 
     language = "ONNX"
     elementwise = frozenset(_ELEMENTWISE)
@@ -32,8 +35,11 @@ class _Graph(Walk):
     def __init__(self):
         from onnx import helper, numpy_helper
 
-        self.helper, self.numpy_helper = helper, numpy_helper
-        self.nodes, self.initializers, self._count = [], [], 0
+        self.helper = helper
+        self.numpy_helper = numpy_helper
+        self.nodes = []
+        self.initializers = []
+        self._count = 0
 
     def name(self, value) -> str:
         """The tensor of a value; a constant becomes an initializer."""
@@ -92,18 +98,26 @@ class _Graph(Walk):
 
     def _op_broadcast_in_dim(self, operation):
         ones = [1] * len(operation.shape)
-        for axis, size in zip(operation.parameters["broadcast_dimensions"], operation.shapes[0], strict=True):
+        for axis, size in zip(
+            operation.parameters["broadcast_dimensions"], operation.shapes[0], strict=True
+        ):
             ones[axis] = size
         value = self._reshape(operation.inputs[0], ones)
-        return value if tuple(ones) == operation.shape else self.add("Expand", value, _whole(operation.shape))
+        return (
+            value
+            if tuple(ones) == operation.shape
+            else self.add("Expand", value, _whole(operation.shape))
+        )
 
     def _op_split(self, operation):
-        sizes, axis = operation.parameters["sizes"], operation.parameters["axis"]
+        sizes = operation.parameters["sizes"]
+        axis = operation.parameters["axis"]
         return self.add("Split", operation.inputs[0], _whole(sizes), outputs=len(sizes), axis=axis)
 
     def _op_slice(self, operation):
         p = operation.parameters
-        starts, axes = p["start_indices"], range(len(p["start_indices"]))
+        starts = p["start_indices"]
+        axes = range(len(p["start_indices"]))
         strides = p["strides"] or [1] * len(starts)
         return self.add(
             "Slice", operation.inputs[0], *map(_whole, (starts, p["limit_indices"], axes, strides))
@@ -128,7 +142,8 @@ def _whole(numbers):
 
 
 def onnx_model(function: Callable, inputs: dict[str, jax.ShapeDtypeStruct], output: str):
-    """An ONNX model of `function(**inputs)`, which returns one array; inputs that it doesn't read are left out.
+    """An ONNX model of `function(**inputs)`, which returns one array; inputs that it doesn't read
+    are left out.
 
     Raises:
       UserError: onnx isn't installed, or the function uses an operation that isn't covered.
@@ -144,7 +159,9 @@ def onnx_model(function: Callable, inputs: dict[str, jax.ShapeDtypeStruct], outp
     read = {name for node in graph.nodes for name in node.input}
 
     def described(name, kind):
-        return helper.make_tensor_value_info(name, helper.np_dtype_to_tensor_dtype(kind.dtype), kind.shape)
+        return helper.make_tensor_value_info(
+            name, helper.np_dtype_to_tensor_dtype(kind.dtype), kind.shape
+        )
 
     out = traced.out_avals[0]
     model = helper.make_model(

@@ -1,4 +1,6 @@
-"""A traced JAX function, walked operation by operation: what the exports to other languages have in common."""
+"""A traced JAX function, walked operation by operation: what the exports to other languages have in
+common.
+"""
 
 import math
 from collections.abc import Callable
@@ -43,12 +45,14 @@ class Operation:
 
 
 class Walk:
-    """Goes through a jaxpr. What doesn't depend on its inputs is computed; each operation left is a call of a method that is
-    named after the primitive: `_op_pad` and so on, or `_op_elementwise` for the primitives in `elementwise`.
+    """Goes through a jaxpr. What doesn't depend on its inputs is computed; each operation left is a
+    call of a method that is named after the primitive: `_op_pad` and so on, or `_op_elementwise`
+    for the primitives in `elementwise`.
 
-    A value is a NumPy array, or whatever those methods make and `inputs` give. A language says how it writes the parts of
-    which the operations below are made: `_reshape(value, shape)`, `_transpose(value, order)`, `_join(values, shape, axis)`,
-    `_power(value, exponent, operation)`, and `_product(left, right, shape)` of matrices, or of as many batches of them.
+    A value is a NumPy array, or whatever those methods make and `inputs` give. A language says how
+    it writes the parts of which the operations below are made: `_reshape(value, shape)`,
+    `_transpose(value, order)`, `_join(values, shape, axis)`, `_power(value, exponent, operation)`,
+    and `_product(left, right, shape)` of matrices, or of as many batches of them.
     """
 
     language = ""
@@ -66,7 +70,8 @@ class Walk:
         return self._join(operation.inputs, operation.shape, operation.parameters["dimension"])
 
     def _op_stack(self, operation: Operation):
-        shape, axis = operation.shape, operation.parameters["axis"]
+        shape = operation.shape
+        axis = operation.parameters["axis"]
         apart = (*shape[:axis], 1, *shape[axis + 1 :])
         return self._join([self._reshape(value, apart) for value in operation.inputs], shape, axis)
 
@@ -78,18 +83,20 @@ class Walk:
 
     def _op_dot_general(self, operation: Operation):
         sums, batches = operation.parameters["dimension_numbers"]
-        sizes, factors = [], []
+        sizes = []
+        factors = []
         for side, (value, shape) in enumerate(zip(operation.inputs, operation.shapes, strict=True)):
-            batch, summed = batches[side], sums[side]
+            batch = batches[side]
+            summed = sums[side]
             free = [axis for axis in range(len(shape)) if axis not in (*batch, *summed)]
             groups = (batch, summed, free) if side else (batch, free, summed)
             matrix = [math.prod(shape[axis] for axis in group) for group in groups]
-            matrix, order = (
-                tuple(matrix if batch else matrix[1:]),
-                [axis for group in groups for axis in group],
-            )
+            matrix = tuple(matrix if batch else matrix[1:])
+            order = [axis for group in groups for axis in group]
             if order != sorted(order):
-                value = np.transpose(value, order) if _known(value) else self._transpose(value, order)
+                value = (
+                    np.transpose(value, order) if _known(value) else self._transpose(value, order)
+                )
             if matrix != tuple(shape[axis] for axis in order):
                 value = np.reshape(value, matrix) if _known(value) else self._reshape(value, matrix)
             sizes.append(matrix)
@@ -112,14 +119,17 @@ class Walk:
         return [read(atom) for atom in jaxpr.outvars]
 
     def _equation(self, equation, inputs) -> list:
-        name, parameters = equation.primitive.name, equation.params
+        name = equation.primitive.name
+        parameters = equation.params
         if name == "platform_index":  # what is not for a platform of its own comes last
             return [np.int32(len(parameters["platforms"]) - 1)]
         if name == "cond" and _known(inputs[0]):
             branch = parameters["branches"][int(inputs[0])]
             return self.run(branch.jaxpr, branch.consts, inputs[1:])
         if name in _INLINE:
-            inner = next(parameters[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in parameters)
+            inner = next(
+                parameters[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in parameters
+            )
             consts = getattr(inner, "consts", ())
             return self.run(getattr(inner, "jaxpr", inner), consts, inputs)
         if all(map(_known, inputs)):
@@ -129,7 +139,8 @@ class Walk:
         rule = getattr(self, f"_op_{'elementwise' if name in self.elementwise else name}", None)
         if rule is None:
             raise UserError(
-                f"the policy uses the operation {name!r}, which has no counterpart in the {self.language} export yet"
+                f"the policy uses the operation {name!r}, which has no counterpart in the "
+                f"{self.language} export yet"
             )
         found = rule(Operation(name, parameters, inputs, equation))
         return found if isinstance(found, list) else [found]
@@ -141,7 +152,9 @@ def _known(value) -> bool:
 
 
 def outer_padding(operation: Operation) -> tuple[list[int], list[int]]:
-    """What a `pad` adds before and after each axis. Raises UserError where it adds between entries, or takes away."""
+    """What a `pad` adds before and after each axis. Raises UserError where it adds between entries,
+    or takes away.
+    """
     low, high, between = zip(*operation.parameters["padding_config"], strict=True)
     if any(between) or min(*low, *high, 0) < 0:
         raise UserError("the policy pads between entries or cuts, which no export knows yet")
@@ -151,4 +164,6 @@ def outer_padding(operation: Operation) -> tuple[list[int], list[int]]:
 def trace(function: Callable, inputs: dict[str, jax.ShapeDtypeStruct]):
     """The closed jaxpr of `function(**inputs)`, its inputs in the order of `inputs`."""
     names = list(inputs)
-    return jax.make_jaxpr(lambda *values: function(**dict(zip(names, values, strict=True))))(*inputs.values())
+    return jax.make_jaxpr(lambda *values: function(**dict(zip(names, values, strict=True))))(
+        *inputs.values()
+    )

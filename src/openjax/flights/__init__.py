@@ -3,4 +3,6 @@
 from openjax.lazy import lazy_names
 
 # reading pulls in the vehicle (and JAX); the containers alone stay light to import
-__getattr__, __dir__, __all__ = lazy_names(__name__, {"case": "load_case", "flight": "Case Flight Issue"})
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__, {"case": "load_case", "flight": "Case Flight Issue"}
+)

@@ -1,8 +1,10 @@
-"""Do a flight's channels agree with each other? What one says, another must show: attitude and gyroscope, position and
-velocity, the path's acceleration and the attitude's thrust, the accelerometer and the path, motors, commands and what follows
-them. A log whose channels contradict each other isn't diagnosed, whatever made it: swapped axes, a wrong convention, unit or
-motor order, rows out of order, columns of another flight, noise in place of data. Where another labelling or convention mends
-a pair, that is what is said."""
+"""Do a flight's channels agree with each other? What one says, another must show: attitude and
+gyroscope, position and velocity, the path's acceleration and the attitude's thrust, the
+accelerometer and the path, motors, commands and what follows them. A log whose channels contradict
+each other isn't diagnosed, whatever made it: swapped axes, a wrong convention, unit or motor order,
+rows out of order, columns of another flight, noise in place of data. Where another labelling or
+convention mends a pair, that is what is said.
+"""
 
 import dataclasses
 import itertools
@@ -19,9 +21,14 @@ TURNING = (0.7, 8.0)  # Hz, where motors turn the vehicle
 UNIT = 2.5  # factor about a unit's, within which a gain is that unit
 RANDOM = 0.5  # share of the variance from row to row at which a continuous signal has no order
 LEAST_ROWS = 100
-# Standard deviation above which the rows of a continuous channel can't be its sensor's noise, in its unit.
+# Standard deviation above which the rows of a continuous channel can't be its sensor's noise, in
+# its unit.
 CONTINUOUS = {"position": 0.05, "quaternion": 0.03, "velocity": 0.25}
-UNITS = {"rad/s": (("deg/s", 180 / np.pi),), "m/s": (("mm/s", 1e3),), "m/s^2": (("mm", 1e3), ("cm", 1e2))}
+UNITS = {
+    "rad/s": (("deg/s", 180 / np.pi),),
+    "m/s": (("mm/s", 1e3),),
+    "m/s^2": (("mm", 1e3), ("cm", 1e2)),
+}
 
 MOTORS = "the motors' torques"
 IDENTITY = ((0, 1, 2, 3), 1.0)  # order and spin as logged
@@ -35,14 +42,17 @@ RELABELLINGS = [
 QUATERNIONS = {
     "in the order x, y, z, w": lambda q: q[:, [3, 0, 1, 2]],
     "from world to body": lambda q: q * [1.0, -1.0, -1.0, -1.0],
-    "in the order x, y, z, w and from world to body": lambda q: q[:, [3, 0, 1, 2]] * [1.0, -1.0, -1.0, -1.0],
+    "in the order x, y, z, w and from world to body": lambda q: (
+        q[:, [3, 0, 1, 2]] * [1.0, -1.0, -1.0, -1.0]
+    ),
 }
 Finding = tuple[str, str, Sequence[str]]  # kind, words and the comparisons that fail
 
 
 def check_agreement(flight: Flight, vehicle) -> list[Issue]:
-    """Findings on a flight that has passed the other checks (sorted, finite, airborne); every one refuses it. `vehicle` gives
-    the rotors' places and spins."""
+    """Findings on a flight that has passed the other checks (sorted, finite, airborne); every one
+    refuses it. `vehicle` gives the rotors' places and spins.
+    """
     found = [("garbage", text, ()) for text in (*_copied_columns(flight), *_rows_at_random(flight))]
     grid = clock_of(flight)
     if grid is not None and not found:
@@ -52,7 +62,9 @@ def check_agreement(flight: Flight, vehicle) -> list[Issue]:
 
 
 def shown_right(flight: Flight, vehicle) -> set[str]:
-    """The comparisons (`Issue.against`) that a flight without a finding moves enough to fail, and passes."""
+    """The comparisons (`Issue.against`) that a flight without a finding moves enough to fail, and
+    passes.
+    """
     grid = clock_of(flight)
     if grid is None:
         return set()
@@ -83,12 +95,16 @@ def _agrees(signals: Signals, bad: list[Pair]) -> bool:
 
 
 def _mended(signals: Signals, bad: list[Pair]) -> tuple[str, str] | None:
-    """Kind and words of a convention or labelling of one channel that makes the disagreeing pairs agree."""
+    """Kind and words of a convention or labelling of one channel that makes the disagreeing pairs
+    agree.
+    """
     if signals.quaternion is not None:
         for name, convert in QUATERNIONS.items():
             other = dataclasses.replace(signals, quaternion=convert(signals.quaternion))
             if _agrees(other, bad):
-                text = f"the quaternion is {name}; the log format wants w, x, y, z from body to world"
+                text = (
+                    f"the quaternion is {name}; the log format wants w, x, y, z from body to world"
+                )
                 return "quaternion", text
     if signals.velocity is not None and signals.quaternion is not None:
         world = to_body(signals.quaternion * [1.0, -1.0, -1.0, -1.0], signals.velocity)
@@ -101,18 +117,24 @@ def _mended(signals: Signals, bad: list[Pair]) -> tuple[str, str] | None:
 
 
 def _relabelled(signals: Signals, pair: Pair, bad: list[Pair]) -> str:
-    """Which axes of a pair's channel hold what, if the best of all 48 labellings of it makes the disagreeing pairs agree."""
+    """Which axes of a pair's channel hold what, if the best of all 48 labellings of it makes the
+    disagreeing pairs agree.
+    """
     values = getattr(signals, pair.holds)
     names = CHANNEL_COLUMNS.get(pair.holds, CHANNEL_COLUMNS["command_body_rates"])
-    best, most = None, -np.inf
+    best = None
+    most = -np.inf
     for order, signs in RELABELLINGS:
         changes = {pair.holds: values[:, order] * signs}
         if pair.holds == "position" and signals.velocity is not None:
             changes["velocity"] = signals.velocity[:, order] * signs
-        other = next(p for p in pairs_of(dataclasses.replace(signals, **changes)) if p.what == pair.what)
+        other = next(
+            p for p in pairs_of(dataclasses.replace(signals, **changes)) if p.what == pair.what
+        )
         score = float(other.agreement.correlation.sum())
         if score > most + 1e-9:
-            best, most = (order, signs, changes), score
+            best = (order, signs, changes)
+            most = score
     order, signs, changes = best
     if not _agrees(dataclasses.replace(signals, **changes), bad):
         return ""
@@ -139,14 +161,19 @@ def _unit(pair: Pair) -> list[Finding]:
 
 
 def _gravity(force: np.ndarray | None) -> list[Finding]:
-    """A flying quadrotor's specific force points along body z, about 9.81 m/s^2 up, whatever its attitude."""
+    """A flying quadrotor's specific force points along body z, about 9.81 m/s^2 up, whatever its
+    attitude.
+    """
     if force is None:
         return []
     mean = np.median(force, 0)
-    size, axis = float(np.linalg.norm(mean)), int(np.argmax(np.abs(mean)))
+    size = float(np.linalg.norm(mean))
+    axis = int(np.argmax(np.abs(mean)))
     unit = "in g" if 0.6 < size < 2.0 else "in thousandths of g" if 600 < size < 2000 else ""
     if unit:
-        return [("units", f"ax, ay, az are {unit} (mean {size:.2f}); the log format wants m/s^2", ())]
+        return [
+            ("units", f"ax, ay, az are {unit} (mean {size:.2f}); the log format wants m/s^2", ())
+        ]
     if not 4.0 < size < 30.0:
         why = "gravity was taken out" if size < 0.6 else "wrong unit or corrupt"
         text = f"the mean specific force is {size:.3g} m/s^2 and not near 9.81: {why}"
@@ -159,12 +186,15 @@ def _gravity(force: np.ndarray | None) -> list[Finding]:
 
 
 def _motors(s: Signals, vehicle) -> list[Finding]:
-    """Motors in another order or with other spins, or whose torques the body doesn't follow at all."""
+    """Motors in another order or with other spins, or whose torques the body doesn't follow at
+    all.
+    """
     torques = _torques(s, vehicle)
     if not torques:
         return []
     logged, (rotors, best) = torques[IDENTITY], max(torques.items(), key=lambda item: item[1].sum())
-    # The right order explains every axis; an offset mass or weak motor can spoil one or two, and isn't an order.
+    # The right order explains every axis; an offset mass or weak motor can spoil one or two, and
+    # isn't an order.
     if (
         best.min() > 0.4
         and best.mean() > 0.65
@@ -175,21 +205,31 @@ def _motors(s: Signals, vehicle) -> list[Finding]:
     if (in_band(s.rates[:, :2], TURNING).std(0) > 0.3).all() and logged[:2].max() < 0.15:
         text = f"correlation {logged[0]:.2f} in roll and {logged[1]:.2f} in pitch"
         text += f" while the body turns at {s.rates[:, :2].std():.1f} rad/s"
-        return [("garbage", f"contradictory: {MOTORS} against the angular acceleration: {text}", [MOTORS])]
+        return [
+            (
+                "garbage",
+                f"contradictory: {MOTORS} against the angular acceleration: {text}",
+                [MOTORS],
+            )
+        ]
     return []
 
 
 def _torques(s: Signals, vehicle) -> dict[tuple, np.ndarray]:
-    """{(order, spin's sign): correlation (3,) of the angular acceleration with the torques that motors in this order make}."""
+    """{(order, spin's sign): correlation (3,) of the angular acceleration with the torques that
+    motors in this order make}.
+    """
     if s.motor is None or s.rates is None:
         return {}
-    place, spin = np.asarray(vehicle.rotor_position, float), np.asarray(vehicle.rotor_spin, float)
+    place = np.asarray(vehicle.rotor_position, float)
+    spin = np.asarray(vehicle.rotor_spin, float)
     mixing = np.stack([place[:, 1], -place[:, 0], spin])  # roll, pitch and yaw torque per thrust
     measured = in_band(np.gradient(s.rates, 1 / RATE, axis=0), TURNING)
     lagged = in_band(first_order(s.motor, float(vehicle.motor_time_constant)), TURNING)
     if (lagged.std(0) < 1e-6).all():
         return {}
-    # Motors are correlated, so whole torques are scored: by the moments of angular acceleration and motors at each offset.
+    # Motors are correlated, so whole torques are scored: by the moments of angular acceleration and
+    # motors at each offset.
     shifted = np.stack([np.roll(lagged, lag, 0) for lag in OFFSETS])
     cross = np.einsum("ti,ltj->lij", measured, shifted)
     among = np.einsum("lti,ltj->lij", shifted, shifted)
@@ -223,7 +263,9 @@ def _copied_columns(flight: Flight) -> Iterator[str]:
 
 
 def _rows_at_random(flight: Flight) -> Iterator[str]:
-    """Channels without order in time: half the mean square step from row to row is the variance itself."""
+    """Channels without order in time: half the mean square step from row to row is the variance
+    itself.
+    """
     for channel, least in CONTINUOUS.items():
         if getattr(flight, channel) is None or (channel == "velocity" and flight.velocity_derived):
             continue
@@ -231,12 +273,14 @@ def _rows_at_random(flight: Flight) -> Iterator[str]:
         near = np.diff(time) < 0.03  # s: longer steps say nothing about continuity
         if near.sum() < LEAST_ROWS:
             continue
-        spread, steps = values.std(0), np.diff(values, axis=0)[near]
+        spread = values.std(0)
+        steps = np.diff(values, axis=0)[near]
         ratio = 0.5 * (steps**2).mean(0) / np.maximum(spread**2, 1e-18)
         bad = (ratio > RANDOM) & (spread > least)
         if bad.any():
             names = ", ".join(n for n, b in zip(CHANNEL_COLUMNS[channel], bad, strict=True) if b)
             yield (
-                f"contradictory: the rows of {names} follow each other at random ({100 * ratio[bad].max():.0f} % of "
+                f"contradictory: the rows of {names} follow each other at random "
+                f"({100 * ratio[bad].max():.0f} % of "
                 "the variance from one row to the next)"
             )

@@ -1,4 +1,6 @@
-"""Loading a case: every log of a folder is read, checked and either kept or refused with the reason."""
+"""Loading a case: every log of a folder is read, checked and either kept or refused with the
+reason.
+"""
 
 import dataclasses
 from collections import Counter
@@ -17,12 +19,12 @@ from openjax.vehicle.vehicle_file import VehicleFile, load_vehicle_file
 
 
 def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> Case:
-    """Read a case folder: its `vehicle.toml` and its logs (CSV, micro-SD logs, ROS 2 bags). For a `comparison`
-    with other flights motor commands alone are enough, and without a vehicle file the nominal vehicle is
-    taken.
+    """Read a case folder: its `vehicle.toml` and its logs (CSV, micro-SD logs, ROS 2 bags). For a
+    `comparison` with other flights motor commands alone are enough, and without a vehicle file the
+    nominal vehicle is taken.
 
-    Logs that can't be used are left out and named in `quality` (`refused`). Raises UserError for a folder
-    that isn't a case, an unusable vehicle file, or if no log is left.
+    Logs that can't be used are left out and named in `quality` (`refused`). Raises UserError for a
+    folder that isn't a case, an unusable vehicle file, or if no log is left.
     """
     path = Path(path)
     if not path.is_dir():
@@ -31,14 +33,17 @@ def load_case(path: str | Path, dtype=jnp.float32, comparison: bool = False) -> 
     logs = find_logs(path)
     if not logs:
         raise UserError(
-            f"{path}: holds no flight log (.csv, .csv.gz, micro-SD log or ROS 2 bag){_cases_inside(path)}"
+            f"{path}: holds no flight log (.csv, .csv.gz, micro-SD log or ROS 2 "
+            f"bag){_cases_inside(path)}"
         )
     described = (path / "vehicle.toml").exists()
     if not described and not comparison:
         raise UserError(f"{path}: no vehicle.toml; an empty one there means the nominal Crazyflie")
     vehicle_file = load_vehicle_file(path / "vehicle.toml" if described else None, dtype)
     mapping = load_mapping(path / MAPPING_FILE) if (path / MAPPING_FILE).exists() else None
-    kept, issues = _usable([_read(log, vehicle_file, mapping) for log in logs], vehicle_file, comparison)
+    kept, issues = _usable(
+        [_read(log, vehicle_file, mapping) for log in logs], vehicle_file, comparison
+    )
     if not kept:
         reasons = [i for i in issues if i.refused]
         first = f"{reasons[0].flight}: {reasons[0].issue}" if reasons else "no vehicle in any log"
@@ -56,7 +61,9 @@ def _cases_inside(path):
 
 
 def _usable(read, vehicle_file: VehicleFile, comparison: bool) -> tuple[list[Flight], list[Issue]]:
-    """Of what was `read` of all logs the flights that can be used, checked and mended, and what was found."""
+    """Of what was `read` of all logs the flights that can be used, checked and mended, and what was
+    found.
+    """
     flights, issues = ([entry for log in read for entry in log[k]] for k in (0, 1))
     copies = duplicates(flights)
     for name, original in copies.items():
@@ -71,15 +78,20 @@ def _usable(read, vehicle_file: VehicleFile, comparison: bool) -> tuple[list[Fli
 def _trusted(
     kept: list[Flight], issues: list[Issue], vehicle_file: VehicleFile
 ) -> tuple[list[Flight], list[Issue]]:
-    """The flights without those that are too calm to show what most others contradict: columns are mixed up for a case."""
+    """The flights without those that are too calm to show what most others contradict: columns are
+    mixed up for a case.
+    """
     failed = Counter(what for issue in issues for what in issue.against)
     if not failed:
         return kept, []
     shown = [shown_right(f, vehicle_file.vehicle_of(f.vehicle)) for f in kept]
     passed = Counter(what for flight in shown for what in flight)
-    out, found = [], []
+    out = []
+    found = []
     for flight, right in zip(kept, shown, strict=True):
-        doubt = next((what for what in failed if what not in right and failed[what] > passed[what]), None)
+        doubt = next(
+            (what for what in failed if what not in right and failed[what] > passed[what]), None
+        )
         if doubt is None:
             out.append(flight)
         else:
@@ -88,9 +100,13 @@ def _trusted(
     return out, found
 
 
-def _check(flight: Flight, vehicle_file: VehicleFile, comparison: bool) -> tuple[Flight | None, list[Issue]]:
+def _check(
+    flight: Flight, vehicle_file: VehicleFile, comparison: bool
+) -> tuple[Flight | None, list[Issue]]:
     try:
-        return check_flight(flight, vehicle_file.vehicle_of(flight.vehicle), vehicle_file.log, comparison)
+        return check_flight(
+            flight, vehicle_file.vehicle_of(flight.vehicle), vehicle_file.log, comparison
+        )
     except (ArithmeticError, ValueError, IndexError, np.linalg.LinAlgError) as error:
         # Values that no check has foreseen: this flight can't be used, the others can.
         text = f"can't be checked ({type(error).__name__}: {error})".split("\n")[0]

@@ -1,4 +1,6 @@
-"""Checks of flight logs: what can be mended is mended and named, what can't be used is refused with a reason."""
+"""Checks of flight logs: what can be mended is mended and named, what can't be used is refused with
+a reason.
+"""
 
 import dataclasses
 
@@ -17,10 +19,11 @@ GROUND_CLEARANCE = 0.02  # m above the floor
 def check_flight(
     flight: Flight, vehicle, log: dict | None = None, comparison: bool = False
 ) -> tuple[Flight | None, list[Issue]]:
-    """Check one flight as read. Returns it sorted, cleaned and cut to its airborne part, or None if it can't
-    be used, and the findings. `vehicle` is the nominal vehicle, `log` the vehicle file's `[log]` table
-    (floor_z). For a `comparison` of flights with flights the motor commands alone are enough, and every
-    airborne stretch is kept, not only the longest."""
+    """Check one flight as read. Returns it sorted, cleaned and cut to its airborne part, or None if
+    it can't be used, and the findings. `vehicle` is the nominal vehicle, `log` the vehicle file's
+    `[log]` table (floor_z). For a `comparison` of flights with flights the motor commands alone are
+    enough, and every airborne stretch is kept, not only the longest.
+    """
     issues: list[Issue] = []
 
     def note(kind: str, text: str) -> None:
@@ -58,11 +61,14 @@ def _has_what_is_needed(flight: Flight, comparison: bool) -> None:
             raise Refused("columns", "holds no motor commands (m1..m4), which a comparison needs")
         return
     if not (flight.has_pose or flight.has_imu):
-        pose, imu = "x, y, z, qw, qx, qy, qz", "ax, ay, az, wx, wy, wz"
+        pose = "x, y, z, qw, qx, qy, qz"
+        imu = "ax, ay, az, wx, wy, wz"
         sensors = f"position and orientation ({pose}) or accelerometer and gyroscope ({imu})"
         raise Refused("columns", f"needs {sensors}")
     if not (flight.has_motors or flight.has_commands):
-        raise Refused("columns", "holds no commands: needs m1..m4, or cmd_thrust and cmd_wx, cmd_wy, cmd_wz")
+        raise Refused(
+            "columns", "holds no commands: needs m1..m4, or cmd_thrust and cmd_wx, cmd_wy, cmd_wz"
+        )
 
 
 def _in_time(flight: Flight, note) -> Flight:
@@ -102,7 +108,9 @@ def _sorted(flight: Flight, note) -> Flight:
         return flight
     if (steps < -1.0).any() or backwards > 0.05 * len(flight.time):
         at = flight.time[int(np.argmin(steps))]
-        text = f"time runs backwards (after t = {at:g}): unsorted, or several recordings in one file"
+        text = (
+            f"time runs backwards (after t = {at:g}): unsorted, or several recordings in one file"
+        )
         raise Refused("time", text)
     note("time", f"{backwards} rows out of order in time were sorted")
     return flight.rows(np.argsort(flight.time, kind="stable"))
@@ -113,10 +121,14 @@ def _refuse_units(step: float) -> None:
     if step > SLOWEST:
         for unit, factor in (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)):
             if 5e-4 <= step / factor <= SLOWEST:
-                raise Refused("units", f"t is in {unit} (rows {step:g} apart); the log format wants seconds")
+                raise Refused(
+                    "units", f"t is in {unit} (rows {step:g} apart); the log format wants seconds"
+                )
         raise Refused("time", f"rows are {step:g} s apart; at least 20 rows per second are needed")
     if step < 2e-4:
-        raise Refused("units", f"rows are {step:g} s apart: t is not in seconds, or the clock is corrupt")
+        raise Refused(
+            "units", f"rows are {step:g} s apart: t is not in seconds, or the clock is corrupt"
+        )
 
 
 def _of_unit_length(quaternion: np.ndarray, note) -> np.ndarray:
@@ -126,20 +138,23 @@ def _of_unit_length(quaternion: np.ndarray, note) -> np.ndarray:
     if np.nanmedian(off) > 0.05:
         text = f"quaternions aren't unit (norm {np.nanmedian(norm):.3g}): wrong columns or corrupt"
         raise Refused("quaternion", text)
-    unit, bad = quaternion / norm[:, None], off > 0.05
+    unit = quaternion / norm[:, None]
+    bad = off > 0.05
     if bad.any():
         note("quaternion", f"{bad.sum()} quaternions far from unit length are taken as not sampled")
         unit[bad] = np.nan
     elif np.nanmax(off) > 2e-3:
         note(
-            "quaternion", f"quaternions were off unit length by up to {np.nanmax(off):.1g} and are normalised"
+            "quaternion",
+            f"quaternions were off unit length by up to {np.nanmax(off):.1g} and are normalised",
         )
     return _without_flips(unit)
 
 
 def _in_range(flight: Flight, note) -> Flight:
-    """Values that no flight of such a vehicle has: units and corrupt columns that show by their size
-    alone."""
+    """Values that no flight of such a vehicle has: units and corrupt columns that show by their
+    size alone.
+    """
     changes = {}
     motor = flight.motor_command
     if motor is not None:
@@ -167,12 +182,15 @@ def _in_range(flight: Flight, note) -> Flight:
 
 
 def _share_of_one(values: np.ndarray, columns: str) -> None:
-    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    low = float(np.nanmin(values))
+    high = float(np.nanmax(values))
     if high > 256.0:
         hint = "16-bit counts; divide by 65535" if high > 2100 else "a pulse width in microseconds"
         raise Refused("units", f"{columns} reach {high:.0f}: {hint}; the log format wants 0..1")
     if high > 1.02:
-        hint = "8-bit counts" if high > 101 else "per cent" if high > 2 else "a wrong scale or corrupt"
+        hint = (
+            "8-bit counts" if high > 101 else "per cent" if high > 2 else "a wrong scale or corrupt"
+        )
         raise Refused("units", f"{columns} reach {high:.3g}: {hint}; the log format wants 0..1")
     if low < -0.02:
         raise Refused("corrupt", f"{columns} go down to {low:.3g}; commands lie in 0..1")
@@ -188,9 +206,10 @@ def _without_flips(quaternion: np.ndarray) -> np.ndarray:
 
 
 def _airborne(flight: Flight, floor_z: float | None, note, every: bool = False) -> Flight:
-    """Cut to the longest airborne stretch, or to `every` one of a useful length. Off the ground: motors give
-    at least 40 % of their usual command, and the vehicle isn't at rest on the floor; shorter dips (half a
-    second) are manoeuvres."""
+    """Cut to the longest airborne stretch, or to `every` one of a useful length. Off the ground:
+    motors give at least 40 % of their usual command, and the vehicle isn't at rest on the floor;
+    shorter dips (half a second) are manoeuvres.
+    """
     drive = flight.motor_command if flight.motor_command is not None else flight.command_thrust
     drive = drive if drive.ndim == 1 else drive.mean(1)
     rows = np.isfinite(drive)
@@ -210,7 +229,9 @@ def _airborne(flight: Flight, floor_z: float | None, note, every: bool = False) 
     start, stop = max(runs, key=lambda r: flight.time[r[1] - 1] - flight.time[r[0]])
     airborne = flight.time[stop - 1] - flight.time[start]
     if airborne < SHORTEST:
-        raise Refused("short", f"airborne for {airborne:.1f} s only; at least {SHORTEST:g} s are needed")
+        raise Refused(
+            "short", f"airborne for {airborne:.1f} s only; at least {SHORTEST:g} s are needed"
+        )
     if every:
         kept = np.zeros(len(flight), bool)
         for first, last in runs:
@@ -225,7 +246,9 @@ def _airborne(flight: Flight, floor_z: float | None, note, every: bool = False) 
 
 
 def _long_runs(flags: np.ndarray, time: np.ndarray, shortest: float = 0.5) -> np.ndarray:
-    """`flags` (T,) without runs of less than `shortest` s: a dip of thrust in the air is a manoeuvre."""
+    """`flags` (T,) without runs of less than `shortest` s: a dip of thrust in the air is a
+    manoeuvre.
+    """
     kept = flags.copy()
     for start, stop in runs_of(flags):
         if time[stop - 1] - time[start] < shortest:

@@ -6,8 +6,14 @@ import numpy as np
 
 from openjax.flights.flight import Flight, Refused
 
-RATE_NOISE = 0.04  # rad/s of body rates that are derived: what gyroscopes of such vehicles have at most
-BESIDE_GAP, GAP, OUTSIDE = 4, 1.5, 6.0  # rows, usual steps, deviations: of a velocity that a gap has spoilt
+RATE_NOISE = (
+    0.04  # rad/s of body rates that are derived: what gyroscopes of such vehicles have at most
+)
+BESIDE_GAP, GAP, OUTSIDE = (
+    4,
+    1.5,
+    6.0,
+)  # rows, usual steps, deviations: of a velocity that a gap has spoilt
 
 
 def derive_velocity(flight: Flight, note) -> Flight:
@@ -29,8 +35,9 @@ def derive_velocity(flight: Flight, note) -> Flight:
 
 
 def mend_velocity(flight: Flight, note) -> Flight:
-    """A velocity that somebody differentiated row by row is wrong beside rows that are missing: there it is taken from the
-    position, where it is far off its slope for such rows alone."""
+    """A velocity that somebody differentiated row by row is wrong beside rows that are missing:
+    there it is taken from the position, where it is far off its slope for such rows alone.
+    """
     if flight.velocity is None or flight.position is None:
         return flight
     rows = np.flatnonzero(np.isfinite(flight.position).all(1) & np.isfinite(flight.velocity).all(1))
@@ -54,15 +61,19 @@ def mend_velocity(flight: Flight, note) -> Flight:
     velocity[rows[wrong]] = slope[wrong]
     note(
         "gaps",
-        f"velocity in {wrong.sum()} rows beside missing ones contradicts the position: taken from it there",
+        f"velocity in {wrong.sum()} rows beside missing ones contradicts the position: taken from "
+        "it there",
     )
     return dataclasses.replace(flight, velocity=velocity)
 
 
 def _slopes(time: np.ndarray, values: np.ndarray, half: int) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives (R, C) of values (R, C) by local quadratic fits over 2 `half` + 1 rows (Savitzky-Golay, for
-    uneven steps too), and how far in time (R,) each fit reaches."""
-    index = np.clip(np.arange(len(time)), half, len(time) - half - 1)[:, None] + np.arange(-half, half + 1)
+    """Derivatives (R, C) of values (R, C) by local quadratic fits over 2 `half` + 1 rows
+    (Savitzky-Golay, for uneven steps too), and how far in time (R,) each fit reaches.
+    """
+    index = np.clip(np.arange(len(time)), half, len(time) - half - 1)[:, None] + np.arange(
+        -half, half + 1
+    )
     dt = time[index] - time[:, None]
     basis = np.stack([np.ones_like(dt), dt, dt**2], -1)
     normal = np.einsum("rki,rkj->rij", basis, basis)
@@ -73,7 +84,9 @@ def _slopes(time: np.ndarray, values: np.ndarray, half: int) -> tuple[np.ndarray
 
 
 def derive_rates(flight: Flight, note) -> Flight:
-    """Body rates from the attitude where no gyroscope was logged: w = 2 (q* dq/dt), local quadratic fits."""
+    """Body rates from the attitude where no gyroscope was logged: w = 2 (q* dq/dt), local quadratic
+    fits.
+    """
     if flight.body_rates is not None or flight.quaternion is None:
         return flight
     time, attitude = flight.sampled("quaternion")
@@ -93,9 +106,12 @@ def derive_rates(flight: Flight, note) -> Flight:
 
 
 def _enough(attitude: np.ndarray, step: float) -> int:
-    """Rows to either side over which the slope of attitudes (R, 4) is no noisier than RATE_NOISE: a wide fit takes the
-    edge off every turn, and an estimator's attitude, which is smooth, doesn't need it."""
-    # Third differences hold little motion; of white noise s they are sqrt(20) s, and their median size .6745 of that.
+    """Rows to either side over which the slope of attitudes (R, 4) is no noisier than RATE_NOISE: a
+    wide fit takes the edge off every turn, and an estimator's attitude, which is smooth, doesn't
+    need it.
+    """
+    # Third differences hold little motion; of white noise s they are sqrt(20) s, and their median
+    # size .6745 of that.
     noise = float(np.median(np.abs(np.diff(attitude, 3, axis=0)))) / (0.6745 * np.sqrt(20.0))
     half = 1
     while half < len(attitude) // 2 and 2.0 * noise / step > RATE_NOISE * np.sqrt(

@@ -1,7 +1,9 @@
-"""The flight container: what one vehicle's log holds, as arrays in the frames and units of the log format.
+"""The flight container: what one vehicle's log holds, as arrays in the frames and units of the log
+format.
 
-A case is a set of flights of the same vehicle(s) with one vehicle file. World frame: x east, y north, z up.
-Body frame: x forward, y left, z up. SI units. Quaternions are scalar-first and rotate body to world.
+A case is a set of flights of the same vehicle(s) with one vehicle file. World frame: x east, y
+north, z up. Body frame: x forward, y left, z up. SI units. Quaternions are scalar-first and rotate
+body to world.
 """
 
 from __future__ import annotations
@@ -38,9 +40,9 @@ SENSORS = ("position", "quaternion", "velocity", "body_rates", "specific_force")
 class Issue:
     """One finding about a flight's data.
 
-    `flight` is the log's file name (with the vehicle's id where several flew), `issue` says in words what was
-    found, `refused` whether the flight can't be used because of it, and `kind` is a short name of the check. `against`
-    names the comparisons of channels that failed.
+    `flight` is the log's file name (with the vehicle's id where several flew), `issue` says in
+    words what was found, `refused` whether the flight can't be used because of it, and `kind` is a
+    short name of the check. `against` names the comparisons of channels that failed.
     """
 
     flight: str
@@ -52,9 +54,9 @@ class Issue:
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """One vehicle's flight, T rows sorted by time, float64. A channel that wasn't logged is None; a value
-    that wasn't sampled at a row (slower channels) is NaN. Motors are in the nominal order: front right, rear
-    right, rear left, front left.
+    """One vehicle's flight, T rows sorted by time, float64. A channel that wasn't logged is None; a
+    value that wasn't sampled at a row (slower channels) is NaN. Motors are in the nominal order:
+    front right, rear right, rear left, front left.
     """
 
     name: str  # log file name; "FILE:ID" where several vehicles share the file
@@ -66,13 +68,19 @@ class Flight:
     velocity: Array | None = None  # (T, 3) m/s, world
     body_rates: Array | None = None  # (T, 3) rad/s, gyroscope
     specific_force: Array | None = None  # (T, 3) m/s^2, body, accelerometer (+9.81 on z at rest)
-    command_thrust: Array | None = None  # (T,) commanded collective thrust, as a share of the largest
+    command_thrust: Array | None = (
+        None  # (T,) commanded collective thrust, as a share of the largest
+    )
     command_body_rates: Array | None = None  # (T, 3) rad/s, commanded body rates
     motor_command: Array | None = None  # (T, 4) 0..1, meaning by the vehicle file's `motor_command`
     battery_voltage: Array | None = None  # (T,) V, under load
     velocity_derived: bool = False  # True: differentiated from position by the reader, not logged
-    body_rates_derived: bool = False  # True: differentiated from the attitude by the reader, no gyroscope
-    pose_age: float = 0.0  # s by which a pose may be older than its row, because the log held the last one
+    body_rates_derived: bool = (
+        False  # True: differentiated from the attitude by the reader, no gyroscope
+    )
+    pose_age: float = (
+        0.0  # s by which a pose may be older than its row, because the log held the last one
+    )
     fingerprint: str = ""  # hash of the whole log's values, the same for copies under other names
 
     def __len__(self) -> int:
@@ -117,9 +125,11 @@ class Flight:
         return self.time[rows], values[rows]
 
     def interpolated(self, channel: str, time: Array | None = None) -> Array:
-        """`channel` at `time` (S,) (default: every row), linearly between its samples, held at the ends.
+        """`channel` at `time` (S,) (default: every row), linearly between its samples, held at the
+        ends.
 
-        Quaternions are interpolated componentwise and normalised, which is exact to second order in the step.
+        Quaternions are interpolated componentwise and normalised, which is exact to second order in
+        the step.
         """
         time = self.time if time is None else time
         at, values = self.sampled(channel)
@@ -145,8 +155,9 @@ class Flight:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """Flights of the same vehicle(s), their vehicle file, and what the checks found, refused flights
-    included."""
+    """Flights of the same vehicle(s), their vehicle file, and what the checks found, refused
+    flights included.
+    """
 
     name: str
     flights: tuple[Flight, ...]
@@ -163,7 +174,9 @@ class Case:
         return tuple(issue for issue in self.quality if issue.refused)
 
     def vehicle_of(self, flight: Flight):
-        """The nominal `Vehicle` of this flight: the vehicle file's, with `[vehicles.<id>]` applied."""
+        """The nominal `Vehicle` of this flight: the vehicle file's, with `[vehicles.<id>]`
+        applied.
+        """
         return self.vehicle_file.vehicle_of(flight.vehicle)
 
 

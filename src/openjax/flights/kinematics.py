@@ -1,8 +1,11 @@
-"""Sensors against each other, without any dynamics: what rigid-body kinematics alone says about a log.
+"""Sensors against each other, without any dynamics: what rigid-body kinematics alone says about a
+log.
 
-Attitude's rate against the gyroscope gives the gyroscope's gain; the path's acceleration against the accelerometer,
-turned into the world, gives the tilt of the world in which motion capture reports. A sensor that is off by more
-than sensors usually are is a finding about the sensors, is corrected before the physics is read, and is no cause."""
+Attitude's rate against the gyroscope gives the gyroscope's gain; the path's acceleration against
+the accelerometer, turned into the world, gives the tilt of the world in which motion capture
+reports. A sensor that is off by more than sensors usually are is a finding about the sensors, is
+corrected before the physics is read, and is no cause.
+"""
 
 import dataclasses
 from dataclasses import dataclass
@@ -25,9 +28,11 @@ ONE_CLOCK = 0.93  # below which they don't share a clock
 
 @dataclass(frozen=True)
 class Kinematics:
-    """`gain` of the gyroscope, 1 where it isn't clearly another; `tilt` (2,) rad by which the world leans about its x and y
-    axes, None where that isn't clear; `one_clock`: whether attitude and gyroscope can be compared sample by sample: what their
-    streams leave of each other is noise, not time; `findings`: what is off by more than usual, in words, by name."""
+    """`gain` of the gyroscope, 1 where it isn't clearly another; `tilt` (2,) rad by which the world
+    leans about its x and y axes, None where that isn't clear; `one_clock`: whether attitude and
+    gyroscope can be compared sample by sample: what their streams leave of each other is noise, not
+    time; `findings`: what is off by more than usual, in words, by name.
+    """
 
     gain: float
     tilt: np.ndarray | None
@@ -36,22 +41,27 @@ class Kinematics:
 
 
 def read_kinematics(tracks: list[Track], limits) -> Kinematics:
-    """Compare the sensors of all tracks of one case. `limits`: `gyroscope_gain` that a sensor may be off by, `world_tilt` in
-    degrees, and the `standard_errors` from which a tilt is clear."""
+    """Compare the sensors of all tracks of one case. `limits`: `gyroscope_gain` that a sensor may
+    be off by, `world_tilt` in degrees, and the `standard_errors` from which a tilt is clear.
+    """
     gain, error, coherence, turning = _gains(_streams(tracks, _turning, BAND))
     apart = turning & (coherence < ONE_CLOCK)
-    one_clock, tilt, findings = int(apart.sum()) < 2, None, {}
+    one_clock = int(apart.sum()) < 2
+    tilt = None
+    findings = {}
     if words := _unusual(gain, error, limits.gyroscope_gain):
         findings["gyroscope gain"] = f"the gyroscope reads {words} times the rate of the attitude"
     scale = _gains(_streams(tracks, _accelerating, (BAND[0], SLOW)))
     if words := _unusual(*scale[:2], limits.gyroscope_gain):
         findings["scale"] = (
-            f"positions change by {words} times what accelerometer and attitude feel: check their scale"
+            f"positions change by {words} times what accelerometer and attitude feel: check their "
+            "scale"
         )
     if not one_clock:
         words = ", ".join(f"{a} {c:.2f}" for a, c in zip("xyz", coherence, strict=True))
         findings["clocks"] = (
-            f"gyroscope and attitude don't share a clock (correlation {words} between {BAND[0]} and {BAND[1]:g} Hz): "
+            f"gyroscope and attitude don't share a clock (correlation {words} between {BAND[0]} "
+            f"and {BAND[1]:g} Hz): "
             "torques and lags can't be told from these logs"
         )
     if (world := _world(tracks)) is not None:
@@ -59,7 +69,9 @@ def read_kinematics(tracks: list[Track], limits) -> Kinematics:
         size = float(np.hypot(*lean))
         tilt = lean if size >= limits.standard_errors * float(np.hypot(*lean_error)) else None
         along = lean / max(size, 1e-12)
-        if size > max(np.radians(limits.world_tilt), CLEAR * float(np.sqrt(along**2 @ lean_error**2))):
+        if size > max(
+            np.radians(limits.world_tilt), CLEAR * float(np.sqrt(along**2 @ lean_error**2))
+        ):
             findings["world tilt"] = (
                 f"motion capture's world leans by {np.degrees(size):.1f} degrees against gravity "
                 f"({np.degrees(lean[0]):+.1f} about x, {np.degrees(lean[1]):+.1f} about y)"
@@ -68,12 +80,14 @@ def read_kinematics(tracks: list[Track], limits) -> Kinematics:
 
 
 def _of_one_chip(gain: np.ndarray, error: np.ndarray, standard_errors: float) -> float:
-    """The gain of all axes (3,) by their precision, where it differs from 1 by more than so many standard errors, which cover
-    what the axes disagree by (Birge 1932); else 1."""
+    """The gain of all axes (3,) by their precision, where it differs from 1 by more than so many
+    standard errors, which cover what the axes disagree by (Birge 1932); else 1.
+    """
     known = np.isfinite(gain)
     if not known.any():
         return 1.0
-    gain, weight = gain[known], 1.0 / np.maximum(error[known], 1e-6) ** 2
+    gain = gain[known]
+    weight = 1.0 / np.maximum(error[known], 1e-6) ** 2
     mean = float((weight * gain).sum() / weight.sum())
     apart = (weight * (gain - mean) ** 2).sum() / max(len(gain) - 1, 1)
     clear = abs(mean - 1.0) > standard_errors * np.sqrt(max(apart, 1.0) / weight.sum())
@@ -81,7 +95,9 @@ def _of_one_chip(gain: np.ndarray, error: np.ndarray, standard_errors: float) ->
 
 
 def _unusual(gain: np.ndarray, error: np.ndarray, usual: float) -> str:
-    """The axes whose gain is clearly off by more than sensors usually are, where these are two or more."""
+    """The axes whose gain is clearly off by more than sensors usually are, where these are two or
+    more.
+    """
     away = np.abs(gain - 1.0)  # NaN where it isn't known
     off = (away > CLEAR * error) & (away > usual)
     words = ", ".join(f"{a} {g:.3f}" for a, g, o in zip("xyz", gain, off, strict=True) if o)
@@ -105,11 +121,15 @@ def _turning(track: Track) -> tuple[np.ndarray, np.ndarray] | None:
     """Rate of the attitude (T, 3) and gyroscope (T, 3), rad/s."""
     if track.quaternion is None or track.body_rates is None:
         return None
-    return turn_increments(track.quaternion) / track.dt, 0.5 * (track.body_rates[1:] + track.body_rates[:-1])
+    return turn_increments(track.quaternion) / track.dt, 0.5 * (
+        track.body_rates[1:] + track.body_rates[:-1]
+    )
 
 
 def _accelerating(track: Track) -> tuple[np.ndarray, np.ndarray] | None:
-    """What the accelerometer feels (T, 3) and the acceleration of the position (T, 3), m/s^2 in the world."""
+    """What the accelerometer feels (T, 3) and the acceleration of the position (T, 3), m/s^2 in the
+    world.
+    """
     if track.quaternion is None or track.position is None or track.specific_force is None:
         return None
     felt = to_world(track.quaternion, track.specific_force)
@@ -117,11 +137,13 @@ def _accelerating(track: Track) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def _streams(tracks, signals_of, band) -> list[tuple[float, np.ndarray, np.ndarray]]:
-    """Row period (s) and two signals (T, 3) in `band` without the ends, of each track that has them and is long enough to be
-    filtered."""
+    """Row period (s) and two signals (T, 3) in `band` without the ends, of each track that has them
+    and is long enough to be filtered.
+    """
     out = []
     for track in tracks:
-        signals, edge = signals_of(track), int(EDGE / track.dt)
+        signals = signals_of(track)
+        edge = int(EDGE / track.dt)
         if signals is None or len(signals[0]) < 4 * edge:
             continue
         passed = butter(2, band, "bandpass", fs=1.0 / track.dt, output="sos")
@@ -130,14 +152,18 @@ def _streams(tracks, signals_of, band) -> list[tuple[float, np.ndarray, np.ndarr
 
 
 def _gains(streams) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Gain (3,) of the second signal over the first, its error (3,) and their correlation (3,), axis by axis; whether an axis
-    moves enough (3,)."""
+    """Gain (3,) of the second signal over the first, its error (3,) and their correlation (3,),
+    axis by axis; whether an axis moves enough (3,).
+    """
     sums = []  # per granule: (4, 3) sums of squares and products, and rows
     for dt, a, b in streams:
         size = max(int(BLOCK / dt), 1)
         for k in range(0, len(a) - size // 2, size):
-            p, q = a[k : k + size], b[k : k + size]
-            sums.append(np.stack([(p * p).sum(0), (p * q).sum(0), (q * q).sum(0), np.full(3, len(p))]))
+            p = a[k : k + size]
+            q = b[k : k + size]
+            sums.append(
+                np.stack([(p * p).sum(0), (p * q).sum(0), (q * q).sum(0), np.full(3, len(p))])
+            )
     nothing = np.full(3, np.nan)
     if len(sums) < 4:
         return nothing, nothing, np.ones(3), np.zeros(3, bool)
@@ -146,7 +172,9 @@ def _gains(streams) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 
     def gains(s):
         # Both have noise: the geometric mean of the two regressions.
-        return np.sqrt(s[2] / np.maximum(s[0], 1e-12)), s[1] / np.sqrt(np.maximum(s[0] * s[2], 1e-12))
+        return np.sqrt(s[2] / np.maximum(s[0], 1e-12)), s[1] / np.sqrt(
+            np.maximum(s[0] * s[2], 1e-12)
+        )
 
     gain, coherence = gains(total)
     error = _jackknife(sums, lambda s: gains(s)[0])
@@ -162,9 +190,10 @@ def _jackknife(sums: np.ndarray, statistic) -> np.ndarray:
 
 
 def _world(tracks) -> tuple[np.ndarray, np.ndarray] | None:
-    """Tilt (2,) rad of the world about x and y and its error: the accelerometer, turned into the world, less the
-    path's acceleration and gravity, is fixed in the world; the accelerometer's bias (per flight) is fixed in the
-    body."""
+    """Tilt (2,) rad of the world about x and y and its error: the accelerometer, turned into the
+    world, less the path's acceleration and gravity, is fixed in the world; the accelerometer's bias
+    (per flight) is fixed in the body.
+    """
     grams = []
     flights = list(dict.fromkeys(t.flight for t in tracks))
     for track in tracks:
@@ -173,7 +202,8 @@ def _world(tracks) -> tuple[np.ndarray, np.ndarray] | None:
         turn = rotation(track.quaternion)
         rest = to_world(track.quaternion, track.specific_force) - np.array([0.0, 0.0, GRAVITY])
         low = butter(2, SLOW, fs=1.0 / track.dt, output="sos")
-        edge, size = int(EDGE / track.dt), max(int(BLOCK / track.dt), 1)
+        edge = int(EDGE / track.dt)
+        size = max(int(BLOCK / track.dt), 1)
         rest = rest - np.gradient(track.velocity, track.dt, axis=0)
         if len(rest) < 4 * edge:
             continue

@@ -1,7 +1,8 @@
 """Pairs of a flight's channels that must follow each other, and how well they do.
 
-Each pair is compared in a low band, with a clock offset free for every few seconds, and speaks only where the one that leads
-moves by more than sensors, latencies and the air explain."""
+Each pair is compared in a low band, with a clock offset free for every few seconds, and speaks only
+where the one that leads moves by more than sensors, latencies and the air explain.
+"""
 
 from __future__ import annotations
 
@@ -16,16 +17,20 @@ from openjax.flights.signals import RATE, in_band, on_clock, rates_of
 from openjax.flights.track import GRAVITY, rotation, to_body
 
 # Hz: above drift, below the noise of what is compared
-LOW, WIDE = (0.3, 2.5), (0.3, 4.0)
+LOW = (0.3, 2.5)
+WIDE = (0.3, 4.0)
 WINDOW = 8.0  # s in which a clock offset is constant
 LAG = 0.2  # s, largest clock offset and latency between honest streams
-AGREE = 0.5  # share of the correlation to be expected below which two channels contradict each other
+AGREE = (
+    0.5  # share of the correlation to be expected below which two channels contradict each other
+)
 FITS = 0.75  # share above which another labelling is what was meant
 TELLS = 0.5  # correlation that the sensors' noise must leave for a comparison to tell anything
 FULL = 0.98  # motor command that counts as the largest: a rotor has nothing left to trim with
-# Motion (rms in the band) that is more than what else moves the channel that must follow: a pose that a filter makes is off by a
-# few cm/s and some hundredths of a radian; floor, wakes and a battery change the thrust by some per cent of hover; a loop at
-# rest opposes the air. Commanded thrust and motors (per cent) are exact.
+# Motion (rms in the band) that is more than what else moves the channel that must follow: a pose
+# that a filter makes is off by a few cm/s and some hundredths of a radian; floor, wakes and a
+# battery change the thrust by some per cent of hover; a loop at rest opposes the air. Commanded
+# thrust and motors (per cent) are exact.
 MOVED = {
     "rate": 0.15,
     "velocity": 0.1,
@@ -75,7 +80,9 @@ class Signals:
 
     @cached_property
     def acceleration(self) -> tuple[np.ndarray | None, int]:
-        """Of the path, m/s^2 in the world, and how many times what was logged of it was differentiated."""
+        """Of the path, m/s^2 in the world, and how many times what was logged of it was
+        differentiated.
+        """
         if self.velocity is not None:
             return np.gradient(self.velocity, 1 / RATE, axis=0), 1
         if self.position is None:
@@ -85,9 +92,11 @@ class Signals:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """`measured` (T, C) and what it must agree with, both in `unit`. `names` of the measured columns; `holds` the channel of
-    `Signals` that they are, where another labelling of it may be right; `derivatives`: how many times each was differentiated
-    from what its sensor gives, None for commands; `least`: rms of the reference in the band from which it tells."""
+    """`measured` (T, C) and what it must agree with, both in `unit`. `names` of the measured
+    columns; `holds` the channel of `Signals` that they are, where another labelling of it may be
+    right; `derivatives`: how many times each was differentiated from what its sensor gives, None
+    for commands; `least`: rms of the reference in the band from which it tells.
+    """
 
     names: tuple[str, ...]
     measured: np.ndarray
@@ -126,8 +135,10 @@ class Pair:
         worst = int(np.argmin(np.where(self.bad, found.correlation, np.inf)))
         columns = ", ".join(n for n, b in zip(self.names, self.bad, strict=True) if b)
         return (
-            f"contradictory: {columns} against {self.what}: correlation {found.correlation[worst]:.2f} where sensors "
-            f"allow {found.expected[worst]:.2f} ({found.measured[worst]:.2g} against {found.reference[worst]:.2g} "
+            f"contradictory: {columns} against {self.what}: correlation "
+            f"{found.correlation[worst]:.2f} where sensors "
+            f"allow {found.expected[worst]:.2f} ({found.measured[worst]:.2g} against "
+            f"{found.reference[worst]:.2g} "
             f"{self.unit} from {self.band[0]:g} to {self.band[1]:g} Hz)"
         )
 
@@ -135,49 +146,77 @@ class Pair:
 def pairs_of(s: Signals) -> Iterator[Pair]:
     """All pairs that were logged."""
     turned, (acceleration, order) = s.attitude_rates, s.acceleration
-    rates, velocity, commands = (CHANNEL_COLUMNS[c] for c in ("body_rates", "velocity", "command_body_rates"))
+    rates, velocity, commands = (
+        CHANNEL_COLUMNS[c] for c in ("body_rates", "velocity", "command_body_rates")
+    )
     if turned is not None and s.body_rates is not None:
-        least, what = MOVED["rate"], "the attitude's rate"
+        least = MOVED["rate"]
+        what = "the attitude's rate"
         yield Pair(rates, s.body_rates, what, turned, WIDE, least, "rad/s", (0, 1), "body_rates")
     if s.position is not None and s.velocity is not None:
-        path, what = np.gradient(s.position, 1 / RATE, axis=0), "the position's rate"
-        yield Pair(velocity, s.velocity, what, path, LOW, MOVED["velocity"], "m/s", (0, 1), "velocity")
+        path = np.gradient(s.position, 1 / RATE, axis=0)
+        what = "the position's rate"
+        yield Pair(
+            velocity, s.velocity, what, path, LOW, MOVED["velocity"], "m/s", (0, 1), "velocity"
+        )
     along = None
     if acceleration is not None and s.quaternion is not None:
         size = np.full(len(acceleration), GRAVITY) if s.force is None else s.force[:, 2]
         lift = rotation(s.quaternion)[:, :, 2] * np.median(size)
-        names, what = ("the path's acceleration in x", "in y"), "the attitude's thrust"
+        names = ("the path's acceleration in x", "in y")
+        what = "the attitude's thrust"
         yield Pair(
-            names, acceleration[:, :2], what, lift[:, :2], LOW, MOVED["tilt"], "m/s^2", (order, 0), "position"
+            names,
+            acceleration[:, :2],
+            what,
+            lift[:, :2],
+            LOW,
+            MOVED["tilt"],
+            "m/s^2",
+            (order, 0),
+            "position",
         )
-        # Sideways a late or tilted attitude feels accelerations that aren't there: the vertical alone tells.
+        # Sideways a late or tilted attitude feels accelerations that aren't there: the vertical
+        # alone tells.
         along = to_body(s.quaternion, acceleration + np.array([0.0, 0.0, GRAVITY]))[:, 2:]
         if s.force is not None:
             # Sideways the attitude tells how wrong the path's acceleration is.
             off = in_band(acceleration[:, :2] - lift[:, :2], LOW).std(0).mean()
-            least, what = max(MOVED["force"], 2.0 * float(off)), "the path's acceleration"
+            least = max(MOVED["force"], 2.0 * float(off))
+            what = "the path's acceleration"
             yield Pair(("az",), s.force[:, 2:], what, along, LOW, least, "m/s^2", (0, order))
     yield from _caused(s, along, order)
     if s.commands is not None and s.rates is not None and not s.saturated:
-        least, what = MOVED["command"], "the body rates"
+        least = MOVED["command"]
+        what = "the body rates"
         yield Pair(commands, s.commands, what, s.rates, LOW, least, "rad/s", (None, 0), "commands")
 
 
 def _caused(s: Signals, along: np.ndarray | None, order: int) -> Iterator[Pair]:
-    """Motors with the force that they make and the thrust that was asked for. What the accelerometer or else the path feels
-    is moved by floor, wakes and gusts, too: it must follow where the motors do much."""
+    """Motors with the force that they make and the thrust that was asked for. What the
+    accelerometer or else the path feels is moved by floor, wakes and gusts, too: it must follow
+    where the motors do much.
+    """
     if s.motor is None:
         return
     collective = s.motor.mean(1, keepdims=True)
     felt, order = (along, order) if s.force is None else (s.force[:, 2:], 0)
     if felt is not None:
         asked = collective * np.median(felt) / max(float(np.median(collective)), 1e-3)
-        what, least = "what the motors would make", MOVED["thrust"]
+        what = "what the motors would make"
+        least = MOVED["thrust"]
         yield Pair(("the force felt",), felt, what, asked, LOW, least, "m/s^2", (order, None))
     if s.thrust is not None and not s.saturated:
         what = "m1 + m2 + m3 + m4"
         yield Pair(
-            ("cmd_thrust",), 100 * s.thrust, what, 100 * collective, WIDE, MOVED["share"], "%", (None, None)
+            ("cmd_thrust",),
+            100 * s.thrust,
+            what,
+            100 * collective,
+            WIDE,
+            MOVED["share"],
+            "%",
+            (None, None),
         )
 
 
@@ -197,21 +236,30 @@ def agreement(
     band: tuple[float, float],
     derivatives: tuple[int | None, int | None] = (0, 0),
 ) -> Agreement:
-    """Compare (T, C) with (T, C) on the common clock in `band` Hz. `derivatives` says how many times each was
-    differentiated from what its sensor gives; None: a command, which has no noise."""
-    y, x = in_band(measured, band), in_band(reference, band)
-    width, shift = int(WINDOW * RATE), int(LAG * RATE)
-    products, powers = np.zeros(y.shape[1]), np.zeros((2, y.shape[1]))
+    """Compare (T, C) with (T, C) on the common clock in `band` Hz. `derivatives` says how many
+    times each was differentiated from what its sensor gives; None: a command, which has no
+    noise.
+    """
+    y = in_band(measured, band)
+    x = in_band(reference, band)
+    width = int(WINDOW * RATE)
+    shift = int(LAG * RATE)
+    products = np.zeros(y.shape[1])
+    powers = np.zeros((2, y.shape[1]))
     for part in np.array_split(np.arange(len(y)), max(len(y) // width, 1)):
-        own, other = y[part], x[part]
+        own = y[part]
+        other = x[part]
         scale = np.sqrt((own**2).sum(0) * (other**2).sum(0)) + 1e-12
         inner = slice(shift, len(part) - shift)
-        each = [(own[inner] * np.roll(other, lag, 0)[inner]).sum(0) for lag in range(-shift, shift + 1)]
+        each = [
+            (own[inner] * np.roll(other, lag, 0)[inner]).sum(0) for lag in range(-shift, shift + 1)
+        ]
         best = int(np.argmax((np.array(each) / scale).sum(1)))
         moved = np.roll(other, best - shift, 0)[inner]
         products += each[best]
         powers += [(own[inner] ** 2).sum(0), (moved**2).sum(0)]
-    rms_y, rms_x = y.std(0), x.std(0)
+    rms_y = y.std(0)
+    rms_x = x.std(0)
     noise_y = _noise(measured, band, derivatives[0])
     noise_x = np.minimum(_noise(reference, band, derivatives[1]), rms_x)
     moved = np.sqrt(rms_x**2 - noise_x**2)

@@ -1,4 +1,5 @@
-"""Reading flight logs: a CSV file (plain or gzipped) becomes a table of columns, a table becomes flights.
+"""Reading flight logs: a CSV file (plain or gzipped) becomes a table of columns, a table becomes
+flights.
 
 Importers of other formats make the same table, so that everything behind it is shared.
 """
@@ -19,7 +20,9 @@ from openjax.flights.flight import CHANNEL_COLUMNS, Flight
 LOG_COLUMNS = ("t", "vehicle", *(c for columns in CHANNEL_COLUMNS.values() for c in columns))
 
 WHOLE = ("quaternion", "motor_command")  # channels of which a part is a mistake, not a choice
-LARGEST = 256 << 20  # bytes of text in one log: a quarter of an hour at 1 kHz; more is no flight log
+LARGEST = (
+    256 << 20
+)  # bytes of text in one log: a quarter of an hour at 1 kHz; more is no flight log
 LARGEST_VALUE = 1e6  # no sensor's reading in SI units is larger; squares of what is would overflow
 
 
@@ -29,8 +32,9 @@ class LogError(UserError):
 
 @dataclass(frozen=True, eq=False)
 class LogTable:
-    """One log file as columns of the log format: `columns[name]` (R,) float64, NaN where a cell was empty;
-    `vehicle` (R,) ids. `remarks` are things found while reading that don't stop it."""
+    """One log file as columns of the log format: `columns[name]` (R,) float64, NaN where a cell was
+    empty; `vehicle` (R,) ids. `remarks` are things found while reading that don't stop it.
+    """
 
     name: str
     columns: dict[str, np.ndarray]
@@ -38,8 +42,11 @@ class LogTable:
     remarks: tuple[str, ...] = field(default=())
 
 
-def read_csv(path: str | Path, delimiter: str = ",", known: tuple[str, ...] | None = LOG_COLUMNS) -> LogTable:
-    """Read a `.csv` or `.csv.gz` log. Columns outside `known` are left out with a remark (None keeps all).
+def read_csv(
+    path: str | Path, delimiter: str = ",", known: tuple[str, ...] | None = LOG_COLUMNS
+) -> LogTable:
+    """Read a `.csv` or `.csv.gz` log. Columns outside `known` are left out with a remark (None
+    keeps all).
 
     Raises LogError if it isn't such a file: unreadable, no header, a cell that is no number.
     """
@@ -52,11 +59,15 @@ def read_csv(path: str | Path, delimiter: str = ",", known: tuple[str, ...] | No
     kept = [
         i
         for i, name in enumerate(names)
-        if name and name != "vehicle" and (name in known if known is not None else _is_number(first[i]))
+        if name
+        and name != "vehicle"
+        and (name in known if known is not None else _is_number(first[i]))
     ]
     unknown = [n for n in names if n and known is not None and n not in known]
     if unknown:
-        remarks.append(f"unknown column{'s' * (len(unknown) > 1)} left out: {', '.join(unknown[:8])}")
+        remarks.append(
+            f"unknown column{'s' * (len(unknown) > 1)} left out: {', '.join(unknown[:8])}"
+        )
     try:
         values = np.loadtxt(
             lines, delimiter=delimiter, usecols=kept, ndmin=2, comments=None, converters=_number
@@ -81,10 +92,14 @@ def read_csv(path: str | Path, delimiter: str = ",", known: tuple[str, ...] | No
 def flights_of(
     table: LogTable, motor_permutation: tuple[int, ...] = (0, 1, 2, 3)
 ) -> tuple[list[Flight], list[str]]:
-    """The table's flights, one per vehicle, as logged (not yet sorted, checked or cut), motors in the
-    nominal order; and remarks on columns that couldn't be used. Raises LogError without time."""
+    """The table's flights, one per vehicle, as logged (not yet sorted, checked or cut), motors in
+    the nominal order; and remarks on columns that couldn't be used. Raises LogError without
+    time.
+    """
     if "t" not in table.columns:
-        raise LogError(f"no column t; the log has {', '.join(table.columns)}: name it in columns.toml")
+        raise LogError(
+            f"no column t; the log has {', '.join(table.columns)}: name it in columns.toml"
+        )
     remarks = list(table.remarks)
     read = {c: _channel(table, c, names, remarks) for c, names in CHANNEL_COLUMNS.items()}
     channels = {c: v for c, v in read.items() if v is not None}
@@ -98,7 +113,14 @@ def flights_of(
         own = {c: v[rows] for c, v in channels.items() if not np.isnan(v[rows]).all()}
         name = table.name if len(ids) == 1 else f"{table.name}:{vehicle_id}"
         flights.append(
-            Flight(name, table.name, vehicle_id, table.columns["t"][rows], fingerprint=fingerprint, **own)
+            Flight(
+                name,
+                table.name,
+                vehicle_id,
+                table.columns["t"][rows],
+                fingerprint=fingerprint,
+                **own,
+            )
         )
     return flights, remarks
 
@@ -111,12 +133,16 @@ def _channel(table: LogTable, channel: str, names, remarks: list[str]) -> np.nda
         if found and channel in WHOLE:
             raise LogError(f"{', '.join(found)} without {missing}: log {missing}, or none of them")
         if found:
-            remarks.append(f"{', '.join(found)} without {missing}: {channel} is left out; log {missing}")
+            remarks.append(
+                f"{', '.join(found)} without {missing}: {channel} is left out; log {missing}"
+            )
         return None
     values = np.stack([table.columns[n] for n in names], 1)
     absurd = np.abs(values) > LARGEST_VALUE
     if absurd.any():
-        remarks.append(f"{', '.join(names)}: {absurd.sum()} values beyond 1e6 are taken as not sampled")
+        remarks.append(
+            f"{', '.join(names)}: {absurd.sum()} values beyond 1e6 are taken as not sampled"
+        )
         values = np.where(absurd, np.nan, values)
     if np.isnan(values).all():
         return None
@@ -124,8 +150,10 @@ def _channel(table: LogTable, channel: str, names, remarks: list[str]) -> np.nda
 
 
 def write_csv(path: str | Path, table: LogTable, decimals: dict[str, int] | None = None) -> None:
-    """Write a table as a log (gzipped where the name ends in `.gz`, with no time stamp in it: same data, same
-    bytes). `decimals` per column; 6 where it isn't named. A NaN becomes an empty cell."""
+    """Write a table as a log (gzipped where the name ends in `.gz`, with no time stamp in it: same
+    data, same bytes). `decimals` per column; 6 where it isn't named. A NaN becomes an empty
+    cell.
+    """
     decimals = decimals or {}
     names = [n for n in LOG_COLUMNS if n in table.columns or n == "vehicle"]
 
@@ -133,7 +161,10 @@ def write_csv(path: str | Path, table: LogTable, decimals: dict[str, int] | None
         if name == "vehicle":
             return table.vehicle.tolist()
         form = f"%.{decimals.get(name, 6)}f"
-        return ["" if math.isnan(v) else form % v for v in np.asarray(table.columns[name], float).tolist()]
+        return [
+            "" if math.isnan(v) else form % v
+            for v in np.asarray(table.columns[name], float).tolist()
+        ]
 
     lines = [",".join(names), *(",".join(row) for row in zip(*map(cells, names), strict=True))]
     data = ("\n".join(lines) + "\n").encode()
@@ -149,7 +180,9 @@ def _text(path: Path) -> str:
     except (OSError, EOFError, zlib.error) as error:
         raise LogError(f"can't be read: {error}") from error
     if len(data) > LARGEST:
-        raise LogError(f"holds more than {LARGEST >> 20} MB of text: no log of a flight; cut it into flights")
+        raise LogError(
+            f"holds more than {LARGEST >> 20} MB of text: no log of a flight; cut it into flights"
+        )
     if b"\0" in data:
         raise LogError("not a text file in UTF-8")
     try:
@@ -162,7 +195,8 @@ def _text(path: Path) -> str:
 def _check_header(names: list[str], delimiter: str, known: tuple[str, ...] | None) -> None:
     if delimiter == "," and len(names) == 1 and ";" in names[0]:
         raise LogError(
-            "columns are separated by ';'; the log format wants ',' (or a columns.toml with its delimiter)"
+            "columns are separated by ';'; the log format wants ',' (or a columns.toml with its "
+            "delimiter)"
         )
     if not any(re.search("[A-Za-z]", name) for name in names):
         raise LogError("the first row holds no column names")
@@ -171,12 +205,15 @@ def _check_header(names: list[str], delimiter: str, known: tuple[str, ...] | Non
         raise LogError(f"column {min(repeated)!r} occurs more than once")
     if known is not None and "t" not in names:
         raise LogError(
-            f"no column t; the log has {', '.join(n for n in names if n)}: say in columns.toml which is which"
+            f"no column t; the log has {', '.join(n for n in names if n)}: say in columns.toml "
+            "which is which"
         )
 
 
 def _whole_lines(lines: list[str], delimiter: str, cells: int) -> tuple[list[str], list[str]]:
-    """The lines that aren't blank, and a remark where the last was cut off: power went while it was written."""
+    """The lines that aren't blank, and a remark where the last was cut off: power went while it was
+    written.
+    """
     numbered = [(number, line) for number, line in enumerate(lines, 2) if line.strip()]
     remarks = []
     if len(numbered) > 1 and numbered[-1][1].count(delimiter) + 1 < cells:
@@ -184,15 +221,18 @@ def _whole_lines(lines: list[str], delimiter: str, cells: int) -> tuple[list[str
         remarks.append("the last line is cut off and left out")
     for number, line in numbered:
         if (found := line.count(delimiter) + 1) != cells:
-            raise LogError(f"line {number} has {found} cells, the header {cells} (cut off or corrupt)")
+            raise LogError(
+                f"line {number} has {found} cells, the header {cells} (cut off or corrupt)"
+            )
     if not numbered:
         raise LogError("no rows")
     return [line for _, line in numbered], remarks
 
 
 def _number(cell: str) -> float:
-    """A cell's number: NaN where it is empty, infinite where somebody wrote that it is none, so that the two can be told
-    apart. Raises ValueError for anything else."""
+    """A cell's number: NaN where it is empty, infinite where somebody wrote that it is none, so
+    that the two can be told apart. Raises ValueError for anything else.
+    """
     try:
         value = float(cell)
     except ValueError:
@@ -211,7 +251,9 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def _why_not(lines: list[str], delimiter: str, names: list[str], kept: list[int], error: Exception) -> str:
+def _why_not(
+    lines: list[str], delimiter: str, names: list[str], kept: list[int], error: Exception
+) -> str:
     """The first cell that is no number, in words. `lines` are those that aren't blank."""
     for number, line in enumerate(lines, 2):
         cells = line.split(delimiter)
@@ -222,10 +264,18 @@ def _why_not(lines: list[str], delimiter: str, names: list[str], kept: list[int]
 
 
 def _fingerprint(channels: dict[str, np.ndarray]) -> str:
-    """Hash of the values without time or file layout, so that a renamed, shifted or repacked copy is the
-    same."""
+    """Hash of the values without time or file layout, so that a renamed, shifted or repacked copy
+    is the same.
+    """
     digest = hashlib.sha256()
-    for name in ("motor_command", "command_thrust", "body_rates", "specific_force", "position", "quaternion"):
+    for name in (
+        "motor_command",
+        "command_thrust",
+        "body_rates",
+        "specific_force",
+        "position",
+        "quaternion",
+    ):
         if name in channels:
             digest.update(name.encode())
             digest.update(np.round(channels[name], 9).tobytes())

@@ -4,7 +4,9 @@ import numpy as np
 
 from openjax.flights.track import Track, smooth
 
-REGIMES = tuple("hover fast climb low high under_neighbour low_battery high_thrust transient".split())
+REGIMES = tuple(
+    "hover fast climb low high under_neighbour low_battery high_thrust transient".split()
+)
 
 
 def regimes_of(track: Track) -> dict[str, np.ndarray]:

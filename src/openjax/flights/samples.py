@@ -1,9 +1,10 @@
-"""Sample flights: openjax's own vehicle flown through manoeuvres, logged as a laboratory would log them.
+"""Sample flights: openjax's own vehicle flown through manoeuvres, logged as a laboratory would log
+them.
 
-Physics at 1 kHz, rate loop at 500 Hz on a noisy gyroscope, off-board commands every 10 ms from a position
-controller that knows the nominal vehicle only. Rows every 10 ms: sensors at t, commands issued at t, motors
-averaged over the 10 ms that begin at t. Noise and biases are of the size of a Crazyflie's IMU and a
-motion-capture system.
+Physics at 1 kHz, rate loop at 500 Hz on a noisy gyroscope, off-board commands every 10 ms from a
+position controller that knows the nominal vehicle only. Rows every 10 ms: sensors at t, commands
+issued at t, motors averaged over the 10 ms that begin at t. Noise and biases are of the size of a
+Crazyflie's IMU and a motion-capture system.
 """
 
 from collections.abc import Mapping
@@ -36,7 +37,9 @@ SUBSTEPS = 2  # per rate loop: 1 kHz
 
 @dataclass(frozen=True)
 class SensorModel:
-    """Noise (standard deviation per sample) and constant biases (standard deviation over flights)."""
+    """Noise (standard deviation per sample) and constant biases (standard deviation over
+    flights).
+    """
 
     gyro_noise: float = 0.02  # rad/s
     gyro_bias: float = 0.01  # rad/s
@@ -54,14 +57,19 @@ class Reference:
 
     position: np.ndarray  # (T, N, 3) m
     yaw: np.ndarray  # (T, N) rad
-    extra_command: np.ndarray  # (T, N, 4) thrust in 0..1, body rates in rad/s, added to the controller's
+    extra_command: (
+        np.ndarray
+    )  # (T, N, 4) thrust in 0..1, body rates in rad/s, added to the controller's
     open_circuit_voltage: float = 3.9  # V at the start
 
 
-def references(seed: int = 0, duration: float = 10.0, neighbour: bool = False) -> dict[str, Reference]:
-    """Three flights that expose a vehicle: waypoints down to 6 cm above the floor and near 1.1 m, a fast
-    Lissajous figure with turning yaw, and doublets on every axis around hover, from a full to a low battery.
-    With `neighbour` a second vehicle sweeps back and forth 35 to 55 cm above."""
+def references(
+    seed: int = 0, duration: float = 10.0, neighbour: bool = False
+) -> dict[str, Reference]:
+    """Three flights that expose a vehicle: waypoints down to 6 cm above the floor and near 1.1 m, a
+    fast Lissajous figure with turning yaw, and doublets on every axis around hover, from a full to
+    a low battery. With `neighbour` a second vehicle sweeps back and forth 35 to 55 cm above.
+    """
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, duration, PERIOD)
     zero = np.zeros((len(t), 4))
@@ -75,12 +83,16 @@ def references(seed: int = 0, duration: float = 10.0, neighbour: bool = False) -
     phase = rng.uniform(0, 2 * np.pi, 3)
     frequency = np.array([0.42, 0.35, 0.25]) * 2 * np.pi * rng.uniform(0.9, 1.1, 3)
     start = np.clip(t / 3.0, 0, 1)[:, None]
-    figure = start**2 * (3 - 2 * start) * [0.55, 0.55, 0.22] * np.sin(frequency * t[:, None] + phase)
+    figure = (
+        start**2 * (3 - 2 * start) * [0.55, 0.55, 0.22] * np.sin(frequency * t[:, None] + phase)
+    )
     figure += [0.0, 0.0, 0.6]
 
-    doublets, size = zero.copy(), np.array([0.12, 4.0, 4.0, 3.0])
+    doublets = zero.copy()
+    size = np.array([0.12, 4.0, 4.0, 3.0])
     for k, begin in enumerate(np.arange(0.8, duration - 0.6, 0.45)):
-        axis, sign = k % 4, 1 if (k // 4) % 2 == 0 else -1
+        axis = k % 4
+        sign = 1 if (k // 4) % 2 == 0 else -1
         at = (t >= begin) & (t < begin + 0.16)
         doublets[at, axis] += sign * size[axis] * np.where(t[at] < begin + 0.08, 1.0, -1.0)
     hover = np.tile([0.0, 0.0, 0.7], (len(t), 1))
@@ -91,10 +103,17 @@ def references(seed: int = 0, duration: float = 10.0, neighbour: bool = False) -
         "flight_c": (hover, 0.0 * t, doublets, 3.7),
     }
     if not neighbour:
-        return {n: Reference(p[:, None], y[:, None], c[:, None], v) for n, (p, y, c, v) in flights.items()}
-    offset = np.stack([0.25 * np.sin(1.3 * t), 0.1 * np.sin(0.8 * t), 0.45 + 0.1 * np.sin(0.5 * t)], 1)
+        return {
+            n: Reference(p[:, None], y[:, None], c[:, None], v)
+            for n, (p, y, c, v) in flights.items()
+        }
+    offset = np.stack(
+        [0.25 * np.sin(1.3 * t), 0.1 * np.sin(0.8 * t), 0.45 + 0.1 * np.sin(0.5 * t)], 1
+    )
     return {
-        n: Reference(np.stack([p, p + offset], 1), np.stack([y, 0 * y], 1), np.stack([c, zero], 1), v)
+        n: Reference(
+            np.stack([p, p + offset], 1), np.stack([y, 0 * y], 1), np.stack([c, zero], 1), v
+        )
         for n, (p, y, c, v) in flights.items()
     }
 
@@ -107,8 +126,10 @@ def fly(
     effects: Mapping[str, Mapping[str, float]] | None = None,
     sensors: SensorModel | None = None,
 ) -> list[dict[str, np.ndarray]]:
-    """Fly `plant` with `effects` ({name: {parameter: value}}) along `reference`, under a controller that
-    assumes the vehicle `assumed`. Returns the columns of the log for each vehicle, {name: (T,)}."""
+    """Fly `plant` with `effects` ({name: {parameter: value}}) along `reference`, under a controller
+    that assumes the vehicle `assumed`. Returns the columns of the log for each vehicle, {name:
+    (T,)}.
+    """
     sensors = SensorModel() if sensors is None else sensors
     names = tuple(sorted(effects or {}))
     parameters = composition.complete_parameters(composition.resolve(names), effects, jnp.float32)
@@ -121,11 +142,15 @@ def fly(
         _fly(plant, assumed, wanted, start, parameters, jax.random.key(seed), names, sensors)
     )
     rng = np.random.default_rng([seed, 1])
-    return [_columns([r[:, n] for r in rows], rng, sensors) for n in range(reference.position.shape[1])]
+    return [
+        _columns([r[:, n] for r in rows], rng, sensors) for n in range(reference.position.shape[1])
+    ]
 
 
 def log_of(columns: list[dict[str, np.ndarray]], name: str) -> LogTable:
-    """The vehicles' columns as one log in the long format, sorted by time; vehicles are "0", "1", ..."""
+    """The vehicles' columns as one log in the long format, sorted by time; vehicles are "0", "1",
+    ...
+    """
     time = np.concatenate([c["t"] for c in columns])
     order = np.argsort(time, kind="stable")
     joined = {n: np.concatenate([c[n] for c in columns])[order] for n in columns[0]}
@@ -134,8 +159,11 @@ def log_of(columns: list[dict[str, np.ndarray]], name: str) -> LogTable:
 
 
 @partial(jax.jit, static_argnames=("names", "sensors"))
-def _fly(plant: Vehicle, assumed: Vehicle, wanted, voltage, parameters, key, names, sensors: SensorModel):
-    effects, count = composition.resolve(names), wanted[0].shape[1]
+def _fly(
+    plant: Vehicle, assumed: Vehicle, wanted, voltage, parameters, key, names, sensors: SensorModel
+):
+    effects = composition.resolve(names)
+    count = wanted[0].shape[1]
     flown = composition.change_body(effects, parameters, plant)
     key, bias_key, memory_key = jax.random.split(key, 3)
     gyro_bias = sensors.gyro_bias * jax.random.normal(bias_key, (count, 3))
@@ -146,12 +174,15 @@ def _fly(plant: Vehicle, assumed: Vehicle, wanted, voltage, parameters, key, nam
     drones = drones.replace(effect_memory=memory)
 
     def contexts(drones, load, air_time, dt):
-        """Of every drone. The cell gives less with charge (0.02 V/s is a short, hard flight) and with
-        load."""
+        """Of every drone. The cell gives less with charge (0.02 V/s is a short, hard flight) and
+        with load.
+        """
         under_load = voltage - 0.004 * air_time - 0.5 * load
 
         def build(d, near, v):
-            return make_context(flown, d, others_position=near, battery_voltage=v, air_time=air_time, dt=dt)
+            return make_context(
+                flown, d, others_position=near, battery_voltage=v, air_time=air_time, dt=dt
+            )
 
         return jax.vmap(build)(drones, drones.position[others(count)], under_load), under_load
 
@@ -160,7 +191,9 @@ def _fly(plant: Vehicle, assumed: Vehicle, wanted, voltage, parameters, key, nam
         wanted_row, air_time = inputs
         key, noise_key = jax.random.split(key)
         seen = jax.vmap(partial(composition.seen_state, effects, parameters))(drones)
-        sent, integral = jax.vmap(_position_controller, (None, 0, 0, 0))(assumed, seen, integral, wanted_row)
+        sent, integral = jax.vmap(_position_controller, (None, 0, 0, 0))(
+            assumed, seen, integral, wanted_row
+        )
         context, under_load = contexts(drones, load, air_time, PERIOD)
         change = partial(composition.change_command, effects, parameters)
         command, memory = jax.vmap(change)(drones.effect_memory, sent, context)
@@ -187,8 +220,8 @@ def _fly(plant: Vehicle, assumed: Vehicle, wanted, voltage, parameters, key, nam
         motors = motors.mean(0)
         memory = jax.vmap(lambda d: composition.record(effects, d.effect_memory, d, PERIOD))(after)
         after = after.replace(effect_memory=memory)
-        # What motion capture and estimator deliver is what the controller sees; the IMU knows the moment
-        # itself.
+        # What motion capture and estimator deliver is what the controller sees; the IMU knows the
+        # moment itself.
         pose = (seen.position, seen.quaternion, seen.velocity)
         log = (*pose, drones.body_rates + gyro_bias, force / flown.mass, sent, motors, under_load)
         return (after, integral, force_after, motors.mean(-1), key), log
@@ -196,11 +229,15 @@ def _fly(plant: Vehicle, assumed: Vehicle, wanted, voltage, parameters, key, nam
     hover = jnp.zeros((count, 3)).at[:, 2].set(flown.mass * flown.gravity)
     load = jnp.full(count, 0.6)
     air_time = jnp.arange(wanted[0].shape[0], dtype=jnp.float32) * PERIOD
-    return jax.lax.scan(row, (drones, jnp.zeros((count, 3)), hover, load, key), (wanted, air_time))[1]
+    return jax.lax.scan(row, (drones, jnp.zeros((count, 3)), hover, load, key), (wanted, air_time))[
+        1
+    ]
 
 
 def _physics(vehicle, effects, parameters, drone: DroneState, motor_command, context):
-    """One physics step of one drone; its state, and the force without gravity in the body frame (3,) N."""
+    """One physics step of one drone; its state, and the force without gravity in the body frame
+    (3,) N.
+    """
     motor_command = composition.change_motor_command(effects, parameters, motor_command, context)
     speed = rotor_speed_step(vehicle, drone.rotor_speed, motor_command, context.dt)
     force, torque = composition.wrench(effects, parameters, vehicle, speed, context)
@@ -209,8 +246,10 @@ def _physics(vehicle, effects, parameters, drone: DroneState, motor_command, con
 
 
 def _position_controller(assumed: Vehicle, state: DroneState, integral, wanted):
-    """Command (4,) of a position controller and its integral (3,) m s: PID to a wanted acceleration, thrust
-    along body z, attitude error to body rates. Gains are for a vehicle of this size."""
+    """Command (4,) of a position controller and its integral (3,) m s: PID to a wanted
+    acceleration, thrust along body z, attitude error to body rates. Gains are for a vehicle of this
+    size.
+    """
     position, velocity, acceleration, yaw, extra = wanted
     error = position - state.position
     integral = jnp.clip(integral + error * PERIOD, -0.5, 0.5)
@@ -241,7 +280,9 @@ def _columns(rows, rng: np.random.Generator, sensors: SensorModel) -> dict[str, 
     specific_force = specific_force + sensors.accelerometer_bias * rng.standard_normal(3)
     groups = {
         ("x", "y", "z"): noisy(position, sensors.position_noise),
-        ("qw", "qx", "qy", "qz"): _turned(quaternion, noisy(np.zeros((count, 3)), sensors.attitude_noise)),
+        ("qw", "qx", "qy", "qz"): _turned(
+            quaternion, noisy(np.zeros((count, 3)), sensors.attitude_noise)
+        ),
         ("vx", "vy", "vz"): noisy(velocity, sensors.velocity_noise),
         ("wx", "wy", "wz"): noisy(gyro, sensors.gyro_noise),
         ("ax", "ay", "az"): noisy(specific_force, sensors.accelerometer_noise),
@@ -257,14 +298,19 @@ def _columns(rows, rng: np.random.Generator, sensors: SensorModel) -> dict[str, 
 
 def _turned(quaternion: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """Attitudes (T, 4) turned by small body-frame rotations (T, 3) rad."""
-    w, u, half = quaternion[:, :1], quaternion[:, 1:], rotation / 2
-    turned = np.concatenate([w - (u * half).sum(1, keepdims=True), u + w * half + np.cross(u, half)], 1)
+    w = quaternion[:, :1]
+    u = quaternion[:, 1:]
+    half = rotation / 2
+    turned = np.concatenate(
+        [w - (u * half).sum(1, keepdims=True), u + w * half + np.cross(u, half)], 1
+    )
     return turned / np.linalg.norm(turned, axis=1, keepdims=True)
 
 
 def _minimum_jerk(points: np.ndarray, t: np.ndarray, leg: float) -> np.ndarray:
-    """Positions (T, 3) along legs of `leg` seconds between points, at rest at each (10 s^3 - 15 s^4 + 6
-    s^5)."""
+    """Positions (T, 3) along legs of `leg` seconds between points, at rest at each (10 s^3 - 15 s^4
+    + 6 s^5).
+    """
     k = np.minimum((t / leg).astype(int), len(points) - 2)
     s = np.clip(t / leg - k, 0.0, 1.0)[:, None]
     return points[k] + (points[k + 1] - points[k]) * s**3 * (10 - 15 * s + 6 * s**2)

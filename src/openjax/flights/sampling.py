@@ -14,10 +14,13 @@ EDGE = 0.03  # cycles of that clock by which its phase may be wrong
 
 
 def drop_frozen(flight: Flight, note) -> Flight:
-    """Constant columns refuse or drop their channel; frozen stretches become not sampled; holes are named."""
+    """Constant columns refuse or drop their channel; frozen stretches become not sampled; holes are
+    named.
+    """
     changes = {}
     for channel in (c for c in CHANNEL_COLUMNS if getattr(flight, c) is not None):
-        values, names = getattr(flight, channel), ", ".join(CHANNEL_COLUMNS[channel])
+        values = getattr(flight, channel)
+        names = ", ".join(CHANNEL_COLUMNS[channel])
         rows = np.flatnonzero(np.isfinite(values.reshape(len(values), -1)).all(1))
         if len(rows) < 2:
             raise Refused("corrupt", f"{names}: hardly any row holds a number")
@@ -33,17 +36,21 @@ def drop_frozen(flight: Flight, note) -> Flight:
 
 def _standing_still(flight: Flight, channel: str, rows, note) -> np.ndarray:
     """(T,) rows in which a sensor is frozen; of columns that never change nothing can be used."""
-    columns, values = CHANNEL_COLUMNS[channel], getattr(flight, channel)
+    columns = CHANNEL_COLUMNS[channel]
+    values = getattr(flight, channel)
     table = values.reshape(len(values), -1)
     changed = np.diff(table[rows], axis=0) != 0
     together = channel in ("position", "quaternion", "velocity")
     dead = [] if together and changed.any() else np.flatnonzero(~changed.any(0))
     if len(dead):
         names = ", ".join(columns[i] for i in dead)
-        raise Refused("corrupt", f"{names}: the same value {table[rows[0], dead[0]]:g} in every row")
+        raise Refused(
+            "corrupt", f"{names}: the same value {table[rows[0], dead[0]]:g} in every row"
+        )
     frozen = _frozen(table, rows, flight.time, together)
     if frozen.any():
-        share, start = frozen.mean(), flight.time[np.argmax(frozen)]
+        share = frozen.mean()
+        start = flight.time[np.argmax(frozen)]
         words = f"{', '.join(columns)} stand still for {share * flight.duration:.1f} s from t = {start:.2f}"
         if share > 0.5:
             raise Refused("corrupt", f"{words}: frozen for {share:.0%} of the flight")
@@ -52,16 +59,21 @@ def _standing_still(flight: Flight, channel: str, rows, note) -> np.ndarray:
 
 
 def _name_hole(time, rows, names: str, note) -> None:
-    """Say where the longest stretch without samples is, if rows are there meanwhile: else it is a gap in time, named already."""
+    """Say where the longest stretch without samples is, if rows are there meanwhile: else it is a
+    gap in time, named already.
+    """
     steps = np.diff(time[rows])
     hole = int(np.argmax(steps))
     if rows[hole + 1] - rows[hole] > 1 and steps[hole] > max(0.2, 10 * np.median(steps)):
-        note("gaps", f"{names}: not sampled for {steps[hole]:.2f} s after t = {time[rows][hole]:.2f}")
+        note(
+            "gaps", f"{names}: not sampled for {steps[hole]:.2f} s after t = {time[rows][hole]:.2f}"
+        )
 
 
 def drop_repeats(flight: Flight, note) -> Flight:
-    """A sensor that is slower than the rows and whose last sample was written again counts as sampled where it changed.
-    A sample that appears in a row may be older than it by up to a row."""
+    """A sensor that is slower than the rows and whose last sample was written again counts as
+    sampled where it changed. A sample that appears in a row may be older than it by up to a row.
+    """
     changes = {}
     for group in (("position", "quaternion", "velocity"), ("body_rates", "specific_force")):
         logged = [c for c in group if getattr(flight, c) is not None]
@@ -73,7 +85,8 @@ def drop_repeats(flight: Flight, note) -> Flight:
             continue
         note(
             "held",
-            f"{repeated.mean():.0%} of the rows repeat the last sample of {', '.join(logged)}: left out",
+            f"{repeated.mean():.0%} of the rows repeat the last sample of {', '.join(logged)}: "
+            "left out",
         )
         for channel in logged:
             changes[channel] = _unsampled(getattr(flight, channel), repeated)
@@ -83,9 +96,10 @@ def drop_repeats(flight: Flight, note) -> Flight:
 
 
 def put_in_step(flight: Flight, note) -> Flight:
-    """Poses at the times of their rows, where the camera is slower than the log: a row says only that a new pose came since the
-    last one, and the camera's own clock is regular. Poses are on a line through their rows; a held one is half a row late on
-    the mean."""
+    """Poses at the times of their rows, where the camera is slower than the log: a row says only
+    that a new pose came since the last one, and the camera's own clock is regular. Poses are on a
+    line through their rows; a held one is half a row late on the mean.
+    """
     logged = [c for c in ("position", "quaternion", "velocity") if getattr(flight, c) is not None]
     if not logged:
         return flight
@@ -106,13 +120,18 @@ def put_in_step(flight: Flight, note) -> Flight:
         moved[rows] = np.stack([np.interp(seen, own, column) for column in values[rows].T], 1)
         changes[channel] = moved
     rate = (len(own) - 1) / (own[-1] - own[0])
-    note("held", f"poses come at {rate:.0f} Hz of a clock of their own: moved from it to the rows' times")
+    note(
+        "held",
+        f"poses come at {rate:.0f} Hz of a clock of their own: moved from it to the rows' times",
+    )
     return dataclasses.replace(flight, **changes)
 
 
 def _regular_clock(seen: np.ndarray, row: float) -> np.ndarray | None:
-    """Times (S,) of a regular clock whose ticks were seen at times (S,) up to a `row` s apart from it, later where rows are
-    missing; None where they have none. Its rate is where the phases of what was seen agree most (Rayleigh's periodogram)."""
+    """Times (S,) of a regular clock whose ticks were seen at times (S,) up to a `row` s apart from
+    it, later where rows are missing; None where they have none. Its rate is where the phases of
+    what was seen agree most (Rayleigh's periodogram).
+    """
     since = seen - seen[0]
     usual = (len(seen) - 1) / since[-1]
     rates = np.arange(0.9 * usual, 1.15 * usual, 0.2 / since[-1])
@@ -121,7 +140,9 @@ def _regular_clock(seen: np.ndarray, row: float) -> np.ndarray | None:
     if np.abs(turned[best]) < IN_PHASE:
         return None
     middle = np.angle(turned[best]) / (2.0 * np.pi)
-    late = rates[best] * since - middle + 0.5 * row * rates[best]  # cycles since a tick could first be seen
+    late = (
+        rates[best] * since - middle + 0.5 * row * rates[best]
+    )  # cycles since a tick could first be seen
     ticks = np.floor(late + EDGE)
     usual = late - ticks < row * rates[best] + EDGE
     slope, start = np.polyfit(ticks[usual], seen[usual], 1)
@@ -136,12 +157,18 @@ def _unsampled(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def _frozen(table: np.ndarray, rows: np.ndarray, time: np.ndarray, together: bool) -> np.ndarray:
-    """(T,) True in runs of at least FROZEN seconds in which a column (all columns if `together`) doesn't
-    change though it does elsewhere. Runs at the column's extremes are saturation, not a frozen sensor."""
+    """(T,) True in runs of at least FROZEN seconds in which a column (all columns if `together`)
+    doesn't change though it does elsewhere. Runs at the column's extremes are saturation, not a
+    frozen sensor.
+    """
     values = table[rows]
     still = np.diff(values, axis=0) == 0
     extreme = (values == values.min(0)) | (values == values.max(0))
-    per_column = [still.all(1)] if together else [s & ~e for s, e in zip(still.T, extreme[1:].T, strict=True)]
+    per_column = (
+        [still.all(1)]
+        if together
+        else [s & ~e for s, e in zip(still.T, extreme[1:].T, strict=True)]
+    )
     frozen = np.zeros(len(time), bool)
     for run in per_column:
         for start, stop in runs_of(run):

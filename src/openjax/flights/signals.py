@@ -16,16 +16,21 @@ FADE = 0.5  # s
 
 
 def clock_of(flight: Flight) -> np.ndarray | None:
-    """The common clock over the longest stretch without gaps; None if that is too short to tell anything."""
+    """The common clock over the longest stretch without gaps; None if that is too short to tell
+    anything.
+    """
     stretch = max(flight.stretches(max(0.1, 5 * flight.row_period)), key=lambda s: s.stop - s.start)
-    start, stop = flight.time[stretch.start], flight.time[stretch.stop - 1]
+    start = flight.time[stretch.start]
+    stop = flight.time[stretch.stop - 1]
     if stop - start < 1.5:
         return None
     return np.arange(start, min(stop, start + LONGEST), 1 / RATE)
 
 
 def on_clock(flight: Flight, channel: str, grid: np.ndarray) -> np.ndarray | None:
-    """A channel (T, C) on the common clock; fast channels are averaged over the clock's period first."""
+    """A channel (T, C) on the common clock; fast channels are averaged over the clock's period
+    first.
+    """
     values = getattr(flight, channel)
     if values is None:
         return None
@@ -42,8 +47,12 @@ def on_clock(flight: Flight, channel: str, grid: np.ndarray) -> np.ndarray | Non
 
 
 def in_band(values: np.ndarray, band: tuple[float, float]) -> np.ndarray:
-    """`values` (T, C) between two frequencies, without delay, and without the ends where that isn't right."""
-    edge = min(20, len(values) // 8)  # rows at the ends where filter and differences aren't trustworthy
+    """`values` (T, C) between two frequencies, without delay, and without the ends where that isn't
+    right.
+    """
+    edge = min(
+        20, len(values) // 8
+    )  # rows at the ends where filter and differences aren't trustworthy
     # Faded in and out: a filter this slow would carry the last row's noise far into the flight.
     fade = _fade(len(values))[:, None]
     return sosfiltfilt(_bandpass(band), fade * (values - values.mean(0)), axis=0)[edge:-edge]

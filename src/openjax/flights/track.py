@@ -1,7 +1,9 @@
 """A flight on a uniform clock: the arrays that the replay runs on.
 
-Replays step from row to row, so a flight is put on an even time grid once: rows between 100 Hz and 50 Hz
-are kept, faster logs are averaged down to 100 Hz, and a longer gap splits a flight into two tracks."""
+Replays step from row to row, so a flight is put on an even time grid once: rows between 100 Hz and
+50 Hz are kept, faster logs are averaged down to 100 Hz, and a longer gap splits a flight into two
+tracks.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -23,8 +25,9 @@ EARLY = 25.0  # per cent of them that may come before the rows that are made for
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """One stretch of one vehicle's flight, T rows of period `dt`. Units and frames are those of `Flight`;
-    motors are fractions of the maximal rotor thrust. What wasn't logged is None."""
+    """One stretch of one vehicle's flight, T rows of period `dt`. Units and frames are those of
+    `Flight`; motors are fractions of the maximal rotor thrust. What wasn't logged is None.
+    """
 
     name: str
     flight: str  # name of the flight it comes from: the unit that is held out
@@ -61,7 +64,9 @@ def flight_tracks(flight: Flight, case: Case) -> list[Track]:
         flight.stretches(max_step=max(MAX_GAP, 3 * flight.row_period), min_duration=MIN_DURATION)
     ):
         part = flight.rows(stretch)
-        found.append(_on_grid(part, flight, case, f"{flight.name}#{number}" if number else flight.name))
+        found.append(
+            _on_grid(part, flight, case, f"{flight.name}#{number}" if number else flight.name)
+        )
     return found
 
 
@@ -79,13 +84,16 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
             return None
         if not faster or channel in ("position", "quaternion"):
             return part.interpolated(channel, grid)
-        # Faster logs: the mean around a grid point; of commands, which hold until the next row, the mean that follows it.
+        # Faster logs: the mean around a grid point; of commands, which hold until the next row, the
+        # mean that follows it.
         at, values = part.sampled(channel)
         flat = values.reshape(len(values), -1)
         means = _means(at, flat, grid if ahead else grid - 0.5 * period, period, ahead)
         return means.reshape((count, *values.shape[1:]))
 
-    motor, voltage, fast_thrust = take("motor_command", ahead=True), take("battery_voltage"), None
+    motor = take("motor_command", ahead=True)
+    voltage = take("battery_voltage")
+    fast_thrust = None
     if motor is not None and case.vehicle_file.motor.command == "pwm":
         motor = pwm_thrust(motor, voltage, case.vehicle_of(flight))
     elif motor is not None and faster:
@@ -93,9 +101,13 @@ def _on_grid(part: Flight, flight: Flight, case: Case, name: str) -> Track:
         fast_thrust = at, values.mean(1)
     command = None
     if part.has_commands:
-        command = np.concatenate([take("command_thrust", True)[:, None], take("command_body_rates", True)], 1)
+        command = np.concatenate(
+            [take("command_thrust", True)[:, None], take("command_body_rates", True)], 1
+        )
     neighbours = [
-        other.interpolated("position", grid) for other in case.others(flight) if other.position is not None
+        other.interpolated("position", grid)
+        for other in case.others(flight)
+        if other.position is not None
     ]
     return Track(
         name=name,
@@ -120,24 +132,30 @@ def _missing(logged: Array, grid: Array, period: float) -> Array:
 
 
 def held_means(at: Array, values: Array, begin: Array, period: float) -> Array:
-    """Means (G,) of values (S,) at times `at` (S,) s, each held until the next, over `period` s from `begin` (G,) s on."""
+    """Means (G,) of values (S,) at times `at` (S,) s, each held until the next, over `period` s
+    from `begin` (G,) s on.
+    """
     return _means(at, values[:, None], begin, period, True)[:, 0]
 
 
 def _means(at, values, begin, period, held):
-    """Means (G, C) of samples (S, C) over periods, of samples that are `held` until the next or of lines between them."""
+    """Means (G, C) of samples (S, C) over periods, of samples that are `held` until the next or of
+    lines between them.
+    """
     step = np.diff(at)[:, None] * (values[:-1] if held else 0.5 * (values[1:] + values[:-1]))
     whole = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(step, 0)])
     begin = np.clip(begin, at[0], at[-1] - 0.5 * period)
     end = np.clip(begin + period, at[0], at[-1])
     means = [
-        (np.interp(end, at, column) - np.interp(begin, at, column)) / (end - begin) for column in whole.T
+        (np.interp(end, at, column) - np.interp(begin, at, column)) / (end - begin)
+        for column in whole.T
     ]
     return np.stack(means, 1)
 
 
 def _command_phase(part: Flight, period: float) -> float:
-    """When within a period (s, from the first row on) new commands begin: rows of the grid that begin there hold one each.
+    """When within a period (s, from the first row on) new commands begin: rows of the grid that
+    begin there hold one each.
 
     A row that mixed two could not tell which of them had arrived.
     """
@@ -157,9 +175,10 @@ def _command_phase(part: Flight, period: float) -> float:
 
 
 def pwm_thrust(duty: Array, voltage: Array | None, vehicle) -> Array:
-    """Thrust fraction (T, 4) that a duty cycle gives: motor voltage U = duty x battery, and the public map
-    of the Crazyflie firmware's battery compensation, U = -0.0006239 g^2 + 0.088 g for g grams of thrust
-    of all four rotors."""
+    """Thrust fraction (T, 4) that a duty cycle gives: motor voltage U = duty x battery, and the
+    public map of the Crazyflie firmware's battery compensation, U = -0.0006239 g^2 + 0.088 g for g
+    grams of thrust of all four rotors.
+    """
     volts = duty * (3.7 if voltage is None else voltage[:, None])
     grams = (0.088 - np.sqrt(np.maximum(0.088**2 - 4 * 0.0006239 * volts, 0.0))) / (2 * 0.0006239)
     newtons = grams * 1e-3 * GRAVITY / 4
@@ -191,8 +210,12 @@ def to_world(quaternion: Array, vector: Array) -> Array:
 
 
 def specific_force_of(quaternion: Array, velocity: Array, period: float) -> Array:
-    """Force per mass (T, 3), m/s^2 in the body frame, that a path with velocities (T, 3) every `period` s needs."""
-    return to_body(quaternion, np.gradient(velocity, period, axis=0) + np.array([0.0, 0.0, GRAVITY]))
+    """Force per mass (T, 3), m/s^2 in the body frame, that a path with velocities (T, 3) every
+    `period` s needs.
+    """
+    return to_body(
+        quaternion, np.gradient(velocity, period, axis=0) + np.array([0.0, 0.0, GRAVITY])
+    )
 
 
 def turn_increments(quaternion: np.ndarray) -> np.ndarray:

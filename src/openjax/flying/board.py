@@ -1,8 +1,9 @@
-"""What the three processes of a flight know of each other: a page of shared memory that outlives any of them.
+"""What the three processes of a flight know of each other: a page of shared memory that outlives
+any of them.
 
-The loop flies through the links. If it falls silent the links' process lands the vehicles; if that one is silent too the
-guard does, over links of its own; if both are gone the loop does. Whoever flies writes its state here, so that the next one
-can go on from it.
+The loop flies through the links. If it falls silent the links' process lands the vehicles; if that
+one is silent too the guard does, over links of its own; if both are gone the loop does. Whoever
+flies writes its state here, so that the next one can go on from it.
 """
 
 import contextlib
@@ -35,7 +36,8 @@ class _Word:
     """One number of the page, read and written as a `kind`."""
 
     def __init__(self, at: int, kind: type = bool):
-        self._at, self._kind = at, kind
+        self._at = at
+        self._kind = kind
 
     def __get__(self, board, _=None):
         return self._kind(int(board._numbers[self._at]))
@@ -60,8 +62,11 @@ class Board:
       stopped: whether the operator wants all motors off, whoever flies.
     """
 
-    flying, pilot, over = _Word(0), _Word(1, Role), _Word(2)
-    armed, stopped = _Word(3), _Word(4)
+    flying = _Word(0)
+    pilot = _Word(1, Role)
+    over = _Word(2)
+    armed = _Word(3)
+    stopped = _Word(4)
 
     def __init__(self, number: int, context, silence: float = SILENCE):
         self._numbers = context.RawArray("d", _HEAD + _EACH * number)
@@ -84,12 +89,14 @@ class Board:
         self._numbers[_PIDS + role] = 0.0
 
     def end_process(self, role: Role) -> None:
-        """Kill the process of `role`, should there be one: if it woke up, two would fly. Returns once it has given back all
-        that it held, a radio dongle above all.
+        """Kill the process of `role`, should there be one: if it woke up, two would fly. Returns
+        once it has given back all that it held, a radio dongle above all.
         """
         pid = int(self._numbers[_PIDS + role])
         if pid:
-            with contextlib.suppress(OSError, AttributeError):  # it has gone; only Linux tells when one goes
+            with contextlib.suppress(
+                OSError, AttributeError
+            ):  # it has gone; only Linux tells when one goes
                 os.kill(pid, signal.SIGKILL)
                 process = os.pidfd_open(pid)
                 select.select([process], [], [], self.silence)
@@ -107,7 +114,9 @@ class Board:
         self.beat(role, now)
 
     def read(self, state: State, now: float) -> State:
-        """`state` with what was written last, moved on to `now` (s): vehicles go on turning as they were told."""
+        """`state` with what was written last, moved on to `now` (s): vehicles go on turning as they
+        were told.
+        """
         drones = []
         for i, drone in enumerate(state.drones):
             mode, trim, known, *numbers = self._numbers[_HEAD + _EACH * i : _HEAD + _EACH * (i + 1)]
@@ -117,7 +126,9 @@ class Board:
 
 
 def stand_alone() -> None:
-    """Make this process its own: no terminal's signal reaches it, nor the end of whoever started it."""
+    """Make this process its own: no terminal's signal reaches it, nor the end of whoever started
+    it.
+    """
     os.setsid()
     for name in DEAF:
         if hasattr(signal, name):

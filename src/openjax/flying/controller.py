@@ -1,7 +1,9 @@
-"""Flying to a point: position and velocity to a set-point, for take-off, waiting, landing and getting out of trouble.
+"""Flying to a point: position and velocity to a set-point, for take-off, waiting, landing and
+getting out of trouble.
 
-A cascade of proportional loops; what it asks for beyond hovering is small, so it needs no more of the vehicle than the
-thrust at which it hovers. Plain numbers instead of arrays: it runs a few times per tick, where JAX would cost more.
+A cascade of proportional loops; what it asks for beyond hovering is small, so it needs no more of
+the vehicle than the thrust at which it hovers. Plain numbers instead of arrays: it runs a few times
+per tick, where JAX would cost more.
 """
 
 import functools
@@ -111,7 +113,9 @@ def level_acceleration(quaternion) -> Vector:
 
 
 def lift_acceleration(quaternion, lift: float) -> Vector:
-    """The acceleration (m/s^2, world) at an attitude (4,) with a thrust that is `lift` times the weight."""
+    """The acceleration (m/s^2, world) at an attitude (4,) with a thrust that is `lift` times the
+    weight.
+    """
     x, y, z = body_axis(quaternion)
     return lift * GRAVITY * x, lift * GRAVITY * y, lift * GRAVITY * z - GRAVITY
 
@@ -149,7 +153,9 @@ def wanted_velocity(position: Vector, target: Vector, speed: float) -> Vector:
 
 
 def wanted_acceleration(velocity: Vector, wanted: Vector) -> Vector:
-    """The acceleration (m/s^2, world) that leads from a velocity to the `wanted` one, within the tilt limit."""
+    """The acceleration (m/s^2, world) that leads from a velocity to the `wanted` one, within the
+    tilt limit.
+    """
     ax, ay, az = (VELOCITY_GAIN * (w - v) for w, v in zip(wanted, velocity, strict=True))
     az = min(max(az, -CLIMB_LIMIT), CLIMB_LIMIT)
     level = math.hypot(ax, ay)
@@ -163,9 +169,10 @@ def accelerate(
 ) -> SetPoint:
     """The set-point for an acceleration (m/s^2, world) at an attitude, yaw to zero.
 
-    The thrust is what of it the body's axis can do at present: a vehicle that still leans elsewhere first turns, then pushes
-    (Lee, Leok, McClamroch 2010, "Geometric tracking control of a quadrotor UAV on SE(3)"). `trim` is added to the hover
-    thrust. `mode` RATES tracks the angles here instead of on board.
+    The thrust is what of it the body's axis can do at present: a vehicle that still leans elsewhere
+    first turns, then pushes (Lee, Leok, McClamroch 2010, "Geometric tracking control of a quadrotor
+    UAV on SE(3)"). `trim` is added to the hover thrust. `mode` RATES tracks the angles here instead
+    of on board.
     """
     ax, ay, az = acceleration
     roll, pitch, yaw = roll_pitch_yaw(quaternion)
@@ -179,6 +186,10 @@ def accelerate(
     yaw_rate = -YAW_GAIN * yaw
     if mode == RATES:
         return SetPoint(
-            RATES, ANGLE_GAIN * (wanted_roll - roll), ANGLE_GAIN * (wanted_pitch - pitch), yaw_rate, thrust
+            RATES,
+            ANGLE_GAIN * (wanted_roll - roll),
+            ANGLE_GAIN * (wanted_pitch - pitch),
+            yaw_rate,
+            thrust,
         )
     return SetPoint(ANGLES, wanted_roll, wanted_pitch, yaw_rate, thrust)

@@ -1,6 +1,7 @@
 """CRTP, the protocol between a Crazyflie and a ground station: ports, types, packed numbers.
 
-Facts from Bitcraze's protocol documentation (https://www.bitcraze.io/documentation/repository/crazyflie-firmware/
+Facts from Bitcraze's protocol documentation
+(https://www.bitcraze.io/documentation/repository/crazyflie-firmware/
 master/functional-areas/crtp/); a packet is one byte of header and up to 30 bytes of data.
 """
 
@@ -10,7 +11,9 @@ from enum import IntEnum, IntFlag
 from typing import NamedTuple
 
 PROTOCOL_VERSION = 12
-"""The version answered: tables of contents with 16-bit ids (4 and up), arming by the supervisor's port (12)."""
+"""The version answered: tables of contents with 16-bit ids (4 and up), arming by the supervisor's
+port (12).
+"""
 MAX_LOG_DATA = 26
 """Bytes of variables in one log packet; the rest is the block's id and the time stamp."""
 FULL_SCALE = 65535
@@ -100,7 +103,9 @@ def pack_number(fmt: str, value: float) -> bytes:
 
 
 def compress_quaternion(wxyz) -> int:
-    """A unit quaternion (4,) wxyz in 32 bits: which component is largest, then sign and 9 bits of the others."""
+    """A unit quaternion (4,) wxyz in 32 bits: which component is largest, then sign and 9 bits of
+    the others.
+    """
     w, *xyz = map(float, wxyz)
     xyzw = (*xyz, w)
     size = math.hypot(*xyzw)
@@ -109,13 +114,17 @@ def compress_quaternion(wxyz) -> int:
     for i, value in enumerate(xyzw):
         if i != largest:
             negative = int((value < 0) != (xyzw[largest] < 0))
-            packed = packed << 10 | negative << 9 | min(round(511 * abs(value) / size * 2**0.5), 511)
+            packed = (
+                packed << 10 | negative << 9 | min(round(511 * abs(value) / size * 2**0.5), 511)
+            )
     return packed
 
 
 def expand_quaternion(packed: int) -> tuple[float, float, float, float]:
     """wxyz from 32 bits, see `compress_quaternion`; precise to about 1e-3."""
-    xyzw, largest, square = [0.0] * 4, packed >> 30, 0.0
+    xyzw = [0.0] * 4
+    largest = packed >> 30
+    square = 0.0
     for i in (3, 2, 1, 0):
         if i != largest:
             value = (packed & 0x1FF) / 511 / 2**0.5

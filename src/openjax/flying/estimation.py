@@ -12,17 +12,22 @@ SMOOTHING = 0.02
 
 
 def see(state: State, time: float, samples: Sequence[PoseSample]) -> State:
-    """The state with each vehicle's estimate at `time` (s): the newest good pose moved on, or reckoned from the last one.
+    """The state with each vehicle's estimate at `time` (s): the newest good pose moved on, or
+    reckoned from the last one.
 
-    Motion capture is what a vehicle is flown by, until it is lost; from then on its own estimate is.
+    Motion capture is what a vehicle is flown by, until it is lost; from then on its own estimate
+    is.
     """
     state = state._replace(time=time, dt=min(max(time - state.time, 0.0), 0.1))
-    drones = (_seen(state, drone, sample) for drone, sample in zip(state.drones, samples, strict=True))
+    drones = (
+        _seen(state, drone, sample) for drone, sample in zip(state.drones, samples, strict=True)
+    )
     return state._replace(drones=tuple(drones))
 
 
 def _seen(state, drone, sample) -> Drone:
-    now, limits = state.time, state.limits
+    now = state.time
+    limits = state.limits
     moving = drone.mode in FLYING and not (drone.mode is Mode.LIFT and now - drone.since < SPIN_UP)
     by_capture = sample.captured is not None and not drone.distrusted
     drone = drone._replace(own=_own(state, drone, sample, by_capture, moving))
@@ -35,18 +40,24 @@ def _seen(state, drone, sample) -> Drone:
         return drone._replace(estimate=estimate, seen=source.pose.time, acceleration=level)
     if drone.estimate is None:
         return drone
-    old, dt = drone.estimate, state.dt
+    old = drone.estimate
+    dt = state.dt
     velocity = tuple(v + dt * a for v, a in zip(old.velocity, drone.acceleration, strict=True))
     position = tuple(p + dt * v for p, v in zip(old.position, velocity, strict=True))
     return drone._replace(estimate=old._replace(time=now, position=position, velocity=velocity))
 
 
 def _own(state, drone, sample, by_capture, moving) -> Track:
-    """The drone's own estimates after the newest one, which motion capture must confirm where they were lost or wrong."""
-    now, limits, before = state.time, state.limits, drone.own
+    """The drone's own estimates after the newest one, which motion capture must confirm where they
+    were lost or wrong.
+    """
+    now = state.time
+    limits = state.limits
+    before = drone.own
     if by_capture and before.fresh(now, limits):
         return before.after(sample.own, now, limits, moving, None)
-    own, seen = before.after(sample.own, now, limits, moving, drone.estimate), drone.captured
+    own = before.after(sample.own, now, limits, moving, drone.estimate)
+    seen = drone.captured
     to_confirm = moving and by_capture and own.pose is not before.pose and seen.fresh(now, limits)
     if to_confirm and agree(*at_one_time(seen.pose, own.pose), limits) is Verdict.APART:
         return own._replace(pose=before.pose, verdict=Verdict.JUMPED)
@@ -54,10 +65,15 @@ def _own(state, drone, sample, by_capture, moving) -> Track:
 
 
 def _captured(state, drone, sample, moving) -> Drone:
-    """The drone after the newest of motion capture: whether it is believed, and told to the estimator on board."""
-    now, limits, own = state.time, state.limits, drone.own
+    """The drone after the newest of motion capture: whether it is believed, and told to the
+    estimator on board.
+    """
+    now = state.time
+    limits = state.limits
+    own = drone.own
     seen = _with_motion(sample.captured, drone.captured.pose, sample.own)
-    captured, distrusted = drone.captured.after(seen, now, limits, moving, drone.estimate), ""
+    captured = drone.captured.after(seen, now, limits, moving, drone.estimate)
+    distrusted = ""
     if captured.pose is seen:
         both = at_one_time(seen, own.pose) if moving and own.pose is not None else None
         drone = drone._replace(told=both is None or follows(*both, limits))
@@ -69,7 +85,9 @@ def _captured(state, drone, sample, moving) -> Drone:
 
 
 def _with_motion(pose, last, own) -> Pose:
-    """A pose of motion capture with the velocity from differences, smoothed, and the body rates of the gyroscope."""
+    """A pose of motion capture with the velocity from differences, smoothed, and the body rates of
+    the gyroscope.
+    """
     if last is None or pose.time <= last.time:
         return pose if last is None else last
     if (pose.position, pose.quaternion) == (last.position, last.quaternion):
@@ -80,4 +98,6 @@ def _with_motion(pose, last, own) -> Pose:
         v + share * ((p - q) / step - v)
         for p, q, v in zip(pose.position, last.position, last.velocity, strict=True)
     )
-    return pose._replace(velocity=velocity, body_rates=pose.body_rates if own is None else own.body_rates)
+    return pose._replace(
+        velocity=velocity, body_rates=pose.body_rates if own is None else own.body_rates
+    )

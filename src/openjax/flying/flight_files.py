@@ -1,7 +1,8 @@
-"""What a flight leaves behind: a case that `openjax diagnose` reads, and `flight.json` about the flight.
+"""What a flight leaves behind: a case that `openjax diagnose` reads, and `flight.json` about the
+flight.
 
-One log per game, with all vehicles in it: a row for each moment at which something was sampled on board. Commands are
-those in force at that moment, as sent: body rates and thrust.
+One log per game, with all vehicles in it: a row for each moment at which something was sampled on
+board. Commands are those in force at that moment, as sent: body rates and thrust.
 """
 
 import json
@@ -21,14 +22,18 @@ SHORTEST = 2.0
 """Shorter games (s) tell a diagnosis nothing and get no log."""
 DECIMALS = {"t": 4, "vbat": 3}
 _POSE = tuple(
-    c for channel in ("position", "velocity", "quaternion", "body_rates") for c in CHANNEL_COLUMNS[channel]
+    c
+    for channel in ("position", "velocity", "quaternion", "body_rates")
+    for c in CHANNEL_COLUMNS[channel]
 )
 """Of a `Pose`'s 13 numbers, in their order."""
 _BODY = CHANNEL_COLUMNS["motor_command"] + CHANNEL_COLUMNS["specific_force"]
 _COMMAND = CHANNEL_COLUMNS["command_thrust"] + CHANNEL_COLUMNS["command_body_rates"]
 
 
-def write_case(folder: Path, samples, record: Record, vehicle: VehicleFile, about: dict) -> list[Path]:
+def write_case(
+    folder: Path, samples, record: Record, vehicle: VehicleFile, about: dict
+) -> list[Path]:
     """Write the case: one log per game long enough, vehicle.toml, flight.json. Returns the files.
 
     Args:
@@ -40,7 +45,8 @@ def write_case(folder: Path, samples, record: Record, vehicle: VehicleFile, abou
     """
     table, vehicles = record.table()
     _, sent, episode = table.T
-    commands, files = vehicles[..., 2:], []
+    commands = vehicles[..., 2:]
+    files = []
     for number in range(len(record.episodes)):
         ticks = np.flatnonzero(episode == number)
         if not len(ticks) or sent[ticks[-1]] - sent[ticks[0]] < SHORTEST:
@@ -69,12 +75,15 @@ def _table(name: str, samples, sent: np.ndarray, commands: np.ndarray) -> LogTab
       commands: (T, N, 5) of them: mode, thrust, body rates.
     """
     log = log_of([_rows(vehicle, sent, commands[:, i]) for i, vehicle in enumerate(samples)], name)
-    return LogTable(name, {n: c for n, c in log.columns.items() if not np.isnan(c).all()}, log.vehicle)
+    return LogTable(
+        name, {n: c for n, c in log.columns.items() if not np.isnan(c).all()}, log.vehicle
+    )
 
 
 def _rows(vehicle: Samples, sent, commands) -> dict[str, np.ndarray]:
     """The rows of one vehicle, by column: one for each moment at which something was measured."""
-    own, seen = vehicle.poses[:, 3:], vehicle.seen[:, 1:]
+    own = vehicle.poses[:, 3:]
+    seen = vehicle.seen[:, 1:]
     sources = [  # when, columns, values; what comes later replaces what came before
         (vehicle.poses[:, 2], (*_POSE, "vbat"), np.column_stack([own, vehicle.poses[:, 1]])),
         (vehicle.bodies[:, 0], _BODY, vehicle.bodies[:, 1:]),

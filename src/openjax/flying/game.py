@@ -1,7 +1,8 @@
-"""The game around vehicles that fly somewhere else: what the pursuers observe, what the policy answers, where the
-evader goes.
+"""The game around vehicles that fly somewhere else: what the pursuers observe, what the policy
+answers, where the evader goes.
 
-The whole tick (the game's step, the observation, predictor and actor) is one function, compiled ahead.
+The whole tick (the game's step, the observation, predictor and actor) is one function, compiled
+ahead.
 """
 
 import dataclasses
@@ -30,11 +31,12 @@ class Play(NamedTuple):
 
 
 def game_functions(policy):
-    """The game's settings and airframe, and its two steps as pure functions of arrays, to compile or to map.
+    """The game's settings and airframe, and its two steps as pure functions of arrays, to compile
+    or to map.
 
-    first(task, poses (N, 13)) -> state, action (N, 4): an episode begins with the pursuers at `poses`.
-    tick(state, action, poses, evader (3,), evader_measured ()) -> state, action, *fields of `Play` but the first: one
-    control step later they are at `poses`.
+    first(task, poses (N, 13)) -> state, action (N, 4): an episode begins with the pursuers at
+    `poses`. tick(state, action, poses, evader (3,), evader_measured ()) -> state, action, *fields
+    of `Play` but the first: one control step later they are at `poses`.
     """
     # what shapes a training world, but not a measured one: the vehicles drawn for it, the clamp
     settings = dataclasses.replace(policy.settings.environment, vehicles=(), speed_limit="none")
@@ -52,7 +54,9 @@ def game_functions(policy):
 
     def first(task: Task, poses):
         drones = drones_of(poses)
-        _, state = environment.reset_to(jax.random.key(0), task.replace(pursuer_position=drones["position"]))
+        _, state = environment.reset_to(
+            jax.random.key(0), task.replace(pursuer_position=drones["position"])
+        )
         state = state.replace(drones=state.drones.replace(**drones))
         return state, policy(environment.observe(state))
 
@@ -61,7 +65,9 @@ def game_functions(policy):
         place = jnp.where(evader_measured, evader, state.evader_position)
         state = state.replace(evader_position=place)
         drones = state.drones.replace(**drones_of(poses))
-        observation, state, _, terminated, truncated, info = environment.follow(state, action, drones)
+        observation, state, _, terminated, truncated, info = environment.follow(
+            state, action, drones
+        )
         return (
             state,
             policy(observation),
@@ -117,10 +123,14 @@ class Game:
         self._flat, action = self._first(pose_array(poses))
         n = self.settings.num_pursuers
         evader = np.asarray(self.task.evader_position)
-        return Play(np.asarray(action), evader, np.zeros(3), False, False, np.zeros(n), np.zeros(n, bool))
+        return Play(
+            np.asarray(action), evader, np.zeros(3), False, False, np.zeros(n), np.zeros(n, bool)
+        )
 
     def step(self, poses: list[Pose], evader: np.ndarray | None = None) -> Play:
-        """One control step later the pursuers are at `poses`, the evader, if it is measured, at (3,) `evader`."""
+        """One control step later the pursuers are at `poses`, the evader, if it is measured, at
+        (3,) `evader`.
+        """
         measured = np.asarray(evader is not None)
         place = np.zeros(3, np.float32) if evader is None else np.asarray(evader, np.float32)
         self._flat, results = self._tick(self._flat, pose_array(poses), place, measured)

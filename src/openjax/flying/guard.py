@@ -1,10 +1,12 @@
 """Landing by another process than the loop, and the process that waits for nothing else.
 
-`fly_down` is what each process does that takes over: wait where all are, land, disarm, say so. The guard's process has a
-session and signals of its own, watches loop and links, and is watched by the loop, which lands without it.
+`fly_down` is what each process does that takes over: wait where all are, land, disarm, say so. The
+guard's process has a session and signals of its own, watches loop and links, and is watched by the
+loop, which lands without it.
 
-Over UDP its links are open from the start. A radio dongle belongs to one process: there the guard can only open it once
-the links' process has ended. The links' process, which has it, is the first to take over for a loop that stops.
+Over UDP its links are open from the start. A radio dongle belongs to one process: there the guard
+can only open it once the links' process has ended. The links' process, which has it, is the first
+to take over for a loop that stops.
 """
 
 from __future__ import annotations
@@ -22,19 +24,30 @@ from openjax.flying.crtp import LOG_TYPES, Port, Supervisor, SupervisorCommand
 from openjax.flying.safety import step
 from openjax.flying.set_point import SetPoint
 from openjax.flying.state import FLYING, LANDING, Event, Mode, PoseSample, Request, State
-from openjax.flying.swarm import POSE_BLOCK, WATCHDOG_PERIOD, Member, Swarm, never_wait, send_set_point
+from openjax.flying.swarm import (
+    POSE_BLOCK,
+    WATCHDOG_PERIOD,
+    Member,
+    Swarm,
+    never_wait,
+    send_set_point,
+)
 
 CHECK = 0.004
 """s between two looks."""
 DISARMING = 1.0
 """A vehicle is asked to disarm until it says that it has, for so long (s)."""
 OPENING = 0.5
-"""s that nobody takes over from the guard while it opens a dongle: half of what the firmware's watchdog waits."""
+"""s that nobody takes over from the guard while it opens a dongle: half of what the firmware's
+watchdog waits.
+"""
 TICK = 0.01
 
 
 def take_over(state: State, now: float) -> State:
-    """The state in which another process goes on flying: all stop where they are, wait, and land."""
+    """The state in which another process goes on flying: all stop where they are, wait, and
+    land.
+    """
 
     def taken(drone, anchor):
         if drone.mode not in FLYING:
@@ -70,7 +83,9 @@ def fly_down(
     while state.flying and board.pilot is role:
         listen()
         request = Request.STOP if board.stopped else Request.NONE
-        state, set_points = step(state, Event(time.perf_counter(), vehicles.observe(), request=request))
+        state, set_points = step(
+            state, Event(time.perf_counter(), vehicles.observe(), request=request)
+        )
         vehicles.send(set_points)
         board.write(role, time.perf_counter(), state)
         due = max(due + TICK, time.perf_counter() - TICK)
@@ -87,7 +102,9 @@ def fly_down(
 
 
 def disarm(vehicles: Swarm | RawLinks, board: Board, role: Role) -> bool:
-    """Ask all to disarm until they have, or nothing is heard of it; whether all have. `role`: whose process this is."""
+    """Ask all to disarm until they have, or nothing is heard of it; whether all have. `role`: whose
+    process this is.
+    """
     deadline = time.perf_counter() + DISARMING
     while True:
         board.beat(role, time.perf_counter())
@@ -113,7 +130,8 @@ class RawLinks:
     def __init__(self, uris: Sequence[str], pose_blocks: Sequence[int], watchdog: bool = True):
         self._members: list[Member] = []
         self._blocks, self._links = tuple(pose_blocks), dict.fromkeys(uris)
-        self._watchdog, self._fed = watchdog, -math.inf
+        self._watchdog = watchdog
+        self._fed = -math.inf
         self._names = [name for name, _ in POSE_BLOCK]
         self._layout = "<" + "".join(LOG_TYPES[kind][1] for _, kind in POSE_BLOCK)
 
@@ -131,14 +149,18 @@ class RawLinks:
 
     def observe(self) -> tuple[PoseSample, ...]:
         """What is known of each vehicle, after what has arrived."""
-        for member, link, block in zip(self._members, self._links.values(), self._blocks, strict=True):
+        for member, link, block in zip(
+            self._members, self._links.values(), self._blocks, strict=True
+        ):
             while (packet := link.receive_packet(0)) is not None:
                 member.last_contact = time.perf_counter()
                 data = bytes(packet.data)
                 if (packet.port, packet.channel) != (Port.LOG, 2) or data[:1] != bytes([block]):
                     continue
                 if len(data) == 4 + struct.calcsize(self._layout):
-                    values = dict(zip(self._names, struct.unpack(self._layout, data[4:]), strict=True))
+                    values = dict(
+                        zip(self._names, struct.unpack(self._layout, data[4:]), strict=True)
+                    )
                     member.pose_arrived(int.from_bytes(data[1:4], "little"), values)
         return tuple(member.sample() for member in self._members)
 
@@ -220,7 +242,9 @@ def watch(board: Board, parent: int, own: RawLinks, state: State) -> None:
         board.beat(Role.GUARD, now)
         links_silent = board.silent(Role.LINKS, now) > board.silence
         # should the links live and not take over
-        loop_silent = board.pilot is Role.LOOP and board.silent(Role.LOOP, now) > 3.0 * board.silence
+        loop_silent = (
+            board.pilot is Role.LOOP and board.silent(Role.LOOP, now) > 3.0 * board.silence
+        )
         if board.flying and (links_silent or loop_silent):
             board.pilot = Role.GUARD
             board.beat(Role.GUARD, now + OPENING)

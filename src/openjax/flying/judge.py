@@ -1,7 +1,8 @@
-"""Whether a pose may be flown by: a measurement against what a vehicle can have done since the last good one.
+"""Whether a pose may be flown by: a measurement against what a vehicle can have done since the last
+good one.
 
-`judge` compares a pose with the last good one of the same source, `agree` motion capture with the vehicle's own
-estimate. Both are pure. What they don't accept is a lost pose, whatever sent it.
+`judge` compares a pose with the last good one of the same source, `agree` motion capture with the
+vehicle's own estimate. Both are pure. What they don't accept is a lost pose, whatever sent it.
 """
 
 import math
@@ -28,11 +29,13 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class PoseLimits:
-    """Bounds of a believable pose. The first four are physics, the others accuracies of measurements.
+    """Bounds of a believable pose. The first four are physics, the others accuracies of
+    measurements.
 
-    A bound is an accuracy plus the most that can have happened since the last good pose. While its source tells something,
-    however wrong, what can happen grows for `horizon` seconds only: by then the vehicle is landed by reckoning, level and
-    slow, and `drift` is what that may lose. While nothing is heard, anything can happen.
+    A bound is an accuracy plus the most that can have happened since the last good pose. While its
+    source tells something, however wrong, what can happen grows for `horizon` seconds only: by then
+    the vehicle is landed by reckoning, level and slow, and `drift` is what that may lose. While
+    nothing is heard, anything can happen.
     """
 
     acceleration: float
@@ -48,7 +51,9 @@ class PoseLimits:
     position: float = 0.03
     """Error of one position (m): three times what `locSrv.extPosStdDev` is set to on board."""
     velocity: float = 0.3
-    """Error of one velocity (m/s): half of a position's error in the time constant of the velocity's low-pass."""
+    """Error of one velocity (m/s): half of a position's error in the time constant of the
+    velocity's low-pass.
+    """
     angle: float = 0.15
     """Error of one attitude (rad)."""
     rate: float = 1.0
@@ -56,9 +61,13 @@ class PoseLimits:
     unit: float = 0.02
     """How far a quaternion's length may be from one: 9 bits a component on board."""
     apart: float = 0.1
-    """Distance (m) between motion capture and the own estimate: 5 standard errors of two of .01 m, and 30 ms at 1 m/s."""
+    """Distance (m) between motion capture and the own estimate: 5 standard errors of two of .01 m,
+    and 30 ms at 1 m/s.
+    """
     turned: float = math.radians(20.0)
-    """Angle (rad) between them: a body marked by hand stands within 10 degrees, as does an estimate of the yaw."""
+    """Angle (rad) between them: a body marked by hand stands within 10 degrees, as does an estimate
+    of the yaw.
+    """
 
 
 def pose_limits(airframe: Airframe, horizon: float) -> PoseLimits:
@@ -78,7 +87,9 @@ def judge(
       limits: bounds.
       expected: where reckoning has the vehicle by now; without it, where `last` leads.
     """
-    if not all(map(math.isfinite, (*pose.position, *pose.velocity, *pose.quaternion, *pose.body_rates))):
+    if not all(
+        map(math.isfinite, (*pose.position, *pose.velocity, *pose.quaternion, *pose.body_rates))
+    ):
         return Verdict.NOT_FINITE
     if abs(math.hypot(*pose.quaternion) - 1.0) > limits.unit:
         return Verdict.NO_ATTITUDE
@@ -86,9 +97,12 @@ def judge(
         return Verdict.SPUN
     if last is None:
         return Verdict.GOOD
-    if pose[1:] == last[1:]:  # a measurement has noise: identical numbers are one measurement sent again
+    if (
+        pose[1:] == last[1:]
+    ):  # a measurement has noise: identical numbers are one measurement sent again
         return Verdict.FROZEN
-    expected, dt = expected or moved_on(last, pose.time), pose.time - last.time
+    expected = expected or moved_on(last, pose.time)
+    dt = pose.time - last.time
     sudden = min(dt, max(unseen, limits.horizon))
     if math.dist(pose.position, expected.position) > (
         limits.position + limits.drift * dt + 0.5 * limits.acceleration * sudden**2
@@ -100,7 +114,10 @@ def judge(
         limits.angle + 0.5 * limits.angular_acceleration * sudden**2
     ):
         return Verdict.TURNED
-    if math.dist(pose.body_rates, last.body_rates) > limits.rate + limits.angular_acceleration * sudden:
+    if (
+        math.dist(pose.body_rates, last.body_rates)
+        > limits.rate + limits.angular_acceleration * sudden
+    ):
         return Verdict.SPUN
     return Verdict.GOOD
 
@@ -121,8 +138,9 @@ class Track(NamedTuple):
     ) -> "Track":
         """The track after its source's newest pose at `now` (s).
 
-        A pose that isn't newer than the last good one, or old, or from the future, changes nothing. Of a vehicle that isn't
-        `moving` any pose is believed that is one. `expected`: see `judge`; at any time.
+        A pose that isn't newer than the last good one, or old, or from the future, changes nothing.
+        Of a vehicle that isn't `moving` any pose is believed that is one. `expected`: see `judge`;
+        at any time.
         """
         last = self.pose
         if pose is None or not abs(now - pose.time) <= limits.horizon:
@@ -151,9 +169,11 @@ def agree(captured: Pose, own: Pose, limits: PoseLimits) -> Verdict:
 
 
 def follows(captured: Pose, own: Pose, limits: PoseLimits) -> bool:
-    """Whether the estimator on board may be told a pose of motion capture, both of one time: errors explain the distance.
+    """Whether the estimator on board may be told a pose of motion capture, both of one time: errors
+    explain the distance.
 
-    An estimator that is told late or drifting poses takes their error for a velocity, by which it would have to land.
+    An estimator that is told late or drifting poses takes their error for a velocity, by which it
+    would have to land.
     """
     return math.dist(own.position, captured.position) <= limits.position
 

@@ -1,4 +1,6 @@
-"""What the person at the terminal wants: keys, and the signals that a terminal sends, as requests to the loop."""
+"""What the person at the terminal wants: keys, and the signals that a terminal sends, as requests
+to the loop.
+"""
 
 from __future__ import annotations
 
@@ -11,16 +13,20 @@ import sys
 from openjax.flying.board import DEAF
 from openjax.flying.state import Request
 
-STOP, LAND, HOLD = b" qQ", b"lL", b"hH"
+STOP = b" qQ"
+LAND = b"lL"
+HOLD = b"hH"
 LANDING = ("SIGHUP", "SIGINT", "SIGTSTP", "SIGTERM", "SIGQUIT")
-"""Ctrl-C, Ctrl-Z, Ctrl-\\ , a closed terminal, and kill: all of them land, however often they come."""
+"""Ctrl-C, Ctrl-Z, Ctrl-\\ , a closed terminal, and kill: all of them land, however often they
+come.
+"""
 
 
 class Operator:
     """Keys and signals while vehicles fly; a context manager.
 
-    Space or q stops all motors, l lands, h waits; signals land. Keys are read byte by byte from the terminal itself, and of
-    all that have come since the last look the strongest counts.
+    Space or q stops all motors, l lands, h waits; signals land. Keys are read byte by byte from the
+    terminal itself, and of all that have come since the last look the strongest counts.
 
     Args:
       terminal: a file descriptor; keys are read only if it is a terminal.
@@ -74,7 +80,8 @@ class Operator:
         except OSError:
             keys = b""
         if not keys:
-            self._terminal, self._signalled = None, True
+            self._terminal = None
+            self._signalled = True
         return keys
 
 

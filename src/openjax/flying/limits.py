@@ -1,4 +1,6 @@
-"""The limits of a flight: what an action may ask for within them, where a vehicle may stop, turn back, part, wait."""
+"""The limits of a flight: what an action may ask for within them, where a vehicle may stop, turn
+back, part, wait.
+"""
 
 import math
 from collections.abc import Sequence
@@ -27,7 +29,9 @@ class SafetySettings:
     outside: Annotated[float, Interval("[0, 100]")] = 0.3
     """Farther out than this (m) something is wrong: all land."""
     separation: Annotated[float, Interval("[0, 10]")] = 0.16
-    """Vehicles in pursuit that couldn't stop at this distance (m) any more brake and part. 0 switches it off."""
+    """Vehicles in pursuit that couldn't stop at this distance (m) any more brake and part. 0
+    switches it off.
+    """
     speed_limit: Annotated[float, Interval("(0, 100]")] = 2.5
     """Faster than this (m/s) something is wrong: all land."""
     tilt_limit: Annotated[float, Interval("(0, 180]")] = 50.0
@@ -67,42 +71,62 @@ class SafetySettings:
 
     @property
     def landing_time(self) -> float:
-        """A landing that takes longer (s) ends with the motors off: by then a vehicle that began at the highest place that is
-        allowed is near the floor, whatever its pose says."""
+        """A landing that takes longer (s) ends with the motors off: by then a vehicle that began at
+        the highest place that is allowed is near the floor, whatever its pose says.
+        """
         return (self.arena_height + self.outside) / self.landing_speed
 
 
-def stopping_point(settings: SafetySettings, pose: Pose, acceleration: Vector | None = None) -> Vector:
-    """Where a vehicle comes to rest that brakes now (m): its acceleration fades with the time constant `reaction`, and as
-    slowly the braking sets in.
+def stopping_point(
+    settings: SafetySettings, pose: Pose, acceleration: Vector | None = None
+) -> Vector:
+    """Where a vehicle comes to rest that brakes now (m): its acceleration fades with the time
+    constant `reaction`, and as slowly the braking sets in.
 
     `acceleration`: at present (m/s^2, world); that of level flight at its tilt, if it isn't known.
     """
-    lag, present = settings.reaction, acceleration or level_acceleration(pose.quaternion)
-    velocity = [v + lag * a for v, a in zip(pose.velocity, present, strict=True)]  # once it has faded
+    lag = settings.reaction
+    present = acceleration or level_acceleration(pose.quaternion)
+    velocity = [
+        v + lag * a for v, a in zip(pose.velocity, present, strict=True)
+    ]  # once it has faded
     time = lag + math.hypot(*velocity) / (2.0 * settings.braking)
-    return tuple(p + time * v - lag**2 * a for p, v, a in zip(pose.position, velocity, present, strict=True))
+    return tuple(
+        p + time * v - lag**2 * a for p, v, a in zip(pose.position, velocity, present, strict=True)
+    )
 
 
-def fence_velocity(settings: SafetySettings, pose: Pose, acceleration: Vector | None = None) -> Vector | None:
-    """The velocity (m/s) that keeps a vehicle in the arena; None while it could still stop inside. See `stopping_point`."""
+def fence_velocity(
+    settings: SafetySettings, pose: Pose, acceleration: Vector | None = None
+) -> Vector | None:
+    """The velocity (m/s) that keeps a vehicle in the arena; None while it could still stop inside.
+    See `stopping_point`.
+    """
     x, y, z = stopping_point(settings, pose, acceleration)
     out = math.hypot(x, y)
-    outside, above, below = out > settings.arena_radius, z > settings.arena_height, z < settings.floor
+    outside = out > settings.arena_radius
+    above = z > settings.arena_height
+    below = z < settings.floor
     if not (outside or above or below):
         return None
     vx, vy, _ = pose.velocity
     if outside:
-        vx, vy = -0.5 * x / out, -0.5 * y / out
+        vx = -0.5 * x / out
+        vy = -0.5 * y / out
     return vx, vy, -0.4 if above else 0.4 if below else 0.0
 
 
-def parting_velocity(settings: SafetySettings, i: int, poses: Sequence[Pose | None]) -> Vector | None:
-    """The velocity (m/s) that keeps vehicle i off the others; None while all could still stop apart.
+def parting_velocity(
+    settings: SafetySettings, i: int, poses: Sequence[Pose | None]
+) -> Vector | None:
+    """The velocity (m/s) that keeps vehicle i off the others; None while all could still stop
+    apart.
 
-    Two vehicles that close in at `c` and both brake at `braking` need `c * reaction + c**2 / (4 * braking)` to stop.
+    Two vehicles that close in at `c` and both brake at `braking` need `c * reaction + c**2 / (4 *
+    braking)` to stop.
     """
-    own, wanted = poses[i], None
+    own = poses[i]
+    wanted = None
     for j, other in enumerate(poses):
         if j == i or other is None:
             continue
@@ -110,8 +134,12 @@ def parting_velocity(settings: SafetySettings, i: int, poses: Sequence[Pose | No
         if distance < 1e-6:
             continue
         away = tuple((p - q) / distance for p, q in zip(own.position, other.position, strict=True))
-        closing = sum(a * (w - v) for a, v, w in zip(away, own.velocity, other.velocity, strict=True))
-        stopping = max(closing, 0.0) * (settings.reaction + max(closing, 0.0) / (4.0 * settings.braking))
+        closing = sum(
+            a * (w - v) for a, v, w in zip(away, own.velocity, other.velocity, strict=True)
+        )
+        stopping = max(closing, 0.0) * (
+            settings.reaction + max(closing, 0.0) / (4.0 * settings.braking)
+        )
         lack = settings.separation - (distance - stopping)
         if lack > 0.0:
             push = 0.5 * max(closing, 0.0) + min(lack / settings.reaction, 0.5)
@@ -120,15 +148,18 @@ def parting_velocity(settings: SafetySettings, i: int, poses: Sequence[Pose | No
 
 
 def within_reach(action: SetPoint, sent: SetPoint, airframe: Airframe, dt: float) -> SetPoint:
-    """The action within its bounds, and no farther from what was sent `dt` (s) before than the vehicle can follow.
+    """The action within its bounds, and no farther from what was sent `dt` (s) before than the
+    vehicle can follow.
 
-    Its rates can't change faster than its largest angular acceleration, its thrust than its motors' time constant.
+    Its rates can't change faster than its largest angular acceleration, its thrust than its motors'
+    time constant.
     """
 
     def near(value, old, room):
         return min(max(value, old - room), old + room) if sent.mode == RATES else value
 
-    turn, lift = airframe.angular_acceleration * dt, dt / airframe.motor_time_constant
+    turn = airframe.angular_acceleration * dt
+    lift = dt / airframe.motor_time_constant
     rates = (
         near(min(max(new, -math.pi), math.pi), old, turn)
         for new, old in (
@@ -143,16 +174,20 @@ def within_reach(action: SetPoint, sent: SetPoint, airframe: Airframe, dt: float
 def resting_places(
     settings: SafetySettings, pillars: Sequence[Vector], poses: Sequence[Pose | None]
 ) -> list[Vector]:
-    """Where vehicles may wait or land: near where they would stop, inside, off the pillars, apart (m).
+    """Where vehicles may wait or land: near where they would stop, inside, off the pillars, apart
+    (m).
 
     Args:
       settings: limits.
       pillars: x, y, radius (m).
       poses: of the vehicles; None for one that was never seen.
     """
-    places = [stopping_point(settings, pose) if pose is not None else (0.0, 0.0, 0.0) for pose in poses]
+    places = [
+        stopping_point(settings, pose) if pose is not None else (0.0, 0.0, 0.0) for pose in poses
+    ]
     reach = settings.arena_radius - 0.15
-    low, high = 0.3, settings.arena_height - 0.3
+    low = 0.3
+    high = settings.arena_height - 0.3
     places = [(x, y, min(max(z, low), high)) for x, y, z in places]
     for _ in range(20):
         moved = []
@@ -171,8 +206,11 @@ def resting_places(
 
 
 def _pushed(place, other, distance, share=1.0) -> Vector:
-    """The place (x, y, z) moved on its level by a share of what it lacks of a distance from another."""
-    dx, dy = place[0] - other[0], place[1] - other[1]
+    """The place (x, y, z) moved on its level by a share of what it lacks of a distance from
+    another.
+    """
+    dx = place[0] - other[0]
+    dy = place[1] - other[1]
     apart = math.hypot(dx, dy)
     if apart >= distance:
         return place

@@ -1,9 +1,10 @@
-"""The vehicles' links in a process of their own, so that `cflib`'s threads never keep the loop waiting.
+"""The vehicles' links in a process of their own, so that `cflib`'s threads never keep the loop
+waiting.
 
-`cflib` has two Python threads per vehicle. In one interpreter with the loop they take it from each other, for
-milliseconds in one tick of a hundred. Here poses come up as they arrive, a record each; set-points go down, a datagram
-for all vehicles, which is answered with the time at which the last one had left. Everything else (arming, recording, the
-samples at the end) is a call over a pipe.
+`cflib` has two Python threads per vehicle. In one interpreter with the loop they take it from each
+other, for milliseconds in one tick of a hundred. Here poses come up as they arrive, a record each;
+set-points go down, a datagram for all vehicles, which is answered with the time at which the last
+one had left. Everything else (arming, recording, the samples at the end) is a call over a pipe.
 """
 
 import contextlib
@@ -51,8 +52,10 @@ class Links:
     """Crazyflies, real or virtual, over links in another process; to the loop what it flies.
 
     Args: as `openjax.flying.swarm.Swarm`, and
-      state: before the flight, from which the links' process lands all if the loop stops; without them it doesn't.
-      silence: of the loop after which it does (s). If it doesn't pass on set-points for half as long again it is taken for
+      state: before the flight, from which the links' process lands all if the loop stops; without
+      them it doesn't.
+      silence: of the loop after which it does (s). If it doesn't pass on set-points for half as
+      long again it is taken for
           dead: vehicles go on turning as they were told last.
     """
 
@@ -64,7 +67,9 @@ class Links:
         state: State | None = None,
         silence: float = SILENCE,
     ):
-        self._uris, self._options, self._state = tuple(uris), (body_logs, watchdog), state
+        self._uris = tuple(uris)
+        self._options = (body_logs, watchdog)
+        self._state = state
         n = len(self._uris)
         self._context = multiprocessing.get_context("spawn")
         self.board = Board(n, self._context, silence)
@@ -72,7 +77,9 @@ class Links:
         self._arrivals = [-math.inf] * n
         self.counts = [0] * n
         """Poses of each vehicle that have arrived."""
-        self._rest, self._count, self._calls = b"", 0, 0
+        self._rest = b""
+        self._count = 0
+        self._calls = 0
         self._process, self._lock = None, threading.Lock()
         self._blocks: tuple[int, ...] = ()
 
@@ -93,7 +100,8 @@ class Links:
         self._stream.setblocking(False)
         self._commands.settimeout(1.5 * self.board.silence)
         ends = (stream, commands, control)
-        options, given = (self._uris, *self._options), (self._contacts, *ends)
+        options = (self._uris, *self._options)
+        given = (self._contacts, *ends)
         arguments = ((options, timeout), given, self.board, os.getpid(), self._state)
         self._process = context.Process(target=_serve, args=arguments, name="openjax links")
         self._process.start()
@@ -179,7 +187,9 @@ class Links:
             raise LinksGone("another process flies")
         self._count += 1
         try:
-            self._commands.send(_NUMBER.pack(self._count) + b"".join(_SET_POINT.pack(*s) for s in set_points))
+            self._commands.send(
+                _NUMBER.pack(self._count) + b"".join(_SET_POINT.pack(*s) for s in set_points)
+            )
             number = 0
             while number != self._count:
                 number, sent = _SENT.unpack(self._commands.recv(_SENT.size))
@@ -212,7 +222,9 @@ class Links:
         """What was recorded of each vehicle."""
         nothing = np.zeros((0, 14))
         return [
-            Samples(np.frombuffer(poses).reshape(-1, 16), np.frombuffer(bodies).reshape(-1, 8), nothing)
+            Samples(
+                np.frombuffer(poses).reshape(-1, 16), np.frombuffer(bodies).reshape(-1, 8), nothing
+            )
             for poses, bodies in self._call("samples")
         ]
 
@@ -233,7 +245,9 @@ class Links:
 
 
 def _serve(connecting, ends, board: Board, parent: int, state: State | None) -> None:
-    """The links' process. Should the loop stop, it lands the vehicles; with nothing in the air it ends with the loop."""
+    """The links' process. Should the loop stop, it lands the vehicles; with nothing in the air it
+    ends with the loop.
+    """
     (options, timeout), (contacts, stream, commands, control) = connecting, ends
     stand_alone()
     board.enter(Role.LINKS)
@@ -241,7 +255,9 @@ def _serve(connecting, ends, board: Board, parent: int, state: State | None) -> 
     threading.excepthook = lambda _: None  # cflib's threads, when their socket goes
     real_time.hurry()
     swarm = Swarm(*options)
-    threading.Thread(target=_watch, args=(swarm, board, parent, state), daemon=True, name="watch").start()
+    threading.Thread(
+        target=_watch, args=(swarm, board, parent, state), daemon=True, name="watch"
+    ).start()
     _pass_on(swarm, contacts, stream)
     try:
         swarm.connect(timeout)
@@ -250,7 +266,9 @@ def _serve(connecting, ends, board: Board, parent: int, state: State | None) -> 
         os._exit(0)  # cflib's threads may hang
     gc.collect()
     gc.disable()
-    threading.Thread(target=_send_on, args=(swarm, commands, board), daemon=True, name="set-points").start()
+    threading.Thread(
+        target=_send_on, args=(swarm, commands, board), daemon=True, name="set-points"
+    ).start()
     control.send((None, swarm.pose_blocks()))
     with contextlib.suppress(EOFError, OSError):
         _answer(swarm, control, board)
@@ -258,7 +276,9 @@ def _serve(connecting, ends, board: Board, parent: int, state: State | None) -> 
 
 
 def _pass_on(swarm: Swarm, contacts, stream: socket.socket) -> None:
-    """Have all poses go up the stream as they arrive, and when anything was heard of a vehicle into `contacts`."""
+    """Have all poses go up the stream as they arrive, and when anything was heard of a vehicle into
+    `contacts`.
+    """
     lock = threading.Lock()
     stream.setblocking(False)
 
@@ -301,7 +321,9 @@ def _send_on(swarm: Swarm, commands: socket.socket, board: Board) -> None:
 
 
 def _watch(swarm: Swarm, board: Board, parent: int, state: State | None) -> None:
-    """Beat; land for a loop that is silent; end the process once the loop's has and nothing flies."""
+    """Beat; land for a loop that is silent; end the process once the loop's has and nothing
+    flies.
+    """
     while True:
         time.sleep(CHECK)
         now = time.perf_counter()
@@ -309,7 +331,10 @@ def _watch(swarm: Swarm, board: Board, parent: int, state: State | None) -> None
         silent = board.silent(Role.LOOP, now)
         left = board.pilot is Role.LINKS or (board.pilot is Role.LOOP and silent > board.silence)
         if left and board.flying and state is not None:
-            say(f"openjax fly: the loop, heard {silent:.2f} s ago, left all vehicles to the links' process")
+            say(
+                f"openjax fly: the loop, heard {silent:.2f} s ago, left all vehicles to the links' "
+                "process"
+            )
             fly_down(board, Role.LINKS, swarm, state)
         if os.getppid() != parent and not board.flying:
             if board.armed:

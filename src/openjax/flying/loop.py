@@ -1,4 +1,6 @@
-"""The loop: a hundred times a second from poses to set-points, on time, with a record of how well that went."""
+"""The loop: a hundred times a second from poses to set-points, on time, with a record of how well
+that went.
+"""
 
 import gc
 import itertools
@@ -23,17 +25,24 @@ from openjax.pursuit.environment import THRUST_LIMIT
 PERIOD = 0.01
 """s"""
 MARGIN = 2.0e-3
-"""A tick is due this long after the newest poses were measured (s), as far as the fastest packets tell."""
-EARLY, PATIENCE = 3.0e-3, 5.0e-3
-"""It begins as soon as all poses are there, up to this much before it is due or after it could begin (s)."""
-TRANSFER, SETTLE = 20.0, 0.3
+"""A tick is due this long after the newest poses were measured (s), as far as the fastest packets
+tell.
+"""
+EARLY = 3.0e-3
+PATIENCE = 5.0e-3
+"""It begins as soon as all poses are there, up to this much before it is due or after it could
+begin (s).
+"""
+TRANSFER = 20.0
+SETTLE = 0.3
 """All land if their starts aren't reached within this time (s); there they wait for so long."""
 GONE = 0.1
 """A vehicle whose newest pose is older (s) isn't waited for."""
 
 
 class Record:
-    """What happened at every tick of a flight with `vehicles`; as numbers, since objects would take two kilobytes a tick.
+    """What happened at every tick of a flight with `vehicles`; as numbers, since objects would take
+    two kilobytes a tick.
 
     Attributes:
       episodes: notes on each game.
@@ -41,36 +50,43 @@ class Record:
     """
 
     def __init__(self, vehicles: int):
-        self._rows, self._width = array("d"), 3 + 7 * vehicles
+        self._rows = array("d")
+        self._width = 3 + 7 * vehicles
         self.episodes: list[dict] = []
         self.skipped = 0
 
     def keep(self, tick, arrivals, measured, set_points) -> None:
-        """A row: of the tick when it was due and its last set-point left (s), and the game (-1: none); of each vehicle when
-        its newest pose arrived and was measured (s), and its set-point."""
+        """A row: of the tick when it was due and its last set-point left (s), and the game (-1:
+        none); of each vehicle when its newest pose arrived and was measured (s), and its
+        set-point.
+        """
         self._rows.extend(tick)
         for arrival, seen, s in zip(arrivals, measured, set_points, strict=True):
             s = s if s.mode == OFF else as_sent(s)
             self._rows.extend((arrival, seen, s.mode, s.thrust, s.roll, s.pitch, s.yaw_rate))
 
     def table(self) -> tuple[np.ndarray, np.ndarray]:
-        """(T, 3) due, sent, game; (T, N, 7) arrival, measured, mode, thrust, roll, pitch, yaw rate as they fit into packets."""
+        """(T, 3) due, sent, game; (T, N, 7) arrival, measured, mode, thrust, roll, pitch, yaw rate
+        as they fit into packets.
+        """
         rows = np.array(self._rows).reshape(-1, self._width)
         # the number of vehicles is spelt out: a flight may end before its first tick
         return rows[:, :3], rows[:, 3:].reshape(len(rows), self._width // 7, 7)
 
     def timing(self) -> dict:
-        """Command age (ms) and missed deadlines of all ticks. A tick's deadline is the next tick's due
-        time; a tick that was left out is a missed one.
+        """Command age (ms) and missed deadlines of all ticks. A tick's deadline is the next tick's
+        due time; a tick that was left out is a missed one.
 
-        `measured_to_sent_ms` counts from the moment on board, as far as the fastest packet of the flight tells it.
+        `measured_to_sent_ms` counts from the moment on board, as far as the fastest packet of the
+        flight tells it.
         """
         ticks, vehicles = self.table()
         if not len(ticks):
             return {"ticks": 0}
         due, sent, _ = ticks.T
         age, measured = 1e3 * (sent[:, None, None] - vehicles[..., :2]).max(1).T
-        work, gaps = 1e3 * (sent - due), 1e3 * np.diff(sent)
+        work = 1e3 * (sent - due)
+        gaps = 1e3 * np.diff(sent)
         missed = int((work > 1e3 * PERIOD).sum()) + self.skipped
         return {
             "ticks": len(due),
@@ -92,14 +108,19 @@ def _percentiles(values) -> dict:
 class Pace:
     """When the ticks are due: every 10 ms, just after the moments at which poses are measured.
 
-    Those moments are regular, unlike arrivals: the vehicles send by clocks of their own, which drift a little.
+    Those moments are regular, unlike arrivals: the vehicles send by clocks of their own, which
+    drift a little.
     """
 
     def __init__(self, now: float):
-        self.due, self.skipped, self._in_step = now, 0, False
+        self.due = now
+        self.skipped = 0
+        self._in_step = False
 
     def next(self, now: float, measured: Sequence[float]) -> float:
-        """The next tick's time, after one that ended at `now` and knew poses measured at `measured` (s)."""
+        """The next tick's time, after one that ended at `now` and knew poses measured at `measured`
+        (s).
+        """
         ages = sorted((self.due - t) % PERIOD for t in measured if now - t < GONE)
         shift = 0.0
         if ages:
@@ -117,11 +138,16 @@ class Pace:
 
 
 def await_poses(vehicles: Links, due: float) -> None:
-    """Return around `due` (s): as soon as each vehicle's newest pose is there that was measured before."""
+    """Return around `due` (s): as soon as each vehicle's newest pose is there that was measured
+    before.
+    """
     latest = max(due, begun := perf_counter()) + PATIENCE
     while (now := perf_counter()) < latest or latest + PATIENCE < now < begun + GONE:
-        if now > latest:  # it stood still: so may the links have, which have first to pass on what came
-            due, latest = now - PATIENCE, now + PATIENCE
+        if (
+            now > latest
+        ):  # it stood still: so may the links have, which have first to pass on what came
+            due = now - PATIENCE
+            latest = now + PATIENCE
         measured = measured_times(vehicles.observe())
         complete = all(t > due - PERIOD or now - t > GONE for t in measured)
         if complete and now >= due - EARLY:
@@ -136,8 +162,11 @@ def measured_times(samples) -> tuple[float, ...]:
 
 
 def flight_state(game: Game, number: int, safety: SafetySettings) -> State:
-    """The state in which `number` vehicles stand before a game: pursuers, then, where it's a vehicle, the evader."""
-    task, settings = game.task, game.settings
+    """The state in which `number` vehicles stand before a game: pursuers, then, where it's a
+    vehicle, the evader.
+    """
+    task = game.task
+    settings = game.settings
     starts = [tuple(map(float, p)) for p in np.asarray(task.pursuer_position)]
     if number > settings.num_pursuers:
         starts.append(tuple(map(float, np.asarray(task.evader_position))))
@@ -168,7 +197,8 @@ class Flight:
       state: before it, see `flight_state`.
       plan: what to fly.
       requests: asked at every tick for what the operator wants.
-      watched: called after every tick with time and state; if it returns anything, all land for that reason.
+      watched: called after every tick with time and state; if it returns anything, all land for
+      that reason.
     """
 
     def __init__(
@@ -180,19 +210,27 @@ class Flight:
         requests: Callable[[], Request] = lambda: Request.NONE,
         watched: Callable[[float, State], str] = lambda now, state: "",
     ):
-        self.vehicles, self.game, self.state, self.plan = vehicles, game, state, plan
-        self._requests, self._watched = requests, watched
+        self.vehicles = vehicles
+        self.game = game
+        self.state = state
+        self.plan = plan
+        self._requests = requests
+        self._watched = watched
         self._pursuers = game.settings.num_pursuers
         self._evader_flies = len(state.drones) > self._pursuers
         self.record = Record(len(state.drones))
-        self._play, self._episode, self._begun = None, -1, 0.0
-        self._since, self._alarm = perf_counter(), ""
+        self._play = None
+        self._episode = -1
+        self._begun = 0.0
+        self._since = perf_counter()
+        self._alarm = ""
 
     def run(self) -> Record:
         """Fly it. Returns when all motors are off."""
         gc.disable()
         try:
-            pace, self._since = Pace(perf_counter()), perf_counter()
+            pace = Pace(perf_counter())
+            self._since = perf_counter()
             while not self.over:
                 self.tick(perf_counter(), pace.due)
                 due = pace.next(perf_counter(), measured_times(self.vehicles.observe()))
@@ -207,7 +245,9 @@ class Flight:
         """Whether all that flew is down, or nothing is going to fly."""
         if self.state.flying or self.state.time - self._since < 0.5:
             return False
-        return self.state.all_in(Mode.LANDED, Mode.STOPPED) or any(d.reason for d in self.state.drones)
+        return self.state.all_in(Mode.LANDED, Mode.STOPPED) or any(
+            d.reason for d in self.state.drones
+        )
 
     def tick(self, now: float, due: float) -> None:
         """One tick at `now` that was due at `due` (s)."""
@@ -222,7 +262,9 @@ class Flight:
         actions = None
         if self._episode >= 0 or request is Request.PURSUE:
             actions = self._actions(now, request is Request.PURSUE)
-        self.state, set_points = decide(self.state, Event(now, samples, actions, request, self._alarm))
+        self.state, set_points = decide(
+            self.state, Event(now, samples, actions, request, self._alarm)
+        )
         sent = self.vehicles.send(set_points)
         self._alarm = self._watched(now, self.state)
         self.record.keep((due, sent, self._episode), arrivals, measured_times(samples), set_points)
@@ -231,7 +273,8 @@ class Flight:
 
     def _planned(self, now) -> Request:
         """What the plan asks for at this tick."""
-        state, plan = self.state, self.plan
+        state = self.state
+        plan = self.plan
         waited = now - self._since
         if state.all_in(Mode.GROUND) and all(d.estimate is not None for d in state.drones):
             return Request.TRANSFER
@@ -241,7 +284,10 @@ class Flight:
             if len(self.record.episodes) >= plan.episodes:
                 return Request.LAND
             return Request.PURSUE
-        if any(m in (Mode.GROUND, Mode.TRANSFER, Mode.READY) for m in state.modes) and waited > TRANSFER:
+        if (
+            any(m in (Mode.GROUND, Mode.TRANSFER, Mode.READY) for m in state.modes)
+            and waited > TRANSFER
+        ):
             self._alarm = f"not all at their starts after {TRANSFER:g} s"
             return Request.LAND
         if self._episode >= 0 and (self._play.over or now - self._begun > plan.episode_seconds):
@@ -251,13 +297,23 @@ class Flight:
         return Request.NONE
 
     def _actions(self, now, first):
-        """The set-points that the policy, and the evader's rule, ask for; they know of poses only what was believed."""
+        """The set-points that the policy, and the evader's rule, ask for; they know of poses only
+        what was believed.
+        """
         poses = [drone.estimate for drone in self.state.drones]
         if first:
             self._play = self.game.start(poses[: self._pursuers])
-            self._episode, self._begun = len(self.record.episodes), now
+            self._episode = len(self.record.episodes)
+            self._begun = now
             self.record.episodes.append(
-                {"capture_step": None, "breaches": 0, "crash": False, "steps": 0, "end": "", "over_speed": 0}
+                {
+                    "capture_step": None,
+                    "breaches": 0,
+                    "crash": False,
+                    "steps": 0,
+                    "end": "",
+                    "over_speed": 0,
+                }
             )
         else:
             evader = np.array(poses[-1].position) if self._evader_flies else None
@@ -276,7 +332,9 @@ class Flight:
             acceleration = wanted_acceleration(poses[-1].velocity, wanted)
             drone = self.state.drones[-1]
             set_points.append(
-                accelerate(poses[-1].quaternion, acceleration, self.state.airframe, drone.trim, RATES)
+                accelerate(
+                    poses[-1].quaternion, acceleration, self.state.airframe, drone.trim, RATES
+                )
             )
         return tuple(set_points)
 

@@ -7,9 +7,10 @@ The adapter of a laboratory is one function that runs for as long as there are p
             for vehicle, body in enumerate(frame.bodies):
                 update(vehicle, body.position, body.quaternion)      # metres, wxyz, body to world
 
-and `openjax fly --motion_capture my_lab:poses`. Velocities are differences, smoothed; body rates come from the
-gyroscope on board. Each pose that was believed, and is near what the vehicle knows, is also sent to it, for the estimator
-on board, by which the vehicle lands should motion capture fail, or the loop.
+and `openjax fly --motion_capture my_lab:poses`. Velocities are differences, smoothed; body rates
+come from the gyroscope on board. Each pose that was believed, and is near what the vehicle knows,
+is also sent to it, for the estimator on board, by which the vehicle lands should motion capture
+fail, or the loop.
 """
 
 import dataclasses
@@ -32,7 +33,9 @@ from openjax.flying.swarm import Samples
 
 
 def find_feed(name: str) -> Callable:
-    """The function MODULE:FUNCTION; modules in the present folder are found too. Raises UserError."""
+    """The function MODULE:FUNCTION; modules in the present folder are found too. Raises
+    UserError.
+    """
     sys.path.insert(0, str(Path.cwd()))
     try:
         found = pkgutil.resolve_name(name)
@@ -56,15 +59,19 @@ class MotionCaptured(Links):
 
     def feed(self, function: Callable) -> None:
         """Let `function(update)` run in a thread of its own."""
-        threading.Thread(target=function, args=(self.update,), daemon=True, name="motion capture").start()
+        threading.Thread(
+            target=function, args=(self.update,), daemon=True, name="motion capture"
+        ).start()
 
     def update(self, vehicle: int, position, quaternion, at: float | None = None) -> None:
-        """Vehicle `vehicle` was seen at position (3,) m, attitude (4,) wxyz, at `at` (s, host clock; default now).
+        """Vehicle `vehicle` was seen at position (3,) m, attitude (4,) wxyz, at `at` (s, host
+        clock; default now).
 
         It is judged before anything flies by it, see `openjax.flying.judge`.
         """
         at = time.perf_counter() if at is None else at
-        position, quaternion = tuple(map(float, position)), tuple(map(float, quaternion))
+        position = tuple(map(float, position))
+        quaternion = tuple(map(float, quaternion))
         self._captured[vehicle] = Pose(at, position, (0.0, 0.0, 0.0), quaternion)
         self._arrived.set()
 
@@ -83,7 +90,9 @@ class MotionCaptured(Links):
     def samples(self) -> list[Samples]:
         """What was recorded of each vehicle, here and on board."""
         both = zip(super().samples(), self._seen, strict=True)
-        return [dataclasses.replace(s, seen=np.frombuffer(seen).reshape(-1, 14)) for s, seen in both]
+        return [
+            dataclasses.replace(s, seen=np.frombuffer(seen).reshape(-1, 14)) for s, seen in both
+        ]
 
     def wait(self, until: float) -> None:
         """Return at `until` (s), or as soon as motion capture sends a pose."""

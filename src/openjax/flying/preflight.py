@@ -1,4 +1,6 @@
-"""Before take-off: what must be so, each failure a line that says what to do. And that nobody else commands."""
+"""Before take-off: what must be so, each failure a line that says what to do. And that nobody else
+commands.
+"""
 
 import contextlib
 import math
@@ -18,7 +20,9 @@ LOOK = 0.5
 RATE = 1000.0 / PERIOD_MS
 """Own estimates a second (Hz)."""
 SHARE = 0.8
-"""Least share of them that must arrive: a vehicle lands after 60 ms without one, and .2**6 of the time six in a row are lost."""
+"""Least share of them that must arrive: a vehicle lands after 60 ms without one, and .2**6 of the
+time six in a row are lost.
+"""
 LEVEL = math.radians(10.0)
 """A floor, or a body marked by hand, is this level."""
 AHEAD = math.radians(30.0)
@@ -29,9 +33,11 @@ FLOOR = 0.1
 
 @contextlib.contextmanager
 def sole_command(uris: Sequence[str]) -> Iterator[None]:
-    """Hold the vehicles against another `fly` on this machine, until this process ends. UserError: one has them.
+    """Hold the vehicles against another `fly` on this machine, until this process ends. UserError:
+    one has them.
 
-    A name in Linux's abstract namespace ends with its process; elsewhere only the vehicles' own word protects them.
+    A name in Linux's abstract namespace ends with its process; elsewhere only the vehicles' own
+    word protects them.
     """
     with contextlib.ExitStack() as held:
         for uri in uris:
@@ -40,7 +46,9 @@ def sole_command(uris: Sequence[str]) -> Iterator[None]:
                 name.bind(f"\0openjax.fly {uri}")
             except OSError as error:
                 if error.errno is not None and "in use" in (error.strerror or ""):
-                    raise UserError(f"{uri}: another openjax.fly has this vehicle; end it first") from None
+                    raise UserError(
+                        f"{uri}: another openjax.fly has this vehicle; end it first"
+                    ) from None
         yield
 
 
@@ -49,11 +57,16 @@ def poses_arriving(links) -> list[float]:
     before = [s.own.time for s in links.observe()], list(links.counts)
     time.sleep(LOOK)
     after = [s.own.time for s in links.observe()], list(links.counts)
-    return [(c - old) / max(t - since, LOOK) for t, c, since, old in zip(*after, *before, strict=True)]
+    return [
+        (c - old) / max(t - since, LOOK) for t, c, since, old in zip(*after, *before, strict=True)
+    ]
 
 
-def faults(state: State, samples: Sequence[PoseSample], rates: Sequence[float], guarded: bool) -> list[str]:
-    """What speaks against taking off, a line each; vehicles are counted from 0 in the order of --uri.
+def faults(
+    state: State, samples: Sequence[PoseSample], rates: Sequence[float], guarded: bool
+) -> list[str]:
+    """What speaks against taking off, a line each; vehicles are counted from 0 in the order of
+    --uri.
 
     Args:
       state: before the flight, for starts and settings.
@@ -61,9 +74,16 @@ def faults(state: State, samples: Sequence[PoseSample], rates: Sequence[float], 
       rates: of each vehicle's poses (Hz).
       guarded: whether a guard watches, or none is wanted.
     """
-    lines = [] if guarded else ["the guard's process isn't there; try again, with fewer programs running"]
+    lines = (
+        []
+        if guarded
+        else ["the guard's process isn't there; try again, with fewer programs running"]
+    )
     for i, (sample, start, rate) in enumerate(zip(samples, state.starts, rates, strict=True)):
-        found = [*_firmware_faults(state.settings, sample, rate), *_pose_faults(state, sample, start)]
+        found = [
+            *_firmware_faults(state.settings, sample, rate),
+            *_pose_faults(state, sample, start),
+        ]
         lines += [f"vehicle {i}: {fault}" for fault in found]
     return lines
 
@@ -85,7 +105,8 @@ def _firmware_faults(settings, sample, rate) -> Iterator[str]:
 
 
 def _pose_faults(state, sample, start: Vector) -> Iterator[str]:
-    pose, limits = sample.captured or sample.own, state.limits
+    pose = sample.captured or sample.own
+    limits = state.limits
     for source in (sample.own, sample.captured):
         if source is not None and (verdict := judge(source, None, 0.0, limits)):
             yield f"{verdict}; look at the positioning system"
@@ -94,7 +115,8 @@ def _pose_faults(state, sample, start: Vector) -> Iterator[str]:
     where = f"({x:.2f}, {y:.2f}, {z:.2f})"
     if math.dist((x, y), start[:2]) > state.settings.stand or abs(z) > FLOOR:
         yield (
-            f"stands at {where} m, its start's mark is ({start[0]:.2f}, {start[1]:.2f}, 0): put it there, "
+            f"stands at {where} m, its start's mark is ({start[0]:.2f}, {start[1]:.2f}, 0): put it "
+            "there, "
             "or mend the positioning system's axes, origin or unit"
         )
     if up(pose.quaternion) < math.cos(LEVEL):
@@ -107,6 +129,7 @@ def _pose_faults(state, sample, start: Vector) -> Iterator[str]:
         and agree(*at_one_time(sample.captured, sample.own), limits)
     ):
         yield (
-            f"motion capture sees it at {where} m, itself at ({', '.join(f'{p:.2f}' for p in sample.own.position)}): "
+            f"motion capture sees it at {where} m, itself at "
+            f"({', '.join(f'{p:.2f}' for p in sample.own.position)}): "
             "mend axes, unit or origin of one of them"
         )

@@ -1,11 +1,13 @@
 """Safety of a flight as a pure state machine: what was seen in, set-points out.
 
-`see` (`openjax.flying.estimation`) judges the poses and brings each vehicle's estimate to now; `decide` says who flies each
-vehicle: the policy, or the controller that lifts, waits and lands, at need by reckoning (`openjax.flying.steering`). `step`
-is both. Nothing here reads a clock or touches a link, so that thousands of faults can be flown in simulated time.
+`see` (`openjax.flying.estimation`) judges the poses and brings each vehicle's estimate to now;
+`decide` says who flies each vehicle: the policy, or the controller that lifts, waits and lands, at
+need by reckoning (`openjax.flying.steering`). `step` is both. Nothing here reads a clock or touches
+a link, so that thousands of faults can be flown in simulated time.
 
-A vehicle in trouble lands; all others stop where they are, wait a moment, and land too. Troubles: its pose is lost, its
-link is silent, its battery low, it is too fast, too tilted, or outside the arena; no action came in time; a key.
+A vehicle in trouble lands; all others stop where they are, wait a moment, and land too. Troubles:
+its pose is lost, its link is silent, its battery low, it is too fast, too tilted, or outside the
+arena; no action came in time; a key.
 """
 
 import math
@@ -32,7 +34,8 @@ def step(state: State, event: Event) -> tuple[State, tuple[SetPoint, ...]]:
 
 def decide(state: State, event: Event) -> tuple[State, tuple[SetPoint, ...]]:
     """The state after a tick whose poses were seen already, and the set-point of each vehicle."""
-    now, actions = event.time, event.actions
+    now = event.time
+    actions = event.actions
     finite = actions is not None and all(math.isfinite(x) for action in actions for x in action)
     action_time = now if finite else state.action_time
     drones = _requested(state, event)
@@ -45,16 +48,21 @@ def decide(state: State, event: Event) -> tuple[State, tuple[SetPoint, ...]]:
         action_time = now
     state = state._replace(drones=_react(state, drones, troubles), action_time=action_time)
     moved = tuple(
-        steer(state, i, actions[i] if finite else None, sample) for i, sample in enumerate(event.samples)
+        steer(state, i, actions[i] if finite else None, sample)
+        for i, sample in enumerate(event.samples)
     )
     return state._replace(drones=moved), tuple(drone.sent for drone in moved)
 
 
 def _requested(state, event) -> tuple[Drone, ...]:
     """The drones after what the operator, or the plan, asks for."""
-    drones, now, anchors = state.drones, event.time, state.starts
+    drones = state.drones
+    now = event.time
+    anchors = state.starts
     if event.request is Request.STOP:
-        return tuple(d.to(Mode.STOPPED, now, reason=event.reason or "stopped by hand") for d in drones)
+        return tuple(
+            d.to(Mode.STOPPED, now, reason=event.reason or "stopped by hand") for d in drones
+        )
     if event.request is Request.PURSUE and state.all_in(Mode.READY):
         return tuple(d.to(Mode.PURSUIT, now) for d in drones)
     answer = {Request.LAND: _land, Request.HOLD: _hold}.get(event.request)
@@ -74,7 +82,9 @@ def _land(state, event, drone, anchor) -> Drone:
     if drone.mode is Mode.GROUND:
         return drone.to(Mode.LANDED, event.time, reason=reason)
     return (
-        drone.to(Mode.LAND, event.time, anchor, reason) if drone.mode in (*_UNTROUBLED, Mode.HOLD) else drone
+        drone.to(Mode.LAND, event.time, anchor, reason)
+        if drone.mode in (*_UNTROUBLED, Mode.HOLD)
+        else drone
     )
 
 
@@ -94,7 +104,8 @@ def _transfer(state, event, drone, start) -> Drone:
 def lift_fault(state: State, drone: Drone) -> str:
     """What speaks against a vehicle's poses in its test lift; empty while nothing does.
 
-    Each source must rise, stay above its stand, and not rise past where a fall still does no harm; both by the same.
+    Each source must rise, stay above its stand, and not rise past where a fall still does no harm;
+    both by the same.
     """
     settings = state.settings
     moves = [
@@ -142,7 +153,8 @@ def _lost(state, drone, sample) -> str:
 
 def _unfit(state, drone) -> str:
     """Why a drone whose pose is known mustn't fly on; empty if it may."""
-    settings, now = state.settings, state.time
+    settings = state.settings
+    now = state.time
     if drone.low_since is not None and now - drone.low_since > settings.battery_time:
         return "battery low"
     if drone.own.pose is not None and now - drone.own.pose.time > settings.link_timeout:
@@ -160,7 +172,9 @@ def _unfit(state, drone) -> str:
 
 
 def _react(state, drones, troubles) -> tuple[Drone, ...]:
-    """The drones after troubles: those in trouble as told; the others stop, wait, and land. A test lift ends at once."""
+    """The drones after troubles: those in trouble as told; the others stop, wait, and land. A test
+    lift ends at once.
+    """
     now = state.time
     team = any(d.reason for d in drones) or any(troubles)
     anchors = state.resting_places() if team else [None] * len(drones)
@@ -173,7 +187,11 @@ def _react(state, drones, troubles) -> tuple[Drone, ...]:
             drone = drone.to(Mode.STOPPED, now, reason="another is in trouble")
         elif team and not drone.reason and drone.mode in (*_UNTROUBLED, Mode.HOLD):
             drone = drone.to(Mode.HOLD, now, anchor, "another is in trouble")
-        elif drone.mode is Mode.HOLD and drone.reason and now - drone.since > state.settings.hold_time:
+        elif (
+            drone.mode is Mode.HOLD
+            and drone.reason
+            and now - drone.since > state.settings.hold_time
+        ):
             drone = drone.to(Mode.LAND, now)
         elif risen:
             drone = drone.to(Mode.TRANSFER, now, start)

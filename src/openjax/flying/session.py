@@ -1,4 +1,6 @@
-"""A session: all that a flight needs and that must be given back, whatever happens: command, links, guard, motion capture."""
+"""A session: all that a flight needs and that must be given back, whatever happens: command, links,
+guard, motion capture.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ from openjax.flying.state import Request, State
 
 FRESH = 0.05
 """No flight begins with poses older than this (s)."""
-ARMING, POSES = 1.0, 5.0
+ARMING = 1.0
+POSES = 5.0
 """A vehicle has this long (s) to say that it is armed, and where it is."""
 
 
@@ -48,9 +51,12 @@ class Session:
     """
 
     def __init__(self, settings: SessionSettings, state: State):
-        self._settings, self._state = settings, state
+        self._settings = settings
+        self._state = state
         kind = Links if settings.feed is None else MotionCaptured
-        self.links = kind(settings.uris, settings.body_logs, settings.watchdog, state, settings.silence)
+        self.links = kind(
+            settings.uris, settings.body_logs, settings.watchdog, state, settings.silence
+        )
         self.requests = Operator()
         self._guard: Guard | None = None
         self.scheduler = "ordinary"
@@ -82,7 +88,9 @@ class Session:
         self._stack.close()
 
     def check(self) -> None:
-        """All that must be so before take-off. UserError: something isn't; where there is more, each stands in a line."""
+        """All that must be so before take-off. UserError: something isn't; where there is more,
+        each stands in a line.
+        """
         self._wait_for_poses()
         rates = poses_arriving(self.links)
         guarded = self._guard is None or self._guard.lives()
@@ -95,8 +103,11 @@ class Session:
             raise UserError(f"no take-off for these {len(found)} reasons")
 
     def fly(self, flight: Flight) -> tuple[list, str]:
-        """Arm and fly; what was recorded of each vehicle, and why another process landed, if one did."""
-        complaint, samples = "", []
+        """Arm and fly; what was recorded of each vehicle, and why another process landed, if one
+        did.
+        """
+        complaint = ""
+        samples = []
         with self.requests:
             self._arm()
             self.links.record()
@@ -128,7 +139,8 @@ class Session:
 
     def _left_to_others(self) -> str:
         """Return once the vehicles are down; land them here if nobody else does. What happened."""
-        board, lander = self.links.board, Role.LINKS
+        board = self.links.board
+        lander = Role.LINKS
         if board.pilot is Role.LOOP:
             board.pilot = Role.LINKS
         while board.flying:

@@ -1,22 +1,29 @@
-"""Set-points: what a vehicle is asked for, and what of it fits into the packet that `cflib` sends."""
+"""Set-points: what a vehicle is asked for, and what of it fits into the packet that `cflib`
+sends.
+"""
 
 import math
 from typing import NamedTuple
 
-OFF, RATES, ANGLES = 0, 1, 2
+OFF = 0
+RATES = 1
+ANGLES = 2
 """Modes of a set-point: motors off; roll and pitch as body rates; as angles."""
 
-_LEAST, _MOST = 10001, 60000
+_LEAST = 10001
+_MOST = 60000
 """Thrust counts of 0 and 100 % in `send_setpoint_manual`."""
 _COUNTS = 65536
 """Motor counts of full thrust."""
-LEAST_THRUST, MOST_THRUST = _LEAST / _COUNTS, _MOST / _COUNTS
+LEAST_THRUST = _LEAST / _COUNTS
+MOST_THRUST = _MOST / _COUNTS
 """No set-point but "off" asks for less, none for more."""
 
 
 class SetPoint(NamedTuple):
-    """Roll, pitch (rad or, by `mode`, rad/s; body frame, pitch positive nose down), yaw rate (rad/s), thrust 0..1 of
-    the four rotors' maximum."""
+    """Roll, pitch (rad or, by `mode`, rad/s; body frame, pitch positive nose down), yaw rate
+    (rad/s), thrust 0..1 of the four rotors' maximum.
+    """
 
     mode: int = OFF
     roll: float = 0.0
@@ -29,9 +36,11 @@ MOTORS_OFF = SetPoint()
 
 
 def manual_arguments(set_point: SetPoint) -> tuple[float, float, float, float, bool]:
-    """Arguments of `cflib`'s `send_setpoint_manual` for a set-point that isn't off: degrees, thrust in percent.
+    """Arguments of `cflib`'s `send_setpoint_manual` for a set-point that isn't off: degrees, thrust
+    in percent.
 
-    `cflib` turns pitch around for the firmware, whose pitch points the other way, so here it's openjax's.
+    `cflib` turns pitch around for the firmware, whose pitch points the other way, so here it's
+    openjax's.
     """
     percent = 100.0 * (set_point.thrust * _COUNTS - _LEAST) / (_MOST - _LEAST)
     return (
@@ -44,19 +53,26 @@ def manual_arguments(set_point: SetPoint) -> tuple[float, float, float, float, b
 
 
 def as_sent(set_point: SetPoint) -> SetPoint:
-    """The set-point with the thrust that is left of it in a packet: that is what a log should hold."""
+    """The set-point with the thrust that is left of it in a packet: that is what a log should
+    hold.
+    """
     return set_point._replace(thrust=min(max(set_point.thrust, LEAST_THRUST), MOST_THRUST))
 
 
 def from_action(action, thrust_limit: float) -> SetPoint:
-    """The set-point of a policy's action (4,) in -1..1: thrust, roll, pitch and yaw rate up to pi rad/s.
+    """The set-point of a policy's action (4,) in -1..1: thrust, roll, pitch and yaw rate up to pi
+    rad/s.
 
-    The same numbers as `openjax.pursuit.environment.action_to_command`, without a trip to JAX. What is infinite isn't cut to
-    full thrust, but NaN, as whoever sends set-points refuses.
+    The same numbers as `openjax.pursuit.environment.action_to_command`, without a trip to JAX. What
+    is infinite isn't cut to full thrust, but NaN, as whoever sends set-points refuses.
     """
     thrust, roll, pitch, yaw = (
         min(max(float(x), -1.0), 1.0) if math.isfinite(x) else math.nan for x in action
     )
     return SetPoint(
-        RATES, math.pi * roll, math.pi * pitch, math.pi * yaw, min(0.5 * (thrust + 1.0), thrust_limit)
+        RATES,
+        math.pi * roll,
+        math.pi * pitch,
+        math.pi * yaw,
+        min(0.5 * (thrust + 1.0), thrust_limit),
     )

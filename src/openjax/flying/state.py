@@ -1,4 +1,6 @@
-"""What is known and wanted of the vehicles of a flight: modes, requests, samples of poses, and the state of all."""
+"""What is known and wanted of the vehicles of a flight: modes, requests, samples of poses, and the
+state of all.
+"""
 
 import math
 from collections.abc import Sequence
@@ -57,7 +59,9 @@ class PoseSample(NamedTuple):
     supervisor: int = Supervisor.ARMED | Supervisor.CAN_FLY
     """The firmware's word on its state."""
     captured: Pose | None = None
-    """The newest of motion capture, whose velocity and body rates mean nothing; None where there is no motion capture."""
+    """The newest of motion capture, whose velocity and body rates mean nothing; None where there is
+    no motion capture.
+    """
 
 
 class Event(NamedTuple):
@@ -83,7 +87,10 @@ class Drone(NamedTuple):
     told: bool = True  # whether the estimator on board is to follow the newest of it
     seen: float = -math.inf  # s, when the pose that it is flown by was measured
     distrusted: str = ""  # why motion capture isn't believed any more in this flight
-    stand: tuple[Vector | None, Vector | None] = (None, None)  # own and captured position before the lift
+    stand: tuple[Vector | None, Vector | None] = (
+        None,
+        None,
+    )  # own and captured position before the lift
     acceleration: Vector = (0.0, 0.0, 0.0)  # m/s^2, what dead reckoning takes it to be
     anchor: Vector = (0.0, 0.0, 0.0)  # where it waits or lands
     trim: float = 0.0  # of the hover thrust
@@ -93,7 +100,9 @@ class Drone(NamedTuple):
     sent: SetPoint = MOTORS_OFF
 
     def to(self, mode: Mode, now: float, anchor: Vector | None = None, reason: str = "") -> "Drone":
-        """The drone in another mode from `now` (s) on; anchor and reason stay what they were unless given."""
+        """The drone in another mode from `now` (s) on; anchor and reason stay what they were unless
+        given.
+        """
         return self._replace(
             mode=mode,
             since=now,
@@ -131,7 +140,9 @@ class State(NamedTuple):
 
     def resting_places(self) -> list[Vector]:
         """Where the vehicles may wait or land (m); see `openjax.flying.limits.resting_places`."""
-        return resting_places(self.settings, self.pillars, [drone.estimate for drone in self.drones])
+        return resting_places(
+            self.settings, self.pillars, [drone.estimate for drone in self.drones]
+        )
 
 
 def initial_state(
@@ -141,7 +152,8 @@ def initial_state(
     settings: SafetySettings | None = None,
 ) -> State:
     """All vehicles on the ground; they are to start at `starts` (m); pillars are x, y, radius."""
-    airframe, settings = airframe or nominal_airframe(), settings or SafetySettings()
+    airframe = airframe or nominal_airframe()
+    settings = settings or SafetySettings()
     limits = pose_limits(airframe, settings.pose_timeout)
     drones = tuple(Drone() for _ in starts)
     return State(drones, tuple(starts), settings, limits, airframe, tuple(pillars))

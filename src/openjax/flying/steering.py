@@ -17,15 +17,19 @@ from openjax.flying.state import FLYING, Drone, Mode, PoseSample, State
 
 LOW = 0.05
 """Below this height (m) a landing settles."""
-SETTLING, SETTLING_LIFT = 0.75, 0.85
-"""A landing ends level, with this share of its weight, for so long (s): from .4 m it comes down at 1.1 m/s. So far may the
-floor be from where it is thought."""
-TRIM_GAIN, TRIM_LIMIT = 0.25, 0.15
+SETTLING = 0.75
+SETTLING_LIFT = 0.85
+"""A landing ends level, with this share of its weight, for so long (s): from .4 m it comes down at
+1.1 m/s. So far may the floor be from where it is thought.
+"""
+TRIM_GAIN = 0.25
+TRIM_LIMIT = 0.15
 
 
 def steer(state: State, i: int, action: SetPoint | None, sample: PoseSample) -> Drone:
     """Vehicle i after this tick, with its set-point. `action`: the policy's, where there is one."""
-    drone, now = _watched(state, state.drones[i], sample)._replace(sent=MOTORS_OFF), state.time
+    drone = _watched(state, state.drones[i], sample)._replace(sent=MOTORS_OFF)
+    now = state.time
     if drone.mode not in FLYING or drone.estimate is None:
         return drone
     if drone.mode is Mode.SETTLE and now - drone.since > SETTLING:
@@ -48,7 +52,9 @@ def _watched(state, drone, sample) -> Drone:
 
     low = sample.voltage < state.settings.battery_low  # an unknown voltage is not low
     over = drone.estimate is not None and up(drone.estimate.quaternion) < 0.0
-    return drone._replace(low_since=since(drone.low_since, low), over_since=since(drone.over_since, over))
+    return drone._replace(
+        low_since=since(drone.low_since, low), over_since=since(drone.over_since, over)
+    )
 
 
 def _is_low(state, drone) -> bool:
@@ -59,7 +65,9 @@ def _is_low(state, drone) -> bool:
 
 def _pursue(state, drone, i, action) -> SetPoint:
     """The policy's action, or what keeps the drone in the arena and off the others."""
-    settings, estimate, parting = state.settings, drone.estimate, None
+    settings = state.settings
+    estimate = drone.estimate
+    parting = None
     if settings.separation > 0.0:
         poses = [d.estimate if d.mode in FLYING else None for d in state.drones]
         parting = parting_velocity(settings, i, poses)
@@ -67,9 +75,13 @@ def _pursue(state, drone, i, action) -> SetPoint:
     sent = state.drones[i].sent
     # until its motors have followed it turns on
     turned = turned_on(estimate.quaternion, estimate.body_rates, state.airframe.motor_time_constant)
-    present = lift_acceleration(turned, max(sent.thrust, LEAST_THRUST) / state.airframe.hover_thrust)
+    present = lift_acceleration(
+        turned, max(sent.thrust, LEAST_THRUST) / state.airframe.hover_thrust
+    )
     wanted = (
-        fence_velocity(settings, estimate, present) or fence_velocity(settings, aimed, present) or parting
+        fence_velocity(settings, estimate, present)
+        or fence_velocity(settings, aimed, present)
+        or parting
     )
     if wanted is None:
         return within_reach(action, sent, state.airframe, state.dt)
@@ -79,14 +91,19 @@ def _pursue(state, drone, i, action) -> SetPoint:
 
 def _go(state, drone, i) -> Drone:
     """The drone on its way to its anchor, or waiting there, by the controller."""
-    estimate, airframe = drone.estimate, state.airframe
+    estimate = drone.estimate
+    airframe = state.airframe
     wanted = _wanted(state, drone, i)
-    acceleration, attitude = wanted_acceleration(estimate.velocity, wanted), estimate.quaternion
+    acceleration = wanted_acceleration(estimate.velocity, wanted)
+    attitude = estimate.quaternion
     if state.time - drone.seen > state.settings.pose_timeout:
         # by reckoning: the vehicle does what it is asked for, and is level else
         share = min(state.dt / state.settings.reaction, 1.0)
-        lagged = tuple(a + share * (b - a) for a, b in zip(drone.acceleration, acceleration, strict=True))
-        drone, attitude = drone._replace(acceleration=lagged), _yaw_only(attitude)
+        lagged = tuple(
+            a + share * (b - a) for a, b in zip(drone.acceleration, acceleration, strict=True)
+        )
+        drone = drone._replace(acceleration=lagged)
+        attitude = _yaw_only(attitude)
     else:
         if estimate.position[2] > (0.02 if drone.mode is Mode.LIFT else 0.1):
             error = min(max(wanted[2] - estimate.velocity[2], -0.3), 0.3)
@@ -99,7 +116,8 @@ def _go(state, drone, i) -> Drone:
 
 def _wanted(state, drone, i) -> Vector:
     """The velocity (m/s) that the drone's mode asks for."""
-    position, settings = drone.estimate.position, state.settings
+    position = drone.estimate.position
+    settings = state.settings
     if drone.mode is Mode.LAND:
         x, y, _ = wanted_velocity(position, (*drone.anchor[:2], position[2]), 0.5)
         return x, y, -(0.6 if position[2] < 0.2 else 1.0) * settings.landing_speed
@@ -113,17 +131,20 @@ def _wanted(state, drone, i) -> Vector:
     for j, other in enumerate(state.drones):  # around each other, to the right
         if j == i or other.estimate is None or other.mode not in FLYING:
             continue
-        dx, dy = position[0] - other.estimate.position[0], position[1] - other.estimate.position[1]
+        dx = position[0] - other.estimate.position[0]
+        dy = position[1] - other.estimate.position[1]
         distance = math.hypot(dx, dy)
         if 1e-6 < distance < APART:
             push = (APART - distance) / distance * 2.0
-            x, y = x + push * (dx + dy), y + push * (dy - dx)
+            x = x + push * (dx + dy)
+            y = y + push * (dy - dx)
     return x, y, z
 
 
 def _arrived(estimate, target) -> bool:
     return (
-        math.dist(estimate.position, target) < 0.06 and math.dist(estimate.velocity, (0.0, 0.0, 0.0)) < 0.15
+        math.dist(estimate.position, target) < 0.06
+        and math.dist(estimate.velocity, (0.0, 0.0, 0.0)) < 0.15
     )
 
 

@@ -1,4 +1,6 @@
-"""The vehicles over `cflib`: connections, log blocks in, set-points out. `cflib` is GPLv3 and an extra."""
+"""The vehicles over `cflib`: connections, log blocks in, set-points out. `cflib` is GPLv3 and an
+extra.
+"""
 
 import contextlib
 import logging
@@ -28,11 +30,16 @@ POSE_BLOCK = (
     ("pm.vbatMV", "uint16_t"),
     ("supervisor.info", "uint16_t"),
 )
-BODY_BLOCK = (*((f"motor.m{i}", "uint16_t") for i in range(1, 5)), *((f"acc.{v}", "FP16") for v in "xyz"))
+BODY_BLOCK = (
+    *((f"motor.m{i}", "uint16_t") for i in range(1, 5)),
+    *((f"acc.{v}", "FP16") for v in "xyz"),
+)
 WATCHDOG_PERIOD = 0.1
 """s between two words to the firmware's watchdog."""
 CONNECTING = 3
-"""Attempts to connect: over UDP nothing is sent again, and one lost answer leaves `cflib` waiting."""
+"""Attempts to connect: over UDP nothing is sent again, and one lost answer leaves `cflib`
+waiting.
+"""
 BOOT = {"udp": 0.2, "radio": 5.0}
 """How long a restarted vehicle takes until it answers (s)."""
 TRIES = 5
@@ -43,10 +50,15 @@ _WRAP = 1 << 24
 
 
 class _Clock:
-    """On-board milliseconds (24 bit) to host seconds: the packet that came through fastest sets the difference."""
+    """On-board milliseconds (24 bit) to host seconds: the packet that came through fastest sets the
+    difference.
+    """
 
     def __init__(self):
-        self.offset, self._last, self._stamp, self._base = math.inf, 0.0, None, 0
+        self.offset = math.inf
+        self._last = 0.0
+        self._stamp = None
+        self._base = 0
 
     def host(self, stamp: int, arrival: float) -> float:
         if self._stamp is not None and stamp < self._stamp - _WRAP // 2:
@@ -55,7 +67,8 @@ class _Clock:
         own = 1e-3 * (stamp + self._base)
         if math.isfinite(self.offset):
             self.offset += DRIFT * (arrival - self._last)
-        self.offset, self._last = min(self.offset, arrival - own), arrival
+        self.offset = min(self.offset, arrival - own)
+        self._last = arrival
         return own + self.offset
 
 
@@ -64,11 +77,15 @@ class Samples:
     """What was recorded of one vehicle; times are host seconds. NumPy."""
 
     poses: np.ndarray
-    """(K, 16) own estimates: arrival, voltage (V), when measured, position, velocity, quaternion, body rates."""
+    """(K, 16) own estimates: arrival, voltage (V), when measured, position, velocity, quaternion,
+    body rates.
+    """
     bodies: np.ndarray
     """(K, 8): when measured, m1..m4 0..1, the specific force (m/s^2)."""
     seen: np.ndarray
-    """(K, 14) by motion capture, where there is one: when measured, position, velocity, quaternion, body rates."""
+    """(K, 14) by motion capture, where there is one: when measured, position, velocity, quaternion,
+    body rates.
+    """
 
 
 class Member:
@@ -79,9 +96,14 @@ class Member:
         self.pose: Pose | None = None
         self.arrival = -math.inf  # host s, of the newest pose
         self.last_contact = perf_counter()
-        self.voltage, self.supervisor = math.nan, 0
+        self.voltage = math.nan
+        self.supervisor = 0
         self.error: str | None = None
-        self.poses, self.bodies, self.recording = array("d"), array("d"), False  # rows as in `Samples`
+        self.poses, self.bodies, self.recording = (
+            array("d"),
+            array("d"),
+            False,
+        )  # rows as in `Samples`
         self.listener: Callable[[bool], None] = lambda new_pose: None
         self.crazyflie = None
         self.blocks: list = []
@@ -102,8 +124,11 @@ class Member:
             expand_quaternion(values[6]),
             tuple(math.radians(v) for v in values[7:10]),
         )
-        self.voltage, self.supervisor = 1e-3 * values[10], values[11]
-        self.pose, self.arrival, self.last_contact = pose, now, now
+        self.voltage = 1e-3 * values[10]
+        self.supervisor = values[11]
+        self.pose = pose
+        self.arrival = now
+        self.last_contact = now
         if self.recording:
             self.poses.extend((now, self.voltage, *numbers_of(pose)))
         self.listener(True)
@@ -121,7 +146,9 @@ class Member:
 
 
 def send_set_point(crazyflie, set_point: SetPoint) -> None:
-    """Send one vehicle its set-point. `crazyflie`: its own, or its link: it needs no more than `send_packet`."""
+    """Send one vehicle its set-point. `crazyflie`: its own, or its link: it needs no more than
+    `send_packet`.
+    """
     from cflib.crazyflie.commander import Commander
 
     commander = Commander(crazyflie)
@@ -132,10 +159,11 @@ def send_set_point(crazyflie, set_point: SetPoint) -> None:
 
 
 def never_wait(link) -> None:
-    """Have packets wait for a link, and never who sends them: the newest of each kind, in the place of an older one.
+    """Have packets wait for a link, and never who sends them: the newest of each kind, in the place
+    of an older one.
 
-    A radio's link has room for one until its vehicle acknowledges; `cflib` waits two seconds for a vehicle that doesn't, and
-    meanwhile sends the others nothing. Over UDP nothing waits.
+    A radio's link has room for one until its vehicle acknowledges; `cflib` waits two seconds for a
+    vehicle that doesn't, and meanwhile sends the others nothing. Over UDP nothing waits.
     """
     room = getattr(link, "out_queue", None)
 
@@ -165,18 +193,24 @@ def _restart(uri: str, crazyflie) -> None:
 
 
 class Swarm:
-    """Crazyflies, real or virtual, in one process. `openjax.flying.links` runs it in one of its own.
+    """Crazyflies, real or virtual, in one process. `openjax.flying.links` runs it in one of its
+    own.
 
     Args:
       uris: as `cflib` writes them: `radio://0/80/2M/E7E7E7E7E7`, `udp://127.0.0.1:19850`.
-      body_logs: log blocks of motors and accelerometer for each vehicle, spread over the 10 ms; more of them tell
+      body_logs: log blocks of motors and accelerometer for each vehicle, spread over the 10 ms;
+      more of them tell
           the diagnosis more exactly when a command arrived, and take more of the link. 0 to 5.
-      watchdog: feed the firmware's emergency-stop watchdog: motors stop 1 s after the last set-point, instead of 2 s.
-          Once it was fed it bites, also after a normal flight, and the vehicle is locked; `connect` restarts such vehicles.
+      watchdog: feed the firmware's emergency-stop watchdog: motors stop 1 s after the last
+      set-point, instead of 2 s.
+          Once it was fed it bites, also after a normal flight, and the vehicle is locked; `connect`
+          restarts such vehicles.
     """
 
     def __init__(self, uris: Sequence[str], body_logs: int = 1, watchdog: bool = True):
-        self._body_logs, self._watchdog, self._fed = body_logs, watchdog, -math.inf
+        self._body_logs = body_logs
+        self._watchdog = watchdog
+        self._fed = -math.inf
         self.members = [Member(uri) for uri in uris]
 
     def connect(self, timeout: float = 20.0) -> None:
@@ -189,7 +223,9 @@ class Swarm:
             import cflib.crtp
             from cflib.crazyflie import Crazyflie
         except ImportError as error:
-            raise UserError(f"{error.name or 'cflib'} is missing: pip install cflib (it is GPLv3)") from error
+            raise UserError(
+                f"{error.name or 'cflib'} is missing: pip install cflib (it is GPLv3)"
+            ) from error
         for name in ("cflib.crazyflie", "cflib.crazyflie.toccache", "cflib.crazyflie.log"):
             logging.getLogger(name).setLevel(logging.CRITICAL)
         if not cflib.crtp.CLASSES:
@@ -211,12 +247,19 @@ class Swarm:
                 if attempt or not member.crazyflie.supervisor.is_locked:
                     return
                 _restart(member.uri, member.crazyflie)
-        on = "does openjax virtual_crazyflie run" if member.uri.startswith("udp:") else "is the vehicle on"
-        raise UserError(f"{member.uri}: no connection ({member.error or 'locked'}); {on}, is the URI right?")
+        on = (
+            "does openjax virtual_crazyflie run"
+            if member.uri.startswith("udp:")
+            else "is the vehicle on"
+        )
+        raise UserError(
+            f"{member.uri}: no connection ({member.error or 'locked'}); {on}, is the URI right?"
+        )
 
     def _answers(self, member, make, timeout) -> bool:
         """Whether the vehicle has told all that `cflib` asks for."""
-        done, member.error = threading.Event(), None
+        done = threading.Event()
+        member.error = None
         member.crazyflie = crazyflie = make()
         crazyflie.fully_connected.add_callback(lambda _uri: done.set())
 
@@ -257,7 +300,8 @@ class Swarm:
             if perf_counter() > deadline:
                 raise UserError(f"the log blocks didn't start within {timeout:g} s")
             sleep(0.01)
-        # Once more, in step. A vehicle samples every 1 or 2 ms: blocks that share a sample leave a gap elsewhere.
+        # Once more, in step. A vehicle samples every 1 or 2 ms: blocks that share a sample leave a
+        # gap elsewhere.
         for _ in range(TRIES):
             self._start_in_step()
             sleep(5e-3 * PERIOD_MS)
@@ -312,7 +356,9 @@ class Swarm:
             member.recording = True
 
     def samples(self) -> list[tuple[bytes, bytes]]:
-        """What was recorded of each vehicle until now: poses and bodies, rows of float64 as in `Samples`."""
+        """What was recorded of each vehicle until now: poses and bodies, rows of float64 as in
+        `Samples`.
+        """
         return [(member.poses.tobytes(), member.bodies.tobytes()) for member in self.members]
 
     def close(self) -> None:

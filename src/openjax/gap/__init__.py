@@ -1,4 +1,6 @@
-"""What separates flights from the simulator: calibrating and diagnosing. Reading and checking: `openjax.flights`."""
+"""What separates flights from the simulator: calibrating and diagnosing. Reading and checking:
+`openjax.flights`.
+"""
 
 import importlib
 

@@ -20,8 +20,10 @@ from openjax.gap.where import locate
 
 
 def diagnose_case(case: Case, without: Iterable[str] = (), progress=None) -> Report:
-    """Diagnose the flights of a case, `without` effects that the library must do without; `progress(text)` is called as the work
-    goes on. Raises UserError where the flights are too short or hold no commands."""
+    """Diagnose the flights of a case, `without` effects that the library must do without;
+    `progress(text)` is called as the work goes on. Raises UserError where the flights are too short
+    or hold no commands.
+    """
     begin = time.perf_counter()
     evidence = gather(case, library(without), progress)
     if progress:
@@ -58,14 +60,19 @@ def not_testable(evidence: Evidence) -> list[str]:
     return missing + [e for c in evidence.channels for e in c.undetectable()]
 
 
-def _report(evidence: Evidence, selection: Selection, check: Check, parts: Split, chances) -> Report:
-    effects, missing = words(check, parts), not_testable(evidence)
+def _report(
+    evidence: Evidence, selection: Selection, check: Check, parts: Split, chances
+) -> Report:
+    effects = words(check, parts)
+    missing = not_testable(evidence)
     nothing = "not_testable" if len(missing) >= len(evidence.library.effects) // 2 else "none"
     named = [e for e in effects if e != "unknown"]
     equivalent = {e: selection.equivalent[e] for e in named if e in selection.equivalent}
     ranked = sorted(chances, key=lambda e: -chances[e])
     second = next((e for e in ranked if e not in (effects or ("none",))), "")
-    splitter = next((o for e in named for o in equivalent.get(e, ())), missing[0] if missing else second)
+    splitter = next(
+        (o for e in named for o in equivalent.get(e, ())), missing[0] if missing else second
+    )
     return Report(
         case=evidence.case.name,
         verdict=nothing if not effects else "unknown" if effects[0] == "unknown" else "effect",
@@ -79,12 +86,15 @@ def _report(evidence: Evidence, selection: Selection, check: Check, parts: Split
         not_testable=missing,
         next_flight=CARDS[splitter].next_flight if splitter in CARDS else "",
         quality=[
-            {"flight": i.flight, "issue": i.issue, "left_out": i.refused} for i in evidence.case.quality
+            {"flight": i.flight, "issue": i.issue, "left_out": i.refused}
+            for i in evidence.case.quality
         ],
         runner_up=f"{second} ({chances[second]:.2f})" if second and chances[second] > 0.01 else "",
         rest=check.in_words(),
         sensors=tuple(evidence.sensors.findings.values()),
-        contradictions=tuple(f"{i.flight}: {i.issue}" for i in evidence.case.quality if i.kind == "garbage"),
+        contradictions=tuple(
+            f"{i.flight}: {i.issue}" for i in evidence.case.quality if i.kind == "garbage"
+        ),
         nuisances=_nuisances(evidence, selection),
         residual={"p_value": check.p_value} | check.measures,
         plots={"evidence": evidence, "selection": selection},
@@ -92,7 +102,9 @@ def _report(evidence: Evidence, selection: Selection, check: Check, parts: Split
 
 
 def _nuisances(evidence: Evidence, selection: Selection) -> dict[str, str]:
-    """What the vehicle's numbers and the sensors' mounting took, in usual sizes; a number at its bound says so."""
+    """What the vehicle's numbers and the sensors' mounting took, in usual sizes; a number at its
+    bound says so.
+    """
     names = np.array(evidence.replay.nuisance_names)[evidence.replay.shared]
     taken = selection.chosen.judged.taken.mean(0)
 
@@ -103,5 +115,7 @@ def _nuisances(evidence: Evidence, selection: Selection) -> dict[str, str]:
     if evidence.sensors.gain != 1.0:
         found["gyroscope gain"] = f"{evidence.sensors.gain:.3f}"
     if "motor_rows" not in evidence.case.vehicle_file.log:
-        found["rows of motor commands"] = "taken for means over the row: [log] motor_rows doesn't say"
+        found["rows of motor commands"] = (
+            "taken for means over the row: [log] motor_rows doesn't say"
+        )
     return found

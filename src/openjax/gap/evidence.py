@@ -18,7 +18,9 @@ from openjax.gap.model.replay import Replay
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What was read. `channels`: of pose, radio and rate loop those that were logged; `motion`: the physics."""
+    """What was read. `channels`: of pose, radio and rate loop those that were logged; `motion`: the
+    physics.
+    """
 
     case: Case
     library: Library
@@ -34,7 +36,9 @@ class Evidence:
 
 
 def gather(case: Case, library: Library, progress=None) -> Evidence:
-    """Read a case by all its channels. Raises UserError where no stretch of flight is long enough."""
+    """Read a case by all its channels. Raises UserError where no stretch of flight is long
+    enough.
+    """
     tell = progress or (lambda text: None)
     if case.vehicle_file.mass_weighed:
         library = Library(tuple(e for e in library.effects if not CARDS[e].weighed))
@@ -65,7 +69,9 @@ def _tracks(case: Case) -> tuple[list[Track], list]:
 
 
 def _sensors(tracks: list[Track], library: Library) -> tuple[list[Track], Pose | None, Kinematics]:
-    """The tracks as sensors that agree would have them, the pose's channel, and what the sensors say of each other."""
+    """The tracks as sensors that agree would have them, the pose's channel, and what the sensors
+    say of each other.
+    """
     pose = read_pose(tracks, library)
     moved = pose is not None and pose.names and pose.late
     if moved:

@@ -1,7 +1,8 @@
 """Parameters of the named effects with their 90 % intervals.
 
-An interval is the fit's, or what flights disagree by where that is more, and never narrower than what forms that aren't
-quite the library's leave: some per cent of the effect."""
+An interval is the fit's, or what flights disagree by where that is more, and never narrower than
+what forms that aren't quite the library's leave: some per cent of the effect.
+"""
 
 import numpy as np
 
@@ -41,7 +42,9 @@ def estimates(evidence: Evidence, fit: SetFit, named) -> dict[str, dict[str, Est
 
 
 def _of_physics(fit: SetFit, effect: str, parameter) -> Estimated:
-    """A parameter of the fit. Forms may be wrong by a share of the effect's largest parameter of that unit."""
+    """A parameter of the fit. Forms may be wrong by a share of the effect's largest parameter of
+    that unit.
+    """
     known = EFFECTS[effect].parameters
     deviation = robust_deviation(fit.covariance, fit.grams[:, 1:, 0])
     deviation = float(deviation[fit.index.tolist().index(PLACE[effect, parameter.name])])

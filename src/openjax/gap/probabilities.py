@@ -1,7 +1,9 @@
 """How sure the words are: the probability of each cause to be the strongest.
 
-Two uncertainties, each with a number of its own: whether an effect acts (how often its set is chosen, `selection`), and which
-part is the largest (the shares' bootstrap). What remains goes to sets chosen otherwise, to nothing and to the unknown."""
+Two uncertainties, each with a number of its own: whether an effect acts (how often its set is
+chosen, `selection`), and which part is the largest (the shares' bootstrap). What remains goes to
+sets chosen otherwise, to nothing and to the unknown.
+"""
 
 from openjax.gap.decision import DECISION
 from openjax.vehicle.effects import EFFECTS
@@ -10,8 +12,10 @@ from openjax.vehicle.effects import EFFECTS
 def probabilities(present, largest, unknown: float, weights) -> dict[str, float]:
     """{cause, "none", "unknown": probability of being the strongest}, whose sum is one.
 
-    present: {named effect: probability that it acts}. largest: {effect or "unexplained": how often it is the largest part}.
-    unknown: probability that what is unexplained is real. weights: {effects: how often that set was chosen}."""
+    present: {named effect: probability that it acts}. largest: {effect or "unexplained": how often
+    it is the largest part}. unknown: probability that what is unexplained is real. weights:
+    {effects: how often that set was chosen}.
+    """
     chance = dict.fromkeys((*EFFECTS, "none", "unknown"), 0.0)
     sure = (1.0 - unknown) if present else 1.0
     for effect, p in present.items():
@@ -30,7 +34,9 @@ def probabilities(present, largest, unknown: float, weights) -> dict[str, float]
 
 
 def tempered(chance: dict[str, float], temperature: float) -> dict[str, float]:
-    """Probabilities as sure as they are right in known cases: their logarithms over one temperature (Guo et al. 2017)."""
+    """Probabilities as sure as they are right in known cases: their logarithms over one temperature
+    (Guo et al. 2017).
+    """
     flat = {name: max(p, 0.0) ** (1.0 / temperature) for name, p in chance.items()}
     total = sum(flat.values())
     return {name: p / total for name, p in flat.items()}

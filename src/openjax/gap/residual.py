@@ -1,9 +1,11 @@
 """What the chosen effects leave: whether it is more than sensors, air and errors of form leave.
 
-Things that should agree are held against each other: measured motion and replay, attitude and gyroscope, path and
-accelerometer, position and velocity. How much is left of each, given what is left of the others, is told in standard deviations
-of cases of several worlds in which nothing unknown acts. The p-value of the largest is conformal over those (Vovk et al. 2005;
-`residual.json`)."""
+Things that should agree are held against each other: measured motion and replay, attitude and
+gyroscope, path and accelerometer, position and velocity. How much is left of each, given what is
+left of the others, is told in standard deviations of cases of several worlds in which nothing
+unknown acts. The p-value of the largest is conformal over those (Vovk et al. 2005;
+`residual.json`).
+"""
 
 import json
 from dataclasses import dataclass
@@ -31,8 +33,10 @@ CALIBRATION = Path(__file__).with_name("residual.json")
 
 @dataclass(frozen=True)
 class Check:
-    """`measures` {name: value} and the one that stands out most, `where`; its `p_value` among cases without an unknown cause;
-    `predicted` (9,): share of each motion channel's squared error beyond what such cases leave, where the check rejects."""
+    """`measures` {name: value} and the one that stands out most, `where`; its `p_value` among cases
+    without an unknown cause; `predicted` (9,): share of each motion channel's squared error beyond
+    what such cases leave, where the check rejects.
+    """
 
     measures: dict[str, float]
     where: str
@@ -46,12 +50,18 @@ class Check:
 
     @property
     def probability(self) -> float:
-        """That something acts which no effect explains: posterior odds are the prior's over the p-value."""
+        """That something acts which no effect explains: posterior odds are the prior's over the
+        p-value.
+        """
         return DECISION.unknown / (DECISION.unknown + self.p_value)
 
     def in_words(self) -> str:
         """What is left, in one sentence."""
-        return f"What is left isn't noise (p = {self.p_value:.2g}): {self.where}." if self.rejects else ""
+        return (
+            f"What is left isn't noise (p = {self.p_value:.2g}): {self.where}."
+            if self.rejects
+            else ""
+        )
 
 
 def check_residual(evidence: Evidence, fit: SetFit) -> Check:
@@ -65,11 +75,16 @@ def check_residual(evidence: Evidence, fit: SetFit) -> Check:
 
 def residuals_of(fit: SetFit) -> list[np.ndarray]:
     """Residual (T, 9) of each track under a fit, nuisances taken off."""
-    return [without_nuisances(fit.replay, column[0], number) for number, column in enumerate(fit.columns)]
+    return [
+        without_nuisances(fit.replay, column[0], number)
+        for number, column in enumerate(fit.columns)
+    ]
 
 
 def disturbances(track: Track, residual: np.ndarray) -> np.ndarray:
-    """A residual as accelerations (T, 9): angular (body), linear (body, from the velocity), specific force (body)."""
+    """A residual as accelerations (T, 9): angular (body), linear (body, from the velocity),
+    specific force (body).
+    """
     out = np.zeros_like(residual)
     out[:, RATES] = np.gradient(residual[:, RATES], track.dt, axis=0)
     out[:, VELOCITY] = np.gradient(residual[:, VELOCITY], track.dt, axis=0)
@@ -80,16 +95,21 @@ def disturbances(track: Track, residual: np.ndarray) -> np.ndarray:
 
 
 def measure(evidence: Evidence, residuals: list[np.ndarray]) -> tuple[dict[str, float], np.ndarray]:
-    """{name: measure} of what is left, and (9,) by which share the motion channels' squares exceed what the calibration's cases
-    leave at most."""
+    """{name: measure} of what is left, and (9,) by which share the motion channels' squares exceed
+    what the calibration's cases leave at most.
+    """
     dt = evidence.tracks[0].dt
-    skip, out, excess = int(SKIP / dt), {}, np.zeros(9)
+    skip = int(SKIP / dt)
+    out = {}
+    excess = np.zeros(9)
     for name, parts in _series(evidence, residuals).items():
         step = max(round(HORIZONS[name][0] / dt), 1)
         size = np.concatenate([(p[step:] - p[:-step])[skip:] for p in parts]).std(0)
         out[name] = float(size.max())
         if name in ("rates", "velocity"):
-            most = np.quantile([c[name] for c in calibration() if name in c], 1.0 - DECISION.unknown)
+            most = np.quantile(
+                [c[name] for c in calibration() if name in c], 1.0 - DECISION.unknown
+            )
             first = 0 if name == "rates" else 3
             excess[first : first + 3] = 1.0 - np.minimum(most / size, 1.0) ** 2
     return out, excess
@@ -97,26 +117,33 @@ def measure(evidence: Evidence, residuals: list[np.ndarray]) -> tuple[dict[str, 
 
 def _series(evidence: Evidence, residuals: list[np.ndarray]) -> dict[str, list[np.ndarray]]:
     """{name of HORIZONS: what is left (T, 3) of each track, added up} of what was logged."""
-    usable, tracks = evidence.replay.usable, evidence.replay.tracks
+    usable = evidence.replay.usable
+    tracks = evidence.replay.tracks
     motion = {"rates": RATES, "velocity": VELOCITY}
     out = {n: [r[:, axes] for r in residuals] for n, axes in motion.items() if usable[axes.start]}
     out |= {c.path: c.fit.residual for c in evidence.channels if c.path in HORIZONS}
     if all(t.position is not None and t.velocity is not None for t in tracks):
-        out["position"] = [t.position - (np.cumsum(t.velocity, 0) - 0.5 * t.velocity) * t.dt for t in tracks]
+        out["position"] = [
+            t.position - (np.cumsum(t.velocity, 0) - 0.5 * t.velocity) * t.dt for t in tracks
+        ]
         if all(t.specific_force is not None and t.quaternion is not None for t in tracks):
             out["accelerometer"] = [_path_against_accelerometer(t) for t in tracks]
     return out
 
 
 def _path_against_accelerometer(track: Track) -> np.ndarray:
-    """Velocity (T, 3) body axes by which the accelerometer and the path's acceleration come apart, its bias aside."""
+    """Velocity (T, 3) body axes by which the accelerometer and the path's acceleration come apart,
+    its bias aside.
+    """
     apart = track.specific_force - specific_force_of(track.quaternion, track.velocity, track.dt)
     return np.cumsum(apart - apart.mean(0), 0) * track.dt
 
 
 def conformal_p(measured: dict[str, float]) -> tuple[float, str]:
-    """Share of cases without an unknown cause, this one among them, that stand out as much, and by which measure this one does.
-    Beyond the largest the tail is exponential, as long as that of the upper quarter (Pickands 1975)."""
+    """Share of cases without an unknown cause, this one among them, that stand out as much, and by
+    which measure this one does. Beyond the largest the tail is exponential, as long as that of the
+    upper quarter (Pickands 1975).
+    """
     value, name = standing_out(measured)
     known = np.array([standing_out(case)[0] for case in calibration()])
     share = float((1 + (known >= value).sum()) / (1 + len(known)))
@@ -126,9 +153,11 @@ def conformal_p(measured: dict[str, float]) -> tuple[float, str]:
 
 
 def standing_out(measured: dict[str, float]) -> tuple[float, str]:
-    """How far one of a case's measures stands out at most of what the others of its logs lead to expect, in standard deviations,
-    and which; logs without anything to hold against each other stand out nowhere. What makes a sensor noisy raises all that it
-    has a part in; so each logarithm is told given the others, as of a normal distribution."""
+    """How far one of a case's measures stands out at most of what the others of its logs lead to
+    expect, in standard deviations, and which; logs without anything to hold against each other
+    stand out nowhere. What makes a sensor noisy raises all that it has a part in; so each logarithm
+    is told given the others, as of a normal distribution.
+    """
     names, (mean, covariance) = list(HORIZONS), usual()
     rows = [k for k, n in enumerate(names) if n in measured]
     precision = np.linalg.inv(covariance[np.ix_(rows, rows)])
@@ -149,6 +178,8 @@ def calibration() -> list[dict[str, float]]:
 
 @lru_cache(maxsize=1)
 def usual() -> tuple[np.ndarray, np.ndarray]:
-    """Mean (measures,) and covariance (measures, measures) of the logarithms over the calibration's cases that have them."""
+    """Mean (measures,) and covariance (measures, measures) of the logarithms over the calibration's
+    cases that have them.
+    """
     logs = np.ma.masked_invalid([logarithms(case) for case in calibration()])
     return logs.mean(0).filled(0.0), np.ma.cov(logs, rowvar=False).filled(0.0)

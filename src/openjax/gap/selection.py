@@ -1,11 +1,14 @@
-"""Which physics effects act: a search that climbs one score, then the most plausible set that isn't clearly worse.
+"""Which physics effects act: a search that climbs one score, then the most plausible set that isn't
+clearly worse.
 
-The score of a set of effects is its log predictive density on stretches left out (Vehtari, Gelman, Gabry 2017) plus the log
-prior odds of its effects. A move takes one effect in, out, or puts it in another's place, and is made only if the score
-rises, so the search ends. Chosen is the set of the largest prior odds among those that these flights can't tell from the best:
-the difference is within two standard errors, or too small to matter (the one-standard-error rule of Breiman et al. 1984,
-with a region of practical equivalence). How often each set is chosen when blocks of flight are weighed anew by a Bayesian
-bootstrap is its probability; named is the most probable one."""
+The score of a set of effects is its log predictive density on stretches left out (Vehtari, Gelman,
+Gabry 2017) plus the log prior odds of its effects. A move takes one effect in, out, or puts it in
+another's place, and is made only if the score rises, so the search ends. Chosen is the set of the
+largest prior odds among those that these flights can't tell from the best: the difference is within
+two standard errors, or too small to matter (the one-standard-error rule of Breiman et al. 1984,
+with a region of practical equivalence). How often each set is chosen when blocks of flight are
+weighed anew by a Bayesian bootstrap is its probability; named is the most probable one.
+"""
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
@@ -20,8 +23,9 @@ from openjax.gap.model.hypotheses import SetFit, fit_set
 from openjax.gap.model.library import CARDS, places
 from openjax.gap.model.table import Table, build, with_effects
 
-# Nats that an effect of usual size must promise: its gain is then expected at two standard errors, as the gain of a true effect
-# is half the square of what it does, and its standard error that square's root.
+# Nats that an effect of usual size must promise: its gain is then expected at two standard errors,
+# as the gain of a true effect is half the square of what it does, and its standard error that
+# square's root.
 DETECTABLE = 2.0 * DECISION.standard_errors**2
 TRIED = 2  # neighbours of each kind that are fitted in full
 DRAWS = 400  # of the bootstrap
@@ -47,8 +51,10 @@ class Hypothesis:
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """The hypothesis `chosen` and `table` around it; `effects` that it names, strongest first; `weights` {effects: share of
-    the draws in which that set is chosen}; `equivalent` {effect: others that would do as well in its place}."""
+    """The hypothesis `chosen` and `table` around it; `effects` that it names, strongest first;
+    `weights` {effects: share of the draws in which that set is chosen}; `equivalent` {effect:
+    others that would do as well in its place}.
+    """
 
     chosen: Hypothesis
     table: Table
@@ -73,9 +79,13 @@ def select(evidence: Evidence) -> Selection:
     weights = search.weights()
     chosen = search.visited[max(weights, key=weights.get)]
     without = {e: search.of_set(set(chosen.effects) - {e}, chosen.fit) for e in chosen.effects}
-    gains = {e: growth(h.judged.squares.sum(0), chosen.judged.squares.sum(0)) for e, h in without.items()}
+    gains = {
+        e: growth(h.judged.squares.sum(0), chosen.judged.squares.sum(0)) for e, h in without.items()
+    }
     ordered = tuple(sorted(gains, key=lambda e: -gains[e]))
-    chosen = replace(chosen, fit=fit_set(chosen.fit.replay, chosen.effects, chosen.fit.theta, rounds=ROUNDS))
+    chosen = replace(
+        chosen, fit=fit_set(chosen.fit.replay, chosen.effects, chosen.fit.theta, rounds=ROUNDS)
+    )
     table = build(chosen.fit, {})
     return Selection(chosen, table, ordered, weights, search.equivalents(chosen, ordered))
 
@@ -91,12 +101,13 @@ def testable(evidence: Evidence) -> dict[str, SetFit]:
 
 
 def difference(better: Judged, other: Judged) -> tuple[float, float, float]:
-    """By how much the log density of one hypothesis exceeds another's on stretches left out, the standard error, and which share
-    of its square white residuals would leave.
+    """By how much the log density of one hypothesis exceeds another's on stretches left out, the
+    standard error, and which share of its square white residuals would leave.
 
-    Given what the two predict, only noise is random: its variance is that of white residuals or, where that is more, what
-    the residuals of the better one show block by block (cluster-robust, Liang and Zeger 1986). So an effect that acts in one
-    block in ten is judged by that block."""
+    Given what the two predict, only noise is random: its variance is that of white residuals or,
+    where that is more, what the residuals of the better one show block by block (cluster-robust,
+    Liang and Zeger 1986). So an effect that acts in one block in ten is judged by that block.
+    """
     change = other.left - better.left
     cross = np.add.reduceat(change * better.left, better.starts)
     energy = np.add.reduceat(change * change, better.starts)
@@ -105,13 +116,19 @@ def difference(better: Judged, other: Judged) -> tuple[float, float, float]:
 
 
 def growth(squares: np.ndarray, floor: np.ndarray) -> np.ndarray:
-    """By how many floors a gap of squared errors (..., channels) is larger than one of the squares `floor` (channels,)."""
+    """By how many floors a gap of squared errors (..., channels) is larger than one of the squares
+    `floor` (channels,).
+    """
     return np.sqrt((squares / floor).mean(-1)) - 1.0
 
 
 def matters(squares: np.ndarray, floor: np.ndarray, nothing: np.ndarray):
-    """Whether a gap (..., channels) is so much larger than `floor` that it matters beside what `nothing` (channels,) leaves."""
-    return growth(squares, floor) > max(DECISION.least_gap, DECISION.form_error * growth(nothing, floor))
+    """Whether a gap (..., channels) is so much larger than `floor` that it matters beside what
+    `nothing` (channels,) leaves.
+    """
+    return growth(squares, floor) > max(
+        DECISION.least_gap, DECISION.form_error * growth(nothing, floor)
+    )
 
 
 def possible(fit: SetFit) -> bool:
@@ -164,11 +181,16 @@ class Search:
             here = max(better, key=lambda h: h.score)
 
     def neighbours(self, here: Hypothesis) -> list[Hypothesis]:
-        """The most promising neighbours, screened by the model linearised here and fitted in full: sets with one effect more,
-        with another in one's place, and of those the ones of larger prior odds, which need not score as high."""
-        effects, table = frozenset(here.effects), build(here.fit, self.singles)
+        """The most promising neighbours, screened by the model linearised here and fitted in full:
+        sets with one effect more, with another in one's place, and of those the ones of larger
+        prior odds, which need not score as high.
+        """
+        effects = frozenset(here.effects)
+        table = build(here.fit, self.singles)
         more = {effects | {new}: ((new,), ()) for new in table.step}
-        instead = {effects - {old} | {new}: ((new,), (old,)) for new in table.step for old in effects}
+        instead = {
+            effects - {old} | {new}: ((new,), (old,)) for new in table.step for old in effects
+        }
         odds = {s: sum(CARDS[e].log_odds for e in s) for s in (effects, *instead)}
         simpler = {s: change for s, change in instead.items() if odds[s] > odds[effects]}
         sets = []
@@ -180,13 +202,17 @@ class Search:
         return [self.of_set(s, here.fit) for s in dict.fromkeys(sets)]
 
     def clearly_worse(self, other: Hypothesis, best: Hypothesis) -> bool:
-        """Whether flights tell a hypothesis from the best one, and it leaves a gap so much larger that it matters."""
+        """Whether flights tell a hypothesis from the best one, and it leaves a gap so much larger
+        that it matters.
+        """
         gain, error, _ = difference(best.judged, other.judged)
         gaps = (h.judged.squares.sum(0) for h in (other, best, self.nothing))
         return gain > DECISION.standard_errors * error and bool(matters(*gaps))
 
     def equivalents(self, chosen: Hypothesis, named) -> dict[str, list[str]]:
-        """For each named effect those in whose place, of the sets visited, flights don't tell the difference."""
+        """For each named effect those in whose place, of the sets visited, flights don't tell the
+        difference.
+        """
         out = {}
         for effect in named:
             rest = frozenset(chosen.effects) - {effect}
@@ -201,15 +227,18 @@ class Search:
         return out
 
     def choose(self, weights: np.ndarray) -> list[Hypothesis]:
-        """For each row of blocks' weights (D, B) the hypothesis of the largest prior odds that isn't clearly worse than the best.
-        Of equal odds it is the one with the most evidence: its density, worth as many nats as blocks bear out (Pauli, Racugno,
-        Ventura 2011), less what its parameters cost (Occam's factor)."""
+        """For each row of blocks' weights (D, B) the hypothesis of the largest prior odds that
+        isn't clearly worse than the best. Of equal odds it is the one with the most evidence: its
+        density, worth as many nats as blocks bear out (Pauli, Racugno, Ventura 2011), less what its
+        parameters cost (Occam's factor).
+        """
         sets = [h for h in self.visited.values() if possible(h.fit)]
         odds, costs = np.array([(h.log_odds, h.fit.cost) for h in sets]).T
         pairs = [[difference(a.judged, b.judged) for b in sets] for a in sets]
         _, errors, trust = np.moveaxis(np.array(pairs), 2, 0)
         density = weights @ np.array([h.judged.nats for h in sets]).T  # (D, sets)
-        nothing, chosen = sets.index(self.nothing), []
+        nothing = sets.index(self.nothing)
+        chosen = []
         squares = np.einsum("db,sbc->dsc", weights, np.array([h.judged.squares for h in sets]))
         for nats, square in zip(density, squares, strict=True):
             best = int(np.argmax(nats + odds))
@@ -222,7 +251,9 @@ class Search:
         return chosen
 
     def weights(self) -> dict[frozenset, float]:
-        """{effects: share of the draws in which that set is chosen}, of a Bayesian bootstrap over blocks (Rubin 1981)."""
+        """{effects: share of the draws in which that set is chosen}, of a Bayesian bootstrap over
+        blocks (Rubin 1981).
+        """
         blocks = len(self.nothing.judged.nats)
         drawn = np.random.default_rng(0).dirichlet(np.ones(blocks), DRAWS) * blocks
         count = Counter(frozenset(h.effects) for h in self.choose(drawn))

@@ -1,11 +1,13 @@
-"""How the gap splits: what each accepted effect, the sensors and the unexplained rest take of it, on stretches that no
-parameter was fitted to.
+"""How the gap splits: what each accepted effect, the sensors and the unexplained rest take of it,
+on stretches that no parameter was fitted to.
 
-The gap is the rms over channels of each channel's prediction error over its floor: velocity over 0.25 s as path and
-accelerometer say it, body rates over 0.05 s, the pose against the gyroscope over 0.1 s, the motor commands from the body-rate
-commands. The floor is what is left with all accepted effects, less what the residual check finds in excess of noise.
-A share is what the gap's square grows by when one part goes and all others stay (its usefulness, Darlington 1968), in proportion
-to that of all parts, so that shares add up to one with what is unexplained."""
+The gap is the rms over channels of each channel's prediction error over its floor: velocity over
+0.25 s as path and accelerometer say it, body rates over 0.05 s, the pose against the gyroscope over
+0.1 s, the motor commands from the body-rate commands. The floor is what is left with all accepted
+effects, less what the residual check finds in excess of noise. A share is what the gap's square
+grows by when one part goes and all others stay (its usefulness, Darlington 1968), in proportion to
+that of all parts, so that shares add up to one with what is unexplained.
+"""
 
 from dataclasses import dataclass
 
@@ -19,8 +21,10 @@ from openjax.gap.model.table import ERRORS, with_effects
 from openjax.gap.selection import DRAWS, Selection
 
 METRIC = (
-    "rms over channels of prediction error / noise floor on stretches left out (velocity over 0.25 s by path and by "
-    "accelerometer, body rates over 0.05 s, pose against gyroscope over 0.1 s, motor commands from body-rate commands)"
+    "rms over channels of prediction error / noise floor on stretches left out (velocity over 0.25 "
+    "s by path and by "
+    "accelerometer, body rates over 0.05 s, pose against gyroscope over 0.1 s, motor commands from "
+    "body-rate commands)"
 )
 # Nuisances that are the sensors' and the clocks': how they are mounted, biased, filtered and timed.
 SENSORS = (
@@ -43,8 +47,9 @@ class Share:
 
 @dataclass(frozen=True)
 class Gap:
-    """`before` (no effect; sensors and clocks as the flights show them), `after` and `floor`, in units of the floor;
-    `reduction` is 1 - after / before."""
+    """`before` (no effect; sensors and clocks as the flights show them), `after` and `floor`, in
+    units of the floor; `reduction` is 1 - after / before.
+    """
 
     metric: str
     before: float
@@ -56,17 +61,22 @@ class Gap:
     def in_words(self) -> str:
         """How far the gap shrinks, and a warning where it doesn't."""
         low, high = (100 * v for v in self.interval90)
-        careful = " Careful: with these effects the held-out predictions got worse." * (self.reduction < 0)
+        careful = " Careful: with these effects the held-out predictions got worse." * (
+            self.reduction < 0
+        )
         return (
-            f"Gap on held-out flights: {self.before:.2f} before, {self.after:.2f} after, floor {self.floor:.2f}: "
+            f"Gap on held-out flights: {self.before:.2f} before, {self.after:.2f} after, floor "
+            f"{self.floor:.2f}: "
             f"{100 * self.reduction:.0f} % smaller [{low:.0f}, {high:.0f}].{careful}"
         )
 
 
 @dataclass(frozen=True)
 class Split:
-    """`effects` {name: Share}; `sensors`: sensors and clocks; `unexplained`: more than noise, and no accepted effect; `largest`
-    {part: share of the bootstrap's draws in which it is the largest}, of effects and "unexplained"."""
+    """`effects` {name: Share}; `sensors`: sensors and clocks; `unexplained`: more than noise, and
+    no accepted effect; `largest` {part: share of the bootstrap's draws in which it is the largest},
+    of effects and "unexplained".
+    """
 
     gap: Gap
     effects: dict[str, Share]
@@ -76,8 +86,9 @@ class Split:
 
 
 def split(evidence: Evidence, selection: Selection, predicted: np.ndarray, named) -> Split:
-    """Shares of the `named` effects, of all paths. `predicted` (9,): share of each motion channel's squared error that the
-    residual check finds in excess of noise."""
+    """Shares of the `named` effects, of all paths. `predicted` (9,): share of each motion channel's
+    squared error that the residual check finds in excess of noise.
+    """
     channels, squares = _squares_of_sets(evidence, selection, named)  # (sets, blocks, channels)
     known = dict(zip(ERRORS, predicted, strict=True))
     left = 1.0 - np.array([known.get(n, 0.0) for n in channels])
@@ -96,15 +107,22 @@ def split(evidence: Evidence, selection: Selection, predicted: np.ndarray, named
     first = np.argmax(values[1:][:, rows], 1)
     largest = {names[k]: float(np.mean(first == place)) for place, k in enumerate(rows)}
     return Split(
-        _gap(before), {e: shares[e] for e in named}, shares["sensors"], shares["unexplained"], largest
+        _gap(before),
+        {e: shares[e] for e in named},
+        shares["sensors"],
+        shares["unexplained"],
+        largest,
     )
 
 
 def shares_of_squares(squares: np.ndarray, weights: np.ndarray, left: np.ndarray):
-    """Shares (draws, parts + 1), what is unexplained last, and the gap's square before and after (draws, 2).
+    """Shares (draws, parts + 1), what is unexplained last, and the gap's square before and after
+    (draws, 2).
 
-    squares (sets, blocks, channels): of all parts, none, none but the sensors, and all without each part. weights (draws,
-    blocks). left (channels,): of the squares that all parts leave, what is floor."""
+    squares (sets, blocks, channels): of all parts, none, none but the sensors, and all without each
+    part. weights (draws, blocks). left (channels,): of the squares that all parts leave, what is
+    floor.
+    """
     level = np.einsum("db,sbc->dsc", weights, squares)
     floor = level[:, :1] * left + 1e-30
     level = (level / floor).mean(2)  # (draws, sets)
@@ -125,15 +143,25 @@ def _gap(square: np.ndarray) -> Gap:
     before, after = np.sqrt(square[0])
     value = float(reduction[0])
     return Gap(
-        METRIC, float(before), float(after), 1.0, value, (min(float(low), value), max(float(high), value))
+        METRIC,
+        float(before),
+        float(after),
+        1.0,
+        value,
+        (min(float(low), value), max(float(high), value)),
     )
 
 
-def _squares_of_sets(evidence: Evidence, selection: Selection, named) -> tuple[list[str], np.ndarray]:
-    """Channels, and their squared errors (sets, blocks, channels) by set of parts, as `shares_of_squares` takes them."""
+def _squares_of_sets(
+    evidence: Evidence, selection: Selection, named
+) -> tuple[list[str], np.ndarray]:
+    """Channels, and their squared errors (sets, blocks, channels) by set of parts, as
+    `shares_of_squares` takes them.
+    """
     table = selection.table
     found = left_out(table, with_effects(table))
-    # Numbers of the vehicle and what feedback makes of gusts are no sensor's fault and no effect: they stay.
+    # Numbers of the vehicle and what feedback makes of gusts are no sensor's fault and no effect:
+    # they stay.
     sensors = np.array([n.startswith(SENSORS) for n in evidence.replay.nuisance_names])
     never = [e for e in selection.fit.effects if e not in named]
 
@@ -141,7 +169,9 @@ def _squares_of_sets(evidence: Evidence, selection: Selection, named) -> tuple[l
         gone = [e for e in named if e not in there and e in selection.fit.effects]
         motion = ablated(table, found, (*never, *gone), off) / table.rows[:, None]
         heard = dict(zip(np.array(ERRORS)[evidence.replay.usable > 0], motion.T, strict=True))
-        return heard | _other_squares(evidence, [e for e in there if e not in selection.fit.effects], table)
+        return heard | _other_squares(
+            evidence, [e for e in there if e not in selection.fit.effects], table
+        )
 
     sets = [squares(named), squares((), sensors), squares(())]
     sets += [squares([e for e in named if e != gone]) for gone in named]
@@ -150,14 +180,18 @@ def _squares_of_sets(evidence: Evidence, selection: Selection, named) -> tuple[l
 
 
 def _other_squares(evidence: Evidence, named, table) -> dict[str, np.ndarray]:
-    """{channel: (blocks,) mean squared errors} of pose, rate loop and radio with the effects `named`."""
+    """{channel: (blocks,) mean squared errors} of pose, rate loop and radio with the effects
+    `named`.
+    """
     counts = [int((table.track_of == k).sum()) for k in range(len(evidence.tracks))]
     out: dict[str, np.ndarray] = {}
     for channel in evidence.channels:
         for name, series in channel.residuals(named).items():
             blocks = []
             for track, errors, count in zip(evidence.tracks, series, counts, strict=True):
-                used = errors[int(SKIP / track.dt) :] if len(errors) > 1 else np.repeat(errors, count)
+                used = (
+                    errors[int(SKIP / track.dt) :] if len(errors) > 1 else np.repeat(errors, count)
+                )
                 blocks += [float((b**2).mean()) for b in np.array_split(used, count)]
             out[name] = np.array(blocks)
     return out

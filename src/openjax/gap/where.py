@@ -1,4 +1,6 @@
-"""Where the gap lies: channel by regime, in units of the noise floor, before and after the named effects."""
+"""Where the gap lies: channel by regime, in units of the noise floor, before and after the named
+effects.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -11,15 +13,26 @@ from openjax.gap.model.hypotheses import SetFit
 from openjax.gap.model.replay import SKIP
 from openjax.gap.residual import disturbances, residuals_of
 
-CHANNELS = ("force_x", "force_y", "force_z", "torque_x", "torque_y", "torque_z", "estimator", "firmware")
+CHANNELS = (
+    "force_x",
+    "force_y",
+    "force_z",
+    "torque_x",
+    "torque_y",
+    "torque_z",
+    "estimator",
+    "firmware",
+)
 LEAST_TIME = 0.5  # s in a regime, or it isn't judged
 CALM = 0.12  # s over which the rest is smoothed: sensor noise out, causes in
 
 
 @dataclass(frozen=True)
 class Place:
-    """One cell of the table. `before` and `after` are rms in units of the noise floor; `share` is the part
-    of the whole excess over the floor that lies here; `seconds` the time spent in the regime."""
+    """One cell of the table. `before` and `after` are rms in units of the noise floor; `share` is
+    the part of the whole excess over the floor that lies here; `seconds` the time spent in the
+    regime.
+    """
 
     channel: str
     regime: str
@@ -30,7 +43,9 @@ class Place:
 
 
 def locate(evidence: Evidence, fit: SetFit, named=()) -> list[Place]:
-    """The table, largest share first. `fit` is the physics part of the verdict, `named` all named effects."""
+    """The table, largest share first. `fit` is the physics part of the verdict, `named` all named
+    effects.
+    """
     masks = [{r: m[int(SKIP / t.dt) :] for r, m in regimes_of(t).items()} for t in evidence.tracks]
     inside = {r: np.concatenate([m[r] for m in masks]) for r in REGIMES}
     seconds = {r: int(m.sum()) * evidence.tracks[0].dt for r, m in inside.items()}
@@ -56,7 +71,9 @@ def _motion_powers(evidence: Evidence, fit: SetFit) -> dict[str, list[np.ndarray
             calm = smooth(np.concatenate([force, rest[:, :3]], 1), CALM, track.dt)
             rows.append(calm[int(SKIP / track.dt) :] ** 2)
         both.append(np.concatenate(rows))
-    return {name: [both[0][:, k], both[1][:, k], both[1][:, k]] for k, name in enumerate(CHANNELS[:6])}
+    return {
+        name: [both[0][:, k], both[1][:, k], both[1][:, k]] for k, name in enumerate(CHANNELS[:6])
+    }
 
 
 def _other_powers(evidence: Evidence, named) -> dict[str, list[np.ndarray]]:
@@ -64,14 +81,22 @@ def _other_powers(evidence: Evidence, named) -> dict[str, list[np.ndarray]]:
     found: dict[str, list[np.ndarray]] = {}
     for channel in evidence.channels:
         floor = channel.residuals(evidence.library.of(channel.path))
-        scale = {n: float(np.sqrt(np.mean(np.concatenate(v) ** 2))) + 1e-12 for n, v in floor.items()}
+        scale = {
+            n: float(np.sqrt(np.mean(np.concatenate(v) ** 2))) + 1e-12 for n, v in floor.items()
+        }
         powers = []
         for errors in (channel.residuals(()), channel.residuals(named), floor):
-            tracks = zip(evidence.tracks, *([v / scale[n] for v in errors[n]] for n in errors), strict=True)
+            tracks = zip(
+                evidence.tracks, *([v / scale[n] for v in errors[n]] for n in errors), strict=True
+            )
             means = [(np.mean(np.square(own), 0), t) for t, *own in tracks]  # (T,) or (1,)
-            powers.append(np.concatenate([np.broadcast_to(m, len(t))[int(SKIP / t.dt) :] for m, t in means]))
+            powers.append(
+                np.concatenate([np.broadcast_to(m, len(t))[int(SKIP / t.dt) :] for m, t in means])
+            )
         name = "estimator" if channel.path == "estimator" else "firmware"
-        found[name] = [a + b for a, b in zip(found[name], powers, strict=True)] if name in found else powers
+        found[name] = (
+            [a + b for a, b in zip(found[name], powers, strict=True)] if name in found else powers
+        )
     return found
 
 
@@ -83,6 +108,7 @@ def in_words(places: list[Place]) -> str:
         kind, _, axis = place.channel.partition("_")
         name = f"{words[kind]} {axis}" if kind in words else place.channel
         parts.append(
-            f"{name} in {place.regime.replace('_', ' ')} flight ({place.before:.1f} times the noise floor)"
+            f"{name} in {place.regime.replace('_', ' ')} flight ({place.before:.1f} times the "
+            "noise floor)"
         )
     return "; ".join(parts) or "no channel stands out of the noise"

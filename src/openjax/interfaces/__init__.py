@@ -1,1 +1,3 @@
-"""The game behind other libraries' interfaces: Gymnasium, PettingZoo, JaxMARL. Each is thin; the game stays what it is."""
+"""The game behind other libraries' interfaces: Gymnasium, PettingZoo, JaxMARL. Each is thin; the
+game stays what it is.
+"""

@@ -20,15 +20,17 @@ def flat_size(settings: PursuitSettings) -> int:
 def flat_observation(observation: Observation) -> jax.Array:
     """(..., N, D) what each of N pursuers observes, in one vector.
 
-    In this order: its own state (see `Observation.self_state`), the other pursuers, the nearest pillars, and its
-    position relative to where the evader was last seen (m). What isn't seen is -5.
+    In this order: its own state (see `Observation.self_state`), the other pursuers, the nearest
+    pillars, and its position relative to where the evader was last seen (m). What isn't seen is -5.
     """
     lead = observation.self_state.shape[:-1]
     parts = (
         observation.self_state,
         observation.others.reshape(*lead, -1),
         observation.pillars.reshape(*lead, -1),
-        turned_back(observation.heading, observation.position - observation.last_seen[..., None, :]),
+        turned_back(
+            observation.heading, observation.position - observation.last_seen[..., None, :]
+        ),
     )
     return jnp.concatenate(parts, axis=-1)
 

@@ -1,4 +1,6 @@
-"""Many worlds as a Gymnasium `VectorEnv` in which one agent flies the whole team (`pip install gymnasium pettingzoo`)."""
+"""Many worlds as a Gymnasium `VectorEnv` in which one agent flies the whole team (`pip install
+gymnasium pettingzoo`).
+"""
 
 import jax
 import jax.numpy as jnp
@@ -14,9 +16,9 @@ from openjax.pursuit import Pursuit
 class PursuitVectorEnv(VectorEnv):
     """E worlds at once, as one compiled function.
 
-    Observations (E, N * D) float32 are all pursuers' vectors (`flat_observation`), actions (E, N * 4) in -1..1 theirs,
-    the reward (E,) is their mean. Worlds start anew in the step that ends them (`AutoresetMode.SAME_STEP`): the last
-    observation of the episode is in `infos["final_obs"]`.
+    Observations (E, N * D) float32 are all pursuers' vectors (`flat_observation`), actions (E, N *
+    4) in -1..1 theirs, the reward (E,) is their mean. Worlds start anew in the step that ends them
+    (`AutoresetMode.SAME_STEP`): the last observation of the episode is in `infos["final_obs"]`.
 
     Args:
       num_envs: worlds E.
@@ -31,7 +33,9 @@ class PursuitVectorEnv(VectorEnv):
         self.num_envs = num_envs
         self.render_mode = None
         team = settings.num_pursuers
-        self.single_observation_space = spaces.Box(-np.inf, np.inf, (team * flat_size(settings),), np.float32)
+        self.single_observation_space = spaces.Box(
+            -np.inf, np.inf, (team * flat_size(settings),), np.float32
+        )
         self.single_action_space = spaces.Box(-1.0, 1.0, (team * ACTION_SIZE,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -50,7 +54,9 @@ class PursuitVectorEnv(VectorEnv):
     def step(self, actions):
         """One control step of all worlds."""
         actions = jnp.asarray(actions, jnp.float32)
-        observation, self._state, reward, terminated, truncated, info = self._step(self._state, actions)
+        observation, self._state, reward, terminated, truncated, info = self._step(
+            self._state, actions
+        )
         over = np.asarray(terminated | truncated)
         infos = {name: np.array(value) for name, value in info.items()} | {
             f"_{name}": np.ones(self.num_envs, bool) for name in info
@@ -81,4 +87,11 @@ class PursuitVectorEnv(VectorEnv):
             jax.random.key(0), state, action
         )
         told = {"captured": jnp.any(info.captured), "crashed": jnp.any(info.crashed)}
-        return flat_observation(observation).ravel(), state, jnp.mean(reward), terminated, truncated, told
+        return (
+            flat_observation(observation).ravel(),
+            state,
+            jnp.mean(reward),
+            terminated,
+            truncated,
+            told,
+        )

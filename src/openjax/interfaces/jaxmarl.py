@@ -1,7 +1,8 @@
-"""The game with JaxMARL's manners: dictionaries by agent, `step` that starts anew where an episode ends.
+"""The game with JaxMARL's manners: dictionaries by agent, `step` that starts anew where an episode
+ends.
 
-It has the methods of `jaxmarl.environments.MultiAgentEnv` without needing JaxMARL: everything is pure, so its trainers
-can map and compile it.
+It has the methods of `jaxmarl.environments.MultiAgentEnv` without needing JaxMARL: everything is
+pure, so its trainers can map and compile it.
 """
 
 import functools
@@ -15,7 +16,8 @@ from openjax.pursuit.spaces import Box
 
 
 class PursuitMultiAgentEnv:
-    """Agents `pursuer_0` ...; each observes (D,) float32 (`flat_observation`) and acts with (4,) in -1..1.
+    """Agents `pursuer_0` ...; each observes (D,) float32 (`flat_observation`) and acts with (4,) in
+    -1..1.
 
     Args:
       environment: the game; None is the nominal one.
@@ -49,23 +51,43 @@ class PursuitMultiAgentEnv:
         return self._by_agent(flat_observation(observation)), state
 
     @functools.partial(jax.jit, static_argnums=0)
-    def step(self, key: jax.Array, state: PursuitState, actions: dict[str, jax.Array], reset_state=None):
-        """`step_env`, and a new episode (of `reset_state`, where given) in place of one that has ended."""
+    def step(
+        self, key: jax.Array, state: PursuitState, actions: dict[str, jax.Array], reset_state=None
+    ):
+        """`step_env`, and a new episode (of `reset_state`, where given) in place of one that has
+        ended.
+        """
         key, reset_key = jax.random.split(key)
         after = self.step_env(key, state, actions)
-        fresh = self.reset(reset_key) if reset_state is None else (self.get_obs(reset_state), reset_state)
+        fresh = (
+            self.reset(reset_key)
+            if reset_state is None
+            else (self.get_obs(reset_state), reset_state)
+        )
         over = after[3]["__all__"]
-        observations, state = jax.tree.map(lambda new, old: jnp.where(over, new, old), fresh, after[:2])
+        observations, state = jax.tree.map(
+            lambda new, old: jnp.where(over, new, old), fresh, after[:2]
+        )
         return observations, state, *after[2:]
 
     def step_env(self, key: jax.Array, state: PursuitState, actions: dict[str, jax.Array]):
-        """One control step: observations, state, rewards, dones (with `__all__`), infos, all by agent."""
+        """One control step: observations, state, rewards, dones (with `__all__`), infos, all by
+        agent.
+        """
         action = jnp.stack([actions[agent] for agent in self.agents])
-        observation, state, reward, terminated, truncated, info = self.environment.step(key, state, action)
+        observation, state, reward, terminated, truncated, info = self.environment.step(
+            key, state, action
+        )
         over = terminated | truncated
         dones = {agent: over for agent in self.agents} | {"__all__": over}
         infos = {"captured": info.captured, "crashed": info.crashed}  # (N,) each
-        return self._by_agent(flat_observation(observation)), state, self._by_agent(reward), dones, infos
+        return (
+            self._by_agent(flat_observation(observation)),
+            state,
+            self._by_agent(reward),
+            dones,
+            infos,
+        )
 
     def get_obs(self, state: PursuitState) -> dict[str, jax.Array]:
         """Observations of a state."""

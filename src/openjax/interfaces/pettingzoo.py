@@ -11,9 +11,11 @@ from openjax.pursuit import Pursuit
 
 
 class PursuitParallelEnv(ParallelEnv):
-    """Agents `pursuer_0` ... act together; each observes (D,) float32 (`flat_observation`) and acts with (4,) in -1..1.
+    """Agents `pursuer_0` ... act together; each observes (D,) float32 (`flat_observation`) and acts
+    with (4,) in -1..1.
 
-    Every pursuer gets its own reward. An episode ends for all at once, after `settings.episode_length` steps.
+    Every pursuer gets its own reward. An episode ends for all at once, after
+    `settings.episode_length` steps.
 
     Args:
       environment: the game; None is the nominal one.
@@ -29,7 +31,8 @@ class PursuitParallelEnv(ParallelEnv):
         self.render_mode = None
         self._observation_space = spaces.Box(-np.inf, np.inf, (flat_size(settings),), np.float32)
         self._action_space = spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
-        self._key, self._state = jax.random.key(0), None
+        self._key = jax.random.key(0)
+        self._state = None
         self._reset, self._step = jax.jit(self.environment.reset), jax.jit(self.environment.step)
 
     def observation_space(self, agent: str) -> spaces.Box:
@@ -47,11 +50,15 @@ class PursuitParallelEnv(ParallelEnv):
         self._key, key = jax.random.split(self._key)
         self.agents = list(self.possible_agents)
         observation, self._state = self._reset(key)
-        return self._by_agent(to_numpy(flat_observation(observation))), {agent: {} for agent in self.agents}
+        return self._by_agent(to_numpy(flat_observation(observation))), {
+            agent: {} for agent in self.agents
+        }
 
     def step(self, actions: dict[str, np.ndarray]):
         """One control step of all agents."""
-        action = jnp.stack([jnp.asarray(actions[agent], jnp.float32) for agent in self.possible_agents])
+        action = jnp.stack(
+            [jnp.asarray(actions[agent], jnp.float32) for agent in self.possible_agents]
+        )
         # the game draws nothing after its reset: the key is for the interface only
         observation, self._state, *told = self._step(jax.random.key(0), self._state, action)
         reward, terminated, truncated, info = to_numpy(told)

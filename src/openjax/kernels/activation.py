@@ -1,4 +1,6 @@
-"""The networks' activation as a formula that XLA and the kernels share, and the arithmetic that kernels do it with."""
+"""The networks' activation as a formula that XLA and the kernels share, and the arithmetic that
+kernels do it with.
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -22,11 +24,14 @@ PLAIN = Arithmetic(jnp.tanh, lambda a, b, c: a * b + c)
 def kernel_arithmetic(dtype: jnp.dtype, interpret: bool) -> Arithmetic:
     """What a kernel computes with whose results are stored as `dtype`.
 
-    The GPU's own tanh errs by less than a bfloat16 can show. Triton's compiler leaves products and sums apart unless told.
+    The GPU's own tanh errs by less than a bfloat16 can show. Triton's compiler leaves products and
+    sums apart unless told.
     """
     if interpret:
         return PLAIN
-    return Arithmetic(pallas_triton.approx_tanh if dtype == jnp.bfloat16 else jnp.tanh, _multiply_add)
+    return Arithmetic(
+        pallas_triton.approx_tanh if dtype == jnp.bfloat16 else jnp.tanh, _multiply_add
+    )
 
 
 def _multiply_add(a, b, c):
@@ -41,12 +46,16 @@ def _multiply_add(a, b, c):
 
 
 def activation(x: jax.Array, arithmetic: Arithmetic = PLAIN) -> jax.Array:
-    """x sigmoid(1.702 x), the cheap approximation of GELU (Hendrycks and Gimpel, 2016), by one tanh."""
+    """x sigmoid(1.702 x), the cheap approximation of GELU (Hendrycks and Gimpel, 2016), by one
+    tanh.
+    """
     half = 0.5 * x
     return arithmetic.multiply_add(half, arithmetic.tanh(0.851 * x), half)
 
 
-def activation_and_slope(x: jax.Array, arithmetic: Arithmetic = PLAIN) -> tuple[jax.Array, jax.Array]:
+def activation_and_slope(
+    x: jax.Array, arithmetic: Arithmetic = PLAIN
+) -> tuple[jax.Array, jax.Array]:
     """`activation` and its derivative."""
     share = 0.5 + 0.5 * arithmetic.tanh(0.851 * x)
     value = x * share

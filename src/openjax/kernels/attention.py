@@ -1,9 +1,10 @@
 """Attention of one query per sample over a few entities that are embedded on the fly.
 
-Entities other than the pursuer itself are described by a few numbers each, so their embeddings, a linear layer and an
-activation, cost less to compute again than to read back. On a GPU a hand-written kernel (Pallas, Triton) therefore
-embeds them in registers, forward and backward, and nothing as large as samples x entities x features reaches memory:
-XLA's own fusions moved several times as many bytes. Elsewhere the same formula is left to XLA.
+Entities other than the pursuer itself are described by a few numbers each, so their embeddings, a
+linear layer and an activation, cost less to compute again than to read back. On a GPU a
+hand-written kernel (Pallas, Triton) therefore embeds them in registers, forward and backward, and
+nothing as large as samples x entities x features reaches memory: XLA's own fusions moved several
+times as many bytes. Elsewhere the same formula is left to XLA.
 """
 
 import functools
@@ -18,7 +19,9 @@ from openjax.kernels.activation import activation, activation_and_slope, kernel_
 from openjax.platform import on_platform, whole_blocks
 
 ROWS = 8
-"""Samples that one program of the kernel works on at a time: with more, the backward kernel's registers spill."""
+"""Samples that one program of the kernel works on at a time: with more, the backward kernel's
+registers spill.
+"""
 
 BLOCK = 64
 """Samples of one program of the backward kernel, which adds up their gradients of the weights."""
@@ -44,8 +47,12 @@ class Layout(NamedTuple):
 
     @property
     def entities(self) -> list[tuple[int, int, int]]:
-        """(row of the first input, size, row of the first weight) of every entity but the pursuer itself."""
-        rows, row, weight = [], 0, 0
+        """(row of the first input, size, row of the first weight) of every entity but the pursuer
+        itself.
+        """
+        rows = []
+        row = 0
+        weight = 0
         for kind in self.kinds:
             for _ in range(kind.count):
                 rows.append((row, kind.size, weight))
@@ -70,13 +77,15 @@ def attend(
 ) -> jax.Array:
     """Weighted mean of entities for each head.
 
-    Entity 0 is `own`; entity m is activation(inverse_m (W' x_m + b) + c) with the weights of its kind. With score
-    s_hm = scale * query_h . e_m + bias_m, the result of head h is sum_m softmax(s_h)_m e_m.
+    Entity 0 is `own`; entity m is activation(inverse_m (W' x_m + b) + c) with the weights of its
+    kind. With score s_hm = scale * query_h . e_m + bias_m, the result of head h is sum_m
+    softmax(s_h)_m e_m.
 
     Args:
       query: (B, heads * features), one query per head in the space of the embeddings.
       own: (B, features).
-      inputs: (input_rows + entities, B) float32: all entities' numbers, then the biases (a large negative one masks).
+      inputs: (input_rows + entities, B) float32: all entities' numbers, then the biases (a large
+      negative one masks).
       inverse: (entities, B) float32, by which the linear layer's output is scaled.
       weights: (sum of size + 2 over kinds, features) float32: per kind its matrix W, then b and c.
       layout: sizes.
@@ -92,10 +101,12 @@ def attend(
 def attend_one_by_one(
     queries: list[jax.Array], entities: list[jax.Array], biases: list[jax.Array | float]
 ) -> list[jax.Array]:
-    """The same mean from arrays of their own for every head and entity, as XLA's CPU compiler wants them.
+    """The same mean from arrays of their own for every head and entity, as XLA's CPU compiler wants
+    them.
 
-    Batches of tiny products are loops without vector instructions there, and so is whatever is fused with a slice or
-    a concatenation of entities; sums over features and (B, features) arrays alone run at full width.
+    Batches of tiny products are loops without vector instructions there, and so is whatever is
+    fused with a slice or a concatenation of entities; sums over features and (B, features) arrays
+    alone run at full width.
 
     Args:
       queries: (B, features) of each head, scaled.
@@ -108,7 +119,8 @@ def attend_one_by_one(
     means = []
     for query in queries:
         scores = [
-            jnp.sum(query * e, axis=-1, keepdims=True) + b for e, b in zip(entities, biases, strict=True)
+            jnp.sum(query * e, axis=-1, keepdims=True) + b
+            for e, b in zip(entities, biases, strict=True)
         ]
         top = jax.lax.stop_gradient(functools.reduce(jnp.maximum, scores))
         parts = [jnp.exp(score - top) for score in scores]
@@ -138,7 +150,9 @@ def _reference(layout, query, own, inputs, inverse, weights):
     batch = own.shape[0]
     entities = [own.astype(jnp.float32)]
     for m, (row, size, weight) in enumerate(layout.entities):
-        linear = inputs[row : row + size].T @ weights[weight : weight + size] + weights[weight + size]
+        linear = (
+            inputs[row : row + size].T @ weights[weight : weight + size] + weights[weight + size]
+        )
         entities.append(activation(inverse[m][:, None] * linear + weights[weight + size + 1]))
     entities = jnp.stack(entities, axis=1)
     heads = query.reshape(batch, layout.heads, layout.features).astype(jnp.float32)
@@ -158,7 +172,9 @@ def _reference_backward(layout, query, own, inputs, inverse, weights, gradient):
 
 
 def _linear(layout, add, x, inverse, w_ref, m):
-    """W' x + b of entity m + 1 for a block of samples, (rows, F) float32, and that times inverse + c."""
+    """W' x + b of entity m + 1 for a block of samples, (rows, F) float32, and that times inverse +
+    c.
+    """
     row, size, weight = layout.entities[m]
     linear = w_ref[weight + size, :][None, :]
     for i in range(size):
@@ -175,7 +191,10 @@ def _softmax(scores):
 
 
 def _forward_kernel(layout, arithmetic, q_ref, own_ref, x_ref, inverse_ref, w_ref, out_ref):
-    f, heads, number, add = layout.features, layout.heads, len(layout.entities), arithmetic.multiply_add
+    f = layout.features
+    heads = layout.heads
+    number = len(layout.entities)
+    add = arithmetic.multiply_add
 
     def x(row):
         return x_ref[row, :]
@@ -184,7 +203,10 @@ def _forward_kernel(layout, arithmetic, q_ref, own_ref, x_ref, inverse_ref, w_re
         return inverse_ref[m, :]
 
     linear = (_linear(layout, add, x, inverse, w_ref, m)[1] for m in range(number))
-    entities = [own_ref[...].astype(jnp.float32), *(activation(entity, arithmetic) for entity in linear)]
+    entities = [
+        own_ref[...].astype(jnp.float32),
+        *(activation(entity, arithmetic) for entity in linear),
+    ]
     for h in range(heads):
         query = q_ref[:, h * f : (h + 1) * f].astype(jnp.float32) * layout.scale
         scores = [jnp.sum(query * entity, axis=1) for entity in entities]
@@ -209,7 +231,10 @@ def _backward_kernel(
     dinverse_ref,
     dw_ref,
 ):
-    f, heads, number, add = layout.features, layout.heads, len(layout.entities), arithmetic.multiply_add
+    f = layout.features
+    heads = layout.heads
+    number = len(layout.entities)
+    add = arithmetic.multiply_add
 
     def block(j, sums):
         rows = pl.ds(j * ROWS, ROWS)
@@ -220,7 +245,9 @@ def _backward_kernel(
         def inverse(m):
             return inverse_ref[m, rows]
 
-        entities, slopes, linears = [own_ref[rows, :].astype(jnp.float32)], [], []
+        entities = [own_ref[rows, :].astype(jnp.float32)]
+        slopes = []
+        linears = []
         for m in range(number):
             linear, normal = _linear(layout, add, x, inverse, w_ref, m)
             entity, slope = activation_and_slope(normal, arithmetic)
@@ -272,9 +299,13 @@ def _block_specs(layout, rows, *arrays):
 def forward_by_kernel(layout, query, own, inputs, inverse, weights, interpret=False):
     """What the reference gives, by a kernel; `interpret` runs it without a GPU."""
     batch = own.shape[0]
-    query, own = whole_blocks(query, ROWS), whole_blocks(own, ROWS)
-    inputs, inverse = whole_blocks(inputs, ROWS, axis=1), whole_blocks(inverse, ROWS, axis=1)
-    specs = _block_specs(layout, ROWS, (query, True), (own, True), (inputs, False), (inverse, False))
+    query = whole_blocks(query, ROWS)
+    own = whole_blocks(own, ROWS)
+    inputs = whole_blocks(inputs, ROWS, axis=1)
+    inverse = whole_blocks(inverse, ROWS, axis=1)
+    specs = _block_specs(
+        layout, ROWS, (query, True), (own, True), (inputs, False), (inverse, False)
+    )
     mean = pl.pallas_call(
         functools.partial(_forward_kernel, layout, kernel_arithmetic(query.dtype, interpret)),
         out_shape=jax.ShapeDtypeStruct(query.shape, query.dtype),
@@ -308,7 +339,14 @@ def backward_by_kernel(layout, query, own, inputs, inverse, weights, gradient, i
             jax.ShapeDtypeStruct((programs, *weights.shape), jnp.float32),
         ),
         grid=(programs,),
-        in_specs=[wide, narrow, numbers, scales, pl.BlockSpec(weights.shape, lambda i: (0, 0)), wide],
+        in_specs=[
+            wide,
+            narrow,
+            numbers,
+            scales,
+            pl.BlockSpec(weights.shape, lambda i: (0, 0)),
+            wide,
+        ],
         out_specs=(wide, narrow, scales, pl.BlockSpec((1, *weights.shape), lambda i: (i, 0, 0))),
         interpret=interpret,
         compiler_params=pallas_triton.CompilerParams(num_warps=BACKWARD_WARPS, num_stages=1),

@@ -1,8 +1,9 @@
 """Evaluating a function of small arrays component by component.
 
-A GPU kernel handles many drones side by side, but has no vectors of three for each of them. So the function of one
-drone is traced, and its operations are done again on arrays of objects whose every component is a block of drones:
-what only moves components (slices, stacks, transposes) costs nothing, and the kernel needs no second set of formulas.
+A GPU kernel handles many drones side by side, but has no vectors of three for each of them. So the
+function of one drone is traced, and its operations are done again on arrays of objects whose every
+component is a block of drones: what only moves components (slices, stacks, transposes) costs
+nothing, and the kernel needs no second set of formulas.
 """
 
 import functools
@@ -17,7 +18,8 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 _CALLS = ("jit", "pjit", "closed_call", "custom_jvp_call")
 _REDUCTIONS = {"reduce_sum": operator.add, "reduce_or": operator.or_, "reduce_and": operator.and_}
 _ELEMENTWISE = frozenset(
-    "abs add and atan2 clamp convert_element_type copy cos div eq exp expm1 ge gt integer_pow le log lt max min mul ne "
+    "abs add and atan2 clamp convert_element_type copy cos div eq exp expm1 ge gt integer_pow le "
+    "log lt max min mul ne "
     "neg not or pow rsqrt select_n sign sin sqrt square sub tanh".split()
 )
 
@@ -39,10 +41,12 @@ def _numbers(array):
 def evaluate(traced: ClosedJaxpr, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
     """What a traced function gives for `arguments`, arrays of objects of its inputs' shapes.
 
-    A component is a number, a scalar or a block (all of one shape) of the input's type; so are the results'.
+    A component is a number, a scalar or a block (all of one shape) of the input's type; so are the
+    results'.
 
     Raises:
-      NotImplementedError: the function holds an operation that mixes components in a way not known here.
+      NotImplementedError: the function holds an operation that mixes components in a way not known
+      here.
     """
     return _evaluate(traced.jaxpr, traced.consts, arguments)
 
@@ -50,7 +54,8 @@ def evaluate(traced: ClosedJaxpr, arguments: Sequence[np.ndarray]) -> list[np.nd
 def _evaluate(jaxpr: Jaxpr, constants, arguments):
     values = dict(zip(jaxpr.invars, arguments, strict=True))
     values |= {
-        variable: _numbers(constant) for variable, constant in zip(jaxpr.constvars, constants, strict=True)
+        variable: _numbers(constant)
+        for variable, constant in zip(jaxpr.constvars, constants, strict=True)
     }
 
     def read(variable):
@@ -65,7 +70,8 @@ def _evaluate(jaxpr: Jaxpr, constants, arguments):
 
 
 def _apply(equation, inputs):
-    name, parameters = equation.primitive.name, equation.params
+    name = equation.primitive.name
+    parameters = equation.params
     if name in _CALLS:
         inner = parameters["jaxpr"] if "jaxpr" in parameters else parameters["call_jaxpr"]
         return _evaluate(inner.jaxpr, inner.consts, inputs)
@@ -78,9 +84,13 @@ def _apply(equation, inputs):
     if name == "reduce" and {inner.primitive.name for inner in parameters["jaxpr"].eqns} == {
         "add"
     }:  # several sums at once
-        return [_total(operator.add, array, parameters["dimensions"]) for array in inputs[: len(inputs) // 2]]
+        return [
+            _total(operator.add, array, parameters["dimensions"])
+            for array in inputs[: len(inputs) // 2]
+        ]
     if name == "unstack":
-        axis, array = parameters["axis"], inputs[0]
+        axis = parameters["axis"]
+        array = inputs[0]
         return [np.squeeze(part, axis) for part in np.split(array, array.shape[axis], axis)]
     if name not in _MOVES:
         raise NotImplementedError(f"component by component: {name}")

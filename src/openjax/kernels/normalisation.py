@@ -1,8 +1,8 @@
 """Bias, layer normalisation and activation of a hidden layer in one pass over its samples.
 
-Left to XLA, the backward pass reads every layer several times (once for each of the sums over features and over
-samples); on a GPU a kernel (Pallas, Triton) holds a block of samples in registers and reads it once.
-Elsewhere the same formula is left to XLA.
+Left to XLA, the backward pass reads every layer several times (once for each of the sums over
+features and over samples); on a GPU a kernel (Pallas, Triton) holds a block of samples in registers
+and reads it once. Elsewhere the same formula is left to XLA.
 """
 
 import functools
@@ -40,7 +40,8 @@ def normalise(x: jax.Array, affine: jax.Array, activate: bool = True) -> jax.Arr
 
 
 def normalised_layer(x: jax.Array, kernel: jax.Array, affine: jax.Array) -> jax.Array:
-    """`normalise(x @ kernel, affine)` with centred weights, whose output needs no centring: half the sums, forward and backward.
+    """`normalise(x @ kernel, affine)` with centred weights, whose output needs no centring: half
+    the sums, forward and backward.
 
     Args:
       x: (B, inputs), whose type is that of the product.
@@ -69,7 +70,9 @@ normalise.defvjp(_forward, _backward)
 
 
 def _standardised(x, bias):
-    """(x + bias) with mean 0 and variance 1 over the features, and the inverse standard deviation."""
+    """(x + bias) with mean 0 and variance 1 over the features, and the inverse standard
+    deviation.
+    """
     x = x.astype(jnp.float32) + bias
     features = x.shape[-1]
     centred = x - jnp.sum(x, axis=-1, keepdims=True) / features
@@ -133,8 +136,10 @@ def forward_by_kernel(activate, x, affine, interpret=False):
 def backward_by_kernel(activate, x, affine, gradient, interpret=False):
     """The reference\'s gradients, by a kernel; `interpret` runs it without a GPU."""
     # samples that only fill the last block have no gradient, so they add nothing to the sums
-    padded, padded_gradient = whole_blocks(x, ROWS), whole_blocks(gradient, ROWS)
-    programs, features = padded.shape[0] // ROWS, x.shape[1]
+    padded = whole_blocks(x, ROWS)
+    padded_gradient = whole_blocks(gradient, ROWS)
+    programs = padded.shape[0] // ROWS
+    features = x.shape[1]
     block = pl.BlockSpec((ROWS, features), lambda i: (i, 0))
     dx, parts = pl.pallas_call(
         functools.partial(_backward_kernel, activate, kernel_arithmetic(x.dtype, interpret)),

@@ -1,4 +1,6 @@
-"""Learning: rollout, advantages, MAPPO, predictor update, task archive and generator, schedule, the compiled training step."""
+"""Learning: rollout, advantages, MAPPO, predictor update, task archive and generator, schedule, the
+compiled training step.
+"""
 
 from openjax.lazy import lazy_names
 

@@ -1,8 +1,10 @@
-"""Adapting a policy to one diagnosed vehicle by the gradient through the simulation, compiled before the diagnosis is known.
+"""Adapting a policy to one diagnosed vehicle by the gradient through the simulation, compiled
+before the diagnosis is known.
 
-Two things are learnt at once, from flights of half a second. From drawn starts, leaning and close to things: to touch
-nothing. From moments of the policy's flights with the nominal vehicle: to fly the diagnosed vehicle, settled in flight, where
-and as fast as the policy flew the nominal one. The simulator's derivative says in one update what MAPPO has to find by trying.
+Two things are learnt at once, from flights of half a second. From drawn starts, leaning and close
+to things: to touch nothing. From moments of the policy's flights with the nominal vehicle: to fly
+the diagnosed vehicle, settled in flight, where and as fast as the policy flew the nominal one. The
+simulator's derivative says in one update what MAPPO has to find by trying.
 """
 
 import dataclasses
@@ -45,23 +47,33 @@ from openjax.vehicle.parameters import NOMINAL
 RATE_LOOP = 0.002
 """Period of a Crazyflie's rate loop (s)."""
 HISTORY = 12
-"""Frames of its own flight that an adapted policy sees at least: with late commands and slow motors one isn't enough."""
+"""Frames of its own flight that an adapted policy sees at least: with late commands and slow motors
+one isn't enough.
+"""
 STEPS = 50
 """Control steps of the flights that are learnt from."""
 FLIGHT = 400
 """Control steps of the flights with the nominal vehicle that these begin in."""
 SETTLE = 40
-"""Control steps that the diagnosed vehicle flies up to such a moment, so that its controllers, rotors and the policy's
-memories are those of that vehicle, and not of one that has just been changed in flight."""
+"""Control steps that the diagnosed vehicle flies up to such a moment, so that its controllers,
+rotors and the policy's memories are those of that vehicle, and not of one that has just been
+changed in flight.
+"""
 LAG = 6
-"""Control steps by which the diagnosed vehicle may follow late: one that hears late can't help it, and would learn to overdo
-what it does if it were to catch up."""
-NEAR, ALIKE = 0.02, 0.1
-"""Distance (m) and difference in velocity (m/s) from the nominal vehicle's flight that count as one."""
+"""Control steps by which the diagnosed vehicle may follow late: one that hears late can't help it,
+and would learn to overdo what it does if it were to catch up.
+"""
+NEAR = 0.02
+ALIKE = 0.1
+"""Distance (m) and difference in velocity (m/s) from the nominal vehicle's flight that count as
+one.
+"""
 
 
 def adapting_game(game: PursuitSettings) -> PursuitSettings:
-    """The game as vehicles fly it, whatever a policy was trained in: no clamp, the rate loop at 500 Hz, solid pillars."""
+    """The game as vehicles fly it, whatever a policy was trained in: no clamp, the rate loop at 500
+    Hz, solid pillars.
+    """
     return dataclasses.replace(
         game,
         vehicles=adapted_family({}, {}, airframe=game.airframe),
@@ -78,7 +90,9 @@ def adapting_game(game: PursuitSettings) -> PursuitSettings:
 def starting_parameters(parameters: PolicyParameters, trained: TrainSettings) -> PolicyParameters:
     """A policy as it begins in `adapting_game`, without its critic; it acts as before."""
     game = trained.environment
-    grown = with_longer_history(parameters.replace(critic={}), trained.predictor, game, adapting_game(game))
+    grown = with_longer_history(
+        parameters.replace(critic={}), trained.predictor, game, adapting_game(game)
+    )
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), grown)
 
 
@@ -86,7 +100,8 @@ def starting_parameters(parameters: PolicyParameters, trained: TrainSettings) ->
 class Flights:
     """Moments of flights with the nominal vehicle, and how that flew on from each."""
 
-    state: PursuitState  # (W, ...) where the nominal vehicle was; with vehicles of the bounds that are adapted to
+    # (W, ...) where the nominal vehicle was; with vehicles of the bounds that are adapted to
+    state: PursuitState
     position: (
         jax.Array
     )  # (LAG + T, W, N, 3) m, after the LAG steps before the moment and the steps that followed
@@ -110,20 +125,24 @@ class Adaptation:
 
 def make_adaptation(trained: TrainSettings, settings: AdaptSettings) -> Adaptation:
     """The programs for a policy that was trained with `trained`."""
-    game, vehicle = adapting_game(trained.environment), load_vehicle(trained.environment.airframe)
+    game = adapting_game(trained.environment)
+    vehicle = load_vehicle(trained.environment.airframe)
     # nothing is solid while the gradient is taken: a crash is told by the gap
     free = dataclasses.replace(game, physics="rigid", contacts=False)
     policy = make_policy(Pursuit(game), trained.network, trained.predictor)
     worlds = settings.worlds or (8 if jax.default_backend() == "cpu" else 320)
     nominal = bounds_of({}, {}, rest=0.0)
-    step_size = optax.linear_schedule(settings.learning_rate, 0.05 * settings.learning_rate, settings.updates)
+    step_size = optax.linear_schedule(
+        settings.learning_rate, 0.05 * settings.learning_rate, settings.updates
+    )
     optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(step_size))
 
     def environment(settings, bounds):
         return Pursuit(settings, vehicle, vehicle_bounds=bounds)
 
     def fly(parameters, key, bounds):
-        pursuit, number = environment(free, nominal), 4 * worlds
+        pursuit = environment(free, nominal)
+        number = 4 * worlds
         task_key, reset_key, moment_key, vehicle_key = jax.random.split(key, 4)
         tasks = jax.vmap(lambda key: _task(free, key))(jax.random.split(task_key, number))
         _, state = jax.vmap(pursuit.reset_to)(jax.random.split(reset_key, number), tasks)
@@ -132,19 +151,24 @@ def make_adaptation(trained: TrainSettings, settings: AdaptSettings) -> Adaptati
 
         def one(carry, step):
             observation, state, before, kept = carry
-            before, kept = _kept(moment - SETTLE == step, state, before), _kept(moment == step, state, kept)
+            before = _kept(moment - SETTLE == step, state, before)
+            kept = _kept(moment == step, state, kept)
             observation, state = fly_on(parameters.actor, observation, state)
-            return (observation, state, before, kept), (state.drones.position, state.drones.velocity)
+            return (observation, state, before, kept), (
+                state.drones.position,
+                state.drones.velocity,
+            )
 
         first = jax.vmap(pursuit.observe)(state), state, state, state
         (_, _, before, kept), flown = jax.lax.scan(one, first, jnp.arange(FLIGHT))
         after = moment + jnp.arange(-LAG, STEPS)[:, None]
         position, velocity = (track[after, jnp.arange(number)] for track in flown)
 
-        drawn = jax.vmap(lambda key: draw_vehicles(free.vehicles, key, free.num_pursuers, 0.0, bounds))(
-            jax.random.split(vehicle_key, number)
-        )
-        pursuit, settled = environment(free, bounds), before.replace(vehicles=drawn)
+        drawn = jax.vmap(
+            lambda key: draw_vehicles(free.vehicles, key, free.num_pursuers, 0.0, bounds)
+        )(jax.random.split(vehicle_key, number))
+        pursuit = environment(free, bounds)
+        settled = before.replace(vehicles=drawn)
         fly_on = _stepper(pursuit, policy, parameters)
         settled, _ = jax.lax.scan(
             lambda carry, _: (fly_on(parameters.actor, *carry), None),
@@ -155,7 +179,9 @@ def make_adaptation(trained: TrainSettings, settings: AdaptSettings) -> Adaptati
         return Flights(_in_its_place(settled[1], kept), position, velocity)
 
     def begin(flights, key, bounds):
-        """Half of the worlds at starts, half in flight, all with vehicles of the bounds; and the flights to follow."""
+        """Half of the worlds at starts, half in flight, all with vehicles of the bounds; and the
+        flights to follow.
+        """
         pursuit = environment(free, bounds)
         task_key, reset_key, moment_key = jax.random.split(key, 3)
         tasks = jax.vmap(lambda key: draw_start(free, key))(jax.random.split(task_key, worlds))
@@ -174,10 +200,18 @@ def make_adaptation(trained: TrainSettings, settings: AdaptSettings) -> Adaptati
             observation, state = fly_on(actor, observation, state)
             least = jnp.minimum(least, nearest_gap(free, state))
             breach = breach + breach_share(free, state) / STEPS
-            return (observation, state, least, breach), (state.drones.position, state.drones.velocity)
+            return (observation, state, least, breach), (
+                state.drones.position,
+                state.drones.velocity,
+            )
 
         number = state.drones.position.shape[:2]
-        first = jax.vmap(pursuit.observe)(state), state, jnp.full(number, jnp.inf), jnp.zeros(number)
+        first = (
+            jax.vmap(pursuit.observe)(state),
+            state,
+            jnp.full(number, jnp.inf),
+            jnp.zeros(number),
+        )
         (_, end, least, breach), (flown, speed) = jax.lax.scan(one, first, None, length=STEPS)
         crash = jnp.mean(crash_share(least), axis=-1)
         fast = jnp.sqrt(jnp.sum(end.drones.velocity[:worlds] ** 2, axis=-1) + 1e-9) - 1.0
@@ -210,7 +244,9 @@ def make_adaptation(trained: TrainSettings, settings: AdaptSettings) -> Adaptati
 
 
 def _stepper(pursuit, policy, parameters):
-    """A control step of worlds (W, ...): (actor, observation, state) -> observation, state; the prediction has no gradient."""
+    """A control step of worlds (W, ...): (actor, observation, state) -> observation, state; the
+    prediction has no gradient.
+    """
     step = jax.vmap(pursuit.step, in_axes=(None, 0, 0))
 
     def fly_on(actor, observation, state):
@@ -223,9 +259,11 @@ def _stepper(pursuit, policy, parameters):
 
 
 def off_the_flight(position, velocity, wanted, wanted_velocity) -> jax.Array:
-    """(T, W, N) how far flights (T, W, N, 3) are from those that are wanted (LAG + T, W, N, 3), at the lag that suits best.
+    """(T, W, N) how far flights (T, W, N, 3) are from those that are wanted (LAG + T, W, N, 3), at
+    the lag that suits best.
 
-    In multiples of `NEAR` and `ALIKE`, less one where it is large and half the square where it is small.
+    In multiples of `NEAR` and `ALIKE`, less one where it is large and half the square where it is
+    small.
     """
 
     def at(lag):
@@ -239,14 +277,17 @@ def off_the_flight(position, velocity, wanted, wanted_velocity) -> jax.Array:
 
 def _kept(now, state, kept):
     """States (W, ...) of which those whose moment is `now` (W,) take the place of what was kept."""
-    return jax.vmap(lambda now, a, b: jax.tree.map(lambda x, y: jnp.where(now, x, y), a, b))(now, state, kept)
+    return jax.vmap(lambda now, a, b: jax.tree.map(lambda x, y: jnp.where(now, x, y), a, b))(
+        now, state, kept
+    )
 
 
 def _in_its_place(settled: PursuitState, there: PursuitState) -> PursuitState:
     """States `there` whose vehicles, as one would find them in flight, are those of `settled`.
 
-    Where they are and how they move, and what their sensors still show of that, is from `there`; rotors, controllers,
-    commands on the way, effects, and what the policy remembers of the vehicle from `settled`.
+    Where they are and how they move, and what their sensors still show of that, is from `there`;
+    rotors, controllers, commands on the way, effects, and what the policy remembers of the vehicle
+    from `settled`.
     """
     kinematic = ("position", "quaternion", "velocity", "body_rates", "previous_body_rates")
     sensors = {name for name, effect in known_effects().items() if effect.sensor is not None}
@@ -294,20 +335,27 @@ def fine_tune(
     score: Callable[[PolicyParameters], np.ndarray],
     tell: Callable[[int, dict[str, jax.Array]], Any] = lambda update, metrics: None,
 ) -> Tuned:
-    """Train `parameters` (from `starting_parameters`) on vehicles within `bounds` (R, 4), and keep the best on the way.
+    """Train `parameters` (from `starting_parameters`) on vehicles within `bounds` (R, 4), and keep
+    the best on the way.
 
-    `score` gives the scores of episodes (B,), of the same tasks and vehicles each time; what isn't clearly better than the
-    first parameters, by the differences of single episodes, isn't kept. `tell` hears of every update.
+    `score` gives the scores of episodes (B,), of the same tasks and vehicles each time; what isn't
+    clearly better than the first parameters, by the differences of single episodes, isn't kept.
+    `tell` hears of every update.
     """
     bounds = jnp.asarray(bounds)
     fly_key, update_key = jax.random.split(key)
     flights = adaptation.fly(parameters, fly_key, bounds)
-    actor, state, history = parameters.actor, adaptation.optimiser.init(parameters.actor), []
+    actor = parameters.actor
+    state = adaptation.optimiser.init(parameters.actor)
+    history = []
     first = np.asarray(score(parameters))
-    best, looks = (parameters, 0), {0: float(first.mean())}
+    best = (parameters, 0)
+    looks = {0: float(first.mean())}
     for update in range(1, training.updates + 1):
         own_key = jax.random.fold_in(update_key, update)
-        actor, state, metrics = adaptation.update(actor, state, parameters, flights, own_key, bounds)
+        actor, state, metrics = adaptation.update(
+            actor, state, parameters, flights, own_key, bounds
+        )
         history.append(metrics)
         tell(update, metrics)
         if update % training.look_every == 0 or update == training.updates:
@@ -316,16 +364,22 @@ def fine_tune(
             looks[update] = float(scores.mean())
             if looks[update] > looks[best[1]] and clearly_better(first, scores):
                 best = now, update
-    history = [{name: float(value) for name, value in row.items()} for row in jax.device_get(history)]
+    history = [
+        {name: float(value) for name, value in row.items()} for row in jax.device_get(history)
+    ]
     return Tuned(*best, history, looks)
 
 
 def clearly_better(before: np.ndarray, after: np.ndarray, errors: float = 2.0) -> bool:
-    """Whether the scores (B,) of the same episodes rose by more than so many standard errors of their differences."""
+    """Whether the scores (B,) of the same episodes rose by more than so many standard errors of
+    their differences.
+    """
     gain = np.asarray(after, float) - np.asarray(before, float)
     return bool(gain.mean() > errors * gain.std() / np.sqrt(len(gain)))
 
 
 def bounds_of(values, intervals, rest: float = REST, airframe: str = NOMINAL) -> jax.Array:
-    """(R, 4) bounds of the family of a diagnosed vehicle; see `adapted_family`. Of nothing found and no rest: nominal."""
+    """(R, 4) bounds of the family of a diagnosed vehicle; see `adapted_family`. Of nothing found
+    and no rest: nominal.
+    """
     return jnp.asarray(family_bounds(adapted_family(values, intervals, rest, airframe)))

@@ -1,4 +1,6 @@
-"""Generalised advantage estimation (Schulman et al., 2016) with terminated and truncated episodes."""
+"""Generalised advantage estimation (Schulman et al., 2016) with terminated and truncated
+episodes.
+"""
 
 import jax
 import jax.numpy as jnp

@@ -1,10 +1,12 @@
-"""The last stage of a policy that is to be flown: the gradient through the simulation (analytic policy gradient).
+"""The last stage of a policy that is to be flown: the gradient through the simulation (analytic
+policy gradient).
 
-MAPPO is a poor teacher of what is decided within tenths of a second. Starts lean by up to 36 degrees, some beside a pillar or
-another pursuer; its noise averages out in the motors, and a crash says little of what would have avoided it. The equations of
-motion know. Here the actor follows the gradient of smooth crashes, breaches and speeds over the limit through half seconds of
-free flight, from the hardest of many leaning starts and from moments of its own flights (Xu et al. 2022, short-horizon
-actor-critic, without the critic). All else is held to what it did.
+MAPPO is a poor teacher of what is decided within tenths of a second. Starts lean by up to 36
+degrees, some beside a pillar or another pursuer; its noise averages out in the motors, and a crash
+says little of what would have avoided it. The equations of motion know. Here the actor follows the
+gradient of smooth crashes, breaches and speeds over the limit through half seconds of free flight,
+from the hardest of many leaning starts and from moments of its own flights (Xu et al. 2022,
+short-horizon actor-critic, without the critic). All else is held to what it did.
 """
 
 import dataclasses
@@ -38,8 +40,11 @@ from openjax.vehicle.solids import DRONE_RADIUS
 
 HORIZON = 0.5
 """Seconds that are learnt at once."""
-SMOOTH, SMOOTH_BREACH = 0.012, 0.008
-"""Distances (m) over which a crash and a breach go from sure to none in what is learnt; ways through rows aren't wide."""
+SMOOTH = 0.012
+SMOOTH_BREACH = 0.008
+"""Distances (m) over which a crash and a breach go from sure to none in what is learnt; ways
+through rows aren't wide.
+"""
 SMOOTH_TILT = 0.05
 """The same for a tip over 90 degrees (cosine of the tilt)."""
 SMOOTH_CAPTURE = 0.1
@@ -47,27 +52,40 @@ SMOOTH_CAPTURE = 0.1
 SMOOTH_NEAREST = 0.15
 """The same for which pursuer is nearest to the evader (m)."""
 FAST = 0.05
-"""Speed (m/s) above where the speed begins to cost that costs as much as a crash in every step would."""
-CRASH_IN_FLIGHT, BREACH_AT_START = 4.0, 0.5
-"""Weights beside the crashes from starts: an episode has one start, and many half seconds after it."""
-LOWEST, FASTEST = 0.35, 1.0
+"""Speed (m/s) above where the speed begins to cost that costs as much as a crash in every step
+would.
+"""
+CRASH_IN_FLIGHT = 4.0
+BREACH_AT_START = 0.5
+"""Weights beside the crashes from starts: an episode has one start, and many half seconds after
+it.
+"""
+LOWEST = 0.35
+FASTEST = 1.0
 """Height (m) below, and speed (m/s) above which the end of a start costs."""
 REST = 0.9
 """Share of the capture radius within which a pursuer needn't come nearer to the evader."""
-CLOSE, SIDE_BY_SIDE = 0.45, 0.35
-"""Shares of the starts close to something (70 % of the pursuers), and of those in which all stand side by side."""
+CLOSE = 0.45
+SIDE_BY_SIDE = 0.35
+"""Shares of the starts close to something (70 % of the pursuers), and of those in which all stand
+side by side.
+"""
 APART = 0.1
 """Farthest gap beyond the safety distance of pursuers side by side (m)."""
 
 
 def side_by_side(settings: PursuitSettings, key: jax.Array, task: Task) -> Task:
-    """A task whose pursuers all start beside one before them; as it was where that would breach something."""
+    """A task whose pursuers all start beside one before them; as it was where that would breach
+    something.
+    """
     position = task.pursuer_position
     for i, own_key in enumerate(jax.random.split(key, position.shape[0] - 1), start=1):
         which_key, direction_key, gap_key = jax.random.split(own_key, 3)
         away = jax.random.normal(direction_key, (3,)) * jnp.array([1.0, 1.0, 0.3])
         gap = settings.drone_clearance + jax.random.uniform(gap_key, (), maxval=APART)
-        beside = position[jax.random.randint(which_key, (), 0, i)] + gap * away / jnp.linalg.norm(away)
+        beside = position[jax.random.randint(which_key, (), 0, i)] + gap * away / jnp.linalg.norm(
+            away
+        )
         position = position.at[i].set(beside)
     pillars = jnp.linalg.norm(position[:, None, :2] - task.pillar_position[None], axis=-1)
     room = settings.pillar_radius + settings.pillar_clearance
@@ -93,7 +111,9 @@ def draw_start(settings: PursuitSettings, key: jax.Array) -> Task:
 
 
 class Way(NamedTuple):
-    """What the pursuers of B worlds met in some steps, all smooth and (B, N) unless said otherwise."""
+    """What the pursuers of B worlds met in some steps, all smooth and (B, N) unless said
+    otherwise.
+    """
 
     least: jax.Array
     """m, least gap to anything solid"""
@@ -111,7 +131,9 @@ class Way(NamedTuple):
 
 @dataclass(frozen=True)
 class AnalyticGradient:
-    """A policy's game in free flight, and what is learnt in it. `World`s are observations and states (B, ...)."""
+    """A policy's game in free flight, and what is learnt in it. `World`s are observations and
+    states (B, ...).
+    """
 
     how: AnalyticSettings
     environment: Pursuit
@@ -134,13 +156,16 @@ class AnalyticGradient:
         return max(1, self.game.episode_length // self.steps - 1)
 
     def inputs(self, parameters: PolicyParameters, observation):
-        """What the actor acts on: observations and predictions, without a gradient through the predictor."""
+        """What the actor acts on: observations and predictions, without a gradient through the
+        predictor.
+        """
         return observation, jax.lax.stop_gradient(self.policy.predict(parameters, observation))
 
     def fly(self, actor: Any, parameters: PolicyParameters, world, steps: int) -> tuple[Any, "Way"]:
         """Worlds some steps later, and what their pursuers met on the way."""
         step = jax.vmap(self.environment.step, in_axes=(None, 0, 0))
-        limit, rest = self.how.speed_from * self.game.max_speed, REST * self.game.capture_radius
+        limit = self.how.speed_from * self.game.max_speed
+        rest = REST * self.game.capture_radius
         ways = jax.vmap(functools.partial(ways_of, self.game))(world[1].task)
 
         @jax.checkpoint
@@ -151,7 +176,8 @@ class AnalyticGradient:
             return step(jax.random.key(0), state, action)[:2]
 
         def one(carry, _):
-            way, world = carry[1], moved(carry[0])
+            way = carry[1]
+            world = moved(carry[0])
             state = world[1]
             distance = evader_distance(self.game, state, ways)
             way = Way(
@@ -172,9 +198,13 @@ class AnalyticGradient:
         """Worlds to learn from, at their starts; bounds (B, R, 4)."""
 
         def one(task_key, key, bounds):
-            return self.environment.with_bounds(bounds).reset_to(key, draw_start(self.game, task_key))
+            return self.environment.with_bounds(bounds).reset_to(
+                key, draw_start(self.game, task_key)
+            )
 
-        return jax.vmap(one)(*(jax.random.split(k, bounds.shape[0]) for k in jax.random.split(key)), bounds)
+        return jax.vmap(one)(
+            *(jax.random.split(k, bounds.shape[0]) for k in jax.random.split(key)), bounds
+        )
 
     def flights(self, parameters: PolicyParameters, key: jax.Array, bounds: jax.Array):
         """Worlds (`moments` * B, ...) along the policy's flights."""
@@ -187,7 +217,9 @@ class AnalyticGradient:
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), worlds)
 
     def hard_starts(self, actor: Any, parameters: PolicyParameters, key: jax.Array):
-        """Of `how.draws` times as many starts those with the least gaps on the actor's way: few of all come near a crash."""
+        """Of `how.draws` times as many starts those with the least gaps on the actor's way: few of
+        all come near a crash.
+        """
         starts = self.starts(key, jnp.concatenate([self.bounds()] * self.how.draws))
         least = jnp.min(self.fly(actor, parameters, starts, self.steps)[1].least, axis=-1)
         hardest = jax.lax.top_k(-least, self.how.worlds)[1]
@@ -195,18 +227,21 @@ class AnalyticGradient:
 
     def loss(self, actor: Any, parameters: PolicyParameters, starts, flying):
         """What is learnt (), and its parts. `parameters` are the policy's before."""
-        how, number = self.how, starts[1].step.shape[0]
+        how = self.how
+        number = starts[1].step.shape[0]
         inputs = self.inputs(parameters, flying[0])
         mean, log_std = self.policy.distribution(parameters.actor, *inputs)
         change = (self.policy.distribution(actor, *inputs)[0] - mean) * jnp.exp(-log_std)
         worlds = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), starts, flying)
         (_, end), way = self.fly(actor, parameters, worlds, self.steps)
         drones = jax.tree.map(lambda leaf: leaf[:number], end.drones)
-        fast, low = _speed(drones) - FASTEST, LOWEST - drones.position[..., 2]
+        fast = _speed(drones) - FASTEST
+        low = LOWEST - drones.position[..., 2]
         parts = {
             "crashes_from_starts": (1.0, crash_depth(way.least[:number])),
             "breaches_from_starts": (BREACH_AT_START, way.breach[:number]),
-            # a dive saves some of those that start tilted towards something, so there the speed is free but for its end
+            # a dive saves some of those that start tilted towards something, so there the speed is
+            # free but for its end
             "ends": (0.2, jax.nn.relu(fast) + jax.nn.relu(low)),
             "crashes_in_flight": (CRASH_IN_FLIGHT, crash_share(way.least[number:])),
             "breaches_in_flight": (how.breach, way.breach[number:]),
@@ -229,7 +264,8 @@ class AnalyticGradient:
 
     def bounds(self) -> jax.Array:
         """(B, R, 4) of each world's vehicles: the game's family, and a share of nominal ones."""
-        family, worlds = self.game.vehicles, self.how.worlds
+        family = self.game.vehicles
+        worlds = self.how.worlds
         if not family:
             return jnp.zeros((worlds, 0, 4))
         plain = jnp.arange(worlds)[:, None, None] < self.how.nominal * worlds
@@ -244,21 +280,30 @@ class AnalyticGradient:
 
 
 def free_flight(environment: Pursuit) -> Pursuit:
-    """`environment` as it is learnt in: nothing is solid while the gradient is taken, a crash is told by the gap."""
-    free = dataclasses.replace(environment.settings, physics="rigid", contacts=False, reward=RewardSettings())
+    """`environment` as it is learnt in: nothing is solid while the gradient is taken, a crash is
+    told by the gap.
+    """
+    free = dataclasses.replace(
+        environment.settings, physics="rigid", contacts=False, reward=RewardSettings()
+    )
     by_default = {"vehicle_bounds": None, "evader_share": None, "dynamics": None}
     return dataclasses.replace(environment, settings=free, **by_default)
 
 
 def finite_or_zero(gradient: Any) -> Any:
-    """A gradient through the simulation, zero where it isn't finite: a world that tumbles may have none."""
+    """A gradient through the simulation, zero where it isn't finite: a world that tumbles may have
+    none.
+    """
     finite = jnp.isfinite(optax.global_norm(gradient))
     return jax.tree.map(lambda leaf: jnp.where(finite, leaf, 0.0), gradient)
 
 
 def nearest_gap(game: PursuitSettings, state: PursuitState) -> jax.Array:
-    """(W, N) m, from each pursuer of worlds (W, ...) to the nearest solid thing: pillar, pursuer or floor."""
-    position, task = state.drones.position, state.task
+    """(W, N) m, from each pursuer of worlds (W, ...) to the nearest solid thing: pillar, pursuer or
+    floor.
+    """
+    position = state.drones.position
+    task = state.task
     to_pillar = jax.vmap(lambda p, q: pillar_distance(game, p, q))(position, task.pillar_position)
     active = task.pillar_active[:, None]
     gap = jnp.min(to_pillar, axis=-1, where=active, initial=jnp.inf) - DRONE_RADIUS
@@ -269,12 +314,16 @@ def nearest_gap(game: PursuitSettings, state: PursuitState) -> jax.Array:
 
 
 def crash_share(gap: jax.Array, smooth: float = SMOOTH) -> jax.Array:
-    """How much of a crash a least gap (m) counts as, from 1 to 0 over `smooth` (m): it has a gradient before a touch."""
+    """How much of a crash a least gap (m) counts as, from 1 to 0 over `smooth` (m): it has a
+    gradient before a touch.
+    """
     return jax.nn.sigmoid((3 * TOUCH - gap) / smooth)
 
 
 def crash_depth(gap: jax.Array) -> jax.Array:
-    """The same that goes on to grow, by 1 every `SMOOTH`: what would crash by far is learnt from, too."""
+    """The same that goes on to grow, by 1 every `SMOOTH`: what would crash by far is learnt from,
+    too.
+    """
     return jax.nn.softplus((3 * TOUCH - gap) / SMOOTH)
 
 
@@ -284,8 +333,11 @@ def tip_share(upright: jax.Array) -> jax.Array:
 
 
 def breach_share(game: PursuitSettings, state: PursuitState) -> jax.Array:
-    """(W, N) smooth number of breaches of each pursuer in worlds (W, ...); `openjax.pursuit.collisions.breaches`."""
-    position, task = state.drones.position, state.task
+    """(W, N) smooth number of breaches of each pursuer in worlds (W, ...);
+    `openjax.pursuit.collisions.breaches`.
+    """
+    position = state.drones.position
+    task = state.task
     to_pillar = jax.vmap(lambda p, q: pillar_distance(game, p, q))(position, task.pillar_position)
     to_pillar = jnp.where(task.pillar_active[:, None], to_pillar, jnp.inf) - game.pillar_clearance
     to_drone = jax.vmap(drone_distance)(position) - game.drone_clearance
@@ -300,20 +352,30 @@ def breach_share(game: PursuitSettings, state: PursuitState) -> jax.Array:
 
 
 def evader_distance(game: PursuitSettings, state: PursuitState, ways: Ways) -> jax.Array:
-    """(W, N) m, ways from pursuers of worlds (W, ...) to the evader, whose flight has no gradient: its answers are a cliff."""
+    """(W, N) m, ways from pursuers of worlds (W, ...) to the evader, whose flight has no gradient:
+    its answers are a cliff.
+    """
     evader = jax.lax.stop_gradient(state.evader_position)
-    return jax.vmap(functools.partial(way_length, game))(state.task, ways, state.drones.position, evader)
+    return jax.vmap(functools.partial(way_length, game))(
+        state.task, ways, state.drones.position, evader
+    )
 
 
 def nearest_way(distance: jax.Array) -> jax.Array:
-    """(W,) m, a smooth least of distances (W, N): where one pursuer is near, others needn't be, and may go round."""
+    """(W,) m, a smooth least of distances (W, N): where one pursuer is near, others needn't be, and
+    may go round.
+    """
     number = distance.shape[-1]
-    return -SMOOTH_NEAREST * (jax.nn.logsumexp(-distance / SMOOTH_NEAREST, axis=-1) - jnp.log(number))
+    return -SMOOTH_NEAREST * (
+        jax.nn.logsumexp(-distance / SMOOTH_NEAREST, axis=-1) - jnp.log(number)
+    )
 
 
 def free_share(game: PursuitSettings, distance: jax.Array) -> jax.Array:
     """(W,) how free the evader at distances (W, N) is, from 0 to 1: smooth, and felt from afar."""
-    return jax.nn.sigmoid((jnp.min(distance, axis=-1) - 0.95 * game.capture_radius) / SMOOTH_CAPTURE)
+    return jax.nn.sigmoid(
+        (jnp.min(distance, axis=-1) - 0.95 * game.capture_radius) / SMOOTH_CAPTURE
+    )
 
 
 def _speed(drones):
@@ -323,14 +385,17 @@ def _speed(drones):
 def compile_analytic(
     gradient: AnalyticGradient, parameters: PolicyParameters
 ) -> Callable[[PolicyParameters, jax.Array], Iterator[tuple[PolicyParameters, dict[str, float]]]]:
-    """Start to compile the stage for parameters of these shapes (or abstract ones), in the background.
+    """Start to compile the stage for parameters of these shapes (or abstract ones), in the
+    background.
 
     Returns:
-      the stage, which waits for the compiler: (parameters, key) -> after every update the parameters and its metrics.
+      the stage, which waits for the compiler: (parameters, key) -> after every update the
+      parameters and its metrics.
     """
     key = jax.eval_shape(lambda: jax.random.key(0))
     record = jax.jit(lambda parameters, key: gradient.flights(parameters, key, gradient.bounds()))
-    actor, flights = parameters.actor, jax.eval_shape(record, parameters, key)
+    actor = parameters.actor
+    flights = jax.eval_shape(record, parameters, key)
     state = jax.eval_shape(gradient.optimiser.init, actor)
     update = jax.jit(gradient.update)
     lowered = record.lower(parameters, key), update.lower(actor, state, parameters, flights, key)
@@ -339,7 +404,8 @@ def compile_analytic(
     def learn(parameters, key):
         record, update = (wait() for wait in ready)
         flight_key, update_key = jax.random.split(key)
-        actor, state = parameters.actor, gradient.optimiser.init(parameters.actor)
+        actor = parameters.actor
+        state = gradient.optimiser.init(parameters.actor)
         flights = record(parameters, flight_key)
         for number in range(gradient.how.updates):
             own_key = jax.random.fold_in(update_key, number)

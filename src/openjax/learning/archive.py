@@ -44,9 +44,10 @@ def insert(
 ) -> TaskArchive:
     """Add the accepted ones of M tasks; where there are more than slots, keep the spread.
 
-    Every task's novelty is its distance to the nearest *newer* one, and the most novel stay: of a cluster the newest
-    member survives and the older ones go first. One matrix product, no host, no sequential choice; farthest-point
-    sampling, which the paper's code runs on the host, has the same aim.
+    Every task's novelty is its distance to the nearest *newer* one, and the most novel stay: of a
+    cluster the newest member survives and the older ones go first. One matrix product, no host, no
+    sequential choice; farthest-point sampling, which the paper's code runs on the host, has the
+    same aim.
 
     Args:
       archive: C slots.
@@ -82,6 +83,8 @@ def insert(
 
 
 def draw(archive: TaskArchive, key: PRNGKeyArray) -> Any:
-    """One used task (leaves without the archive's leading axis), uniformly; of an empty archive zeros: check `size` first."""
+    """One used task (leaves without the archive's leading axis), uniformly; of an empty archive
+    zeros: check `size` first.
+    """
     slot = jax.random.randint(key, (), 0, jnp.maximum(archive.size, 1))
     return jax.tree.map(lambda leaf: leaf[slot], archive.tasks)

@@ -1,4 +1,5 @@
-"""A best response to fixed pursuers: evaders learn against a policy's mean (`openjax.learning.evader_learning`).
+"""A best response to fixed pursuers: evaders learn against a policy's mean
+(`openjax.learning.evader_learning`).
 
 Seeds learn side by side in one compiled step, each with worlds of its own.
 """
@@ -74,7 +75,9 @@ class BestResponse:
             uniform = turn_task(turn_key, uniform_task(self.environment.settings, uniform_key))
             which = jax.random.randint(layout_key, (), 0, self.layouts.evader_position.shape[0])
             on_layout = jax.random.uniform(choice_key) < self.how.layouts
-            drawn = jax.tree.map(lambda a, b: jnp.where(on_layout, a[which], b), self.layouts, uniform)
+            drawn = jax.tree.map(
+                lambda a, b: jnp.where(on_layout, a[which], b), self.layouts, uniform
+            )
             return drawn.replace(evader=seed)
 
         def begin(key, seed):
@@ -86,7 +89,8 @@ class BestResponse:
 
     def _collect(self, parameters, carry, noise):
         """Samples, and observation and state after them; noise (T, S * E, 3)."""
-        key, step = jax.random.key(0), jax.vmap(self.environment.step, in_axes=(None, 0, 0, 0))
+        key = jax.random.key(0)
+        step = jax.vmap(self.environment.step, in_axes=(None, 0, 0, 0))
 
         def one(world, noise):
             observation, state = world
@@ -100,7 +104,9 @@ class BestResponse:
     def step(
         self, parameters: PolicyParameters, carry: ResponseCarry
     ) -> tuple[ResponseCarry, dict[str, jax.Array]]:
-        """One training step against a policy's `parameters`; metrics (S,) over the episodes that ended with it."""
+        """One training step against a policy's `parameters`; metrics (S,) over the episodes that
+        ended with it.
+        """
         how = self.how
         key, noise_key, order_key, world_key = jax.random.split(carry.key, 4)
         noise = jax.random.normal(noise_key, (how.rollout_length, how.seeds * how.num_envs, 3))
@@ -132,10 +138,12 @@ class BestResponse:
 def make_duel(
     environment: Pursuit, policy: Policy
 ) -> Callable[[PolicyParameters, Task, jax.Array, jax.Array, dict], EpisodeStatistics]:
-    """`duel(parameters, tasks (B, ...), kinds (B,) or (), key, changes) -> statistics (B,)`: whole episodes of the mean policy.
+    """`duel(parameters, tasks (B, ...), kinds (B,) or (), key, changes) -> statistics (B,)`: whole
+    episodes of the mean policy.
 
-    `kinds` are places in the settings' evaders; where one is for all worlds, no other is worked out. `changes` are fields of
-    the environment that hold arrays: `evader_networks`, the `vehicle_bounds`.
+    `kinds` are places in the settings' evaders; where one is for all worlds, no other is worked
+    out. `changes` are fields of the environment that hold arrays: `evader_networks`, the
+    `vehicle_bounds`.
     """
 
     def duel(parameters, tasks, kinds, key, changes):

@@ -23,12 +23,16 @@ class BestResponseSettings(EvaderLearningSettings):
     rollout_length: Annotated[int, Interval("[1, 100000]")] = 40
     """Control steps per iteration; worlds whose evader was caught start anew after it."""
     layouts: Annotated[float, Interval("[0, 1]")] = 0.5
-    """Share of the episodes on the six layouts, which the pursuers never learned on; the others are uniform tasks."""
+    """Share of the episodes on the six layouts, which the pursuers never learned on; the others are
+    uniform tasks.
+    """
 
     def __post_init__(self):
         super().__post_init__()
         if self.num_envs % self.minibatches:
-            raise UserError(f"num_envs {self.num_envs} must be a multiple of minibatches {self.minibatches}")
+            raise UserError(
+                f"num_envs {self.num_envs} must be a multiple of minibatches {self.minibatches}"
+            )
 
     @property
     def total_updates(self) -> int:

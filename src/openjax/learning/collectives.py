@@ -1,7 +1,7 @@
 """Environments spread over devices: what a training step needs to know of the others.
 
-A training step sees its own device's environments only. With `axis=None` there is one device and these functions do
-nothing. Everything else (parameters, archive, keys) is the same on every device.
+A training step sees its own device's environments only. With `axis=None` there is one device and
+these functions do nothing. Everything else (parameters, archive, keys) is the same on every device.
 """
 
 import jax
@@ -22,7 +22,11 @@ def mean_over_devices(tree, axis: str | None):
 
 def gather_over_devices(tree, axis: str | None):
     """Every leaf with the devices' leading axes joined, in the order of the devices."""
-    return tree if axis is None else jax.tree.map(lambda x: jax.lax.all_gather(x, axis, tiled=True), tree)
+    return (
+        tree
+        if axis is None
+        else jax.tree.map(lambda x: jax.lax.all_gather(x, axis, tiled=True), tree)
+    )
 
 
 def own_share(x: jax.Array, axis: str | None) -> jax.Array:
@@ -34,13 +38,16 @@ def own_share(x: jax.Array, axis: str | None) -> jax.Array:
 
 
 def own_keys(key: jax.Array, number: int, axis: str | None) -> jax.Array:
-    """This device's (number,) keys out of one split for all devices: the same ones however many devices there are."""
+    """This device's (number,) keys out of one split for all devices: the same ones however many
+    devices there are.
+    """
     devices = 1 if axis is None else jax.lax.axis_size(axis)
     return own_share(jax.random.split(key, number * devices), axis)
 
 
 def minibatches(tree, number: int):
-    """Leaves (T, E, ...) as (number, E / number, T, ...): whole trajectories of world e in minibatch e mod `number`.
+    """Leaves (T, E, ...) as (number, E / number, T, ...): whole trajectories of world e in
+    minibatch e mod `number`.
 
     So each device of several holds its share of every minibatch.
     """

@@ -1,8 +1,9 @@
 """Evaders that learn, by PPO, to be caught as late as they can be.
 
-Payoff is the time to the capture and not whether there is one: where captures are forced, every evader would be as good as any
-other. A game names `learned` among its evaders as often as there are networks; the world of one of them is flown by its samples,
-and it learns from these until it is caught. `openjax.learning.training_step` has them learn while the pursuers do,
+Payoff is the time to the capture and not whether there is one: where captures are forced, every
+evader would be as good as any other. A game names `learned` among its evaders as often as there are
+networks; the world of one of them is flown by its samples, and it learns from these until it is
+caught. `openjax.learning.training_step` has them learn while the pursuers do,
 `openjax.learning.best_response` against fixed ones.
 """
 
@@ -72,7 +73,8 @@ class EvaderLearning:
     @functools.cached_property
     def optimiser(self) -> optax.GradientTransformation:
         """Of each network."""
-        how, steps = self.how, self.updates * self.how.epochs * self.how.minibatches
+        how = self.how
+        steps = self.updates * self.how.epochs * self.how.minibatches
         rate = optax.linear_schedule(how.learning_rate, how.learning_rate_end, steps)
         return clipped_adam(1.0, rate)
 
@@ -97,14 +99,18 @@ class EvaderLearning:
     def act(
         self, evaders: LearningEvaders, state: PursuitState, noise: jax.Array
     ) -> tuple[jax.Array, EvaderSamples]:
-        """Wishes (E, 3) in worlds (E, ...), NaN where none of the networks acts, and the samples; noise (E, 3)."""
+        """Wishes (E, 3) in worlds (E, ...), NaN where none of the networks acts, and the samples;
+        noise (E, 3).
+        """
         which, seen = self.see(evaders.actor, state)
         mean = outputs_of(evaders.actor, which, seen)[0]
         log_std = self._by_network(which) @ evaders.log_std
         sample = mean + jnp.exp(log_std) * noise
         log_prob = jax.vmap(gaussian_log_prob)(sample, mean, log_std)
         samples = EvaderSamples(seen, which, sample, log_prob, ~state.statistics.captured)
-        return jax.lax.optimization_barrier(jnp.where((which >= 0)[:, None], sample, jnp.nan)), samples
+        return jax.lax.optimization_barrier(
+            jnp.where((which >= 0)[:, None], sample, jnp.nan)
+        ), samples
 
     def learn(
         self,
@@ -114,7 +120,8 @@ class EvaderLearning:
         key: jax.Array,
         axis: str | None = None,
     ) -> LearningEvaders:
-        """The evaders after all epochs on samples (T, E, ...), which ended in worlds `last` (E, ...).
+        """The evaders after all epochs on samples (T, E, ...), which ended in worlds `last` (E,
+        ...).
 
         `key` shuffles, the same on all devices; `axis` is the name of the devices' axis.
         """
@@ -122,7 +129,9 @@ class EvaderLearning:
 
         def step(carry, index):
             networks, state = carry
-            gradient = self._gradient(networks, *jax.tree.map(lambda leaf: leaf[index], (worlds, batch)))
+            gradient = self._gradient(
+                networks, *jax.tree.map(lambda leaf: leaf[index], (worlds, batch))
+            )
             gradient = mean_over_devices(gradient, axis)
             change, state = jax.vmap(self.optimiser.update)(gradient, state, networks)
             return (optax.apply_updates(networks, change), state), None
@@ -137,9 +146,11 @@ class EvaderLearning:
         return jax.nn.one_hot(which, self.number)
 
     def _gradient(self, networks, worlds, part):
-        """Of the networks' losses, each from its own worlds alone: some of them at a time, as often as the busiest one needs.
+        """Of the networks' losses, each from its own worlds alone: some of them at a time, as often
+        as the busiest one needs.
 
-        worlds: the networks' numbers of worlds (K,) and all worlds (K, W), each network's own ones first; part: see `_loss`.
+        worlds: the networks' numbers of worlds (K,) and all worlds (K, W), each network's own ones
+        first; part: see `_loss`.
         """
         (number, order), kinds = worlds, len(self.environment.settings.evaders)
         some = order.shape[1] // max(n for n in range(1, kinds + 1) if order.shape[1] % n == 0)
@@ -154,8 +165,10 @@ class EvaderLearning:
         return jax.lax.fori_loop(0, rounds, add, jax.tree.map(jnp.zeros_like, networks))
 
     def _loss(self, networks, own, part):
-        """() of one network, the sum over worlds of the mean over steps; own (n,) whether a world is the network's; part: seen,
-        sample, log_prob, weight, advantage, target, all (n, T, ...)."""
+        """() of one network, the sum over worlds of the mean over steps; own (n,) whether a world
+        is the network's; part: seen, sample, log_prob, weight, advantage, target, all (n, T,
+        ...).
+        """
         actor, critic, log_std = networks
         seen, sample, log_prob, weight, advantage, target = part
         weight = own[:, None] * weight
@@ -171,7 +184,8 @@ class EvaderLearning:
 
     def _batch(self, evaders, samples, last, axis):
         """What gradient steps need, minibatch by minibatch: see `_gradient` and `_loss`."""
-        how, critic = self.how, evaders.critic
+        how = self.how
+        critic = evaders.critic
         value = outputs_of(critic, samples.which, samples.seen)[1]
         last_value = outputs_of(critic, *self.see(evaders.actor, last))[1]
         caught = jnp.concatenate([~samples.flying[1:], last.statistics.captured[None]])

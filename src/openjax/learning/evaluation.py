@@ -36,7 +36,8 @@ class EpisodeRecord:
 def make_evaluate(
     environment: Pursuit, policy: Policy, trajectory: bool = False
 ) -> Callable[[PolicyParameters, Task, jax.Array], Evaluation | tuple[Evaluation, EpisodeRecord]]:
-    """`evaluate(parameters, tasks, key)`: one episode per task (leading axis B), to be compiled by the caller.
+    """`evaluate(parameters, tasks, key)`: one episode per task (leading axis B), to be compiled by
+    the caller.
 
     With `trajectory` it returns positions of every step as well.
     """
@@ -45,14 +46,18 @@ def make_evaluate(
     def evaluate(parameters: PolicyParameters, tasks: Task, key: jax.Array):
         number = tasks.evader_position.shape[0]
         reset_key, step_key = jax.random.split(key)
-        observation, state = jax.vmap(environment.reset_to)(jax.random.split(reset_key, number), tasks)
+        observation, state = jax.vmap(environment.reset_to)(
+            jax.random.split(reset_key, number), tasks
+        )
 
         def one(carry, step_key):
             observation, state, errors = carry
             predicted = policy.predict(parameters, observation)
             mean, _ = policy.distribution(parameters.actor, observation, predicted)
             last_seen = observation.last_seen
-            observation, state, _, _, _, info = step(step_key, state, policy.action(mean, observation))
+            observation, state, _, _, _, info = step(
+                step_key, state, policy.action(mean, observation)
+            )
             guesses = [last_seen if predicted is None else predicted[:, 0], last_seen]
             errors = errors + jnp.stack(
                 [jnp.linalg.norm(guess - state.evader_position, axis=-1) for guess in guesses]
@@ -76,7 +81,9 @@ def make_evaluate(
         errors = errors / length
         evaluation = Evaluation(
             statistics=state.statistics,
-            prediction_error=errors[0] if policy.predictor.enabled else jnp.full_like(errors[0], jnp.nan),
+            prediction_error=errors[0]
+            if policy.predictor.enabled
+            else jnp.full_like(errors[0], jnp.nan),
             last_seen_error=errors[1],
         )
         if trajectory:
@@ -87,7 +94,9 @@ def make_evaluate(
 
 
 def summarise(evaluation: Evaluation) -> dict[str, float]:
-    """Captures, breaches, crashes and errors as means over the episodes, capture steps of the slowest hundredth too."""
+    """Captures, breaches, crashes and errors as means over the episodes, capture steps of the
+    slowest hundredth too.
+    """
     statistics = evaluation.statistics
     slowest = jnp.sort(statistics.capture_step)[-max(1, len(statistics.capture_step) // 100) :]
     steps = jnp.maximum(statistics.steps, 1)

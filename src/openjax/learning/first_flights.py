@@ -1,8 +1,10 @@
-"""The first stage of a run: to fly, and to go after the evader, by the gradient through the simulation.
+"""The first stage of a run: to fly, and to go after the evader, by the gradient through the
+simulation.
 
-From scratch MAPPO spends half of its data on learning to fly. The equations of motion teach that in seconds: how far the
-nearest pursuer is from the evader over the next moments has a gradient, and so have near misses
-(`openjax.learning.analytic_gradient`). What has none, waiting or cutting off, is left to MAPPO.
+From scratch MAPPO spends half of its data on learning to fly. The equations of motion teach that in
+seconds: how far the nearest pursuer is from the evader over the next moments has a gradient, and so
+have near misses (`openjax.learning.analytic_gradient`). What has none, waiting or cutting off, is
+left to MAPPO.
 """
 
 import dataclasses
@@ -32,17 +34,23 @@ from openjax.pursuit import Pursuit, scatter_starts, turn_task, uniform_task
 from openjax.vehicle.family import narrowed_bounds
 
 OUTSIDE = 1.2
-"""A world starts anew where a pursuer is farther out than this share of the arena's radius or height."""
+"""A world starts anew where a pursuer is farther out than this share of the arena's radius or
+height.
+"""
 PHYSICS_STEP = 0.01
 """Seconds of a physics step: finer ones teach nothing more."""
 SCATTERED = 0.5
-"""Share of the tasks that start anywhere: who knows the uniform ones alone dives where the evader is far, into the floor."""
+"""Share of the tasks that start anywhere: who knows the uniform ones alone dives where the evader
+is far, into the floor.
+"""
 LOW = 0.25
 """Height (m) below which the end of a moment costs: the gap to the floor is felt too late."""
 
 
 def first_game(environment: Pursuit, how: FirstFlightsSettings) -> Pursuit:
-    """`environment` as it is learnt in: in free flight, with control steps of its own and episodes as long."""
+    """`environment` as it is learnt in: in free flight, with control steps of its own and episodes
+    as long.
+    """
     free = free_flight(environment)
     game = free.settings
     ratio = max(1, round(how.time_step / game.time_step))
@@ -69,7 +77,9 @@ class FirstCarry:
 
 @dataclass(frozen=True)
 class FirstFlights:
-    """How a fresh actor learns to fly. `World`s are observations and states (B, ...), a device's share of them all."""
+    """How a fresh actor learns to fly. `World`s are observations and states (B, ...), a device's
+    share of them all.
+    """
 
     how: FirstFlightsSettings
     environment: Pursuit
@@ -98,7 +108,8 @@ class FirstFlights:
             return jax.tree.map(lambda a, b: jnp.where(scattered, a, b), anywhere, task)
 
         task_key, reset_key = (
-            own_share(jax.random.split(k, self.how.worlds), self.axis) for k in jax.random.split(key)
+            own_share(jax.random.split(k, self.how.worlds), self.axis)
+            for k in jax.random.split(key)
         )
         tasks = jax.vmap(draw)(task_key)
         environment = self.environment
@@ -107,7 +118,9 @@ class FirstFlights:
         return jax.vmap(environment.reset_to)(reset_key, tasks)
 
     def loss(self, actor: Any, parameters: PolicyParameters, world, risen: jax.Array):
-        """What is learnt (); worlds after it and its parts. `risen` () is how far the penalties have risen, 0 to 1."""
+        """What is learnt (); worlds after it and its parts. `risen` () is how far the penalties
+        have risen, 0 to 1.
+        """
         how = self.how
         end, way = self.stage.fly(actor, parameters, world, how.steps)
         penalty = how.penalty_start + (1.0 - how.penalty_start) * risen
@@ -125,11 +138,17 @@ class FirstFlights:
 
     def update(self, carry: FirstCarry, key: jax.Array) -> tuple[FirstCarry, dict[str, jax.Array]]:
         """The carry after an update, and the parts of the loss."""
-        parameters, world, risen = carry.parameters, carry.world, carry.risen
-        gradient, (end, parts) = jax.grad(self.loss, has_aux=True)(parameters.actor, parameters, world, risen)
+        parameters = carry.parameters
+        world = carry.world
+        risen = carry.risen
+        gradient, (end, parts) = jax.grad(self.loss, has_aux=True)(
+            parameters.actor, parameters, world, risen
+        )
         gradient, parts = mean_over_devices((gradient, parts), self.axis)
         step = 1.0 / (self.how.penalty_ramp * max(self.how.updates, 1))
-        risen = jnp.minimum(risen + jnp.where(parts["free"] < self.how.penalty_free, step, 0.0), 1.0)
+        risen = jnp.minimum(
+            risen + jnp.where(parts["free"] < self.how.penalty_free, step, 0.0), 1.0
+        )
         change, state = self.optimiser.update(finite_or_zero(gradient), carry.optimiser)
         parameters = parameters.replace(actor=optax.apply_updates(parameters.actor, change))
         start_key, choice_key = jax.random.split(key)
@@ -144,25 +163,34 @@ class FirstFlights:
 
     def _over(self, state):
         """(B,) worlds that end: crashed, far outside, or too late for another moment."""
-        game, position = self.environment.settings, state.drones.position
+        game = self.environment.settings
+        position = state.drones.position
         outside = jnp.sum(position[..., :2] ** 2, axis=-1) > (OUTSIDE * game.arena_radius) ** 2
         outside |= position[..., 2] > OUTSIDE * game.arena_height
         crashed = nearest_gap(game, state) < 0.0
-        return jnp.any(outside | crashed, axis=-1) | (state.step > game.episode_length - self.how.steps)
+        return jnp.any(outside | crashed, axis=-1) | (
+            state.step > game.episode_length - self.how.steps
+        )
 
     @functools.cached_property
     def optimiser(self) -> optax.GradientTransformation:
         """Adam with clipped gradients; its step size falls to a twentieth."""
-        schedule = optax.cosine_decay_schedule(self.how.learning_rate, max(self.how.updates, 1), 0.05)
+        schedule = optax.cosine_decay_schedule(
+            self.how.learning_rate, max(self.how.updates, 1), 0.05
+        )
         return optax.chain(optax.clip_by_global_norm(1.0), optax.adam(schedule))
 
     def begin(self, parameters: PolicyParameters, key: jax.Array) -> FirstCarry:
         """The carry of `update` before the first one."""
-        return FirstCarry(parameters, self.optimiser.init(parameters.actor), self.start(key), jnp.zeros(()))
+        return FirstCarry(
+            parameters, self.optimiser.init(parameters.actor), self.start(key), jnp.zeros(())
+        )
 
 
 def make_first_flights(flights: FirstFlights, together: int) -> Callable:
-    """`together` updates as one function (carry, key, updates done) -> carry, mean parts of the loss; to be compiled."""
+    """`together` updates as one function (carry, key, updates done) -> carry, mean parts of the
+    loss; to be compiled.
+    """
 
     def some(carry, key, done):
         keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(done + jnp.arange(together))

@@ -23,7 +23,9 @@ from openjax.pursuit import (
 def task_like(environment: PursuitSettings) -> Task:
     """A task of zeros, of the shapes of generated ones."""
     task = empty_task(environment)
-    return task.replace(evader=jnp.zeros((), jnp.int32)) if len(set(environment.evaders)) > 1 else task
+    return (
+        task.replace(evader=jnp.zeros((), jnp.int32)) if len(set(environment.evaders)) > 1 else task
+    )
 
 
 def generate_task(
@@ -35,11 +37,16 @@ def generate_task(
 ) -> Task:
     """Draw one task: with probability p an archived one, expanded, else a uniform one.
 
-    A share `close` of its pursuers is put close to a pillar or to another one (not in the paper). Where there are several
-    evaders it has one of them, as its success rate is that of a task and an evader.
+    A share `close` of its pursuers is put close to a pillar or to another one (not in the paper).
+    Where there are several evaders it has one of them, as its success rate is that of a task and an
+    evader.
     """
     task = _archived_or_uniform(settings, environment, archive, key)
-    return task if close is None else close_starts(environment, jax.random.fold_in(key, 1), task, close)
+    return (
+        task
+        if close is None
+        else close_starts(environment, jax.random.fold_in(key, 1), task, close)
+    )
 
 
 def _archived_or_uniform(settings, environment, archive, key):
@@ -47,7 +54,9 @@ def _archived_or_uniform(settings, environment, archive, key):
     uniform = uniform_task(environment, uniform_key)
     uniform = vary_pillars(settings, environment, jax.random.fold_in(uniform_key, 1), uniform)
     if len(set(environment.evaders)) > 1:
-        kind = jax.random.randint(jax.random.fold_in(uniform_key, 2), (), 0, len(environment.evaders))
+        kind = jax.random.randint(
+            jax.random.fold_in(uniform_key, 2), (), 0, len(environment.evaders)
+        )
         uniform = uniform.replace(evader=kind)
     if settings.turn:
         uniform = turn_task(turn_key, uniform)
@@ -59,18 +68,28 @@ def _archived_or_uniform(settings, environment, archive, key):
 
 
 def successes(
-    settings: GeneratorSettings, statistics: EpisodeStatistics, penalty_share: jax.Array | float = 1.0
+    settings: GeneratorSettings,
+    statistics: EpisodeStatistics,
+    penalty_share: jax.Array | float = 1.0,
 ) -> jax.Array:
-    """Whether episodes count as solved: captured, and (by setting) with few collisions. Any leading axes.
+    """Whether episodes count as solved: captured, and (by setting) with few collisions. Any leading
+    axes.
 
-    `penalty_share` is the share of the penalties that counts by now (0 to 1). As it grows, the tolerated collision rate
-    falls from one to the setting: before the penalties teach to avoid collisions, they'd keep the archive empty.
+    `penalty_share` is the share of the penalties that counts by now (0 to 1). As it grows, the
+    tolerated collision rate falls from one to the setting: before the penalties teach to avoid
+    collisions, they'd keep the archive empty.
     """
-    return statistics.captured & (statistics.collision_rate <= settings.collision_tolerance**penalty_share)
+    return statistics.captured & (
+        statistics.collision_rate <= settings.collision_tolerance**penalty_share
+    )
 
 
 def select(
-    settings: GeneratorSettings, archive: TaskArchive, tasks: Task, success: jax.Array, complete: jax.Array
+    settings: GeneratorSettings,
+    archive: TaskArchive,
+    tasks: Task,
+    success: jax.Array,
+    complete: jax.Array,
 ) -> TaskArchive:
     """Keep the tasks that are neither solved nor hopeless.
 
@@ -86,7 +105,9 @@ def select(
 
 
 def vary_pillars(settings, environment, key, task):
-    """Other pillars than the paper's uniform tasks have: some of them in a row, all off the grid."""
+    """Other pillars than the paper's uniform tasks have: some of them in a row, all off the
+    grid.
+    """
     choice_key, row_key, shift_key = jax.random.split(key, 3)
     if settings.row_share:
         row = jax.random.uniform(choice_key) < settings.row_share

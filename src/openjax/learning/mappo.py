@@ -67,12 +67,14 @@ class StepScale(NamedTuple):
 
 
 def follow_kl(target: float) -> optax.GradientTransformationExtraArgs:
-    """Scale steps so that the policy's divergence from the one that flew stays near `target` (nats).
+    """Scale steps so that the policy's divergence from the one that flew stays near `target`
+    (nats).
 
-    Its `update` takes `kl` (), that divergence before the step: above twice the target the step is divided by 1.5, below half
-    of it multiplied, never past the schedule's (the adaptive rule of Schulman et al., 2017, section 4, on the step size as in
-    Rudin et al., 2022). From a policy whose noise is small, a step of fixed size leads far outside the ratio's clip range,
-    where the clipped loss has no gradient that would lead back.
+    Its `update` takes `kl` (), that divergence before the step: above twice the target the step is
+    divided by 1.5, below half of it multiplied, never past the schedule's (the adaptive rule of
+    Schulman et al., 2017, section 4, on the step size as in Rudin et al., 2022). From a policy
+    whose noise is small, a step of fixed size leads far outside the ratio's clip range, where the
+    clipped loss has no gradient that would lead back.
     """
 
     def init(parameters):
@@ -92,7 +94,8 @@ def follow_kl(target: float) -> optax.GradientTransformationExtraArgs:
 def make_optimiser(
     settings: MappoSettings, total_updates: int
 ) -> tuple[optax.GradientTransformationExtraArgs, optax.GradientTransformationExtraArgs]:
-    """Optimisers of actor and critic; the step size falls linearly to zero over the run, the actor's may start late.
+    """Optimisers of actor and critic; the step size falls linearly to zero over the run, the
+    actor's may start late.
 
     With a `target_kl` the actor's update takes `kl`; see `follow_kl`.
     """
@@ -102,18 +105,24 @@ def make_optimiser(
     def late(count):
         return jnp.where(count < settings.actor_start * steps, 0.0, schedule(count))
 
-    after, most = (follow_kl(settings.target_kl),) if settings.target_kl else (), settings.max_grad_norm
+    after = (follow_kl(settings.target_kl),) if settings.target_kl else ()
+    most = settings.max_grad_norm
     actor = clipped_adam(most, late if settings.actor_start else schedule, *after)
     return actor, clipped_adam(most, schedule)
 
 
 def loss(
-    settings: MappoSettings, policy: Policy, parameters: tuple[Any, Any], batch: Batch, clip: jax.Array
+    settings: MappoSettings,
+    policy: Policy,
+    parameters: tuple[Any, Any],
+    batch: Batch,
+    clip: jax.Array,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Sum of actor's and critic's () loss, `parameters` (actor, critic); and what to watch.
 
-    The actor's is the surrogate, its ratio clipped to 1 +- `clip` (), minus the entropy bonus; the critic's the Huber
-    loss of normalised values. Unless they share an encoder, neither's gradient knows of the other.
+    The actor's is the surrogate, its ratio clipped to 1 +- `clip` (), minus the entropy bonus; the
+    critic's the Huber loss of normalised values. Unless they share an encoder, neither's gradient
+    knows of the other.
     """
     mean, log_std, value = policy.evaluate(*parameters, batch.observation, batch.predicted)
     log_ratio = gaussian_log_prob(batch.action, mean, log_std) - batch.log_prob
@@ -174,7 +183,8 @@ def update_policy(
     # before and after all steps by one program: one for what comes last would be as large
     seen = jax.tree.map(lambda x, last: jnp.concatenate([x, last[None]]), flown, end)
     values = mean + std * policy.value(*parameters, *seen)
-    value, next_value = values[:-1], values[1:]
+    value = values[:-1]
+    next_value = values[1:]
     per_pursuer = value.shape
     advantage = generalised_advantages(
         settings.reward_scale * rollout.reward,
@@ -186,7 +196,9 @@ def update_policy(
         settings.gae_lambda,
     )
     returns = advantage + value
-    explained = 1.0 - joint_moments(advantage, axis)[1] ** 2 / (joint_moments(returns, axis)[1] ** 2 + 1e-8)
+    explained = 1.0 - joint_moments(advantage, axis)[1] ** 2 / (
+        joint_moments(returns, axis)[1] ** 2 + 1e-8
+    )
 
     keep = settings.value_norm_decay
     first, second = mean_over_devices((jnp.mean(returns), jnp.mean(returns**2)), axis)
@@ -208,7 +220,8 @@ def update_policy(
     batch = minibatches(batch, settings.minibatches)
     clip = settings.clip_epsilon + (settings.clip_epsilon_end - settings.clip_epsilon) * progress
 
-    # each network as one vector while it learns: leaf by leaf, a step on a GPU is forty kernels more
+    # each network as one vector while it learns: leaf by leaf, a step on a GPU is forty kernels
+    # more
     (actor_vector, to_actor), (critic_vector, to_critic) = map(ravel_pytree, parameters)
 
     def gradient_step(carry, chosen):
@@ -219,7 +232,9 @@ def update_policy(
         def part_loss(actor, critic):
             return loss(settings, policy, (to_actor(actor), to_critic(critic)), part, clip)
 
-        gradient = jax.grad(part_loss, argnums=(0, 1), has_aux=True)(actor.parameters, critic.parameters)
+        gradient = jax.grad(part_loss, argnums=(0, 1), has_aux=True)(
+            actor.parameters, critic.parameters
+        )
         (actor_gradient, critic_gradient), watch = mean_over_devices(gradient, axis)
         watch |= {"actor_gradient": jnp.linalg.norm(actor_gradient)}
         actor = actor.updated(optimisers.actor, actor_gradient, kl=watch["kl"])
@@ -229,7 +244,9 @@ def update_policy(
     order = shuffled(key, settings.epochs, settings.minibatches)
     first = None
     if settings.step_subsampling > 1:
-        first = jax.random.randint(jax.random.fold_in(key, 1), order.shape, 0, settings.step_subsampling)
+        first = jax.random.randint(
+            jax.random.fold_in(key, 1), order.shape, 0, settings.step_subsampling
+        )
     start = actor.replace(parameters=actor_vector), critic.replace(parameters=critic_vector)
     (actor, critic), watched = jax.lax.scan(gradient_step, start, (order, first))
     actor = actor.replace(parameters=to_actor(actor.parameters))

@@ -11,7 +11,9 @@ from openjax.policy import Policy, PredictorSettings
 from openjax.pursuit import PursuitSettings
 
 
-def make_predictor_optimiser(settings: PredictorSettings, total_updates: int) -> optax.GradientTransformation:
+def make_predictor_optimiser(
+    settings: PredictorSettings, total_updates: int
+) -> optax.GradientTransformation:
     """Adam, with gradients cut at norm 1."""
     step_size = settings.learning_rate
     if settings.decay:
@@ -24,13 +26,14 @@ def windows_and_labels(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Windows of frames that end at the given steps, and the true positions to be predicted.
 
-    Episodes start and end between rollouts only and the history is cleared at a reset, so no window and no label
-    crosses the boundary of an episode.
+    Episodes start and end between rollouts only and the history is cleared at a reset, so no window
+    and no label crosses the boundary of an episode.
 
     Args:
       policy: for the predictor's horizons.
       history_spacing: steps between two frames of a window.
-      earlier: (E, H, F) frames before the rollout's second step, oldest first (H = window's span); its last one
+      earlier: (E, H, F) frames before the rollout's second step, oldest first (H = window's span);
+      its last one
           is the rollout's first.
       rollout: T steps.
       times: (E, W) steps of the rollout, at most T - largest horizon.
@@ -57,10 +60,12 @@ def prediction_loss(
     last_seen: jax.Array,
     positions: jax.Array,
 ) -> jax.Array:
-    """() loss of predictions (..., K, 3), given last_seen (..., 3) and the true positions (..., K, 3).
+    """() loss of predictions (..., K, 3), given last_seen (..., 3) and the true positions (..., K,
+    3).
 
-    Squared errors are nearly all those of the longest horizon, and of windows that end before the evader was first seen:
-    nothing can be learnt from these, but what is learnt from them is carried over to where it is lost from sight.
+    Squared errors are nearly all those of the longest horizon, and of windows that end before the
+    evader was first seen: nothing can be learnt from these, but what is learnt from them is carried
+    over to where it is lost from sight.
     """
     error = predicted - positions
     if settings.loss == "squared":

@@ -1,15 +1,22 @@
 """The presets: settings of whole training runs by name."""
 
 from openjax.errors import UserError, suggestion
-from openjax.learning.settings import FirstFlightsSettings, GeneratorSettings, MappoSettings, TrainSettings
+from openjax.learning.settings import (
+    FirstFlightsSettings,
+    GeneratorSettings,
+    MappoSettings,
+    TrainSettings,
+)
 from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import PursuitSettings, RewardSettings
 from openjax.ranges import changed
 
 
 def quick() -> TrainSettings:
-    """Minutes on two CPU cores: the paper's evader and starts, any number of pillars up to five, and 25 commands a second
-    instead of 100. The gradient through the simulation teaches to fly and to chase, then MAPPO goes on."""
+    """Minutes on two CPU cores: the paper's evader and starts, any number of pillars up to five,
+    and 25 commands a second instead of 100. The gradient through the simulation teaches to fly and
+    to chase, then MAPPO goes on.
+    """
     return TrainSettings(
         environment=PursuitSettings(
             physics="rigid",
@@ -17,14 +24,16 @@ def quick() -> TrainSettings:
             min_pillars=0,
             # with three, pursuers don't know where a row ends
             observed_pillars=5,
-            # fewer, longer steps: the same noise tries more, and there is less to learn from a second
+            # fewer, longer steps: the same noise tries more, and there is less to learn from a
+            # second
             time_step=0.04,
             substeps=4,
             episode_length=200,
             history_length=5,
             reward=RewardSettings(crash=10.0, first_crash=300.0, margin=0.03, lookahead=0.15),
         ),
-        # in so short a run the mean policy learns faster this way; over longer ones the other is better
+        # in so short a run the mean policy learns faster this way; over longer ones the other is
+        # better
         network=NetworkSettings(
             features=64, heads=2, squash="sample", initial_log_std=-3.0, critic_encoder="layers"
         ),
@@ -40,11 +49,19 @@ def quick() -> TrainSettings:
             clip_epsilon_end=0.2,
             discount=0.99,
         ),
-        # a crash that is felt from afar: pursuers go round rows of pillars, and don't try gaps under half a metre
+        # a crash that is felt from afar: pursuers go round rows of pillars, and don't try gaps
+        # under half a metre
         first_flights=FirstFlightsSettings(
-            updates=800, worlds=128, steps=20, learning_rate=2e-3, crash=30.0, crash_smooth=0.05, breach=4.0
+            updates=800,
+            worlds=128,
+            steps=20,
+            learning_rate=2e-3,
+            crash=30.0,
+            crash_smooth=0.05,
+            breach=4.0,
         ),
-        # few tasks reach the archive in so short a run; drawn from too often, they'd be all that is learnt
+        # few tasks reach the archive in so short a run; drawn from too often, they'd be all that is
+        # learnt
         generator=GeneratorSettings(capacity=500, expansion=0.3, pillar_shift=0.1, row_share=0.25),
         num_envs=640,
         rollout_length=20,
@@ -88,8 +105,10 @@ def paper() -> TrainSettings:
 
 
 def flight() -> TrainSettings:
-    """Policies to be flown: no clamp on the speed, the rate loop at 500 Hz, every pursuer its own vehicle; at last half seconds
-    by the gradient through the simulation. Five minutes on one large accelerator."""
+    """Policies to be flown: no clamp on the speed, the rate loop at 500 Hz, every pursuer its own
+    vehicle; at last half seconds by the gradient through the simulation. Five minutes on one large
+    accelerator.
+    """
     from openjax.vehicle.family import vehicle_family
 
     return changed(
@@ -102,13 +121,14 @@ def flight() -> TrainSettings:
             vehicles=vehicle_family(),
             rare_vehicles=0.5,
             observe_history=12,
-            # Without the clamp, a first crash at 5,000 teaches to stay away from rows of pillars, and so does all that is dear
-            # near a pillar. The last stage sees to crashes, breaches and speeds over the limit
+            # Without the clamp, a first crash at 5,000 teaches to stay away from rows of pillars,
+            # and so does all that is dear near a pillar. The last stage sees to crashes, breaches
+            # and speeds over the limit
             reward=dict(collision=15.0, margin=0.02, crash=40.0, first_crash=1000.0),
         ),
         mappo=dict(step_subsampling=1, penalty_ramp=0.75),
-        # Starts force collisions. If they counted against success, the archive would hold such starts instead of the
-        # tasks whose evader nobody reaches
+        # Starts force collisions. If they counted against success, the archive would hold such
+        # starts instead of the tasks whose evader nobody reaches
         generator=dict(row_share=0.6, success_low=0.25, collision_tolerance=1.0),
         analytic=dict(updates=200),
         # flown from the start, the whole family teaches to hover out of harm's way and nothing else
@@ -120,19 +140,33 @@ def flight() -> TrainSettings:
 
 
 def evaders() -> TrainSettings:
-    """Policies to be flown after evaders that fight back: first the paper's, then scripted ones, slow at first, and three that
-    learn while the pursuers do. One run for one large accelerator; how far it has been flown: experiments/results/evaders.md."""
+    """Policies to be flown after evaders that fight back: first the paper's, then scripted ones,
+    slow at first, and three that learn while the pursuers do. One run for one large accelerator;
+    how far it has been flown: experiments/results/evaders.md.
+    """
     return changed(
         flight(),
         environment=dict(
-            evaders=("field", "field", "greedy", "greedy", "wall_runner", "slow_hugger", *["learned"] * 3),
+            evaders=(
+                "field",
+                "field",
+                "greedy",
+                "greedy",
+                "wall_runner",
+                "slow_hugger",
+                *["learned"] * 3,
+            ),
             observe_in="heading",
             min_pillars=0,
-            # The distance pays for going near a pillar, the first capture for the last centimetres: a step of it alone costs too
-            # much. Breaches that count .02 m early make a way between pillars .4 m apart cost as much as a capture pays
-            reward=dict(distance=0.5, first_capture=500.0, margin=0.01, crash=60.0, first_crash=2000.0),
+            # The distance pays for going near a pillar, the first capture for the last centimetres:
+            # a step of it alone costs too much. Breaches that count .02 m early make a way between
+            # pillars .4 m apart cost as much as a capture pays
+            reward=dict(
+                distance=0.5, first_capture=500.0, margin=0.01, crash=60.0, first_crash=2000.0
+            ),
         ),
-        # as long as a breach costs less than a step in reach pays, pursuers learn to hold an evader from beyond the wall
+        # as long as a breach costs less than a step in reach pays, pursuers learn to hold an evader
+        # from beyond the wall
         mappo=dict(target_kl=0.02, step_subsampling=2, entropy_coefficient=2e-3, penalty_ramp=0.5),
         analytic=dict(updates=100, look_every=20, hold=0.2),
         vehicles_start=0.08,
@@ -145,8 +179,10 @@ def evaders() -> TrainSettings:
 
 
 def mappo() -> TrainSettings:
-    """The paper's plain MAPPO, without predictor and generator, with penalties under which it learns to catch: where a
-    first crash costs 5,000, only the generator's tasks lead past hovering."""
+    """The paper's plain MAPPO, without predictor and generator, with penalties under which it
+    learns to catch: where a first crash costs 5,000, only the generator's tasks lead past
+    hovering.
+    """
     return changed(
         paper(),
         environment=dict(observe_in="world", reward=dict(first_crash=0.0)),
@@ -159,7 +195,9 @@ def mappo() -> TrainSettings:
 
 
 def dacoop() -> TrainSettings:
-    """DACOOP: plain MAPPO puts out the parameters of a potential field (`openjax.baselines.dacoop`)."""
+    """DACOOP: plain MAPPO puts out the parameters of a potential field
+    (`openjax.baselines.dacoop`).
+    """
     return changed(mappo(), network=dict(output="field"), total_steps=100_000_000)
 
 
@@ -167,7 +205,8 @@ PRESETS = {recipe.__name__: recipe for recipe in (quick, paper, flight, evaders,
 
 
 def preset(name: str, **changes) -> TrainSettings:
-    """A preset's settings, with fields changed; those of settings within them by a dict, as in `changed`.
+    """A preset's settings, with fields changed; those of settings within them by a dict, as in
+    `changed`.
 
     Raises:
       UserError: no such preset.

@@ -12,17 +12,23 @@ from openjax.pursuit import Observation, Pursuit, PursuitState
 
 @struct.dataclass
 class Rollout:
-    """T steps of E worlds with N pursuers. Of the history only the newest frame of each step is kept."""
+    """T steps of E worlds with N pursuers. Of the history only the newest frame of each step is
+    kept.
+    """
 
     observation: Observation  # (T, E, ...), before the step; `frames` (T, E, 1, F)
-    predicted: jax.Array | None  # (T, E, K, 3) m, predicted evader positions; None without predictor
+    predicted: (
+        jax.Array | None
+    )  # (T, E, K, 3) m, predicted evader positions; None without predictor
     action: jax.Array  # (T, E, N, A) samples of the policy's Gaussian
     log_prob: jax.Array  # (T, E, N)
     reward: jax.Array  # (T, E, N)
     terminated: jax.Array  # (T, E) bool
     truncated: jax.Array  # (T, E) bool
     evader: jax.Array  # (T, E, 3) m, true position after the step
-    learning: EvaderSamples | None = None  # (T, E, ...), of the evaders that learn; None where none does
+    learning: EvaderSamples | None = (
+        None  # (T, E, ...), of the evaders that learn; None where none does
+    )
 
 
 def newest_frame(observation: Observation) -> Observation:

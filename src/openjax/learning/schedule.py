@@ -1,4 +1,6 @@
-"""When worlds start: in groups, one of which ends its episodes after each rollout, and some anew in between."""
+"""When worlds start: in groups, one of which ends its episodes after each rollout, and some anew in
+between.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -10,10 +12,12 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Schedule:
-    """World e of E belongs to start group e mod `groups`; `share` neighbours of a group fly the same task.
+    """World e of E belongs to start group e mod `groups`; `share` neighbours of a group fly the
+    same task.
 
-    Ages are counted in rollouts. In each training step the group of age `groups` ends its episodes. Of the other groups
-    the worlds of every `restart_every`-th task start anew when the group's age is one of `restart_ages`.
+    Ages are counted in rollouts. In each training step the group of age `groups` ends its episodes.
+    Of the other groups the worlds of every `restart_every`-th task start anew when the group's age
+    is one of `restart_ages`.
     """
 
     groups: int
@@ -49,18 +53,24 @@ class Schedule:
         return jax.tree.map(take, worlds)
 
     def restarts(self, number: int) -> int:
-        """How many of `number` worlds start anew in a training step, beside those whose episodes ended."""
+        """How many of `number` worlds start anew in a training step, beside those whose episodes
+        ended.
+        """
         if not self.restart_every:
             return 0
         return number // self.groups // self.restart_every * len(self.restart_ages)
 
     def renewed(self, worlds: Any, fresh: Any, ending: jax.Array) -> Any:
-        """`worlds` (E, ...) with `fresh` ones in place of the group `ending`, and then of those that start anew."""
+        """`worlds` (E, ...) with `fresh` ones in place of the group `ending`, and then of those
+        that start anew.
+        """
         number = jax.tree.leaves(worlds)[0].shape[0]
         member, group = np.divmod(np.arange(number), self.groups)
         task, neighbour = np.divmod(member, self.share)
         every = self.restart_every or 1
-        which = np.full(self.groups, -1)  # of the restarts, by how far a group is behind the one that ends
+        which = np.full(
+            self.groups, -1
+        )  # of the restarts, by how far a group is behind the one that ends
         if self.restart_every:
             which[list(self.restart_ages)] = np.arange(len(self.restart_ages))
         behind = (group - ending) % self.groups
@@ -71,6 +81,8 @@ class Schedule:
         return jax.tree.map(lambda x, new: jnp.concatenate([x, new])[source], worlds, fresh)
 
     def lasting(self, number: int) -> np.ndarray:
-        """(number,) bool of a group's members: those that are never started anew within an episode."""
+        """(number,) bool of a group's members: those that are never started anew within an
+        episode.
+        """
         task = np.arange(number) // self.share
         return task % self.restart_every != 0 if self.restart_every else np.ones(number, bool)

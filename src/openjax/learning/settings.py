@@ -10,7 +10,9 @@ from openjax.pursuit.evaders import check_evaders
 from openjax.ranges import Interval, Seed, check_intervals
 
 if TYPE_CHECKING:
-    from openjax.learning.schedule import Schedule  # written in JAX, which a command's help needn't wait for
+    from openjax.learning.schedule import (
+        Schedule,
+    )  # written in JAX, which a command's help needn't wait for
 
 
 @dataclass(frozen=True)
@@ -20,20 +22,25 @@ class MappoSettings:
     learning_rate: Annotated[float, Interval("(0, 1]")] = 5e-4
     """Adam step size at the start; falls linearly to zero over `total_steps`."""
     actor_start: Annotated[float, Interval("[0, 1]")] = 0.0
-    """Share of the run before the actor begins to learn: a run that starts from a policy without its critic learns that
-    first."""
+    """Share of the run before the actor begins to learn: a run that starts from a policy without
+    its critic learns that first.
+    """
     epochs: Annotated[int, Interval("[1, 1000]")] = 4
     minibatches: Annotated[int, Interval("[1, 100000]")] = 16
     step_subsampling: Annotated[int, Interval("[1, 100000]")] = 1
-    """A gradient step sees every n-th step of its trajectories, from a first one drawn each time: consecutive steps are so
-    alike that fewer of them teach nearly as much. Divides `rollout_length`."""
+    """A gradient step sees every n-th step of its trajectories, from a first one drawn each time:
+    consecutive steps are so alike that fewer of them teach nearly as much. Divides
+    `rollout_length`.
+    """
     clip_epsilon: Annotated[float, Interval("(0, 10]")] = 0.1
     """Clip range of the probability ratio at the start ..."""
     clip_epsilon_end: Annotated[float, Interval("(0, 10]")] = 0.1
     """... which changes linearly to this over `total_steps`."""
     target_kl: Annotated[float, Interval("[0, 10]")] = 0.0
-    """Divergence (nats) of the learning policy from the one that flew, near which the actor's step size keeps it; 0: steps
-    aren't scaled. A run that starts from a policy with little noise needs it."""
+    """Divergence (nats) of the learning policy from the one that flew, near which the actor's step
+    size keeps it; 0: steps aren't scaled. A run that starts from a policy with little noise needs
+    it.
+    """
     entropy_coefficient: Annotated[float, Interval("[0, 10]")] = 1e-3
     """Weight of the entropy."""
     discount: Annotated[float, Interval("[0, 1]")] = 0.995
@@ -46,7 +53,9 @@ class MappoSettings:
     value_coefficient: Annotated[float, Interval("(0, 1000]")] = 1.0
     """Weight of the value loss; it matters where actor and critic share an encoder."""
     value_norm_decay: Annotated[float, Interval("[0, 1)")] = 0.95
-    """Share of the old mean and variance of the returns that value normalisation keeps per iteration."""
+    """Share of the old mean and variance of the returns that value normalisation keeps per
+    iteration.
+    """
     reward_scale: Annotated[float, Interval("(0, 1e6]")] = 0.1
     penalty_start: Annotated[float, Interval("[0, 1]")] = 1.0
     """Share of the penalties (collision, speed, crash) at the start of the run ..."""
@@ -66,11 +75,17 @@ class GeneratorSettings:
     capacity: Annotated[int, Interval("[1, 10000000]")] = 5000
     """Tasks in the archive."""
     turn: bool = True
-    """Turn uniform tasks about the arena's axis, so that they come from all sides (the paper's come from one)."""
+    """Turn uniform tasks about the arena's axis, so that they come from all sides (the paper's come
+    from one).
+    """
     pillar_shift: Annotated[float, Interval("[0, 10]")] = 0.0
-    """Pillars of uniform tasks are moved by up to this along x and y (m), off the grid on which the paper's stand."""
+    """Pillars of uniform tasks are moved by up to this along x and y (m), off the grid on which the
+    paper's stand.
+    """
     row_share: Annotated[float, Interval("[0, 1]")] = 0.0
-    """Share of the uniform tasks whose pillars stand in a row between the two sides (none of the paper's)."""
+    """Share of the uniform tasks whose pillars stand in a row between the two sides (none of the
+    paper's).
+    """
     expansion: Annotated[float, Interval("[0, 1]")] = 0.7
     """Probability p of local expansion of an archived task, else a uniform one."""
     success_low: Annotated[float, Interval("[0, 1]")] = 0.5
@@ -81,14 +96,17 @@ class GeneratorSettings:
     episodes_per_task: Annotated[int, Interval("[1, 100000]")] = 4
     """Environments that share one task, so that its success rate can be told."""
     collision_tolerance: Annotated[float, Interval("(0, 1]")] = 1.0
-    """An episode counts as success if it captures and its collision rate stays below this (1: capture alone), once the
-    penalties count in full; before that, more is tolerated (this to the power of the penalties' share)."""
+    """An episode counts as success if it captures and its collision rate stays below this (1:
+    capture alone), once the penalties count in full; before that, more is tolerated (this to the
+    power of the penalties' share).
+    """
 
     def __post_init__(self):
         check_intervals(self, "generator.")
         if self.success_low > self.success_high:
             raise UserError(
-                f"generator.success_low {self.success_low} is more than generator.success_high {self.success_high}"
+                f"generator.success_low {self.success_low} is more than generator.success_high "
+                f"{self.success_high}"
             )
 
 
@@ -116,7 +134,9 @@ class EvaderLearningSettings:
 
 @dataclass(frozen=True)
 class FirstFlightsSettings:
-    """The stage before MAPPO by the gradient through the simulation; see `openjax.learning.first_flights`."""
+    """The stage before MAPPO by the gradient through the simulation; see
+    `openjax.learning.first_flights`.
+    """
 
     updates: Annotated[int, Interval("[0, 1000000]")] = 0
     """Updates of the actor; 0: there is no such stage."""
@@ -130,19 +150,27 @@ class FirstFlightsSettings:
     anew: Annotated[float, Interval("[0, 1]")] = 0.15
     """Share of the worlds that start anew after each update, beside those that have to."""
     distance: Annotated[float, Interval("[0, 1000]")] = 3.0
-    """Weight of the nearest pursuer's mean way to the evader (m), beside the share of the time in which it is free ..."""
+    """Weight of the nearest pursuer's mean way to the evader (m), beside the share of the time in
+    which it is free ...
+    """
     crash: Annotated[float, Interval("[0, 1000]")] = 20.0
     """... at the end of the share of pursuers that touch something or tip over ..."""
     crash_smooth: Annotated[float, Interval("[0.001, 1]")] = 0.012
-    """... from all to none over this distance (m): a longer one is felt earlier, and closes narrower ways ..."""
+    """... from all to none over this distance (m): a longer one is felt earlier, and closes
+    narrower ways ...
+    """
     breach: Annotated[float, Interval("[0, 1000]")] = 10.0
     """... and of the mean number of breaches ..."""
     speed: Annotated[float, Interval("[0, 1000]")] = 1.0
     """... and of speeds over the limit."""
     penalty_start: Annotated[float, Interval("[0, 1]")] = 0.2
-    """Share of the weights of crashes and breaches at the start: who fears them then stays away from the evader."""
+    """Share of the weights of crashes and breaches at the start: who fears them then stays away
+    from the evader.
+    """
     penalty_free: Annotated[float, Interval("[0, 1]")] = 0.62
-    """They rise, and tips over begin to count, in updates in which the evader is free for less than this share of the time ..."""
+    """They rise, and tips over begin to count, in updates in which the evader is free for less than
+    this share of the time ...
+    """
     penalty_ramp: Annotated[float, Interval("(0, 1]")] = 0.4
     """... and have their whole weights after this share of the stage of such updates."""
 
@@ -152,7 +180,9 @@ class FirstFlightsSettings:
 
 @dataclass(frozen=True)
 class AnalyticSettings:
-    """The stage after MAPPO by the gradient through the simulation; see `openjax.learning.analytic_gradient`."""
+    """The stage after MAPPO by the gradient through the simulation; see
+    `openjax.learning.analytic_gradient`.
+    """
 
     updates: Annotated[int, Interval("[0, 1000000]")] = 0
     """Updates of the actor; 0: there is no such stage."""
@@ -165,9 +195,13 @@ class AnalyticSettings:
     learning_rate: Annotated[float, Interval("(0, 1]")] = 3e-4
     """Adam step size at the start; falls linearly to a twentieth."""
     hold: Annotated[float, Interval("[0, 1000]")] = 0.04
-    """Weight of the squared change of the actions in flight, in standard deviations of the policy's."""
+    """Weight of the squared change of the actions in flight, in standard deviations of the
+    policy's.
+    """
     breach: Annotated[float, Interval("[0, 1000]")] = 2.0
-    """Weight of the breaches per step in flight, beside the share of pursuers that touch something from a start."""
+    """Weight of the breaches per step in flight, beside the share of pursuers that touch something
+    from a start.
+    """
     speed: Annotated[float, Interval("[0, 1000]")] = 0.6
     """Weight of speeds over the limit in flight."""
     speed_from: Annotated[float, Interval("[0, 10]")] = 0.97
@@ -184,14 +218,18 @@ class AdaptSettings:
     """How a policy is fine-tuned."""
 
     worlds: Annotated[int | None, Interval("[1, 65536]")] = None
-    """Worlds of each kind of flight in an update; by default 320 on an accelerator, 8 on a CPU: enough to see it work."""
+    """Worlds of each kind of flight in an update; by default 320 on an accelerator, 8 on a CPU:
+    enough to see it work.
+    """
     updates: Annotated[int, Interval("[1, 1000000]")] = 120
     look_every: Annotated[int, Interval("[1, 1000000]")] = 40
     """Updates between evaluations of the policy; the best of all is kept."""
     learning_rate: Annotated[float, Interval("(0, 1]")] = 3e-4
     """Adam step size at the start; falls linearly to a twentieth."""
     follow: Annotated[float, Interval("[0, 1000]")] = 0.1
-    """Weight of flying where the nominal vehicle would, beside the share of pursuers that touch something."""
+    """Weight of flying where the nominal vehicle would, beside the share of pursuers that touch
+    something.
+    """
 
     def __post_init__(self):
         check_intervals(self, "training.")
@@ -199,7 +237,9 @@ class AdaptSettings:
 
 @dataclass(frozen=True)
 class TrainSettings:
-    """Everything that determines a run. A run's result depends on nothing else but the machine's arithmetic."""
+    """Everything that determines a run. A run's result depends on nothing else but the machine's
+    arithmetic.
+    """
 
     environment: PursuitSettings = field(default_factory=PursuitSettings)
     network: NetworkSettings = field(default_factory=NetworkSettings)
@@ -212,22 +252,33 @@ class TrainSettings:
     num_envs: Annotated[int, Interval("[1, 16777216]")] = 2560
     """Worlds that are simulated at once."""
     rollout_length: Annotated[int, Interval("[1, 100000]")] = 80
-    """Control steps per iteration; divides the episode's length, so that episodes end between rollouts."""
+    """Control steps per iteration; divides the episode's length, so that episodes end between
+    rollouts.
+    """
     total_steps: Annotated[int, Interval("[1, 1e15]")] = 400_000_000
     """Environment steps of the run (one step moves one world, all its pursuers)."""
     restart_every: Annotated[int, Interval("[0, 100000]")] = 0
-    """The worlds of every n-th task are started anew after `restart_steps` already, so that more is learnt of starts,
-    the hardest part of an episode; 0: none are."""
+    """The worlds of every n-th task are started anew after `restart_steps` already, so that more is
+    learnt of starts, the hardest part of an episode; 0: none are.
+    """
     restart_steps: Annotated[int, Interval("[1, 100000]")] = 160
-    """Multiple of `rollout_length`; the value of what would have come is estimated, as after every rollout."""
+    """Multiple of `rollout_length`; the value of what would have come is estimated, as after every
+    rollout.
+    """
     restart_close: Annotated[float, Interval("[0, 1]")] = 0.0
-    """Share of the pursuers in worlds that are started anew which start close to a pillar or another pursuer."""
+    """Share of the pursuers in worlds that are started anew which start close to a pillar or
+    another pursuer.
+    """
     vehicles_start: Annotated[float, Interval("[0, 1]")] = 0.0
-    """Share of the run in which all vehicles are nominal; after it, the family `environment.vehicles` grows about them ..."""
+    """Share of the run in which all vehicles are nominal; after it, the family
+    `environment.vehicles` grows about them ...
+    """
     vehicles_ramp: Annotated[float, Interval("[0, 1]")] = 0.0
     """... to its whole size over this share of the run."""
     evaders_start: Annotated[float, Interval("[0, 1]")] = 0.0
-    """Share of the run in which all evaders are the first of `environment.evaders`; then the others come in, slow ones ..."""
+    """Share of the run in which all evaders are the first of `environment.evaders`; then the others
+    come in, slow ones ...
+    """
     evaders_ramp: Annotated[float, Interval("[0, 1]")] = 0.0
     """... and have their whole odds and speed after this share of the run."""
     evaders_validation: tuple[str, ...] = ()
@@ -248,7 +299,8 @@ class TrainSettings:
 
     def _demands(self):
         """What settings ask of each other: whether it holds, and what to say if not."""
-        length, rollout = self.environment.episode_length, self.rollout_length
+        length = self.environment.episode_length
+        rollout = self.rollout_length
         yield (
             length % rollout == 0,
             f"rollout_length {rollout} must divide environment.episode_length {length}",
@@ -256,8 +308,8 @@ class TrainSettings:
         unit = self.world_unit
         yield (
             self.num_envs % unit == 0,
-            f"num_envs {self.num_envs} must be a multiple of {unit} (start groups times episodes per task"
-            + (", times restart_every)" if self.restart_every else ")"),
+            f"num_envs {self.num_envs} must be a multiple of {unit} (start groups times episodes "
+            "per task" + (", times restart_every)" if self.restart_every else ")"),
         )
         yield self.restart_every != 1, "restart_every is 1; 0 (never) or at least 2 are possible"
         yield (
@@ -266,11 +318,13 @@ class TrainSettings:
         )
         yield (
             self.restart_every or not self.restart_close,
-            f"restart_close {self.restart_close} needs restart_every; without it no world is started anew",
+            f"restart_close {self.restart_close} needs restart_every; without it no world is "
+            "started anew",
         )
         yield (
             self.total_updates < 2**31,
-            f"total_steps {self.total_steps} are {self.total_updates} updates; fewer than 2^31 are possible",
+            f"total_steps {self.total_steps} are {self.total_updates} updates; fewer than 2^31 are "
+            "possible",
         )
         for name, number in self.minibatches.items():
             yield (
@@ -279,17 +333,22 @@ class TrainSettings:
             )
         yield (
             rollout % self.mappo.step_subsampling == 0,
-            f"mappo.step_subsampling {self.mappo.step_subsampling} must divide rollout_length {rollout}",
+            f"mappo.step_subsampling {self.mappo.step_subsampling} must divide rollout_length "
+            f"{rollout}",
         )
-        last, windows = self.predictor.horizons[-1], self.predictor.windows
+        last = self.predictor.horizons[-1]
+        windows = self.predictor.windows
         yield (
             not self.predictor.enabled or rollout - last + 1 >= windows,
-            f"predictor: {windows} windows and horizon {last} do not fit into rollout_length {rollout}",
+            f"predictor: {windows} windows and horizon {last} do not fit into rollout_length "
+            f"{rollout}",
         )
 
     @property
     def start_groups(self) -> int:
-        """Groups of environments by start time; one of them ends its episodes after each rollout."""
+        """Groups of environments by start time; one of them ends its episodes after each
+        rollout.
+        """
         return self.environment.episode_length // self.rollout_length
 
     @property

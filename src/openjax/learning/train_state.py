@@ -12,28 +12,41 @@ from openjax.policy import PolicyParameters
 
 @struct.dataclass
 class TrainState:
-    """One network. Flax's own would carry the optimiser itself, which would make every build a carry of another type."""
+    """One network. Flax's own would carry the optimiser itself, which would make every build a
+    carry of another type.
+    """
 
     parameters: Any
     optimiser: Any
     """State of the `optax` transformation."""
 
-    def updated(self, optimiser: optax.GradientTransformation, gradient: Any, **others: Any) -> "TrainState":
-        """One step against `gradient`, a tree like the parameters; `others` is what else the optimiser's update takes."""
+    def updated(
+        self, optimiser: optax.GradientTransformation, gradient: Any, **others: Any
+    ) -> "TrainState":
+        """One step against `gradient`, a tree like the parameters; `others` is what else the
+        optimiser's update takes.
+        """
         update, state = optimiser.update(gradient, self.optimiser, self.parameters, **others)
         return TrainState(optax.apply_updates(self.parameters, update), state)
 
 
-def clipped_adam(most: float, rate: optax.ScalarOrSchedule, *after) -> optax.GradientTransformationExtraArgs:
+def clipped_adam(
+    most: float, rate: optax.ScalarOrSchedule, *after
+) -> optax.GradientTransformationExtraArgs:
     """Adam of gradients cut at norm `most`, and what comes after it.
 
-    On one vector instead of dozens of small arrays: on a GPU their updates cost by number, not by size.
+    On one vector instead of dozens of small arrays: on a GPU their updates cost by number, not by
+    size.
     """
-    return optax.flatten(optax.chain(optax.clip_by_global_norm(most), optax.adam(rate, eps=1e-5), *after))
+    return optax.flatten(
+        optax.chain(optax.clip_by_global_norm(most), optax.adam(rate, eps=1e-5), *after)
+    )
 
 
 def shuffled(key: jax.Array, epochs: int, minibatches: int) -> jax.Array:
-    """(epochs * minibatches,) the minibatches in the order in which they are learnt from, each once in an epoch."""
+    """(epochs * minibatches,) the minibatches in the order in which they are learnt from, each once
+    in an epoch.
+    """
     keys = jax.random.split(key, epochs)
     return jax.vmap(lambda key: jax.random.permutation(key, minibatches))(keys).ravel()
 
@@ -58,9 +71,11 @@ _OF_POLICY = re.compile(f"{_NETWORK}/parameters/(.+)"), re.compile(f"policy/{_NE
 
 
 def policy_leaf(name: str) -> str | None:
-    """The path in `PolicyParameters` of a leaf of a training carry: `actor/params/x` for `actor/parameters/params/x`.
+    """The path in `PolicyParameters` of a leaf of a training carry: `actor/params/x` for
+    `actor/parameters/params/x`.
 
-    None for one that isn't of the policy. In carries from before networks had a `TrainState` it is `policy/actor/params/x`.
+    None for one that isn't of the policy. In carries from before networks had a `TrainState` it is
+    `policy/actor/params/x`.
     """
     for pattern in _OF_POLICY:
         if found := pattern.fullmatch(name):

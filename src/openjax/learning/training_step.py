@@ -1,4 +1,6 @@
-"""The compiled training step: rollout, predictor update, policy update, selection of tasks; one function of one carry."""
+"""The compiled training step: rollout, predictor update, policy update, selection of tasks; one
+function of one carry.
+"""
 
 import functools
 from collections.abc import Callable
@@ -45,7 +47,9 @@ class TrainCarry:
     def policy(self) -> PolicyParameters:
         """The parameters that act."""
         return PolicyParameters(
-            actor=self.actor.parameters, critic=self.critic.parameters, predictor=self.predictor.parameters
+            actor=self.actor.parameters,
+            critic=self.critic.parameters,
+            predictor=self.predictor.parameters,
         )
 
     def with_policy(self, policy: PolicyParameters) -> "TrainCarry":
@@ -68,7 +72,9 @@ class Building:
 
 
 def build(settings: TrainSettings, environment: Pursuit | None = None) -> Building:
-    """Environment, networks and optimisers of a run. `environment` overrides the nominal one (effects, vehicle)."""
+    """Environment, networks and optimisers of a run. `environment` overrides the nominal one
+    (effects, vehicle).
+    """
     environment = environment or Pursuit(settings.environment)
     return Building(
         environment=environment,
@@ -84,7 +90,8 @@ def build(settings: TrainSettings, environment: Pursuit | None = None) -> Buildi
 def make_start(
     settings: TrainSettings, environment: Pursuit | None = None
 ) -> Callable[[jax.Array], TrainCarry]:
-    """The start of a run, key -> carry, by `jax.jit`: fresh networks, uniform tasks, an empty archive, staggered starts.
+    """The start of a run, key -> carry, by `jax.jit`: fresh networks, uniform tasks, an empty
+    archive, staggered starts.
 
     `jax.eval_shape` of it tells the carry's shapes; it is traced once for both.
     """
@@ -98,10 +105,14 @@ def initial_carry(settings: TrainSettings, parts: Building, key: jax.Array) -> T
     archive = empty_archive(task_like(settings.environment), settings.generator.capacity)
     key, policy_key, task_key, reset_key = jax.random.split(key, 4)
     tasks = _tasks(
-        settings, archive, jax.random.split(task_key, settings.num_envs // settings.episodes_per_task)
+        settings,
+        archive,
+        jax.random.split(task_key, settings.num_envs // settings.episodes_per_task),
     )
     tasks = settings.schedule.first(tasks, settings.num_envs)
-    observation, state = jax.vmap(environment.reset_to)(jax.random.split(reset_key, settings.num_envs), tasks)
+    observation, state = jax.vmap(environment.reset_to)(
+        jax.random.split(reset_key, settings.num_envs), tasks
+    )
     state = state.replace(step=settings.schedule.age(settings.num_envs) * settings.rollout_length)
     observation = jax.vmap(environment.observe)(state)
     policy = parts.policy.init(policy_key, jax.tree.map(lambda x: x[0], observation))
@@ -110,7 +121,9 @@ def initial_carry(settings: TrainSettings, parts: Building, key: jax.Array) -> T
         value_scale=initial_value_scale(),
         observation=observation,
         state=state,
-        evaders=parts.evaders.start(jax.random.fold_in(policy_key, 1)) if parts.evaders.number else None,
+        evaders=parts.evaders.start(jax.random.fold_in(policy_key, 1))
+        if parts.evaders.number
+        else None,
         archive=archive,
         key=key,
         update=jnp.zeros((), jnp.int32),
@@ -136,12 +149,18 @@ class Phases:
     fly: Callable[[TrainCarry], tuple[TrainCarry, Flown, dict[str, jax.Array]]]
     """carry -> carry after a rollout, what is learnt from it, metrics"""
     learn: tuple[Callable[[TrainCarry, Flown], tuple[TrainCarry, dict[str, jax.Array]]], ...]
-    """(carry, flown) -> carry after an update, metrics; one for each network that learns on its own"""
+    """(carry, flown) -> carry after an update, metrics; one for each network that learns on its
+    own
+    """
     renew: Callable[[TrainCarry], tuple[TrainCarry, dict[str, jax.Array]]]
-    """carry -> carry whose worlds have new tasks where their episodes have just ended, metrics of these episodes"""
+    """carry -> carry whose worlds have new tasks where their episodes have just ended, metrics of
+    these episodes
+    """
 
     def __call__(self, carry: TrainCarry) -> tuple[TrainCarry, dict[str, jax.Array]]:
-        """The whole step; its operations bear the parts' names, by which a profile tells them apart."""
+        """The whole step; its operations bear the parts' names, by which a profile tells them
+        apart.
+        """
         carry, flown, metrics = _named(self.fly)(carry)
         for learn in self.learn:
             carry, watched = _named(learn)(carry, flown)
@@ -157,7 +176,9 @@ def _named(phase):
 def make_phases(
     settings: TrainSettings, environment: Pursuit | None = None, axis: str | None = None
 ) -> Phases:
-    """The parts of the training step; `axis` names the axis of devices when they run under `shard_map`."""
+    """The parts of the training step; `axis` names the axis of devices when they run under
+    `shard_map`.
+    """
     step = _Step(settings, build(settings, environment), axis)
     learn = (step.learn_predictor,) if settings.predictor.enabled else ()
     learn += (step.learn_evaders,) if step.parts.evaders.number else ()
@@ -167,7 +188,8 @@ def make_phases(
 def make_training_step(
     settings: TrainSettings, environment: Pursuit | None = None, axis: str | None = None
 ) -> Callable[[TrainCarry], tuple[TrainCarry, dict[str, jax.Array]]]:
-    """The training step `carry -> (carry, metrics)` as one function; compile it with `jax.jit(step, donate_argnums=0)`.
+    """The training step `carry -> (carry, metrics)` as one function; compile it with `jax.jit(step,
+    donate_argnums=0)`.
 
     `axis` names the axis of devices when it runs under `shard_map` (see `openjax.cluster.devices`).
     """
@@ -185,15 +207,20 @@ class _Step:
     axis: str | None
 
     def fly(self, carry):
-        settings, axis = self.settings, self.axis
-        environment, policy = self.parts.environment, self.parts.policy
+        settings = self.settings
+        axis = self.axis
+        environment = self.parts.environment
+        policy = self.parts.policy
         shape = (settings.rollout_length, settings.environment.num_pursuers, policy.sample_size)
         keys = own_keys(self._key(carry, 1), carry.state.step.shape[0], axis)
         noise = jax.vmap(lambda k: jax.random.normal(k, shape))(keys)
-        world, share = (carry.observation, carry.state), penalty_share_at(settings, self._progress(carry))
+        world = (carry.observation, carry.state)
+        share = penalty_share_at(settings, self._progress(carry))
         learning = None
         if carry.evaders is not None:
-            draws = jax.vmap(lambda k: jax.random.normal(jax.random.fold_in(k, 1), (shape[0], 3)))(keys)
+            draws = jax.vmap(lambda k: jax.random.normal(jax.random.fold_in(k, 1), (shape[0], 3)))(
+                keys
+            )
             learning = self.parts.evaders, carry.evaders, jnp.moveaxis(draws, 1, 0)
         rollout, observation, state = collect(
             environment, policy, carry.policy, *world, jnp.moveaxis(noise, 1, 0), share, learning
@@ -203,29 +230,44 @@ class _Step:
         return carry.replace(observation=observation, state=state), flown, metrics
 
     def learn_predictor(self, carry, flown):
-        rollout, axis = flown.rollout, self.axis
+        rollout = flown.rollout
+        axis = self.axis
         keys = own_keys(self._key(carry, 2), flown.frames.shape[0], axis)
         how = self.parts.policy, self.parts.optimisers.predictor, self.parts.environment.settings
         predictor, loss = update_predictor(*how, carry.predictor, flown.frames, rollout, keys, axis)
         error = jnp.linalg.norm(rollout.predicted[:, :, 0] - rollout.evader, axis=-1)
-        metrics = {"predictor_loss": loss, "prediction_error": mean_over_devices(jnp.mean(error), axis)}
+        metrics = {
+            "predictor_loss": loss,
+            "prediction_error": mean_over_devices(jnp.mean(error), axis),
+        }
         return carry.replace(predictor=predictor), metrics
 
     def learn_policy(self, carry, flown):
-        before, last = (carry.actor, carry.critic, carry.value_scale), (carry.observation, flown.predicted)
+        before = (carry.actor, carry.critic, carry.value_scale)
+        last = (carry.observation, flown.predicted)
         how = self.settings.mappo, self.parts.policy, self.parts.optimisers
         actor, critic, scale, metrics = update_policy(
-            *how, *before, flown.rollout, *last, self._key(carry, 3), self.axis, self._progress(carry)
+            *how,
+            *before,
+            flown.rollout,
+            *last,
+            self._key(carry, 3),
+            self.axis,
+            self._progress(carry),
         )
         return carry.replace(actor=actor, critic=critic, value_scale=scale), metrics
 
     def learn_evaders(self, carry, flown):
         key = jax.random.fold_in(self._key(carry, 3), 1)
-        evaders = self.parts.evaders.learn(carry.evaders, flown.rollout.learning, carry.state, key, self.axis)
+        evaders = self.parts.evaders.learn(
+            carry.evaders, flown.rollout.learning, carry.state, key, self.axis
+        )
         return carry.replace(evaders=evaders), {"evader_noise": jnp.mean(evaders.log_std)}
 
     def renew(self, carry):
-        settings, schedule, axis = self.settings, self.settings.schedule, self.axis
+        settings = self.settings
+        schedule = self.settings.schedule
+        axis = self.axis
         progress = self._progress(carry)
         starting = _starting(settings, self.parts.environment, progress)
         group = schedule.ending(carry.update)
@@ -233,7 +275,8 @@ class _Step:
         archive, metrics = _selection(
             settings, carry.archive, ended, penalty_share_at(settings, progress), axis
         )
-        # new worlds for those that end, and for those that are started anew within the episodes of other groups
+        # new worlds for those that end, and for those that are started anew within the episodes of
+        # other groups
         numbers = ended.step.shape[0], schedule.restarts(carry.state.step.shape[0])
         keys = self._key(carry, 4), self._key(carry, 5)
         fresh = _fresh(settings, starting, archive, *keys, numbers, axis)
@@ -248,7 +291,9 @@ class _Step:
         return carry, metrics
 
     def _key(self, carry, number):
-        """One of the keys of this step: of the next step, noise, windows, shuffling, tasks, resets."""
+        """One of the keys of this step: of the next step, noise, windows, shuffling, tasks,
+        resets.
+        """
         return jax.random.split(carry.key, 6)[number]
 
     def _progress(self, carry):
@@ -257,13 +302,19 @@ class _Step:
 
 
 def penalty_share_at(settings, progress):
-    """Share of the penalties that counts when a share `progress` of the run is done: a ramp from its start to one."""
+    """Share of the penalties that counts when a share `progress` of the run is done: a ramp from
+    its start to one.
+    """
     start = settings.mappo.penalty_start
-    return start + (1.0 - start) * jnp.minimum(progress / max(settings.mappo.penalty_ramp, 1e-6), 1.0)
+    return start + (1.0 - start) * jnp.minimum(
+        progress / max(settings.mappo.penalty_ramp, 1e-6), 1.0
+    )
 
 
 def _starting(settings, environment, progress):
-    """The environment whose episodes start with the vehicles and evaders of that moment of the run."""
+    """The environment whose episodes start with the vehicles and evaders of that moment of the
+    run.
+    """
 
     def grown(start, ramp):
         return jnp.clip((progress - start) / max(ramp, 1e-6), 0.0, 1.0)
@@ -279,27 +330,35 @@ def _starting(settings, environment, progress):
 
 
 def _tasks(settings, archive, keys, close=None):
-    """One task per key, repeated for the environments that share it; shares `close` of pursuers start close to something."""
+    """One task per key, repeated for the environments that share it; shares `close` of pursuers
+    start close to something.
+    """
     draw = functools.partial(generate_task, settings.generator, settings.environment, archive)
     tasks = jax.vmap(draw)(keys, close if settings.restart_close else None)
     return jax.tree.map(lambda x: jnp.repeat(x, settings.episodes_per_task, axis=0), tasks)
 
 
 def _fresh(settings, environment, archive, task_key, reset_key, numbers, axis):
-    """Observations and states of worlds of this device at the start of newly drawn tasks, of both `numbers` in one.
+    """Observations and states of worlds of this device at the start of newly drawn tasks, of both
+    `numbers` in one.
 
-    Of the second ones some pursuers start close to something. All are drawn at once, by a program half as large.
+    Of the second ones some pursuers start close to something. All are drawn at once, by a program
+    half as large.
     """
     share = settings.episodes_per_task
     close = jnp.repeat(jnp.array([0.0, settings.restart_close]), np.array(numbers) // share)
 
     def keys(key, numbers):
         parts = (
-            own_keys(jax.random.fold_in(key, i), number, axis) for i, number in enumerate(numbers) if number
+            own_keys(jax.random.fold_in(key, i), number, axis)
+            for i, number in enumerate(numbers)
+            if number
         )
         return jnp.concatenate(list(parts))
 
-    tasks = _tasks(settings, archive, keys(task_key, [number // share for number in numbers]), close)
+    tasks = _tasks(
+        settings, archive, keys(task_key, [number // share for number in numbers]), close
+    )
     return jax.vmap(environment.reset_to)(keys(reset_key, numbers), tasks)
 
 
@@ -308,7 +367,11 @@ def _selection(settings, archive, ended, penalty_share, axis):
     statistics = ended.statistics
     complete = statistics.steps >= settings.environment.episode_length
     share = settings.episodes_per_task
-    solved = successes(settings.generator, statistics, penalty_share).astype(jnp.float32).reshape(-1, share)
+    solved = (
+        successes(settings.generator, statistics, penalty_share)
+        .astype(jnp.float32)
+        .reshape(-1, share)
+    )
     if settings.generator.enabled:
         tasks = jax.tree.map(lambda x: x[::share], ended.task)
         candidates = gather_over_devices((tasks, jnp.mean(solved, axis=1), complete[::share]), axis)
@@ -326,7 +389,9 @@ def _selection(settings, archive, ended, penalty_share, axis):
         by_network = learned_place(settings.environment.evaders, ended.evader.kind) >= 0
         counted |= {"learned": by_network, "learned_capture_rate": by_network & statistics.captured}
     lasting = settings.schedule.lasting(statistics.steps.shape[0])
-    counted = {name: jnp.mean(value.astype(jnp.float32)[lasting]) for name, value in counted.items()}
+    counted = {
+        name: jnp.mean(value.astype(jnp.float32)[lasting]) for name, value in counted.items()
+    }
     counted = mean_over_devices(counted, axis)
     if "learned" in counted:
         counted["learned_capture_rate"] /= jnp.maximum(counted["learned"], 1e-6)

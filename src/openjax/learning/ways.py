@@ -1,7 +1,9 @@
-"""How far it is to the evader for who can't fly through pillars: shortest ways in the plane, by a visibility graph.
+"""How far it is to the evader for who can't fly through pillars: shortest ways in the plane, by a
+visibility graph.
 
-A shortest way round discs is straight but for where it bends about one. Here the discs, pillars with their safety distance,
-are polygons, and a way bends at their corners (Lozano-Perez and Wesley 1979, An algorithm for planning collision-free paths).
+A shortest way round discs is straight but for where it bends about one. Here the discs, pillars
+with their safety distance, are polygons, and a way bends at their corners (Lozano-Perez and Wesley
+1979, An algorithm for planning collision-free paths).
 """
 
 import jax
@@ -14,8 +16,10 @@ from openjax.pursuit import PursuitSettings, Task
 CORNERS = 6
 """Of the polygon about each pillar."""
 ROOM = 0.03
-"""How much farther from a pillar than the safety distance a way keeps (m). Nearer, the shares of crashes and breaches that a
-first flight counts early cost more than a way through saves: pursuers then stand before it."""
+"""How much farther from a pillar than the safety distance a way keeps (m). Nearer, the shares of
+crashes and breaches that a first flight counts early cost more than a way through saves: pursuers
+then stand before it.
+"""
 TOLL = 3.0
 """What a way through a pillar costs (m): more than any way round."""
 
@@ -26,7 +30,9 @@ class Ways:
 
     corner: jax.Array  # (C, 2) m
     toll: jax.Array  # (C,) m
-    """Of corners that no way may pass: outside the arena, in another pillar's reach, of no pillar."""
+    """Of corners that no way may pass: outside the arena, in another pillar's reach, of no
+    pillar.
+    """
     length: jax.Array  # (C, C) m, of the shortest way from one to another
 
 
@@ -35,7 +41,9 @@ def ways_of(settings: PursuitSettings, task: Task) -> Ways:
     reach = _reach(settings)
     angle = 2.0 * np.pi * np.arange(CORNERS) / CORNERS
     # where edges touch the circle, and a thousandth beyond it
-    around = 1.001 * reach / np.cos(np.pi / CORNERS) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    around = (
+        1.001 * reach / np.cos(np.pi / CORNERS) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    )
     corner = (task.pillar_position[:, None] + around).reshape(-1, 2)
     to_axis = jnp.sum((corner[:, None] - task.pillar_position) ** 2, axis=-1)
     closed = jnp.any((to_axis < reach**2) & task.pillar_active, axis=-1)
@@ -52,7 +60,9 @@ def ways_of(settings: PursuitSettings, task: Task) -> Ways:
 def way_length(
     settings: PursuitSettings, task: Task, ways: Ways, position: jax.Array, target: jax.Array
 ) -> jax.Array:
-    """(N,) m, of the shortest way from each of (N, 3) positions to (3,) a target; its gradient points along the way."""
+    """(N,) m, of the shortest way from each of (N, 3) positions to (3,) a target; its gradient
+    points along the way.
+    """
     from_corner = _straight(settings, task, ways.corner, target[:2])
     rest = jnp.append(ways.toll + jnp.min(ways.length + from_corner, axis=-1, initial=jnp.inf), 0.0)
     first = jnp.concatenate([ways.corner, target[None, :2]])
@@ -64,9 +74,12 @@ def way_length(
 
 
 def _straight(settings, task, start, end):
-    """(...,) m, from (..., 2) to (..., 2), with the toll of each pillar that is nearer on the way than at both its ends."""
+    """(...,) m, from (..., 2) to (..., 2), with the toll of each pillar that is nearer on the way
+    than at both its ends.
+    """
     along = end - start
-    square, reach = jnp.sum(along**2, axis=-1), _reach(settings)
+    square = jnp.sum(along**2, axis=-1)
+    reach = _reach(settings)
 
     def crosses(pillar, active):
         to_axis = pillar - start

@@ -27,9 +27,13 @@ class Actor(nn.Module):
         Float[Array, " sample"],
         Float[Array, "*worlds pursuers features"],
     ]:
-        """Mean, log standard deviation, and what the encoder made of the observation; predicted positions in m."""
+        """Mean, log standard deviation, and what the encoder made of the observation; predicted
+        positions in m.
+        """
         settings = self.settings
-        hidden = Encoder(settings.features, settings.heads, jnp.dtype(settings.compute_type), name="encoder")(
+        hidden = Encoder(
+            settings.features, settings.heads, jnp.dtype(settings.compute_type), name="encoder"
+        )(
             own_features(observation, predicted),
             observation.others,
             observation.pillars,
@@ -44,7 +48,9 @@ class Actor(nn.Module):
             name="mean",
         )(hidden)
         log_std = self.param(
-            "log_std", nn.initializers.constant(settings.initial_log_std), (len(self.initial_action),)
+            "log_std",
+            nn.initializers.constant(settings.initial_log_std),
+            (len(self.initial_action),),
         )
         return (jnp.tanh(mean) if settings.squash == "mean" else mean), log_std, hidden
 
@@ -61,14 +67,18 @@ class Critic(nn.Module):
         predicted: Float[Array, "*worlds horizons 3"] | None,
         encoded: Float[Array, "*worlds pursuers features"] | None = None,
     ) -> Float[Array, "*worlds pursuers"]:
-        """Values; `encoded` is what the actor's encoder made of the observation, if the encoder is shared."""
+        """Values; `encoded` is what the actor's encoder made of the observation, if the encoder is
+        shared.
+        """
         settings = self.settings
         dtype = jnp.dtype(settings.compute_type)
         sees_state = settings.critic_input == "state"
         if settings.shared_encoder:
             hidden = encoded
             if sees_state:
-                hidden = padded(jnp.concatenate([encoded, observation.privileged.astype(dtype)], axis=-1))
+                hidden = padded(
+                    jnp.concatenate([encoded, observation.privileged.astype(dtype)], axis=-1)
+                )
         else:
             own = own_features(observation, predicted)
             if sees_state:
@@ -78,13 +88,14 @@ class Critic(nn.Module):
         hidden = HiddenLayer(settings.features, dtype, name="hidden")(
             hidden.reshape(math.prod(leading), hidden.shape[-1])
         )
-        value = nn.Dense(1, dtype=jnp.float32, kernel_init=nn.initializers.orthogonal(1.0), name="value")(
-            hidden
-        )
+        value = nn.Dense(
+            1, dtype=jnp.float32, kernel_init=nn.initializers.orthogonal(1.0), name="value"
+        )(hidden)
         return value.reshape(leading)
 
     def _encoded(self, own, observation, dtype):
-        settings, leading = self.settings, own.shape[:-1]
+        settings = self.settings
+        leading = own.shape[:-1]
         if settings.critic_encoder == "attention":
             return Encoder(settings.features, settings.heads, dtype, name="encoder")(
                 own, observation.others, observation.pillars, observation.pillar_seen
@@ -108,4 +119,6 @@ def own_features(
         return observation.self_state
     relative = observation.position[..., :, None, :] - predicted[..., None, :, :]
     relative = turned_back(observation.heading, relative)
-    return jnp.concatenate([observation.self_state, relative.reshape(*relative.shape[:-2], -1)], axis=-1)
+    return jnp.concatenate(
+        [observation.self_state, relative.reshape(*relative.shape[:-2], -1)], axis=-1
+    )

@@ -18,9 +18,10 @@ MASKED = -1e4
 class SelfAttention(nn.Module):
     """Multi-head attention of the pursuer itself over itself and all other entities.
 
-    Only the own token's output is used, so one query suffices, and the key projection is folded into the query's, the
-    value projection into the output's: score and mean are taken in the space of the embeddings. Algebraically the same
-    as projecting keys and values of every entity (a bias of the keys cancels in the softmax).
+    Only the own token's output is used, so one query suffices, and the key projection is folded
+    into the query's, the value projection into the output's: score and mean are taken in the space
+    of the embeddings. Algebraically the same as projecting keys and values of every entity (a bias
+    of the keys cancels in the softmax).
     """
 
     features: int
@@ -31,8 +32,11 @@ class SelfAttention(nn.Module):
     def __call__(
         self, own: jax.Array, others: jax.Array, pillars: jax.Array, pillar_seen: jax.Array
     ) -> jax.Array:
-        """own (B, F) embedded; others (B, A, O), pillars (B, k, 5) as observed; pillar_seen (B, k) bool -> (B, F)."""
-        f, h = self.features, self.heads
+        """own (B, F) embedded; others (B, A, O), pillars (B, k, 5) as observed; pillar_seen (B, k)
+        bool -> (B, F).
+        """
+        f = self.features
+        h = self.heads
         width = f // h
         orthogonal = nn.initializers.orthogonal()
 
@@ -52,7 +56,10 @@ class SelfAttention(nn.Module):
         embed = nn.initializers.orthogonal(2**0.5)
         seen = jnp.where(pillar_seen, 0.0, MASKED)
         entities = []
-        for name, x, bias in (("others", others, jnp.zeros(others.shape[:-1])), ("pillars", pillars, seen)):
+        for name, x, bias in (
+            ("others", others, jnp.zeros(others.shape[:-1])),
+            ("pillars", pillars, seen),
+        ):
             size = x.shape[-1]
             if x.shape[-2] == 0:
                 continue
@@ -70,25 +77,37 @@ class SelfAttention(nn.Module):
         return self._one_by_one(own, query, output, entities)
 
     def _one_by_one(self, own, query, output, kinds):
-        """Entity by entity and head by head: matrix products of whole batches, which a CPU is good at."""
-        embedded, biases = [own.astype(jnp.float32)], [0.0]
+        """Entity by entity and head by head: matrix products of whole batches, which a CPU is good
+        at.
+        """
+        embedded = [own.astype(jnp.float32)]
+        biases = [0.0]
         for x, linear, scale, shift, bias in kinds:
             affine = jnp.stack([linear[-1], scale, shift[0]])
             for m in range(x.shape[-2]):
                 embedded.append(normalised_layer(x[:, m], linear[:-1], affine))
                 biases.append(bias[:, m : m + 1])
-        own, scale = own.astype(self.dtype), (self.features // self.heads) ** -0.5
+        own = own.astype(self.dtype)
+        scale = (self.features // self.heads) ** -0.5
         queries = [
-            scale * (own @ query[:, h].astype(self.dtype)).astype(jnp.float32) for h in range(self.heads)
+            scale * (own @ query[:, h].astype(self.dtype)).astype(jnp.float32)
+            for h in range(self.heads)
         ]
         means = attend_one_by_one(queries, embedded, biases)
-        return sum(means[h].astype(self.dtype) @ output[h].astype(self.dtype) for h in range(self.heads))
+        return sum(
+            means[h].astype(self.dtype) @ output[h].astype(self.dtype) for h in range(self.heads)
+        )
 
     def _fused(self, own, query, output, entities):
         """By the kernels for GPUs, and the formula that stands for them elsewhere."""
-        f, h = self.features, self.heads
+        f = self.features
+        h = self.heads
         width = f // h
-        kinds, weights, inputs, inverses, biases = [], [], [], [], []
+        kinds = []
+        weights = []
+        inputs = []
+        inverses = []
+        biases = []
         for x, linear, scale, shift, bias in entities:
             count, size = x.shape[-2:]
             inverse, linear = normalised_linear(x, linear)
@@ -111,8 +130,8 @@ class SelfAttention(nn.Module):
 def normalised_linear(x: jax.Array, linear: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Layer normalisation of a linear layer, without its output.
 
-    Mean and variance over the features of W' x are a linear and a quadratic form of the few numbers x, so centred
-    weights and the inverse standard deviation give the normalised output.
+    Mean and variance over the features of W' x are a linear and a quadratic form of the few numbers
+    x, so centred weights and the inverse standard deviation give the normalised output.
 
     Args:
       x: (..., size).
@@ -124,13 +143,17 @@ def normalised_linear(x: jax.Array, linear: jax.Array) -> tuple[jax.Array, jax.A
     """
     x = jnp.concatenate([x, jnp.ones_like(x[..., :1])], axis=-1)
     centred = linear - jnp.mean(linear, axis=1, keepdims=True)
-    covariance = jnp.matmul(centred, centred.T, precision=jax.lax.Precision.HIGHEST) / linear.shape[1]
+    covariance = (
+        jnp.matmul(centred, centred.T, precision=jax.lax.Precision.HIGHEST) / linear.shape[1]
+    )
     variance = jnp.sum(jnp.matmul(x, covariance, precision=jax.lax.Precision.HIGHEST) * x, axis=-1)
     return jax.lax.rsqrt(variance + 1e-6), centred
 
 
 class Encoder(nn.Module):
-    """Embeds self, other pursuers and pillars by an MLP per kind, attends, adds the self embedding, one more MLP."""
+    """Embeds self, other pursuers and pillars by an MLP per kind, attends, adds the self embedding,
+    one more MLP.
+    """
 
     features: int
     heads: int
@@ -140,7 +163,9 @@ class Encoder(nn.Module):
     def __call__(
         self, self_state: jax.Array, others: jax.Array, pillars: jax.Array, pillar_seen: jax.Array
     ) -> jax.Array:
-        """self_state (..., S), others (..., A, O), pillars (..., k, 5), pillar_seen (..., k) bool -> (..., F)."""
+        """self_state (..., S), others (..., A, O), pillars (..., k, 5), pillar_seen (..., k) bool
+        -> (..., F).
+        """
         leading = self_state.shape[:-1]
         rows = len(leading)
 
@@ -175,7 +200,9 @@ class HiddenLayer(nn.Module):
 
 
 def padded(x: jax.Array) -> jax.Array:
-    """(..., S) with zeros up to a multiple of 8: else XLA copies all samples to pad them for the matrix unit."""
+    """(..., S) with zeros up to a multiple of 8: else XLA copies all samples to pad them for the
+    matrix unit.
+    """
     extra = -x.shape[-1] % 8
     return jnp.concatenate([x, jnp.zeros((*x.shape[:-1], extra), x.dtype)], axis=-1) if extra else x
 

@@ -1,4 +1,6 @@
-"""A policy for a game in which it observes more of its own history: the same policy until it learns to use it."""
+"""A policy for a game in which it observes more of its own history: the same policy until it learns
+to use it.
+"""
 
 from collections.abc import Mapping
 from typing import Any
@@ -12,12 +14,16 @@ from openjax.pursuit.settings import OWN_FRAME, PursuitSettings
 
 
 def with_longer_history(
-    parameters: PolicyParameters, predictor: PredictorSettings, old: PursuitSettings, new: PursuitSettings
+    parameters: PolicyParameters,
+    predictor: PredictorSettings,
+    old: PursuitSettings,
+    new: PursuitSettings,
 ) -> PolicyParameters:
-    """`parameters` of a policy trained in the game `old`, for the game `new`, which observes as long a history or longer.
+    """`parameters` of a policy trained in the game `old`, for the game `new`, which observes as
+    long a history or longer.
 
-    The first layer's weights for the additional, older frames are zero. The critic, which may see other privileged
-    numbers as well, is left out where the history grows.
+    The first layer's weights for the additional, older frames are zero. The critic, which may see
+    other privileged numbers as well, is left out where the history grows.
 
     Raises:
       UserError: the policy isn't made of networks.
@@ -36,7 +42,9 @@ def with_longer_history(
         kernel = encoder["self_1"]["kernel"][:inputs]
         zeros = jnp.zeros((more, kernel.shape[1]), kernel.dtype)
         kernel = jnp.concatenate([kernel[:before], zeros, kernel[before:]])
-        kernel = jnp.pad(kernel, ((0, -kernel.shape[0] % 8), (0, 0)))  # as the encoder pads its inputs
+        kernel = jnp.pad(
+            kernel, ((0, -kernel.shape[0] % 8), (0, 0))
+        )  # as the encoder pads its inputs
         encoder["self_1"] = {**encoder["self_1"], "kernel": kernel}
         return {**actor, "params": {**params, "encoder": encoder}}
 

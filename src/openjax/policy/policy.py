@@ -1,4 +1,6 @@
-"""Actor, critic and predictor as one policy: initial parameters, distribution, value, prediction."""
+"""Actor, critic and predictor as one policy: initial parameters, distribution, value,
+prediction.
+"""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -67,7 +69,9 @@ class Policy:
         actor_key, critic_key, predictor_key = jax.random.split(key, 3)
         predictor = {}
         if self.predictor.enabled:
-            predictor = self._predictor.init(predictor_key, observation.frames, observation.last_seen)
+            predictor = self._predictor.init(
+                predictor_key, observation.frames, observation.last_seen
+            )
         parameters = PolicyParameters(actor={}, critic={}, predictor=predictor)
         predicted = self.predict(parameters, observation)
         actor = self._actor.init(actor_key, observation, predicted)
@@ -90,11 +94,16 @@ class Policy:
         frames: Float[Array, "*worlds window features"],
         last_seen: Float[Array, "*worlds 3"],
     ) -> Float[Array, "*worlds horizons 3"]:
-        """Positions (m) predicted from windows of frames, oldest first, and last seen positions (m)."""
+        """Positions (m) predicted from windows of frames, oldest first, and last seen positions
+        (m).
+        """
         return self._predictor.apply(predictor, frames, last_seen)
 
     def distribution(
-        self, actor: Any, observation: Observation, predicted: Float[Array, "*worlds horizons 3"] | None
+        self,
+        actor: Any,
+        observation: Observation,
+        predicted: Float[Array, "*worlds horizons 3"] | None,
     ) -> tuple[Float[Array, "*worlds pursuers sample"], Float[Array, " sample"]]:
         """Mean and log standard deviation of the Gaussian over samples; see `action`."""
         return self._actor.apply(actor, observation, predicted)[:2]
@@ -105,11 +114,14 @@ class Policy:
         return len(self.initial_action)
 
     def action(
-        self, sample: Float[Array, "*worlds pursuers sample"], observation: Observation | None = None
+        self,
+        sample: Float[Array, "*worlds pursuers sample"],
+        observation: Observation | None = None,
     ) -> Float[Array, "*worlds pursuers sample"]:
         """The action in -1..1 that a sample of the Gaussian, or its mean, stands for.
 
-        Policies whose samples aren't commands work the four out from the `observation` (`openjax.baselines.dacoop`).
+        Policies whose samples aren't commands work the four out from the `observation`
+        (`openjax.baselines.dacoop`).
         """
         return jnp.clip(sample, -1.0, 1.0) if self.network.squash == "mean" else jnp.tanh(sample)
 
@@ -130,7 +142,9 @@ class Policy:
         observation: Observation,
         predicted: Float[Array, "*worlds horizons 3"] | None,
     ) -> tuple[
-        Float[Array, "*worlds pursuers sample"], Float[Array, " sample"], Float[Array, "*worlds pursuers"]
+        Float[Array, "*worlds pursuers sample"],
+        Float[Array, " sample"],
+        Float[Array, "*worlds pursuers"],
     ]:
         """`distribution` and `value`: mean, log standard deviation, value."""
         mean, log_std, encoded = self._actor.apply(actor, observation, predicted)
@@ -141,11 +155,15 @@ class Policy:
     ) -> Float[Array, "*worlds pursuers 4"]:
         """The mean policy's action in -1..1."""
         predicted = self.predict(parameters, observation)
-        return self.action(self.distribution(parameters.actor, observation, predicted)[0], observation)
+        return self.action(
+            self.distribution(parameters.actor, observation, predicted)[0], observation
+        )
 
 
 def gaussian_log_prob(
-    sample: Float[Array, "*samples size"], mean: Float[Array, "*samples size"], log_std: Float[Array, " size"]
+    sample: Float[Array, "*samples size"],
+    mean: Float[Array, "*samples size"],
+    log_std: Float[Array, " size"],
 ) -> Float[Array, "*samples"]:
     """Log density of samples under independent Gaussians."""
     scaled = (sample - mean) * jnp.exp(-log_std)

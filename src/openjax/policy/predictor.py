@@ -19,8 +19,11 @@ class EvaderPredictor(nn.Module):
     def __call__(
         self, frames: Float[Array, "*worlds window features"], last_seen: Float[Array, "*worlds 3"]
     ) -> Float[Array, "*worlds horizons 3"]:
-        """Positions (m, world) from frames, oldest first, and where the evader was last seen (m)."""
-        units, horizons = self.settings.units, self.settings.horizons
+        """Positions (m, world) from frames, oldest first, and where the evader was last seen
+        (m).
+        """
+        units = self.settings.units
+        horizons = self.settings.horizons
         # all frames' projections in one product; only the recurrent part is sequential
         inputs = nn.Dense(4 * units, name="input")(frames)
         recurrent = self.param("recurrent", nn.initializers.orthogonal(), (units, 4 * units))
@@ -28,13 +31,17 @@ class EvaderPredictor(nn.Module):
         for i in range(frames.shape[-2]):
             gates = inputs[..., i, :] + hidden @ recurrent
             in_gate, forget_gate, candidate, out_gate = jnp.split(gates, 4, axis=-1)
-            cell = jax.nn.sigmoid(forget_gate + 1.0) * cell + jax.nn.sigmoid(in_gate) * jnp.tanh(candidate)
+            cell = jax.nn.sigmoid(forget_gate + 1.0) * cell + jax.nn.sigmoid(in_gate) * jnp.tanh(
+                candidate
+            )
             hidden = jax.nn.sigmoid(out_gate) * jnp.tanh(cell)
-        output = nn.Dense(3 * len(horizons), kernel_init=nn.initializers.orthogonal(0.1), name="output")(
-            hidden
-        )
+        output = nn.Dense(
+            3 * len(horizons), kernel_init=nn.initializers.orthogonal(0.1), name="output"
+        )(hidden)
         output = output.reshape(*output.shape[:-1], len(horizons), 3)
-        scale = jnp.array([self.arena_radius, self.arena_radius, self.arena_height / 2], jnp.float32)
+        scale = jnp.array(
+            [self.arena_radius, self.arena_radius, self.arena_height / 2], jnp.float32
+        )
         if self.settings.relative:
             return last_seen[..., None, :] + 0.1 * scale * output
         return jnp.array([0.0, 0.0, self.arena_height / 2], jnp.float32) + scale * output

@@ -25,7 +25,9 @@ class Breaches:
         return self.pillar + self.drone + self.bounds
 
 
-def pillar_distance(settings: PursuitSettings, position: jax.Array, pillar_position: jax.Array) -> jax.Array:
+def pillar_distance(
+    settings: PursuitSettings, position: jax.Array, pillar_position: jax.Array
+) -> jax.Array:
     """(N, P) distance (m) between (N, 3) centres and the surfaces of (P, 2) pillars."""
     offset = position[:, None, :2] - pillar_position[None]
     return jnp.sqrt(jnp.sum(offset**2, axis=-1) + 1e-12) - settings.pillar_radius
@@ -46,7 +48,9 @@ def breaches(
     pillar_active: jax.Array,
     margin: float = 0.0,
 ) -> Breaches:
-    """Count the breaches of each of N pursuers at (N, 3) positions; `margin` (m) widens every limit."""
+    """Count the breaches of each of N pursuers at (N, 3) positions; `margin` (m) widens every
+    limit.
+    """
     to_pillar = pillar_distance(settings, position, pillar_position)
     near_pillar = pillar_active[None] & (to_pillar < settings.pillar_clearance + margin)
     near_drone = drone_distance(position) < settings.drone_clearance + margin
@@ -67,9 +71,11 @@ def crashed(
     pillar_active: jax.Array,
     margin: float = 0.0,
 ) -> jax.Array:
-    """(N,) whether each pursuer touches the floor or anything solid, or is tilted beyond 90 degrees.
+    """(N,) whether each pursuer touches the floor or anything solid, or is tilted beyond 90
+    degrees.
 
-    `body_z_up` (N,) is the world z component of the body's z axis. `margin` widens every limit (m; and the cosine).
+    `body_z_up` (N,) is the world z component of the body's z axis. `margin` widens every limit (m;
+    and the cosine).
     """
     reach = DRONE_RADIUS + TOUCH + margin
     on_floor = position[:, 2] < reach

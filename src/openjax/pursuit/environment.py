@@ -21,11 +21,20 @@ from openjax.pursuit.state import PursuitState
 from openjax.pursuit.statistics import count, empty_statistics
 from openjax.pursuit.task import Task, start_attitude, uniform_task
 from openjax.ranges import changed
-from openjax.vehicle import DroneState, Vehicle, hover_share, hover_state, load_vehicle, make_drones_step
+from openjax.vehicle import (
+    DroneState,
+    Vehicle,
+    hover_share,
+    hover_state,
+    load_vehicle,
+    make_drones_step,
+)
 from openjax.vehicle.family import draw_vehicles, family_effects
 
 THRUST_LIMIT = 0.9
-"""The commanded thrust is cut here, as a fraction of the maximum (the paper's simulator does so)."""
+"""The commanded thrust is cut here, as a fraction of the maximum (the paper's simulator does
+so).
+"""
 
 
 def hover_action(vehicle: Vehicle) -> jax.Array:
@@ -34,7 +43,9 @@ def hover_action(vehicle: Vehicle) -> jax.Array:
 
 
 def action_to_command(action: jax.Array) -> jax.Array:
-    """(..., 4) action in -1..1 to command: collective thrust 0..0.9 of the maximum, body rates up to pi rad/s."""
+    """(..., 4) action in -1..1 to command: collective thrust 0..0.9 of the maximum, body rates up
+    to pi rad/s.
+    """
     action = jnp.clip(action, -1.0, 1.0)
     thrust = jnp.minimum(0.5 * (action[..., :1] + 1.0), THRUST_LIMIT)
     return jnp.concatenate([thrust, jnp.pi * action[..., 1:]], axis=-1)
@@ -63,7 +74,9 @@ class Dynamics(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Pursuit:
-    """Pursuit-evasion by N quadrotors, as pure functions: map them with `jax.vmap`, compile them with `jax.jit`."""
+    """Pursuit-evasion by N quadrotors, as pure functions: map them with `jax.vmap`, compile them
+    with `jax.jit`.
+    """
 
     settings: PursuitSettings | None = None
     """The game; None: the paper's."""
@@ -76,10 +89,13 @@ class Pursuit:
     vehicle_bounds: jax.Array | None = None
     """(R, 4) bounds of `settings.vehicles` that go before those written there."""
     evader_share: jax.Array | None = None
-    """() from 0 to 1, how far a curriculum over `settings.evaders` has come; None is 1. See `openjax.pursuit.evaders`."""
+    """() from 0 to 1, how far a curriculum over `settings.evaders` has come; None is 1. See
+    `openjax.pursuit.evaders`.
+    """
     evader_networks: Any = None
-    """Parameters of the learned evaders (`openjax.pursuit.evaders.learned`) that the settings name, with their axis first; None:
-    they do as the greedy one."""
+    """Parameters of the learned evaders (`openjax.pursuit.evaders.learned`) that the settings name,
+    with their axis first; None: they do as the greedy one.
+    """
     dynamics: Dynamics | None = None
     """What moves the pursuers; None: the physics that the settings name, with the effects."""
 
@@ -101,7 +117,9 @@ class Pursuit:
             ),
         }
         for name, value in complete.items():
-            object.__setattr__(self, name, value)  # the one moment at which a frozen object is filled
+            object.__setattr__(
+                self, name, value
+            )  # the one moment at which a frozen object is filled
 
     @property
     def action_space(self) -> Box:
@@ -142,7 +160,9 @@ class Pursuit:
         chex.assert_shape(task.pillar_position, (*task.pillar_active.shape, 2))
         attitude_key, effect_key = jax.random.split(key)
         quaternion = start_attitude(settings, attitude_key)
-        drones = jax.vmap(lambda p, q: hover_state(self.vehicle, p, q))(task.pursuer_position, quaternion)
+        drones = jax.vmap(lambda p, q: hover_state(self.vehicle, p, q))(
+            task.pursuer_position, quaternion
+        )
         drones = self.dynamics.reset(self.vehicle, drones, effect_key)
         vehicles = draw_vehicles(
             settings.vehicles,
@@ -158,7 +178,11 @@ class Pursuit:
             steps = settings.observe_history * settings.observe_history_spacing
             own_history = jnp.broadcast_to(own_history, (steps, *own_history.shape))
         in_sight = line_of_sight(
-            settings, task.pursuer_position, task.evader_position, task.pillar_position, task.pillar_active
+            settings,
+            task.pursuer_position,
+            task.evader_position,
+            task.pillar_position,
+            task.pillar_active,
         )
         seen = jnp.any(in_sight)
         still = jnp.zeros(3, jnp.float32)
@@ -175,7 +199,11 @@ class Pursuit:
             evader_position=task.evader_position,
             evader_velocity=still,
             evader=draw_evader(
-                settings, jax.random.fold_in(key, 3), task.pursuer_position, self.evader_share, task.evader
+                settings,
+                jax.random.fold_in(key, 3),
+                task.pursuer_position,
+                self.evader_share,
+                task.evader,
             ),
             last_seen=jnp.where(seen, task.evader_position, middle),
             in_sight=in_sight,
@@ -196,11 +224,15 @@ class Pursuit:
         return dataclasses.replace(self, evader_share=share)
 
     def observe(self, state: PursuitState) -> Observation:
-        """The observation of a state; effects on the sensors act on what a pursuer knows of all pursuers."""
+        """The observation of a state; effects on the sensors act on what a pursuer knows of all
+        pursuers.
+        """
         return observe(self.settings, state, self._seen(state.drones, state.vehicles))
 
     def _parameters(self, vehicles):
-        """Parameters of all effects: those drawn for the episode, and this environment's own, which go first."""
+        """Parameters of all effects: those drawn for the episode, and this environment's own, which
+        go first.
+        """
         return {**vehicles, **self.effect_parameters}
 
     def _seen(self, drones, vehicles):
@@ -212,16 +244,20 @@ class Pursuit:
         """One control step.
 
         Args:
-          key: for an interface like other environments'; the game itself draws nothing after its reset.
+          key: for an interface like other environments'; the game itself draws nothing after its
+          reset.
           state: of this step's start.
-          action: (N, 4) in -1..1: collective thrust, roll, pitch and yaw rate; see `action_to_command`.
-          wish: (3,) where an evader from outside flies, as a share of its speed (at most length one); None or NaN: its own rule.
+          action: (N, 4) in -1..1: collective thrust, roll, pitch and yaw rate; see
+          `action_to_command`.
+          wish: (3,) where an evader from outside flies, as a share of its speed (at most length
+          one); None or NaN: its own rule.
 
         Returns:
           observation, state, reward (N,), terminated (), truncated (), info.
         """
         del key
-        settings, task = self.settings, state.task
+        settings = self.settings
+        task = state.task
         chex.assert_shape(action, (settings.num_pursuers, 4))
         action = jnp.clip(action.astype(jnp.float32), -1.0, 1.0)
         drones = self.dynamics(
@@ -234,18 +270,27 @@ class Pursuit:
         )
         if settings.speed_limit == "clamp":
             speed = jnp.sqrt(jnp.sum(drones.velocity**2, axis=-1, keepdims=True) + 1e-12)
-            drones = drones.replace(velocity=drones.velocity * jnp.minimum(1.0, settings.max_speed / speed))
+            drones = drones.replace(
+                velocity=drones.velocity * jnp.minimum(1.0, settings.max_speed / speed)
+            )
         return self.follow(state, action, drones, wish)
 
     def follow(
-        self, state: PursuitState, action: jax.Array, drones: DroneState, wish: jax.Array | None = None
+        self,
+        state: PursuitState,
+        action: jax.Array,
+        drones: DroneState,
+        wish: jax.Array | None = None,
     ) -> tuple[Observation, PursuitState, jax.Array, jax.Array, jax.Array, StepInfo]:
-        """The game's part of a step that began at `state` with `action` and ended with the pursuers as `drones`.
+        """The game's part of a step that began at `state` with `action` and ended with the pursuers
+        as `drones`.
 
-        `step` is physics and this; where the pursuers are flown by something else, real vehicles say, this alone.
-        Returns what `step` does.
+        `step` is physics and this; where the pursuers are flown by something else, real vehicles
+        say, this alone. Returns what `step` does.
         """
-        settings, task, before = self.settings, state.task, state
+        settings = self.settings
+        task = state.task
+        before = state
         pillars = (task.pillar_position, task.pillar_active)
         velocity, evader_state = evader_velocity(settings, before, self.evader_networks, wish)
         evader = before.evader_position + settings.time_step * velocity
@@ -276,7 +321,9 @@ class Pursuit:
             seen=seen,
             breaches=breaches(settings, position, *pillars),
             over_speed=over_speed(settings, drones.velocity),
-            crashed=crashed(settings, position, rotation_axes(drones.quaternion)[1][:, 2], *pillars),
+            crashed=crashed(
+                settings, position, rotation_axes(drones.quaternion)[1][:, 2], *pillars
+            ),
             penalty=jnp.zeros(settings.num_pursuers, jnp.float32),
         )
         rewards, penalty = reward(settings, before, state, info)
@@ -284,7 +331,8 @@ class Pursuit:
         state = state.replace(statistics=count(before.statistics, step, info, rewards))
         over = step >= settings.episode_length
         never = jnp.zeros((), bool)
-        # an observed horizon is part of the task, so its end is terminal; an unobserved one only cuts the episode
+        # an observed horizon is part of the task, so its end is terminal; an unobserved one only
+        # cuts the episode
         terminated, truncated = (over, never) if settings.observe_time else (never, over)
         return observe(settings, state, seen_drones), state, rewards, terminated, truncated, info
 
@@ -298,12 +346,14 @@ def make(settings: PursuitSettings | None = None, evader: str | None = None, **c
       changes: fields of `PursuitSettings`: `make(num_pursuers=4, reward=dict(crash=20.0))`.
 
     Raises:
-      UserError: no such setting, a value that it can't have, an evader that nobody knows, or the learned one, which is more
+      UserError: no such setting, a value that it can't have, an evader that nobody knows, or the
+      learned one, which is more
         than a name.
     """
     if evader == "learned":
         raise UserError(
-            "evader learned: a name isn't enough; a file of openjax exploit is the opponent= of openjax.evaluate, "
+            "evader learned: a name isn't enough; a file of openjax exploit is the opponent= of "
+            "openjax.evaluate, "
             "the --opponent of commands"
         )
     if evader is not None:

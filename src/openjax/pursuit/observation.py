@@ -16,10 +16,14 @@ from openjax.vehicle.family import standard_parameters
 
 @struct.dataclass
 class Observation:
-    """Observation of N pursuers. Relative positions point from the entity to the pursuer (p_i - p_entity), in metres."""
+    """Observation of N pursuers. Relative positions point from the entity to the pursuer (p_i -
+    p_entity), in metres.
+    """
 
     self_state: jax.Array
-    """(N, S) evader, quaternion wxyz, velocity, body x, body z axis, t/T x 4 [, position] [, history]"""
+    """(N, S) evader, quaternion wxyz, velocity, body x, body z axis, t/T x 4 [, position] [,
+    history]
+    """
     others: jax.Array
     """(N, N - 1, O) other pursuers: relative position [, relative velocity, body z axis]"""
     pillars: jax.Array
@@ -27,7 +31,9 @@ class Observation:
     pillar_seen: jax.Array
     """(N, k) bool, slots in use"""
     privileged: jax.Array
-    """(N, Q) true relative evader position, its velocity, own position, seen [, own velocity, vehicle]"""
+    """(N, Q) true relative evader position, its velocity, own position, seen [, own velocity,
+    vehicle]
+    """
     position: jax.Array
     """(N, 3) own positions, to express predicted positions relative to them"""
     last_seen: jax.Array
@@ -35,7 +41,9 @@ class Observation:
     frames: jax.Array
     """(n, F) history for the predictor, oldest first"""
     heading: jax.Array | None = None
-    """(N, 2) cosine and sine of the yaw by which each pursuer's vectors are turned back, all but `position`; None: by none"""
+    """(N, 2) cosine and sine of the yaw by which each pursuer's vectors are turned back, all but
+    `position`; None: by none
+    """
 
 
 def rotation_axes(quaternion: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -54,14 +62,18 @@ def frame(
     velocity: jax.Array,
     seen: jax.Array,
 ) -> jax.Array:
-    """(F,) one frame of the predictor's history: t/T, evader position and velocity (-5 where unseen), pursuers."""
+    """(F,) one frame of the predictor's history: t/T, evader position and velocity (-5 where
+    unseen), pursuers.
+    """
     time = step.astype(jnp.float32)[None] / settings.episode_length
     evader = jnp.where(seen, jnp.concatenate([evader, velocity]), HIDDEN)
     return jnp.concatenate([time, evader, pursuers.ravel()])
 
 
 def own_frame(quaternion: jax.Array, velocity: jax.Array, action: jax.Array) -> jax.Array:
-    """(N, OWN_FRAME) what N pursuers remember of a moment: (N, 3) velocity, body x and z axes, the action before it."""
+    """(N, OWN_FRAME) what N pursuers remember of a moment: (N, 3) velocity, body x and z axes, the
+    action before it.
+    """
     return jnp.concatenate([velocity, *rotation_axes(quaternion), action], axis=-1)
 
 
@@ -71,7 +83,10 @@ def observe(settings: PursuitSettings, state: PursuitState, seen_drones: DroneSt
     `seen_drones` is what sensors tell of `state.drones`; only the critic sees these themselves.
     """
     n = settings.num_pursuers
-    evader, seen, task, position = state.evader_position, state.seen, state.task, seen_drones.position
+    evader = state.evader_position
+    seen = state.seen
+    task = state.task
+    position = seen_drones.position
     heading = None
     if settings.observe_in == "heading":
         ahead = rotation_axes(seen_drones.quaternion)[0][:, :2]
@@ -79,13 +94,24 @@ def observe(settings: PursuitSettings, state: PursuitState, seen_drones: DroneSt
     turned = functools.partial(turned_back, heading)
 
     # slices and no index: the gradient of an index is a scatter
-    others = jnp.stack([position[i] - jnp.concatenate([position[:i], position[i + 1 :]]) for i in range(n)])
-    pillars, pillar_seen = _nearest_pillars(settings, position, task.pillar_position, task.pillar_active)
+    others = jnp.stack(
+        [position[i] - jnp.concatenate([position[:i], position[i + 1 :]]) for i in range(n)]
+    )
+    pillars, pillar_seen = _nearest_pillars(
+        settings, position, task.pillar_position, task.pillar_active
+    )
     drones = state.drones
-    vectors = drones.position - evader, jnp.broadcast_to(state.evader_velocity, (n, 3)), drones.position
+    vectors = (
+        drones.position - evader,
+        jnp.broadcast_to(state.evader_velocity, (n, 3)),
+        drones.position,
+    )
     true_parts = [*map(turned, vectors), jnp.broadcast_to(seen.astype(jnp.float32), (n, 1))]
     if settings.vehicles:
-        true_parts += [turned(drones.velocity), standard_parameters(settings.vehicles, state.vehicles)]
+        true_parts += [
+            turned(drones.velocity),
+            standard_parameters(settings.vehicles, state.vehicles),
+        ]
     return Observation(
         self_state=_own_part(settings, state, seen_drones, turned),
         others=turned(others),
@@ -101,7 +127,8 @@ def observe(settings: PursuitSettings, state: PursuitState, seen_drones: DroneSt
 
 def _own_part(settings, state, seen_drones, turned):
     """`self_state`; `turned` turns vectors (N, ..., 3)."""
-    position, quaternion = seen_drones.position, seen_drones.quaternion
+    position = seen_drones.position
+    quaternion = seen_drones.quaternion
     body_x, body_z = map(turned, rotation_axes(quaternion))
     if settings.observe_in == "heading":
         quaternion = _quaternion(body_x, body_z)
@@ -116,7 +143,9 @@ def _own_part(settings, state, seen_drones, turned):
         spacing = settings.observe_history_spacing
         history = jnp.moveaxis(state.own_history[spacing - 1 :: spacing], 0, 1)
         vectors = [turned(history[..., i : i + 3]) for i in (0, 3, 6)]
-        parts.append(jnp.concatenate([*vectors, history[..., 9:]], axis=-1).reshape(len(position), -1))
+        parts.append(
+            jnp.concatenate([*vectors, history[..., 9:]], axis=-1).reshape(len(position), -1)
+        )
     return jnp.concatenate(parts, axis=-1)
 
 
@@ -125,20 +154,24 @@ def _quaternion(body_x, body_z):
     body_y = jnp.cross(body_z, body_x)
     trace = body_x[:, 0] + body_y[:, 1] + body_z[:, 2]
     w = 0.5 * jnp.sqrt(jnp.maximum(1.0 + trace, 1e-3))
-    x, y, z = body_y[:, 2] - body_z[:, 1], body_z[:, 0] - body_x[:, 2], body_x[:, 1] - body_y[:, 0]
+    x = body_y[:, 2] - body_z[:, 1]
+    y = body_z[:, 0] - body_x[:, 2]
+    z = body_x[:, 1] - body_y[:, 0]
     return jnp.stack([w, 0.25 * x / w, 0.25 * y / w, 0.25 * z / w], axis=-1)
 
 
 def _nearest_pillars(settings, position, pillar_position, pillar_active):
     """The k nearest active pillars of each pursuer: (N, k, 5) features, and (N, k) in use."""
-    n, k = settings.num_pursuers, settings.observed_pillars
+    n = settings.num_pursuers
+    k = settings.observed_pillars
     slots = pillar_position.shape[0]
     if slots < k:
         pillar_position = jnp.concatenate([pillar_position, jnp.zeros((k - slots, 2), jnp.float32)])
         pillar_active = jnp.concatenate([pillar_active, jnp.zeros(k - slots, bool)])
     distance = pillar_distance(settings, position, pillar_position)
     distance = jnp.where(pillar_active[None], distance, jnp.inf)
-    # rank by counting nearer ones: for a handful of pillars much cheaper on an accelerator than a sort
+    # rank by counting nearer ones: for a handful of pillars much cheaper on an accelerator than a
+    # sort
     earlier = jnp.arange(distance.shape[1])[:, None] < jnp.arange(distance.shape[1])[None]
     nearer = (distance[:, :, None] < distance[:, None, :]) | (
         (distance[:, :, None] == distance[:, None, :]) & earlier[None]

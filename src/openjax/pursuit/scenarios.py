@@ -72,14 +72,19 @@ SCENARIOS: dict[str, Scenario] = {
         ),
         _layout("empty", (), _RIGHT, (-0.8, 0.0)),
         _layout(
-            "hidden", ((0.0, 0.0), (0.0, 0.2), (0.0, -0.2), (-0.4, 0.4), (-0.4, -0.4)), _RIGHT, (-0.8, 0.0)
+            "hidden",
+            ((0.0, 0.0), (0.0, 0.2), (0.0, -0.2), (-0.4, 0.4), (-0.4, -0.4)),
+            _RIGHT,
+            (-0.8, 0.0),
         ),
     )
 }
 
 
 def scenario_settings(settings: PursuitSettings, scenario: Scenario) -> PursuitSettings:
-    """The settings with as many pursuers and pillar slots as the scenario has (at least one slot)."""
+    """The settings with as many pursuers and pillar slots as the scenario has (at least one
+    slot).
+    """
     slots = max(1, len(scenario.pillars))
     return dataclasses.replace(
         settings,
@@ -95,14 +100,16 @@ def scenario_task(settings: PursuitSettings, scenario: Scenario) -> Task:
     Raises:
       UserError: it has more pillars than that, or not `settings.num_pursuers` pursuers.
     """
-    slots, used = settings.max_pillars, len(scenario.pillars)
+    slots = settings.max_pillars
+    used = len(scenario.pillars)
     if used > slots:
         raise UserError(
             f"scenario {scenario.name}: {used} pillars do not fit into {slots} slots (max_pillars)"
         )
     if len(scenario.pursuers) != settings.num_pursuers:
         raise UserError(
-            f"scenario {scenario.name}: has {len(scenario.pursuers)} pursuers, the environment {settings.num_pursuers}"
+            f"scenario {scenario.name}: has {len(scenario.pursuers)} pursuers, the environment "
+            f"{settings.num_pursuers}"
         )
     pillars = np.zeros((slots, 2), np.float32)
     pillars[:used] = np.asarray(scenario.pillars, np.float32).reshape(used, 2)
@@ -117,18 +124,20 @@ def scenario_task(settings: PursuitSettings, scenario: Scenario) -> Task:
 def find_scenario(name_or_path: str, settings: PursuitSettings) -> Scenario:
     """A scenario by its name, or read from a TOML file.
 
-    The file holds `pillars` (list of [x, y]), `pursuers` (list of [x, y, z]) and `evader` ([x, y, z]), in metres, and
-    optionally a `name`.
+    The file holds `pillars` (list of [x, y]), `pursuers` (list of [x, y, z]) and `evader` ([x, y,
+    z]), in metres, and optionally a `name`.
 
     Raises:
-      UserError: no such name or file, a wrong entry, a pillar outside the arena or over a start, a start outside.
+      UserError: no such name or file, a wrong entry, a pillar outside the arena or over a start, a
+      start outside.
     """
     if name_or_path in SCENARIOS:
         return SCENARIOS[name_or_path]
     path = Path(name_or_path)
     if path.suffix != ".toml":
         raise UserError(
-            f"scenario {name_or_path}: no such layout, nor a .toml file; {suggestion(str(name_or_path), SCENARIOS)}"
+            f"scenario {name_or_path}: no such layout, nor a .toml file; "
+            f"{suggestion(str(name_or_path), SCENARIOS)}"
         )
     told = {"name": path.stem, "pillars": [], **read_toml(path, "layout")}
     scenario = from_plain(Scenario, told, f"{path}: ")
@@ -139,13 +148,14 @@ def find_scenario(name_or_path: str, settings: PursuitSettings) -> Scenario:
 
 def _faults(layout: Scenario, settings: PursuitSettings) -> list[str]:
     """What can't be about a layout."""
-    pursuers, pillars, radius, height = (
-        layout.pursuers,
-        layout.pillars,
-        settings.arena_radius,
-        settings.arena_height,
-    )
-    starts = [*((f"pursuer {i + 1}", p) for i, p in enumerate(pursuers)), ("the evader", layout.evader)]
+    pursuers = layout.pursuers
+    pillars = layout.pillars
+    radius = settings.arena_radius
+    height = settings.arena_height
+    starts = [
+        *((f"pursuer {i + 1}", p) for i, p in enumerate(pursuers)),
+        ("the evader", layout.evader),
+    ]
     reach = settings.pillar_radius + DRONE_RADIUS
     faults = []
     if not 1 <= len(pursuers) <= 8:

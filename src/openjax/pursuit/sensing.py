@@ -13,9 +13,11 @@ def line_of_sight(
     pillar_position: jax.Array,
     pillar_active: jax.Array,
 ) -> jax.Array:
-    """(N,) whether the segment from each (N, 3) position to the (3,) target is clear of pillars, seen from above.
+    """(N,) whether the segment from each (N, 3) position to the (3,) target is clear of pillars,
+    seen from above.
 
-    A pillar blocks it if its axis is closer to the segment than its radius and the foot point lies on the segment.
+    A pillar blocks it if its axis is closer to the segment than its radius and the foot point lies
+    on the segment.
     """
     start = position[:, None, :2]
     segment = target[None, None, :2] - start

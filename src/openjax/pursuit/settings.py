@@ -17,13 +17,16 @@ OWN_FRAME = 13
 
 @dataclass(frozen=True)
 class RewardSettings:
-    """Weights of the reward. Paper, section IV-A; the speed penalty is the released code's, at the collision's weight."""
+    """Weights of the reward. Paper, section IV-A; the speed penalty is the released code's, at the
+    collision's weight.
+    """
 
     capture: Annotated[float, Interval("[0, 1e6]")] = 6.0
     """To every pursuer, in each step in which any pursuer captures."""
     first_capture: Annotated[float, Interval("[0, 1e6]")] = 0.0
-    """To every pursuer, once, at an episode's first capture: where the evader gets away again, a step in reach of it is worth
-    less than closing in costs (not in the paper)."""
+    """To every pursuer, once, at an episode's first capture: where the evader gets away again, a
+    step in reach of it is worth less than closing in costs (not in the paper).
+    """
     distance: Annotated[float, Interval("[0, 1e6]")] = 0.1
     """Subtracted per metre between pursuer and evader."""
     collision: Annotated[float, Interval("[0, 1e6]")] = 10.0
@@ -33,14 +36,22 @@ class RewardSettings:
     smoothness: Annotated[float, Interval("[0, 1e6]")] = 0.0
     """Weight of `exp(-|a_t - a_{t-1}|)`; 2.0 in the paper's second stage."""
     crash: Annotated[float, Interval("[0, 1e6]")] = 0.0
-    """Subtracted in each step in which a pursuer touches something solid or tips over (not in the paper)."""
+    """Subtracted in each step in which a pursuer touches something solid or tips over (not in the
+    paper).
+    """
     first_crash: Annotated[float, Interval("[0, 1e6]")] = 0.0
-    """Subtracted once, of the pursuers that crash first in an episode, and not early by margin or lookahead: while they
-    count a start close to a pillar as a crash anyhow, nothing else would be lost by touching it (not in the paper)."""
+    """Subtracted once, of the pursuers that crash first in an episode, and not early by margin or
+    lookahead: while they count a start close to a pillar as a crash anyhow, nothing else would be
+    lost by touching it (not in the paper).
+    """
     margin: Annotated[float, Interval("[0, 1]")] = 0.0
-    """The reward counts breaches, floor and tilt (as a cosine) this much early; the metrics don't (m; not in the paper)."""
+    """The reward counts breaches, floor and tilt (as a cosine) this much early; the metrics don't
+    (m; not in the paper).
+    """
     lookahead: Annotated[float, Interval("[0, 10]")] = 0.0
-    """The reward also counts the breaches that come within this time at the present velocities (s; not in the paper)."""
+    """The reward also counts the breaches that come within this time at the present velocities (s;
+    not in the paper).
+    """
 
     def __post_init__(self):
         check_intervals(self, "environment.reward.")
@@ -48,7 +59,9 @@ class RewardSettings:
 
 @dataclass(frozen=True)
 class PursuitSettings:
-    """The pursuit-evasion game. Lengths in metres, times in seconds; numbers of the paper unless said otherwise."""
+    """The pursuit-evasion game. Lengths in metres, times in seconds; numbers of the paper unless
+    said otherwise.
+    """
 
     num_pursuers: Annotated[int, Interval("[1, 8]")] = 3
     """Number of pursuing quadrotors, 1 to 8."""
@@ -63,14 +76,20 @@ class PursuitSettings:
     evader_speed: Annotated[float, Interval("(0, 100]")] = 1.3
     """Speed of the evader (m/s)."""
     evader_norm: Literal["euclidean", "axis"] = "euclidean"
-    """How the evader's force becomes a velocity; "axis" normalises by the largest component (up to 3**0.5 faster)."""
+    """How the evader's force becomes a velocity; "axis" normalises by the largest component (up to
+    3**0.5 faster).
+    """
     evaders: tuple[str, ...] = ("field",)
-    """Evaders, one of which is drawn for each episode with equal odds; a name that comes twice is drawn twice as often. "field"
-    is the paper's; each "learned" is a network of its own, which learns while the pursuers do; see `openjax.pursuit.evaders`."""
+    """Evaders, one of which is drawn for each episode with equal odds; a name that comes twice is
+    drawn twice as often. "field" is the paper's; each "learned" is a network of its own, which
+    learns while the pursuers do; see `openjax.pursuit.evaders`.
+    """
     max_speed: Annotated[float, Interval("(0, 100]")] = 1.0
     """Maximal speed of a pursuer (m/s)."""
     speed_limit: Literal["clamp", "none"] = "clamp"
-    """"clamp": the velocity's norm is cut after each step, as in the paper's simulator; "none": honest physics."""
+    """"clamp": the velocity's norm is cut after each step, as in the paper's simulator; "none":
+    honest physics.
+    """
     pillar_clearance: Annotated[float, Interval("[0, 10]")] = 0.07
     """A drone's centre closer than this to a pillar's surface is a collision."""
     drone_clearance: Annotated[float, Interval("[0, 10]")] = 0.14
@@ -84,15 +103,23 @@ class PursuitSettings:
     substeps: Annotated[int, Interval("[1, 100]")] = 1
     """Physics (and rate controller) steps per control step."""
     physics: Literal["mjx", "rigid", "stops"] = "mjx"
-    """"mjx": MuJoCo MJX, the reference; "rigid": the same equations written out, contacts included, many times faster;
-    "stops": free flight, and drones are put back out of floor, pillars and one another once per control step."""
+    """"mjx": MuJoCo MJX, the reference; "rigid": the same equations written out, contacts included,
+    many times faster; "stops": free flight, and drones are put back out of floor, pillars and one
+    another once per control step.
+    """
     contacts: bool = True
-    """Floor, pillars and other drones are solid; False: free flight, in which nothing is touched."""
+    """Floor, pillars and other drones are solid; False: free flight, in which nothing is
+    touched.
+    """
     airframe: Literal["crazyflie", "brushless"] = "crazyflie"
-    """The nominal vehicle: the Crazyflie 2.1, or the Crazyflie 2.1 Brushless; see `openjax.vehicle.parameters`."""
+    """The nominal vehicle: the Crazyflie 2.1, or the Crazyflie 2.1 Brushless; see
+    `openjax.vehicle.parameters`.
+    """
     vehicles: tuple[tuple[str, float, float, float, float], ...] = ()
-    """Family from which every pursuer's vehicle is drawn in each episode: parameters of effects (`motor_lag.extra_up`), each
-    with its range and the wider range of the rare; see `openjax.vehicle.family`. Empty: the nominal vehicle."""
+    """Family from which every pursuer's vehicle is drawn in each episode: parameters of effects
+    (`motor_lag.extra_up`), each with its range and the wider range of the rare; see
+    `openjax.vehicle.family`. Empty: the nominal vehicle.
+    """
     rare_vehicles: Annotated[float, Interval("[0, 1]")] = 0.0
     """Share of the vehicles of which one effect is drawn from its wider range."""
     observed_pillars: Annotated[int, Interval("[1, 32]")] = 3
@@ -100,13 +127,17 @@ class PursuitSettings:
     observe_time: bool = True
     """Observe t/T; then the end of an episode is terminal, otherwise it is a truncation."""
     observe_position: bool = False
-    """Also observe the own position in the arena (not in the paper, where the arena's bounds stay unseen)."""
+    """Also observe the own position in the arena (not in the paper, where the arena's bounds stay
+    unseen).
+    """
     observe_in: Literal["world", "heading"] = "world"
-    """Axes of what a pursuer observes. "heading": its own, but upright: a game turned about the arena's axis looks the same, at
-    any yaw (not in the paper)."""
+    """Axes of what a pursuer observes. "heading": its own, but upright: a game turned about the
+    arena's axis looks the same, at any yaw (not in the paper).
+    """
     observe_history: Annotated[int, Interval("[0, 1000]")] = 0
-    """Also observe this many of the last frames of the own velocity, attitude and command (not in the paper): they show how
-    this vehicle answers, and which commands are still on their way."""
+    """Also observe this many of the last frames of the own velocity, attitude and command (not in
+    the paper): they show how this vehicle answers, and which commands are still on their way.
+    """
     observe_history_spacing: Annotated[int, Interval("[1, 1000]")] = 1
     """Control steps between two of these frames."""
     history_length: Annotated[int, Interval("[1, 1000]")] = 10
@@ -119,16 +150,20 @@ class PursuitSettings:
         check_intervals(self, "environment.")
         if self.min_pillars > self.max_pillars:
             raise UserError(
-                f"environment.min_pillars {self.min_pillars} is more than environment.max_pillars {self.max_pillars}"
+                f"environment.min_pillars {self.min_pillars} is more than environment.max_pillars "
+                f"{self.max_pillars}"
             )
         most = self.arena_radius - self.pillar_clearance
         if self.max_pillars and self.pillar_radius >= most:
             raise UserError(
-                f"environment.pillar_radius {self.pillar_radius} leaves no room in an arena of radius {self.arena_radius}: "
+                f"environment.pillar_radius {self.pillar_radius} leaves no room in an arena of "
+                f"radius {self.arena_radius}: "
                 f"less than {most:.3g} would be right, or environment.max_pillars 0"
             )
         if self.vehicles:
-            from openjax.vehicle.family import check_ranges  # knows the effects, which are written in JAX
+            from openjax.vehicle.family import (
+                check_ranges,
+            )  # knows the effects, which are written in JAX
 
             check_ranges(self.vehicles)
         check_evaders(self.evaders)
@@ -145,13 +180,23 @@ class PursuitSettings:
 
     @property
     def frame_size(self) -> int:
-        """Numbers in one frame of the history: time, evader position and velocity, pursuer positions."""
+        """Numbers in one frame of the history: time, evader position and velocity, pursuer
+        positions.
+        """
         return 1 + 3 + 3 + 3 * self.num_pursuers
 
     @property
     def self_size(self) -> int:
         """Numbers of a pursuer's own part of the observation, without the predicted positions."""
-        own = 3 + 4 + 3 + 3 + 3 + (4 if self.observe_time else 0) + (3 if self.observe_position else 0)
+        own = (
+            3
+            + 4
+            + 3
+            + 3
+            + 3
+            + (4 if self.observe_time else 0)
+            + (3 if self.observe_position else 0)
+        )
         return own + OWN_FRAME * self.observe_history
 
     @property

@@ -12,7 +12,9 @@ class EpisodeStatistics:
     """Running counts of one episode; every leaf ()."""
 
     steps: jax.Array  # int32, steps counted
-    capture_step: jax.Array  # int32, first step with a capture, counted from 1; the episode's length if none
+    capture_step: (
+        jax.Array
+    )  # int32, first step with a capture, counted from 1; the episode's length if none
     captured: jax.Array  # bool
     collision_steps: jax.Array  # float32, steps in which any pursuer breached any limit
     pillar_steps: jax.Array  # float32, the same by parts

@@ -15,16 +15,22 @@ START_Z = 0.1
 """Uniform tasks: |z - H/2| at the start at most (m)."""
 PILLAR_GRID = 0.2
 PILLAR_REACH = 0.8
-"""Pillars of uniform tasks stand on cells of this grid whose centre is closer to the axis than this (m)."""
+"""Pillars of uniform tasks stand on cells of this grid whose centre is closer to the axis than this
+(m).
+"""
 ROW_OFFSET = 0.2
 ROW_SPACING = (0.2, 0.4)
-"""Pillars in a row: its middle's largest offset from the axis along x and y, and the distance of neighbours (m)."""
+"""Pillars in a row: its middle's largest offset from the axis along x and y, and the distance of
+neighbours (m).
+"""
 EXPANSION = 0.1
 """Local expansion moves each vehicle by up to this along each axis (m): the paper's delta."""
 WALL_DISTANCE = 0.1
 """Local expansion keeps starts this far from the arena's wall (m): the released code's."""
 CLOSE = 0.05
-"""Close starts are up to this much farther from a pillar or another pursuer than the safety distance (m)."""
+"""Close starts are up to this much farther from a pillar or another pursuer than the safety
+distance (m).
+"""
 NEIGHBOURS = 0.75
 """Scattered pursuers start at most this far from their middle along x and y (m)."""
 CANDIDATES = 8
@@ -40,7 +46,9 @@ class Task:
     pillar_position: jax.Array  # (P, 2) m, axis of each pillar
     pillar_active: jax.Array  # (P,) bool, slots in use
     evader: jax.Array | None = None
-    """() int32, the place of its evader in the settings' `evaders`; None: it is drawn at the reset."""
+    """() int32, the place of its evader in the settings' `evaders`; None: it is drawn at the
+    reset.
+    """
 
 
 def empty_task(settings: PursuitSettings) -> Task:
@@ -58,7 +66,11 @@ def task_descriptor(tasks: Task) -> jax.Array:
     pillars = jnp.where(tasks.pillar_active[..., None], tasks.pillar_position, 0.0)
     m = pillars.shape[0]
     return jnp.concatenate(
-        [tasks.pursuer_position.reshape(m, -1), tasks.evader_position.reshape(m, -1), pillars.reshape(m, -1)],
+        [
+            tasks.pursuer_position.reshape(m, -1),
+            tasks.evader_position.reshape(m, -1),
+            pillars.reshape(m, -1),
+        ],
         axis=-1,
     )
 
@@ -82,7 +94,8 @@ def uniform_task(settings: PursuitSettings, key: jax.Array) -> Task:
     """Draw a task uniformly: the paper's global exploration.
 
     Pursuers on one side, the evader on the other, pillars on distinct free cells of a grid. Among a
-    few draws of the pursuers' starts the first without a breach is taken; cells too close to a start stay free.
+    few draws of the pursuers' starts the first without a breach is taken; cells too close to a
+    start stay free.
     """
     n = settings.num_pursuers
     position_key, evader_key, number_key, cell_key = jax.random.split(key, 4)
@@ -118,15 +131,17 @@ def expand_task(
 ) -> Task:
     """Move every vehicle of a task a little and keep its pillars: the paper's local expansion.
 
-    Starts stay `wall_distance` (m) from the arena's wall and within 0.1 m of half its height. Among a few draws the
-    first that starts clear is taken, else the task itself.
+    Starts stay `wall_distance` (m) from the arena's wall and within 0.1 m of half its height. Among
+    a few draws the first that starts clear is taken, else the task itself.
     """
 
     def draw(key):
         pursuer_key, evader_key = jax.random.split(key)
 
         def move(key, position):
-            moved = position + jax.random.uniform(key, position.shape, jnp.float32, -EXPANSION, EXPANSION)
+            moved = position + jax.random.uniform(
+                key, position.shape, jnp.float32, -EXPANSION, EXPANSION
+            )
             radius = jnp.linalg.norm(moved[..., :2], axis=-1, keepdims=True)
             reach = settings.arena_radius - wall_distance
             xy = moved[..., :2] * jnp.minimum(1.0, reach / jnp.maximum(radius, 1e-6))
@@ -140,18 +155,25 @@ def expand_task(
     return _first_clear(settings, draw, key, task)
 
 
-def close_starts(settings: PursuitSettings, key: jax.Array, task: Task, share: float | jax.Array) -> Task:
-    """Put a `share` (0 to 1) of the pursuers next to a pillar or another pursuer: starts that leave the least room.
+def close_starts(
+    settings: PursuitSettings, key: jax.Array, task: Task, share: float | jax.Array
+) -> Task:
+    """Put a `share` (0 to 1) of the pursuers next to a pillar or another pursuer: starts that leave
+    the least room.
 
-    They stand 0 to 0.05 m outside its safety distance, in any direction, within 0.1 m of half the arena's height. One
-    is placed after the other: beside a pillar, or beside a pursuer whose start is settled, with equal odds where there
-    are both. Among a few draws the first that starts clear is taken, else the task itself.
+    They stand 0 to 0.05 m outside its safety distance, in any direction, within 0.1 m of half the
+    arena's height. One is placed after the other: beside a pillar, or beside a pursuer whose start
+    is settled, with equal odds where there are both. Among a few draws the first that starts clear
+    is taken, else the task itself.
     """
-    start, n = task.pursuer_position, task.pursuer_position.shape[0]
+    start = task.pursuer_position
+    n = task.pursuer_position.shape[0]
     no_pillar = ~jnp.any(task.pillar_active)
 
     def place(position, i, key):
-        """All positions (N, 3) after pursuer i was put beside a pillar or one of those before it."""
+        """All positions (N, 3) after pursuer i was put beside a pillar or one of those before
+        it.
+        """
         kind_key, which_key, direction_key, gap_key = jax.random.split(key, 4)
         pillar = jax.random.categorical(which_key, jnp.where(task.pillar_active, 0.0, -jnp.inf))
         beside = jnp.append(task.pillar_position[pillar], position[i, 2])
@@ -180,12 +202,14 @@ def close_starts(settings: PursuitSettings, key: jax.Array, task: Task, share: f
 
 
 def scatter_starts(settings: PursuitSettings, key: jax.Array, task: Task) -> Task:
-    """Start evader and pursuers anywhere up to `WALL_DISTANCE` from the arena's wall, the pursuers more or less together.
+    """Start evader and pursuers anywhere up to `WALL_DISTANCE` from the arena's wall, the pursuers
+    more or less together.
 
-    Uniform tasks keep both within 0.76 m of the axis and 1.1 m of each other along x. Among a few draws the first that
-    starts clear is taken, else the task itself.
+    Uniform tasks keep both within 0.76 m of the axis and 1.1 m of each other along x. Among a few
+    draws the first that starts clear is taken, else the task itself.
     """
-    reach, n = settings.arena_radius - WALL_DISTANCE, task.pursuer_position.shape[0]
+    reach = settings.arena_radius - WALL_DISTANCE
+    n = task.pursuer_position.shape[0]
 
     def draw(key):
         middle_key, apart_key, offset_key, height_key = jax.random.split(key, 4)
@@ -199,7 +223,9 @@ def scatter_starts(settings: PursuitSettings, key: jax.Array, task: Task) -> Tas
         from_axis = jnp.linalg.norm(pursuers, axis=-1, keepdims=True)
         pursuers = pursuers * jnp.minimum(1.0, reach / jnp.maximum(from_axis, 1e-6))
         middle = settings.arena_height / 2
-        z = jax.random.uniform(height_key, (n + 1, 1), minval=middle - START_Z, maxval=middle + START_Z)
+        z = jax.random.uniform(
+            height_key, (n + 1, 1), minval=middle - START_Z, maxval=middle + START_Z
+        )
         return task.replace(
             pursuer_position=jnp.concatenate([pursuers, z[1:]], axis=-1),
             evader_position=jnp.append(xy[:, 1], z[0]),
@@ -219,20 +245,26 @@ def _first_clear(settings, draw, key, task):
     candidates = jax.vmap(draw)(jax.random.split(key, CANDIDATES))
     clear = jax.vmap(lambda candidate: starts_clear(settings, candidate))(candidates)
     first = jnp.argmax(clear)
-    return jax.tree.map(lambda drawn, seed: jnp.where(jnp.any(clear), drawn[first], seed), candidates, task)
+    return jax.tree.map(
+        lambda drawn, seed: jnp.where(jnp.any(clear), drawn[first], seed), candidates, task
+    )
 
 
 def shift_pillars(settings: PursuitSettings, key: jax.Array, task: Task, reach: float) -> Task:
-    """Move each pillar by up to `reach` (m) along x and y; those that would come too close to a start stay."""
+    """Move each pillar by up to `reach` (m) along x and y; those that would come too close to a
+    start stay.
+    """
     offset = jax.random.uniform(key, task.pillar_position.shape, jnp.float32, -reach, reach)
     return _move_pillars(settings, task, task.pillar_position + offset)
 
 
 def line_up_pillars(settings: PursuitSettings, key: jax.Array, task: Task) -> Task:
-    """Put the pillars of a uniform task in a row across the arena, between the pursuers' side and the evader's.
+    """Put the pillars of a uniform task in a row across the arena, between the pursuers' side and
+    the evader's.
 
-    The row's middle lies within 0.2 m of the axis along x and y, it is turned by up to 45 degrees, and its pillars
-    stand 0.2 m (touching) to 0.4 m apart. Those that would come too close to a start or to the wall stay.
+    The row's middle lies within 0.2 m of the axis along x and y, it is turned by up to 45 degrees,
+    and its pillars stand 0.2 m (touching) to 0.4 m apart. Those that would come too close to a
+    start or to the wall stay.
     """
     middle_key, angle_key, spacing_key = jax.random.split(key, 3)
     middle = jax.random.uniform(middle_key, (2,), jnp.float32, -ROW_OFFSET, ROW_OFFSET)
@@ -245,7 +277,9 @@ def line_up_pillars(settings: PursuitSettings, key: jax.Array, task: Task) -> Ta
 
 
 def _move_pillars(settings, task, moved):
-    """The task with those pillars moved that stay within reach of the axis and clear of all starts."""
+    """The task with those pillars moved that stay within reach of the axis and clear of all
+    starts.
+    """
     vehicles = jnp.concatenate([task.pursuer_position, task.evader_position[None]])[:, :2]
     inside = jnp.linalg.norm(moved, axis=-1) < PILLAR_REACH
     accepted = (_clear_of(settings, moved, vehicles) & inside & task.pillar_active)[:, None]
@@ -259,12 +293,16 @@ def _clear_of(settings, pillars, vehicles):
 
 
 def turn_task(key: jax.Array, task: Task) -> Task:
-    """Turn a whole task about the arena's axis by a random angle: the game looks the same from every side."""
+    """Turn a whole task about the arena's axis by a random angle: the game looks the same from
+    every side.
+    """
     angle = jax.random.uniform(key, (), jnp.float32, -np.pi, np.pi)
-    cosine, sine = jnp.cos(angle), jnp.sin(angle)
+    cosine = jnp.cos(angle)
+    sine = jnp.sin(angle)
 
     def turn(position):
-        x, y = position[..., 0], position[..., 1]
+        x = position[..., 0]
+        y = position[..., 1]
         xy = jnp.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
         return jnp.concatenate([xy, position[..., 2:]], axis=-1)
 
@@ -276,7 +314,9 @@ def turn_task(key: jax.Array, task: Task) -> Task:
 
 
 def start_attitude(settings: PursuitSettings, key: jax.Array) -> jax.Array:
-    """(N, 4) start quaternions wxyz: roll and pitch within 36 degrees, yaw in 0 to 36 degrees; or all level."""
+    """(N, 4) start quaternions wxyz: roll and pitch within 36 degrees, yaw in 0 to 36 degrees; or
+    all level.
+    """
     n = settings.num_pursuers
     if settings.start_attitude == "level":
         return jnp.broadcast_to(jnp.array([1.0, 0.0, 0.0, 0.0], jnp.float32), (n, 4))

@@ -14,12 +14,13 @@ METRICS_FILE = "metrics.jsonl"
 class MetricsWriter:
     """Appends records to `DIR/metrics.jsonl` and `DIR/tensorboard`.
 
-    Each record is one write to an unbuffered file, so nothing logged is lost with the process, and nothing is
-    kept in memory.
+    Each record is one write to an unbuffered file, so nothing logged is lost with the process, and
+    nothing is kept in memory.
 
     Args:
       directory: the run's directory.
-      resumed_update: records of later updates are removed first (they come again); None starts afresh.
+      resumed_update: records of later updates are removed first (they come again); None starts
+      afresh.
       resumed_steps: environment steps done at `resumed_update`, where TensorBoard's curves go on.
       tensorboard: False leaves the event files out.
     """
@@ -45,9 +46,13 @@ class MetricsWriter:
             from tensorboardX import SummaryWriter
 
             purge_step = None if resumed_update is None else resumed_steps + 1
-            self._events = SummaryWriter(str(directory / "tensorboard"), purge_step=purge_step, flush_secs=10)
+            self._events = SummaryWriter(
+                str(directory / "tensorboard"), purge_step=purge_step, flush_secs=10
+            )
 
-    def write(self, event: str, update: int, steps: int, seconds: float, values: dict[str, float]) -> None:
+    def write(
+        self, event: str, update: int, steps: int, seconds: float, values: dict[str, float]
+    ) -> None:
         """Log one record.
 
         Args:
@@ -58,7 +63,12 @@ class MetricsWriter:
           values: numbers by name; what isn't finite is written as null.
         """
         numbers = {name: float(value) for name, value in values.items()}
-        record = {"event": event, "update": int(update), "steps": int(steps), "seconds": round(seconds, 3)}
+        record = {
+            "event": event,
+            "update": int(update),
+            "steps": int(steps),
+            "seconds": round(seconds, 3),
+        }
         record |= {name: value if math.isfinite(value) else None for name, value in numbers.items()}
         self._file.write((json.dumps(record) + "\n").encode())
         if self._events is not None:
@@ -74,7 +84,9 @@ class MetricsWriter:
 
 
 def read_metrics(path: Path, event: str | None = None) -> Iterator[dict]:
-    """Records of a metrics file, optionally of one event only; a half-written last line is passed over."""
+    """Records of a metrics file, optionally of one event only; a half-written last line is passed
+    over.
+    """
     with open(path, "rb") as lines:
         for line in lines:
             try:

@@ -1,4 +1,6 @@
-"""Pages in one file, nothing to fetch from elsewhere, with figures in SVG that take their colours from the page."""
+"""Pages in one file, nothing to fetch from elsewhere, with figures in SVG that take their colours
+from the page.
+"""
 
 import io
 import re
@@ -20,14 +22,18 @@ STYLE = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "legend.frameon": False,
-    **dict.fromkeys(("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), INK),
+    **dict.fromkeys(
+        ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), INK
+    ),
 }
 
 
 def filled(template: str, folder: Path, **values) -> str:
     """A template of a folder with its values and the pages' looks."""
     loader = jinja2.FileSystemLoader([folder, Path(__file__).parent])
-    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
+    environment = jinja2.Environment(
+        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined
+    )
     page = environment.get_template(template).render(**values)
     return re.sub(r"(?<=\d) %", "\u00a0%", page)  # a number and its sign stay on one line
 
@@ -45,7 +51,9 @@ def add_legend(axes: Axes) -> None:
 
 
 def as_svg(figure: Figure, salt: str) -> str:
-    """The figure as an element for a page: text stays text, ink takes the page's colour, sizes are the page's."""
+    """The figure as an element for a page: text stays text, ink takes the page's colour, sizes are
+    the page's.
+    """
     data = io.StringIO()
     with rc_context({"svg.hashsalt": salt}):
         figure.savefig(data, format="svg", metadata={"Date": None, "Creator": None})

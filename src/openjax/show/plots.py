@@ -12,7 +12,16 @@ from openjax.files import replacing
 from openjax.show.metrics import read_metrics
 from openjax.show.trajectory import Trajectory
 
-PURSUER_COLORS = ("tab:blue", "tab:green", "tab:purple", "tab:cyan", "tab:olive", "tab:brown", "navy", "teal")
+PURSUER_COLORS = (
+    "tab:blue",
+    "tab:green",
+    "tab:purple",
+    "tab:cyan",
+    "tab:olive",
+    "tab:brown",
+    "navy",
+    "teal",
+)
 EVADER_COLOR = "tab:red"
 
 _CURVES = (
@@ -26,7 +35,9 @@ _CURVES = (
 
 
 def plot_trajectories(path: Path, trajectories: Sequence[Trajectory]) -> None:
-    """One panel per episode from above: paths, starts (hollow), pillars and the first capture (star)."""
+    """One panel per episode from above: paths, starts (hollow), pillars and the first capture
+    (star).
+    """
     columns = min(3, len(trajectories))
     rows = -(-len(trajectories) // columns)
     figure = Figure(figsize=(4 * columns, 4.3 * rows), layout="constrained")
@@ -40,7 +51,9 @@ def plot_trajectories(path: Path, trajectories: Sequence[Trajectory]) -> None:
     for axes in figure.axes:
         for artist, label in zip(*axes.get_legend_handles_labels(), strict=True):
             shown.setdefault(label, artist)
-    figure.legend(shown.values(), shown, loc="outside lower center", ncols=len(shown), fontsize="small")
+    figure.legend(
+        shown.values(), shown, loc="outside lower center", ncols=len(shown), fontsize="small"
+    )
     _save(figure, path)
 
 
@@ -50,8 +63,11 @@ def draw_from_above(axes: Axes, trajectory: Trajectory) -> None:
     for pillar in trajectory.pillar_position:
         axes.add_patch(Circle(pillar, trajectory.pillar_radius, color="0.6"))
     limit = 1.08 * trajectory.arena_radius
-    axes.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal", xlabel="x [m]", ylabel="y [m]")
-    capture, end = trajectory.capture_index, trajectory.end()
+    axes.set(
+        xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal", xlabel="x [m]", ylabel="y [m]"
+    )
+    capture = trajectory.capture_index
+    end = trajectory.end()
     for i in range(trajectory.pursuer_position.shape[1]):
         position = trajectory.pursuer_position[:end, i]
         color = PURSUER_COLORS[i % len(PURSUER_COLORS)]
@@ -69,9 +85,16 @@ def draw_from_above(axes: Axes, trajectory: Trajectory) -> None:
         outcome = "not captured"
     else:
         captured_at = trajectory.evader_position[capture, :2]
-        axes.add_patch(Circle(captured_at, trajectory.capture_radius, fill=False, color="0.5", linestyle=":"))
+        axes.add_patch(
+            Circle(captured_at, trajectory.capture_radius, fill=False, color="0.5", linestyle=":")
+        )
         axes.plot(
-            *captured_at, "*", color="gold", markeredgecolor="black", markersize=14, label="first capture"
+            *captured_at,
+            "*",
+            color="gold",
+            markeredgecolor="black",
+            markersize=14,
+            label="first capture",
         )
         outcome = f"captured after {(capture + 1) * trajectory.time_step:.2f} s"
     axes.set_title(f"{trajectory.title}: {outcome}", fontsize="medium")
@@ -85,7 +108,11 @@ def plot_training(path: Path, metrics_path: Path) -> None:
     for axes, (name, label) in zip(figure.subplots(2, 3).ravel(), _CURVES, strict=True):
         for records, style, legend in (
             (training, {"color": "tab:blue", "linewidth": 1}, "training"),
-            (evaluation, {"color": "tab:orange", "marker": "o", "markersize": 3}, "validation tasks"),
+            (
+                evaluation,
+                {"color": "tab:orange", "marker": "o", "markersize": 3},
+                "validation tasks",
+            ),
         ):
             points = [(r["steps"], r[name]) for r in records if r.get(name) is not None]
             if points:

@@ -1,4 +1,6 @@
-"""What a run, or another command that takes its time, shows on the terminal: a live display, or plain lines into a file."""
+"""What a run, or another command that takes its time, shows on the terminal: a live display, or
+plain lines into a file.
+"""
 
 import time
 from collections.abc import Mapping
@@ -25,7 +27,9 @@ LONG = 30.0
 
 
 class _Display:
-    """What `_render` returns, drawn again and again on a terminal while it is entered; into a file it draws nothing."""
+    """What `_render` returns, drawn again and again on a terminal while it is entered; into a file
+    it draws nothing.
+    """
 
     def __init__(self, console: Console, stays: bool):
         terminal = console.is_terminal
@@ -95,7 +99,8 @@ class Progress(_Display):
             rate = (steps - self._last[1]) / (now - self._last[0])
             self._rate = rate if self._rate == 0.0 else 0.9 * self._rate + 0.1 * rate
         self._last = (now, steps)
-        self._steps, self._values = steps, values
+        self._steps = steps
+        self._values = values
         if self._lines and now - self._last_line > _LINE_INTERVAL:
             self._last_line = now
             shown = ", ".join(f"{label} {value}" for label, value in _shown(values).items())
@@ -118,11 +123,18 @@ class Progress(_Display):
     def _render(self):
         seconds = time.monotonic() - self._phase_start
         self._spinner.update(text=Text(f"{self._phase}  {seconds:.0f} s"))
-        rows = [self._spinner, ProgressBar(total=self._total, completed=self._steps), Text(self._speed())]
+        rows = [
+            self._spinner,
+            ProgressBar(total=self._total, completed=self._steps),
+            Text(self._speed()),
+        ]
         if self._values or self._validation:
             table = Table.grid(padding=(0, 3))
-            table.add_row("", Text("training", style="bold"), Text("validation tasks", style="bold"))
-            training, validation = _shown(self._values), _shown(self._validation)
+            table.add_row(
+                "", Text("training", style="bold"), Text("validation tasks", style="bold")
+            )
+            training = _shown(self._values)
+            validation = _shown(self._validation)
             for label in _SHOWN.values():
                 if label in training or label in validation:
                     table.add_row(Text(label), training.get(label, ""), validation.get(label, ""))
@@ -134,7 +146,8 @@ def _shown(values):
     """Those that are shown, as text by their labels."""
     known = {label: values[name] for name, label in _SHOWN.items() if name in values}
     return {
-        label: "–" if value is None or value != value else f"{value:.3g}" for label, value in known.items()
+        label: "–" if value is None or value != value else f"{value:.3g}"
+        for label, value in known.items()
     }
 
 
@@ -153,11 +166,13 @@ def duration(seconds: float) -> str:
 
 
 class Steps(_Display):
-    """One line on a terminal; into a file, how long it will take, if that is long. Use as a context manager.
+    """One line on a terminal; into a file, how long it will take, if that is long. Use as a context
+    manager.
 
     Args:
       title: what is done.
-      expected: {step: seconds on a usual machine}, in the order in which they come. What the steps so far took against
+      expected: {step: seconds on a usual machine}, in the order in which they come. What the steps
+      so far took against
         this tells how long the rest takes here.
       console: where to draw.
     """
@@ -165,7 +180,9 @@ class Steps(_Display):
     def __init__(self, title: str, expected: Mapping[str, float], console: Console):
         self._title, self._expected = title, dict(expected)
         self._total = sum(self._expected.values())
-        self._done, self._step, self._note = 0.0, None, ""
+        self._done = 0.0
+        self._step = None
+        self._note = ""
         self._start = self._step_start = time.monotonic()
         super().__init__(console, stays=False)  # which draws it
 
@@ -175,7 +192,9 @@ class Steps(_Display):
         return super().__enter__()
 
     def begin(self, step: str, note: str = "") -> None:
-        """The step before is done, and `step` begins; one that isn't in `expected` takes no time of its own."""
+        """The step before is done, and `step` begins; one that isn't in `expected` takes no time of
+        its own.
+        """
         if step != self._step:
             self._done += self._expected.get(self._step, 0.0)
             self._step, self._step_start = step, time.monotonic()
@@ -193,7 +212,9 @@ class Steps(_Display):
         now = time.monotonic()
         left = self.seconds_left(now)
         done = (now - self._start) / max(now - self._start + left, 1e-6)
-        text = f"{self._title}: {self._step or 'starting'}{f' ({self._note})' if self._note else ''}"
+        text = (
+            f"{self._title}: {self._step or 'starting'}{f' ({self._note})' if self._note else ''}"
+        )
         row = Table.grid(padding=(0, 1))
         row.add_row(
             self._spinner,

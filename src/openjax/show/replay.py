@@ -33,7 +33,9 @@ def write_replay(path: Path, flights: Sequence[tuple[str, Trajectory]]) -> None:
 
 
 def _plain(policy: str, flight: Trajectory) -> dict:
-    """An episode up to two seconds after its capture: lengths in mm, quaternions in thousandths, times in frames."""
+    """An episode up to two seconds after its capture: lengths in mm, quaternions in thousandths,
+    times in frames.
+    """
     every = max(1, round(LONGEST_STEP / flight.time_step))
     steps = slice(0, flight.end(after=2.0), every)
 

@@ -14,7 +14,9 @@ class Trajectory:
     pursuer_quaternion: np.ndarray  # (T, N, 4) wxyz, body to world
     evader_position: np.ndarray  # (T, 3)
     captured: np.ndarray  # (T, N) bool, pursuers that capture in this step
-    crashed: np.ndarray  # (T, N) bool, pursuers that touch something solid or lie on their side in this step
+    crashed: (
+        np.ndarray
+    )  # (T, N) bool, pursuers that touch something solid or lie on their side in this step
     pillar_position: np.ndarray  # (P, 2), those in use
     arena_radius: float
     arena_height: float
@@ -22,7 +24,9 @@ class Trajectory:
     capture_radius: float
     time_step: float  # s
     seen: np.ndarray | None = None  # (T,) bool, whether some pursuer sees the evader
-    predicted: np.ndarray | None = None  # (T, K, 3) where the policy expects the evader in the steps after
+    predicted: np.ndarray | None = (
+        None  # (T, K, 3) where the policy expects the evader in the steps after
+    )
 
     @property
     def capture_index(self) -> int | None:

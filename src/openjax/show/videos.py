@@ -1,4 +1,6 @@
-"""Animations of an episode, drawn in perspective by Pillow: the same on every machine, without display or OpenGL."""
+"""Animations of an episode, drawn in perspective by Pillow: the same on every machine, without
+display or OpenGL.
+"""
 
 from functools import partial
 from pathlib import Path
@@ -13,7 +15,8 @@ from openjax.show.plots import EVADER_COLOR, PURSUER_COLORS
 from openjax.show.trajectory import Trajectory
 
 FRAMES_PER_SECOND = 12.5
-WIDTH, HEIGHT = 560, 400
+WIDTH = 560
+HEIGHT = 400
 FINER = 2
 """Frames are drawn so many times as large and then reduced, so that edges are smooth."""
 AZIMUTH, ELEVATION, OPENING = np.radians((60.0, 42.0, 45.0))
@@ -22,14 +25,19 @@ DISTANCE = 3.3
 """Of the camera from the arena's middle, in radii of the arena."""
 TRAIL = 1.2
 """Seconds of each path that are drawn behind a vehicle."""
-ARM, ROTOR, BALL = 0.065, 0.035, 0.045
-"""Metres from a vehicle's centre to a rotor, a rotor's radius, the evader's: larger than they are, to be seen."""
+ARM = 0.065
+ROTOR = 0.035
+BALL = 0.045
+"""Metres from a vehicle's centre to a rotor, a rotor's radius, the evader's: larger than they are,
+to be seen.
+"""
 _ROTORS = np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]]) / np.sqrt(2)
 _LETTERS = 20  # pixels
 
 
 def animate(path: Path, *trajectories: Trajectory) -> None:
-    """Write an animated GIF up to a second after the first capture; time, capture and crash stand above it.
+    """Write an animated GIF up to a second after the first capture; time, capture and crash stand
+    above it.
 
     Args:
       path: the .gif file.
@@ -43,7 +51,10 @@ def animate(path: Path, *trajectories: Trajectory) -> None:
     # one palette, which covers small coloured things too
     sample = np.concatenate(frames[:: max(1, len(frames) // 6)])
     palette = Image.fromarray(sample).quantize(255, method=Image.Quantize.MAXCOVERAGE)
-    images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    images = [
+        Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
+        for frame in frames
+    ]
     with replacing(path) as partial_file:
         images[0].save(
             partial_file,
@@ -71,7 +82,8 @@ def caption(trajectory: Trajectory, step: int) -> tuple[str, str]:
 
 def _frame(trajectory, step):
     """(H, W, 3) uint8: the scene below a band that says what one sees."""
-    band, font = round(2.8 * _LETTERS), ImageFont.load_default(_LETTERS)
+    band = round(2.8 * _LETTERS)
+    font = ImageFont.load_default(_LETTERS)
     image = Image.new("RGB", (WIDTH, HEIGHT + band), "white")
     image.paste(draw(trajectory, step), (0, band))
     pen = ImageDraw.Draw(image)
@@ -96,16 +108,20 @@ def draw(trajectory: Trajectory, step: int) -> Image.Image:
 
 
 def _things(pen, trajectory, step):
-    """(place, function that draws it, outlines of its shadow) of all that stands or flies in the scene."""
+    """(place, function that draws it, outlines of its shadow) of all that stands or flies in the
+    scene.
+    """
     for place in trajectory.pillar_position:
         yield place, partial(pen.pillar, place, trajectory.pillar_radius), ()
     bodies = Rotation.from_quat(trajectory.pursuer_quaternion[step], scalar_first=True).as_matrix()
     for i, body in enumerate(bodies):
-        color, path = _rgb(PURSUER_COLORS[i % len(PURSUER_COLORS)]), trajectory.pursuer_position[:, i]
+        color = _rgb(PURSUER_COLORS[i % len(PURSUER_COLORS)])
+        path = trajectory.pursuer_position[:, i]
         rotors = path[step] + (ARM * _ROTORS[:, None] + ROTOR * _circle(12)) @ body.T
         yield path[step], partial(pen.vehicle, rotors, color), rotors
         yield from _trail(pen, path, step, color, trajectory.time_step)
-    color, path = _rgb(EVADER_COLOR), trajectory.evader_position
+    color = _rgb(EVADER_COLOR)
+    path = trajectory.evader_position
     now = (255, 200, 25) if trajectory.captured[step].any() else color
     yield path[step], partial(pen.ball, path[step], BALL, now), [path[step] + BALL * _circle(24)]
     yield from _trail(pen, path, step, color, trajectory.time_step)
@@ -113,9 +129,11 @@ def _things(pen, trajectory, step):
 
 def _trail(pen, path, step, color, time_step):
     """The last second of a path, fainter the longer ago it was."""
-    every, length = max(1, round(0.04 / time_step)), round(TRAIL / time_step)
+    every = max(1, round(0.04 / time_step))
+    length = round(TRAIL / time_step)
     for end in range(step, max(0, step - length), -every):
-        points, faint = path[[max(end - every, 0), end]], round(190 * (1 - (step - end) / length))
+        points = path[[max(end - every, 0), end]]
+        faint = round(190 * (1 - (step - end) / length))
         yield points.mean(axis=0), partial(pen.line, points, (*color, faint), 4), ()
 
 
@@ -123,7 +141,9 @@ class _Pen:
     """Draws into an image what is given in metres, as a camera above the arena's edge sees it."""
 
     def __init__(self, image: Image.Image, radius: float, height: float):
-        self._draw, self._radius, self._height = ImageDraw.Draw(image, "RGBA"), radius, height
+        self._draw = ImageDraw.Draw(image, "RGBA")
+        self._radius = radius
+        self._height = height
         self._middle = np.array(image.size) / 2
         (ca, ce), (sa, se) = (function((AZIMUTH, ELEVATION)) for function in (np.cos, np.sin))
         # right, down, on
@@ -161,7 +181,8 @@ class _Pen:
         for i, normal in enumerate(_circle(48)[1::2]):
             if normal @ self._axes[2] < 0:  # towards the camera
                 self.fill(
-                    [foot[i], foot[i + 1], top[i + 1], top[i]], _wood(0.68 + 0.2 * normal @ self._axes[0])
+                    [foot[i], foot[i + 1], top[i + 1], top[i]],
+                    _wood(0.68 + 0.2 * normal @ self._axes[0]),
                 )
         self.fill(top, _wood(0.95))
 

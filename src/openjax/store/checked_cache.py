@@ -1,8 +1,9 @@
 """The cache of compiled programs, each entry with its checksum.
 
-JAX runs what it finds in its cache: a flipped bit there ends the process, or changes a number, and half an entry is never
-replaced. An entry of this cache is loaded only whole. JAX has no public way to be given a cache, so the function of its
-module that makes one is replaced; a JAX without it keeps its own.
+JAX runs what it finds in its cache: a flipped bit there ends the process, or changes a number, and
+half an entry is never replaced. An entry of this cache is loaded only whole. JAX has no public way
+to be given a cache, so the function of its module that makes one is replaced; a JAX without it
+keeps its own.
 """
 
 import contextlib

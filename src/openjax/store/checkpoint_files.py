@@ -1,11 +1,11 @@
 """One checkpoint on disk: it appears whole or not at all, and a changed byte is found.
 
-It is a folder of orbax's and, written after it, NAME.sha256 with the checksums of all its files: it counts once that is
-there, and only while they agree. Orbax stands behind this module only.
+It is a folder of orbax's and, written after it, NAME.sha256 with the checksums of all its files: it
+counts once that is there, and only while they agree. Orbax stands behind this module only.
 
-A carry is any pytree of arrays; optimiser states, typed random keys and counters are leaves like all others, so nothing
-can be forgotten. Leaves are stored under their path in the tree, which makes a carry of another shape a readable error
-instead of a wrong run.
+A carry is any pytree of arrays; optimiser states, typed random keys and counters are leaves like
+all others, so nothing can be forgotten. Leaves are stored under their path in the tree, which makes
+a carry of another shape a readable error instead of a wrong run.
 """
 
 import functools
@@ -31,7 +31,9 @@ class DamagedError(UserError):
 
 
 def save_state(path: Path, carry: Any, notes: dict | None = None) -> None:
-    """Write one carry to the directory `path`, in place of what is there; it appears whole or not at all."""
+    """Write one carry to the directory `path`, in place of what is there; it appears whole or not
+    at all.
+    """
     path = Path(path)
     if jax.process_index() == 0:
         remove_state(path)
@@ -39,7 +41,8 @@ def save_state(path: Path, carry: Any, notes: dict | None = None) -> None:
 
 
 def load_state(path: Path, abstract: Any) -> Any:
-    """Read a carry whose shapes, dtypes and shardings are those of `abstract` (from `abstract_like`).
+    """Read a carry whose shapes, dtypes and shardings are those of `abstract` (from
+    `abstract_like`).
 
     Raises:
       UserError: not a checkpoint, a damaged one (`DamagedError`), or one of another shape.
@@ -101,7 +104,9 @@ def is_checkpoint(path: Path) -> bool:
 
 
 def start_save(path: Path, carry: Any, notes: dict) -> Any:
-    """Hand a carry to orbax, which writes it beside what follows; `commit` waits for it. Its arrays are copied then."""
+    """Hand a carry to orbax, which writes it beside what follows; `commit` waits for it. Its arrays
+    are copied then.
+    """
     arrays = {name: leaf for name, leaf in named_leaves(carry).items() if leaf.size}
     path.parent.mkdir(parents=True, exist_ok=True)
     return load_orbax().save_async(path.absolute(), arrays, custom_metadata=notes)
@@ -118,12 +123,16 @@ def commit(path: Path, started: Any) -> None:
 
 
 def check_state(path: Path) -> None:
-    """Raises UserError where no checkpoint is, and DamagedError where its files aren't as they were written."""
+    """Raises UserError where no checkpoint is, and DamagedError where its files aren't as they were
+    written.
+    """
     if not is_checkpoint(path):
         raise UserError(f"{path} is no checkpoint; expected a directory written by openjax.train")
     try:
         lines = _checksums_file(path).read_text(encoding="utf-8").splitlines()
-        expected = {name: checksum for checksum, _, name in (line.partition("  ") for line in lines)}
+        expected = {
+            name: checksum for checksum, _, name in (line.partition("  ") for line in lines)
+        }
         found = {file.relative_to(path).as_posix(): _checksum(file) for file in _files(path)}
         different = sorted(dict(expected.items() ^ found.items()))
     except (OSError, UnicodeDecodeError) as error:
@@ -170,7 +179,8 @@ def _check_same_shapes(path, stored, wanted):
         shape = tuple(stored[name].shape)
         if shape != tuple(expected.shape) or stored[name].dtype != expected.dtype:
             raise UserError(
-                f"checkpoint {path} is of another shape: {name} is {stored[name].dtype}{list(shape)} there, "
+                f"checkpoint {path} is of another shape: {name} is "
+                f"{stored[name].dtype}{list(shape)} there, "
                 f"the settings make it {expected.dtype}{list(expected.shape)}"
             )
     for name in stored:

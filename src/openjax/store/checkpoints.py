@@ -1,4 +1,6 @@
-"""Checkpoints of a run: the last few and the best are kept, the last good one is found again after any kill or damage."""
+"""Checkpoints of a run: the last few and the best are kept, the last good one is found again after
+any kill or damage.
+"""
 
 import dataclasses
 import functools
@@ -82,7 +84,8 @@ class Checkpoints:
     def load_best(
         self, name_of: Callable[[str], str | None], warn: Callable[[str], None]
     ) -> tuple[dict[str, np.ndarray], CheckpointRecord]:
-        """Leaves (see `load_arrays`) of the best checkpoint, or of the latest where none has a score.
+        """Leaves (see `load_arrays`) of the best checkpoint, or of the latest where none has a
+        score.
 
         One that is damaged is passed over with a warning.
 
@@ -107,10 +110,14 @@ class Checkpoints:
         records = self.records()
         return records[-1] if records else None
 
-    def save(self, update: int, carry: Any, score: float | None = None, notes: dict | None = None) -> None:
-        """Start writing a checkpoint; returns when the arrays are copied, so that the carry may be donated.
+    def save(
+        self, update: int, carry: Any, score: float | None = None, notes: dict | None = None
+    ) -> None:
+        """Start writing a checkpoint; returns when the arrays are copied, so that the carry may be
+        donated.
 
-        A second save of the same update is ignored: training is deterministic, the content would be the same.
+        A second save of the same update is ignored: training is deterministic, the content would be
+        the same.
         """
         self.wait()
         path = self.directory / f"{update:0{_DIGITS}d}"
@@ -123,14 +130,18 @@ class Checkpoints:
         self._pending = in_background(functools.partial(commit, path, started))
 
     def wait(self) -> None:
-        """Block until the checkpoint under way is on disk, then drop the ones that are no longer kept."""
+        """Block until the checkpoint under way is on disk, then drop the ones that are no longer
+        kept.
+        """
         if self._pending is None:
             return
-        pending, self._pending = self._pending, None
+        pending = self._pending
+        self._pending = None
         pending()
         if not self._processes.is_first:
             return
-        records, best = self.records(), self.best()
+        records = self.records()
+        best = self.best()
         for record in records[: -self.keep_last]:
             if best is None or record.path != best.path:
                 remove_state(record.path)
@@ -147,7 +158,9 @@ class Checkpoints:
         for text in self._damaged.values():
             warn(f"{text}; using the one before it")
         for name in reversed(self._processes.of_first(list(records))):
-            path, failure, carry = self.directory / name, None, None
+            path = self.directory / name
+            failure = None
+            carry = None
             try:
                 carry = load_state(path, abstract)
             except DamagedError:

@@ -1,4 +1,6 @@
-"""Compiled programs: kept in a folder of the user's own, so that a machine compiles each of them once."""
+"""Compiled programs: kept in a folder of the user's own, so that a machine compiles each of them
+once.
+"""
 
 import contextlib
 import hashlib
@@ -18,11 +20,12 @@ _WORTH_KEEPING = 0.5
 
 
 def cache_programs() -> Path | None:
-    """Have JAX keep compiled programs in the user's cache folder, each with a checksum, and take them from there next time.
+    """Have JAX keep compiled programs in the user's cache folder, each with a checksum, and take
+    them from there next time.
 
-    JAX itself knows a program again by its code, its compiler and its devices; the folder is this processor's, as code
-    for one need not run on another that shares the home. Where JAX was already told of a folder
-    (JAX_COMPILATION_CACHE_DIR), that one is used.
+    JAX itself knows a program again by its code, its compiler and its devices; the folder is this
+    processor's, as code for one need not run on another that shares the home. Where JAX was already
+    told of a folder (JAX_COMPILATION_CACHE_DIR), that one is used.
 
     Returns:
       the folder; None where no folder of the user's own can be written to, so that nothing is kept.
@@ -38,7 +41,9 @@ def cache_programs() -> Path | None:
     if folder is None:
         return None
     if given is not None and folder.exists() and not _is_private(folder):
-        _LOGGER.warning("others can write to %s, and so run what they like here: chmod go-w it", folder)
+        _LOGGER.warning(
+            "others can write to %s, and so run what they like here: chmod go-w it", folder
+        )
     use_checked_cache()
     jax.config.update("jax_compilation_cache_dir", str(folder))
     # XLA's own caches have no checksums
@@ -49,7 +54,9 @@ def cache_programs() -> Path | None:
 
 
 def _own_folder():
-    """A folder that only this user can write to, as a program in it is run; None where none can be had."""
+    """A folder that only this user can write to, as a program in it is run; None where none can be
+    had.
+    """
     import jax
 
     with contextlib.suppress(OSError, RuntimeError):  # RuntimeError: a user without a home
@@ -66,7 +73,11 @@ def _own_folder():
 def _is_private(folder):
     """Whether it's a folder, no link to one, this user's, and nobody else can write to it."""
     status = folder.lstat()
-    return stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid() and not status.st_mode & 0o022
+    return (
+        stat.S_ISDIR(status.st_mode)
+        and status.st_uid == os.geteuid()
+        and not status.st_mode & 0o022
+    )
 
 
 def _user_cache():
@@ -89,9 +100,14 @@ def _processor_key():
 
 
 def _bound(folder, size):
-    """Delete the files of a folder that were used longest ago, until they take at most `size` bytes."""
-    files, total = [(path.stat(), path) for path in folder.rglob("*") if path.is_file()], 0
-    for status, path in sorted(files, key=lambda file: max(file[0].st_atime, file[0].st_mtime), reverse=True):
+    """Delete the files of a folder that were used longest ago, until they take at most `size`
+    bytes.
+    """
+    files = [(path.stat(), path) for path in folder.rglob("*") if path.is_file()]
+    total = 0
+    for status, path in sorted(
+        files, key=lambda file: max(file[0].st_atime, file[0].st_mtime), reverse=True
+    ):
         total += status.st_size
         if total > size:
             path.unlink(missing_ok=True)

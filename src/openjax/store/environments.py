@@ -30,7 +30,8 @@ SAME = (
 
 
 def with_airframe(settings: PursuitSettings, vehicle: Path | None) -> PursuitSettings:
-    """The game of the airframe that a vehicle file, or a name, says; a family of the former one becomes the new one's.
+    """The game of the airframe that a vehicle file, or a name, says; a family of the former one
+    becomes the new one's.
 
     Raises:
       UserError: a file that can't be used.
@@ -44,10 +45,13 @@ def with_airframe(settings: PursuitSettings, vehicle: Path | None) -> PursuitSet
 
 
 def make_environment(
-    settings: PursuitSettings, vehicle: Path | None, effects: Path | None, opponent: str | Path | None = None
+    settings: PursuitSettings,
+    vehicle: Path | None,
+    effects: Path | None,
+    opponent: str | Path | None = None,
 ) -> Pursuit:
-    """The game with the vehicle of a vehicle.toml, or of an airframe's name, the effects of an effects.toml, and one evader
-    (`find_opponent`), where given.
+    """The game with the vehicle of a vehicle.toml, or of an airframe's name, the effects of an
+    effects.toml, and one evader (`find_opponent`), where given.
 
     Raises:
       UserError: a file that can't be used, or an evader that nobody knows.
@@ -86,19 +90,25 @@ def find_opponent(name_or_path: str | Path, game: PursuitSettings) -> tuple[Purs
     path = Path(name_or_path)
     if not path.is_file():
         raise UserError(
-            f"--opponent {str(name_or_path)[:60]}: no such evader or file; possible are {', '.join(SCRIPTED)} or a file "
+            f"--opponent {str(name_or_path)[:60]}: no such evader or file; possible are "
+            f"{', '.join(SCRIPTED)} or a file "
             "written by openjax exploit"
         )
     leaves, settings, _ = load_policy_file(path, "evader's file", "openjax exploit")
     if not any(name.startswith("evader/") for name in leaves):
         raise UserError(
-            f"--opponent {path}: holds a policy of pursuers; an evader's file comes from openjax exploit"
+            f"--opponent {path}: holds a policy of pursuers; an evader's file comes from openjax "
+            "exploit"
         )
-    learned_in, plain = settings["environment"], to_plain(game)
+    learned_in = settings["environment"]
+    plain = to_plain(game)
     for name in SAME:
         if learned_in.get(name) != plain[name]:
             raise UserError(
-                f"--opponent {path}: learned in a game with {name} {learned_in.get(name)}, here it's {plain[name]}"
+                f"--opponent {path}: learned in a game with {name} {learned_in.get(name)}, here "
+                f"it's {plain[name]}"
             )
     abstract = {"evader": jax.eval_shape(init_network, jax.random.key(0))}
-    return dataclasses.replace(game, evaders=("learned",)), fill(abstract, leaves, str(path))["evader"]
+    return dataclasses.replace(game, evaders=("learned",)), fill(abstract, leaves, str(path))[
+        "evader"
+    ]

@@ -14,7 +14,8 @@ def named_leaves(tree: Any) -> dict[str, Any]:
 
 
 def place(carry: Any, shardings: Any = None) -> Any:
-    """Commit every leaf to its devices, so that a fresh and a restored carry hit the same compiled step.
+    """Commit every leaf to its devices, so that a fresh and a restored carry hit the same compiled
+    step.
 
     Args:
       carry: pytree of arrays.

@@ -1,4 +1,6 @@
-"""Policies from wherever they lie: a policy file, a run, a checkpoint, or one shipped with the package."""
+"""Policies from wherever they lie: a policy file, a run, a checkpoint, or one shipped with the
+package.
+"""
 
 import dataclasses
 import functools
@@ -25,7 +27,8 @@ from openjax.store.run_directory import RunDirectory, is_run
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LoadedPolicy:
-    """A trained policy or a heuristic, called with observations of its game: `openjax.make(policy.settings.environment)`.
+    """A trained policy or a heuristic, called with observations of its game:
+    `openjax.make(policy.settings.environment)`.
 
     It goes into `jax.jit` and `jax.vmap` as it is; two are the same only if they're one object.
     """
@@ -45,22 +48,27 @@ class LoadedPolicy:
         if isinstance(self.policy, Heuristic):
             policy = Heuristic.for_environment(self.policy.name, environment)
             return dataclasses.replace(self, policy=policy)
-        game, own = environment.settings, self.settings.environment
+        game = environment.settings
+        own = self.settings.environment
         seen = ("self_size", "observe_in", "observed_pillars", "history_length", "frame_size")
         for name in ("num_pursuers", *seen):
             if getattr(game, name) != getattr(own, name):
                 raise UserError(
                     f"policy {self.source} was trained with {name} {getattr(own, name)}, here it's "
-                    f"{getattr(game, name)}: pursuers, observation and history must stay as in training"
+                    f"{getattr(game, name)}: pursuers, observation and history must stay as in "
+                    "training"
                 )
         if isinstance(self.policy, CraftPolicy):  # its controller flies another arena, or vehicle
             craft = Craft.of(environment)
-            check_flyable(f"the policy's output {self.settings.network.output}", craft, game.time_step)
+            check_flyable(
+                f"the policy's output {self.settings.network.output}", craft, game.time_step
+            )
             return dataclasses.replace(self, policy=dataclasses.replace(self.policy, craft=craft))
         return self
 
     def __call__(self, observation: Observation) -> jax.Array:
-        """The mean policy's action (..., N, 4) in -1..1: collective thrust, roll, pitch and yaw rate.
+        """The mean policy's action (..., N, 4) in -1..1: collective thrust, roll, pitch and yaw
+        rate.
 
         Raises:
           UserError: the observation is that of another game.
@@ -81,13 +89,15 @@ def load_policy(name_or_path: str | Path = DEFAULT_POLICY) -> LoadedPolicy:
     """Load a policy.
 
     Args:
-      name_or_path: a name from `known_policies()` (`DEFAULT_POLICY` if none is given), a policy file (.npz), a run's directory
+      name_or_path: a name from `known_policies()` (`DEFAULT_POLICY` if none is given), a policy
+      file (.npz), a run's directory
         (its best policy) or a checkpoint's directory inside a run.
 
     Raises:
       UserError: nothing of that kind is there, or it's of another shape than its settings say.
     """
-    path, source = Path(name_or_path), str(name_or_path)
+    path = Path(name_or_path)
+    source = str(name_or_path)
     if source in METHODS:
         return _heuristic(source)
     if str(name_or_path) in shipped_policies():
@@ -101,10 +111,13 @@ def load_policy(name_or_path: str | Path = DEFAULT_POLICY) -> LoadedPolicy:
         return _build(run.read_settings(), load_arrays(path, policy_leaf), source)
     if path.exists():
         raise UserError(
-            f"{path} is no policy; expected a .npz file, a run of openjax.train or one of its checkpoints"
+            f"{path} is no policy; expected a .npz file, a run of openjax.train or one of its "
+            "checkpoints"
         )
     hint = suggestion(source, known_policies())
-    raise UserError(f"policy {source}: no such file or directory, nor shipped with the package; {hint}")
+    raise UserError(
+        f"policy {source}: no such file or directory, nor shipped with the package; {hint}"
+    )
 
 
 def known_policies() -> list[str]:
@@ -120,7 +133,9 @@ def _heuristic(name):
 
 def abstract_parameters(environment: Pursuit, policy: Policy) -> PolicyParameters:
     """Shapes and dtypes of the policy's parameters."""
-    return jax.eval_shape(lambda key: policy.init(key, environment.reset(key)[0]), jax.random.key(0))
+    return jax.eval_shape(
+        lambda key: policy.init(key, environment.reset(key)[0]), jax.random.key(0)
+    )
 
 
 def _from_file(path, source):
@@ -142,7 +157,9 @@ def _build(settings, leaves, source):
     game = settings.environment
     # learned evaders' networks aren't in a policy's file
     scripted = tuple(name for name in game.evaders if name in SCRIPTED) or PursuitSettings().evaders
-    settings = dataclasses.replace(settings, environment=dataclasses.replace(game, evaders=scripted))
+    settings = dataclasses.replace(
+        settings, environment=dataclasses.replace(game, evaders=scripted)
+    )
     if jax.default_backend() == "cpu":  # CPUs emulate bfloat16, slowly
         settings = dataclasses.replace(
             settings, network=dataclasses.replace(settings.network, compute_type="float32")
@@ -157,7 +174,9 @@ def _build(settings, leaves, source):
 
 @functools.lru_cache(maxsize=8)
 def _untrained(game: PursuitSettings, network: NetworkSettings, predictor: PredictorSettings):
-    """The networks of these settings and the kinds of their parameters, which take a second to trace."""
+    """The networks of these settings and the kinds of their parameters, which take a second to
+    trace.
+    """
     environment = Pursuit(game)
     policy = make_policy(environment, network, predictor)
     return policy, abstract_parameters(environment, policy)

@@ -1,8 +1,8 @@
 """Trained policies as one small file: arrays and settings in a .npz, no pickle.
 
-A file holds the leaves of a parameter tree under their paths, the settings that rebuild everything around
-them, and a note of where they come from. Floating-point arrays are stored as float16 by default (half the
-size, about three decimal digits), other kinds stay as they are.
+A file holds the leaves of a parameter tree under their paths, the settings that rebuild everything
+around them, and a note of where they come from. Floating-point arrays are stored as float16 by
+default (half the size, about three decimal digits), other kinds stay as they are.
 """
 
 import json
@@ -38,7 +38,12 @@ def save_policy_file(
       notes: anything worth knowing later (commit, steps, scores).
       storage: dtype in which floating-point arrays are stored: `float16` or `float32`.
     """
-    header = {"format": _FORMAT, "settings": to_plain(settings), "notes": to_plain(notes or {}), "dtypes": {}}
+    header = {
+        "format": _FORMAT,
+        "settings": to_plain(settings),
+        "notes": to_plain(notes or {}),
+        "dtypes": {},
+    }
     arrays = {}
     for name, leaf in named_leaves(parameters).items():
         array = np.asarray(leaf.astype(jnp.float32) if leaf.dtype == jnp.bfloat16 else leaf)
@@ -52,7 +57,8 @@ def save_policy_file(
 def load_policy_file(
     path: Path, kind: str = "policy file", writer: str = "openjax.train"
 ) -> tuple[dict[str, np.ndarray], dict, dict]:
-    """Leaves by path in their original dtype, the settings and the notes as plain values; `kind` and `writer` for errors.
+    """Leaves by path in their original dtype, the settings and the notes as plain values; `kind`
+    and `writer` for errors.
 
     Raises:
       UserError: no policy file, or one of another format.
@@ -62,17 +68,25 @@ def load_policy_file(
         header = json.loads(stored.pop(_HEADER).tobytes())
         if not isinstance(header, dict) or header.get("format") != _FORMAT:
             raise UserError(f"{path} isn't of the format {_FORMAT!r}")
-        leaves = {name: array.astype(_dtype(header["dtypes"][name])) for name, array in stored.items()}
-        settings, notes = header["settings"], header["notes"]
+        leaves = {
+            name: array.astype(_dtype(header["dtypes"][name])) for name, array in stored.items()
+        }
+        settings = header["settings"]
+        notes = header["notes"]
     except UserError:
         raise
     except OSError as error:
         raise UserError(f"{path} can't be read: {error.strerror or error}") from error
-    except Exception as error:  # a damaged or foreign archive fails in every way that zipfile and NumPy know
+    except (
+        Exception
+    ) as error:  # a damaged or foreign archive fails in every way that zipfile and NumPy know
         raise UserError(
-            f"{path} is no {kind}, or it's damaged ({type(error).__name__}); expected one written by {writer} (.npz)"
+            f"{path} is no {kind}, or it's damaged ({type(error).__name__}); expected one written "
+            f"by {writer} (.npz)"
         ) from error
-    broken = [name for name, leaf in leaves.items() if not np.isfinite(leaf.astype(np.float32)).all()]
+    broken = [
+        name for name, leaf in leaves.items() if not np.isfinite(leaf.astype(np.float32)).all()
+    ]
     if broken:
         raise UserError(f"{path} holds numbers that aren't finite, in {broken[0]}")
     return leaves, settings, notes
@@ -82,7 +96,9 @@ def _read_arrays(path):
     """The arrays of an .npz file, without pickles, and none larger than `LARGEST`."""
     with zipfile.ZipFile(path) as archive:
         if sum(member.file_size for member in archive.infolist()) > LARGEST:
-            raise UserError(f"{path} holds more than {LARGEST >> 20} MiB; no policy of openjax is so large")
+            raise UserError(
+                f"{path} holds more than {LARGEST >> 20} MiB; no policy of openjax is so large"
+            )
     with np.load(path, allow_pickle=False) as stored:
         return {name: stored[name] for name in stored.files}
 
@@ -104,7 +120,9 @@ def fill(abstract: Any, leaves: dict[str, np.ndarray], where: str) -> Any:
     filled = []
     for name, leaf in named_leaves(abstract).items():
         if name not in leaves:
-            raise UserError(f"{where} lacks the parameters {name}; it was made by another network or version")
+            raise UserError(
+                f"{where} lacks the parameters {name}; it was made by another network or version"
+            )
         if leaves[name].shape != leaf.shape:
             raise UserError(
                 f"{where} is of another shape: {name} is {list(leaves[name].shape)} there, "

@@ -106,7 +106,8 @@ def open_run(path: Path) -> RunDirectory:
     """
     if not is_run(path):
         raise UserError(
-            f"{path} is no run; expected a directory written by openjax.train (with {SETTINGS_FILE})"
+            f"{path} is no run; expected a directory written by openjax.train (with "
+            f"{SETTINGS_FILE})"
         )
     return RunDirectory(Path(path))
 
@@ -117,7 +118,8 @@ def check_free(path: Path, overwrite: bool) -> None:
     What a run left that was killed before it had settings is in nobody's way.
 
     Raises:
-      UserError: it holds a run and `overwrite` is False, or it holds other things, or can't be written to.
+      UserError: it holds a run and `overwrite` is False, or it holds other things, or can't be
+      written to.
     """
     path = Path(path)
     if path.exists() and not path.is_dir():
@@ -126,21 +128,24 @@ def check_free(path: Path, overwrite: bool) -> None:
     if is_run(path):
         if not overwrite:
             raise UserError(
-                f"{path} already holds a run; --resume {path} goes on with it, --overwrite replaces it"
+                f"{path} already holds a run; --resume {path} goes on with it, --overwrite "
+                "replaces it"
             )
     elif path.is_dir() and any(not _is_ours(entry.name) for entry in path.iterdir()):
         raise UserError(f"{path} holds files that are no run; choose another --out")
 
 
 def create_run(path: Path, overwrite: bool) -> RunDirectory:
-    """An empty run directory; with `overwrite` a run that is there is removed, and only its own files.
+    """An empty run directory; with `overwrite` a run that is there is removed, and only its own
+    files.
 
     Call it inside `locked`.
     """
     check_free(path, overwrite)
     path = Path(path)
     path.mkdir(parents=True, exist_ok=True)
-    # The settings file goes first: what is left of a half-removed run is no run that could be resumed.
+    # The settings file goes first: what is left of a half-removed run is no run that could be
+    # resumed.
     for name in _FILES:
         (path / name).unlink(missing_ok=True)
     for name in _FOLDERS:
@@ -151,7 +156,8 @@ def create_run(path: Path, overwrite: bool) -> RunDirectory:
 
 @contextlib.contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Keep the directory, which is made where it isn't there, for this process; its end gives it free, also a kill.
+    """Keep the directory, which is made where it isn't there, for this process; its end gives it
+    free, also a kill.
 
     Raises:
       UserError: another process trains there.

@@ -1,4 +1,6 @@
-"""A drone: parameters from its MJCF, rotors, rate controller, dynamics with solids, optional effects."""
+"""A drone: parameters from its MJCF, rotors, rate controller, dynamics with solids, optional
+effects.
+"""
 
 from openjax.lazy import lazy_names
 

@@ -1,6 +1,8 @@
-"""What differs from flight to flight and moment to moment: gusts, sensor noise, commands and poses that come unevenly.
+"""What differs from flight to flight and moment to moment: gusts, sensor noise, commands and poses
+that come unevenly.
 
-Effects like those of `openjax.vehicle.effects`, for flying with only: they're random, so no diagnosis looks for them.
+Effects like those of `openjax.vehicle.effects`, for flying with only: they're random, so no
+diagnosis looks for them.
 """
 
 import jax
@@ -19,11 +21,16 @@ def _draw(memory):
 
 
 def _jitter_memory(vehicle, state, dt, key):
-    return {"previous": hover_command(vehicle, state.position.dtype), "key": jax.random.key_data(key)}
+    return {
+        "previous": hover_command(vehicle, state.position.dtype),
+        "key": jax.random.key_data(key),
+    }
 
 
 def _jitter_command(parameters, memory, command, context):
-    """A command that comes late by part of a step: the mean of the old and the new one over that step."""
+    """A command that comes late by part of a step: the mean of the old and the new one over that
+    step.
+    """
     draw, key = _draw(memory)
     late = parameters["longest"] * jax.random.uniform(draw, (), command.dtype)
     part = jnp.clip(late / context.dt, 0.0, 1.0)
@@ -35,7 +42,10 @@ COMMAND_JITTER = Effect(
     description="each command comes later by a time drawn anew",
     parameters={
         "longest": Parameter(
-            "s", 0.0, (0.0, LONGEST_JITTER), "2.4 GHz radio: a packet waits for its slot or is sent again"
+            "s",
+            0.0,
+            (0.0, LONGEST_JITTER),
+            "2.4 GHz radio: a packet waits for its slot or is sent again",
         )
     },
     command=_jitter_command,
@@ -46,7 +56,9 @@ COMMAND_JITTER = Effect(
 
 def _gust_wrench(parameters, context):
     """Forces in the world that rise and fall, at rates without a common period."""
-    angle = parameters["rate"] * context.air_time * jnp.array([1.0, 1.31, 0.77], context.velocity.dtype)
+    angle = (
+        parameters["rate"] * context.air_time * jnp.array([1.0, 1.31, 0.77], context.velocity.dtype)
+    )
     size = jnp.stack([parameters["x"], parameters["y"], parameters["z"]])
     force = rotate_inverse(context.quaternion, size * jnp.sin(angle + parameters["phase"]))
     return force, jnp.zeros_like(force)
@@ -70,7 +82,11 @@ GUST = Effect(
 
 def _noise_memory(vehicle, state, dt, key):
     dtype = state.position.dtype
-    return {"noise": jnp.zeros(9, dtype), "late": jnp.zeros((), dtype), "key": jax.random.key_data(key)}
+    return {
+        "noise": jnp.zeros(9, dtype),
+        "late": jnp.zeros((), dtype),
+        "key": jax.random.key_data(key),
+    }
 
 
 def _noise_record(memory, state):
@@ -85,11 +101,15 @@ def _noise_record(memory, state):
 
 
 def _noise_sensor(parameters, memory, state):
-    """White noise on pose and velocity; a pose that is older by up to `jitter` is where the drone was then."""
+    """White noise on pose and velocity; a pose that is older by up to `jitter` is where the drone
+    was then.
+    """
     position, velocity, angle = jnp.split(memory["noise"], 3)
     late = parameters["jitter"] * memory["late"]
     turn = 0.5 * (parameters["attitude"] * angle - late * state.body_rates)
-    quaternion = quaternion_multiply(state.quaternion, jnp.concatenate([jnp.ones_like(turn[:1]), turn]))
+    quaternion = quaternion_multiply(
+        state.quaternion, jnp.concatenate([jnp.ones_like(turn[:1]), turn])
+    )
     return state.replace(
         position=state.position - late * state.velocity + parameters["position"] * position,
         velocity=state.velocity + parameters["velocity"] * velocity,
@@ -100,13 +120,16 @@ def _noise_sensor(parameters, memory, state):
 _CAPTURE = "motion capture of Crazyflies: about 1 mm, .5 degrees; velocity by differences at 100 Hz"
 
 POSE_NOISE = Effect(
-    name="view_noise",  # effects act by name: after the latency, which shows true poses of earlier moments
+    # effects act by name: after the latency, which shows true poses of earlier moments
+    name="view_noise",
     description="the pose that the off-board controller sees is noisy and unevenly late",
     parameters={
         "position": Parameter("m", 0.0, (0.0, 0.003), _CAPTURE),
         "velocity": Parameter("m/s", 0.0, (0.0, 0.05), _CAPTURE),
         "attitude": Parameter("rad", 0.0, (0.0, 0.02), _CAPTURE, "about each axis"),
-        "jitter": Parameter("s", 0.0, (0.0, LONGEST_JITTER), "motion capture, filtering and network"),
+        "jitter": Parameter(
+            "s", 0.0, (0.0, LONGEST_JITTER), "motion capture, filtering and network"
+        ),
     },
     sensor=_noise_sensor,
     record=_noise_record,

@@ -46,20 +46,24 @@ def motors(
       dt: seconds.
 
     Returns:
-      the drone with its new rotors and controller, force (3,) N in the world without gravity, torque (3,) N m about
-      the centre of mass, body frame.
+      the drone with its new rotors and controller, force (3,) N in the world without gravity,
+      torque (3,) N m about the centre of mass, body frame.
     """
     motor_command, integral = rate_controller(vehicle, drone, command, dt)
     motor_command = composition.change_motor_command(effects, parameters, motor_command, context)
     speed = rotor_speed_step(vehicle, drone.rotor_speed, motor_command, dt)
     force, torque = composition.wrench(effects, parameters, vehicle, speed, context)
-    drone = drone.replace(rotor_speed=speed, rate_integral=integral, previous_body_rates=drone.body_rates)
+    drone = drone.replace(
+        rotor_speed=speed, rate_integral=integral, previous_body_rates=drone.body_rates
+    )
     return drone, rotate(drone.quaternion, force), torque
 
 
 @dataclass(frozen=True)
 class DronesStep:
-    """The step of N drones of one world, made by `make_drones_step`. Its methods are pure, to be mapped."""
+    """The step of N drones of one world, made by `make_drones_step`. Its methods are pure, to be
+    mapped.
+    """
 
     physics: str
     dt: float
@@ -80,19 +84,24 @@ class DronesStep:
         """`drones` (leading axis N) after one step of `dt` seconds.
 
         command (N, 4) as for `rate_controller`, pillar_position (P, 2) m, pillar_active (P,) bool,
-        effect_parameters {effect: {parameter: () or (N,) array}} for the effects of this step, of all drones or of
-        each; what is left out has no effect. The arithmetic is done in the precision of the drones' state.
+        effect_parameters {effect: {parameter: () or (N,) array}} for the effects of this step, of
+        all drones or of each; what is left out has no effect. The arithmetic is done in the
+        precision of the drones' state.
 
         Raises:
-          UserError: parameters of other effects than this step's, or drones without the memory of its effects.
+          UserError: parameters of other effects than this step's, or drones without the memory of
+          its effects.
         """
         dtype = drones.position.dtype
         vehicle = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), vehicle)
-        command, pillars = jnp.asarray(command, dtype), (pillar_position, pillar_active)
+        command = jnp.asarray(command, dtype)
+        pillars = (pillar_position, pillar_active)
         if self.physics == "rigid" and not self.effects:
             memory = drones.effect_memory  # of other effects than this step's, if any
             around = pillars if self.contacts else None
-            drones = step_many(self.fused, vehicle, drones.replace(effect_memory=()), command, around)
+            drones = step_many(
+                self.fused, vehicle, drones.replace(effect_memory=()), command, around
+            )
             return drones.replace(effect_memory=memory)
 
         composition.check_memory(self.effects, drones.effect_memory)
@@ -125,7 +134,9 @@ class DronesStep:
         return drones.replace(effect_memory=jax.vmap(memory)(drones, number))
 
     def seen(self, drones: DroneState, effect_parameters=None) -> DroneState:
-        """What the off-board controller sees of `drones` (leading axis N): they themselves without sensor effects."""
+        """What the off-board controller sees of `drones` (leading axis N): they themselves without
+        sensor effects.
+        """
         if not self.effects:
             return drones
         parameters = self._parameters(effect_parameters, drones)
@@ -208,21 +219,25 @@ def make_drones_step(
 ) -> DronesStep:
     """Make the step of N drones of one world.
 
-    physics "mjx": MuJoCo MJX; "rigid": the same equations written out, many times faster. In both floor, pillars
-    (sized by `arena`) and other drones are solid unless `contacts` is off. "stops": free
-    flight, and drones are put back out of solid things once per step. dt is the step
-    in seconds; `substeps` divide it, and the rate controller runs in each. `effects` (names, or of type `Effect`) are modelled
-    beyond the nominal vehicle. Within a substep: controller on the present state, motors, rotor speeds,
-    wrench from the updated rotor speeds, body.
+    physics "mjx": MuJoCo MJX; "rigid": the same equations written out, many times faster. In both
+    floor, pillars (sized by `arena`) and other drones are solid unless `contacts` is off. "stops":
+    free flight, and drones are put back out of solid things once per step. dt is the step in
+    seconds; `substeps` divide it, and the rate controller runs in each. `effects` (names, or of
+    type `Effect`) are modelled beyond the nominal vehicle. Within a substep: controller on the
+    present state, motors, rotor speeds, wrench from the updated rotor speeds, body.
 
-    Sizes are those of the arrays that the step gets; with `max_pillars` and `num_drones` the MJX model for
-    them is built here instead of at the first step. Raises UserError for unknown physics or effects and
-    impossible steps.
+    Sizes are those of the arrays that the step gets; with `max_pillars` and `num_drones` the MJX
+    model for them is built here instead of at the first step. Raises UserError for unknown physics
+    or effects and impossible steps.
     """
     if physics not in PHYSICS:
-        raise UserError(f"physics {physics!r} is unknown; one of {', '.join(PHYSICS)} would be right")
+        raise UserError(
+            f"physics {physics!r} is unknown; one of {', '.join(PHYSICS)} would be right"
+        )
     if substeps < 1 or dt <= 0:
-        raise UserError(f"dt {dt} with {substeps} substeps: dt > 0 and substeps >= 1 would be right")
+        raise UserError(
+            f"dt {dt} with {substeps} substeps: dt > 0 and substeps >= 1 would be right"
+        )
     if physics == "mjx" and contacts and max_pillars is not None and num_drones is not None:
         make_world(arena, max_pillars, num_drones - 1, dt / substeps, True)
     return DronesStep(physics, dt, substeps, contacts, arena, composition.resolve(effects))

@@ -1,4 +1,6 @@
-"""Families of vehicles: ranges from which the parameters of effects are drawn, one vehicle per pursuer and episode."""
+"""Families of vehicles: ranges from which the parameters of effects are drawn, one vehicle per
+pursuer and episode.
+"""
 
 import functools
 from collections.abc import Sequence
@@ -17,7 +19,9 @@ from openjax.vehicle.parameters import NOMINAL, find_mjcf
 
 
 class VehicleRange(NamedTuple):
-    """Where one parameter of an effect is drawn from: uniformly in its range, now and then in a wider one."""
+    """Where one parameter of an effect is drawn from: uniformly in its range, now and then in a
+    wider one.
+    """
 
     parameter: str
     """`effect.parameter`, for example `motor_lag.extra_up`."""
@@ -41,7 +45,9 @@ def find_parameter(name: str) -> tuple[Effect, Parameter]:
 
 
 def check_ranges(ranges: Sequence[VehicleRange]) -> None:
-    """Raises UserError for unknown parameters, parameters that come twice and ranges that aren't."""
+    """Raises UserError for unknown parameters, parameters that come twice and ranges that
+    aren't.
+    """
     seen = set()
     for name, low, high, rare_low, rare_high in ranges:
         find_parameter(name)
@@ -49,10 +55,13 @@ def check_ranges(ranges: Sequence[VehicleRange]) -> None:
             raise UserError(f"vehicles: {name} comes twice")
         seen.add(name)
         if not (
-            np.isfinite([low, high, rare_low, rare_high]).all() and low <= high and rare_low <= rare_high
+            np.isfinite([low, high, rare_low, rare_high]).all()
+            and low <= high
+            and rare_low <= rare_high
         ):
             raise UserError(
-                f"vehicles: {name} lies in {low}..{high}, rarely {rare_low}..{rare_high}; bounds must rise"
+                f"vehicles: {name} lies in {low}..{high}, rarely {rare_low}..{rare_high}; bounds "
+                "must rise"
             )
 
 
@@ -68,7 +77,9 @@ def family_bounds(ranges: Sequence[VehicleRange]) -> np.ndarray:
 
 
 def narrowed_bounds(ranges: Sequence[VehicleRange], share) -> jax.Array:
-    """(R, 4) bounds of the family of which only this `share` () is left about the nominal vehicle."""
+    """(R, 4) bounds of the family of which only this `share` () is left about the nominal
+    vehicle.
+    """
     none = np.array([[find_parameter(entry[0])[1].none] for entry in ranges], np.float32)
     return none + share * (family_bounds(ranges) - none)
 
@@ -80,10 +91,12 @@ def draw_vehicles(
     rare: float = 0.0,
     bounds: jax.Array | None = None,
 ) -> dict[str, dict[str, jax.Array]]:
-    """Effect parameters {effect: {parameter: (number,)}} of `number` vehicles, each drawn by itself.
+    """Effect parameters {effect: {parameter: (number,)}} of `number` vehicles, each drawn by
+    itself.
 
-    With probability `rare` one effect of a vehicle, any with equal odds, is drawn from its rare bounds. `bounds` (R, 4)
-    take the place of those in `ranges`: they may be known only after the program was compiled.
+    With probability `rare` one effect of a vehicle, any with equal odds, is drawn from its rare
+    bounds. `bounds` (R, 4) take the place of those in `ranges`: they may be known only after the
+    program was compiled.
     """
     if not ranges:
         return {}
@@ -106,9 +119,11 @@ def draw_vehicles(
 
 
 def standard_parameters(ranges: Sequence[VehicleRange], parameters: dict) -> jax.Array:
-    """(N, R) parameters of `ranges` in units of their effects' usual ranges, zero where there is no effect.
+    """(N, R) parameters of `ranges` in units of their effects' usual ranges, zero where there is no
+    effect.
 
-    The units don't depend on the family's bounds, so that a network that has learnt one family can be shown another.
+    The units don't depend on the family's bounds, so that a network that has learnt one family can
+    be shown another.
     """
     columns = []
     for entry in ranges:
@@ -151,14 +166,17 @@ def adapted_family(
     rest: float = REST,
     airframe: str = NOMINAL,
 ) -> tuple[VehicleRange, ...]:
-    """The family of one vehicle that was diagnosed: what was found, within its intervals, and a share of all else.
+    """The family of one vehicle that was diagnosed: what was found, within its intervals, and a
+    share of all else.
 
-    It holds every parameter there is, so that families of any two diagnoses differ in their bounds only.
+    It holds every parameter there is, so that families of any two diagnoses differ in their bounds
+    only.
 
     Args:
       values: {effect: {parameter: value}} of the effects that were found.
       intervals: their 90 % intervals, where known; else a tenth of the value either way.
-      rest: the part of the airframe's family that remains for effects that weren't found: flights can't rule them out.
+      rest: the part of the airframe's family that remains for effects that weren't found: flights
+      can't rule them out.
       airframe: that was diagnosed.
     """
     usual = {entry.parameter: entry for entry in vehicle_family(airframe)}
@@ -169,10 +187,14 @@ def adapted_family(
             name = f"{effect.name}.{key}"
             if found is None:
                 _, low, high, *_ = usual.get(name, (name, parameter.none, parameter.none))
-                low, high = (parameter.none + rest * (bound - parameter.none) for bound in (low, high))
+                low, high = (
+                    parameter.none + rest * (bound - parameter.none) for bound in (low, high)
+                )
             else:
                 value = found.get(key, parameter.none)
                 margin = 0.1 * abs(value - parameter.none)
-                low, high = intervals.get(effect.name, {}).get(key, (value - margin, value + margin))
+                low, high = intervals.get(effect.name, {}).get(
+                    key, (value - margin, value + margin)
+                )
             family.append(VehicleRange(name, float(low), float(high), float(low), float(high)))
     return tuple(family)

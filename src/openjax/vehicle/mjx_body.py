@@ -1,9 +1,9 @@
 """The body of one drone among solid things, its accelerations found by MuJoCo MJX.
 
-Each drone has its own small world: itself as the only moving body, and floor, pillars and other drones as
-shapes that are put in place anew in every step. Mapping this world over drones costs far less than one model
-that holds them all (its matrices grow with the square of the number of drones), and only true state is
-carried between steps.
+Each drone has its own small world: itself as the only moving body, and floor, pillars and other
+drones as shapes that are put in place anew in every step. Mapping this world over drones costs far
+less than one model that holds them all (its matrices grow with the square of the number of drones),
+and only true state is carried between steps.
 """
 
 from __future__ import annotations
@@ -49,7 +49,8 @@ class World(NamedTuple):
 
 
 def world_xml(arena: Arena, n_pillars: int, n_others: int, dt: float, contacts: bool = True) -> str:
-    """MJCF of one drone; a step lasts dt seconds. The drone's geom comes after those of `solids_xml`.
+    """MJCF of one drone; a step lasts dt seconds. The drone's geom comes after those of
+    `solids_xml`.
 
     One Newton iteration finds the contact forces for the things that are hit, without a loop.
     """
@@ -76,7 +77,9 @@ def world_xml(arena: Arena, n_pillars: int, n_others: int, dt: float, contacts: 
 
 @lru_cache(maxsize=32)
 def make_world(arena: Arena, n_pillars: int, n_others: int, dt: float, contacts: bool) -> World:
-    """The compiled world; numpy arrays, so that it can be closed over by compiled code of any precision."""
+    """The compiled world; numpy arrays, so that it can be closed over by compiled code of any
+    precision.
+    """
     model = mujoco.MjModel.from_xml_string(world_xml(arena, n_pillars, n_others, dt, contacts))
     device = jax.local_devices()[0]  # of several processes each builds its own
 
@@ -84,7 +87,8 @@ def make_world(arena: Arena, n_pillars: int, n_others: int, dt: float, contacts:
         mjx_model = _mjx().put_model(model, device, impl="jax")
         return World(*jax.tree.map(np.asarray, (mjx_model, _mjx().make_data(mjx_model, device))))
 
-    # A thread of its own knows nothing of the caller's trace or mesh, which may span other processes' devices.
+    # A thread of its own knows nothing of the caller's trace or mesh, which may span other
+    # processes' devices.
     with ThreadPoolExecutor(max_workers=1) as pool:
         return pool.submit(build).result()
 
@@ -92,14 +96,16 @@ def make_world(arena: Arena, n_pillars: int, n_others: int, dt: float, contacts:
 def _as_dtype(tree, dtype):
     def convert(leaf):
         kind = dtype if np.issubdtype(leaf.dtype, np.floating) else leaf.dtype
-        # empty arrays are made here: closed over by a shard_map, they crash the compiler of JAX 0.11
+        # empty arrays are made here: closed over by a shard_map, they crash the compiler of JAX
+        # 0.11
         return jnp.asarray(leaf, kind) if leaf.size else jnp.zeros(leaf.shape, kind)
 
     return jax.tree.map(convert, tree)
 
 
 def _forward(model, data, contacts: bool):
-    """MJX's forward dynamics without what this world has none of: tendons, actuators, sensors, cameras.
+    """MJX's forward dynamics without what this world has none of: tendons, actuators, sensors,
+    cameras.
 
     The barrier keeps XLA from computing each collision once per entry of the contacts' Jacobian.
     """
@@ -121,11 +127,11 @@ def mjx_step(
     torque_body: Vector,
     dt: Seconds,
 ) -> DroneState:
-    """`rigid_step` by MJX among `shapes` of `place_solids`, (n, 3) m (None: contact-free); dt must be the
-    world's.
+    """`rigid_step` by MJX among `shapes` of `place_solids`, (n, 3) m (None: contact-free); dt must
+    be the world's.
 
-    MJX gives the accelerations; velocities and positions are advanced as its Euler integrator does it.
-    Gradients are those of free flight: what contacts add is a constant to them.
+    MJX gives the accelerations; velocities and positions are advanced as its Euler integrator does
+    it. Gradients are those of free flight: what contacts add is a constant to them.
     """
     dtype = drone.position.dtype
     model, data = _as_dtype(world, dtype)
@@ -148,7 +154,8 @@ def mjx_step(
     data = _forward(model, data, shapes is not None)
     qacc = data.qacc_smooth
     if shapes is not None:
-        # The solver's line search leaves float32 noise of some 1e-3 m/s^2 even where nothing is touched.
+        # The solver's line search leaves float32 noise of some 1e-3 m/s^2 even where nothing is
+        # touched.
         contact = jnp.where(jnp.any(data.qfrc_constraint != 0), data.qacc - data.qacc_smooth, 0.0)
         qacc = qacc + jax.lax.stop_gradient(contact)
     qacc = qacc.astype(dtype)

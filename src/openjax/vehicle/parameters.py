@@ -13,7 +13,9 @@ from openjax.vehicle.shapes import Command, Hubs, Rotors, Scalar, Vector
 
 NOMINAL = "crazyflie"
 AIRFRAMES = {NOMINAL: "crazyflie.xml", "brushless": "crazyflie_brushless.xml"}
-"""Vehicles whose MJCF, and family beside it, the package has: the Crazyflie 2.1 and the Crazyflie 2.1 Brushless."""
+"""Vehicles whose MJCF, and family beside it, the package has: the Crazyflie 2.1 and the Crazyflie
+2.1 Brushless.
+"""
 
 ROTORS = ("rotor_1", "rotor_2", "rotor_3", "rotor_4")
 BODY = "crazyflie"
@@ -31,8 +33,9 @@ _NUMBERS = {
 
 @flax.struct.dataclass
 class Vehicle:
-    """One vehicle: a pytree of arrays. A copy with replaced leaves is another vehicle. Body frame: x forward,
-    y left, z up, origin at the centre of mass."""
+    """One vehicle: a pytree of arrays. A copy with replaced leaves is another vehicle. Body frame:
+    x forward, y left, z up, origin at the centre of mass.
+    """
 
     mass: Scalar  # kg
     inertia: Vector  # kg m^2, principal, along the body axes
@@ -53,12 +56,16 @@ class Vehicle:
 
 
 def assets_directory() -> Path:
-    """Where the MJCF files lie: inside the installed package, or at the top of the source tree. UserError: nowhere."""
+    """Where the MJCF files lie: inside the installed package, or at the top of the source tree.
+    UserError: nowhere.
+    """
     here = Path(__file__).resolve()
     for candidate in (here.parents[1] / "assets", here.parents[3] / "assets"):
         if (candidate / "crazyflie.xml").is_file():
             return candidate
-    raise UserError(f"crazyflie.xml is neither in {here.parents[1]}/assets nor in {here.parents[3]}/assets")
+    raise UserError(
+        f"crazyflie.xml is neither in {here.parents[1]}/assets nor in {here.parents[3]}/assets"
+    )
 
 
 @lru_cache(maxsize=8)
@@ -71,18 +78,25 @@ def read_mjcf(path: str) -> dict[str, np.ndarray]:
     try:
         model = mujoco.MjModel.from_xml_path(path)
     except (ValueError, OSError) as error:
-        raise UserError(f"{path}: not a readable MJCF model ({str(error).splitlines()[0]})") from None
-    body = _find(model, path, "body", BODY)
-    if not (np.allclose(model.body_iquat[body], [1, 0, 0, 0]) and np.allclose(model.body_ipos[body], 0)):
         raise UserError(
-            f"{path}: the inertial frame of {BODY!r} must lie in the body frame (pos 0, diaginertia only)"
+            f"{path}: not a readable MJCF model ({str(error).splitlines()[0]})"
+        ) from None
+    body = _find(model, path, "body", BODY)
+    if not (
+        np.allclose(model.body_iquat[body], [1, 0, 0, 0]) and np.allclose(model.body_ipos[body], 0)
+    ):
+        raise UserError(
+            f"{path}: the inertial frame of {BODY!r} must lie in the body frame (pos 0, "
+            "diaginertia only)"
         )
     gear = np.array([model.actuator_gear[_find(model, path, "actuator", name)] for name in ROTORS])
     numbers = {name: _number(model, path, name, size) for name, size in _NUMBERS.items()}
     return {
         "mass": model.body_mass[body],
         "inertia": model.body_inertia[body].copy(),
-        "rotor_position": np.array([model.site_pos[_find(model, path, "site", name)] for name in ROTORS]),
+        "rotor_position": np.array(
+            [model.site_pos[_find(model, path, "site", name)] for name in ROTORS]
+        ),
         "rotor_spin": np.sign(gear[:, 5]),
         "torque_constant": np.abs(gear[:, 5]).mean() * numbers["thrust_constant"],
         "motor_slowdown_ratio": np.float64(1.0),
@@ -102,7 +116,8 @@ def _find(model, path, kind, name):
 def _number(model, path, name, size):
     """The values of a `numeric`."""
     index = _find(model, path, "numeric", name)
-    start, count = model.numeric_adr[index], model.numeric_size[index]
+    start = model.numeric_adr[index]
+    count = model.numeric_size[index]
     if count != size:
         raise UserError(f"{path}: numeric {name!r} holds {count} values, {size} would be right")
     values = np.array(model.numeric_data[start : start + count])
@@ -126,7 +141,10 @@ def load_vehicle(airframe: str | Path = NOMINAL, dtype=jnp.float32) -> Vehicle:
     """
     path = find_mjcf(airframe)
     return Vehicle(
-        **{name: jnp.asarray(value, dtype) for name, value in read_mjcf(str(path.resolve())).items()}
+        **{
+            name: jnp.asarray(value, dtype)
+            for name, value in read_mjcf(str(path.resolve())).items()
+        }
     )
 
 

@@ -1,4 +1,6 @@
-"""The body-rate PID and the mixer of the Crazyflie firmware (CTBR: collective thrust and body rates)."""
+"""The body-rate PID and the mixer of the Crazyflie firmware (CTBR: collective thrust and body
+rates).
+"""
 
 import jax.numpy as jnp
 
@@ -13,9 +15,11 @@ _DEGREES = 57.29577951308232
 
 
 def mixer(vehicle: Vehicle) -> Hubs:
-    """(4, 3) share of each motor in roll, pitch and yaw outputs: the sign of the torque it exerts, roll and
-    pitch halved as in the firmware's x configuration."""
-    x, y = vehicle.rotor_position[:, 0], vehicle.rotor_position[:, 1]
+    """(4, 3) share of each motor in roll, pitch and yaw outputs: the sign of the torque it exerts,
+    roll and pitch halved as in the firmware's x configuration.
+    """
+    x = vehicle.rotor_position[:, 0]
+    y = vehicle.rotor_position[:, 1]
     return jnp.stack([0.5 * jnp.sign(y), -0.5 * jnp.sign(x), vehicle.rotor_spin], axis=-1)
 
 
@@ -24,8 +28,8 @@ def rate_controller(
 ) -> tuple[Rotors, Vector]:
     """Motor commands (4,) in 0..1 and the new integrals (3,) deg, for one drone.
 
-    command (4,): collective thrust in 0..1 as a share of four times the largest rotor thrust, body rates in
-    rad/s. The derivative acts on the measurement, so a step of the command does not kick.
+    command (4,): collective thrust in 0..1 as a share of four times the largest rotor thrust, body
+    rates in rad/s. The derivative acts on the measurement, so a step of the command does not kick.
     """
     error = (command[1:] - state.body_rates) * _DEGREES
     limit = vehicle.rate_integral_limit

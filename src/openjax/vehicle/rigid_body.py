@@ -1,4 +1,6 @@
-"""Free rigid-body flight written out: the same step as MuJoCo's Euler integrator (semi-implicit)."""
+"""Free rigid-body flight written out: the same step as MuJoCo's Euler integrator
+(semi-implicit).
+"""
 
 from collections.abc import Callable
 
@@ -12,21 +14,25 @@ from openjax.vehicle.state import DroneState
 
 def rotate(quaternion: Quaternion, vector: Vector) -> Vector:
     """`vector` (3,) of the body frame in the world frame."""
-    w, u = quaternion[0], quaternion[1:]
+    w = quaternion[0]
+    u = quaternion[1:]
     t = 2.0 * cross(u, vector)
     return vector + w * t + cross(u, t)
 
 
 def rotate_inverse(quaternion: Quaternion, vector: Vector) -> Vector:
     """`vector` (3,) of the world frame in the body frame."""
-    w, u = quaternion[0], quaternion[1:]
+    w = quaternion[0]
+    u = quaternion[1:]
     t = 2.0 * cross(u, vector)
     return vector - w * t + cross(u, t)
 
 
 def cross(a: Vector, b: Vector) -> Vector:
     """Cross product of two (3,) vectors; written out, since it fuses better than `jnp.cross`."""
-    return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    return jnp.stack(
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    )
 
 
 def quaternion_multiply(a: Quaternion, b: Quaternion) -> Quaternion:
@@ -40,7 +46,9 @@ def quaternion_multiply(a: Quaternion, b: Quaternion) -> Quaternion:
 
 
 def quaternion_integrate(quaternion: Quaternion, body_rates: Vector, dt: Seconds) -> Quaternion:
-    """Attitude (4,) after dt seconds at constant body rates (3,) rad/s: exact, and smooth at zero rate."""
+    """Attitude (4,) after dt seconds at constant body rates (3,) rad/s: exact, and smooth at zero
+    rate.
+    """
     half = 0.5 * dt * body_rates
     square = jnp.sum(half * half)
     tiny = square < 1e-12  # the series is exact to rounding there
@@ -54,8 +62,9 @@ def quaternion_integrate(quaternion: Quaternion, body_rates: Vector, dt: Seconds
 def euler_step(
     drone: DroneState, acceleration: Vector, angular_acceleration: Vector, dt: Seconds
 ) -> DroneState:
-    """Advance velocities by the accelerations (3,) m/s^2 world and (3,) rad/s^2 body, then positions by the
-    new velocities: MuJoCo's Euler integrator."""
+    """Advance velocities by the accelerations (3,) m/s^2 world and (3,) rad/s^2 body, then
+    positions by the new velocities: MuJoCo's Euler integrator.
+    """
     velocity = drone.velocity + dt * acceleration
     body_rates = drone.body_rates + dt * angular_acceleration
     return drone.replace(
@@ -76,10 +85,13 @@ def rigid_step(
 ) -> DroneState:
     """One drone after dt seconds, its rotors and controller as they are.
 
-    force_world (3,) N without gravity, torque_body (3,) N m about the centre of mass. Newton-Euler equations.
-    `contact`, if any, maps the acceleration (3,) m/s^2 that the drone would have in free flight to what contacts add.
+    force_world (3,) N without gravity, torque_body (3,) N m about the centre of mass. Newton-Euler
+    equations. `contact`, if any, maps the acceleration (3,) m/s^2 that the drone would have in free
+    flight to what contacts add.
     """
-    acceleration = force_world / vehicle.mass - vehicle.gravity * jnp.array([0, 0, 1], force_world.dtype)
+    acceleration = force_world / vehicle.mass - vehicle.gravity * jnp.array(
+        [0, 0, 1], force_world.dtype
+    )
     if contact is not None:
         # as by MJX, gradients are those of free flight: what contacts add is a constant to them
         acceleration = acceleration + jax.lax.stop_gradient(contact(acceleration))

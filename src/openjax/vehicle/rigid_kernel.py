@@ -1,8 +1,9 @@
 """The rigid step of many worlds in one GPU kernel.
 
-XLA splits the step into some ten kernels (more with contacts), each of which reads and writes all drones' states; with
-tens of thousands of drones most of the time is spent on starting them. Here every drone's state is read once and written
-once. One thread holds all drones of a world, which therefore know of each other without a detour through memory.
+XLA splits the step into some ten kernels (more with contacts), each of which reads and writes all
+drones' states; with tens of thousands of drones most of the time is spent on starting them. Here
+every drone's state is read once and written once. One thread holds all drones of a world, which
+therefore know of each other without a detour through memory.
 """
 
 import functools
@@ -22,7 +23,9 @@ from openjax.vehicle.solids import Surroundings, others, surroundings
 from openjax.vehicle.state import DroneState
 
 WORTH = 16384
-"""Worlds from which the kernel is taken: it saves microseconds a step, and the compiler needs half a minute for it."""
+"""Worlds from which the kernel is taken: it saves microseconds a step, and the compiler needs half
+a minute for it.
+"""
 WORLDS = 128
 """Worlds of one program."""
 WARPS = 4
@@ -32,17 +35,22 @@ class FusedStep(NamedTuple):
     """What a step does to one drone: hashable, since compiled code is kept for each."""
 
     substep: Callable[[Vehicle, DroneState, jax.Array, Surroundings | None], DroneState]
-    """(vehicle, drone, command (4,), what is around it or None in free flight) -> the drone a substep later."""
+    """(vehicle, drone, command (4,), what is around it or None in free flight) -> the drone a
+    substep later.
+    """
     substeps: int
 
 
-def step_many(step: FusedStep, vehicle: Vehicle, drones: DroneState, command, pillars=None) -> DroneState:
+def step_many(
+    step: FusedStep, vehicle: Vehicle, drones: DroneState, command, pillars=None
+) -> DroneState:
     """The n drones (leading axis) of one world after a step.
 
-    The drones are of one vehicle and have no effect memory. `pillars`: position (P, 2) m and active (P,) bool, or None
-    for free flight, in which drones don't notice each other. On NVIDIA GPUs in one kernel, elsewhere mapped. May be
-    mapped further, over worlds (still one kernel) and vehicles (not); derivatives are those of `looped_step`, and whatever isn't
-    float32 is done by `mapped_step`.
+    The drones are of one vehicle and have no effect memory. `pillars`: position (P, 2) m and active
+    (P,) bool, or None for free flight, in which drones don't notice each other. On NVIDIA GPUs in
+    one kernel, elsewhere mapped. May be mapped further, over worlds (still one kernel) and vehicles
+    (not); derivatives are those of `looped_step`, and whatever isn't float32 is done by
+    `mapped_step`.
     """
     if drones.position.dtype != jnp.float32:
         return mapped_step(step, vehicle, drones, command, pillars or ())
@@ -53,18 +61,25 @@ def step_many(step: FusedStep, vehicle: Vehicle, drones: DroneState, command, pi
     return jax.tree.map(lambda leaf: leaf[0], _many_worlds(step)(vehicle, *world))
 
 
-def mapped_step(step: FusedStep, vehicle: Vehicle, drones: DroneState, command, pillars) -> DroneState:
-    """The n drones of one world after a step, by the formulas as they stand; `pillars` () in free flight."""
+def mapped_step(
+    step: FusedStep, vehicle: Vehicle, drones: DroneState, command, pillars
+) -> DroneState:
+    """The n drones of one world after a step, by the formulas as they stand; `pillars` () in free
+    flight.
+    """
     for _ in range(step.substeps):
         around = surroundings(drones.position, drones.velocity, *pillars) if pillars else None
         drones = jax.vmap(step.substep, (None, 0, 0, 0))(vehicle, drones, command, around)
     return drones
 
 
-def looped_step(step: FusedStep, vehicle: Vehicle, drones: DroneState, command, pillars) -> DroneState:
+def looped_step(
+    step: FusedStep, vehicle: Vehicle, drones: DroneState, command, pillars
+) -> DroneState:
     """The same by a loop over the substeps, each of which is done again in the backward pass.
 
-    A gradient through substeps written out one after the other takes five times as long on a CPU, and to compile.
+    A gradient through substeps written out one after the other takes five times as long on a CPU,
+    and to compile.
     """
 
     @jax.checkpoint
@@ -83,7 +98,9 @@ def _many_worlds(step):
     def run(vehicle, drones, command, pillars):
         if command.shape[0] < WORTH:
             return mapped(vehicle, drones, command, pillars)
-        return on_platform(mapped, functools.partial(kernel_call, step))(vehicle, drones, command, pillars)
+        return on_platform(mapped, functools.partial(kernel_call, step))(
+            vehicle, drones, command, pillars
+        )
 
     @run.def_vmap
     def _(axis_size, in_batched, vehicle, *worlds):
@@ -97,7 +114,9 @@ def _many_worlds(step):
                 return leaf.reshape(-1, *leaf.shape[2:])
 
             stepped = run(vehicle, *jax.tree.map(flat, worlds, tuple(in_batched[1:])))
-            stepped = jax.tree.map(lambda leaf: leaf.reshape(axis_size, -1, *leaf.shape[1:]), stepped)
+            stepped = jax.tree.map(
+                lambda leaf: leaf.reshape(axis_size, -1, *leaf.shape[1:]), stepped
+            )
         return stepped, jax.tree.map(lambda _: True, stepped)
 
     derived = jax.custom_jvp(run)
@@ -134,13 +153,16 @@ def kernel_call(
     traced = jax.make_jaxpr(step.substep)(vehicle, drone, one_command, around)
 
     def kernel(packed_ref, *refs):
-        vehicle_parts, start = [], 0
+        vehicle_parts = []
+        start = 0
         for leaf in constants:
             parts = split(packed_ref[start + i] for i in range(leaf.size))
             vehicle_parts.append(parts.reshape(leaf.shape))
             start += leaf.size
         parts = [split(ref[:, i] for i in range(ref.shape[1])) for ref in refs[: len(inputs)]]
-        world = [p.reshape(n, *leaf.shape[2:]) for p, leaf in zip(parts[:results], leaves, strict=False)]
+        world = [
+            p.reshape(n, *leaf.shape[2:]) for p, leaf in zip(parts[:results], leaves, strict=False)
+        ]
         commands = parts[results].reshape(n, 4)
         solids = []
         if pillars:

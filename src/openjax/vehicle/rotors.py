@@ -5,25 +5,32 @@ import jax.numpy as jnp
 from openjax.vehicle.parameters import Vehicle
 from openjax.vehicle.shapes import Rotors, Seconds, Vector
 
-# Below this motor command a rotor is asked to stand still: keeps the slope of the square root finite.
+# Below this motor command a rotor is asked to stand still: keeps the slope of the square root
+# finite.
 _SMALLEST_COMMAND = 1e-8
 
 
 def commanded_rotor_speed(vehicle: Vehicle, motor_command: Rotors) -> Rotors:
-    """Speed asked for by a motor command in 0..1, which is a share of the largest thrust: (4,) rad/s."""
+    """Speed asked for by a motor command in 0..1, which is a share of the largest thrust: (4,)
+    rad/s.
+    """
     on = motor_command > _SMALLEST_COMMAND
     root = jnp.sqrt(jnp.where(on, motor_command, 1.0))
     return vehicle.max_rotor_speed * jnp.where(on, root, 0.0)
 
 
-def rotor_speed_step(vehicle: Vehicle, rotor_speed: Rotors, motor_command: Rotors, dt: Seconds) -> Rotors:
+def rotor_speed_step(
+    vehicle: Vehicle, rotor_speed: Rotors, motor_command: Rotors, dt: Seconds
+) -> Rotors:
     """Rotor speeds after dt seconds of a constant motor command, (4,) rad/s.
 
     T dw/dt = w_commanded - w, solved exactly; T may differ between speeding up and slowing down.
     """
     target = commanded_rotor_speed(vehicle, motor_command)
     slowing = target < rotor_speed
-    time_constant = vehicle.motor_time_constant * jnp.where(slowing, vehicle.motor_slowdown_ratio, 1.0)
+    time_constant = vehicle.motor_time_constant * jnp.where(
+        slowing, vehicle.motor_slowdown_ratio, 1.0
+    )
     return rotor_speed + (target - rotor_speed) * -jnp.expm1(-dt / time_constant)
 
 
@@ -40,9 +47,11 @@ def rotor_reaction(vehicle: Vehicle, rotor_speed: Rotors) -> Rotors:
 def total_wrench(vehicle: Vehicle, thrust: Rotors, reaction: Rotors) -> tuple[Vector, Vector]:
     """Force (3,) N and torque about the centre of mass (3,) N m of the rotors, body frame.
 
-    thrust (4,) N acts along body z at the hubs; reaction (4,) N m are the signed torques of `rotor_reaction`.
+    thrust (4,) N acts along body z at the hubs; reaction (4,) N m are the signed torques of
+    `rotor_reaction`.
     """
-    x, y = vehicle.rotor_position[:, 0], vehicle.rotor_position[:, 1]
+    x = vehicle.rotor_position[:, 0]
+    y = vehicle.rotor_position[:, 1]
     zero = jnp.zeros_like(thrust[0])
     force = jnp.stack([zero, zero, jnp.sum(thrust)])
     torque = jnp.stack([jnp.sum(y * thrust), -jnp.sum(x * thrust), jnp.sum(reaction)])

@@ -1,13 +1,15 @@
-"""Solid things around a drone: the floor, vertical pillars, the other drones; and how contact with them acts.
+"""Solid things around a drone: the floor, vertical pillars, the other drones; and how contact with
+them acts.
 
-A test of present positions would let a drone sink in by the way of one step before anything stops it. So the
-solver is shown each thing moved along the present normal of contact to where its surface will be, seen from the
-drone, at the end of the step if nothing intervened. A contact then stops the drone at the surface, in the
-step in which it would have passed it. While one thing is hit, whatever else is near is shown as just
-touching: it may not be approached faster because of that impact, which keeps a drone from being squeezed
-through a gap narrower than itself.
+A test of present positions would let a drone sink in by the way of one step before anything stops
+it. So the solver is shown each thing moved along the present normal of contact to where its surface
+will be, seen from the drone, at the end of the step if nothing intervened. A contact then stops the
+drone at the surface, in the step in which it would have passed it. While one thing is hit, whatever
+else is near is shown as just touching: it may not be approached faster because of that impact,
+which keeps a drone from being squeezed through a gap narrower than itself.
 
-The same contacts are solved by MuJoCo MJX (`place_solids`, `mjx_body`) and, written out, by `contact_acceleration`.
+The same contacts are solved by MuJoCo MJX (`place_solids`, `mjx_body`) and, written out, by
+`contact_acceleration`.
 """
 
 import flax.struct
@@ -16,7 +18,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from openjax.vehicle.arena import Arena
-from openjax.vehicle.shapes import Active, Components, Gaps, Others, Pillars, Seconds, Team, Things, Vector
+from openjax.vehicle.shapes import (
+    Active,
+    Components,
+    Gaps,
+    Others,
+    Pillars,
+    Seconds,
+    Team,
+    Things,
+    Vector,
+)
 
 DRONE_RADIUS = 0.05  # m, the solid sphere of a drone
 PARKED = -100.0  # m, height of a pillar that isn't there
@@ -34,9 +46,11 @@ class Surroundings:
 
 @flax.struct.dataclass
 class Encounters:
-    """One drone beside its solid things: floor, P pillars, K other drones, in this order (M = 1 + P + K).
+    """One drone beside its solid things: floor, P pillars, K other drones, in this order (M = 1 + P
+    + K).
 
-    Vectors are their three components, each an array over the things: so a processor works on eight of them at once.
+    Vectors are their three components, each an array over the things: so a processor works on eight
+    of them at once.
     """
 
     origin: Components  # m, where each shape stands; the floor's below the drone
@@ -45,12 +59,12 @@ class Encounters:
     shown: Gaps  # m, the gap that the solver of contacts is shown; < 0: it acts
 
 
-# Contacts in MuJoCo's direct form: acceleration along the normal >= -stiffness * gap - damping * speed, `gap`
-# being the one at the end of the step. (stiffness in 1/dt^2, damping in 1/dt, impedance: the share of that
-# which is enforced.) Fixed things: together they cancel the approach in one step and close 0.4 of the gap,
-# below the half at which a resting drone would chatter. Other drones: each of the pair takes half of the
-# approach, an inelastic impact of equal masses that keeps their momentum; a low impedance, since the other
-# gives way too.
+# Contacts in MuJoCo's direct form: acceleration along the normal >= -stiffness * gap - damping *
+# speed, `gap` being the one at the end of the step. (stiffness in 1/dt^2, damping in 1/dt,
+# impedance: the share of that which is enforced.) Fixed things: together they cancel the approach
+# in one step and close 0.4 of the gap, below the half at which a resting drone would chatter. Other
+# drones: each of the pair takes half of the approach, an inelastic impact of equal masses that
+# keeps their momentum; a low impedance, since the other gives way too.
 _FIXED = (0.4, 0.6, 0.99)
 _DRONE = (0.5, 0.0, 0.5)
 
@@ -59,16 +73,26 @@ _TOUCHING = -1e-6  # m, gap at which a contact acts but doesn't push
 
 
 def solids_xml(arena: Arena, n_pillars: int, n_others: int, dt: float) -> tuple[str, str]:
-    """MJCF of the shapes (floor, pillars, other drones) and of their contact pairs with the geom "drone"."""
+    """MJCF of the shapes (floor, pillars, other drones) and of their contact pairs with the geom
+    "drone".
+    """
     shapes = ['<geom name="floor" type="plane" size="0 0 1"/>']
     pillar = f'type="capsule" size="{arena.pillar_radius} {arena.height / 2}"'
     shapes += [f'<geom name="pillar_{k}" {pillar}/>' for k in range(n_pillars)]
-    shapes += [f'<geom name="other_{k}" type="sphere" size="{DRONE_RADIUS}"/>' for k in range(n_others)]
-    names = ["floor", *(f"pillar_{k}" for k in range(n_pillars)), *(f"other_{k}" for k in range(n_others))]
+    shapes += [
+        f'<geom name="other_{k}" type="sphere" size="{DRONE_RADIUS}"/>' for k in range(n_others)
+    ]
+    names = [
+        "floor",
+        *(f"pillar_{k}" for k in range(n_pillars)),
+        *(f"other_{k}" for k in range(n_others)),
+    ]
     contacts = (
         f'<pair geom1="drone" geom2="{name}" condim="1" '
         f'solref="{-stiffness / dt**2} {-damping / dt}" solimp="{impedance} {impedance} 0.001"/>'
-        for name, (stiffness, damping, impedance) in zip(names, _contacts(n_pillars, n_others), strict=True)
+        for name, (stiffness, damping, impedance) in zip(
+            names, _contacts(n_pillars, n_others), strict=True
+        )
     )
     return "".join(shapes), "".join(contacts)
 
@@ -107,9 +131,13 @@ def surroundings(
 def encounters(
     arena: Arena, position: Vector, velocity: Vector, around: Surroundings, dt: Seconds
 ) -> Encounters:
-    """One drone at `position` (3,) m with `velocity` (3,) m/s beside its solid things, for a step of dt seconds."""
-    dtype, half = position.dtype, arena.height / 2
-    p, k = around.pillar_position.shape[0], around.other_position.shape[0]
+    """One drone at `position` (3,) m with `velocity` (3,) m/s beside its solid things, for a step
+    of dt seconds.
+    """
+    dtype = position.dtype
+    half = arena.height / 2
+    p = around.pillar_position.shape[0]
+    k = around.other_position.shape[0]
     height = jnp.where(around.pillar_active, half, PARKED).astype(dtype)
     level = jnp.clip(position[2] - height, -half, half) + height
     pillar = (*around.pillar_position.T, height)
@@ -120,12 +148,16 @@ def encounters(
     )
     nearest = (*origin[:2], jnp.concatenate([below[2][None], level, around.other_position[:, 2]]))
     moving = (jnp.concatenate([jnp.zeros(1 + p, dtype), part]) for part in around.other_velocity.T)
-    radius = np.r_[DRONE_RADIUS, np.full(p, arena.pillar_radius + DRONE_RADIUS), np.full(k, 2 * DRONE_RADIUS)]
+    radius = np.r_[
+        DRONE_RADIUS, np.full(p, arena.pillar_radius + DRONE_RADIUS), np.full(k, 2 * DRONE_RADIUS)
+    ]
     away = tuple(own - other for own, other in zip(position, nearest, strict=True))
     distance = jnp.sqrt(sum(part * part for part in away) + 1e-12)
     normal = tuple(part / distance for part in away)
     gap = distance - jnp.asarray(radius, dtype)
-    approach = sum(n * (own - other) for n, own, other in zip(normal, velocity, moving, strict=True))
+    approach = sum(
+        n * (own - other) for n, own, other in zip(normal, velocity, moving, strict=True)
+    )
     gap_ahead = gap + dt * approach
     hit = jnp.any(gap_ahead < 0.0)
     shown = jnp.where(hit & (gap < _NEAR) & (gap_ahead >= 0.0), _TOUCHING, gap_ahead)
@@ -139,17 +171,25 @@ def place_solids(met: Encounters) -> Things:
 
 
 def contact_acceleration(
-    arena: Arena, position: Vector, velocity: Vector, acceleration: Vector, around: Surroundings, dt: Seconds
+    arena: Arena,
+    position: Vector,
+    velocity: Vector,
+    acceleration: Vector,
+    around: Surroundings,
+    dt: Seconds,
 ) -> Vector:
-    """What contacts add over a step of dt seconds to the `acceleration` (3,) m/s^2 that a drone would have without them.
+    """What contacts add over a step of dt seconds to the `acceleration` (3,) m/s^2 that a drone
+    would have without them.
 
-    MuJoCo's soft contacts (its documentation, "Computation": constraint model, primal problem) written out for a sphere
-    without friction. They act on its centre along the normals, so its mass cancels and three unknowns are left,
+    MuJoCo's soft contacts (its documentation, "Computation": constraint model, primal problem)
+    written out for a sphere without friction. They act on its centre along the normals, so its mass
+    cancels and three unknowns are left,
 
         argmin_a |a - a_free|^2 / 2 + sum_i w_i min(0, n_i a - r_i)^2 / 2,
 
-    with weights w_i = d / (1 - d) of the impedance d and reference accelerations r_i = -(b n_i v + k gap_i) / d. As the
-    MJCF's solver does, this takes one Newton step from a_free: exact unless the step brings in another contact.
+    with weights w_i = d / (1 - d) of the impedance d and reference accelerations r_i = -(b n_i v +
+    k gap_i) / d. As the MJCF's solver does, this takes one Newton step from a_free: exact unless
+    the step brings in another contact.
     """
     met = encounters(arena, position, velocity, around, dt)
     contacts = _contacts(around.pillar_position.shape[0], around.other_position.shape[0])
@@ -167,9 +207,13 @@ def contact_acceleration(
     *pull, xx, yy, zz, xy, xz, yz = _sums(terms)
 
     # (1 + sum_i w_i n_i n_i^T) step = -pull, by an LDL^T factorisation
-    xx, yy, zz = 1.0 + xx, 1.0 + yy, 1.0 + zz
-    l_y, l_z = xy / xx, xz / xx
-    d_y, e = yy - l_y * xy, yz - l_z * xy
+    xx = 1.0 + xx
+    yy = 1.0 + yy
+    zz = 1.0 + zz
+    l_y = xy / xx
+    l_z = xz / xx
+    d_y = yy - l_y * xy
+    e = yz - l_z * xy
     l_zy = e / d_y
     d_z = zz - l_z * xz - l_zy * e
     f_y = l_y * pull[0] - pull[1]
@@ -179,7 +223,9 @@ def contact_acceleration(
 
 
 def _sums(terms):
-    """The sum of each over the things, by one loop: as many loops as sums would find the contacts anew in each. No gradient."""
+    """The sum of each over the things, by one loop: as many loops as sums would find the contacts
+    anew in each. No gradient.
+    """
 
     def add(one, other):
         return tuple(a + b for a, b in zip(one, other, strict=True))

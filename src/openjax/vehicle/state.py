@@ -12,7 +12,9 @@ from openjax.vehicle.shapes import Quaternion, Rotors, Vector
 
 @flax.struct.dataclass
 class DroneState:
-    """One drone; more drones or environments are leading axes. World frame: z up, z = 0 is the floor."""
+    """One drone; more drones or environments are leading axes. World frame: z up, z = 0 is the
+    floor.
+    """
 
     position: Vector  # m, world, of the centre of mass
     quaternion: Quaternion  # scalar first, rotates body to world, of unit length
@@ -31,15 +33,18 @@ def hover_state(
     velocity: ArrayLike | None = None,
     effect_memory: Any = (),
 ) -> DroneState:
-    """A drone with its rotors at hover speed, at rest unless `velocity` says otherwise, controller reset.
+    """A drone with its rotors at hover speed, at rest unless `velocity` says otherwise, controller
+    reset.
 
-    position (..., 3) m, quaternion (..., 4) (default: level), velocity (..., 3) m/s (default: zero); leading
-    axes are broadcast. `effect_memory` comes from `openjax.vehicle.effects.initial_memory` where effects need
-    it.
+    position (..., 3) m, quaternion (..., 4) (default: level), velocity (..., 3) m/s (default:
+    zero); leading axes are broadcast. `effect_memory` comes from
+    `openjax.vehicle.effects.initial_memory` where effects need it.
     """
     dtype = vehicle.mass.dtype
     position = jnp.asarray(position, dtype)
-    quaternion = jnp.array([1, 0, 0, 0], dtype) if quaternion is None else jnp.asarray(quaternion, dtype)
+    quaternion = (
+        jnp.array([1, 0, 0, 0], dtype) if quaternion is None else jnp.asarray(quaternion, dtype)
+    )
     velocity = jnp.zeros(3, dtype) if velocity is None else jnp.asarray(velocity, dtype)
     lead = jnp.broadcast_shapes(position.shape[:-1], quaternion.shape[:-1], velocity.shape[:-1])
     zeros = jnp.zeros((*lead, 3), dtype)

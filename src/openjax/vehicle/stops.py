@@ -1,6 +1,8 @@
-"""Solid things, cheaply: once per step, drones are put back out of what they have sunk into and lose their approach.
+"""Solid things, cheaply: once per step, drones are put back out of what they have sunk into and
+lose their approach.
 
-For learning, where a touch ends what the episode is worth anyhow; `mjx` stops a drone at the surface itself.
+For learning, where a touch ends what the episode is worth anyhow; `mjx` stops a drone at the
+surface itself.
 """
 
 import jax.numpy as jnp
@@ -11,9 +13,14 @@ from openjax.vehicle.solids import DRONE_RADIUS
 from openjax.vehicle.state import DroneState
 
 
-def stop(arena: Arena, drones: DroneState, pillar_position: Pillars, pillar_active: Active) -> DroneState:
-    """`drones` (leading axis N) out of the floor, pillars (P, 2) m in use (P,) and one another; no friction, no bounce."""
-    position, velocity = drones.position, drones.velocity
+def stop(
+    arena: Arena, drones: DroneState, pillar_position: Pillars, pillar_active: Active
+) -> DroneState:
+    """`drones` (leading axis N) out of the floor, pillars (P, 2) m in use (P,) and one another; no
+    friction, no bounce.
+    """
+    position = drones.position
+    velocity = drones.velocity
     if pillar_position.shape[0]:
         away = position[:, None, :2] - pillar_position[None]
         position, velocity = _push(
@@ -27,11 +34,15 @@ def stop(arena: Arena, drones: DroneState, pillar_position: Pillars, pillar_acti
     low = position[:, 2] < DRONE_RADIUS
     height = jnp.maximum(position[:, 2], DRONE_RADIUS)
     fall = jnp.where(low, jnp.maximum(velocity[:, 2], 0.0), velocity[:, 2])
-    return drones.replace(position=position.at[:, 2].set(height), velocity=velocity.at[:, 2].set(fall))
+    return drones.replace(
+        position=position.at[:, 2].set(height), velocity=velocity.at[:, 2].set(fall)
+    )
 
 
 def _push(position, velocity, away, reach, solid, share, moving=None):
-    """Move drones out of things at `away` (N, M, 2 or 3) from them, by their `share` of the depth and of the approach."""
+    """Move drones out of things at `away` (N, M, 2 or 3) from them, by their `share` of the depth
+    and of the approach.
+    """
     size = away.shape[-1]
     moving = velocity[:, None, :size] if moving is None else moving
     distance = jnp.sqrt(jnp.sum(away * away, axis=-1) + 1e-12)

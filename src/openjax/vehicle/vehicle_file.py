@@ -1,7 +1,7 @@
 """`vehicle.toml`: which vehicle flew, how its motors are commanded, and what a calibration found.
 
-All tables but `[log]` are strict, so that a misspelt key can't be ignored silently. What the file leaves out is the nominal
-vehicle.
+All tables but `[log]` are strict, so that a misspelt key can't be ignored silently. What the file
+leaves out is the nominal vehicle.
 """
 
 import tomllib
@@ -47,7 +47,9 @@ class Overrides:
     """`[vehicles.<id>]`: in what one of a flight's vehicles differs."""
 
     name: str | None = None
-    mass: Annotated[float | None, Interval("[0.005, 1]", "kg")] = None  # the lightest frame weighs twice that
+    mass: Annotated[float | None, Interval("[0.005, 1]", "kg")] = (
+        None  # the lightest frame weighs twice that
+    )
     mass_weighed: bool | None = None
 
 
@@ -101,7 +103,9 @@ class _Tables:
 
 @dataclass(frozen=True)
 class CalibratedValue:
-    """A fitted quantity of the vehicle: `value` and its 90 % interval, tuples of length 1 (3 for inertia)."""
+    """A fitted quantity of the vehicle: `value` and its 90 % interval, tuples of length 1 (3 for
+    inertia).
+    """
 
     value: tuple[float, ...]
     interval90: tuple[tuple[float, float], ...]
@@ -110,8 +114,9 @@ class CalibratedValue:
 
 @dataclass(frozen=True, eq=False)
 class VehicleFile:
-    """What a vehicle file says. `vehicle` is the nominal one with everything of the file applied, its motors in the nominal
-    order; `motor` is of the logged columns."""
+    """What a vehicle file says. `vehicle` is the nominal one with everything of the file applied,
+    its motors in the nominal order; `motor` is of the logged columns.
+    """
 
     vehicle: Vehicle
     name: str = NOMINAL_NAME
@@ -127,7 +132,9 @@ class VehicleFile:
 
     @property
     def motor_permutation(self) -> tuple[int, ...]:
-        """Logged column of each motor in the nominal order: `nominal = logged[..., permutation]`."""
+        """Logged column of each motor in the nominal order: `nominal = logged[...,
+        permutation]`.
+        """
         return tuple(self.motor.order.index(place) for place in NOMINAL_ORDER)
 
     def vehicle_of(self, vehicle_id: str) -> Vehicle:
@@ -136,22 +143,27 @@ class VehicleFile:
         return self.vehicle if mass is None else _changed(self.vehicle, mass=mass)
 
     def mass_weighed_of(self, vehicle_id: str) -> bool:
-        """Whether the mass of `vehicle_id` was weighed, so that a thrust error can't be explained by it."""
+        """Whether the mass of `vehicle_id` was weighed, so that a thrust error can't be explained
+        by it.
+        """
         own = self.vehicles.get(vehicle_id, Overrides()).mass_weighed
         return self.mass_weighed if own is None else own
 
 
 def load_vehicle_file(path: str | Path | None = None, dtype=jnp.float32) -> VehicleFile:
-    """Read a `vehicle.toml` (or a folder that holds one); None or an airframe's name give that nominal vehicle.
+    """Read a `vehicle.toml` (or a folder that holds one); None or an airframe's name give that
+    nominal vehicle.
 
-    Raises UserError for a missing or unreadable file, an unknown key in a strict table, or an impossible
-    value.
+    Raises UserError for a missing or unreadable file, an unknown key in a strict table, or an
+    impossible value.
     """
     path = Path(NOMINAL if path is None else path)
     if str(path) in AIRFRAMES and not path.exists():
         return VehicleFile(load_vehicle(str(path), dtype), _usual_name(str(path)), str(path))
     if not path.exists() and not path.suffix:
-        raise UserError(f"{path}: no such vehicle file, nor airframe; {suggestion(str(path), AIRFRAMES)}")
+        raise UserError(
+            f"{path}: no such vehicle file, nor airframe; {suggestion(str(path), AIRFRAMES)}"
+        )
     if path.is_dir():
         path = path / "vehicle.toml"
     return _from_tables(read_toml(path, "vehicle file"), path, dtype)
@@ -160,7 +172,8 @@ def load_vehicle_file(path: str | Path | None = None, dtype=jnp.float32) -> Vehi
 def save_vehicle_file(path: str | Path, vehicle_file: VehicleFile) -> None:
     """Write a vehicle file that `load_vehicle_file` reads back to the same vehicle.
 
-    The source file's text, comments included, is kept where there is one; `[calibrated]` is written anew.
+    The source file's text, comments included, is kept where there is one; `[calibrated]` is written
+    anew.
     """
     if vehicle_file.path:
         document = tomlkit.parse(vehicle_file.path.read_text(encoding="utf-8"))
@@ -175,12 +188,16 @@ def save_vehicle_file(path: str | Path, vehicle_file: VehicleFile) -> None:
         document.add("calibrated", tables)
     text = tomlkit.dumps(document)
     _copy_mjcf(vehicle_file, Path(path))
-    _from_tables(tomllib.loads(text), Path(path), jnp.float32)  # never write what can't be read back
+    _from_tables(
+        tomllib.loads(text), Path(path), jnp.float32
+    )  # never write what can't be read back
     write_text(path, text)
 
 
 def copy_vehicle_file(source: str | Path, target: Path) -> None:
-    """Copy a vehicle file as it is, with the MJCF that it names. Raises UserError where it can't be used."""
+    """Copy a vehicle file as it is, with the MJCF that it names. Raises UserError where it can't be
+    used.
+    """
     vehicle_file = load_vehicle_file(source)
     _copy_mjcf(vehicle_file, target)
     write_text(target, vehicle_file.path.read_text(encoding="utf-8"))
@@ -198,27 +215,34 @@ def _usual_name(airframe):
 
 
 def _own_mjcf(name, path):
-    """The MJCF file that `[vehicle] airframe` of the file at `path` names; None for one of `AIRFRAMES`."""
+    """The MJCF file that `[vehicle] airframe` of the file at `path` names; None for one of
+    `AIRFRAMES`.
+    """
     if name in AIRFRAMES:
         return None
     if not name or Path(name).name != name or not path.with_name(name).is_file():
         raise UserError(
-            f"{path}: [vehicle] airframe is {name!r}; it must be {', '.join(AIRFRAMES)}, or the name of an MJCF file beside it"
+            f"{path}: [vehicle] airframe is {name!r}; it must be {', '.join(AIRFRAMES)}, or the "
+            "name of an MJCF file beside it"
         )
     return path.with_name(name)
 
 
 def _from_tables(plain: dict, path: Path, dtype) -> VehicleFile:
-    tables, root = from_plain(_Tables, plain, f"{path}: "), f"{path}: "
-    told, motor = tables.vehicle, tables.motor
+    tables = from_plain(_Tables, plain, f"{path}: ")
+    root = f"{path}: "
+    told = tables.vehicle
+    motor = tables.motor
     from_plain(_Log, {k: v for k, v in tables.log.items() if k == "floor_z"}, f"{root}log")
     if sorted(motor.order) != sorted(NOMINAL_ORDER):
         raise UserError(
-            f"{root}motor.order is {list(motor.order)}; it must name each of {', '.join(NOMINAL_ORDER)} once"
+            f"{root}motor.order is {list(motor.order)}; it must name each of "
+            f"{', '.join(NOMINAL_ORDER)} once"
         )
     mjcf = _own_mjcf(told.airframe, path)
     nominal = load_vehicle(mjcf or told.airframe, dtype)
-    # of NumPy's, as going through one of JAX's compiles, which a flight that writes its log can't in a fork
+    # of NumPy's, as going through one of JAX's compiles, which a flight that writes its log can't
+    # in a fork
     usual = ["cw" if spin > 0 else "ccw" for spin in np.asarray(nominal.rotor_spin)]
     spin = motor.spin or tuple(usual[NOMINAL_ORDER.index(place)] for place in motor.order)
     if sorted(spin) != ["ccw", "ccw", "cw", "cw"]:
@@ -247,10 +271,13 @@ def _as_told(nominal: Vehicle, mass: float | None, motor: Motor, calibrated: dic
     """The nominal vehicle with everything that the file says of it."""
     spin = dict(zip(motor.order, motor.spin, strict=True))
     # in the nominal order; +1 where the reaction on the body is along +z (a cw rotor)
-    changes: dict[str, Any] = {"rotor_spin": [1.0 if spin[name] == "cw" else -1.0 for name in NOMINAL_ORDER]}
+    changes: dict[str, Any] = {
+        "rotor_spin": [1.0 if spin[name] == "cw" else -1.0 for name in NOMINAL_ORDER]
+    }
     changes |= {"mass": mass} if mass is not None else {}
     changes |= {
-        name: entry.value if len(entry.value) > 1 else entry.value[0] for name, entry in calibrated.items()
+        name: entry.value if len(entry.value) > 1 else entry.value[0]
+        for name, entry in calibrated.items()
     }
     if motor.torque_per_thrust is not None and "torque_constant" not in calibrated:
         thrust = changes.get("thrust_constant", float(nominal.thrust_constant))
@@ -259,7 +286,9 @@ def _as_told(nominal: Vehicle, mass: float | None, motor: Motor, calibrated: dic
 
 
 def _changed(vehicle: Vehicle, **values) -> Vehicle:
-    return vehicle.replace(**{name: jnp.asarray(value, vehicle.mass.dtype) for name, value in values.items()})
+    return vehicle.replace(
+        **{name: jnp.asarray(value, vehicle.mass.dtype) for name, value in values.items()}
+    )
 
 
 def _calibrated(name: str, entry: _Calibrated, nominal: Vehicle, where: str) -> CalibratedValue:
@@ -267,7 +296,8 @@ def _calibrated(name: str, entry: _Calibrated, nominal: Vehicle, where: str) -> 
     if (entry.unit or CALIBRATED_UNITS[name]) != CALIBRATED_UNITS[name]:
         raise UserError(f"{where} is in {entry.unit!r}; it must be in {CALIBRATED_UNITS[name]!r}")
     usual = np.atleast_1d(np.asarray(getattr(nominal, name)))
-    value, interval = np.atleast_1d(entry.value), np.atleast_2d(entry.interval90)
+    value = np.atleast_1d(entry.value)
+    interval = np.atleast_2d(entry.interval90)
     if value.shape != usual.shape or interval.shape != (usual.size, 2):
         number = f"{usual.size} number{'s' * (usual.size > 1)}"
         raise UserError(f"{where} needs value ({number}) and interval90 ([low, high] each)")
@@ -279,7 +309,9 @@ def _calibrated(name: str, entry: _Calibrated, nominal: Vehicle, where: str) -> 
 
 
 def _tables_of(vehicle_file: VehicleFile) -> dict[str, Any]:
-    """The tables of a vehicle file that wasn't read from one, without its calibration and what is usual."""
+    """The tables of a vehicle file that wasn't read from one, without its calibration and what is
+    usual.
+    """
     tables = {
         "vehicle": {
             "name": vehicle_file.name,
@@ -296,7 +328,9 @@ def _tables_of(vehicle_file: VehicleFile) -> dict[str, Any]:
 
 def _given(plain: dict) -> dict:
     """A tree of tables without empty ones and without None, which TOML hasn't."""
-    kept = {name: _given(value) if isinstance(value, dict) else value for name, value in plain.items()}
+    kept = {
+        name: _given(value) if isinstance(value, dict) else value for name, value in plain.items()
+    }
     return {name: value for name, value in kept.items() if value is not None and value != {}}
 
 

@@ -1,7 +1,8 @@
-"""What a Crazyflie's firmware answers over CRTP: parameters, log blocks, set-points, arming, external pose.
+"""What a Crazyflie's firmware answers over CRTP: parameters, log blocks, set-points, arming,
+external pose.
 
-One vehicle, without sockets or clock: packets in, packets out. Set-points of body rates or angles with thrust are
-flown; position set-points, trajectories and memories are not there.
+One vehicle, without sockets or clock: packets in, packets out. Set-points of body rates or angles
+with thrust are flown; position set-points, trajectories and memories are not there.
 """
 
 import errno
@@ -33,11 +34,15 @@ from openjax.virtual_crazyflie.tables import (
 )
 
 LEVEL_AFTER = 0.5
-"""Set-points older than this (s) are replaced by a level attitude at the same thrust (firmware: supervisor.c, a constant)."""
+"""Set-points older than this (s) are replaced by a level attitude at the same thrust (firmware:
+supervisor.c, a constant).
+"""
 STOP_AFTER = 2.0
 """Set-points older than this (s) stop the motors and disarm."""
 WATCHDOG = 1.0
-"""Once an emergency-stop watchdog was started, it stops the motors unless it is repeated within this time (s)."""
+"""Once an emergency-stop watchdog was started, it stops the motors unless it is repeated within
+this time (s).
+"""
 THRUST_CUT = 60000
 """The legacy commander cuts thrust here and takes less than 1000 as none (16 bit)."""
 
@@ -46,8 +51,11 @@ class VirtualFirmware:
     """One virtual Crazyflie's firmware. Times are seconds of one clock that the caller owns."""
 
     def __init__(self, needs_arming: bool = True):
-        """`needs_arming`: motors stay off until armed; otherwise armed from the start, as on brushed Crazyflies."""
-        self.auto_arm, self.level_after = not needs_arming, LEVEL_AFTER
+        """`needs_arming`: motors stay off until armed; otherwise armed from the start, as on
+        brushed Crazyflies.
+        """
+        self.auto_arm = not needs_arming
+        self.level_after = LEVEL_AFTER
         self.restart()
 
     def restart(self) -> None:
@@ -69,9 +77,17 @@ class VirtualFirmware:
 
     @property
     def supervisor_info(self) -> int:
-        """The supervisor's bits: can be armed, is armed, auto arming, can fly, is flying, tumbled, locked, crashed."""
+        """The supervisor's bits: can be armed, is armed, auto arming, can fly, is flying, tumbled,
+        locked, crashed.
+        """
         ready = not (self.crashed or self.emergency)
-        flies = (ready and not self.armed, self.armed, self.auto_arm, ready and self.armed, self.flying)
+        flies = (
+            ready and not self.armed,
+            self.armed,
+            self.auto_arm,
+            ready and self.armed,
+            self.flying,
+        )
         bits = (*flies, self.crashed, self.emergency, self.crashed)
         return sum(int(bit) << i for i, bit in enumerate(bits))
 
@@ -82,7 +98,9 @@ class VirtualFirmware:
         if self._set_point_time is None or not self.armed or self.crashed or self.emergency:
             return SetPoint()
         age = now - self._set_point_time
-        if self._set_point.mode == OFF:  # nothing to time out: an armed vehicle waits for its first set-point
+        if (
+            self._set_point.mode == OFF
+        ):  # nothing to time out: an armed vehicle waits for its first set-point
             return SetPoint()
         if age > STOP_AFTER:
             self._disarm()
@@ -143,7 +161,9 @@ class VirtualFirmware:
     def _platform(self, packet, now):
         command = packet.data[0]
         if packet.channel == 1:
-            answer = {0: bytes([PROTOCOL_VERSION]), 1: b"openjax virtual", 2: b"CF21"}.get(command, b"")
+            answer = {0: bytes([PROTOCOL_VERSION]), 1: b"openjax virtual", 2: b"CF21"}.get(
+                command, b""
+            )
             return [packet._replace(data=bytes([command]) + answer)]
         if packet.channel == 0 and command == 1:
             return [packet._replace(data=bytes([command, *self._arm(bool(packet.data[1]))]))]
@@ -178,7 +198,11 @@ class VirtualFirmware:
         return [] if answer is None else [packet._replace(data=bytes([command | 0x80]) + answer)]
 
     def _memory(self, packet, now):
-        return [packet._replace(data=b"\x01\x00")] if packet.channel == 0 and packet.data[0] == 1 else []
+        return (
+            [packet._replace(data=b"\x01\x00")]
+            if packet.channel == 0 and packet.data[0] == 1
+            else []
+        )
 
     def _localization(self, packet, now):
         if packet.channel == 0:
@@ -205,7 +229,8 @@ class VirtualFirmware:
         if packet.channel != 0:
             return []
         if packet.data[0] == 0:
-            self._set_point, self._set_point_time = SetPoint(), now
+            self._set_point = SetPoint()
+            self._set_point_time = now
             self.set_points += 1
         elif packet.data[0] == 11:
             *degrees, thrust, rates = struct.unpack("<fffHB", packet.data[1:16])
@@ -252,7 +277,9 @@ class VirtualFirmware:
         command = packet.data[0]
         ident = packet.data[1] if len(packet.data) > 1 else 0
         return [
-            packet._replace(data=bytes([command, ident, self.logs.control(command, ident, packet.data, now)]))
+            packet._replace(
+                data=bytes([command, ident, self.logs.control(command, ident, packet.data, now)])
+            )
         ]
 
     def _parameter(self, packet, now):
@@ -272,5 +299,9 @@ class VirtualFirmware:
             if packet.channel == 2 and name.split(".")[0] != READ_ONLY_GROUP:
                 (self.parameters[name],) = struct.unpack("<" + fmt, packet.data[2:])
             status = b"\0" if packet.channel == 1 else b""
-            return [packet._replace(data=packet.data[:2] + status + pack_number(fmt, self.parameters[name]))]
+            return [
+                packet._replace(
+                    data=packet.data[:2] + status + pack_number(fmt, self.parameters[name])
+                )
+            ]
         return [packet._replace(data=packet.data[:3] + bytes([errno.ENOENT]))]

@@ -1,4 +1,6 @@
-"""The link of a virtual Crazyflie: UDP, one packet a datagram, with latency, jitter and loss to order."""
+"""The link of a virtual Crazyflie: UDP, one packet a datagram, with latency, jitter and loss to
+order.
+"""
 
 import contextlib
 import heapq
@@ -17,7 +19,9 @@ BASE_PORT = 19850
 
 @dataclass(frozen=True)
 class LinkFaults:
-    """What the link does to the two streams of a flight. Requests and their answers pass: a radio sends them again."""
+    """What the link does to the two streams of a flight. Requests and their answers pass: a radio
+    sends them again.
+    """
 
     latency_ms: Annotated[float, Interval("[0, 1000]")] = 0.0
     """Set-points arrive this much later (ms)."""
@@ -43,14 +47,22 @@ class VirtualLink:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self.socket.bind((host, port))
-        except (OSError, OverflowError, UnicodeError) as error:  # taken, beyond 65535, no name of a host
+        except (
+            OSError,
+            OverflowError,
+            UnicodeError,
+        ) as error:  # taken, beyond 65535, no name of a host
             self.socket.close()
             reason = getattr(error, "strerror", None) or error
             raise UserError(
                 f"UDP port {port} of {host} can't be had ({reason}); choose another --port"
             ) from error
         self.socket.setblocking(False)
-        self.faults, self._random, self._listener = faults, random.Random(1000 * faults.seed + i), None
+        self.faults, self._random, self._listener = (
+            faults,
+            random.Random(1000 * faults.seed + i),
+            None,
+        )
         self._incoming: list = []
         self._outgoing: list = []
         self._count = 0
@@ -85,7 +97,10 @@ class VirtualLink:
 
     def next_due(self) -> float:
         """When the next packet in either direction is due; infinite if none waits."""
-        return min((queue[0][0] for queue in (self._incoming, self._outgoing) if queue), default=float("inf"))
+        return min(
+            (queue[0][0] for queue in (self._incoming, self._outgoing) if queue),
+            default=float("inf"),
+        )
 
     def received(self, now: float):
         """The packets that have come through by `now`, in order: time, bytes, who sent them."""
@@ -94,7 +109,9 @@ class VirtualLink:
             yield due, raw, peer
 
     def send(self, raw: bytes, now: float, peer=None) -> None:
-        """Send an answer to who asked, log data to who set up log blocks or commanded last: a stranger gets none."""
+        """Send an answer to who asked, log data to who set up log blocks or commanded last: a
+        stranger gets none.
+        """
         log_data = raw[0] >> 4 == Port.LOG and raw[0] & 3 == 2
         if log_data and self._random.random() < self.faults.pose_loss:
             return

@@ -86,7 +86,8 @@ class LogBlocks:
             block.due += block.period * (1 + int((now - block.due) / block.period))
             stamp = struct.pack("<I", int(now * 1000) & 0xFFFFFF)[:3]
             values = b"".join(
-                pack_number(fmt, LOG_VARIABLES[name][1](firmware, sensors)) for name, fmt in block.variables
+                pack_number(fmt, LOG_VARIABLES[name][1](firmware, sensors))
+                for name, fmt in block.variables
             )
             packets.append(Packet(Port.LOG, 2, bytes([ident]) + stamp + values).encode())
         return packets

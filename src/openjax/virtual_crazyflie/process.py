@@ -35,12 +35,15 @@ class VirtualCrazyflies:
         faults: LinkFaults | None = None,
         needs_arming: bool = True,
     ):
-        self.vehicles, self.late = vehicles, 0
+        self.vehicles = vehicles
+        self.late = 0
         self.firmware = [VirtualFirmware(needs_arming) for _ in range(vehicles.number)]
         self.links: list[VirtualLink] = []
         try:
             for i in range(vehicles.number):
-                self.links.append(VirtualLink(host, port + i if port else 0, faults or LinkFaults(), i))
+                self.links.append(
+                    VirtualLink(host, port + i if port else 0, faults or LinkFaults(), i)
+                )
         except BaseException:
             self.close()
             raise
@@ -89,7 +92,9 @@ class VirtualCrazyflies:
         if steps < 1:
             return
         self.late += steps * STEP > LATE + LONGEST_WAIT
-        set_points = np.array([firmware.set_point(self.time) for firmware in self.firmware], np.float32)
+        set_points = np.array(
+            [firmware.set_point(self.time) for firmware in self.firmware], np.float32
+        )
         report = self.vehicles.advance(set_points, steps)
         self._steps += steps
         for i, firmware in enumerate(self.firmware):

@@ -1,7 +1,7 @@
 """Vehicles in simulated time: virtual firmware and vehicles without sockets or clock.
 
-What `Swarm` is to the loop, for flights that must not wait for a clock. What the vehicles and a camera would send passes
-through two functions, in which an experiment can damage it at its source.
+What `Swarm` is to the loop, for flights that must not wait for a clock. What the vehicles and a
+camera would send passes through two functions, in which an experiment can damage it at its source.
 """
 
 import math
@@ -21,8 +21,10 @@ from openjax.virtual_crazyflie.vehicles import STEP, VirtualVehicles
 TICK = 0.01
 """s"""
 FOLLOWING = (0.1, 0.5)
-"""How the estimator on board follows motion capture: share of the innovation taken into the position at each pose, and into
-the velocity (1/s). Steady state of a Kalman filter for .01 m and .5 m/s^2 at 100 Hz (Kalata 1984: tracking index .005)."""
+"""How the estimator on board follows motion capture: share of the innovation taken into the
+position at each pose, and into the velocity (1/s). Steady state of a Kalman filter for .01 m and .5
+m/s^2 at 100 Hz (Kalata 1984: tracking index .005).
+"""
 CAMERA_NOISE = 5e-4
 """Of positions of motion capture, and of components of its quaternions."""
 
@@ -32,7 +34,9 @@ Damage = Callable[[int, float, Pose], Pose | None]
 
 @dataclass
 class Uplink:
-    """What goes wrong with one vehicle's set-points, and what its battery is said to have; changed while it flies."""
+    """What goes wrong with one vehicle's set-points, and what its battery is said to have; changed
+    while it flies.
+    """
 
     loss: float = 0.0
     """Share that is lost."""
@@ -45,19 +49,27 @@ class SimulatedSwarm:
 
     Args:
       vehicles: what flies.
-      following: whether the estimator on board of each vehicle follows motion capture, as far as it is believed, instead of
+      following: whether the estimator on board of each vehicle follows motion capture, as far as it
+      is believed, instead of
         knowing its place by itself.
       radio, camera: what is received of own estimates and of motion capture.
     """
 
-    def __init__(self, vehicles: VirtualVehicles, following: Sequence[bool], radio: Damage, camera: Damage):
-        self.vehicles, self.now, self._following = vehicles, 0.0, following
-        self._radio, self._camera = radio, camera
+    def __init__(
+        self, vehicles: VirtualVehicles, following: Sequence[bool], radio: Damage, camera: Damage
+    ):
+        self.vehicles = vehicles
+        self.now = 0.0
+        self._following = following
+        self._radio = radio
+        self._camera = camera
         n = vehicles.number
         self.firmware = [VirtualFirmware(needs_arming=False) for _ in range(n)]
         self.uplinks = [Uplink() for _ in range(n)]
         self._random = random.Random(0)  # losses, noise
-        self._offsets = np.zeros((n, 2, 3))  # of the own estimates from the truth: position, velocity
+        self._offsets = np.zeros(
+            (n, 2, 3)
+        )  # of the own estimates from the truth: position, velocity
         self._samples = [PoseSample(None, 0.0, 4.0) for _ in range(n)]
         self._steps = 0
         self.asleep: set[int] = set()
@@ -69,7 +81,9 @@ class SimulatedSwarm:
         return tuple(self._samples)
 
     def send(self, set_points: Sequence[SetPoint | None]) -> None:
-        """Send each vehicle its set-point, and a word to its watchdog, or nothing where it is None."""
+        """Send each vehicle its set-point, and a word to its watchdog, or nothing where it is
+        None.
+        """
         for i, set_point in enumerate(set_points):
             if set_point is not None and self._random.random() >= self.uplinks[i].loss:
                 sent = set_point if set_point.mode == OFF else as_sent(set_point)
@@ -100,11 +114,14 @@ class SimulatedSwarm:
         self._look()
 
     def _look(self):
-        report, noise = self.vehicles.report, self._random.gauss
+        report = self.vehicles.report
+        noise = self._random.gauss
         # in the packets' units: millimetres
         own = np.round(np.stack([report.position, report.velocity], 1) + self._offsets, 3).tolist()
-        position, quaternion = report.position.tolist(), report.quaternion.tolist()
-        rates, voltage = report.body_rates.tolist(), self.vehicles.voltage().tolist()
+        position = report.position.tolist()
+        quaternion = report.quaternion.tolist()
+        rates = report.body_rates.tolist()
+        voltage = self.vehicles.voltage().tolist()
         for i, old in enumerate(self._samples):
             if i in self.asleep:
                 continue
@@ -113,7 +130,9 @@ class SimulatedSwarm:
             place = tuple(p + noise(0.0, CAMERA_NOISE) for p in position[i])
             seen = Pose(self.now, place, (0.0, 0.0, 0.0), tuple(q / size for q in shaken))
             on_board = expand_quaternion(compress_quaternion(quaternion[i]))
-            told = self._radio(i, self.now, Pose(self.now, *map(tuple, own[i]), on_board, tuple(rates[i])))
+            told = self._radio(
+                i, self.now, Pose(self.now, *map(tuple, own[i]), on_board, tuple(rates[i]))
+            )
             self._samples[i] = PoseSample(
                 told or old.own,
                 self.now if told else old.last_contact,

@@ -1,4 +1,6 @@
-"""What a virtual Crazyflie's firmware has names for: log variables and parameters, with their types and values."""
+"""What a virtual Crazyflie's firmware has names for: log variables and parameters, with their types
+and values.
+"""
 
 import zlib
 from collections.abc import Callable
@@ -29,7 +31,9 @@ def _angles(quaternion):
 
 
 def _log_variables() -> dict[str, tuple[str, Callable]]:
-    """Name -> C type and value of (firmware, sensors): the variables that a flight needs, named as on board."""
+    """Name -> C type and value of (firmware, sensors): the variables that a flight needs, named as
+    on board.
+    """
     table: dict[str, tuple[str, Callable]] = {}
     for i, axis in enumerate("xyz"):
         table[f"stateEstimate.{axis}"] = ("float", lambda f, s, i=i: s.position[i])
@@ -76,4 +80,5 @@ def _crc(table) -> int:
     return zlib.crc32(repr([(name, table[name][0]) for name in table]).encode())
 
 
-LOG_CRC, PARAMETER_CRC = _crc(LOG_VARIABLES), _crc(PARAMETERS)
+LOG_CRC = _crc(LOG_VARIABLES)
+PARAMETER_CRC = _crc(PARAMETERS)

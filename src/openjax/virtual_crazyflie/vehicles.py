@@ -1,4 +1,6 @@
-"""The vehicles inside virtual Crazyflies: openjax's own, with any of its effects, advanced between packets."""
+"""The vehicles inside virtual Crazyflies: openjax's own, with any of its effects, advanced between
+packets.
+"""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -20,13 +22,20 @@ from openjax.virtual_crazyflie.tables import Sensors
 STEP = 0.002
 """Seconds of a step: the firmware's rate loop runs at 500 Hz."""
 ANGLE_GAIN = 6.0
-"""Body rate asked for per angle error (1/s): proportional part of the firmware's attitude controller."""
-CRASH_SPEED, CRASH_TILT = 1.5, 0.5
+"""Body rate asked for per angle error (1/s): proportional part of the firmware's attitude
+controller.
+"""
+CRASH_SPEED = 1.5
+CRASH_TILT = 0.5
 """Touching the floor faster (m/s) or with body z lower (cosine) than this is a crash."""
 _NO_THRUST = -10.0
 """As a thrust set-point: whatever the rate controller adds, all motors stay off."""
-FULL_VOLTAGE, SAG, SPENT = 4.15, 0.35, 0.9
-"""Battery: open circuit when full, drop at full thrust, fall from full to empty (V); empty is about 3.25 V."""
+FULL_VOLTAGE = 4.15
+SAG = 0.35
+SPENT = 0.9
+"""Battery: open circuit when full, drop at full thrust, fall from full to empty (V); empty is about
+3.25 V.
+"""
 
 
 class Report(NamedTuple):
@@ -48,7 +57,8 @@ class VirtualVehicles:
     Args:
       vehicle: their parameters.
       position: (N, 2) m, where they stand on the floor, level; or (N, 3), where they hover.
-      effects: {effect: {parameter: value}}; those that delay or lose commands belong to the link instead.
+      effects: {effect: {parameter: value}}; those that delay or lose commands belong to the link
+      instead.
       battery: charge at the start, 0..1.
       endurance: s of hover that empty a full battery.
 
@@ -70,7 +80,8 @@ class VirtualVehicles:
         for effect in self._step.effects:
             if effect.command is not None:
                 raise UserError(
-                    f"effect {effect.name} acts on commands: order it from the link, with --latency_ms or --loss"
+                    f"effect {effect.name} acts on commands: order it from the link, with "
+                    "--latency_ms or --loss"
                 )
         position = np.atleast_2d(np.asarray(position, np.float32))
         self.number, dimensions = position.shape
@@ -92,7 +103,9 @@ class VirtualVehicles:
         self.report = self.advance(np.zeros((self.number, 5), np.float32), 0)
 
     def advance(self, set_points: np.ndarray, steps: int) -> Report:
-        """What is sensed after `steps` steps under constant set-points (N, 5) float32, see `SetPoint`."""
+        """What is sensed after `steps` steps under constant set-points (N, 5) float32, see
+        `SetPoint`.
+        """
         self._state, report = self._advance(self._state, set_points, np.int32(steps))
         self.report = Report(*(np.asarray(leaf, np.float64) for leaf in report))
         share = self.report.motor_command.mean(1) / self._hover
@@ -101,7 +114,8 @@ class VirtualVehicles:
 
     def _advanced(self, flat, set_points, steps):
         """The flat state after `steps` steps, and what is sensed then."""
-        vehicle, effects = self._vehicle, self._step.effects
+        vehicle = self._vehicle
+        effects = self._step.effects
         no_pillars = (jnp.zeros((1, 2)), jnp.zeros(1, bool))
         complete = composition.complete_parameters(effects, self._parameters, jnp.float32)
         flown = composition.change_body(effects, complete, vehicle)
@@ -139,7 +153,8 @@ class VirtualVehicles:
 
 
 def commands(quaternion, set_points):
-    """(N, 4) thrust and body rates (rad/s) for the rate controller from set-points (N, 5) at attitudes (N, 4).
+    """(N, 4) thrust and body rates (rad/s) for the rate controller from set-points (N, 5) at
+    attitudes (N, 4).
 
     Angles are tracked by the proportional attitude loop of the firmware, whose yaw is a rate.
     """
@@ -164,7 +179,8 @@ def _stand(drones):
     below = (drones.position[:, 2] <= 0.0) & (drones.velocity[:, 2] <= 0.0)
     up = jax.vmap(lambda q: rotate(q, jnp.array([0.0, 0.0, 1.0])))(drones.quaternion)[:, 2]
     hit = below & ((drones.velocity[:, 2] < -CRASH_SPEED) | (up < CRASH_TILT))
-    w, z = drones.quaternion[:, 0], drones.quaternion[:, 3]
+    w = drones.quaternion[:, 0]
+    z = drones.quaternion[:, 3]
     size = jnp.sqrt(w * w + z * z + 1e-12)
     level = jnp.stack([w / size, 0 * w, 0 * w, z / size], axis=-1)
 

@@ -1,7 +1,8 @@
 """Importers: logs of other formats become the same table as a CSV of the log format.
 
-A case folder may hold CSV logs, Bitcraze micro-SD logs and ROS 2 bags side by side. A `columns.toml` in the
-folder says which of their columns is what, where the names aren't the usual ones.
+A case folder may hold CSV logs, Bitcraze micro-SD logs and ROS 2 bags side by side. A
+`columns.toml` in the folder says which of their columns is what, where the names aren't the usual
+ones.
 """
 
 from pathlib import Path

@@ -1,7 +1,7 @@
 """Column mapping: which column, log variable or message field holds what, in which unit.
 
-A `columns.toml` in a case folder applies to all its logs. A CSV column that it doesn't name and that has a name of the log
-format is taken as it is:
+A `columns.toml` in a case folder applies to all its logs. A CSV column that it doesn't name and
+that has a name of the log format is taken as it is:
 
     delimiter = ";"                                        # CSV only; "," if left out
     [columns]
@@ -11,8 +11,8 @@ format is taken as it is:
     ax     = { from = "/cf1/imu:linear_acceleration.x" }   # a field of a ROS 2 topic
     cmd_wy = { from = "pitch_rate", unit = "deg/s", scale = -1 }
 
-Besides the columns of the log format, `roll`, `pitch`, `yaw` (z-y-x, body to world) may stand for the
-quaternion.
+Besides the columns of the log format, `roll`, `pitch`, `yaw` (z-y-x, body to world) may stand for
+the quaternion.
 """
 
 import math
@@ -38,14 +38,20 @@ UNITS = {
     "percent": 1e-2, "8bit": 1 / 255, "16bit": 1 / 65535,
 }  # fmt: skip
 
-_MOTION = {c for n in ("position", "quaternion", "body_rates", "specific_force") for c in CHANNEL_COLUMNS[n]}
+_MOTION = {
+    c
+    for n in ("position", "quaternion", "body_rates", "specific_force")
+    for c in CHANNEL_COLUMNS[n]
+}
 _CONTINUOUS = _MOTION | set(CHANNEL_COLUMNS["velocity"]) | set(EULER)
 _STALE = 5.0  # periods after which a stream's last value counts as not sampled
 
 
 @dataclass(frozen=True)
 class Source:
-    """Where a column comes from: raw name, and value = scale * raw + offset in the log format's unit."""
+    """Where a column comes from: raw name, and value = scale * raw + offset in the log format's
+    unit.
+    """
 
     name: str
     scale: float = 1.0
@@ -68,7 +74,9 @@ class ColumnMapping:
     delimiter: str = ","
 
     def over(self, usual: dict[str, Source]) -> dict[str, Source]:
-        """The `usual` sources of columns, and in their place those that the mapping names; time is no source."""
+        """The `usual` sources of columns, and in their place those that the mapping names; time is
+        no source.
+        """
         kept = _without_attitude(usual) if set(EULER) & set(self.columns) else usual
         return kept | {c: s for c, s in self.columns.items() if c not in ("t", "vehicle")}
 
@@ -116,12 +124,12 @@ def load_mapping(path: str | Path) -> ColumnMapping:
 
 
 def merge_streams(streams: list[Stream], columns: dict[str, Source]) -> dict[str, np.ndarray]:
-    """Columns of the log format on one clock: that of the fastest stream with motion in it (`t` as in the
-    stream).
+    """Columns of the log format on one clock: that of the fastest stream with motion in it (`t` as
+    in the stream).
 
-    Other motion streams are interpolated linearly, commands are held, the battery keeps its own samples.
-    What is older than five periods of its stream counts as not sampled. Raises LogError if no motion is
-    there.
+    Other motion streams are interpolated linearly, commands are held, the battery keeps its own
+    samples. What is older than five periods of its stream counts as not sampled. Raises LogError if
+    no motion is there.
     """
     used = []
     for stream in streams:
@@ -130,13 +138,15 @@ def merge_streams(streams: list[Stream], columns: dict[str, Source]) -> dict[str
         if own and finite.sum() > 1:
             order = np.argsort(stream.time[finite], kind="stable")
             converted = {
-                c: (s.scale * stream.values[s.name] + s.offset)[finite][order] for c, s in own.items()
+                c: (s.scale * stream.values[s.name] + s.offset)[finite][order]
+                for c, s in own.items()
             }
             used.append((stream.time[finite][order], converted))
     with_motion = [u for u in used if _MOTION & set(u[1])]
     if not with_motion:
         raise LogError(
-            "holds neither position and orientation nor accelerometer and gyroscope under known names"
+            "holds neither position and orientation nor accelerometer and gyroscope under known "
+            "names"
         )
     clock = min(with_motion, key=lambda u: float(np.median(np.diff(u[0]))))[0]
     clock = clock[np.r_[True, np.diff(clock) > 0]]
@@ -167,7 +177,8 @@ def _onto(clock, time, values, column: str, period: float) -> np.ndarray:
     if len(time) == len(clock) and np.array_equal(time, clock):
         return values
     finite = np.isfinite(values)
-    time, values = time[finite], values[finite]
+    time = time[finite]
+    values = values[finite]
     if not len(time):
         return np.full(len(clock), np.nan)
     before = np.searchsorted(time, clock, side="right") - 1
@@ -189,11 +200,15 @@ def source_of(column: str, entry, path: Path) -> Source:
     """An entry of a `columns.toml`. Raises UserError for an unknown key, column or unit."""
     known = (*LOG_COLUMNS, *EULER)
     if column not in known:
-        raise UserError(f"{path}: unknown column {column!r} in [columns]; known are {', '.join(known)}")
+        raise UserError(
+            f"{path}: unknown column {column!r} in [columns]; known are {', '.join(known)}"
+        )
     if isinstance(entry, str):
         return Source(entry)
     if not isinstance(entry, dict) or not isinstance(entry.get("from"), str):
-        raise UserError(f'{path}: {column} must be "NAME" or {{ from = "NAME", unit = "...", scale = ... }}')
+        raise UserError(
+            f'{path}: {column} must be "NAME" or {{ from = "NAME", unit = "...", scale = ... }}'
+        )
     unknown = sorted(set(entry) - {"from", "unit", "scale", "offset"})
     if unknown:
         raise UserError(

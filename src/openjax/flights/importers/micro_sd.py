@@ -1,9 +1,10 @@
 """Bitcraze micro-SD deck logs (the binary files that a Crazyflie writes while flying).
 
-Layout, little endian (crazyflie-firmware, tools/usdlog): byte 0xBC; uint16 version (1 or 2); uint16 number
-of event types; for each: uint16 id, name and NUL, uint16 number of variables, each "group.name(T)" and NUL
-with T a struct letter. Then records: uint16 event id, time stamp (version 1: uint32 ms, version 2: uint64
-us), the variables packed. The last four bytes are the CRC-32 of all before.
+Layout, little endian (crazyflie-firmware, tools/usdlog): byte 0xBC; uint16 version (1 or 2); uint16
+number of event types; for each: uint16 id, name and NUL, uint16 number of variables, each
+"group.name(T)" and NUL with T a struct letter. Then records: uint16 event id, time stamp (version
+1: uint32 ms, version 2: uint64 us), the variables packed. The last four bytes are the CRC-32 of all
+before.
 """
 
 import struct
@@ -13,7 +14,13 @@ from zlib import crc32
 import numpy as np
 
 from openjax.files import read_toml
-from openjax.flights.importers.columns import ColumnMapping, Source, Stream, merge_streams, source_of
+from openjax.flights.importers.columns import (
+    ColumnMapping,
+    Source,
+    Stream,
+    merge_streams,
+    source_of,
+)
 from openjax.flights.reading import LARGEST, LogError, LogTable
 
 MAGIC = 0xBC
@@ -38,7 +45,8 @@ def is_micro_sd(path: Path) -> bool:
 
 
 def read_micro_sd(path: str | Path, mapping: ColumnMapping | None = None) -> LogTable:
-    """Read a micro-SD log. The firmware's usual log variables are looked for, unless the mapping names others.
+    """Read a micro-SD log. The firmware's usual log variables are looked for, unless the mapping
+    names others.
 
     Raises LogError if it isn't such a log, or holds nothing that can be used.
     """
@@ -49,7 +57,8 @@ def read_micro_sd(path: str | Path, mapping: ColumnMapping | None = None) -> Log
     streams = [with_mixer(stream) for stream in streams]
     names = {name for stream in streams for name in stream.values}
     columns = {
-        c: next((s for s in options if s.name in names), None) for c, options in FIRMWARE_SOURCES.items()
+        c: next((s for s in options if s.name in names), None)
+        for c, options in FIRMWARE_SOURCES.items()
     }
     columns = {c: s for c, s in columns.items() if s is not None}
     if mapping is not None:
@@ -64,13 +73,19 @@ def read_micro_sd(path: str | Path, mapping: ColumnMapping | None = None) -> Log
 
 
 def with_mixer(stream: Stream) -> Stream:
-    """The stream with `mixer.m1` to `mixer.m4`, 0 to 65535, where it holds the mixer's four inputs: what the
-    firmware's legacy power distribution (power_distribution_quadrotor.c) makes of them, before the battery
-    compensation."""
-    inputs = [stream.values.get(f"controller.cmd_{name}") for name in ("thrust", "roll", "pitch", "yaw")]
+    """The stream with `mixer.m1` to `mixer.m4`, 0 to 65535, where it holds the mixer's four inputs:
+    what the firmware's legacy power distribution (power_distribution_quadrotor.c) makes of them,
+    before the battery compensation.
+    """
+    inputs = [
+        stream.values.get(f"controller.cmd_{name}") for name in ("thrust", "roll", "pitch", "yaw")
+    ]
     if any(values is None for values in inputs):
         return stream
-    thrust, roll, pitch, yaw = inputs[0], inputs[1] / 2, inputs[2] / 2, inputs[3]
+    thrust = inputs[0]
+    roll = inputs[1] / 2
+    pitch = inputs[2] / 2
+    yaw = inputs[3]
     motors = (thrust - roll + pitch + yaw, thrust - roll - pitch - yaw,
               thrust + roll - pitch + yaw, thrust + roll + pitch - yaw)  # fmt: skip
     mixed = {f"mixer.m{i}": np.clip(m, 0.0, 65535.0) for i, m in enumerate(motors, 1)}
@@ -78,8 +93,9 @@ def with_mixer(stream: Stream) -> Stream:
 
 
 def decode(data: bytes) -> tuple[list[Stream], list[str]]:
-    """The events of a micro-SD log as streams, one per event type, and remarks. Raises LogError if it is
-    none."""
+    """The events of a micro-SD log as streams, one per event type, and remarks. Raises LogError if
+    it is none.
+    """
     if len(data) < 9 or data[0] != MAGIC:
         raise LogError("not a micro-SD log (it doesn't start with 0xBC)")
     version, event_types = struct.unpack_from("<HH", data, 1)
@@ -89,7 +105,9 @@ def decode(data: bytes) -> tuple[list[Stream], list[str]]:
     end = len(data) - 4
     if crc32(data[:end]) != int.from_bytes(data[end:], "little"):
         # Power was cut before the file was closed: what was written is there, its checksum isn't.
-        remarks.append("the checksum doesn't match: the log is cut off or corrupt, read as far as it goes")
+        remarks.append(
+            "the checksum doesn't match: the log is cut off or corrupt, read as far as it goes"
+        )
         end = len(data)
     try:
         events, start = _header(data, event_types)
@@ -109,8 +127,12 @@ def decode(data: bytes) -> tuple[list[Stream], list[str]]:
     return streams, remarks
 
 
-def _records(data: bytes, at: int, end: int, events, head: str) -> dict[int, list[tuple[int, bytes]]]:
-    """Event id -> (stamp, packed record) of every one from byte `at` on; the last of a log that was cut off may be torn."""
+def _records(
+    data: bytes, at: int, end: int, events, head: str
+) -> dict[int, list[tuple[int, bytes]]]:
+    """Event id -> (stamp, packed record) of every one from byte `at` on; the last of a log that was
+    cut off may be torn.
+    """
     records: dict[int, list[tuple[int, bytes]]] = {event: [] for event in events}
     head_size = struct.calcsize(head)
     while at + head_size <= end:
@@ -135,7 +157,8 @@ def _header(data: bytes, event_types: int) -> tuple[dict[int, np.dtype], int]:
         stop = data.index(0, at)
         return data[at:stop].decode("utf-8"), stop + 1
 
-    events, at = {}, 5
+    events = {}
+    at = 5
     for _ in range(event_types):
         (event,) = struct.unpack_from("<H", data, at)
         _, at = text(at + 2)
@@ -144,7 +167,8 @@ def _header(data: bytes, event_types: int) -> tuple[dict[int, np.dtype], int]:
         fields = []
         for _ in range(count):
             variable, at = text(at)
-            name, letter = variable[:-3], variable[-2]
+            name = variable[:-3]
+            letter = variable[-2]
             if letter not in _TYPES:
                 raise ValueError(variable)
             fields.append((name, "<" + np.dtype(letter).str[1:]))

@@ -1,8 +1,8 @@
 """ROS 2 bags (SQLite or MCAP), through the `rosbags` library; no ROS installation is needed.
 
-Without a column mapping, topics are recognised by their message types, and a topic's namespace ("/cf1" of
-"/cf1/imu") is the vehicle. Times are the messages' header stamps where they have one, else the bag's receive
-times.
+Without a column mapping, topics are recognised by their message types, and a topic's namespace
+("/cf1" of "/cf1/imu") is the vehicle. Times are the messages' header stamps where they have one,
+else the bag's receive times.
 """
 
 import re
@@ -14,7 +14,8 @@ from openjax.errors import UserError
 from openjax.flights.importers.columns import ColumnMapping, Source, Stream, merge_streams
 from openjax.flights.reading import CHANNEL_COLUMNS, LogError, LogTable
 
-_POSITION, _QUATERNION = CHANNEL_COLUMNS["position"], CHANNEL_COLUMNS["quaternion"]
+_POSITION = CHANNEL_COLUMNS["position"]
+_QUATERNION = CHANNEL_COLUMNS["quaternion"]
 
 
 def _pose(position: str, orientation: str) -> dict[str, str]:
@@ -25,12 +26,14 @@ def _pose(position: str, orientation: str) -> dict[str, str]:
 _RATES = {f"w{a}": f"angular_velocity.{a}" for a in "xyz"}
 _FORCE = {f"a{a}": f"linear_acceleration.{a}" for a in "xyz"}
 
-# Fields of the message types that say what they hold: column -> field. An odometry's twist is left out: it
-# is in the body frame, and velocity can be derived from position.
+# Fields of the message types that say what they hold: column -> field. An odometry's twist is left
+# out: it is in the body frame, and velocity can be derived from position.
 KNOWN_TYPES = {
     "sensor_msgs/msg/Imu": _RATES | _FORCE,
     "geometry_msgs/msg/PoseStamped": _pose("pose.position", "pose.orientation"),
-    "geometry_msgs/msg/PoseWithCovarianceStamped": _pose("pose.pose.position", "pose.pose.orientation"),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": _pose(
+        "pose.pose.position", "pose.pose.orientation"
+    ),
     "geometry_msgs/msg/TransformStamped": _pose("transform.translation", "transform.rotation"),
     "nav_msgs/msg/Odometry": _pose("pose.pose.position", "pose.pose.orientation"),
     "sensor_msgs/msg/BatteryState": {"vbat": "voltage"},
@@ -42,7 +45,8 @@ KNOWN_TYPES = {
 _ARRAY_TYPES = {"std_msgs/msg/Float32MultiArray", "std_msgs/msg/Float64MultiArray"}
 _ARRAY_NAMES = {
     "motor": {f"m{i + 1}": f"data[{i}]" for i in range(4)},
-    "command": {"cmd_thrust": "data[0]"} | {f"cmd_w{a}": f"data[{i + 1}]" for i, a in enumerate("xyz")},
+    "command": {"cmd_thrust": "data[0]"}
+    | {f"cmd_w{a}": f"data[{i + 1}]" for i, a in enumerate("xyz")},
 }
 
 
@@ -55,7 +59,8 @@ def read_bag(path: str | Path, mapping: ColumnMapping | None = None) -> LogTable
     """Read a ROS 2 bag. With a mapping, sources are "TOPIC:FIELD" ("/cf1/imu:angular_velocity.x",
     "/m:data[0]").
 
-    Raises LogError if the bag can't be read or holds nothing known, UserError without the rosbags library.
+    Raises LogError if the bag can't be read or holds nothing known, UserError without the rosbags
+    library.
     """
     try:
         from rosbags.highlevel import AnyReader
@@ -69,23 +74,34 @@ def read_bag(path: str | Path, mapping: ColumnMapping | None = None) -> LogTable
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             wanted = _wanted(reader.connections, mapping)
             streams = {
-                c.topic: _stream(reader, c, wanted[c.topic]) for c in reader.connections if c.topic in wanted
+                c.topic: _stream(reader, c, wanted[c.topic])
+                for c in reader.connections
+                if c.topic in wanted
             }
     except LogError:
         raise
-    except Exception as error:  # the library raises many kinds for a damaged bag; all mean the same here
+    except (
+        Exception
+    ) as error:  # the library raises many kinds for a damaged bag; all mean the same here
         raise LogError(
             f"ROS 2 bag can't be read: {str(error).splitlines()[0] if str(error) else type(error)}"
         ) from error
     return _joined(path.name, *_by_vehicle(streams, wanted, mapping))
 
 
-def _by_vehicle(streams, wanted, mapping: ColumnMapping | None) -> tuple[dict[str, dict], list[str]]:
-    """The columns of each vehicle, and remarks on topics that hold none. Raises LogError if none does."""
+def _by_vehicle(
+    streams, wanted, mapping: ColumnMapping | None
+) -> tuple[dict[str, dict], list[str]]:
+    """The columns of each vehicle, and remarks on topics that hold none. Raises LogError if none
+    does.
+    """
     vehicles: dict[str, list[str]] = {}
     for topic in streams:
-        vehicles.setdefault("" if mapping is not None else topic.rpartition("/")[0], []).append(topic)
-    tables, remarks = {}, []
+        vehicles.setdefault("" if mapping is not None else topic.rpartition("/")[0], []).append(
+            topic
+        )
+    tables = {}
+    remarks = []
     for vehicle, topics in vehicles.items():
         if mapping is not None:
             columns = {c: s for c, s in mapping.columns.items() if c not in ("t", "vehicle")}
@@ -123,7 +139,8 @@ def _wanted(connections, mapping: ColumnMapping | None) -> dict[str, dict[str, s
 
 def _stream(reader, connection, fields: dict[str, str]) -> Stream:
     """The wanted fields of one topic, named "TOPIC:FIELD"."""
-    times, rows = [], []
+    times = []
+    rows = []
     for _, received, data in reader.messages(connections=[connection]):
         message = reader.deserialize(data, connection.msgtype)
         stamp = getattr(getattr(message, "header", None), "stamp", None)
@@ -133,7 +150,8 @@ def _stream(reader, connection, fields: dict[str, str]) -> Stream:
         rows.append([_field(message, field, connection.topic) for field in fields.values()])
     values = np.asarray(rows, float).reshape(len(rows), len(fields))
     named = {
-        f"{connection.topic}:{field}": column for field, column in zip(fields.values(), values.T, strict=True)
+        f"{connection.topic}:{field}": column
+        for field, column in zip(fields.values(), values.T, strict=True)
     }
     return Stream(np.asarray(times, float) * 1e-9, named)
 
@@ -152,7 +170,8 @@ def _joined(name: str, tables: dict[str, dict[str, np.ndarray]], remarks: list[s
     start = min(t["t"][0] for t in tables.values())
     names = sorted({c for t in tables.values() for c in t})
     columns = {
-        c: np.concatenate([t.get(c, np.full(len(t["t"]), np.nan)) for t in tables.values()]) for c in names
+        c: np.concatenate([t.get(c, np.full(len(t["t"]), np.nan)) for t in tables.values()])
+        for c in names
     }
     columns["t"] = columns["t"] - start
     vehicle = np.concatenate([np.full(len(t["t"]), v) for v, t in tables.items()])

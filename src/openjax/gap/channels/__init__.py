@@ -1,4 +1,6 @@
-"""What a log says by ways of its own: pose, radio, rate loop and motion, each a channel with the same few methods."""
+"""What a log says by ways of its own: pose, radio, rate loop and motion, each a channel with the
+same few methods.
+"""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -38,12 +40,16 @@ class Channel(Protocol):
         """{name: [(T,) per track]} of normalised prediction errors with the effects `named`."""
 
     def named(self) -> dict[str, float]:
-        """Those of the acting effects without which the channel's errors grow by more than an effect's form may be wrong by."""
+        """Those of the acting effects without which the channel's errors grow by more than an
+        effect's form may be wrong by.
+        """
         acting = self.acting()
         return {e: p for e, p in acting.items() if self.growth(e, acting) > DECISION.form_error}
 
     def growth(self, effect: str, acting) -> float:
-        """By what share the channel's errors are larger without an effect than with all that act."""
+        """By what share the channel's errors are larger without an effect than with all that
+        act.
+        """
         without, whole = (
             np.array([np.mean(np.concatenate(v) ** 2) for v in self.residuals(named).values()])
             for named in (set(acting) - {effect}, acting)
@@ -52,14 +58,19 @@ class Channel(Protocol):
 
 
 def few(count: int) -> float:
-    """By what an error from so many flights is widened: Student's quantile of a 90 % interval over the normal one."""
+    """By what an error from so many flights is widened: Student's quantile of a 90 % interval over
+    the normal one.
+    """
     return float(student.ppf(0.95, max(count - 1, 1)) / norm.ppf(0.95))
 
 
 def robust_deviation(covariance: np.ndarray, pushes: np.ndarray) -> np.ndarray:
-    """Standard deviations (p,) of parameters: those of `covariance` (p, p), or what flights differ by where that is more: the
-    sandwich of their gradients `pushes` (F, p), widened where they are few (Liang, Zeger 1986)."""
-    model, count = np.sqrt(np.diag(covariance)), len(pushes)
+    """Standard deviations (p,) of parameters: those of `covariance` (p, p), or what flights differ
+    by where that is more: the sandwich of their gradients `pushes` (F, p), widened where they are
+    few (Liang, Zeger 1986).
+    """
+    model = np.sqrt(np.diag(covariance))
+    count = len(pushes)
     if count < 2 or not len(model):
         return model
     apart = pushes - pushes.mean(0)

@@ -1,9 +1,11 @@
 """What commands caused of the motors, and what feedback made of them.
 
-In closed loop the motors answer gusts, noise of the gyroscope and whatever pushes the body, so a regression on the motors
-as logged is biased: towards weak motors where they were logged as single samples, towards any cause that feedback
-follows. What body-rate commands caused is free of all that. It serves as an instrument (two-stage least squares): the
-first stage here tells the two parts apart; the second lets the feedback part do what it likes."""
+In closed loop the motors answer gusts, noise of the gyroscope and whatever pushes the body, so a
+regression on the motors as logged is biased: towards weak motors where they were logged as single
+samples, towards any cause that feedback follows. What body-rate commands caused is free of all
+that. It serves as an instrument (two-stage least squares): the first stage here tells the two parts
+apart; the second lets the feedback part do what it likes.
+"""
 
 from dataclasses import dataclass
 
@@ -25,9 +27,11 @@ EDGE = 0.3  # s at either end that the filter spoils
 
 @dataclass(frozen=True, eq=False)
 class Feedback:
-    """Of one track: `acceleration` (T, 3) rad/s^2 that the feedback part of the motors makes, through their lag; `trim` the same
-    of what motors do slowly but for its mean, which holds what pushes the body slowly;
-    `quick` (T, 3) the same of what motors do within QUICK s, whoever caused it."""
+    """Of one track: `acceleration` (T, 3) rad/s^2 that the feedback part of the motors makes,
+    through their lag; `trim` the same of what motors do slowly but for its mean, which holds what
+    pushes the body slowly; `quick` (T, 3) the same of what motors do within QUICK s, whoever caused
+    it.
+    """
 
     acceleration: np.ndarray
     trim: np.ndarray
@@ -50,16 +54,19 @@ def in_force(track: Track, arrived) -> np.ndarray:
 
 def read_feedback(tracks, vehicles, by_commands) -> list[Feedback]:
     """The feedback part of every track's motors. `by_commands`: `caused_by_commands` of each."""
-    caused, made = [], []
+    caused = []
+    made = []
     for track, vehicle, (motors, _) in zip(tracks, vehicles, by_commands, strict=True):
         outputs = outputs_of(vehicle)
         caused.append((motors - motors.mean(0)) @ outputs)
         made.append(track.motor @ outputs)
-    # First stage: as much of the outputs as is proportional to what commands would have caused, axis by axis. More freedom
-    # (a filter) would let the outer loop's answers to gusts in.
+    # First stage: as much of the outputs as is proportional to what commands would have caused,
+    # axis by axis. More freedom (a filter) would let the outer loop's answers to gusts in.
     made = [m - m.mean(0) for m in made]
     power = sum((c * c).sum(0) for c in caused)
-    share = sum((c * m).sum(0) for c, m in zip(caused, made, strict=True)) / np.maximum(power, 1e-12)
+    share = sum((c * m).sum(0) for c, m in zip(caused, made, strict=True)) / np.maximum(
+        power, 1e-12
+    )
     rest = [m - share * c for c, m in zip(caused, made, strict=True)]
     return [
         Feedback(
@@ -72,8 +79,10 @@ def read_feedback(tracks, vehicles, by_commands) -> list[Feedback]:
 
 
 def caused_by_commands(track: Track, vehicle, link) -> tuple[np.ndarray, np.ndarray]:
-    """Motor commands (T, 4) and rates (T, 3) that the body-rate commands alone cause; `link`: what arrived of them, None where
-    that wasn't read. Where none were logged, the nominal controller's law says which ones the motors and rates imply, slowly."""
+    """Motor commands (T, 4) and rates (T, 3) that the body-rate commands alone cause; `link`: what
+    arrived of them, None where that wasn't read. Where none were logged, the nominal controller's
+    law says which ones the motors and rates imply, slowly.
+    """
     if track.command is not None:
         sent = track.command if link is None else in_force(track, link).mean(1)
     else:
@@ -87,11 +96,14 @@ def caused_by_commands(track: Track, vehicle, link) -> tuple[np.ndarray, np.ndar
 
 
 def _turning(motors: np.ndarray, track: Track, vehicle) -> np.ndarray:
-    """Angular acceleration (T, 3) that changes of the motor commands (T, 4) make, through the motors' lag."""
+    """Angular acceleration (T, 3) that changes of the motor commands (T, 4) make, through the
+    motors' lag.
+    """
     blend = -np.expm1(-track.dt / float(vehicle.motor_time_constant))
     thrust = lfilter([blend], [1.0, blend - 1.0], motors, axis=0)
     thrust *= float(vehicle.thrust_constant * vehicle.max_rotor_speed**2)
-    place, spin = np.asarray(vehicle.rotor_position, float), np.asarray(vehicle.rotor_spin, float)
+    place = np.asarray(vehicle.rotor_position, float)
+    spin = np.asarray(vehicle.rotor_spin, float)
     ratio = float(vehicle.torque_constant / vehicle.thrust_constant)
     torque = np.stack([thrust @ place[:, 1], -thrust @ place[:, 0], ratio * (thrust @ spin)], 1)
     return torque / np.asarray(vehicle.inertia, float)

@@ -1,4 +1,6 @@
-"""The motion: motors to body rates, velocity and specific force. What each physics effect alone explains of it."""
+"""The motion: motors to body rates, velocity and specific force. What each physics effect alone
+explains of it.
+"""
 
 import dataclasses
 from dataclasses import dataclass
@@ -17,16 +19,22 @@ from openjax.gap.model.library import CARDS, Library, numbers_of
 from openjax.gap.model.observer import TICKS
 from openjax.gap.model.replay import Replay, make_replay
 
-FEW_ROWS = 2.4  # of a log in one of the grid's: if they are samples, their mean isn't what five ticks of the loop did
-SLOW_ROWS = 1.2  # grid periods: rows as slow hide every other command of a loop that sends one each 10 ms
+# of a log in one of the grid's: if they are samples, their mean isn't what five ticks of the loop
+# did
+FEW_ROWS = 2.4
+SLOW_ROWS = (
+    1.2  # grid periods: rows as slow hide every other command of a loop that sends one each 10 ms
+)
 
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """How the rows of a case are read. `arrived`: the commands that the link let through, None without commands; `pwm`: motors
-    are duty cycles; `at_once`: a row's motors are one sample, as the vehicle file's [log] says by motor_rows = "sample";
-    `blind`: what motors do within a row isn't known; `late` s: by how much they may be off against the gyroscope, None where
-    that isn't known either."""
+    """How the rows of a case are read. `arrived`: the commands that the link let through, None
+    without commands; `pwm`: motors are duty cycles; `at_once`: a row's motors are one sample, as
+    the vehicle file's [log] says by motor_rows = "sample"; `blind`: what motors do within a row
+    isn't known; `late` s: by how much they may be off against the gyroscope, None where that isn't
+    known either.
+    """
 
     library: Library
     tracks: list[Track]
@@ -40,23 +48,33 @@ class Reading:
 
     @property
     def numbers(self):
-        situation = "nuisance_duty" if self.pwm else "nuisance_samples" if self.blind else "nuisance"
+        situation = (
+            "nuisance_duty" if self.pwm else "nuisance_samples" if self.blind else "nuisance"
+        )
         return numbers_of(situation, self.vehicles[0])
 
     @property
     def heard(self) -> list[Track]:
-        """The tracks as the firmware hears them: its gyroscope as it is, whatever was found to be its gain."""
-        return [dataclasses.replace(t, body_rates=t.body_rates * self.sensors.gain) for t in self.tracks]
+        """The tracks as the firmware hears them: its gyroscope as it is, whatever was found to be
+        its gain.
+        """
+        return [
+            dataclasses.replace(t, body_rates=t.body_rates * self.sensors.gain) for t in self.tracks
+        ]
 
     @cached_property
     def by_commands(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """`caused_by_commands` of each track."""
         links = self.arrived if self.arrived is not None else [None] * len(self.tracks)
-        return [caused_by_commands(*of) for of in zip(self.tracks, self.vehicles, links, strict=True)]
+        return [
+            caused_by_commands(*of) for of in zip(self.tracks, self.vehicles, links, strict=True)
+        ]
 
 
 def rows_are_samples(case: Case) -> bool:
-    """Whether a row's motor commands are one sample, and not the mean since the last row. Raises UserError for anything else."""
+    """Whether a row's motor commands are one sample, and not the mean since the last row. Raises
+    UserError for anything else.
+    """
     rows = case.vehicle_file.log.get("motor_rows", "mean")
     if rows not in ("mean", "sample"):
         raise UserError(
@@ -65,7 +83,9 @@ def rows_are_samples(case: Case) -> bool:
     return rows == "sample"
 
 
-def make_reading(case: Case, library: Library, tracks, vehicles, arrived, sensors: Kinematics) -> Reading:
+def make_reading(
+    case: Case, library: Library, tracks, vehicles, arrived, sensors: Kinematics
+) -> Reading:
     """How the rows of a case are to be read."""
     shortest = min(f.row_period for f in case.flights)
     slow = shortest > 0.8 * GRID_PERIOD  # faster logs are averaged
@@ -82,7 +102,9 @@ def make_reading(case: Case, library: Library, tracks, vehicles, arrived, sensor
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """`replay` of the flights; `exposure` {effect: nats that it would leave at its usual size}, none where it can't be told."""
+    """`replay` of the flights; `exposure` {effect: nats that it would leave at its usual size},
+    none where it can't be told.
+    """
 
     replay: Replay
     library: Library
@@ -101,10 +123,14 @@ class Motion:
 
 def read_motion(reading: Reading, loop: RateLoop | None) -> Motion:
     """Replay the flights; `loop` knows what the motors did within a row."""
-    tracks, sensors, library = reading.tracks, reading.sensors, reading.library
+    tracks = reading.tracks
+    sensors = reading.sensors
+    library = reading.library
     ticks = [np.repeat(t.motor[:, None], TICKS, 1) for t in tracks] if loop is None else loop.ticks
     if loop is not None and reading.at_once:
-        tracks = [dataclasses.replace(t, motor=m.mean(1)) for t, m in zip(tracks, ticks, strict=True)]
+        tracks = [
+            dataclasses.replace(t, motor=m.mean(1)) for t, m in zip(tracks, ticks, strict=True)
+        ]
     feedback = read_feedback(tracks, reading.vehicles, reading.by_commands)
     clocks = sensors.one_clock, reading.at_once
     replay = make_replay(tracks, reading.vehicles, ticks, feedback, reading.numbers, *clocks)
@@ -114,8 +140,9 @@ def read_motion(reading: Reading, loop: RateLoop | None) -> Motion:
 
 
 def _hidden(card, reading: Reading) -> bool:
-    """Whether an effect can't be told from these logs, however large it is: its channel is missing, or it looks like a nuisance,
-    what motors do unseen or the map from duty cycles to thrust."""
+    """Whether an effect can't be told from these logs, however large it is: its channel is missing,
+    or it looks like a nuisance, what motors do unseen or the map from duty cycles to thrust.
+    """
     if card.needs and any(getattr(t, card.needs) is None for t in reading.tracks):
         return True
     if (reading.blind and card.torque_axes) or (reading.pwm and card.thrust_map):

@@ -1,4 +1,6 @@
-"""The pose: the attitude against the integrated gyroscope. No dynamics are needed to see a late pose."""
+"""The pose: the attitude against the integrated gyroscope. No dynamics are needed to see a late
+pose.
+"""
 
 from dataclasses import dataclass
 
@@ -25,8 +27,10 @@ START = 20  # rows at the start of a track that the noise model needs
 
 @dataclass(frozen=True, eq=False)
 class Delay:
-    """`value`, `error`: how late the pose is, s, and the standard error; `nats`: log Bayes factor against no delay; `before` and
-    `residual` [(T, 3)]: attitude less integrated gyroscope, rad, without the delay, all else as fitted, and after the fit."""
+    """`value`, `error`: how late the pose is, s, and the standard error; `nats`: log Bayes factor
+    against no delay; `before` and `residual` [(T, 3)]: attitude less integrated gyroscope, rad,
+    without the delay, all else as fitted, and after the fit.
+    """
 
     value: float
     error: float
@@ -37,8 +41,9 @@ class Delay:
 
 @dataclass(frozen=True, eq=False)
 class Pose(Channel):
-    """`clock` s by which pose and gyroscope may be apart in these logs; `names`: the effects that it tells; `steps`: rows of
-    POSE_HORIZON on each track."""
+    """`clock` s by which pose and gyroscope may be apart in these logs; `names`: the effects that
+    it tells; `steps`: rows of POSE_HORIZON on each track.
+    """
 
     fit: Delay
     clock: float
@@ -52,7 +57,9 @@ class Pose(Channel):
         return self.fit.value > DECISION.standard_errors * self.fit.error and self.fit.nats > 0.0
 
     def acting(self) -> dict[str, float]:
-        odds = {e: self.fit.nats + CARDS[e].log_odds for e in self.names if self.fit.value > self.clock}
+        odds = {
+            e: self.fit.nats + CARDS[e].log_odds for e in self.names if self.fit.value > self.clock
+        }
         return {e: 1.0 - DECISION.unknown for e, nats in odds.items() if self.late and nats > 0.0}
 
     def estimate(self, effect: str, parameter: str) -> Estimated:
@@ -62,7 +69,8 @@ class Pose(Channel):
     def residuals(self, named) -> dict[str, list[np.ndarray]]:
         used = self.fit.residual if set(named) & set(self.names) else self.fit.before
         moved = [
-            np.concatenate([np.zeros((n, 3)), r[n:] - r[:-n]]) for r, n in zip(used, self.steps, strict=True)
+            np.concatenate([np.zeros((n, 3)), r[n:] - r[:-n]])
+            for r, n in zip(used, self.steps, strict=True)
         ]
         return {f"pose {axis}": [m[:, k] for m in moved] for k, axis in enumerate("xyz")}
 
@@ -77,8 +85,9 @@ def read_pose(tracks: list[Track], library) -> Pose | None:
 
 
 def read_delay(tracks: list[Track]) -> Delay:
-    """How late the attitude is against the gyroscope; a clock offset of a few ms is a nuisance. The delay is found by
-    Gauss-Newton steps: the body turns on meanwhile."""
+    """How late the attitude is against the gyroscope; a clock offset of a few ms is a nuisance. The
+    delay is found by Gauss-Newton steps: the body turns on meanwhile.
+    """
     delay = 0.0
     for _ in range(STEPS):
         fit = _read_around(tracks, delay)
@@ -90,12 +99,15 @@ def read_delay(tracks: list[Track]) -> Delay:
 
 
 def _read_around(tracks: list[Track], delay: float) -> Delay:
-    """The model linearised at a delay: the attitude, what a second of delay does, and the nuisances as columns."""
+    """The model linearised at a delay: the attitude, what a second of delay does, and the nuisances
+    as columns.
+    """
     data = []
     for track in tracks:
         turned = turn_increments(track.quaternion)
         gyro, calm = (
-            earlier(v, delay, track) for v in (track.body_rates, smooth(track.body_rates, 0.03, track.dt))
+            earlier(v, delay, track)
+            for v in (track.body_rates, smooth(track.body_rates, 0.03, track.dt))
         )
         between = 0.5 * (gyro[1:] + gyro[:-1]) * track.dt
         start = np.zeros((1, 3))
@@ -112,21 +124,25 @@ def _read_around(tracks: list[Track], delay: float) -> Delay:
 
 
 def _fit(data: list[np.ndarray]) -> Delay:
-    """Fit y = delay x column + nuisances of unit prior variance + coloured noise to tracks (2 + N, T, 3) of all these."""
+    """Fit y = delay x column + nuisances of unit prior variance + coloured noise to tracks (2 + N,
+    T, 3) of all these.
+    """
     residual = [d[0] - d[0].mean(0) for d in data]
     for _ in range(PASSES):
         noise = fit_noise((0, 1, 2), residual, True, START)
         white = [whiten((noise,), d)[:, START:].reshape(len(d), -1) for d in data]
         cross = [w[2:] @ w[:2].T for w in white]
         taken = [
-            np.linalg.solve(np.eye(len(c)) + w[2:] @ w[2:].T, c) for w, c in zip(white, cross, strict=True)
+            np.linalg.solve(np.eye(len(c)) + w[2:] @ w[2:].T, c)
+            for w, c in zip(white, cross, strict=True)
         ]
         gram = sum(w[:2] @ w[:2].T - c.T @ t for w, c, t in zip(white, cross, taken, strict=True))
         precision = gram[1, 1] + 1.0 / DELAY_SPREAD**2
         value = gram[1, 0] / precision
         left = np.array([1.0, -value])
         residual = [
-            np.tensordot(np.concatenate([left, -t @ left]), d, 1) for d, t in zip(data, taken, strict=True)
+            np.tensordot(np.concatenate([left, -t @ left]), d, 1)
+            for d, t in zip(data, taken, strict=True)
         ]
     # Nuisances stay as they are beside the delay: set free, a clock of a few ms would take any.
     before = [r + value * d[1] for r, d in zip(residual, data, strict=True)]

@@ -1,6 +1,8 @@
 """The radio: delay and lost packets of the commands, read without any dynamics.
 
-The mean of the motor commands is the commanded thrust, so its delay and its lost packets show row by row."""
+The mean of the motor commands is the commanded thrust, so its delay and its lost packets show row
+by row.
+"""
 
 from dataclasses import dataclass
 
@@ -16,7 +18,10 @@ DELAY_STEP = 0.0005  # s
 TOLERANCE = 3e-4  # of thrust: rounding of the logs and of the firmware's integers
 READABLE = 3e-3  # of thrust: mean misfit above which motors and commands aren't one stream
 INFORMATIVE = 1.5e-3  # smallest change of commanded thrust that shows what the link does at all
-HELD, BETWEEN = 0.2, 0.6  # of the way from the command held to the one due: up to here it is held, or neither
+HELD, BETWEEN = (
+    0.2,
+    0.6,
+)  # of the way from the command held to the one due: up to here it is held, or neither
 DEPENDENT = 3.0  # rows that count as one independent error
 FEWEST = 30  # changes of the command that tell what a link does
 CLEAR = 20.0  # nats that a delay or losses must gain: errors of a link aren't independent
@@ -27,10 +32,12 @@ DELAY, LOSS = "delay", "probability"  # the parameters of the effects that a rad
 
 @dataclass(frozen=True, eq=False)
 class Link:
-    """The link under one hypothesis. `arrived` [(fraction, (T, 2) rows)]: of each track the command in force at the end and at
-    the start of each row, and the share of the row that the older one rules; `error` (M,) of the collective thrust;
-    (tracks,) numbers of rows: `informative` have a new command, `told` ones are so clear that they tell whether it arrived, in
-    `lost` of them it didn't, and `between` neither hold the old command nor follow the new one."""
+    """The link under one hypothesis. `arrived` [(fraction, (T, 2) rows)]: of each track the command
+    in force at the end and at the start of each row, and the share of the row that the older one
+    rules; `error` (M,) of the collective thrust; (tracks,) numbers of rows: `informative` have a
+    new command, `told` ones are so clear that they tell whether it arrived, in `lost` of them it
+    didn't, and `between` neither hold the old command nor follow the new one.
+    """
 
     arrived: list
     error: np.ndarray
@@ -51,7 +58,9 @@ class Link:
 
 @dataclass(frozen=True, eq=False)
 class Radio(Channel):
-    """`links` {parameters that aren't as nominal: the link}; `names` {parameter: effect} of the library."""
+    """`links` {parameters that aren't as nominal: the link}; `names` {parameter: effect} of the
+    library.
+    """
 
     delay: float
     links: dict[frozenset, Link]
@@ -77,8 +86,10 @@ class Radio(Channel):
 
     @property
     def found(self) -> frozenset:
-        """The parameters that aren't nominal: each must gain beside the other, exceed what clocks may differ by, or a share of
-        lost packets. Packets aren't lost where as many rows lie between two commands: a delay that jitters leaves those."""
+        """The parameters that aren't nominal: each must gain beside the other, exceed what clocks
+        may differ by, or a share of lost packets. Packets aren't lost where as many rows lie
+        between two commands: a delay that jitters leaves those.
+        """
         if not self.readable:
             return frozenset()
         both = frozenset({DELAY, LOSS})
@@ -108,7 +119,8 @@ class Radio(Channel):
             error = float(np.hypot(DELAY_STEP, ROW_ERROR[self.sampled] * self.row))
             return Estimated(self.delay, error, error)
         used = self.links[frozenset({DELAY, LOSS})]
-        told, each = max(used.told.sum(), 1), used.lost / np.maximum(used.told, 1)
+        told = max(used.told.sum(), 1)
+        each = used.lost / np.maximum(used.told, 1)
         # Packets are lost in bursts: how much flights differ tells more than how many there were.
         apart = few(len(each)) * each.std(ddof=1) / np.sqrt(len(each)) if len(each) > 1 else 0.0
         error = float(np.hypot(np.sqrt(self.loss * (1 - self.loss) / told), apart) + 0.5 / told)
@@ -124,7 +136,9 @@ def read_radio(tracks: list[Track], library, sampled: bool = False) -> Radio:
     delays = np.arange(0.0, LONGEST_DELAY, DELAY_STEP)
     delay = float(delays[int(np.argmin(sum(_delay_misfit(t, delays) for t in tracks)))])
     links = {
-        frozenset(p for p, on in ((DELAY, late), (LOSS, lost)) if on): _decode(tracks, late * delay, lost)
+        frozenset(p for p, on in ((DELAY, late), (LOSS, lost)) if on): _decode(
+            tracks, late * delay, lost
+        )
         for late in (False, True)
         for lost in (False, True)
     }
@@ -139,7 +153,8 @@ def _clean_rows(track: Track) -> np.ndarray:
 
 
 def _delay_misfit(track: Track, delays: np.ndarray) -> np.ndarray:
-    thrust, clean = track.command[:, 0], _clean_rows(track)
+    thrust = track.command[:, 0]
+    clean = _clean_rows(track)
     cap = 0.3 * np.std(np.diff(thrust)) + 1e-9  # a lost packet must not pull at the delay
     return np.array([np.minimum(np.abs(_late_error(track, d)[clean]), cap).sum() for d in delays])
 
@@ -162,9 +177,10 @@ def _rows_late(track: Track, delay: float) -> tuple[int, float]:
 
 
 def _link_rows(track: Track, delay: float) -> tuple[int, float, np.ndarray, np.ndarray]:
-    """Rows in which commands of `delay` s ago are in force: whole rows late, the share of a row that the one before still
-    rules, the motors' mean (T,), whether it can be read (T,). Logs faster than the rows are cut anew where the commands
-    arrive, so that a row holds one command."""
+    """Rows in which commands of `delay` s ago are in force: whole rows late, the share of a row
+    that the one before still rules, the motors' mean (T,), whether it can be read (T,). Logs faster
+    than the rows are cut anew where the commands arrive, so that a row holds one command.
+    """
     clean = _clean_rows(track)
     if track.fast_thrust is None:
         return *_rows_late(track, delay), track.motor.mean(1), clean
@@ -177,7 +193,9 @@ def _link_rows(track: Track, delay: float) -> tuple[int, float, np.ndarray, np.n
 
 def _decode(tracks, delay: float, may_lose: bool) -> Link:
     """Row by row: did the command due in this row arrive, or is the one before still held?"""
-    errors, arrived, counts = [], [], []
+    errors = []
+    arrived = []
+    counts = []
     for track in tracks:
         in_force, error, counted = _follow(track, delay, may_lose)
         errors.append(error)
@@ -189,18 +207,27 @@ def _decode(tracks, delay: float, may_lose: bool) -> Link:
 
 
 def _follow(track: Track, delay: float, may_lose: bool):
-    """Row of the command in force (T,), errors of the thrust in clean rows, and how many rows are informative, told, lost,
-    between."""
+    """Row of the command in force (T,), errors of the thrust in clean rows, and how many rows are
+    informative, told, lost, between.
+    """
     whole, part, given, clean = _link_rows(track, delay)
     error = np.abs(_late_error(track, delay)[clean])
     noise = float(np.median(error)) if len(error) else 0.0
-    telling = (TOLERANCE + 2.0 * noise) / HELD  # least change of thrust that shows whether a packet arrived
-    thrust, given, flags = track.command[:, 0].tolist(), given.tolist(), clean.tolist()
-    held, in_force, error, counts = 0, np.zeros(len(track), int), np.zeros(len(track)), np.zeros(4, int)
+    telling = (
+        TOLERANCE + 2.0 * noise
+    ) / HELD  # least change of thrust that shows whether a packet arrived
+    thrust = track.command[:, 0].tolist()
+    given = given.tolist()
+    flags = clean.tolist()
+    held = 0
+    in_force = np.zeros(len(track), int)
+    error = np.zeros(len(track))
+    counts = np.zeros(4, int)
     for row in range(len(track)):
         due = max(row - whole, 0)
         expected = (1 - part) * thrust[due] + part * thrust[held]
-        change, missed = abs(thrust[held] - expected), False
+        change = abs(thrust[held] - expected)
+        missed = False
         if flags[row] and change > INFORMATIVE:
             way = abs(given[row] - thrust[held]) / change
             missed = may_lose and way < abs(given[row] - expected) / change

@@ -1,8 +1,10 @@
 """The rate loop: its gains, read from what commands excite.
 
-What the motors differ by is the rate controller's output. In closed loop it answers noise and gusts, so the gains are read by
-the generalised method of moments (Hansen 1982), with what the nominal loop would have done under the same commands as
-instruments: neither colour nor clocks need a model. An observer runs the same loop for the motor command of every tick."""
+What the motors differ by is the rate controller's output. In closed loop it answers noise and
+gusts, so the gains are read by the generalised method of moments (Hansen 1982), with what the
+nominal loop would have done under the same commands as instruments: neither colour nor clocks need
+a model. An observer runs the same loop for the motor command of every tick.
+"""
 
 import dataclasses
 from dataclasses import dataclass
@@ -36,9 +38,11 @@ GAINS = ("p", "i", "d")
 
 @dataclass(frozen=True, eq=False)
 class RateLoop(Channel):
-    """`change` (6,) and `error` (6,) of p, i, d as shares, roll and pitch first and then yaw; `outputs` [(4, T, 3)]: logged less
-    nominal outputs of each track, and what one more of p, i, d would give; `ticks` [(T, TICKS, 4)]: the motor commands of the
-    rate loop's ticks; `names`: the effects that it tells."""
+    """`change` (6,) and `error` (6,) of p, i, d as shares, roll and pitch first and then yaw;
+    `outputs` [(4, T, 3)]: logged less nominal outputs of each track, and what one more of p, i, d
+    would give; `ticks` [(T, TICKS, 4)]: the motor commands of the rate loop's ticks; `names`: the
+    effects that it tells.
+    """
 
     change: np.ndarray
     error: np.ndarray
@@ -50,9 +54,11 @@ class RateLoop(Channel):
 
     @cached_property
     def gain(self) -> tuple[np.ndarray, np.ndarray]:
-        """Changes (3,) of p, i, d and their errors, of roll, pitch and yaw together: by their precision, with an error that
-        covers what the two disagree by (Birge 1932)."""
-        value, error = self.change.reshape(2, 3), self.error.reshape(2, 3)
+        """Changes (3,) of p, i, d and their errors, of roll, pitch and yaw together: by their
+        precision, with an error that covers what the two disagree by (Birge 1932).
+        """
+        value = self.change.reshape(2, 3)
+        error = self.error.reshape(2, 3)
         weight = 1.0 / np.maximum(error, 1e-9) ** 2
         total = np.maximum(weight.sum(0), 1e-12)
         mean = (weight * value).sum(0) / total
@@ -60,8 +66,11 @@ class RateLoop(Channel):
         return mean, np.maximum(apart, 1.0) / np.sqrt(total)
 
     def acting(self) -> dict[str, float]:
-        """Either group of axes may be retuned alone: the surer one tells, if P changes by more than forms are wrong by."""
-        change, error = np.abs(self.change[[0, 3]]), np.minimum(self.error[[0, 3]], PRIOR[0])
+        """Either group of axes may be retuned alone: the surer one tells, if P changes by more than
+        forms are wrong by.
+        """
+        change = np.abs(self.change[[0, 3]])
+        error = np.minimum(self.error[[0, 3]], PRIOR[0])
         nats = 0.5 * (change / error) ** 2 - np.log(PRIOR[0] / error)  # Savage and Dickey's
         chance = norm.cdf((change - DECISION.form_error) / error) * (1.0 - DECISION.unknown)
         odds = {e: chance[nats + CARDS[e].log_odds > 0.0].max(initial=0.0) for e in self.names}
@@ -78,7 +87,9 @@ class RateLoop(Channel):
 
     def residuals(self, named) -> dict[str, list[np.ndarray]]:
         changed = np.append(1.0, -self.gain[0] if set(named) & set(self.names) else np.zeros(3))
-        out: dict[str, list[np.ndarray]] = {f"motors {axis}": [] for axis in ("roll", "pitch", "yaw")}
+        out: dict[str, list[np.ndarray]] = {
+            f"motors {axis}": [] for axis in ("roll", "pitch", "yaw")
+        }
         for outputs in self.outputs:
             left = detrend(np.tensordot(changed, outputs, 1), axis=0)
             for column, series in zip(left.T, out.values(), strict=True):
@@ -88,13 +99,17 @@ class RateLoop(Channel):
 
 def read_rate_loop(reading) -> RateLoop:
     """Read the rate controllers of all tracks of a `motion.Reading`."""
-    ticks, series, outputs = [], [], []
+    ticks = []
+    series = []
+    outputs = []
     tracks = zip(reading.heard, reading.vehicles, reading.arrived, reading.by_commands, strict=True)
     for track, vehicle, link, (_, drawn) in tracks:
         wanted, sent = observed(track, vehicle, link, reading.at_once)
         ticks.append(sent)
         logged, nominal, *larger = np.concatenate([track.motor[None], wanted]) @ outputs_of(vehicle)
-        outputs.append(np.stack([logged - nominal, *((made - nominal) / GAIN_STEP for made in larger)]))
+        outputs.append(
+            np.stack([logged - nominal, *((made - nominal) / GAIN_STEP for made in larger)])
+        )
         series.append(_series(track, vehicle, in_force(track, link), drawn, reading))
     change, error = read_gains(reading, series, ticks)
     names = reading.library.of("rate_loop")
@@ -102,8 +117,9 @@ def read_rate_loop(reading) -> RateLoop:
 
 
 def with_motors(track: Track, vehicle) -> Track:
-    """The track with motor commands: where they weren't logged, those that the nominal rate controller
-    would send."""
+    """The track with motor commands: where they weren't logged, those that the nominal rate
+    controller would send.
+    """
     if track.motor is not None:
         return track
     rows = np.arange(len(track))
@@ -116,12 +132,14 @@ def with_motors(track: Track, vehicle) -> Track:
 
 
 def observed(track: Track, vehicle, link, at_once=False):
-    """The observer's output: mean motor commands (1 + 3, T, 4) that the nominal loop wants, and with one gain each larger by
-    GAIN_STEP; and the commands sent in the ticks (T, TICKS, 4).
+    """The observer's output: mean motor commands (1 + 3, T, 4) that the nominal loop wants, and
+    with one gain each larger by GAIN_STEP; and the commands sent in the ticks (T, TICKS, 4).
 
-    What pushed the body beyond the nominal physics in a first run is given to a second, so that the rates
-    inside a row are right whatever the physics."""
-    rows, size = len(track), bucket(len(track))
+    What pushed the body beyond the nominal physics in a first run is given to a second, so that the
+    rates inside a row are right whatever the physics.
+    """
+    rows = len(track)
+    size = bucket(len(track))
     inputs = [padded(v, size) for v in (in_force(track, link), track.motor, track.body_rates)]
     push = padded(np.zeros((rows, 3)), size)
     *_, rates = observe(vehicle, vehicle, *inputs, push, np.float32(track.dt), at_once)
@@ -131,17 +149,26 @@ def observed(track: Track, vehicle, link, at_once=False):
     push = padded(smooth(np.concatenate([step, step[-1:]]), 0.06, track.dt) / track.dt, size)
     gains = ("rate_kp", "rate_ki", "rate_kd")
     larger = [vehicle.replace(**{n: (1.0 + GAIN_STEP) * getattr(vehicle, n)}) for n in gains]
-    runs = [observe(c, vehicle, *inputs, push, np.float32(track.dt), at_once) for c in (vehicle, *larger)]
+    runs = [
+        observe(c, vehicle, *inputs, push, np.float32(track.dt), at_once)
+        for c in (vehicle, *larger)
+    ]
     return np.array([r[0] for r in runs], float)[:, :rows], np.asarray(runs[0][1])[:rows]
 
 
 def read_gains(reading, series, ticks) -> tuple[np.ndarray, np.ndarray]:
-    """Changes (6,) of p, i, d as shares - roll and pitch, then yaw - and their errors, infinite where flights say too little.
-    `series`: `_series` of each track; `ticks`: as in `RateLoop`."""
-    change, error = np.zeros(6), np.full(6, np.inf)
+    """Changes (6,) of p, i, d as shares - roll and pitch, then yaw - and their errors, infinite
+    where flights say too little. `series`: `_series` of each track; `ticks`: as in `RateLoop`.
+    """
+    change = np.zeros(6)
+    error = np.full(6, np.inf)
     if reading.late is None:
         return change, error
-    moments: dict[int, list] = {0: [], 1: [], 2: []}  # axis: [(moments (5, 1 + 5), track)] of every segment
+    moments: dict[int, list] = {
+        0: [],
+        1: [],
+        2: [],
+    }  # axis: [(moments (5, 1 + 5), track)] of every segment
     for unit, (track, of, sent) in enumerate(zip(reading.heard, series, ticks, strict=True)):
         for axis, part in _segments(of, sent, track.dt):
             moments[axis].append((part, unit))
@@ -156,23 +183,33 @@ def read_gains(reading, series, ticks) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _series(track: Track, vehicle, ruling: np.ndarray, drawn: np.ndarray, reading) -> np.ndarray:
-    """(11, T, 3): outputs beyond the nominal ones, what P, I and D make of the rates, what a delay does to P and a low-pass to D,
-    and the last five again of the rates `drawn` (T, 3) that commands alone cause: the instruments.
+    """(11, T, 3): outputs beyond the nominal ones, what P, I and D make of the rates, what a delay
+    does to P and a low-pass to D, and the last five again of the rates `drawn` (T, 3) that commands
+    alone cause: the instruments.
 
-    The rates at the ticks of a row lie on a smooth curve through those of the rows; the derivative is of the tick before."""
-    pick = 0 if reading.at_once else slice(None) if track.fast_thrust is None else TICKS // 2  # means already
+    The rates at the ticks of a row lie on a smooth curve through those of the rows; the derivative
+    is of the tick before.
+    """
+    pick = (
+        0 if reading.at_once else slice(None) if track.fast_thrust is None else TICKS // 2
+    )  # means already
     at = np.arange(len(track))[:, None] + np.arange(TICKS) / TICKS
     curve = CubicSpline(np.arange(len(track)), track.body_rates)
-    rates, slopes = curve(at), (curve(at) - curve(at - 1.0 / TICKS)) * TICKS / track.dt
+    rates = curve(at)
+    slopes = (curve(at) - curve(at - 1.0 / TICKS)) * TICKS / track.dt
     low = butter(2, FILTER, fs=TICKS / track.dt)
     filtered = lfilter(*low, slopes.reshape(-1, 3), axis=0).reshape(slopes.shape)
     sent, rates, slope, filtered = (
-        (v[:, pick] if pick != slice(None) else v.mean(1)) for v in (ruling[..., 1:], rates, slopes, filtered)
+        (v[:, pick] if pick != slice(None) else v.mean(1))
+        for v in (ruling[..., 1:], rates, slopes, filtered)
     )
     x = _terms(track, vehicle, sent - rates, slope)
     z = _terms(track, vehicle, sent - drawn, np.gradient(drawn, track.dt, axis=0))
     apart = reading.late or 0.0
-    off = [apart * np.gradient(x[0], track.dt, axis=0), _terms(track, vehicle, sent, filtered - slope)[2]]
+    off = [
+        apart * np.gradient(x[0], track.dt, axis=0),
+        _terms(track, vehicle, sent, filtered - slope)[2],
+    ]
     late = [apart * np.gradient(v, track.dt, axis=0) for v in z[[0, 2]]]
     y = track.motor @ outputs_of(vehicle) - x.sum(0)
     return np.stack([y, *x, *off, *z, *late])
@@ -180,13 +217,18 @@ def _series(track: Track, vehicle, ruling: np.ndarray, drawn: np.ndarray, readin
 
 def _terms(track: Track, vehicle, error: np.ndarray, slope: np.ndarray) -> np.ndarray:
     """(3, T, 3): outputs of P, I and D for an error of the body rates and their slope (T, 3)."""
-    p, i, d = (np.asarray(getattr(vehicle, n), float) * COUNT for n in ("rate_kp", "rate_ki", "rate_kd"))
+    p, i, d = (
+        np.asarray(getattr(vehicle, n), float) * COUNT for n in ("rate_kp", "rate_ki", "rate_kd")
+    )
     return np.stack([p * error, i * np.cumsum(error, 0) * track.dt, -d * slope])
 
 
 def _segments(series: np.ndarray, ticks: np.ndarray, dt: float):
-    """(axis, moments (5, 1 + 5)) of each segment of a series (11, T, 3) without a motor near its limits, which obeys no gains."""
-    edge, size = int(EDGE / dt), max(int(SEGMENT / dt), 1)
+    """(axis, moments (5, 1 + 5)) of each segment of a series (11, T, 3) without a motor near its
+    limits, which obeys no gains.
+    """
+    edge = int(EDGE / dt)
+    size = max(int(SEGMENT / dt), 1)
     if series.shape[1] < 4 * edge + size:
         return
     band = butter(2, (BAND[0], min(BAND[1], 0.4 / dt)), "bandpass", fs=1.0 / dt, output="sos")
@@ -201,8 +243,9 @@ def _segments(series: np.ndarray, ticks: np.ndarray, dt: float):
 
 
 def _moments(found: np.ndarray, units: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients (5,) and errors (5,) that bring the moments (B, 5, 1 + 5) to zero, with weak priors. Errors are what segments
-    or, where that is more, `units` (B,) differ by."""
+    """Coefficients (5,) and errors (5,) that bring the moments (B, 5, 1 + 5) to zero, with weak
+    priors. Errors are what segments or, where that is more, `units` (B,) differ by.
+    """
     precision = np.diag(1.0 / PRIOR**2)
     total = found.sum(0)
     theta = np.zeros(5)

@@ -1,4 +1,6 @@
-"""Least squares with bounds: a nuisance may take twice its usual size, and one that wants more is a finding."""
+"""Least squares with bounds: a nuisance may take twice its usual size, and one that wants more is a
+finding.
+"""
 
 import numpy as np
 
@@ -7,20 +9,27 @@ PATIENCE = 4
 
 
 def bounded(hessian, push, free: int = 0) -> np.ndarray:
-    """Minimum of x'Hx/2 - push'x with |x| <= BOUND beyond the first `free` entries, H positive definite.
+    """Minimum of x'Hx/2 - push'x with |x| <= BOUND beyond the first `free` entries, H positive
+    definite.
 
-    Block principal pivoting (Judice, Pires 1994): entries that leave the box are fixed at its edge and those that would come
-    back are let go, all at once as long as fewer are wrong each time, else the last of them alone, so that it ends."""
+    Block principal pivoting (Judice, Pires 1994): entries that leave the box are fixed at its edge
+    and those that would come back are let go, all at once as long as fewer are wrong each time,
+    else the last of them alone, so that it ends.
+    """
     limit = np.full(len(push), BOUND)
     limit[:free] = np.inf
-    side, fewest, patience = np.zeros(len(push)), len(push) + 1, PATIENCE
+    side = np.zeros(len(push))
+    fewest = len(push) + 1
+    patience = PATIENCE
     while True:
         found = np.where(side == 0.0, 0.0, side * BOUND)
-        inside, fixed = np.flatnonzero(side == 0.0), np.flatnonzero(side)
+        inside = np.flatnonzero(side == 0.0)
+        fixed = np.flatnonzero(side)
         right = push[inside] - hessian[np.ix_(inside, fixed)] @ found[fixed]
         found[inside] = np.linalg.solve(hessian[np.ix_(inside, inside)], right)
         pull = side * (hessian @ found - push)  # positive: back into the box is downhill
-        beyond, back = np.abs(found) > limit * (1.0 + 1e-9), pull > 1e-9 * np.abs(push)
+        beyond = np.abs(found) > limit * (1.0 + 1e-9)
+        back = pull > 1e-9 * np.abs(push)
         wrong = np.flatnonzero(beyond | back)
         if not len(wrong):
             return found

@@ -13,8 +13,9 @@ from openjax.gap.model.table import Model, Table
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """A model on stretches left out: `nats` (B,) minus half the whitened sum of squares, `squares` (B, K) of the
-    errors of logged channels, `taken` (B, N) of the shared nuisances."""
+    """A model on stretches left out: `nats` (B,) minus half the whitened sum of squares, `squares`
+    (B, K) of the errors of logged channels, `taken` (B, N) of the shared nuisances.
+    """
 
     nats: np.ndarray
     squares: np.ndarray
@@ -25,8 +26,9 @@ class Judged:
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """Normal equations of a model on a table: of its free columns and the nuisances that all flights share. What belongs to a
-    block alone is marginalised already."""
+    """Normal equations of a model on a table: of its free columns and the nuisances that all
+    flights share. What belongs to a block alone is marginalised already.
+    """
 
     table: Table
     model: Model
@@ -36,15 +38,20 @@ class Equations:
         return np.concatenate([self.model.free, self.table.nuisances[self.table.shared]])
 
     def solve(self, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Hessian, right side and solution from `table.marginal` summed (C, C) over the blocks to fit."""
-        hessian, free = sums[np.ix_(self.columns, self.columns)], len(self.model.free)
+        """Hessian, right side and solution from `table.marginal` summed (C, C) over the blocks to
+        fit.
+        """
+        hessian = sums[np.ix_(self.columns, self.columns)]
+        free = len(self.model.free)
         push = sums[self.columns][:, [0, *self.model.parts]].sum(1)
         hessian += block_diag(self.model.precision, np.eye(len(push) - free))
         push[:free] += self.model.precision @ self.model.mean
         return hessian, push, bounded(hessian, push, free)
 
     def coefficients(self, found: np.ndarray, block: int) -> np.ndarray:
-        """Coefficients (C,) of every column on a block, whose own nuisances are the most likely ones."""
+        """Coefficients (C,) of every column on a block, whose own nuisances are the most likely
+        ones.
+        """
         out = np.zeros(self.table.size)
         out[[0, *self.model.parts]] = 1.0
         out[self.columns] -= found
@@ -53,8 +60,11 @@ class Equations:
 
 
 def promise(table: Table, model: Model) -> float:
-    """Log posterior of a model at its best, fitted to all blocks, up to what all of a table share: what screening needs."""
-    sums, own = table.marginal.sum(0), [0, *model.parts]
+    """Log posterior of a model at its best, fitted to all blocks, up to what all of a table share:
+    what screening needs.
+    """
+    sums = table.marginal.sum(0)
+    own = [0, *model.parts]
     hessian, push, found = Equations(table, model).solve(sums)
     square = sums[np.ix_(own, own)].sum()
     return float(push @ found - 0.5 * found @ hessian @ found - 0.5 * square)
@@ -62,7 +72,8 @@ def promise(table: Table, model: Model) -> float:
 
 def left_out(table: Table, model: Model) -> np.ndarray:
     """Coefficients (B, C) of a model on each block, fitted to all others."""
-    equations, sums = Equations(table, model), table.marginal.sum(0)
+    equations = Equations(table, model)
+    sums = table.marginal.sum(0)
     others = (equations.solve(sums - block)[2] for block in table.marginal)
     return np.array([equations.coefficients(found, k) for k, found in enumerate(others)])
 
@@ -86,12 +97,15 @@ def _squares(table: Table, found: np.ndarray) -> np.ndarray:
 
 
 def ablated(table: Table, found: np.ndarray, drop=(), off: np.ndarray | None = None) -> np.ndarray:
-    """Squared errors (B, K) of a table's set with the coefficients `found` (B, C) of `left_out`, without the effects `drop` and
-    the nuisances `off` (N,); everything else stays as fitted."""
+    """Squared errors (B, K) of a table's set with the coefficients `found` (B, C) of `left_out`,
+    without the effects `drop` and the nuisances `off` (N,); everything else stays as fitted.
+    """
     found = found.copy()
     kept = {int(i) for e in table.fit.effects if e not in drop for i in prior((e,))[0]}
     for effect in drop:
-        found[:, [table.derivative[int(i)] for i in prior((effect,))[0] if int(i) not in kept]] = 0.0
+        found[:, [table.derivative[int(i)] for i in prior((effect,))[0] if int(i) not in kept]] = (
+            0.0
+        )
         found[:, table.part[effect]] = 1.0
     if off is not None:
         found[:, table.nuisances[off]] = 0.0

@@ -1,7 +1,9 @@
-"""Sets of physics effects as hypotheses: Gauss-Newton fits through the simulator, and how well each explains a case.
+"""Sets of physics effects as hypotheses: Gauss-Newton fits through the simulator, and how well each
+explains a case.
 
-Every set is fitted with the same nuisances and weighed by its marginal likelihood (Laplace's approximation), so that
-parameters cost what they are worth."""
+Every set is fitted with the same nuisances and weighed by its marginal likelihood (Laplace's
+approximation), so that parameters cost what they are worth.
+"""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -14,14 +16,18 @@ from openjax.gap.model.whitening import fit_noise
 
 ITERATIONS = 6
 SMALL_STEP = 0.05  # nats: an improvement below this ends the search
-STEADY = 20.0  # degrees of freedom of the prior on a block's variance, whose scale is that of all blocks
+STEADY = (
+    20.0  # degrees of freedom of the prior on a block's variance, whose scale is that of all blocks
+)
 UNEXPOSED = 0.5  # nats that a typical effect would leave: below, the effect isn't fitted at all
 
 
 @dataclass(frozen=True, eq=False)
 class SetFit:
-    """A fitted set of effects. `replay`: with nuisances as they are there; `grams` (F, 1 + p, 1 + p) of residual and derivatives
-    at the optimum, by flight, and their `columns`; `index` (p,) places in `theta` (P,); `precision` (p, p) of the prior."""
+    """A fitted set of effects. `replay`: with nuisances as they are there; `grams` (F, 1 + p, 1 +
+    p) of residual and derivatives at the optimum, by flight, and their `columns`; `index` (p,)
+    places in `theta` (P,); `precision` (p, p) of the prior.
+    """
 
     replay: Replay
     effects: tuple[str, ...]
@@ -43,7 +49,9 @@ class SetFit:
     @cached_property
     def cost(self) -> float:
         """Nats that the parameters cost: how much narrower their posterior is than their prior."""
-        return 0.5 * float(np.linalg.slogdet(self.hessian)[1] - np.linalg.slogdet(self.precision)[1])
+        return 0.5 * float(
+            np.linalg.slogdet(self.hessian)[1] - np.linalg.slogdet(self.precision)[1]
+        )
 
     @property
     def score(self) -> float:
@@ -61,10 +69,15 @@ class SetFit:
 
 
 def fit_set(
-    replay: Replay, effects, start: np.ndarray | None = None, iterations: int = ITERATIONS, rounds: int = 1
+    replay: Replay,
+    effects,
+    start: np.ndarray | None = None,
+    iterations: int = ITERATIONS,
+    rounds: int = 1,
 ) -> SetFit:
-    """Gauss-Newton from `start` (P,), by default the effects' first starts. After each of so many `rounds` nuisances of the
-    vehicle's numbers, which depend on what acts, are worked out anew."""
+    """Gauss-Newton from `start` (P,), by default the effects' first starts. After each of so many
+    `rounds` nuisances of the vehicle's numbers, which depend on what acts, are worked out anew.
+    """
     effects = tuple(effects)
     theta = ABSENT.copy()  # what isn't in the set is absent
     for effect in effects:
@@ -72,7 +85,8 @@ def fit_set(
         theta[own] = (_starts(effect)[0] if start is None else start)[own]
     fit = _at(replay, effects, theta)
     for _ in range(rounds if effects else 0):
-        before, fit = fit, _descend(fit, iterations)
+        before = fit
+        fit = _descend(fit, iterations)
         fit = _at(fit.replay.around(fit.theta), effects, fit.theta, fit.columns)
         if np.allclose(before.theta, fit.theta, rtol=1e-3, atol=0.0):
             break
@@ -83,7 +97,8 @@ def _at(replay: Replay, effects, theta: np.ndarray, columns=None) -> SetFit:
     """The set with these parameters (P,), linearised there."""
     index, mean, precision = prior(effects)
     columns = replay.linearised(theta, index) if columns is None else columns
-    grams, off = replay.grams(columns), theta[index] - mean
+    grams = replay.grams(columns)
+    off = theta[index] - mean
     objective = 0.5 * float(grams[:, 0, 0].sum() + off @ precision @ off)
     return SetFit(replay, effects, theta, index, precision, columns, grams, objective)
 
@@ -91,7 +106,8 @@ def _at(replay: Replay, effects, theta: np.ndarray, columns=None) -> SetFit:
 def _descend(fit: SetFit, iterations: int) -> SetFit:
     """Steps of Gauss and Newton, half of one that overshoots, while they gain anything."""
     index, mean, precision = prior(fit.effects)
-    reach, share = 3.0 * np.sqrt(np.diag(np.linalg.inv(precision))), 1.0
+    reach = 3.0 * np.sqrt(np.diag(np.linalg.inv(precision)))
+    share = 1.0
     for _ in range(iterations):
         push = fit.grams.sum(0)[1:, 0] - precision @ (fit.theta[index] - mean)
         step = np.linalg.solve(fit.hessian, push)
@@ -108,24 +124,33 @@ def _descend(fit: SetFit, iterations: int) -> SetFit:
 
 
 def model_noise(replay: Replay, library: Library) -> tuple[Replay, dict[str, float]]:
-    """The replay with noise models that fit what is left when all effects of the library may act at once, and what each effect
-    would show if it acted as at its start (nats, nuisances marginalised): its exposure."""
+    """The replay with noise models that fit what is left when all effects of the library may act at
+    once, and what each effect would show if it acted as at its start (nats, nuisances
+    marginalised): its exposure.
+    """
     starts = [(effect, theta) for effect in library.physics for theta in _starts(effect)]
     index, _, precision = prior(library.physics)
     columns = replay.linearised(ABSENT, index)
     ahead = np.array([theta for _, theta in starts])
     moved = replay.predict(ahead) if starts else [np.zeros((0, *n.shape)) for n in replay.nominal]
     columns = [
-        np.concatenate([c, m - n[None]]) for c, m, n in zip(columns, moved, replay.nominal, strict=True)
+        np.concatenate([c, m - n[None]])
+        for c, m, n in zip(columns, moved, replay.nominal, strict=True)
     ]
     size = len(index)
     penalty = np.eye(size + len(starts))
     penalty[:size, :size] = precision
     for weighed in (False, False, True, True):
         gram = replay.grams(columns).sum(0)
-        taken = np.linalg.solve(gram[1:, 1:] + penalty, gram[1:, 0]) if weighed else np.zeros(len(penalty))
+        taken = (
+            np.linalg.solve(gram[1:, 1:] + penalty, gram[1:, 0])
+            if weighed
+            else np.zeros(len(penalty))
+        )
         left = [c[0] - np.tensordot(taken, c[1:], 1) for c in columns]
-        replay = with_noise_of(replay, [without_nuisances(replay, r, k) for k, r in enumerate(left)])
+        replay = with_noise_of(
+            replay, [without_nuisances(replay, r, k) for k, r in enumerate(left)]
+        )
     shown = np.diag(replay.grams(columns).sum(0))[1 + size :]
     exposure = {e: 0.0 for e in library.physics}
     for (effect, _), square in zip(starts, shown, strict=True):
@@ -134,7 +159,9 @@ def model_noise(replay: Replay, library: Library) -> tuple[Replay, dict[str, flo
 
 
 def with_noise_of(replay: Replay, residuals: list[np.ndarray]) -> Replay:
-    """The replay with noise models of residuals; channels that weren't logged keep the present ones."""
+    """The replay with noise models of residuals; channels that weren't logged keep the present
+    ones.
+    """
     skip = int(SKIP / replay.tracks[0].dt)
     noises = tuple(
         fit_noise(axes, residuals, integrated, skip=skip) if replay.usable[axes[0]] else old
@@ -145,11 +172,15 @@ def with_noise_of(replay: Replay, residuals: list[np.ndarray]) -> Replay:
 
 
 def _loudness(replay: Replay, residual: np.ndarray, track: int) -> np.ndarray:
-    """(T', 9) how loud the noise is in each block: rotors, air and what motors do between rows are quieter in hover than in a
-    turn. The variance of a group of axes has a scaled inverse chi-squared prior (Gelman et al. 2013)."""
+    """(T', 9) how loud the noise is in each block: rotors, air and what motors do between rows are
+    quieter in hover than in a turn. The variance of a group of axes has a scaled inverse
+    chi-squared prior (Gelman et al. 2013).
+    """
     squares = replay.whiten(residual, track) ** 2
     out = np.ones_like(squares)
-    for rows in np.array_split(np.arange(len(squares)), block_count(len(squares), replay.tracks[track].dt)):
+    for rows in np.array_split(
+        np.arange(len(squares)), block_count(len(squares), replay.tracks[track].dt)
+    ):
         for axes, _ in GROUPS:
             block = np.ix_(rows, axes)
             out[block] = (squares[block].sum() + STEADY) / (squares[block].size + STEADY)

@@ -13,12 +13,15 @@ from openjax.errors import UserError, suggestion
 from openjax.vehicle.effects import EFFECTS, Card
 
 # {effect: its card}: what can be diagnosed.
-CARDS: dict[str, Card] = {name: effect.card for name, effect in EFFECTS.items() if effect.card is not None}
+CARDS: dict[str, Card] = {
+    name: effect.card for name, effect in EFFECTS.items() if effect.card is not None
+}
 
 
 def numbers_of(situation: str, vehicle) -> tuple[tuple[str, str, float], ...]:
-    """(effect, parameter, usual size) of small errors of a vehicle's numbers, which are free in every hypothesis; `situation`
-    is the field of `Card` that holds them."""
+    """(effect, parameter, usual size) of small errors of a vehicle's numbers, which are free in
+    every hypothesis; `situation` is the field of `Card` that holds them.
+    """
     return tuple(
         (e, p, float(size(vehicle) if callable(size) else size))
         for e, card in CARDS.items()
@@ -45,8 +48,9 @@ class Library:
         return tuple(e for e in self.effects if path_of(e) == path)
 
 
-# Every physics parameter has a fixed place in theta, whatever is left out of a library: one compiled function. The last two are
-# no effect's: the propellers' inertia and the motors' shift in time, see `physics`.
+# Every physics parameter has a fixed place in theta, whatever is left out of a library: one
+# compiled function. The last two are no effect's: the propellers' inertia and the motors' shift in
+# time, see `physics`.
 PHYSICS_EFFECTS = tuple(e for e in CARDS if CARDS[e].path == "physics")
 THETA = tuple((e, p.name) for e in PHYSICS_EFFECTS for p in CARDS[e].fitted)
 PLACE = {key: number for number, key in enumerate(THETA)}
@@ -73,8 +77,12 @@ def places(effects) -> np.ndarray:
 
 
 def prior(effects) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Indices (p,), mean (p,) and precision (p, p) of the parameters of a set of physics effects."""
-    index, mean, blocks = [], [], []
+    """Indices (p,), mean (p,) and precision (p, p) of the parameters of a set of physics
+    effects.
+    """
+    index = []
+    mean = []
+    blocks = []
     for effect in effects:
         card = CARDS[effect]
         index += [PLACE[effect, p.name] for p in card.fitted]

@@ -1,5 +1,6 @@
-"""Nuisances of the replay: small errors that every vehicle and every log has, as columns of the channels in units of
-their standard deviations."""
+"""Nuisances of the replay: small errors that every vehicle and every log has, as columns of the
+channels in units of their standard deviations.
+"""
 
 import pathlib
 import tomllib
@@ -18,12 +19,15 @@ SIZE = {
 }
 TRIM = 0.5  # s: what motors do more slowly is no answer to a gust, but what the vehicle needs
 FEEDBACK_ROWS, QUICK_ROWS = (0, 2), (0, 1, 2)  # rows of delay
-# Nuisances that belong to a block of flight, not to the vehicle: noise of the gyroscope weakens feedback where little else moves.
+# Nuisances that belong to a block of flight, not to the vehicle: noise of the gyroscope weakens
+# feedback where little else moves.
 OF_A_BLOCK = ("feedback",)
 
 
 def columns_of(track: Track, path: Path, nominal, feedback, at_once: bool) -> dict[str, np.ndarray]:
-    """{name: column (T, 9)} of one track, of what doesn't depend on what acts; the arguments as in `make_replay`."""
+    """{name: column (T, 9)} of one track, of what doesn't depend on what acts; the arguments as in
+    `make_replay`.
+    """
     columns = _late_torques("feedback", track, feedback.acceleration, FEEDBACK_ROWS)
     columns |= _late_torques("trim", track, feedback.trim, (0,))
     if at_once:
@@ -32,7 +36,9 @@ def columns_of(track: Track, path: Path, nominal, feedback, at_once: bool) -> di
 
 
 def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> dict[str, np.ndarray]:
-    """Mounting, biases and clocks of the sensors, and what a rigid body with small errors does: columns (T, 9)."""
+    """Mounting, biases and clocks of the sensors, and what a rigid body with small errors does:
+    columns (T, 9).
+    """
     rows = len(track)
     attitude = np.asarray(path.quaternion, float)[:rows]
     body = specific_force_of(attitude, nominal[:, VELOCITY], track.dt)
@@ -51,7 +57,12 @@ def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> dict[str
     for name, axis in zip("xy", np.eye(3), strict=False):
         column(f"frame tilt {name}", VELOCITY, moved(np.cross(axis, body)), SIZE["frame_tilt"])
     for number, name in enumerate("xyz"):  # another in each flight, as a chip's temperature is
-        column(f"accelerometer bias {name} of {track.flight}", 6 + number, 1.0, SIZE["accelerometer_bias"])
+        column(
+            f"accelerometer bias {name} of {track.flight}",
+            6 + number,
+            1.0,
+            SIZE["accelerometer_bias"],
+        )
     for name, axis in zip("xyz", np.eye(3), strict=True):
         column(f"IMU tilt {name}", RATES, -np.cross(axis, rates - rates[0]), SIZE["imu_tilt"])
         column(f"IMU tilt {name}", FORCE, -np.cross(axis, force), SIZE["imu_tilt"])
@@ -62,10 +73,16 @@ def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> dict[str
         column(name, axes, -np.cumsum(rates, 0)[:, axes] * track.dt, SIZE["damping"])
     for axis, name in enumerate("xy"):
         column(
-            f"level of the world {name}", 3 + axis, GRAVITY * track.dt * np.arange(rows), SIZE["world_level"]
+            f"level of the world {name}",
+            3 + axis,
+            GRAVITY * track.dt * np.arange(rows),
+            SIZE["world_level"],
         )
     column(
-        "accelerometer's low-pass", FORCE, -np.gradient(force, track.dt, axis=0), SIZE["accelerometer_lag"]
+        "accelerometer's low-pass",
+        FORCE,
+        -np.gradient(force, track.dt, axis=0),
+        SIZE["accelerometer_lag"],
     )
     spinning = np.gradient(nominal[:, RATES], track.dt, axis=0)
     column("gyroscope's low-pass", RATES, -(spinning - spinning[0]), SIZE["gyroscope_lag"])
@@ -76,8 +93,12 @@ def _sensor_nuisances(track: Track, path: Path, nominal: np.ndarray) -> dict[str
     return columns
 
 
-def _late_torques(name: str, track: Track, acceleration: np.ndarray, delays) -> dict[str, np.ndarray]:
-    """Columns (T, 9) of angular accelerations by roll and pitch, yaw, at some delays: a filter of any shape."""
+def _late_torques(
+    name: str, track: Track, acceleration: np.ndarray, delays
+) -> dict[str, np.ndarray]:
+    """Columns (T, 9) of angular accelerations by roll and pitch, yaw, at some delays: a filter of
+    any shape.
+    """
     columns = {}
     for rows in delays:
         late = np.concatenate([np.zeros((rows, 3)), acceleration[: len(acceleration) - rows]])

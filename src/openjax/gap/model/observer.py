@@ -1,10 +1,12 @@
 """The nominal vehicle flown along a log: what the firmware did inside each row.
 
-A row of a log holds the mean of the motor commands over 10 ms (or the first of them), in which the 500 Hz rate loop ran
-five times: a jump of the command kicks the motors, and they are back before the next row. The observer runs that loop: the
-nominal rate controller on body rates that the logged motors drive and the gyroscope corrects after every row. It gives the
-motor command of every tick, which the physics needs, and the one that the controller would have sent, which shows whether
-the controller is the assumed one."""
+A row of a log holds the mean of the motor commands over 10 ms (or the first of them), in which the
+500 Hz rate loop ran five times: a jump of the command kicks the motors, and they are back before
+the next row. The observer runs that loop: the nominal rate controller on body rates that the logged
+motors drive and the gyroscope corrects after every row. It gives the motor command of every tick,
+which the physics needs, and the one that the controller would have sent, which shows whether the
+controller is the assumed one.
+"""
 
 from functools import partial
 
@@ -16,15 +18,18 @@ from openjax.vehicle.rate_controller import rate_controller
 from openjax.vehicle.rotors import rotor_reaction, rotor_speed_step, rotor_thrust, total_wrench
 
 TICKS = 5  # of the rate loop per row
-GYRO_GAIN = 0.3  # share of a gyro innovation that corrects the observer, near the optimum for usual noise
-FOLLOWED = (
-    0.2  # share of what single samples of the motors miss that corrects the next ones: their noise stays out
+GYRO_GAIN = (
+    0.3  # share of a gyro innovation that corrects the observer, near the optimum for usual noise
 )
+# share of what single samples of the motors miss that corrects the next ones: their noise stays out
+FOLLOWED = 0.2
 
 
 def _ticking(controller, vehicle, h):
-    """The tick of `h` s: (rates, previous, integral, speed), command, offset of the motors and angular acceleration beyond the
-    nominal -> the same, what the controller wanted and what the motors got."""
+    """The tick of `h` s: (rates, previous, integral, speed), command, offset of the motors and
+    angular acceleration beyond the nominal -> the same, what the controller wanted and what the
+    motors got.
+    """
     at_rest = jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0])
 
     def tick(state, command, offset, push):
@@ -33,7 +38,9 @@ def _ticking(controller, vehicle, h):
         wanted, integral = rate_controller(controller, drone, command, h)
         given = jnp.clip(wanted + offset, 0.0, 1.0)
         speed = rotor_speed_step(vehicle, speed, given, h)
-        _, torque = total_wrench(vehicle, rotor_thrust(vehicle, speed), rotor_reaction(vehicle, speed))
+        _, torque = total_wrench(
+            vehicle, rotor_thrust(vehicle, speed), rotor_reaction(vehicle, speed)
+        )
         gyroscopic = jnp.cross(rates, vehicle.inertia * rates)
         after = rates + h * ((torque - gyroscopic) / vehicle.inertia + push)
         return (after, rates, integral, speed), (wanted, given)
@@ -43,13 +50,16 @@ def _ticking(controller, vehicle, h):
 
 @partial(jax.jit, static_argnames="at_once")
 def observe(controller, vehicle, command, motor, gyro, disturbance, dt, at_once=False):
-    """One track: `controller` is the vehicle with its gains; command (T, TICKS, 4), motor (T, 4), gyro (T, 3) rad/s,
-    disturbance (T, 3) rad/s^2 of angular acceleration beyond the nominal; dt () s per row.
+    """One track: `controller` is the vehicle with its gains; command (T, TICKS, 4), motor (T, 4),
+    gyro (T, 3) rad/s, disturbance (T, 3) rad/s^2 of angular acceleration beyond the nominal; dt ()
+    s per row.
 
     `at_once`: a row's motor is its first tick's, not the mean.
 
-    Returns the controller's motor command as it would be logged (T, 4), the motor commands of the ticks (T, TICKS, 4) that
-    suit the log, and the rates at the end of each row as predicted (T, 3)."""
+    Returns the controller's motor command as it would be logged (T, 4), the motor commands of the
+    ticks (T, TICKS, 4) that suit the log, and the rates at the end of each row as predicted (T,
+    3).
+    """
     tick = _ticking(controller, vehicle, dt / TICKS)
 
     def ticks(state, command, offset, push):
@@ -65,10 +75,12 @@ def observe(controller, vehicle, command, motor, gyro, disturbance, dt, at_once=
         else:
             _, (wanted, _) = ticks(state, command, jnp.zeros(4), push)
             wanted = wanted.mean(0)
-            # The second pass follows the motors as logged: the controller's pattern in the row, the log's mean.
+            # The second pass follows the motors as logged: the controller's pattern in the row, the
+            # log's mean.
             (rates, previous, *rest), (again, sent) = ticks(state, command, logged - wanted, push)
             wanted = again.mean(0)
-            # The log's mean, within a motor's limits: what a limit cuts off one tick, the others must have had.
+            # The log's mean, within a motor's limits: what a limit cuts off one tick, the others
+            # must have had.
             for _ in range(3):
                 sent = jnp.clip(sent + (logged - sent.mean(0)), 0.0, 1.0)
         step = GYRO_GAIN * (gyro_next - rates)
@@ -82,13 +94,17 @@ def observe(controller, vehicle, command, motor, gyro, disturbance, dt, at_once=
 
 @jax.jit
 def commanded(vehicle, command, dt):
-    """Mean motor commands (T, 4) and body rates (T, 3) amid the rows that the body-rate commands (T, 4) alone cause:
-    the nominal loop around the nominal vehicle, without gyroscope noise and air."""
+    """Mean motor commands (T, 4) and body rates (T, 3) amid the rows that the body-rate commands
+    (T, 4) alone cause: the nominal loop around the nominal vehicle, without gyroscope noise and
+    air.
+    """
     tick = _ticking(vehicle, vehicle, dt / TICKS)
 
     def row(carry, command):
         start = carry[0]
-        carry, (_, given) = jax.lax.scan(lambda c, _: tick(c, command, 0.0, 0.0), carry, None, length=TICKS)
+        carry, (_, given) = jax.lax.scan(
+            lambda c, _: tick(c, command, 0.0, 0.0), carry, None, length=TICKS
+        )
         return carry, (given.mean(0), 0.5 * (start + carry[0]))
 
     speed = vehicle.max_rotor_speed * jnp.sqrt(jnp.clip(jnp.full(4, command[0, 0]), 1e-4, 1.0))

@@ -1,9 +1,10 @@
-"""Forces and torques along a flight: the simulator's own functions on logged states, driven by the logged
-motors.
+"""Forces and torques along a flight: the simulator's own functions on logged states, driven by the
+logged motors.
 
-Nothing is rolled out: at every row the vehicle is where the log says, only the rotor speeds are simulated,
-from the motor commands through the motors' lag. So an error stays where it arises, and one call is a few
-milliseconds."""
+Nothing is rolled out: at every row the vehicle is where the log says, only the rotor speeds are
+simulated, from the motor commands through the motors' lag. So an error stays where it arises, and
+one call is a few milliseconds.
+"""
 
 from functools import lru_cache, partial
 
@@ -13,7 +14,12 @@ import jax.numpy as jnp
 
 from openjax.vehicle import DroneState
 from openjax.vehicle.effects import make_context, resolve
-from openjax.vehicle.effects.composition import added_wrench, change_body, change_motor_command, change_thrust
+from openjax.vehicle.effects.composition import (
+    added_wrench,
+    change_body,
+    change_motor_command,
+    change_thrust,
+)
 from openjax.vehicle.rigid_body import rotate
 from openjax.vehicle.rotors import commanded_rotor_speed, rotor_reaction, rotor_thrust, total_wrench
 
@@ -34,18 +40,21 @@ class Path:
 
 @lru_cache(maxsize=16)
 def compiled_physics(names: tuple[str, ...], parameters: tuple[tuple[str, str], ...]):
-    """The batched physics with the effects `names`: theta (B, P), and of each its vehicle and path (leaves (B, ...)) ->
-    (B, T, 9).
+    """The batched physics with the effects `names`: theta (B, P), and of each its vehicle and path
+    (leaves (B, ...)) -> (B, T, 9).
 
-    `parameters` says which (effect, parameter) each entry of theta is; parameters not named stay without
-    effect. Beyond them stand the propellers' inertia, each a share of the body's about z, and a shift of the motors in time (s,
-    later is positive)."""
+    `parameters` says which (effect, parameter) each entry of theta is; parameters not named stay
+    without effect. Beyond them stand the propellers' inertia, each a share of the body's about z,
+    and a shift of the motors in time (s, later is positive).
+    """
     return jax.jit(jax.vmap(partial(_channels, resolve(names), parameters)))
 
 
 def _channels(effects, parameters, theta, vehicle, path: Path):
     """(T, 9) of one track with parameters theta (P,)."""
-    values = {e.name: {k: jnp.asarray(v, theta.dtype) for k, v in e.none().items()} for e in effects}
+    values = {
+        e.name: {k: jnp.asarray(v, theta.dtype) for k, v in e.none().items()} for e in effects
+    }
     for number, (effect, parameter) in enumerate(parameters):
         values[effect] = {**values[effect], parameter: theta[number]}
     flown = change_body(effects, values, vehicle)
@@ -55,7 +64,14 @@ def _channels(effects, parameters, theta, vehicle, path: Path):
         state = DroneState(position, quaternion, velocity, rates, speed, rates, rates, ())
         return make_context(flown, state, others_position=others, battery_voltage=voltage, dt=step)
 
-    along = (path.position, path.quaternion, path.velocity, path.body_rates, path.voltage, path.others)
+    along = (
+        path.position,
+        path.quaternion,
+        path.velocity,
+        path.body_rates,
+        path.voltage,
+        path.others,
+    )
     still = jax.vmap(context)(*along, jnp.zeros_like(path.motor[:, 0]))
 
     def demanded(commands, around):
@@ -69,7 +85,8 @@ def _channels(effects, parameters, theta, vehicle, path: Path):
     slower = -jnp.expm1(-step / (flown.motor_time_constant * flown.motor_slowdown_ratio))
 
     def row(speed, targets):
-        total, before = 0.0, speed
+        total = 0.0
+        before = speed
         for tick in range(len(targets)):
             target = targets[tick]
             after = speed + (target - speed) * jnp.where(target < speed, slower, faster)
@@ -81,16 +98,19 @@ def _channels(effects, parameters, theta, vehicle, path: Path):
     start = jnp.sqrt(jnp.clip(given[0, 0], 1e-6, None)) * flown.max_rotor_speed
     _, driven = jax.lax.scan(row, start, wanted)
     square, sped_up = (v - theta[-1] * jnp.gradient(v, path.dt, axis=0) for v in driven)
-    speed, spun_up = jnp.sqrt(jnp.maximum(square, 0.0)), theta[-2] * (sped_up @ flown.rotor_spin)
+    speed = jnp.sqrt(jnp.maximum(square, 0.0))
+    spun_up = theta[-2] * (sped_up @ flown.rotor_spin)
 
     def wrench(position, quaternion, velocity, rates, voltage, others, speed, spun_up):
         around = context(position, quaternion, velocity, rates, voltage, others, speed)
-        thrust, reaction = rotor_thrust(flown, speed), rotor_reaction(flown, speed)
+        thrust = rotor_thrust(flown, speed)
+        reaction = rotor_reaction(flown, speed)
         thrust, reaction = change_thrust(effects, values, thrust, reaction, around)
         around = around.replace(thrust=thrust)
         force, torque = total_wrench(flown, thrust, reaction)
         more_force, more_torque = added_wrench(effects, values, around)
-        force, torque = force + more_force, torque + more_torque
+        force = force + more_force
+        torque = torque + more_torque
         angular = (torque - jnp.cross(rates, flown.inertia * rates)) / flown.inertia
         angular = angular.at[2].add(spun_up)  # what speeds a rotor up turns the body
         specific = force / flown.mass

@@ -1,6 +1,9 @@
-"""What a vehicle with given effects does along each track: the physics on logged states, in lanes of one size.
+"""What a vehicle with given effects does along each track: the physics on logged states, in lanes
+of one size.
 
-Channels: body rates (3), velocity (3, world) - both integrated from the first row - and specific force (3, body)."""
+Channels: body rates (3), velocity (3, world) - both integrated from the first row - and specific
+force (3, body).
+"""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,7 +16,9 @@ from openjax.gap.model.library import PHYSICS_EFFECTS, THETA
 from openjax.gap.model.physics import Path, compiled_physics
 from openjax.vehicle.effects.effect import ARENA_CEILING
 
-RATES, VELOCITY, FORCE = slice(0, 3), slice(3, 6), slice(6, 9)
+RATES = slice(0, 3)
+VELOCITY = slice(3, 6)
+FORCE = slice(6, 9)
 BUCKETS = (256, 512, 1024, 2048, 4096, 8192, 16384, 32768)
 LANES = 8  # parameter vectors along tracks that one call of the physics takes
 
@@ -63,8 +68,11 @@ class Physics:
 
 
 def make_physics(tracks, vehicles, motor_ticks) -> Physics:
-    """Physics of tracks with their nominal vehicles and motor commands (T, TICKS, 4) of the rate loop's ticks."""
-    size, neighbours = bucket(max(map(len, tracks))), max(1, *(len(t.neighbours) for t in tracks))
+    """Physics of tracks with their nominal vehicles and motor commands (T, TICKS, 4) of the rate
+    loop's ticks.
+    """
+    size = bucket(max(map(len, tracks)))
+    neighbours = max(1, *(len(t.neighbours) for t in tracks))
     return Physics(
         tuple(tracks),
         tuple(jax.tree.map(np.float32, v) for v in vehicles),
@@ -79,7 +87,9 @@ def _path(track: Track, ticks: np.ndarray, size: int, neighbours: int) -> Path:
         return padded(0.5 * (values + np.concatenate([values[1:], values[-1:]])), size)
 
     unknown = np.zeros((rows, 3))
-    quaternion = track.quaternion if track.quaternion is not None else np.tile([1.0, 0, 0, 0], (rows, 1))
+    quaternion = (
+        track.quaternion if track.quaternion is not None else np.tile([1.0, 0, 0, 0], (rows, 1))
+    )
     quaternion = middle(quaternion)
     quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
     # Without a pose the vehicle is taken to be in mid-air, far from everything.

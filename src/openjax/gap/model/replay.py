@@ -1,6 +1,9 @@
-"""Replay of the motion: what was measured along each track against what the nominal vehicle would have measured.
+"""Replay of the motion: what was measured along each track against what the nominal vehicle would
+have measured.
 
-Residuals are compared through noise models (`whitening`), with the nuisances marginalised per flight."""
+Residuals are compared through noise models (`whitening`), with the nuisances marginalised per
+flight.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,14 @@ from openjax.gap.model.prediction import FORCE, RATES, VELOCITY, Physics, make_p
 from openjax.gap.model.whitening import Noise, first_noise, whiten
 
 # Groups of channels that share a noise model: axes, whether integrated.
-GROUPS = (((0, 1), True), ((2,), True), ((3, 4), True), ((5,), True), ((6, 7), False), ((8,), False))
+GROUPS = (
+    ((0, 1), True),
+    ((2,), True),
+    ((3, 4), True),
+    ((5,), True),
+    ((6, 7), False),
+    ((8,), False),
+)
 FIRST_NOISE = (0.03, 0.03, 0.006, 0.006, 0.25, 0.25)
 MOTORS_LATE = ("clock of the motors", "delay of the motors")
 SKIP = 0.2  # s left out at the start of a track: rotor speeds are not known there
@@ -26,19 +36,24 @@ BLOCK = 1.0  # s that are left out together: gusts and sensors forget within les
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """All tracks of a case under one nominal vehicle each, and their noise. What noise models make of the nuisances is
-    worked out once."""
+    """All tracks of a case under one nominal vehicle each, and their noise. What noise models make
+    of the nuisances is worked out once.
+    """
 
     physics: Physics
     measured: list[np.ndarray]  # (T, 9)
     nominal: list[np.ndarray]  # (T, 9)
     nuisances: list[np.ndarray]  # (N, T, 9), in units of their standard deviations
     nuisance_names: tuple[str, ...]
-    sizes: list[np.ndarray]  # usual ones of each track's numbers, propellers, motors' clock and delay
+    sizes: list[
+        np.ndarray
+    ]  # usual ones of each track's numbers, propellers, motors' clock and delay
     numbers: tuple  # the vehicle's numbers
     usable: np.ndarray  # (9,) channels that were logged
     noises: tuple[Noise, ...]  # unlogged channels have one, but count nothing
-    loudness: tuple[np.ndarray, ...] | None = None  # (T', 9) of each track, in units of the noise models
+    loudness: tuple[np.ndarray, ...] | None = (
+        None  # (T', 9) of each track, in units of the noise models
+    )
 
     @property
     def tracks(self) -> tuple[Track, ...]:
@@ -78,9 +93,12 @@ class Replay:
         return self.physics.predict(theta)
 
     def around(self, theta: np.ndarray) -> Replay:
-        """With the derivatives of a vehicle that has the effects theta (P,): a wrong moment of inertia scales the torques that
-        are left once an effect is accounted for, not those of motors that hold against it."""
-        places, nuisances = [PLACE[key[:2]] for key in self.numbers] + [len(theta) - 2, len(theta) - 1], []
+        """With the derivatives of a vehicle that has the effects theta (P,): a wrong moment of
+        inertia scales the torques that are left once an effect is accounted for, not those of
+        motors that hold against it.
+        """
+        places = [PLACE[key[:2]] for key in self.numbers] + [len(theta) - 2, len(theta) - 1]
+        nuisances = []
         moved = (column[1:] for column in self.linearised(theta, places))
         for m, old, size in zip(moved, self.nuisances, self.sizes, strict=True):
             own = np.concatenate([m, m[-1:]]) * size[:, None, None]
@@ -88,17 +106,22 @@ class Replay:
         return replace(self, nuisances=nuisances)
 
     def whiten(self, x: np.ndarray, track: int) -> np.ndarray:
-        """x (..., T, 9) of a track -> (..., T', 9) in units of the noise, without the first moments."""
+        """x (..., T, 9) of a track -> (..., T', 9) in units of the noise, without the first
+        moments.
+        """
         out = whiten(self.noises, x)
         out *= self.usable
         out = out[..., int(SKIP / self.tracks[track].dt) :, :]
         return out if self.loudness is None else out / self.loudness[track]
 
     def grams(self, columns: list[np.ndarray]) -> np.ndarray:
-        """Inner products (F, C, C) per flight of columns [(C, T, 9) per track], nuisances marginalised."""
+        """Inner products (F, C, C) per flight of columns [(C, T, 9) per track], nuisances
+        marginalised.
+        """
         total = np.zeros((len(self.flights), len(columns[0]), len(columns[0])))
         for number, column in enumerate(columns):
-            w, n = self.whiten(column, number).reshape(len(column), -1), self.whitened_nuisances[number]
+            w = self.whiten(column, number).reshape(len(column), -1)
+            n = self.whitened_nuisances[number]
             cross = n.reshape(len(n), -1) @ w.T
             taken = solve_triangular(self._roots[number], cross, lower=True, check_finite=False)
             total[self.flight_of[number]] += w @ w.T - taken.T @ taken
@@ -106,14 +129,18 @@ class Replay:
 
     def taken(self, residual: np.ndarray, track: int) -> np.ndarray:
         """(N,) the nuisances' most likely sizes, given a residual (T, 9) of a track."""
-        gram, n = self.nuisance_grams[track], self.whitened_nuisances[track]
+        gram = self.nuisance_grams[track]
+        n = self.whitened_nuisances[track]
         return np.linalg.solve(
             np.eye(len(gram)) + gram, n.reshape(len(n), -1) @ self.whiten(residual, track).ravel()
         )
 
     def linearised(self, theta: np.ndarray, index: np.ndarray) -> list[np.ndarray]:
-        """Residual and derivatives (1 + p, T, 9) of each track at theta (P,) with respect to theta[index]."""
-        count, steps = len(index), STEP[np.asarray(index, int)]
+        """Residual and derivatives (1 + p, T, 9) of each track at theta (P,) with respect to
+        theta[index].
+        """
+        count = len(index)
+        steps = STEP[np.asarray(index, int)]
         batch = np.repeat(theta[None], count + 1, 0)
         batch[np.arange(count) + 1, index] += steps
         return [
@@ -122,12 +149,15 @@ class Replay:
         ]
 
 
-def make_replay(tracks, vehicles, motor_ticks, feedback, numbers, one_clock=True, at_once=False) -> Replay:
-    """Replay of tracks with their nominal vehicles and motor commands (T, TICKS, 4) of the rate loop's ticks. `feedback` of
-    each track: what it made of the motors may be anything in strength and lag. `at_once`: motor commands are single
-    samples, whose quick part and time within a row aren't known. Without `one_clock`
-    the IMU's stream and the motors' are apart by unknown times: the IMU counts nothing, and the motors may be off by
-    tens of milliseconds."""
+def make_replay(
+    tracks, vehicles, motor_ticks, feedback, numbers, one_clock=True, at_once=False
+) -> Replay:
+    """Replay of tracks with their nominal vehicles and motor commands (T, TICKS, 4) of the rate
+    loop's ticks. `feedback` of each track: what it made of the motors may be anything in strength
+    and lag. `at_once`: motor commands are single samples, whose quick part and time within a row
+    aren't known. Without `one_clock` the IMU's stream and the motors' are apart by unknown times:
+    the IMU counts nothing, and the motors may be off by tens of milliseconds.
+    """
     usable = np.ones(9)
     if any(t.velocity is None for t in tracks):
         usable[VELOCITY] = 0.0
@@ -136,7 +166,9 @@ def make_replay(tracks, vehicles, motor_ticks, feedback, numbers, one_clock=True
     if not one_clock and usable[3]:
         usable[RATES] = usable[FORCE] = 0.0
     if usable[3:].any() and not all(t.motors_logged for t in tracks):
-        usable[RATES] = 0.0  # motors made from commands tell the thrust, not how a real loop shares it out
+        usable[RATES] = (
+            0.0  # motors made from commands tell the thrust, not how a real loop shares it out
+        )
     physics = make_physics(tracks, vehicles, motor_ticks)
     nominal = [p[0] for p in physics.predict(ABSENT[None])]
     named = [
@@ -145,9 +177,12 @@ def make_replay(tracks, vehicles, motor_ticks, feedback, numbers, one_clock=True
     ]
     names = tuple(dict.fromkeys(name for columns in named for name in columns))
     moving = (*(" ".join(key[:2]) for key in numbers), "propellers' inertia", *MOTORS_LATE)
-    own, apart = [key[2] for key in numbers], SIZE["motor_clock" if one_clock else "streams_apart"]
+    own = [key[2] for key in numbers]
+    apart = SIZE["motor_clock" if one_clock else "streams_apart"]
     sizes = [
-        np.array([*own, SIZE["propeller"], max(apart, t.dt / 4 if at_once else 0.0), SIZE["motor_delay"]])
+        np.array(
+            [*own, SIZE["propeller"], max(apart, t.dt / 4 if at_once else 0.0), SIZE["motor_delay"]]
+        )
         for t in tracks
     ]
     replay = Replay(
@@ -169,8 +204,10 @@ def make_replay(tracks, vehicles, motor_ticks, feedback, numbers, one_clock=True
 
 
 def _balanced(nuisances: np.ndarray, count: int) -> np.ndarray:
-    """Nuisances (N, T, 9), the first `count` of them without their mean torque: as long as it isn't known what acts, motors that
-    pull one way all the time hold against something, and of a sum of torques that is zero no number can be wrong."""
+    """Nuisances (N, T, 9), the first `count` of them without their mean torque: as long as it isn't
+    known what acts, motors that pull one way all the time hold against something, and of a sum of
+    torques that is zero no number can be wrong.
+    """
     out = nuisances.copy()
     out[:count, :, RATES] -= np.linspace(0.0, 1.0, out.shape[1])[:, None] * out[:count, -1:, RATES]
     return out

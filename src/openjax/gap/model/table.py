@@ -1,12 +1,16 @@
-"""Everything that a set of effects could still become, as small matrices: the case linearised around a fitted set.
+"""Everything that a set of effects could still become, as small matrices: the case linearised
+around a fitted set.
 
-A table holds, for every second of flight, inner products of all columns that a decision may combine - what is left,
-its derivatives with respect to every parameter, what each further effect would do as it was fitted alone, what each
-effect of the set does, and the nuisances - once whitened (likelihood) and once as errors of short predictions (gap). So
-adding, dropping and swapping effects on stretches left out costs nothing but linear algebra.
+A table holds, for every second of flight, inner products of all columns that a decision may combine
+- what is left, its derivatives with respect to every parameter, what each further effect would do
+as it was fitted alone, what each effect of the set does, and the nuisances - once whitened
+(likelihood) and once as errors of short predictions (gap). So adding, dropping and swapping effects
+on stretches left out costs nothing but linear algebra.
 
-Nuisances of the vehicle and its sensors are shared by all flights of the case and bounded: each stays within twice its usual
-size, and one that ends there is a finding. How strong feedback is depends on what the vehicle does, block by block."""
+Nuisances of the vehicle and its sensors are shared by all flights of the case and bounded: each
+stays within twice its usual size, and one that ends there is a finding. How strong feedback is
+depends on what the vehicle does, block by block.
+"""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,16 +22,19 @@ from openjax.gap.model.hypotheses import SetFit
 from openjax.gap.model.library import ABSENT, CARDS, places, prior
 from openjax.gap.model.replay import FORCE, SKIP, block_count
 
-# s of the predictions whose errors are the gap; "acceleration" is the velocity that the accelerometer says
+# s of the predictions whose errors are the gap; "acceleration" is the velocity that the
+# accelerometer says
 HORIZONS = {"rates": 0.05, "velocity": 0.25, "acceleration": 0.25}
 ERRORS = tuple(f"{kind} {axis}" for kind in HORIZONS for axis in "xyz")
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """`white` (B, C, C) and `error` (B, logged of ERRORS, C, C) by block; `rows` (B,) that count; `track_of` (B,). Columns: 0 is
-    what is left; `derivative` {place: column}; `step` {effect: column}; `part` {effect: column}; the last are nuisances, of
-    which `shared` (N,) are the case's and the others a block's."""
+    """`white` (B, C, C) and `error` (B, logged of ERRORS, C, C) by block; `rows` (B,) that count;
+    `track_of` (B,). Columns: 0 is what is left; `derivative` {place: column}; `step` {effect:
+    column}; `part` {effect: column}; the last are nuisances, of which `shared` (N,) are the case's
+    and the others a block's.
+    """
 
     fit: SetFit
     white: np.ndarray
@@ -67,8 +74,9 @@ class Table:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """One combination of a table's columns: column 0 and `parts` are there, the coefficients of `free` are fitted, with
-    prior `mean` and `precision`."""
+    """One combination of a table's columns: column 0 and `parts` are there, the coefficients of
+    `free` are fitted, with prior `mean` and `precision`.
+    """
 
     parts: tuple[int, ...]
     free: np.ndarray
@@ -77,24 +85,37 @@ class Model:
 
 
 def build(fit: SetFit, singles: dict[str, SetFit] | None) -> Table:
-    """The table around a fitted set; `singles` {effect: its fit alone} are the effects that may come in; None: nothing may
-    come in or go."""
-    replay, own = fit.replay, fit.effects if singles is not None else ()
+    """The table around a fitted set; `singles` {effect: its fit alone} are the effects that may
+    come in; None: nothing may come in or go.
+    """
+    replay = fit.replay
+    own = fit.effects if singles is not None else ()
     others = [e for e in singles or () if e not in own]
     index = np.concatenate([fit.index, places(others)])
     points = []
     for effect in (*others, *own):
-        point, at = fit.theta.copy(), places((effect,))
+        point = fit.theta.copy()
+        at = places((effect,))
         point[at] = ABSENT[at] if effect in own else singles[effect].theta[at]
         points.append(point)
     columns = fit.columns if singles is None else replay.linearised(fit.theta, index)
-    moved = replay.predict(np.array(points)) if points else [np.zeros((0, *y.shape)) for y in replay.measured]
-    white, error, rows, track_of, whole = [], [], [], [], []
+    moved = (
+        replay.predict(np.array(points))
+        if points
+        else [np.zeros((0, *y.shape)) for y in replay.measured]
+    )
+    white = []
+    error = []
+    rows = []
+    track_of = []
+    whole = []
     for number, (c, m, track) in enumerate(zip(columns, moved, replay.tracks, strict=True)):
         now = replay.measured[number] - c[0]
         nuisances = replay.nuisances[number]
         x = np.concatenate([c, m[: len(others)] - now, now - m[len(others) :], nuisances])
-        w = np.concatenate([replay.whiten(x[: -len(nuisances)], number), replay.whitened_nuisances[number]])
+        w = np.concatenate(
+            [replay.whiten(x[: -len(nuisances)], number), replay.whitened_nuisances[number]]
+        )
         count = block_count(w.shape[1], track.dt)
         e = _errors(x, track.dt)[:, max(int(SKIP / track.dt), 25) :, replay.usable > 0]
         for a, b in zip(np.array_split(w, count, 1), np.array_split(e, count, 1), strict=True):
@@ -119,20 +140,25 @@ def _errors(x: np.ndarray, dt: float) -> np.ndarray:
     """Errors (C, T, 9) of predictions over HORIZONS that end at each row."""
     out = np.zeros_like(x)
     for k, horizon in enumerate(HORIZONS.values()):
-        axes, step = slice(3 * k, 3 * k + 3), max(round(horizon / dt), 1)
+        axes = slice(3 * k, 3 * k + 3)
+        step = max(round(horizon / dt), 1)
         whole = np.cumsum(x[..., axes], axis=1) * dt if axes == FORCE else x[..., axes]
         out[:, step:, axes] = whole[:, step:] - whole[:, :-step]
     return out
 
 
 def with_effects(table: Table, add=(), drop=()) -> Model:
-    """The table's set with effects that come in as they were fitted alone (and may move from there) or go."""
+    """The table's set with effects that come in as they were fitted alone (and may move from there)
+    or go.
+    """
     kept = tuple(e for e in table.fit.effects if e not in drop)
     index, mean, precision = prior(kept)
     own = np.array([table.derivative[int(i)] for i in index], int)
     # The set's parameters: coefficients count from where they were fitted.
     mean = mean - table.fit.theta[index] if len(index) else mean
-    free, means, blocks = [own], [mean], [precision]
+    free = [own]
+    means = [mean]
+    blocks = [precision]
     for effect in add:
         if effect in table.step:
             free.append(np.array([table.step[effect]]))
@@ -144,4 +170,6 @@ def with_effects(table: Table, add=(), drop=()) -> Model:
         means.append(np.zeros(len(inside)))
         blocks.append(np.diag(1.0 / spread[inside] ** 2))
     free = np.concatenate(free).astype(int)
-    return Model(tuple(table.part[e] for e in drop), free, np.concatenate(means), block_diag(*blocks))
+    return Model(
+        tuple(table.part[e] for e in drop), free, np.concatenate(means), block_diag(*blocks)
+    )

@@ -1,10 +1,12 @@
-"""Noise models: what turns the residual of a channel into (nearly) independent numbers of unit variance.
+"""Noise models: what turns the residual of a channel into (nearly) independent numbers of unit
+variance.
 
-A residual is sensor noise and gusts. Sensor noise is white; a gust is a force or torque with a memory of
-some time, which integrated channels (rates, velocity, attitude) add up, beside small white steps from what
-the replay leaves out. The innovations of the Kalman filter of this model are white. Everything acts on residuals
-and on their derivatives alike, and causally: in closed loop the motors answer disturbances, so only a residual
-given its own past says something about causes."""
+A residual is sensor noise and gusts. Sensor noise is white; a gust is a force or torque with a
+memory of some time, which integrated channels (rates, velocity, attitude) add up, beside small
+white steps from what the replay leaves out. The innovations of the Kalman filter of this model are
+white. Everything acts on residuals and on their derivatives alike, and causally: in closed loop the
+motors answer disturbances, so only a residual given its own past says something about causes.
+"""
 
 import itertools
 from dataclasses import dataclass
@@ -14,8 +16,8 @@ import numpy as np
 from scipy.linalg import solve_discrete_are
 from scipy.signal import lfilter
 
-# The grid of models: memory of the gust (per row), its rms per row and that of the white steps over sensor
-# noise.
+# The grid of models: memory of the gust (per row), its rms per row and that of the white steps over
+# sensor noise.
 MEMORIES = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.995)
 GUSTS = (0.003, 0.01, 0.02, 0.04, 0.08, 0.15, 0.3, 0.6, 1.5)
 STEPS = (0.0, 0.05, 0.15, 0.4, 1.0)
@@ -23,7 +25,9 @@ STEPS = (0.0, 0.05, 0.15, 0.4, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Noise of one group of axes: whitening filter (numerator, denominator), innovation's deviation."""
+    """Noise of one group of axes: whitening filter (numerator, denominator), innovation's
+    deviation.
+    """
 
     axes: tuple[int, ...]
     numerator: np.ndarray
@@ -36,7 +40,9 @@ class Noise:
 
 
 def whiten(noises, x: np.ndarray) -> np.ndarray:
-    """x (..., T, C) channel by channel, each group of axes, which lie side by side, by its own noise model."""
+    """x (..., T, C) channel by channel, each group of axes, which lie side by side, by its own
+    noise model.
+    """
     out = np.empty_like(x)
     for noise in noises:
         axes = slice(noise.axes[0], noise.axes[-1] + 1)
@@ -46,7 +52,9 @@ def whiten(noises, x: np.ndarray) -> np.ndarray:
 
 def first_noise(axes, integrated: bool, deviation: float) -> Noise:
     """A noise model to begin with: sensor noise and some white steps."""
-    return Noise(tuple(axes), *_kalman(0.9, 0.04, 0.15 if integrated else 0.0, integrated), deviation)
+    return Noise(
+        tuple(axes), *_kalman(0.9, 0.04, 0.15 if integrated else 0.0, integrated), deviation
+    )
 
 
 def fit_noise(axes, residuals, integrated: bool, skip: int = 20) -> Noise:
@@ -56,13 +64,21 @@ def fit_noise(axes, residuals, integrated: bool, skip: int = 20) -> Noise:
     axes = tuple(axes)
     chosen = _choose([r[skip:, list(axes)] for r in residuals], integrated)
     numerator, denominator = _kalman(*chosen, integrated)
-    white = [lfilter(numerator, denominator, r[:, list(axes)], axis=0)[skip:].ravel() for r in residuals]
-    return Noise(axes, numerator, denominator, float(np.sqrt(np.mean(np.concatenate(white) ** 2))) + 1e-9)
+    white = [
+        lfilter(numerator, denominator, r[:, list(axes)], axis=0)[skip:].ravel() for r in residuals
+    ]
+    return Noise(
+        axes, numerator, denominator, float(np.sqrt(np.mean(np.concatenate(white) ** 2))) + 1e-9
+    )
 
 
 def _choose(parts, integrated: bool) -> tuple[float, float, float]:
-    """The grid's (memory, gust, step) with the largest Whittle likelihood, its scale profiled out."""
-    log_part, ratio_part, count = 0.0, 0.0, 0
+    """The grid's (memory, gust, step) with the largest Whittle likelihood, its scale profiled
+    out.
+    """
+    log_part = 0.0
+    ratio_part = 0.0
+    count = 0
     for part in parts:
         z = np.diff(part, axis=0) if integrated else part
         taper = np.hanning(len(z))[:, None]
@@ -95,14 +111,21 @@ def _spectra(rows: int, integrated: bool) -> tuple[np.ndarray, np.ndarray]:
 
 
 @lru_cache(maxsize=1024)
-def _kalman(memory: float, gust: float, step: float, integrated: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Innovation filter (numerator, denominator) of the stationary Kalman filter with unit sensor noise."""
+def _kalman(
+    memory: float, gust: float, step: float, integrated: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """Innovation filter (numerator, denominator) of the stationary Kalman filter with unit sensor
+    noise.
+    """
     drive = gust**2 * (1 - memory**2)
     if integrated:
-        a, q = np.array([[1.0, 1.0], [0.0, memory]]), np.diag([step**2 + 1e-9, drive])
+        a = np.array([[1.0, 1.0], [0.0, memory]])
+        q = np.diag([step**2 + 1e-9, drive])
         c = np.array([[1.0, 0.0]])
     else:
-        a, q, c = np.array([[memory]]), np.array([[drive + 1e-9]]), np.array([[1.0]])
+        a = np.array([[memory]])
+        q = np.array([[drive + 1e-9]])
+        c = np.array([[1.0]])
     variance = solve_discrete_are(a.T, c.T, q, np.eye(1))
     gain = a @ variance @ c.T / (c @ variance @ c.T + 1.0)
     return np.poly(a), np.poly(a - gain @ c)

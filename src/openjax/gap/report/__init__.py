@@ -21,8 +21,9 @@ VERDICTS = {
 
 @dataclass(frozen=True)
 class Estimate:
-    """A fitted parameter with its 90 % interval, in `unit`; `usual` is the prior range; `may_be_none`: the interval holds the
-    value at which the effect does nothing."""
+    """A fitted parameter with its 90 % interval, in `unit`; `usual` is the prior range;
+    `may_be_none`: the interval holds the value at which the effect does nothing.
+    """
 
     value: float
     unit: str
@@ -31,7 +32,9 @@ class Estimate:
     may_be_none: bool = False
 
     def in_words(self, name: str) -> str:
-        """The value of the parameter `name` with its interval and unit, and whether it is unusual."""
+        """The value of the parameter `name` with its interval and unit, and whether it is
+        unusual.
+        """
         low, high = self.interval90
         value = f"{name} = {self.value:.4g} [{low:.4g}, {high:.4g}] {self.unit}".removesuffix(" 1")
         return value + " (unusual)" * self.unusual
@@ -43,8 +46,10 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """What the flights of one case say. `parameters` {effect: {parameter: Estimate}}; `nuisances` {name:
-    text} says what they took; `plots` holds arrays for the pictures and isn't part of the JSON."""
+    """What the flights of one case say. `parameters` {effect: {parameter: Estimate}}; `nuisances`
+    {name: text} says what they took; `plots` holds arrays for the pictures and isn't part of the
+    JSON.
+    """
 
     case: str
     verdict: str
@@ -99,7 +104,9 @@ class Report:
             for e, found in self.parameters.items()
         }
         found = {
-            f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("case", "plots", "seconds")
+            f.name: getattr(self, f.name)
+            for f in fields(self)
+            if f.name not in ("case", "plots", "seconds")
         }
         return _plain(found | {"shares": shares, "parameters": estimates})
 
@@ -108,10 +115,13 @@ class Report:
         return " or ".join([effect, *self.equivalent.get(effect, ())])
 
     def shares_in_words(self) -> str:
-        """Every named class' share with its interval, then sensors and clocks, then what is unexplained."""
+        """Every named class' share with its interval, then sensors and clocks, then what is
+        unexplained.
+        """
         named = [(self.class_of(e), self.shares.effects[e]) for e in self.named]
         parts = ", ".join(
-            f"{e} {_short(v.value)} [{_short(v.interval90[0])}, {_short(v.interval90[1])}]" for e, v in named
+            f"{e} {_short(v.value)} [{_short(v.interval90[0])}, {_short(v.interval90[1])}]"
+            for e, v in named
         )
         rest = f"sensors and clocks {_short(self.shares.sensors.value)}; unexplained {_short(self.shares.unexplained.value)}"
         return f"Shares of the gap: {parts}; {rest}." if parts else f"Shares of the gap: {rest}."
@@ -119,7 +129,9 @@ class Report:
     def in_words(self) -> list[str]:
         """The shares, then what they mean, in a few plain sentences."""
         sure = self.probabilities.get(self.verdict)
-        verdict = VERDICTS.get(self.verdict, "") + (f" Probability {sure:.2f}." if sure is not None else "")
+        verdict = VERDICTS.get(self.verdict, "") + (
+            f" Probability {sure:.2f}." if sure is not None else ""
+        )
         lines = [
             *(f"Left out: {text}." for text in self.left_out),
             self.shares_in_words() if self.effects or self.sensors else "",
@@ -132,7 +144,8 @@ class Report:
                 for e, of in self.parameters.items()
             ),
             *(
-                f"Flights disagree about {e}: it may be none at all. Were they of one vehicle, and alike?"
+                f"Flights disagree about {e}: it may be none at all. Were they of one vehicle, and "
+                "alike?"
                 for e, of in self.parameters.items()
                 if all(v.may_be_none for v in of.values())
             ),
@@ -142,7 +155,9 @@ class Report:
             ),
             self.gap.in_words() if self.parameters else "",
             f"Runner-up: {self.runner_up}." if self.runner_up else "",
-            f"Not testable with these flights: {', '.join(self.not_testable)}." if self.not_testable else "",
+            f"Not testable with these flights: {', '.join(self.not_testable)}."
+            if self.not_testable
+            else "",
             f"Fly next: {self.next_flight}" if self.next_flight else "",
         ]
         return [line for line in lines if line]
@@ -164,27 +179,38 @@ def _short(value: float) -> str:
 
 
 def to_fly(report: Report) -> tuple[dict, dict]:
-    """Values and 90 % intervals by effect and parameter for a simulator that knows no voltage: the battery and what
-    depends on it are as in the flights, at their median."""
+    """Values and 90 % intervals by effect and parameter for a simulator that knows no voltage: the
+    battery and what depends on it are as in the flights, at their median.
+    """
     values = {e: {p: v.value for p, v in found.items()} for e, found in report.parameters.items()}
-    intervals = {e: {p: v.interval90 for p, v in found.items()} for e, found in report.parameters.items()}
+    intervals = {
+        e: {p: v.interval90 for p, v in found.items()} for e, found in report.parameters.items()
+    }
     # What wasn't fitted keeps the value at which it does nothing.
     values = {e: EFFECTS[e].none() | found for e, found in values.items()}
     evidence = report.plots.get("evidence")
-    logged = [t.voltage for t in evidence.tracks if t.voltage is not None] if evidence is not None else []
+    logged = (
+        [t.voltage for t in evidence.tracks if t.voltage is not None]
+        if evidence is not None
+        else []
+    )
     if not logged:
         return values, intervals
     voltage = float(np.median(np.concatenate(logged)))
     for effect, found in values.items():
         if CARDS[effect].at_voltage is not None:
-            values[effect], intervals[effect] = CARDS[effect].at_voltage(found, intervals[effect], voltage)
+            values[effect], intervals[effect] = CARDS[effect].at_voltage(
+                found, intervals[effect], voltage
+            )
     return values, intervals
 
 
 def write_report(report: Report, folder: Path, pictures: bool = True) -> None:
     """Write `report.json`, `effects.toml` and (with `pictures`) `report.html` into an existing
     folder."""
-    (folder / "report.json").write_text(json.dumps(report.to_dict(), indent=1) + "\n", encoding="utf-8")
+    (folder / "report.json").write_text(
+        json.dumps(report.to_dict(), indent=1) + "\n", encoding="utf-8"
+    )
     values, intervals = to_fly(report)
     save_effects(folder / "effects.toml", values, intervals, notes=" ".join(report.in_words()[:2]))
     if pictures:

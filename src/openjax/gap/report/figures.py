@@ -19,7 +19,9 @@ BINS = 15
 
 
 def figures(report: Report) -> list[tuple[str, str, str]]:
-    """(title, what it shows, SVG) of every figure that the report's arrays allow; a gap only where there is one."""
+    """(title, what it shows, SVG) of every figure that the report's arrays allow; a gap only where
+    there is one.
+    """
     if not report.plots:
         return []
     with rc_context(STYLE):
@@ -29,11 +31,15 @@ def figures(report: Report) -> list[tuple[str, str, str]]:
 
 def _residuals(report: Report) -> tuple[list, list]:
     """Residuals of each track of the nominal simulator, and with the named effects."""
-    return residuals_of(report.plots["evidence"].motion.nothing), residuals_of(report.plots["selection"].fit)
+    return residuals_of(report.plots["evidence"].motion.nothing), residuals_of(
+        report.plots["selection"].fit
+    )
 
 
 def _places(report: Report):
-    """The parts of the flights that hold most of the gap: error before and after, in units of the noise."""
+    """The parts of the flights that hold most of the gap: error before and after, in units of the
+    noise.
+    """
     places = [place for place in report.where if place.share > 0.01][:8][::-1]
     if not report.effects or not places:
         return None
@@ -49,11 +55,17 @@ def _places(report: Report):
     axes.set_yticks(rows, [f"{p.channel}, {p.regime}".replace("_", " ") for p in places])
     axes.set(xlabel="error, in units of the noise", xlim=(0, None), ylim=(-0.6, len(places) - 0.4))
     add_legend(axes)
-    return "Where the gap lies", f"Forces and torques, averaged over {CALM} s, by part of the flight.", figure
+    return (
+        "Where the gap lies",
+        f"Forces and torques, averaged over {CALM} s, by part of the flight.",
+        figure,
+    )
 
 
 def _worst(report: Report) -> tuple:
-    """(track, its residuals before and after, axis): where the nominal simulator errs most, against what is left."""
+    """(track, its residuals before and after, axis): where the nominal simulator errs most, against
+    what is left.
+    """
     evidence = report.plots["evidence"]
     axes = (*range(3), *range(3, 6)) if evidence.replay.usable[3] else range(3)
     before, after = _residuals(report)
@@ -63,7 +75,9 @@ def _worst(report: Report) -> tuple:
         errors = [np.std(r[number][step:, axis] - r[number][:-step, axis]) for r in (before, after)]
         return errors[0] / errors[1]
 
-    number, axis = max(((n, a) for n in range(len(before)) for a in axes), key=lambda place: ratio(*place))
+    number, axis = max(
+        ((n, a) for n in range(len(before)) for a in axes), key=lambda place: ratio(*place)
+    )
     return evidence.tracks[number], before[number], after[number], axis
 
 
@@ -87,13 +101,23 @@ def _course(report: Report):
     for residual, colour, label in _lines(report, before, after):
         error = residual[step:, axis] - residual[:-step, axis]
         axes.plot(time, error, color=colour, linewidth=1.1, label=label)
-    axes.set(xlabel="time in the flight [s]", ylabel=f"error of {name} [{unit}]", xlim=(time[0], time[-1]))
+    axes.set(
+        xlabel="time in the flight [s]",
+        ylabel=f"error of {name} [{unit}]",
+        xlim=(time[0], time[-1]),
+    )
     add_legend(axes)
-    return "One flight", f"{track.name}: error of predictions {HORIZONS['velocity']} s ahead.", figure
+    return (
+        "One flight",
+        f"{track.name}: error of predictions {HORIZONS['velocity']} s ahead.",
+        figure,
+    )
 
 
 def _lines(report: Report, before, after) -> Sequence[tuple]:
-    """(residual, colour, label): the nominal simulator, and the corrected one where effects were named."""
+    """(residual, colour, label): the nominal simulator, and the corrected one where effects were
+    named.
+    """
     if not report.parameters:
         return ((before, AFTER if report.verdict == "none" else BEFORE, "nominal simulator"),)
     return (before, BEFORE, "nominal simulator"), (after, AFTER, "with the named effects")
@@ -109,41 +133,65 @@ def _horizons(report: Report):
     for residual, colour, label in _lines(report, before, after):
         errors = [np.std(residual[r:, axis] - residual[:-r, axis]) for r in rows]
         most = max(most, *errors)
-        axes.semilogx([r * track.dt for r in rows], errors, "o-", color=colour, markersize=5, label=label)
+        axes.semilogx(
+            [r * track.dt for r in rows], errors, "o-", color=colour, markersize=5, label=label
+        )
     axes.set(xlabel="time ahead [s]", ylabel=f"rms error of {name} [{unit}]", ylim=(0, 1.1 * most))
     axes.set_xticks(HORIZONS_SHOWN, [f"{horizon:g}" for horizon in HORIZONS_SHOWN])
     axes.minorticks_off()
     add_legend(axes)
-    return "How far ahead", f"{track.name}: the error grows with the time that is predicted.", figure
+    return (
+        "How far ahead",
+        f"{track.name}: the error grows with the time that is predicted.",
+        figure,
+    )
 
 
 def _coordinate(report: Report):
-    """What the nominal simulator misses, against the variable that the first named effect follows."""
-    evidence, named = report.plots["evidence"], report.named
+    """What the nominal simulator misses, against the variable that the first named effect
+    follows.
+    """
+    evidence = report.plots["evidence"]
+    named = report.named
     if not named or not evidence.replay.usable[3] or evidence.tracks[0].quaternion is None:
         return None
     coordinate = CARDS[named[0]].coordinate
     if not coordinate:  # its force follows none, or it makes torques or delays
         return None
     figure, axes = small_figure(2.6)
-    for residuals, (_, colour, label) in zip(_residuals(report), _lines(report, None, None), strict=False):
+    for residuals, (_, colour, label) in zip(
+        _residuals(report), _lines(report, None, None), strict=False
+    ):
         both = zip(evidence.tracks, residuals, strict=True)
         pairs = [p for p in (_pairs(*of, coordinate) for of in both) if p is not None]
         if not pairs:
             return None
         axes.plot(*_binned(np.concatenate(pairs)).T, "o-", color=colour, markersize=5, label=label)
-    units = {"body velocity": "forward speed [m/s]", "voltage": "voltage [V]", "thrust": "mean motor command"}
+    units = {
+        "body velocity": "forward speed [m/s]",
+        "voltage": "voltage [V]",
+        "thrust": "mean motor command",
+    }
     axes.axhline(0.0, color=GREY, linestyle=":", linewidth=1.2)
-    axes.set(xlabel=units.get(coordinate, f"{coordinate} [m]"), ylabel="missing acceleration [m/s²]")
+    axes.set(
+        xlabel=units.get(coordinate, f"{coordinate} [m]"), ylabel="missing acceleration [m/s²]"
+    )
     add_legend(axes)
-    return "The strongest effect", f"{named[0]}: what the simulator misses, against what drives it.", figure
+    return (
+        "The strongest effect",
+        f"{named[0]}: what the simulator misses, against what drives it.",
+        figure,
+    )
 
 
 def _pairs(track, residual, coordinate):
-    """(T', 2) of the coordinate and the missing acceleration along its axis; None where the track hasn't it."""
+    """(T', 2) of the coordinate and the missing acceleration along its axis; None where the track
+    hasn't it.
+    """
     missing = smooth(disturbances(track, residual), CALM, track.dt)[:, 3:6]
     if coordinate == "body velocity":
-        x, y = to_body(track.quaternion, track.velocity)[:, 0], missing[:, 0]
+        x = to_body(track.quaternion, track.velocity)[:, 0]
+        y = missing[:, 0]
     else:
         y = missing[:, 2]
         x = {

@@ -10,7 +10,9 @@ from openjax.vehicle.effects import EFFECTS
 
 
 def page_of(report: Report) -> str:
-    """The whole page as text: the answer and what to type next, figures, values, and folded what is rarely asked."""
+    """The whole page as text: the answer and what to type next, figures, values, and folded what is
+    rarely asked.
+    """
     ranked = sorted(report.probabilities.items(), key=lambda item: -item[1])
     return filled(
         "page.html.jinja",
@@ -70,8 +72,16 @@ def shares(report: Report) -> list[dict]:
     rows += [("unexplained", report.shares.unexplained, "unexplained")]
 
     def row(name, share, kind):
-        value, low, high = (min(max(100.0 * v, 0.0), 100.0) for v in (share.value, *share.interval90))
-        return {"name": name.replace("_", " "), "kind": kind, "value": value, "low": low, "high": high}
+        value, low, high = (
+            min(max(100.0 * v, 0.0), 100.0) for v in (share.value, *share.interval90)
+        )
+        return {
+            "name": name.replace("_", " "),
+            "kind": kind,
+            "value": value,
+            "low": low,
+            "high": high,
+        }
 
     return [row(*entry) for entry in rows]
 
@@ -81,14 +91,14 @@ def next_steps(report: Report) -> list[tuple[str, str]]:
     steps = []
     if report.parameters:
         names = ", ".join(effect.replace("_", " ") for effect in report.parameters)
-        tune, train = (
-            "openjax adapt effects.toml --policy flight",
-            "openjax train --preset flight --effects effects.toml",
-        )
+        tune = "openjax adapt effects.toml --policy flight"
+        train = "openjax train --preset flight --effects effects.toml"
         steps.append((f"Fine-tune shipped weights to a vehicle with {names}:", tune))
         steps.append(("Or train from scratch in the corrected simulator:", train))
     for name, others in report.equivalent.items():
-        steps.append((f"These flights can't tell {name} from {', '.join(others)}. {_fly(report)}", ""))
+        steps.append(
+            (f"These flights can't tell {name} from {', '.join(others)}. {_fly(report)}", "")
+        )
     if report.left_out:
         why = "Mend the logs that were left out, and diagnose again: each says above what is wrong."
         steps.append((why, ""))
@@ -107,4 +117,8 @@ def next_steps(report: Report) -> list[tuple[str, str]]:
 
 def _fly(report: Report) -> str:
     text = report.next_flight.strip().rstrip(".")
-    return f"Next flight: {text[:1].lower()}{text[1:]}; then diagnose all of them again." if text else ""
+    return (
+        f"Next flight: {text[:1].lower()}{text[1:]}; then diagnose all of them again."
+        if text
+        else ""
+    )

@@ -2,8 +2,8 @@
 
     behaviour(scene, memory) -> wish (3,), memory (MEMORY,)
 
-A wish is a velocity as a share of the evader's speed, of at most length one. `openjax.pursuit.evaders.evader` sees to the
-speed, the acceleration and what is solid.
+A wish is a velocity as a share of the evader's speed, of at most length one.
+`openjax.pursuit.evaders.evader` sees to the speed, the acceleration and what is solid.
 """
 
 from collections.abc import Callable
@@ -18,18 +18,23 @@ from openjax.pursuit.sensing import line_of_sight
 from openjax.pursuit.settings import PursuitSettings
 
 MEMORY = 4
-"""Numbers that a scripted evader remembers; drawn uniformly from 0 to 1 at the start of an episode."""
+"""Numbers that a scripted evader remembers; drawn uniformly from 0 to 1 at the start of an
+episode.
+"""
 DIRECTIONS = 64
 """That a greedy evader tries; one that looks two steps ahead tries half as many at each."""
 MARGIN = 0.02
 """Distance (m) at which an evader keeps off pillars and the arena's bounds."""
 AROUND = 0.1
-"""A pillar's hugger stays this far from its surface, and way-points are left when nearer than this (m)."""
+"""A pillar's hugger stays this far from its surface, and way-points are left when nearer than this
+(m).
+"""
 PLACES = 128
 """In the arena, among which one looks for the safest."""
 R_SEQUENCE = 1.2207440846057596 ** -np.arange(1.0, 4.0)
-"""Steps from point to point of a sequence of low discrepancy: by the root of x^4 = x + 1 (Roberts 2018, The unreasonable
-effectiveness of quasirandom sequences)."""
+"""Steps from point to point of a sequence of low discrepancy: by the root of x^4 = x + 1 (Roberts
+2018, The unreasonable effectiveness of quasirandom sequences).
+"""
 FAR_AWAY = 100.0
 """Distance (m) at which pursuers are put that an evader doesn't know of."""
 
@@ -62,16 +67,23 @@ class Scene:
 def directions(number: int) -> np.ndarray:
     """(number, 3) unit vectors spread evenly over the sphere: a Fibonacci lattice."""
     i = np.arange(number) + 0.5
-    z, angle = 1.0 - 2.0 * i / number, np.pi * (1.0 + 5.0**0.5) * i
+    z = 1.0 - 2.0 * i / number
+    angle = np.pi * (1.0 + 5.0**0.5) * i
     radius = np.sqrt(1.0 - z**2)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=-1).astype(np.float32)
 
 
 def into_free_space(
-    settings: PursuitSettings, place: jax.Array, pillar_position: jax.Array, pillar_active: jax.Array
+    settings: PursuitSettings,
+    place: jax.Array,
+    pillar_position: jax.Array,
+    pillar_active: jax.Array,
 ) -> jax.Array:
-    """(..., 3) the points nearest to `place` (..., 3) that keep their distance from bounds and one pillar."""
-    xy, z = place[..., :2], place[..., 2:]
+    """(..., 3) the points nearest to `place` (..., 3) that keep their distance from bounds and one
+    pillar.
+    """
+    xy = place[..., :2]
+    z = place[..., 2:]
     offset = xy[..., None, :] - pillar_position
     distance = _length(offset)
     depth = jnp.maximum(settings.pillar_radius + MARGIN - distance, 0.0)
@@ -89,7 +101,9 @@ def greedy(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def two_step(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The same over two steps; after the first the pursuers have come closer, each straight to where it went."""
+    """The same over two steps; after the first the pursuers have come closer, each straight to
+    where it went.
+    """
     tried = directions(DIRECTIONS // 2)
     first, open_way = _ends(scene, scene.position, tried)
 
@@ -107,7 +121,8 @@ def two_step(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 def wall_runner(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Run along the wall, round the arena and up or down, away from the nearest pursuer."""
-    settings, threat = scene.settings, scene.nearest
+    settings = scene.settings
+    threat = scene.nearest
     radius = _length(scene.position[:2])
     out = scene.position[:2] / radius
     left = jnp.stack([-out[1], out[0]])
@@ -119,21 +134,28 @@ def wall_runner(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def pillar_hugger(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Stay behind a pillar, as seen by the nearest pursuer; where there is none, fly straight away from it."""
-    threat, pillars = scene.nearest, scene.pillar_position
+    """Stay behind a pillar, as seen by the nearest pursuer; where there is none, fly straight away
+    from it.
+    """
+    threat = scene.nearest
+    pillars = scene.pillar_position
     behind = pillars - threat[:2]
     behind = pillars + behind / _length(behind) * (scene.settings.pillar_radius + AROUND)
     distance = jnp.where(scene.pillar_active, _length(behind - scene.position[:2])[:, 0], jnp.inf)
     is_chosen = jnp.arange(distance.shape[0])[:, None] == jnp.argmin(distance)
     goal = jnp.concatenate([jnp.sum(jnp.where(is_chosen, behind, 0.0), axis=0), scene.position[2:]])
-    to_goal, away = goal - scene.position, _unit(scene.position - threat)
+    to_goal = goal - scene.position
+    away = _unit(scene.position - threat)
     hidden = to_goal / jnp.maximum(_length(to_goal), AROUND)
     return jnp.where(jnp.any(scene.pillar_active), hidden, away), memory
 
 
 def safe_place(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Fly to the place, of many all over the arena, that it would reach the longest before any pursuer; none behind a pillar."""
-    settings, pillars = scene.settings, (scene.pillar_position, scene.pillar_active)
+    """Fly to the place, of many all over the arena, that it would reach the longest before any
+    pursuer; none behind a pillar.
+    """
+    settings = scene.settings
+    pillars = (scene.pillar_position, scene.pillar_active)
     share = np.mod(0.5 + np.arange(PLACES)[:, None] * R_SEQUENCE[[1, 0, 2]], 1.0)
     places = _free_place(scene, jnp.asarray(share, jnp.float32))
     to_place = places - scene.position
@@ -146,13 +168,19 @@ def safe_place(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def way_points(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Fly from point to point, whatever the pursuers do. The points are a sequence of low discrepancy from a drawn one on."""
-    share, left, rest = memory[:3], memory[3], memory[4:]
+    """Fly from point to point, whatever the pursuers do. The points are a sequence of low
+    discrepancy from a drawn one on.
+    """
+    share = memory[:3]
+    left = memory[3]
+    rest = memory[4:]
     to_goal = _free_place(scene, share) - scene.position
     # after a second it gives up a point that it doesn't reach
     left = left - scene.settings.time_step
     done = (_length(to_goal)[0] < AROUND) | (left < 0.0)
-    own = jnp.where(done, jnp.append(jnp.mod(share + R_SEQUENCE, 1.0), 1.0), jnp.append(share, left))
+    own = jnp.where(
+        done, jnp.append(jnp.mod(share + R_SEQUENCE, 1.0), 1.0), jnp.append(share, left)
+    )
     return _unit(to_goal), jnp.concatenate([own, rest])
 
 
@@ -173,15 +201,26 @@ BEHAVIOURS: dict[str, Callable[[Scene, Any], tuple[jax.Array, Any]]] = {
 
 
 def _free_place(scene, share):
-    """(..., 3) m, a place outside pillars at shares (..., 3) from 0 to 1 of a turn, of the arena's area and of its height."""
+    """(..., 3) m, a place outside pillars at shares (..., 3) from 0 to 1 of a turn, of the arena's
+    area and of its height.
+    """
     settings = scene.settings
-    angle, radius = 2.0 * jnp.pi * share[..., 0], settings.arena_radius * jnp.sqrt(share[..., 1])
-    place = [radius * jnp.cos(angle), radius * jnp.sin(angle), settings.arena_height * share[..., 2]]
-    return into_free_space(settings, jnp.stack(place, axis=-1), scene.pillar_position, scene.pillar_active)
+    angle = 2.0 * jnp.pi * share[..., 0]
+    radius = settings.arena_radius * jnp.sqrt(share[..., 1])
+    place = [
+        radius * jnp.cos(angle),
+        radius * jnp.sin(angle),
+        settings.arena_height * share[..., 2],
+    ]
+    return into_free_space(
+        settings, jnp.stack(place, axis=-1), scene.pillar_position, scene.pillar_active
+    )
 
 
 def _ends(scene, start, tried):
-    """(K, 3) where K directions lead within the look-ahead, and (K,) whether no pillar is in the way."""
+    """(K, 3) where K directions lead within the look-ahead, and (K,) whether no pillar is in the
+    way.
+    """
     pillars = scene.pillar_position, scene.pillar_active
     ends = start + scene.reach * scene.look_ahead * tried
     ends = into_free_space(scene.settings, ends, *pillars)
@@ -189,10 +228,14 @@ def _ends(scene, start, tried):
 
 
 def _nearness(scene, ends, pursuers):
-    """(K,) m, from (K, 3) places to the nearest of (N, 3) pursuers; those without a line of sight count farther."""
+    """(K,) m, from (K, 3) places to the nearest of (N, 3) pursuers; those without a line of sight
+    count farther.
+    """
     distance = _length(ends[:, None] - pursuers)[..., 0]
     sees = jax.vmap(
-        lambda end: line_of_sight(scene.settings, pursuers, end, scene.pillar_position, scene.pillar_active)
+        lambda end: line_of_sight(
+            scene.settings, pursuers, end, scene.pillar_position, scene.pillar_active
+        )
     )(ends)
     distance = distance + jnp.where(sees, 0.0, scene.hiding)
     return jnp.min(jnp.where(scene.known, distance, FAR_AWAY), axis=-1)

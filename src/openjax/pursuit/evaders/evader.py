@@ -1,4 +1,6 @@
-"""The evader of one world: which it is, its numbers and its memory, drawn at the start; and its velocity in each step."""
+"""The evader of one world: which it is, its numbers and its memory, drawn at the start; and its
+velocity in each step.
+"""
 
 import functools
 from typing import TYPE_CHECKING, Any
@@ -40,7 +42,8 @@ def draw_evader(
       settings: their `evaders` are drawn with equal odds.
       key: ().
       pursuers: (N, 3) m, their starts, for the memory of a learned evader.
-      share: () from 0 to 1, how far a curriculum has come; None is 1. At 0 all worlds have the first of the evaders; from
+      share: () from 0 to 1, how far a curriculum has come; None is 1. At 0 all worlds have the
+      first of the evaders; from
         there the others' odds grow to the equal ones, and their speed from half to the whole.
       kind: () int32, the place in `settings.evaders` of the one it is; None draws it.
     """
@@ -75,17 +78,23 @@ def _drawn(values, kind, draw):
 
 
 def evader_velocity(
-    settings: PursuitSettings, world: "PursuitState", networks: Any = None, wish: jax.Array | None = None
+    settings: PursuitSettings,
+    world: "PursuitState",
+    networks: Any = None,
+    wish: jax.Array | None = None,
 ) -> tuple[jax.Array, EvaderState | None]:
     """(3,) velocity (m/s, world) of the evader of a world in this step, and its state after it.
 
-    Evaders other than the paper's neither leave the arena nor enter a pillar, and no gradient goes through what they decide.
+    Evaders other than the paper's neither leave the arena nor enter a pillar, and no gradient goes
+    through what they decide.
 
     Args:
       settings: the game.
       world: before this step.
-      networks: parameters of the learned evaders among the settings', their axis first; None: they do as the greedy one.
-      wish: (3,) a velocity, as a share of its speed, that is flown in place of its own; None or NaN is its own.
+      networks: parameters of the learned evaders among the settings', their axis first; None: they
+      do as the greedy one.
+      wish: (3,) a velocity, as a share of its speed, that is flown in place of its own; None or NaN
+      is its own.
     """
     if world.evader is None and wish is None:
         return _field(settings, world), None
@@ -100,7 +109,9 @@ def evader_velocity(
     velocity = _flown(settings, world, speed, state.numbers["acceleration"], wish)
     is_field = np.array([EVADERS[name].behaviour == "field" for name in settings.evaders])
     if is_field.any():
-        velocity = jnp.where(is_own & jnp.asarray(is_field)[state.kind], _field(settings, world), velocity)
+        velocity = jnp.where(
+            is_own & jnp.asarray(is_field)[state.kind], _field(settings, world), velocity
+        )
     return velocity, state.replace(memory=memory)
 
 
@@ -139,7 +150,8 @@ def _wish(settings, world, networks):
     behaviours = [EVADERS[name].behaviour for name in settings.evaders]
     used = [name for name in known if name in behaviours]
     place = np.array([used.index(name) if name in used else 0 for name in behaviours], np.int32)
-    # mapped over worlds, a switch works all of them out and selects: each behaviour stands in it once
+    # mapped over worlds, a switch works all of them out and selects: each behaviour stands in it
+    # once
     return jax.lax.switch(
         jnp.asarray(place)[state.kind],
         [known[name] for name in used],
@@ -149,12 +161,16 @@ def _wish(settings, world, networks):
 
 
 def _flown(settings, world, speed, acceleration, wish):
-    """(3,) m/s, what is flown of a wish: bounded in speed and acceleration, and past what is solid."""
+    """(3,) m/s, what is flown of a wish: bounded in speed and acceleration, and past what is
+    solid.
+    """
 
     def at_most(vector, limit):
         return vector * jnp.minimum(1.0, limit / jnp.sqrt(jnp.sum(vector**2) + 1e-12))
 
-    dt, start, before = settings.time_step, world.evader_position, world.evader_velocity
+    dt = settings.time_step
+    start = world.evader_position
+    before = world.evader_velocity
     velocity = at_most(before + at_most(speed * wish - before, acceleration * dt), speed)
     moved = into_free_space(settings, start + dt * velocity, *_pillars(world))
     velocity = at_most((moved - start) / dt, speed)

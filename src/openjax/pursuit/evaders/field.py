@@ -1,4 +1,6 @@
-"""The paper's evader: a potential field that flees pursuers in sight, pillars and the arena's bounds."""
+"""The paper's evader: a potential field that flees pursuers in sight, pillars and the arena's
+bounds.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -20,10 +22,13 @@ def field_velocity(
 ) -> jax.Array:
     """(3,) velocity (m/s, world) of the evader at (3,), memoryless, of constant speed.
 
-    `pursuers` (N, 3) repel as 1/distance where `in_sight` (N,); bounds and pillars as 1/distance to their surface.
+    `pursuers` (N, 3) repel as 1/distance where `in_sight` (N,); bounds and pillars as 1/distance to
+    their surface.
     """
     away = evader - pursuers
-    force = jnp.sum(jnp.where(in_sight[:, None], away / (_norm_squared(away) + EPSILON), 0.0), axis=0)
+    force = jnp.sum(
+        jnp.where(in_sight[:, None], away / (_norm_squared(away) + EPSILON), 0.0), axis=0
+    )
 
     radius = jnp.sqrt(_norm_squared(evader[:2])[0] + 1e-12)
     outward = evader[:2] / radius
@@ -38,10 +43,16 @@ def field_velocity(
     distance = jnp.sqrt(_norm_squared(from_pillar) + 1e-12)
     to_surface = distance - settings.pillar_radius
     strength = jnp.where(to_surface > 0.0, 1.0 / (jnp.maximum(to_surface, 0.0) + EPSILON), INWARD)
-    pillars = jnp.sum(jnp.where(pillar_active[:, None], from_pillar / distance * strength, 0.0), axis=0)
+    pillars = jnp.sum(
+        jnp.where(pillar_active[:, None], from_pillar / distance * strength, 0.0), axis=0
+    )
 
     force = force + jnp.concatenate([wall + pillars, (floor - ceiling)[None]])
-    size = jnp.max(jnp.abs(force)) if settings.evader_norm == "axis" else jnp.sqrt(jnp.sum(force**2) + 1e-12)
+    size = (
+        jnp.max(jnp.abs(force))
+        if settings.evader_norm == "axis"
+        else jnp.sqrt(jnp.sum(force**2) + 1e-12)
+    )
     return settings.evader_speed * force / (size + EPSILON)
 
 

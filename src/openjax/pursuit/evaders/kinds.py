@@ -1,4 +1,6 @@
-"""The evaders by name: a behaviour, and the values of its numbers, one of which is drawn for each world."""
+"""The evaders by name: a behaviour, and the values of its numbers, one of which is drawn for each
+world.
+"""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -11,13 +13,18 @@ UNBOUNDED = 1e6
 
 @dataclass(frozen=True)
 class EvaderKind:
-    """One evader. Where a number has several values, each world draws one of them, with equal odds."""
+    """One evader. Where a number has several values, each world draws one of them, with equal
+    odds.
+    """
 
     behaviour: str
-    """A name in `openjax.pursuit.evaders.behaviours.BEHAVIOURS`; "field" is the paper's, which has none of these numbers."""
+    """A name in `openjax.pursuit.evaders.behaviours.BEHAVIOURS`; "field" is the paper's, which has
+    none of these numbers.
+    """
     of: Literal["train", "validation", "held out", "file"]
-    """What it may be used for: held-out ones are never trained on, nor are checkpoints chosen by them. "file": it is read from
-    one."""
+    """What it may be used for: held-out ones are never trained on, nor are checkpoints chosen by
+    them. "file": it is read from one.
+    """
     look_ahead: tuple[float, ...] = (0.15,)
     """Seconds after which it looks at where a direction leads."""
     hiding: tuple[float, ...] = (0.0,)
@@ -43,9 +50,12 @@ EVADERS = {
         sees_all=(True, True, False),
     ),
     "wall_runner": EvaderKind("wall_runner", "train", speed=(0.8, 1.0)),
-    # slow enough to be caught by whoever dares to come near: without it, some teams wait a pillar's width away for good
+    # slow enough to be caught by whoever dares to come near: without it, some teams wait a pillar's
+    # width away for good
     "slow_hugger": EvaderKind("pillar_hugger", "train", speed=(0.4, 0.7)),
-    "heavy": EvaderKind("greedy", "validation", look_ahead=(0.2,), acceleration=(8.0,), hiding=(0.0, 0.3)),
+    "heavy": EvaderKind(
+        "greedy", "validation", look_ahead=(0.2,), acceleration=(8.0,), hiding=(0.0, 0.3)
+    ),
     "pillar_hugger": EvaderKind("pillar_hugger", "validation"),
     "greedy_far": EvaderKind("greedy", "held out", look_ahead=(0.4,)),
     "greedy_near": EvaderKind("greedy", "held out", look_ahead=(0.05,), hiding=(0.3,)),
@@ -62,13 +72,17 @@ def _of(split):
     return tuple(name for name, kind in EVADERS.items() if kind.of == split)
 
 
-TRAINED, VALIDATED, HELD_OUT = _of("train"), _of("validation"), _of("held out")
+TRAINED = _of("train")
+VALIDATED = _of("validation")
+HELD_OUT = _of("held out")
 
 
 def check_evaders(names: tuple[str, ...]) -> None:
     """Raises UserError for no evader, or one that nobody knows."""
     if not names:
-        raise UserError("environment.evaders is empty; it names at least one evader, for example field")
+        raise UserError(
+            "environment.evaders is empty; it names at least one evader, for example field"
+        )
     for name in names:
         if name not in EVADERS:
             raise UserError(f"evader {str(name)[:60]}: unknown; {suggestion(str(name), SCRIPTED)}")

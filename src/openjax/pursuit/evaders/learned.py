@@ -1,7 +1,9 @@
-"""A learned evader: a small network with a memory, added to what the greedy evader of some look-ahead would do.
+"""A learned evader: a small network with a memory, added to what the greedy evader of some
+look-ahead would do.
 
-Its memory holds where the pursuers were in the last steps. Pursuers and pillars are pooled, so that their number and order
-don't matter. With zeros in its last layer, as it starts, it is that greedy evader.
+Its memory holds where the pursuers were in the last steps. Pursuers and pillars are pooled, so that
+their number and order don't matter. With zeros in its last layer, as it starts, it is that greedy
+evader.
 """
 
 import functools
@@ -19,27 +21,42 @@ STEPS = 10
 """Steps that it remembers."""
 WIDTH = 64
 LOOK_AHEAD = (0.15, 0.5, 0.3)
-"""Seconds that the greedy evaders look ahead as which networks start, one after the other: a best response to who is caught
-out by a far-sighted one isn't found from a short-sighted one."""
-_OWN, _PURSUER, _PILLAR = 9, 10, 4
+"""Seconds that the greedy evaders look ahead as which networks start, one after the other: a best
+response to who is caught out by a far-sighted one isn't found from a short-sighted one.
+"""
+_OWN = 9
+_PURSUER = 10
+_PILLAR = 4
 
 
 def learned_place(names: tuple[str, ...], kind: jax.Array) -> jax.Array:
-    """The place among the learned evaders of those at the places `kind` (...) in `names`; -1 for others."""
+    """The place among the learned evaders of those at the places `kind` (...) in `names`; -1 for
+    others.
+    """
     is_learned = np.array([EVADERS[name].behaviour == "learned" for name in names])
     return jnp.asarray(np.where(is_learned, np.cumsum(is_learned) - 1, -1))[kind]
 
 
-def init_network(key: jax.Array, number: int | jax.Array = 0, own_axes: bool = False) -> dict[str, Any]:
-    """Parameters of a network (actor and critic alike) whose output, three numbers and one, is zero; `number` among others.
+def init_network(
+    key: jax.Array, number: int | jax.Array = 0, own_axes: bool = False
+) -> dict[str, Any]:
+    """Parameters of a network (actor and critic alike) whose output, three numbers and one, is
+    zero; `number` among others.
 
-    With `own_axes` it sees in axes of its own, x away from the arena's axis, so that a game that is turned looks the same.
+    With `own_axes` it sees in axes of its own, x away from the arena's axis, so that a game that is
+    turned looks the same.
     """
     inputs = {"pursuer": _PURSUER, "pillar": _PILLAR, "own": _OWN + 3 * WIDTH, "hidden": WIDTH}
     layers = {
-        # no orthogonal ones: several decompositions at once may wait for each other for ever on a CPU of two cores
-        name: {"kernel": jax.nn.initializers.he_normal()(own, (size, WIDTH)), "bias": jnp.zeros(WIDTH)}
-        for (name, size), own in zip(inputs.items(), jax.random.split(key, len(inputs)), strict=True)
+        # no orthogonal ones: several decompositions at once may wait for each other for ever on a
+        # CPU of two cores
+        name: {
+            "kernel": jax.nn.initializers.he_normal()(own, (size, WIDTH)),
+            "bias": jnp.zeros(WIDTH),
+        }
+        for (name, size), own in zip(
+            inputs.items(), jax.random.split(key, len(inputs)), strict=True
+        )
     }
     return {
         **layers,
@@ -53,13 +70,16 @@ def init_network(key: jax.Array, number: int | jax.Array = 0, own_axes: bool = F
 def features(
     networks: dict[str, Any], which: jax.Array, scene: Scene, memory: jax.Array
 ) -> dict[str, jax.Array]:
-    """What the one of K networks that `which` () names sees: own (9,), pursuers (N, 10), pillars (P, 4), in_use (P,), greedy
-    (3,), outward (2,)."""
-    settings, scene = scene.settings, scene.replace(look_ahead=networks["look_ahead"][which])
+    """What the one of K networks that `which` () names sees: own (9,), pursuers (N, 10), pillars
+    (P, 4), in_use (P,), greedy (3,), outward (2,).
+    """
+    settings = scene.settings
+    scene = scene.replace(look_ahead=networks["look_ahead"][which])
     before = memory[MEMORY:].reshape(STEPS, *scene.pursuers.shape)
     relative = scene.pursuers - scene.position
     distance = jnp.sqrt(jnp.sum(relative**2, axis=-1, keepdims=True) + 1e-12)
-    half, whole = (scene.pursuers - before[STEPS // 2]), (scene.pursuers - before[0])
+    half = scene.pursuers - before[STEPS // 2]
+    whole = scene.pursuers - before[0]
     scale = settings.max_speed * settings.time_step * STEPS
     to_pillar = scene.pillar_position - scene.position[:2]
     gap = jnp.sqrt(jnp.sum(to_pillar**2, axis=-1, keepdims=True) + 1e-12)
@@ -70,7 +90,11 @@ def features(
     outward = scene.position[:2] / jnp.sqrt(jnp.sum(scene.position[:2] ** 2) + 1e-6)
     outward = jnp.where(networks["own_axes"][which] > 0, outward, np.array([1.0, 0.0], np.float32))
     own = functools.partial(turned_back, outward)
-    vectors = own((scene.position - middle) / size), own(scene.velocity / settings.evader_speed), own(wish)
+    vectors = (
+        own((scene.position - middle) / size),
+        own(scene.velocity / settings.evader_speed),
+        own(wish),
+    )
     moved = [own(relative), distance, own(2.0 * half / scale), own(whole / scale)]
     seen = {
         "own": jnp.concatenate(vectors),
@@ -101,13 +125,17 @@ def outputs(network: dict[str, Any], seen: dict[str, jax.Array]) -> tuple[jax.Ar
 
 def remember(scene: Scene, memory: jax.Array) -> jax.Array:
     """The memory after this step."""
-    return jnp.concatenate([memory[:MEMORY], memory[MEMORY + scene.pursuers.size :], scene.pursuers.ravel()])
+    return jnp.concatenate(
+        [memory[:MEMORY], memory[MEMORY + scene.pursuers.size :], scene.pursuers.ravel()]
+    )
 
 
 def outputs_of(
     networks: dict[str, Any], which: jax.Array, seen: dict[str, jax.Array]
 ) -> tuple[jax.Array, jax.Array]:
-    """`outputs` of the one of K networks, every leaf with their axis first, that `which` (...) names for each of the features."""
+    """`outputs` of the one of K networks, every leaf with their axis first, that `which` (...)
+    names for each of the features.
+    """
     # all of them: cheaper than their parameters by world
     wishes, values = jax.vmap(outputs, (0, None))(networks, seen)
     chosen = jax.nn.one_hot(which, values.shape[0], axis=0)
@@ -115,7 +143,9 @@ def outputs_of(
 
 
 def learning(scene: Scene, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The behaviour without a network, whose wishes come from outside: the greedy one's, and the memory goes on."""
+    """The behaviour without a network, whose wishes come from outside: the greedy one's, and the
+    memory goes on.
+    """
     return greedy(scene, memory)[0], remember(scene, memory)
 
 

@@ -23,7 +23,8 @@ def hub_velocity(context: Context) -> jax.Array:
 def hub_height(context: Context) -> jax.Array:
     """World height of each hub, (4,) m."""
     return (
-        jax.vmap(lambda r: rotate(context.quaternion, r))(context.rotor_position)[:, 2] + context.position[2]
+        jax.vmap(lambda r: rotate(context.quaternion, r))(context.rotor_position)[:, 2]
+        + context.position[2]
     )
 
 

@@ -1,4 +1,6 @@
-"""Thrust falls with the battery's voltage: a motor command is a share of what the battery gives now."""
+"""Thrust falls with the battery's voltage: a motor command is a share of what the battery gives
+now.
+"""
 
 import jax.numpy as jnp
 
@@ -6,7 +8,9 @@ from openjax.vehicle.effects.effect import RARE, Card, Effect, Fitted, Parameter
 
 
 def voltage(parameters, context):
-    """Battery voltage () V: the context's where it is known, else a linear discharge from `full`."""
+    """Battery voltage () V: the context's where it is known, else a linear discharge from
+    `full`.
+    """
     simulated = parameters["full"] - parameters["discharge"] * context.air_time
     known = ~jnp.isnan(context.battery_voltage)
     return jnp.maximum(jnp.where(known, context.battery_voltage, simulated), 1.0)
@@ -37,9 +41,15 @@ EFFECT = Effect(
             prior=(0.0, 2.0),
             source="0 with voltage compensation, 2 where speed follows voltage; to 40 % less thrust empty",
         ),
-        "reference": Parameter("V", 3.9, (3.7, 4.2), _CELL, "voltage at which the nominal thrust holds"),
-        "full": Parameter("V", 4.0, (3.8, 4.15), _CELL, "voltage at take-off, where none is logged"),
-        "discharge": Parameter("V/s", 0.0017, (0.001, 0.003), _CELL, "loss per second, where none is logged"),
+        "reference": Parameter(
+            "V", 3.9, (3.7, 4.2), _CELL, "voltage at which the nominal thrust holds"
+        ),
+        "full": Parameter(
+            "V", 4.0, (3.8, 4.15), _CELL, "voltage at take-off, where none is logged"
+        ),
+        "discharge": Parameter(
+            "V/s", 0.0017, (0.001, 0.003), _CELL, "loss per second, where none is logged"
+        ),
     },
     motor=motor,
     card=Card(

@@ -20,7 +20,9 @@ EFFECT = Effect(
     parameters={
         "x": Parameter("m", 0.0, (-0.008, 0.008), _SOURCE, "forward"),
         "y": Parameter("m", 0.0, (-0.008, 0.008), _SOURCE, "left"),
-        "z": Parameter("m", 0.0, (-0.01, 0.01), _SOURCE, "up; felt only through forces in the rotor plane"),
+        "z": Parameter(
+            "m", 0.0, (-0.01, 0.01), _SOURCE, "up; felt only through forces in the rotor plane"
+        ),
     },
     body=body,
     card=Card(

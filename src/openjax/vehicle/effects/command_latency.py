@@ -20,7 +20,9 @@ EFFECT = Effect(
     description="the rate controller gets commands of a fixed time ago",
     formula=r"u'(t) = u(t - \Delta)",
     parameters={
-        "delay": Parameter("s", 0.0, (0.004, 0.06), "radio links of the Crazyflie and of ROS bridges")
+        "delay": Parameter(
+            "s", 0.0, (0.004, 0.06), "radio links of the Crazyflie and of ROS bridges"
+        )
     },
     command=command,
     initial_memory=initial_memory,

@@ -1,4 +1,6 @@
-"""Several effects at once. They act in the order of their names, whatever order they are given in."""
+"""Several effects at once. They act in the order of their names, whatever order they are given
+in.
+"""
 
 from collections.abc import Mapping
 from functools import reduce
@@ -18,7 +20,9 @@ AIR_TIME = "air_time"  # beside the effects' own memories
 
 
 def resolve(effects) -> tuple[Effect, ...]:
-    """Effects from names or `Effect`s, in the order in which they act. Raises UserError for unknown names."""
+    """Effects from names or `Effect`s, in the order in which they act. Raises UserError for unknown
+    names.
+    """
     found = {}
     for effect in effects:
         effect = effect if isinstance(effect, Effect) else find_effect(effect)
@@ -26,7 +30,9 @@ def resolve(effects) -> tuple[Effect, ...]:
     return tuple(found[name] for name in sorted(found))
 
 
-def complete_parameters(effects, given: Mapping[str, Mapping[str, Any]] | None, dtype) -> dict[str, dict]:
+def complete_parameters(
+    effects, given: Mapping[str, Mapping[str, Any]] | None, dtype
+) -> dict[str, dict]:
     """Parameters of every effect as arrays; what `given` leaves out has no effect.
 
     Raises UserError for effects or parameters that aren't known.
@@ -35,7 +41,9 @@ def complete_parameters(effects, given: Mapping[str, Mapping[str, Any]] | None, 
     known = {effect.name: effect for effect in effects}
     for name, values in given.items():
         if name not in known:
-            raise UserError(f"parameters for {name!r}, which is not among the effects {sorted(known)}")
+            raise UserError(
+                f"parameters for {name!r}, which is not among the effects {sorted(known)}"
+            )
         for parameter in values:
             find_effect(name, parameter, known=known)
     complete = {name: {**effect.none(), **given.get(name, {})} for name, effect in known.items()}
@@ -61,7 +69,9 @@ def initial_memory(effects, vehicle: Vehicle, state: DroneState, dt: float, key=
 
 def change_body(effects, parameters, vehicle: Vehicle) -> Vehicle:
     """The vehicle that really flies."""
-    hooks = [(effect.body, parameters[effect.name]) for effect in effects if effect.body is not None]
+    hooks = [
+        (effect.body, parameters[effect.name]) for effect in effects if effect.body is not None
+    ]
     return reduce(lambda vehicle, hook: hook[0](hook[1], vehicle), hooks, vehicle)
 
 
@@ -69,14 +79,18 @@ def change_command(effects, parameters, memory, command, context: Context):
     """The command (4,) that reaches the rate controller, and the memory after it."""
     for effect in effects:
         if effect.command is not None:
-            command, own = effect.command(parameters[effect.name], memory[effect.name], command, context)
+            command, own = effect.command(
+                parameters[effect.name], memory[effect.name], command, context
+            )
             memory = {**memory, effect.name: own}
     return command, memory
 
 
 def change_motor_command(effects, parameters, motor_command, context: Context):
     """The motor command (4,) that the motors follow; negative thrust is beyond a rotor."""
-    hooks = [(effect.motor, parameters[effect.name]) for effect in effects if effect.motor is not None]
+    hooks = [
+        (effect.motor, parameters[effect.name]) for effect in effects if effect.motor is not None
+    ]
     changed = reduce(lambda command, hook: hook[0](hook[1], command, context), hooks, motor_command)
     return jnp.maximum(changed, 0.0) if hooks else changed
 
@@ -95,16 +109,19 @@ def added_wrench(effects, parameters, context: Context):
     for effect in effects:
         if effect.wrench is not None:
             more_force, more_torque = effect.wrench(parameters[effect.name], context)
-            force, torque = force + more_force, torque + more_torque
+            force = force + more_force
+            torque = torque + more_torque
     return force, torque
 
 
 def wrench(effects, parameters, vehicle: Vehicle, rotor_speed, context: Context | None):
-    """Force (3,) N and torque (3,) N m about the centre of mass on the body, body frame, of rotors and effects.
+    """Force (3,) N and torque (3,) N m about the centre of mass on the body, body frame, of rotors
+    and effects.
 
     rotor_speed (4,) rad/s; without effects there need be no `context`.
     """
-    thrust, reaction = rotor_thrust(vehicle, rotor_speed), rotor_reaction(vehicle, rotor_speed)
+    thrust = rotor_thrust(vehicle, rotor_speed)
+    reaction = rotor_reaction(vehicle, rotor_speed)
     if not effects:
         return total_wrench(vehicle, thrust, reaction)
     context = context.replace(rotor_speed=rotor_speed, thrust=thrust)
@@ -117,7 +134,9 @@ def wrench(effects, parameters, vehicle: Vehicle, rotor_speed, context: Context 
 def check_memory(effects, memory) -> None:
     """Raises UserError where the drones have no memory of the effects."""
     if effects and not isinstance(memory, dict):
-        raise UserError("drones without memory of the effects: pass them through the step's reset() first")
+        raise UserError(
+            "drones without memory of the effects: pass them through the step's reset() first"
+        )
 
 
 def air_time(effects, memory):

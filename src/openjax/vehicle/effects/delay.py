@@ -26,10 +26,11 @@ def push(buffer, value) -> jax.Array:
 def look_back(buffer, delay, dt) -> jax.Array:
     """The value `delay` seconds before the newest, interpolated linearly.
 
-    For values that are held over a step this is their mean over the step that starts now, which is what a
-    plant driven by the delayed signal integrates. The delay is cut to 0..LONGEST_DELAY.
+    For values that are held over a step this is their mean over the step that starts now, which is
+    what a plant driven by the delayed signal integrates. The delay is cut to 0..LONGEST_DELAY.
     """
-    # not jnp.clip, which has half a slope at its bounds: a fit that starts from no delay needs the whole
+    # not jnp.clip, which has half a slope at its bounds: a fit that starts from no delay needs the
+    # whole
     steps = jnp.where(delay < 0.0, 0.0, jnp.where(delay > LONGEST_DELAY, LONGEST_DELAY, delay)) / dt
     whole = jax.lax.stop_gradient(jnp.floor(steps))
     part = steps - whole

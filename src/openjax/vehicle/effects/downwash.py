@@ -9,9 +9,12 @@ from openjax.vehicle.rigid_body import rotate, rotate_inverse
 
 
 def wrench(parameters, context):
-    """-A exp(-dz / h) exp(-r^2 / 2 s^2), s = width + spread dz, along world z; a quarter of it at each
-    hub."""
-    hubs = jax.vmap(lambda r: rotate(context.quaternion, r))(context.rotor_position) + context.position
+    """-A exp(-dz / h) exp(-r^2 / 2 s^2), s = width + spread dz, along world z; a quarter of it at
+    each hub.
+    """
+    hubs = (
+        jax.vmap(lambda r: rotate(context.quaternion, r))(context.rotor_position) + context.position
+    )
     separation = context.others_position[None] - hubs[:, None]  # (4, M, 3)
     above = separation[..., 2] > 0.0
     dz = jnp.where(above, separation[..., 2], 0.0)
@@ -32,7 +35,9 @@ EFFECT = Effect(
     parameters={
         "force": Parameter("N", 0.0, (0.03, 0.2), _SOURCE, "right under the other vehicle"),
         "length": Parameter("m", 0.5, (0.2, 1.0), _SOURCE, "decay below"),
-        "width": Parameter("m", 0.05, (0.03, 0.08), _SOURCE, "standard deviation to the side, at the rotors"),
+        "width": Parameter(
+            "m", 0.05, (0.03, 0.08), _SOURCE, "standard deviation to the side, at the rotors"
+        ),
         "spread": Parameter("1", 0.1, (0.0, 0.3), "turbulent jets widen by about 0.1 m per m"),
     },
     wrench=wrench,

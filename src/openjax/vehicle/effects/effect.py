@@ -37,10 +37,11 @@ class Context:
 
 
 def make_context(vehicle: Vehicle, state: DroneState, **known) -> Context:
-    """The context of one drone in `state`, of which `known` are fields; others are usual, or not known.
+    """The context of one drone in `state`, of which `known` are fields; others are usual, or not
+    known.
 
-    For logged flights: map it over the samples, `jax.vmap(lambda state, v: make_context(vehicle, state,
-    battery_voltage=v))(states, voltages)`, and map an effect's hooks over the result.
+    For logged flights: map it over the samples, `jax.vmap(lambda state, v: make_context(vehicle,
+    state, battery_voltage=v))(states, voltages)`, and map an effect's hooks over the result.
     """
     usual = Context(
         position=state.position,
@@ -58,7 +59,9 @@ def make_context(vehicle: Vehicle, state: DroneState, **known) -> Context:
         ceiling_height=ARENA_CEILING,
         dt=0.01,
     )
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, state.position.dtype), usual.replace(**known))
+    return jax.tree.map(
+        lambda leaf: jnp.asarray(leaf, state.position.dtype), usual.replace(**known)
+    )
 
 
 @dataclass(frozen=True)
@@ -78,9 +81,10 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Fitted:
-    """How one parameter is fitted: prior mean and standard deviation, start of the search, step of the difference
-    quotient, all in the parameter's unit. `error`: standard
-    deviation that rows of a log leave, whatever a fit says."""
+    """How one parameter is fitted: prior mean and standard deviation, start of the search, step of
+    the difference quotient, all in the parameter's unit. `error`: standard deviation that rows of a
+    log leave, whatever a fit says.
+    """
 
     name: str
     mean: float
@@ -90,31 +94,36 @@ class Fitted:
     error: float = 0.0
 
 
-# Log prior odds of effects, in round numbers: one vehicle in twenty, one in a hundred and fifty, one in four hundred.
-UNCOMMON, RARE, VERY_RARE = -3.0, -5.0, -6.0
+# Log prior odds of effects, in round numbers: one vehicle in twenty, one in a hundred and fifty,
+# one in four hundred.
+UNCOMMON = -3.0
+RARE = -5.0
+VERY_RARE = -6.0
 
 
 @dataclass(frozen=True)
 class Card:
     """How an effect is told from flights.
 
-    fitted: its parameters; `common` is the spread that all share, `balanced`: their mean belongs to another effect and is
+    fitted: its parameters; `common` is the spread that all share, `balanced`: their mean belongs to
+    another effect and is
         held near zero, `others`: more starts of the search.
-    path: by which way of the log it is read: "physics" (motors to motion), "radio", "rate_loop", "estimator".
-    needs: the channel without which it can't be told, though it leaves a trace in others.
-    coordinate: the variable that its force follows, for pictures; none where it makes torques or delays.
-    thrust_map: a map from duty cycles to thrust that isn't known can imitate it.
-    torque_axes: those of the torques by which it is told, which what motors do between two rows can imitate.
-    log_odds: log prior odds that it acts at a size that matters.
-    possible({parameter: value}, {parameter: deviation}): whether fitted values lie within physical bounds.
-    nuisance: {parameter: size, or a function of the vehicle that gives it} by which the vehicle's number is usually off: free in
+    path: by which way of the log it is read: "physics" (motors to motion), "radio", "rate_loop",
+    "estimator". needs: the channel without which it can't be told, though it leaves a trace in
+    others. coordinate: the variable that its force follows, for pictures; none where it makes
+    torques or delays. thrust_map: a map from duty cycles to thrust that isn't known can imitate it.
+    torque_axes: those of the torques by which it is told, which what motors do between two rows can
+    imitate. log_odds: log prior odds that it acts at a size that matters. possible({parameter:
+    value}, {parameter: deviation}): whether fitted values lie within physical bounds. nuisance:
+    {parameter: size, or a function of the vehicle that gives it} by which the vehicle's number is
+    usually off: free in
         every hypothesis, never a cause.
-    nuisance_duty, nuisance_samples: the same where motor commands are duty cycles, or single samples whose rows hide the rest.
-    weighed: whether a weighed vehicle rules it out.
-    at_voltage(values, intervals, voltage): both as they are at one voltage, for simulators that know none.
-    sample: a strength within its usual range to fly with, strong enough to see.
-    impossible(position): whether a flight along position (T, 3), m, rules it out.
-    next_flight: what would show it, in words.
+    nuisance_duty, nuisance_samples: the same where motor commands are duty cycles, or single
+    samples whose rows hide the rest. weighed: whether a weighed vehicle rules it out.
+    at_voltage(values, intervals, voltage): both as they are at one voltage, for simulators that
+    know none. sample: a strength within its usual range to fly with, strong enough to see.
+    impossible(position): whether a flight along position (T, 3), m, rules it out. next_flight: what
+    would show it, in words.
     """
 
     fitted: tuple[Fitted, ...]
@@ -142,27 +151,30 @@ class Card:
 BodyHook = Callable[[Mapping[str, Any], Vehicle], Vehicle]
 CommandHook = Callable[[Mapping[str, Any], Any, jax.Array, Context], tuple[jax.Array, Any]]
 MotorHook = Callable[[Mapping[str, Any], jax.Array, Context], jax.Array]
-ThrustHook = Callable[[Mapping[str, Any], jax.Array, jax.Array, Context], tuple[jax.Array, jax.Array]]
+ThrustHook = Callable[
+    [Mapping[str, Any], jax.Array, jax.Array, Context], tuple[jax.Array, jax.Array]
+]
 WrenchHook = Callable[[Mapping[str, Any], Context], tuple[jax.Array, jax.Array]]
 SensorHook = Callable[[Mapping[str, Any], Any, DroneState], DroneState]
 
 
 @dataclass(frozen=True)
 class Effect:
-    """One physical effect that the nominal vehicle leaves out. Any subset of the hooks may be given:
+    """One physical effect that the nominal vehicle leaves out. Any subset of the hooks may be
+    given:
 
-    body(parameters, vehicle) -> vehicle: another vehicle; once per step.
-    command(parameters, memory, command (4,), context) -> command, memory: what reaches the rate controller of
+    body(parameters, vehicle) -> vehicle: another vehicle; once per step. command(parameters,
+    memory, command (4,), context) -> command, memory: what reaches the rate controller of
         what the off-board controller sent; once per step.
     motor(parameters, motor_command (4,), context) -> motor_command: before the motors' lag.
-    thrust(parameters, thrust (4,) N, reaction (4,) N m, context) -> thrust, reaction: of each rotor.
-    wrench(parameters, context) -> force (3,) N, torque (3,) N m: added, body frame, about the centre of mass.
-    sensor(parameters, memory, state) -> state: what the off-board controller sees of the present state.
-    record(memory, state) -> memory: remembers the state at the end of a step, for `sensor`.
-    initial_memory(vehicle, state, dt, key) -> memory: needed where `command`, `sensor` or `record` use one.
-    random: whether `initial_memory` needs its key.
-    formula: what it changes, in LaTeX, for the documentation.
-    card: how the diagnosis tells it; without one it can be flown with, but not be diagnosed.
+    thrust(parameters, thrust (4,) N, reaction (4,) N m, context) -> thrust, reaction: of each
+    rotor. wrench(parameters, context) -> force (3,) N, torque (3,) N m: added, body frame, about
+    the centre of mass. sensor(parameters, memory, state) -> state: what the off-board controller
+    sees of the present state. record(memory, state) -> memory: remembers the state at the end of a
+    step, for `sensor`. initial_memory(vehicle, state, dt, key) -> memory: needed where `command`,
+    `sensor` or `record` use one. random: whether `initial_memory` needs its key. formula: what it
+    changes, in LaTeX, for the documentation. card: how the diagnosis tells it; without one it can
+    be flown with, but not be diagnosed.
     """
 
     name: str

@@ -1,4 +1,5 @@
-"""`effects.toml`: which effects act, and how strongly. Written by the diagnosis, read by the trainer.
+"""`effects.toml`: which effects act, and how strongly. Written by the diagnosis, read by the
+trainer.
 
     notes = "optional text"
 
@@ -6,8 +7,8 @@
     d_xy = { value = 0.012, unit = "N s/m", interval90 = [0.0113, 0.0128] }
     d_z = 0.0            # a bare number is in the parameter's own unit
 
-A parameter that is left out has no effect. `unit` and `interval90` are optional; a unit other than the
-parameter's own is an error, so that nothing is converted silently.
+A parameter that is left out has no effect. `unit` and `interval90` are optional; a unit other than
+the parameter's own is an error, so that nothing is converted silently.
 """
 
 import dataclasses
@@ -37,8 +38,8 @@ class _Entry:
 def load_effects(path: str | Path) -> tuple[tuple[str, ...], dict[str, dict[str, float]]]:
     """Names of the effects, sorted, and {effect: {parameter: value}} from an effects file.
 
-    Raises UserError for a missing or unreadable file, unknown names, wrong units and values that aren't
-    numbers.
+    Raises UserError for a missing or unreadable file, unknown names, wrong units and values that
+    aren't numbers.
     """
     entries = _read(Path(path))
     return tuple(sorted(entries)), {
@@ -47,7 +48,9 @@ def load_effects(path: str | Path) -> tuple[tuple[str, ...], dict[str, dict[str,
 
 
 def load_intervals(path: str | Path) -> dict[str, dict[str, tuple[float, float]]]:
-    """90 % intervals {effect: {parameter: (low, high)}} of an effects file, of those that have any."""
+    """90 % intervals {effect: {parameter: (low, high)}} of an effects file, of those that have
+    any.
+    """
     found = {
         name: {key: entry.interval90 for key, entry in own.items() if entry.interval90 is not None}
         for name, own in _read(Path(path)).items()
@@ -57,7 +60,8 @@ def load_intervals(path: str | Path) -> dict[str, dict[str, tuple[float, float]]
 
 def _read(path: Path) -> dict[str, dict[str, _Entry]]:
     """The entries of an effects file."""
-    table, read = read_toml(path, "effects file"), {}
+    table = read_toml(path, "effects file")
+    read = {}
     table.pop("notes", None)
     for name, entries in table.items():
         if not isinstance(entries, dict):
@@ -68,17 +72,21 @@ def _read(path: Path) -> dict[str, dict[str, _Entry]]:
 
 
 def _entry(path: Path, name: str, key: str, told) -> _Entry:
-    where, parameter = f"{path}: {name}.{key}", find_effect(name, key, f"{path}: ").parameters[key]
+    where = f"{path}: {name}.{key}"
+    parameter = find_effect(name, key, f"{path}: ").parameters[key]
     entry = from_plain(_Entry, told if isinstance(told, dict) else {"value": told}, where)
     if entry.unit not in (None, parameter.unit):
         raise UserError(f"{where} is in {entry.unit!r}; {parameter.unit!r} would be right")
     low, high = parameter.prior
     if not low - FAR * (high - low) <= entry.value <= high + FAR * (high - low):
         raise UserError(
-            f"{where} = {entry.value:g} {parameter.unit} is far from what occurs, {low:g} to {high:g}"
+            f"{where} = {entry.value:g} {parameter.unit} is far from what occurs, {low:g} to "
+            f"{high:g}"
         )
     if entry.interval90 is not None and entry.interval90[0] > entry.interval90[1]:
-        raise UserError(f"{where}: interval90 is {list(entry.interval90)}; low must not exceed high")
+        raise UserError(
+            f"{where}: interval90 is {list(entry.interval90)}; low must not exceed high"
+        )
     return entry
 
 
@@ -88,7 +96,8 @@ def save_effects(
     intervals: Mapping[str, Mapping[str, tuple[float, float]]] | None = None,
     notes: str = "",
 ) -> None:
-    """Write an effects file: {effect: {parameter: value}}, with 90 % intervals where `intervals` has them.
+    """Write an effects file: {effect: {parameter: value}}, with 90 % intervals where `intervals`
+    has them.
 
     Raises UserError for unknown effects or parameters, before anything is written.
     """
@@ -96,7 +105,8 @@ def save_effects(
     if notes:
         document.add("notes", notes)
     for name in sorted(parameters):
-        effect, table = find_effect(name), tomlkit.table()
+        effect = find_effect(name)
+        table = tomlkit.table()
         table.comment(effect.description)
         for key, value in parameters[name].items():
             find_effect(name, key)

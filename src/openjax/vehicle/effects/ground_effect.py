@@ -7,7 +7,9 @@ from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
 
 def gain(strength, distance):
-    """1 + strength (R / distance)^2 for hubs at `distance` m from a plane; cut at half a propeller radius."""
+    """1 + strength (R / distance)^2 for hubs at `distance` m from a plane; cut at half a propeller
+    radius.
+    """
     near = jnp.maximum(distance, 0.5 * PROPELLER_RADIUS)
     return 1.0 + strength * (PROPELLER_RADIUS / near) ** 2
 
@@ -18,9 +20,7 @@ def thrust(parameters, thrust, reaction, context):
     return thrust * gain(parameters["strength"], height + parameters["offset"]), reaction
 
 
-_SOURCE = (
-    "5-25 % at 5 cm (Cheeseman-Bennett form with free strength; Sanchez-Cuevas et al. 2017 for multirotors)"
-)
+_SOURCE = "5-25 % at 5 cm (Cheeseman-Bennett form with free strength; Sanchez-Cuevas et al. 2017 for multirotors)"
 
 EFFECT = Effect(
     name="ground_effect",

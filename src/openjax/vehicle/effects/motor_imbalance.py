@@ -1,4 +1,6 @@
-"""Rotors differ: bent or worn propellers and motors, each with its own factor on thrust and torque."""
+"""Rotors differ: bent or worn propellers and motors, each with its own factor on thrust and
+torque.
+"""
 
 import jax.numpy as jnp
 
@@ -16,7 +18,9 @@ EFFECT = Effect(
     name="motor_imbalance",
     description="rotor i gives (1 + m_i) times its thrust and torque",
     formula=r"T_i' = (1 + m_i)\,T_i,\quad Q_i' = (1 + m_i)\,Q_i",
-    parameters={name: Parameter("1", 0.0, (-0.15, 0.15), _SOURCE) for name in ("m1", "m2", "m3", "m4")},
+    parameters={
+        name: Parameter("1", 0.0, (-0.15, 0.15), _SOURCE) for name in ("m1", "m2", "m3", "m4")
+    },
     thrust=thrust,
     card=Card(
         fitted=(

@@ -5,19 +5,24 @@ import jax.numpy as jnp
 from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 
 _SHORTEST = 1e-3  # s
-_SLOWEST = 0.1  # s: small brushed motors were measured at up to 0.1 in all, and no loop flies through more
+_SLOWEST = (
+    0.1  # s: small brushed motors were measured at up to 0.1 in all, and no loop flies through more
+)
 EARLY = 0.0025  # s: motors that seem earlier than this are not what they seem
 
 
 def body(parameters, vehicle):
     up = jnp.maximum(vehicle.motor_time_constant + parameters["extra_up"], _SHORTEST)
     down = vehicle.motor_time_constant * vehicle.motor_slowdown_ratio + parameters["extra_down"]
-    return vehicle.replace(motor_time_constant=up, motor_slowdown_ratio=jnp.maximum(down, _SHORTEST) / up)
+    return vehicle.replace(
+        motor_time_constant=up, motor_slowdown_ratio=jnp.maximum(down, _SHORTEST) / up
+    )
 
 
 def lags(value, deviation):
-    """Whether motors lag. That they are early is what gusts look like, which the rate controller answers, and single
-    samples of the motors; a motor's time constant is known better than that."""
+    """Whether motors lag. That they are early is what gusts look like, which the rate controller
+    answers, and single samples of the motors; a motor's time constant is known better than that.
+    """
     return -EARLY < max(value["extra_up"], value["extra_down"]) < _SLOWEST
 
 

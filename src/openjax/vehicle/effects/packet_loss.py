@@ -1,8 +1,8 @@
 """Some commands never arrive: the last one is held.
 
-Which are lost is drawn from a key in the memory. In a replay that knows, `Context.packet_lost` decides
-instead (1 lost, 0 arrived). A share between gives the mean over draws of one step, which is differentiable in
-that share.
+Which are lost is drawn from a key in the memory. In a replay that knows, `Context.packet_lost`
+decides instead (1 lost, 0 arrived). A share between gives the mean over draws of one step, which is
+differentiable in that share.
 """
 
 import jax
@@ -30,7 +30,9 @@ EFFECT = Effect(
     description="each command is lost with a fixed probability, and the last one is held",
     formula=r"u'_k = u_k \text{ with probability } 1 - p,\ \text{else } u'_{k-1}",
     parameters={
-        "probability": Parameter("1", 0.0, (0.01, 0.5), "2.4 GHz radio in crowded rooms and swarms: 1-50 %")
+        "probability": Parameter(
+            "1", 0.0, (0.01, 0.5), "2.4 GHz radio in crowded rooms and swarms: 1-50 %"
+        )
     },
     command=command,
     initial_memory=initial_memory,

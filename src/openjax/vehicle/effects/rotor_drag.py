@@ -12,9 +12,7 @@ def wrench(parameters, context):
     return hub_wrench(context, -0.25 * drag * hub_velocity(context))
 
 
-_SOURCE = (
-    "induced drag of small quadrotors (Foerster 2015 for the Crazyflie; Faessler, Franchi, Scaramuzza 2018)"
-)
+_SOURCE = "induced drag of small quadrotors (Foerster 2015 for the Crazyflie; Faessler, Franchi, Scaramuzza 2018)"
 
 
 def brakes(value, deviation):
@@ -27,8 +25,12 @@ EFFECT = Effect(
     description="force against the hubs' velocity in the body frame",
     formula=r"f_i = -\tfrac14\,\mathrm{diag}(d_{xy}, d_{xy}, d_z)\,v_i",
     parameters={
-        "d_xy": Parameter("N s/m", 0.0, (0.005, 0.03), _SOURCE, "in the rotor plane, all four rotors"),
-        "d_z": Parameter("N s/m", 0.0, (0.0, 0.03), _SOURCE, "along the rotor axes, all four rotors"),
+        "d_xy": Parameter(
+            "N s/m", 0.0, (0.005, 0.03), _SOURCE, "in the rotor plane, all four rotors"
+        ),
+        "d_z": Parameter(
+            "N s/m", 0.0, (0.0, 0.03), _SOURCE, "along the rotor axes, all four rotors"
+        ),
     },
     wrench=wrench,
     card=Card(

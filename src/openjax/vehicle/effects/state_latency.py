@@ -11,14 +11,16 @@ def _pose(state):
 
 
 def initial_memory(vehicle, state, dt, key):
-    """As if the drone had been here before. The step is remembered, since `sensor` has no other way to know
-    it."""
+    """As if the drone had been here before. The step is remembered, since `sensor` has no other way
+    to know it.
+    """
     return {"pose": fill(_pose(state), dt), "dt": jnp.asarray(dt, state.position.dtype)}
 
 
 def record(memory, state):
-    """Quaternions q and -q are the same attitude: the one nearer to the last is kept, so they can be
-    averaged."""
+    """Quaternions q and -q are the same attitude: the one nearer to the last is kept, so they can
+    be averaged.
+    """
     pose = _pose(state)
     same = jnp.sum(state.quaternion * memory["pose"][0, 3:7]) >= 0.0
     sign = jnp.where(same, 1.0, -1.0).astype(pose.dtype)
@@ -36,7 +38,9 @@ EFFECT = Effect(
     name="state_latency",
     description="position, attitude and velocity are seen a fixed time late",
     formula=r"(p, q, v)_{\mathrm{seen}}(t) = (p, q, v)(t - \Delta)",
-    parameters={"delay": Parameter("s", 0.0, (0.004, 0.06), "motion capture, filtering and network")},
+    parameters={
+        "delay": Parameter("s", 0.0, (0.004, 0.06), "motion capture, filtering and network")
+    },
     sensor=sensor,
     record=record,
     initial_memory=initial_memory,

@@ -11,14 +11,21 @@ def motor(parameters, motor_command, context):
     return parameters["offset"] + parameters["slope"] * motor_command + square
 
 
-_SOURCE = "spread of quadratic thrust maps published for the Crazyflie, as shares of the largest thrust"
+_SOURCE = (
+    "spread of quadratic thrust maps published for the Crazyflie, as shares of the largest thrust"
+)
 
 
-_STEEPNESS = 0.4, 2.2  # of the curve, where a straight line has 1: powers of the command from 0.6 to 1.9
+_STEEPNESS = (
+    0.4,
+    2.2,
+)  # of the curve, where a straight line has 1: powers of the command from 0.6 to 1.9
 
 
 def rises(value, deviation):
-    """Whether a fitted curve rises over the usual commands as a motor's does; if not, the motors don't make this force."""
+    """Whether a fitted curve rises over the usual commands as a motor's does; if not, the motors
+    don't make this force.
+    """
     steepness = value["slope"] + 2.0 * value["curvature"] * np.array([0.45, 0.85])
     return bool(_STEEPNESS[0] < steepness.min() and steepness.max() < _STEEPNESS[1])
 

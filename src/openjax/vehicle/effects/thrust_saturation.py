@@ -8,9 +8,12 @@ _REFERENCE_VOLTAGE = 3.9  # V
 
 
 def motor(parameters, motor_command, context):
-    """min(m, limit), before the motors' lag: a saturated motor leaves its limit as soon as the command
-    does."""
-    missing = jnp.where(jnp.isnan(context.battery_voltage), 0.0, context.battery_voltage - _REFERENCE_VOLTAGE)
+    """min(m, limit), before the motors' lag: a saturated motor leaves its limit as soon as the
+    command does.
+    """
+    missing = jnp.where(
+        jnp.isnan(context.battery_voltage), 0.0, context.battery_voltage - _REFERENCE_VOLTAGE
+    )
     limit = parameters["limit"] * (1.0 + parameters["voltage_slope"] * missing)
     return jnp.minimum(motor_command, limit)
 
@@ -34,7 +37,9 @@ EFFECT = Effect(
     parameters={
         "limit": Parameter(
             unit="1",
-            none=1.5,  # out of reach: what a curve or a full battery gives beyond the nominal largest thrust stays
+            # out of reach: what a curve or a full battery gives beyond the nominal largest thrust
+            # stays
+            none=1.5,
             prior=(0.6, 0.95),
             source="brushed motors on a worn battery top out 10-30 % early",
             meaning="largest thrust as a share of the nominal one, at 3.9 V",
@@ -54,7 +59,15 @@ EFFECT = Effect(
             Fitted("limit", mean=0.8, spread=0.12, start=0.8, step=0.002),
             Fitted("voltage_slope", mean=0.0, spread=0.1, start=0.0, step=0.01),
         ),
-        others=((0.95, 0.0), (0.92, 0.0), (0.89, 0.0), (0.865, 0.0), (0.84, 0.0), (0.76, 0.0), (0.7, 0.0)),
+        others=(
+            (0.95, 0.0),
+            (0.92, 0.0),
+            (0.89, 0.0),
+            (0.865, 0.0),
+            (0.84, 0.0),
+            (0.76, 0.0),
+            (0.7, 0.0),
+        ),
         thrust_map=True,
         possible=tops_out,
         at_voltage=frozen,

@@ -6,7 +6,8 @@ from openjax.vehicle.effects.effect import Card, Effect, Fitted, Parameter
 def body(parameters, vehicle):
     factor = 1.0 + parameters["scale"]
     return vehicle.replace(
-        thrust_constant=vehicle.thrust_constant * factor, torque_constant=vehicle.torque_constant * factor
+        thrust_constant=vehicle.thrust_constant * factor,
+        torque_constant=vehicle.torque_constant * factor,
     )
 
 

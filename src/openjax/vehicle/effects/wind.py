@@ -1,4 +1,6 @@
-"""Steady wind: a force fixed in the world, so it turns with yaw in the body frame and persists at rest."""
+"""Steady wind: a force fixed in the world, so it turns with yaw in the body frame and persists at
+rest.
+"""
 
 import jax.numpy as jnp
 
@@ -8,8 +10,12 @@ from openjax.vehicle.rigid_body import rotate_inverse
 
 
 def wrench(parameters, context):
-    """-drag (v - w) at the hubs, of which a share along the rotors' axes: rotor drag in air that moves."""
-    wind = rotate_inverse(context.quaternion, jnp.stack([parameters["x"], parameters["y"], parameters["z"]]))
+    """-drag (v - w) at the hubs, of which a share along the rotors' axes: rotor drag in air that
+    moves.
+    """
+    wind = rotate_inverse(
+        context.quaternion, jnp.stack([parameters["x"], parameters["y"], parameters["z"]])
+    )
     drag = parameters["drag"] * jnp.stack([1.0, 1.0, parameters["along"]])
     return hub_wrench(context, -0.25 * drag * (hub_velocity(context) - wind))
 
