@@ -14,8 +14,8 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from openjax.commands.evaluator import Evaluator, layout_slots
-from openjax.commands.validation import uniform_tasks
+from openjax.evaluation.evaluator import Evaluator, layout_slots
+from openjax.evaluation.validation import uniform_tasks
 from openjax.files import replacing
 from openjax.show.plots import EVADER_COLOR, PURSUER_COLORS, draw_from_above
 from openjax.show.trajectory import Trajectory

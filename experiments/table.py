@@ -24,8 +24,8 @@ from typing import Any
 
 import numpy as np
 
-from openjax.commands.machine import describe_machine
 from openjax.files import read_json, write_json, write_text
+from openjax.runs.machine import describe_machine
 
 RESULTS = Path(__file__).parent / "results"
 PLACES = ("--out", "--work", "--results", "--flights", "--commit")

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import pytest
 
 from openjax.background import compile_ahead
-from openjax.commands.training_loop import guarded
+from openjax.runs.loop import guarded
 from openjax.store.leaves import abstract_like, place
 
 

@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 
 import openjax
-from openjax.commands import benchmark, evaluate, train, training_job
-from openjax.commands.command_line import run_command
-from openjax.commands.evaluator import FIELDS
+from openjax.command_line import run_command
+from openjax.commands import benchmark, evaluate, train
+from openjax.evaluation.evaluator import FIELDS
 from openjax.learning import training_step
 from openjax.learning.training_step import make_phases
 from openjax.pursuit import SCENARIOS

@@ -10,12 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from openjax.command_line import parse
 from openjax.commands import calibrate, diagnose, export, fly, sample_flights, virtual_crazyflie
 from openjax.commands.adapt import AdaptCommand
 from openjax.commands.benchmark import BenchmarkCommand
-from openjax.commands.command_line import parse
 from openjax.commands.evaluate import EvaluateCommand
-from openjax.commands.training_command import TrainCommand
 from openjax.commands.view import ViewCommand
 from openjax.errors import UserError
 from openjax.files import to_plain
@@ -26,6 +25,7 @@ from openjax.plain import from_plain
 from openjax.policy import NetworkSettings, PredictorSettings
 from openjax.pursuit import PursuitSettings, RewardSettings
 from openjax.ranges import Interval, check_intervals, ranged_fields
+from openjax.runs.start import TrainCommand
 from openjax.virtual_crazyflie.link import LinkFaults
 
 SETTINGS = (

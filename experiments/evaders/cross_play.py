@@ -18,9 +18,9 @@ import numpy as np
 from experiments.diagnosis.figures import wilson
 from experiments.flying.vehicles import vehicles
 from experiments.table import Page, Table, page_parser, publish
-from openjax.commands.command_line import run_command
-from openjax.commands.evaluator import layout_slots, layout_tasks, stacked
-from openjax.commands.validation import uniform_tasks
+from openjax.command_line import run_command
+from openjax.evaluation.evaluator import layout_slots, layout_tasks, stacked
+from openjax.evaluation.validation import uniform_tasks
 from openjax.learning.best_response import make_duel
 from openjax.pursuit import (
     SCENARIOS,

@@ -209,7 +209,7 @@ class Flown:
 
     def _child(self):
         """The flight itself, in a fork of the worker with a terminal of its own."""
-        from openjax.commands.command_line import run_command
+        from openjax.command_line import run_command
         from openjax.commands.fly import fly
 
         # the worker's are others: what multiprocessing puts in their place, files

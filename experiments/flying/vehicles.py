@@ -14,10 +14,10 @@ import jax
 import numpy as np
 
 from experiments.table import Page, Table, cell, page_parser, publish
-from openjax.commands.command_line import run_command
-from openjax.commands.evaluator import layout_slots, layout_tasks, stacked
-from openjax.commands.validation import uniform_tasks
-from openjax.learning import make_evaluate, summarise
+from openjax.command_line import run_command
+from openjax.evaluation.episodes import make_evaluate, summarise
+from openjax.evaluation.evaluator import layout_slots, layout_tasks, stacked
+from openjax.evaluation.validation import uniform_tasks
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, RewardSettings
 from openjax.store.policies import load_policy
 from openjax.vehicle import load_vehicle

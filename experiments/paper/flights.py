@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from openjax.learning import Evaluation
+from openjax.evaluation.episodes import Evaluation
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Pursuit, PursuitSettings, Task
 from openjax.pursuit.reward import captures

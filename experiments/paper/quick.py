@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 
 from experiments.table import Page, Table, page_parser, publish, spread
-from openjax.commands.validation import uniform_tasks
+from openjax.evaluation.validation import uniform_tasks
 from openjax.files import read_json
 from openjax.learning.presets import PRESETS
 from openjax.pursuit import SCENARIOS, Pursuit

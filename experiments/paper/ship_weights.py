@@ -4,7 +4,7 @@ experiments.paper.ship_weights NAME=RUN ...`.
 
 from pathlib import Path
 
-from openjax.commands.command_line import run_command
+from openjax.command_line import run_command
 from openjax.store.policies import load_policy
 from openjax.store.policy_files import WEIGHTS, load_policy_file, save_policy_file
 

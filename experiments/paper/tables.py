@@ -22,10 +22,10 @@ from experiments.paper.roster import ABLATIONS, METHODS, seeds_of
 from experiments.table import facts, page_parser, write_page
 from openjax.background import compile_ahead
 from openjax.baselines import METHODS as HEURISTICS
-from openjax.commands.command_line import run_command
-from openjax.commands.evaluator import layout_slots, record_of, repeat_task, stacked
+from openjax.command_line import run_command
+from openjax.evaluation.episodes import summarise
+from openjax.evaluation.evaluator import layout_slots, record_of, repeat_task, stacked
 from openjax.files import read_json, to_plain, write_text
-from openjax.learning import summarise
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, RewardSettings, Task, scenario_task
 from openjax.store.policies import LoadedPolicy, load_policy
 

@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.table import Page, Table, facts, page_parser, publish
-from openjax.commands.command_line import run_command
+from openjax.command_line import run_command
 from openjax.files import read_json, to_plain, write_json
 from openjax.pursuit import SCENARIOS
 from openjax.show.metrics import METRICS_FILE, read_metrics

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 
 from openjax import __version__
-from openjax.commands.command_line import run_command
+from openjax.command_line import run_command
 from openjax.errors import UserError, suggestion
 
 COMMANDS = {

@@ -14,8 +14,8 @@ import time
 import pytest
 
 from openjax.cluster.joining import Membership, find_membership
-from openjax.commands.training_command import membership
 from openjax.errors import UserError
+from openjax.runs.start import membership
 from openjax.show.metrics import read_metrics
 from openjax.store.checkpoint_files import is_checkpoint
 
@@ -45,7 +45,7 @@ from openjax.store.checkpoint_files import load_arrays
 from openjax.store.checkpoints import Checkpoints
 from openjax.store.leaves import named_leaves, place
 from openjax.cluster.devices import carry_shardings, everywhere, make_device_step
-from openjax.commands.training_loop import guarded
+from openjax.runs.loop import guarded
 from openjax.store.run_directory import RunDirectory
 
 run, directory, UPDATES = RunDirectory(Path(sys.argv[1])), Path(sys.argv[2]), int(sys.argv[3])

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from openjax.commands.command_line import LONGEST, parse, run_command
+from openjax.command_line import LONGEST, parse, run_command
 from openjax.commands.exploit import ExploitCommand
 from openjax.errors import UserError
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from openjax.commands.command_line import LONGEST, one_line
+from openjax.command_line import LONGEST, one_line
 from tests.fuzz.inputs import KINDS
 
 SECONDS = 30.0

@@ -23,9 +23,9 @@ def fuzz_train(rng: random.Random, folder: Path):
     import jax
 
     from openjax.cluster.processes import Processes
-    from openjax.commands.command_line import option_names
-    from openjax.commands.training_command import TrainCommand, membership, prepare, read_command
+    from openjax.command_line import option_names
     from openjax.learning import make_start
+    from openjax.runs.start import TrainCommand, membership, prepare, read_command
 
     names = _cached("train options", lambda: option_names(TrainCommand()))
     chosen = rng.choices(names, k=rng.randint(1, 3))
@@ -42,7 +42,7 @@ def fuzz_train(rng: random.Random, folder: Path):
 
 
 def fuzz_evaluate(rng: random.Random, folder: Path):
-    from openjax.commands.command_line import option_names, parse
+    from openjax.command_line import option_names, parse
     from openjax.commands.evaluate import PROGRAM, EvaluateCommand, prepare
 
     names = _cached("evaluate options", lambda: option_names(EvaluateCommand()))
@@ -53,8 +53,8 @@ def fuzz_evaluate(rng: random.Random, folder: Path):
 
 
 def fuzz_benchmark(rng: random.Random, folder: Path):
+    from openjax.command_line import option_names, parse
     from openjax.commands.benchmark import PROGRAM, BenchmarkCommand
-    from openjax.commands.command_line import option_names, parse
 
     names = _cached("benchmark options", lambda: option_names(BenchmarkCommand()))
     arguments = _hostile_options(rng, rng.choices(names, k=rng.randint(1, 3)), names)

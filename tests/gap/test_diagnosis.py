@@ -10,8 +10,8 @@ import sys
 import numpy as np
 import pytest
 
+from openjax.command_line import one_line
 from openjax.commands import diagnose
-from openjax.commands.command_line import one_line
 from openjax.errors import UserError
 from openjax.flights.case import load_case
 from openjax.flights.reading import write_csv

@@ -12,17 +12,16 @@ import numpy as np
 import pytest
 
 from openjax.errors import UserError
+from openjax.evaluation.episodes import make_evaluate, summarise
 from openjax.learning import (
     GeneratorSettings,
     MappoSettings,
     TrainSettings,
     build,
     changed,
-    make_evaluate,
     make_start,
     make_training_step,
     preset,
-    summarise,
     training_step,
 )
 from openjax.learning.training_step import initial_carry, make_phases, penalty_share_at

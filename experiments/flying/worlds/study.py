@@ -27,7 +27,7 @@ from experiments.flying.worlds.game import play
 from experiments.flying.worlds.plant import PlantWorld, rng_of
 from experiments.flying.worlds.rotorpy import RotorPyWorld
 from experiments.table import Page, Table, page_parser, publish
-from openjax.commands.evaluator import layout_slots
+from openjax.evaluation.evaluator import layout_slots
 from openjax.pursuit import SCENARIOS, scenario_task
 from openjax.pursuit.evaders import HELD_OUT
 from openjax.store.policies import load_policy

@@ -12,7 +12,7 @@ from typing import Annotated
 
 import tyro
 
-from openjax.commands.command_line import output_console, parse
+from openjax.command_line import output_console, parse
 from openjax.errors import UserError
 from openjax.files import check_output_folder
 from openjax.learning.settings import AdaptSettings
@@ -58,7 +58,7 @@ def main(arguments: Sequence[str]) -> int:
         cache_programs()
     import jax
 
-    from openjax.commands.adapting import ON_CPU, STEPS, adapt, check, in_words
+    from openjax.runs.adaptation import ON_CPU, STEPS, adapt, check, in_words
 
     console = output_console()
     on_cpu = jax.default_backend() == "cpu"

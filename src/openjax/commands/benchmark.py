@@ -14,7 +14,7 @@ from typing import Annotated, Literal, get_args
 
 import tyro
 
-from openjax.commands.command_line import output_console, parse, peek
+from openjax.command_line import output_console, parse, peek
 from openjax.errors import UserError
 from openjax.files import check_output, write_json
 from openjax.learning.presets import preset
@@ -79,8 +79,8 @@ def main(arguments: Sequence[str]) -> int:
 
     if max(command.devices) > (available := len(jax.devices())):
         raise UserError(f"--devices is {max(command.devices)}; {available} are here")
-    from openjax.commands.benchmark_cases import cases, time_compiled
-    from openjax.commands.machine import describe_machine
+    from openjax.runs.benchmark_cases import cases, time_compiled
+    from openjax.runs.machine import describe_machine
 
     machine = describe_machine()
     console = output_console()

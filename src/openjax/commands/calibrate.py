@@ -11,7 +11,7 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from openjax.commands.command_line import one_thread_for_matrices, output_console, parse
+from openjax.command_line import one_thread_for_matrices, output_console, parse
 from openjax.errors import UserError
 from openjax.files import check_output
 from openjax.show.number_tables import numbers_table

@@ -12,12 +12,12 @@ import jax.numpy as jnp
 from openjax.background import quiet_compiler
 from openjax.baselines.heuristic import WithoutNetwork
 from openjax.cluster.processes import Processes
-from openjax.commands.training_command import TrainCommand, default_preset, start
 from openjax.errors import UserError
 from openjax.learning import TrainSettings, preset
 from openjax.policy import PolicyParameters
 from openjax.pursuit import Observation, PursuitSettings
 from openjax.ranges import changed
+from openjax.runs.start import TrainCommand, default_preset, start
 from openjax.store.policies import LoadedPolicy, load_policy
 
 

@@ -12,7 +12,7 @@ import tyro
 from rich.panel import Panel
 from rich.text import Text
 
-from openjax.commands.command_line import one_line, one_thread_for_matrices, output_console, parse
+from openjax.command_line import one_line, one_thread_for_matrices, output_console, parse
 from openjax.errors import UserError
 from openjax.files import check_output, check_output_folder, replacing, write_json
 from openjax.show.progress import Steps

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from openjax.commands.command_line import output_console, parse
+from openjax.command_line import output_console, parse
 from openjax.errors import UserError
 from openjax.files import check_output, write_json
 from openjax.pursuit.settings import PursuitSettings
@@ -125,7 +125,7 @@ def prepare(command: EvaluateCommand, arguments: Sequence[str]) -> list[tuple]:
 
 
 def fly_scenarios(command: EvaluateCommand, loaded, evaluators: dict) -> tuple[list[dict], list]:
-    """A record (see `openjax.commands.evaluator.FIELDS`) and the first episode's `Trajectory` per
+    """A record (see `openjax.evaluation.evaluator.FIELDS`) and the first episode's `Trajectory` per
     scenario.
 
     Args:
@@ -138,8 +138,8 @@ def fly_scenarios(command: EvaluateCommand, loaded, evaluators: dict) -> tuple[l
     """
     import jax
 
-    from openjax.commands.evaluator import Evaluator, layout_tasks
-    from openjax.commands.validation import uniform_tasks
+    from openjax.evaluation.evaluator import Evaluator, layout_tasks
+    from openjax.evaluation.validation import uniform_tasks
 
     game, loaded, layouts = _game(command, loaded)
     tasks = layout_tasks(game.settings, layouts, command.episodes)
@@ -166,7 +166,7 @@ def fly_scenarios(command: EvaluateCommand, loaded, evaluators: dict) -> tuple[l
 
 def _game(command, loaded):
     """The game of a command, the policy in it, and the layouts; none: uniform tasks."""
-    from openjax.commands.evaluator import layout_slots
+    from openjax.evaluation.evaluator import layout_slots
     from openjax.pursuit.scenarios import SCENARIOS, find_scenario
     from openjax.store.environments import make_environment
 
@@ -197,8 +197,8 @@ def _game(command, loaded):
 
 def _show(command, results):
     """Print the tables and write the file: a record, a list of them, or such a list by policy."""
-    from openjax.commands.evaluator import results_table, spread_table
-    from openjax.commands.run_words import unlike_the_papers
+    from openjax.evaluation.evaluator import results_table, spread_table
+    from openjax.runs.words import unlike_the_papers
 
     console = output_console()
     for own, source, rows in results:

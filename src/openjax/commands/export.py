@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from openjax.commands.command_line import output_console, parse
+from openjax.command_line import output_console, parse
 from openjax.errors import UserError
 from openjax.files import check_output_folder, replacing
 from openjax.ranges import Interval, Seed

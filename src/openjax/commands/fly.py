@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
-from openjax.commands.command_line import one_line, output_console, parse
+from openjax.command_line import one_line, output_console, parse
 from openjax.errors import UserError
 from openjax.files import check_new_folder, replacing
 from openjax.flying.limits import SafetySettings

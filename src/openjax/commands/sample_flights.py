@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from openjax.commands.command_line import output_console, parse
+from openjax.command_line import output_console, parse
 from openjax.errors import UserError, suggestion
 from openjax.files import check_new_folder, replacing
 from openjax.ranges import Interval, Seed

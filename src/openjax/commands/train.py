@@ -8,7 +8,7 @@ From Python: `openjax.train(settings, out)`, see `openjax.commands.calls.train`.
 import time
 from collections.abc import Sequence
 
-from openjax.commands.command_line import parse, peek
+from openjax.command_line import parse, peek
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -23,8 +23,8 @@ def main(arguments: Sequence[str]) -> int:
     import jax
 
     from openjax.cluster.joining import joined
-    from openjax.commands.training_command import membership, read_command, start
     from openjax.platform import make_cores_devices
+    from openjax.runs.start import membership, read_command, start
 
     # the same numbers by a kernel of JAX's own: written out, they're half of what there is to
     # compile for a GPU
@@ -38,8 +38,8 @@ def main(arguments: Sequence[str]) -> int:
 
 def _help(arguments):
     """The options and a preset's defaults, without waiting for JAX to find its devices."""
-    from openjax.commands.training_options import PROGRAM, TrainCommand
     from openjax.learning.presets import preset
+    from openjax.runs.options import PROGRAM, TrainCommand
 
     default = TrainCommand(settings=preset(peek(arguments, "preset") or "quick"))
     parse(TrainCommand, default, ["--help"], PROGRAM)  # prints and exits

@@ -9,7 +9,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Annotated
 
-from openjax.commands.command_line import output_console, parse
+from openjax.command_line import output_console, parse
 from openjax.commands.evaluate import EvaluateCommand, FlightOptions, fly_scenarios
 from openjax.errors import UserError
 from openjax.files import check_output

@@ -14,7 +14,7 @@ from typing import Annotated
 
 import tyro
 
-from openjax.commands.command_line import output_console, parse
+from openjax.command_line import output_console, parse
 from openjax.ranges import Interval
 from openjax.virtual_crazyflie.link import BASE_PORT, LinkFaults
 

@@ -7,7 +7,6 @@ from openjax.lazy import lazy_names
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
-        "evaluation": "EpisodeRecord Evaluation make_evaluate summarise",
         "presets": "PRESETS changed preset",
         "settings": "AnalyticSettings GeneratorSettings MappoSettings TrainSettings",
         "training_step": "TrainCarry build make_start make_training_step",

@@ -20,6 +20,7 @@ import optax
 from flax import struct
 
 from openjax.baselines import make_policy
+from openjax.evaluation.episodes import Evaluation, make_evaluate
 from openjax.learning.analytic_gradient import (
     breach_share,
     crash_share,
@@ -27,7 +28,6 @@ from openjax.learning.analytic_gradient import (
     finite_or_zero,
     nearest_gap,
 )
-from openjax.learning.evaluation import Evaluation, make_evaluate
 from openjax.learning.settings import AdaptSettings, TrainSettings
 from openjax.policy import Policy, PolicyParameters
 from openjax.policy.growth import with_longer_history

@@ -1,6 +1,6 @@
 """`python -m openjax.virtual_crazyflie`: the command is `openjax.commands.virtual_crazyflie`."""
 
-from openjax.commands.command_line import run_command
+from openjax.command_line import run_command
 from openjax.commands.virtual_crazyflie import main
 
 if __name__ == "__main__":

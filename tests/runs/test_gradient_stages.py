@@ -4,8 +4,8 @@ import jax
 import numpy as np
 import pytest
 
-from openjax.commands.gradient_stages import TOGETHER, compile_first_flights, first_flights
 from openjax.learning import build, make_start, preset
+from openjax.runs.gradient_stages import TOGETHER, compile_first_flights, first_flights
 
 SETTINGS = preset(
     "quick",

@@ -18,13 +18,13 @@ import numpy as np
 
 from openjax.background import compile_ahead
 from openjax.baselines import Heuristic
-from openjax.commands.evaluator import episode_figures
-from openjax.commands.machine import describe_machine
-from openjax.commands.validation import selection_score, uniform_tasks
 from openjax.errors import UserError
+from openjax.evaluation.evaluator import episode_figures
+from openjax.evaluation.validation import selection_score, uniform_tasks
 from openjax.files import write_json, write_text
 from openjax.flights.case import load_case
 from openjax.learning.adaptation import bounds_of, fine_tune, make_adaptation, starting_parameters
+from openjax.runs.machine import describe_machine
 from openjax.store.policies import load_policy
 from openjax.store.policy_files import save_policy_file
 from openjax.vehicle.effects.effects_file import load_effects, load_intervals

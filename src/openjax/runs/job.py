@@ -25,22 +25,23 @@ from openjax.cluster.devices import (
     own_copy,
 )
 from openjax.cluster.processes import Processes
-from openjax.commands.before_and_after import game_for, report
-from openjax.commands.gradient_stages import (
-    compile_first_flights,
-    compile_last_stage,
-    first_flights,
-)
-from openjax.commands.run_words import closing_words
-from openjax.commands.training_loop import Loop, NotFiniteError, Outcome, Plan, StopRequest, guarded
-from openjax.commands.validation import Validation, flat_metrics, selection_score
 from openjax.errors import UserError
+from openjax.evaluation.episodes import summarise
+from openjax.evaluation.validation import Validation, flat_metrics, selection_score
 from openjax.files import write_json
-from openjax.learning import TrainSettings, build, make_start, summarise
+from openjax.learning import TrainSettings, build, make_start
 from openjax.learning.train_state import policy_leaf
 from openjax.policy import PolicyParameters
 from openjax.policy.growth import with_longer_history
 from openjax.pursuit import Pursuit
+from openjax.runs.gradient_stages import (
+    compile_first_flights,
+    compile_last_stage,
+    first_flights,
+)
+from openjax.runs.loop import Loop, NotFiniteError, Outcome, Plan, StopRequest, guarded
+from openjax.runs.report import game_for, report
+from openjax.runs.words import closing_words
 from openjax.show.metrics import MetricsWriter
 from openjax.show.progress import Progress
 from openjax.store.checkpoint_files import load_orbax
@@ -335,7 +336,11 @@ class _Run:
         loaded.
         """
         load_orbax()
-        validation = Validation(self.settings, self.job.environment)
+        settings, environment = self.settings, self.job.environment
+        policy = build(settings, environment).policy
+        validation = Validation(
+            environment, policy, settings.validation_episodes, settings.evaders_validation
+        )
         tasks = validation.tasks["validation"]
         validation.evaluator.compile_ahead(abstract_like(self.abstract.policy), tasks)()
         return validation

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 import jax
 from rich.table import Table
 
-from openjax.commands.evaluator import Evaluator, layout_slots, layout_tasks
-from openjax.commands.run_words import layouts_like
-from openjax.commands.training_loop import Outcome
-from openjax.commands.validation import Validation, uniform_tasks
+from openjax.evaluation.evaluator import Evaluator, layout_slots, layout_tasks
+from openjax.evaluation.validation import Validation, uniform_tasks
 from openjax.files import write_json
 from openjax.pursuit import Pursuit, PursuitSettings, Scenario
+from openjax.runs.loop import Outcome
+from openjax.runs.words import layouts_like
 from openjax.show.metrics import METRICS_FILE
 from openjax.show.number_tables import numbers_table
 from openjax.show.progress import Progress
@@ -24,7 +24,7 @@ from openjax.store.policy_files import fill, load_policy_file
 from openjax.store.run_directory import RunDirectory
 
 if TYPE_CHECKING:
-    from openjax.commands.training_job import TrainingJob
+    from openjax.runs.job import TrainingJob
 
 _BESIDE_RECORD = ("episode_return", "last_seen_error")
 

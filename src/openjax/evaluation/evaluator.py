@@ -13,7 +13,7 @@ import numpy as np
 from rich.table import Table
 
 from openjax.background import compile_ahead
-from openjax.learning import Evaluation, make_evaluate, summarise
+from openjax.evaluation.episodes import Evaluation, make_evaluate, summarise
 from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings, Scenario, Task, scenario_task
 from openjax.pursuit.statistics import EpisodeStatistics

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from openjax.cluster.processes import Processes
-from openjax.commands.training_command import prepare
-from openjax.commands.training_job import keep_best
-from openjax.commands.training_options import TrainCommand
 from openjax.files import read_json
 from openjax.learning import build, preset
 from openjax.pursuit import Pursuit
+from openjax.runs.job import keep_best
+from openjax.runs.options import TrainCommand
+from openjax.runs.start import prepare
 from openjax.store.leaves import named_leaves
 from openjax.store.policy_files import load_policy_file, save_policy_file
 from openjax.store.run_directory import RunDirectory

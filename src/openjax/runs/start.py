@@ -14,14 +14,14 @@ import jax
 from openjax.cluster.devices import can_share_out
 from openjax.cluster.joining import Membership, find_membership
 from openjax.cluster.processes import Processes
-from openjax.commands.command_line import output_console, parse, peek
-from openjax.commands.machine import describe_machine
-from openjax.commands.run_words import different_settings, opening_words
-from openjax.commands.training_job import TrainingJob, run_job
-from openjax.commands.training_options import MAY_CHANGE, PROGRAM, TrainCommand
+from openjax.command_line import output_console, parse, peek
 from openjax.errors import UserError
 from openjax.files import remove_unfinished, to_plain
 from openjax.learning import TrainSettings, preset
+from openjax.runs.job import TrainingJob, run_job
+from openjax.runs.machine import describe_machine
+from openjax.runs.options import MAY_CHANGE, PROGRAM, TrainCommand
+from openjax.runs.words import different_settings, opening_words
 from openjax.store.checkpoints import Checkpoints
 from openjax.store.compiled_programs import cache_programs
 from openjax.store.environments import make_environment

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import openjax
-from openjax.commands.before_and_after import compare, game_for
 from openjax.pursuit import SCENARIOS, Pursuit, PursuitSettings
+from openjax.runs.report import compare, game_for
 
 
 @pytest.mark.slow

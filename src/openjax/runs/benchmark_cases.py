@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from openjax.cluster.devices import carry_shardings, check_devices, make_device_step
-from openjax.commands.validation import uniform_tasks
 from openjax.errors import UserError
+from openjax.evaluation.validation import uniform_tasks
 from openjax.learning import TrainSettings, build, make_start, training_step
 from openjax.learning.rollout import collect
 from openjax.pursuit import Pursuit, hover_action

@@ -15,7 +15,7 @@ import pytest
 from flax import struct
 from rich.console import Console
 
-from openjax.commands.training_loop import Loop, NotFiniteError, Plan, StopRequest, guarded
+from openjax.runs.loop import Loop, NotFiniteError, Plan, StopRequest, guarded
 from openjax.show.metrics import MetricsWriter, read_metrics
 from openjax.show.progress import Progress
 from openjax.store.checkpoint_files import is_checkpoint

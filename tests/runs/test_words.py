@@ -3,8 +3,8 @@
 import dataclasses
 from pathlib import Path
 
-from openjax.commands.run_words import closing_words, layouts_like, opening_words
 from openjax.learning import preset
+from openjax.runs.words import closing_words, layouts_like, opening_words
 
 
 def test_another_game_is_said_to_be_one_and_judged_by_layouts_like_it():

@@ -7,9 +7,8 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from openjax.commands.evaluator import Evaluator, Flown, layout_slots
-from openjax.learning import TrainSettings, build
-from openjax.policy import PolicyParameters
+from openjax.evaluation.evaluator import Evaluator, Flown, layout_slots
+from openjax.policy import Policy, PolicyParameters
 from openjax.pursuit import Pursuit, PursuitSettings, Task, expand_task, turn_task, uniform_task
 
 VALIDATION_KEY = 20_000_003
@@ -53,18 +52,21 @@ class Validation:
     room for layouts' pillars.
 
     Args:
-      settings: of the run; from its game the tasks are drawn.
-      environment: the run's.
+      environment: the run's; from its game the tasks are drawn.
+      policy: the networks.
+      number: tasks of each kind.
+      evaders: who flies; none: the game's own.
     """
 
-    def __init__(self, settings: TrainSettings, environment: Pursuit):
-        drawn = settings.environment
-        self.number = settings.validation_episodes
+    def __init__(
+        self, environment: Pursuit, policy: Policy, number: int, evaders: tuple[str, ...] = ()
+    ):
+        drawn = environment.settings
+        self.number = number
         slots = layout_slots(drawn)
-        evaders = settings.evaders_validation or drawn.evaders
-        game = dataclasses.replace(drawn, max_pillars=slots, evaders=evaders)
+        game = dataclasses.replace(drawn, max_pillars=slots, evaders=evaders or drawn.evaders)
         wide = dataclasses.replace(environment, settings=game, dynamics=None)
-        self.evaluator = Evaluator(wide, build(settings, environment).policy, 2 * self.number)
+        self.evaluator = Evaluator(wide, policy, 2 * number)
         self.tasks: dict[str, Task] = {
             "validation": uniform_tasks(drawn, self.number, slots),
             "validation_far": far_tasks(drawn, self.number, slots),
@@ -84,7 +86,7 @@ def selection_score(summary: dict, episode_length: int) -> float:
     would keep the first checkpoints of a policy that starts smooth.
 
     Args:
-      summary: from `openjax.learning.summarise`.
+      summary: from `openjax.evaluation.summarise`.
       episode_length: control steps of an episode; `capture_step` of an episode without a capture.
     """
     return (
