@@ -10,6 +10,8 @@ observation, state, reward, terminated, truncated, info = jax.jit(environment.st
 )
 """
 
+import sys
+import types
 from typing import TYPE_CHECKING
 
 from openjax.lazy import lazy_names
@@ -39,3 +41,19 @@ __getattr__, __dir__, __all__ = lazy_names(
         "store.policies": "load_policy",
     },
 )
+
+
+class _Package(types.ModuleType):
+    """The package, whose functions `train` and `evaluate` stay what they are.
+
+    `python -m openjax.train` needs a module of that name, too. Whoever imports it (an editor, a
+    walk through all modules) has the import system bind it as an attribute of the package, in place
+    of the function; that is ignored.
+    """
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if name not in __all__ or not isinstance(value, types.ModuleType):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package

@@ -101,7 +101,8 @@ def evaluate(
     Returns:
       A record, or a list of them for "all": scenario, episodes; capture_rate, crash_rate in 0..1;
       capture_step, and slowest_capture_step of the slowest hundredth, in control steps;
-      collision_rate, collision_parts (pillar, drone, bounds) and over_speed_rate, of pursuer steps;
+      collision_rate, collision_parts (pillar, drone, bounds) and over_speed_rate, each the share of
+      steps in which any pursuer does so;
       prediction_error (m).
 
     Raises:
